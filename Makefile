@@ -1,0 +1,60 @@
+# Needs bash, make and Python 3.11 to 3.13; `make help` lists what can be done.
+SHELL := bash
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+VENV := .venv
+PY := $(VENV)/bin/python
+READY := $(VENV)/.installed
+PIP_FLAGS := -qq --disable-pip-version-check
+SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
+# The first suitable Python unless PYTHON names one.
+PYTHON ?= python3.13 python3.12 python3.11 python3 python
+
+TYPED := build/typecheck
+SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py)))
+MAPPED := configs|data|kernels|viz
+
+.PHONY: help demo test lint wheel-test clean
+
+help: ## List the targets.
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: $(READY) ## Simulate July in New York and California; results in runs/demo.
+	$(VENV)/bin/sdc-taichi simulate --site ny,ca --days 31 --start 07-01 --out runs/demo
+
+test: $(READY) ## Run all tests; those on measured files need SDC_REAL_DATA.
+	$(PY) -m pytest
+
+lint: $(READY) ## Check style, format and types.
+	$(PY) -m ruff check
+	$(PY) -m ruff format --check
+	rm -rf $(TYPED)
+	$(PY) -c 'from setuptools import setup; setup()' --quiet build_py --build-lib $(TYPED)
+	set -o pipefail; cd $(TYPED) && ../../$(PY) -m mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache \
+	    sdc_taichi $(addprefix ../../,$(SCRIPTS)) \
+	    | sed -E 's#^sdc_taichi/($(MAPPED))/#\1/#; s#^\.\./\.\./##'
+
+wheel-test: $(READY) ## Build the wheel and run the tests against it, away from the sources.
+	.ci/wheel-test $(PY)
+
+clean: ## Remove everything that can be built again, the environment included.
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(READY): pyproject.toml
+	@if [ ! -x $(PY) ]; then \
+	    for candidate in $(PYTHON); do \
+	        if "$$candidate" -c '$(SUITABLE)' 2>/dev/null; then found=$$candidate; break; fi; \
+	    done; \
+	    if [ -z "$${found:-}" ]; then \
+	        echo "No Python 3.11, 3.12 or 3.13 with the venv module among: $(PYTHON). Install one" \
+	            "(on Debian and Ubuntu with its python3-venv package) or name it: make PYTHON=..." >&2; \
+	        exit 1; \
+	    fi; \
+	    echo "Creating $(VENV) with $$("$$found" --version)"; \
+	    "$$found" -m venv $(VENV); \
+	fi
+	@echo "Installing sdc-taichi and its dependencies into $(VENV) (once, a few minutes at most)"
+	@$(PY) -m pip install $(PIP_FLAGS) --editable '.[plot,dev]'
+	@touch $@

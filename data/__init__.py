@@ -1,0 +1,1 @@
+"""Embedded tables; README.md names source, unit and licence of each."""

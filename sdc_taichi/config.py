@@ -1,0 +1,861 @@
+"""Configuration of one data center: one validated, frozen schema for YAML, overrides and Python.
+
+A preset names one model per stage (see docs/presets.md); no stage asks which preset it is in.
+Units are part of every field name. An unknown key is an error that suggests the nearest valid one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import re
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from sdc_taichi.errors import ConfigError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+Pair = tuple[Finite, Finite]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
+
+
+class ServerGroup(_Section):
+    """Servers of a rack that are alike: computed once, expanded to servers on request.
+
+    ``load_weight`` is relative to the rack's mean (by count) and may reach twice the mean;
+    ``inlet_offset_k`` is added to the rack's inlet temperature (height in the rack).
+    """
+
+    count: Count
+    full_w: Positive
+    idle_w: NonNegative
+    load_weight: NonNegative = 1.0
+    inlet_offset_k: Finite = 0.0
+
+    @model_validator(mode="after")
+    def _idle_below_full(self) -> Self:
+        if self.idle_w > self.full_w:
+            raise ValueError(f"idle_w {self.idle_w:g} must not exceed full_w {self.full_w:g}")
+        return self
+
+
+class HallConfig(_Section):
+    """Rows of racks, their approach temperatures, and how many servers they hold."""
+
+    rows: Count
+    racks_per_row: Count
+    servers_per_rack: Count | tuple[Count, ...] = 200
+    capacity_mw: Positive | None = None
+    """IT nameplate to scale the number of servers to; None keeps servers_per_rack."""
+    inlet_model: Literal["approach"] = "approach"
+    supply_approach_k: NonNegative | tuple[NonNegative, ...]
+    supply_approach_limits_k: Pair | None = None
+    return_approach_k: Finite | tuple[Finite, ...]
+    room_heat_capacity_kj_per_k_per_server: Positive = 10.0
+    air_density_kg_m3: Positive = 1.225
+    air_heat_capacity_j_per_kg_k: Positive = 1006.0
+
+    @property
+    def racks(self) -> int:
+        """Number of racks, rows x racks per row."""
+        return self.rows * self.racks_per_row
+
+    @field_validator("supply_approach_limits_k")
+    @classmethod
+    def _ordered(cls, value: Pair | None) -> Pair | None:
+        return _check_ordered(value)
+
+    @model_validator(mode="after")
+    def _one_entry_per_rack(self) -> Self:
+        for name in ("servers_per_rack", "supply_approach_k", "return_approach_k"):
+            _check_length(name, getattr(self, name), self.racks)
+        return self
+
+
+class ServerConfig(_Section):
+    """Power and airflow of the servers (ITE:AirCooled form of EnergyPlus, curves of Sun 2021)."""
+
+    power_w: tuple[Pair, ...] | Pair = (150.0, 10.0)
+    """(full, idle) power of one server: one pair for all racks or one pair per rack."""
+    groups: tuple[tuple[ServerGroup, ...], ...] | None = None
+    """Server groups per rack (one entry serves all racks); replaces power_w and servers_per_rack."""
+    cpu_power_ratio_lb: Pair = (0.01, 1.00)
+    cpu_power_ratio_ub: Pair = (0.03, 1.02)
+    cpu_slope_offset_per_k: Finite = 0.0
+    inlet_range_c: Pair = (16.0, 28.0)
+    fan_airflow_ratio_lb: Pair = (0.01, 0.225)
+    fan_airflow_ratio_ub: Pair = (0.225, 1.0)
+    fan_model: Literal["linear", "released"] = "linear"
+    """Airflow ratio against inlet temperature and load: config curve, or the released scaling."""
+    fan_airflow_ratio_limits: Pair | None = None
+    fan_power_exponent: Annotated[float, Field(ge=1, le=3)] = 3.0
+    fan_full_airflow_m3s: Positive = 0.051
+    fan_reference_ratio: Positive = 1.0
+    fan_reference_w: NonNegative = 10.0
+    outlet_model: Literal["server", "rack", "released"] = "server"
+
+    @field_validator("inlet_range_c", "fan_airflow_ratio_limits")
+    @classmethod
+    def _ordered(cls, value: Pair | None) -> Pair | None:
+        return _check_ordered(value)
+
+    @model_validator(mode="after")
+    def _idle_below_full(self) -> Self:
+        for rack, (full_w, idle_w) in enumerate(self.power_pairs()):
+            if not full_w > 0 or not 0 <= idle_w <= full_w:
+                raise ValueError(
+                    f"power_w entry {rack} is ({full_w:g}, {idle_w:g}); "
+                    "valid is (full, idle) with full > 0 and 0 <= idle <= full"
+                )
+        return self
+
+    def power_pairs(self) -> tuple[Pair, ...]:
+        """The (full, idle) pairs, one for all racks or one per rack."""
+        first = self.power_w[0]
+        return self.power_w if isinstance(first, tuple) else (self.power_w,)  # type: ignore[return-value]
+
+
+class SetpointConfig(_Section):
+    """CRAC supply setpoint: range, start value and how actions move it."""
+
+    model: Literal["symmetric", "accelerating"] = "symmetric"
+    min_c: Finite = 16.0
+    max_c: Finite = 23.0
+    initial_c: Finite = 18.0
+    step_k: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _inside(self) -> Self:
+        if not self.min_c <= self.initial_c <= self.max_c:
+            raise ValueError(
+                f"initial_c {self.initial_c:g} must lie within min_c {self.min_c:g} "
+                f"and max_c {self.max_c:g}"
+            )
+        return self
+
+
+class CracConfig(_Section):
+    """CRAC units: airflow per IT watt at design, fan power."""
+
+    supply_m3s_per_w: Positive = 5.663e-5
+    reference_m3s_per_w: Positive = 9.438e-5
+    flow_model: Literal["constant", "follow_servers", "per_watt"] = "follow_servers"
+    min_flow_ratio: Annotated[float, Field(gt=0, le=1)] = 0.5
+    fan_w_per_m3s: NonNegative = 500.0
+    """Design fan power per design airflow (specific fan power)."""
+    released_fan_w: NonNegative = 150.0
+    """CRAC_FAN_REF_P of the SustainDC format: one unscaled fan."""
+
+
+class ChillerConfig(_Section):
+    """Chiller model and its reference point."""
+
+    model: Literal[
+        "carnot",
+        "eir_york",
+        "electric_water_cooled",
+        "electric_air_cooled",
+        "constant_cop",
+        "released",
+        "paper",
+    ] = "carnot"
+    reference_cop: Positive = 5.96
+    coil_approach_k: Positive = 8.0
+    chilled_water_range_k: Positive = 6.0
+    min_condenser_c: Finite = 12.78
+
+
+class TowerConfig(_Section):
+    """Cooling tower, condenser water and waterside economiser."""
+
+    model: Literal["yorkcalc", "released", "paper"] = "yorkcalc"
+    approach_min_k: Positive = 4.0
+    water_range_k: Positive = 5.56
+    fan_w_per_w_rejected: NonNegative = 0.02
+    printed_fan_w: NonNegative = 1000.0
+    """CT_FAN_REF_P of the SustainDC format, for the tower of the paper."""
+    printed_airflow_m3s: Positive = 2.8315
+    """CT_REFRENCE_AIR_FLOW_RATE of the SustainDC format, for the tower of the paper."""
+    economiser: bool = True
+    economiser_approach_k: NonNegative = 5.0
+    """Tower and heat exchanger together: coldest water the exchanger gives, above wet bulb."""
+
+    @model_validator(mode="after")
+    def _exchanger_adds(self) -> Self:
+        if self.economiser_approach_k < self.approach_min_k:
+            raise ValueError(
+                f"economiser_approach_k {self.economiser_approach_k:g} must not be below "
+                f"approach_min_k {self.approach_min_k:g}, which it contains"
+            )
+        return self
+
+
+class PumpConfig(_Section):
+    """Chilled- and condenser-water pumps."""
+
+    model: Literal["sized", "released"] = "sized"
+    pressure_drop_pa: Positive = 200_000.0
+    efficiency: Annotated[float, Field(gt=0, le=1)] = 0.75
+    min_flow_ratio: Annotated[float, Field(gt=0, le=1)] = 0.4
+    released_chilled_w: NonNegative = 0.0
+    released_condenser_w: NonNegative = 0.0
+
+
+class WaterConfig(_Section):
+    """Make-up water of the cooling tower."""
+
+    model: Literal["mass_balance", "released", "paper"] = "mass_balance"
+    cycles_of_concentration: Annotated[float, Field(gt=1)] = 5.0
+    drift_share: Share = 2e-5
+
+
+class SizingConfig(_Section):
+    """How devices are sized for load and site."""
+
+    model: Literal["design_day", "released"] = "design_day"
+    margin: Annotated[float, Field(ge=1)] = 1.15
+    design_wet_bulb_c: Finite | None = None
+    """None takes the 99.6 % quantile of the site's weather."""
+    design_outdoor_c: Finite | None = None
+    """None takes the 99.6 % quantile of the site's weather (released: 30 NY, 20 WA, else 50 C)."""
+
+
+Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
+
+
+class HvacConfig(_Section):
+    """Cooling from the CRAC units to the tower."""
+
+    setpoint: SetpointConfig = SetpointConfig()
+    crac: CracConfig = CracConfig()
+    cooling_load_model: Literal["heat_balance", "released", "paper"] = "heat_balance"
+    chiller: ChillerConfig = ChillerConfig()
+    tower: TowerConfig = TowerConfig()
+    pumps: PumpConfig = PumpConfig()
+    water: WaterConfig = WaterConfig()
+    sizing: SizingConfig = SizingConfig()
+    total_of: tuple[Device, ...] = (
+        "chiller",
+        "tower_fan",
+        "chilled_pump",
+        "condenser_pump",
+        "crac_fan",
+    )
+    """Devices counted in the HVAC total."""
+    ups_efficiency: Annotated[float, Field(gt=0, le=1)] = 0.96
+    """Only for the PUE with UPS losses; the grid balance is IT + HVAC + battery."""
+
+
+class BatteryConfig(_Section):
+    """Battery: model, capacity and limits (C/L/C of Kazhamiaka, Rosenberg and Keshav 2019)."""
+
+    model: Literal["clc", "released", "paper"] = "clc"
+    capacity_kwh: NonNegative | None = None
+    """None sizes it to hours_of_design_load."""
+    hours_of_design_load: NonNegative = 1.0
+    initial_soc: Share = 0.0
+    charge_efficiency: Annotated[float, Field(gt=0, le=1)] = 0.97
+    discharge_factor: Annotated[float, Field(ge=1)] = 1.04
+    """Energy drawn from the store per energy delivered."""
+    charge_limit_c_rate: Positive = 3.0
+    discharge_limit_c_rate: Positive = 3.0
+    upper_u_h: Annotated[float, Field(le=0)] = -0.04
+    upper_v: Share = 1.0
+    lower_u_h: NonNegative = 0.01
+    lower_v: Share = 0.0
+
+    @model_validator(mode="after")
+    def _limits(self) -> Self:
+        if self.lower_v >= self.upper_v:
+            raise ValueError(f"lower_v {self.lower_v:g} must be below upper_v {self.upper_v:g}")
+        return self
+
+
+class WorkloadConfig(_Section):
+    """Delay-tolerant work: its share, queue and deadline (1 task = 1 % of capacity for a step)."""
+
+    model: Literal["fluid", "tasks"] = "fluid"
+    trace: str = "alibaba_1"
+    flexible_share: Share = 0.2
+    max_utilisation: Annotated[float, Field(gt=0, le=1)] = 1.0
+    queue_limit_h: Positive | None = 2.5
+    """Queue capacity in hours of the whole data center at full utilisation; None is unlimited."""
+    deadline_h: Positive | None = 24.0
+    age_horizon_h: Positive = 24.0
+    """Ages are exact up to this; older work is counted at this age."""
+
+    @model_validator(mode="after")
+    def _deadline_within_horizon(self) -> Self:
+        if self.deadline_h is not None and self.deadline_h > self.age_horizon_h:
+            raise ValueError(
+                f"deadline_h {self.deadline_h:g} must not exceed age_horizon_h {self.age_horizon_h:g}"
+            )
+        return self
+
+
+class SiteConfig(_Section):
+    """Where the data center stands and when its year starts."""
+
+    location: str = "NY"
+    start: str = "01-01"
+    """Month and day of the first step, MM-DD, local standard time."""
+    seed: Annotated[int, Field(ge=0)] = 10
+    """Seed of the synthetic year; imported data ignore it."""
+    weather_file: str | None = None
+    carbon_file: str | None = None
+    workload_file: str | None = None
+    carbon_pairing: Literal["local", "utc_rows"] = "local"
+    """utc_rows pairs UTC rows with local rows, as the released SustainDC does."""
+
+    @field_validator("start", mode="before")
+    @classmethod
+    def _month_day(cls, value: Any) -> Any:
+        first_step_day(value)
+        return value
+
+
+class SimulationConfig(_Section):
+    """Time step."""
+
+    steps_per_hour: Annotated[int, Field(ge=1, le=60)] = 4
+
+    @field_validator("steps_per_hour")
+    @classmethod
+    def _divides(cls, value: int) -> int:
+        if 60 % value:
+            raise ValueError(
+                f"{value} does not divide 60 minutes; valid are 1, 2, 3, 4, 5, 6, 10, 12, 15, 20, 30, 60"
+            )
+        return value
+
+
+class DataCenterConfig(_Section):
+    """Everything that defines one data center."""
+
+    name: str = "dc"
+    description: str = ""
+    hall: HallConfig
+    servers: ServerConfig = ServerConfig()
+    hvac: HvacConfig = HvacConfig()
+    battery: BatteryConfig = BatteryConfig()
+    workload: WorkloadConfig = WorkloadConfig()
+    site: SiteConfig = SiteConfig()
+    simulation: SimulationConfig = SimulationConfig()
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        racks = self.hall.racks
+        pairs = self.servers.power_pairs()
+        groups = self.servers.groups
+        if groups is None:
+            if len(pairs) not in (1, racks):
+                raise ValueError(_length_message("servers.power_w", len(pairs), racks))
+        else:
+            if len(groups) not in (1, racks):
+                raise ValueError(_length_message("servers.groups", len(groups), racks))
+            for index, rack in enumerate(groups):
+                _check_load_weights(index, rack)
+        coldest = self.hvac.setpoint.min_c
+        ratio = float(np.min(self.airflow_ratio(np.array([coldest]), np.array([0.0]))))
+        if ratio <= 0:
+            raise ValueError(
+                f"servers: the airflow ratio is {ratio:.3g} at {coldest:g} C and no load; it must be "
+                "positive (raise fan_airflow_ratio_lb or set fan_airflow_ratio_limits)"
+            )
+        return self
+
+    def airflow_ratio(self, inlet_c: np.ndarray, utilisation: np.ndarray) -> np.ndarray:
+        """Server airflow over full airflow, the curve that the kernels use (dimensionless)."""
+        slope, offset, shift = fan_coefficients(self.servers)
+        limits = self.servers.fan_airflow_ratio_limits or (-np.inf, np.inf)
+        return np.clip(slope * inlet_c + offset + shift * utilisation, *limits)
+
+    def rack_groups(self) -> tuple[tuple[ServerGroup, ...], ...]:
+        """Server groups of every rack, with capacity_mw applied to the counts."""
+        racks = self.hall.racks
+        if self.servers.groups is not None:
+            found = self.servers.groups
+            per_rack = found * racks if len(found) == 1 else found
+        else:
+            pairs = self.servers.power_pairs()
+            pairs = pairs * racks if len(pairs) == 1 else pairs
+            counts = self.hall.servers_per_rack
+            counts = (counts,) * racks if isinstance(counts, int) else counts
+            per_rack = tuple(
+                (ServerGroup(count=n, full_w=full, idle_w=idle),)
+                for n, (full, idle) in zip(counts, pairs, strict=True)
+            )
+        if self.hall.capacity_mw is None:
+            return per_rack
+        nameplate_w = sum(g.count * g.full_w for rack in per_rack for g in rack)
+        scale = self.hall.capacity_mw * 1e6 / nameplate_w
+        return tuple(
+            tuple(g.model_copy(update={"count": max(1, round(g.count * scale))}) for g in rack)
+            for rack in per_rack
+        )
+
+    def to_yaml(self) -> str:
+        """YAML text that ``load_config`` reads back equal."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+
+
+def cpu_coefficients(servers: ServerConfig) -> tuple[float, float, float]:
+    """Slope (1/K), offset and load shift of CPU power over nameplate (Sun et al. 2021)."""
+    low, high = servers.inlet_range_c
+    slope = (servers.cpu_power_ratio_ub[0] - servers.cpu_power_ratio_lb[0]) / (high - low)
+    offset = servers.cpu_power_ratio_ub[0] - slope * high
+    shift = servers.cpu_power_ratio_lb[1] - servers.cpu_power_ratio_lb[0]
+    return slope + servers.cpu_slope_offset_per_k, offset, shift
+
+
+def fan_coefficients(servers: ServerConfig) -> tuple[float, float, float]:
+    """Slope (1/K), offset and load shift of the airflow ratio.
+
+    ``released`` scales slope by 10, offset by 5 and shift by 5 (shift per 20 % of load),
+    as the released SustainDC code does.
+    """
+    low, high = servers.inlet_range_c
+    slope = (servers.fan_airflow_ratio_ub[0] - servers.fan_airflow_ratio_lb[0]) / (high - low)
+    offset = servers.fan_airflow_ratio_ub[0] - slope * high
+    shift = servers.fan_airflow_ratio_lb[1] - servers.fan_airflow_ratio_lb[0]
+    if servers.fan_model == "released":
+        return 10 * slope, 5 * offset, 5 * shift
+    return slope, offset, shift
+
+
+_MONTH_DAYS = (31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31)
+
+
+def first_step_day(start: object) -> int:
+    """Day of the 365-day year (0-based) of a ``MM-DD`` text.
+
+    Raises:
+        ValueError: the text is no day of a 365-day year.
+    """
+    match = re.fullmatch(r"(\d{1,2})-(\d{1,2})", str(start).strip())
+    if match:
+        month, day = int(match[1]), int(match[2])
+        if 1 <= month <= 12 and 1 <= day <= _MONTH_DAYS[month - 1]:
+            return sum(_MONTH_DAYS[: month - 1]) + day - 1
+    raise ValueError(
+        f"start {start!r} is no day of a 365-day year; valid is MM-DD, for example 07-01"
+    )
+
+
+def preset_names() -> list[str]:
+    """Names of the presets that come with the package."""
+    folder = resources.files("sdc_taichi.configs")
+    return sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+
+
+def load_config(
+    source: str | os.PathLike[str] | None = None, overrides: tuple[str, ...] | list[str] = ()
+) -> DataCenterConfig:
+    """Read a preset, a YAML file or a SustainDC ``dc_config.json``.
+
+    Args:
+        source: a preset name (see ``preset_names``), a path to YAML with the schema of this
+            module, which may name a preset to start from under ``extends``, or a path to the
+            SustainDC JSON format, which starts from preset ``sustaindc``. None is ``corrected``.
+        overrides: ``a.b=c`` assignments applied last; ``c`` is read as YAML.
+
+    Raises:
+        ConfigError: naming the file, the key, the value and what would be valid.
+    """
+    label, values = _read_source("corrected" if source is None else source)
+    for override in overrides:
+        _apply_override(values, override)
+    return config_from_dict(values, label)
+
+
+def config_from_dict(values: dict[str, Any], label: str = "config") -> DataCenterConfig:
+    """Validate plain values; errors start with ``label``."""
+    try:
+        return DataCenterConfig.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(_explain(error, label)) from None
+
+
+def apply_overrides(config: DataCenterConfig, overrides: list[str]) -> DataCenterConfig:
+    """A copy of ``config`` with ``a.b=c`` assignments applied."""
+    values = config.model_dump(mode="json")
+    for override in overrides:
+        _apply_override(values, override)
+    return config_from_dict(values, config.name)
+
+
+def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
+    if isinstance(source, str) and source in preset_names():
+        text = resources.files("sdc_taichi.configs").joinpath(f"{source}.yaml").read_text("utf-8")
+        return _resolve_extends(f"preset {source}", _parse_yaml(text, f"preset {source}"))
+    path = Path(source)
+    try:
+        text = path.read_text("utf-8")
+    except FileNotFoundError:
+        near = difflib.get_close_matches(str(source), preset_names(), n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ConfigError(
+            f"{source}: no such file or preset{hint} (presets: {', '.join(preset_names())})"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{source}: cannot be read ({error})") from None
+    if path.suffix.lower() == ".json":
+        values = _parse_json(text, str(path))
+        if "data_center_configuration" in values:
+            return str(path), from_sustaindc(values, str(path))
+    else:
+        values = _parse_yaml(text, str(path))
+    return _resolve_extends(str(path), values)
+
+
+def _resolve_extends(label: str, values: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    base = values.pop("extends", None)
+    if base is None:
+        return label, values
+    if base not in preset_names():
+        raise ConfigError(
+            f"{label}: extends: {base!r} is no preset; valid: {', '.join(preset_names())}"
+        )
+    _, merged = _read_source(str(base))
+    return label, _merge(merged, values)
+
+
+def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in over.items():
+        old = out.get(key)
+        out[key] = (
+            _merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+        )
+    return out
+
+
+def _parse_yaml(text: str, label: str) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{label}: not valid YAML ({' '.join(str(error).split())})") from None
+    return _require_mapping(values, label)
+
+
+def _parse_json(text: str, label: str) -> dict[str, Any]:
+    try:
+        values = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{label}: not valid JSON ({error})") from None
+    return _require_mapping(values, label)
+
+
+def _require_mapping(values: Any, label: str) -> dict[str, Any]:
+    if not isinstance(values, dict):
+        kind = type(values).__name__
+        raise ConfigError(f"{label}: the top level is a {kind}; valid is a mapping of sections")
+    return values
+
+
+def _apply_override(values: dict[str, Any], override: str) -> None:
+    path, sign, text = override.partition("=")
+    keys = path.strip().split(".")
+    if not sign or not all(keys):
+        raise ConfigError(f"override {override!r}: valid is section.key=value")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ConfigError(f"override {override!r}: {text!r} is not a YAML value") from None
+    node: Any = values
+    for key in keys[:-1]:
+        if isinstance(node, list):
+            node = node[_list_index(node, key, override)]
+        else:
+            node = node.setdefault(key, {})
+        if not isinstance(node, dict | list):
+            raise ConfigError(f"override {override!r}: {key} is a value, not a section")
+    if isinstance(node, list):
+        node[_list_index(node, keys[-1], override)] = value
+    else:
+        node[keys[-1]] = value
+
+
+def _list_index(node: list[Any], key: str, override: str) -> int:
+    if not key.isdigit() or int(key) >= len(node):
+        raise ConfigError(f"override {override!r}: index {key!r} is not in 0..{len(node) - 1}")
+    return int(key)
+
+
+def _explain(error: ValidationError, label: str) -> str:
+    parts = []
+    seen = set()
+    for item in error.errors(include_url=False):
+        names = [str(p) for p in item["loc"] if not _is_union_branch(p)]
+        where = ".".join(names)
+        if item["type"] == "extra_forbidden":
+            valid = _fields_at(names[:-1])
+            near = difflib.get_close_matches(names[-1], valid, n=1, cutoff=0.5)
+            hint = f"; did you mean {near[0]!r}?" if near else f"; valid: {', '.join(valid)}"
+            text = f"{where}: unknown key{hint}"
+        elif item["type"] == "missing":
+            text = f"{where}: missing"
+        else:
+            message = item["msg"].removeprefix("Value error, ")
+            given = item["input"]
+            scalar = given is None or isinstance(given, str | int | float | bool)
+            text = f"{where}: {message}" if where else message
+            if scalar:
+                text += f" (got {given!r})"
+        if where not in seen:
+            parts.append(text)
+        seen.add(where)
+    shown = "; ".join(parts[:3])
+    more = f" (and {len(parts) - 3} more)" if len(parts) > 3 else ""
+    return f"{label}: {shown}{more}"
+
+
+def _is_union_branch(part: str | int) -> bool:
+    """Pydantic puts the tried type of a union into the location; it is no key of the user's."""
+    return isinstance(part, str) and (
+        part in {"int", "float"} or part.startswith(("tuple[", "constrained"))
+    )
+
+
+def _fields_at(path: list[str]) -> list[str]:
+    node: Any = DataCenterConfig
+    for key in path:
+        if key.isdigit():
+            continue
+        annotation = node.model_fields[key].annotation
+        node = ServerGroup if key == "groups" else annotation
+    return list(node.model_fields)
+
+
+def _check_ordered(value: Pair | None) -> Pair | None:
+    if value is not None and not value[0] < value[1]:
+        raise ValueError(f"({value[0]:g}, {value[1]:g}) must be (low, high) with low < high")
+    return value
+
+
+def _length_message(name: str, found: int, expected: int) -> str:
+    return f"{name} has {found} entries, expected {expected} (rows x racks_per_row), or one value for all"
+
+
+def _check_length(name: str, value: Any, expected: int) -> None:
+    if isinstance(value, tuple) and len(value) != expected:
+        raise ValueError(_length_message(name, len(value), expected))
+
+
+def _check_load_weights(index: int, rack: tuple[ServerGroup, ...]) -> None:
+    if not rack:
+        raise ValueError(f"servers.groups rack {index} is empty; valid is at least one group")
+    mean = sum(g.count * g.load_weight for g in rack) / sum(g.count for g in rack)
+    if mean <= 0:
+        raise ValueError(f"servers.groups rack {index}: at least one load_weight must be positive")
+    highest = max(g.load_weight for g in rack)
+    if highest > 2 * mean:
+        raise ValueError(
+            f"servers.groups rack {index}: load_weight {highest:g} exceeds twice the rack's mean "
+            f"{mean:.3g}, which would overload the server at partial load"
+        )
+
+
+_SUSTAINDC_KEYS: dict[str, tuple[str, ...]] = {
+    "data_center_configuration": (
+        "NUM_ROWS",
+        "NUM_RACKS_PER_ROW",
+        "RACK_SUPPLY_APPROACH_TEMP_LIST",
+        "RACK_RETURN_APPROACH_TEMP_LIST",
+        "CPUS_PER_RACK",
+    ),
+    "hvac_configuration": (
+        "C_AIR",
+        "RHO_AIR",
+        "CRAC_SUPPLY_AIR_FLOW_RATE_pu",
+        "CRAC_REFRENCE_AIR_FLOW_RATE_pu",
+        "CRAC_FAN_REF_P",
+        "CHILLER_COP_BASE",
+        "CHILLER_COP_K",
+        "CHILLER_COP_T_NOMINAL",
+        "CT_FAN_REF_P",
+        "CT_REFRENCE_AIR_FLOW_RATE",
+        "CW_PRESSURE_DROP",
+        "CW_WATER_FLOW_RATE",
+        "CW_PUMP_EFFICIENCY",
+        "CT_PRESSURE_DROP",
+        "CT_WATER_FLOW_RATE",
+        "CT_PUMP_EFFICIENCY",
+    ),
+    "server_characteristics": (
+        "CPU_POWER_RATIO_LB",
+        "CPU_POWER_RATIO_UB",
+        "IT_FAN_AIRFLOW_RATIO_LB",
+        "IT_FAN_AIRFLOW_RATIO_UB",
+        "IT_FAN_FULL_LOAD_V",
+        "ITFAN_REF_V_RATIO",
+        "ITFAN_REF_P",
+        "INLET_TEMP_RANGE",
+        "DEFAULT_SERVER_POWER_CHARACTERISTICS",
+        "HP_PROLIANT",
+    ),
+}
+
+
+def from_sustaindc(values: dict[str, Any], label: str) -> dict[str, Any]:
+    """Map the SustainDC ``dc_config.json`` onto this schema, starting from preset ``sustaindc``.
+
+    The CHILLER_COP values and HP_PROLIANT are checked but, as in the released code, not used.
+
+    Raises:
+        ConfigError: for a missing or unknown key, a wrong type, or a wrong length.
+    """
+    problems = _sustaindc_problems(values)
+    if problems:
+        raise ConfigError(f"{label}: {'; '.join(problems)}")
+    hall, hvac, servers = (values[section] for section in _SUSTAINDC_KEYS)
+
+    def pump_w(prefix: str) -> float:
+        drop, flow = hvac[f"{prefix}_PRESSURE_DROP"], hvac[f"{prefix}_WATER_FLOW_RATE"]
+        return float(drop * flow / hvac[f"{prefix}_PUMP_EFFICIENCY"])
+
+    per_rack = hall["CPUS_PER_RACK"]
+    mapped = {
+        "name": Path(label).stem,
+        "description": "read from the SustainDC dc_config.json format",
+        "hall": {
+            "rows": hall["NUM_ROWS"],
+            "racks_per_row": hall["NUM_RACKS_PER_ROW"],
+            "servers_per_rack": [int(n) for n in per_rack]
+            if isinstance(per_rack, list)
+            else int(per_rack),
+            "supply_approach_k": hall["RACK_SUPPLY_APPROACH_TEMP_LIST"],
+            "return_approach_k": hall["RACK_RETURN_APPROACH_TEMP_LIST"],
+            "air_density_kg_m3": hvac["RHO_AIR"],
+            "air_heat_capacity_j_per_kg_k": hvac["C_AIR"],
+        },
+        "servers": {
+            "power_w": [
+                (pair[0], pair[-1]) for pair in servers["DEFAULT_SERVER_POWER_CHARACTERISTICS"]
+            ],
+            "cpu_power_ratio_lb": servers["CPU_POWER_RATIO_LB"],
+            "cpu_power_ratio_ub": servers["CPU_POWER_RATIO_UB"],
+            "inlet_range_c": servers["INLET_TEMP_RANGE"],
+            "fan_airflow_ratio_lb": servers["IT_FAN_AIRFLOW_RATIO_LB"],
+            "fan_airflow_ratio_ub": servers["IT_FAN_AIRFLOW_RATIO_UB"],
+            "fan_full_airflow_m3s": servers["IT_FAN_FULL_LOAD_V"],
+            "fan_reference_ratio": servers["ITFAN_REF_V_RATIO"],
+            "fan_reference_w": servers["ITFAN_REF_P"],
+        },
+        "hvac": {
+            "crac": {
+                "supply_m3s_per_w": hvac["CRAC_SUPPLY_AIR_FLOW_RATE_pu"],
+                "reference_m3s_per_w": hvac["CRAC_REFRENCE_AIR_FLOW_RATE_pu"],
+                "released_fan_w": hvac["CRAC_FAN_REF_P"],
+            },
+            "tower": {
+                "printed_fan_w": hvac["CT_FAN_REF_P"],
+                "printed_airflow_m3s": hvac["CT_REFRENCE_AIR_FLOW_RATE"],
+            },
+            "pumps": {"released_chilled_w": pump_w("CW"), "released_condenser_w": pump_w("CT")},
+        },
+    }
+    _, base = _read_source("sustaindc")
+    return _merge(base, mapped)
+
+
+def _sustaindc_problems(values: dict[str, Any]) -> list[str]:
+    problems = []
+    for section in values:
+        if section not in _SUSTAINDC_KEYS:
+            problems.append(f"{section}: unknown section; valid: {', '.join(_SUSTAINDC_KEYS)}")
+    for section, keys in _SUSTAINDC_KEYS.items():
+        found = values.get(section)
+        if not isinstance(found, dict):
+            problems.append(f"{section}: missing section")
+            continue
+        for key in found:
+            if key not in keys:
+                near = difflib.get_close_matches(key, keys, n=1, cutoff=0.5)
+                hint = f"; did you mean {near[0]!r}?" if near else ""
+                problems.append(f"{section}.{key}: unknown key{hint}")
+        problems.extend(f"{section}.{key}: missing" for key in keys if key not in found)
+    if problems and not all(isinstance(values.get(s), dict) for s in _SUSTAINDC_KEYS):
+        return problems
+    problems.extend(_sustaindc_value_problems(values))
+    return problems
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _sustaindc_value_problems(values: dict[str, Any]) -> list[str]:
+    problems = []
+    hall, servers = values["data_center_configuration"], values["server_characteristics"]
+    for section, keys in _SUSTAINDC_KEYS.items():
+        for key in keys:
+            value = values[section].get(key, 0)
+            flat = value if isinstance(value, list) else [value]
+            flat = [x for item in flat for x in (item if isinstance(item, list) else [item])]
+            wrong = next((x for x in flat if not _is_number(x)), None)
+            if wrong is not None or not flat:
+                problems.append(f"{section}.{key}: {wrong!r} is not a number")
+    rows, per_row = hall.get("NUM_ROWS"), hall.get("NUM_RACKS_PER_ROW")
+    counted = _is_number(rows) and _is_number(per_row)
+    racks = int(rows * per_row) if counted else 0
+    lists = (
+        (hall, "data_center_configuration", "RACK_SUPPLY_APPROACH_TEMP_LIST"),
+        (hall, "data_center_configuration", "RACK_RETURN_APPROACH_TEMP_LIST"),
+        (servers, "server_characteristics", "DEFAULT_SERVER_POWER_CHARACTERISTICS"),
+    )
+    for section_values, section, key in lists:
+        if counted and key in section_values:
+            value = section_values[key]
+            length = len(value) if isinstance(value, list) else 0
+            if length != racks:
+                problems.append(
+                    f"{section}.{key}: length {length}, expected {racks} (NUM_ROWS x NUM_RACKS_PER_ROW)"
+                )
+    per_rack = hall.get("CPUS_PER_RACK", 1)
+    for count in per_rack if isinstance(per_rack, list) else [per_rack]:
+        if _is_number(count) and (count < 1 or count != int(count)):
+            problems.append(
+                f"data_center_configuration.CPUS_PER_RACK: {count!r} is no positive integer"
+            )
+    if isinstance(per_rack, list) and counted and len(per_rack) != racks:
+        problems.append(
+            f"data_center_configuration.CPUS_PER_RACK: length {len(per_rack)}, expected {racks}"
+        )
+    for key in ("CW_PUMP_EFFICIENCY", "CT_PUMP_EFFICIENCY"):
+        efficiency = values["hvac_configuration"].get(key, 1)
+        if _is_number(efficiency) and efficiency <= 0:
+            problems.append(f"hvac_configuration.{key}: {efficiency!r} must be positive")
+    for key in (
+        "CPU_POWER_RATIO_LB",
+        "CPU_POWER_RATIO_UB",
+        "IT_FAN_AIRFLOW_RATIO_LB",
+        "IT_FAN_AIRFLOW_RATIO_UB",
+        "INLET_TEMP_RANGE",
+    ):
+        value = servers.get(key)
+        if key in servers and (not isinstance(value, list) or len(value) != 2):
+            length = len(value) if isinstance(value, list) else 0
+            problems.append(f"server_characteristics.{key}: length {length}, expected 2")
+    pairs = servers.get("DEFAULT_SERVER_POWER_CHARACTERISTICS", [])
+    for index, pair in enumerate(pairs if isinstance(pairs, list) else []):
+        if not isinstance(pair, list) or len(pair) != 2:
+            length = len(pair) if isinstance(pair, list) else 0
+            problems.append(
+                f"server_characteristics.DEFAULT_SERVER_POWER_CHARACTERISTICS[{index}]: "
+                f"length {length}, expected 2 (full, idle)"
+            )
+    return problems

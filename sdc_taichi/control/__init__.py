@@ -1,0 +1,1 @@
+"""Controllers that are not learned: from what a fleet shows to named actions."""

@@ -1,0 +1,490 @@
+"""What the loaders share: reading tables, naming the place of a fault, gaps, and whole years.
+
+Rows are lines of the file counted from 1, headers included, as an editor shows them (rows of a
+Parquet file count from 1 without headers).
+"""
+
+from __future__ import annotations
+
+import calendar
+import hashlib
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sdc_taichi.errors import DataError
+from sdc_taichi.exogenous.series import MINUTES_PER_YEAR, FloatArray, Series
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MAX_GAP_H = 24.0
+MISSING_TEXT = frozenset({"", "nan", "na", "n/a", "null", "none"})
+METADATA_KEY = b"sdc_taichi"
+FORMAT = "sdc-series/1"
+
+
+def fault(path: Path, row: int, column: str, value: object, valid: str) -> DataError:
+    """Error that names file, row, column, value and what would be valid."""
+    return DataError(f"{path}: row {row}, column {column}: {value!r}, expected {valid}")
+
+
+def existing_file(path: str | Path) -> Path:
+    """The path, if it is a file.
+
+    Raises:
+        DataError: it is missing, or a folder.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise DataError(f"{path}: is a folder, expected a file")
+    if not path.is_file():
+        raise DataError(f"{path}: no such file")
+    return path
+
+
+def sha256(path: Path) -> str:
+    """Hash of a file's bytes, hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def is_parquet(path: Path) -> bool:
+    """Whether a file is Parquet, by its name or its first bytes."""
+    if path.suffix.lower() in {".parquet", ".pq"}:
+        return True
+    with path.open("rb") as handle:
+        return handle.read(4) == b"PAR1"
+
+
+# Reading
+
+
+def read_table(path: Path) -> tuple[pd.DataFrame, int]:
+    """Read a CSV file as text, or a Parquet file without our metadata.
+
+    Returns:
+        The table, all columns as text, and the row number of its first line of data.
+
+    Raises:
+        DataError: not readable as a table, or without rows.
+    """
+    import pandas as pd
+
+    if is_parquet(path):
+        frame = _read_arrow(path).to_pandas()
+        if not isinstance(frame.index, pd.RangeIndex):
+            frame = frame.reset_index()
+        first_row = 1
+        frame = frame.astype(object).where(frame.notna(), "").astype(str)
+    else:
+        try:
+            frame = pd.read_csv(
+                path,
+                dtype=str,
+                keep_default_na=False,
+                skip_blank_lines=False,
+                encoding="utf-8-sig",
+                index_col=False,
+                on_bad_lines="error",
+            )
+        except pd.errors.EmptyDataError:
+            raise DataError(f"{path}: empty, expected a header and rows") from None
+        except pd.errors.ParserError as error:
+            reason = " ".join(str(error).split())
+            raise DataError(f"{path}: not a CSV table: {reason}") from None
+        except UnicodeDecodeError as error:
+            raise DataError(f"{path}: byte {error.start}: not UTF-8 text") from None
+        first_row = 2
+        frame = frame.fillna("")
+    while len(frame) and not "".join(str(x) for x in frame.iloc[-1]).strip():
+        frame = frame.iloc[:-1]
+    if frame.empty:
+        raise DataError(f"{path}: no rows of data")
+    return frame, first_row
+
+
+def _read_arrow(path: Path) -> Any:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).split(". ")[0].splitlines()[0]
+        raise DataError(f"{path}: not a readable Parquet file: {reason}") from None
+
+
+def require_columns(path: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> None:
+    """Reject a table that lacks columns.
+
+    Raises:
+        DataError: names the missing and the present ones.
+    """
+    missing = [c for c in columns if c not in frame.columns]
+    if missing:
+        present = ", ".join(str(c) or "(blank)" for c in frame.columns[:12])
+        raise DataError(
+            f"{path}: row 1: missing column {', '.join(missing)}; found {present}; "
+            f"expected {', '.join(columns)}"
+        )
+
+
+def numbers(
+    path: Path,
+    text: pd.Series[str],
+    column: str,
+    rows: NDArray[np.int64],
+    low: float,
+    high: float,
+    hint: str = "",
+) -> FloatArray:
+    """A column of text as numbers; blanks and NaN markers become NaN.
+
+    Args:
+        path: file, for messages.
+        text: shape (T,).
+        column: for messages.
+        rows: shape (T,), their rows in the file, for messages.
+        low: least valid value.
+        high: greatest valid value.
+        hint: appended to what would be valid.
+
+    Raises:
+        DataError: text that is no number, or a value outside [low, high].
+    """
+    import pandas as pd
+
+    text = text.str.strip()
+    values = np.array(pd.to_numeric(text, errors="coerce"), dtype=np.float64)
+    missing = text.str.lower().isin(MISSING_TEXT).to_numpy(dtype=bool)
+    wrong = ~missing & ~((values >= low) & (values <= high))
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        valid = f"a number from {low:g} to {high:g}{hint}"
+        raise fault(path, int(rows[at]), column, text.iloc[at], valid)
+    values[missing] = np.nan
+    return values
+
+
+# Gaps and whole years
+
+
+def fill_gaps(
+    path: Path, values: FloatArray, minutes: float, column: str, rows: NDArray[np.int64]
+) -> FloatArray:
+    """Interpolate NaN linearly; at an end, the value beside it is kept.
+
+    Args:
+        path: file, for messages.
+        values: shape (T,).
+        minutes: resolution.
+        column: for messages.
+        rows: shape (T,), row of the file each value came from, for messages.
+
+    Raises:
+        DataError: a gap longer than 24 h, or no value at all.
+    """
+    missing = np.isnan(values)
+    if not missing.any():
+        return values
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        hours = (end - start) * minutes / 60.0
+        if hours > MAX_GAP_H:
+            raise fault(
+                path,
+                int(rows[start]),
+                column,
+                f"{hours:g} h without a value",
+                f"gaps of at most {MAX_GAP_H:g} h",
+            )
+    index = np.arange(values.size)
+    return np.interp(index, index[~missing], values[~missing])
+
+
+def rows_per_year(path: Path, minutes: float) -> int:
+    """Number of intervals in 365 days.
+
+    Raises:
+        DataError: the resolution does not divide an hour, nor is a whole number of hours of a day.
+    """
+    per_day = 1440.0 / minutes
+    if abs(per_day - round(per_day)) > 1e-9:
+        raise DataError(f"{path}: resolution {minutes:g} min, expected one that divides a day")
+    return round(MINUTES_PER_YEAR / minutes)
+
+
+def check_length(path: Path, n: int, minutes: float) -> None:
+    """Reject files shorter than a year of 365 days (8,760 hourly rows).
+
+    Raises:
+        DataError: names the number of rows and the least number.
+    """
+    least = rows_per_year(path, minutes)
+    if n < least:
+        raise DataError(
+            f"{path}: row {n}: {n} rows of {minutes:g} min without 29 February, "
+            f"expected at least {least} (365 days)"
+        )
+
+
+def without_leap_days(
+    values: FloatArray, start: np.datetime64, minutes: float
+) -> tuple[FloatArray, float, list[str]]:
+    """Remove 29 February from contiguous values.
+
+    Args:
+        values: shape (T, ...), intervals one after another.
+        start: local start of the first interval.
+        minutes: resolution.
+
+    Returns:
+        The remaining values, the first one's start in minutes since 1 January 00:00 of a 365-day
+        year, and notes.
+    """
+    seconds = np.timedelta64(round(minutes * 60), "s")
+    times = start.astype("datetime64[s]") + seconds * np.arange(len(values))
+    leap = (_month(times) == 2) & (_day(times) == 29)
+    kept = times[~leap]
+    notes = [f"29 February removed ({int(leap.sum())} rows)"] if leap.any() else []
+    if not kept.size:
+        return values[~leap], 0.0, notes
+    since = kept[0] - kept[0].astype("datetime64[Y]").astype("datetime64[s]")
+    minutes_since = float(since / np.timedelta64(1, "m"))
+    year = int(kept[0].astype("datetime64[Y]").astype(np.int64)) + 1970
+    if calendar.isleap(year) and int(_month(kept[:1])[0]) > 2:
+        minutes_since -= 1440.0
+    return values[~leap], minutes_since, notes
+
+
+def whole_years(
+    path: Path, values: FloatArray, since_minutes: float, minutes: float
+) -> tuple[FloatArray, list[str]]:
+    """Cut contiguous values to whole 365-day years and begin them on 1 January at 00:00.
+
+    What lies before the first 1 January is moved to the end. A start within an interval (a UTC
+    offset in half hours) is averaged by overlap, which conserves the mean.
+
+    Args:
+        path: file, for messages.
+        values: shape (T, ...), without 29 February.
+        since_minutes: start of the first value since 1 January 00:00 of a 365-day year.
+        minutes: resolution.
+
+    Returns:
+        Values, shape (years * rows per year, ...), and notes.
+
+    Raises:
+        DataError: fewer than 365 days.
+    """
+    notes = []
+    check_length(path, len(values), minutes)
+    per_year = rows_per_year(path, minutes)
+    extra = len(values) % per_year
+    if extra:
+        values = values[:-extra]
+        notes.append(f"truncated to {len(values) // per_year} x 365 days ({extra} rows cut)")
+    before = (-since_minutes % MINUTES_PER_YEAR) / minutes
+    first = math.ceil(before - 1e-9)
+    values = np.roll(values, -first, axis=0)
+    late = first - before
+    if late > 1e-9:
+        values = (1.0 - late) * values + late * np.roll(values, 1, axis=0)
+        notes.append(f"averaged by overlap: rows start {late * minutes:g} min into the interval")
+    if first:
+        notes.append(f"{first} rows before 1 January 00:00 moved to the end")
+    return values, notes
+
+
+def _month(times: NDArray[np.datetime64]) -> NDArray[np.int64]:
+    return np.asarray(times.astype("datetime64[M]").astype(np.int64) % 12 + 1)
+
+
+def _day(times: NDArray[np.datetime64]) -> NDArray[np.int64]:
+    since = times.astype("datetime64[D]") - times.astype("datetime64[M]").astype("datetime64[D]")
+    return np.asarray(since.astype(np.int64) + 1)
+
+
+def grid_of_stamps(
+    path: Path, stamps: NDArray[np.datetime64], rows: NDArray[np.int64], column: str
+) -> tuple[float, NDArray[np.int64]]:
+    """Resolution of increasing stamps and the place of each on the regular grid.
+
+    Args:
+        path: file, for messages.
+        stamps: shape (T,), datetime64[s].
+        rows: shape (T,), their rows in the file.
+        column: for messages.
+
+    Returns:
+        Resolution in minutes (the most frequent step), and positions, shape (T,), from 0.
+
+    Raises:
+        DataError: stamps repeat, go back, are off the grid, or leave a gap over 24 h.
+    """
+    if stamps.size < 2:
+        raise DataError(f"{path}: row {int(rows[0])}: 1 row of data, expected 365 days")
+    steps = np.diff(stamps).astype("timedelta64[s]").astype(np.int64)
+    back = steps <= 0
+    if back.any():
+        at = int(np.argmax(back)) + 1
+        what = "a stamp not seen before" if steps[at - 1] == 0 else "a stamp after the row above"
+        raise fault(path, int(rows[at]), column, str(stamps[at]), what)
+    sizes, counts = np.unique(steps, return_counts=True)
+    step = int(sizes[np.argmax(counts)])
+    off = (steps % step != 0) | (steps > MAX_GAP_H * 3600 + step)
+    if off.any():
+        at = int(np.argmax(off)) + 1
+        hours = steps[at - 1] / 3600.0
+        if steps[at - 1] % step:
+            valid = f"steps of {step / 60:g} min as in most rows, not {hours:g} h"
+        else:
+            valid = f"gaps of at most {MAX_GAP_H:g} h, not {hours - step / 3600.0:g} h"
+        raise fault(path, int(rows[at]), column, str(stamps[at]), valid)
+    positions = np.concatenate([[0], np.cumsum(steps // step)]).astype(np.int64)
+    return step / 60.0, positions
+
+
+def spread(values: FloatArray, positions: NDArray[np.int64]) -> FloatArray:
+    """Put values at positions of a regular grid; what is between is NaN."""
+    out = np.full((int(positions[-1]) + 1, *values.shape[1:]), np.nan)
+    out[positions] = values
+    return out
+
+
+# The Parquet format that `data import` writes
+
+
+def write_parquet(
+    path: Path, columns: Mapping[str, FloatArray], metadata: Mapping[str, Any]
+) -> None:
+    """Write columns with metadata, atomically: a reader sees the old file or the whole new one."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pa.table(dict(columns)).replace_schema_metadata(
+        {METADATA_KEY: json.dumps({"format": FORMAT, **metadata}).encode()}
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        pq.write_table(table, part)
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def read_metadata(path: Path) -> dict[str, Any] | None:
+    """Metadata of a Parquet file that `data import` wrote; None if it is another Parquet file.
+
+    Raises:
+        DataError: not readable, or metadata of another version.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        schema = pq.read_schema(path)
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).split(". ")[0].splitlines()[0]
+        raise DataError(f"{path}: not a readable Parquet file: {reason}") from None
+    raw = (schema.metadata or {}).get(METADATA_KEY)
+    if raw is None:
+        return None
+    try:
+        metadata: dict[str, Any] = json.loads(raw)
+    except ValueError:
+        raise DataError(f"{path}: metadata sdc_taichi: not JSON") from None
+    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+        found = metadata.get("format") if isinstance(metadata, dict) else metadata
+        raise DataError(f"{path}: metadata format: {found!r}, expected {FORMAT!r}")
+    return metadata
+
+
+def metadata_value(path: Path, metadata: Mapping[str, Any], key: str, kind: type) -> Any:
+    """One metadata value of the expected type.
+
+    Raises:
+        DataError: missing or of another type.
+    """
+    value = metadata.get(key)
+    good = isinstance(value, int | float) if kind is float else isinstance(value, kind)
+    if not good or isinstance(value, bool) or (kind is float and not math.isfinite(value or 0)):
+        raise DataError(f"{path}: metadata {key}: {value!r}, expected {kind.__name__}")
+    return kind(value)
+
+
+def read_columns(
+    path: Path, limits: Mapping[str, tuple[float, float]], minutes: float
+) -> dict[str, FloatArray]:
+    """Columns of a Parquet file that `data import` wrote, checked like any other input.
+
+    Args:
+        path: the file.
+        limits: column to lowest and highest physical value.
+        minutes: resolution, from the metadata.
+
+    Raises:
+        DataError: a column is missing, not numeric, not finite, out of limits, or shorter than
+            a year.
+    """
+    table = _read_arrow(path)
+    out = {}
+    for column, (low, high) in limits.items():
+        if column not in table.column_names:
+            found = ", ".join(table.column_names)
+            raise DataError(f"{path}: missing column {column}; found {found}")
+        try:
+            values = np.asarray(table[column].to_numpy(), dtype=np.float64)
+        except (TypeError, ValueError):
+            kind = table.schema.field(column).type
+            raise DataError(f"{path}: column {column}: type {kind}, expected numbers") from None
+        good = (values >= low) & (values <= high)
+        if not good.all():
+            at = int(np.argmin(good))
+            valid = f"a number from {low:g} to {high:g}"
+            raise fault(path, at + 1, column, float(values[at]), valid)
+        check_length(path, values.size, minutes)
+        if values.size % rows_per_year(path, minutes):
+            raise DataError(f"{path}: {values.size} rows, expected whole years of 365 days")
+        out[column] = values
+    return out
+
+
+def imported_series(
+    path: Path,
+    metadata: Mapping[str, Any],
+    column: str,
+    unit: str,
+    columns: Mapping[str, FloatArray],
+    minutes: float,
+) -> Series:
+    """Series of one column of a Parquet file that `data import` wrote, with its provenance."""
+    source = metadata_value(path, metadata, "source_file", str)
+    digest = metadata_value(path, metadata, "sha256", str)
+    notes = metadata_value(path, metadata, "notes", list)
+    return Series(
+        columns[column],
+        minutes,
+        column,
+        unit,
+        f"{source} (sha256 {digest[:12]})",
+        synthetic=False,
+        notes=tuple(str(note) for note in notes),
+    )
+
+
+def column_names(path: Path) -> list[str]:
+    """Names of the columns of a Parquet file.
+
+    Raises:
+        DataError: not readable.
+    """
+    return [str(name) for name in _read_arrow(path).column_names]

@@ -1,0 +1,237 @@
+"""Validate, align and store files in the user's data folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sdc_taichi.errors import DataError
+from sdc_taichi.exogenous import files
+from sdc_taichi.exogenous.carbon import Pairing, Stamp, read_carbon
+from sdc_taichi.exogenous.registry import (
+    find_name,
+    imported_sites,
+    imported_traces,
+    new_name,
+    user_data_dir,
+)
+from sdc_taichi.exogenous.series import Series
+from sdc_taichi.exogenous.synthetic import (
+    coefficients,
+    synthetic_site,
+    synthetic_sites,
+    synthetic_traces,
+)
+from sdc_taichi.exogenous.weather import read_epw
+from sdc_taichi.exogenous.workload import read_workload
+
+KINDS = ("weather", "carbon", "workload")
+
+
+@dataclass(frozen=True)
+class Imported:
+    """One imported file: what it became, where it lies, and what was done to it."""
+
+    kind: str
+    name: str
+    source: Path
+    target: Path
+    notes: tuple[str, ...]
+
+
+def file_kind(path: Path) -> str:
+    """Whether a file is ``weather``, ``carbon`` or ``workload``, by its content.
+
+    Raises:
+        DataError: none of them.
+    """
+    path = files.existing_file(path)
+    if files.is_parquet(path):
+        metadata = files.read_metadata(path) or {}
+        if metadata.get("kind") in KINDS:
+            return str(metadata["kind"])
+        header = set(files.column_names(path))
+    else:
+        with path.open("rb") as handle:
+            line = handle.readline(4096).decode("utf-8", errors="replace").lstrip("\ufeff").strip()
+        if line.upper().startswith("LOCATION,"):
+            return "weather"
+        header = {cell.strip().strip('"') for cell in line.split(",")}
+    if "avg_CI" in header:
+        return "carbon"
+    if "cpu_load" in header:
+        return "workload"
+    raise DataError(
+        f"{path}: row 1: expected an EPW file (LOCATION,...), a column avg_CI (carbon) or "
+        "a column cpu_load (workload)"
+    )
+
+
+def import_weather(
+    path: Path, name: str, base: str | None, data_dir: Path | None = None
+) -> Imported:
+    """Store a weather file as ``sites/NAME/weather.parquet``."""
+    name = _stored_name(new_name("site", name, synthetic_sites()), imported_sites(data_dir))
+    weather = read_epw(path)
+    series = (
+        weather.outdoor_c,
+        weather.wet_bulb_c,
+        weather.relative_humidity_pct,
+        weather.pressure_pa,
+    )
+    metadata = {
+        "kind": "weather",
+        "label": weather.label,
+        "latitude_deg": weather.latitude_deg,
+        "longitude_deg": weather.longitude_deg,
+        "elevation_m": weather.elevation_m,
+        "utc_offset_h": weather.utc_offset_h,
+        "base": base,
+    }
+    target = user_data_dir(data_dir) / "sites" / name / "weather.parquet"
+    return _store(path, name, target, [s for s in series if s is not None], metadata)
+
+
+def import_carbon(
+    path: Path,
+    name: str,
+    base: str | None,
+    data_dir: Path | None = None,
+    *,
+    utc_offset_h: float | None = None,
+    stamp: Stamp = "auto",
+    pairing: Pairing = "local",
+) -> Imported:
+    """Store a carbon file as ``sites/NAME/carbon.parquet``.
+
+    The UTC offset is that of the weather imported under the same name, else ``utc_offset_h``, else
+    the base's.
+
+    Raises:
+        DataError: none of them is known, or they differ.
+    """
+    name = _stored_name(new_name("site", name, synthetic_sites()), imported_sites(data_dir))
+    offset, longitude = utc_offset_h, None
+    weather_path = imported_sites(data_dir).get(name, {}).get("weather")
+    if weather_path is not None or (base is not None and offset is None):
+        if weather_path is not None:
+            station = read_epw(weather_path)
+            known, longitude = station.utc_offset_h, station.longitude_deg
+        else:
+            site = synthetic_site(find_name("base", base or "", synthetic_sites()))
+            known, longitude = site.utc_offset_h, site.longitude_deg
+        if offset is not None and offset != known:
+            raise DataError(f"utc_offset_h: {offset:g}, expected {known:g} as in the weather file")
+        offset = known
+    if offset is None:
+        raise DataError(
+            f"{path}: UTC offset of site {name!r} unknown, expected the weather file imported "
+            "first, --base SITE or --utc-offset HOURS"
+        )
+    series = read_carbon(path, offset, stamp, pairing=pairing, longitude_deg=longitude)
+    metadata = {"kind": "carbon", "utc_offset_h": offset, "pairing": pairing, "base": base}
+    target = user_data_dir(data_dir) / "sites" / name / "carbon.parquet"
+    return _store(path, name, target, [series], metadata)
+
+
+def import_workload(path: Path, name: str, data_dir: Path | None = None) -> Imported:
+    """Store a workload file as ``traces/NAME.parquet``."""
+    name = _stored_name(new_name("trace", name, synthetic_traces()), imported_traces(data_dir))
+    target = user_data_dir(data_dir) / "traces" / f"{name}.parquet"
+    return _store(path, name, target, [read_workload(path)], {"kind": "workload"})
+
+
+def plan_folder(folder: Path) -> tuple[list[tuple[str, Path, str]], list[tuple[Path, str]]]:
+    """What to import from a SustainDC ``data`` folder, or one with carbon, weather, workload.
+
+    Every weather file becomes a site, with the carbon file of its state: ``NY-real`` for the
+    station the embedded year is fitted to (else the first of the state), other stations with
+    their name added. Every workload file becomes a trace.
+
+    Returns:
+        Kind, path and name of each import, weather before carbon; and the files left out, each
+        with the reason.
+
+    Raises:
+        DataError: the folder has none of the subfolders, or no file in them.
+    """
+    subfolders = {
+        "weather": ("weather", ".epw"),
+        "carbonintensity": ("carbon", ".csv"),
+        "carbon": ("carbon", ".csv"),
+        "workload": ("workload", ".csv"),
+    }
+    found: dict[str, list[Path]] = {kind: [] for kind in KINDS}
+    for child in sorted(folder.iterdir()):
+        if child.is_dir() and child.name.casefold() in subfolders:
+            kind, suffix = subfolders[child.name.casefold()]
+            found[kind] += sorted(x for x in child.iterdir() if x.suffix.lower() == suffix)
+    if not any(found.values()):
+        raise DataError(
+            f"{folder}: expected subfolders CarbonIntensity, Weather, Workload with EPW and CSV "
+            "files (the data folder of SustainDC)"
+        )
+    carbon = {path.name.split("_")[0]: path for path in found["carbon"]}
+    fitted = {name: str(table["station"]) for name, table in coefficients()["weather"].items()}
+    by_state: dict[str, list[tuple[Path, str]]] = {}
+    for path in found["weather"]:
+        parts = path.stem.split("_", 2)
+        is_state = len(parts) == 3 and parts[0] == "USA"
+        state, station = (parts[1], parts[2]) if is_state else (path.stem, path.stem)
+        by_state.setdefault(state, []).append((path, station))
+    plan: list[tuple[str, Path, str]] = []
+    for state, stations in by_state.items():
+        stations.sort(key=lambda x: (not fitted.get(state, "").startswith(x[1]), x[1]))
+        for i, (path, station) in enumerate(stations):
+            name = _clean(f"{state}-real" if i == 0 else f"{state}-{station}-real")
+            plan.append(("weather", path, name))
+            if state in carbon:
+                plan.append(("carbon", carbon[state], name))
+    plan += [("workload", path, default_name(path)) for path in found["workload"]]
+    left_out = [
+        (path, f"no weather file of {key}; import it with --site NAME --base SITE")
+        for key, path in carbon.items()
+        if key not in by_state
+    ]
+    return plan, left_out
+
+
+def default_name(path: Path) -> str:
+    """Name of a file without suffix, made valid as a name."""
+    return _clean(path.stem)
+
+
+def _stored_name(name: str, existing: Iterable[str]) -> str:
+    """The name as it is stored already, if it differs in case alone."""
+    return next((x for x in existing if x.casefold() == name.casefold()), name)
+
+
+def _clean(text: str) -> str:
+    """The text with what is not valid in a name replaced by ``-``."""
+    return "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in text).strip(
+        "-"
+    )
+
+
+def _store(
+    source: Path, name: str, target: Path, series: list[Series], metadata: dict[str, Any]
+) -> Imported:
+    from importlib.metadata import version
+
+    notes = series[0].notes
+    files.write_parquet(
+        target,
+        {s.name: s.values for s in series},
+        {
+            **metadata,
+            "name": name,
+            "minutes": series[0].minutes,
+            "source_file": source.name,
+            "sha256": files.sha256(source),
+            "notes": list(notes),
+            "created_by": f"sdc-taichi {version('sdc-taichi')}",
+        },
+    )
+    return Imported(metadata["kind"], name, source, target, notes)

@@ -1,0 +1,208 @@
+"""Sites and workload traces by name: the embedded ones and those the user imported.
+
+Imported files lie in ``$SDC_TAICHI_DATA``, else in the platform's folder for user data:
+``sites/NAME/weather.parquet``, ``sites/NAME/carbon.parquet``, ``traces/NAME.parquet``. An imported
+name never hides an embedded one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from sdc_taichi.errors import DataError
+from sdc_taichi.exogenous import files
+from sdc_taichi.exogenous.carbon import Pairing, Stamp, read_carbon
+from sdc_taichi.exogenous.series import Series, SiteData, make_site, site_weather
+from sdc_taichi.exogenous.synthetic import (
+    DEFAULT_SEED,
+    synthetic_site,
+    synthetic_sites,
+    synthetic_trace,
+    synthetic_traces,
+)
+from sdc_taichi.exogenous.weather import read_epw
+from sdc_taichi.exogenous.workload import read_workload
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+
+
+def user_data_dir(data_dir: str | Path | None = None) -> Path:
+    """Folder of imported files: the argument, else ``$SDC_TAICHI_DATA``, else the platform's."""
+    if data_dir is not None:
+        return Path(data_dir)
+    if os.environ.get("SDC_TAICHI_DATA"):
+        return Path(os.environ["SDC_TAICHI_DATA"])
+    import platformdirs
+
+    return Path(platformdirs.user_data_dir("sdc-taichi", appauthor=False))
+
+
+def imported_sites(data_dir: str | Path | None = None) -> dict[str, dict[str, Path]]:
+    """Imported sites: name to ``{"weather": path, "carbon": path}``, either may be missing."""
+    sites: dict[str, dict[str, Path]] = {}
+    for path in sorted((user_data_dir(data_dir) / "sites").glob("*/*.parquet")):
+        if path.stem in ("weather", "carbon"):
+            sites.setdefault(path.parent.name, {})[path.stem] = path
+    return sites
+
+
+def imported_traces(data_dir: str | Path | None = None) -> dict[str, Path]:
+    """Imported workload traces: name to path."""
+    return {p.stem: p for p in sorted((user_data_dir(data_dir) / "traces").glob("*.parquet"))}
+
+
+def site_names(data_dir: str | Path | None = None) -> tuple[str, ...]:
+    """Embedded sites, then imported ones."""
+    return (*synthetic_sites(), *imported_sites(data_dir))
+
+
+def trace_names(data_dir: str | Path | None = None) -> tuple[str, ...]:
+    """Embedded workload traces, then imported ones."""
+    return (*synthetic_traces(), *imported_traces(data_dir))
+
+
+def find_name(kind: str, name: str, valid: tuple[str, ...]) -> str:
+    """The valid name that equals ``name`` up to case.
+
+    Raises:
+        DataError: none does; names the nearest valid ones.
+    """
+    by_folded = {x.casefold(): x for x in valid}
+    found = by_folded.get(name.strip().casefold())
+    if found is None:
+        near = difflib.get_close_matches(name.strip().casefold(), by_folded, n=3, cutoff=0.5)
+        nearest = f"; nearest: {', '.join(by_folded[x] for x in near)}" if near else ""
+        raise DataError(f"{kind} {name!r}: expected one of {', '.join(valid)}{nearest}")
+    return found
+
+
+def new_name(kind: str, name: str, embedded: tuple[str, ...]) -> str:
+    """Check a name for an import.
+
+    Raises:
+        DataError: not usable as a folder name, or that of an embedded site or trace.
+    """
+    if not _NAME.fullmatch(name):
+        raise DataError(
+            f"{kind} {name!r}: expected 1 to 64 letters, digits, '_' or '-', beginning with a "
+            "letter or digit"
+        )
+    if name.casefold() in {x.casefold() for x in embedded}:
+        raise DataError(
+            f"{kind} {name!r}: is the embedded synthetic one, expected another name such as "
+            f"{name}-real"
+        )
+    return name
+
+
+def load_site(
+    name: str, *, seed: int = DEFAULT_SEED, data_dir: str | Path | None = None
+) -> SiteData:
+    """Weather and carbon intensity of a site.
+
+    Args:
+        name: embedded or imported, any case.
+        seed: of the synthetic year, for embedded sites and for embedded parts of imported ones.
+        data_dir: folder of imported files instead of the user's.
+
+    Raises:
+        DataError: unknown name, an imported site that lacks a part and was not given a base, or
+            an imported file that is damaged.
+    """
+    name = find_name("site", name, site_names(data_dir))
+    if name in synthetic_sites():
+        return synthetic_site(name, seed)
+    parts = imported_sites(data_dir)[name]
+    bases = {str(m["base"]) for m in map(_metadata, parts.values()) if m.get("base")}
+    missing = sorted({"weather", "carbon"} - set(parts))
+    if missing and not bases:
+        raise DataError(
+            f"site {name!r}: imported without {missing[0]}; import a {missing[0]} file with "
+            f"--site {name}, or import again with --base SITE to take it from an embedded site"
+        )
+    base = (
+        synthetic_site(find_name("base", bases.pop(), synthetic_sites()), seed) if bases else None
+    )
+    return site_from_files(base, parts.get("weather"), parts.get("carbon"), name)
+
+
+def load_trace(
+    name: str, *, seed: int = DEFAULT_SEED, data_dir: str | Path | None = None
+) -> Series:
+    """A workload trace, share of the capacity.
+
+    Args:
+        name: embedded or imported, any case.
+        seed: of the synthetic year, for embedded traces.
+        data_dir: folder of imported files instead of the user's.
+
+    Raises:
+        DataError: unknown name, or an imported file that is damaged.
+    """
+    name = find_name("trace", name, trace_names(data_dir))
+    if name in synthetic_traces():
+        return synthetic_trace(name, seed)
+    return read_workload(imported_traces(data_dir)[name])
+
+
+def site_from_files(
+    base: SiteData | None,
+    weather: str | Path | None = None,
+    carbon: str | Path | None = None,
+    name: str | None = None,
+    *,
+    stamp: Stamp = "auto",
+    pairing: Pairing = "local",
+) -> SiteData:
+    """A site from a weather file, a carbon file, or both, without importing them.
+
+    The weather file's header gives location and UTC offset. What no file gives is taken from
+    ``base``, and is then synthetic if the base is.
+
+    Args:
+        base: site that gives what is missing; None if both files are given.
+        weather: EPW or imported Parquet.
+        carbon: CSV or imported Parquet.
+        name: of the site; the base's, else the weather file's stem.
+        stamp: what a stamp of the carbon file marks, see ``read_carbon``.
+        pairing: see ``read_carbon``.
+
+    Raises:
+        DataError: neither file nor base gives a part, or a file is not valid.
+    """
+    if weather is not None:
+        station = read_epw(weather)
+        name = name or (base.name if base else Path(weather).stem)
+    elif base is not None:
+        station = site_weather(base)
+        name = name or base.name
+    else:
+        raise DataError("weather: no file and no base site, expected one of them")
+    if carbon is not None:
+        intensity = read_carbon(
+            carbon,
+            station.utc_offset_h,
+            stamp,
+            pairing=pairing,
+            longitude_deg=station.longitude_deg,
+        )
+    elif base is not None:
+        intensity = base.ci_g_per_kwh
+        if base.utc_offset_h != station.utc_offset_h:
+            note = f"of {base.name} at UTC{base.utc_offset_h:+g} h, on the clock of that site"
+            intensity = replace(intensity, notes=(*intensity.notes, note))
+    else:
+        raise DataError("carbon: no file and no base site, expected one of them")
+    return make_site(name, station, intensity)
+
+
+def _metadata(path: Path) -> dict[str, Any]:
+    metadata = files.read_metadata(path)
+    if metadata is None:
+        raise DataError(f"{path}: no sdc_taichi metadata, expected a file written by `data import`")
+    return metadata

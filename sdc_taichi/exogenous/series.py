@@ -1,0 +1,238 @@
+"""Time series that drive a site: a year (or more) of values on the simulator's clock.
+
+Clock: local standard time, 365-day years without 29 February. Index 0 is the interval that starts
+on 1 January at 00:00, and a value stands for its whole interval.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sdc_taichi.errors import DataError
+
+FloatArray = NDArray[np.float64]
+
+MINUTES_PER_YEAR = 365 * 24 * 60
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Values on a regular grid, periodic beyond the end.
+
+    Attributes:
+        values: shape (T,), float64, read-only, finite, in ``unit``.
+        minutes: length of one interval, minutes.
+        name: what it is, e.g. ``outdoor_c``.
+        unit: unit of the values.
+        source: where the values come from.
+        synthetic: whether the values were generated rather than measured.
+        notes: what was repaired, with counts, and warnings.
+    """
+
+    values: FloatArray
+    minutes: float
+    name: str
+    unit: str
+    source: str
+    synthetic: bool
+    notes: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        """Take a read-only copy of the values and check them.
+
+        Raises:
+            DataError: values are not a finite vector, or the resolution is not positive.
+        """
+        values = np.array(self.values, dtype=np.float64)
+        if values.ndim != 1 or values.size == 0:
+            raise DataError(f"{self.name}: shape {values.shape}, expected (T,) with T >= 1")
+        if not np.isfinite(self.minutes) or self.minutes <= 0:
+            raise DataError(f"{self.name}: minutes {self.minutes}, expected a positive number")
+        finite = np.isfinite(values)
+        if not finite.all():
+            at = int(np.argmin(finite))
+            raise DataError(f"{self.name}: index {at}: {values[at]}, expected a finite number")
+        values.setflags(write=False)
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "minutes", float(self.minutes))
+        object.__setattr__(self, "notes", tuple(self.notes))
+
+    @property
+    def days(self) -> float:
+        """Length of the series in days."""
+        return self.values.size * self.minutes / 1440.0
+
+
+@dataclass(frozen=True, eq=False)
+class Weather:
+    """Weather of one station on the simulator's clock, with its location."""
+
+    label: str
+    latitude_deg: float
+    longitude_deg: float
+    elevation_m: float
+    utc_offset_h: float
+    outdoor_c: Series
+    wet_bulb_c: Series
+    relative_humidity_pct: Series | None = None
+    pressure_pa: Series | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SiteData:
+    """Weather and grid carbon intensity of one site on one clock.
+
+    The series may differ in resolution and in length; ``resample`` brings each to the step of a
+    simulation.
+    """
+
+    name: str
+    label: str
+    latitude_deg: float
+    longitude_deg: float
+    elevation_m: float
+    utc_offset_h: float
+    outdoor_c: Series
+    wet_bulb_c: Series
+    ci_g_per_kwh: Series
+    relative_humidity_pct: Series | None = None
+    pressure_pa: Series | None = None
+
+    @property
+    def series(self) -> tuple[Series, ...]:
+        """All series that exist, temperatures first."""
+        every = (
+            self.outdoor_c,
+            self.wet_bulb_c,
+            self.ci_g_per_kwh,
+            self.relative_humidity_pct,
+            self.pressure_pa,
+        )
+        return tuple(s for s in every if s is not None)
+
+    @property
+    def synthetic(self) -> bool:
+        """Whether any of the three driving series was generated."""
+        return any(s.synthetic for s in (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh))
+
+
+def make_site(name: str, weather: Weather, ci_g_per_kwh: Series) -> SiteData:
+    """Join a station's weather and a grid's carbon intensity under one name."""
+    return SiteData(
+        name=name,
+        label=weather.label,
+        latitude_deg=weather.latitude_deg,
+        longitude_deg=weather.longitude_deg,
+        elevation_m=weather.elevation_m,
+        utc_offset_h=weather.utc_offset_h,
+        outdoor_c=weather.outdoor_c,
+        wet_bulb_c=weather.wet_bulb_c,
+        ci_g_per_kwh=ci_g_per_kwh,
+        relative_humidity_pct=weather.relative_humidity_pct,
+        pressure_pa=weather.pressure_pa,
+    )
+
+
+def site_weather(site: SiteData) -> Weather:
+    """The weather part of a site."""
+    return Weather(
+        label=site.label,
+        latitude_deg=site.latitude_deg,
+        longitude_deg=site.longitude_deg,
+        elevation_m=site.elevation_m,
+        utc_offset_h=site.utc_offset_h,
+        outdoor_c=site.outdoor_c,
+        wet_bulb_c=site.wet_bulb_c,
+        relative_humidity_pct=site.relative_humidity_pct,
+        pressure_pa=site.pressure_pa,
+    )
+
+
+def step_minutes(steps_per_hour: int) -> int:
+    """Length of a step in minutes.
+
+    Raises:
+        DataError: ``steps_per_hour`` does not divide 60 minutes.
+    """
+    whole = not isinstance(steps_per_hour, bool) and isinstance(steps_per_hour, int | np.integer)
+    if not whole or steps_per_hour < 1 or 60 % int(steps_per_hour):
+        raise DataError(
+            f"steps_per_hour: {steps_per_hour!r}, expected one of "
+            "1, 2, 3, 4, 5, 6, 10, 12, 15, 20, 30, 60"
+        )
+    return 60 // int(steps_per_hour)
+
+
+def resample(series: Series, steps_per_hour: int, *, hold: bool = False) -> FloatArray:
+    """Bring a series to the step of a simulation.
+
+    To a finer step, values are interpolated linearly between interval centres, periodically at
+    the wrap, so the year is neither stretched nor shifted; with ``hold`` (flows such as work)
+    each value is kept over its interval instead. To a coarser step, values are averaged by
+    overlap. Averaging and holding conserve the mean; interpolation does so when the step divides
+    the resolution.
+
+    Args:
+        series: the series, resolution ``series.minutes``.
+        steps_per_hour: a divisor of 60.
+        hold: keep values over their interval instead of interpolating.
+
+    Returns:
+        Shape (N,), float64, N = length of the series / step.
+
+    Raises:
+        DataError: the step does not divide an hour, or the series is not a whole number of steps.
+    """
+    step = step_minutes(steps_per_hour)
+    total = series.values.size * series.minutes
+    n = round(total / step)
+    if n < 1 or abs(n * step - total) > 1e-6 * step:
+        raise DataError(
+            f"{series.name}: {series.values.size} values of {series.minutes:g} min are not a whole "
+            f"number of {step} min steps"
+        )
+    values = series.values
+    if n == values.size:
+        return values.copy()
+    if n < values.size:
+        if values.size % n == 0:
+            return np.asarray(values.reshape(n, -1).mean(axis=1), dtype=np.float64)
+        return _rebin(values, n)
+    if hold:
+        return np.repeat(values, n // values.size) if n % values.size == 0 else _rebin(values, n)
+    centres = (np.arange(n) + 0.5) * (values.size / n) - 0.5
+    left = np.floor(centres).astype(np.int64)
+    share = centres - left
+    return np.asarray(
+        (1.0 - share) * values[left % values.size] + share * values[(left + 1) % values.size],
+        dtype=np.float64,
+    )
+
+
+def _rebin(values: FloatArray, n: int) -> FloatArray:
+    """Mean over each of n equal intervals of a function that is constant over each value's own."""
+    mean = values.mean()  # taken off first, so that the running sum stays small
+    total = np.concatenate([[0.0], np.cumsum(values - mean)])
+    edges = np.linspace(0.0, values.size, n + 1)
+    return np.asarray(
+        mean + np.diff(np.interp(edges, np.arange(values.size + 1), total)) * (n / values.size),
+        dtype=np.float64,
+    )
+
+
+def check_physical(name: str, values: ArrayLike, low: float, high: float) -> None:
+    """Reject values outside [low, high].
+
+    Raises:
+        DataError: names the first index outside.
+    """
+    array: Any = np.asarray(values, dtype=np.float64)
+    good = (array >= low) & (array <= high)
+    if not np.all(good):
+        at = int(np.argmin(good))
+        value = float(array.ravel()[at])
+        raise DataError(f"{name}: index {at}: {value:g}, expected {low:g} to {high:g}")

@@ -1,0 +1,298 @@
+"""Weather files: EnergyPlus EPW, and what `data import` writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sdc_taichi.errors import DataError
+from sdc_taichi.exogenous import files
+from sdc_taichi.exogenous.psychrometrics import wet_bulb_c
+from sdc_taichi.exogenous.series import FloatArray, Series, Weather
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+HEADER_LINES = 8
+DATA_COLUMNS = 35
+# Limits and missing codes of the EPW format (EnergyPlus Auxiliary Programs, EPW data dictionary).
+OUTDOOR_LIMITS_C = (-70.0, 70.0)
+PRESSURE_LIMITS_PA = (31_000.0, 120_000.0)
+_DRY_BULB = ("dry bulb (column 7)", 6, OUTDOOR_LIMITS_C, 99.9)
+_DEW_POINT = ("dew point (column 8)", 7, (-70.0, 70.0), 99.9)
+_HUMIDITY = ("relative humidity (column 9)", 8, (0.0, 110.0), 999.0)
+_PRESSURE = ("station pressure (column 10)", 9, PRESSURE_LIMITS_PA, 999_999.0)
+# Dew point above dry bulb by more than the rounding of both would put the wet bulb above it too.
+_DEW_POINT_SLACK_K = 0.2
+_MONTH_DAYS = np.array([31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])
+_MONTH_START = np.concatenate([[0], np.cumsum(_MONTH_DAYS)[:-1]])
+_YEAR_H = 8760
+
+
+def read_epw(path: str | Path) -> Weather:
+    """Read an EPW file: dry bulb, relative humidity, station pressure; wet bulb is computed.
+
+    Hour k of the format is the hour that ends at k, in local standard time. Years may differ
+    between months, as in typical years; several years may follow each other, and an hour may have
+    several rows (DATA PERIODS). 29 February is removed, missing codes and absent hours up to 24 h
+    are interpolated. A Parquet file written by ``data import`` is read too.
+
+    Args:
+        path: EPW or Parquet.
+
+    Returns:
+        Weather, whole years of 365 days.
+
+    Raises:
+        DataError: names file, row, column, value and what would be valid.
+    """
+    path = files.existing_file(path)
+    if files.is_parquet(path):
+        metadata = files.read_metadata(path)
+        if metadata is None:
+            raise DataError(
+                f"{path}: Parquet without sdc_taichi metadata (location, UTC offset, resolution), "
+                "expected an EPW file or one written by `data import`"
+            )
+        return _read_imported(path, metadata)
+    lines = path.read_bytes().decode("latin-1").splitlines()
+    label, latitude, longitude, offset, elevation = _location(path, lines)
+    per_hour = _records_per_hour(path, lines)
+    frame = _rows(path, lines)
+    hours, frame, leap_rows = _hours(path, frame)
+    positions = _positions(path, frame, hours, per_hour)
+    minutes = 60.0 / per_hour
+    notes = [f"29 February removed ({leap_rows} rows)"] if leap_rows else []
+    columns, column_notes = _columns(path, frame)
+    notes += column_notes
+    values = files.spread(columns, positions)
+    absent = len(values) - len(frame)
+    if absent:
+        notes.append(f"{absent} absent rows interpolated")
+    rows = frame.index.to_numpy()
+    rows = rows[np.minimum(np.searchsorted(positions, np.arange(len(values))), rows.size - 1)]
+    names = (_DRY_BULB[0], _HUMIDITY[0], _PRESSURE[0])
+    values = np.stack(
+        [files.fill_gaps(path, values[:, i], minutes, n, rows) for i, n in enumerate(names)], axis=1
+    )
+    values, year_notes = files.whole_years(path, values, float(hours[0]) * 60.0, minutes)
+    notes += year_notes
+    outdoor, humidity, pressure = values.T
+    wet_bulb = wet_bulb_c(outdoor, humidity, pressure)
+
+    def series(name: str, unit: str, x: FloatArray) -> Series:
+        return Series(x, minutes, name, unit, path.name, synthetic=False, notes=tuple(notes))
+
+    return Weather(
+        label=label,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        elevation_m=elevation,
+        utc_offset_h=offset,
+        outdoor_c=series("outdoor_c", "C", outdoor),
+        wet_bulb_c=series("wet_bulb_c", "C", wet_bulb),
+        relative_humidity_pct=series("relative_humidity_pct", "%", humidity),
+        pressure_pa=series("pressure_pa", "Pa", pressure),
+    )
+
+
+def _location(path: Path, lines: list[str]) -> tuple[str, float, float, float, float]:
+    """Label, latitude, longitude, UTC offset (h) and elevation (m) of the first line."""
+    fields = [x.strip() for x in lines[0].split(",")] if lines else [""]
+    if fields[0].upper() != "LOCATION":
+        raise DataError(
+            f"{path}: row 1: starts with {fields[0][:20]!r}, expected LOCATION (an EPW file)"
+        )
+    if len(fields) < 10:
+        raise DataError(f"{path}: row 1: {len(fields)} fields, expected 10 of LOCATION")
+    limits = {
+        "latitude": (6, -90.0, 90.0),
+        "longitude": (7, -180.0, 180.0),
+        "UTC offset": (8, -12.0, 14.0),
+        "elevation": (9, -1000.0, 9999.9),
+    }
+    numbers = []
+    for name, (at, low, high) in limits.items():
+        try:
+            value = float(fields[at])
+        except ValueError:
+            value = np.nan
+        if not low <= value <= high:
+            raise files.fault(path, 1, name, fields[at], f"a number from {low:g} to {high:g}")
+        numbers.append(value)
+    label = ", ".join(x for x in (fields[1], fields[2], fields[3]) if x and x != "-")
+    latitude, longitude, offset, elevation = numbers
+    return label, latitude, longitude, offset, elevation
+
+
+def _records_per_hour(path: Path, lines: list[str]) -> int:
+    """Records per hour of the DATA PERIODS line, the last of the header."""
+    if len(lines) < HEADER_LINES:
+        raise DataError(f"{path}: row {len(lines)}: ends in the header, expected 8 header lines")
+    fields = [x.strip() for x in lines[HEADER_LINES - 1].split(",")]
+    if fields[0].upper() != "DATA PERIODS":
+        raise DataError(
+            f"{path}: row 8: starts with {fields[0][:20]!r}, expected DATA PERIODS "
+            "(the last of 8 header lines)"
+        )
+    text = fields[2] if len(fields) > 2 else ""
+    if not text.isdigit() or int(text) < 1 or 60 % int(text):
+        raise files.fault(path, 8, "records per hour", text, "a divisor of 60")
+    return int(text)
+
+
+def _rows(path: Path, lines: list[str]) -> pd.DataFrame:
+    """Rows of data as text, indexed by their row in the file."""
+    import pandas as pd
+
+    data = lines[HEADER_LINES:]
+    while data and not data[-1].strip():
+        data.pop()
+    if not data:
+        raise DataError(f"{path}: row {HEADER_LINES}: no rows of data after the header")
+    cells = []
+    for at, line in enumerate(data):
+        row = line.split(",", 10)
+        if len(row) < 10:
+            raise DataError(
+                f"{path}: row {HEADER_LINES + 1 + at}: {len(row)} columns, "
+                f"expected {DATA_COLUMNS} (at least the first 10)"
+            )
+        cells.append(row[:10])
+    first = HEADER_LINES + 1
+    return pd.DataFrame(cells, index=range(first, first + len(cells)), columns=range(10), dtype=str)
+
+
+def _hours(path: Path, frame: pd.DataFrame) -> tuple[NDArray[np.int64], pd.DataFrame, int]:
+    """Hour of the 365-day year per row, the rows without 29 February, and how many that were."""
+    dates, rows = {}, frame.index.to_numpy()
+    for name, at, high in (("month", 1, 12), ("day", 2, 31), ("hour", 3, 24)):
+        column = f"{name} (column {at + 1})"
+        values = files.numbers(path, frame[at], column, rows, 1.0, high)
+        bad = np.isnan(values) | (values != np.round(values))
+        if bad.any():
+            row = int(np.argmax(bad))
+            valid = f"a whole number from 1 to {high}"
+            raise files.fault(path, int(rows[row]), column, frame[at].iloc[row], valid)
+        dates[name] = values.astype(np.int64)
+    month, day, hour = dates["month"], dates["day"], dates["hour"]
+    leap = (month == 2) & (day == 29)
+    long = day > _MONTH_DAYS[month - 1] + leap
+    if long.any():
+        row = int(np.argmax(long))
+        valid = f"a day of month {month[row]}"
+        raise files.fault(path, int(rows[row]), "day (column 3)", int(day[row]), valid)
+    of_year = (_MONTH_START[month - 1] + day - 1) * 24 + hour - 1
+    kept = frame[~leap]
+    if kept.empty:
+        raise DataError(f"{path}: row {HEADER_LINES + 1}: only 29 February, expected 365 days")
+    return of_year[~leap], kept, int(leap.sum())
+
+
+def _positions(
+    path: Path, frame: pd.DataFrame, hours: NDArray[np.int64], per_hour: int
+) -> NDArray[np.int64]:
+    """Place of each row on the regular grid, from 0; years follow each other."""
+    rows = frame.index.to_numpy()
+    starts = np.flatnonzero(np.diff(hours, prepend=hours[0] - 1))
+    counts = np.diff(starts, append=hours.size)
+    if (counts > per_hour).any():
+        row = int(rows[starts[np.argmax(counts > per_hour)] + per_hour])
+        raise DataError(
+            f"{path}: row {row}, column hour: repeats the hour above, expected {per_hour} "
+            f"row{'s' if per_hour > 1 else ''} per hour (DATA PERIODS)"
+        )
+    if (counts < per_hour).any():
+        at = int(np.argmax(counts < per_hour))
+        raise DataError(
+            f"{path}: row {int(rows[starts[at]])}, column hour: {int(counts[at])} rows in the "
+            f"hour, expected {per_hour} (DATA PERIODS)"
+        )
+    steps = np.diff(hours[starts]) % _YEAR_H
+    bad = steps - 1 > files.MAX_GAP_H
+    if bad.any():
+        at = int(np.argmax(bad)) + 1
+        month, day, hour = (frame[i].iloc[starts[at]].strip() for i in (1, 2, 3))
+        back = steps[at - 1] > _YEAR_H // 2
+        valid = (
+            "an hour after the row above"
+            if back
+            else f"gaps of at most 24 h, not {int(steps[at - 1] - 1)} h"
+        )
+        stamp = f"month {month} day {day} hour {hour}"
+        raise files.fault(path, int(rows[starts[at]]), "date", stamp, valid)
+    hour_position = np.concatenate([[0], np.cumsum(steps)])
+    within = np.arange(hours.size) - np.repeat(starts, counts)
+    return np.asarray(np.repeat(hour_position, counts) * per_hour + within, dtype=np.int64)
+
+
+def _columns(path: Path, frame: pd.DataFrame) -> tuple[FloatArray, list[str]]:
+    """Dry bulb, relative humidity and pressure, NaN where missing; shape (T, 3)."""
+    values, notes, rows = {}, [], frame.index.to_numpy()
+    for column, at, (low, high), code in (_DRY_BULB, _DEW_POINT, _HUMIDITY, _PRESSURE):
+        text = frame[at].str.strip()
+        coded = _is_code(text, code)
+        x = files.numbers(path, text.mask(coded, "nan"), column, rows, low, high)
+        values[column] = x
+        missing = int(np.isnan(x).sum())
+        if missing and column != _DEW_POINT[0]:
+            notes.append(f"{missing} missing values of {column} interpolated")
+    outdoor, humidity = values[_DRY_BULB[0]], values[_HUMIDITY[0]]
+    above = values[_DEW_POINT[0]] > outdoor + _DEW_POINT_SLACK_K
+    if above.any():
+        at = int(np.argmax(above))
+        dew_point = float(values[_DEW_POINT[0]][at])
+        valid = f"at most the dry bulb of {outdoor[at]:g} C (the wet bulb would lie above it)"
+        raise files.fault(path, int(frame.index[at]), _DEW_POINT[0], dew_point, valid)
+    over = humidity > 100.0
+    if over.any():
+        notes.append(f"{int(over.sum())} values of relative humidity over 100 % set to 100 %")
+        values[_HUMIDITY[0]] = np.where(over, 100.0, humidity)
+    pressure = values[_PRESSURE[0]]
+    known = pressure[~np.isnan(pressure)]
+    if known.size and known.std() < 100.0:
+        notes.append(f"warning: station pressure is nearly constant ({known.mean():.0f} Pa)")
+    return np.stack([values[x[0]] for x in (_DRY_BULB, _HUMIDITY, _PRESSURE)], axis=1), notes
+
+
+def _is_code(text: pd.Series[str], code: float) -> pd.Series[bool]:
+    """Where a text column carries the missing code, however many decimals it is written with."""
+    import pandas as pd
+
+    result: pd.Series[bool] = pd.to_numeric(text, errors="coerce") == code
+    return result
+
+
+def _read_imported(path: Path, metadata: dict[str, Any]) -> Weather:
+    kind = files.metadata_value(path, metadata, "kind", str)
+    if kind != "weather":
+        raise DataError(f"{path}: metadata kind: {kind!r}, expected 'weather'")
+    minutes = files.metadata_value(path, metadata, "minutes", float)
+    limits = {
+        "outdoor_c": OUTDOOR_LIMITS_C,
+        "wet_bulb_c": (-100.0, 70.0),
+        "relative_humidity_pct": (0.0, 100.0),
+        "pressure_pa": PRESSURE_LIMITS_PA,
+    }
+    columns = files.read_columns(path, limits, minutes)
+    above = columns["wet_bulb_c"] > columns["outdoor_c"] + 1e-6
+    if above.any():
+        at = int(np.argmax(above))
+        valid = f"at most the dry bulb of {columns['outdoor_c'][at]:g} C"
+        raise files.fault(path, at + 1, "wet_bulb_c", float(columns["wet_bulb_c"][at]), valid)
+    units = {"outdoor_c": "C", "wet_bulb_c": "C", "relative_humidity_pct": "%", "pressure_pa": "Pa"}
+    series = {
+        name: files.imported_series(path, metadata, name, unit, columns, minutes)
+        for name, unit in units.items()
+    }
+    return Weather(
+        label=files.metadata_value(path, metadata, "label", str),
+        latitude_deg=files.metadata_value(path, metadata, "latitude_deg", float),
+        longitude_deg=files.metadata_value(path, metadata, "longitude_deg", float),
+        elevation_m=files.metadata_value(path, metadata, "elevation_m", float),
+        utc_offset_h=files.metadata_value(path, metadata, "utc_offset_h", float),
+        **series,
+    )

@@ -1,0 +1,1 @@
+"""Plant stages and devices: pure functions over arrays of shape (B,)."""

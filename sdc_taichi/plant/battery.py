@@ -1,0 +1,298 @@
+"""Batteries: energy stored, drawn and delivered in one step, each model a pure function by name.
+
+Every model has the same signature, so a caller can look it up in `BATTERIES` and pass all of:
+
+    stored_kwh             energy in the store, kWh
+    command                -1..1: 1 charges at the limit power, -1 discharges at it, 0 idles; the
+                           power is this share of the limit
+    capacity_kwh           capacity, kWh (0 is a battery that is not there)
+    load_kw                facility load, kW; a discharge never delivers more
+    dt_h                   length of the step, h
+    charge_efficiency      energy stored per energy drawn from the bus
+    discharge_factor       energy taken from the store per energy delivered
+    charge_limit_c_rate    largest rate into the store, in capacities per hour
+    discharge_limit_c_rate largest rate out of the store, in capacities per hour
+    upper_u_h, upper_v     upper limit of the stored energy at charge power P: u*P + v*capacity
+    lower_u_h, lower_v     lower limit of the stored energy at discharge power P
+
+Arguments are float64 arrays of shape (B,), or anything that broadcasts to it; a model reads only
+what its equations need. Energy at the bus: charge_kwh is drawn, discharge_kwh delivered, and
+
+    stored' = stored + charge_efficiency*charge_kwh - discharge_factor*discharge_kwh
+
+to rounding; the released model has no losses and rounds its store to 8 decimals of a MWh.
+
+Sources: F. Kazhamiaka, C. Rosenberg, S. Keshav, "Tractable lithium-ion storage models for
+optimizing energy systems", Energy Informatics 2 (2019); SustainDC, appendix A.3.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Values = Array | float
+
+
+@dataclass(frozen=True, slots=True)
+class Battery:
+    """One step of a battery, in kWh; all fields have shape (B,).
+
+    Attributes:
+        stored_kwh: Energy in the store at the end of the step.
+        charge_kwh: Energy drawn from the bus.
+        discharge_kwh: Energy delivered to the load.
+        loss_kwh: charge_kwh - discharge_kwh - change of stored_kwh.
+        grid_kwh: Energy bought, load + charge_kwh - discharge_kwh, at least 0.
+    """
+
+    stored_kwh: Array
+    charge_kwh: Array
+    discharge_kwh: Array
+    loss_kwh: Array
+    grid_kwh: Array
+
+
+def clc(
+    stored_kwh: Values,
+    command: Values,
+    *,
+    capacity_kwh: Values,
+    load_kw: Values,
+    dt_h: Values,
+    charge_efficiency: Values = 0.97,
+    discharge_factor: Values = 1.04,
+    charge_limit_c_rate: Values = 3.0,
+    discharge_limit_c_rate: Values = 3.0,
+    upper_u_h: Values = -0.04,
+    upper_v: Values = 1.0,
+    lower_u_h: Values = 0.01,
+    lower_v: Values = 0.0,
+) -> Battery:
+    """C/L/C: constant efficiencies, linear limits of the stored energy, constant rate limits.
+
+    P_c <= min(alpha_c*C/eta_c, (v*C - b)/(eta_c*dt - u)),
+    P_d <= min(alpha_d*C/eta_d, (b - v'*C)/(u' + eta_d*dt), load), with the true step length, so
+    the limits of the stored energy hold at the end of the step.
+
+    Args:
+        stored_kwh: Energy in the store b, kWh.
+        command: Share of the limit power, -1..1.
+        capacity_kwh: Capacity C, kWh.
+        load_kw: Facility load, kW.
+        dt_h: Length of the step, h.
+        charge_efficiency: eta_c.
+        discharge_factor: eta_d, 1 or more.
+        charge_limit_c_rate: alpha_c, 1/h.
+        discharge_limit_c_rate: alpha_d, 1/h.
+        upper_u_h: u, h, at most 0.
+        upper_v: v.
+        lower_u_h: u', h, at least 0.
+        lower_v: v'.
+
+    Returns:
+        The battery's step.
+    """
+    room_kwh = np.maximum(upper_v * capacity_kwh - stored_kwh, 0.0)
+    content_kwh = np.maximum(stored_kwh - lower_v * capacity_kwh, 0.0)
+    return _step(
+        stored_kwh,
+        command,
+        capacity_kwh=capacity_kwh,
+        load_kw=load_kw,
+        dt_h=dt_h,
+        charge_limit_kw=np.minimum(
+            charge_limit_c_rate * capacity_kwh / charge_efficiency,
+            room_kwh / (charge_efficiency * dt_h - upper_u_h),
+        ),
+        discharge_limit_kw=np.minimum(
+            discharge_limit_c_rate * capacity_kwh / discharge_factor,
+            content_kwh / (lower_u_h + discharge_factor * dt_h),
+        ),
+        charge_efficiency=charge_efficiency,
+        discharge_factor=discharge_factor,
+    )
+
+
+def released(
+    stored_kwh: Values,
+    command: Values,
+    *,
+    capacity_kwh: Values,
+    load_kw: Values,
+    dt_h: Values,
+    charge_efficiency: Values = 1.0,
+    discharge_factor: Values = 1.0,
+    charge_limit_c_rate: Values = 0.1,
+    discharge_limit_c_rate: Values = 1.0,
+    upper_u_h: Values = -0.04,
+    upper_v: Values = 1.0,
+    lower_u_h: Values = 0.01,
+    lower_v: Values = 0.0,
+) -> Battery:
+    """The battery of the released SustainDC code, as identified from its recorded runs.
+
+    The limits use a step length T that depends on the state of charge s instead of dt: charging
+    T = dt*round(sigmoid(5 - 10*s)/2, 4) and energy min(0.1*C, (C - b)/(T + 0.04))*T; discharging
+    T = dt*max(4*sigmoid(10*(s - 0.25)), 0.5) and energy min(C, b/(T + 0.01), load/4)*T. The
+    quarter comes from passing the energy of a quarter hour where a power belongs, so even a full
+    battery carries less than the load. No losses. The store is kept in MWh with 8 decimals.
+
+    Args:
+        stored_kwh: Energy in the store b, kWh.
+        command: Share of the limit power, -1..1.
+        capacity_kwh: Capacity C, kWh.
+        load_kw: Facility load, kW.
+        dt_h: Length of the step, h; the code was only used with 0.25.
+        charge_efficiency: Not used, 1.
+        discharge_factor: Not used, 1.
+        charge_limit_c_rate: Not used, 0.1.
+        discharge_limit_c_rate: Not used, 1.
+        upper_u_h: Not used, -0.04.
+        upper_v: Not used, 1.
+        lower_u_h: Not used, 0.01.
+        lower_v: Not used, 0.
+
+    Returns:
+        The battery's step. Its loss_kwh is what the rounding takes or gives, 5e-6 kWh at most.
+    """
+    exists = np.greater(capacity_kwh, 0.0)
+    soc = np.where(exists, stored_kwh / np.where(exists, capacity_kwh, 1.0), 0.0)
+
+    charge_h = dt_h * np.round(0.5 * _sigmoid(5.0 - 10.0 * soc), 4)
+    charge_kw = np.minimum(0.1 * capacity_kwh, (capacity_kwh - stored_kwh) / (charge_h + 0.04))
+    discharge_h = dt_h * np.maximum(4.0 * _sigmoid(10.0 * (soc - 0.25)), 0.5)
+    discharge_kw = np.minimum(
+        np.minimum(capacity_kwh, stored_kwh / (discharge_h + 0.01)), 0.25 * load_kw
+    )
+
+    charge_kwh = np.maximum(command, 0.0) * charge_kw * charge_h
+    discharge_kwh = np.maximum(-command, 0.0) * discharge_kw * discharge_h
+    change_kwh = charge_kwh - discharge_kwh
+    rounded_kwh = np.clip(np.round((stored_kwh + change_kwh) / 1e3, 8) * 1e3, 0.0, capacity_kwh)
+    return _battery(
+        stored_kwh,
+        np.where(np.equal(change_kwh, 0.0), stored_kwh, rounded_kwh),
+        charge_kwh=charge_kwh,
+        discharge_kwh=discharge_kwh,
+        load_kwh=load_kw * dt_h,
+    )
+
+
+def paper(
+    stored_kwh: Values,
+    command: Values,
+    *,
+    capacity_kwh: Values,
+    load_kw: Values,
+    dt_h: Values,
+    charge_efficiency: Values = 0.97,
+    discharge_factor: Values = 1.04,
+    charge_limit_c_rate: Values = 0.5,
+    discharge_limit_c_rate: Values = 0.5,
+    upper_u_h: Values = -0.04,
+    upper_v: Values = 1.0,
+    lower_u_h: Values = 0.01,
+    lower_v: Values = 0.0,
+) -> Battery:
+    """Appendix A.3.4: the rates are limited by the energy that fits and by a largest power.
+
+    r_charge = min((C - E)/(eta_c*dt), P_max), r_discharge = min(E/(eta_d*dt), P_max, load). The
+    paper defines its P_max by itself (P_max = u*P + v), so it is taken as a share of the capacity;
+    it also writes E for both the state and the flow, which is read here as the change of the
+    state, +eta_c*r*dt when charging and -eta_d*r*dt when discharging.
+
+    Args:
+        stored_kwh: Energy in the store E, kWh.
+        command: Share of the limit power, -1..1.
+        capacity_kwh: Capacity C, kWh.
+        load_kw: Facility load, kW.
+        dt_h: Length of the step, h.
+        charge_efficiency: eta_c.
+        discharge_factor: eta_d, energy taken from the store per energy delivered.
+        charge_limit_c_rate: P_max over capacity when charging, 1/h.
+        discharge_limit_c_rate: P_max over capacity when discharging, 1/h.
+        upper_u_h: Not used.
+        upper_v: Not used.
+        lower_u_h: Not used.
+        lower_v: Not used.
+
+    Returns:
+        The battery's step.
+    """
+    return _step(
+        stored_kwh,
+        command,
+        capacity_kwh=capacity_kwh,
+        load_kw=load_kw,
+        dt_h=dt_h,
+        charge_limit_kw=np.minimum(
+            (capacity_kwh - stored_kwh) / (charge_efficiency * dt_h),
+            charge_limit_c_rate * capacity_kwh,
+        ),
+        discharge_limit_kw=np.minimum(
+            stored_kwh / (discharge_factor * dt_h), discharge_limit_c_rate * capacity_kwh
+        ),
+        charge_efficiency=charge_efficiency,
+        discharge_factor=discharge_factor,
+    )
+
+
+BATTERIES: dict[str, Callable[..., Battery]] = {
+    "clc": clc,
+    "released": released,
+    "paper": paper,
+}
+
+
+def _step(
+    stored_kwh: Values,
+    command: Values,
+    *,
+    capacity_kwh: Values,
+    load_kw: Values,
+    dt_h: Values,
+    charge_limit_kw: Values,
+    discharge_limit_kw: Values,
+    charge_efficiency: Values,
+    discharge_factor: Values,
+) -> Battery:
+    """Apply the share `command` of the limits."""
+    charge_kwh = np.maximum(command, 0.0) * charge_limit_kw * dt_h
+    discharge_kwh = np.maximum(-command, 0.0) * np.minimum(discharge_limit_kw, load_kw) * dt_h
+    after_kwh = stored_kwh + charge_efficiency * charge_kwh - discharge_factor * discharge_kwh
+    return _battery(
+        stored_kwh,
+        # Emptying or filling exactly can overshoot by the last bit.
+        np.clip(after_kwh, 0.0, capacity_kwh),
+        charge_kwh=charge_kwh,
+        discharge_kwh=discharge_kwh,
+        load_kwh=load_kw * dt_h,
+    )
+
+
+def _battery(
+    before_kwh: Values,
+    after_kwh: Values,
+    *,
+    charge_kwh: Values,
+    discharge_kwh: Values,
+    load_kwh: Values,
+) -> Battery:
+    return Battery(
+        *np.broadcast_arrays(
+            after_kwh,
+            charge_kwh,
+            discharge_kwh,
+            charge_kwh - discharge_kwh - (after_kwh - before_kwh),
+            load_kwh + charge_kwh - discharge_kwh,
+        )
+    )
+
+
+def _sigmoid(x: Values) -> Values:
+    return 1.0 / (1.0 + np.exp(-x))

@@ -1,0 +1,373 @@
+"""Cooling towers: fan power and water temperature for the heat to reject.
+
+Every model has the same signature, so a caller can look it up in `TOWERS` and pass all of:
+
+    heat_w               heat to reject, W (`rejected_w` of the chiller, plus what an economiser
+                         takes past it)
+    wet_bulb_c           outdoor wet bulb, C
+    outdoor_c            outdoor dry bulb, C
+    condenser_setpoint_c water temperature the tower is controlled to, C
+    supply_setpoint_c    CRAC supply setpoint, C (air-side models of the paper and its code)
+    water_kg_s           condenser water flow, kg/s
+    reference_water_kg_s water flow at which the water flow ratio of YorkCalc is 1, kg/s
+    reference_air_m3s    airflow at full fan speed, m3/s (air-side models)
+    design_fan_w         fan power at full speed, W
+
+Arguments are float64 arrays of shape (B,), or anything that broadcasts to it. A model reads only
+what its equations need; pass 0 for the rest.
+
+YorkCalc gives the approach (leaving water minus wet bulb) as a polynomial with 27 coefficients in
+wet bulb, range (entering minus leaving water) and the ratio of liquid to gas flow. Sources:
+EnergyPlus Engineering Reference, CoolingTower:VariableSpeed (YorkCalc correlation, its bounds and
+the free-convection share); Modelica Buildings, Fluid.HeatExchangers.CoolingTowers.YorkCalc
+(reference flow and fan power per water flow).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sdc_taichi.errors import SdcError
+
+Array = NDArray[np.float64]
+Values = Array | float
+
+WATER_J_PER_KG_K = 4184.0
+
+# [power of L/G, power of the range, power of the wet bulb]
+YORKCALC = np.array(
+    [
+        [
+            [-0.359741205, -0.055053608, 0.0023850432],
+            [0.173926877, -0.0248473764, 0.00048430224],
+            [-0.005589849456, 0.0005770079712, -0.00001342427256],
+        ],
+        [
+            [2.84765801111111, -0.121765149, 0.0014599242],
+            [1.680428651, -0.0166920786, -0.0007190532],
+            [-0.025485194448, 0.0000487491696, 0.00002719234152],
+        ],
+        [
+            [-0.0653766255555556, -0.002278167, 0.0002500254],
+            [-0.0910565458, 0.00318176316, 0.000038621772],
+            [-0.0034285382352, 0.00000856589904, -0.000001516821552],
+        ],
+    ]
+)
+WET_BULB_BOUNDS_C = (-34.4, 26.7)
+RANGE_BOUNDS_K = (1.1, 22.2)
+APPROACH_BOUNDS_K = (1.1, 40.0)
+MAX_LIQUID_GAS_RATIO = 8.0
+
+# Share of the full-speed cooling that is left when the fan stands still.
+FREE_CONVECTION_SHARE = 0.125
+
+# 275 W of fan per 0.15 kg/s of water, the default of the Modelica model.
+FAN_W_PER_KG_S = 275.0 / 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Tower:
+    """One step of a cooling tower; all fields have shape (B,).
+
+    Attributes:
+        fan_w: Fan power, W.
+        air_ratio: Airflow over its design (reference) value; 0 when the fan is off.
+        leaving_c: Water leaving the tower, C.
+        range_k: Entering minus leaving water, K.
+        approach_k: Leaving water minus wet bulb, K.
+    """
+
+    fan_w: Array
+    air_ratio: Array
+    leaving_c: Array
+    range_k: Array
+    approach_k: Array
+
+
+def yorkcalc_approach_k(wet_bulb_c: Values, range_k: Values, liquid_gas_ratio: Values) -> Array:
+    """Approach of a York tower: leaving water minus wet bulb.
+
+    Args:
+        wet_bulb_c: Outdoor wet bulb, C; evaluated within -34.4..26.7 C.
+        range_k: Entering minus leaving water, K; evaluated within 1.1..22.2 K.
+        liquid_gas_ratio: Water flow ratio over air flow ratio; evaluated at 8 or less.
+
+    Returns:
+        Approach within 1.1..40 K.
+    """
+    a, b, c = _approach_parabola(wet_bulb_c, range_k)
+    x = np.minimum(liquid_gas_ratio, MAX_LIQUID_GAS_RATIO)
+    return np.asarray(np.clip(a + x * (b + x * c), *APPROACH_BOUNDS_K))
+
+
+def yorkcalc_liquid_gas_ratio(wet_bulb_c: Values, range_k: Values, approach_k: Values) -> Array:
+    """Largest liquid to gas ratio (least air) that reaches an approach, the inverse of YorkCalc.
+
+    For a given wet bulb and range the approach is a + b*x + c*x^2 in the ratio x, and b > 0
+    throughout the bounds. The root on the branch that rises from x = 0 is
+    2*(t - a)/(b + sqrt(b^2 + 4*c*(t - a))), which needs no case for c = 0.
+
+    Args:
+        wet_bulb_c: Outdoor wet bulb, C.
+        range_k: Entering minus leaving water, K.
+        approach_k: Approach wanted, K; evaluated within 1.1..40 K.
+
+    Returns:
+        The ratio, 0..8. It is 0 where no airflow reaches the approach, and 8, the bound of the
+        correlation, where less air than that would do.
+    """
+    a, b, c = _approach_parabola(wet_bulb_c, range_k)
+    above_intercept = np.clip(approach_k, *APPROACH_BOUNDS_K) - a
+    discriminant = b**2 + 4.0 * c * above_intercept
+    # A negative discriminant has two meanings. The parabola opens downwards and stays below the
+    # approach: any airflow will do. It opens upwards and stays above: none will; then the
+    # approach also lies below the intercept, which the last line turns into 0.
+    reached = discriminant >= 0.0
+    root = 2.0 * above_intercept / (b + np.sqrt(np.where(reached, discriminant, 0.0)))
+    ratio = np.where(reached, np.minimum(root, MAX_LIQUID_GAS_RATIO), MAX_LIQUID_GAS_RATIO)
+    return np.asarray(np.where(above_intercept > 0.0, ratio, 0.0))
+
+
+def yorkcalc_reference_water_kg_s(
+    water_kg_s: Values, *, wet_bulb_c: Values, range_k: Values, approach_k: Values
+) -> Array:
+    """Water flow at which the flow ratio is 1, so that full air meets the design approach.
+
+    Args:
+        water_kg_s: Design water flow, kg/s.
+        wet_bulb_c: Design wet bulb, C.
+        range_k: Design range, K.
+        approach_k: Design approach, K.
+
+    Returns:
+        Reference water flow, kg/s.
+
+    Raises:
+        SdcError: The design approach lies below what any airflow reaches.
+    """
+    ratio = yorkcalc_liquid_gas_ratio(wet_bulb_c, range_k, approach_k)
+    if np.any(ratio <= 0.0):
+        t, r, a, _ = np.broadcast_arrays(wet_bulb_c, range_k, approach_k, ratio)
+        i = int(np.argmin(ratio))
+        raise SdcError(
+            f"cooling tower: no airflow reaches a design approach of {a.flat[i]:g} K at wet bulb "
+            f"{t.flat[i]:g} C and range {r.flat[i]:g} K; the approach must be above "
+            f"{_approach_parabola(t.flat[i], r.flat[i])[0]:.2f} K there"
+        )
+    return np.asarray(water_kg_s / ratio)
+
+
+def design_water_kg_s(heat_w: Values, *, range_k: Values) -> Values:
+    """Condenser water flow that carries `heat_w` with a range of `range_k`, kg/s."""
+    return heat_w / (WATER_J_PER_KG_K * range_k)
+
+
+def sized_fan_w(water_kg_s: Values, *, fan_w_per_kg_s: Values = FAN_W_PER_KG_S) -> Values:
+    """Fan power at full speed from the design water flow (Modelica Buildings, YorkCalc), W."""
+    return fan_w_per_kg_s * water_kg_s
+
+
+def fan_power_w(air_ratio: Values, *, design_fan_w: Values) -> Values:
+    """Fan power by the affinity law, W: design power times the cube of the flow ratio."""
+    return design_fan_w * air_ratio**3
+
+
+def yorkcalc(
+    heat_w: Values,
+    *,
+    wet_bulb_c: Values,
+    outdoor_c: Values,
+    condenser_setpoint_c: Values,
+    supply_setpoint_c: Values,
+    water_kg_s: Values,
+    reference_water_kg_s: Values,
+    reference_air_m3s: Values,
+    design_fan_w: Values,
+) -> Tower:
+    """York tower with a variable-speed fan that holds the condenser water at its setpoint.
+
+    All heat is rejected: the range is heat_w/(c*m). The fan runs at the lowest speed that reaches
+    the setpoint; at full speed the leaving water rises above it. At the lowest airflow the
+    correlation covers (liquid to gas ratio 8), and with the fan off, a bypass keeps the water from
+    falling below the setpoint. With the fan off the tower still gives the free-convection share f
+    of its full-speed cooling (EnergyPlus: T_out = T_in - f*(T_in - T_out_full)), which for a given
+    range makes the approach A_full + range*(1 - f)/f.
+
+    Args:
+        heat_w: Heat to reject, W.
+        wet_bulb_c: Outdoor wet bulb, C.
+        outdoor_c: Not used.
+        condenser_setpoint_c: Setpoint of the leaving water, C.
+        supply_setpoint_c: Not used.
+        water_kg_s: Condenser water flow, kg/s; above 0 wherever there is heat.
+        reference_water_kg_s: Water flow at which the flow ratio is 1, kg/s, above 0.
+        reference_air_m3s: Not used.
+        design_fan_w: Fan power at full speed, W.
+
+    Returns:
+        The tower's step; leaving_c is never below the setpoint.
+    """
+    range_k = _range_k(heat_w, water_kg_s)
+    water_ratio = water_kg_s / reference_water_kg_s
+    wanted_k = condenser_setpoint_c - wet_bulb_c
+    full_speed_k = yorkcalc_approach_k(wet_bulb_c, range_k, water_ratio)
+
+    free_k = full_speed_k + range_k * (1.0 - FREE_CONVECTION_SHARE) / FREE_CONVECTION_SHARE
+    fan_off = (wanted_k >= free_k) | (range_k <= 0.0)
+    saturated = ~fan_off & (wanted_k <= full_speed_k)
+
+    ratio = yorkcalc_liquid_gas_ratio(wet_bulb_c, range_k, wanted_k)
+    modulating = ~fan_off & ~saturated & (ratio > 0.0)
+    part_speed = np.minimum(water_ratio / np.where(modulating, ratio, 1.0), 1.0)
+    air_ratio = np.where(fan_off, 0.0, np.where(modulating, part_speed, 1.0))
+
+    approach_k = np.where(saturated, full_speed_k, wanted_k)
+    return _tower(
+        fan_power_w(air_ratio, design_fan_w=design_fan_w),
+        air_ratio,
+        leaving_c=wet_bulb_c + approach_k,
+        range_k=range_k,
+        wet_bulb_c=wet_bulb_c,
+    )
+
+
+def released(
+    heat_w: Values,
+    *,
+    wet_bulb_c: Values,
+    outdoor_c: Values,
+    condenser_setpoint_c: Values,
+    supply_setpoint_c: Values,
+    water_kg_s: Values,
+    reference_water_kg_s: Values,
+    reference_air_m3s: Values,
+    design_fan_w: Values,
+    rho_kg_m3: Values = 1.225,
+    cp_j_per_kg_k: Values = 1006.0,
+) -> Tower:
+    """The tower of the released SustainDC code: a cubic fan on the airflow that carries the heat.
+
+    V = Q/(cp*rho*max(50 - (T_amb - T_set), 1)), P = P_ref*min(V/V_ref, 1)^3, and no power at all
+    below 5 C outdoors. There is no water loop: the condenser setpoint counts as met.
+
+    Args:
+        heat_w: Heat to reject, W (the released code hands over the CRAC cooling load).
+        wet_bulb_c: Outdoor wet bulb, C, for `approach_k` alone.
+        outdoor_c: Outdoor dry bulb, C.
+        condenser_setpoint_c: Reported as leaving water, C.
+        supply_setpoint_c: CRAC supply setpoint, C.
+        water_kg_s: Condenser water flow, kg/s, for `range_k` alone.
+        reference_water_kg_s: Not used.
+        reference_air_m3s: Airflow at full speed, m3/s, above 0.
+        design_fan_w: Fan power at full speed, W.
+        rho_kg_m3: Air density, kg/m3.
+        cp_j_per_kg_k: Specific heat of air, J/(kg K).
+
+    Returns:
+        The tower's step.
+    """
+    air_m3s = _air_m3s(heat_w, outdoor_c, supply_setpoint_c, rho_kg_m3, cp_j_per_kg_k)
+    running = np.greater_equal(outdoor_c, 5.0)
+    air_ratio = np.where(running, np.minimum(air_m3s / reference_air_m3s, 1.0), 0.0)
+    return _tower(
+        fan_power_w(air_ratio, design_fan_w=design_fan_w),
+        air_ratio,
+        leaving_c=condenser_setpoint_c,
+        range_k=_range_k(heat_w, water_kg_s),
+        wet_bulb_c=wet_bulb_c,
+    )
+
+
+def paper(
+    heat_w: Values,
+    *,
+    wet_bulb_c: Values,
+    outdoor_c: Values,
+    condenser_setpoint_c: Values,
+    supply_setpoint_c: Values,
+    water_kg_s: Values,
+    reference_water_kg_s: Values,
+    reference_air_m3s: Values,
+    design_fan_w: Values,
+    rho_kg_m3: Values = 1.225,
+    cp_j_per_kg_k: Values = 1006.0,
+) -> Tower:
+    """Appendix A.2.2 as printed: P_CT = P_ref*(V/V_ref)^-3, so less airflow costs more power.
+
+    The paper leaves f_ct_delta to Breen et al. 2010; the temperature difference is that of the
+    released code, max(50 - (T_amb - T_set), 1). Without airflow the fan is off: the printed
+    power is infinite there. No step at 5 C and no limit at V_ref are printed.
+
+    Args:
+        heat_w: Heat to reject, W (the paper hands over P_chiller = P_cool*(1 + 1/COP)).
+        wet_bulb_c: Outdoor wet bulb, C, for `approach_k` alone.
+        outdoor_c: Outdoor dry bulb, C.
+        condenser_setpoint_c: Reported as leaving water, C.
+        supply_setpoint_c: CRAC supply setpoint, C.
+        water_kg_s: Condenser water flow, kg/s, for `range_k` alone.
+        reference_water_kg_s: Not used.
+        reference_air_m3s: V_ref, m3/s, above 0.
+        design_fan_w: P_ref, W.
+        rho_kg_m3: Air density, kg/m3.
+        cp_j_per_kg_k: Specific heat of air, J/(kg K).
+
+    Returns:
+        The tower's step.
+    """
+    air_m3s = _air_m3s(heat_w, outdoor_c, supply_setpoint_c, rho_kg_m3, cp_j_per_kg_k)
+    air_ratio = air_m3s / reference_air_m3s
+    moving = air_ratio > 0.0
+    return _tower(
+        np.where(moving, design_fan_w * np.where(moving, air_ratio, 1.0) ** -3.0, 0.0),
+        air_ratio,
+        leaving_c=condenser_setpoint_c,
+        range_k=_range_k(heat_w, water_kg_s),
+        wet_bulb_c=wet_bulb_c,
+    )
+
+
+TOWERS: dict[str, Callable[..., Tower]] = {
+    "yorkcalc": yorkcalc,
+    "released": released,
+    "paper": paper,
+}
+
+
+def _approach_parabola(wet_bulb_c: Values, range_k: Values) -> tuple[Values, Values, Values]:
+    """Coefficients of the approach in powers 0, 1, 2 of the liquid to gas ratio."""
+    t = np.clip(wet_bulb_c, *WET_BULB_BOUNDS_C)
+    r = np.clip(range_k, *RANGE_BOUNDS_K)
+    a, b, c = (
+        sum(r**j * (k[j, 0] + t * (k[j, 1] + t * k[j, 2])) for j in range(3)) for k in YORKCALC
+    )
+    return a, b, c
+
+
+def _range_k(heat_w: Values, water_kg_s: Values) -> Array:
+    flowing = np.greater(water_kg_s, 0.0)
+    carried = np.maximum(heat_w, 0.0) / (WATER_J_PER_KG_K * np.where(flowing, water_kg_s, 1.0))
+    return np.asarray(np.where(flowing, carried, 0.0))
+
+
+def _air_m3s(
+    heat_w: Values,
+    outdoor_c: Values,
+    supply_setpoint_c: Values,
+    rho_kg_m3: Values,
+    cp_j_per_kg_k: Values,
+) -> Array:
+    delta_k = np.maximum(50.0 - (outdoor_c - supply_setpoint_c), 1.0)
+    return np.asarray(np.maximum(heat_w, 0.0) / (cp_j_per_kg_k * rho_kg_m3 * delta_k))
+
+
+def _tower(
+    power_w: Values, air_ratio: Values, *, leaving_c: Values, range_k: Values, wet_bulb_c: Values
+) -> Tower:
+    return Tower(
+        *np.broadcast_arrays(power_w, air_ratio, leaving_c, range_k, leaving_c - wet_bulb_c)
+    )

@@ -1,0 +1,54 @@
+"""Start Taichi once, on the CPU, at the first reset or step; refuse to run in a forked child."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+
+from sdc_taichi.errors import ConfigError, RuntimeStateError
+
+_owner_pid: int | None = None
+
+
+def ensure_started() -> int:
+    """Start the runtime when none exists and return its number of threads.
+
+    A runtime that another library started is used as it is: a second start would destroy the
+    fields of the first. ``SDC_TAICHI_THREADS`` limits the threads of a runtime started here.
+
+    Raises:
+        RuntimeStateError: in a child forked after the start, where Taichi would hang.
+        ConfigError: ``SDC_TAICHI_THREADS`` is no positive integer.
+    """
+    global _owner_pid
+    if _owner_pid is not None and _owner_pid != os.getpid():
+        raise RuntimeStateError(
+            "this process was forked after Taichi started and would hang; start workers with the "
+            "'spawn' method (multiprocessing.get_context('spawn')) or create simulators only in "
+            "the children"
+        )
+    from sdc_taichi.kernels.backend import ti
+
+    runtime = ti.lang.impl.get_runtime()
+    if runtime.prog is None:
+        options = {"cpu_max_num_threads": _thread_limit()} if _thread_limit() else {}
+        # ti.init prints a banner, which would end up in a user's piped output.
+        with contextlib.redirect_stdout(io.StringIO()):
+            ti.init(arch=ti.cpu, offline_cache=True, log_level=ti.ERROR, **options)
+    _owner_pid = os.getpid()
+    return int(ti.lang.impl.current_cfg().cpu_max_num_threads)
+
+
+def _thread_limit() -> int:
+    text = os.environ.get("SDC_TAICHI_THREADS", "").strip()
+    if not text:
+        return 0
+    if not text.isdigit() or int(text) < 1:
+        raise ConfigError(f"SDC_TAICHI_THREADS={text!r}: valid is a positive integer")
+    return int(text)
+
+
+def owned_by_this_process() -> bool:
+    """Whether the runtime was started here and not in a parent that forked."""
+    return _owner_pid == os.getpid()

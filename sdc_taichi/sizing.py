@@ -1,0 +1,258 @@
+"""Size every device of a fleet for its load and its site."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sdc_taichi.fleet import Fleet
+from sdc_taichi.hall import Hall
+from sdc_taichi.plant import chiller, tower
+from sdc_taichi.plant.air import hydraulic_pump_w
+from sdc_taichi.plant.water_side import Design
+from sdc_taichi.types import F64
+
+WATER_DENSITY_KG_M3 = 1000.0
+RELEASED_OUTDOOR_C = {"NY": 30.0, "WA": 20.0}
+"""Sizing temperatures of the released SustainDC; 50 C elsewhere."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sizing:
+    """Sized quantities, each (B,)."""
+
+    it_w: F64
+    """IT power at full load and the highest setpoint."""
+    it_airflow_m3s: F64
+    crac_flow_m3s: F64
+    crac_fan_w: F64
+    design_outdoor_c: F64
+    design_wet_bulb_c: F64
+    facility_w: F64
+    """IT and HVAC power at the design point."""
+    battery_kwh: F64
+    room_kwh_per_k: F64
+    """Heat that warms servers and room by 1 K."""
+    water_side: Design
+
+
+def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64) -> Sizing:
+    """Size the fleet.
+
+    Args:
+        fleet: the data centers.
+        hall: their halls, in f64.
+        design_outdoor_c: design dry bulb of each site's weather, (B,).
+        design_wet_bulb_c: design wet bulb of each site's weather, (B,).
+    """
+    outdoor = fleet.values("hvac.sizing.design_outdoor_c")
+    wet_bulb = fleet.values("hvac.sizing.design_wet_bulb_c")
+    model = MODELS[fleet.models["sizing"]]
+    return model(
+        fleet,
+        hall,
+        np.where(np.isnan(outdoor), design_outdoor_c, outdoor),
+        np.where(np.isnan(wet_bulb), design_wet_bulb_c, wet_bulb),
+    )
+
+
+def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizing:
+    """Full load, highest setpoint and design wet bulb, with the margin of the config on top."""
+    v = fleet.values
+    full = hall.solve(v("hvac.setpoint.max_c"), np.ones(fleet.size))
+    it_w = full.cpu_w + full.fan_w
+    crac_flow = v("hvac.crac.supply_m3s_per_w") * it_w
+    crac_fan_w = v("hvac.crac.fan_w_per_m3s") * crac_flow
+    cooling_w = (it_w + crac_fan_w) * v("hvac.sizing.margin")
+
+    approach_k = v("hvac.tower.approach_min_k")
+    range_k = v("hvac.tower.water_range_k")
+    condenser_c = np.maximum(wet_bulb_c + approach_k, v("hvac.chiller.min_condenser_c"))
+    # The coldest chilled water asks most of the chiller.
+    chilled_c = v("hvac.setpoint.min_c") - v("hvac.chiller.coil_approach_k")
+
+    def run_chiller(load_w: F64, reference_w: F64) -> chiller.Chiller:
+        return chiller.CHILLERS[fleet.models["chiller"]](
+            load_w,
+            reference_w=reference_w,
+            chilled_water_c=chilled_c,
+            condenser_c=condenser_c,
+            outdoor_c=outdoor_c,
+            reference_cop=v("hvac.chiller.reference_cop"),
+        )
+
+    per_reference = run_chiller(np.zeros(fleet.size), np.ones(fleet.size)).available_w
+    chiller_w = cooling_w / per_reference
+    machine = run_chiller(cooling_w, chiller_w)
+    rejected_w = machine.rejected_w
+    water_kg_s = tower.design_water_kg_s(rejected_w, range_k=range_k)
+    yorkcalc = fleet.models["tower"] == "yorkcalc"
+    design = Design(
+        cooling_w=cooling_w,
+        chiller_w=chiller_w,
+        reference_cop=v("hvac.chiller.reference_cop"),
+        rejected_w=rejected_w,
+        tower_water_kg_s=np.asarray(water_kg_s),
+        tower_reference_kg_s=tower.yorkcalc_reference_water_kg_s(
+            water_kg_s, wet_bulb_c=wet_bulb_c, range_k=range_k, approach_k=approach_k
+        )
+        if yorkcalc
+        else np.asarray(water_kg_s),
+        tower_air_m3s=v("hvac.tower.printed_airflow_m3s"),
+        tower_fan_w=v("hvac.tower.fan_w_per_w_rejected") * rejected_w
+        if yorkcalc
+        else v("hvac.tower.printed_fan_w"),
+        chilled_pump_w=_pump_w(fleet, cooling_w, v("hvac.chiller.chilled_water_range_k")),
+        condenser_pump_w=_pump_w(fleet, rejected_w, range_k),
+        pump_min_ratio=v("hvac.pumps.min_flow_ratio"),
+        **_common(fleet),
+    )
+    facility_w = (
+        it_w
+        + crac_fan_w
+        + machine.power_w
+        + design.tower_fan_w
+        + design.chilled_pump_w
+        + design.condenser_pump_w
+    )
+    hours = v("battery.hours_of_design_load")
+    return Sizing(
+        it_w=it_w,
+        it_airflow_m3s=full.airflow_m3s,
+        crac_flow_m3s=crac_flow,
+        crac_fan_w=crac_fan_w,
+        design_outdoor_c=outdoor_c,
+        design_wet_bulb_c=wet_bulb_c,
+        facility_w=facility_w,
+        battery_kwh=_battery_kwh(fleet, facility_w * hours / 1e3),
+        room_kwh_per_k=_room_kwh_per_k(fleet),
+        water_side=design,
+    )
+
+
+def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizing:
+    """The sizing rules of the released SustainDC.
+
+    Tower air and rated load: the cooling load at full load and highest setpoint, taken down to the
+    lowest setpoint, with 50 - (design outdoor - lowest setpoint) K of air. Battery: one hour of
+    1.1 times the highest IT power of 15..22 C plus 1.1 times rated load and chiller power.
+    """
+    v = fleet.values
+    ones = np.ones(fleet.size)
+    listed = np.array(
+        [RELEASED_OUTDOOR_C.get(c.site.location.upper(), 50.0) for c in fleet.configs]
+    )
+    given = v("hvac.sizing.design_outdoor_c")
+    outdoor_c = np.where(np.isnan(given), listed, given)
+    low_c, air = v("hvac.setpoint.min_c"), air_j_per_m3_k(fleet)
+    full = hall.solve(v("hvac.setpoint.max_c"), ones)
+    it_w = full.cpu_w + full.fan_w
+    crac_flow = v("hvac.crac.supply_m3s_per_w") * it_w
+    rise_k = np.maximum(full.outlet_mean_c + mean_return_approach_k(fleet) - low_c, 0.0)
+    rated_w = air * crac_flow * rise_k
+    tower_air = rated_w / (air * np.maximum(50.0 - (outdoor_c - low_c), 1.0))
+    highest_w = released_ranges(fleet, hall)["it_w"][1]
+    machine = chiller.released(
+        highest_w,
+        reference_w=rated_w,
+        chilled_water_c=low_c,
+        condenser_c=outdoor_c,
+        outdoor_c=outdoor_c,
+        reference_cop=v("hvac.chiller.reference_cop"),
+    )
+    facility_w = 1.1 * (highest_w + rated_w + machine.power_w)
+    water_kg_s = np.asarray(tower.design_water_kg_s(rated_w, range_k=v("hvac.tower.water_range_k")))
+    return Sizing(
+        it_w=it_w,
+        it_airflow_m3s=full.airflow_m3s,
+        crac_flow_m3s=crac_flow,
+        crac_fan_w=v("hvac.crac.released_fan_w")
+        * (v("hvac.crac.supply_m3s_per_w") / v("hvac.crac.reference_m3s_per_w")) ** 3,
+        design_outdoor_c=outdoor_c,
+        design_wet_bulb_c=wet_bulb_c,
+        facility_w=facility_w,
+        battery_kwh=_battery_kwh(fleet, facility_w / 1e3),
+        room_kwh_per_k=_room_kwh_per_k(fleet),
+        water_side=Design(
+            cooling_w=rated_w,
+            chiller_w=rated_w,
+            reference_cop=v("hvac.chiller.reference_cop"),
+            rejected_w=rated_w,
+            tower_water_kg_s=water_kg_s,
+            tower_reference_kg_s=water_kg_s,
+            tower_air_m3s=tower_air,
+            tower_fan_w=rated_w,
+            chilled_pump_w=v("hvac.pumps.released_chilled_w"),
+            condenser_pump_w=v("hvac.pumps.released_condenser_w"),
+            pump_min_ratio=ones,
+            **_common(fleet),
+        ),
+    )
+
+
+MODELS: dict[str, Callable[[Fleet, Hall, F64, F64], Sizing]] = {
+    "design_day": design_day,
+    "released": released,
+}
+
+
+def released_ranges(fleet: Fleet, hall: Hall) -> dict[str, tuple[F64, F64]]:
+    """Lowest and highest IT power and mean outlet over 15..22 C and 0..100 % load, each (B,)."""
+    it_w, outlet_c = [], []
+    for supply_c in range(15, 23):
+        for percent in range(0, 101, 10):
+            sums = hall.solve(
+                np.full(fleet.size, float(supply_c)), np.full(fleet.size, percent / 100)
+            )
+            it_w.append(sums.cpu_w + sums.fan_w)
+            outlet_c.append(sums.outlet_mean_c)
+    return {
+        "it_w": (np.min(it_w, axis=0), np.max(it_w, axis=0)),
+        "outlet_c": (np.min(outlet_c, axis=0), np.max(outlet_c, axis=0)),
+    }
+
+
+def air_j_per_m3_k(fleet: Fleet) -> F64:
+    """Heat capacity of air per volume, (B,)."""
+    return fleet.values("hall.air_density_kg_m3") * fleet.values(
+        "hall.air_heat_capacity_j_per_kg_k"
+    )
+
+
+def mean_return_approach_k(fleet: Fleet) -> F64:
+    """Return approach temperature, mean over the racks, (B,)."""
+    return np.array([np.mean(np.asarray(c.hall.return_approach_k)) for c in fleet.configs])
+
+
+def _common(fleet: Fleet) -> dict[str, F64]:
+    v = fleet.values
+    approach_k = v("hvac.tower.approach_min_k")
+    return {
+        "coil_approach_k": v("hvac.chiller.coil_approach_k"),
+        "chilled_water_range_k": v("hvac.chiller.chilled_water_range_k"),
+        "approach_min_k": approach_k,
+        "exchanger_approach_k": v("hvac.tower.economiser_approach_k") - approach_k,
+        "min_condenser_c": v("hvac.chiller.min_condenser_c"),
+        "economiser": v("hvac.tower.economiser"),
+    }
+
+
+def _pump_w(fleet: Fleet, heat_w: F64, range_k: F64) -> F64:
+    flow = np.asarray(tower.design_water_kg_s(heat_w, range_k=range_k)) / WATER_DENSITY_KG_M3
+    return hydraulic_pump_w(
+        fleet.values("hvac.pumps.pressure_drop_pa"),
+        flow,
+        efficiency=fleet.values("hvac.pumps.efficiency"),
+    )
+
+
+def _battery_kwh(fleet: Fleet, sized_kwh: F64) -> F64:
+    given = fleet.values("battery.capacity_kwh")
+    return np.where(np.isnan(given), sized_kwh, given)
+
+
+def _room_kwh_per_k(fleet: Fleet) -> F64:
+    per_server = fleet.values("hall.room_heat_capacity_kj_per_k_per_server")
+    return per_server * fleet.per_dc_servers() / 3600.0

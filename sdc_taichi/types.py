@@ -1,0 +1,219 @@
+"""Arrays that flow through a step. Shapes: B data centers, R racks of all, one row each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+Reals = npt.NDArray[np.floating[Any]]
+
+
+class LoadAction(Enum):
+    """What to do with delay-tolerant work; the value is the command in -1..1."""
+
+    DEFER = -1
+    NEUTRAL = 0
+    DRAIN = 1
+
+
+class CoolAction(Enum):
+    """How to move the CRAC setpoint, in steps of ``hvac.setpoint.step_k``."""
+
+    LOWER = -1
+    HOLD = 0
+    RAISE = 1
+
+
+class BatteryAction(Enum):
+    """What the battery does, as a share of its power limit."""
+
+    DISCHARGE = -1
+    IDLE = 0
+    CHARGE = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Actions:
+    """One command per data center; an enum or a number serves all of them.
+
+    Numbers are continuous commands: ``load`` and ``battery`` within -1..1 are shares of what could
+    be deferred (negative) or drained, discharged (negative) or charged; ``cooling`` is in setpoint
+    steps and may exceed 1.
+    """
+
+    load: LoadAction | float | F64 = LoadAction.NEUTRAL
+    cooling: CoolAction | float | F64 = CoolAction.HOLD
+    battery: BatteryAction | float | F64 = BatteryAction.IDLE
+
+
+@dataclass(frozen=True, slots=True)
+class Exogenous:
+    """What the world does during one step, each (B,)."""
+
+    outdoor_c: F64
+    wet_bulb_c: F64
+    ci_g_per_kwh: F64
+    demand: F64
+    """Work that arrives, as a share of capacity, 0..1."""
+
+
+@dataclass(slots=True)
+class State:
+    """What is carried from step to step; everything else derives from it."""
+
+    step: int
+    """Steps done since reset."""
+    setpoint_c: F64
+    """CRAC supply setpoint, (B,)."""
+    cooling_run: I64
+    """Equal non-zero cooling commands in a row, (B,)."""
+    cooling_last: F64
+    """Last cooling command, (B,)."""
+    cooling_scale: F64
+    """Acceleration of the setpoint step, (B,)."""
+    queue: F64
+    """Queued tasks by the step that put them in, oldest first and accumulated, (B, L)."""
+    stored_kwh: F64
+    """Energy in the battery, (B,)."""
+    room_heat_kwh: F64
+    """Heat that the cooling failed to remove, held by servers and room, (B,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """Every quantity of one step, (B,) unless stated; powers are means over the step.
+
+    Energy units: kWh per step. 1 task is 1 % of the data center's capacity for one step.
+    """
+
+    step: int
+    """Index of the step, 0 at reset."""
+    step_h: float
+    """Length of the step."""
+    outdoor_c: F64
+    wet_bulb_c: F64
+    ci_g_per_kwh: F64
+    demand: F64
+    load_command: F64
+    cooling_command: F64
+    battery_command: F64
+
+    utilisation: F64
+    """Executed work as a share of capacity."""
+    arrived_tasks: F64
+    executed_tasks: F64
+    deferred_tasks: F64
+    """Work that entered the queue."""
+    drained_tasks: F64
+    """Work that left the queue on command."""
+    due_tasks: F64
+    """Queued work whose deadline has come at the start of the step."""
+    overdue_tasks: F64
+    """Due work that did not fit into this step."""
+    dropped_tasks: F64
+    queue_tasks: F64
+    """Work in the queue at the end of the step."""
+    oldest_age_h: F64
+    mean_age_h: F64
+
+    setpoint_c: F64
+    supply_c: F64
+    """CRAC supply air: the setpoint plus what unmet cooling has warmed the room by."""
+    inlet_mean_c: F64
+    inlet_max_c: F64
+    outlet_mean_c: F64
+    cpu_w: F64
+    it_fan_w: F64
+    it_w: F64
+    it_airflow_m3s: F64
+    crac_flow_m3s: F64
+    return_c: F64
+    cooling_load_w: F64
+    """Heat that the CRAC units take from the room."""
+
+    chilled_water_c: F64
+    condenser_water_c: F64
+    """Water that leaves the tower."""
+    economiser_w: F64
+    chiller_load_w: F64
+    unmet_w: F64
+    """Cooling load beyond the plant's capacity; it stays in the room."""
+    recovered_w: F64
+    """Heat stored earlier that spare capacity removes."""
+    heat_removed_w: F64
+    rejected_w: F64
+    """Heat that the tower gives to the outside."""
+    room_heat_kwh: F64
+    chiller_w: F64
+    tower_fan_w: F64
+    chilled_pump_w: F64
+    condenser_pump_w: F64
+    crac_fan_w: F64
+    hvac_w: F64
+    """Sum of the devices that ``hvac.total_of`` names."""
+
+    evaporation_l: F64
+    drift_l: F64
+    blowdown_l: F64
+    water_l: F64
+    """Make-up water."""
+
+    stored_kwh: F64
+    soc: F64
+    charge_kwh: F64
+    """Drawn from the grid into the battery."""
+    discharge_kwh: F64
+    """Delivered by the battery."""
+    battery_loss_kwh: F64
+    it_kwh: F64
+    hvac_kwh: F64
+    grid_kwh: F64
+    carbon_g: F64
+
+    rack_cpu_w: Reals
+    """(R,), as the other rack arrays."""
+    rack_fan_w: Reals
+    rack_airflow_m3s: Reals
+    rack_inlet_c: Reals
+    rack_inlet_max_c: Reals
+    rack_outlet_c: Reals
+
+    @property
+    def rack_power_w(self) -> Reals:
+        """IT power per rack, (R,)."""
+        return self.rack_cpu_w + self.rack_fan_w
+
+    @property
+    def facility_kwh(self) -> F64:
+        """IT and HVAC energy, without the battery, (B,)."""
+        return self.it_kwh + self.hvac_kwh
+
+    @property
+    def pue(self) -> F64:
+        """(IT + HVAC) / IT, dimensionless, (B,)."""
+        return 1.0 + self.hvac_w / self.it_w
+
+    def per_dc(self) -> dict[str, F64]:
+        """All (B,) quantities by name, in the order of the fields."""
+        names = (f.name for f in fields(self))
+        values = ((name, getattr(self, name)) for name in names)
+        return {
+            name: value
+            for name, value in values
+            if isinstance(value, np.ndarray) and not name.startswith("rack_")
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class ServerLayers:
+    """Per-server values of one step, each (S,); server order follows racks, then groups."""
+
+    inlet_c: Reals
+    outlet_c: Reals
+    power_w: Reals

@@ -1,0 +1,29 @@
+"""Settings and fixtures that all tests share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import hypothesis
+import numpy as np
+import pytest
+
+# Sloppy arithmetic is a failure; code that means it says so with np.errstate.
+np.seterr(divide="raise", invalid="raise")
+
+# The same examples on every machine, and no time limit per example: first calls compile kernels.
+hypothesis.settings.register_profile("reproducible", derandomize=True, deadline=None)
+hypothesis.settings.load_profile("reproducible")
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """Folder of measured weather, carbon and workload files, named by SDC_REAL_DATA."""
+    name = os.environ.get("SDC_REAL_DATA")
+    if not name:
+        pytest.skip("SDC_REAL_DATA is not set: no measured files")
+    folder = Path(name).resolve()
+    if not folder.is_dir():
+        pytest.fail(f"SDC_REAL_DATA={name}: not a folder")
+    return folder

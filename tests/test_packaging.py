@@ -1,0 +1,131 @@
+"""The package as it is listed, built, installed and imported."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.resources
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+MAPPED = ("configs", "data", "kernels", "viz")
+PYPROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PACKAGES: list[str] = PYPROJECT["tool"]["setuptools"]["packages"]
+# Imported by the functions that need them, so that `import sdc_taichi` stays light.
+LAZY = {"matplotlib", "pandas", "psychrolib", "pyarrow", "rerun", "taichi"}
+
+
+def run_python(code: str, cwd: Path) -> str:
+    """Run code in a fresh interpreter that sees installed packages alone, and return its output."""
+    done = subprocess.run(
+        [sys.executable, "-I", "-c", code], cwd=cwd, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def source_files() -> dict[str, Path]:
+    """Map each path inside an installed package to its file in the source tree."""
+    roots = {"sdc_taichi": "sdc_taichi"} | {name: f"sdc_taichi/{name}" for name in MAPPED}
+    return {
+        f"{target}/{path.relative_to(ROOT / folder).as_posix()}": path
+        for folder, target in roots.items()
+        for path in (ROOT / folder).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+@pytest.mark.repo
+def test_packages_are_the_folders_on_disk() -> None:
+    folders = {
+        target.rpartition("/")[0].replace("/", ".")
+        for target in source_files()
+        if target.endswith(".py")
+    }
+    assert set(PACKAGES) == folders
+    assert len(PACKAGES) == len(set(PACKAGES))
+    assert [
+        name for name in PACKAGES if f"{name.replace('.', '/')}/__init__.py" not in source_files()
+    ] == []
+
+
+@pytest.mark.repo
+def test_build_holds_every_source_file(tmp_path: Path) -> None:
+    build = "from setuptools import setup; setup()"
+    options = ["--quiet", "build_py", "--build-lib", str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, "-c", build, *options], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    built = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
+    assert built == set(source_files())
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_package_is_importable(package: str) -> None:
+    module = importlib.import_module(package)
+    assert module.__spec__ is not None
+    assert module.__spec__.origin is not None, f"{package} has no __init__.py"
+
+
+def test_folders_are_not_importable_by_their_top_level_names(tmp_path: Path) -> None:
+    code = f"from importlib.util import find_spec; print([find_spec(n) for n in {MAPPED!r}])"
+    assert run_python(code, tmp_path).strip() == str([None] * len(MAPPED))
+
+
+def test_embedded_files_are_installed() -> None:
+    configs = {item.name for item in importlib.resources.files("sdc_taichi.configs").iterdir()}
+    assert {f"{n}.yaml" for n in ("corrected", "sustaindc", "paper", "tiny", "large")} <= configs
+    assert importlib.resources.files("sdc_taichi").joinpath("py.typed").is_file()
+
+
+def test_metadata_agrees_with_pyproject() -> None:
+    import sdc_taichi
+
+    project = PYPROJECT["project"]
+    metadata = importlib.metadata.metadata("sdc-taichi")
+    assert sdc_taichi.__version__ == metadata["Version"] == project["version"]
+    bounds = set(metadata["Requires-Python"].split(","))
+    assert bounds == set(project["requires-python"].split(","))
+
+
+def test_console_script_resolves() -> None:
+    (script,) = importlib.metadata.entry_points(group="console_scripts", name="sdc-taichi")
+    assert callable(script.load())
+
+
+def test_import_is_light(tmp_path: Path) -> None:
+    code = "import sys, sdc_taichi; print(*sys.modules)"
+    loaded = {name.partition(".")[0] for name in run_python(code, tmp_path).split()}
+    assert "sdc_taichi" in loaded
+    assert loaded & LAZY == set()
+
+
+def test_works_without_rerun(tmp_path: Path) -> None:
+    code = "import sys; sys.modules['rerun'] = None; import sdc_taichi; print(sdc_taichi.__name__)"
+    assert run_python(code, tmp_path).strip() == "sdc_taichi"
+
+
+def test_kernels_evaluate_their_annotations() -> None:
+    sources = [
+        item.read_text(encoding="utf-8")
+        for item in importlib.resources.files("sdc_taichi.kernels").iterdir()
+        if item.name.endswith(".py")
+    ]
+    assert any("@ti.kernel" in source for source in sources)
+    # Taichi reads annotations as objects; the future import turns them into strings.
+    assert not [s for s in sources if re.search(r"from\s+__future__\s+import.*annotations", s)]
+
+
+def test_kernels_import_nothing_of_the_package() -> None:
+    pattern = re.compile(r"^\s*(?:from|import)\s+(sdc_taichi(?!\.kernels)\S*)", re.MULTILINE)
+    for item in importlib.resources.files("sdc_taichi.kernels").iterdir():
+        if item.name.endswith(".py"):
+            assert pattern.findall(item.read_text(encoding="utf-8")) == [], item.name

@@ -1,0 +1,312 @@
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sdc_taichi.plant.battery import BATTERIES, Battery
+
+REFERENCE = Path(__file__).parent / "reference"
+ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
+CHECKS = [c for c in ALL if c["group"] == "battery"]
+TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
+FIELDS = Battery.__slots__
+COMMAND_OF_CODE = {0: 1.0, 1: -1.0, 2: 0.0}
+
+PROPERTY = settings(max_examples=80, deadline=None, derandomize=True)
+five = {"min_size": 5, "max_size": 5}
+shares = st.lists(st.floats(0.0, 1.0, allow_subnormal=False), **five)
+commands = st.lists(st.floats(-1.0, 1.0, allow_subnormal=False), **five)
+names = st.sampled_from(sorted(BATTERIES))
+steps_h = st.sampled_from([1.0 / 12.0, 0.25, 0.5, 1.0])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _no_floating_point_warnings() -> Any:
+    with np.errstate(all="raise", under="ignore"):
+        yield
+
+
+def run(name: str, stored_kwh: Any, command: Any, **changes: Any) -> Battery:
+    arguments: dict[str, Any] = {"capacity_kwh": 2000.0, "load_kw": 1500.0, "dt_h": 0.25}
+    return BATTERIES[name](
+        np.asarray(stored_kwh, float), np.asarray(command, float), **{**arguments, **changes}
+    )
+
+
+# ------------------------------------------------------------------------------- reference checks
+
+
+def evaluated(check: dict[str, Any]) -> dict[str, float]:
+    inputs = check["inputs"]
+    capacity_kwh = 1e3 * inputs["cap_MWh"]
+    if "action" in inputs:
+        result = run(
+            "released",
+            inputs["SoC"] * capacity_kwh,
+            COMMAND_OF_CODE[inputs["action"]],
+            capacity_kwh=capacity_kwh,
+            load_kw=1e3 * inputs["dcload_MW"],
+            dt_h=inputs["dt_h"],
+        )
+        return {
+            "SoC_after": float(result.stored_kwh) / capacity_kwh,
+            "E_grid_kWh": float(result.grid_kwh),
+            "CO2_g": float(result.grid_kwh) * inputs["CI_g_kWh"],
+        }
+    limits = {
+        "capacity_kwh": capacity_kwh,
+        "load_kw": 1e9,  # the check leaves the load out
+        "dt_h": inputs["T_h"],
+        "charge_efficiency": inputs["eff_c"],
+        "discharge_factor": inputs["eff_d"],
+        "charge_limit_c_rate": inputs["c_lim"],
+        "discharge_limit_c_rate": inputs["d_lim"],
+        "upper_u_h": inputs["upper_u"],
+        "upper_v": inputs["upper_v"],
+        "lower_u_h": inputs["lower_u"],
+        "lower_v": inputs["lower_v"],
+    }
+    charged = run("clc", inputs["SoC"] * capacity_kwh, 1.0, **limits)
+    discharged = run("clc", inputs["SoC"] * capacity_kwh, -1.0, **limits)
+    return {
+        "P_charge_max_MW": float(charged.charge_kwh) / inputs["T_h"] / 1e3,
+        "SoC_after_max_charge": float(charged.stored_kwh) / capacity_kwh,
+        "P_discharge_max_MW": float(discharged.discharge_kwh) / inputs["T_h"] / 1e3,
+        "SoC_after_max_discharge": float(discharged.stored_kwh) / capacity_kwh,
+    }
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c["id"])
+def test_check(check: dict[str, Any]) -> None:
+    assert evaluated(check) == pytest.approx(check["expected"], **check["tolerance"], abs=1e-15)
+
+
+@pytest.mark.parametrize("path", TRAJECTORIES, ids=lambda p: p.stem)
+def test_recorded_run(path: Path) -> None:
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    sizing = json.loads(path.with_suffix(".json").read_text())["sizing"]
+    capacity_kwh = 1e3 * sizing["battery_capacity_mwh"]
+    stored_kwh = np.zeros(1)
+    soc, grid_kwh = [], []
+    for row in rows:
+        result = run(
+            "released",
+            stored_kwh,
+            COMMAND_OF_CODE[int(row["action_bat"])],
+            capacity_kwh=capacity_kwh,
+            load_kw=4.0 * float(row["dc_kwh"]),
+        )
+        stored_kwh = result.stored_kwh
+        soc.append(float(stored_kwh[0]) / capacity_kwh)
+        grid_kwh.append(float(result.grid_kwh[0]))
+    assert len(rows) == 672
+    np.testing.assert_allclose(soc, [float(r["soc"]) for r in rows], rtol=1e-6, atol=0.0)
+    np.testing.assert_allclose(grid_kwh, [float(r["grid_kwh"]) for r in rows], rtol=1e-6)
+
+
+# ------------------------------------------------------------------------------------- invariants
+
+
+@given(names, shares, commands, shares, steps_h, st.floats(10.0, 1e5))
+@PROPERTY
+def test_ledger_bounds_and_batch(
+    name: str,
+    soc: list[float],
+    command: list[float],
+    load: list[float],
+    dt_h: float,
+    capacity_kwh: float,
+) -> None:
+    stored, load_kw = np.array(soc) * capacity_kwh, np.array(load) * 2e4
+    changes: dict[str, Any] = {"capacity_kwh": capacity_kwh, "dt_h": dt_h}
+    efficiency, factor = (1.0, 1.0) if name == "released" else (0.9, 1.1)
+    changes |= {"charge_efficiency": efficiency, "discharge_factor": factor}
+    result = run(name, stored, command, load_kw=load_kw, **changes)
+    for field in FIELDS:
+        values = getattr(result, field)
+        assert values.shape == (5,)
+        assert values.dtype == np.float64
+        assert np.isfinite(values).all()
+        assert (values >= (-5.01e-6 if field == "loss_kwh" else 0.0)).all()
+        for i in range(5):
+            single = run(
+                name, stored[i : i + 1], command[i : i + 1], load_kw=load_kw[i : i + 1], **changes
+            )
+            assert getattr(single, field)[0] == values[i]
+    after = stored + efficiency * result.charge_kwh - factor * result.discharge_kwh
+    tiny = 5.01e-6 if name == "released" else 1e-14 * capacity_kwh
+    np.testing.assert_allclose(result.stored_kwh, after, rtol=1e-13, atol=tiny)
+    assert (result.stored_kwh <= capacity_kwh).all()
+    assert (result.stored_kwh >= 0.0).all()
+    np.testing.assert_allclose(
+        result.loss_kwh,
+        (1.0 - efficiency) * result.charge_kwh + (factor - 1.0) * result.discharge_kwh,
+        atol=5.01e-6 if name == "released" else 1e-12 * capacity_kwh,
+    )
+    np.testing.assert_allclose(
+        result.charge_kwh - result.discharge_kwh - result.loss_kwh,
+        result.stored_kwh - stored,
+        atol=1e-12 * capacity_kwh,
+    )
+    np.testing.assert_allclose(
+        result.grid_kwh, load_kw * dt_h + result.charge_kwh - result.discharge_kwh, rtol=1e-12
+    )
+    charging = np.array(command) > 0.0
+    assert (result.charge_kwh[~charging] == 0.0).all()
+    assert (result.discharge_kwh[charging] == 0.0).all()
+    assert (result.discharge_kwh <= load_kw * dt_h).all()
+
+
+@given(names, shares, st.floats(0.0, 1.0), steps_h)
+@PROPERTY
+def test_energy_is_the_command_s_share_of_the_limit(
+    name: str, soc: list[float], share: float, dt_h: float
+) -> None:
+    stored = 2000.0 * np.array(soc)
+    for sign in (1.0, -1.0):
+        full = run(name, stored, sign, dt_h=dt_h)
+        part = run(name, stored, sign * share, dt_h=dt_h)
+        np.testing.assert_allclose(part.charge_kwh, share * full.charge_kwh, atol=1e-5)
+        np.testing.assert_allclose(part.discharge_kwh, share * full.discharge_kwh, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", sorted(BATTERIES))
+def test_idle_keeps_the_store(name: str) -> None:
+    stored = np.array([0.0, 123.456789012345, 2000.0])
+    result = run(name, stored, 0.0)
+    np.testing.assert_array_equal(result.stored_kwh, stored)
+    for field in ("charge_kwh", "discharge_kwh", "loss_kwh"):
+        np.testing.assert_array_equal(getattr(result, field), 0.0)
+    np.testing.assert_array_equal(result.grid_kwh, 375.0)
+
+
+@pytest.mark.parametrize("name", sorted(BATTERIES))
+def test_battery_of_no_capacity_does_nothing(name: str) -> None:
+    for command in (-1.0, 1.0):
+        result = run(name, [0.0], command, capacity_kwh=0.0)
+        assert result.stored_kwh[0] == result.charge_kwh[0] == result.discharge_kwh[0] == 0.0
+        assert result.grid_kwh[0] == 375.0
+
+
+@pytest.mark.parametrize("name", sorted(BATTERIES))
+def test_full_battery_takes_nothing_and_an_empty_one_gives_nothing(name: str) -> None:
+    assert run(name, [2000.0], 1.0).charge_kwh[0] == 0.0
+    assert run(name, [0.0], -1.0).discharge_kwh[0] == 0.0
+    assert run(name, [0.0], 1.0).charge_kwh[0] > 0.0
+    assert run(name, [2000.0], -1.0).discharge_kwh[0] > 0.0
+    assert run(name, [2000.0], -1.0, load_kw=0.0).discharge_kwh[0] == 0.0
+
+
+# -------------------------------------------------------------------------------- single equations
+
+
+@given(shares, steps_h)
+@PROPERTY
+def test_clc_ends_the_step_within_its_limits(soc: list[float], dt_h: float) -> None:
+    limits = {"upper_v": 0.9, "lower_v": 0.2, "upper_u_h": -0.05, "lower_u_h": 0.02, "dt_h": dt_h}
+    stored = 2000.0 * np.array(soc)
+    up = run("clc", stored, 1.0, load_kw=1e9, **limits)
+    moved = up.charge_kwh > 0.0
+    assert (moved == (stored < 1800.0)).all()
+    power_kw = up.charge_kwh / dt_h
+    assert (power_kw <= 3.0 * 2000.0 / 0.97 + 1e-6).all()
+    rate_limited = np.isclose(power_kw, 3.0 * 2000.0 / 0.97)
+    ends_at = 1800.0 - 0.05 * power_kw
+    on_limit = moved & ~rate_limited
+    np.testing.assert_allclose(up.stored_kwh[on_limit], ends_at[on_limit], rtol=1e-9)
+    assert (up.stored_kwh[moved] <= ends_at[moved] + 1e-6).all()
+
+    down = run("clc", stored, -1.0, load_kw=1e9, **limits)
+    moved = down.discharge_kwh > 0.0
+    assert (moved == (stored > 400.0)).all()
+    power_kw = down.discharge_kwh / dt_h
+    assert (power_kw <= 3.0 * 2000.0 / 1.04 + 1e-6).all()
+    rate_limited = np.isclose(power_kw, 3.0 * 2000.0 / 1.04)
+    ends_at = 400.0 + 0.02 * power_kw
+    on_limit = moved & ~rate_limited
+    np.testing.assert_allclose(down.stored_kwh[on_limit], ends_at[on_limit], rtol=1e-9)
+    assert (down.stored_kwh[moved] >= ends_at[moved] - 1e-6).all()
+
+
+def test_clc_rate_limits_are_rates_of_the_store() -> None:
+    result = run("clc", [1000.0], 1.0, dt_h=0.01, charge_limit_c_rate=0.4)
+    assert result.charge_kwh[0] == pytest.approx(0.4 * 2000.0 / 0.97 * 0.01)
+    result = run("clc", [1000.0], -1.0, dt_h=0.01, discharge_limit_c_rate=0.3)
+    assert result.discharge_kwh[0] == pytest.approx(0.3 * 2000.0 / 1.04 * 0.01)
+
+
+def test_clc_defaults_are_those_of_the_checks() -> None:
+    result = run("clc", [1000.0, 1000.0], [1.0, -1.0], load_kw=1e9)
+    assert result.charge_kwh[0] == pytest.approx(2000.0 * 1.7699115044247788 * 0.25)
+    assert result.discharge_kwh[1] == pytest.approx(2000.0 * 1.8518518518518516 * 0.25)
+    empty, full = run("clc", [0.0], 1.0), run("clc", [2000.0], -1.0, load_kw=1e9)
+    assert empty.charge_kwh[0] == pytest.approx(2000.0 * 3.0927835051546397 * 0.25)
+    assert full.discharge_kwh[0] == pytest.approx(2000.0 * 2.884615384615384 * 0.25)
+
+
+@pytest.mark.parametrize("name", ["clc", "paper"])
+def test_discharge_never_exceeds_the_load(name: str) -> None:
+    result = run(name, [1500.0], [-1.0], load_kw=np.array([300.0, 1e9]))
+    assert result.discharge_kwh[0] == 75.0
+    assert result.grid_kwh[0] == 0.0
+    assert result.discharge_kwh[1] > 75.0
+
+
+def test_paper_rates() -> None:
+    # (C - E)/(eta_c*dt) = 824.7 kW and E/(eta_d*dt) = 769.2 kW against P_max = 1000 kW.
+    near = run("paper", [1800.0, 200.0], [1.0, -1.0])
+    assert near.charge_kwh[0] == pytest.approx(200.0 / 0.97)
+    assert near.stored_kwh[0] == pytest.approx(2000.0)
+    assert near.discharge_kwh[1] == pytest.approx(200.0 / 1.04)
+    assert near.stored_kwh[1] == pytest.approx(0.0, abs=1e-9)
+    middle = run("paper", [1000.0, 1000.0], [1.0, -1.0])
+    assert middle.charge_kwh[0] == middle.discharge_kwh[1] == 250.0
+    slower = {"charge_limit_c_rate": 0.2, "discharge_limit_c_rate": 0.1}
+    slow = run("paper", [1000.0, 1000.0], [1.0, -1.0], **slower)
+    assert slow.charge_kwh[0] == pytest.approx(100.0)
+    assert slow.discharge_kwh[1] == pytest.approx(50.0)
+
+
+def test_released_charge() -> None:
+    # Empty: T = 0.25*round(sigmoid(5)/2, 4) h at a tenth of the capacity per hour.
+    assert run("released", [0.0], 1.0).charge_kwh[0] == pytest.approx(200.0 * 0.25 * 0.4967)
+    # Nearly full: T = 0.25*0.0033 h, and the room over T + 0.04 h.
+    room = run("released", [1999.999], 1.0).charge_kwh[0]
+    assert room == pytest.approx(0.001 / (0.04 + 0.25 * 0.0033) * 0.25 * 0.0033, rel=0.5)
+    assert run("released", [1999.0], 1.0).charge_kwh[0] == pytest.approx(
+        1.0 / (0.04 + 0.25 * 0.0034) * 0.25 * 0.0034, abs=1e-4
+    )
+
+
+def test_released_discharge_limits() -> None:
+    # Load: a quarter of it, for T = sigmoid(10*(0.5 - 0.25)) h.
+    sigmoid = 1.0 / (1.0 + np.exp(-2.5))
+    loaded = run("released", [1000.0], -1.0, load_kw=400.0)
+    assert loaded.discharge_kwh[0] == pytest.approx(100.0 * sigmoid, abs=1e-5)
+    # Capacity: C for T at a load beyond it, and the content over T + 0.01 h.
+    heavy = run("released", [2000.0], -1.0, load_kw=1e6)
+    full_h = 1.0 / (1.0 + np.exp(-7.5))
+    assert heavy.discharge_kwh[0] == pytest.approx(2000.0 / (full_h + 0.01) * full_h, abs=1e-5)
+    # Nearly empty: T is at least 0.125 h.
+    low = run("released", [10.0], -1.0, load_kw=1e6)
+    assert low.discharge_kwh[0] == pytest.approx(10.0 / 0.135 * 0.125, abs=1e-5)
+
+
+def test_released_step_length_scales_with_the_step() -> None:
+    quarter = run("released", [600.0, 600.0], [1.0, -1.0], load_kw=200.0)
+    hour = run("released", [600.0, 600.0], [1.0, -1.0], load_kw=200.0, dt_h=1.0)
+    np.testing.assert_allclose(hour.charge_kwh, 4.0 * quarter.charge_kwh, atol=1e-4)
+    np.testing.assert_allclose(hour.discharge_kwh, 4.0 * quarter.discharge_kwh, atol=1e-4)
+
+
+def test_released_store_has_eight_decimals_of_a_mwh() -> None:
+    stored = run("released", np.linspace(3.0, 1900.0, 40), -1.0).stored_kwh / 1e3
+    np.testing.assert_array_equal(stored, np.round(stored, 8))

@@ -1,0 +1,332 @@
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sdc_taichi.plant import chiller
+from sdc_taichi.plant.chiller import CHILLERS, Chiller
+
+REFERENCE = Path(__file__).parent / "reference"
+ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
+CHECKS = [c for c in ALL if c["group"] == "chiller"]
+DC_CHECKS = [c for c in ALL if c["group"] == "dc" and "P_comp" in c["expected"]]
+TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
+FIELDS = Chiller.__slots__
+CURVES = ("carnot", "eir_york", "electric_water_cooled", "electric_air_cooled", "released")
+
+PROPERTY = settings(max_examples=60, deadline=None, derandomize=True)
+loads = st.lists(st.floats(0.0, 3e6, allow_subnormal=False), min_size=5, max_size=5)
+temperatures = st.lists(st.floats(-60.0, 80.0, allow_subnormal=False), min_size=5, max_size=5)
+names = st.sampled_from(sorted(CHILLERS))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _no_floating_point_warnings() -> Any:
+    with np.errstate(all="raise", under="ignore"):
+        yield
+
+
+def run(name: str, load_w: Any, **changes: Any) -> Chiller:
+    arguments: dict[str, Any] = {
+        "reference_w": 1e6,
+        "chilled_water_c": 6.67,
+        "condenser_c": 29.44,
+        "outdoor_c": 35.0,
+        "reference_cop": 5.96,
+    }
+    return CHILLERS[name](np.asarray(load_w, float), **{**arguments, **changes})
+
+
+# ------------------------------------------------------------------------------- reference checks
+
+
+def evaluated(check: dict[str, Any]) -> dict[str, float]:
+    """What the model of a check gives for each quantity the check can expect."""
+    inputs = check["inputs"]
+    if "max_cooling_cap" in inputs:
+        result = run(
+            "released",
+            inputs["load_W"],
+            reference_w=inputs["max_cooling_cap"],
+            outdoor_c=inputs["ambient_C"],
+            reference_cop=3.0,
+        )
+        return {"P_W": float(result.power_w)}
+    if "T_cond_ent" in inputs:
+        name, cop, condenser_c = "eir_york", inputs["COP_nom"], inputs["T_cond_ent"]
+        evaporator_c, part_load_sum = inputs["T_evap_lvg"], sum(chiller.YORK_PART_LOAD)
+    elif "T_cond_in" in inputs:
+        name, cop, condenser_c = "electric_water_cooled", 4.75, inputs["T_cond_in"]
+        evaporator_c, part_load_sum = inputs["T_evap_out"], sum(chiller.FULL_LOAD_RATIO)
+    else:
+        name, cop, condenser_c = "electric_air_cooled", 3.0, None
+        evaporator_c, part_load_sum = inputs["T_evap_out"], sum(chiller.FULL_LOAD_RATIO)
+    place = {
+        "reference_w": inputs["Q_nom_W"],
+        "chilled_water_c": evaporator_c,
+        "condenser_c": np.nan if condenser_c is None else condenser_c,
+        "outdoor_c": inputs.get("T_amb", np.nan),
+        "reference_cop": cop,
+    }
+    result = run(name, inputs["load_W"], **place)
+    full = run(name, result.available_w, **place)
+    full_load_ratio = float(full.power_w * cop / result.available_w / part_load_sum)
+    capacity = float(result.available_w) / inputs["Q_nom_W"]
+    return {
+        "AvailNomCapRat": capacity,
+        "capFunT": capacity,
+        "FullLoadPowerRat": full_load_ratio,
+        "EIRFunT": full_load_ratio,
+        "EIRFunPLR": float(result.power_w / full.power_w) * part_load_sum,
+        "PLR": float(result.plr),
+        "P_W": float(result.power_w),
+        "Q_evap_W": float(result.evaporator_w),
+        "COP": float(result.cop),
+        "unmet_W": float(result.unmet_w),
+    }
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c["id"])
+def test_check(check: dict[str, Any]) -> None:
+    # DeltaTemp is an intermediate of Chiller:Electric; the capacity ratio is a function of it.
+    expected = {k: v for k, v in check["expected"].items() if k != "DeltaTemp"}
+    got = evaluated(check)
+    assert {k: got[k] for k in expected} == pytest.approx(expected, **check["tolerance"], abs=1e-6)
+
+
+@pytest.mark.parametrize("check", DC_CHECKS, ids=lambda c: c["id"])
+def test_compressor_of_the_released_code(check: dict[str, Any]) -> None:
+    result = run(
+        "released",
+        check["expected"]["Q_cool"],
+        reference_w=2307120.481120018,
+        outdoor_c=check["inputs"]["ambient_C"],
+        reference_cop=3.0,
+    )
+    assert float(result.power_w) == pytest.approx(check["expected"]["P_comp"], rel=1e-6)
+
+
+@pytest.mark.parametrize("path", TRAJECTORIES, ids=lambda p: p.stem)
+def test_compressor_along_a_recorded_run(path: Path) -> None:
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    sizing = json.loads(path.with_suffix(".json").read_text())["sizing"]
+    cooling_w = np.array([float(r["crac_cooling_w"]) for r in rows])
+    result = run(
+        "released",
+        cooling_w,
+        reference_w=sizing["ct_rated_load_w"],
+        outdoor_c=np.array([float(r["dry_bulb_c"]) for r in rows]),
+        reference_cop=3.0,
+    )
+    recorded_w = 1e3 * np.array([float(r["compressor_kw"]) for r in rows])
+    np.testing.assert_allclose(result.power_w, recorded_w, rtol=1e-6)
+    np.testing.assert_array_equal(result.rejected_w, cooling_w)
+
+
+# ------------------------------------------------------------------------------------- invariants
+
+
+@given(names, loads, temperatures, temperatures, temperatures)
+@PROPERTY
+def test_energy_balance_and_bounds(
+    name: str, load: list[float], chilled: list[float], condenser: list[float], air: list[float]
+) -> None:
+    result = run(
+        name,
+        load,
+        chilled_water_c=np.array(chilled),
+        condenser_c=np.array(condenser),
+        outdoor_c=np.array(air),
+    )
+    for field in FIELDS:
+        values = getattr(result, field)
+        assert values.shape == (5,)
+        assert values.dtype == np.float64
+        assert np.isfinite(values).all()
+        assert (values >= 0.0).all()
+    np.testing.assert_allclose(result.evaporator_w + result.unmet_w, load, rtol=1e-12)
+    np.testing.assert_allclose(result.cop * result.power_w, result.evaporator_w, rtol=1e-12)
+    np.testing.assert_allclose(result.plr * result.available_w, result.evaporator_w, rtol=1e-12)
+    assert (result.evaporator_w <= result.available_w).all()
+    if name not in ("released", "paper"):
+        np.testing.assert_allclose(
+            result.rejected_w, result.evaporator_w + result.power_w, rtol=1e-12
+        )
+
+
+@given(names, loads, temperatures, temperatures, temperatures)
+@PROPERTY
+def test_batch_equals_each_alone(
+    name: str, load: list[float], chilled: list[float], condenser: list[float], air: list[float]
+) -> None:
+    places = [
+        {"chilled_water_c": t, "condenser_c": c, "outdoor_c": o, "reference_w": 1e6 + o}
+        for t, c, o in zip(chilled, condenser, air, strict=True)
+    ]
+    batch = run(name, load, **{k: np.array([p[k] for p in places]) for k in places[0]})
+    for i, place in enumerate(places):
+        single = run(name, load[i : i + 1], **{k: np.array([v]) for k, v in place.items()})
+        for field in FIELDS:
+            assert getattr(single, field)[0] == getattr(batch, field)[i]
+
+
+@given(names, st.floats(4.0, 20.0), st.floats(5.0, 40.0))
+@PROPERTY
+def test_power_rises_with_load(name: str, chilled_c: float, condenser_c: float) -> None:
+    result = run(
+        name,
+        np.linspace(0.0, 2e6, 401),
+        chilled_water_c=chilled_c,
+        condenser_c=condenser_c,
+        outdoor_c=condenser_c,
+    )
+    assert result.power_w[0] == 0.0
+    assert (np.diff(result.power_w) >= 0.0).all()
+    assert (np.diff(result.power_w)[result.plr[1:] < 1.0] > 0.0).all()
+
+
+@given(st.floats(-20.0, 60.0), st.floats(0.0, 30.0), st.floats(0.0, 10.0))
+@PROPERTY
+def test_carnot_power_rises_with_lift(condenser_c: float, chilled_c: float, by_k: float) -> None:
+    base = run("carnot", 6e5, condenser_c=condenser_c, chilled_water_c=chilled_c).power_w
+    hotter = run("carnot", 6e5, condenser_c=condenser_c + by_k, chilled_water_c=chilled_c).power_w
+    colder = run("carnot", 6e5, condenser_c=condenser_c, chilled_water_c=chilled_c - by_k).power_w
+    assert hotter >= base
+    assert colder >= base
+
+
+@pytest.mark.parametrize("name", sorted(CHILLERS))
+def test_no_load_no_power(name: str) -> None:
+    for load_w in (0.0, -5e4):
+        result = run(name, [load_w])
+        for field in ("power_w", "evaporator_w", "unmet_w", "plr", "cop", "rejected_w"):
+            assert getattr(result, field)[0] == 0.0
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_machine_cycles_below_its_least_load(name: str) -> None:
+    minimum = {"electric_water_cooled": 0.15, "electric_air_cooled": 0.05, "released": 0.05}
+    least_w = minimum.get(name, 0.1) * run(name, [1.0]).available_w
+    at_least, half, just_above = (run(name, least_w * f).power_w for f in (1.0, 0.5, 1.0 + 1e-9))
+    np.testing.assert_allclose(half, 0.5 * at_least, rtol=1e-12)
+    np.testing.assert_allclose(just_above, at_least, rtol=1e-8)
+    # Above the least load the curve, not the cycling, decides.
+    assert run(name, least_w * 2.0).power_w < 2.0 * at_least * (1.0 - 1e-3)
+
+
+# -------------------------------------------------------------------------------- single equations
+
+
+def test_carnot_is_calibrated_at_the_york_reference_point() -> None:
+    result = run("carnot", 1e6, reference_cop=np.array([5.96, 4.0]))
+    np.testing.assert_allclose(result.cop, [5.96, 4.0], rtol=1e-12)
+
+
+def test_carnot_cop_is_proportional_to_evaporator_temperature_over_lift() -> None:
+    result = run("carnot", 1e6, chilled_water_c=np.array([10.0]), condenser_c=25.0)
+    effectiveness = 5.96 * (29.44 - 6.67) / (6.67 + 273.15)
+    np.testing.assert_allclose(result.cop, effectiveness * 283.15 / 15.0, rtol=1e-12)
+
+
+def test_carnot_part_load_follows_the_york_curve() -> None:
+    a, b, c = chiller.YORK_PART_LOAD
+    for plr in (0.1, 0.4, 0.85):
+        ratio = run("carnot", plr * 1e6).power_w / run("carnot", 1e6).power_w
+        assert float(ratio) == pytest.approx((a + b * plr + c * plr**2) / (a + b + c), rel=1e-12)
+
+
+def test_carnot_lift_has_a_floor() -> None:
+    assert pytest.approx(6.11) == chiller.MIN_LIFT_K
+    at_floor = run("carnot", 6e5, chilled_water_c=10.0, condenser_c=16.11)
+    np.testing.assert_allclose(
+        run("carnot", 6e5, chilled_water_c=10.0, condenser_c=np.array([16.0, 5.0, -9.0])).power_w,
+        at_floor.power_w,
+    )
+    assert run("carnot", 6e5, chilled_water_c=10.0, condenser_c=16.2).power_w > at_floor.power_w
+    lower = run("carnot", 6e5, chilled_water_c=10.0, condenser_c=12.0, min_lift_k=3.055)
+    np.testing.assert_allclose(2.0 * lower.power_w, at_floor.power_w, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(chiller.CHILLED_WATER_BOUNDS_C))
+def test_chilled_water_is_held_within_the_curve(name: str) -> None:
+    low, high = chiller.CHILLED_WATER_BOUNDS_C[name]
+    inside = run(name, 6e5, chilled_water_c=np.array([low, high])).power_w
+    outside = run(name, 6e5, chilled_water_c=np.array([low - 9.0, high + 9.0])).power_w
+    np.testing.assert_array_equal(inside, outside)
+    assert inside[0] > inside[1]
+
+
+def test_york_condenser_water_is_held_within_the_curve() -> None:
+    inside = run("eir_york", 6e5, condenser_c=np.array([12.78, 35.0]))
+    outside = run("eir_york", 6e5, condenser_c=np.array([0.0, 45.0]))
+    np.testing.assert_array_equal(inside.power_w, outside.power_w)
+    np.testing.assert_array_equal(inside.available_w, outside.available_w)
+    between = run("eir_york", 6e5, condenser_c=np.array([12.9, 34.9]))
+    assert (inside.power_w != between.power_w).all()
+
+
+def test_electric_difference_is_held_above_minus_15_k() -> None:
+    # Water-cooled: condenser water at 29.44 - 15*2.682759 = -10.8 C and design chilled water.
+    cold = run(
+        "electric_water_cooled",
+        6e5,
+        chilled_water_c=6.667,
+        condenser_c=np.array([-10.801385, -30.0, -10.0]),
+    )
+    assert cold.available_w[0] == pytest.approx(cold.available_w[1], rel=1e-9)
+    assert cold.available_w[2] < cold.available_w[1]
+    air = run("electric_air_cooled", 6e5, outdoor_c=np.array([-6.67, -40.0, -6.0]))
+    assert air.available_w[0] == pytest.approx(air.available_w[1], rel=1e-9)
+    assert air.available_w[2] < air.available_w[1]
+
+
+def test_condenser_side_each_model_sees() -> None:
+    by_water = {n: run(n, 6e5, condenser_c=np.array([20.0, 30.0])).power_w for n in CHILLERS}
+    by_air = {n: run(n, 6e5, outdoor_c=np.array([20.0, 30.0])).power_w for n in CHILLERS}
+    water = {n for n, p in by_water.items() if np.ptp(p) > 0.0}
+    air = {n for n, p in by_air.items() if np.ptp(p) > 0.0}
+    assert water == {"carnot", "eir_york", "electric_water_cooled"}
+    assert air == {"electric_air_cooled", "released"}
+
+
+def test_heat_wave_beyond_the_electric_curve_leaves_no_capacity() -> None:
+    result = run("electric_water_cooled", 6e5, condenser_c=np.array([75.0]))
+    assert result.available_w[0] == 0.0
+    assert result.unmet_w[0] == 6e5
+    assert result.power_w[0] == 0.0
+
+
+def test_constant_cop_is_limited_by_its_capacity() -> None:
+    result = run("constant_cop", [4e5, 1.5e6], reference_cop=4.0)
+    np.testing.assert_allclose(result.power_w, [1e5, 2.5e5])
+    np.testing.assert_allclose(result.unmet_w, [0.0, 5e5])
+    np.testing.assert_allclose(result.cop, 4.0)
+    np.testing.assert_allclose(result.plr, [0.4, 1.0])
+
+
+def test_paper_counts_the_rejected_heat_as_electricity() -> None:
+    result = run("paper", [4e5, 1.5e6], reference_cop=5.0)
+    np.testing.assert_allclose(result.power_w, [4.8e5, 1.8e6])
+    np.testing.assert_array_equal(result.rejected_w, result.power_w)
+    np.testing.assert_array_equal(result.unmet_w, 0.0)
+    np.testing.assert_allclose(result.plr, [0.4, 1.0])
+
+
+def test_released_chiller_prefers_heat() -> None:
+    result = run("released", 4e5, outdoor_c=np.array([20.0, 30.0, 40.0]), reference_cop=3.0)
+    assert (np.diff(result.power_w) < 0.0).all()
+    assert (np.diff(result.available_w) > 0.0).all()
+
+
+def test_released_hands_the_unmet_load_to_the_tower_too() -> None:
+    result = run("released", [3e6], outdoor_c=30.0, reference_cop=3.0)
+    assert result.unmet_w[0] > 1e6
+    assert result.rejected_w[0] == 3e6

@@ -1,0 +1,317 @@
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sdc_taichi.errors import SdcError
+from sdc_taichi.plant import tower
+from sdc_taichi.plant.tower import TOWERS, Tower
+
+REFERENCE = Path(__file__).parent / "reference"
+ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
+CHECKS = [c for c in ALL if c["group"] == "tower"]
+DC_CHECKS = [c for c in ALL if c["group"] == "dc" and "P_ct" in c["expected"]]
+TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
+FIELDS = Tower.__slots__
+
+PROPERTY = settings(max_examples=60, deadline=None, derandomize=True)
+wet_bulbs = st.floats(-34.4, 26.7)
+ranges = st.floats(1.1, 22.2)
+five = {"min_size": 5, "max_size": 5}
+
+# Design point of a York tower: 25.55 C wet bulb, 5.56 K range, 3.89 K approach.
+HEAT_W = 1e6
+WATER_KG_S = HEAT_W / (4184.0 * 5.56)
+REFERENCE_WATER_KG_S = float(
+    tower.yorkcalc_reference_water_kg_s(WATER_KG_S, wet_bulb_c=25.55, range_k=5.56, approach_k=3.89)
+)
+DESIGN_FAN_W = 2e4
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _no_floating_point_warnings() -> Any:
+    with np.errstate(all="raise", under="ignore"):
+        yield
+
+
+def run(name: str, heat_w: Any, **changes: Any) -> Tower:
+    arguments: dict[str, Any] = {
+        "wet_bulb_c": 20.0,
+        "outdoor_c": 25.0,
+        "condenser_setpoint_c": 24.0,
+        "supply_setpoint_c": 18.0,
+        "water_kg_s": WATER_KG_S,
+        "reference_water_kg_s": REFERENCE_WATER_KG_S,
+        "reference_air_m3s": 53.48945350914959,
+        "design_fan_w": DESIGN_FAN_W,
+    }
+    return TOWERS[name](np.asarray(heat_w, float), **{**arguments, **changes})
+
+
+# ------------------------------------------------------------------------------- reference checks
+
+
+def evaluated(check: dict[str, Any]) -> dict[str, Any]:
+    inputs = check["inputs"]
+    if check["id"] == "CT-CUBE":
+        return {"P": tower.fan_power_w(np.array(inputs["FR_air"]), design_fan_w=inputs["P_ref"])}
+    if check["id"] == "CT-FAN-275":
+        water = tower.design_water_kg_s(inputs["Q_rej_W"], range_k=inputs["range_K"])
+        fan_w = tower.sized_fan_w(water, fan_w_per_kg_s=inputs["fan_W_per_kgps"])
+        assert tower.sized_fan_w(water) == fan_w
+        return {
+            "m_water": water,
+            "P_fan_design_W": fan_w,
+            "ratio_to_Qrej": fan_w / inputs["Q_rej_W"],
+        }
+    approach = tower.yorkcalc_approach_k(
+        inputs["Twb_C"], inputs["range_K"], inputs["FR_water"] / inputs["FR_air"]
+    )
+    return {"approach_K": float(approach)}
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c["id"])
+def test_check(check: dict[str, Any]) -> None:
+    got = evaluated(check)
+    assert got.keys() == check["expected"].keys()
+    for name, expected in check["expected"].items():
+        assert got[name] == pytest.approx(np.asarray(expected), **check["tolerance"])
+
+
+@pytest.mark.parametrize("check", DC_CHECKS, ids=lambda c: c["id"])
+def test_fan_of_the_released_code(check: dict[str, Any]) -> None:
+    result = run(
+        "released",
+        check["expected"]["Q_cool"],
+        outdoor_c=check["inputs"]["ambient_C"],
+        supply_setpoint_c=check["inputs"]["setpoint_C"],
+        design_fan_w=2307120.481120018,
+    )
+    assert float(result.fan_w) == pytest.approx(check["expected"]["P_ct"], rel=1e-6)
+
+
+@pytest.mark.parametrize("path", TRAJECTORIES, ids=lambda p: p.stem)
+def test_fan_along_a_recorded_run(path: Path) -> None:
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    sizing = json.loads(path.with_suffix(".json").read_text())["sizing"]
+    column = {k: np.array([float(r[k]) for r in rows]) for k in rows[0]}
+    result = run(
+        "released",
+        column["crac_cooling_w"],
+        outdoor_c=column["dry_bulb_c"],
+        supply_setpoint_c=column["setpoint_c"],
+        reference_air_m3s=sizing["ct_reference_air_flow_m3_s"],
+        design_fan_w=sizing["ct_rated_load_w"],
+    )
+    np.testing.assert_allclose(result.fan_w, 1e3 * column["ct_kw"], rtol=1e-6)
+
+
+# ---------------------------------------------------------------------------------------- YorkCalc
+
+
+@given(wet_bulbs, ranges, st.floats(0.05, 8.0))
+@PROPERTY
+def test_ratio_inverts_the_approach_on_the_rising_branch(
+    wet_bulb_c: float, range_k: float, ratio: float
+) -> None:
+    approach = float(tower.yorkcalc_approach_k(wet_bulb_c, range_k, ratio))
+    below = tower.yorkcalc_approach_k(wet_bulb_c, range_k, np.linspace(0.0, ratio, 200)[:-1])
+    if not 1.1 < approach < 40.0 or not (below < approach).all():
+        return  # At a bound, or past the top of the parabola, the inverse is not unique.
+    inverse = float(tower.yorkcalc_liquid_gas_ratio(wet_bulb_c, range_k, approach))
+    assert inverse == pytest.approx(ratio, rel=1e-5)
+
+
+@given(wet_bulbs, ranges)
+@PROPERTY
+def test_ratio_is_the_least_air_that_reaches_the_approach(
+    wet_bulb_c: float, range_k: float
+) -> None:
+    beyond = tower.yorkcalc_liquid_gas_ratio(wet_bulb_c, range_k, np.linspace(-5.0, 60.0, 131))
+    assert ((beyond >= 0.0) & (beyond <= 8.0)).all()
+    assert (np.diff(beyond) >= -1e-12).all()
+    # Against a search over a grid of ratios, from much air to little.
+    wanted_k = np.linspace(1.2, 39.8, 100)
+    grid = np.linspace(0.0, 8.0, 4001)
+    approach = tower.yorkcalc_approach_k(wet_bulb_c, range_k, grid)
+    ratio = tower.yorkcalc_liquid_gas_ratio(wet_bulb_c, range_k, wanted_k)
+    for k, x in zip(wanted_k, ratio, strict=True):
+        exceeded = np.flatnonzero(approach > k)
+        first = grid[exceeded[0]] if exceeded.size else 8.0
+        assert x == pytest.approx(first, abs=4e-3)
+
+
+def test_approach_is_evaluated_within_its_bounds() -> None:
+    approach = tower.yorkcalc_approach_k
+    assert approach(40.0, 6.0, 1.0) == approach(26.7, 6.0, 1.0) != approach(26.5, 6.0, 1.0)
+    assert approach(-50.0, 6.0, 1.0) == approach(-34.4, 6.0, 1.0) != approach(-34.0, 6.0, 1.0)
+    assert approach(20.0, 0.1, 1.0) == approach(20.0, 1.1, 1.0) != approach(20.0, 1.2, 1.0)
+    assert approach(20.0, 30.0, 1.0) == approach(20.0, 22.2, 1.0) != approach(20.0, 22.1, 1.0)
+    assert approach(20.0, 3.0, 20.0) == approach(20.0, 3.0, 8.0) != approach(20.0, 3.0, 7.9)
+    assert approach(20.0, 1.1, 0.5) == 1.1
+    assert approach(-30.0, 20.0, 4.0) == 40.0
+
+
+def test_reference_flow_meets_the_design_point_at_full_air() -> None:
+    result = run("yorkcalc", HEAT_W, wet_bulb_c=25.55, condenser_setpoint_c=25.55 + 3.89)
+    assert float(result.air_ratio) == pytest.approx(1.0, rel=1e-9)
+    assert float(result.fan_w) == pytest.approx(DESIGN_FAN_W, rel=1e-9)
+    assert float(result.approach_k) == pytest.approx(3.89)
+    assert float(result.range_k) == pytest.approx(5.56)
+
+
+def test_unreachable_design_approach_is_an_error() -> None:
+    with pytest.raises(SdcError, match=r"approach of 4 K at wet bulb -20 C and range 5\.56 K"):
+        tower.yorkcalc_reference_water_kg_s(
+            WATER_KG_S, wet_bulb_c=np.array([20.0, -20.0]), range_k=5.56, approach_k=4.0
+        )
+
+
+@given(
+    st.lists(st.just(0.0) | st.floats(1.0, 5e6), **five),
+    st.lists(st.floats(-60.0, 50.0), **five),
+    st.lists(st.floats(5.0, 40.0), **five),
+    st.sampled_from(sorted(TOWERS)),
+)
+@PROPERTY
+def test_heat_balance_bounds_and_batch(
+    heat: list[float], wet_bulb: list[float], setpoint: list[float], name: str
+) -> None:
+    wet, outdoor = np.array(wet_bulb), np.array(wet_bulb) + 3.0
+    changes = {"wet_bulb_c": wet, "outdoor_c": outdoor, "condenser_setpoint_c": np.array(setpoint)}
+    result = run(name, heat, **changes)
+    for field in FIELDS:
+        values = getattr(result, field)
+        assert values.shape == (5,)
+        assert values.dtype == np.float64
+        assert np.isfinite(values).all()
+        for i in range(5):
+            single = run(name, heat[i : i + 1], **{k: v[i : i + 1] for k, v in changes.items()})
+            assert getattr(single, field)[0] == values[i]
+    np.testing.assert_allclose(result.range_k * WATER_KG_S * 4184.0, heat, rtol=1e-12)
+    np.testing.assert_allclose(result.leaving_c - wet, result.approach_k, rtol=1e-12, atol=1e-12)
+    assert (result.fan_w >= 0.0).all()
+    assert (result.air_ratio >= 0.0).all()
+    if name != "paper":
+        assert (result.air_ratio <= 1.0).all()
+        np.testing.assert_allclose(result.fan_w, DESIGN_FAN_W * result.air_ratio**3, rtol=1e-12)
+    if name == "yorkcalc":
+        assert (result.leaving_c >= np.array(setpoint) - 1e-9).all()
+        above = result.leaving_c > np.array(setpoint) + 1e-9
+        assert (result.air_ratio[above] == 1.0).all()
+        assert (result.approach_k[above] >= 1.1 - 1e-9).all()
+
+
+@given(st.floats(1e4, 3e6), st.floats(-30.0, 30.0))
+@PROPERTY
+def test_fan_slows_as_the_setpoint_rises(heat_w: float, wet_bulb_c: float) -> None:
+    result = run(
+        "yorkcalc", heat_w, wet_bulb_c=wet_bulb_c, condenser_setpoint_c=np.linspace(0.0, 60.0, 121)
+    )
+    assert (np.diff(result.air_ratio) <= 1e-9).all()
+    assert (np.diff(result.leaving_c) >= -1e-9).all()
+
+
+@given(st.floats(10.0, 26.0), st.floats(18.0, 30.0))
+@PROPERTY
+def test_fan_speeds_up_with_heat(wet_bulb_c: float, setpoint_c: float) -> None:
+    result = run(
+        "yorkcalc",
+        np.linspace(3e5, 2e6, 80),
+        wet_bulb_c=wet_bulb_c,
+        condenser_setpoint_c=setpoint_c,
+    )
+    assert (np.diff(result.air_ratio) >= -1e-9).all()
+
+
+def test_modulating_fan_reaches_the_setpoint_with_its_air() -> None:
+    setpoint_c = np.array([22.0, 24.0, 27.0])
+    result = run("yorkcalc", 7e5, wet_bulb_c=16.0, condenser_setpoint_c=setpoint_c)
+    assert ((result.air_ratio > 0.0) & (result.air_ratio < 1.0)).all()
+    water_ratio = WATER_KG_S / REFERENCE_WATER_KG_S
+    approach = tower.yorkcalc_approach_k(16.0, result.range_k, water_ratio / result.air_ratio)
+    np.testing.assert_allclose(approach, setpoint_c - 16.0, rtol=1e-9)
+    np.testing.assert_allclose(result.leaving_c, setpoint_c)
+
+
+def test_full_speed_lets_the_water_rise_above_the_setpoint() -> None:
+    result = run("yorkcalc", HEAT_W, wet_bulb_c=15.0, condenser_setpoint_c=np.array([16.0, 10.0]))
+    full = tower.yorkcalc_approach_k(15.0, 5.56, WATER_KG_S / REFERENCE_WATER_KG_S)
+    np.testing.assert_array_equal(result.air_ratio, 1.0)
+    np.testing.assert_array_equal(result.fan_w, DESIGN_FAN_W)
+    np.testing.assert_allclose(result.leaving_c, 15.0 + full, rtol=1e-12)
+
+
+def test_fan_is_off_once_free_convection_carries_the_heat() -> None:
+    heat_w, wet_bulb_c = 2e5, -10.0
+    range_k = heat_w / (4184.0 * WATER_KG_S)
+    full = tower.yorkcalc_approach_k(wet_bulb_c, range_k, WATER_KG_S / REFERENCE_WATER_KG_S)
+    # T_in - T_out = f*(T_in - T_out_full) with f = 1/8.
+    threshold_c = wet_bulb_c + full + 7.0 * range_k
+    below, above = threshold_c - 1e-6, threshold_c + 1e-6
+    result = run(
+        "yorkcalc", heat_w, wet_bulb_c=wet_bulb_c, condenser_setpoint_c=np.array([below, above])
+    )
+    assert result.air_ratio[0] > 0.1
+    assert result.air_ratio[1] == 0.0
+    assert result.fan_w[1] == 0.0
+    np.testing.assert_allclose(result.leaving_c, [below, above])
+
+
+def test_least_air_is_the_bound_of_the_correlation() -> None:
+    # 39 K of approach at 20 C and 5.56 K would need less air than a liquid to gas ratio of 8 gives,
+    # yet free convection (44 K) does not reach it.
+    result = run("yorkcalc", HEAT_W, wet_bulb_c=20.0, condenser_setpoint_c=np.array([59.0, 57.0]))
+    assert result.air_ratio[0] == pytest.approx(WATER_KG_S / REFERENCE_WATER_KG_S / 8.0)
+    assert result.air_ratio[1] > result.air_ratio[0]
+    np.testing.assert_allclose(result.leaving_c, [59.0, 57.0])
+
+
+def test_idle_tower_costs_nothing() -> None:
+    for name in TOWERS:
+        result = run(name, [0.0], water_kg_s=0.0)
+        assert result.fan_w[0] == 0.0
+        assert result.range_k[0] == 0.0
+        assert result.leaving_c[0] == 24.0
+    assert run("yorkcalc", [0.0]).air_ratio[0] == 0.0
+
+
+def test_no_step_at_five_degrees() -> None:
+    place = {"wet_bulb_c": np.array([4.999, 5.001]), "condenser_setpoint_c": 15.0}
+    yorkcalc = run("yorkcalc", 7e5, outdoor_c=np.array([4.999, 5.001]), **place).fan_w
+    released = run("released", 7e5, outdoor_c=np.array([4.999, 5.001]), **place).fan_w
+    assert yorkcalc[1] == pytest.approx(yorkcalc[0], rel=2e-3)
+    assert yorkcalc[0] > 0.0
+    assert released[0] == 0.0
+    assert released[1] > 50.0
+
+
+# ------------------------------------------------------------------------- air-side towers
+
+
+def test_released_airflow_carries_the_heat_up_to_full_speed() -> None:
+    # 50 - (45 - 18) = 23 K, and at least 1 K.
+    heat_w = 1225.0 * 1.006 * 23.0 * 26.744726754574795
+    assert float(run("released", heat_w, outdoor_c=45.0).air_ratio) == pytest.approx(0.5)
+    assert float(run("released", heat_w, outdoor_c=45.0).fan_w) == pytest.approx(DESIGN_FAN_W / 8)
+    assert float(run("released", 1e9).fan_w) == DESIGN_FAN_W
+    warm = run("released", 1e3, outdoor_c=np.array([67.0, 90.0])).air_ratio
+    assert warm[0] == warm[1] == pytest.approx(1e3 / (1225.0 * 1.006) / 53.48945350914959)
+    other_air = run("released", heat_w, outdoor_c=45.0, rho_kg_m3=2.45, cp_j_per_kg_k=503.0)
+    assert float(other_air.air_ratio) == pytest.approx(0.5)
+
+
+def test_paper_fan_power_falls_with_the_cube_of_the_airflow() -> None:
+    heat_w = 1225.0 * 1.006 * 43.0 * 53.48945350914959
+    result = run("paper", heat_w * np.array([1.0, 0.5, 2.0]))
+    np.testing.assert_allclose(result.air_ratio, [1.0, 0.5, 2.0])
+    np.testing.assert_allclose(result.fan_w, DESIGN_FAN_W * np.array([1.0, 8.0, 0.125]))
+    assert run("paper", heat_w, outdoor_c=-20.0).fan_w > DESIGN_FAN_W

@@ -1,0 +1,208 @@
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sdc_taichi.plant.water import WATER, Water
+
+REFERENCE = Path(__file__).parent / "reference"
+ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
+CHECKS = [c for c in ALL if c["group"] == "water"]
+DC_CHECKS = [c for c in ALL if c["group"] == "dc" and "water_L_15min" in c["expected"]]
+TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
+FIELDS = Water.__slots__
+
+PROPERTY = settings(max_examples=80, deadline=None, derandomize=True)
+five = {"min_size": 5, "max_size": 5}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _no_floating_point_warnings() -> Any:
+    with np.errstate(all="raise", under="ignore"):
+        yield
+
+
+def run(name: str, **changes: Any) -> Water:
+    arguments: dict[str, Any] = {
+        "rejected_w": 1e6,
+        "range_k": 5.56,
+        "water_kg_s": 1e6 / (4184.0 * 5.56),
+        "wet_bulb_c": 15.0,
+        "return_c": 30.0,
+        "supply_setpoint_c": 18.0,
+        "cycles_of_concentration": 5.0,
+        "drift_share": 2e-5,
+        "dt_s": 900.0,
+    }
+    return WATER[name](**{**arguments, **changes})
+
+
+def evaluated(check: dict[str, Any]) -> dict[str, float]:
+    inputs = check["inputs"]
+    if check["id"] == "W-PHYS-1MW":
+        rejected_w = inputs["Q_cool_W"] * (1.0 + 1.0 / inputs["COP"])
+        result = run(
+            "mass_balance",
+            rejected_w=rejected_w,
+            range_k=inputs["range_K"],
+            water_kg_s=rejected_w / (4184.0 * inputs["range_K"]),
+            cycles_of_concentration=inputs["COC"],
+            drift_share=inputs["drift_frac_circ"],
+            dt_s=inputs["dt_s"],
+        )
+        return {
+            "evap_L": float(result.evaporation_l),
+            "blowdown_L": float(result.blowdown_l),
+            "drift_L": float(result.drift_l),
+            "makeup_L": float(result.makeup_l),
+            "L_per_kWh_heat": float(result.makeup_l) / (rejected_w * inputs["dt_s"] / 3.6e6),
+        }
+    place = {
+        "wet_bulb_c": inputs["Twb"],
+        "return_c": inputs["T_ret"],
+        "supply_setpoint_c": inputs["setpoint"],
+    }
+    return {
+        "code_L_15min": float(run("released", **place).makeup_l),
+        "paper_eq_L_15min": float(run("paper", **place).makeup_l),
+    }
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c["id"])
+def test_check(check: dict[str, Any]) -> None:
+    assert evaluated(check) == pytest.approx(check["expected"], **check["tolerance"])
+
+
+@pytest.mark.parametrize("check", DC_CHECKS, ids=lambda c: c["id"])
+def test_water_of_the_released_code(check: dict[str, Any]) -> None:
+    result = run(
+        "released",
+        wet_bulb_c=check["inputs"]["wet_bulb_C"],
+        return_c=check["expected"]["T_ret"],
+        supply_setpoint_c=check["inputs"]["setpoint_C"],
+    )
+    assert float(result.makeup_l) == pytest.approx(check["expected"]["water_L_15min"], rel=1e-9)
+
+
+@pytest.mark.parametrize("path", TRAJECTORIES, ids=lambda p: p.stem)
+def test_water_along_a_recorded_run(path: Path) -> None:
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    column = {k: np.array([float(r[k]) for r in rows]) for k in rows[0]}
+    result = run(
+        "released",
+        wet_bulb_c=column["wet_bulb_c"],
+        return_c=column["return_c"],
+        supply_setpoint_c=column["setpoint_c"],
+    )
+    np.testing.assert_allclose(result.makeup_l, column["water_l"], rtol=1e-6)
+
+
+@given(
+    st.lists(st.floats(0.0, 1e7, allow_subnormal=False), **five),
+    st.lists(st.floats(0.0, 30.0, allow_subnormal=False), **five),
+    st.lists(st.floats(-40.0, 35.0), **five),
+    st.lists(st.floats(1.05, 10.0), **five),
+    st.sampled_from(sorted(WATER)),
+)
+@PROPERTY
+def test_balance_and_batch(
+    heat: list[float], range_k: list[float], wet: list[float], cycles: list[float], name: str
+) -> None:
+    changes = {
+        "rejected_w": np.array(heat),
+        "range_k": np.array(range_k),
+        "wet_bulb_c": np.array(wet),
+        "return_c": 18.0 + np.array(range_k),
+        "cycles_of_concentration": np.array(cycles),
+    }
+    result = run(name, **changes)
+    np.testing.assert_allclose(
+        result.makeup_l,
+        result.evaporation_l + result.drift_l + result.blowdown_l,
+        rtol=1e-12,
+        atol=1e-12,
+    )
+    for field in FIELDS:
+        values = getattr(result, field)
+        assert values.shape == (5,)
+        assert values.dtype == np.float64
+        assert np.isfinite(values).all()
+        if name != "paper":
+            assert (values >= -1e-12).all()
+        for i in range(5):
+            single = run(name, **{k: v[i : i + 1] for k, v in changes.items()})
+            assert getattr(single, field)[0] == values[i]
+
+
+@given(st.floats(1e3, 1e7), st.floats(1.5, 10.0), st.floats(1e-3, 22.0))
+@PROPERTY
+def test_solids_are_conserved(heat_w: float, cycles: float, range_k: float) -> None:
+    result = run(
+        "mass_balance",
+        rejected_w=heat_w,
+        range_k=range_k,
+        water_kg_s=heat_w / (4184.0 * range_k),
+        cycles_of_concentration=cycles,
+        drift_share=1e-6,
+    )
+    # What enters with the make-up leaves, concentrated, with drift and blowdown.
+    leaving = cycles * (result.drift_l + result.blowdown_l)
+    if result.blowdown_l > 0.0:
+        np.testing.assert_allclose(leaving, result.makeup_l, rtol=1e-9)
+    np.testing.assert_allclose(result.evaporation_l * 2.45e6, heat_w * 900.0, rtol=1e-12)
+
+
+def test_evaporation_is_bounded_by_flow_and_range() -> None:
+    result = run("mass_balance", rejected_w=np.array([8e5, 2e6]), range_k=5.0, water_kg_s=40.0)
+    np.testing.assert_allclose(result.evaporation_l, [8e5 / 2.45e6 * 900.0, 0.002 * 5 * 40 * 900])
+
+
+def test_drift_beyond_the_blowdown_needs_no_blowdown() -> None:
+    result = run("mass_balance", drift_share=np.array([0.0, 1e-2]))
+    assert result.blowdown_l[0] == pytest.approx(result.evaporation_l[0] / 4.0)
+    assert result.blowdown_l[1] == 0.0
+    assert result.makeup_l[1] == result.evaporation_l[1] + result.drift_l[1]
+
+
+def test_idle_tower_only_drifts() -> None:
+    result = run("mass_balance", rejected_w=np.array([0.0, -1e5]), range_k=0.0, water_kg_s=50.0)
+    np.testing.assert_allclose(result.makeup_l, 50.0 * 2e-5 * 900.0)
+    np.testing.assert_array_equal(result.evaporation_l, 0.0)
+
+
+@pytest.mark.parametrize("name", sorted(WATER))
+def test_litres_scale_with_the_step(name: str) -> None:
+    quarter, hour = run(name), run(name, dt_s=3600.0)
+    for field in FIELDS:
+        np.testing.assert_allclose(getattr(hour, field), 4.0 * getattr(quarter, field), rtol=1e-6)
+
+
+def test_fits_split_off_one_percent_of_drift() -> None:
+    for name, slope, offset in (("released", 0.3528, 0.101), ("paper", 0.35, 0.1)):
+        result = run(name)
+        use_l = (0.044 * 15.0 + slope * 12.0 + offset) * 250.0
+        assert float(result.evaporation_l) == pytest.approx(use_l, abs=1e-4)
+        assert float(result.drift_l) == pytest.approx(0.01 * use_l)
+        assert float(result.blowdown_l) == 0.0
+
+
+def test_released_litres_have_four_decimals() -> None:
+    makeup = run("released", wet_bulb_c=np.linspace(-40.0, 25.0, 50)).makeup_l
+    np.testing.assert_array_equal(makeup, np.round(makeup, 4))
+    assert makeup[0] == round((0.044 * -40.0 + 0.3528 * 12.0 + 0.101) * 1.01 * 250.0, 4)
+
+
+def test_fits_never_turn_into_a_source() -> None:
+    place = {"wet_bulb_c": -30.0, "return_c": 18.0}
+    assert float(run("released", **place).makeup_l) == 0.0
+    assert float(run("paper", **place).evaporation_l) == 0.0
+    # As printed, the drift stays on the unclipped use.
+    assert float(run("paper", **place).makeup_l) == pytest.approx((0.1 - 1.32) * 0.01 * 250.0)

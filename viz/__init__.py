@@ -1,0 +1,1 @@
+"""Pictures and recordings of results; never imported by the simulator."""
