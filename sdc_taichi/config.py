@@ -153,8 +153,8 @@ class CracConfig(_Section):
     supply_m3s_per_w: Positive = 5.663e-5
     reference_m3s_per_w: Positive = 9.438e-5
     flow_model: Literal["constant", "follow_servers", "per_watt"] = "follow_servers"
-    min_flow_ratio: Annotated[float, Field(gt=0, le=1)] = 0.5
-    fan_w_per_m3s: NonNegative = 500.0
+    min_flow_ratio: Annotated[float, Field(gt=0, le=1)] = 0.6
+    fan_w_per_m3s: NonNegative = 800.0
     """Design fan power per design airflow (specific fan power)."""
     released_fan_w: NonNegative = 150.0
     """CRAC_FAN_REF_P of the SustainDC format: one unscaled fan."""
@@ -207,9 +207,9 @@ class PumpConfig(_Section):
     """Chilled- and condenser-water pumps."""
 
     model: Literal["sized", "released"] = "sized"
-    pressure_drop_pa: Positive = 200_000.0
+    pressure_drop_pa: Positive = 300_000.0
     efficiency: Annotated[float, Field(gt=0, le=1)] = 0.75
-    min_flow_ratio: Annotated[float, Field(gt=0, le=1)] = 0.4
+    min_flow_ratio: Annotated[float, Field(gt=0, le=1)] = 0.6
     released_chilled_w: NonNegative = 0.0
     released_condenser_w: NonNegative = 0.0
 

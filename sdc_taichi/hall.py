@@ -81,6 +81,14 @@ class Hall:
         Raises:
             RuntimeStateError: before the first ``solve``.
         """
+        return ServerLayers(*self.fill_layers().to_numpy())
+
+    def fill_layers(self) -> Any:
+        """Compute the per-server fields of the last ``solve`` and return the kernel's layers.
+
+        Raises:
+            RuntimeStateError: before the first ``solve``.
+        """
         if not self._solved:
             raise RuntimeStateError("no step has been done yet; server layers exist after one")
         runtime.ensure_started()
@@ -89,7 +97,7 @@ class Hall:
         if self._layers is None:
             self._layers = self._thermal.ServerLayers(self._fleet.servers, self._precision)
         self._layers.fill(self._server_slices, self._fleet.server_start, group_out)
-        return ServerLayers(*self._layers.to_numpy())
+        return self._layers
 
     def forget(self) -> None:
         """Drop the last ``solve``, so that ``servers`` cannot show layers of another state."""

@@ -129,7 +129,7 @@ def operate(
     share = precooled_share(cooled.leaving_c)
     machine = run_chiller(share, cooled.leaving_c)
     economiser_w = wanted_w * share
-    removed_w = economiser_w + machine.evaporator_w if limited else wanted_w
+    removed_w = wanted_w - machine.unmet_w if limited else wanted_w
     return WaterSide(
         removed_w=removed_w,
         economiser_w=economiser_w,

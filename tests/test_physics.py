@@ -1,0 +1,66 @@
+"""What the presets say as a whole: where the best setpoint lies, and what a year uses."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from sdc_taichi import Simulator, load_config, make_configs
+from sdc_taichi.exogenous import site_names
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+@pytest.fixture(scope="module")
+def study() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("setpoint_study", EXAMPLES / "setpoint_study.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.repo
+def test_best_setpoint_of_corrected_moves_with_weather_and_load(study: ModuleType) -> None:
+    setpoints = np.arange(16.0, 24.0)
+    wet_bulb, load = np.arange(-5.0, 28.0, 4.0), np.array([0.2, 0.4, 0.6, 0.8, 1.0])
+    power = study.power_kw("corrected", wet_bulb, load, setpoints)
+    best = setpoints[power.argmin(axis=2)]
+    interior = (best > 16.0) & (best < 23.0)
+    assert len(np.unique(best)) >= 4
+    assert len(np.unique(best[interior])) >= 3
+    assert interior.mean() > 0.4
+    assert any(len(np.unique(column)) > 2 for column in best.T), "moves with weather"
+    assert any(len(np.unique(row)) > 2 for row in best), "moves with load"
+
+
+@pytest.mark.repo
+@pytest.mark.parametrize("site", ["NY", "CA", "WA"])
+def test_coldest_setpoint_is_best_in_the_released_code(study: ModuleType, site: str) -> None:
+    setpoints = np.append(np.arange(15.0, 21.5), 21.6)
+    wet_bulb, load = np.arange(-5.0, 28.0, 4.0), np.array([0.2, 0.4, 0.6, 0.8, 1.0])
+    power = study.power_kw("sustaindc", wet_bulb, load, setpoints, (f"site.location={site}",))
+    coldest = power.argmin(axis=2) == 0
+    # Sized for 50 C it holds everywhere; sized for NY or WA at all but the hottest corner.
+    assert coldest.all() if site == "CA" else coldest.mean() > 0.7
+
+
+def test_annual_pue_of_all_sites_is_that_of_real_plants() -> None:
+    base = load_config("corrected", ["simulation.steps_per_hour=1"])
+    sites = [name for name in site_names() if len(name) == 2]
+    assert len(sites) >= 8
+    with Simulator(make_configs(base, sites=sites)) as sim:
+        sim.reset()
+        it_kwh, hvac_kwh = np.zeros(sim.size), np.zeros(sim.size)
+        for _ in range(8760):
+            result = sim.step()
+            it_kwh += result.it_kwh
+            hvac_kwh += result.hvac_kwh
+    pue = 1.0 + hvac_kwh / it_kwh
+    assert np.all((pue > 1.05) & (pue < 1.7)), dict(zip(sites, pue.round(3), strict=True))
+    hot, cold = sites.index("AZ"), sites.index("WA")
+    assert pue[hot] > pue[cold]
