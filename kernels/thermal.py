@@ -1,9 +1,9 @@
 """Server temperatures and power over all racks of all data centers.
 
-Servers of a rack that are alike form a group, which is computed once; ``expand`` copies group values
-to per-server layers. Racks point into groups and groups into servers by CSR offsets, so halls may
-have any size. Every literal here is exact in binary, so that f64 runs lose nothing to the default
-f32 literals of the runtime.
+Servers of a rack that are alike form a group, which is computed once; ``expand`` copies its
+values to per-server layers. Racks point into groups and groups into servers by offsets, so halls
+may have any size. Every literal here is exact in binary, so that f64 runs lose nothing to the
+default f32 literals of the runtime.
 
 Row order of the two-dimensional arguments:
 
@@ -14,7 +14,7 @@ Row order of the two-dimensional arguments:
 """
 
 from functools import cache
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 
@@ -68,6 +68,7 @@ def reduce_kernel(precision: str) -> Any:
     doubles_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
 
     @ti.kernel
+    @no_type_check
     def reduce(
         outlet_model: ti.template(),
         fan_power: ti.template(),
@@ -218,6 +219,7 @@ def _expand_kernel(precision: str) -> Any:
     ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
     @ti.kernel
+    @no_type_check
     def expand(layers: ti.template(), slices: ti.i32, server_start: ints_1d, group_out: reals_2d):
         n_groups = server_start.shape[0] - 1
         for k in range(slices * 512):

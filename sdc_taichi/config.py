@@ -91,7 +91,7 @@ class ServerConfig(_Section):
     power_w: tuple[Pair, ...] | Pair = (150.0, 10.0)
     """(full, idle) power of one server: one pair for all racks or one pair per rack."""
     groups: tuple[tuple[ServerGroup, ...], ...] | None = None
-    """Server groups per rack (one entry serves all racks); replaces power_w and servers_per_rack."""
+    """Server groups per rack, or one entry for all; replaces power_w and servers_per_rack."""
     cpu_power_ratio_lb: Pair = (0.01, 1.00)
     cpu_power_ratio_ub: Pair = (0.03, 1.02)
     cpu_slope_offset_per_k: Finite = 0.0
@@ -301,7 +301,8 @@ class WorkloadConfig(_Section):
     def _deadline_within_horizon(self) -> Self:
         if self.deadline_h is not None and self.deadline_h > self.age_horizon_h:
             raise ValueError(
-                f"deadline_h {self.deadline_h:g} must not exceed age_horizon_h {self.age_horizon_h:g}"
+                f"deadline_h {self.deadline_h:g} must not exceed "
+                f"age_horizon_h {self.age_horizon_h:g}"
             )
         return self
 
@@ -337,7 +338,8 @@ class SimulationConfig(_Section):
     def _divides(cls, value: int) -> int:
         if 60 % value:
             raise ValueError(
-                f"{value} does not divide 60 minutes; valid are 1, 2, 3, 4, 5, 6, 10, 12, 15, 20, 30, 60"
+                f"{value} does not divide 60 minutes; "
+                "valid are 1, 2, 3, 4, 5, 6, 10, 12, 15, 20, 30, 60"
             )
         return value
 
@@ -372,8 +374,8 @@ class DataCenterConfig(_Section):
         ratio = float(np.min(self.airflow_ratio(np.array([coldest]), np.array([0.0]))))
         if ratio <= 0:
             raise ValueError(
-                f"servers: the airflow ratio is {ratio:.3g} at {coldest:g} C and no load; it must be "
-                "positive (raise fan_airflow_ratio_lb or set fan_airflow_ratio_limits)"
+                f"servers: the airflow ratio is {ratio:.3g} at {coldest:g} C and no load; it must "
+                "be positive (raise fan_airflow_ratio_lb or set fan_airflow_ratio_limits)"
             )
         return self
 
@@ -647,7 +649,10 @@ def _check_ordered(value: Pair | None) -> Pair | None:
 
 
 def _length_message(name: str, found: int, expected: int) -> str:
-    return f"{name} has {found} entries, expected {expected} (rows x racks_per_row), or one value for all"
+    return (
+        f"{name} has {found} entries, expected {expected} (rows x racks_per_row), "
+        "or one value for all"
+    )
 
 
 def _check_length(name: str, value: Any, expected: int) -> None:
@@ -823,7 +828,8 @@ def _sustaindc_value_problems(values: dict[str, Any]) -> list[str]:
             length = len(value) if isinstance(value, list) else 0
             if length != racks:
                 problems.append(
-                    f"{section}.{key}: length {length}, expected {racks} (NUM_ROWS x NUM_RACKS_PER_ROW)"
+                    f"{section}.{key}: length {length}, expected {racks} "
+                    "(NUM_ROWS x NUM_RACKS_PER_ROW)"
                 )
     per_rack = hall.get("CPUS_PER_RACK", 1)
     for count in per_rack if isinstance(per_rack, list) else [per_rack]:

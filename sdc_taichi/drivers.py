@@ -6,14 +6,14 @@ Series may differ in length; each repeats from its own start.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig, first_step_day
-from sdc_taichi.errors import ConfigError, DataError
+from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous.registry import load_site, load_trace, site_from_files
 from sdc_taichi.exogenous.series import Series, SiteData, resample
 from sdc_taichi.exogenous.workload import read_workload
@@ -170,7 +170,7 @@ def drivers_from_arrays(
         if not np.all(np.isfinite(value)):
             raise DataError(f"{source}: {name} has values that are not finite")
         rows[name] = np.broadcast_to(value, shape)
-    limits: dict[str, tuple[npt.ArrayLike, npt.ArrayLike]] = {
+    limits: dict[str, tuple[float, float | F64]] = {
         "outdoor_c": (-90.0, 70.0),
         "wet_bulb_c": (-90.0, rows["outdoor_c"] + 1e-9),
         "ci_g_per_kwh": (0.0, np.inf),

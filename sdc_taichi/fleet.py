@@ -1,4 +1,4 @@
-"""Many data centers of any size as flat arrays: racks by data center, groups by rack, servers by group."""
+"""Many data centers of any size as flat arrays: racks, server groups and servers by offsets."""
 
 from __future__ import annotations
 
@@ -228,8 +228,8 @@ def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
     for config, value in zip(configs, found, strict=True):
         if value != found[0]:
             raise ConfigError(
-                f"fleet: {path} is {found[0]!r} in {configs[0].name} and {value!r} in {config.name}; "
-                "it must be the same in all data centers of a fleet"
+                f"fleet: {path} is {found[0]!r} in {configs[0].name} and {value!r} in "
+                f"{config.name}; it must be the same in all data centers of a fleet"
             )
     return found[0]
 

@@ -1,4 +1,4 @@
-"""The halls of a fleet on the thermal kernel: supply air and load in, temperatures and power out."""
+"""The halls of a fleet on the thermal kernel: supply air and load in, temperatures out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sdc_taichi.types import F64, Reals, ServerLayers
 Precision = Literal["f32", "f64"]
 
 _RELEASED_OUTLET_FIT = (1.918, 1.096, 0.526, 0.824, -14.01)
-"""Rack outlet fit of the released SustainDC: factor, power exponent, divisor, flow exponent, shift."""
+"""Rack outlet fit of the released SustainDC: factor, power exponent, divisor, flow exponent, K."""
 
 _RACKS_PER_SLICE = 64
 """Fewer racks than this are not worth a thread of their own."""

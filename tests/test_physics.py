@@ -15,13 +15,18 @@ from sdc_taichi.exogenous import site_names
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
-@pytest.fixture(scope="module")
-def study() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("setpoint_study", EXAMPLES / "setpoint_study.py")
-    assert spec is not None and spec.loader is not None
+def _example(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def study() -> ModuleType:
+    return _example("setpoint_study")
 
 
 @pytest.mark.repo
@@ -64,3 +69,17 @@ def test_annual_pue_of_all_sites_is_that_of_real_plants() -> None:
     assert np.all((pue > 1.05) & (pue < 1.7)), dict(zip(sites, pue.round(3), strict=True))
     hot, cold = sites.index("AZ"), sites.index("WA")
     assert pue[hot] > pue[cold]
+
+
+@pytest.mark.repo
+def test_measured_years_agree_with_synthetic_years(real_data: Path) -> None:
+    example = _example("real_vs_synthetic")
+    configs = example.pairs_of_configs(real_data, steps_per_hour=1)
+    sums = example.year(configs, 8760)
+    pue = 1.0 + sums["hvac_kwh"] / sums["it_kwh"]
+    assert np.all((pue > 1.05) & (pue < 1.7))
+    for name, values in sums.items():
+        measured, synthetic = values[0::2], values[1::2]
+        np.testing.assert_allclose(synthetic, measured, rtol=0.04, err_msg=name)
+    lines = example.table(configs, sums).splitlines()
+    assert len(lines) == 2 + len(configs) // 2

@@ -214,7 +214,10 @@ def test_no_load_no_power(name: str) -> None:
 @pytest.mark.parametrize("name", CURVES)
 def test_machine_cycles_below_its_least_load(name: str) -> None:
     minimum = {"electric_water_cooled": 0.15, "electric_air_cooled": 0.05, "released": 0.05}
-    least_w = minimum.get(name, 0.1) * run(name, [1.0]).available_w
+    least = minimum.get(name, 0.1)
+    assert run(name, 1e4).power_w == run(name, 1e4, min_plr=least).power_w
+    assert run(name, 1e4).power_w != run(name, 1e4, min_plr=least * 1.01).power_w
+    least_w = least * run(name, [1.0]).available_w
     at_least, half, just_above = (run(name, least_w * f).power_w for f in (1.0, 0.5, 1.0 + 1e-9))
     np.testing.assert_allclose(half, 0.5 * at_least, rtol=1e-12)
     np.testing.assert_allclose(just_above, at_least, rtol=1e-8)
@@ -255,9 +258,9 @@ def test_carnot_lift_has_a_floor() -> None:
     np.testing.assert_allclose(2.0 * lower.power_w, at_floor.power_w, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", sorted(chiller.CHILLED_WATER_BOUNDS_C))
-def test_chilled_water_is_held_within_the_curve(name: str) -> None:
-    low, high = chiller.CHILLED_WATER_BOUNDS_C[name]
+@pytest.mark.parametrize(("name", "low", "high"), [("carnot", 4, 20), ("eir_york", 4.44, 8.89)])
+def test_chilled_water_is_held_within_the_curve(name: str, low: float, high: float) -> None:
+    assert chiller.CHILLED_WATER_BOUNDS_C[name] == (low, high)
     inside = run(name, 6e5, chilled_water_c=np.array([low, high])).power_w
     outside = run(name, 6e5, chilled_water_c=np.array([low - 9.0, high + 9.0])).power_w
     np.testing.assert_array_equal(inside, outside)
@@ -286,6 +289,25 @@ def test_electric_difference_is_held_above_minus_15_k() -> None:
     air = run("electric_air_cooled", 6e5, outdoor_c=np.array([-6.67, -40.0, -6.0]))
     assert air.available_w[0] == pytest.approx(air.available_w[1], rel=1e-9)
     assert air.available_w[2] < air.available_w[1]
+
+
+def test_electric_trades_chilled_water_for_condenser_temperature() -> None:
+    # One kelvin of chilled water is worth the temperature rise coefficient on the other side.
+    water = run(
+        "electric_water_cooled",
+        6e5,
+        chilled_water_c=np.array([6.667, 9.667]),
+        condenser_c=np.array([22.0, 22.0 + 3.0 * 2.682759]),
+    )
+    air = run(
+        "electric_air_cooled",
+        6e5,
+        chilled_water_c=np.array([6.67, 9.67]),
+        outdoor_c=np.array([22.0, 22.0 + 3.0 * 2.778]),
+    )
+    for result in (water, air):
+        assert result.available_w[0] == pytest.approx(result.available_w[1], rel=1e-12)
+        assert result.power_w[0] == pytest.approx(result.power_w[1], rel=1e-12)
 
 
 def test_condenser_side_each_model_sees() -> None:

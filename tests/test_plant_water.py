@@ -173,7 +173,7 @@ def test_drift_beyond_the_blowdown_needs_no_blowdown() -> None:
 
 
 def test_idle_tower_only_drifts() -> None:
-    result = run("mass_balance", rejected_w=np.array([0.0, -1e5]), range_k=0.0, water_kg_s=50.0)
+    result = run("mass_balance", rejected_w=np.array([0.0, -1e5]), water_kg_s=50.0)
     np.testing.assert_allclose(result.makeup_l, 50.0 * 2e-5 * 900.0)
     np.testing.assert_array_equal(result.evaporation_l, 0.0)
 

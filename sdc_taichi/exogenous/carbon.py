@@ -73,10 +73,7 @@ def read_carbon(
             return _read_imported(path, metadata, utc_offset_h, pairing)
     frame, first_row = files.read_table(path)
     notes = []
-    if "timestamp" not in frame.columns and str(frame.columns[0]).strip() in (
-        "",
-        "Unnamed: 0",
-    ):
+    if "timestamp" not in frame.columns and frame.columns[0].strip() in files.BLANK_HEADERS:
         frame = frame.rename(columns={frame.columns[0]: "timestamp"})
         notes.append("blank first header read as timestamp")
     with_fuels = any(fuel in frame.columns for fuel in FUELS)
@@ -214,6 +211,8 @@ def _repair(
     import pandas as pd
 
     notes = []
+    for i, column in enumerate(columns):  # names the column; below, a row counts as a whole
+        files.fill_gaps(path, values[:, i], minutes, column, rows)
     absent = len(values) - rows_in_file
     missing = np.isnan(values).any(axis=1)
     blank = int(missing.sum()) - absent

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_GAP_H = 24.0
+BLANK_HEADERS = frozenset({"", "Unnamed: 0"})  # the second is how pandas names the first
 MISSING_TEXT = frozenset({"", "nan", "na", "n/a", "null", "none"})
 METADATA_KEY = b"sdc_taichi"
 FORMAT = "sdc-series/1"
@@ -128,7 +129,9 @@ def require_columns(path: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -
     """
     missing = [c for c in columns if c not in frame.columns]
     if missing:
-        present = ", ".join(str(c) or "(blank)" for c in frame.columns[:12])
+        present = ", ".join(
+            "(blank)" if str(c) in BLANK_HEADERS else str(c) for c in frame.columns[:12]
+        )
         raise DataError(
             f"{path}: row 1: missing column {', '.join(missing)}; found {present}; "
             f"expected {', '.join(columns)}"
@@ -212,11 +215,13 @@ def rows_per_year(path: Path, minutes: float) -> int:
     """Number of intervals in 365 days.
 
     Raises:
-        DataError: the resolution does not divide an hour, nor is a whole number of hours of a day.
+        DataError: the resolution is not positive or does not divide a day.
     """
-    per_day = 1440.0 / minutes
+    per_day = 1440.0 / minutes if minutes > 0.0 else 0.5
     if abs(per_day - round(per_day)) > 1e-9:
-        raise DataError(f"{path}: resolution {minutes:g} min, expected one that divides a day")
+        raise DataError(
+            f"{path}: resolution {minutes:g} min, expected a positive one that divides a day"
+        )
     return round(MINUTES_PER_YEAR / minutes)
 
 

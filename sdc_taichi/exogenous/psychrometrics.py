@@ -13,7 +13,7 @@ from sdc_taichi.exogenous.series import FloatArray, check_physical
 
 TRIPLE_POINT_C = 0.01
 MIN_HUMIDITY_RATIO = 1e-7
-_BISECTIONS = 40  # 60 K / 2**40 < 1e-10 K
+_BISECTIONS = 40  # 180 K / 2**40 < 1e-9 K
 
 
 def saturation_pressure_pa(temperature_c: ArrayLike) -> FloatArray:
@@ -66,7 +66,8 @@ def wet_bulb_c(
     """Thermodynamic wet-bulb temperature at station pressure.
 
     Solves ASHRAE Fundamentals (2017) ch. 1, eq. 33 (wet bulb above 0 C) and 35 (below) by
-    bisection to 1e-10 K.
+    bisection to 1e-9 K. The two meet with a step at 0 C, so some states have a root on either
+    side; beginning between dew point and dry bulb finds the one that psychrolib does.
 
     Args:
         outdoor_c: dry bulb, -100..70 C; shapes broadcast.
@@ -87,7 +88,7 @@ def wet_bulb_c(
         for a in np.broadcast_arrays(outdoor_c, relative_humidity_pct, pressure_pa)
     )
     ratio = humidity_ratio(t, humidity, pressure)
-    low, high = t - 60.0, t.copy()
+    low, high = _dew_point_c(ratio, pressure, t), t.copy()
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         vapour = saturation_pressure_pa(middle)
@@ -102,6 +103,18 @@ def wet_bulb_c(
             )
             > ratio
         )
+        high = np.where(above, middle, high)
+        low = np.where(above, low, middle)
+    return np.asarray(0.5 * (low + high), dtype=np.float64)
+
+
+def _dew_point_c(ratio: FloatArray, pressure: FloatArray, outdoor: FloatArray) -> FloatArray:
+    """Dew point, C, at most the dry bulb: eq. 5 and 6 inverted by bisection."""
+    vapour = pressure * ratio / (0.621945 + ratio)
+    low, high = np.full_like(outdoor, -110.0), outdoor
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        above = saturation_pressure_pa(middle) > vapour
         high = np.where(above, middle, high)
         low = np.where(above, low, middle)
     return np.asarray(0.5 * (low + high), dtype=np.float64)

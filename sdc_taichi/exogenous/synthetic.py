@@ -65,7 +65,7 @@ def synthetic_traces() -> tuple[str, ...]:
     return tuple(coefficients()["workload"])
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=64, typed=True)
 def synthetic_site(name: str, seed: int = DEFAULT_SEED) -> SiteData:
     """Generate one hourly year of weather and carbon intensity.
 
@@ -114,7 +114,7 @@ def synthetic_site(name: str, seed: int = DEFAULT_SEED) -> SiteData:
     )
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=64, typed=True)
 def synthetic_trace(name: str, seed: int = DEFAULT_SEED) -> Series:
     """Generate one hourly year of workload, share of the capacity.
 

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 Rows: TypeAlias = NDArray[np.int64]
 Stamps: TypeAlias = NDArray[np.datetime64]
 
-_BLANK_HEADERS = frozenset({"", "unnamed: 0"})
-_INDEX_HEADERS = _BLANK_HEADERS | {"index", "hour", "step", "time", "timestamp", "datetime"}
+_INDEX_HEADERS = frozenset({"index", "hour", "step", "time", "timestamp", "datetime"})
 _HINT = " (divide percentages by 100)"
 
 
@@ -57,7 +56,8 @@ def read_workload(path: str | Path, *, minutes: float | None = None) -> Series:
     positions = np.arange(len(frame))
     start = np.datetime64("2001-01-01T00:00:00", "s")
     first, stamped = str(frame.columns[0]), False
-    if first.strip().lower() in _INDEX_HEADERS:
+    blank_header = first.strip() in files.BLANK_HEADERS
+    if blank_header or first.strip().lower() in _INDEX_HEADERS:
         text = frame[first].str.strip()
         stamped = not text.iloc[0].replace(".", "", 1).isdigit()
         if stamped:
@@ -68,7 +68,7 @@ def read_workload(path: str | Path, *, minutes: float | None = None) -> Series:
             minutes, start = found, stamps[0]
         else:
             positions = _running_index(path, text, first, rows)
-        if first.strip().lower() in _BLANK_HEADERS:
+        if blank_header:
             notes.append("blank first header read as " + ("timestamp" if stamped else "index"))
     minutes = 60.0 if minutes is None else float(minutes)
     longest = np.diff(positions).max(initial=1)

@@ -202,9 +202,9 @@ def paper(
     """Appendix A.3.4: the rates are limited by the energy that fits and by a largest power.
 
     r_charge = min((C - E)/(eta_c*dt), P_max), r_discharge = min(E/(eta_d*dt), P_max, load). The
-    paper defines its P_max by itself (P_max = u*P + v), so it is taken as a share of the capacity;
-    it also writes E for both the state and the flow, which is read here as the change of the
-    state, +eta_c*r*dt when charging and -eta_d*r*dt when discharging.
+    paper puts P_max in terms of the rate it limits (P_charge,max = u*P_charge + v), so it is taken
+    as a share of the capacity. It writes E for both the state and the flow; the latter is read as
+    the change of the state, +eta_c*r*dt when charging and -eta_d*r*dt when discharging.
 
     Args:
         stored_kwh: Energy in the store E, kWh.

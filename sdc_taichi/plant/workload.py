@@ -143,7 +143,7 @@ def age_histogram(queue: F64, edges_steps: F64) -> F64:
 
     Args:
         queue: work still queued by the step that put it in, (B, L).
-        edges_steps: lower edges of the age bins in steps, increasing, first 0; the last bin is open.
+        edges_steps: lower edges of the age bins in steps, rising from 0; the last bin is open.
     """
     last = queue.shape[1] - 1
     at_least = queue[:, np.clip(last - np.asarray(edges_steps).astype(np.int64), 0, last)]

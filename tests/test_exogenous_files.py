@@ -1,0 +1,448 @@
+"""Loaders on well-formed files: alignment, repairs, leap days, any length and resolution."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import exogenous_builders as build
+from sdc_taichi.errors import DataError
+from sdc_taichi.exogenous import read_carbon, read_epw, read_workload, statistics, wet_bulb_c
+from sdc_taichi.exogenous.statistics import DAYS_PER_MONTH
+
+
+def write(path: Path, lines: list[str] | tuple[str, ...], newline: str = "\n") -> Path:
+    path.write_bytes(build.text(lines, newline).encode())
+    return path
+
+
+# Carbon: time
+
+
+@pytest.mark.parametrize("offset", [-8.0, -5.0, 0.0, 1.0, 5.5, 10.0])
+@pytest.mark.parametrize("marks", ["end", "start"])
+@pytest.mark.parametrize("given", [True, False])
+def test_solar_dip_lands_on_local_noon(
+    offset: float, marks: str, given: bool, tmp_path: Path
+) -> None:
+    path = write(tmp_path / "ci.csv", build.carbon_lines(utc_offset_h=offset, marks=marks))
+    series = read_carbon(path, offset, marks if given else "auto")  # type: ignore[arg-type]
+    assert series.values.shape == (8760,)
+    by_hour = series.values.reshape(365, 24).mean(axis=0)
+    # The dip is symmetric about 12:00, the edge between the intervals 11 and 12.
+    np.testing.assert_allclose(by_hour, by_hour[::-1], rtol=0, atol=1e-3 * by_hour.max())
+    assert set(np.argsort(by_hour)[:2]) == {11, 12}
+    assert not series.synthetic
+
+
+def test_the_wrong_stamp_is_an_hour_off(tmp_path: Path) -> None:
+    path = write(tmp_path / "ci.csv", build.carbon_lines(marks="end"))
+    right, wrong = read_carbon(path, -5.0, "end"), read_carbon(path, -5.0, "start")
+    np.testing.assert_array_equal(wrong.values, np.roll(right.values, 1))
+
+
+@pytest.mark.parametrize(("first", "second"), [("start", "end"), ("end", "start")])
+def test_a_change_of_what_stamps_mark_is_found(first: str, second: str, tmp_path: Path) -> None:
+    lines = build.carbon_lines(marks=first, change="2022-06-15")
+    series = read_carbon(write(tmp_path / "ci.csv", lines), -5.0)
+    note = next(n for n in series.notes if "until" in n)
+    assert f"the {first} until 2022-06-1" in note
+    assert f"then the {second}" in note
+    assert series.values.size == 8760
+    for part in (series.values[: 24 * 150], series.values[24 * 180 :]):
+        by_hour = part.reshape(-1, 24).mean(axis=0)
+        assert set(np.argsort(by_hour)[:2]) == {11, 12}
+
+
+def test_no_solar_generation_means_stamps_mark_the_end(tmp_path: Path) -> None:
+    lines = [
+        build.CARBON_HEADER,
+        *(
+            f"{row.split(',')[0]},0,0,0,0,{5000 + i % 24},0,0,0,490"
+            for i, row in enumerate(build.carbon_lines()[1:])
+        ),
+    ]
+    series = read_carbon(write(tmp_path / "ci.csv", lines), -5.0)
+    assert any("assumed: no solar generation" in note for note in series.notes)
+
+
+def test_hours_before_the_year_wrap_to_its_end(tmp_path: Path) -> None:
+    lines = build.carbon_lines()
+    numbered = [
+        lines[0].split(",")[0] + ",avg_CI",
+        *(f"{row.split(',')[0]},{100 + 0.01 * i:.2f}" for i, row in enumerate(lines[1:])),
+    ]
+    path = write(tmp_path / "ci.csv", numbered)
+    series = read_carbon(path, -5.0, "end")
+    # Row i (UTC, end) is the local interval that starts 6 h earlier.
+    assert series.values[0] == pytest.approx(100.06)
+    assert series.values[8753] == pytest.approx(100 + 0.01 * 8759)
+    assert series.values[8754] == pytest.approx(100.0)
+    assert "6 rows before 1 January 00:00 moved to the end" in series.notes
+    east = read_carbon(path, 3.0, "start")
+    assert east.values[3] == pytest.approx(100.0)
+    assert east.values[0] == pytest.approx(100 + 0.01 * 8757)
+    kept = read_carbon(path, -5.0, pairing="utc_rows")
+    np.testing.assert_allclose(kept.values, 100 + 0.01 * np.arange(8760))
+
+
+def test_half_hour_offsets_average_by_overlap(tmp_path: Path) -> None:
+    lines = build.carbon_lines()
+    numbered = [
+        "timestamp,avg_CI",
+        *(f"{row.split(',')[0]},{100 + i % 24}" for i, row in enumerate(lines[1:])),
+    ]
+    series = read_carbon(write(tmp_path / "ci.csv", numbered), 5.5, "start")
+    # Local 06:00 holds the second half of UTC hour 0 and the first half of UTC hour 1.
+    assert series.values[24 * 10 + 6] == pytest.approx(100.5)
+    assert series.values.mean() == pytest.approx(111.5)
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "minutes", "rows"),
+    [
+        ("2024-01-01", "2025-01-01", 60, 8760),
+        ("2021-01-01", "2024-01-01", 60, 3 * 8760),
+        ("2023-01-01", "2026-01-01", 60, 3 * 8760),
+        ("2022-01-01", "2023-01-01", 5, 105_120),
+        ("2022-01-01", "2023-01-01", 30, 17_520),
+        ("2022-07-01", "2023-07-01", 60, 8760),
+        ("2023-07-01", "2024-07-01", 60, 8760),
+        ("2022-01-01", "2023-02-15", 60, 8760),
+    ],
+)
+def test_any_span_and_resolution(
+    start: str, stop: str, minutes: int, rows: int, tmp_path: Path
+) -> None:
+    lines = build.carbon_lines(start, stop, -8.0, minutes)
+    series = read_carbon(write(tmp_path / "ci.csv", lines), -8.0)
+    assert series.values.shape == (rows,)
+    assert series.minutes == minutes
+    by_step = series.values.reshape(-1, 1440 // minutes).mean(axis=0)
+    half = by_step.size // 2
+    assert set(np.argsort(by_step)[:2]) == {half - 1, half}
+
+
+def test_29_february_is_the_local_day(tmp_path: Path) -> None:
+    lines = build.carbon_lines("2024-01-01", "2025-01-01")
+    numbered = ["timestamp,avg_CI"]
+    for row in lines[1:]:
+        stamp = row.split(",")[0]
+        local = np.datetime64(stamp[:10]) + np.timedelta64(int(stamp[11:13]) - 5, "h")
+        is_leap_day = str(local)[5:10] == "02-29"
+        numbered.append(f"{stamp},{999 if is_leap_day else 100}")
+    series = read_carbon(write(tmp_path / "ci.csv", numbered), -5.0, "start")
+    assert np.all(series.values == 100.0)
+    assert "29 February removed (24 rows)" in series.notes
+
+
+@pytest.mark.parametrize("start", [2022, 2023, 2024])
+def test_a_file_from_july_to_june_begins_with_january(start: int, tmp_path: Path) -> None:
+    stamps = build.days(f"{start}-07-01", f"{start + 1}-07-01").astype("datetime64[h]")
+    hours = np.repeat(stamps, 24) + np.tile(np.arange(24), stamps.size)
+    lines = ["timestamp,cpu_load", *(f"{t}:00,{int(str(t)[5:7]) / 100}" for t in hours)]
+    months = np.rint(read_workload(write(tmp_path / "w.csv", lines)).values * 100).astype(int)
+    january_to_december = np.repeat(np.arange(1, 13), np.array(DAYS_PER_MONTH) * 24)
+    np.testing.assert_array_equal(months, january_to_december)
+
+
+# Carbon: repairs
+
+
+def test_carbon_repairs_are_counted(tmp_path: Path) -> None:
+    lines: list[str] = build.carbon_lines()
+    clean = read_carbon(write(tmp_path / "clean.csv", lines), -5.0, "end")
+    for row in (100, 101, 102):
+        lines = build.with_cell(lines, row, 9, "")
+    partial = lines[4999].split(",")
+    lines[4999] = f"{partial[0]},0,0,0,0,900,0,100,0,{(900 * 490 + 100 * 12) / 1000}"
+    lines = build.without_rows(lines, 7001, 7024)
+    lines[0] = lines[0].replace("timestamp", "")
+    path = tmp_path / "damaged.csv"
+    path.write_text("\n".join(lines))  # no final newline
+    series = read_carbon(path, -5.0, "end")
+    assert "blank first header read as timestamp" in series.notes
+    assert "24 absent rows interpolated" in series.notes
+    assert "3 rows without values interpolated" in series.notes
+    assert any(n.startswith("1 rows with under half of the 25 h median") for n in series.notes)
+    assert any(n.startswith("integers written as floats") for n in series.notes) is False
+    changed = np.flatnonzero(series.values != clean.values)
+    assert changed.size <= 3 + 1 + 24
+    assert np.abs(series.values - clean.values).max() < 250.0
+
+
+def test_integers_as_floats_are_noted(tmp_path: Path) -> None:
+    lines = [
+        build.CARBON_HEADER,
+        *(f"{row.split(',')[0]},0.0,0,0,0,5000.0,0,0,0,490" for row in build.carbon_lines()[1:]),
+    ]
+    series = read_carbon(write(tmp_path / "ci.csv", lines), -5.0)
+    assert "integers written as floats in 2 columns" in series.notes
+
+
+def test_carbon_oddities_are_warned_of_and_kept(tmp_path: Path) -> None:
+    lines: list[str] = build.carbon_lines()
+    for row in range(2000, 2010):
+        cells = lines[row - 1].split(",")
+        sun, gas = float(cells[2]), float(cells[5])
+        mix = (41 * sun + 490 * gas + 230 * 2000) / 10_000
+        lines[row - 1] = f"{cells[0]},0,{sun},0,0,{gas},0,0,2000,{mix}"
+    for row in (3000, 3001):
+        cells = lines[row - 1].split(",")
+        gas = 90_000.0
+        sun = float(cells[2])
+        mix = (41 * sun + 490 * gas + 12 * 2000) / (sun + gas + 2000)
+        lines[row - 1] = f"{cells[0]},0,{sun},0,0,{gas},0,2000,0,{mix}"
+    series = read_carbon(write(tmp_path / "ci.csv", lines), -5.0, "end")
+    warnings = [n for n in series.notes if n.startswith("warning")]
+    assert len(warnings) == 2
+    assert "10 rows with no nuclear but high OTH" in warnings[1]
+    assert "first: row 2000" in warnings[1]
+    assert "2 rows with over twice" in warnings[0]
+    # Row 3000 is kept: data index 2998, stamped at its end, 5 h behind UTC.
+    assert series.values[2998 - 1 - 5] == pytest.approx(float(lines[2999].split(",")[-1]))
+
+
+# Weather
+
+
+def test_epw_hour_one_is_the_first_interval(tmp_path: Path) -> None:
+    lines = build.epw_lines()
+    weather = read_epw(write(tmp_path / "x.epw", lines, "\r\n"))
+    assert weather.outdoor_c.values.shape == (8760,)
+    first = lines[len(build.EPW_HEADER)].split(",")
+    assert first[3] == "1"
+    assert weather.outdoor_c.values[0] == float(first[6])
+    assert (weather.latitude_deg, weather.longitude_deg) == (40.7, -75.0)
+    assert (weather.utc_offset_h, weather.elevation_m) == (-5.0, 10.0)
+    assert weather.label == "Test.Station, NY, USA"
+    assert weather.pressure_pa is not None
+    expected = wet_bulb_c(weather.outdoor_c.values, 60.0, weather.pressure_pa.values)
+    np.testing.assert_allclose(weather.wet_bulb_c.values, expected, rtol=0, atol=1e-12)
+    assert weather.outdoor_c.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "per_hour", "rows", "removed"),
+    [
+        ("2024-01-01", "2025-01-01", 1, 8760, 24),
+        ("2021-01-01", "2024-01-01", 1, 3 * 8760, 0),
+        ("2023-01-01", "2026-01-01", 1, 3 * 8760, 24),
+        ("2022-01-01", "2023-01-01", 12, 105_120, 0),
+        ("2024-01-01", "2025-01-01", 4, 35_040, 96),
+        ("2022-07-01", "2023-07-01", 1, 8760, 0),
+        ("2022-01-01", "2023-03-01", 1, 8760, 0),
+    ],
+)
+def test_epw_of_any_span_and_resolution(
+    start: str, stop: str, per_hour: int, rows: int, removed: int, tmp_path: Path
+) -> None:
+    weather = read_epw(write(tmp_path / "x.epw", build.epw_lines(start, stop, per_hour)))
+    series = weather.outdoor_c
+    assert series.values.shape == (rows,)
+    assert series.minutes == 60 / per_hour
+    assert (f"29 February removed ({removed} rows)" in series.notes) == bool(removed)
+    by_day = series.values.reshape(-1, 24 * per_hour)
+    assert 14 * per_hour <= int(by_day.mean(axis=0).argmax()) <= 16 * per_hour
+    assert abs(int(by_day[:365].mean(axis=1).argmin()) - 14) <= 2  # mid January
+
+
+def test_epw_mixed_years_are_one_year(tmp_path: Path) -> None:
+    lines = list(build.epw_lines())
+    for at in range(8, len(lines)):
+        cells = lines[at].split(",", 2)
+        lines[at] = f"{2000 + int(cells[1]) % 5},{cells[1]},{cells[2]}"
+    mixed = read_epw(write(tmp_path / "x.epw", lines))
+    plain = read_epw(write(tmp_path / "y.epw", build.epw_lines()))
+    np.testing.assert_array_equal(mixed.outdoor_c.values, plain.outdoor_c.values)
+
+
+def test_epw_missing_codes_and_gaps_are_interpolated(tmp_path: Path) -> None:
+    lines: list[str] = list(build.epw_lines())
+    clean = read_epw(write(tmp_path / "clean.epw", lines)).outdoor_c.values
+    for row, (column, code) in enumerate([(6, "99.9"), (8, "999"), (9, "999999.")], start=1000):
+        lines = build.with_cell(lines, row, column, code)
+    lines = build.with_cell(lines, 3000, 8, "104")
+    lines = build.without_rows(lines, 5001, 5020)
+    weather = read_epw(write(tmp_path / "x.epw", lines))
+    notes = weather.outdoor_c.notes
+    assert "1 missing values of dry bulb (column 7) interpolated" in notes
+    assert "1 missing values of relative humidity (column 9) interpolated" in notes
+    assert "1 missing values of station pressure (column 10) interpolated" in notes
+    assert "1 values of relative humidity over 100 % set to 100 %" in notes
+    assert "20 absent rows interpolated" in notes
+    at = 1000 - 9
+    assert weather.outdoor_c.values[at] == pytest.approx((clean[at - 1] + clean[at + 1]) / 2)
+
+
+# Workload
+
+
+def test_workload_trace(tmp_path: Path) -> None:
+    series = read_workload(write(tmp_path / "w.csv", build.workload_lines()))
+    assert series.values.shape == (8760,)
+    assert series.values[0] == pytest.approx(0.5)
+    assert series.notes == ("blank first header read as index",)
+
+
+def test_workload_longer_than_a_year_is_cut_and_repetition_warned_of(tmp_path: Path) -> None:
+    week = [f"{0.3 + 0.001 * (i * 37 % 168):.3f}" for i in range(168)]
+    lines = ["cpu_load", *(week * 53)]
+    series = read_workload(write(tmp_path / "w.csv", lines))
+    assert series.values.shape == (8760,)
+    assert "warning: the same 168 rows repeat 53 times" in series.notes
+    assert "truncated to 1 x 365 days (144 rows cut)" in series.notes
+
+
+def test_workload_of_five_minutes_and_of_three_years(tmp_path: Path) -> None:
+    lines = ["cpu_load", *(f"{0.5 + i % 7 / 100}" for i in range(105_120))]
+    path = write(tmp_path / "w.csv", lines)
+    assert read_workload(path, minutes=5.0).days == 365
+    assert read_workload(path).days == 12 * 365  # hourly unless told
+    stamps = np.datetime_as_string(
+        np.arange(np.datetime64("2022-03-01T00:00"), np.datetime64("2023-03-01T00:00"), 30)
+    )
+    stamped = ["timestamp,cpu_load", *(f"{t},{0.2 + 0.3 * (t[5:7] < '03')}" for t in stamps)]
+    series = read_workload(write(tmp_path / "s.csv", stamped))
+    assert series.minutes == 30.0
+    by_day = series.values.reshape(365, 48).mean(axis=1)
+    np.testing.assert_allclose(by_day[:59], 0.5)  # January and February lead
+    np.testing.assert_allclose(by_day[59:], 0.2)
+
+
+def test_workload_gaps_are_interpolated(tmp_path: Path) -> None:
+    lines = build.with_cell(build.workload_lines(8800), 50, 1, "NaN")
+    lines = build.without_rows(lines, 2001, 2010)
+    series = read_workload(write(tmp_path / "w.csv", lines))
+    assert "10 absent rows interpolated" in series.notes
+    assert "1 rows without values interpolated" in series.notes
+    middle = 0.5 * (series.values[47] + series.values[49])
+    assert series.values[48] == pytest.approx(middle)
+
+
+# Measured files, if SDC_REAL_DATA names their folder
+
+STATES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
+LOCATIONS = {
+    "AZ": (33.428, -112.004, -7.0, 337.4),
+    "CA": (37.359, -121.924, -8.0, 15.5),
+    "GA": (33.63, -84.442, -5.0, 307.9),
+    "IL": (41.96, -87.932, -6.0, 201.8),
+    "NY": (40.779, -73.88, -5.0, 3.4),
+    "TX": (32.898, -97.019, -6.0, 170.7),
+    "VA": (39.078, -77.558, -5.0, 119.0),
+    "WA": (47.444, -122.314, -8.0, 137.0),
+}
+BLANK_ROWS = {"CA": 3, "IL": 3, "VA": 23}
+OLD_PAIRING_ERROR = {"CA": 0.58, "AZ": 0.19}
+
+
+def epw_of(real_data: Path, state: str) -> Path:
+    return next((real_data / "weather").glob(f"USA_{state}_*.epw"))
+
+
+def carbon_of(real_data: Path, state: str) -> Path:
+    return real_data / "carbon" / f"{state}_NG_&_avgCI.csv"
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_measured_weather(state: str, real_data: Path) -> None:
+    weather = read_epw(epw_of(real_data, state))
+    found = (
+        weather.latitude_deg,
+        weather.longitude_deg,
+        weather.utc_offset_h,
+        weather.elevation_m,
+    )
+    assert found == LOCATIONS[state]
+    constant = any("nearly constant" in note for note in weather.outdoor_c.notes)
+    assert constant == (state == "VA")
+    assert len(weather.outdoor_c.notes) == int(constant)
+    compare(state, "outdoor_c", statistics(weather.outdoor_c), 1e-3)
+    compare(state, "wet_bulb_c", statistics(weather.wet_bulb_c), 1e-3)
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_measured_carbon(state: str, real_data: Path) -> None:
+    _, longitude, offset, _ = LOCATIONS[state]
+    series = read_carbon(carbon_of(real_data, state), offset, longitude_deg=longitude)
+    text = "; ".join(series.notes)
+    blank = BLANK_ROWS.get(state)
+    assert (f"{blank} rows without values" in text) if blank else ("rows without" not in text)
+    assert ("5 rows with under half" in text) == (state == "VA")
+    assert ("559 rows with no nuclear but high OTH" in text) == (state == "NY")
+    assert ("12 rows with one fuel only" in text) == (state == "WA")
+    assert ("2 rows with over twice" in text) == (state == "AZ")
+    marks = {
+        "VA": "mark the start of the interval (solar noon)",
+        "CA": "mark the start until 2022-06-14, then the end",
+        "NY": "mark the end of the interval (assumed: no solar generation)",
+    }
+    assert marks.get(state, "mark the end of the interval (solar noon)") in text
+    np.testing.assert_array_equal(
+        series.values, read_carbon(carbon_of(real_data, state), offset).values
+    )
+    # The fitted statistics also repaired what is only warned of here, so those are wider.
+    compare(state, "ci_g_per_kwh", statistics(series), 0.05 if state in ("NY", "VA") else 5e-3)
+
+
+@pytest.mark.parametrize("state", list(OLD_PAIRING_ERROR))
+def test_measured_carbon_in_the_old_pairing(state: str, real_data: Path) -> None:
+    _, longitude, offset, _ = LOCATIONS[state]
+    path = carbon_of(real_data, state)
+    aligned = read_carbon(path, offset, longitude_deg=longitude).values.reshape(365, 24)
+    paired = read_carbon(path, offset, pairing="utc_rows").values.reshape(365, 24)
+    error = paired[:, 10:16].mean() / aligned[:, 10:16].mean() - 1.0
+    assert error == pytest.approx(OLD_PAIRING_ERROR[state], abs=0.01)
+
+
+def test_measured_carbon_without_first_header_and_final_newline(real_data: Path) -> None:
+    path = real_data / "carbon" / "WAAT_NG_&_avgCI.csv"
+    series = read_carbon(path, -8.0)
+    assert "blank first header read as timestamp" in series.notes
+    plain = read_carbon(carbon_of(real_data, "WA"), -8.0)
+    assert np.corrcoef(series.values, plain.values)[0, 1] > 0.99
+
+
+@pytest.mark.parametrize(
+    ("name", "rows_cut", "repeats", "mean"),
+    [
+        ("Alibaba_CPU_Data_Hourly_1.csv", 144, True, 0.49532),
+        ("Alibaba_CPU_Data_Hourly_2.csv", 144, True, 0.31516),
+        ("GoogleClusteData_CPU_Data_Hourly_1.csv", 0, False, 0.67940),
+    ],
+)
+def test_measured_workload(
+    name: str, rows_cut: int, repeats: bool, mean: float, real_data: Path
+) -> None:
+    series = read_workload(real_data / "workload" / name)
+    assert series.values.shape == (8760,)
+    text = "; ".join(series.notes)
+    assert ("168 rows repeat 53 times" in text) == repeats
+    assert (f"({rows_cut} rows cut)" in text) == bool(rows_cut)
+    assert series.values.mean() == pytest.approx(mean, abs=1e-3)
+
+
+def compare(state: str, quantity: str, found: dict[str, float], tolerance: float) -> None:
+    from test_exogenous_synthetic import REAL
+
+    for statistic, real in REAL[quantity][state].items():
+        allowed = tolerance * max(abs(real), 0.1)
+        assert found[statistic] == pytest.approx(real, abs=allowed), statistic
+
+
+def test_missing_folder_and_bad_arguments(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        read_epw(tmp_path / "absent.epw")
+    path = write(tmp_path / "ci.csv", build.carbon_lines())
+    for kwargs, message in (
+        ({"utc_offset_h": 20.0}, "utc_offset_h"),
+        ({"utc_offset_h": -5.0, "stamp": "middle"}, "stamp"),
+        ({"utc_offset_h": -5.0, "pairing": "rows"}, "pairing"),
+    ):
+        with pytest.raises(DataError, match=message):
+            read_carbon(path, **kwargs)
+    with pytest.raises(DataError, match="minutes"):
+        read_workload(path, minutes=0.0)
