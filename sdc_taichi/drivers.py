@@ -214,11 +214,15 @@ def _read_site(config: DataCenterConfig, steps_per_hour: int) -> _Site:
     )
     outdoor_c = resample(data.outdoor_c, steps_per_hour)
     wet_bulb_c = resample(data.wet_bulb_c, steps_per_hour)
+    ci_g_per_kwh = resample(data.ci_g_per_kwh, steps_per_hour)
+    if site.carbon_pairing == "utc_rows" and site.carbon_file is None:
+        # Local hour k gets the row of UTC hour k; files come with that pairing already.
+        ci_g_per_kwh = np.roll(ci_g_per_kwh, -round(data.utc_offset_h * steps_per_hour))
     return _Site(
         data=data,
         outdoor_c=outdoor_c,
         wet_bulb_c=wet_bulb_c,
-        ci_g_per_kwh=resample(data.ci_g_per_kwh, steps_per_hour),
+        ci_g_per_kwh=ci_g_per_kwh,
         design_outdoor_c=float(np.quantile(outdoor_c, DESIGN_QUANTILE)),
         design_wet_bulb_c=float(np.quantile(wet_bulb_c, DESIGN_QUANTILE)),
     )

@@ -1,0 +1,63 @@
+"""Series on the clock of the simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sdc_taichi import DataError, drivers_from_arrays, load_config, load_drivers, make_configs
+
+
+def test_seasons_start_where_the_config_says() -> None:
+    year, july = (
+        load_drivers([load_config("tiny", [f"site.start={start}"])]) for start in ("01-01", "07-01")
+    )
+    first_of_july = 181 * 96
+    assert july.at(0).outdoor_c == year.at(first_of_july).outdoor_c
+    assert july.at(0).demand == year.at(first_of_july).demand
+    assert july.at(184 * 96).outdoor_c == year.at(0).outdoor_c, "the year repeats"
+
+
+def test_utc_rows_shift_carbon_intensity_by_the_offset_of_the_site() -> None:
+    local, shifted = (
+        load_drivers([load_config("tiny", ["site.location=CA", f"site.carbon_pairing={pairing}"])])
+        for pairing in ("local", "utc_rows")
+    )
+    # California is 8 h behind UTC: at local noon the released pairing shows the row of 4 o'clock.
+    noon, four = 48, 16
+    assert shifted.at(noon).ci_g_per_kwh == local.at(four).ci_g_per_kwh
+    assert shifted.at(noon).outdoor_c == local.at(noon).outdoor_c
+
+
+def test_copies_share_one_table() -> None:
+    drivers = load_drivers(make_configs(load_config("tiny"), count=50, sites=["ny", "wa"]))
+    assert len(drivers.outdoor_c.values) == 2 * 35040
+    world = drivers.at(1000)
+    assert len(np.unique(world.outdoor_c)) == 2
+    np.testing.assert_array_equal(world.outdoor_c[0::2], world.outdoor_c[0])
+
+
+def test_series_of_different_length_repeat_on_their_own() -> None:
+    drivers = drivers_from_arrays([1.0, 2.0, 3.0], [0.0] * 3, [100.0] * 3, [0.1, 0.2, 0.3])
+    assert [float(drivers.at(k).outdoor_c[0]) for k in range(5)] == [1.0, 2.0, 3.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("change", "place"),
+    [
+        ({"demand": [0.5, 1.2]}, "demand of data center 0 at step 1 is 1.2"),
+        ({"wet_bulb_c": [5.0, 25.0]}, "wet_bulb_c of data center 0 at step 1 is 25"),
+        ({"ci_g_per_kwh": [-1.0, 3.0]}, "ci_g_per_kwh of data center 0 at step 0 is -1"),
+        ({"outdoor_c": [20.0, np.nan]}, "outdoor_c has values that are not finite"),
+        ({"outdoor_c": [20.0, 20.0, 20.0]}, "has shape"),
+    ],
+)
+def test_impossible_arrays_are_refused(change: dict[str, list[float]], place: str) -> None:
+    given = {
+        "outdoor_c": [20.0, 20.0],
+        "wet_bulb_c": [15.0, 15.0],
+        "ci_g_per_kwh": [300.0, 300.0],
+        "demand": [0.5, 0.5],
+    }
+    with pytest.raises(DataError, match=place):
+        drivers_from_arrays(**{**given, **change})
