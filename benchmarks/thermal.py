@@ -89,11 +89,10 @@ def main() -> None:
         alike = Hall(fleet_of(n_dcs, racks, servers, mixed=False), "f32")
         supply, load = np.full(n_dcs, 18.0), np.linspace(0.1, 0.9, n_dcs)
         reduce_alike = best_of(lambda: alike.solve(supply, load), repeats)  # noqa: B023
-        expand = best_of(alike.fill_layers, repeats)
-        alike.close()
+        layers = alike.servers()
+        expand = best_of(lambda: alike.servers(layers), repeats)  # noqa: B023
         mixed = Hall(fleet_of(n_dcs, racks, servers, mixed=True), "f32")
         reduce_mixed = best_of(lambda: mixed.solve(supply, load), repeats)  # noqa: B023
-        mixed.close()
         ns = 1e9 / total
         figures = (
             roof * ns,

@@ -16,8 +16,6 @@ Row order of the two-dimensional arguments:
 from functools import cache
 from typing import Any, no_type_check
 
-import numpy as np
-
 from .backend import ti
 
 GROUP_ROWS = ("count", "full_w", "idle_w", "inlet_offset_k", "load_deviation")
@@ -71,7 +69,6 @@ def reduce_kernel(precision: str) -> Any:
     @no_type_check
     def reduce(
         outlet_model: ti.template(),
-        fan_power: ti.template(),
         write_groups: ti.template(),
         slices: ti.i32,
         group_start: ints_1d,
@@ -114,10 +111,12 @@ def reduce_kernel(precision: str) -> Any:
                         )
                         speed = y / dcs[8, n]
                         fan_1 = dcs[10, n]
-                        if ti.static(fan_power == 1):
-                            fan_1 *= speed
-                        elif ti.static(fan_power == 3):
+                        # A branch on data, not one kernel per exponent: compiled apart, they
+                        # would round apart, and a data center must not depend on its batch.
+                        if dcs[9, n] == real(3.0):
                             fan_1 *= speed * speed * speed
+                        elif dcs[9, n] == real(1.0):
+                            fan_1 *= speed
                         else:
                             fan_1 *= ti.pow(speed, dcs[9, n])
                         flow_1 = dcs[11, n] * y
@@ -178,49 +177,28 @@ def reduce_kernel(precision: str) -> Any:
     return reduce
 
 
-@ti.data_oriented
-class ServerLayers:
-    """Per-server inlet, outlet and power as fields: field stores vectorise, array stores do not.
-
-    The fields live in a tree of their own that ``destroy`` gives back.
-    """
-
-    def __init__(self, n_servers: int, precision: str) -> None:
-        builder = ti.FieldsBuilder()
-        self.inlet_c = ti.field(_real(precision))
-        self.outlet_c = ti.field(_real(precision))
-        self.power_w = ti.field(_real(precision))
-        for layer in (self.inlet_c, self.outlet_c, self.power_w):
-            builder.dense(ti.i, n_servers).place(layer)
-        self.n_servers = n_servers
-        self._dtype = np.float32 if precision == "f32" else np.float64
-        self._tree = builder.finalize()
-        self.expand = _expand_kernel(precision)
-
-    def fill(self, slices: int, server_start: Any, group_out: Any) -> None:
-        """Copy group values (3, n_groups) to every server of the group."""
-        self.expand(self, slices, server_start, group_out)
-
-    def to_numpy(self) -> tuple[Any, Any, Any]:
-        """Inlet C, outlet C and power W, each (n_servers,)."""
-        return tuple(
-            layer.to_numpy().astype(self._dtype, copy=False)
-            for layer in (self.inlet_c, self.outlet_c, self.power_w)
-        )
-
-    def destroy(self) -> None:
-        """Give the memory of the fields back; the layers are unusable afterwards."""
-        self._tree.destroy()
-
-
 @cache
-def _expand_kernel(precision: str) -> Any:
-    reals_2d = ti.types.ndarray(dtype=_real(precision), ndim=2)
+def expand_kernel(precision: str) -> Any:
+    """Kernel that copies the values of every group to its servers.
+
+    It stores at the speed of memory into the caller's arrays, one per layer; no field, whose
+    memory would outlive the simulator and whose kernels would be compiled per simulator.
+    """
+    real = _real(precision)
+    reals_2d = ti.types.ndarray(dtype=real, ndim=2)
+    reals_1d = ti.types.ndarray(dtype=real, ndim=1)
     ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
     @ti.kernel
     @no_type_check
-    def expand(layers: ti.template(), slices: ti.i32, server_start: ints_1d, group_out: reals_2d):
+    def expand(
+        slices: ti.i32,
+        server_start: ints_1d,
+        group_out: reals_2d,
+        inlet_c: reals_1d,
+        outlet_c: reals_1d,
+        power_w: reals_1d,
+    ):
         n_groups = server_start.shape[0] - 1
         for k in range(slices * 512):
             if k % 512 == 0:
@@ -230,12 +208,9 @@ def _expand_kernel(precision: str) -> Any:
                     inlet = group_out[0, g]
                     outlet = group_out[1, g]
                     power = group_out[2, g]
-                    # Touching the tree here keeps its root pointer out of the inner loop,
-                    # which then vectorises.
-                    layers.inlet_c[server_start[g]] = inlet
                     for s in range(server_start[g], server_start[g + 1]):
-                        layers.inlet_c[s] = inlet
-                        layers.outlet_c[s] = outlet
-                        layers.power_w[s] = power
+                        inlet_c[s] = inlet
+                        outlet_c[s] = outlet
+                        power_w[s] = power
 
     return expand

@@ -40,7 +40,7 @@ class HallSums:
 
 
 class Hall:
-    """Owns the kernel arguments of a fleet; ``close`` gives the server fields back."""
+    """Kernel arguments of a fleet: plain arrays, given back with the object."""
 
     def __init__(self, fleet: Fleet, precision: Precision) -> None:
         threads = runtime.ensure_started()
@@ -54,14 +54,12 @@ class Hall:
         self._server_slices = max(1, min(8 * threads, fleet.servers // 4096))
         self._kernel = thermal.reduce_kernel(precision)
         self._outlet_model = thermal.OUTLET_MODELS.index(fleet.models["outlet"])
-        self._fan_power = _shared_integer(fleet.dcs[thermal.DC_ROWS.index("fan_exponent")])
         self._groups = self._real(fleet.groups)
         self._dcs = self._real(fleet.dcs)
         self._approach_k = self._real(fleet.approach_k)
         self._fit = self._real(np.array(_RELEASED_OUTLET_FIT))
         self._inputs = np.zeros((2, fleet.size), self._dtype)
         self._no_groups = np.zeros((len(thermal.GROUP_OUT), 1), self._dtype)
-        self._layers: Any = None
         self._solved = False
 
     def _real(self, values: F64) -> Any:
@@ -75,29 +73,25 @@ class Hall:
         racks, dcs = self._run(self._no_groups)
         return HallSums(*dcs, *racks)
 
-    def servers(self) -> ServerLayers:
-        """Per-server layers of the last ``solve``, copied out of their fields, each (S,).
+    def servers(self, into: ServerLayers | None = None) -> ServerLayers:
+        """Per-server layers of the last ``solve``, each (S,).
 
-        Raises:
-            RuntimeStateError: before the first ``solve``.
-        """
-        return ServerLayers(*self.fill_layers().to_numpy())
-
-    def fill_layers(self) -> Any:
-        """Compute the per-server fields of the last ``solve`` and return the kernel's layers.
+        Args:
+            into: layers to overwrite and return; None allocates new ones.
 
         Raises:
             RuntimeStateError: before the first ``solve``.
         """
         if not self._solved:
             raise RuntimeStateError("no step has been done yet; server layers exist after one")
-        runtime.ensure_started()
         group_out = np.empty((len(self._thermal.GROUP_OUT), self._groups.shape[1]), self._dtype)
         self._run(group_out)
-        if self._layers is None:
-            self._layers = self._thermal.ServerLayers(self._fleet.servers, self._precision)
-        self._layers.fill(self._server_slices, self._fleet.server_start, group_out)
-        return self._layers
+        if into is None:
+            into = ServerLayers(*(np.empty(self._fleet.servers, self._dtype) for _ in range(3)))
+        expand = self._thermal.expand_kernel(self._precision)
+        layers = (into.inlet_c, into.outlet_c, into.power_w)
+        expand(self._server_slices, self._fleet.server_start, group_out, *layers)
+        return into
 
     def forget(self) -> None:
         """Drop the last ``solve``, so that ``servers`` cannot show layers of another state."""
@@ -110,7 +104,6 @@ class Hall:
         dcs = np.empty((len(self._thermal.DC_OUT), fleet.size), np.float64)
         self._kernel(
             self._outlet_model,
-            self._fan_power,
             group_out is not self._no_groups,
             self._slices,
             fleet.group_start,
@@ -126,15 +119,3 @@ class Hall:
             dcs,
         )
         return racks, dcs
-
-    def close(self) -> None:
-        """Give back the server fields; harmless when there are none or in a forked child."""
-        if self._layers is not None and runtime.owned_by_this_process():
-            self._layers.destroy()
-        self._layers = None
-
-
-def _shared_integer(exponents: F64) -> int:
-    """1 or 3 when all fans have that exponent, which spares a power function; 0 otherwise."""
-    first = float(exponents[0])
-    return int(first) if first in (1.0, 3.0) and bool(np.all(exponents == first)) else 0

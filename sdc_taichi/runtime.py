@@ -47,8 +47,3 @@ def _thread_limit() -> int:
     if not text.isdigit() or int(text) < 1:
         raise ConfigError(f"SDC_TAICHI_THREADS={text!r}: valid is a positive integer")
     return int(text)
-
-
-def owned_by_this_process() -> bool:
-    """Whether the runtime was started here and not in a parent that forked."""
-    return _owner_pid == os.getpid()

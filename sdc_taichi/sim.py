@@ -427,9 +427,7 @@ class Simulator:
         self.load_state_dict(values)
 
     def close(self) -> None:
-        """Give back kernel memory; the simulator is unusable afterwards."""
-        if self._hall is not None:
-            self._hall.close()
+        """Let go of the kernel arrays; the simulator is unusable afterwards."""
         self._hall = None
         self._closed = True
 

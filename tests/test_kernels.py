@@ -1,0 +1,372 @@
+"""The thermal kernels against their NumPy twin, and what must hold to the bit."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import reference_twin
+from sdc_taichi import DataCenterConfig, RuntimeStateError, build_fleet, load_config
+from sdc_taichi.config import config_from_dict
+from sdc_taichi.hall import Hall, HallSums, Precision
+from sdc_taichi.types import F64
+
+OUTLETS = ("server", "rack", "released")
+EXPONENTS = (1.0, 2.5, 3.0)
+TOLERANCE: dict[Precision, float] = {"f64": 1e-12, "f32": 1e-5}
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def preset_values(name: str) -> dict[str, Any]:
+    return load_config(name).model_dump(mode="json")
+
+
+def random_rack(rng: np.random.Generator) -> list[dict[str, float]]:
+    """Groups of one rack; no load weight reaches twice their mean."""
+    groups = []
+    for _ in range(int(rng.integers(1, 5))):
+        full = float(rng.uniform(80, 500))
+        groups.append(
+            {
+                "count": int(rng.integers(1, 40)),
+                "full_w": full,
+                "idle_w": float(rng.uniform(0, 0.6) * full),
+                "load_weight": float(rng.uniform(0.8, 1.3)),
+                "inlet_offset_k": float(rng.uniform(-0.5, 1.5)),
+            }
+        )
+    return groups
+
+
+def random_config(
+    rng: np.random.Generator, name: str, outlet_model: str, exponent: float
+) -> DataCenterConfig:
+    """A data center of any size and make-up."""
+    values = preset_values("corrected")
+    hall, servers = values["hall"], values["servers"]
+    if rng.integers(2):
+        servers |= preset_values("sustaindc")["servers"]
+        hall["supply_approach_limits_k"] = [3.8, 5.3]
+    hall["rows"], hall["racks_per_row"] = (int(n) for n in rng.integers(1, 5, 2))
+    racks = hall["rows"] * hall["racks_per_row"]
+    hall["supply_approach_k"] = rng.uniform(1, 7, racks).tolist()
+    hall["return_approach_k"] = rng.uniform(-5, 0, racks).tolist()
+    hall["air_density_kg_m3"] = float(rng.uniform(1.0, 1.25))
+    servers["outlet_model"], servers["fan_power_exponent"] = outlet_model, exponent
+    servers["fan_reference_ratio"] = float(rng.uniform(0.5, 1.5))
+    servers["fan_full_airflow_m3s"] = float(rng.uniform(0.02, 0.06))
+    kind = rng.integers(3)
+    if kind == 0:
+        servers["groups"] = [random_rack(rng) for _ in range(racks)]
+    elif kind == 1:
+        servers["groups"] = [random_rack(rng)]
+    else:
+        full = rng.uniform(80, 500, racks)
+        servers["power_w"] = np.stack([full, full * rng.uniform(0, 0.6, racks)], axis=1).tolist()
+        hall["servers_per_rack"] = rng.integers(1, 300, racks).tolist()
+    if rng.integers(3) == 0:
+        hall["capacity_mw"] = float(rng.uniform(0.05, 0.5))
+    return config_from_dict({**values, "name": name}, name)
+
+
+def random_fleet(
+    seed: int, outlet_model: str = "server", exponent: float = 3.0
+) -> tuple[list[DataCenterConfig], F64, F64]:
+    """A ragged fleet, supply air and load."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 7))
+    configs = [random_config(rng, f"dc{i}", outlet_model, exponent) for i in range(count)]
+    load = rng.choice([0.0, 1.0, *rng.uniform(0, 1, 4)], count)
+    return configs, rng.uniform(17, 28, count), load
+
+
+def solve(
+    configs: list[DataCenterConfig], supply_c: F64, load: F64, precision: Precision
+) -> HallSums:
+    """Sums per data center and rack of a fleet."""
+    return Hall(build_fleet(configs), precision).solve(supply_c, load)
+
+
+def solve_servers(
+    configs: list[DataCenterConfig], supply_c: F64, load: F64, precision: Precision
+) -> tuple[HallSums, dict[str, Any]]:
+    """Sums and server layers of a fleet."""
+    hall = Hall(build_fleet(configs), precision)
+    sums, layers = hall.solve(supply_c, load), hall.servers()
+    return sums, {f.name: getattr(layers, f.name) for f in fields(layers)}
+
+
+def assert_close(found: Any, expected: Any, rel: float, name: str) -> None:
+    np.testing.assert_allclose(found, expected, rtol=rel, atol=0, err_msg=name)
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+@pytest.mark.parametrize("outlet_model", OUTLETS)
+@pytest.mark.parametrize("exponent", EXPONENTS)
+@settings(max_examples=8)
+@given(seed=SEEDS)
+def test_sums_agree_with_the_twin(
+    precision: Precision, outlet_model: str, exponent: float, seed: int
+) -> None:
+    configs, supply_c, load = random_fleet(seed, outlet_model, exponent)
+    sums = solve(configs, supply_c, load, precision)
+    twin = reference_twin.evaluate(configs, supply_c, load)
+    for name, expected in twin.dcs.items():
+        assert_close(getattr(sums, name), expected, TOLERANCE[precision], name)
+    for name, expected in twin.racks.items():
+        assert_close(getattr(sums, f"rack_{name}"), expected, TOLERANCE[precision], f"rack {name}")
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+@pytest.mark.parametrize("outlet_model", OUTLETS)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_servers_agree_with_the_twin(precision: Precision, outlet_model: str, seed: int) -> None:
+    configs, supply_c, load = random_fleet(seed, outlet_model)
+    _, servers = solve_servers(configs, supply_c, load, precision)
+    twin = reference_twin.evaluate(configs, supply_c, load)
+    for name, expected in twin.servers.items():
+        assert_close(servers[name], expected, TOLERANCE[precision], f"server {name}")
+
+
+@pytest.mark.parametrize("field", ["full_w", "count", "inlet_offset_k", "load_weight"])
+def test_twin_sees_a_change_of_any_group_value(field: str) -> None:
+    rng = np.random.default_rng(5)
+    config = random_config(rng, "dc", "server", 3.0).model_dump(mode="json")
+    config["servers"]["groups"] = [random_rack(rng) + random_rack(rng)]
+    config["hall"]["capacity_mw"] = None
+    supply, load = np.array([22.0]), np.array([0.6])
+    sums = solve([config_from_dict(config)], supply, load, "f64")
+    group = config["servers"]["groups"][0][1]
+    group[field] += 1 if field == "count" else 1e-6
+    twin = reference_twin.evaluate([config_from_dict(config)], supply, load)
+    same = np.allclose(sums.rack_cpu_w, twin.racks["cpu_w"], rtol=1e-12, atol=0)
+    assert not same, f"{field} has no effect on CPU power"
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+@pytest.mark.parametrize("seed", [3, 4])
+def test_server_layers_are_the_values_of_their_group(precision: Precision, seed: int) -> None:
+    configs, supply_c, load = random_fleet(seed)
+    fleet = build_fleet(configs)
+    sums, servers = solve_servers(configs, supply_c, load, precision)
+    first, counts = fleet.server_start[:-1], np.diff(fleet.server_start)
+    for values in servers.values():
+        assert values.shape == (fleet.servers,)
+        assert values.dtype == np.dtype(np.float32 if precision == "f32" else np.float64)
+        assert np.array_equal(values, np.repeat(values[first], counts))
+    rel = TOLERANCE[precision]
+    rack_of = fleet.server_rack()
+    for total, layer in (
+        (sums.rack_cpu_w.astype(np.float64) + sums.rack_fan_w, servers["power_w"]),
+        (sums.rack_inlet_c * np.bincount(rack_of), servers["inlet_c"]),
+    ):
+        assert_close(total, np.bincount(rack_of, layer, fleet.racks), rel, "sum per rack")
+    hottest = np.maximum.reduceat(servers["inlet_c"], fleet.server_start[fleet.group_start[:-1]])
+    assert np.array_equal(sums.rack_inlet_max_c, hottest)
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+@settings(max_examples=10)
+@given(seed=SEEDS)
+def test_data_centers_are_the_sums_and_means_of_their_racks(
+    precision: Precision, seed: int
+) -> None:
+    configs, supply_c, load = random_fleet(seed)
+    fleet = build_fleet(configs)
+    sums = solve(configs, supply_c, load, precision)
+    racks = np.diff(fleet.rack_start)
+
+    def total(name: str) -> F64:
+        rack_values = getattr(sums, f"rack_{name}").astype(np.float64)
+        return np.bincount(fleet.rack_dc, rack_values, fleet.size)
+
+    for name in ("cpu_w", "fan_w", "airflow_m3s"):
+        assert_close(getattr(sums, name), total(name), 1e-14, name)
+    assert_close(sums.inlet_mean_c, total("inlet_c") / racks, 1e-14, "inlet")
+    assert_close(sums.outlet_mean_c, total("outlet_c") / racks, 1e-14, "outlet")
+    hottest = np.maximum.reduceat(sums.rack_inlet_max_c, fleet.rack_start[:-1])
+    assert np.array_equal(sums.inlet_max_c, hottest.astype(np.float64))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("load", [0.0, 0.35, 0.8, 1.0])
+def test_load_weights_conserve_the_work_of_a_rack(seed: int, load: float) -> None:
+    # With power proportional to load and no fan power, a server's power is its share of the work.
+    rng = np.random.default_rng(seed)
+    values = preset_values("tiny")
+    values["servers"] |= {
+        "cpu_power_ratio_lb": [0.0, 1.0],
+        "cpu_power_ratio_ub": [0.0, 1.0],
+        "fan_reference_w": 0.0,
+        "groups": [
+            [{**g, "full_w": 100.0, "idle_w": 0.0} for g in random_rack(rng)] for _ in range(4)
+        ],
+    }
+    config = config_from_dict(values)
+    sums, servers = solve_servers([config], np.array([20.0]), np.array([load]), "f64")
+    share = servers["power_w"] / 100.0
+    assert np.all((share >= 0.0) & (share <= 1.0))
+    counts = [sum(g.count for g in rack) for rack in config.rack_groups()]
+    assert_close(np.asarray(sums.rack_cpu_w) / 100.0, load * np.array(counts), 1e-12, "work")
+    assert share.sum() == pytest.approx(load * sum(counts), rel=1e-12)
+    assert (np.ptp(share) > 0) == (0 < load < 1)
+
+
+def results_equal(one: HallSums, other: HallSums) -> bool:
+    return all(np.array_equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_a_second_run_is_equal_to_the_bit(precision: Precision) -> None:
+    fleet = random_fleet(6)
+    (first, layers), (second, again) = (solve_servers(*fleet, precision) for _ in range(2))
+    assert results_equal(first, second)
+    assert all(np.array_equal(layers[name], again[name]) for name in layers)
+
+
+def part_of(sums: HallSums, configs: list[DataCenterConfig], index: int) -> HallSums:
+    """The sums of one data center of a fleet."""
+    start = np.concatenate([[0], np.cumsum([c.hall.racks for c in configs])])
+    racks, dc = slice(start[index], start[index + 1]), slice(index, index + 1)
+    return HallSums(
+        *(getattr(sums, f.name)[racks if f.name.startswith("rack_") else dc] for f in fields(sums))
+    )
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+@pytest.mark.parametrize("outlet_model", OUTLETS)
+@settings(max_examples=6)
+@given(seed=SEEDS)
+def test_a_data_center_of_a_batch_equals_itself_alone(
+    precision: Precision, outlet_model: str, seed: int
+) -> None:
+    exponent = EXPONENTS[seed % len(EXPONENTS)]
+    configs, supply_c, load = random_fleet(seed, outlet_model, exponent)
+    batch = solve(configs, supply_c, load, precision)
+    for i, config in enumerate(configs):
+        alone = solve([config], supply_c[i : i + 1], load[i : i + 1], precision)
+        assert results_equal(alone, part_of(batch, configs, i)), i
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_servers_of_a_batch_equal_themselves_alone(precision: Precision) -> None:
+    configs, supply_c, load = random_fleet(7)
+    fleet = build_fleet(configs)
+    assert fleet.size > 3
+    _, servers = solve_servers(configs, supply_c, load, precision)
+    start = fleet.server_start[fleet.group_start[fleet.rack_start]]
+    for i, config in enumerate(configs):
+        _, own = solve_servers([config], supply_c[i : i + 1], load[i : i + 1], precision)
+        for name, values in servers.items():
+            assert np.array_equal(own[name], values[start[i] : start[i + 1]]), (i, name)
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_fan_exponents_may_differ_within_a_fleet(precision: Precision) -> None:
+    rng = np.random.default_rng(11)
+    configs = [
+        random_config(rng, f"dc{i}", "server", e) for i, e in enumerate((3.0, 1.0, 2.5, 3.0))
+    ]
+    supply_c, load = np.array([18.0, 20.0, 22.0, 24.0]), np.array([0.3, 0.5, 0.7, 0.9])
+    batch = solve(configs, supply_c, load, precision)
+    for i, config in enumerate(configs):
+        alone = solve([config], supply_c[i : i + 1], load[i : i + 1], precision)
+        assert results_equal(alone, part_of(batch, configs, i)), f"dc{i}"
+
+
+def hall_of_many_racks(racks: int) -> DataCenterConfig:
+    """Enough racks and servers for every thread to get slices of both kernels."""
+    rng = np.random.default_rng(racks)
+    values = preset_values("large")
+    values["hall"] |= {
+        "rows": 1,
+        "racks_per_row": racks,
+        "supply_approach_k": rng.uniform(3, 6, racks).tolist(),
+        "servers_per_rack": rng.integers(20, 60, racks).tolist(),
+    }
+    values["servers"]["power_w"] = [[f, 0.1 * f] for f in rng.uniform(200, 500, racks).tolist()]
+    return config_from_dict(values | {"name": f"racks-{racks}"})
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_large_and_small_halls_in_one_fleet_equal_themselves_alone(precision: Precision) -> None:
+    sizes = (1, 63, 64, 65, 500, 2, 1100)
+    configs = [hall_of_many_racks(n) for n in sizes]
+    supply_c, load = np.linspace(16, 23, len(sizes)), np.linspace(0.1, 1, len(sizes))
+    batch = solve(configs, supply_c, load, precision)
+    for i, config in enumerate(configs):
+        alone = solve([config], supply_c[i : i + 1], load[i : i + 1], precision)
+        assert results_equal(alone, part_of(batch, configs, i)), f"{sizes[i]} racks"
+
+
+def digest_of_large_hall() -> str:
+    """Fingerprint of everything the kernels compute for a large hall, in both precisions."""
+    config = hall_of_many_racks(1500)
+    digest = hashlib.sha256()
+    precisions: tuple[Precision, ...] = ("f32", "f64")
+    for precision in precisions:
+        sums, servers = solve_servers([config], np.array([19.0]), np.array([0.55]), precision)
+        for f in fields(sums):
+            digest.update(np.ascontiguousarray(getattr(sums, f.name)).tobytes())
+        for values in servers.values():
+            digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
+    code = (
+        "import test_kernels as t; from sdc_taichi import runtime;"
+        "print(runtime.ensure_started(), t.digest_of_large_hall())"
+    )
+    found = {}
+    for threads in (1, 2, 3):
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=os.path.dirname(__file__),
+            env={**os.environ, "SDC_TAICHI_THREADS": str(threads)},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=True,
+        )
+        used, found[threads] = done.stdout.split()
+        assert int(used) == threads
+    assert len(set(found.values())) == 1, found
+
+
+@settings(max_examples=20)
+@given(supply_c=st.floats(16, 27), load=st.floats(0, 0.99), warmer_k=st.floats(0, 1), seed=SEEDS)
+def test_warmer_air_and_more_load_never_lower_power(
+    supply_c: float, load: float, warmer_k: float, seed: int
+) -> None:
+    config = random_config(np.random.default_rng(seed), "dc", "server", 3.0)
+    hall = Hall(build_fleet(config), "f64")
+    cool = hall.solve(np.array([supply_c]), np.array([load]))
+    warm = hall.solve(np.array([supply_c + warmer_k]), np.array([load]))
+    busy = hall.solve(np.array([supply_c]), np.array([min(1.0, load + 0.01)]))
+    assert np.all(warm.rack_cpu_w >= cool.rack_cpu_w)
+    assert np.all(warm.rack_fan_w >= cool.rack_fan_w)
+    assert np.all(busy.cpu_w >= cool.cpu_w * (1 - 1e-12))
+
+
+def test_server_layers_need_a_solve() -> None:
+    hall = Hall(build_fleet(load_config("tiny")), "f32")
+    with pytest.raises(RuntimeStateError, match="no step has been done yet"):
+        hall.servers()
+    hall.solve(np.array([20.0]), np.array([0.5]))
+    layers = hall.servers()
+    assert layers.power_w.shape == (12,)
+    assert hall.servers(into=layers) is layers
+    hall.forget()
+    with pytest.raises(RuntimeStateError, match="no step has been done yet"):
+        hall.servers()

@@ -1,0 +1,290 @@
+"""Delay-tolerant work: conservation, deadlines and ages against a queue of single batches."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sdc_taichi.plant.workload import MODELS, TASKS_PER_STEP, Work, age_histogram
+from sdc_taichi.types import F64
+
+LENGTH = 40
+"""Steps of age the queue arrays tell apart, more than any run here lasts."""
+
+STEPS = st.lists(
+    st.tuples(st.floats(0, 1), st.one_of(st.sampled_from([-1.0, 0.0, 1.0]), st.floats(-1, 1))),
+    min_size=10,
+    max_size=36,
+)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Parameters of one data center."""
+
+    flexible_share: float
+    max_utilisation: float
+    queue_limit: float
+    deadline_steps: float
+
+    def arrays(self) -> dict[str, F64]:
+        return {f.name: np.array([getattr(self, f.name)]) for f in fields(self)}
+
+
+LIMITS = st.builds(
+    Limits,
+    flexible_share=st.floats(0, 1),
+    max_utilisation=st.sampled_from([0.3, 0.7, 0.9, 1.0]),
+    queue_limit=st.sampled_from([40.0, 130.0, 1000.0, math.inf]),
+    deadline_steps=st.sampled_from([1.0, 3.0, 8.0, math.inf]),
+)
+
+
+@dataclass
+class Batch:
+    step: int
+    amount: float
+
+
+@dataclass
+class Line:
+    """A first-in-first-out line of batches, each with the step that put it in."""
+
+    batches: deque[Batch] = field(default_factory=deque)
+
+    @property
+    def length(self) -> float:
+        return math.fsum(b.amount for b in self.batches)
+
+    def waited(self, steps: float, now: int) -> float:
+        """Work that has waited ``steps`` or more at step ``now``."""
+        return math.fsum(b.amount for b in self.batches if now - b.step >= steps)
+
+    def take(self, amount: float) -> None:
+        while amount > 1e-12 and self.batches:
+            taken = min(amount, self.batches[0].amount)
+            self.batches[0].amount -= taken
+            amount -= taken
+            if self.batches[0].amount <= 1e-12:
+                self.batches.popleft()
+
+    def ages(self, now: int) -> list[tuple[int, float]]:
+        return [(now - b.step, b.amount) for b in self.batches if b.amount > 1e-9]
+
+
+def expected_step(
+    model: str, line: Line, now: int, demand: float, command: float, limits: Limits
+) -> dict[str, float]:
+    """One step of the line, in words of the model's description."""
+    capacity = limits.max_utilisation * 100.0
+    defer, drain = max(-command, 0.0), max(command, 0.0)
+    if model == "fluid":
+        arrived = 100.0 * demand
+        flexible = limits.flexible_share * arrived
+        due = line.waited(limits.deadline_steps, now)
+        at_once = min(arrived - defer * flexible, capacity)
+        forced = min(due, capacity - at_once)
+        held_back = arrived - at_once
+    else:
+        capacity = math.floor(capacity)
+        fixed = math.ceil(demand * (1.0 - limits.flexible_share) * 100.0)
+        flexible = math.floor(demand * limits.flexible_share * 100.0)
+        arrived = fixed + flexible
+        due = line.waited(limits.deadline_steps + 1.0, now)
+        forced = min(due, max(capacity - arrived, 0.0))
+        held_back = math.floor(defer * flexible)
+    line.take(forced)
+    deferred = min(held_back, limits.queue_limit - line.length)
+    dropped = held_back - deferred
+    if model == "fluid":
+        drained = min(line.length, drain * (capacity - at_once - forced))
+        executed = at_once + forced + drained
+    else:
+        free = max(capacity - arrived - forced, 0.0)
+        drained = math.floor(drain * min(line.length, flexible, free))
+        executed = arrived - deferred + forced + drained
+    line.take(drained)
+    if deferred > 0:
+        line.batches.append(Batch(now, deferred))
+    ages = line.ages(now)
+    total = math.fsum(amount for _, amount in ages)
+    return {
+        "utilisation": executed / 100.0,
+        "arrived": arrived,
+        "executed": executed,
+        "deferred": deferred,
+        "drained": drained,
+        "due": due,
+        "overdue": due - forced,
+        "dropped": dropped,
+        "oldest_age_steps": max((age for age, _ in ages), default=0),
+        "mean_age_steps": math.fsum(a * n for a, n in ages) / total if total else 0.0,
+    }
+
+
+def one_step(model: str, queue: F64, demand: float, command: float, limits: Limits) -> Work:
+    return MODELS[model](np.array([demand]), np.array([command]), queue, **limits.arrays())
+
+
+def whole(steps: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Commands as agents give them: whole tasks depend on the last bit of a share of them."""
+    return [(demand, float(np.sign(command))) for demand, command in steps]
+
+
+@pytest.mark.parametrize("model", MODELS)
+@settings(max_examples=150)
+@given(steps=STEPS, limits=LIMITS)
+def test_every_step_equals_a_line_of_batches(
+    model: str, steps: list[tuple[float, float]], limits: Limits
+) -> None:
+    queue, line = np.zeros((1, LENGTH)), Line()
+    for now, (demand, command) in enumerate(whole(steps) if model == "tasks" else steps):
+        work = one_step(model, queue, demand, command, limits)
+        queue = work.queue
+        expected = expected_step(model, line, now, demand, command, limits)
+        for name, value in expected.items():
+            tolerance = 0.0 if model == "tasks" and name not in ("mean_age_steps",) else 1e-8
+            if name == "oldest_age_steps" and model == "fluid":
+                continue  # what rounding leaves of a batch is compared below
+            found = float(getattr(work, name)[0])
+            assert abs(found - value) <= tolerance + 1e-12 * abs(value), (now, name, found, value)
+        if model == "fluid":
+            old = line.waited(work.oldest_age_steps[0] + 1.0, now)
+            assert old <= 1e-8, "older work than reported"
+            assert line.waited(work.oldest_age_steps[0], now) >= min(1e-9, line.length) - 1e-10
+        edges = np.array([0.0, 1.0, 3.0, 10.0, 20.0])
+        bins = [
+            math.fsum(n for a, n in line.ages(now) if low <= a < high)
+            for low, high in zip(edges, [*edges[1:], math.inf], strict=True)
+        ]
+        np.testing.assert_allclose(age_histogram(queue, edges)[0], bins, rtol=0, atol=1e-7)
+
+
+@settings(max_examples=150)
+@given(steps=STEPS, limits=LIMITS)
+def test_fluid_work_is_conserved_and_within_its_limits(
+    steps: list[tuple[float, float]], limits: Limits
+) -> None:
+    queue = np.zeros((1, LENGTH))
+    arrived = executed = dropped = 0.0
+    capacity = TASKS_PER_STEP * limits.max_utilisation
+    for demand, command in steps:
+        before = queue[0, -1]
+        work = one_step("fluid", queue, demand, command, limits)
+        queue = work.queue
+        a, e, d = (float(x[0]) for x in (work.arrived, work.executed, work.dropped))
+        assert a == pytest.approx(e + queue[0, -1] - before + d, abs=1e-10)
+        assert min(e, d, queue[0, -1], float(work.deferred[0])) >= 0.0
+        assert e <= capacity * (1 + 1e-12)
+        assert queue[0, -1] <= limits.queue_limit * (1 + 1e-12)
+        assert np.all(np.diff(queue[0]) >= 0.0)
+        if d > 1e-9:
+            assert queue[0, -1] == pytest.approx(limits.queue_limit), "dropped before it was full"
+        if work.overdue[0] > 1e-9:
+            assert e == pytest.approx(capacity), "overdue with capacity to spare"
+        elif work.due[0] == 0 and command == 0 and a <= capacity:
+            assert e == a, "neutral runs what arrives"
+        if command == 1:
+            assert e == pytest.approx(min(a + before, capacity), abs=1e-9), "drain runs all it can"
+        arrived, executed, dropped = arrived + a, executed + e, dropped + d
+    assert arrived == pytest.approx(executed + queue[0, -1] + dropped, abs=1e-9)
+
+
+@settings(max_examples=150)
+@given(steps=STEPS, limits=LIMITS)
+def test_whole_tasks_stay_whole_and_are_conserved(
+    steps: list[tuple[float, float]], limits: Limits
+) -> None:
+    queue = np.zeros((1, LENGTH))
+    for demand, command in steps:
+        before = queue[0, -1]
+        work = one_step("tasks", queue, demand, command, limits)
+        queue = work.queue
+        for f in fields(work):
+            if f.name not in ("utilisation", "mean_age_steps"):
+                values = getattr(work, f.name)
+                assert np.array_equal(values, np.rint(values)), f.name
+        # Tasks that find the queue full count as dropped and run all the same.
+        assert work.arrived[0] == work.executed[0] + queue[0, -1] - before
+        assert abs(work.arrived[0] - 100.0 * demand) < 1.0 + 1e-9
+        cap = math.floor(limits.max_utilisation * 100.0)
+        assert work.executed[0] <= max(cap, work.arrived[0])
+        assert queue[0, -1] <= limits.queue_limit
+
+
+@given(steps=STEPS, limits=LIMITS, deadline=st.sampled_from([1.0, 3.0, 8.0]))
+def test_no_work_outlives_its_deadline_where_capacity_allows(
+    steps: list[tuple[float, float]], limits: Limits, deadline: float
+) -> None:
+    limits = Limits(limits.flexible_share, 1.0, limits.queue_limit, deadline)
+    queue = np.zeros((1, LENGTH))
+    for demand, command in steps:
+        work = one_step("fluid", queue, 0.5 * demand, -abs(command), limits)
+        queue = work.queue
+        # At most half the capacity arrives, and no more than that can be due in one step.
+        assert work.overdue[0] <= 1e-9
+        assert work.oldest_age_steps[0] < deadline
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_full_queue_drops(model: str) -> None:
+    limits = Limits(0.5, 0.9, 120.0, math.inf)
+    queue, dropped = np.zeros((1, LENGTH)), []
+    for _ in range(6):
+        work = one_step(model, queue, 0.8, -1.0, limits)
+        queue = work.queue
+        dropped.append(float(work.dropped[0]))
+    assert dropped == [0, 0, 0, 40, 40, 40]
+    assert queue[0, -1] == 120
+    assert work.executed[0] == (80 if model == "tasks" else 40)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_work_older_than_the_array_is_kept_and_counted_at_its_end(model: str) -> None:
+    limits = Limits(0.5, 0.9, math.inf, math.inf)
+    queue = one_step(model, np.zeros((1, 6)), 0.8, -1.0, limits).queue
+    for _ in range(9):
+        work = one_step(model, queue, 0.0, -1.0, limits)
+        queue = work.queue
+    assert queue[0, -1] == 40
+    assert work.oldest_age_steps[0] == work.mean_age_steps[0] == 5
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_batch_equals_each_data_center_alone(model: str) -> None:
+    rng = np.random.default_rng(3)
+    size = 7
+    given: dict[str, Any] = {
+        "flexible_share": rng.uniform(0, 1, size),
+        "max_utilisation": rng.choice([0.5, 0.9, 1.0], size),
+        "queue_limit": rng.choice([50.0, 300.0, np.inf], size),
+        "deadline_steps": rng.choice([4.0, 12.0, np.inf], size),
+    }
+    queues, single = np.zeros((size, LENGTH)), [np.zeros((1, LENGTH)) for _ in range(size)]
+    for _ in range(60):
+        demand, command = rng.uniform(0, 1, size), rng.uniform(-1, 1, size)
+        together = MODELS[model](demand, command, queues, **given)
+        queues = together.queue
+        for i in range(size):
+            own = {name: values[i : i + 1] for name, values in given.items()}
+            alone = MODELS[model](demand[i : i + 1], command[i : i + 1], single[i], **own)
+            single[i] = alone.queue
+            for f in fields(alone):
+                part = getattr(together, f.name)[i : i + 1]
+                assert np.array_equal(getattr(alone, f.name), part), (i, f.name)
+
+
+def test_age_histogram_by_hand() -> None:
+    limits = Limits(1.0, 1.0, math.inf, math.inf)
+    queue = np.zeros((1, 30))
+    for demand in (0.1, 0.2, 0.3, 0.0, 0.05):
+        queue = one_step("fluid", queue, demand, -1.0, limits).queue
+    found = age_histogram(queue, np.array([0.0, 2.0, 3.0, 25.0, 99.0]))
+    np.testing.assert_allclose(found, [[5.0, 30.0, 30.0, 0.0, 0.0]], atol=1e-12)

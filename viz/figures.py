@@ -1,0 +1,326 @@
+"""Pictures of results with matplotlib: a hall's rack temperatures and a dashboard of a run.
+
+Every function returns a ``matplotlib.figure.Figure``; ``figure.savefig(path)`` writes it. pyplot is
+not used, so no window or global state is touched. Colours are those of Okabe and Ito (2008), "Color
+Universal Design", and the inferno map, which readers with colour vision deficiency can tell apart.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sdc_taichi.config import first_step_day
+from sdc_taichi.errors import SdcError
+from sdc_taichi.fleet import Fleet
+from sdc_taichi.types import F64, Reals, StepResult
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LABELLED_RACKS = 60
+"""Largest hall whose racks show their temperature as a number."""
+MIN_COLOUR_RANGE_K = 2.0
+TIE_K = 0.05
+"""Racks this close to the hottest one count as equally hot; the labels show no finer steps."""
+
+BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
+PINK, SKY, GREY = "#CC79A7", "#56B4E9", "#777777"
+
+POWERS = {
+    "it_w": ("IT", BLUE),
+    "chiller_w": ("chiller", ORANGE),
+    "tower_fan_w": ("tower fan", SKY),
+    "chilled_pump_w": ("chilled-water pump", GREEN),
+    "condenser_pump_w": ("condenser pump", PINK),
+    "crac_fan_w": ("CRAC fan", RED),
+}
+"""Stacked powers: column to name and colour."""
+
+COLUMNS = (
+    "time",
+    "outdoor_c",
+    "wet_bulb_c",
+    "setpoint_c",
+    *POWERS,
+    "hvac_w",
+    "ci_g_per_kwh",
+    "carbon_g",
+    "queue_tasks",
+    "soc",
+)
+"""Columns that a picture of a run reads."""
+
+
+def hall_map(result: StepResult, fleet: Fleet, dc: int = 0) -> Figure:
+    """Inlet and outlet temperature of every rack of one hall, hottest racks outlined.
+
+    Args:
+        result: one step.
+        fleet: the fleet it belongs to.
+        dc: index of the data center.
+
+    Raises:
+        SdcError: matplotlib is missing, or result, fleet and index do not fit together.
+    """
+    figure = _figure(9.6, 4.2)
+    _check_result(result, fleet, dc)
+    for what, axes in zip(("inlet", "outlet"), figure.subplots(1, 2), strict=True):
+        _draw_hall(axes, what, result, fleet, dc)
+    figure.suptitle(f"{fleet.names[dc]}: {_clock(result, fleet, dc)}", x=0.01, ha="left")
+    return figure
+
+
+def overview(steps: pd.DataFrame) -> Figure:
+    """A run of one data center: weather, power by device, carbon, queue and battery.
+
+    Args:
+        steps: one row per step with ``time`` and the columns of ``StepResult.per_dc``.
+
+    Raises:
+        SdcError: matplotlib is missing, a column is missing, fewer than two rows, or times that do
+            not increase.
+    """
+    figure = _figure(12.0, 9.0)
+    _check_steps(steps)
+    draws = (_draw_temperatures, _draw_power, _draw_carbon, _draw_storage)
+    all_axes = figure.subplots(4, 1, sharex=True, height_ratios=[3, 4, 3, 3])
+    for axes, draw in zip(all_axes, draws, strict=True):
+        draw(axes, steps)
+    _format_time(all_axes[-1], steps)
+    return figure
+
+
+def readme_picture(result: StepResult, fleet: Fleet, steps: pd.DataFrame, dc: int = 0) -> Figure:
+    """The hall at one step beside power and carbon of the run, 1600 x 700 pixels at 100 dpi.
+
+    Args:
+        result: one step of the run; it is marked in the series.
+        fleet: the fleet it belongs to.
+        steps: the run of that data center, as for ``overview``.
+        dc: index of the data center.
+
+    Raises:
+        SdcError: as ``hall_map`` and ``overview``, or a step that the run does not have.
+    """
+    figure = _figure(16.0, 7.0)
+    _check_result(result, fleet, dc)
+    _check_steps(steps)
+    when = _step_time(result, fleet, dc)
+    if when not in steps["time"].to_numpy():
+        raise SdcError(f"step {result.step} at {when}: the run has no such time")
+    left, right = figure.subfigures(1, 2, width_ratios=[4, 5], squeeze=False)[0]
+    for what, axes in zip(("inlet", "outlet"), left.subplots(2, 1), strict=True):
+        _draw_hall(axes, what, result, fleet, dc)
+    left.suptitle(f"Racks on {_clock(result, fleet, dc)}", fontsize=13)
+    right.suptitle("Power, carbon, queue and battery", fontsize=13)
+    all_axes = right.subplots(3, 1, sharex=True, height_ratios=[4, 3, 3])
+    for axes, draw in zip(all_axes, (_draw_power, _draw_carbon, _draw_storage), strict=True):
+        draw(axes, steps)
+        axes.axvline(when, color="black", linewidth=1, linestyle=":")
+    _format_time(all_axes[-1], steps)
+    return figure
+
+
+def _figure(width_in: float, height_in: float) -> Figure:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise SdcError(
+            f'pictures need matplotlib ({error}); install it with: pip install "sdc-taichi[plot]"'
+        ) from None
+    return Figure(figsize=(width_in, height_in), dpi=100, layout="constrained")
+
+
+def _check_result(result: StepResult, fleet: Fleet, dc: int) -> None:
+    if not 0 <= dc < fleet.size:
+        raise SdcError(f"data center {dc}: valid is 0..{fleet.size - 1}")
+    if len(result.rack_inlet_c) != fleet.racks:
+        raise SdcError(
+            f"result of {len(result.rack_inlet_c)} racks, expected {fleet.racks} as in the fleet"
+        )
+
+
+def _check_steps(steps: pd.DataFrame) -> None:
+    missing = [name for name in COLUMNS if name not in steps.columns]
+    if missing:
+        raise SdcError(f"steps: missing columns {', '.join(missing)}")
+    times = steps["time"].to_numpy()
+    if len(times) < 2 or not np.all(times[1:] > times[:-1]):
+        raise SdcError(
+            f"steps: {len(times)} rows; valid are two or more with increasing time, "
+            "of one data center"
+        )
+
+
+def _step_time(result: StepResult, fleet: Fleet, dc: int) -> np.datetime64:
+    day = np.datetime64("2001-01-01", "s") + np.timedelta64(
+        first_step_day(fleet.configs[dc].site.start), "D"
+    )
+    return day + np.timedelta64(round(result.step * result.step_h * 3600), "s")
+
+
+def _clock(result: StepResult, fleet: Fleet, dc: int) -> str:
+    when: datetime = _step_time(result, fleet, dc).astype(datetime)
+    return f"{when.day} {when:%B %H:%M}"
+
+
+def _draw_hall(axes: Axes, what: str, result: StepResult, fleet: Fleet, dc: int) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    hall = fleet.configs[dc].hall
+    every: Reals = result.rack_inlet_c if what == "inlet" else result.rack_outlet_c
+    grid = np.asarray(every[slice(*fleet.rack_start[dc : dc + 2])], dtype=np.float64)
+    grid = grid.reshape(hall.rows, hall.racks_per_row)
+    low, high = _colour_range(grid)
+    image = axes.pcolormesh(
+        grid,
+        cmap="inferno",
+        vmin=low,
+        vmax=high,
+        edgecolors="white" if grid.size <= LABELLED_RACKS else "none",
+        linewidth=1.5,
+    )
+    axes.invert_yaxis()
+    for axis, count in ((axes.xaxis, hall.racks_per_row), (axes.yaxis, hall.rows)):
+        shown = np.arange(0, count, max(1, count // 10))
+        axis.set_ticks(shown + 0.5, [str(i) for i in shown])
+        axis.set_tick_params(length=0)
+    axes.set(xlabel="rack in row", ylabel="row")
+    axes.spines[:].set_visible(False)
+    if grid.size <= LABELLED_RACKS:
+        for (row, rack), value in np.ndenumerate(grid):
+            ink = "black" if value > (low + high) / 2 else "white"
+            axes.text(rack + 0.5, row + 0.5, f"{value:.1f}", color=ink, ha="center", va="center")
+    _outline_hottest(axes, what, grid)
+    ticks = MaxNLocator(6, steps=[1, 2, 5, 10])
+    axes.figure.colorbar(image, ax=axes, label=f"{what} (°C)", ticks=ticks)
+
+
+def _colour_range(grid: F64) -> tuple[float, float]:
+    """Range of the values, widened so that differences of a few tenths look small."""
+    middle = (grid.min() + grid.max()) / 2
+    half = max((grid.max() - grid.min()) / 2, MIN_COLOUR_RANGE_K / 2)
+    return float(middle - half), float(middle + half)
+
+
+def _outline_hottest(axes: Axes, what: str, grid: F64) -> None:
+    """Outline the hottest racks of a small hall and ring the first of them in a large one."""
+    from matplotlib.patches import Rectangle
+
+    hottest = np.argwhere(grid >= grid.max() - TIE_K)
+    row, rack = np.unravel_index(grid.argmax(), grid.shape)
+    where = f"row {row} rack {rack}" + (f" and {len(hottest) - 1} more" * (len(hottest) > 1))
+    if len(hottest) == grid.size > 1:
+        where = "all racks alike"
+    elif grid.size <= LABELLED_RACKS:
+        for y, x in hottest + 0.04:
+            axes.add_patch(Rectangle((x, y), 0.92, 0.92, fill=False, color=SKY, linewidth=2.5))
+    else:
+        axes.plot(rack + 0.5, row + 0.5, "o", color=SKY, markersize=12, mfc="none", mew=2.5)
+    title = f"Rack {what}: hottest {grid.max():.1f} °C, {where}"
+    axes.set_title(title, fontsize=10, loc="left")
+
+
+def _draw_temperatures(axes: Axes, steps: pd.DataFrame) -> None:
+    time = steps["time"]
+    axes.plot(time, steps["outdoor_c"], color=RED, linewidth=1.2, label="outdoor")
+    axes.plot(time, steps["wet_bulb_c"], color=SKY, linewidth=1.2, label="wet bulb")
+    axes.plot(
+        time,
+        steps["setpoint_c"],
+        color="black",
+        linewidth=1.2,
+        drawstyle="steps-post",
+        label="setpoint",
+    )
+    axes.set_ylabel("temperature (°C)")
+    _finish(axes)
+
+
+def _draw_power(axes: Axes, steps: pd.DataFrame) -> None:
+    powers = [steps[column] / 1e3 for column in POWERS]
+    axes.stackplot(
+        steps["time"],
+        powers,
+        labels=[name for name, _ in POWERS.values()],
+        colors=[colour for _, colour in POWERS.values()],
+        linewidth=0,
+    )
+    counted = (steps["it_w"] + steps["hvac_w"]) / 1e3
+    # Presets may leave devices out of the HVAC total.
+    if not np.allclose(counted, sum(powers), rtol=1e-6):
+        axes.plot(steps["time"], counted, color="black", linewidth=1.2, label="counted in total")
+    axes.set_ylabel("power (kW)")
+    axes.set_ylim(bottom=0)
+    _finish(axes)
+
+
+def _draw_carbon(axes: Axes, steps: pd.DataFrame) -> None:
+    time = steps["time"]
+    emitted = axes.twinx()
+    emitted.fill_between(time, steps["carbon_g"] / 1e3, color=GREY, alpha=0.35, linewidth=0)
+    emitted.set_ylabel("emitted (kg CO₂/step)", color=GREY)
+    emitted.set_ylim(bottom=0)
+    axes.plot(time, steps["ci_g_per_kwh"], color=RED, linewidth=1.4)
+    axes.set_ylabel("carbon intensity\n(g CO₂/kWh)", color=RED)
+    _put_in_front(axes, emitted)
+
+
+def _draw_storage(axes: Axes, steps: pd.DataFrame) -> None:
+    time = steps["time"]
+    charge = axes.twinx()
+    charge.fill_between(time, 100 * steps["soc"], color=GREEN, alpha=0.3, linewidth=0)
+    charge.set_ylabel("battery charge (%)", color=GREEN)
+    charge.set_ylim(0, 100)
+    axes.plot(time, steps["queue_tasks"], color=PINK, linewidth=1.4)
+    axes.set_ylabel("queue (tasks)", color=PINK)
+    axes.set_ylim(0, 1.05 * max(1.0, steps["queue_tasks"].max()))
+    _put_in_front(axes, charge)
+
+
+def _put_in_front(axes: Axes, behind: Axes) -> None:
+    axes.set_zorder(behind.get_zorder() + 1)
+    axes.patch.set_visible(False)
+    behind.spines[:].set_visible(False)
+    axes.margins(x=0)
+    axes.spines[:].set_visible(False)
+    axes.grid(alpha=0.25)
+
+
+def _finish(axes: Axes) -> None:
+    axes.margins(x=0)
+    axes.spines[:].set_visible(False)
+    axes.grid(alpha=0.25)
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(0, 1),
+        ncols=7,
+        fontsize=9,
+        frameon=False,
+        borderaxespad=0.2,
+        columnspacing=1.2,
+        handlelength=1.2,
+    )
+
+
+def _format_time(axes: Axes, steps: pd.DataFrame) -> None:
+    """Days and hours without the year, which is a placeholder."""
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
+    locator = AutoDateLocator(maxticks=9)  # type: ignore[no-untyped-call]
+    formats = ["%b", "%b", "%d %b", "%H:%M", "%H:%M", "%H:%M:%S"]
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(
+        ConciseDateFormatter(  # type: ignore[no-untyped-call]
+            locator,
+            formats=formats,
+            zero_formats=["%b", "%b", "%d %b", "%d %b", "%H:%M", "%H:%M"],
+            show_offset=False,
+        )
+    )
+    axes.set_xlabel("local standard time")
