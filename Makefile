@@ -21,7 +21,7 @@ help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(READY) ## Simulate July in New York and California; results in runs/demo.
-	$(VENV)/bin/sdc-taichi simulate --site ny,ca --days 31 --start 07-01 --out runs/demo
+	$(VENV)/bin/sdc-taichi simulate --site ny,ca --days 31 --start 07-01 --out runs/demo --record runs/demo/hall.rrd
 
 test: $(READY) ## Run all tests; those on measured files need SDC_REAL_DATA.
 	$(PY) -m pytest

@@ -370,12 +370,18 @@ class DataCenterConfig(_Section):
                 raise ValueError(_length_message("servers.groups", len(groups), racks))
             for index, rack in enumerate(groups):
                 _check_load_weights(index, rack)
-        coldest = self.hvac.setpoint.min_c
-        ratio = float(np.min(self.airflow_ratio(np.array([coldest]), np.array([0.0]))))
-        if ratio <= 0:
+        approach_k = np.broadcast_to(np.asarray(self.hall.supply_approach_k), (racks,))
+        if self.hall.supply_approach_limits_k is not None:
+            approach_k = np.clip(approach_k, *self.hall.supply_approach_limits_k)
+        lowest_k = np.array([min(g.inlet_offset_k for g in r) for r in groups] if groups else [0.0])
+        coldest_c = self.hvac.setpoint.min_c + approach_k + lowest_k
+        ratio = self.airflow_ratio(coldest_c, np.zeros(racks))
+        worst = int(np.argmin(ratio))
+        if ratio[worst] <= 0:
             raise ValueError(
-                f"servers: the airflow ratio is {ratio:.3g} at {coldest:g} C and no load; it must "
-                "be positive (raise fan_airflow_ratio_lb or set fan_airflow_ratio_limits)"
+                f"servers: the airflow ratio is {ratio[worst]:.3g} at {coldest_c[worst]:g} C, the "
+                f"coldest inlet of rack {worst}, and no load; it must be positive (raise "
+                "fan_airflow_ratio_lb or set fan_airflow_ratio_limits)"
             )
         return self
 

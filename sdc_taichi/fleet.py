@@ -43,8 +43,8 @@ STAGE_MODELS = {
 class Fleet:
     """Data centers that run in one simulator; B of them, R racks, G server groups, S servers.
 
-    All of them share the stage models and the time step; size, site, season and every parameter
-    may differ.
+    All of them share the stage models, the time step and the age horizon of the queue; size, site,
+    season and every other parameter may differ.
     """
 
     configs: tuple[DataCenterConfig, ...]
@@ -114,7 +114,8 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     """Lay data centers out as flat arrays.
 
     Raises:
-        ConfigError: no data center, equal names, or stage models or time steps that differ.
+        ConfigError: no data center, equal names, or stage models, time steps or age horizons that
+            differ.
     """
     listed = (configs,) if isinstance(configs, DataCenterConfig) else tuple(configs)
     if not listed:
@@ -122,6 +123,8 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     models = {stage: _shared(listed, path) for stage, path in STAGE_MODELS.items()}
     steps_per_hour = _shared(listed, "simulation.steps_per_hour")
     _shared(listed, "hvac.total_of")
+    # One queue array serves the fleet; ages are read off its length.
+    _shared(listed, "workload.age_horizon_h")
     _check_names(listed)
     # Copies share their hall and server sections, which are laid out once.
     cache: dict[tuple[int, int], _HallArrays] = {}

@@ -10,6 +10,7 @@ from dataclasses import fields
 from enum import Enum
 from pathlib import Path
 from typing import Any, Self
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -420,9 +421,11 @@ class Simulator:
             SdcError: the file cannot be read or is no snapshot of this fleet.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            # Opened here: np.load leaves its own file open when the archive is broken.
+            with open(path, "rb") as raw:
+                file = np.load(raw, allow_pickle=False)
                 values = {name: file[name] for name in file.files}
-        except (OSError, ValueError, EOFError, KeyError) as error:
+        except (OSError, ValueError, EOFError, KeyError, AttributeError, BadZipFile) as error:
             raise SdcError(f"{path}: cannot be read as a snapshot ({error})") from None
         self.load_state_dict(values)
 

@@ -28,7 +28,7 @@ def line(x0: float, x1: float, y0: float, y1: float, x: F64) -> F64:
     return np.asarray(y0 + (y1 - y0) / (x1 - x0) * (x - x0))
 
 
-def cpu_w(config: DataCenterConfig, full_w: float, idle_w: float, inlet_c: F64, load: F64) -> F64:
+def cpu_w(config: DataCenterConfig, full_w: F64, idle_w: F64, inlet_c: F64, load: F64) -> F64:
     """CPU power of one server, W (Sun et al. 2021: linear in inlet, shifted by load)."""
     s = config.servers
     ratio = line(
@@ -55,9 +55,7 @@ def airflow_ratio(config: DataCenterConfig, inlet_c: F64, load: F64) -> F64:
     return np.asarray(ratio)
 
 
-def evaluate(
-    configs: Sequence[DataCenterConfig], supply_c: Sequence[float], utilisation: Sequence[float]
-) -> Twin:
+def evaluate(configs: Sequence[DataCenterConfig], supply_c: F64, utilisation: F64) -> Twin:
     """Temperatures and power of every server at the given supply air and load."""
     servers: list[dict[str, F64]] = []
     racks: list[dict[str, float]] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -53,7 +55,7 @@ def test_series_of_different_length_repeat_on_their_own() -> None:
     ],
 )
 def test_impossible_arrays_are_refused(change: dict[str, list[float]], place: str) -> None:
-    given = {
+    given: dict[str, Any] = {
         "outdoor_c": [20.0, 20.0],
         "wet_bulb_c": [15.0, 15.0],
         "ci_g_per_kwh": [300.0, 300.0],

@@ -188,7 +188,7 @@ def test_data_centers_are_the_sums_and_means_of_their_racks(
 
     def total(name: str) -> F64:
         rack_values = getattr(sums, f"rack_{name}").astype(np.float64)
-        return np.bincount(fleet.rack_dc, rack_values, fleet.size)
+        return np.asarray(np.bincount(fleet.rack_dc, rack_values, fleet.size), dtype=np.float64)
 
     for name in ("cpu_w", "fan_w", "airflow_m3s"):
         assert_close(getattr(sums, name), total(name), 1e-14, name)

@@ -20,7 +20,7 @@ FIELDS = Battery.__slots__
 COMMAND_OF_CODE = {0: 1.0, 1: -1.0, 2: 0.0}
 
 PROPERTY = settings(max_examples=80, deadline=None, derandomize=True)
-five = {"min_size": 5, "max_size": 5}
+five: dict[str, Any] = {"min_size": 5, "max_size": 5}
 shares = st.lists(st.floats(0.0, 1.0, allow_subnormal=False), **five)
 commands = st.lists(st.floats(-1.0, 1.0, allow_subnormal=False), **five)
 names = st.sampled_from(sorted(BATTERIES))

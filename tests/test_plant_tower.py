@@ -24,7 +24,7 @@ FIELDS = Tower.__slots__
 PROPERTY = settings(max_examples=60, deadline=None, derandomize=True)
 wet_bulbs = st.floats(-34.4, 26.7)
 ranges = st.floats(1.1, 22.2)
-five = {"min_size": 5, "max_size": 5}
+five: dict[str, Any] = {"min_size": 5, "max_size": 5}
 
 # Design point of a York tower: 25.55 C wet bulb, 5.56 K range, 3.89 K approach.
 HEAT_W = 1e6

@@ -20,7 +20,7 @@ TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
 FIELDS = Water.__slots__
 
 PROPERTY = settings(max_examples=80, deadline=None, derandomize=True)
-five = {"min_size": 5, "max_size": 5}
+five: dict[str, Any] = {"min_size": 5, "max_size": 5}
 
 
 @pytest.fixture(autouse=True, scope="module")

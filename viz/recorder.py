@@ -122,7 +122,7 @@ class Recorder:
         self._last_step = -1
         self._open = False
         # Hidden and of another ending, so that nothing takes an unfinished file for a recording.
-        self._temporary = self._target.with_name(f".{self._target.name}.{uuid.uuid4().hex}.tmp")
+        self._temporary = self._target.with_name(f".{self._target.name}.{uuid.uuid4().hex}.part")
         _check_writable(self._target, self._temporary)
         self._stream = rr.RecordingStream("sdc_taichi")
         try:

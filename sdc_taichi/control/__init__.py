@@ -1,1 +1,34 @@
-"""Controllers that are not learned: from what a fleet shows to named actions."""
+"""Controllers that are not learned, and what a controller sees."""
+
+from sdc_taichi.control.registry import AGENTS, controller_names, make_controller
+from sdc_taichi.control.rules import (
+    Controller,
+    FixedSetpoint,
+    GreedyCarbon,
+    Idle,
+    Lookahead,
+    PerAgent,
+    Random,
+    TrimAndRespond,
+    trim_and_respond,
+)
+from sdc_taichi.control.view import Forecast, Limits, View, viewer
+
+__all__ = [
+    "AGENTS",
+    "Controller",
+    "FixedSetpoint",
+    "Forecast",
+    "GreedyCarbon",
+    "Idle",
+    "Limits",
+    "Lookahead",
+    "PerAgent",
+    "Random",
+    "TrimAndRespond",
+    "View",
+    "controller_names",
+    "make_controller",
+    "trim_and_respond",
+    "viewer",
+]

@@ -1,0 +1,122 @@
+"""Controllers by name, for the command line and for benchmarks."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from sdc_taichi.control.rules import (
+    Controller,
+    FixedSetpoint,
+    GreedyCarbon,
+    Idle,
+    Lookahead,
+    PerAgent,
+    Random,
+    TrimAndRespond,
+)
+from sdc_taichi.control.view import limits_of
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.fleet import Fleet
+
+AGENTS = ("load", "cooling", "battery")
+
+
+class _Entry(NamedTuple):
+    make: Callable[[], Controller]
+    agents: tuple[str, ...]
+    """What it controls."""
+
+
+_ENTRIES: dict[str, _Entry] = {
+    "idle": _Entry(Idle, AGENTS),
+    "random": _Entry(Random, AGENTS),
+    "g36": _Entry(TrimAndRespond, ("cooling",)),
+    "coldest": _Entry(lambda: FixedSetpoint("low"), ("cooling",)),
+    "warmest": _Entry(lambda: FixedSetpoint("high"), ("cooling",)),
+    "lookahead-3h": _Entry(lambda: Lookahead(3.0), ("battery",)),
+    "lookahead-24h": _Entry(lambda: Lookahead(24.0), ("battery",)),
+    "greedy-ci": _Entry(GreedyCarbon, ("load", "battery")),
+}
+_CONSTANT = "constant:C"
+
+
+def controller_names() -> tuple[str, ...]:
+    """Valid names; ``constant:C`` stands for a setpoint in C, such as ``constant:20``."""
+    return (*_ENTRIES, _CONSTANT)
+
+
+def make_controller(spec: str, fleet: Fleet) -> Controller:
+    """A controller by name, or one per agent.
+
+    Args:
+        spec: a name, or ``agent=name`` parts joined by commas, such as
+            ``load=greedy-ci,cooling=g36``; agents not mentioned stay idle.
+        fleet: the data centers it is for.
+
+    Raises:
+        ConfigError: an unknown agent or name, a controller that does not act on the agent, or a
+            constant setpoint that is out of range.
+    """
+    if "=" not in spec:
+        return _make(spec.strip(), fleet, AGENTS)
+    chosen: dict[str, Controller] = {}
+    for part in spec.split(","):
+        agent, sign, name = (text.strip() for text in part.partition("="))
+        if not sign or agent not in AGENTS:
+            raise ConfigError(
+                f"controller {spec!r}: {part.strip()!r}: valid is agent=name with one of the "
+                f"agents {', '.join(AGENTS)}{_nearest(agent, AGENTS)}"
+            )
+        if agent in chosen:
+            raise ConfigError(f"controller {spec!r}: {agent} is given twice")
+        chosen[agent] = _make(name, fleet, (agent,))
+    return PerAgent(*(chosen.get(agent, Idle()) for agent in AGENTS))
+
+
+def _make(name: str, fleet: Fleet, agents: tuple[str, ...]) -> Controller:
+    """Look a name up, for use on any of ``agents``."""
+    kind, colon, text = name.partition(":")
+    if kind == "constant":
+        entry = _Entry(lambda: _constant(text if colon else "", fleet), ("cooling",))
+    elif name in _ENTRIES:
+        entry = _ENTRIES[name]
+    else:
+        valid = controller_names()
+        raise ConfigError(
+            f"controller {name!r}: unknown; valid: {', '.join(valid)}{_nearest(name, valid)}"
+        )
+    if not set(agents) & set(entry.agents):
+        (agent,) = agents
+        able = [n for n, e in _ENTRIES.items() if agent in e.agents]
+        able += [_CONSTANT] if agent == "cooling" else []
+        raise ConfigError(
+            f"controller {name!r}: does not act on {agent}; valid for {agent}: {', '.join(able)}"
+        )
+    return entry.make()
+
+
+def _constant(text: str, fleet: Fleet) -> Controller:
+    try:
+        setpoint_c = float(text)
+    except ValueError:
+        setpoint_c = math.nan
+    limits = limits_of(fleet)
+    inside = (limits.setpoint_low_c <= setpoint_c) & (setpoint_c <= limits.setpoint_high_c)
+    if not inside.all():
+        at = int(np.argmin(inside))
+        raise ConfigError(
+            f"controller 'constant:{text}': valid is a setpoint of "
+            f"{limits.setpoint_low_c[at]:g}..{limits.setpoint_high_c[at]:g} C "
+            f"(hvac.setpoint of {fleet.names[at]}), such as constant:20"
+        )
+    return FixedSetpoint(setpoint_c)
+
+
+def _nearest(name: str, valid: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name.casefold(), list(valid), n=1, cutoff=0.4)
+    return f" (did you mean {near[0]!r}?)" if near else ""

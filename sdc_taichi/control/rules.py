@@ -1,0 +1,268 @@
+"""Controllers that are not learned; each acts on a whole fleet at once.
+
+A controller has ``reset(seed)`` and ``act(view) -> Actions``. What it does not control it leaves
+neutral: work neither deferred nor drained, setpoint held, battery idle.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.control.view import View
+from sdc_taichi.types import F64, Actions
+
+SLOT_MIN = 5.0
+"""Interval of trim and respond, minutes."""
+REQUEST_INLET_C = 27.0
+"""Highest recommended inlet temperature (ASHRAE TC 9.9); a rack above it requests cooling."""
+_DRAWN_STEPS = 256
+
+
+class Controller(Protocol):
+    """What drives a simulator."""
+
+    def reset(self, seed: int) -> None:
+        """Forget earlier episodes; ``seed`` decides everything that is random."""
+
+    def act(self, view: View) -> Actions:
+        """Commands for the step to come, each (B,) or one for all."""
+
+
+class Idle:
+    """Moves no work, holds the setpoint, leaves the battery alone."""
+
+    def reset(self, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, view: View) -> Actions:
+        """Neutral commands."""
+        return Actions()
+
+
+class Random:
+    """Each command drawn evenly from its three named actions.
+
+    Data center i draws from ``SeedSequence([seed, i])``, whatever the batch it is in.
+    """
+
+    def __init__(self) -> None:
+        self.reset(0)
+
+    def reset(self, seed: int) -> None:
+        """Start the streams of ``seed``."""
+        self._seed = seed
+        self._streams: list[np.random.Generator] = []
+        self._drawn = np.empty((0, 0, 3))
+        self._next = 0
+
+    def act(self, view: View) -> Actions:
+        """The next draw of each stream."""
+        if len(self._streams) != view.size:
+            seeds = [np.random.SeedSequence([self._seed, i]) for i in range(view.size)]
+            self._streams = [np.random.Generator(np.random.PCG64(s)) for s in seeds]
+            self._next = _DRAWN_STEPS
+        if self._next == _DRAWN_STEPS:
+            draws = [s.integers(-1, 2, size=(_DRAWN_STEPS, 3)) for s in self._streams]
+            self._drawn = np.stack(draws).astype(np.float64)
+            self._next = 0
+        load, cooling, battery = self._drawn[:, self._next].T
+        self._next += 1
+        return Actions(load=load, cooling=cooling, battery=battery)
+
+
+class TrimAndRespond:
+    """Supply setpoint by trim and respond of ASHRAE Guideline 36 (2021), section 5.1.14.
+
+    The setpoint drifts up and is lowered on request, once per 5 min; a step of 15 min does three
+    slots on the requests of the step before. A rack whose hottest inlet is above 27 C requests.
+    """
+
+    def reset(self, seed: int) -> None:
+        """Nothing to forget: the setpoint is part of the simulator's state."""
+
+    def act(self, view: View) -> Actions:
+        """Setpoint command alone."""
+        if view.last is None:
+            requests = np.zeros(view.size)
+        else:
+            hot = np.asarray(view.last.rack_inlet_max_c > REQUEST_INLET_C, dtype=np.float64)
+            requests = np.add.reduceat(hot, view.fleet.rack_start[:-1])
+        target_c = view.state.setpoint_c
+        for _ in range(slots_in_step(view.state.step, view.step_h)):
+            target_c = trim_and_respond(
+                target_c,
+                requests,
+                low_c=view.limits.setpoint_low_c,
+                high_c=view.limits.setpoint_high_c,
+            )
+        return Actions(cooling=steps_to(target_c, view))
+
+
+class FixedSetpoint:
+    """Moves the setpoint to one temperature with its first command, and keeps it there.
+
+    Args:
+        setpoint_c: temperature, C, or the name of a limit: ``low`` or ``high``.
+    """
+
+    def __init__(self, setpoint_c: float | str) -> None:
+        self._setpoint_c = setpoint_c
+
+    def reset(self, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, view: View) -> Actions:
+        """Setpoint command alone."""
+        if self._setpoint_c == "low":
+            target_c = view.limits.setpoint_low_c
+        elif self._setpoint_c == "high":
+            target_c = view.limits.setpoint_high_c
+        else:
+            target_c = np.full(view.size, float(self._setpoint_c))
+        return Actions(cooling=steps_to(target_c, view))
+
+
+class Lookahead:
+    """Battery against the carbon intensity of a coming window, known in advance.
+
+    Charges at full power when the present intensity is in the lowest quarter of the window,
+    discharges when it is in the highest, otherwise idles; it also idles when the window's highest
+    and lowest intensity differ by less than what the battery loses. The idea, to time storage by a
+    forecast, is that of Carbon Explorer (Acun et al., ASPLOS 2023).
+
+    Args:
+        hours: length of the window.
+    """
+
+    def __init__(self, hours: float) -> None:
+        self._hours = hours
+
+    def reset(self, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, view: View) -> Actions:
+        """Battery command alone."""
+        ci = view.forecast(self._hours).ci_g_per_kwh
+        pays = ci.max(axis=1) * view.limits.battery_round_trip > ci.min(axis=1)
+        return Actions(battery=np.where(pays, quarter_command(ci), 0.0))
+
+
+class GreedyCarbon:
+    """Work and battery by whether the grid is now dirtier than on average over the coming window.
+
+    Above the mean it defers work and discharges, below it drains the queue and charges.
+
+    Args:
+        hours: length of the window.
+    """
+
+    def __init__(self, hours: float = 24.0) -> None:
+        self._hours = hours
+
+    def reset(self, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, view: View) -> Actions:
+        """Commands for work and battery."""
+        ci = view.forecast(self._hours).ci_g_per_kwh
+        # The mean of equal values may differ from them in the last bit.
+        flat = np.ptp(ci, axis=1) == 0.0
+        command = np.where(flat, 0.0, np.sign(ci.mean(axis=1) - ci[:, 0]))
+        return Actions(load=command, battery=command)
+
+
+class PerAgent:
+    """One controller for each of load, cooling and battery.
+
+    Args:
+        load: gives the load command.
+        cooling: gives the setpoint command.
+        battery: gives the battery command.
+    """
+
+    def __init__(self, load: Controller, cooling: Controller, battery: Controller) -> None:
+        self._load, self._cooling, self._battery = load, cooling, battery
+
+    def reset(self, seed: int) -> None:
+        """Reset each with the same seed."""
+        for controller in (self._load, self._cooling, self._battery):
+            controller.reset(seed)
+
+    def act(self, view: View) -> Actions:
+        """Of each controller the command it was chosen for."""
+        return Actions(
+            load=self._load.act(view).load,
+            cooling=self._cooling.act(view).cooling,
+            battery=self._battery.act(view).battery,
+        )
+
+
+def trim_and_respond(
+    setpoint_c: F64,
+    requests: npt.ArrayLike,
+    *,
+    low_c: npt.ArrayLike,
+    high_c: npt.ArrayLike,
+    trim_k: float = 0.1,
+    respond_k: float = -0.2,
+    max_respond_k: float = -0.6,
+    ignored: int = 2,
+) -> F64:
+    """One slot of trim and respond (ASHRAE Guideline 36-2021, 5.1.14) on a supply setpoint.
+
+    The setpoint moves by ``trim_k``, and with more than ``ignored`` requests R also by
+    max(max_respond_k, respond_k*(R - ignored)), within its range.
+
+    Args:
+        setpoint_c: present setpoint, (B,).
+        requests: number of requests, (B,).
+        low_c: lowest setpoint.
+        high_c: highest setpoint.
+        trim_k: change without requests, upwards.
+        respond_k: change per request that counts, downwards.
+        max_respond_k: largest response of a slot.
+        ignored: requests without effect.
+
+    Returns:
+        The new setpoint, (B,).
+    """
+    counted = np.maximum(np.asarray(requests, dtype=np.float64) - ignored, 0.0)
+    response_k = np.maximum(max_respond_k, respond_k * counted)
+    return np.clip(setpoint_c + trim_k + response_k, low_c, high_c)
+
+
+def slots_in_step(step: int, step_h: float) -> int:
+    """Slots of trim and respond that end within step ``step`` (0-based)."""
+    minutes = round(step_h * 60.0)
+    return int((step + 1) * minutes // SLOT_MIN - step * minutes // SLOT_MIN)
+
+
+def steps_to(target_c: F64, view: View) -> F64:
+    """Setpoint command that reaches ``target_c`` in one step, (B,)."""
+    command = (target_c - view.state.setpoint_c) / view.limits.setpoint_step_k
+    # The accelerating setpoint multiplies a command that is repeated exactly.
+    repeated = command == view.state.cooling_last
+    command[repeated] = np.nextafter(command[repeated], 0.0)
+    return command
+
+
+def quarter_command(ci_g_per_kwh: F64) -> F64:
+    """1 where the first of n values is in the lowest quarter of its row, -1 in the highest, else 0.
+
+    A value is in the lowest quarter if fewer than n/4 of the row are lower. One that is in both,
+    as all are in a constant row, gives 0.
+
+    Args:
+        ci_g_per_kwh: carbon intensity, (B, n).
+
+    Returns:
+        Battery command, (B,).
+    """
+    now, quarter = ci_g_per_kwh[:, :1], ci_g_per_kwh.shape[1] / 4.0
+    low = np.count_nonzero(ci_g_per_kwh < now, axis=1) < quarter
+    high = np.count_nonzero(ci_g_per_kwh > now, axis=1) < quarter
+    command: F64 = low.astype(np.float64) - high.astype(np.float64)
+    return command

@@ -1,0 +1,120 @@
+"""What a controller may see before each step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sdc_taichi.drivers import Drivers, Table
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.fleet import Fleet
+from sdc_taichi.sim import Simulator
+from sdc_taichi.sizing import Sizing
+from sdc_taichi.types import F64, I64, Exogenous, State, StepResult
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What bounds the commands, each (B,)."""
+
+    setpoint_low_c: F64
+    setpoint_high_c: F64
+    setpoint_step_k: F64
+    battery_round_trip: F64
+    """Energy delivered per energy drawn to charge."""
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """Perfect foresight of the inputs: the present step, then those that follow, each (B, n)."""
+
+    drivers: Drivers
+    index: I64
+    """Steps since the start of the year, (B, n)."""
+
+    @property
+    def ci_g_per_kwh(self) -> F64:
+        """Carbon intensity."""
+        return _gather(self.drivers.ci_g_per_kwh, self.index)
+
+    @property
+    def outdoor_c(self) -> F64:
+        """Dry bulb."""
+        return _gather(self.drivers.outdoor_c, self.index)
+
+    @property
+    def wet_bulb_c(self) -> F64:
+        """Wet bulb."""
+        return _gather(self.drivers.wet_bulb_c, self.index)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The situation before a step of a fleet of B data centers."""
+
+    last: StepResult | None
+    """Result of the step before; None before the first."""
+    state: State
+    now: Exogenous
+    """Inputs of the step to come."""
+    forecast: Callable[[float], Forecast]
+    """Inputs of the coming hours, the step to come first."""
+    fleet: Fleet
+    sizing: Sizing
+    limits: Limits
+    step_h: float
+
+    @property
+    def size(self) -> int:
+        """Number of data centers, B."""
+        return self.fleet.size
+
+
+def limits_of(fleet: Fleet) -> Limits:
+    """Limits from the configs of a fleet."""
+    return Limits(
+        setpoint_low_c=fleet.values("hvac.setpoint.min_c"),
+        setpoint_high_c=fleet.values("hvac.setpoint.max_c"),
+        setpoint_step_k=fleet.values("hvac.setpoint.step_k"),
+        battery_round_trip=fleet.values("battery.charge_efficiency")
+        / fleet.values("battery.discharge_factor"),
+    )
+
+
+def viewer(sim: Simulator) -> Callable[[StepResult | None], View]:
+    """A function from the last result to the view before the next step.
+
+    Args:
+        sim: a simulator that has been reset.
+    """
+    drivers, step_h = sim.drivers, sim.step_h
+    limits, sizing = limits_of(sim.fleet), sim.sizing
+
+    def look(last: StepResult | None) -> View:
+        state = sim.state
+        first = drivers.start + state.step
+
+        def forecast(hours: float) -> Forecast:
+            steps = round(hours / step_h)
+            if steps < 1:
+                raise ConfigError(f"forecast of {hours:g} h: valid is at least {step_h:g} h")
+            return Forecast(drivers, first[:, None] + np.arange(steps))
+
+        return View(
+            last=last,
+            state=state,
+            now=drivers.at(state.step),
+            forecast=forecast,
+            fleet=sim.fleet,
+            sizing=sizing,
+            limits=limits,
+            step_h=step_h,
+        )
+
+    return look
+
+
+def _gather(table: Table, index: I64) -> F64:
+    return table.values[table.offset[:, None] + index % table.length[:, None]]

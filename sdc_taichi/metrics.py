@@ -1,0 +1,195 @@
+"""What an episode used: energy, carbon, water, work and temperatures of each data center.
+
+``begin`` and ``add`` sum the steps as they come, so a year of a large fleet needs no more memory
+than a day; ``per_dc`` and ``overall`` turn the sums into figures. Sums run step by step in f64, so
+a data center has the same figures whatever the batch it is in.
+
+Definitions (PUE, CUE and WUE after The Green Grid, white papers 49, 32 and 35):
+
+    facility_kwh     IT + HVAC (the devices of ``hvac.total_of``), without the battery
+    battery_net_kwh  charged - discharged; grid_kwh = facility_kwh + battery_net_kwh
+    pue              facility / IT
+    pue_with_ups     (IT / ``hvac.ups_efficiency`` + HVAC) / IT
+    partial_pue      (IT + chiller + tower fan) / IT
+    wue_l_per_kwh    make-up water / IT
+    cue_kg_per_kwh   cfp_kg / IT, cfp_kg being grid energy times carbon intensity, step by step
+    battery_throughput_kwh  energy delivered, as warranties count it
+
+A ratio without IT energy is None.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sdc_taichi.fleet import Fleet
+from sdc_taichi.types import F64, I64, StepResult
+
+HOT_INLET_C = 27.0
+"""Highest recommended inlet temperature (ASHRAE TC 9.9)."""
+
+Metric = float | int | str | None
+
+_SUMMED = (
+    "it_kwh",
+    "hvac_kwh",
+    "grid_kwh",
+    "charge_kwh",
+    "discharge_kwh",
+    "carbon_g",
+    "water_l",
+    "arrived_tasks",
+    "executed_tasks",
+    "dropped_tasks",
+    "overdue_tasks",
+    "queue_tasks",
+    "chiller_w",
+    "tower_fan_w",
+    "unmet_w",
+)
+
+
+@dataclass(slots=True)
+class Totals:
+    """Sums and extremes of the steps so far."""
+
+    steps: int
+    step_h: float
+    sums: dict[str, F64]
+    """Sum over the steps of the field of ``StepResult``, (B,) each."""
+    hot_steps: I64
+    """Steps with an inlet above ``HOT_INLET_C``, (B,)."""
+    queue_max_tasks: F64
+    overdue_max_tasks: F64
+    hottest_inlet_c: F64
+    hottest_rack: I64
+    """Rack of the hottest inlet, counted from 0 in its data center, (B,)."""
+    hottest_step: I64
+
+
+def begin(size: int, step_h: float) -> Totals:
+    """Totals of no steps.
+
+    Args:
+        size: number of data centers, B.
+        step_h: length of a step.
+    """
+    return Totals(
+        steps=0,
+        step_h=step_h,
+        sums={name: np.zeros(size) for name in _SUMMED},
+        hot_steps=np.zeros(size, dtype=np.int64),
+        queue_max_tasks=np.zeros(size),
+        overdue_max_tasks=np.zeros(size),
+        hottest_inlet_c=np.full(size, -np.inf),
+        hottest_rack=np.zeros(size, dtype=np.int64),
+        hottest_step=np.zeros(size, dtype=np.int64),
+    )
+
+
+def add(totals: Totals, result: StepResult, fleet: Fleet) -> None:
+    """Add one step to the totals, in place."""
+    totals.steps += 1
+    for name, total in totals.sums.items():
+        total += getattr(result, name)
+    totals.hot_steps += result.inlet_max_c > HOT_INLET_C
+    np.maximum(totals.queue_max_tasks, result.queue_tasks, out=totals.queue_max_tasks)
+    np.maximum(totals.overdue_max_tasks, result.overdue_tasks, out=totals.overdue_max_tasks)
+    hotter = np.flatnonzero(result.inlet_max_c > totals.hottest_inlet_c)
+    totals.hottest_inlet_c[hotter] = result.inlet_max_c[hotter]
+    totals.hottest_step[hotter] = result.step
+    for dc in hotter:
+        racks = result.rack_inlet_max_c[fleet.rack_start[dc] : fleet.rack_start[dc + 1]]
+        totals.hottest_rack[dc] = int(np.argmax(racks))
+
+
+def totals_of(results: Sequence[StepResult], fleet: Fleet) -> Totals:
+    """Totals of steps that were kept.
+
+    Args:
+        results: at least one step.
+        fleet: the data centers they are of.
+    """
+    totals = begin(fleet.size, results[0].step_h)
+    for result in results:
+        add(totals, result, fleet)
+    return totals
+
+
+def per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
+    """Figures of every data center, in the order of the fleet; at least one step."""
+    efficiency = fleet.values("hvac.ups_efficiency")
+    out = []
+    for dc in range(fleet.size):
+        sums = {name: float(values[dc]) for name, values in totals.sums.items()}
+        figures = _figures(sums, sums["it_kwh"] / float(efficiency[dc]), totals.step_h)
+        out.append(
+            figures
+            | {
+                "queue_mean_tasks": sums["queue_tasks"] / totals.steps,
+                "queue_max_tasks": float(totals.queue_max_tasks[dc]),
+                "overdue_max_tasks": float(totals.overdue_max_tasks[dc]),
+                "inlet_above_27_h": int(totals.hot_steps[dc]) * totals.step_h,
+                "hottest_inlet_c": float(totals.hottest_inlet_c[dc]),
+                "hottest_rack": int(totals.hottest_rack[dc]),
+                "hottest_step": int(totals.hottest_step[dc]),
+            }
+        )
+    return out
+
+
+def overall(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
+    """Figures of the whole fleet; at least one step.
+
+    Energies, carbon, water, tasks and hours are sums over the data centers, ratios are those of the
+    sums. ``queue_mean_tasks`` is the mean, ``queue_max_tasks`` and ``overdue_max_tasks`` the
+    highest over the data centers, because a task is 1 % of the capacity of its own data center.
+    """
+    sums = {name: float(values.sum()) for name, values in totals.sums.items()}
+    behind_ups_kwh = float((totals.sums["it_kwh"] / fleet.values("hvac.ups_efficiency")).sum())
+    hottest = int(np.argmax(totals.hottest_inlet_c))
+    return _figures(sums, behind_ups_kwh, totals.step_h) | {
+        "queue_mean_tasks": sums["queue_tasks"] / totals.steps / fleet.size,
+        "queue_max_tasks": float(totals.queue_max_tasks.max()),
+        "overdue_max_tasks": float(totals.overdue_max_tasks.max()),
+        "inlet_above_27_h": int(totals.hot_steps.sum()) * totals.step_h,
+        "hottest_inlet_c": float(totals.hottest_inlet_c[hottest]),
+        "hottest_dc": fleet.names[hottest],
+        "hottest_rack": int(totals.hottest_rack[hottest]),
+        "hottest_step": int(totals.hottest_step[hottest]),
+    }
+
+
+def _figures(sums: dict[str, float], behind_ups_kwh: float, step_h: float) -> dict[str, Metric]:
+    it_kwh, hvac_kwh = sums["it_kwh"], sums["hvac_kwh"]
+    compression_kwh = (sums["chiller_w"] + sums["tower_fan_w"]) * step_h / 1e3
+    cfp_kg = sums["carbon_g"] / 1e3
+
+    def per_it(value: float) -> float | None:
+        return value / it_kwh if it_kwh > 0 else None
+
+    return {
+        "it_kwh": it_kwh,
+        "hvac_kwh": hvac_kwh,
+        "facility_kwh": it_kwh + hvac_kwh,
+        "battery_net_kwh": sums["charge_kwh"] - sums["discharge_kwh"],
+        "grid_kwh": sums["grid_kwh"],
+        "pue": per_it(it_kwh + hvac_kwh),
+        "pue_with_ups": per_it(behind_ups_kwh + hvac_kwh),
+        "partial_pue": per_it(it_kwh + compression_kwh),
+        "wue_l_per_kwh": per_it(sums["water_l"]),
+        "cue_kg_per_kwh": per_it(cfp_kg),
+        "cfp_kg": cfp_kg,
+        "water_l": sums["water_l"],
+        "battery_charge_kwh": sums["charge_kwh"],
+        "battery_discharge_kwh": sums["discharge_kwh"],
+        "battery_throughput_kwh": sums["discharge_kwh"],
+        "unmet_cooling_kwh": sums["unmet_w"] * step_h / 1e3,
+        "arrived_tasks": sums["arrived_tasks"],
+        "executed_tasks": sums["executed_tasks"],
+        "dropped_tasks": sums["dropped_tasks"],
+        "overdue_task_h": sums["overdue_tasks"] * step_h,
+    }

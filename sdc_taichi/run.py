@@ -1,0 +1,413 @@
+"""Run a simulator under a controller, and record what it did in files.
+
+A recorded run is a folder of ``steps.parquet``, ``metrics.json`` and ``config.yaml`` (one data
+center) or ``configs.yaml`` (several, one YAML document each). Every file is written beside its
+place and renamed when it is whole. Equal runs give equal bytes. See docs/cli.md for the columns.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import operator
+import os
+import platform
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from sdc_taichi import metrics
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.control import Controller, viewer
+from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.exogenous.files import sha256
+from sdc_taichi.sim import Simulator
+from sdc_taichi.types import F64, I64, StepResult
+
+FORMAT = "sdc-run/1"
+METADATA_KEY = b"sdc_taichi"
+FIRST_YEAR = 2001
+"""Calendar year of the first simulated year in time stamps; it has no other meaning."""
+_ROWS_PER_GROUP = 1 << 16
+_MINUTES_PER_YEAR = 365 * 24 * 60
+_MARCH_MIN = 59 * 24 * 60
+_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a run was asked to do."""
+
+    controller: str
+    """Name, for the record."""
+    steps: int
+    seed: int = 0
+
+
+def run(
+    sim: Simulator,
+    controller: Controller,
+    steps: int,
+    seed: int = 0,
+    *,
+    on_step: Callable[[StepResult], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> metrics.Totals:
+    """Reset and run.
+
+    Args:
+        sim: the simulator.
+        controller: what drives it.
+        steps: number of steps.
+        seed: of simulator and controller.
+        on_step: called after every step.
+        stop: asked before every step; true ends the run.
+
+    Returns:
+        The totals of the steps done.
+
+    Raises:
+        SdcError: a command that is not valid.
+    """
+    sim.reset(seed)
+    controller.reset(seed)
+    look = viewer(sim)
+    totals = metrics.begin(sim.size, sim.step_h)
+    last: StepResult | None = None
+    for _ in range(steps):
+        if stop is not None and stop():
+            break
+        last = sim.step(controller.act(look(last)))
+        metrics.add(totals, last, sim.fleet)
+        if on_step is not None:
+            on_step(last)
+    return totals
+
+
+def record(
+    sim: Simulator,
+    controller: Controller,
+    asked: Asked,
+    out: Path,
+    *,
+    force: bool = False,
+    on_step: Callable[[StepResult], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> dict[str, Any] | None:
+    """Run and write the files of the run.
+
+    Args:
+        sim: the simulator.
+        controller: what drives it.
+        asked: steps, seed and the controller's name.
+        out: folder, created if need be; files of a former run there are replaced.
+        force: also write into a folder with other files.
+        on_step: called after every step.
+        stop: asked before every step; true ends the run with files of the steps done.
+
+    Returns:
+        The content of metrics.json; None, and no files, if it was stopped before the first step.
+
+    Raises:
+        SdcError: the folder is not free, a file cannot be written, or a command is not valid.
+    """
+    former = prepare_folder(out, force=force)
+    sim.reset(asked.seed)
+    about = describe(sim, asked)
+    configs = configs_yaml(sim.fleet.configs)
+    names = ["config.yaml", "configs.yaml"]
+    config_name, other_name = names if sim.size == 1 else names[::-1]
+    with StepsWriter(out / "steps.parquet", sim, {**about, "configs_yaml": configs}) as writer:
+
+        def each(result: StepResult) -> None:
+            writer.add(result)
+            if on_step is not None:
+                on_step(result)
+
+        totals = run(sim, controller, asked.steps, asked.seed, on_step=each, stop=stop)
+        if totals.steps == 0:
+            return None
+        writer.commit()
+    write_text(out / config_name, configs)
+    if former:
+        with _writing(out / other_name):
+            (out / other_name).unlink(missing_ok=True)
+    report = {
+        **about,
+        "steps_done": totals.steps,
+        "data_centers": [
+            {**dc, "metrics": figures}
+            for dc, figures in zip(
+                about["data_centers"], metrics.per_dc(totals, sim.fleet), strict=True
+            )
+        ],
+        "total": metrics.overall(totals, sim.fleet),
+    }
+    # Last, because it marks the folder as that of a whole run.
+    write_text(out / "metrics.json", report_json(report) + "\n")
+    return report
+
+
+def describe(sim: Simulator, asked: Asked) -> dict[str, Any]:
+    """What a run is, before any step: versions, seed, inputs and data centers.
+
+    Args:
+        sim: a simulator that has been reset.
+        asked: what it is to do.
+    """
+    drivers = sim.drivers
+    hashes = _file_hashes(sim.fleet.configs)
+    packages = ("sdc-taichi", "taichi", "numpy", "pyarrow")
+    return {
+        "format": FORMAT,
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in packages},
+        },
+        "fingerprint": str(sim.state_dict()["fingerprint"]),
+        "controller": asked.controller,
+        "seed": asked.seed,
+        "precision": sim.precision,
+        "step_h": sim.step_h,
+        "steps_asked": asked.steps,
+        "synthetic": any(drivers.synthetic),
+        "notes": list(drivers.notes),
+        "data_centers": [
+            {
+                "name": config.name,
+                "location": config.site.location,
+                "start": config.site.start,
+                "synthetic": synthetic,
+                "provenance": sources,
+                "sha256": {kind: hashes[path] for kind, path in _input_files(config).items()},
+            }
+            for config, synthetic, sources in zip(
+                sim.fleet.configs, drivers.synthetic, drivers.sources, strict=True
+            )
+        ],
+    }
+
+
+def report_json(report: dict[str, Any]) -> str:
+    """JSON text of the content of metrics.json."""
+    return json.dumps(report, indent=2, allow_nan=False)
+
+
+def configs_yaml(configs: Sequence[DataCenterConfig]) -> str:
+    """One YAML document per data center."""
+    dumped = (c.model_dump(mode="json") for c in configs)
+    return yaml.dump_all(
+        dumped, Dumper=_DUMPER, sort_keys=False, allow_unicode=True, explicit_start=len(configs) > 1
+    )
+
+
+def step_times(start: I64, steps: I64, steps_per_hour: int) -> npt.NDArray[np.datetime64]:
+    """Local standard time at which each step begins.
+
+    Years have 365 days and are written as 2001, 2002 and so on; the 29 February of a calendar leap
+    year is left out.
+
+    Args:
+        start: first step of each data center since the start of its year, (B,).
+        steps: steps since reset, (n,).
+        steps_per_hour: the time step.
+
+    Returns:
+        Milliseconds since 1970, (n, B).
+    """
+    minutes = (start + steps[:, None]) * (60 // steps_per_hour)
+    years, within = FIRST_YEAR + minutes // _MINUTES_PER_YEAR, minutes % _MINUTES_PER_YEAR
+    leap = (years % 4 == 0) & ((years % 100 != 0) | (years % 400 == 0))
+    within = within + 1440 * (leap & (within >= _MARCH_MIN))
+    begun = (years - 1970).astype("datetime64[Y]").astype("datetime64[ms]")
+    return np.asarray(begun + within.astype("timedelta64[m]"))
+
+
+class StepsWriter:
+    """Writes one row per data center and step to a Parquet file, a row group at a time.
+
+    Memory does not grow with the number of steps. The file appears under its name on ``commit``;
+    without it, nothing is left behind.
+
+    Args:
+        path: the file.
+        sim: the simulator whose steps are added.
+        metadata: stored as JSON under ``sdc_taichi`` in the file's metadata.
+
+    Raises:
+        SdcError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path, sim: Simulator, metadata: Mapping[str, Any]) -> None:
+        self._path, self._part = path, _part_of(path)
+        self._fleet, self._start = sim.fleet, sim.drivers.start
+        self._metadata = {METADATA_KEY: json.dumps(metadata, allow_nan=False).encode()}
+        self._steps_per_group = max(1, _ROWS_PER_GROUP // sim.size)
+        self._names: tuple[str, ...] = ()
+        self._values: F64 = np.empty((0, 0, 0))
+        self._filled = 0
+        self._first = 0
+        self._writer: Any = None
+        with _writing(path):
+            for leftover in path.parent.glob(f".{path.name}.*.part"):
+                leftover.unlink()
+            self._file = self._part.open("wb")
+
+    def add(self, result: StepResult) -> None:
+        """Add one step; steps follow each other.
+
+        Raises:
+            SdcError: the file cannot be written.
+        """
+        if not self._names:
+            self._names = tuple(result.per_dc())
+            self._columns = operator.attrgetter(*self._names)
+            shape = (len(self._names), self._steps_per_group, self._fleet.size)
+            self._values = np.empty(shape)
+        if self._filled == 0:
+            self._first = result.step
+        self._values[:, self._filled] = self._columns(result)
+        self._filled += 1
+        if self._filled == self._steps_per_group:
+            self._flush()
+
+    def commit(self) -> None:
+        """Finish the file and give it its name.
+
+        Raises:
+            SdcError: the file cannot be written.
+        """
+        self._flush()
+        with _writing(self._path):
+            self._writer.close()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            self._part.replace(self._path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # After a commit there is nothing left to close or delete.
+        with contextlib.suppress(OSError):
+            self._file.close()
+        with contextlib.suppress(OSError):
+            self._part.unlink(missing_ok=True)
+
+    def _flush(self) -> None:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        if self._filled == 0:
+            return
+        n, size = self._filled, self._fleet.size
+        steps = np.arange(self._first, self._first + n)
+        times = step_times(self._start, steps, self._fleet.steps_per_hour)
+        names = pa.array(self._fleet.names)
+        dc = pa.array(np.tile(np.arange(size, dtype=np.int32), n))
+        columns: dict[str, Any] = {
+            "dc": pa.DictionaryArray.from_arrays(dc, names),
+            "step": np.repeat(steps, size),
+            "time": times.reshape(-1),
+        }
+        for name, values in zip(self._names, self._values, strict=True):
+            columns[name] = values[:n].reshape(-1)
+        table = pa.table(columns).replace_schema_metadata(self._metadata)
+        with _writing(self._path):
+            if self._writer is None:
+                self._writer = pq.ParquetWriter(
+                    self._file, table.schema, compression="zstd", use_dictionary=["dc"]
+                )
+            self._writer.write_table(table)
+        self._filled = 0
+
+
+def prepare_folder(out: Path, *, force: bool = False) -> bool:
+    """Create the folder of a run, or check that its files may be replaced.
+
+    Returns:
+        Whether it holds a former run.
+
+    Raises:
+        SdcError: it holds other files than those of a run and ``force`` is not set, or it cannot
+            be created or read.
+    """
+    with _writing(out):
+        if out.exists() and not out.is_dir():
+            raise ConfigError(f"{out}: is a file; valid is a folder to write the run to")
+        out.mkdir(parents=True, exist_ok=True)
+        found = sorted(p.name for p in out.iterdir() if not p.name.endswith(".part"))
+    former = _is_run(out)
+    if found and not force and not former:
+        some = ", ".join(found[:3]) + (", ..." if len(found) > 3 else "")
+        raise ConfigError(
+            f"{out}: holds files that are not of a run ({some}); choose an empty folder with --out "
+            "or write into it with --force"
+        )
+    return former
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file so that a reader sees the old one or the whole new one.
+
+    Raises:
+        SdcError: it cannot be written.
+    """
+    part = _part_of(path)
+    with _writing(path):
+        try:
+            with part.open("w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def _input_files(config: DataCenterConfig) -> dict[str, str]:
+    """Files that the config names, by what they give."""
+    site = config.site
+    named = {
+        "weather": site.weather_file,
+        "carbon": site.carbon_file,
+        "workload": site.workload_file,
+    }
+    return {kind: path for kind, path in named.items() if path is not None}
+
+
+def _file_hashes(configs: Sequence[DataCenterConfig]) -> dict[str, str]:
+    """SHA-256 of every file that the configs name, by path.
+
+    Drivers made from arrays need no such file, so one that is gone has the hash "missing".
+    """
+    paths = {path for config in configs for path in _input_files(config).values()}
+    return {p: sha256(Path(p)) if Path(p).is_file() else "missing" for p in sorted(paths)}
+
+
+def _is_run(out: Path) -> bool:
+    try:
+        report = json.loads((out / "metrics.json").read_text("utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(report, dict) and str(report.get("format", "")).startswith("sdc-run/")
+
+
+def _part_of(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.part")
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn a failure of the file system into an error that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise SdcError(f"{path}: cannot be written: {error.strerror or error}") from error

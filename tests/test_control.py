@@ -1,0 +1,344 @@
+"""Controllers that are not learned: rules, registry, and what they may see."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sdc_taichi import (
+    Actions,
+    ConfigError,
+    DataCenterConfig,
+    Drivers,
+    Simulator,
+    StepResult,
+    build_fleet,
+    drivers_from_arrays,
+    load_config,
+    make_configs,
+)
+from sdc_taichi.control import (
+    AGENTS,
+    Controller,
+    View,
+    controller_names,
+    make_controller,
+    trim_and_respond,
+    viewer,
+)
+from sdc_taichi.control.rules import quarter_command, slots_in_step
+from sdc_taichi.run import run
+
+CHECKS = json.loads((Path(__file__).parent / "reference" / "physics_checks.json").read_text())
+TRIM = next(c for c in CHECKS["checks"] if c["id"] == "G36-TR")
+TINY = load_config("tiny")
+SITES = ("ny", "ca", "az")
+
+
+def fleet_of(count: int, **changes: Any) -> list[DataCenterConfig]:
+    return make_configs(load_config("tiny", **changes), count=count, sites=SITES[:count])
+
+
+@pytest.fixture
+def sim() -> Iterator[Simulator]:
+    with Simulator(fleet_of(3)) as made:
+        made.reset(0)
+        yield made
+
+
+def results(sim: Simulator, controller: Controller, steps: int, seed: int = 0) -> list[StepResult]:
+    kept: list[StepResult] = []
+    run(sim, controller, steps, seed, on_step=kept.append)
+    return kept
+
+
+def one_with(ci: np.ndarray) -> tuple[DataCenterConfig, Drivers]:
+    n = len(ci)
+    return TINY, drivers_from_arrays(np.full(n, 20.0), np.full(n, 15.0), ci, np.full(n, 0.5))
+
+
+# Trim and respond
+
+
+def test_trim_and_respond_gives_the_reference_sequence() -> None:
+    given = TRIM["inputs"]
+    setpoint = np.array([given["SP0"]])
+    found = []
+    for requests in given["requests"]:
+        setpoint = trim_and_respond(
+            setpoint,
+            [requests],
+            low_c=given["SPmin"],
+            high_c=given["SPmax"],
+            trim_k=given["trim"],
+            respond_k=given["res"],
+            max_respond_k=given["maxres"],
+            ignored=given["I"],
+        )
+        found.append(float(setpoint[0]))
+    assert found == pytest.approx(TRIM["expected"]["sp"], **TRIM["tolerance"])
+
+
+def test_defaults_are_those_of_the_reference() -> None:
+    given = TRIM["inputs"]
+    requests = np.arange(12)
+    arguments = (np.full(12, 17.0), requests)
+    spelled = trim_and_respond(
+        *arguments,
+        low_c=12.0,
+        high_c=18.0,
+        trim_k=given["trim"],
+        respond_k=given["res"],
+        max_respond_k=given["maxres"],
+        ignored=given["I"],
+    )
+    assert np.array_equal(trim_and_respond(*arguments, low_c=12.0, high_c=18.0), spelled)
+
+
+@pytest.mark.parametrize("steps_per_hour", [1, 2, 3, 4, 5, 6, 10, 12, 15, 20, 30, 60])
+def test_twelve_slots_an_hour_whatever_the_step(steps_per_hour: int) -> None:
+    slots = [slots_in_step(step, 1 / steps_per_hour) for step in range(3 * steps_per_hour)]
+    assert sum(slots) == 36
+    assert max(slots) - min(slots) <= 1
+
+
+@pytest.mark.parametrize("model", ["symmetric", "accelerating"])
+def test_g36_trims_up_without_requests_at_the_same_rate_under_any_model(model: str) -> None:
+    config = load_config("tiny", [f"hvac.setpoint.model={model}"])
+    with Simulator(config) as sim:
+        setpoints = [float(r.setpoint_c[0]) for r in results(sim, g36(sim), 9)]
+    assert setpoints == pytest.approx([18.0 + 0.3 * (i + 1) for i in range(9)])
+
+
+def test_g36_lowers_the_setpoint_when_more_than_two_racks_are_hot() -> None:
+    config = load_config("tiny", ["hvac.setpoint.initial_c=23", "hall.supply_approach_k=5"])
+    with Simulator(config) as sim:
+        kept = results(sim, g36(sim), 60)
+    hot = np.array([np.count_nonzero(r.rack_inlet_max_c > 27.0) for r in kept])
+    moved = np.diff([23.0, *(float(r.setpoint_c[0]) for r in kept)])
+    assert hot[0] == 4
+    for requests, change in zip(hot[:-1], moved[1:], strict=True):
+        counted = max(requests - 2, 0)
+        slot = 0.1 + max(-0.6, -0.2 * counted)
+        assert change == pytest.approx(3 * slot, abs=1e-9)
+    assert {0.3, -0.9} <= set(np.round(moved, 6))
+
+
+def test_g36_counts_the_racks_of_each_data_center() -> None:
+    with Simulator(fleet_of(2)) as sim:
+        sim.reset(0)
+        look, last = viewer(sim), sim.step()
+        racks = np.where(sim.fleet.rack_dc == 0, 26.0, 28.0)
+        hot = replace(last, rack_inlet_max_c=racks)
+        command = np.asarray(g36(sim).act(look(hot)).cooling)
+    assert command == pytest.approx([0.3, 3 * (0.1 - 0.4)])
+
+
+def g36(sim: Simulator) -> Controller:
+    return make_controller("g36", sim.fleet)
+
+
+# Other rules
+
+
+def test_idle_leaves_everything_alone(sim: Simulator) -> None:
+    assert make_controller("idle", sim.fleet).act(viewer(sim)(None)) == Actions()
+
+
+def test_random_is_reproducible_and_independent_of_the_batch() -> None:
+    def drawn(count: int, seed: int, steps: int = 600) -> np.ndarray:
+        with Simulator(fleet_of(count)) as sim:
+            kept = results(sim, make_controller("random", sim.fleet), steps, seed)
+        return np.array([[r.load_command, r.cooling_command, r.battery_command] for r in kept])
+
+    three = drawn(3, 7)
+    assert np.array_equal(drawn(3, 7), three)
+    assert np.array_equal(drawn(1, 7)[..., 0], three[..., 0])
+    assert not np.array_equal(drawn(1, 8)[..., 0], three[..., 0])
+    assert not np.array_equal(three[..., 0], three[..., 1])
+    expected = np.random.Generator(np.random.PCG64(np.random.SeedSequence([7, 1])))
+    assert np.array_equal(three[:256, :, 1], expected.integers(-1, 2, size=(256, 3)))
+    values, counts = np.unique(three, return_counts=True)
+    assert values.tolist() == [-1.0, 0.0, 1.0]
+    assert counts == pytest.approx(np.full(3, three.size / 3), rel=0.1)
+
+
+def test_random_starts_again_at_reset(sim: Simulator) -> None:
+    controller = make_controller("random", sim.fleet)
+    first = [r.load_command.tolist() for r in results(sim, controller, 5, 3)]
+    assert [r.load_command.tolist() for r in results(sim, controller, 5, 3)] == first
+
+
+@pytest.mark.parametrize("model", ["symmetric", "accelerating"])
+@pytest.mark.parametrize(
+    ("name", "setpoint_c"), [("coldest", 16.0), ("warmest", 23.0), ("constant:19.5", 19.5)]
+)
+def test_fixed_setpoints_are_reached_at_once_and_kept(
+    name: str, setpoint_c: float, model: str
+) -> None:
+    with Simulator(load_config("tiny", [f"hvac.setpoint.model={model}"])) as sim:
+        kept = results(sim, make_controller(name, sim.fleet), 12)
+    assert [float(r.setpoint_c[0]) for r in kept] == [setpoint_c] * 12
+    assert not any(np.any(r.load_command) or np.any(r.battery_command) for r in kept)
+
+
+def test_quarters_of_a_window() -> None:
+    rising = np.arange(12.0)
+    rows = [rising, rising[::-1], np.ones(12), np.r_[5.0, np.zeros(6), np.full(5, 9.0)]]
+    assert quarter_command(np.array(rows)).tolist() == [1.0, -1.0, 0.0, 0.0]
+    # Two of eight are lower: no longer in the lowest quarter.
+    assert quarter_command(np.array([[2.0, 0, 1, 3, 3, 3, 3, 3]])).tolist() == [0.0]
+    assert quarter_command(np.array([[2.0, 0, 3, 3, 3, 3, 3, 3]])).tolist() == [1.0]
+
+
+@pytest.mark.parametrize("name", ["lookahead-3h", "lookahead-24h"])
+def test_lookahead_saves_carbon_by_the_battery_alone(name: str) -> None:
+    emitted = {}
+    with Simulator(fleet_of(3)) as sim:
+        for controller in ("idle", name):
+            kept = results(sim, make_controller(controller, sim.fleet), 14 * 96)
+            emitted[controller] = np.sum([r.carbon_g for r in kept], axis=0)
+            assert not any(np.any(r.load_command) or np.any(r.cooling_command) for r in kept)
+    # A rule of thumb: a single site can lose over some weeks, as a full battery outlasts a peak.
+    assert emitted[name].sum() < 0.995 * emitted["idle"].sum()
+
+
+@pytest.mark.parametrize(
+    ("wave_g", "trades"), [(0.0, False), (10.0, False), (100.0, True)], ids=["flat", "low", "high"]
+)
+def test_lookahead_trades_only_for_more_than_the_battery_loses(wave_g: float, trades: bool) -> None:
+    hours = np.arange(4 * 96) / 4
+    config, drivers = one_with(300.0 + wave_g * np.sin(2 * np.pi * hours / 24))
+    with Simulator(config, drivers=drivers) as sim:
+        kept = results(sim, make_controller("lookahead-24h", sim.fleet), 200)
+    assert any(np.any(r.battery_command) for r in kept) is trades
+
+
+def test_greedy_follows_the_mean_of_the_coming_day() -> None:
+    ci = np.r_[np.full(96, 500.0), np.full(192, 100.0), np.full(192, 500.0)]
+    config, drivers = one_with(ci)
+    with Simulator(config, drivers=drivers) as sim:
+        kept = results(sim, make_controller("greedy-ci", sim.fleet), 480)
+    command = np.array([float(r.load_command[0]) for r in kept])
+    assert np.array_equal(command, [float(r.battery_command[0]) for r in kept])
+    # High before the drop defers; low before the rise drains; a constant window moves nothing.
+    assert command[1:96].tolist() == [-1.0] * 95
+    assert command[192 + 1 : 288].tolist() == [1.0] * 95
+    assert command[96:192].tolist() == [0.0] * 96
+    assert kept[95].queue_tasks[0] > 0
+    assert kept[-1].queue_tasks[0] == 0
+
+
+# What a controller sees
+
+
+def test_view_before_and_after_a_step(sim: Simulator) -> None:
+    look = viewer(sim)
+    first = look(None)
+    assert first.last is None
+    assert first.state.step == 0
+    result = sim.step()
+    then = look(result)
+    assert then.last is result
+    assert then.state is sim.state
+    assert then.size == 3
+    assert then.step_h == 0.25
+    assert then.sizing is sim.sizing
+    coming = sim.step()
+    assert np.array_equal(then.now.demand, coming.demand)
+    assert np.array_equal(then.now.ci_g_per_kwh, coming.ci_g_per_kwh)
+
+
+def test_forecast_is_what_comes_also_over_the_turn_of_the_year() -> None:
+    configs = fleet_of(3, overrides=["site.start=12-31"])
+    configs[1] = load_config("tiny", ["name=other", "site.location=CA", "site.start=06-01"])
+    with Simulator(configs) as sim:
+        sim.reset(0)
+        for _ in range(5):
+            last = sim.step()
+        forecast = viewer(sim)(last).forecast(30.0)
+        coming = [sim.step() for _ in range(120)]
+    for name in ("ci_g_per_kwh", "outdoor_c", "wet_bulb_c"):
+        seen = np.array([getattr(r, name) for r in coming]).T
+        assert np.array_equal(getattr(forecast, name), seen), name
+
+
+def test_forecast_shorter_than_a_step_is_an_error(sim: Simulator) -> None:
+    with pytest.raises(ConfigError, match=r"forecast of 0 h: valid is at least 0\.25 h"):
+        viewer(sim)(None).forecast(0.0)
+
+
+# Names
+
+
+@pytest.mark.parametrize("name", controller_names())
+def test_every_name_runs(name: str, sim: Simulator) -> None:
+    controller = make_controller(name.replace(":C", ":20"), sim.fleet)
+    assert run(sim, controller, 8, 1).steps == 8
+
+
+def test_each_agent_may_have_its_own(sim: Simulator) -> None:
+    spec = "load=greedy-ci, cooling=constant:20 ,battery=random"
+    mixed = results(sim, make_controller(spec, sim.fleet), 50, 4)
+    alone = {
+        "load_command": results(sim, make_controller("greedy-ci", sim.fleet), 50, 4),
+        "cooling_command": results(sim, make_controller("constant:20", sim.fleet), 50, 4),
+        "battery_command": results(sim, make_controller("random", sim.fleet), 50, 4),
+    }
+    for command, kept in alone.items():
+        found = [getattr(r, command).tolist() for r in mixed]
+        assert found == [getattr(r, command).tolist() for r in kept], command
+
+
+def test_agents_not_mentioned_stay_idle(sim: Simulator) -> None:
+    kept = results(sim, make_controller("battery=random", sim.fleet), 20)
+    assert not any(np.any(r.load_command) or np.any(r.cooling_command) for r in kept)
+    assert any(np.any(r.battery_command) for r in kept)
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("g37", r"controller 'g37': unknown; valid: idle, .*did you mean 'g36'\?"),
+        ("lookahead", "did you mean 'lookahead-3h'"),
+        ("load=g36", "'g36': does not act on load; valid for load: idle, random, greedy-ci"),
+        ("battery=constant:20", "'constant:20': does not act on battery"),
+        ("cool=g36", "'cool=g36': valid is agent=name .*did you mean 'cooling'"),
+        ("load=idle,load=random", "load is given twice"),
+        ("load=idle,", "valid is agent=name"),
+        ("constant:24", r"'constant:24': valid is a setpoint of 16\.\.23 C \(hvac\.setpoint of dc"),
+        ("constant:nan", r"valid is a setpoint of 16\.\.23 C"),
+        ("constant", r"valid is a setpoint of 16\.\.23 C"),
+        ("", "unknown; valid: idle"),
+    ],
+)
+def test_wrong_names(spec: str, message: str) -> None:
+    fleet = build_fleet(TINY.model_copy(update={"name": "dc"}))
+    with pytest.raises(ConfigError, match=message):
+        make_controller(spec, fleet)
+
+
+def test_a_constant_must_suit_every_data_center() -> None:
+    narrow = load_config("tiny", ["name=narrow", "hvac.setpoint.max_c=20"])
+    with pytest.raises(ConfigError, match=r"16\.\.20 C \(hvac\.setpoint of narrow\)"):
+        make_controller("constant:21", build_fleet([TINY, narrow]))
+
+
+def test_own_controllers_need_no_base_class(sim: Simulator) -> None:
+    class Alternate:
+        def reset(self, seed: int) -> None:
+            self.turn = seed
+
+        def act(self, view: View) -> Actions:
+            self.turn += 1
+            return Actions(battery=float((-1) ** self.turn))
+
+    kept = results(sim, Alternate(), 4)
+    assert [float(r.battery_command[0]) for r in kept] == [-1.0, 1.0, -1.0, 1.0]
+    assert AGENTS == ("load", "cooling", "battery")

@@ -1,0 +1,337 @@
+"""Malformed configurations and arguments: exit code 2 and one line that names the place."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from sdc_taichi import DataCenterConfig, load_config
+from sdc_taichi.cli import app
+
+HALL, HVAC, SERVERS = (
+    "data_center_configuration",
+    "hvac_configuration",
+    "server_characteristics",
+)
+# The format of SustainDC's utils/dc_config.json with the defaults of its paper (appendix B).
+DC_CONFIG: dict[str, dict[str, Any]] = {
+    HALL: {
+        "NUM_ROWS": 4,
+        "NUM_RACKS_PER_ROW": 5,
+        "RACK_SUPPLY_APPROACH_TEMP_LIST": [5.3] * 5 + [5.0] * 10 + [5.3] * 5,
+        "RACK_RETURN_APPROACH_TEMP_LIST": [-3.7] * 5 + [-2.5] * 10 + [-3.7] * 5,
+        "CPUS_PER_RACK": 200,
+    },
+    HVAC: {
+        "C_AIR": 1006,
+        "RHO_AIR": 1.225,
+        "CRAC_SUPPLY_AIR_FLOW_RATE_pu": 0.00005663,
+        "CRAC_REFRENCE_AIR_FLOW_RATE_pu": 0.00009438,
+        "CRAC_FAN_REF_P": 150,
+        "CHILLER_COP_BASE": 5.0,
+        "CHILLER_COP_K": 0.1,
+        "CHILLER_COP_T_NOMINAL": 25.0,
+        "CT_FAN_REF_P": 1000,
+        "CT_REFRENCE_AIR_FLOW_RATE": 2.8315,
+        "CW_PRESSURE_DROP": 300000,
+        "CW_WATER_FLOW_RATE": 0.0011,
+        "CW_PUMP_EFFICIENCY": 0.87,
+        "CT_PRESSURE_DROP": 300000,
+        "CT_WATER_FLOW_RATE": 0.0011,
+        "CT_PUMP_EFFICIENCY": 0.87,
+    },
+    SERVERS: {
+        "CPU_POWER_RATIO_LB": [0.01, 1.00],
+        "CPU_POWER_RATIO_UB": [0.03, 1.02],
+        "IT_FAN_AIRFLOW_RATIO_LB": [0.01, 0.225],
+        "IT_FAN_AIRFLOW_RATIO_UB": [0.225, 1.0],
+        "IT_FAN_FULL_LOAD_V": 0.051,
+        "ITFAN_REF_V_RATIO": 1.0,
+        "ITFAN_REF_P": 10.0,
+        "INLET_TEMP_RANGE": [16, 28],
+        "DEFAULT_SERVER_POWER_CHARACTERISTICS": [[170, 20]] + [[130, 10]] * 19,
+        "HP_PROLIANT": [110, 170],
+    },
+}
+
+
+def fails(arguments: list[str], parts: list[str]) -> None:
+    """Run, and expect one line of error that holds every part."""
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 2, done.output
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    for part in parts:
+        assert part in line
+
+
+# Configuration files
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("", ["the top level is a NoneType", "valid is a mapping"]),
+        ("- 1", ["the top level is a list", "valid is a mapping"]),
+        ("hall: [1", ["not valid YAML", "line 1"]),
+        ("a: 1\n---\nb: 2\n", ["not valid YAML", "single document"]),
+        ("!!python/object:os.system {}", ["not valid YAML", "python/object"]),
+        ("extends: corected", ["extends: 'corected'", "corrected, large, paper"]),
+        ("hall: {rows: 2}", ["hall.racks_per_row: missing", "hall.supply_approach_k: missing"]),
+        ("extends: tiny\nhvca: {}", ["hvca: unknown key", "did you mean 'hvac'?"]),
+        (
+            "extends: tiny\nhvac: {chiller: {mdel: york}}",
+            ["hvac.chiller.mdel: unknown key", "did you mean 'model'?"],
+        ),
+        ("extends: tiny\nhall: null", ["hall:", "None"]),
+        ("extends: tiny\nhall: {1: 2}", ["hall.1", "Keys should be strings"]),
+        (
+            "extends: tiny\nservers: {groups: [[{count: 1, full_w: 10, idle_w: 20}]]}",
+            ["servers.groups.0.0: idle_w 20 must not exceed full_w 10"],
+        ),
+        (
+            "extends: tiny\nservers: {groups: [[{count: 1, full_w: .inf, idle_w: 2}]]}",
+            ["servers.groups.0.0.full_w", "finite"],
+        ),
+    ],
+)
+def test_yaml(tmp_path: Path, text: str, parts: list[str]) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    fails(["config", "check", str(path)], [f"{path}: ", *parts])
+    fails(["simulate", str(path), "--out", str(tmp_path / "run")], [f"{path}: ", *parts])
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.yaml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    fails(["config", "show", str(binary)], [f"{binary}: cannot be read", "0xff"])
+    fails(["config", "show", str(tmp_path)], [f"{tmp_path}: cannot be read", "directory"])
+    missing = str(tmp_path / "no.yaml")
+    fails(["config", "show", missing], [f"{missing}: no such file or preset"])
+    fails(["config", "show", "corected"], ["corected", "did you mean 'corrected'?"])
+
+
+# Overrides
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("=3", ["override '=3'", "section.key=value"]),
+        ("a..b=3", ["override 'a..b=3'", "section.key=value"]),
+        ("hall.rows=: :", ["override 'hall.rows=: :'", "YAML"]),
+        ("hall.rows=0", ["hall.rows", "greater than or equal to 1", "0"]),
+        ("hall.rows=2.5", ["hall.rows", "integer", "2.5"]),
+        ("hall.rows=3", ["supply_approach_k has 4 entries, expected 6"]),
+        ("hall.rows.x=3", ["override 'hall.rows.x=3'", "rows is a value"]),
+        ("hall.supply_aproach_k=3", ["hall.supply_aproach_k", "did you mean 'supply_approach_k'?"]),
+        ("hall.supply_approach_k=[1, 2]", ["supply_approach_k has 2 entries, expected 4"]),
+        ("servers.groups.9.0.count=1", ["index '9' is not in 0..3"]),
+        ("servers.groups.0.0.count=-1", ["servers.groups.0.0.count", "-1"]),
+        ("servers.groups.0.0.cnt=1", ["servers.groups.0.0.cnt", "did you mean 'count'?"]),
+        ("servers.groups=[[]]", ["servers.groups rack 0 is empty"]),
+        ("servers.groups.1.1.load_weight=20", ["servers.groups rack 1: load_weight 20"]),
+        ("servers.inlet_range_c=[28, 16]", ["servers.inlet_range_c", "low < high"]),
+        ("hvac.chiller.model=york", ["hvac.chiller.model", "eir_york", "'york'"]),
+        ("hvac.total_of=[chiler]", ["hvac.total_of.0", "'chiller'", "'chiler'"]),
+        ("hvac.setpoint.min_c=30", ["hvac.setpoint", "initial_c 18", "min_c 30"]),
+        ("hvac.setpoint.initial_c=.nan", ["hvac.setpoint.initial_c", "finite"]),
+        ("hvac.water.cycles_of_concentration=1", ["cycles_of_concentration", "greater than 1"]),
+        ("battery.capacity_kwh=-1", ["battery.capacity_kwh", "-1"]),
+        ("battery.lower_v=1", ["battery: lower_v 1 must be below upper_v 1"]),
+        ("workload.deadline_h=48", ["workload: deadline_h 48", "age_horizon_h 24"]),
+        ("workload.trace=alibba", ["trace 'alibba'", "alibaba_1"]),
+        ("site.start=02-29", ["site.start", "02-29", "MM-DD"]),
+        ("site.start=2001-07-01", ["site.start", "MM-DD"]),
+        ("site.location=5", ["site.location", "5"]),
+        ("site.weather_file=/no/such.epw", ["/no/such.epw: no such file"]),
+        ("simulation.steps_per_hour=7", ["simulation.steps_per_hour", "7", "1, 2, 3, 4, 5, 6"]),
+    ],
+)
+def test_overrides(override: str, parts: list[str]) -> None:
+    fails(["config", "check", "tiny", override], parts)
+    fails(["config", "check", "tiny", "--set", override], parts)
+
+
+# The SustainDC format
+
+
+def test_inline_dc_config_is_valid(tmp_path: Path) -> None:
+    config = load_config(dc_config(tmp_path, lambda _: None))
+    assert isinstance(config, DataCenterConfig)
+    assert (config.hall.racks, config.hall.servers_per_rack) == (20, 200)
+
+
+def dc_config(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    values = copy.deepcopy(DC_CONFIG)
+    change(values)
+    path = folder / "dc_config.json"
+    path.write_text(json.dumps(values))
+    return path
+
+
+def dc1(values: dict[str, Any]) -> None:
+    """Lists of 16 racks in a hall of 20, one COP instead of three keys, as a released file has."""
+    dc3(values)
+    values[HALL]["RACK_SUPPLY_APPROACH_TEMP_LIST"] = [5.3] * 4 + [5.0] * 8 + [5.3] * 4
+    values[HALL]["RACK_RETURN_APPROACH_TEMP_LIST"] = [-3.7] * 4 + [-2.5] * 8 + [-3.7] * 4
+    values[HALL]["NUM_ROWS"] = 4
+
+
+def dc3(values: dict[str, Any]) -> None:
+    """20 power pairs in a hall of 25 racks, one COP instead of three keys, as another has."""
+    values[HALL] |= {
+        "NUM_ROWS": 5,
+        "CPUS_PER_RACK": 1e6,
+        "RACK_SUPPLY_APPROACH_TEMP_LIST": [5.3] * 5 + [5.0] * 15 + [5.3] * 5,
+        "RACK_RETURN_APPROACH_TEMP_LIST": [-3.7] * 5 + [-2.5] * 15 + [-3.7] * 5,
+    }
+    for name in ("CHILLER_COP_BASE", "CHILLER_COP_K", "CHILLER_COP_T_NOMINAL"):
+        del values[HVAC][name]
+    values[HVAC]["CHILLER_COP"] = 6.0
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (
+            dc1,
+            [
+                f"{HVAC}.CHILLER_COP: unknown key",
+                f"{HVAC}.CHILLER_COP_BASE: missing",
+                f"{HALL}.RACK_SUPPLY_APPROACH_TEMP_LIST: length 16, expected 20",
+                f"{HALL}.RACK_RETURN_APPROACH_TEMP_LIST: length 16, expected 20",
+            ],
+        ),
+        (
+            dc3,
+            [
+                f"{HVAC}.CHILLER_COP: unknown key",
+                f"{HVAC}.CHILLER_COP_T_NOMINAL: missing",
+                f"{SERVERS}.DEFAULT_SERVER_POWER_CHARACTERISTICS: length 20, expected 25",
+            ],
+        ),
+        (lambda v: v.pop(SERVERS), [f"{SERVERS}: missing section"]),
+        (lambda v: v.update(extra=1), ["extra: unknown section", HALL, HVAC, SERVERS]),
+        (lambda v: v[HVAC].pop("C_AIR"), [f"{HVAC}.C_AIR: missing"]),
+        (lambda v: v[HVAC].update(C_AIRR=1), [f"{HVAC}.C_AIRR", "did you mean 'C_AIR'?"]),
+        (lambda v: v[HALL].update(NUM_ROWS="4"), [f"{HALL}.NUM_ROWS", "'4' is not a number"]),
+        (lambda v: v[HALL].update(CPUS_PER_RACK=[200] * 19), ["CPUS_PER_RACK: length 19", "20"]),
+        (lambda v: v[HALL].update(CPUS_PER_RACK=0.5), ["CPUS_PER_RACK: 0.5 is no positive int"]),
+        (lambda v: v[HALL].update(CPUS_PER_RACK={}), ["CPUS_PER_RACK: {} is not a number"]),
+        (lambda v: v[HVAC].update(CT_PUMP_EFFICIENCY=0), ["CT_PUMP_EFFICIENCY: 0 must be posit"]),
+        (lambda v: v[SERVERS].update(INLET_TEMP_RANGE=[16]), ["INLET_TEMP_RANGE: length 1", "2"]),
+        (lambda v: v[SERVERS].update(INLET_TEMP_RANGE=[28, 16]), ["(28, 16)", "low < high"]),
+        (
+            lambda v: v[SERVERS]["DEFAULT_SERVER_POWER_CHARACTERISTICS"].__setitem__(3, [130]),
+            ["DEFAULT_SERVER_POWER_CHARACTERISTICS[3]: length 1, expected 2"],
+        ),
+        (lambda v: v[SERVERS].update(ITFAN_REF_P={"a": 1}), ["ITFAN_REF_P", "is not a number"]),
+    ],
+)
+def test_dc_config(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], parts: list[str]
+) -> None:
+    path = dc_config(tmp_path, change)
+    fails(["config", "check", str(path)], [f"{path}: ", *parts])
+
+
+def test_json_that_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "dc_config.json"
+    for text, part in (("{", "not valid JSON"), ("[]", "the top level is a list")):
+        path.write_text(text)
+        fails(["config", "check", str(path)], [f"{path}: {part}"])
+
+
+# Sampling
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("3", ["the top level is a int", "valid is a mapping of fields"]),
+        ("1: {choice: [1]}", ["key 1", "valid is a mapping of fields"]),
+        ("a: [", ["not valid YAML"]),
+        ("hvac.chiller.reference_cop: 5", ["sample hvac.chiller.reference_cop", "uniform"]),
+        (
+            "hvac.chiller.reference_cop: {unifrom: [5, 6]}",
+            ["sample hvac.chiller.reference_cop: unknown kind 'unifrom'", "mean 'uniform'?"],
+        ),
+        ("hvac.chiller.reference_cop: {uniform: [6, 5]}", ["low <= high", "[6, 5]"]),
+        ("hvac.chiller.reference_cop: {uniform: [5]}", ["needs [low, high]", "[5]"]),
+        ("hvac.chiller.reference_cop: {choice: []}", ["choice needs a list", "[]"]),
+        ("hvac.chiller.reference_cop: {uniform: [-1, 6]}", ["reference_cop", "(got -1)"]),
+        ("hvac.chiler.model: {choice: [carnot]}", ["hvac.chiler", "did you mean 'chiller'?"]),
+        ("hall.rows: {choice: [3]}", ["supply_approach_k has 4 entries, expected 6"]),
+    ],
+)
+def test_sample(tmp_path: Path, text: str, parts: list[str]) -> None:
+    path = tmp_path / "sample.yaml"
+    path.write_text(text)
+    arguments = ["simulate", "tiny", "--dcs", "2", "--out", str(tmp_path / "run")]
+    fails([*arguments, "--sample", str(path)], [f"{path}: ", *parts])
+    assert not (tmp_path / "run").exists()
+
+
+def test_sample_that_is_no_file(tmp_path: Path) -> None:
+    for path, part in ((tmp_path / "no.yaml", "No such file"), (tmp_path, "directory")):
+        fails(["simulate", "tiny", "--sample", str(path)], [f"{path}: cannot be read", part])
+
+
+# Arguments
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--days", "x"], ["--days", "number"]),
+        (["--days", "nan"], ["--days nan", "positive number of days"]),
+        (["--days", "-1"], ["--days -1", "positive number of days"]),
+        (["--days", "0"], ["--days 0", "positive number of days"]),
+        (["--days", "0.3"], ["--days 0.3", "whole steps of 15 min", "n/96"]),
+        (["--days", "1.5", "simulation.steps_per_hour=1", "--days", "0.1"], ["60 min", "n/24"]),
+        (["--start", "13-01"], ["--start", "13-01", "MM-DD"]),
+        (["--start", "02-29"], ["--start", "02-29", "MM-DD"]),
+        (["--dcs", "0"], ["--dcs", "greater than or equal to 1"]),
+        (["--dcs", "99999999999"], ["--dcs", "less than or equal to 100000"]),
+        (["--seed", "-1"], ["--seed", "greater than or equal to 0"]),
+        (["--precision", "f16"], ["--precision", "'f16'", "'f32', 'f64'"]),
+        (["--controller", "g37"], ["'g37'", "did you mean 'g36'?"]),
+        (["--controller", "cooling=lookahead-3h"], ["does not act on cooling", "g36"]),
+        (["--controller", "constant:30"], ["constant:30", "16..23 C"]),
+        (["--site", "nyy"], ["site 'NYY'", "nearest: NY"]),
+        (["--site", "ny,NY"], ["--site 'ny,NY'", "given twice", "--dcs"]),
+        (["--site", "ny,,ca"], ["--site 'ny,,ca'", "empty name"]),
+        (["--weather", "a.epw", "--weather", "b.epw"], ["--weather: 2 given for 1"]),
+        (["--site", "ny,ca", "--carbon", "a.csv"], ["--carbon: 1 given for 2"]),
+        (["--workload", "/no/such.csv"], ["/no/such.csv: no such file"]),
+        (["large"], ["'large'", "second preset or file", "'tiny'"]),
+        (["--set", "x"], ["override 'x'", "section.key=value"]),
+        (["--controler", "g36"], ["--controler", "--controller"]),
+        (["--days"], ["--days", "requires an argument"]),
+    ],
+)
+def test_arguments(tmp_path: Path, arguments: list[str], parts: list[str]) -> None:
+    out = tmp_path / "run"
+    fails(["simulate", "tiny", "--days", "1", "--out", str(out), *arguments], parts)
+    assert not out.exists()
+
+
+def test_commands() -> None:
+    fails(["simlate"], ["'simlate'", "'simulate'"])
+    fails(["config", "chek"], ["'chek'", "'check'"])
+    fails(["data", "show", "nyy"], ["'nyy'", "nearest: NY"])
+
+
+def test_errors_fit_on_a_line_of_any_width() -> None:
+    done = CliRunner().invoke(app, ["config", "check", "hall.x=1"], env={"COLUMNS": "40"})
+    assert re.fullmatch(r"error: preset corrected: hall\.x: unknown key.*\n", done.stderr)
