@@ -10,21 +10,39 @@ import difflib
 import json
 import os
 import re
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from sdc_taichi.errors import ConfigError
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
+
+def _no_bool(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError("should be a number")
+    return value
+
+
+_Real = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
+_Whole = Annotated[int, BeforeValidator(_no_bool)]
+Positive = Annotated[_Real, Field(gt=0)]
+NonNegative = Annotated[_Real, Field(ge=0)]
+Share = Annotated[_Real, Field(ge=0, le=1)]
+Finite = _Real
+Count = Annotated[_Whole, Field(ge=1)]
 Pair = tuple[Finite, Finite]
 
 
@@ -88,7 +106,7 @@ class HallConfig(_Section):
 class ServerConfig(_Section):
     """Power and airflow of the servers (ITE:AirCooled form of EnergyPlus, curves of Sun 2021)."""
 
-    power_w: tuple[Pair, ...] | Pair = (150.0, 10.0)
+    power_w: Annotated[tuple[Pair, ...], Field(min_length=1)] = ((150.0, 10.0),)
     """(full, idle) power of one server: one pair for all racks or one pair per rack."""
     groups: tuple[tuple[ServerGroup, ...], ...] | None = None
     """Server groups per rack, or one entry for all; replaces power_w and servers_per_rack."""
@@ -107,6 +125,14 @@ class ServerConfig(_Section):
     fan_reference_w: NonNegative = 10.0
     outlet_model: Literal["server", "rack", "released"] = "server"
 
+    @field_validator("power_w", mode="before")
+    @classmethod
+    def _one_pair_is_a_list_of_one(cls, value: Any) -> Any:
+        flat = isinstance(value, list | tuple) and not any(
+            isinstance(x, list | tuple) for x in value
+        )
+        return [value] if flat and value else value
+
     @field_validator("inlet_range_c", "fan_airflow_ratio_limits")
     @classmethod
     def _ordered(cls, value: Pair | None) -> Pair | None:
@@ -114,18 +140,13 @@ class ServerConfig(_Section):
 
     @model_validator(mode="after")
     def _idle_below_full(self) -> Self:
-        for rack, (full_w, idle_w) in enumerate(self.power_pairs()):
+        for rack, (full_w, idle_w) in enumerate(self.power_w):
             if not full_w > 0 or not 0 <= idle_w <= full_w:
                 raise ValueError(
                     f"power_w entry {rack} is ({full_w:g}, {idle_w:g}); "
                     "valid is (full, idle) with full > 0 and 0 <= idle <= full"
                 )
         return self
-
-    def power_pairs(self) -> tuple[Pair, ...]:
-        """The (full, idle) pairs, one for all racks or one per rack."""
-        first = self.power_w[0]
-        return self.power_w if isinstance(first, tuple) else (self.power_w,)  # type: ignore[return-value]
 
 
 class SetpointConfig(_Section):
@@ -258,6 +279,28 @@ class HvacConfig(_Section):
     ups_efficiency: Annotated[float, Field(gt=0, le=1)] = 0.96
     """Only for the PUE with UPS losses; the grid balance is IT + HVAC + battery."""
 
+    @field_validator("total_of")
+    @classmethod
+    def _each_device_once(cls, value: tuple[Device, ...]) -> tuple[Device, ...]:
+        if not value or len(set(value)) < len(value):
+            raise ValueError(f"{list(value)} must name at least one device and each one once")
+        return value
+
+    @model_validator(mode="after")
+    def _chilled_water_within_the_model(self) -> Self:
+        if self.chiller.model == "carnot":
+            low, high = 4.0, 20.0
+            for name in ("min_c", "max_c"):
+                setpoint = getattr(self.setpoint, name)
+                water = setpoint - self.chiller.coil_approach_k
+                if not low <= water <= high:
+                    raise ValueError(
+                        f"setpoint.{name} {setpoint:g} less chiller.coil_approach_k "
+                        f"{self.chiller.coil_approach_k:g} makes chilled water of {water:g} C; "
+                        f"model carnot is valid within {low:g}..{high:g} C"
+                    )
+        return self
+
 
 class BatteryConfig(_Section):
     """Battery: model, capacity and limits (C/L/C of Kazhamiaka, Rosenberg and Keshav 2019)."""
@@ -294,7 +337,7 @@ class WorkloadConfig(_Section):
     queue_limit_h: Positive | None = 2.5
     """Queue capacity in hours of the whole data center at full utilisation; None is unlimited."""
     deadline_h: Positive | None = 24.0
-    age_horizon_h: Positive = 24.0
+    age_horizon_h: Annotated[Positive, Field(le=8760)] = 24.0
     """Ages are exact up to this; older work is counted at this age."""
 
     @model_validator(mode="after")
@@ -360,7 +403,7 @@ class DataCenterConfig(_Section):
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         racks = self.hall.racks
-        pairs = self.servers.power_pairs()
+        pairs = self.servers.power_w
         groups = self.servers.groups
         if groups is None:
             if len(pairs) not in (1, racks):
@@ -398,7 +441,7 @@ class DataCenterConfig(_Section):
             found = self.servers.groups
             per_rack = found * racks if len(found) == 1 else found
         else:
-            pairs = self.servers.power_pairs()
+            pairs = self.servers.power_w
             pairs = pairs * racks if len(pairs) == 1 else pairs
             counts = self.hall.servers_per_rack
             counts = (counts,) * racks if isinstance(counts, int) else counts
@@ -410,8 +453,14 @@ class DataCenterConfig(_Section):
             return per_rack
         nameplate_w = sum(g.count * g.full_w for rack in per_rack for g in rack)
         scale = self.hall.capacity_mw * 1e6 / nameplate_w
+        if min(g.count for rack in per_rack for g in rack) * scale < 0.5:
+            smallest = nameplate_w / min(g.count for rack in per_rack for g in rack) / 1e6
+            raise ConfigError(
+                f"{self.name}: hall.capacity_mw {self.hall.capacity_mw:g} leaves racks without "
+                f"servers; valid is at least {smallest:.3g} for this hall"
+            )
         return tuple(
-            tuple(g.model_copy(update={"count": max(1, round(g.count * scale))}) for g in rack)
+            tuple(g.model_copy(update={"count": round(g.count * scale)}) for g in rack)
             for rack in per_rack
         )
 
@@ -505,6 +554,14 @@ def apply_overrides(config: DataCenterConfig, overrides: list[str]) -> DataCente
     return config_from_dict(values, config.name)
 
 
+def with_values(config: DataCenterConfig, assigned: Mapping[str, Any]) -> DataCenterConfig:
+    """A copy of ``config`` with plain values put at dotted paths."""
+    values = config.model_dump(mode="json")
+    for path, value in assigned.items():
+        _assign(values, path, value, f"{path}={value!r}")
+    return config_from_dict(values, config.name)
+
+
 def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
     if isinstance(source, str) and source in preset_names():
         text = resources.files("sdc_taichi.configs").joinpath(f"{source}.yaml").read_text("utf-8")
@@ -576,13 +633,19 @@ def _require_mapping(values: Any, label: str) -> dict[str, Any]:
 
 def _apply_override(values: dict[str, Any], override: str) -> None:
     path, sign, text = override.partition("=")
-    keys = path.strip().split(".")
-    if not sign or not all(keys):
+    if not sign:
         raise ConfigError(f"override {override!r}: valid is section.key=value")
     try:
         value = yaml.safe_load(text)
     except yaml.YAMLError:
         raise ConfigError(f"override {override!r}: {text!r} is not a YAML value") from None
+    _assign(values, path, value, override)
+
+
+def _assign(values: dict[str, Any], path: str, value: Any, override: str) -> None:
+    keys = path.strip().split(".")
+    if not all(keys):
+        raise ConfigError(f"override {override!r}: valid is section.key=value")
     node: Any = values
     for key in keys[:-1]:
         if isinstance(node, list):
@@ -743,8 +806,8 @@ def from_sustaindc(values: dict[str, Any], label: str) -> dict[str, Any]:
         "name": Path(label).stem,
         "description": "read from the SustainDC dc_config.json format",
         "hall": {
-            "rows": hall["NUM_ROWS"],
-            "racks_per_row": hall["NUM_RACKS_PER_ROW"],
+            "rows": int(hall["NUM_ROWS"]),
+            "racks_per_row": int(hall["NUM_RACKS_PER_ROW"]),
             "servers_per_rack": [int(n) for n in per_rack]
             if isinstance(per_rack, list)
             else int(per_rack),
@@ -809,6 +872,10 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
+def _is_count(value: Any) -> bool:
+    return _is_number(value) and 1 <= value <= 1e9 and value == int(value)
+
+
 def _sustaindc_value_problems(values: dict[str, Any]) -> list[str]:
     problems = []
     hall, servers = values["data_center_configuration"], values["server_characteristics"]
@@ -820,9 +887,12 @@ def _sustaindc_value_problems(values: dict[str, Any]) -> list[str]:
             wrong = next((x for x in flat if not _is_number(x)), None)
             if wrong is not None or not flat:
                 problems.append(f"{section}.{key}: {wrong!r} is not a number")
-    rows, per_row = hall.get("NUM_ROWS"), hall.get("NUM_RACKS_PER_ROW")
-    counted = _is_number(rows) and _is_number(per_row)
-    racks = int(rows * per_row) if counted else 0
+    counts = {key: hall.get(key, 1) for key in ("NUM_ROWS", "NUM_RACKS_PER_ROW")}
+    for key, count in counts.items():
+        if _is_number(count) and not _is_count(count):
+            problems.append(f"data_center_configuration.{key}: {count!r} is no positive integer")
+    counted = all(key in hall and _is_count(count) for key, count in counts.items())
+    racks = int(np.prod([int(c) for c in counts.values()])) if counted else 0
     lists = (
         (hall, "data_center_configuration", "RACK_SUPPLY_APPROACH_TEMP_LIST"),
         (hall, "data_center_configuration", "RACK_RETURN_APPROACH_TEMP_LIST"),
@@ -839,7 +909,7 @@ def _sustaindc_value_problems(values: dict[str, Any]) -> list[str]:
                 )
     per_rack = hall.get("CPUS_PER_RACK", 1)
     for count in per_rack if isinstance(per_rack, list) else [per_rack]:
-        if _is_number(count) and (count < 1 or count != int(count)):
+        if _is_number(count) and not _is_count(count):
             problems.append(
                 f"data_center_configuration.CPUS_PER_RACK: {count!r} is no positive integer"
             )

@@ -230,7 +230,7 @@ def _read_site(config: DataCenterConfig, steps_per_hour: int) -> _Site:
 
 def _notes(site: _Site, trace: Series) -> tuple[str, ...]:
     series = (site.data.outdoor_c, site.data.wet_bulb_c, site.data.ci_g_per_kwh, trace)
-    return tuple(note for s in series for note in s.notes)
+    return tuple(f"{s.source}: {note}" for s in series for note in s.notes)
 
 
 def _table(rows: Sequence[F64]) -> Table:

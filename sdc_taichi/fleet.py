@@ -13,15 +13,16 @@ import numpy.typing as npt
 
 from sdc_taichi.config import (
     DataCenterConfig,
-    apply_overrides,
     cpu_coefficients,
     fan_coefficients,
+    with_values,
 )
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.types import F64
 
 I32 = npt.NDArray[np.int32]
 
+MOST_SERVERS = int(np.iinfo(np.int32).max)
 STAGE_MODELS = {
     "inlet": "hall.inlet_model",
     "outlet": "servers.outlet_model",
@@ -182,8 +183,7 @@ def make_configs(
             config = config.model_copy(update={"site": site})
         if rules:
             rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, index])))
-            drawn = [f"{path}={_draw(rule, rng)!r}" for path, rule in rules.items()]
-            config = apply_overrides(config, drawn)
+            config = with_values(config, {path: _draw(rule, rng) for path, rule in rules.items()})
         stem = config.site.location.lower()
         name = stem if count <= max(len(sites), 1) else f"{stem}-{index:0{len(str(count - 1))}d}"
         out.append(config.model_copy(update={"name": name}))
@@ -204,26 +204,23 @@ def _check_rule(base: DataCenterConfig, path: str, rule: Any) -> None:
     if not isinstance(values, list | tuple) or not values:
         raise ConfigError(f"{where}: {kind} needs a list, got {values!r}")
     if kind == "uniform":
-        numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+        numbers = all(isinstance(v, int | float) and abs(v) < np.inf for v in values)
+        numbers &= not any(isinstance(v, bool) for v in values)
         if len(values) != 2 or not numbers or not values[0] <= values[1]:
             raise ConfigError(
                 f"{where}: uniform needs [low, high] with low <= high, got {values!r}"
             )
-    apply_overrides(base, [f"{path}={_plain(values[0])!r}"])
+    with_values(base, {path: values[0]})
 
 
 def _draw(rule: Mapping[str, Any], rng: np.random.Generator) -> Any:
     ((kind, values),) = rule.items()
     if kind == "choice":
-        return _plain(values[int(rng.integers(len(values)))])
+        return values[int(rng.integers(len(values)))]
     low, high = values
     if isinstance(low, int) and isinstance(high, int):
         return int(rng.integers(low, high + 1))
     return float(rng.uniform(low, high))
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
@@ -256,6 +253,10 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
             for g in rack
         ]
     groups = np.array(columns, dtype=np.float64).T
+    if groups[0].sum() > MOST_SERVERS:
+        raise ConfigError(
+            f"{config.name}: {groups[0].sum():.4g} servers; valid is at most {MOST_SERVERS:,}"
+        )
     approach = np.broadcast_to(np.asarray(hall.supply_approach_k, dtype=np.float64), (hall.racks,))
     if hall.supply_approach_limits_k is not None:
         approach = np.clip(approach, *hall.supply_approach_limits_k)
@@ -282,6 +283,6 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
 
 def _starts(counts: npt.NDArray[Any]) -> I32:
     starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-    if starts[-1] > np.iinfo(np.int32).max:
-        raise ConfigError(f"fleet: {starts[-1]} servers exceed the limit of 2,147,483,647")
+    if starts[-1] > MOST_SERVERS:
+        raise ConfigError(f"fleet: {starts[-1]:,} servers; valid is at most {MOST_SERVERS:,}")
     return starts.astype(np.int32)

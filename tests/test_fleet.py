@@ -1,0 +1,243 @@
+"""Fleets: flat arrays with offsets, copies over sites, sampling, and what all must share."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sdc_taichi import ConfigError, DataCenterConfig, build_fleet, load_config, make_configs
+from sdc_taichi.config import apply_overrides
+from sdc_taichi.kernels.thermal import DC_ROWS, GROUP_ROWS
+
+TINY = load_config("tiny")
+
+
+def named(config: DataCenterConfig, name: str, *changes: str) -> DataCenterConfig:
+    changed = apply_overrides(config, list(changes)) if changes else config
+    return changed.model_copy(update={"name": name})
+
+
+def ragged() -> list[DataCenterConfig]:
+    """Four mixed racks, one rack of one server, three plain racks of different size."""
+    return [
+        TINY,
+        named(TINY, "one", "hall.rows=1", "hall.racks_per_row=1", "hall.supply_approach_k=6",
+              "hall.return_approach_k=-3", "servers.groups=[[{count: 1, full_w: 99, idle_w: 9}]]"),
+        named(load_config("corrected"), "plain", "hall.rows=3", "hall.racks_per_row=1",
+              "hall.supply_approach_k=[1, 2, 9]", "hall.supply_approach_limits_k=[1.5, 5]",
+              "hall.return_approach_k=-3", "servers.power_w=[[100, 10], [200, 20], [300, 30]]",
+              "hall.servers_per_rack=[5, 6, 7]"),
+    ]  # fmt: skip
+
+
+def test_offsets_of_a_ragged_fleet() -> None:
+    fleet = build_fleet(ragged())
+    assert fleet.names == ("tiny", "one", "plain")
+    assert (fleet.size, fleet.racks, fleet.servers) == (3, 8, 12 + 1 + 18)
+    assert fleet.rack_start.tolist() == [0, 4, 5, 8]
+    assert fleet.rack_dc.tolist() == [0, 0, 0, 0, 1, 2, 2, 2]
+    assert fleet.group_start.tolist() == [0, 1, 3, 4, 7, 8, 9, 10, 11]
+    assert np.diff(fleet.server_start).tolist() == [3, 2, 1, 3, 1, 1, 1, 1, 5, 6, 7]
+    assert fleet.per_dc_servers().tolist() == [12, 1, 18]
+    assert np.bincount(fleet.server_rack()).tolist() == [3, 3, 3, 3, 1, 5, 6, 7]
+    assert fleet.approach_k.tolist() == [5.3, 5.0, 4.0, 4.5, 6.0, 1.5, 2.0, 5.0]
+    row = dict(zip(GROUP_ROWS, fleet.groups, strict=True))
+    assert row["count"].tolist() == np.diff(fleet.server_start).tolist()
+    assert row["full_w"].tolist()[-3:] == [100, 200, 300]
+    assert row["idle_w"].tolist()[-3:] == [10, 20, 30]
+    assert row["inlet_offset_k"].tolist() == [0, -0.2, 0.4, 0, -0.3, 0, 0.3, 0, 0, 0, 0]
+    mean = (2 * 1.2 + 0.6) / 3
+    np.testing.assert_allclose(row["load_deviation"][1:3], [1.2 / mean - 1, 0.6 / mean - 1])
+    weighted = np.add.reduceat(row["count"] * row["load_deviation"], fleet.group_start[:-1])
+    np.testing.assert_allclose(weighted, 0.0, atol=1e-15)
+    for offsets in (fleet.rack_start, fleet.group_start, fleet.server_start, fleet.rack_dc):
+        assert offsets.dtype == np.int32
+
+
+def test_parameters_of_each_data_center_reach_the_kernel() -> None:
+    configs = [
+        TINY,
+        named(TINY, "b", "servers.fan_power_exponent=2.5", "servers.fan_reference_w=7",
+              "servers.fan_full_airflow_m3s=0.04", "servers.fan_airflow_ratio_limits=null",
+              "hall.air_density_kg_m3=1.1"),
+    ]  # fmt: skip
+    row = dict(zip(DC_ROWS, build_fleet(configs).dcs, strict=True))
+    np.testing.assert_allclose(row["cpu_slope_per_k"], 1 / 600)
+    np.testing.assert_allclose(row["cpu_offset"], -1 / 60)
+    np.testing.assert_allclose(row["cpu_shift"], 0.99)
+    np.testing.assert_allclose(row["fan_slope_per_k"], 0.215 / 12)
+    np.testing.assert_allclose(row["fan_offset"], 0.225 - 28 * 0.215 / 12)
+    np.testing.assert_allclose(row["fan_shift"], 0.215)
+    assert row["fan_low"].tolist() == [0.2, -np.inf]
+    assert row["fan_high"].tolist() == [1.0, np.inf]
+    assert row["fan_exponent"].tolist() == [3.0, 2.5]
+    assert row["fan_reference_w"].tolist() == [10.0, 7.0]
+    assert row["fan_full_m3s"].tolist() == [0.051, 0.04]
+    np.testing.assert_allclose(row["air_j_per_m3_k"], [1.225 * 1006, 1.1 * 1006])
+
+
+def test_values_of_a_field() -> None:
+    fleet = build_fleet(
+        [TINY, named(TINY, "b", "workload.deadline_h=null", "battery.capacity_kwh=5")]
+    )
+    assert fleet.values("hvac.setpoint.max_c").tolist() == [23, 23]
+    assert np.array_equal(fleet.values("workload.deadline_h"), [24, np.nan], equal_nan=True)
+    assert np.array_equal(fleet.values("battery.capacity_kwh"), [np.nan, 5], equal_nan=True)
+    assert fleet.values("hvac.tower.economiser").tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "servers.outlet_model=rack",
+        "hvac.setpoint.model=accelerating",
+        "hvac.crac.flow_model=constant",
+        "hvac.cooling_load_model=paper",
+        "hvac.chiller.model=eir_york",
+        "hvac.tower.model=released",
+        "hvac.pumps.model=released",
+        "hvac.water.model=paper",
+        "hvac.sizing.model=released",
+        "battery.model=paper",
+        "workload.model=tasks",
+        "simulation.steps_per_hour=1",
+        "hvac.total_of=[chiller]",
+        "workload.age_horizon_h=48",
+    ],
+)
+def test_what_a_fleet_must_share(change: str) -> None:
+    path = change.split("=")[0]
+    with pytest.raises(
+        ConfigError, match=f"fleet: {re.escape(path)} is .* in tiny and .* in other"
+    ):
+        build_fleet([TINY, named(TINY, "other", change)])
+
+
+def test_fleets_that_cannot_be() -> None:
+    with pytest.raises(ConfigError, match="no data center given"):
+        build_fleet([])
+    with pytest.raises(ConfigError, match="'tiny' is used twice"):
+        build_fleet([TINY, TINY])
+    huge = named(TINY, "huge", "servers.groups=[[{count: 2000000000, full_w: 99, idle_w: 9}]]")
+    with pytest.raises(ConfigError, match=r"8e\+09 servers; valid is at most 2,147,483,647"):
+        build_fleet(huge)
+
+
+def test_equal_halls_are_laid_out_once_and_equal() -> None:
+    fleet = build_fleet(make_configs(TINY, count=50))
+    assert fleet.size == 50
+    groups = fleet.groups.reshape(len(GROUP_ROWS), 50, -1)
+    assert np.all(groups == groups[:, :1])
+
+
+# --- copies and sampling ------------------------------------------------------------------------
+
+SAMPLE: dict[str, Any] = {
+    "servers.fan_reference_w": {"uniform": [5.0, 15.0]},
+    "hvac.chiller.reference_cop": {"choice": [4.0, 5.0, 6.0]},
+    "workload.deadline_h": {"uniform": [1, 24]},
+    "battery.capacity_kwh": {"choice": [None, 100]},
+    "hvac.setpoint.initial_c": {"uniform": [16, 23]},
+}
+
+
+def drawn(configs: list[DataCenterConfig]) -> list[tuple[Any, ...]]:
+    return [
+        (
+            c.servers.fan_reference_w,
+            c.hvac.chiller.reference_cop,
+            c.workload.deadline_h,
+            c.battery.capacity_kwh,
+            c.hvac.setpoint.initial_c,
+        )
+        for c in configs
+    ]
+
+
+def test_copies_are_dealt_over_the_sites() -> None:
+    found = make_configs(TINY, count=5, sites=["ny", "AZ"])
+    assert [c.site.location for c in found] == ["NY", "AZ", "NY", "AZ", "NY"]
+    assert len({c.name for c in found}) == 5
+    assert [c.name for c in make_configs(TINY, sites=["ny", "az", "wa"])] == ["ny", "az", "wa"]
+    (alone,) = make_configs(TINY)
+    assert alone.site == TINY.site
+    names = [c.name for c in make_configs(TINY, count=12)]
+    assert names == sorted(names), "names sort as numbers do"
+    assert build_fleet(make_configs(TINY, count=3, sites=["ny", "az"])).size == 3
+
+
+def test_a_copy_draws_the_same_whatever_the_count() -> None:
+    few = drawn(make_configs(TINY, count=3, sample=SAMPLE, seed=4))
+    many = drawn(make_configs(TINY, count=40, sample=SAMPLE, seed=4))
+    assert many[:3] == few
+    assert drawn(make_configs(TINY, count=3, sites=["AZ", "WA"], sample=SAMPLE, seed=4)) == few
+    assert drawn(make_configs(TINY, count=3, sample=SAMPLE, seed=5)) != few
+    assert len(set(many)) == 40
+
+
+def test_draws_follow_their_rule() -> None:
+    fan, cop, deadline, capacity, initial = zip(
+        *drawn(make_configs(TINY, count=300, sample=SAMPLE)), strict=True
+    )
+    assert all(5 <= x <= 15 for x in fan)
+    assert np.mean(fan) == pytest.approx(10, abs=0.6)
+    assert np.std(fan) == pytest.approx(10 / 12**0.5, rel=0.1)
+    assert {cop.count(x) for x in (4.0, 5.0, 6.0)} <= set(range(75, 126))
+    assert set(deadline) == set(range(1, 25)), "whole limits draw whole numbers, both included"
+    assert set(capacity) == {None, 100}
+    assert set(initial) == set(range(16, 24))
+
+
+def test_sampled_lists_and_texts() -> None:
+    sample = {
+        "hall.supply_approach_k": {"choice": [[4, 4, 4, 4], [5, 5, 5, 6]]},
+        "workload.trace": {"choice": ["alibaba_1", "google_1"]},
+        "hvac.tower.economiser": {"choice": [True, False]},
+        "site.start": {"choice": ["01-01", "07-01"]},
+    }
+    found = make_configs(TINY, count=20, sample=sample)
+    assert {c.hall.supply_approach_k for c in found} == {(4, 4, 4, 4), (5, 5, 5, 6)}
+    assert {c.workload.trace for c in found} == {"alibaba_1", "google_1"}
+    assert {c.hvac.tower.economiser for c in found} == {True, False}
+    assert {c.site.start for c in found} == {"01-01", "07-01"}
+
+
+@pytest.mark.parametrize(
+    ("path", "rule", "message"),
+    [
+        ("battery.capacity_kwh", 5, "valid is {uniform"),
+        ("battery.capacity_kwh", {}, "valid is {uniform"),
+        ("battery.capacity_kwh", {"unifrom": [1, 2]}, "did you mean 'uniform'"),
+        (
+            "battery.capacity_kwh",
+            {"normal": [1, 2]},
+            "unknown kind 'normal'; valid: uniform, choice",
+        ),
+        ("battery.capacity_kwh", {"choice": []}, "choice needs a list"),
+        ("battery.capacity_kwh", {"choice": "abc"}, "choice needs a list"),
+        ("battery.capacity_kwh", {"uniform": [2, 1]}, "low <= high"),
+        ("battery.capacity_kwh", {"uniform": [1, 2, 3]}, r"needs \[low, high\]"),
+        ("battery.capacity_kwh", {"uniform": ["a", "b"]}, r"needs \[low, high\]"),
+        ("battery.capacity_kwh", {"uniform": [True, 2]}, r"needs \[low, high\]"),
+        ("battery.capacity", {"uniform": [1, 2]}, "did you mean 'capacity_kwh'"),
+        ("batery.capacity_kwh", {"uniform": [1, 2]}, "did you mean 'battery'"),
+        ("battery.initial_soc", {"uniform": [1.5, 2]}, "less than or equal to 1"),
+    ],
+)
+def test_wrong_sampling_rules(path: str, rule: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make_configs(TINY, count=2, sample={path: rule})
+
+
+def test_a_drawn_value_that_is_not_valid_is_an_error() -> None:
+    with pytest.raises(ConfigError, match=r"battery\.initial_soc"):
+        make_configs(TINY, count=50, sample={"battery.initial_soc": {"uniform": [0.5, 1.5]}})
+
+
+@pytest.mark.parametrize("count", [0, -3])
+def test_a_fleet_has_at_least_one(count: int) -> None:
+    with pytest.raises(ConfigError, match=f"fleet: {count} data centers; valid is at least 1"):
+        make_configs(TINY, count=count)

@@ -1,0 +1,640 @@
+"""The simulator as a whole: repeatable, resumable, independent of its batch, clear when misused."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sdc_taichi import (
+    Actions,
+    BatteryAction,
+    ConfigError,
+    CoolAction,
+    DataCenterConfig,
+    Drivers,
+    LoadAction,
+    RuntimeStateError,
+    SdcError,
+    Simulator,
+    StepResult,
+    drivers_from_arrays,
+    load_config,
+    load_drivers,
+    make_configs,
+)
+from sdc_taichi.config import apply_overrides
+from sdc_taichi.drivers import Table
+from sdc_taichi.hall import Precision
+from sdc_taichi.types import F64
+
+PRECISIONS: tuple[Precision, ...] = ("f32", "f64")
+
+
+def short_drivers(size: int = 1, steps: int = 96, seed: int = 0) -> Drivers:
+    rng = np.random.default_rng(seed)
+    wet_bulb = rng.uniform(-5, 24, (size, steps))
+    return drivers_from_arrays(
+        wet_bulb + 5,
+        wet_bulb,
+        rng.uniform(50, 600, (size, steps)),
+        rng.uniform(0, 1, (size, steps)),
+    )
+
+
+def random_actions(steps: int, size: int, seed: int = 0) -> list[Actions]:
+    rng = np.random.default_rng(seed)
+    return [
+        Actions(
+            rng.uniform(-1, 1, size),
+            rng.integers(-1, 2, size).astype(np.float64),
+            rng.uniform(-1, 1, size),
+        )
+        for _ in range(steps)
+    ]
+
+
+def mixed_fleet(preset: str = "corrected") -> list[DataCenterConfig]:
+    """Data centers of different size, site, season, make-up and parameters."""
+    base = load_config(preset)
+    changes: list[list[str]] = [
+        ["site.location=NY"],
+        ["site.location=AZ", "site.start=07-01", "hall.capacity_mw=3.5", "site.seed=4"],
+        ["site.location=WA", "site.start=12-31", "workload.trace=google_1"],
+        ["hall.rows=1", "hall.racks_per_row=3", "hall.supply_approach_k=4.2",
+         "hall.return_approach_k=-3", "servers.power_w=[300, 60]", "hall.servers_per_rack=[7,1,9]"],
+        ["hvac.setpoint.initial_c=21", "hvac.sizing.margin=1.5", "battery.capacity_kwh=0"],
+        ["workload.flexible_share=0.7", "workload.max_utilisation=0.8",
+         "workload.queue_limit_h=0.5", "workload.deadline_h=3"],
+        ["battery.initial_soc=0.8", "battery.hours_of_design_load=4", "site.location=TX"],
+        ["workload.queue_limit_h=null", "workload.deadline_h=null"],
+    ]  # fmt: skip
+    return [
+        apply_overrides(base, change).model_copy(update={"name": f"dc{i}"})
+        for i, change in enumerate(changes)
+    ]
+
+
+def grouped_fleet() -> list[DataCenterConfig]:
+    """Racks of unlike servers beside a hall of one rack with another fan law."""
+    base = load_config("tiny")
+    return [
+        base,
+        apply_overrides(
+            base.model_copy(update={"name": "one"}),
+            ["hall.rows=1", "hall.racks_per_row=1", "hall.supply_approach_k=3",
+             "hall.return_approach_k=-3", "servers.groups=[[{count: 4, full_w: 90, idle_w: 9}]]",
+             "servers.fan_power_exponent=2.5"],
+        ),
+        base.model_copy(update={"name": "again"}),
+    ]  # fmt: skip
+
+
+def results_of(
+    configs: Sequence[DataCenterConfig],
+    actions: Sequence[Actions],
+    precision: Precision,
+    drivers: Drivers | None = None,
+) -> list[StepResult]:
+    with Simulator(configs, precision=precision, drivers=drivers) as sim:
+        sim.reset()
+        return [sim.step(a) for a in actions]
+
+
+def assert_same(one: StepResult, other: StepResult, where: object = "") -> None:
+    for f in fields(one):
+        a, b = getattr(one, f.name), getattr(other, f.name)
+        assert np.array_equal(a, b), (f.name, where)
+
+
+def part_of(result: StepResult, configs: Sequence[DataCenterConfig], index: int) -> StepResult:
+    """What one data center did in a step of a fleet."""
+    start = np.concatenate([[0], np.cumsum([c.hall.racks for c in configs])])
+    values: dict[str, Any] = {}
+    for f in fields(result):
+        value = getattr(result, f.name)
+        if isinstance(value, np.ndarray):
+            is_rack = f.name.startswith("rack_")
+            part = slice(start[index], start[index + 1]) if is_rack else slice(index, index + 1)
+            value = value[part]
+        values[f.name] = value
+    return StepResult(**values)
+
+
+# --- repeatable ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize(
+    "fleet",
+    [mixed_fleet, grouped_fleet, lambda: mixed_fleet("sustaindc"), lambda: mixed_fleet("paper")],
+    ids=["corrected", "groups", "sustaindc", "paper"],
+)
+def test_a_day_of_a_batch_equals_each_data_center_alone(
+    fleet: Callable[[], list[DataCenterConfig]], precision: Precision
+) -> None:
+    configs = fleet()
+    actions = random_actions(96, len(configs), seed=2)
+    batch = results_of(configs, actions, precision)
+    for i, config in enumerate(configs):
+        own = [
+            Actions(*(np.asarray(getattr(a, f.name))[i : i + 1] for f in fields(a)))
+            for a in actions
+        ]
+        for together, alone in zip(batch, results_of([config], own, precision), strict=True):
+            assert_same(alone, part_of(together, configs, i), (i, alone.step))
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_reset_starts_the_same_run_again(precision: Precision) -> None:
+    configs = mixed_fleet()
+    actions = random_actions(40, len(configs))
+    with Simulator(configs, precision=precision) as sim:
+        sim.reset(seed=5)
+        first = [sim.step(a) for a in actions]
+        sim.reset(seed=5)
+        second = [sim.step(a) for a in actions]
+    third = results_of(configs, actions, precision)
+    for a, b, c in zip(first, second, third, strict=True):
+        assert_same(a, b)
+        assert_same(a, c)
+
+
+def test_results_of_a_step_stay_as_they_were() -> None:
+    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+        sim.reset()
+        first = sim.step(Actions(LoadAction.DEFER, CoolAction.LOWER, BatteryAction.CHARGE))
+        before = {f.name: np.copy(getattr(first, f.name)) for f in fields(first)}
+        for _ in range(5):
+            sim.step(Actions(LoadAction.DRAIN, CoolAction.RAISE, BatteryAction.DISCHARGE))
+        assert all(np.array_equal(getattr(first, name), value) for name, value in before.items())
+
+
+def test_enums_and_numbers_are_the_same_commands() -> None:
+    config, drivers = load_config("tiny"), short_drivers()
+    for load in LoadAction:
+        for cooling in CoolAction:
+            for battery in BatteryAction:
+                named = Actions(load, cooling, battery)
+                numbers = Actions(float(load.value), float(cooling.value), float(battery.value))
+                pair = (results_of([config], [a] * 2, "f32", drivers) for a in (named, numbers))
+                for one, other in zip(*pair, strict=True):
+                    assert_same(one, other)
+
+
+def test_series_repeat_after_their_end() -> None:
+    drivers = short_drivers(steps=10)
+    results = results_of([load_config("tiny")], [Actions()] * 23, "f32", drivers)
+    for name in ("outdoor_c", "wet_bulb_c", "ci_g_per_kwh", "demand"):
+        seen = np.concatenate([getattr(r, name) for r in results])
+        assert np.array_equal(seen[:10], getattr(drivers, name).values)
+        assert np.array_equal(seen[10:], seen[:13])
+
+
+# --- time step ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("per_hour", [1, 4, 12])
+def test_any_time_step_conserves(per_hour: int) -> None:
+    steps = 72 * per_hour
+    config = load_config("corrected", [f"simulation.steps_per_hour={per_hour}"])
+    actions = random_actions(steps, 1, seed=per_hour)
+    with Simulator(config) as sim:
+        assert sim.step_h == 1.0 / per_hour
+        sim.reset()
+        results = [sim.step(a) for a in actions]
+        stored = sim.state.stored_kwh
+
+    def total(name: str) -> float:
+        return float(np.sum([getattr(r, name) for r in results]))
+
+    assert all(r.step_h == 1.0 / per_hour for r in results)
+    arrived = total("arrived_tasks")
+    assert arrived == pytest.approx(
+        total("executed_tasks") + total("dropped_tasks") + results[-1].queue_tasks[0], rel=1e-12
+    )
+    assert total("it_kwh") == pytest.approx(total("it_w") / per_hour / 1e3, rel=1e-12)
+    assert total("it_w") + total("crac_fan_w") == pytest.approx(total("heat_removed_w"), rel=1e-12)
+    assert stored[0] == pytest.approx(
+        0.97 * total("charge_kwh") - 1.04 * total("discharge_kwh"), rel=1e-9
+    )
+
+
+def test_energy_of_a_day_does_not_depend_on_the_time_step() -> None:
+    totals = []
+    for per_hour in (1, 4, 12):
+        config = load_config("corrected", [f"simulation.steps_per_hour={per_hour}"])
+        results = results_of([config], [Actions()] * (24 * per_hour), "f64")
+        totals.append([np.sum([getattr(r, n) for r in results]) for n in ("it_kwh", "water_l")])
+    np.testing.assert_allclose(totals, [totals[1]] * 3, rtol=0.01)
+
+
+# --- snapshots ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("preset", ["corrected", "sustaindc"])
+def test_a_snapshot_continues_to_the_bit(preset: str, precision: Precision, tmp_path: Path) -> None:
+    configs = mixed_fleet(preset)
+    actions = random_actions(120, len(configs), seed=9)
+    with Simulator(configs, precision=precision) as sim:
+        sim.reset()
+        for a in actions[:60]:
+            sim.step(a)
+        snapshot = sim.state_dict()
+        sim.save(tmp_path / "state.npz")
+        expected = [sim.step(a) for a in actions[60:]]
+        sim.load_state_dict(snapshot)
+        again = [sim.step(a) for a in actions[60:]]
+    with Simulator(configs, precision=precision) as other:
+        other.load(tmp_path / "state.npz")
+        elsewhere = [other.step(a) for a in actions[60:]]
+    for a, b, c in zip(expected, again, elsewhere, strict=True):
+        assert_same(a, b)
+        assert_same(a, c)
+    assert expected[0].step == 60
+
+
+def test_a_snapshot_is_a_copy() -> None:
+    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+        sim.reset()
+        sim.step(Actions(LoadAction.DEFER, CoolAction.RAISE, BatteryAction.CHARGE))
+        snapshot = sim.state_dict()
+        kept = {name: np.copy(value) for name, value in snapshot.items()}
+        sim.load_state_dict(snapshot)
+        for _ in range(4):
+            sim.step(Actions(LoadAction.DRAIN, CoolAction.LOWER, BatteryAction.DISCHARGE))
+        assert all(np.array_equal(snapshot[name], value) for name, value in kept.items())
+
+
+def test_snapshot_files_hold_no_pickle_and_leave_nothing_else(tmp_path: Path) -> None:
+    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+        sim.reset()
+        sim.save(tmp_path / "state.npz")
+        sim.save(tmp_path / "state.npz")
+    assert [p.name for p in tmp_path.iterdir()] == ["state.npz"]
+    with np.load(tmp_path / "state.npz", allow_pickle=False) as file:
+        assert {file[name].dtype.kind for name in file.files} <= set("fiU")
+
+
+def broken(**changes: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    """A snapshot with some entries replaced, or taken out where the value is None."""
+    return lambda snapshot: {
+        name: value for name, value in {**snapshot, **changes}.items() if value is not None
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (broken(queue=None), r"missing \['queue'\]"),
+        (broken(extra=np.zeros(1)), r"unknown \['extra'\]"),
+        (broken(version=np.array(99)), "version 99, expected"),
+        (broken(fingerprint=np.array("0" * 64)), "made by another fleet"),
+        (broken(setpoint_c=np.zeros(3)), r"setpoint_c is float64 \(3,\), expected float64 \(1,\)"),
+        (broken(stored_kwh=np.zeros(1, np.float32)), "stored_kwh is float32"),
+        (broken(cooling_run=np.zeros(1)), "cooling_run is float64"),
+    ],
+)
+def test_a_wrong_snapshot_is_refused(
+    change: Callable[[dict[str, Any]], dict[str, Any]], message: str
+) -> None:
+    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+        sim.reset()
+        good = sim.state_dict()
+        sim.step()
+        before = sim.state_dict()
+        with pytest.raises(SdcError, match=message):
+            sim.load_state_dict(change(good))
+        after = sim.state_dict()
+        assert all(np.array_equal(before[name], after[name]) for name in before), "half loaded"
+
+
+@pytest.mark.parametrize(
+    ("change", "precision"),
+    [
+        (["servers.fan_reference_w=11"], "f32"),
+        (["simulation.steps_per_hour=12"], "f32"),
+        ([], "f64"),
+    ],
+    ids=["other config", "other time step", "other precision"],
+)
+def test_a_snapshot_of_another_simulator_is_refused(
+    change: list[str], precision: Precision
+) -> None:
+    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+        sim.reset()
+        snapshot = sim.state_dict()
+    other = load_config("tiny", change)
+    with (
+        Simulator(other, drivers=short_drivers(), precision=precision) as sim,
+        pytest.raises(SdcError, match="made by another fleet, time step or precision"),
+    ):
+        sim.load_state_dict(snapshot)
+
+
+def test_a_snapshot_of_another_order_of_the_fleet_is_refused() -> None:
+    configs = grouped_fleet()
+    with Simulator(configs, drivers=short_drivers(3)) as sim:
+        sim.reset()
+        snapshot = sim.state_dict()
+    swapped = [configs[2], configs[1], configs[0]]
+    with (
+        Simulator(swapped, drivers=short_drivers(3)) as sim,
+        pytest.raises(SdcError, match="made by another fleet"),
+    ):
+        sim.load_state_dict(snapshot)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"no zip archive", b"PK\x03\x04 cut off", b"\x93NUMPY\x01\x00 cut off"]
+)
+def test_a_file_that_is_no_snapshot_is_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "state.npz"
+    path.write_bytes(content)
+    with (
+        Simulator(load_config("tiny"), drivers=short_drivers()) as sim,
+        pytest.raises(SdcError, match=r"state\.npz: cannot be read as a snapshot"),
+    ):
+        sim.load(path)
+
+
+def test_an_array_file_or_half_a_snapshot_is_refused(tmp_path: Path) -> None:
+    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+        sim.reset()
+        np.save(tmp_path / "array.npy", np.zeros(3))
+        sim.save(tmp_path / "state.npz")
+        whole = (tmp_path / "state.npz").read_bytes()
+        (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
+        damaged = bytearray(whole)
+        damaged[200:260] = bytes(60)
+        (tmp_path / "damaged.npz").write_bytes(damaged)
+        for name in ("array.npy", "half.npz", "damaged.npz"):
+            with pytest.raises(SdcError, match=f"{name}: cannot be read as a snapshot"):
+                sim.load(tmp_path / name)
+
+
+def test_a_missing_snapshot_is_refused(tmp_path: Path) -> None:
+    with (
+        Simulator(load_config("tiny"), drivers=short_drivers()) as sim,
+        pytest.raises(SdcError, match=r"none\.npz: cannot be read as a snapshot"),
+    ):
+        sim.load(tmp_path / "none.npz")
+
+
+# --- misuse -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (Actions(load=1.5), r"action load: 1\.5; valid is a finite number within -1\.\.1"),
+        (Actions(battery=-1.01), r"action battery: -1\.01"),
+        (Actions(cooling=np.nan), "action cooling: nan"),
+        (Actions(cooling=np.inf), "action cooling: inf"),
+        (Actions(load=np.array([0.0, np.nan])), "action load: nan"),
+        (Actions(load=np.zeros(3)), r"action load: shape \(3,\), expected \(\) or \(2,\)"),
+        (Actions(battery=np.zeros((2, 1))), r"action battery: shape \(2, 1\)"),
+        (Actions(load=CoolAction.LOWER), "action load: CoolAction.LOWER is no LoadAction"),  # type: ignore[arg-type]
+        (Actions(battery="charge"), "action battery: 'charge' is neither"),  # type: ignore[arg-type]
+        (Actions(cooling=[BatteryAction.IDLE] * 2), "action cooling: .* is neither"),  # type: ignore[arg-type]
+    ],
+)
+def test_a_wrong_action_is_refused_and_changes_nothing(actions: Actions, message: str) -> None:
+    configs = make_configs(load_config("tiny"), count=2)
+    with Simulator(configs, drivers=short_drivers(2)) as sim:
+        sim.reset()
+        sim.step()
+        before = sim.state_dict()
+        with pytest.raises(SdcError, match=message):
+            sim.step(actions)
+        after = sim.state_dict()
+        assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_steps_need_a_reset() -> None:
+    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+        for use in (sim.step, sim.state_dict, lambda: sim.state):
+            with pytest.raises(RuntimeStateError, match="has not been reset"):
+                use()
+        with pytest.raises(RuntimeStateError, match="no step has been done"):
+            sim.servers()
+
+
+def test_a_closed_simulator_says_so() -> None:
+    sim = Simulator(load_config("tiny"), drivers=short_drivers())
+    sim.reset()
+    snapshot = sim.state_dict()
+    sim.close()
+    sim.close()
+    uses: tuple[Callable[[], object], ...] = (
+        sim.reset,
+        sim.step,
+        sim.servers,
+        lambda: sim.sizing,
+        lambda: sim.load_state_dict(snapshot),
+    )
+    for use in uses:
+        with pytest.raises(RuntimeStateError, match="is closed"):
+            use()
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "7"])
+def test_a_wrong_seed_is_refused(seed: Any) -> None:
+    with (
+        Simulator(load_config("tiny"), drivers=short_drivers()) as sim,
+        pytest.raises(ConfigError, match="valid is a non-negative integer"),
+    ):
+        sim.reset(seed=seed)
+
+
+def test_wrong_arguments_of_a_simulator() -> None:
+    with pytest.raises(ConfigError, match="'f16': valid are f32 and f64"):
+        Simulator(load_config("tiny"), precision="f16")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="drivers of 2 data centers for a fleet of 1"):
+        Simulator(load_config("tiny"), drivers=short_drivers(2))
+
+
+def test_server_layers_belong_to_the_last_step() -> None:
+    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+        sim.reset()
+        result = sim.step()
+        layers = sim.servers()
+        assert layers.power_w.shape == (sim.fleet.servers,)
+        assert float(layers.power_w.sum(dtype=np.float64)) == pytest.approx(
+            result.it_w[0], rel=1e-6
+        )
+        assert layers.inlet_c.max() == result.inlet_max_c[0]
+        snapshot = sim.state_dict()
+        sim.load_state_dict(snapshot)
+        with pytest.raises(RuntimeStateError, match="no step has been done"):
+            sim.servers()
+        sim.step()
+        sim.reset()
+        with pytest.raises(RuntimeStateError, match="no step has been done"):
+            sim.servers()
+
+
+# --- processes and memory -----------------------------------------------------------------------
+
+
+def child_step(queue: Any) -> None:
+    """Run a step in another process and tell how it ended."""
+    try:
+        with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+            sim.reset()
+            queue.put(("done", float(sim.step().it_w[0])))
+    except RuntimeStateError as error:
+        queue.put(("refused", str(error)))
+
+
+def run_child(method: str) -> tuple[str, Any]:
+    context = multiprocessing.get_context(method)
+    queue = context.Queue()
+    process = context.Process(target=child_step, args=(queue,))
+    process.start()
+    try:
+        answer: tuple[str, Any] = queue.get(timeout=60)
+        process.join(60)
+        assert process.exitcode == 0
+    finally:
+        if process.is_alive():
+            process.kill()
+    return answer
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+def test_a_forked_worker_is_refused_and_a_spawned_one_works() -> None:
+    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+        sim.reset()
+        here = float(sim.step().it_w[0])
+    kind, text = run_child("fork")
+    assert kind == "refused"
+    assert "forked after Taichi started" in text
+    assert "spawn" in text
+    assert run_child("spawn") == ("done", here)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+@pytest.mark.parametrize("use", ["step", "servers", "reset", "new", "close"])
+def test_a_simulator_in_a_forked_child_never_hangs(use: str) -> None:
+    sim = Simulator(load_config("tiny"), drivers=short_drivers())
+    sim.reset()
+    sim.step()
+    pid = os.fork()
+    if pid == 0:
+        signal.alarm(30)
+        code = 1
+        try:
+            if use == "new":
+                Simulator(load_config("tiny"), drivers=short_drivers()).reset()
+            else:
+                getattr(sim, use)()
+            code = 0
+        except RuntimeStateError:
+            code = 2
+        finally:
+            os._exit(code)
+    _, status = os.waitpid(pid, 0)
+    # A reset touches no kernel once the devices are sized; the step after it does.
+    harmless = use in ("close", "reset")
+    assert os.waitstatus_to_exitcode(status) == (0 if harmless else 2)
+    assert sim.step().step == 1, "the parent goes on"
+    sim.close()
+
+
+def test_creating_a_simulator_starts_no_runtime() -> None:
+    code = (
+        "import sys, time; t = time.perf_counter(); import sdc_taichi as s;"
+        "sim = s.Simulator(s.load_config('tiny'),"
+        " drivers=s.drivers_from_arrays([20.], [15.], [300.], [.5]));"
+        "assert 'taichi' not in sys.modules; sim.reset(); assert 'taichi' in sys.modules;"
+        "import taichi; assert not sys.stdout.tell() if sys.stdout.seekable() else True"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "", "Taichi's banner reached standard output"
+
+
+def resident_mb() -> float:
+    statm = Path("/proc/self/statm")
+    if not statm.exists():
+        pytest.skip("no /proc: resident memory cannot be read")
+    return int(statm.read_text().split()[1]) * resource.getpagesize() / 1e6
+
+
+def test_memory_does_not_grow_with_simulators_made_and_closed() -> None:
+    configs = [load_config("tiny"), load_config("corrected")]
+    drivers = short_drivers(steps=4)
+
+    def cycle(i: int) -> None:
+        with Simulator(configs[i % 2], drivers=drivers) as sim:
+            sim.reset()
+            sim.step()
+            sim.servers()
+
+    for i in range(20):
+        cycle(i)
+    gc.collect()
+    before = resident_mb()
+    for i in range(300):
+        cycle(i)
+    gc.collect()
+    assert resident_mb() - before < 20.0
+
+
+def test_server_layers_are_given_back() -> None:
+    config = load_config("large", ["hall.servers_per_rack=2000"])
+    drivers = short_drivers(steps=4)
+    layer_mb = 3 * 4 * config.hall.racks * 2000 / 1e6
+
+    def cycle() -> None:
+        with Simulator(config, drivers=drivers) as sim:
+            sim.reset()
+            sim.step()
+            assert sim.servers().power_w.shape == (config.hall.racks * 2000,)
+
+    for _ in range(2):
+        cycle()
+    gc.collect()
+    before = resident_mb()
+    for _ in range(12):
+        cycle()
+    gc.collect()
+    assert resident_mb() - before < 2 * layer_mb
+
+
+# --- inputs -------------------------------------------------------------------------------------
+
+
+def test_drivers_follow_site_season_and_trace() -> None:
+    configs = mixed_fleet()[:3]
+    drivers = load_drivers(configs)
+    table: F64 = drivers.outdoor_c.at(drivers.start)
+    assert len(set(table)) == 3
+    same = load_drivers([configs[0], configs[0]])
+    assert np.array_equal(same.outdoor_c.offset, [0, 0]), "one copy serves equal sites"
+    july = load_drivers([configs[1]])
+    assert july.start[0] == 181 * 96
+    assert july.outdoor_c.at(july.start)[0] > table[2]
+
+
+def test_tables_gather_one_entry_per_data_center() -> None:
+    table = Table(np.array([1.0, 2.0, 3.0, 10.0, 20.0]), np.array([0, 3]), np.array([3, 2]))
+    found = [table.at(np.array([i, i])).tolist() for i in range(4)]
+    assert found == [[1, 10], [2, 20], [3, 10], [1, 20]]
