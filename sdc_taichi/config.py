@@ -453,8 +453,9 @@ class DataCenterConfig(_Section):
             return per_rack
         nameplate_w = sum(g.count * g.full_w for rack in per_rack for g in rack)
         scale = self.hall.capacity_mw * 1e6 / nameplate_w
-        if min(g.count for rack in per_rack for g in rack) * scale < 0.5:
-            smallest = nameplate_w / min(g.count for rack in per_rack for g in rack) / 1e6
+        fewest = min(g.count for rack in per_rack for g in rack)
+        if round(fewest * scale) < 1:
+            smallest = 0.51e-6 * nameplate_w / fewest
             raise ConfigError(
                 f"{self.name}: hall.capacity_mw {self.hall.capacity_mw:g} leaves racks without "
                 f"servers; valid is at least {smallest:.3g} for this hall"

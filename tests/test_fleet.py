@@ -124,6 +124,9 @@ def test_fleets_that_cannot_be() -> None:
     huge = named(TINY, "huge", "servers.groups=[[{count: 2000000000, full_w: 99, idle_w: 9}]]")
     with pytest.raises(ConfigError, match=r"8e\+09 servers; valid is at most 2,147,483,647"):
         build_fleet(huge)
+    half = [named(huge, name, "servers.groups.0.0.count=400000000") for name in "ab"]
+    with pytest.raises(ConfigError, match="fleet: 3,200,000,000 servers; valid is at most"):
+        build_fleet(half)
 
 
 def test_equal_halls_are_laid_out_once_and_equal() -> None:

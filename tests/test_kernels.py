@@ -74,8 +74,11 @@ def random_config(
         full = rng.uniform(80, 500, racks)
         servers["power_w"] = np.stack([full, full * rng.uniform(0, 0.6, racks)], axis=1).tolist()
         hall["servers_per_rack"] = rng.integers(1, 300, racks).tolist()
-    if rng.integers(3) == 0:
-        hall["capacity_mw"] = float(rng.uniform(0.05, 0.5))
+    config = config_from_dict({**values, "name": name}, name)
+    if rng.integers(3):
+        return config
+    nameplate_w = sum(g.count * g.full_w for rack in config.rack_groups() for g in rack)
+    hall["capacity_mw"] = nameplate_w * float(rng.uniform(1, 3)) / 1e6
     return config_from_dict({**values, "name": name}, name)
 
 

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -260,9 +260,9 @@ def test_a_snapshot_continues_to_the_bit(preset: str, precision: Precision, tmp_
     with Simulator(configs, precision=precision) as other:
         other.load(tmp_path / "state.npz")
         elsewhere = [other.step(a) for a in actions[60:]]
-    for a, b, c in zip(expected, again, elsewhere, strict=True):
-        assert_same(a, b)
-        assert_same(a, c)
+    for one, second, third in zip(expected, again, elsewhere, strict=True):
+        assert_same(one, second)
+        assert_same(one, third)
     assert expected[0].step == 60
 
 
@@ -499,8 +499,8 @@ def child_step(queue: Any) -> None:
         queue.put(("refused", str(error)))
 
 
-def run_child(method: str) -> tuple[str, Any]:
-    context = multiprocessing.get_context(method)
+def run_child(method: Literal["fork", "spawn"]) -> tuple[str, Any]:
+    context: Any = multiprocessing.get_context(method)
     queue = context.Queue()
     process = context.Process(target=child_step, args=(queue,))
     process.start()

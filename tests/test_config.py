@@ -1,0 +1,463 @@
+"""Configurations: presets, files, overrides, write-back, the SustainDC format, and capacity."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from sdc_taichi import (
+    ConfigError,
+    DataCenterConfig,
+    Simulator,
+    drivers_from_arrays,
+    load_config,
+    preset_names,
+)
+from sdc_taichi.config import (
+    apply_overrides,
+    config_from_dict,
+    cpu_coefficients,
+    fan_coefficients,
+    first_step_day,
+)
+
+PRESETS = ("corrected", "large", "paper", "sustaindc", "tiny")
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, "utf-8")
+    return path
+
+
+# --- presets and files --------------------------------------------------------------------------
+
+
+def test_presets_that_come_with_the_package() -> None:
+    assert set(preset_names()) >= set(PRESETS)
+    assert load_config() == load_config("corrected")
+    for name in preset_names():
+        assert load_config(name).name == name
+        assert load_config(name).description
+
+
+def test_presets_differ_by_the_models_they_name() -> None:
+    released, paper = load_config("sustaindc"), load_config("paper")
+    assert (released.hvac.setpoint.min_c, released.hvac.setpoint.max_c) == (15, 21.6)
+    assert (paper.hvac.setpoint.min_c, paper.hvac.setpoint.max_c) == (16, 23)
+    assert released.workload.model == "tasks"
+    assert released.workload.max_utilisation == 0.9
+    assert released.hall.racks == 20
+    assert released.hvac.total_of == paper.hvac.total_of == ("tower_fan", "chiller")
+    assert load_config("large").hall.racks == 1000
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_config_written_back_reads_back_equal(preset: str, tmp_path: Path) -> None:
+    config = load_config(preset)
+    path = written(tmp_path / "dc.yaml", config.to_yaml())
+    assert load_config(path) == config
+    assert load_config(str(path)).to_yaml() == config.to_yaml()
+    path = written(tmp_path / "dc.json", json.dumps(config.model_dump(mode="json")))
+    assert load_config(path) == config
+
+
+@settings(max_examples=40)
+@given(
+    values=st.tuples(
+        st.floats(1e-300, 1e300),
+        st.floats(0, 1),
+        st.one_of(st.none(), st.floats(1e-9, 1e9)),
+        st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), max_size=12),
+    )
+)
+def test_any_number_and_name_survives_being_written(
+    values: tuple[float, float, float | None, str],
+) -> None:
+    reference_cop, share, capacity_kwh, name = values
+    given_values = load_config("tiny").model_dump(mode="json")
+    given_values["name"] = name
+    given_values["hvac"]["chiller"]["reference_cop"] = reference_cop
+    given_values["workload"]["flexible_share"] = share
+    given_values["battery"]["capacity_kwh"] = capacity_kwh
+    config = config_from_dict(given_values)
+    assert config_from_dict(yaml.safe_load(config.to_yaml())) == config
+
+
+def test_a_file_extends_a_preset(tmp_path: Path) -> None:
+    path = written(
+        tmp_path / "mine.yaml",
+        "extends: sustaindc\nname: mine\nhvac:\n  setpoint: {initial_c: 20}\n"
+        "site:\n  location: TX\n",
+    )
+    found, base = load_config(path), load_config("sustaindc")
+    assert found.hvac.setpoint.initial_c == 20
+    assert found.hvac.setpoint.model == base.hvac.setpoint.model, "siblings stay"
+    assert found.site.carbon_pairing == "utc_rows"
+    assert found.hall == base.hall
+    assert (found.name, found.site.location) == ("mine", "TX")
+
+
+def test_configs_are_frozen_and_hashable() -> None:
+    config = load_config("tiny")
+    with pytest.raises(ValidationError):
+        config.hall.rows = 3
+    assert len({config, load_config("tiny"), load_config("corrected")}) == 2
+
+
+# --- overrides ----------------------------------------------------------------------------------
+
+
+def test_overrides_of_every_kind() -> None:
+    config = load_config(
+        "tiny",
+        [
+            "hvac.setpoint.max_c=24.5",
+            "battery.capacity_kwh=null",
+            "hvac.tower.economiser=false",
+            "site.location=WA",
+            "site.start=07-04",
+            "hall.supply_approach_k.2=9",
+            "servers.groups.1.0.count=7",
+            "hvac.total_of=[chiller, crac_fan]",
+            "name=a=b",
+        ],
+    )
+    assert config.hvac.setpoint.max_c == 24.5
+    assert config.battery.capacity_kwh is None
+    assert config.hvac.tower.economiser is False
+    assert (config.site.location, config.site.start) == ("WA", "07-04")
+    assert config.hall.supply_approach_k == (5.3, 5.0, 9.0, 4.5)
+    assert config.servers.groups is not None
+    assert config.servers.groups[1][0].count == 7
+    assert config.hvac.total_of == ("chiller", "crac_fan")
+    assert config.name == "a=b"
+
+
+def test_the_last_override_wins_and_the_original_stays() -> None:
+    config = load_config("tiny")
+    before = config.to_yaml()
+    changed = apply_overrides(config, ["site.seed=1", "site.seed=2"])
+    assert changed.site.seed == 2
+    assert config.to_yaml() == before
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("hvac.setpoint.max_c", "valid is section.key=value"),
+        ("=3", "valid is section.key=value"),
+        ("hvac..max_c=3", "valid is section.key=value"),
+        ("site.start=13-01", "13-01"),
+        ("hvac.setpoint.maxc=22", "hvac.setpoint.maxc: unknown key; did you mean 'max_c'"),
+        ("hvc.setpoint.max_c=22", "hvc: unknown key; did you mean 'hvac'"),
+        ("name.first=x", "name is a value, not a section"),
+        ("hall.supply_approach_k.4=1", "index '4' is not in 0..3"),
+        ("site.seed=[1", "is not a YAML value"),
+        ("hvac.chiller.model=carno", "'carnot'"),
+        ("simulation.steps_per_hour=7", "7 does not divide 60 minutes; valid are 1, 2, 3, 4"),
+        ("workload.deadline_h=30", "deadline_h 30 must not exceed age_horizon_h 24"),
+        ("hvac.setpoint.initial_c=30", "initial_c 30 must lie within min_c 16 and max_c 23"),
+        ("hvac.tower.economiser_approach_k=2", "must not be below approach_min_k 4"),
+        ("battery.upper_v=0", "lower_v 0 must be below upper_v 0"),
+        ("hall.supply_approach_k=[1, 2, 3]", "supply_approach_k has 3 entries, expected 4"),
+        ("servers.groups=[[], [], [], []]", "rack 0 is empty"),
+        (
+            "servers.groups=[[{count: 3, full_w: 9, idle_w: 1},"
+            " {count: 1, full_w: 9, idle_w: 1, load_weight: 9}]]",
+            "load_weight 9 exceeds twice the rack's mean 3",
+        ),
+        (
+            "servers.groups=[[{count: 3, full_w: 9, idle_w: 10}]]",
+            "idle_w 10 must not exceed full_w 9",
+        ),
+    ],
+)
+def test_wrong_overrides_name_the_place(override: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config("tiny", [override])
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+# --- servers ------------------------------------------------------------------------------------
+
+
+def test_curve_coefficients_by_hand() -> None:
+    servers = load_config("corrected").servers
+    assert cpu_coefficients(servers) == pytest.approx((1 / 600, -1 / 60, 0.99))
+    assert fan_coefficients(servers) == pytest.approx((0.215 / 12, 0.225 - 0.215 * 28 / 12, 0.215))
+    released = load_config("sustaindc").servers
+    assert cpu_coefficients(released) == pytest.approx((1 / 600 + 0.05, -1 / 60, 0.99))
+    slope, offset, shift = fan_coefficients(servers)
+    assert fan_coefficients(released) == pytest.approx((10 * slope, 5 * offset, 5 * shift))
+
+
+def test_airflow_curve_is_the_one_that_runs() -> None:
+    config = load_config("tiny", ["hvac.setpoint.initial_c=20"])
+    drivers = drivers_from_arrays([20.0], [15.0], [300.0], [0.6])
+    with Simulator(config, drivers=drivers, precision="f64") as sim:
+        sim.reset()
+        result = sim.step()
+    inlet = result.rack_inlet_c[[0, 2]].astype(np.float64)
+    ratio = config.airflow_ratio(inlet, np.array([0.6]))
+    np.testing.assert_allclose(result.rack_airflow_m3s[[0, 2]], 3 * 0.051 * ratio, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ["servers.fan_airflow_ratio_lb=[-0.5, 0.2]"],
+        ["hall.supply_approach_k=0", "servers.groups=[[{count: 3, full_w: 150, idle_w: 10,"
+         " inlet_offset_k: -3}]]"],
+        ["hall.supply_approach_k=[5, 0, 5, 5]", "hvac.setpoint.min_c=15"],
+        ["hvac.setpoint.min_c=12"],
+    ],
+    ids=["curve", "offset", "one rack", "setpoint"],
+)  # fmt: skip
+def test_servers_without_airflow_are_refused(changes: list[str]) -> None:
+    unlimited = ["servers.fan_airflow_ratio_limits=null", "hall.supply_approach_limits_k=null",
+                 "hvac.chiller.coil_approach_k=5", "servers.groups=null",
+                 "hall.supply_approach_k=1", "servers.power_w=[150, 10]"]  # fmt: skip
+    load_config("tiny", unlimited)
+    with pytest.raises(ConfigError, match=r"airflow ratio is -?[\d.e-]+ at .* must be positive"):
+        load_config("tiny", unlimited + changes)
+    load_config("tiny", [*unlimited, *changes, "servers.fan_airflow_ratio_limits=[0.2, 1]"])
+
+
+@pytest.mark.parametrize("preset", ["corrected", "tiny", "large"])
+@pytest.mark.parametrize("scale", [0.7, 3.0, 25.0])
+def test_capacity_scales_the_number_of_servers(preset: str, scale: float) -> None:
+    config = load_config(preset)
+    groups = [g for rack in config.rack_groups() for g in rack]
+    nameplate_w = sum(g.count * g.full_w for g in groups)
+    scaled = apply_overrides(config, [f"hall.capacity_mw={scale * nameplate_w / 1e6}"])
+    found = [g for rack in scaled.rack_groups() for g in rack]
+    assert len(found) == len(groups)
+    for before, after in zip(groups, found, strict=True):
+        assert after.count == max(1, round(before.count * scale))
+        assert after.model_copy(update={"count": before.count}) == before
+    total_w = sum(g.count * g.full_w for g in found)
+    # Whole servers: each group is off by half a server at most.
+    assert abs(total_w - scale * nameplate_w) <= 0.5 * sum(g.full_w for g in groups) * (1 + 1e-9)
+
+
+def test_capacity_below_one_server_per_group_is_refused() -> None:
+    config = load_config("tiny", ["hall.capacity_mw=0.0001"])
+    with pytest.raises(ConfigError, match=r"tiny: hall\.capacity_mw 0\.0001 .*valid is at least"):
+        config.rack_groups()
+
+
+def test_capacity_without_scaling_keeps_the_racks() -> None:
+    config = load_config("corrected", ["hall.servers_per_rack=[" + ", ".join(["3"] * 19) + ", 8]"])
+    counts = [rack[0].count for rack in config.rack_groups()]
+    assert counts == [3] * 19 + [8]
+
+
+# --- dates --------------------------------------------------------------------------------------
+
+
+def test_first_step_day_counts_a_year_of_365_days() -> None:
+    days = [
+        first_step_day(f"{month:02d}-{day:02d}")
+        for month, length in enumerate((31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31), 1)
+        for day in range(1, length + 1)
+    ]
+    assert days == list(range(365))
+    assert first_step_day("7-1") == first_step_day(" 07-01 ") == 181
+
+
+@pytest.mark.parametrize("text", ["02-29", "00-01", "13-01", "04-31", "07/01", "", "07", 701, None])
+def test_days_that_are_none(text: object) -> None:
+    with pytest.raises(ValueError, match=r"valid is MM-DD"):
+        first_step_day(text)
+
+
+# --- the SustainDC format -----------------------------------------------------------------------
+
+HALL, HVAC, SERVERS = (
+    "data_center_configuration",
+    "hvac_configuration",
+    "server_characteristics",
+)
+
+
+def sustaindc_values() -> dict[str, dict[str, Any]]:
+    """The format of SustainDC's dc_config.json with values no preset has."""
+    return {
+        HALL: {
+            "NUM_ROWS": 2,
+            "NUM_RACKS_PER_ROW": 3,
+            "RACK_SUPPLY_APPROACH_TEMP_LIST": [4.1, 4.2, 4.3, 4.4, 4.5, 9.0],
+            "RACK_RETURN_APPROACH_TEMP_LIST": [-1.1, -1.2, -1.3, -1.4, -1.5, -1.6],
+            "CPUS_PER_RACK": 30,
+        },
+        HVAC: {
+            "C_AIR": 1005,
+            "RHO_AIR": 1.2,
+            "CRAC_SUPPLY_AIR_FLOW_RATE_pu": 0.00006,
+            "CRAC_REFRENCE_AIR_FLOW_RATE_pu": 0.00009,
+            "CRAC_FAN_REF_P": 140,
+            "CHILLER_COP_BASE": 4.0,
+            "CHILLER_COP_K": 0.2,
+            "CHILLER_COP_T_NOMINAL": 24.0,
+            "CT_FAN_REF_P": 900,
+            "CT_REFRENCE_AIR_FLOW_RATE": 2.5,
+            "CW_PRESSURE_DROP": 200000,
+            "CW_WATER_FLOW_RATE": 0.002,
+            "CW_PUMP_EFFICIENCY": 0.8,
+            "CT_PRESSURE_DROP": 100000,
+            "CT_WATER_FLOW_RATE": 0.003,
+            "CT_PUMP_EFFICIENCY": 0.6,
+        },
+        SERVERS: {
+            "CPU_POWER_RATIO_LB": [0.02, 0.98],
+            "CPU_POWER_RATIO_UB": [0.04, 1.01],
+            "IT_FAN_AIRFLOW_RATIO_LB": [0.02, 0.3],
+            "IT_FAN_AIRFLOW_RATIO_UB": [0.25, 0.9],
+            "IT_FAN_FULL_LOAD_V": 0.05,
+            "ITFAN_REF_V_RATIO": 0.9,
+            "ITFAN_REF_P": 11.0,
+            "INLET_TEMP_RANGE": [15, 27],
+            "DEFAULT_SERVER_POWER_CHARACTERISTICS": [
+                [171, 21], [121, 11], [131, 12], [141, 13], [151, 14], [161, 15],
+            ],
+            "HP_PROLIANT": [110, 170],
+        },
+    }  # fmt: skip
+
+
+def dc_config(folder: Path, values: dict[str, Any]) -> Path:
+    return written(folder / "dc_config.json", json.dumps(values))
+
+
+def test_every_value_of_the_sustaindc_format_arrives(tmp_path: Path) -> None:
+    config = load_config(dc_config(tmp_path, sustaindc_values()))
+    hall, servers, hvac = config.hall, config.servers, config.hvac
+    assert config.name == "dc_config"
+    assert (hall.rows, hall.racks_per_row, hall.racks) == (2, 3, 6)
+    assert hall.supply_approach_k == (4.1, 4.2, 4.3, 4.4, 4.5, 9.0)
+    assert hall.return_approach_k == (-1.1, -1.2, -1.3, -1.4, -1.5, -1.6)
+    assert [rack[0].count for rack in config.rack_groups()] == [30] * 6
+    assert (hall.air_density_kg_m3, hall.air_heat_capacity_j_per_kg_k) == (1.2, 1005)
+    assert servers.cpu_power_ratio_lb == (0.02, 0.98)
+    assert servers.cpu_power_ratio_ub == (0.04, 1.01)
+    assert servers.fan_airflow_ratio_lb == (0.02, 0.3)
+    assert servers.fan_airflow_ratio_ub == (0.25, 0.9)
+    assert servers.fan_full_airflow_m3s == 0.05
+    assert servers.fan_reference_ratio == 0.9
+    assert servers.fan_reference_w == 11
+    assert servers.inlet_range_c == (15, 27)
+    pairs = [(rack[0].full_w, rack[0].idle_w) for rack in config.rack_groups()]
+    assert pairs == [(171, 21), (121, 11), (131, 12), (141, 13), (151, 14), (161, 15)]
+    assert hvac.crac.supply_m3s_per_w == 0.00006
+    assert hvac.crac.reference_m3s_per_w == 0.00009
+    assert hvac.crac.released_fan_w == 140
+    assert (hvac.tower.printed_fan_w, hvac.tower.printed_airflow_m3s) == (900, 2.5)
+    assert hvac.pumps.released_chilled_w == pytest.approx(200000 * 0.002 / 0.8)
+    assert hvac.pumps.released_condenser_w == pytest.approx(100000 * 0.003 / 0.6)
+
+
+def test_the_sustaindc_format_starts_from_its_preset(tmp_path: Path) -> None:
+    config, preset = load_config(dc_config(tmp_path, sustaindc_values())), load_config("sustaindc")
+    for section in ("workload", "battery", "site", "simulation"):
+        assert getattr(config, section) == getattr(preset, section)
+    assert config.hvac.setpoint == preset.hvac.setpoint
+    assert config.hvac.chiller == preset.hvac.chiller
+    assert config.servers.outlet_model == "released"
+    changed = load_config(dc_config(tmp_path, sustaindc_values()), ["battery.model=paper"])
+    assert changed.battery.model == "paper"
+    assert load_config(written(tmp_path / "back.yaml", config.to_yaml())) == config
+
+
+def test_servers_per_rack_may_differ_in_the_sustaindc_format(tmp_path: Path) -> None:
+    values = sustaindc_values()
+    values[HALL]["CPUS_PER_RACK"] = [1, 2, 3, 4, 5, 6]
+    config = load_config(dc_config(tmp_path, values))
+    assert [rack[0].count for rack in config.rack_groups()] == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "length"),
+    [
+        (HALL, "RACK_SUPPLY_APPROACH_TEMP_LIST", 5),
+        (HALL, "RACK_RETURN_APPROACH_TEMP_LIST", 7),
+        (SERVERS, "DEFAULT_SERVER_POWER_CHARACTERISTICS", 4),
+    ],
+)
+def test_a_wrong_length_names_file_key_and_both_lengths(
+    section: str, key: str, length: int, tmp_path: Path
+) -> None:
+    values = sustaindc_values()
+    values[section][key] = (values[section][key] * 2)[:length]
+    path = dc_config(tmp_path, values)
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    assert str(caught.value).startswith(f"{path}: {section}.{key}: length {length}, expected 6")
+
+
+@pytest.mark.parametrize(
+    ("section", "key"), [(s, k) for s, keys in sustaindc_values().items() for k in keys]
+)
+def test_every_key_of_the_sustaindc_format_is_needed(
+    section: str, key: str, tmp_path: Path
+) -> None:
+    values = sustaindc_values()
+    values[section][key + "X"] = values[section].pop(key)
+    path = dc_config(tmp_path, values)
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    assert f"{path}: " in str(caught.value)
+    assert f"{section}.{key}: missing" in str(caught.value)
+    assert f"{section}.{key}X: unknown key; did you mean '{key}'?" in str(caught.value)
+
+
+def test_the_config_of_sustaindc_itself(real_data: Path) -> None:
+    config, preset = load_config(real_data / "dc_config.json"), load_config("sustaindc")
+    assert config.hall == preset.hall.model_copy(
+        update={"servers_per_rack": config.hall.servers_per_rack}
+    )
+    assert config.rack_groups() == preset.rack_groups()
+    assert cpu_coefficients(config.servers) == cpu_coefficients(preset.servers)
+    assert fan_coefficients(config.servers) == fan_coefficients(preset.servers)
+    assert config.hvac == preset.hvac
+
+
+@pytest.mark.parametrize(
+    ("file", "parts"),
+    [
+        (
+            "dc_config_dc1.json",
+            ["RACK_SUPPLY_APPROACH_TEMP_LIST: length 16, expected 20",
+             "RACK_RETURN_APPROACH_TEMP_LIST: length 16, expected 20"],
+        ),
+        ("dc_config_dc3.json", ["length 20, expected 25"]),
+    ],
+)  # fmt: skip
+def test_broken_configs_of_sustaindc(file: str, parts: list[str], real_data: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(real_data / file)
+    message = str(caught.value)
+    assert message.startswith(f"{real_data / file}: ")
+    assert "missing" in message
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+def test_a_data_center_of_the_sustaindc_format_runs(tmp_path: Path) -> None:
+    config: DataCenterConfig = load_config(dc_config(tmp_path, sustaindc_values()))
+    drivers = drivers_from_arrays([20.0], [15.0], [300.0], [0.5])
+    with Simulator(config, drivers=drivers) as sim:
+        sim.reset()
+        result = sim.step()
+    assert result.it_w[0] > 0
+    # 9 K lies beyond the limits of the released code.
+    np.testing.assert_allclose(result.rack_inlet_c - 18, [4.1, 4.2, 4.3, 4.4, 4.5, 5.3], rtol=1e-6)
