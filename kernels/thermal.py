@@ -33,6 +33,7 @@ DC_ROWS = (
     "fan_reference_w",
     "fan_full_m3s",
     "air_j_per_m3_k",
+    "curve_limit_c",
 )
 RACK_OUT = ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "inlet_max_c", "outlet_c")
 GROUP_OUT = ("inlet_c", "outlet_c", "power_w")
@@ -53,8 +54,9 @@ def reduce_kernel(precision: str) -> Any:
 
     Equations: CPU power max(idle, full*(slope*T + offset + shift*u)); airflow ratio
     y = clip(slope*T + offset + shift*u); fan power reference*(y/reference ratio)^exponent
-    (Sun et al. 2021; EnergyPlus ElectricEquipment:ITE:AirCooled). Utilisation of a group is
-    u + deviation*u*(1 - u), which conserves the rack's work and stays within 0..1.
+    (Sun et al. 2021; EnergyPlus ElectricEquipment:ITE:AirCooled), T at most the curve limit.
+    Utilisation of a group is u + deviation*u*(1 - u), which conserves the rack's work and stays
+    within 0..1.
     Outlet: ``server`` is T + P/(rho*cp*V) per group, ``rack`` the same with the rack's sums, and
     ``released`` the rack fit T + 1.918*P^1.096/(0.526*rho*cp*V^0.824) - 14.01 of the released
     SustainDC, whose constants come in as ``fit``.
@@ -103,10 +105,11 @@ def reduce_kernel(precision: str) -> Any:
                     for g in range(group_start[q], group_start[q + 1]):
                         t = base + groups[3, g]
                         load = u + groups[4, g] * spread
-                        ratio = dcs[0, n] * t + dcs[1, n] + dcs[2, n] * load
+                        on_curve = ti.min(t, dcs[13, n])
+                        ratio = dcs[0, n] * on_curve + dcs[1, n] + dcs[2, n] * load
                         cpu_1 = ti.max(groups[2, g], groups[1, g] * ratio)
                         y = ti.min(
-                            ti.max(dcs[3, n] * t + dcs[4, n] + dcs[5, n] * load, dcs[6, n]),
+                            ti.max(dcs[3, n] * on_curve + dcs[4, n] + dcs[5, n] * load, dcs[6, n]),
                             dcs[7, n],
                         )
                         speed = y / dcs[8, n]

@@ -114,6 +114,9 @@ class ServerConfig(_Section):
     cpu_power_ratio_ub: Pair = (0.03, 1.02)
     cpu_slope_offset_per_k: Finite = 0.0
     inlet_range_c: Pair = (16.0, 28.0)
+    curve_limit_c: Finite | None = 45.0
+    """Power and airflow stay as at this inlet above it (upper limit of ASHRAE class A4); without
+    a limit a room that cannot be cooled draws ever more power. None is no limit."""
     fan_airflow_ratio_lb: Pair = (0.01, 0.225)
     fan_airflow_ratio_ub: Pair = (0.225, 1.0)
     fan_model: Literal["linear", "released"] = "linear"
@@ -338,7 +341,7 @@ class WorkloadConfig(_Section):
     """Queue capacity in hours of the whole data center at full utilisation; None is unlimited."""
     deadline_h: Positive | None = 24.0
     age_horizon_h: Annotated[Positive, Field(le=8760)] = 24.0
-    """Ages are exact up to this; older work is counted at this age."""
+    """Ages are exact up to this; older work counts as one step older than this."""
 
     @model_validator(mode="after")
     def _deadline_within_horizon(self) -> Self:

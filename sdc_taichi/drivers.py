@@ -6,6 +6,7 @@ Series may differ in length; each repeats from its own start.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -59,6 +60,14 @@ class Drivers:
     def size(self) -> int:
         """Number of data centers."""
         return len(self.start)
+
+    def digest(self) -> bytes:
+        """SHA-256 of what the data centers see, which tells inputs apart."""
+        sha = hashlib.sha256(self.start.tobytes())
+        for table in (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh, self.demand):
+            for array in (table.values, table.offset, table.length):
+                sha.update(array.tobytes())
+        return sha.digest()
 
     def at(self, step: int) -> Exogenous:
         """Inputs of step ``step`` after reset."""

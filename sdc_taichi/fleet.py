@@ -64,7 +64,7 @@ class Fleet:
     groups: F64
     """Rows GROUP_ROWS of the thermal kernel, (5, G)."""
     dcs: F64
-    """Rows DC_ROWS of the thermal kernel, (13, B)."""
+    """Rows DC_ROWS of the thermal kernel, (14, B)."""
 
     @property
     def size(self) -> int:
@@ -271,6 +271,7 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         servers.fan_reference_w,
         servers.fan_full_airflow_m3s,
         hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k,
+        np.inf if servers.curve_limit_c is None else servers.curve_limit_c,
     )
     return _HallArrays(
         groups_per_rack=np.array([len(rack) for rack in per_rack], dtype=np.int32),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from enum import Enum
@@ -377,7 +376,7 @@ class Simulator:
         return out
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
-        """Continue from a ``state_dict`` of a simulator with the same fleet and precision.
+        """Continue from a ``state_dict`` of a simulator with the same fleet, inputs and precision.
 
         Raises:
             SdcError: the snapshot is of another version or fleet, incomplete, or of wrong shape.
@@ -392,7 +391,7 @@ class Simulator:
         if int(values["version"]) != SNAPSHOT_VERSION:
             raise SdcError(f"snapshot: version {values['version']}, expected {SNAPSHOT_VERSION}")
         if str(values["fingerprint"]) != self._fingerprint():
-            raise SdcError("snapshot: made by another fleet, time step or precision than this one")
+            raise SdcError("snapshot: made by another fleet, inputs or precision than this one")
         like = self._state if self._state is not None else self.reset()
         loaded: dict[str, Any] = {}
         for field in fields(State):
@@ -408,11 +407,21 @@ class Simulator:
         self._state = State(**loaded)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the state to an .npz file, atomically and without pickle."""
-        target = Path(path)
-        with tempfile.NamedTemporaryFile(dir=target.parent, suffix=".npz", delete=False) as file:
-            np.savez(file, **self.state_dict())
-        os.replace(file.name, target)
+        """Write the state to an .npz file, atomically and without pickle.
+
+        Raises:
+            SdcError: the file cannot be written.
+        """
+        values, target = self.state_dict(), Path(path)
+        part = target.with_name(f".{target.name}.{os.getpid()}.part")
+        try:
+            with part.open("wb") as file:
+                np.savez(file, **values)
+            part.replace(target)
+        except OSError as error:
+            raise SdcError(f"{path}: cannot be written ({error})") from None
+        finally:
+            part.unlink(missing_ok=True)
 
     def load(self, path: str | os.PathLike[str]) -> None:
         """Continue from a file of ``save``.
@@ -472,5 +481,5 @@ class Simulator:
         digest = hashlib.sha256(self.precision.encode())
         for config in dict.fromkeys(self.fleet.configs):
             digest.update(config.model_dump_json().encode())
-        digest.update(str(self.size).encode())
+        digest.update(self.drivers.digest())
         return digest.hexdigest()

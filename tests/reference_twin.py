@@ -87,8 +87,9 @@ def _rack(
     load = utilisation + (weight / weight.mean() - 1.0) * utilisation * (1.0 - utilisation)
     inlet_c = supply_c + approach_k + np.repeat([g.inlet_offset_k for g in groups], count)
     full_w, idle_w = (np.repeat([getattr(g, n) for g in groups], count) for n in POWERS)
-    cpu = cpu_w(config, full_w, idle_w, inlet_c, load)
-    ratio = airflow_ratio(config, inlet_c, load)
+    on_curve_c = np.minimum(inlet_c, np.inf if s.curve_limit_c is None else s.curve_limit_c)
+    cpu = cpu_w(config, full_w, idle_w, on_curve_c, load)
+    ratio = airflow_ratio(config, on_curve_c, load)
     fan = s.fan_reference_w * (ratio / s.fan_reference_ratio) ** s.fan_power_exponent
     flow = s.fan_full_airflow_m3s * ratio
     heat = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k

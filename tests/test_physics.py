@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sdc_taichi import Simulator, load_config, make_configs
+from sdc_taichi import Simulator, drivers_from_arrays, load_config, make_configs
 from sdc_taichi.exogenous import site_names
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -83,3 +83,19 @@ def test_measured_years_agree_with_synthetic_years(real_data: Path) -> None:
         np.testing.assert_allclose(synthetic, measured, rtol=0.04, err_msg=name)
     lines = example.table(configs, sums).splitlines()
     assert len(lines) == 2 + len(configs) // 2
+
+
+def test_a_room_that_overheats_recovers_when_load_falls() -> None:
+    small = ["hvac.sizing.margin=1", "hvac.sizing.design_wet_bulb_c=10"]
+    config = load_config("corrected", ["hvac.chiller.model=electric_water_cooled", *small])
+    demand = [1.0] * 100 + [0.1] * 400
+    drivers = drivers_from_arrays([36.0] * 500, [30.0] * 500, [300.0] * 500, demand)
+    with Simulator(config, drivers=drivers) as sim:
+        sim.reset()
+        results = [sim.step() for _ in range(500)]
+        highest_w = 1.1 * sum(g.count * g.full_w for rack in config.rack_groups() for g in rack)
+    inlet_c = np.array([r.inlet_max_c[0] for r in results])
+    assert inlet_c.max() > 45.0
+    assert max(float(r.it_w[0]) for r in results) < highest_w
+    assert results[-1].room_heat_kwh[0] == 0.0
+    assert inlet_c[-1] == pytest.approx(inlet_c[0])

@@ -339,7 +339,7 @@ def test_a_snapshot_of_another_simulator_is_refused(
     other = load_config("tiny", change)
     with (
         Simulator(other, drivers=short_drivers(), precision=precision) as sim,
-        pytest.raises(SdcError, match="made by another fleet, time step or precision"),
+        pytest.raises(SdcError, match="made by another fleet, inputs or precision"),
     ):
         sim.load_state_dict(snapshot)
 
