@@ -191,7 +191,7 @@ def simulate(
     """
     from sdc_taichi.control import make_controller
     from sdc_taichi.fleet import build_fleet
-    from sdc_taichi.run import Asked, record, report_json
+    from sdc_taichi.run import Asked, prepare_folder, record, report_json
     from sdc_taichi.sim import Simulator
 
     base, label = _read_config(source, overrides)
@@ -204,6 +204,7 @@ def simulate(
     with Simulator(fleet, precision=precision) as sim:
         for note in sim.drivers.notes:
             print(f"note: {note}", file=sys.stderr)
+        prepare_folder(folder, force=force)
         with (
             _interruptible() as interrupted,
             _recorded(recording, sim) as log,

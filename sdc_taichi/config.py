@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 import yaml
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -28,6 +29,7 @@ from pydantic import (
 )
 
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C
 
 
 def _no_bool(value: Any) -> Any:
@@ -36,14 +38,27 @@ def _no_bool(value: Any) -> Any:
     return value
 
 
-_Real = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
+def _bounded(value: float) -> float:
+    # Beyond any hall, and products of two still fit the kernels' f32.
+    if abs(value) > 1e12:
+        raise ValueError("should be within -1e12..1e12")
+    return value
+
+
+_Real = Annotated[
+    float, BeforeValidator(_no_bool), AfterValidator(_bounded), Field(allow_inf_nan=False)
+]
 _Whole = Annotated[int, BeforeValidator(_no_bool)]
 Positive = Annotated[_Real, Field(gt=0)]
 NonNegative = Annotated[_Real, Field(ge=0)]
 Share = Annotated[_Real, Field(ge=0, le=1)]
 Finite = _Real
 Count = Annotated[_Whole, Field(ge=1)]
+FileName = Annotated[str, Field(min_length=1)]
 Pair = tuple[Finite, Finite]
+
+
+MOST_RACKS = 10_000_000
 
 
 class _Section(BaseModel):
@@ -91,6 +106,14 @@ class HallConfig(_Section):
         """Number of racks, rows x racks per row."""
         return self.rows * self.racks_per_row
 
+    @model_validator(mode="after")
+    def _not_too_many_racks(self) -> Self:
+        if self.racks > MOST_RACKS:
+            raise ValueError(
+                f"rows x racks_per_row is {self.racks:,}; valid is at most {MOST_RACKS:,} racks"
+            )
+        return self
+
     @field_validator("supply_approach_limits_k")
     @classmethod
     def _ordered(cls, value: Pair | None) -> Pair | None:
@@ -106,10 +129,11 @@ class HallConfig(_Section):
 class ServerConfig(_Section):
     """Power and airflow of the servers (ITE:AirCooled form of EnergyPlus, curves of Sun 2021)."""
 
-    power_w: Annotated[tuple[Pair, ...], Field(min_length=1)] = ((150.0, 10.0),)
-    """(full, idle) power of one server: one pair for all racks or one pair per rack."""
+    power_w: Annotated[tuple[Pair, ...], Field(min_length=1)] | None = None
+    """(full, idle) power of one server: one pair for all racks or one pair per rack. Without it and
+    without groups a server draws 150 W at full load and 10 W idle."""
     groups: tuple[tuple[ServerGroup, ...], ...] | None = None
-    """Server groups per rack, or one entry for all; replaces power_w and servers_per_rack."""
+    """Server groups per rack, or one entry for all, in place of power_w and servers_per_rack."""
     cpu_power_ratio_lb: Pair = (0.01, 1.00)
     cpu_power_ratio_ub: Pair = (0.03, 1.02)
     cpu_slope_offset_per_k: Finite = 0.0
@@ -122,11 +146,16 @@ class ServerConfig(_Section):
     fan_model: Literal["linear", "released"] = "linear"
     """Airflow ratio against inlet temperature and load: config curve, or the released scaling."""
     fan_airflow_ratio_limits: Pair | None = None
-    fan_power_exponent: Annotated[float, Field(ge=1, le=3)] = 3.0
+    fan_power_exponent: Annotated[_Real, Field(ge=1, le=3)] = 3.0
     fan_full_airflow_m3s: Positive = 0.051
     fan_reference_ratio: Positive = 1.0
     fan_reference_w: NonNegative = 10.0
     outlet_model: Literal["server", "rack", "released"] = "server"
+
+    @property
+    def power_pairs(self) -> tuple[Pair, ...]:
+        """(full, idle) power, one pair for all racks or one per rack."""
+        return self.power_w or ((150.0, 10.0),)
 
     @field_validator("power_w", mode="before")
     @classmethod
@@ -143,7 +172,9 @@ class ServerConfig(_Section):
 
     @model_validator(mode="after")
     def _idle_below_full(self) -> Self:
-        for rack, (full_w, idle_w) in enumerate(self.power_w):
+        if self.power_w is not None and self.groups is not None:
+            raise ValueError("power_w and groups are both given; valid is one, null for the other")
+        for rack, (full_w, idle_w) in enumerate(self.power_pairs):
             if not full_w > 0 or not 0 <= idle_w <= full_w:
                 raise ValueError(
                     f"power_w entry {rack} is ({full_w:g}, {idle_w:g}); "
@@ -177,7 +208,7 @@ class CracConfig(_Section):
     supply_m3s_per_w: Positive = 5.663e-5
     reference_m3s_per_w: Positive = 9.438e-5
     flow_model: Literal["constant", "follow_servers", "per_watt"] = "follow_servers"
-    min_flow_ratio: Annotated[float, Field(gt=0, le=1)] = 0.6
+    min_flow_ratio: Annotated[_Real, Field(gt=0, le=1)] = 0.6
     fan_w_per_m3s: NonNegative = 800.0
     """Design fan power per design airflow (specific fan power)."""
     released_fan_w: NonNegative = 150.0
@@ -232,8 +263,8 @@ class PumpConfig(_Section):
 
     model: Literal["sized", "released"] = "sized"
     pressure_drop_pa: Positive = 300_000.0
-    efficiency: Annotated[float, Field(gt=0, le=1)] = 0.75
-    min_flow_ratio: Annotated[float, Field(gt=0, le=1)] = 0.6
+    efficiency: Annotated[_Real, Field(gt=0, le=1)] = 0.75
+    min_flow_ratio: Annotated[_Real, Field(gt=0, le=1)] = 0.6
     released_chilled_w: NonNegative = 0.0
     released_condenser_w: NonNegative = 0.0
 
@@ -242,7 +273,7 @@ class WaterConfig(_Section):
     """Make-up water of the cooling tower."""
 
     model: Literal["mass_balance", "released", "paper"] = "mass_balance"
-    cycles_of_concentration: Annotated[float, Field(gt=1)] = 5.0
+    cycles_of_concentration: Annotated[_Real, Field(gt=1)] = 5.0
     drift_share: Share = 2e-5
 
 
@@ -250,7 +281,7 @@ class SizingConfig(_Section):
     """How devices are sized for load and site."""
 
     model: Literal["design_day", "released"] = "design_day"
-    margin: Annotated[float, Field(ge=1)] = 1.15
+    margin: Annotated[_Real, Field(ge=1)] = 1.15
     design_wet_bulb_c: Finite | None = None
     """None takes the 99.6 % quantile of the site's weather."""
     design_outdoor_c: Finite | None = None
@@ -279,7 +310,7 @@ class HvacConfig(_Section):
         "crac_fan",
     )
     """Devices counted in the HVAC total."""
-    ups_efficiency: Annotated[float, Field(gt=0, le=1)] = 0.96
+    ups_efficiency: Annotated[_Real, Field(gt=0, le=1)] = 0.96
     """Only for the PUE with UPS losses; the grid balance is IT + HVAC + battery."""
 
     @field_validator("total_of")
@@ -292,7 +323,7 @@ class HvacConfig(_Section):
     @model_validator(mode="after")
     def _chilled_water_within_the_model(self) -> Self:
         if self.chiller.model == "carnot":
-            low, high = 4.0, 20.0
+            low, high = CHILLED_WATER_BOUNDS_C["carnot"]
             for name in ("min_c", "max_c"):
                 setpoint = getattr(self.setpoint, name)
                 water = setpoint - self.chiller.coil_approach_k
@@ -313,12 +344,12 @@ class BatteryConfig(_Section):
     """None sizes it to hours_of_design_load."""
     hours_of_design_load: NonNegative = 1.0
     initial_soc: Share = 0.0
-    charge_efficiency: Annotated[float, Field(gt=0, le=1)] = 0.97
-    discharge_factor: Annotated[float, Field(ge=1)] = 1.04
+    charge_efficiency: Annotated[_Real, Field(gt=0, le=1)] = 0.97
+    discharge_factor: Annotated[_Real, Field(ge=1)] = 1.04
     """Energy drawn from the store per energy delivered."""
     charge_limit_c_rate: Positive = 3.0
     discharge_limit_c_rate: Positive = 3.0
-    upper_u_h: Annotated[float, Field(le=0)] = -0.04
+    upper_u_h: Annotated[_Real, Field(le=0)] = -0.04
     upper_v: Share = 1.0
     lower_u_h: NonNegative = 0.01
     lower_v: Share = 0.0
@@ -336,7 +367,7 @@ class WorkloadConfig(_Section):
     model: Literal["fluid", "tasks"] = "fluid"
     trace: str = "alibaba_1"
     flexible_share: Share = 0.2
-    max_utilisation: Annotated[float, Field(gt=0, le=1)] = 1.0
+    max_utilisation: Annotated[_Real, Field(gt=0, le=1)] = 1.0
     queue_limit_h: Positive | None = 2.5
     """Queue capacity in hours of the whole data center at full utilisation; None is unlimited."""
     deadline_h: Positive | None = 24.0
@@ -359,11 +390,11 @@ class SiteConfig(_Section):
     location: str = "NY"
     start: str = "01-01"
     """Month and day of the first step, MM-DD, local standard time."""
-    seed: Annotated[int, Field(ge=0)] = 10
+    seed: Annotated[_Whole, Field(ge=0)] = 10
     """Seed of the synthetic year; imported data ignore it."""
-    weather_file: str | None = None
-    carbon_file: str | None = None
-    workload_file: str | None = None
+    weather_file: FileName | None = None
+    carbon_file: FileName | None = None
+    workload_file: FileName | None = None
     carbon_pairing: Literal["local", "utc_rows"] = "local"
     """utc_rows pairs UTC rows with local rows, as the released SustainDC does."""
 
@@ -377,7 +408,7 @@ class SiteConfig(_Section):
 class SimulationConfig(_Section):
     """Time step."""
 
-    steps_per_hour: Annotated[int, Field(ge=1, le=60)] = 4
+    steps_per_hour: Annotated[_Whole, Field(ge=1, le=60)] = 4
 
     @field_validator("steps_per_hour")
     @classmethod
@@ -404,9 +435,21 @@ class DataCenterConfig(_Section):
     simulation: SimulationConfig = SimulationConfig()
 
     @model_validator(mode="after")
+    def _times_are_whole_steps(self) -> Self:
+        for name in ("deadline_h", "age_horizon_h"):
+            hours = getattr(self.workload, name)
+            steps = None if hours is None else hours * self.simulation.steps_per_hour
+            if steps is not None and (steps < 1 or abs(steps - round(steps)) > 1e-9):
+                raise ValueError(
+                    f"workload.{name} {hours:g} h is {steps:g} steps; valid is a whole number of "
+                    f"steps of {60 // self.simulation.steps_per_hour} min"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _fits_together(self) -> Self:
         racks = self.hall.racks
-        pairs = self.servers.power_w
+        pairs = self.servers.power_pairs
         groups = self.servers.groups
         if groups is None:
             if len(pairs) not in (1, racks):
@@ -435,7 +478,9 @@ class DataCenterConfig(_Section):
         """Server airflow over full airflow, the curve that the kernels use (dimensionless)."""
         slope, offset, shift = fan_coefficients(self.servers)
         limits = self.servers.fan_airflow_ratio_limits or (-np.inf, np.inf)
-        return np.clip(slope * inlet_c + offset + shift * utilisation, *limits)
+        highest = np.inf if self.servers.curve_limit_c is None else self.servers.curve_limit_c
+        on_curve_c = np.minimum(inlet_c, highest)
+        return np.clip(slope * on_curve_c + offset + shift * utilisation, *limits)
 
     def rack_groups(self) -> tuple[tuple[ServerGroup, ...], ...]:
         """Server groups of every rack, with capacity_mw applied to the counts."""
@@ -444,7 +489,7 @@ class DataCenterConfig(_Section):
             found = self.servers.groups
             per_rack = found * racks if len(found) == 1 else found
         else:
-            pairs = self.servers.power_w
+            pairs = self.servers.power_pairs
             pairs = pairs * racks if len(pairs) == 1 else pairs
             counts = self.hall.servers_per_rack
             counts = (counts,) * racks if isinstance(counts, int) else counts
@@ -536,6 +581,8 @@ def load_config(
     Raises:
         ConfigError: naming the file, the key, the value and what would be valid.
     """
+    if isinstance(overrides, str):
+        raise ConfigError(f"overrides {overrides!r}: valid is a list of section.key=value")
     label, values = _read_source("corrected" if source is None else source)
     for override in overrides:
         _apply_override(values, override)
@@ -599,7 +646,18 @@ def _resolve_extends(label: str, values: dict[str, Any]) -> tuple[str, dict[str,
             f"{label}: extends: {base!r} is no preset; valid: {', '.join(preset_names())}"
         )
     _, merged = _read_source(str(base))
-    return label, _merge(merged, values)
+    merged = _merge(merged, values)
+    given = values.get("servers")
+    if isinstance(given, dict):
+        _replace_other_servers(merged["servers"], given)
+    return label, merged
+
+
+def _replace_other_servers(servers: dict[str, Any], given: Mapping[str, Any]) -> None:
+    """Groups take the place of inherited power pairs, and the other way round."""
+    for new, old in (("groups", "power_w"), ("power_w", "groups")):
+        if given.get(new) is not None and old not in given:
+            servers[old] = None
 
 
 def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
@@ -615,7 +673,7 @@ def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 def _parse_yaml(text: str, label: str) -> dict[str, Any]:
     try:
         values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise ConfigError(f"{label}: not valid YAML ({' '.join(str(error).split())})") from None
     return _require_mapping(values, label)
 
@@ -623,7 +681,7 @@ def _parse_yaml(text: str, label: str) -> dict[str, Any]:
 def _parse_json(text: str, label: str) -> dict[str, Any]:
     try:
         values = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (RecursionError, ValueError) as error:
         raise ConfigError(f"{label}: not valid JSON ({error})") from None
     return _require_mapping(values, label)
 
@@ -662,6 +720,8 @@ def _assign(values: dict[str, Any], path: str, value: Any, override: str) -> Non
         node[_list_index(node, keys[-1], override)] = value
     else:
         node[keys[-1]] = value
+        if keys[:-1] == ["servers"]:
+            _replace_other_servers(node, {keys[-1]: value})
 
 
 def _list_index(node: list[Any], key: str, override: str) -> int:
@@ -700,9 +760,7 @@ def _explain(error: ValidationError, label: str) -> str:
 
 def _is_union_branch(part: str | int) -> bool:
     """Pydantic puts the tried type of a union into the location; it is no key of the user's."""
-    return isinstance(part, str) and (
-        part in {"int", "float"} or part.startswith(("tuple[", "constrained"))
-    )
+    return isinstance(part, str) and (part in {"int", "float"} or "[" in part)
 
 
 def _fields_at(path: list[str]) -> list[str]:

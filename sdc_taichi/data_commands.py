@@ -178,9 +178,6 @@ def import_data(
     stamp: Annotated[
         StampOption, typer.Option(help="What a stamp of a carbon file marks.")
     ] = StampOption.AUTO,
-    utc_rows: Annotated[
-        bool, typer.Option(help="Keep carbon rows in UTC order, as the released SustainDC does.")
-    ] = False,
 ) -> None:
     """Validate and align files, and store them in the user's data folder."""
     console = Console()
@@ -212,7 +209,6 @@ def import_data(
                         base,
                         utc_offset_h=utc_offset,
                         stamp=stamp.value,
-                        pairing="utc_rows" if utc_rows else "local",
                     )
                 )
             else:

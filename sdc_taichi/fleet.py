@@ -119,6 +119,11 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
             differ.
     """
     listed = (configs,) if isinstance(configs, DataCenterConfig) else tuple(configs)
+    for config in listed:
+        if not isinstance(config, DataCenterConfig):
+            raise ConfigError(
+                f"fleet: {config!r} is no DataCenterConfig; load_config reads presets and files"
+            )
     if not listed:
         raise ConfigError("fleet: no data center given; valid is at least one")
     models = {stage: _shared(listed, path) for stage, path in STAGE_MODELS.items()}
@@ -169,9 +174,15 @@ def make_configs(
     Raises:
         ConfigError: count below 1, or a sampling rule or drawn value that is not valid.
     """
+    if isinstance(sites, str):
+        raise ConfigError(f"sites {sites!r}: valid is a list of names")
     count = max(len(sites), 1) if count is None else count
     if count < 1:
         raise ConfigError(f"fleet: {count} data centers; valid is at least 1")
+    if count < len(sites):
+        raise ConfigError(
+            f"fleet: {count} data centers for {len(sites)} sites; valid is at least one per site"
+        )
     rules = dict(sample or {})
     for path, rule in rules.items():
         _check_rule(base, path, rule)

@@ -343,7 +343,7 @@ def prepare_folder(out: Path, *, force: bool = False) -> bool:
         if out.exists() and not out.is_dir():
             raise ConfigError(f"{out}: is a file; valid is a folder to write the run to")
         out.mkdir(parents=True, exist_ok=True)
-        found = sorted(p.name for p in out.iterdir() if not p.name.endswith(".part"))
+        found = sorted(p.name for p in out.iterdir() if not _is_of_a_run(p))
     former = _is_run(out)
     if found and not force and not former:
         some = ", ".join(found[:3]) + (", ..." if len(found) > 3 else "")
@@ -390,6 +390,11 @@ def _file_hashes(configs: Sequence[DataCenterConfig]) -> dict[str, str]:
     """
     paths = {path for config in configs for path in _input_files(config).values()}
     return {p: sha256(Path(p)) if Path(p).is_file() else "missing" for p in sorted(paths)}
+
+
+def _is_of_a_run(path: Path) -> bool:
+    """Files that a run may leave without its metrics.json when it is broken off."""
+    return path.name == "steps.parquet" or path.suffix in (".part", ".rrd")
 
 
 def _is_run(out: Path) -> bool:

@@ -5,10 +5,22 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import sys
 
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 
-_owner_pid: int | None = None
+_forked = False
+
+
+def _mark_child() -> None:
+    """Remember in a forked child that its parent had a runtime, whoever started it."""
+    global _forked
+    taichi = sys.modules.get("taichi")
+    _forked = taichi is not None and taichi.lang.impl.get_runtime().prog is not None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_mark_child)
 
 
 def ensure_started() -> int:
@@ -21,8 +33,7 @@ def ensure_started() -> int:
         RuntimeStateError: in a child forked after the start, where Taichi would hang.
         ConfigError: ``SDC_TAICHI_THREADS`` is no positive integer.
     """
-    global _owner_pid
-    if _owner_pid is not None and _owner_pid != os.getpid():
+    if _forked:
         raise RuntimeStateError(
             "this process was forked after Taichi started and would hang; start workers with the "
             "'spawn' method (multiprocessing.get_context('spawn')) or create simulators only in "
@@ -36,7 +47,6 @@ def ensure_started() -> int:
         # ti.init prints a banner, which would end up in a user's piped output.
         with contextlib.redirect_stdout(io.StringIO()):
             ti.init(arch=ti.cpu, offline_cache=True, log_level=ti.ERROR, **options)
-    _owner_pid = os.getpid()
     return int(ti.lang.impl.current_cfg().cpu_max_num_threads)
 
 

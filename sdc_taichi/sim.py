@@ -196,6 +196,8 @@ class Simulator:
             RuntimeStateError: before ``reset``, after ``close``, or in a forked child.
             SdcError: a command that is not finite, out of range or of the wrong shape.
         """
+        if actions is not None and not isinstance(actions, Actions):
+            raise SdcError(f"actions are a {type(actions).__name__}; valid is Actions(...)")
         state, sized, step_h = self.state, self.sizing, self.step_h
         hall = self._start()
         load_command, cooling_command, battery_command = self._commands(actions or Actions())
@@ -402,6 +404,11 @@ class Simulator:
                     f"snapshot: {field.name} is {given.dtype} {given.shape}, "
                     f"expected {model.dtype} {model.shape}"
                 )
+            # The last command is not a number before the first step.
+            low = -np.inf if field.name == "setpoint_c" else 0.0
+            valid = np.all(np.isfinite(given) & (given >= low))
+            if field.name != "cooling_last" and not valid:
+                raise SdcError(f"snapshot: {field.name} has values that are negative or not finite")
             loaded[field.name] = int(given) if given.ndim == 0 else given.copy()
         self._start().forget()
         self._state = State(**loaded)
@@ -461,6 +468,8 @@ class Simulator:
             if not isinstance(given, kind):
                 raise SdcError(f"action {name}: {given} is no {kind.__name__}")
             return np.full(self.size, float(given.value))
+        if isinstance(given, list | tuple) and any(isinstance(x, Enum) for x in given):
+            given = [x.value if isinstance(x, kind) else x for x in given]
         try:
             command = np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError):

@@ -16,7 +16,7 @@ from sdc_taichi.types import F64
 
 WATER_DENSITY_KG_M3 = 1000.0
 RELEASED_OUTDOOR_C = {"NY": 30.0, "WA": 20.0}
-"""Sizing temperatures of the released SustainDC; 50 C elsewhere."""
+"""Sizing temperatures of the released SustainDC by the first letters of the site; else 50 C."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,6 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     cooling_w = (it_w + crac_fan_w) * v("hvac.sizing.margin")
 
     approach_k = v("hvac.tower.approach_min_k")
-    range_k = v("hvac.tower.water_range_k")
     condenser_c = np.maximum(wet_bulb_c + approach_k, v("hvac.chiller.min_condenser_c"))
     # The coldest chilled water asks most of the chiller.
     chilled_c = v("hvac.setpoint.min_c") - v("hvac.chiller.coil_approach_k")
@@ -87,26 +86,13 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     chiller_w = cooling_w / per_reference
     machine = run_chiller(cooling_w, chiller_w)
     rejected_w = machine.rejected_w
-    water_kg_s = tower.design_water_kg_s(rejected_w, range_k=range_k)
-    yorkcalc = fleet.models["tower"] == "yorkcalc"
     design = Design(
         cooling_w=cooling_w,
         chiller_w=chiller_w,
         reference_cop=v("hvac.chiller.reference_cop"),
         rejected_w=rejected_w,
-        tower_water_kg_s=np.asarray(water_kg_s),
-        tower_reference_kg_s=tower.yorkcalc_reference_water_kg_s(
-            water_kg_s, wet_bulb_c=wet_bulb_c, range_k=range_k, approach_k=approach_k
-        )
-        if yorkcalc
-        else np.asarray(water_kg_s),
-        tower_air_m3s=v("hvac.tower.printed_airflow_m3s"),
-        tower_fan_w=v("hvac.tower.fan_w_per_w_rejected") * rejected_w
-        if yorkcalc
-        else v("hvac.tower.printed_fan_w"),
-        chilled_pump_w=_pump_w(fleet, cooling_w, v("hvac.chiller.chilled_water_range_k")),
-        condenser_pump_w=_pump_w(fleet, rejected_w, range_k),
-        pump_min_ratio=v("hvac.pumps.min_flow_ratio"),
+        **_tower(fleet, cooling_w, rejected_w, outdoor_c, wet_bulb_c),
+        **_pumps(fleet, cooling_w, rejected_w),
         **_common(fleet),
     )
     facility_w = (
@@ -142,7 +128,7 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
     v = fleet.values
     ones = np.ones(fleet.size)
     listed = np.array(
-        [RELEASED_OUTDOOR_C.get(c.site.location.upper(), 50.0) for c in fleet.configs]
+        [RELEASED_OUTDOOR_C.get(c.site.location.upper()[:2], 50.0) for c in fleet.configs]
     )
     given = v("hvac.sizing.design_outdoor_c")
     outdoor_c = np.where(np.isnan(given), listed, given)
@@ -152,7 +138,6 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
     crac_flow = v("hvac.crac.supply_m3s_per_w") * it_w
     rise_k = np.maximum(full.outlet_mean_c + mean_return_approach_k(fleet) - low_c, 0.0)
     rated_w = air * crac_flow * rise_k
-    tower_air = rated_w / (air * np.maximum(50.0 - (outdoor_c - low_c), 1.0))
     highest_w = released_ranges(fleet, hall)["it_w"][1]
     machine = chiller.released(
         highest_w,
@@ -163,7 +148,6 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
         reference_cop=v("hvac.chiller.reference_cop"),
     )
     facility_w = 1.1 * (highest_w + rated_w + machine.power_w)
-    water_kg_s = np.asarray(tower.design_water_kg_s(rated_w, range_k=v("hvac.tower.water_range_k")))
     return Sizing(
         it_w=it_w,
         it_airflow_m3s=full.airflow_m3s,
@@ -180,13 +164,8 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
             chiller_w=rated_w,
             reference_cop=v("hvac.chiller.reference_cop"),
             rejected_w=rated_w,
-            tower_water_kg_s=water_kg_s,
-            tower_reference_kg_s=water_kg_s,
-            tower_air_m3s=tower_air,
-            tower_fan_w=rated_w,
-            chilled_pump_w=v("hvac.pumps.released_chilled_w"),
-            condenser_pump_w=v("hvac.pumps.released_condenser_w"),
-            pump_min_ratio=ones,
+            **_tower(fleet, rated_w, rated_w, outdoor_c, wet_bulb_c),
+            **_pumps(fleet, rated_w, rated_w),
             **_common(fleet),
         ),
     )
@@ -239,13 +218,57 @@ def _common(fleet: Fleet) -> dict[str, F64]:
     }
 
 
-def _pump_w(fleet: Fleet, heat_w: F64, range_k: F64) -> F64:
-    flow = np.asarray(tower.design_water_kg_s(heat_w, range_k=range_k)) / WATER_DENSITY_KG_M3
-    return hydraulic_pump_w(
-        fleet.values("hvac.pumps.pressure_drop_pa"),
-        flow,
-        efficiency=fleet.values("hvac.pumps.efficiency"),
-    )
+def _tower(
+    fleet: Fleet, cooling_w: F64, rejected_w: F64, outdoor_c: F64, wet_bulb_c: F64
+) -> dict[str, F64]:
+    """Water, air and fan of the tower, by the rules of its model.
+
+    ``yorkcalc`` meets the design approach with full air; ``released`` carries the cooling load with
+    50 - (design outdoor - lowest setpoint) K of air and draws that load at full speed; ``paper``
+    takes the printed figures at any size.
+    """
+    v, model, air = fleet.values, fleet.models["tower"], air_j_per_m3_k(fleet)
+    range_k, approach_k = v("hvac.tower.water_range_k"), v("hvac.tower.approach_min_k")
+    water_kg_s = np.asarray(tower.design_water_kg_s(rejected_w, range_k=range_k))
+    rise_k = np.maximum(50.0 - (outdoor_c - v("hvac.setpoint.min_c")), 1.0)
+    sized = {
+        "tower_water_kg_s": water_kg_s,
+        "tower_reference_kg_s": water_kg_s,
+        "tower_air_m3s": cooling_w / (air * rise_k),
+        "tower_fan_w": cooling_w,
+        "air_j_per_m3_k": air,
+    }
+    if model == "yorkcalc":
+        sized["tower_fan_w"] = v("hvac.tower.fan_w_per_w_rejected") * rejected_w
+        sized["tower_reference_kg_s"] = tower.yorkcalc_reference_water_kg_s(
+            water_kg_s, wet_bulb_c=wet_bulb_c, range_k=range_k, approach_k=approach_k
+        )
+    elif model == "paper":
+        sized["tower_fan_w"] = v("hvac.tower.printed_fan_w")
+        sized["tower_air_m3s"] = v("hvac.tower.printed_airflow_m3s")
+    return sized
+
+
+def _pumps(fleet: Fleet, cooling_w: F64, rejected_w: F64) -> dict[str, F64]:
+    """Chilled- and condenser-water pumps: sized for their flow, or one unscaled pump each."""
+    v = fleet.values
+    if fleet.models["pumps"] == "released":
+        return {
+            "chilled_pump_w": v("hvac.pumps.released_chilled_w"),
+            "condenser_pump_w": v("hvac.pumps.released_condenser_w"),
+            "pump_min_ratio": np.ones(fleet.size),
+        }
+
+    def design_w(heat_w: F64, range_k: F64) -> F64:
+        flow = np.asarray(tower.design_water_kg_s(heat_w, range_k=range_k)) / WATER_DENSITY_KG_M3
+        efficiency = v("hvac.pumps.efficiency")
+        return hydraulic_pump_w(v("hvac.pumps.pressure_drop_pa"), flow, efficiency=efficiency)
+
+    return {
+        "chilled_pump_w": design_w(cooling_w, v("hvac.chiller.chilled_water_range_k")),
+        "condenser_pump_w": design_w(rejected_w, v("hvac.tower.water_range_k")),
+        "pump_min_ratio": v("hvac.pumps.min_flow_ratio"),
+    }
 
 
 def _battery_kwh(fleet: Fleet, sized_kwh: F64) -> F64:

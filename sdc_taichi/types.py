@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Any
@@ -40,16 +41,16 @@ class BatteryAction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Actions:
-    """One command per data center; an enum or a number serves all of them.
+    """One command per data center, a list or an array; an enum or a number serves all of them.
 
     Numbers are continuous commands: ``load`` and ``battery`` within -1..1 are shares of what could
     be deferred (negative) or drained, discharged (negative) or charged; ``cooling`` is in setpoint
     steps and may exceed 1.
     """
 
-    load: LoadAction | float | F64 = LoadAction.NEUTRAL
-    cooling: CoolAction | float | F64 = CoolAction.HOLD
-    battery: BatteryAction | float | F64 = BatteryAction.IDLE
+    load: LoadAction | float | F64 | Sequence[LoadAction] = LoadAction.NEUTRAL
+    cooling: CoolAction | float | F64 | Sequence[CoolAction] = CoolAction.HOLD
+    battery: BatteryAction | float | F64 | Sequence[BatteryAction] = BatteryAction.IDLE
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +127,7 @@ class StepResult:
     supply_c: F64
     """CRAC supply air: the setpoint plus what unmet cooling has warmed the room by."""
     inlet_mean_c: F64
+    """Mean over racks of any size, as ``outlet_mean_c``."""
     inlet_max_c: F64
     outlet_mean_c: F64
     cpu_w: F64

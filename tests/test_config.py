@@ -72,7 +72,7 @@ def test_a_config_written_back_reads_back_equal(preset: str, tmp_path: Path) -> 
 @settings(max_examples=40)
 @given(
     values=st.tuples(
-        st.floats(1e-300, 1e300),
+        st.floats(1e-300, 1e12),
         st.floats(0, 1),
         st.one_of(st.none(), st.floats(1e-9, 1e9)),
         st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), max_size=12),
@@ -208,7 +208,7 @@ def test_airflow_curve_is_the_one_that_runs() -> None:
         result = sim.step()
     inlet = result.rack_inlet_c[[0, 2]].astype(np.float64)
     ratio = config.airflow_ratio(inlet, np.array([0.6]))
-    np.testing.assert_allclose(result.rack_airflow_m3s[[0, 2]], 3 * 0.051 * ratio, rtol=1e-12)
+    np.testing.assert_allclose(result.rack_airflow_m3s[[0, 2]], 3 * 0.0212 * ratio, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

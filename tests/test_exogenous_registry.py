@@ -194,15 +194,6 @@ def test_weather_of_another_zone_than_the_stored_carbon(sources: Path, user_fold
         load_site("d")
 
 
-def test_import_in_the_old_pairing(sources: Path, user_folder: Path) -> None:
-    run("import", epw(sources), "--site", "old")
-    run("import", carbon(sources), "--site", "old", "--utc-rows")
-    expected = read_carbon(carbon(sources), -5.0, pairing="utc_rows")
-    found = load_site("old").ci_g_per_kwh
-    np.testing.assert_array_equal(found.values, expected.values)
-    assert any("UTC order" in note for note in found.notes)
-
-
 @pytest.mark.parametrize("name", ["NY", "ny", "../x", "", "a b", ".hidden", "x" * 65])
 def test_names_that_cannot_be_imported(name: str, sources: Path, user_folder: Path) -> None:
     with pytest.raises(DataError, match="site "):

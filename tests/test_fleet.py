@@ -75,7 +75,7 @@ def test_parameters_of_each_data_center_reach_the_kernel() -> None:
     assert row["fan_high"].tolist() == [1.0, np.inf]
     assert row["fan_exponent"].tolist() == [3.0, 2.5]
     assert row["fan_reference_w"].tolist() == [10.0, 7.0]
-    assert row["fan_full_m3s"].tolist() == [0.051, 0.04]
+    assert row["fan_full_m3s"].tolist() == [0.0212, 0.04]
     np.testing.assert_allclose(row["air_j_per_m3_k"], [1.225 * 1006, 1.1 * 1006])
 
 

@@ -66,10 +66,9 @@ def random_config(
     servers["fan_reference_ratio"] = float(rng.uniform(0.5, 1.5))
     servers["fan_full_airflow_m3s"] = float(rng.uniform(0.02, 0.06))
     kind = rng.integers(3)
-    if kind == 0:
-        servers["groups"] = [random_rack(rng) for _ in range(racks)]
-    elif kind == 1:
-        servers["groups"] = [random_rack(rng)]
+    if kind < 2:
+        servers["groups"] = [random_rack(rng) for _ in range(racks if kind == 0 else 1)]
+        servers["power_w"] = None
     else:
         full = rng.uniform(80, 500, racks)
         servers["power_w"] = np.stack([full, full * rng.uniform(0, 0.6, racks)], axis=1).tolist()
@@ -145,7 +144,7 @@ def test_servers_agree_with_the_twin(precision: Precision, outlet_model: str, se
 def test_twin_sees_a_change_of_any_group_value(field: str) -> None:
     rng = np.random.default_rng(5)
     config = random_config(rng, "dc", "server", 3.0).model_dump(mode="json")
-    config["servers"]["groups"] = [random_rack(rng) + random_rack(rng)]
+    config["servers"] |= {"groups": [random_rack(rng) + random_rack(rng)], "power_w": None}
     config["hall"]["capacity_mw"] = None
     supply, load = np.array([22.0]), np.array([0.6])
     sums = solve([config_from_dict(config)], supply, load, "f64")

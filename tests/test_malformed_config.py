@@ -99,7 +99,7 @@ def fails(arguments: list[str], parts: list[str]) -> None:
         ),
         (
             "extends: tiny\nservers: {groups: [[{count: 1, full_w: .inf, idle_w: 2}]]}",
-            ["servers.groups.0.0.full_w", "finite"],
+            ["servers.groups.0.0.full_w", "within -1e12..1e12"],
         ),
     ],
 )

@@ -99,3 +99,18 @@ def test_a_room_that_overheats_recovers_when_load_falls() -> None:
     assert max(float(r.it_w[0]) for r in results) < highest_w
     assert results[-1].room_heat_kwh[0] == 0.0
     assert inlet_c[-1] == pytest.approx(inlet_c[0])
+
+
+@pytest.mark.parametrize("preset", ["corrected", "large", "tiny"])
+def test_return_air_is_no_hotter_than_the_hottest_server(preset: str) -> None:
+    """The air of the hall closes: CRAC airflow, server airflow and approach fit each other."""
+    demand = np.linspace(0.0, 1.0, 21)
+    flat = np.full_like(demand, 20.0)
+    for setpoint_c in (16.0, 23.0):
+        config = load_config(preset, [f"hvac.setpoint.initial_c={setpoint_c}"])
+        drivers = drivers_from_arrays(flat, flat - 5.0, flat, demand)
+        with Simulator(config, drivers=drivers, precision="f64") as sim:
+            sim.reset()
+            for _ in demand:
+                result = sim.step()
+                assert result.return_c[0] <= sim.servers().outlet_c.max() + 1e-9

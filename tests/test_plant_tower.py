@@ -307,7 +307,7 @@ def test_released_airflow_carries_the_heat_up_to_full_speed() -> None:
     assert float(run("released", 1e9).fan_w) == DESIGN_FAN_W
     warm = run("released", 1e3, outdoor_c=np.array([67.0, 90.0])).air_ratio
     assert warm[0] == warm[1] == pytest.approx(1e3 / (1225.0 * 1.006) / 53.48945350914959)
-    other_air = run("released", heat_w, outdoor_c=45.0, rho_kg_m3=2.45, cp_j_per_kg_k=503.0)
+    other_air = run("released", heat_w, outdoor_c=45.0, air_j_per_m3_k=2.45 * 503.0)
     assert float(other_air.air_ratio) == pytest.approx(0.5)
 
 

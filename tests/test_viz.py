@@ -192,7 +192,12 @@ def test_recording_explains_itself(
 
 def test_without_sources_the_configured_ones_are_named(tmp_path: Path) -> None:
     base = load_config("tiny", ["site.carbon_file=/data/ci.csv", "site.seed=4"])
-    Recorder(tmp_path / "x.rrd", build_fleet(base)).close()
+    with (
+        Simulator(load_config("tiny")) as sim,
+        Recorder(tmp_path / "x.rrd", build_fleet(base)) as r,
+    ):
+        sim.reset()
+        r.log(sim.step())
     (((text,),)) = read(tmp_path / "x.rrd")["/summary"]["TextDocument:text"]
     assert "weather (as configured): NY, synthetic, seed 4" in text
     assert "carbon (as configured): file /data/ci.csv" in text

@@ -89,8 +89,8 @@ def expected_step(
         arrived = 100.0 * demand
         flexible = limits.flexible_share * arrived
         due = line.waited(limits.deadline_steps, now)
-        at_once = min(arrived - defer * flexible, capacity)
-        forced = min(due, capacity - at_once)
+        forced = min(due, capacity)
+        at_once = min(arrived - defer * flexible, capacity - forced)
         held_back = arrived - at_once
     else:
         capacity = math.floor(capacity)

@@ -176,12 +176,17 @@ class Recorder:
     def close(self) -> None:
         """Write what is left and give the file its name; closing again does nothing.
 
+        Without a step there is no file, and a former one stays.
+
         Raises:
             SdcError: the file cannot be written.
         """
         if not self._open:
             return
         self._open = False
+        if self._last_step < 0:
+            self._discard()
+            return
         try:
             self._write_block()
             self._stream.flush()

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,15 +86,18 @@ def read_table(path: Path) -> tuple[pd.DataFrame, int]:
         frame = frame.astype(object).where(frame.notna(), "").astype(str)
     else:
         try:
-            frame = pd.read_csv(
-                path,
-                dtype=str,
-                keep_default_na=False,
-                skip_blank_lines=False,
-                encoding="utf-8-sig",
-                index_col=False,
-                on_bad_lines="error",
-            )
+            with warnings.catch_warnings():
+                # A row of another width than the header is reported by what is missing then.
+                warnings.simplefilter("ignore", pd.errors.ParserWarning)
+                frame = pd.read_csv(
+                    path,
+                    dtype=str,
+                    keep_default_na=False,
+                    skip_blank_lines=False,
+                    encoding="utf-8-sig",
+                    index_col=False,
+                    on_bad_lines="error",
+                )
         except pd.errors.EmptyDataError:
             raise DataError(f"{path}: empty, expected a header and rows") from None
         except pd.errors.ParserError as error:
@@ -369,21 +373,27 @@ def spread(values: FloatArray, positions: NDArray[np.int64]) -> FloatArray:
 def write_parquet(
     path: Path, columns: Mapping[str, FloatArray], metadata: Mapping[str, Any]
 ) -> None:
-    """Write columns with metadata, atomically: a reader sees the old file or the whole new one."""
+    """Write columns with metadata, atomically: a reader sees the old file or the whole new one.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     table = pa.table(dict(columns)).replace_schema_metadata(
         {METADATA_KEY: json.dumps({"format": FORMAT, **metadata}).encode()}
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        pq.write_table(table, part)
-        part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            pq.write_table(table, part)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error})") from None
 
 
 def read_metadata(path: Path) -> dict[str, Any] | None:

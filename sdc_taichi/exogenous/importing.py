@@ -9,7 +9,7 @@ from typing import Any
 
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import files
-from sdc_taichi.exogenous.carbon import Pairing, Stamp, read_carbon
+from sdc_taichi.exogenous.carbon import Stamp, read_carbon
 from sdc_taichi.exogenous.registry import (
     find_name,
     imported_sites,
@@ -102,7 +102,6 @@ def import_carbon(
     *,
     utc_offset_h: float | None = None,
     stamp: Stamp = "auto",
-    pairing: Pairing = "local",
 ) -> Imported:
     """Store a carbon file as ``sites/NAME/carbon.parquet``.
 
@@ -130,8 +129,8 @@ def import_carbon(
             f"{path}: UTC offset of site {name!r} unknown, expected the weather file imported "
             "first, --base SITE or --utc-offset HOURS"
         )
-    series = read_carbon(path, offset, stamp, pairing=pairing, longitude_deg=longitude)
-    metadata = {"kind": "carbon", "utc_offset_h": offset, "pairing": pairing, "base": base}
+    series = read_carbon(path, offset, stamp, longitude_deg=longitude)
+    metadata = {"kind": "carbon", "utc_offset_h": offset, "pairing": "local", "base": base}
     target = user_data_dir(data_dir) / "sites" / name / "carbon.parquet"
     return _store(path, name, target, [series], metadata)
 

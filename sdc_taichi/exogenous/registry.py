@@ -128,10 +128,7 @@ def load_site(
     base = (
         synthetic_site(find_name("base", bases.pop(), synthetic_sites()), seed) if bases else None
     )
-    pairing: Pairing = "local"
-    if "carbon" in parts and _metadata(parts["carbon"]).get("pairing") == "utc_rows":
-        pairing = "utc_rows"
-    return site_from_files(base, parts.get("weather"), parts.get("carbon"), name, pairing=pairing)
+    return site_from_files(base, parts.get("weather"), parts.get("carbon"), name)
 
 
 def load_trace(

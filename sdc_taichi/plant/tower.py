@@ -12,6 +12,7 @@ Every model has the same signature, so a caller can look it up in `TOWERS` and p
     reference_water_kg_s water flow at which the water flow ratio of YorkCalc is 1, kg/s
     reference_air_m3s    airflow at full fan speed, m3/s (air-side models)
     design_fan_w         fan power at full speed, W
+    air_j_per_m3_k       heat capacity of air per volume, J/(m3 K) (air-side models)
 
 Arguments are float64 arrays of shape (B,), or anything that broadcasts to it. A model reads only
 what its equations need; pass 0 for the rest.
@@ -37,6 +38,7 @@ Array = NDArray[np.float64]
 Values = Array | float
 
 WATER_J_PER_KG_K = 4184.0
+AIR_J_PER_M3_K = 1.225 * 1006.0
 
 # [power of L/G, power of the range, power of the wet bulb]
 YORKCALC = np.array(
@@ -188,6 +190,7 @@ def yorkcalc(
     reference_water_kg_s: Values,
     reference_air_m3s: Values,
     design_fan_w: Values,
+    air_j_per_m3_k: Values = AIR_J_PER_M3_K,
 ) -> Tower:
     """York tower with a variable-speed fan that holds the condenser water at its setpoint.
 
@@ -208,6 +211,7 @@ def yorkcalc(
         reference_water_kg_s: Water flow at which the flow ratio is 1, kg/s, above 0.
         reference_air_m3s: Not used.
         design_fan_w: Fan power at full speed, W.
+        air_j_per_m3_k: Not used.
 
     Returns:
         The tower's step; leaving_c is never below the setpoint.
@@ -247,8 +251,7 @@ def released(
     reference_water_kg_s: Values,
     reference_air_m3s: Values,
     design_fan_w: Values,
-    rho_kg_m3: Values = 1.225,
-    cp_j_per_kg_k: Values = 1006.0,
+    air_j_per_m3_k: Values = AIR_J_PER_M3_K,
 ) -> Tower:
     """The tower of the released SustainDC code: a cubic fan on the airflow that carries the heat.
 
@@ -265,13 +268,12 @@ def released(
         reference_water_kg_s: Not used.
         reference_air_m3s: Airflow at full speed, m3/s, above 0.
         design_fan_w: Fan power at full speed, W.
-        rho_kg_m3: Air density, kg/m3.
-        cp_j_per_kg_k: Specific heat of air, J/(kg K).
+        air_j_per_m3_k: Heat capacity of air per volume, J/(m3 K).
 
     Returns:
         The tower's step.
     """
-    air_m3s = _air_m3s(heat_w, outdoor_c, supply_setpoint_c, rho_kg_m3, cp_j_per_kg_k)
+    air_m3s = _air_m3s(heat_w, outdoor_c, supply_setpoint_c, air_j_per_m3_k)
     running = np.greater_equal(outdoor_c, 5.0)
     air_ratio = np.where(running, np.minimum(air_m3s / reference_air_m3s, 1.0), 0.0)
     return _tower(
@@ -294,8 +296,7 @@ def paper(
     reference_water_kg_s: Values,
     reference_air_m3s: Values,
     design_fan_w: Values,
-    rho_kg_m3: Values = 1.225,
-    cp_j_per_kg_k: Values = 1006.0,
+    air_j_per_m3_k: Values = AIR_J_PER_M3_K,
 ) -> Tower:
     """Appendix A.2.2 as printed: P_CT = P_ref*(V/V_ref)^-3, so less airflow costs more power.
 
@@ -313,13 +314,12 @@ def paper(
         reference_water_kg_s: Not used.
         reference_air_m3s: V_ref, m3/s, above 0.
         design_fan_w: P_ref, W.
-        rho_kg_m3: Air density, kg/m3.
-        cp_j_per_kg_k: Specific heat of air, J/(kg K).
+        air_j_per_m3_k: Heat capacity of air per volume, J/(m3 K).
 
     Returns:
         The tower's step.
     """
-    air_m3s = _air_m3s(heat_w, outdoor_c, supply_setpoint_c, rho_kg_m3, cp_j_per_kg_k)
+    air_m3s = _air_m3s(heat_w, outdoor_c, supply_setpoint_c, air_j_per_m3_k)
     air_ratio = air_m3s / reference_air_m3s
     moving = air_ratio > 0.0
     return _tower(
@@ -358,11 +358,10 @@ def _air_m3s(
     heat_w: Values,
     outdoor_c: Values,
     supply_setpoint_c: Values,
-    rho_kg_m3: Values,
-    cp_j_per_kg_k: Values,
+    air_j_per_m3_k: Values,
 ) -> Array:
     delta_k = np.maximum(50.0 - (outdoor_c - supply_setpoint_c), 1.0)
-    return np.asarray(np.maximum(heat_w, 0.0) / (cp_j_per_kg_k * rho_kg_m3 * delta_k))
+    return np.asarray(np.maximum(heat_w, 0.0) / (air_j_per_m3_k * delta_k))
 
 
 def _tower(

@@ -28,6 +28,7 @@ class Design:
     """Water flow at which the tower's water flow ratio is 1."""
     tower_air_m3s: F64
     tower_fan_w: F64
+    air_j_per_m3_k: F64
     chilled_pump_w: F64
     condenser_pump_w: F64
     pump_min_ratio: F64
@@ -125,6 +126,7 @@ def operate(
         reference_water_kg_s=design.tower_reference_kg_s,
         reference_air_m3s=design.tower_air_m3s,
         design_fan_w=design.tower_fan_w,
+        air_j_per_m3_k=design.air_j_per_m3_k,
     )
     share = precooled_share(cooled.leaving_c)
     machine = run_chiller(share, cooled.leaving_c)

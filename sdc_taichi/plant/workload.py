@@ -71,8 +71,8 @@ def fluid(
     due = _older_than(queue, deadline_steps)
     flexible = flexible_share * arrived
     wanted = arrived - np.maximum(-command, 0.0) * flexible
-    now = np.minimum(wanted, capacity)
-    forced = np.minimum(due, capacity - now)
+    forced = np.minimum(due, capacity)
+    now = np.minimum(wanted, capacity - forced)
     held_back = arrived - now
     room = queue_limit - (waiting - forced)
     deferred = np.minimum(held_back, room)
