@@ -480,7 +480,7 @@ class DataCenterConfig(_Section):
         limits = self.servers.fan_airflow_ratio_limits or (-np.inf, np.inf)
         highest = np.inf if self.servers.curve_limit_c is None else self.servers.curve_limit_c
         on_curve_c = np.minimum(inlet_c, highest)
-        return np.clip(slope * on_curve_c + offset + shift * utilisation, *limits)
+        return np.asarray(np.clip(slope * on_curve_c + offset + shift * utilisation, *limits))
 
     def rack_groups(self) -> tuple[tuple[ServerGroup, ...], ...]:
         """Server groups of every rack, with capacity_mw applied to the counts."""

@@ -317,7 +317,7 @@ def config_of_check(check: Check) -> DataCenterConfig:
     """The hall of a check: the paper's, with what the check says about racks and sizing."""
     given = check["inputs"]
     base = load_config("sustaindc")
-    pairs = base.servers.power_w
+    pairs = base.servers.power_pairs
     full = given.get("full_load_W_by_rack", [p[0] for p in pairs])
     idle = given.get("idle_W_by_rack", [p[1] for p in pairs])
     servers = base.hall.servers_per_rack

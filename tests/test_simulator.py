@@ -408,7 +408,7 @@ def test_a_missing_snapshot_is_refused(tmp_path: Path) -> None:
         (Actions(battery=np.zeros((2, 1))), r"action battery: shape \(2, 1\)"),
         (Actions(load=CoolAction.LOWER), "action load: CoolAction.LOWER is no LoadAction"),  # type: ignore[arg-type]
         (Actions(battery="charge"), "action battery: 'charge' is neither"),  # type: ignore[arg-type]
-        (Actions(cooling=[BatteryAction.IDLE] * 2), "action cooling: .* is neither"),  # type: ignore[arg-type]
+        (Actions(cooling=[BatteryAction.IDLE] * 2), "action cooling: .* is neither"),  # type: ignore[list-item]
     ],
 )
 def test_a_wrong_action_is_refused_and_changes_nothing(actions: Actions, message: str) -> None:
