@@ -8,9 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sdc_taichi import ConfigError, DataCenterConfig, build_fleet, load_config, make_configs
-from sdc_taichi.config import apply_overrides
+from sdc_taichi import (
+    ConfigError,
+    DataCenterConfig,
+    Simulator,
+    build_fleet,
+    drivers_from_arrays,
+    load_config,
+    make_configs,
+)
+from sdc_taichi.config import apply_overrides, config_from_dict
 from sdc_taichi.kernels.thermal import DC_ROWS, GROUP_ROWS
+from sdc_taichi.plant.water_side import Design
 
 TINY = load_config("tiny")
 
@@ -244,3 +253,56 @@ def test_a_drawn_value_that_is_not_valid_is_an_error() -> None:
 def test_a_fleet_has_at_least_one(count: int) -> None:
     with pytest.raises(ConfigError, match=f"fleet: {count} data centers; valid is at least 1"):
         make_configs(TINY, count=count)
+
+
+def _design(*overrides: str) -> Design:
+    drivers = drivers_from_arrays([20.0], [15.0], [300.0], [0.5])
+    with Simulator(load_config("corrected", list(overrides)), drivers=drivers) as sim:
+        return sim.sizing.water_side
+
+
+def test_towers_and_pumps_are_sized_by_their_own_model() -> None:
+    own, released_tower = _design(), _design("hvac.tower.model=released")
+    assert own.tower_fan_w == pytest.approx(0.02 * own.rejected_w)
+    assert released_tower.tower_fan_w == released_tower.cooling_w
+    assert released_tower.tower_air_m3s > 10.0
+    yorkcalc = _design("hvac.sizing.model=released")
+    assert yorkcalc.tower_fan_w == pytest.approx(0.02 * yorkcalc.rejected_w)
+    unscaled = _design("hvac.pumps.model=released", "hvac.pumps.released_chilled_w=379")
+    assert unscaled.chilled_pump_w == 379.0
+    assert own.chilled_pump_w > 5000.0
+
+
+def test_the_air_of_the_config_reaches_the_tower() -> None:
+    released = ["hvac.tower.model=released", "hvac.sizing.model=released"]
+    fan_w = []
+    for density in (1.225, 1.0):
+        config = load_config("sustaindc", [*released, f"hall.air_density_kg_m3={density}"])
+        drivers = drivers_from_arrays([20.0], [15.0], [300.0], [1.0])
+        with Simulator(config, drivers=drivers, precision="f64") as sim:
+            sim.reset()
+            result = sim.step()
+            share = result.cooling_load_w / sim.sizing.water_side.cooling_w
+            fan_w.append(float(result.tower_fan_w[0] / sim.sizing.water_side.tower_fan_w[0]))
+            rise = (50.0 - (30.0 - 15.0)) / (50.0 - (20.0 - result.setpoint_c))
+            assert fan_w[-1] == pytest.approx(float(np.minimum(share * rise, 1.0)[0]) ** 3)
+
+
+def test_fewer_data_centers_than_sites_are_refused() -> None:
+    with pytest.raises(ConfigError, match="2 data centers for 3 sites"):
+        make_configs(load_config("tiny"), count=2, sites=["NY", "CA", "TX"])
+    with pytest.raises(ConfigError, match="sites 'NY'"):
+        make_configs(load_config("tiny"), sites="NY")
+
+
+def test_groups_and_power_pairs_exclude_each_other() -> None:
+    config = load_config("tiny")
+    values = config.model_dump(mode="json")
+    values["servers"]["power_w"] = [[100, 10]]
+    with pytest.raises(ConfigError, match="power_w and groups are both given"):
+        config_from_dict(values)
+    pairs = load_config("tiny", ["servers.power_w=[300, 30]"])
+    assert pairs.servers.groups is None
+    groups = load_config("corrected", ["servers.groups=[[{count: 2, full_w: 9, idle_w: 1}]]"])
+    assert groups.servers.power_w is None
+    assert build_fleet(groups).servers == 40

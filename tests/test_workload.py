@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sdc_taichi import Actions, LoadAction, Simulator, drivers_from_arrays, load_config
 from sdc_taichi.plant.workload import MODELS, TASKS_PER_STEP, Work, age_histogram
 from sdc_taichi.types import F64
 
@@ -288,3 +289,16 @@ def test_age_histogram_by_hand() -> None:
         queue = one_step("fluid", queue, demand, -1.0, limits).queue
     found = age_histogram(queue, np.array([0.0, 2.0, 3.0, 25.0, 99.0]))
     np.testing.assert_allclose(found, [[5.0, 30.0, 30.0, 0.0, 0.0]], atol=1e-12)
+
+
+def test_due_work_runs_before_what_arrives() -> None:
+    """Deferred work whose deadline comes while the data center is full does not wait longer."""
+    config = load_config("tiny", ["workload.deadline_h=2"])
+    demand = [0.5] * 8 + [1.0] * 24
+    drivers = drivers_from_arrays([20.0] * 32, [15.0] * 32, [300.0] * 32, demand)
+    with Simulator(config, drivers=drivers) as sim:
+        sim.reset()
+        results = [sim.step(Actions(load=LoadAction.DEFER if t < 8 else 0.0)) for t in range(32)]
+    assert max(float(r.due_tasks[0]) for r in results) > 0
+    assert all(r.overdue_tasks[0] == 0 for r in results)
+    assert max(float(r.oldest_age_h[0]) for r in results) <= 2.0
