@@ -73,7 +73,8 @@ def test_a_config_written_back_reads_back_equal(preset: str, tmp_path: Path) -> 
 @given(
     values=st.tuples(
         st.floats(1e-300, 1e12),
-        st.floats(0, 1),
+        # Libraries built with fast maths flush subnormal numbers to zero in the whole process.
+        st.floats(0, 1, allow_subnormal=False),
         st.one_of(st.none(), st.floats(1e-9, 1e9)),
         st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), max_size=12),
     )
