@@ -20,7 +20,6 @@ A ratio without IT energy is None.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,19 +103,6 @@ def add(totals: Totals, result: StepResult, fleet: Fleet) -> None:
     for dc in hotter:
         racks = result.rack_inlet_max_c[fleet.rack_start[dc] : fleet.rack_start[dc + 1]]
         totals.hottest_rack[dc] = int(np.argmax(racks))
-
-
-def totals_of(results: Sequence[StepResult], fleet: Fleet) -> Totals:
-    """Totals of steps that were kept.
-
-    Args:
-        results: at least one step.
-        fleet: the data centers they are of.
-    """
-    totals = begin(fleet.size, results[0].step_h)
-    for result in results:
-        add(totals, result, fleet)
-    return totals
 
 
 def per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
