@@ -106,6 +106,12 @@ class HallConfig(_Section):
         """Number of racks, rows x racks per row."""
         return self.rows * self.racks_per_row
 
+    def rack_approach_k(self) -> np.ndarray:
+        """Supply approach temperature of every rack, within the limits if there are any."""
+        given = np.broadcast_to(np.asarray(self.supply_approach_k, np.float64), (self.racks,))
+        limits = self.supply_approach_limits_k
+        return given.copy() if limits is None else np.asarray(np.clip(given, *limits))
+
     @model_validator(mode="after")
     def _not_too_many_racks(self) -> Self:
         if self.racks > MOST_RACKS:
@@ -459,11 +465,8 @@ class DataCenterConfig(_Section):
                 raise ValueError(_length_message("servers.groups", len(groups), racks))
             for index, rack in enumerate(groups):
                 _check_load_weights(index, rack)
-        approach_k = np.broadcast_to(np.asarray(self.hall.supply_approach_k), (racks,))
-        if self.hall.supply_approach_limits_k is not None:
-            approach_k = np.clip(approach_k, *self.hall.supply_approach_limits_k)
         lowest_k = np.array([min(g.inlet_offset_k for g in r) for r in groups] if groups else [0.0])
-        coldest_c = self.hvac.setpoint.min_c + approach_k + lowest_k
+        coldest_c = self.hvac.setpoint.min_c + self.hall.rack_approach_k() + lowest_k
         ratio = self.airflow_ratio(coldest_c, np.zeros(racks))
         worst = int(np.argmin(ratio))
         if ratio[worst] <= 0:

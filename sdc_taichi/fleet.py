@@ -268,9 +268,6 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         raise ConfigError(
             f"{config.name}: {groups[0].sum():.4g} servers; valid is at most {MOST_SERVERS:,}"
         )
-    approach = np.broadcast_to(np.asarray(hall.supply_approach_k, dtype=np.float64), (hall.racks,))
-    if hall.supply_approach_limits_k is not None:
-        approach = np.clip(approach, *hall.supply_approach_limits_k)
     fan_low, fan_high = servers.fan_airflow_ratio_limits or (-np.inf, np.inf)
     dc = (
         *cpu_coefficients(servers),
@@ -288,7 +285,7 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         groups_per_rack=np.array([len(rack) for rack in per_rack], dtype=np.int32),
         counts=groups[0].astype(np.int32),
         groups=groups,
-        approach_k=approach.copy(),
+        approach_k=hall.rack_approach_k(),
         dc=np.array(dc),
     )
 

@@ -118,7 +118,6 @@ def record(
         SdcError: the folder is not free, a file cannot be written, or a command is not valid.
     """
     former = prepare_folder(out, force=force)
-    sim.reset(asked.seed)
     about = describe(sim, asked)
     configs = configs_yaml(sim.fleet.configs)
     names = ["config.yaml", "configs.yaml"]
@@ -158,7 +157,7 @@ def describe(sim: Simulator, asked: Asked) -> dict[str, Any]:
     """What a run is, before any step: versions, seed, inputs and data centers.
 
     Args:
-        sim: a simulator that has been reset.
+        sim: the simulator.
         asked: what it is to do.
     """
     drivers = sim.drivers
@@ -170,7 +169,7 @@ def describe(sim: Simulator, asked: Asked) -> dict[str, Any]:
             "python": platform.python_version(),
             **{name: version(name) for name in packages},
         },
-        "fingerprint": str(sim.state_dict()["fingerprint"]),
+        "fingerprint": sim.fingerprint(),
         "controller": asked.controller,
         "seed": asked.seed,
         "precision": sim.precision,

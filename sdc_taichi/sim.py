@@ -374,7 +374,7 @@ class Simulator:
         state = self.state
         out = {f.name: np.array(getattr(state, f.name)) for f in fields(State)}
         out["version"] = np.array(SNAPSHOT_VERSION)
-        out["fingerprint"] = np.array(self._fingerprint())
+        out["fingerprint"] = np.array(self.fingerprint())
         return out
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
@@ -392,7 +392,7 @@ class Simulator:
             )
         if int(values["version"]) != SNAPSHOT_VERSION:
             raise SdcError(f"snapshot: version {values['version']}, expected {SNAPSHOT_VERSION}")
-        if str(values["fingerprint"]) != self._fingerprint():
+        if str(values["fingerprint"]) != self.fingerprint():
             raise SdcError("snapshot: made by another fleet, inputs or precision than this one")
         like = self._state if self._state is not None else self.reset()
         loaded: dict[str, Any] = {}
@@ -486,9 +486,10 @@ class Simulator:
             )
         return np.broadcast_to(command, (self.size,)).copy()
 
-    def _fingerprint(self) -> str:
+    def fingerprint(self) -> str:
+        """SHA-256 of configs, inputs and precision, which tells simulators apart."""
         digest = hashlib.sha256(self.precision.encode())
-        for config in dict.fromkeys(self.fleet.configs):
+        for config in self.fleet.configs:
             digest.update(config.model_dump_json().encode())
         digest.update(self.drivers.digest())
         return digest.hexdigest()
