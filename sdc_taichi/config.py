@@ -85,6 +85,59 @@ class ServerGroup(_Section):
         return self
 
 
+class LayoutConfig(_Section):
+    """Measures of the hall: rows side by side, fronts facing fronts across the cold aisles.
+
+    Row 0 lies along the first wall and faces away from it, row 1 faces row 0, and so on.
+    """
+
+    rack_pitch_m: Positive = 0.6
+    rack_depth_m: Positive = 1.2
+    rack_height_m: Positive = 2.1
+    cold_aisle_m: Positive = 1.2
+    hot_aisle_m: Positive = 1.2
+    end_margin_m: NonNegative = 1.8
+    """Between the ends of the rows and the walls."""
+    side_margin_m: Positive = 1.2
+    """Between the outer rows and the walls."""
+    ceiling_m: Positive = 3.6
+    containment: Share = 0.0
+    """Share of the paths from hot to cold aisles that containment closes."""
+    returns: Literal["ceiling", "end_wall"] = "ceiling"
+    """Where warm air leaves the hall: grilles above the hot aisles, or the wall at the row ends."""
+
+    @model_validator(mode="after")
+    def _racks_fit(self) -> Self:
+        if self.ceiling_m <= self.rack_height_m:
+            raise ValueError(
+                f"ceiling_m {self.ceiling_m:g} must be above rack_height_m {self.rack_height_m:g}"
+            )
+        return self
+
+
+class RecirculationConfig(_Section):
+    """How exhaust air reaches the inlets of the racks."""
+
+    decay_m: Positive = 3.0
+    """Length over which the exhaust of another rack loses weight by a factor of e."""
+    cutoff: Annotated[_Real, Field(ge=0, le=0.01)] = 1e-4
+    """Weights below this are dropped in large halls."""
+    matrix_file: FileName | None = None
+    """R or D of a CFD study (.npz, .csv) in place of the weights of the layout."""
+    matrix_kind: Literal["R", "D"] | None = None
+    """What a .csv file holds; an .npz file names it."""
+    calibrate: bool = True
+    """Scale the weights to supply_approach_k; False takes the magnitude from the file."""
+
+    @model_validator(mode="after")
+    def _magnitude_is_known(self) -> Self:
+        if not self.calibrate and self.matrix_file is None:
+            raise ValueError(
+                "calibrate false needs a matrix_file; the layout alone gives weights, no magnitude"
+            )
+        return self
+
+
 class HallConfig(_Section):
     """Rows of racks, their approach temperatures, and how many servers they hold."""
 
@@ -93,11 +146,18 @@ class HallConfig(_Section):
     servers_per_rack: Count | tuple[Count, ...] = 200
     capacity_mw: Positive | None = None
     """IT nameplate to scale the number of servers to; None keeps servers_per_rack."""
-    inlet_model: Literal["approach"] = "approach"
+    inlet_model: Literal["approach", "recirculation"] = "approach"
     supply_approach_k: NonNegative | tuple[NonNegative, ...]
     supply_approach_limits_k: Pair | None = None
     return_approach_k: Finite | tuple[Finite, ...]
-    room_heat_capacity_kj_per_k_per_server: Positive = 10.0
+    layout: LayoutConfig = LayoutConfig()
+    recirculation: RecirculationConfig = RecirculationConfig()
+    height_zones: Count = 5
+    """Zones over the height of a rack that share an inlet temperature (recirculation only)."""
+    height_gradient: Annotated[_Real, Field(ge=0, lt=1)] = 0.4
+    """Recirculated share of the intake at top and bottom over that of the rack, less 1."""
+    room_heat_capacity_kj_per_k_per_server: Positive = 2.0
+    """Room, coils and what else follows the supply air."""
     air_density_kg_m3: Positive = 1.225
     air_heat_capacity_j_per_kg_k: Positive = 1006.0
 
@@ -153,10 +213,15 @@ class ServerConfig(_Section):
     """Airflow ratio against inlet temperature and load: config curve, or the released scaling."""
     fan_airflow_ratio_limits: Pair | None = None
     fan_power_exponent: Annotated[_Real, Field(ge=1, le=3)] = 3.0
-    fan_full_airflow_m3s: Positive = 0.051
+    fan_full_airflow_m3s: Positive | None = 0.051
+    """None takes what the supply and return approach temperatures close on at the design point."""
     fan_reference_ratio: Positive = 1.0
     fan_reference_w: NonNegative = 10.0
     outlet_model: Literal["server", "rack", "released"] = "server"
+    heat_capacity_kj_per_k: Positive = 9.75
+    """Of one server."""
+    heat_exchange_effectiveness: Annotated[_Real, Field(gt=0, le=1)] = 0.95
+    """Of a server's mass with the air that passes it."""
 
     @property
     def power_pairs(self) -> tuple[Pair, ...]:
@@ -209,12 +274,23 @@ class SetpointConfig(_Section):
 
 
 class CracConfig(_Section):
-    """CRAC units: airflow per IT watt at design, fan power."""
+    """CRAC units: airflow per IT watt at design, fan power, who supplies whom."""
 
+    units: Annotated[_Whole, Field(ge=1, le=64)] = 1
+    """They stand along both end walls in turn, evenly spread over the rows."""
+    unit_shares: tuple[tuple[Share, ...], ...] | None = None
+    """Share of each unit in the supply air of each rack, one row per rack, each summing to 1; None
+    is by distance."""
+    supply_length_m: Positive = 6.0
+    """Length over which a unit loses weight in a rack's supply by a factor of e."""
     supply_m3s_per_w: Positive = 5.663e-5
     reference_m3s_per_w: Positive = 9.438e-5
-    flow_model: Literal["constant", "follow_servers", "per_watt"] = "follow_servers"
+    flow_model: Literal["constant", "follow_servers", "per_watt", "controlled"] = "follow_servers"
     min_flow_ratio: Annotated[_Real, Field(gt=0, le=1)] = 0.6
+    fan_step: Annotated[_Real, Field(gt=0, le=1)] = 0.05
+    """Fan speed of one action step over design speed (flow model controlled)."""
+    coasting_flow_ratio: Annotated[_Real, Field(gt=0, le=1)] = 0.1
+    """Airflow through a unit that is down over its design airflow."""
     fan_w_per_m3s: NonNegative = 800.0
     """Design fan power per design airflow (specific fan power)."""
     released_fan_w: NonNegative = 150.0
@@ -372,6 +448,8 @@ class WorkloadConfig(_Section):
 
     model: Literal["fluid", "tasks"] = "fluid"
     trace: str = "alibaba_1"
+    placement: Literal["uniform", "fill", "coolest-first", "inlet-aware", "weights"] = "uniform"
+    """Where in the hall work runs."""
     flexible_share: Share = 0.2
     max_utilisation: Annotated[_Real, Field(gt=0, le=1)] = 1.0
     queue_limit_h: Positive | None = 2.5
@@ -411,9 +489,105 @@ class SiteConfig(_Section):
         return value
 
 
-class SimulationConfig(_Section):
-    """Time step."""
+class ProtectionConfig(_Section):
+    """What servers do when their inlets leave the allowable range of their ASHRAE class.
 
+    Above the limit a rack throttles; ``trip_margin_k`` above it, it switches off and loses the
+    work of the step, until its inlet is at most ``restart_c``.
+    """
+
+    ashrae_class: Literal["A1", "A2", "A3", "A4"] | None = None
+    """ASHRAE TC 9.9 (2021) class of the servers; None is no protection."""
+    throttle_share: Share = 0.5
+    """Utilisation a throttled rack may reach."""
+    trip_margin_k: NonNegative = 5.0
+    restart_c: Finite = 27.0
+
+
+EventKind = Literal["crac_down", "chiller_derate", "rack_fan_failure", "heat_wave", "grid_outage"]
+
+
+class ScheduledEvent(_Section):
+    """Something that goes wrong at a known time."""
+
+    kind: EventKind
+    start_h: NonNegative
+    """Hours after reset."""
+    duration_h: Positive
+    unit: Annotated[_Whole, Field(ge=0)] | None = None
+    """CRAC unit that is down; None is all of them."""
+    rack: Annotated[_Whole, Field(ge=0)] | None = None
+    """Rack whose fans fail."""
+    share: Share | None = None
+    """What is left: of the chiller's capacity, or of the rack's airflow."""
+    offset_k: Finite | None = None
+    """Heat wave: added to the dry-bulb and wet-bulb temperature."""
+
+    @model_validator(mode="after")
+    def _has_what_its_kind_needs(self) -> Self:
+        _check_event(self)
+        return self
+
+
+class SampledEvent(_Section):
+    """Something that goes wrong at random times: a Poisson process with uniform durations."""
+
+    kind: EventKind
+    per_year: Positive
+    duration_h: Pair
+    """Shortest and longest duration; units and racks are drawn evenly."""
+    share: Share | None = None
+    offset_k: Finite | None = None
+
+    @model_validator(mode="after")
+    def _has_what_its_kind_needs(self) -> Self:
+        low, high = self.duration_h
+        if not 0 < low <= high:
+            raise ValueError(
+                f"duration_h ({low:g}, {high:g}) must be (low, high) with 0 < low <= high"
+            )
+        _check_event(self)
+        return self
+
+
+class EventsConfig(_Section):
+    """Failures and weather that a run meets."""
+
+    scheduled: tuple[ScheduledEvent, ...] = ()
+    sampled: tuple[SampledEvent, ...] = ()
+
+
+_EVENT_FIELDS = {
+    "crac_down": ("unit",),
+    "chiller_derate": ("share",),
+    "rack_fan_failure": ("rack", "share"),
+    "heat_wave": ("offset_k",),
+    "grid_outage": (),
+}
+_OPTIONAL_EVENT_FIELDS = ("unit",)
+
+
+def _check_event(event: ScheduledEvent | SampledEvent) -> None:
+    used = _EVENT_FIELDS[event.kind]
+    for name in ("unit", "rack", "share", "offset_k"):
+        if name not in type(event).model_fields:
+            continue
+        given = getattr(event, name) is not None
+        if given and name not in used:
+            raise ValueError(f"{name} has no meaning for {event.kind}")
+        if not given and name in used and name not in _OPTIONAL_EVENT_FIELDS:
+            raise ValueError(f"{event.kind} needs {name}")
+    if event.kind == "rack_fan_failure" and event.share == 0.0:
+        raise ValueError("share 0 leaves a rack without air; valid is above 0")
+
+
+class SimulationConfig(_Section):
+    """Time step, and whether servers and room have thermal mass."""
+
+    thermal: Literal["quasi_steady", "transient"] = "quasi_steady"
+    """Quasi-steady temperatures belong to the present load; transient ones remember."""
+    substep_s: Annotated[_Real, Field(ge=5, le=120)] = 60.0
+    """Longest substep of transient temperatures."""
     steps_per_hour: Annotated[_Whole, Field(ge=1, le=60)] = 4
 
     @field_validator("steps_per_hour")
@@ -437,8 +611,70 @@ class DataCenterConfig(_Section):
     hvac: HvacConfig = HvacConfig()
     battery: BatteryConfig = BatteryConfig()
     workload: WorkloadConfig = WorkloadConfig()
+    protection: ProtectionConfig = ProtectionConfig()
+    events: EventsConfig = EventsConfig()
     site: SiteConfig = SiteConfig()
     simulation: SimulationConfig = SimulationConfig()
+
+    @model_validator(mode="after")
+    def _air_models_fit_together(self) -> Self:
+        crac = self.hvac.crac
+        wants: list[tuple[bool, str]] = []
+        if self.hall.inlet_model == "approach":
+            kinds = {e.kind for e in (*self.events.scheduled, *self.events.sampled)}
+            wants = [
+                (crac.units > 1, f"hvac.crac.units {crac.units}"),
+                (self.simulation.thermal == "transient", "simulation.thermal transient"),
+                ("crac_down" in kinds, "event crac_down"),
+                ("rack_fan_failure" in kinds, "event rack_fan_failure"),
+            ]
+            for given, what in wants:
+                if given:
+                    raise ValueError(f"{what} needs hall.inlet_model recirculation")
+            return self
+        groups = self.servers.groups or ()
+        wants = [
+            (self.servers.outlet_model != "server", "servers.outlet_model server"),
+            (
+                self.hvac.cooling_load_model != "heat_balance",
+                "hvac.cooling_load_model heat_balance",
+            ),
+            (crac.flow_model == "per_watt", "another hvac.crac.flow_model than per_watt"),
+            (
+                self.hall.supply_approach_limits_k is not None,
+                "hall.supply_approach_limits_k null",
+            ),
+            (
+                any(g.inlet_offset_k for rack in groups for g in rack),
+                "inlet_offset_k 0 in servers.groups (hall.height_zones takes its place)",
+            ),
+        ]
+        for missing, what in wants:
+            if missing:
+                raise ValueError(f"hall.inlet_model recirculation needs {what}")
+        return self
+
+    @model_validator(mode="after")
+    def _names_existing_places(self) -> Self:
+        crac, racks = self.hvac.crac, self.hall.racks
+        for index, event in enumerate(self.events.scheduled):
+            for name, limit in (("unit", crac.units), ("rack", racks)):
+                given = getattr(event, name)
+                if given is not None and given >= limit:
+                    raise ValueError(
+                        f"events.scheduled.{index}.{name} {given}: valid is 0..{limit - 1}"
+                    )
+        if crac.unit_shares is None:
+            return self
+        if len(crac.unit_shares) != racks:
+            raise ValueError(_length_message("hvac.crac.unit_shares", len(crac.unit_shares), racks))
+        for rack, shares in enumerate(crac.unit_shares):
+            if len(shares) != crac.units or abs(sum(shares) - 1.0) > 1e-9:
+                raise ValueError(
+                    f"hvac.crac.unit_shares of rack {rack}: {len(shares)} entries that sum to "
+                    f"{sum(shares):g}; valid is {crac.units} (hvac.crac.units) that sum to 1"
+                )
+        return self
 
     @model_validator(mode="after")
     def _times_are_whole_steps(self) -> Self:
@@ -466,7 +702,15 @@ class DataCenterConfig(_Section):
             for index, rack in enumerate(groups):
                 _check_load_weights(index, rack)
         lowest_k = np.array([min(g.inlet_offset_k for g in r) for r in groups] if groups else [0.0])
-        coldest_c = self.hvac.setpoint.min_c + self.hall.rack_approach_k() + lowest_k
+        coldest_c = (
+            self.hvac.setpoint.min_c
+            + lowest_k
+            + (
+                self.hall.rack_approach_k()
+                if self.hall.inlet_model == "approach"
+                else np.zeros(racks)
+            )
+        )
         ratio = self.airflow_ratio(coldest_c, np.zeros(racks))
         worst = int(np.argmin(ratio))
         if ratio[worst] <= 0:

@@ -18,6 +18,15 @@ from sdc_taichi.config import (
     with_values,
 )
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.layout import floor_plan, unit_shares
+from sdc_taichi.recirculation import (
+    DesignPoint,
+    RackServers,
+    Recirculation,
+    calibrate,
+    design_point,
+    rack_servers,
+)
 from sdc_taichi.types import F64
 
 I32 = npt.NDArray[np.int32]
@@ -36,8 +45,35 @@ STAGE_MODELS = {
     "sizing": "hvac.sizing.model",
     "battery": "battery.model",
     "workload": "workload.model",
+    "placement": "workload.placement",
+    "thermal": "simulation.thermal",
 }
 """Where the config names the model of each stage."""
+
+
+@dataclass(frozen=True, slots=True)
+class HallAir:
+    """Recirculation and CRAC supply of all racks."""
+
+    run_start: I32
+    """First run of weights of each rack, (R + 1,); see ``recirculation.Exchange``."""
+    run_first: I32
+    run_length: I32
+    run_offset: I32
+    weights: F64
+    norm: F64
+    """(R,)."""
+    unit_shares: F64
+    """Share of each unit in each rack's supply, rack by rack."""
+    share_start: I32
+    """First entry of each data center in ``unit_shares``, (B,)."""
+    outlet_rise_k: F64
+    """Mean outlet over supply at the design point, (R,)."""
+    rise_over_design: F64
+    """How much the air warms at loads of LOADS over full load, (B, len(LOADS))."""
+
+
+LOADS = np.linspace(0.0, 1.0, 9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +91,8 @@ class Fleet:
     """First rack of each data center, (B + 1,)."""
     rack_dc: I32
     """Data center of each rack, (R,)."""
+    unit_start: I32
+    """First CRAC unit of each data center, (B + 1,)."""
     group_start: I32
     """First group of each rack, (R + 1,)."""
     server_start: I32
@@ -62,9 +100,25 @@ class Fleet:
     approach_k: F64
     """Supply approach temperature, within the limits of the config, (R,)."""
     groups: F64
-    """Rows GROUP_ROWS of the thermal kernel, (5, G)."""
+    """The first six GROUP_ROWS of the thermal kernel, (6, G)."""
     dcs: F64
-    """Rows DC_ROWS of the thermal kernel, (14, B)."""
+    """Rows DC_ROWS of the thermal kernel, (18, B)."""
+    unit_design_m3s: F64
+    """Airflow of each CRAC unit at full speed, (U,)."""
+    it_airflow_m3s: F64
+    """Airflow through all servers at the design point, (B,)."""
+    air: HallAir | None
+    """How air moves in the halls; None with inlet model ``approach``."""
+
+    @property
+    def units(self) -> int:
+        """Number of CRAC units of all data centers."""
+        return int(self.unit_start[-1])
+
+    @property
+    def unit_dc(self) -> I32:
+        """Data center of each CRAC unit, (U,)."""
+        return np.repeat(np.arange(self.size, dtype=np.int32), np.diff(self.unit_start))
 
     @property
     def size(self) -> int:
@@ -105,10 +159,14 @@ class Fleet:
 @dataclass(frozen=True, slots=True)
 class _HallArrays:
     groups_per_rack: I32
-    counts: I32
     groups: F64
     approach_k: F64
     dc: F64
+    unit_design_m3s: F64
+    it_airflow_m3s: float
+    shares: F64
+    recirculation: Recirculation | None
+    rise_over_design: F64
 
 
 def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet:
@@ -132,13 +190,13 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     # One queue array serves the fleet; ages are read off its length.
     _shared(listed, "workload.age_horizon_h")
     _check_names(listed)
-    # Copies share their hall and server sections, which are laid out once.
-    cache: dict[tuple[int, int], _HallArrays] = {}
+    # Copies share their hall, server and HVAC sections, which are laid out once.
+    cache: dict[tuple[int, int, int], _HallArrays] = {}
     for config in listed:
-        key = (id(config.hall), id(config.servers))
+        key = (id(config.hall), id(config.servers), id(config.hvac))
         if key not in cache:
             cache[key] = _hall_arrays(config)
-    halls = [cache[id(c.hall), id(c.servers)] for c in listed]
+    halls = [cache[id(c.hall), id(c.servers), id(c.hvac)] for c in listed]
     racks = np.array([len(h.groups_per_rack) for h in halls])
     return Fleet(
         configs=listed,
@@ -147,10 +205,14 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         rack_start=_starts(racks),
         rack_dc=np.repeat(np.arange(len(listed), dtype=np.int32), racks),
         group_start=_starts(np.concatenate([h.groups_per_rack for h in halls])),
-        server_start=_starts(np.concatenate([h.counts for h in halls])),
+        server_start=_starts(np.concatenate([h.groups[0] for h in halls])),
         approach_k=np.concatenate([h.approach_k for h in halls]),
         groups=np.concatenate([h.groups for h in halls], axis=1),
         dcs=np.stack([h.dc for h in halls], axis=1),
+        unit_start=_starts(np.array([len(h.unit_design_m3s) for h in halls])),
+        unit_design_m3s=np.concatenate([h.unit_design_m3s for h in halls]),
+        it_airflow_m3s=np.array([h.it_airflow_m3s for h in halls]),
+        air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
     )
 
 
@@ -254,21 +316,31 @@ def _check_names(configs: Sequence[DataCenterConfig]) -> None:
 
 
 def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
-    hall, servers = config.hall, config.servers
-    per_rack = config.rack_groups()
-    columns = []
-    for rack in per_rack:
-        mean = sum(g.count * g.load_weight for g in rack) / sum(g.count for g in rack)
-        columns += [
-            (g.count, g.full_w, g.idle_w, g.inlet_offset_k, g.load_weight / mean - 1.0)
-            for g in rack
-        ]
-    groups = np.array(columns, dtype=np.float64).T
-    if groups[0].sum() > MOST_SERVERS:
+    hall, servers, crac = config.hall, config.servers, config.hvac.crac
+    racks = rack_servers(config)
+    if racks.count.sum() > MOST_SERVERS:
         raise ConfigError(
-            f"{config.name}: {groups[0].sum():.4g} servers; valid is at most {MOST_SERVERS:,}"
+            f"{config.name}: {racks.count.sum():.4g} servers; valid is at most {MOST_SERVERS:,}"
         )
+    shares = np.ones((hall.racks, 1))
+    if hall.inlet_model == "recirculation":
+        flows: Recirculation | None = calibrate(config, racks)
+        assert flows is not None
+        design, captured, fresh_share = flows.design, flows.captured, flows.fresh_share
+        shares = (
+            unit_shares(floor_plan(hall), crac.units, crac.supply_length_m)
+            if crac.unit_shares is None
+            else np.array(crac.unit_shares)
+        )
+        # Units are sized for the racks they supply.
+        need = shares.T @ ((1.0 - flows.share) * design.airflow_m3s)
+        unit_design_m3s = design.crac_flow_m3s * need / need.sum()
+    else:
+        flows, captured, fresh_share = None, np.zeros(len(racks.count)), 1.0
+        design = design_point(config)
+        unit_design_m3s = np.array([design.crac_flow_m3s])
     fan_low, fan_high = servers.fan_airflow_ratio_limits or (-np.inf, np.inf)
+    air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
     dc = (
         *cpu_coefficients(servers),
         *fan_coefficients(servers),
@@ -277,16 +349,73 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         servers.fan_reference_ratio,
         servers.fan_power_exponent,
         servers.fan_reference_w,
-        servers.fan_full_airflow_m3s,
-        hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k,
+        design.fan_full_airflow_m3s,
+        air,
         np.inf if servers.curve_limit_c is None else servers.curve_limit_c,
+        fresh_share,
+        servers.heat_capacity_kj_per_k * 1e3,
+        servers.heat_exchange_effectiveness,
+        air * floor_plan(hall).air_m3 / hall.racks,
     )
     return _HallArrays(
-        groups_per_rack=np.array([len(rack) for rack in per_rack], dtype=np.int32),
-        counts=groups[0].astype(np.int32),
-        groups=groups,
+        groups_per_rack=np.diff(racks.start),
+        groups=np.stack(
+            [racks.count, racks.full_w, racks.idle_w, racks.offset_k, racks.deviation, captured]
+        ),
         approach_k=hall.rack_approach_k(),
         dc=np.array(dc),
+        unit_design_m3s=unit_design_m3s,
+        it_airflow_m3s=float(design.airflow_m3s.sum()),
+        shares=shares,
+        recirculation=flows,
+        rise_over_design=np.array([_mean_rise_k(config, racks, design, u) for u in LOADS])
+        / _mean_rise_k(config, racks, design, 1.0),
+    )
+
+
+def _mean_rise_k(
+    config: DataCenterConfig, racks: RackServers, design: DesignPoint, load: float
+) -> float:
+    """How much servers warm their air at a load and the inlets of the design point, mean."""
+    servers = config.servers
+    slope, offset, shift = cpu_coefficients(servers)
+    inlet_c = design.supply_c + racks.per_group(design.approach_k) * design.height
+    ratio = config.airflow_ratio(inlet_c, np.full(len(inlet_c), load))
+    cpu_w = np.maximum(racks.idle_w, racks.full_w * (slope * inlet_c + offset + shift * load))
+    return float(np.sum(racks.count * cpu_w) / np.sum(racks.count * ratio))
+
+
+def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
+    """Exchanges end to end; copies of a hall share its weights."""
+    found = [h.recirculation for h in halls if h.recirculation is not None]
+    tables: dict[int, int] = {}
+    weights: list[F64] = []
+    total = 0
+    first_rack = 0
+    firsts, offsets, lengths, runs = [], [], [], []
+    for flows in found:
+        exchange = flows.exchange
+        if id(exchange) not in tables:
+            tables[id(exchange)] = total
+            weights.append(exchange.weights)
+            total += len(exchange.weights)
+        firsts.append(exchange.first + first_rack)
+        offsets.append(exchange.offset.astype(np.int64) + tables[id(exchange)])
+        lengths.append(exchange.length)
+        runs.append(np.diff(exchange.run_start))
+        first_rack += len(exchange.norm)
+    sizes = np.array([h.shares.size for h in halls])
+    return HallAir(
+        run_start=_starts(np.concatenate(runs)),
+        run_first=np.concatenate(firsts).astype(np.int32),
+        run_length=np.concatenate(lengths),
+        run_offset=np.concatenate(offsets).astype(np.int32),
+        weights=np.concatenate(weights),
+        norm=np.concatenate([f.exchange.norm for f in found]),
+        unit_shares=np.concatenate([h.shares.reshape(-1) for h in halls]),
+        share_start=_starts(sizes)[:-1],
+        outlet_rise_k=np.concatenate([f.design.outlet_rise_k for f in found]),
+        rise_over_design=np.stack([h.rise_over_design for h in halls]),
     )
 
 

@@ -5,38 +5,48 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, Self
 from zipfile import BadZipFile
 
 import numpy as np
+import numpy.typing as npt
 
+from sdc_taichi import air_metrics
+from sdc_taichi.air_metrics import ALLOWABLE_C
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.drivers import Drivers, load_drivers
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
+from sdc_taichi.events import Disturbance, schedule
 from sdc_taichi.fleet import Fleet, build_fleet
-from sdc_taichi.hall import Hall, Precision
+from sdc_taichi.hall import Coil, Conditions, Hall, HallState, HallSums, Precision
+from sdc_taichi.placement import Bins, layout, place
+from sdc_taichi.plant import air as air_side
 from sdc_taichi.plant import cooling, water_side, workload
 from sdc_taichi.plant.battery import BATTERIES
 from sdc_taichi.plant.carbon import emitted_g
 from sdc_taichi.plant.chiller import CHILLERS
+from sdc_taichi.plant.protection import THROTTLED, TRIPPED, capacity, protect
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER
 from sdc_taichi.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k, size
 from sdc_taichi.types import (
     F64,
+    I64,
     Actions,
     BatteryAction,
     CoolAction,
+    FanAction,
     LoadAction,
     ServerLayers,
     State,
+    Status,
     StepResult,
 )
 
-SNAPSHOT_VERSION = 1
+SNAPSHOT_VERSION = 2
 
 
 class Simulator:
@@ -68,6 +78,13 @@ class Simulator:
             )
         self.precision: Precision = precision
         self.step_h = 1.0 / self.fleet.steps_per_hour
+        self._timeline = schedule(
+            self.fleet.configs,
+            rack_start=self.fleet.rack_start,
+            unit_start=self.fleet.unit_start,
+            steps_per_hour=self.fleet.steps_per_hour,
+            seed=0,
+        )
         self._hall: Hall | None = None
         self._sizing: Sizing | None = None
         self._state: State | None = None
@@ -91,10 +108,17 @@ class Simulator:
         horizon = float(np.max(np.rint(v("workload.age_horizon_h") * per_hour)))
         self._queue_length = int(horizon) + 2
         self._setpoint = {
-            "step_k": v("hvac.setpoint.step_k"),
-            "low_c": v("hvac.setpoint.min_c"),
-            "high_c": v("hvac.setpoint.max_c"),
+            "step_k": v("hvac.setpoint.step_k")[self.fleet.unit_dc],
+            "low_c": v("hvac.setpoint.min_c")[self.fleet.unit_dc],
+            "high_c": v("hvac.setpoint.max_c")[self.fleet.unit_dc],
         }
+        self._unit_dc = self.fleet.unit_dc
+        self._fan_step = v("hvac.crac.fan_step")[self._unit_dc]
+        self._coasting = v("hvac.crac.coasting_flow_ratio")[self._unit_dc]
+        self._servers = self.fleet.per_dc_servers()
+        self._rack_servers = np.add.reduceat(self.fleet.groups[0], self.fleet.group_start[:-1])
+        self._prepare_protection()
+        self._bins = self._placement_bins()
         self._air_j_per_m3_k = air_j_per_m3_k(self.fleet)
         self._return_approach_k = mean_return_approach_k(self.fleet)
         self._min_flow_ratio = v("hvac.crac.min_flow_ratio")
@@ -117,6 +141,11 @@ class Simulator:
             )
         }
         self._counted = self.fleet.configs[0].hvac.total_of
+        self._flow_name = models["crac_flow"]
+        self._recirculates = models["inlet"] == "recirculation"
+        self._transient = models["thermal"] == "transient"
+        self._substep_s = float(np.min(v("simulation.substep_s")))
+        self._policy = models["placement"]
         self._stores_heat = models["cooling_load"] in cooling.STORES_UNMET_HEAT
         self._work_model = workload.MODELS[models["workload"]]
         self._setpoint_model = cooling.SETPOINTS[models["setpoint"]]
@@ -126,6 +155,32 @@ class Simulator:
         self._tower_model = TOWERS[models["tower"]]
         self._water_model = WATER[models["water"]]
         self._battery_model = BATTERIES[models["battery"]]
+
+    def _prepare_protection(self) -> None:
+        """Temperatures at which racks throttle, trip and restart, each (R,)."""
+        fleet = self.fleet
+        classes = [c.protection.ashrae_class for c in fleet.configs]
+        limit_c = np.array([np.inf if c is None else ALLOWABLE_C[c][1] for c in classes])
+        trip_c = limit_c + fleet.values("protection.trip_margin_k")
+        self._protected = bool(np.any(np.isfinite(limit_c)))
+        self._protect = {
+            "limit_c": limit_c[fleet.rack_dc],
+            "trip_c": trip_c[fleet.rack_dc],
+            "restart_c": fleet.values("protection.restart_c")[fleet.rack_dc],
+        }
+        self._throttle_share = fleet.values("protection.throttle_share")[fleet.rack_dc]
+        allowable = np.array([ALLOWABLE_C[c or "A2"] for c in classes])
+        self._allowable_low_c, self._allowable_high_c = allowable[:, 0], allowable[:, 1]
+
+    def _placement_bins(self) -> Bins:
+        """Racks where all are loaded alike, else server groups."""
+        fleet = self.fleet
+        start = fleet.rack_start if self._per_rack else fleet.group_start[fleet.rack_start]
+        return layout(start, fleet.names)
+
+    @property
+    def _per_rack(self) -> bool:
+        return self.fleet.models["placement"] == "uniform"
 
     @property
     def size(self) -> int:
@@ -164,25 +219,43 @@ class Simulator:
     def reset(self, seed: int | None = None) -> State:
         """Go back to the first step.
 
-        The stages are deterministic; ``seed`` is accepted for callers that treat all environments
-        alike and must be a non-negative integer.
+        Args:
+            seed: decides the sampled events, a non-negative integer; None is 0. The stages are
+                deterministic.
 
         Returns:
             The initial state.
         """
         if seed is not None and (not isinstance(seed, int | np.integer) or seed < 0):
             raise ConfigError(f"seed {seed!r}: valid is a non-negative integer")
-        self._start().forget()
-        v, b = self.fleet.values, self.size
+        hall = self._start()
+        hall.forget()
+        seed = 0 if seed is None else int(seed)
+        self._timeline = self._timeline.reseeded(seed)
+        v, b, fleet = self.fleet.values, self.size, self.fleet
+        setpoint_c = v("hvac.setpoint.initial_c")[self._unit_dc]
+        inlet_c = v("hvac.setpoint.initial_c")[fleet.rack_dc] + fleet.approach_k
+        groups = np.diff(fleet.group_start)
+        watches_groups = self._policy in ("coolest-first", "inlet-aware")
+        none = np.zeros(0)
+        memory = HallState(none, none, none, none, none)
+        if self._transient:
+            demand = self.drivers.at(0).demand
+            memory = hall.settle(Conditions(setpoint_c, demand, **self._fan_limits(None)))
         self._state = State(
             step=0,
-            setpoint_c=v("hvac.setpoint.initial_c"),
-            cooling_run=np.zeros(b, dtype=np.int64),
-            cooling_last=np.full(b, np.nan),
-            cooling_scale=np.ones(b),
+            seed=seed,
+            setpoint_c=setpoint_c,
+            cooling_run=np.zeros(fleet.units, dtype=np.int64),
+            cooling_last=np.full(fleet.units, np.nan),
+            cooling_scale=np.ones(fleet.units),
+            fan_speed=np.ones(fleet.units),
             queue=np.zeros((b, self._queue_length)),
             stored_kwh=v("battery.initial_soc") * self.sizing.battery_kwh,
             room_heat_kwh=np.zeros(b),
+            rack_status=np.zeros(fleet.racks, dtype=np.int8),
+            group_inlet_c=np.repeat(inlet_c, groups) if watches_groups else none,
+            **_fields(memory),
         )
         return self._state
 
@@ -198,12 +271,30 @@ class Simulator:
         """
         if actions is not None and not isinstance(actions, Actions):
             raise SdcError(f"actions are a {type(actions).__name__}; valid is Actions(...)")
+        given = actions or Actions()
         state, sized, step_h = self.state, self.sizing, self.step_h
-        hall = self._start()
-        load_command, cooling_command, battery_command = self._commands(actions or Actions())
+        hall, fleet, first_unit = self._start(), self.fleet, self.fleet.unit_start[:-1]
+        load_command = self._command("load", given.load, LoadAction, 1.0)
+        battery_command = self._command("battery", given.battery, BatteryAction, 1.0)
+        cooling_command = self._unit_command("cooling", given.cooling, CoolAction)
+        fan_speed = self._fan_speed(state, given.fan)
+        event = self._timeline.at(state.step)
         world = self.drivers.at(state.step)
+        outdoor_c = world.outdoor_c + event.outdoor_offset_k
+        wet_bulb_c = world.wet_bulb_c + event.outdoor_offset_k
 
-        work = self._work_model(world.demand, load_command, state.queue, **self._work)
+        powered = self._powered(state, event)
+        capacity, highest = self._capacity(state, powered, given.placement)
+        work = self._work_model(
+            world.demand,
+            load_command,
+            state.queue,
+            **{
+                **self._work,
+                "max_utilisation": np.minimum(self._work["max_utilisation"], highest),
+            },
+        )
+        loads, placed = self._place(work.utilisation, capacity, powered, state, given.placement)
 
         setpoint_c, run, last, scale = self._setpoint_model(
             state.setpoint_c,
@@ -213,110 +304,200 @@ class Simulator:
             state.cooling_scale,
             **self._setpoint,
         )
-        supply_c = setpoint_c + state.room_heat_kwh / sized.room_kwh_per_k
+        running = event.unit_up.astype(np.float64)
+        warmed_k = state.room_heat_kwh / sized.room_kwh_per_k
+        met = Conditions(
+            unit_supply_c=setpoint_c + warmed_k[self._unit_dc],
+            utilisation=np.minimum(work.utilisation, 1.0),
+            powered=self._rack_powered(state, powered),
+            rack_airflow=None if self._timeline.quiet else event.rack_airflow,
+            **loads,
+            **self._fan_limits(fan_speed, event.unit_up),
+        )
+        # The water of the plant serves the coldest coil in use.
+        served_c = np.where(running > 0, setpoint_c, np.inf)
+        plant_c = np.minimum.reduceat(served_c, first_unit)
+        plant_c = np.where(
+            np.isfinite(plant_c), plant_c, np.minimum.reduceat(setpoint_c, first_unit)
+        )
+        coils = np.add.reduceat(running * fleet.unit_design_m3s, first_unit) / np.add.reduceat(
+            fleet.unit_design_m3s, first_unit
+        )
+        design = sized.water_side
+        if not self._timeline.quiet:
+            design = replace(design, chiller_w=design.chiller_w * event.chiller_share)
 
-        air = hall.solve(supply_c, work.utilisation)
+        def plant(request_w: F64) -> water_side.WaterSide:
+            return self._operate(request_w, powered, plant_c, outdoor_c, wet_bulb_c, design)
+
+        memory = HallState(none := np.zeros(0), none, none, none, none)
+        if self._transient:
+            memory = HallState(**{f.name: getattr(state, f.name) for f in fields(HallState)})
+            air, memory = hall.advance(
+                met,
+                memory,
+                Coil(
+                    setpoint_c=setpoint_c,
+                    room_j=state.room_heat_kwh * 3.6e6,
+                    room_j_per_k=sized.room_kwh_per_k * 3.6e6,
+                    limit_w=plant(sized.water_side.cooling_w * coils).removed_w,
+                    fan_w_per_m3s=self._fan_w_per_m3s * powered,
+                ),
+                step_h * 3600.0,
+                self._substep_s,
+            )
+        else:
+            air = hall.solve(met)
         it_w = air.cpu_w + air.fan_w
 
-        crac_flow, fan_speed = self._flow_model(
-            it_w,
-            air.airflow_m3s,
-            design_flow_m3s=sized.crac_flow_m3s,
-            design_it_airflow_m3s=sized.it_airflow_m3s,
-            min_ratio=self._min_flow_ratio,
-            supply_m3s_per_w=self._supply_m3s_per_w,
-        )
-        fan_w = sized.crac_fan_w * fan_speed**3
-        return_c, load_w = self._load_model(
-            it_w,
-            fan_w,
-            crac_flow,
-            supply_c,
-            setpoint_c,
-            air.outlet_mean_c,
-            air_j_per_m3_k=self._air_j_per_m3_k,
-            return_approach_k=self._return_approach_k,
-        )
+        if self._recirculates:
+            crac_flow, supply_c, unit_flow = air.crac_flow_m3s, air.supply_c, air.unit_flow_m3s
+            unit_fan_w = self._fan_w_per_m3s[self._unit_dc] * fleet.unit_design_m3s
+            fan_w = np.add.reduceat(unit_fan_w * air.unit_cubed_speed, first_unit) * powered
+            return_c, load_w = air.return_c, it_w + fan_w
+        else:
+            supply_c = setpoint_c + warmed_k
+            crac_flow, speed = self._flow_model(
+                it_w,
+                air.airflow_m3s,
+                design_flow_m3s=sized.crac_flow_m3s,
+                design_it_airflow_m3s=sized.it_airflow_m3s,
+                min_ratio=self._min_flow_ratio,
+                supply_m3s_per_w=self._supply_m3s_per_w,
+                speed=fan_speed,
+            )
+            unit_flow = crac_flow
+            fan_w = air_side.crac_fan_w(speed, design_flow_m3s=1.0, design_w=sized.crac_fan_w)
+            return_c, load_w = self._load_model(
+                it_w,
+                fan_w * powered,
+                crac_flow,
+                supply_c,
+                setpoint_c,
+                air.outlet_mean_c,
+                air_j_per_m3_k=self._air_j_per_m3_k,
+                return_approach_k=self._return_approach_k,
+            )
+            fan_w = fan_w * powered
 
-        plant = water_side.operate(
-            load_w + state.room_heat_kwh * 1e3 / step_h,
-            setpoint_c=setpoint_c,
-            outdoor_c=world.outdoor_c,
-            wet_bulb_c=world.wet_bulb_c,
-            design=sized.water_side,
-            chiller=self._chiller_model,
-            tower=self._tower_model,
-            limited=self._stores_heat,
-        )
-        unmet_w, recovered_w, room_heat_kwh = cooling.hold_heat(
-            load_w, plant.removed_w, state.room_heat_kwh, step_h
-        )
+        if self._transient:
+            load_w, wanted_w = air.coil_load_w, air.coil_w
+            kept_kwh = air.room_j / 3.6e6
+        else:
+            wanted_w = load_w + state.room_heat_kwh * 1e3 / step_h
+            if not np.all(running):
+                wanted_w = np.minimum(
+                    wanted_w - self._past_idle_coils_w(air, running, return_c, met.unit_supply_c),
+                    sized.water_side.cooling_w * coils,
+                )
+            kept_kwh = state.room_heat_kwh
+        device = plant(wanted_w)
+        if self._transient:
+            room_heat_kwh = kept_kwh + (wanted_w - device.removed_w) * step_h / 1e3
+            unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, device.removed_w)
+        else:
+            unmet_w, recovered_w, room_heat_kwh = cooling.hold_heat(
+                load_w, device.removed_w, kept_kwh, step_h
+            )
 
         water = self._water_model(
-            rejected_w=plant.rejected_w,
-            range_k=plant.tower_range_k,
-            water_kg_s=plant.tower_water_kg_s,
-            wet_bulb_c=world.wet_bulb_c,
+            rejected_w=device.rejected_w,
+            range_k=device.tower_range_k,
+            water_kg_s=device.tower_water_kg_s,
+            wet_bulb_c=wet_bulb_c,
             return_c=return_c,
-            supply_setpoint_c=setpoint_c,
+            supply_setpoint_c=plant_c,
             dt_s=step_h * 3600.0,
             **self._water,
         )
 
         devices = {
-            "chiller": plant.chiller_w,
-            "tower_fan": plant.tower_fan_w,
-            "chilled_pump": plant.chilled_pump_w,
-            "condenser_pump": plant.condenser_pump_w,
+            "chiller": device.chiller_w,
+            "tower_fan": device.tower_fan_w,
+            "chilled_pump": device.chilled_pump_w,
+            "condenser_pump": device.condenser_pump_w,
             "crac_fan": fan_w,
         }
         hvac_w = sum((devices[name] for name in self._counted), np.zeros(self.size))
         facility_kw = (it_w + hvac_w) / 1e3
 
+        grid_up = event.grid_up.astype(np.float64)
         battery = self._battery_model(
             state.stored_kwh,
-            battery_command,
+            np.where(event.grid_up, battery_command, -1.0),
             capacity_kwh=sized.battery_kwh,
             load_kw=facility_kw,
             dt_h=step_h,
             **self._battery,
         )
+        grid_kwh = battery.grid_kwh * grid_up
+
+        status = state.rack_status
+        lost = np.maximum(work.utilisation - placed, 0.0)
+        if self._protected:
+            status = protect(status, air.rack_inlet_max_c, **self._protect)
+            lost = lost + self._lost_share(state.rack_status, status, loads, met, work.utilisation)
+        lost_tasks = lost * workload.TASKS_PER_STEP
         self._state = State(
             step=state.step + 1,
+            seed=state.seed,
             setpoint_c=setpoint_c,
             cooling_run=run,
             cooling_last=last,
             cooling_scale=scale,
+            fan_speed=fan_speed,
             queue=work.queue,
             stored_kwh=battery.stored_kwh,
             room_heat_kwh=room_heat_kwh,
+            rack_status=status,
+            group_inlet_c=hall.group_inlets() if len(state.group_inlet_c) else state.group_inlet_c,
+            **_fields(memory),
         )
-        capacity = np.where(sized.battery_kwh > 0, sized.battery_kwh, 1.0)
+        battery_kwh = np.where(sized.battery_kwh > 0, sized.battery_kwh, 1.0)
+        hottest_rack, hottest_server = self._hottest(air.hottest_group)
         return StepResult(
             step=state.step,
             step_h=step_h,
-            outdoor_c=world.outdoor_c,
-            wet_bulb_c=world.wet_bulb_c,
+            outdoor_c=outdoor_c,
+            wet_bulb_c=wet_bulb_c,
             ci_g_per_kwh=world.ci_g_per_kwh,
             demand=world.demand,
             load_command=load_command,
-            cooling_command=cooling_command,
+            cooling_command=self._per_dc(cooling_command),
             battery_command=battery_command,
             utilisation=work.utilisation,
             arrived_tasks=work.arrived,
-            executed_tasks=work.executed,
+            executed_tasks=work.executed - lost_tasks,
             deferred_tasks=work.deferred,
             drained_tasks=work.drained,
             due_tasks=work.due,
             overdue_tasks=work.overdue,
             dropped_tasks=work.dropped,
+            lost_tasks=lost_tasks,
             queue_tasks=work.queue[:, -1].copy(),
             oldest_age_h=work.oldest_age_steps * step_h,
             mean_age_h=work.mean_age_steps * step_h,
-            setpoint_c=setpoint_c,
+            setpoint_c=self._per_dc(setpoint_c),
             supply_c=supply_c,
             inlet_mean_c=air.inlet_mean_c,
             inlet_max_c=air.inlet_max_c,
+            hottest_rack=hottest_rack,
+            hottest_server=hottest_server,
+            hot_k=air.hot_k / self._servers,
+            shi=air_metrics.shi(air.inlet_m3k_s, air.outlet_m3k_s),
+            rti_pct=air_metrics.rti(
+                return_c,
+                supply_c,
+                air_metrics.it_rise_k(air.inlet_m3k_s, air.outlet_m3k_s, air.airflow_m3s),
+            ),
+            rci_hi_pct=air_metrics.rci_hi(
+                air.hot_k, self._servers, allowable_c=self._allowable_high_c
+            ),
+            rci_lo_pct=air_metrics.rci_lo(
+                air.cold_k, self._servers, allowable_c=self._allowable_low_c
+            ),
+            throttled_racks=self._count_racks(status == THROTTLED),
+            tripped_racks=self._count_racks(status == TRIPPED),
             outlet_mean_c=air.outlet_mean_c,
             cpu_w=air.cpu_w,
             it_fan_w=air.fan_w,
@@ -325,19 +506,20 @@ class Simulator:
             crac_flow_m3s=crac_flow,
             return_c=return_c,
             cooling_load_w=load_w,
-            chilled_water_c=plant.chilled_water_c,
-            condenser_water_c=plant.condenser_water_c,
-            economiser_w=plant.economiser_w,
-            chiller_load_w=plant.chiller_load_w,
+            chilled_water_c=device.chilled_water_c,
+            condenser_water_c=device.condenser_water_c,
+            economiser_w=device.economiser_w,
+            chiller_load_w=device.chiller_load_w,
             unmet_w=unmet_w if self._stores_heat else np.zeros(self.size),
             recovered_w=recovered_w if self._stores_heat else np.zeros(self.size),
-            heat_removed_w=plant.removed_w,
-            rejected_w=plant.rejected_w,
+            heat_removed_w=device.removed_w,
+            rejected_w=device.rejected_w,
             room_heat_kwh=room_heat_kwh,
-            chiller_w=plant.chiller_w,
-            tower_fan_w=plant.tower_fan_w,
-            chilled_pump_w=plant.chilled_pump_w,
-            condenser_pump_w=plant.condenser_pump_w,
+            stored_w=air.stored_w,
+            chiller_w=device.chiller_w,
+            tower_fan_w=device.tower_fan_w,
+            chilled_pump_w=device.chilled_pump_w,
+            condenser_pump_w=device.condenser_pump_w,
             crac_fan_w=fan_w,
             hvac_w=hvac_w,
             evaporation_l=water.evaporation_l,
@@ -345,14 +527,22 @@ class Simulator:
             blowdown_l=water.blowdown_l,
             water_l=water.makeup_l,
             stored_kwh=battery.stored_kwh,
-            soc=battery.stored_kwh / capacity,
+            soc=battery.stored_kwh / battery_kwh,
             charge_kwh=battery.charge_kwh,
             discharge_kwh=battery.discharge_kwh,
             battery_loss_kwh=battery.loss_kwh,
             it_kwh=it_w * step_h / 1e3,
             hvac_kwh=hvac_w * step_h / 1e3,
-            grid_kwh=battery.grid_kwh,
-            carbon_g=emitted_g(battery.grid_kwh, world.ci_g_per_kwh),
+            grid_kwh=grid_kwh,
+            unserved_kwh=battery.grid_kwh - grid_kwh,
+            carbon_g=emitted_g(grid_kwh, world.ci_g_per_kwh),
+            grid_up=grid_up,
+            powered=powered,
+            unit_setpoint_c=setpoint_c,
+            unit_supply_c=met.unit_supply_c,
+            unit_flow_m3s=unit_flow,
+            unit_running=running,
+            rack_status=status,
             rack_cpu_w=air.rack_cpu_w,
             rack_fan_w=air.rack_fan_w,
             rack_airflow_m3s=air.rack_airflow_m3s,
@@ -360,6 +550,200 @@ class Simulator:
             rack_inlet_max_c=air.rack_inlet_max_c,
             rack_outlet_c=air.rack_outlet_c,
         )
+
+    def _powered(self, state: State, event: Disturbance) -> F64:
+        """Share of the step with power, (B,).
+
+        In an outage it lasts as long as the battery would carry the facility at its design power,
+        which is more than it draws.
+        """
+        if np.all(event.grid_up):
+            return np.ones(self.size)
+        design_kw = self.sizing.facility_w / 1e3
+        carried = self._battery_model(
+            state.stored_kwh,
+            np.full(self.size, -1.0),
+            capacity_kwh=self.sizing.battery_kwh,
+            load_kw=design_kw,
+            dt_h=self.step_h,
+            **self._battery,
+        ).discharge_kwh
+        return np.where(event.grid_up, 1.0, np.minimum(carried / (design_kw * self.step_h), 1.0))
+
+    def _capacity(
+        self, state: State, powered: F64, weights: F64 | None
+    ) -> tuple[F64 | None, F64 | float]:
+        """Utilisation each bin may reach, (n,), None if all of it, and the data center, (B,)."""
+        limited = self._protected and bool(np.any(state.rack_status))
+        chosen = self._policy == "weights" and weights is not None
+        if not limited and not chosen and np.all(powered == 1.0):
+            return None, 1.0
+        per_rack = capacity(state.rack_status, self._throttle_share) * powered[self.fleet.rack_dc]
+        bins = per_rack if self._per_rack else self._spread(per_rack)
+        usable = bins if not chosen else np.where(self._bin_weights(weights) > 0, bins, 0.0)
+        highest = self._bins.sums(self._bin_servers * usable) / self._servers
+        return bins, highest
+
+    @property
+    def _bin_servers(self) -> F64:
+        return self._rack_servers if self._per_rack else self.fleet.groups[0]
+
+    def _spread(self, per_rack: F64) -> F64:
+        """Rack values for each server group, (G,)."""
+        return np.repeat(per_rack, np.diff(self.fleet.group_start))
+
+    def _bin_weights(self, weights: F64 | None) -> F64:
+        """Placement weights of the server groups, (G,), from one per rack or per group."""
+        groups = len(self.fleet.groups[0])
+        if weights is None:
+            return np.ones(groups)
+        try:
+            given = np.asarray(weights, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise SdcError(f"action placement: {weights!r} are no numbers") from None
+        if given.shape == (self.fleet.racks,) != (groups,):
+            return self._spread(given)
+        if given.shape != (groups,):
+            raise SdcError(
+                f"action placement: shape {given.shape}, expected ({self.fleet.racks},), one per "
+                f"rack, or ({groups},), one per server group"
+            )
+        return given
+
+    def _place(
+        self,
+        utilisation: F64,
+        bin_capacity: F64 | None,
+        powered: F64,
+        state: State,
+        weights: F64 | None,
+    ) -> tuple[dict[str, F64], F64]:
+        """Loads while servers are on, for ``Conditions``, and the utilisation placed, (B,)."""
+        if weights is not None and self._policy != "weights":
+            raise SdcError(
+                f"action placement: given, but workload.placement is {self._policy}; valid is None"
+            )
+        if self._per_rack and bin_capacity is None:
+            return {}, utilisation
+        bins = self._bins
+        load, placed = place(
+            self._policy,
+            utilisation,
+            bins=bins,
+            count=self._bin_servers,
+            capacity=np.ones(len(bins.dc)) if bin_capacity is None else bin_capacity,
+            inlet_c=state.group_inlet_c,
+            limit_c=self._allowable_high_c,
+            weights=self._bin_weights(weights) if self._policy == "weights" else None,
+        )
+        on = powered[bins.dc]
+        load = load / np.where(on > 0, on, 1.0)
+        return {"rack_load" if self._per_rack else "group_load": load}, placed
+
+    def _rack_powered(self, state: State, powered: F64) -> F64 | None:
+        """Share of the step that each rack is on, (R,); None if all are on."""
+        tripped = state.rack_status == TRIPPED
+        if not np.any(tripped) and np.all(powered == 1.0):
+            return None
+        return np.where(tripped, 0.0, powered[self.fleet.rack_dc])
+
+    def _lost_share(
+        self, before: Status, after: Status, loads: dict[str, F64], met: Conditions, work: F64
+    ) -> F64:
+        """Work of the racks that tripped in this step, as a share of capacity, (B,)."""
+        tripped = (after == TRIPPED) & (before != TRIPPED)
+        if not np.any(tripped):
+            return np.zeros(self.size)
+        fleet = self.fleet
+        if met.group_load is not None:
+            busy = np.add.reduceat(fleet.groups[0] * met.group_load, fleet.group_start[:-1])
+        else:
+            busy = self._rack_servers * (
+                work[fleet.rack_dc] if met.rack_load is None else met.rack_load
+            )
+        if met.powered is not None:
+            busy = busy * met.powered
+        return np.add.reduceat(busy * tripped, fleet.rack_start[:-1]) / self._servers
+
+    def _operate(
+        self,
+        request_w: F64,
+        powered: F64,
+        setpoint_c: F64,
+        outdoor_c: F64,
+        wet_bulb_c: F64,
+        design: water_side.Design,
+    ) -> water_side.WaterSide:
+        """The plant, which stands still while there is no power."""
+        dark = bool(np.any(powered < 1.0))
+        on = np.where(powered > 0, powered, 1.0)
+        found = water_side.operate(
+            np.where(powered > 0, request_w / on, 0.0) if dark else request_w,
+            setpoint_c=setpoint_c,
+            outdoor_c=outdoor_c,
+            wet_bulb_c=wet_bulb_c,
+            design=design,
+            chiller=self._chiller_model,
+            tower=self._tower_model,
+            limited=self._stores_heat,
+        )
+        return found.scaled(powered) if dark else found
+
+    def _past_idle_coils_w(self, air: HallSums, running: F64, return_c: F64, supply_c: F64) -> F64:
+        """Heat of the air that passes units that are down, (B,); it stays in the room."""
+        passed = (1.0 - running) * air.unit_flow_m3s * (return_c[self._unit_dc] - supply_c)
+        return self._air_j_per_m3_k * np.add.reduceat(passed, self.fleet.unit_start[:-1])
+
+    def _fan_limits(
+        self, speed: F64 | None, unit_up: npt.NDArray[np.bool_] | None = None
+    ) -> dict[str, F64]:
+        """Speeds between which each CRAC fan follows the servers' airflow, for ``Conditions``."""
+        low = np.ones(self.fleet.units)
+        high = low
+        if self._flow_name == "follow_servers":
+            low = self._min_flow_ratio[self._unit_dc]
+        elif self._flow_name == "controlled" and speed is not None:
+            low = high = speed
+        if unit_up is None or np.all(unit_up):
+            return {"unit_low": low, "unit_high": high}
+        return {
+            "unit_low": np.where(unit_up, low, self._coasting),
+            "unit_high": np.where(unit_up, high, self._coasting),
+            "unit_running": unit_up.astype(np.float64),
+        }
+
+    def _fan_speed(self, state: State, given: Any) -> F64:
+        command = self._unit_command("fan", given, FanAction)
+        if self._flow_name != "controlled":
+            if np.any(command):
+                raise SdcError(
+                    f"action fan: given, but hvac.crac.flow_model is {self._flow_name}; valid is "
+                    "HOLD, or flow model controlled"
+                )
+            return state.fan_speed
+        low = self._min_flow_ratio[self._unit_dc]
+        return np.clip(state.fan_speed + command * self._fan_step, low, 1.0)
+
+    @property
+    def _fan_w_per_m3s(self) -> F64:
+        return self.sizing.crac_fan_w / self.sizing.crac_flow_m3s
+
+    def _hottest(self, group: I64) -> tuple[F64, F64]:
+        """Rack within its data center and server within its rack of server groups, (B,) each."""
+        fleet = self.fleet
+        rack = np.searchsorted(fleet.group_start, group, side="right") - 1
+        server = fleet.server_start[group] - fleet.server_start[fleet.group_start[rack]]
+        return (rack - fleet.rack_start[:-1]).astype(np.float64), server.astype(np.float64)
+
+    def _count_racks(self, chosen: npt.NDArray[np.bool_]) -> F64:
+        return np.add.reduceat(chosen.astype(np.float64), self.fleet.rack_start[:-1])
+
+    def _per_dc(self, per_unit: F64) -> F64:
+        """Mean over the CRAC units, (B,)."""
+        if self.fleet.units == self.size:
+            return per_unit
+        first = self.fleet.unit_start
+        return np.add.reduceat(per_unit, first[:-1]) / np.diff(first)
 
     def servers(self) -> ServerLayers:
         """Inlet, outlet and power of every server in the last step, each (S,).
@@ -405,13 +789,14 @@ class Simulator:
                     f"expected {model.dtype} {model.shape}"
                 )
             # The last command is not a number before the first step.
-            low = -np.inf if field.name == "setpoint_c" else 0.0
+            low = -np.inf if field.name.endswith("_c") else 0.0
             valid = np.all(np.isfinite(given) & (given >= low))
             if field.name != "cooling_last" and not valid:
                 raise SdcError(f"snapshot: {field.name} has values that are negative or not finite")
             loaded[field.name] = int(given) if given.ndim == 0 else given.copy()
         self._start().forget()
         self._state = State(**loaded)
+        self._timeline = self._timeline.reseeded(self._state.seed)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to an .npz file, atomically and without pickle.
@@ -456,14 +841,14 @@ class Simulator:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _commands(self, actions: Actions) -> tuple[F64, F64, F64]:
-        return (
-            self._command("load", actions.load, LoadAction, 1.0),
-            self._command("cooling", actions.cooling, CoolAction, np.inf),
-            self._command("battery", actions.battery, BatteryAction, 1.0),
-        )
+    def _unit_command(self, name: str, given: Any, kind: type[Enum]) -> F64:
+        """A command for each CRAC unit, (U,), given for all, per data center or per unit."""
+        command = self._command(name, given, kind, np.inf, (self.fleet.units,))
+        return command if len(command) == self.fleet.units else command[self._unit_dc]
 
-    def _command(self, name: str, given: Any, kind: type[Enum], limit: float) -> F64:
+    def _command(
+        self, name: str, given: Any, kind: type[Enum], limit: float, also: tuple[int, ...] = ()
+    ) -> F64:
         if isinstance(given, Enum):
             if not isinstance(given, kind):
                 raise SdcError(f"action {name}: {given} is no {kind.__name__}")
@@ -476,15 +861,18 @@ class Simulator:
             raise SdcError(
                 f"action {name}: {given!r} is neither {kind.__name__} nor numbers"
             ) from None
-        if command.shape not in ((), (self.size,)):
-            raise SdcError(f"action {name}: shape {command.shape}, expected () or ({self.size},)")
+        valid = dict.fromkeys([(), (self.size,), *((n,) for n in also)])
+        if command.shape not in valid:
+            raise SdcError(
+                f"action {name}: shape {command.shape}, expected {' or '.join(map(str, valid))}"
+            )
         wrong = ~(np.abs(command) <= limit) | ~np.isfinite(command)
         if np.any(wrong):
             value = command[wrong].flat[0] if command.ndim else command
             raise SdcError(
                 f"action {name}: {value}; valid is a finite number within -{limit:g}..{limit:g}"
             )
-        return np.broadcast_to(command, (self.size,)).copy()
+        return np.full(self.size, float(command)) if command.ndim == 0 else command.copy()
 
     def fingerprint(self) -> str:
         """SHA-256 of configs, inputs and precision, which tells simulators apart."""
@@ -493,3 +881,8 @@ class Simulator:
             digest.update(config.model_dump_json().encode())
         digest.update(self.drivers.digest())
         return digest.hexdigest()
+
+
+def _fields(record: Any) -> dict[str, Any]:
+    """Fields of a dataclass by name."""
+    return {f.name: getattr(record, f.name) for f in fields(record)}

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdc_taichi.fleet import Fleet
-from sdc_taichi.hall import Hall
+from sdc_taichi.hall import Conditions, Hall, HallSums
 from sdc_taichi.plant import chiller, tower
 from sdc_taichi.plant.air import hydraulic_pump_w
 from sdc_taichi.plant.water_side import Design
@@ -34,7 +34,7 @@ class Sizing:
     """IT and HVAC power at the design point."""
     battery_kwh: F64
     room_kwh_per_k: F64
-    """Heat that warms servers and room by 1 K."""
+    """Heat that warms the room, and its servers if quasi-steady, by 1 K."""
     water_side: Design
 
 
@@ -61,9 +61,9 @@ def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64
 def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizing:
     """Full load, highest setpoint and design wet bulb, with the margin of the config on top."""
     v = fleet.values
-    full = hall.solve(v("hvac.setpoint.max_c"), np.ones(fleet.size))
+    full = _solve(fleet, hall, v("hvac.setpoint.max_c"), np.ones(fleet.size))
     it_w = full.cpu_w + full.fan_w
-    crac_flow = v("hvac.crac.supply_m3s_per_w") * it_w
+    crac_flow = np.add.reduceat(fleet.unit_design_m3s, fleet.unit_start[:-1])
     crac_fan_w = v("hvac.crac.fan_w_per_m3s") * crac_flow
     cooling_w = (it_w + crac_fan_w) * v("hvac.sizing.margin")
 
@@ -133,7 +133,7 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
     given = v("hvac.sizing.design_outdoor_c")
     outdoor_c = np.where(np.isnan(given), listed, given)
     low_c, air = v("hvac.setpoint.min_c"), air_j_per_m3_k(fleet)
-    full = hall.solve(v("hvac.setpoint.max_c"), ones)
+    full = _solve(fleet, hall, v("hvac.setpoint.max_c"), ones)
     it_w = full.cpu_w + full.fan_w
     crac_flow = v("hvac.crac.supply_m3s_per_w") * it_w
     rise_k = np.maximum(full.outlet_mean_c + mean_return_approach_k(fleet) - low_c, 0.0)
@@ -182,8 +182,11 @@ def released_ranges(fleet: Fleet, hall: Hall) -> dict[str, tuple[F64, F64]]:
     it_w, outlet_c = [], []
     for supply_c in range(15, 23):
         for percent in range(0, 101, 10):
-            sums = hall.solve(
-                np.full(fleet.size, float(supply_c)), np.full(fleet.size, percent / 100)
+            sums = _solve(
+                fleet,
+                hall,
+                np.full(fleet.size, float(supply_c)),
+                np.full(fleet.size, percent / 100),
             )
             it_w.append(sums.cpu_w + sums.fan_w)
             outlet_c.append(sums.outlet_mean_c)
@@ -191,6 +194,11 @@ def released_ranges(fleet: Fleet, hall: Hall) -> dict[str, tuple[F64, F64]]:
         "it_w": (np.min(it_w, axis=0), np.max(it_w, axis=0)),
         "outlet_c": (np.min(outlet_c, axis=0), np.max(outlet_c, axis=0)),
     }
+
+
+def _solve(fleet: Fleet, hall: Hall, supply_c: F64, utilisation: F64) -> HallSums:
+    """The hall in order, at one supply temperature and full CRAC airflow."""
+    return hall.solve(Conditions(supply_c[fleet.unit_dc], utilisation))
 
 
 def air_j_per_m3_k(fleet: Fleet) -> F64:
@@ -277,5 +285,8 @@ def _battery_kwh(fleet: Fleet, sized_kwh: F64) -> F64:
 
 
 def _room_kwh_per_k(fleet: Fleet) -> F64:
+    """Room alone where servers have temperatures of their own, else with them."""
     per_server = fleet.values("hall.room_heat_capacity_kj_per_k_per_server")
+    if fleet.models["thermal"] == "quasi_steady":
+        per_server = per_server + fleet.values("servers.heat_capacity_kj_per_k")
     return per_server * fleet.per_dc_servers() / 3600.0

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
+Status = npt.NDArray[np.int8]
 Reals = npt.NDArray[np.floating[Any]]
 
 
@@ -31,6 +32,14 @@ class CoolAction(Enum):
     RAISE = 1
 
 
+class FanAction(Enum):
+    """How to move the CRAC fan speed, in steps of ``hvac.crac.fan_step``."""
+
+    LOWER = -1
+    HOLD = 0
+    RAISE = 1
+
+
 class BatteryAction(Enum):
     """What the battery does, as a share of its power limit."""
 
@@ -44,13 +53,17 @@ class Actions:
     """One command per data center, a list or an array; an enum or a number serves all of them.
 
     Numbers are continuous commands: ``load`` and ``battery`` within -1..1 are shares of what could
-    be deferred (negative) or drained, discharged (negative) or charged; ``cooling`` is in setpoint
-    steps and may exceed 1.
+    be deferred (negative) or drained, discharged (negative) or charged; ``cooling`` and ``fan`` are
+    in steps, may exceed 1 and may have one entry per CRAC unit. ``fan`` is for flow model
+    ``controlled`` alone, ``placement`` for policy ``weights``: relative loads of the racks, (R,),
+    or of the server groups, (G,), None being all alike.
     """
 
     load: LoadAction | float | F64 | Sequence[LoadAction] = LoadAction.NEUTRAL
     cooling: CoolAction | float | F64 | Sequence[CoolAction] = CoolAction.HOLD
     battery: BatteryAction | float | F64 | Sequence[BatteryAction] = BatteryAction.IDLE
+    fan: FanAction | float | F64 | Sequence[FanAction] = FanAction.HOLD
+    placement: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,24 +79,45 @@ class Exogenous:
 
 @dataclass(slots=True)
 class State:
-    """What is carried from step to step; everything else derives from it."""
+    """What is carried from step to step; everything else derives from it.
+
+    Arrays that the models in use do not need are empty.
+    """
 
     step: int
     """Steps done since reset."""
+    seed: int
+    """Decides the sampled events."""
     setpoint_c: F64
-    """CRAC supply setpoint, (B,)."""
+    """Setpoint of each CRAC unit, (U,)."""
     cooling_run: I64
-    """Equal non-zero cooling commands in a row, (B,)."""
+    """Equal non-zero cooling commands in a row, (U,)."""
     cooling_last: F64
-    """Last cooling command, (B,)."""
+    """Last cooling command, (U,)."""
     cooling_scale: F64
-    """Acceleration of the setpoint step, (B,)."""
+    """Acceleration of the setpoint step, (U,)."""
+    fan_speed: F64
+    """Controlled speed of each CRAC fan over design speed, (U,)."""
     queue: F64
     """Queued tasks by the step that put them in, oldest first and accumulated, (B, L)."""
     stored_kwh: F64
     """Energy in the battery, (B,)."""
     room_heat_kwh: F64
-    """Heat that the cooling failed to remove, held by servers and room, (B,)."""
+    """Heat that the cooling failed to remove, held by the room, (B,)."""
+    rack_status: Status
+    """0 normal, 1 throttled, 2 tripped, (R,)."""
+    group_inlet_c: F64
+    """Inlet of each server group in the last step, (G,), for placement by temperature."""
+    server_c: Reals
+    """Temperature of the servers of each group, (G,), in transient halls, as what follows."""
+    mixed_c: Reals
+    """Recirculated air before each rack, (R,)."""
+    outlet_c: Reals
+    """(R,)."""
+    captured_m3s: Reals
+    """Recirculated air that each rack takes in, (R,)."""
+    fresh_ratio: F64
+    """Share of their need that each CRAC unit covers, (U,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,17 +152,36 @@ class StepResult:
     overdue_tasks: F64
     """Due work that did not fit into this step."""
     dropped_tasks: F64
+    lost_tasks: F64
+    """Work that had been started and went down with its servers."""
     queue_tasks: F64
     """Work in the queue at the end of the step."""
     oldest_age_h: F64
     mean_age_h: F64
 
     setpoint_c: F64
+    """Mean over the CRAC units."""
     supply_c: F64
     """CRAC supply air: the setpoint plus what unmet cooling has warmed the room by."""
     inlet_mean_c: F64
     """Mean over racks of any size, as ``outlet_mean_c``."""
     inlet_max_c: F64
+    hottest_rack: F64
+    """Rack with the hottest inlet, counted from 0 in its data center."""
+    hottest_server: F64
+    """Server with the hottest inlet, counted from the floor of its rack."""
+    hot_k: F64
+    """Mean over the servers of what their inlets exceed 27 C by; times hours, degree-hours."""
+    shi: F64
+    """Supply heat index, 0 without recirculation; see ``air_metrics``."""
+    rti_pct: F64
+    """Return temperature index; above 100 air recirculates on balance."""
+    rci_hi_pct: F64
+    """Rack cooling index at the high end; 100 is no inlet above 27 C."""
+    rci_lo_pct: F64
+    throttled_racks: F64
+    """At the end of the step, as the next."""
+    tripped_racks: F64
     outlet_mean_c: F64
     cpu_w: F64
     it_fan_w: F64
@@ -152,6 +205,8 @@ class StepResult:
     rejected_w: F64
     """Heat that the tower gives to the outside."""
     room_heat_kwh: F64
+    stored_w: F64
+    """Heat that went into servers and recirculated air (transient)."""
     chiller_w: F64
     tower_fan_w: F64
     chilled_pump_w: F64
@@ -176,8 +231,22 @@ class StepResult:
     it_kwh: F64
     hvac_kwh: F64
     grid_kwh: F64
+    unserved_kwh: F64
+    """What facility and battery lacked in an outage."""
     carbon_g: F64
+    grid_up: F64
+    """1 with grid, 0 in an outage."""
+    powered: F64
+    """Share of the step that the data center had power."""
 
+    unit_setpoint_c: F64
+    """(U,), as the other unit arrays."""
+    unit_supply_c: F64
+    unit_flow_m3s: F64
+    unit_running: F64
+    """1 for CRAC units that run, 0 for those that are down."""
+    rack_status: Status
+    """0 normal, 1 throttled, 2 tripped, (R,)."""
     rack_cpu_w: Reals
     """(R,), as the other rack arrays."""
     rack_fan_w: Reals
@@ -197,9 +266,15 @@ class StepResult:
         return self.it_kwh + self.hvac_kwh
 
     @property
+    def rhi(self) -> F64:
+        """Return heat index, 1 - SHI, (B,)."""
+        return 1.0 - self.shi
+
+    @property
     def pue(self) -> F64:
-        """(IT + HVAC) / IT, dimensionless, (B,)."""
-        return 1.0 + self.hvac_w / self.it_w
+        """(IT + HVAC) / IT, dimensionless, (B,); inf without IT power."""
+        some = self.it_w > 0
+        return np.where(some, 1.0 + self.hvac_w / np.where(some, self.it_w, 1.0), np.inf)
 
     def per_dc(self) -> dict[str, F64]:
         """All (B,) quantities by name, in the order of the fields."""
@@ -208,7 +283,7 @@ class StepResult:
         return {
             name: value
             for name, value in values
-            if isinstance(value, np.ndarray) and not name.startswith("rack_")
+            if isinstance(value, np.ndarray) and not name.startswith(("rack_", "unit_"))
         }
 
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import reference_twin
 from sdc_taichi import DataCenterConfig, RuntimeStateError, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
-from sdc_taichi.hall import Hall, HallSums, Precision
+from sdc_taichi.hall import Conditions, Hall, HallSums, Precision
 from sdc_taichi.types import F64
 
 OUTLETS = ("server", "rack", "released")
@@ -54,6 +54,7 @@ def random_config(
     """A data center of any size and make-up."""
     values = preset_values("corrected")
     hall, servers = values["hall"], values["servers"]
+    hall["inlet_model"] = "approach"
     if rng.integers(2):
         servers |= preset_values("sustaindc")["servers"]
         hall["supply_approach_limits_k"] = [3.8, 5.3]
@@ -96,7 +97,7 @@ def solve(
     configs: list[DataCenterConfig], supply_c: F64, load: F64, precision: Precision
 ) -> HallSums:
     """Sums per data center and rack of a fleet."""
-    return Hall(build_fleet(configs), precision).solve(supply_c, load)
+    return Hall(build_fleet(configs), precision).solve(Conditions(supply_c, load))
 
 
 def solve_servers(
@@ -104,7 +105,7 @@ def solve_servers(
 ) -> tuple[HallSums, dict[str, Any]]:
     """Sums and server layers of a fleet."""
     hall = Hall(build_fleet(configs), precision)
-    sums, layers = hall.solve(supply_c, load), hall.servers()
+    sums, layers = hall.solve(Conditions(supply_c, load)), hall.servers()
     return sums, {f.name: getattr(layers, f.name) for f in fields(layers)}
 
 
@@ -353,9 +354,9 @@ def test_warmer_air_and_more_load_never_lower_power(
 ) -> None:
     config = random_config(np.random.default_rng(seed), "dc", "server", 3.0)
     hall = Hall(build_fleet(config), "f64")
-    cool = hall.solve(np.array([supply_c]), np.array([load]))
-    warm = hall.solve(np.array([supply_c + warmer_k]), np.array([load]))
-    busy = hall.solve(np.array([supply_c]), np.array([min(1.0, load + 0.01)]))
+    cool = hall.solve(Conditions(np.array([supply_c]), np.array([load])))
+    warm = hall.solve(Conditions(np.array([supply_c + warmer_k]), np.array([load])))
+    busy = hall.solve(Conditions(np.array([supply_c]), np.array([min(1.0, load + 0.01)])))
     assert np.all(warm.rack_cpu_w >= cool.rack_cpu_w)
     assert np.all(warm.rack_fan_w >= cool.rack_fan_w)
     assert np.all(busy.cpu_w >= cool.cpu_w * (1 - 1e-12))
@@ -365,7 +366,7 @@ def test_server_layers_need_a_solve() -> None:
     hall = Hall(build_fleet(load_config("tiny")), "f32")
     with pytest.raises(RuntimeStateError, match="no step has been done yet"):
         hall.servers()
-    hall.solve(np.array([20.0]), np.array([0.5]))
+    hall.solve(Conditions(np.array([20.0]), np.array([0.5])))
     layers = hall.servers()
     assert layers.power_w.shape == (12,)
     assert hall.servers(into=layers) is layers

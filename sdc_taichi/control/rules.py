@@ -90,7 +90,7 @@ class TrimAndRespond:
         else:
             hot = np.asarray(view.last.rack_inlet_max_c > REQUEST_INLET_C, dtype=np.float64)
             requests = np.add.reduceat(hot, view.fleet.rack_start[:-1])
-        target_c = view.state.setpoint_c
+        target_c = view.setpoint_c
         for _ in range(slots_in_step(view.state.step, view.step_h)):
             target_c = trim_and_respond(
                 target_c,
@@ -242,9 +242,9 @@ def slots_in_step(step: int, step_h: float) -> int:
 
 def steps_to(target_c: F64, view: View) -> F64:
     """Setpoint command that reaches ``target_c`` in one step, (B,)."""
-    command = (target_c - view.state.setpoint_c) / view.limits.setpoint_step_k
+    command = (target_c - view.setpoint_c) / view.limits.setpoint_step_k
     # The accelerating setpoint multiplies a command that is repeated exactly.
-    repeated = command == view.state.cooling_last
+    repeated = command == view.cooling_last
     command[repeated] = np.nextafter(command[repeated], 0.0)
     return command
 

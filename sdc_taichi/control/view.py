@@ -26,6 +26,10 @@ class Limits:
     """Energy delivered per energy drawn to charge."""
 
 
+def _first_of_units(per_unit: F64, fleet: Fleet) -> F64:
+    return per_unit[fleet.unit_start[:-1]]
+
+
 @dataclass(frozen=True, slots=True)
 class Forecast:
     """Perfect foresight of the inputs: the present step, then those that follow, each (B, n)."""
@@ -65,6 +69,16 @@ class View:
     sizing: Sizing
     limits: Limits
     step_h: float
+
+    @property
+    def setpoint_c(self) -> F64:
+        """Setpoint of the first CRAC unit; built-in controllers move all units alike, (B,)."""
+        return _first_of_units(self.state.setpoint_c, self.fleet)
+
+    @property
+    def cooling_last(self) -> F64:
+        """Last cooling command of the first CRAC unit, (B,)."""
+        return _first_of_units(self.state.cooling_last, self.fleet)
 
     @property
     def size(self) -> int:

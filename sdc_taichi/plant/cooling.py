@@ -114,10 +114,21 @@ def per_watt_flow(
     return supply_m3s_per_w * it_w, np.ones(it_w.shape)
 
 
+def controlled_flow(
+    it_w: F64, airflow_m3s: F64, *, design_flow_m3s: F64, speed: F64, **_: F64
+) -> tuple[F64, F64]:
+    """CRAC airflow of fans that an agent controls, at ``speed`` over design speed.
+
+    See ``constant_flow``.
+    """
+    return design_flow_m3s * speed, speed.copy()
+
+
 FLOWS: dict[str, Callable[..., tuple[F64, F64]]] = {
     "constant": constant_flow,
     "follow_servers": following_flow,
     "per_watt": per_watt_flow,
+    "controlled": controlled_flow,
 }
 
 
@@ -185,4 +196,9 @@ def hold_heat(
         Unmet W, recovered W and the new stored heat kWh, each (B,).
     """
     stored = np.maximum(room_heat_kwh + (load_w - removed_w) * step_h / 1e3, 0.0)
-    return np.maximum(load_w - removed_w, 0.0), np.maximum(removed_w - load_w, 0.0), stored
+    return *unmet_and_recovered(load_w, removed_w), stored
+
+
+def unmet_and_recovered(load_w: F64, removed_w: F64) -> tuple[F64, F64]:
+    """Load beyond what is removed, and what is removed beyond the load, each (B,)."""
+    return np.maximum(load_w - removed_w, 0.0), np.maximum(removed_w - load_w, 0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -58,6 +58,11 @@ class WaterSide:
     tower_fan_w: F64
     chilled_pump_w: F64
     condenser_pump_w: F64
+
+    def scaled(self, share: F64) -> WaterSide:
+        """Means over a step of which the plant ran a share, (B,); temperatures are those then."""
+        flows = [f.name for f in fields(self) if f.name.endswith(("_w", "_kg_s"))]
+        return replace(self, **{name: getattr(self, name) * share for name in flows})
 
 
 def operate(

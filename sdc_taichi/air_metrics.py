@@ -1,0 +1,167 @@
+"""Indices of air management in a hall: SHI, RHI, RTI, RCI, and the temperature ranges of ASHRAE.
+
+The indices are functions of sums, so that whoever carries only sums per data center and whoever has
+an entry per rack use the same; the first functions make the sums from racks. Racks are the last
+axis, or those of all data centers end to end with ``start``, the first rack of each.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.types import F64
+
+Values = F64 | float
+
+RECOMMENDED_C = (18.0, 27.0)
+"""Recommended inlet temperatures of all classes (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
+ALLOWABLE_C = {"A1": (15.0, 32.0), "A2": (10.0, 35.0), "A3": (5.0, 40.0), "A4": (5.0, 45.0)}
+"""Allowable inlet temperatures by class (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
+
+_NO_RISE = 1e-9
+"""Rises (K, m3 K/s) up to this are none: a ratio to what rounding left would mean nothing."""
+
+
+def rise_m3k_s(
+    airflow_m3s: F64,
+    temperature_c: F64,
+    supply_c: Values,
+    start: npt.NDArray[np.integer] | None = None,
+) -> F64:
+    """Flow-weighted temperature above the supply air, sum V*(T - T_sup); times rho*cp it is heat.
+
+    With sums alone it is sum(V*T) - T_sup*sum(V).
+
+    Args:
+        airflow_m3s: airflow of each rack, (..., N) or (R,) with ``start``.
+        temperature_c: inlet or outlet temperature, same shape.
+        supply_c: supply air, one for all, (..., 1) or per rack; with ``start`` also (B,).
+        start: first rack of each data center and their total, (B + 1,), each with a rack or more.
+
+    Returns:
+        Sum over the racks, m3 K/s, (...) or (B,).
+    """
+    supply = np.asarray(supply_c, dtype=np.float64)
+    if start is not None and supply.shape == (len(start) - 1,):
+        supply = np.repeat(supply, np.diff(start))
+    return _sum(airflow_m3s * (temperature_c - supply), start)
+
+
+def over_temperature_k(
+    inlet_c: F64,
+    start: npt.NDArray[np.integer] | None = None,
+    *,
+    above_c: float = RECOMMENDED_C[1],
+) -> F64:
+    """Sum over racks of max(0, T_in - above_c), K; times hours it is degree-hours.
+
+    Args:
+        inlet_c: inlet temperatures, (..., N) or (R,) with ``start``.
+        start: first rack of each data center and their total, (B + 1,).
+        above_c: upper end of the recommended range.
+    """
+    return _sum(np.maximum(inlet_c - above_c, 0.0), start)
+
+
+def under_temperature_k(
+    inlet_c: F64,
+    start: npt.NDArray[np.integer] | None = None,
+    *,
+    below_c: float = RECOMMENDED_C[0],
+) -> F64:
+    """Sum over racks of max(0, below_c - T_in), K; arguments as in ``over_temperature_k``."""
+    return _sum(np.maximum(below_c - inlet_c, 0.0), start)
+
+
+def shi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:
+    """Supply heat index, sum V*(T_in - T_sup) / sum V*(T_out - T_sup).
+
+    The share of the heat in the exhaust that the air had before it reached the racks (Sharma, Bash
+    and Patel 2002, "Dimensionless parameters for evaluation of thermal design and performance of
+    large-scale data centers", AIAA 2002-3091): 0 without recirculation.
+
+    Args:
+        inlet_rise_m3k_s: ``rise_m3k_s`` of the inlets.
+        outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets.
+
+    Returns:
+        SHI, and 0 where the outlets have no rise, as without load or airflow.
+    """
+    return _ratio(inlet_rise_m3k_s, outlet_rise_m3k_s)
+
+
+def rhi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:
+    """Return heat index, 1 - SHI (Sharma, Bash and Patel 2002); arguments as in ``shi``."""
+    return np.asarray(1.0 - shi(inlet_rise_m3k_s, outlet_rise_m3k_s))
+
+
+def it_rise_k(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values, airflow_m3s: Values) -> F64:
+    """Flow-weighted temperature rise through the equipment, sum V*(T_out - T_in) / sum V, K.
+
+    Args:
+        inlet_rise_m3k_s: ``rise_m3k_s`` of the inlets.
+        outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets.
+        airflow_m3s: sum of the airflow of the racks.
+
+    Returns:
+        Rise, and 0 where there is no airflow.
+    """
+    return _ratio(np.subtract(outlet_rise_m3k_s, inlet_rise_m3k_s), airflow_m3s)
+
+
+def rti(return_c: Values, supply_c: Values, it_rise_k: Values) -> F64:
+    """Return temperature index, 100*(T_ret - T_sup)/dT_IT, %.
+
+    Herrlin 2008, "Airflow and cooling performance of data centers: two performance metrics", ASHRAE
+    Transactions 114(2). Above 100 % air recirculates on balance, below it bypasses the equipment.
+
+    Args:
+        return_c: return air of the CRAC units.
+        supply_c: supply air.
+        it_rise_k: ``it_rise_k`` of the equipment.
+
+    Returns:
+        RTI, and 0 where the equipment does not warm its air: all that is supplied bypasses it.
+    """
+    return 100.0 * _ratio(np.subtract(return_c, supply_c), it_rise_k)
+
+
+def rci_hi(over_k: Values, racks: Values, *, allowable_c: Values) -> F64:
+    """Rack cooling index at the high end, 100*(1 - over/(n*(T_allowable - T_recommended))), %.
+
+    Herrlin 2005, "Rack cooling effectiveness in data centers and telecom central offices: the Rack
+    Cooling Index (RCI)", ASHRAE Transactions 111(2). 100 is no inlet above the recommended range; 0
+    is over-temperatures that average to the allowable limit, and worse is negative.
+
+    Args:
+        over_k: ``over_temperature_k`` above ``RECOMMENDED_C``.
+        racks: number of inlets in that sum, at least 1.
+        allowable_c: upper end of the allowable range, above the recommended one.
+    """
+    return np.asarray(100.0 * (1.0 - over_k / (racks * (allowable_c - RECOMMENDED_C[1]))))
+
+
+def rci_lo(under_k: Values, racks: Values, *, allowable_c: Values) -> F64:
+    """Rack cooling index at the low end, 100*(1 - under/(n*(T_recommended - T_allowable))), %.
+
+    Args:
+        under_k: ``under_temperature_k`` below ``RECOMMENDED_C``.
+        racks: number of inlets in that sum, at least 1.
+        allowable_c: lower end of the allowable range, below the recommended one.
+
+    Returns:
+        RCI (Herrlin 2005, as ``rci_hi``).
+    """
+    return np.asarray(100.0 * (1.0 - under_k / (racks * (RECOMMENDED_C[0] - allowable_c))))
+
+
+def _ratio(part: Values, whole: Values) -> F64:
+    some = np.greater(whole, _NO_RISE)
+    return np.asarray(np.where(some, part / np.where(some, whole, 1.0), 0.0))
+
+
+def _sum(values: F64, start: npt.NDArray[np.integer] | None) -> F64:
+    if start is None:
+        return np.asarray(values.sum(axis=-1))
+    return np.asarray(np.add.reduceat(values, start[:-1]))

@@ -1,0 +1,331 @@
+"""Layout solver: potential flow through a hall, tags of all rack exhausts, and their temperatures.
+
+For halls without a CFD study: the shares of exhaust air in the intake of every rack, and what they
+do at the design point. docs/layout-solver.md has the method and what it cannot say.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import sdc_taichi
+from sdc_taichi import air_metrics, runtime
+from sdc_taichi.airflow_grid import LEAST_LEAK, Grid, build_grid
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.errors import ConfigError, RuntimeStateError
+from sdc_taichi.recirculation import MOST_MATRIX_RACKS
+from sdc_taichi.types import F64
+
+DEFAULT_CELL_M = 0.3
+MIXING_M = 0.3
+"""Eddy diffusivity over air speed: half a floor tile. It is what upwind differences add on cells of
+0.6 m, so that it bounds theirs at any finer one and results do not drift with the cell."""
+
+_TOLERANCE = 1e-13
+_MOST_ITERATIONS = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class LayoutSolution:
+    """Air and temperatures of a hall of R racks at its design point."""
+
+    R: F64
+    """Share of rack j's intake that is rack i's exhaust, (R, R)."""
+    supply_share: F64
+    """Share of each rack's intake that comes from the floor tiles, (R,)."""
+    approach_k: F64
+    """Inlet over supply, (R,)."""
+    supply_c: float
+    return_c: float
+    shi: float
+    rhi: float
+    rti: float
+    rci_hi: float
+    rci_lo: float
+    """Indices as in ``air_metrics``; RCI against the allowable range of the ASHRAE class."""
+    mass_residual: float
+    """Sum over the cells of air that appears or vanishes, over supply."""
+    share_residual: float
+    """Largest departure of a row of R and its share of supply air from 1."""
+    energy_residual: float
+    """Heat that leaves by the returns less IT power, over IT power; the larger of through R and of
+    the temperatures solved on the grid."""
+    direct_difference_k: float
+    """Largest difference of inlets through R and of those solved on the grid."""
+    cells: int
+    seconds: float
+    provenance: dict[str, Any]
+
+
+def solve(
+    config: DataCenterConfig,
+    *,
+    airflow_m3s: F64,
+    power_w: F64,
+    supply_m3s: float,
+    supply_c: float,
+    cell_m: float = DEFAULT_CELL_M,
+) -> LayoutSolution:
+    """Solve the air and the temperatures of a hall.
+
+    Potential flow: div(grad phi) = 0 in the air, with the given flows through rack faces, floor
+    tiles and returns. Tag i is 1 in the exhaust of rack i and 0 in all other air that enters:
+    div(u*c) = div(MIXING_M*|u|*grad c). Inlets follow from T_in = T_sup + R (T_out - T_sup), T_out
+    = T_in + P/(rho*cp*V) (Tang, Gupta and Varsamopoulos 2008), and once more from one solve on the
+    grid in which air passes the racks.
+
+    Args:
+        config: gives shape of the hall and properties of air.
+        airflow_m3s: of each rack, (R,).
+        power_w: IT power of each rack, (R,).
+        supply_m3s: of all CRAC units.
+        supply_c: supply air.
+        cell_m: longest cell.
+
+    Raises:
+        ConfigError: values out of range, too many cells or racks, or a solve that cannot converge.
+    """
+    begun = time.perf_counter()
+    airflow_m3s, power_w = _checked(config, airflow_m3s, power_w, supply_m3s, supply_c)
+    hall = config.hall
+    grid = build_grid(hall, airflow_m3s, supply_m3s, cell_m)
+    system = _System(grid, airflow_m3s)
+    mass_residual = system.find_flow() / supply_m3s
+    R, supply_share, returned_m3s = system.tags()
+
+    air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
+    rise_k = power_w / (air * airflow_m3s)
+    approach_k = np.linalg.solve(np.eye(hall.racks) - R, R @ rise_k)
+    outlet_k = approach_k + rise_k
+    direct_k, direct_returned = system.temperatures(rise_k)
+    returned = float(returned_m3s @ outlet_k)
+    it_m3k_s = float(airflow_m3s @ rise_k)
+    return_c = supply_c + returned / supply_m3s
+    inlet_c = supply_c + approach_k
+    inlet = air_metrics.rise_m3k_s(airflow_m3s, inlet_c, supply_c)
+    outlet = air_metrics.rise_m3k_s(airflow_m3s, inlet_c + rise_k, supply_c)
+    mean_rise_k = air_metrics.it_rise_k(inlet, outlet, airflow_m3s.sum())
+    low_c, high_c = air_metrics.ALLOWABLE_C[_ashrae_class(config)]
+    racks = hall.racks
+    return LayoutSolution(
+        R=R,
+        supply_share=supply_share,
+        approach_k=approach_k,
+        supply_c=float(supply_c),
+        return_c=return_c,
+        shi=float(air_metrics.shi(inlet, outlet)),
+        rhi=float(air_metrics.rhi(inlet, outlet)),
+        rti=float(air_metrics.rti(return_c, supply_c, mean_rise_k)),
+        rci_hi=float(
+            air_metrics.rci_hi(
+                air_metrics.over_temperature_k(inlet_c), racks, allowable_c=high_c
+            )
+        ),
+        rci_lo=float(
+            air_metrics.rci_lo(
+                air_metrics.under_temperature_k(inlet_c), racks, allowable_c=low_c
+            )
+        ),
+        mass_residual=mass_residual,
+        share_residual=float(np.abs(R.sum(axis=1) + supply_share - 1.0).max()),
+        energy_residual=max(
+            abs(returned / it_m3k_s - 1.0), abs(direct_returned / it_m3k_s - 1.0)
+        ),
+        direct_difference_k=float(np.abs(direct_k - approach_k).max()),
+        cells=grid.cells,
+        seconds=time.perf_counter() - begun,
+        provenance=_provenance(config, grid, cell_m, supply_m3s, supply_c),
+    )
+
+
+class _System:
+    """The kernels' arguments for one grid, in the order of the calls."""
+
+    def __init__(self, grid: Grid, airflow_m3s: F64) -> None:
+        self._threads = runtime.ensure_started()
+        from sdc_taichi.kernels import airflow
+
+        self._kernels = airflow
+        self._grid = grid
+        self._racks = len(airflow_m3s)
+        fronts = grid.fronts
+        self._front_share = fronts.m3s / np.repeat(airflow_m3s, np.diff(fronts.start))
+        self._off = np.zeros_like(grid.conductance_m)
+        self._diagonal = np.zeros(grid.cells)
+
+    def find_flow(self) -> float:
+        """Find the flow and the coefficients of the tags; gives what the cells lose, m3/s."""
+        grid = self._grid
+        diagonal = grid.conductance_m[:-1].sum(axis=1)
+        # All flows are given, so the level of the potential is free: the last cell fixes it.
+        diagonal[-1] *= 2.0
+        entering = -grid.boundary_m3s[:-1].sum(axis=1)
+        cells = np.arange(grid.cells, dtype=np.int32)
+        start = np.array([0, grid.cells], np.int32)
+        found = self._solve(grid.conductance_m, diagonal, start, cells, entering, "potential")
+        imbalance = np.empty(grid.cells)
+        self._kernels.transport_kernel()(
+            grid.beyond,
+            grid.conductance_m,
+            grid.boundary_m3s,
+            grid.area_m2,
+            MIXING_M,
+            found.solution[0],
+            np.zeros(grid.cells + 1),
+            imbalance,
+            self._off,
+            self._diagonal,
+        )
+        return float(np.abs(imbalance).sum())
+
+    def tags(self) -> tuple[F64, F64, F64]:
+        """R, share of supply air per rack, and flow of every rack's exhaust into the returns."""
+        grid, backs = self._grid, self._grid.backs
+        last = backs.start[-1] + len(grid.supply_cell)
+        start = np.append(backs.start, last).astype(np.int32)
+        cell = np.concatenate([backs.cell, grid.supply_cell])
+        amount = np.concatenate([backs.m3s, grid.supply_m3s])
+        found = self._solve(self._off, self._diagonal, start, cell, amount, "tags")
+        # The exact shares are positive; the solver leaves zeros of either sign.
+        shares = np.maximum(found.intake, 0.0)
+        return shares[:, :-1].copy(), shares[:, -1].copy(), found.returned[:-1]
+
+    def temperatures(self, rise_k: F64) -> tuple[F64, float]:
+        """Inlets over supply, (R,), and m3 K/s in the returns, with air passing the racks."""
+        backs = self._grid.backs
+        amount = backs.m3s * np.repeat(rise_k, np.diff(backs.start))
+        start = np.array([0, len(amount)], np.int32)
+        found = self._solve(
+            self._off, self._diagonal, start, backs.cell, amount, "temperatures", coupled=True
+        )
+        return found.intake[:, 0], float(found.returned[0])
+
+    def _solve(
+        self,
+        off: F64,
+        diagonal: F64,
+        start: Any,
+        cell: Any,
+        amount: F64,
+        what: str,
+        *,
+        coupled: bool = False,
+    ) -> _Found:
+        grid, kernels = self._grid, self._kernels
+        tags = len(start) - 1
+        slices = min(self._threads, tags)
+        found = _Found(
+            solution=np.zeros((1, grid.cells + 1)),
+            intake=np.empty((self._racks, tags)),
+            returned=np.empty(tags),
+        )
+        residual = np.empty(tags)
+        iterations = np.empty(tags, np.int32)
+        kernels.solve_kernel()(
+            coupled,
+            tags == 1,
+            slices,
+            _MOST_ITERATIONS,
+            _TOLERANCE,
+            grid.beyond,
+            off,
+            diagonal,
+            start,
+            cell,
+            amount,
+            grid.fronts.start,
+            grid.fronts.cell,
+            self._front_share,
+            grid.backs.start,
+            grid.backs.cell,
+            grid.backs.m3s,
+            grid.return_cell,
+            grid.return_m3s,
+            np.empty((slices, kernels.VECTORS, grid.cells + 1)),
+            found.solution,
+            found.intake,
+            found.returned,
+            residual,
+            iterations,
+        )
+        worst = int(np.argmax(np.where(np.isfinite(residual), residual, np.inf)))
+        if not residual[worst] <= 100 * _TOLERANCE:
+            raise RuntimeStateError(
+                f"layout solver: {what} {worst} of {tags} stopped at a residual of "
+                f"{residual[worst]:.3g} after {iterations[worst]} iterations; valid is at most "
+                f"{100 * _TOLERANCE:g}: change cell_m, or measures of very different size"
+            )
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    solution: F64
+    """Of a single tag, (1, N + 1)."""
+    intake: F64
+    """Mean over the front of each rack, (R, tags)."""
+    returned: F64
+    """Flow into the returns, (tags,)."""
+
+
+def _checked(
+    config: DataCenterConfig, airflow_m3s: F64, power_w: F64, supply_m3s: float, supply_c: float
+) -> tuple[F64, F64]:
+    racks = config.hall.racks
+    if racks > MOST_MATRIX_RACKS:
+        raise ConfigError(
+            f"{config.name}: {racks:,} racks; the layout solver takes at most "
+            f"{MOST_MATRIX_RACKS:,}, the largest matrix that a hall can use"
+        )
+    given = {
+        "airflow_m3s": np.ascontiguousarray(airflow_m3s, dtype=np.float64),
+        "power_w": np.ascontiguousarray(power_w, dtype=np.float64),
+        "supply_m3s": np.array([supply_m3s], dtype=np.float64),
+        "supply_c": np.array([supply_c], dtype=np.float64),
+    }
+    for name, values in given.items():
+        if values.ndim != 1 or len(values) not in (1, racks):
+            raise ConfigError(f"{name} has shape {values.shape}, expected ({racks},)")
+    for name in ("airflow_m3s", "power_w"):
+        if len(given[name]) != racks:
+            raise ConfigError(f"{name} has {len(given[name])} entries, expected {racks}")
+    for name, values in given.items():
+        valid = np.isfinite(values) & ((values > 0) | (name == "supply_c"))
+        if not valid.all():
+            place = int(np.argmin(valid))
+            want = "a finite number" if name == "supply_c" else "a finite number above 0"
+            raise ConfigError(f"{name}[{place}] is {values[place]:g}; valid is {want}")
+    return given["airflow_m3s"], given["power_w"]
+
+
+def _ashrae_class(config: DataCenterConfig) -> str:
+    return config.protection.ashrae_class or "A2"
+
+
+def _provenance(
+    config: DataCenterConfig, grid: Grid, cell_m: float, supply_m3s: float, supply_c: float
+) -> dict[str, Any]:
+    """Where a matrix comes from; without time and place, so that equal solves are equal files."""
+    hall = config.hall
+    return {
+        "package": f"sdc-taichi {sdc_taichi.__version__}",
+        "solver": "potential flow, hybrid differences, BiCGSTAB with diagonal incomplete LU",
+        "config": config.name,
+        "config_sha256": hashlib.sha256(config.to_yaml().encode()).hexdigest(),
+        "rows": hall.rows,
+        "racks_per_row": hall.racks_per_row,
+        "layout": hall.layout.model_dump(mode="json"),
+        "cell_m": cell_m,
+        "cells": grid.cells,
+        "grid": [len(width) for width in grid.widths_m],
+        "mixing_m": MIXING_M,
+        "least_leak": LEAST_LEAK,
+        "supply_m3s": supply_m3s,
+        "supply_c": supply_c,
+        "tolerance": _TOLERANCE,
+    }

@@ -1,0 +1,333 @@
+"""Failures and weather that a run meets: the events of each config as arrays per step.
+
+An event covers every step that it has any part in: from the step in which it starts to the one in
+which it ends. One that is shorter than a step, or out of line with the steps, thus counts longer
+than it lasts, by one step on average.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.config import DataCenterConfig, EventKind, SampledEvent, ScheduledEvent
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.types import F64, I64
+
+MOST_PER_YEAR = 8760.0
+"""Highest rate of a sampled event, one an hour."""
+HOURS_PER_BLOCK = 8760
+"""Sampled events are drawn in blocks of 365 days, each from a stream of its own."""
+_HOURS_PER_WINDOW = 120  # Divides a block. Events are looked up once per window.
+_KINDS: tuple[EventKind, ...] = get_args(EventKind)
+_WHOLE = -1
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """What events do to one step; arrays are read-only. U CRAC units, R racks, B data centers."""
+
+    unit_up: Mask
+    """Whether each CRAC unit runs, (U,)."""
+    chiller_share: F64
+    """What is left of the chiller's capacity, (B,)."""
+    rack_airflow: F64
+    """What is left of each rack's airflow, (R,)."""
+    outdoor_offset_k: F64
+    """Added to the dry bulb and to the wet bulb alike, so that order is kept, (B,)."""
+    grid_up: Mask
+    """Whether the grid supplies, (B,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveEvent:
+    """One event that covers a step."""
+
+    kind: EventKind
+    dc: int
+    target: int | None
+    """CRAC unit or rack, counted within its data center; None is all of them, or none to name."""
+    share: float | None
+    offset_k: float | None
+    start_step: int
+    end_step: int
+    """First step after it."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Events:
+    """Events, one entry each; those of a data center keep their order in any fleet."""
+
+    kind: I64
+    dc: I64
+    target: I64
+    value: F64
+    """Share or offset; nan for kinds without."""
+    start: I64
+    end: I64
+
+    def chosen(self, mask: Mask) -> _Events:
+        return _Events(*(getattr(self, f.name)[mask] for f in fields(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Rule:
+    dc: int
+    key: tuple[int, int]
+    """Tells the stream: CRC-32 of the data center's name, and the index of the rule."""
+    targets: int
+    event: SampledEvent
+
+
+class Timeline:
+    """Events of a fleet, step by step; made by ``schedule``.
+
+    What a step meets depends on the configs, the seed and the step alone, not on what was asked
+    before, so a snapshot needs to hold nothing but the seed.
+    """
+
+    def __init__(
+        self,
+        scheduled: _Events,
+        rules: tuple[_Rule, ...],
+        *,
+        rack_start: I64,
+        unit_start: I64,
+        steps_per_hour: int,
+        seed: int,
+    ) -> None:
+        self._scheduled, self._rules, self._seed = scheduled, rules, seed
+        self._rack_start, self._unit_start = rack_start, unit_start
+        self._steps_per_hour = steps_per_hour
+        longest_h = max((rule.event.duration_h[1] for rule in rules), default=0.0)
+        self._blocks_back = int(np.ceil(longest_h / HOURS_PER_BLOCK))
+        self._blocks: dict[int, _Events] = {}
+        self._window = -1
+        self._near = scheduled
+        size = len(rack_start) - 1
+        self._normal = _read_only(
+            Disturbance(
+                unit_up=np.ones(unit_start[-1], dtype=np.bool_),
+                chiller_share=np.ones(size),
+                rack_airflow=np.ones(rack_start[-1]),
+                outdoor_offset_k=np.zeros(size),
+                grid_up=np.ones(size, dtype=np.bool_),
+            )
+        )
+
+    @property
+    def quiet(self) -> bool:
+        """Whether no event can ever happen."""
+        return not self._rules and not len(self._scheduled.kind)
+
+    def reseeded(self, seed: int) -> Timeline:
+        """The same events with sampled ones of another seed."""
+        if not self._rules:
+            return self
+        return Timeline(
+            self._scheduled,
+            self._rules,
+            rack_start=self._rack_start,
+            unit_start=self._unit_start,
+            steps_per_hour=self._steps_per_hour,
+            seed=seed,
+        )
+
+    def at(self, step: int) -> Disturbance:
+        """What events do to step ``step`` after reset; one shared object while there are none."""
+        found = self._at(step)
+        if not len(found.kind):
+            return self._normal
+        normal = self._normal
+        unit_up, grid_up = normal.unit_up.copy(), normal.grid_up.copy()
+        chiller, airflow = normal.chiller_share.copy(), normal.rack_airflow.copy()
+        offset_k = normal.outdoor_offset_k.copy()
+        is_kind = {kind: found.kind == code for code, kind in enumerate(_KINDS)}
+        down = found.chosen(is_kind["crac_down"])
+        one = down.target != _WHOLE
+        unit_up[self._unit_start[down.dc[one]] + down.target[one]] = False
+        without = np.zeros(len(grid_up), dtype=np.bool_)
+        without[down.dc[~one]] = True
+        unit_up &= ~np.repeat(without, np.diff(self._unit_start))
+        derated = found.chosen(is_kind["chiller_derate"])
+        np.multiply.at(chiller, derated.dc, derated.value)
+        failed = found.chosen(is_kind["rack_fan_failure"])
+        np.multiply.at(airflow, self._rack_start[failed.dc] + failed.target, failed.value)
+        wave = found.chosen(is_kind["heat_wave"])
+        np.add.at(offset_k, wave.dc, wave.value)
+        grid_up[found.dc[is_kind["grid_outage"]]] = False
+        return _read_only(Disturbance(unit_up, chiller, airflow, offset_k, grid_up))
+
+    def active(self, step: int) -> list[ActiveEvent]:
+        """Events that cover step ``step``, by data center and start."""
+        found = self._at(step)
+        out = []
+        for i in np.lexsort((found.start, found.dc)):
+            kind, value = _KINDS[found.kind[i]], float(found.value[i])
+            target = int(found.target[i])
+            out.append(
+                ActiveEvent(
+                    kind=kind,
+                    dc=int(found.dc[i]),
+                    target=None if target == _WHOLE else target,
+                    share=value if kind in ("chiller_derate", "rack_fan_failure") else None,
+                    offset_k=value if kind == "heat_wave" else None,
+                    start_step=int(found.start[i]),
+                    end_step=int(found.end[i]),
+                )
+            )
+        return out
+
+    def _at(self, step: int) -> _Events:
+        if self.quiet:
+            return self._scheduled
+        steps = _HOURS_PER_WINDOW * self._steps_per_hour
+        window = step // steps
+        if window != self._window:
+            self._near = self._within(window * steps, (window + 1) * steps)
+            self._window = window
+        return self._near.chosen((self._near.start <= step) & (step < self._near.end))
+
+    def _within(self, low: int, high: int) -> _Events:
+        """Events that cover any of the steps low..high-1, which lie in one block."""
+        listed = [self._scheduled]
+        if self._rules:
+            last = low // (HOURS_PER_BLOCK * self._steps_per_hour)
+            wanted = range(max(0, last - self._blocks_back), last + 1)
+            self._blocks = {
+                block: self._blocks[block] if block in self._blocks else self._sampled(block)
+                for block in wanted
+            }
+            listed += self._blocks.values()
+        together = _joined(listed)
+        return together.chosen((together.start < high) & (low < together.end))
+
+    def _sampled(self, block: int) -> _Events:
+        return _joined([self._drawn(rule, block) for rule in self._rules])
+
+    def _drawn(self, rule: _Rule, block: int) -> _Events:
+        """Events of one rule that start in one block of 365 days."""
+        sequence = np.random.SeedSequence([self._seed, *rule.key, block])
+        rng = np.random.Generator(np.random.PCG64(sequence))
+        event = rule.event
+        n = int(rng.poisson(event.per_year))
+        start_h = HOURS_PER_BLOCK * (block + rng.random(n))
+        duration_h = rng.uniform(*event.duration_h, n)
+        target = rng.integers(rule.targets, size=n) if rule.targets else np.full(n, _WHOLE)
+        return _events(
+            event, rule.dc, target, start_h, duration_h, steps_per_hour=self._steps_per_hour
+        )
+
+
+def schedule(
+    configs: Sequence[DataCenterConfig],
+    *,
+    rack_start: npt.NDArray[np.integer],
+    unit_start: npt.NDArray[np.integer],
+    steps_per_hour: int,
+    seed: int,
+) -> Timeline:
+    """Events of a fleet.
+
+    Sampled events are a Poisson process per rule, with durations, units and racks drawn evenly.
+    Each rule of each data center draws from a stream of its own, told by seed, name and rule, so a
+    data center meets the same events alone and in a fleet. None started before step 0. Where events
+    overlap, shares multiply, offsets add, and a unit is down as long as any of them has it down.
+
+    Args:
+        configs: data centers, B of them, with names that differ.
+        rack_start: first rack of each data center and their total, (B + 1,).
+        unit_start: first CRAC unit of each data center and their total, (B + 1,).
+        steps_per_hour: steps per hour.
+        seed: decides the sampled events, at least 0.
+
+    Raises:
+        ConfigError: an event names a unit or rack that its data center lacks, or happens too often.
+    """
+    racks, units = np.diff(rack_start), np.diff(unit_start)
+    listed, rules = [_EMPTY], []
+    for dc, config in enumerate(configs):
+        for i, event in enumerate(config.events.scheduled):
+            where = f"{config.name}: events.scheduled.{i}"
+            _check_target(where, "unit", event.unit, int(units[dc]), "CRAC units")
+            _check_target(where, "rack", event.rack, int(racks[dc]), "racks")
+            target = event.rack if event.kind == "rack_fan_failure" else event.unit
+            listed.append(
+                _events(
+                    event,
+                    dc,
+                    np.array([_WHOLE if target is None else target]),
+                    np.array([event.start_h]),
+                    np.array([event.duration_h]),
+                    steps_per_hour=steps_per_hour,
+                )
+            )
+        key = zlib.crc32(config.name.encode())
+        targets = {"crac_down": int(units[dc]), "rack_fan_failure": int(racks[dc])}
+        for i, rule in enumerate(config.events.sampled):
+            if rule.per_year > MOST_PER_YEAR:
+                raise ConfigError(
+                    f"{config.name}: events.sampled.{i}.per_year is {rule.per_year:g}; "
+                    f"valid is at most {MOST_PER_YEAR:g}, one an hour"
+                )
+            rules.append(_Rule(dc, (key, i), targets.get(rule.kind, 0), rule))
+    return Timeline(
+        _joined(listed),
+        tuple(rules),
+        rack_start=np.asarray(rack_start, dtype=np.int64),
+        unit_start=np.asarray(unit_start, dtype=np.int64),
+        steps_per_hour=steps_per_hour,
+        seed=seed,
+    )
+
+
+def _check_target(where: str, name: str, index: int | None, number: int, of: str) -> None:
+    if index is not None and index >= number:
+        raise ConfigError(
+            f"{where}.{name} is {index}; valid is 0..{number - 1}, the data center has "
+            f"{number} {of}"
+        )
+
+
+def _events(
+    event: ScheduledEvent | SampledEvent,
+    dc: int,
+    target: I64,
+    start_h: F64,
+    duration_h: F64,
+    *,
+    steps_per_hour: int,
+) -> _Events:
+    # The tolerance keeps a step boundary that is no exact binary number a boundary.
+    start = np.floor(start_h * steps_per_hour + 1e-9)
+    end = np.ceil((start_h + duration_h) * steps_per_hour - 1e-9)
+    value = event.share if event.share is not None else event.offset_k
+    n = len(start)
+    return _Events(
+        kind=np.full(n, _KINDS.index(event.kind)),
+        dc=np.full(n, dc),
+        target=target,
+        value=np.full(n, np.nan if value is None else value),
+        start=start.astype(np.int64),
+        end=np.maximum(end, start + 1.0).astype(np.int64),
+    )
+
+
+def _joined(listed: Sequence[_Events]) -> _Events:
+    return _Events(*(np.concatenate([getattr(e, f.name) for e in listed]) for f in fields(_Events)))
+
+
+def _read_only(disturbance: Disturbance) -> Disturbance:
+    for field in fields(disturbance):
+        getattr(disturbance, field.name).flags.writeable = False
+    return disturbance
+
+
+_EMPTY = _Events(*(np.empty(0, np.int64),) * 3, np.empty(0), *(np.empty(0, np.int64),) * 2)

@@ -1,0 +1,182 @@
+"""``sdc-taichi hall``: solve the air of a hall from its layout."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from sdc_taichi.config import DataCenterConfig, load_config
+from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.types import F64
+
+if TYPE_CHECKING:
+    from sdc_taichi.airflow import LayoutSolution
+
+hall_app = typer.Typer(help="Air in the hall.", no_args_is_help=True)
+
+
+@hall_app.callback()
+def _hall() -> None:
+    """Air in the hall."""
+
+
+@hall_app.command("solve")
+def solve_hall(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="[PRESET|FILE]", help="Preset, YAML file or SustainDC dc_config.json."
+        ),
+    ] = "corrected",
+    cell: Annotated[float, typer.Option(metavar="M", help="Longest cell of the grid.")] = 0.3,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.npz", help="Write R and its provenance, for recirculation.matrix_file."
+        ),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="A.B=C", help="Override a field of the config; repeatable."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Solve air and temperatures at the design point, and write the recirculation matrix R.
+
+    Potential flow on a grid: racks, floor tiles, returns and containment of hall.layout, full load
+    at the highest setpoint. docs/layout-solver.md says what potential flow cannot tell.
+    """
+    if out is not None:
+        _check_target(out, force=force)
+    config = load_config(source, overrides or [])
+    solution = _solve(config, cell)
+    if out is not None:
+        _write_npz(out, solution)
+    if as_json:
+        print(json.dumps(report(config, solution), indent=2))
+        return
+    _print_report(config, solution)
+    if out is not None:
+        print(f"Matrix: {out} (hall.recirculation.matrix_file)")
+
+
+def _solve(config: DataCenterConfig, cell_m: float) -> LayoutSolution:
+    from sdc_taichi.airflow import solve
+    from sdc_taichi.recirculation import design_point
+
+    design = design_point(config)
+    return solve(
+        config,
+        airflow_m3s=design.airflow_m3s,
+        power_w=design.it_w,
+        supply_m3s=design.crac_flow_m3s,
+        supply_c=design.supply_c,
+        cell_m=cell_m,
+    )
+
+
+def report(config: DataCenterConfig, solution: LayoutSolution) -> dict[str, Any]:
+    """What the solve found, in plain values; entries per rack in the order of the racks."""
+    inner, outer = _row_means(config, solution.approach_k)
+    return {
+        "cells": solution.cells,
+        "seconds": round(solution.seconds, 3),
+        "supply_c": solution.supply_c,
+        "return_c": solution.return_c,
+        "approach_mean_k": float(solution.approach_k.mean()),
+        "approach_outer_rows_k": outer,
+        "approach_inner_rows_k": inner,
+        "approach_k": solution.approach_k.tolist(),
+        "supply_approach_k": config.hall.rack_approach_k().tolist(),
+        "recirculated_share": solution.R.sum(axis=1).tolist(),
+        "shi": solution.shi,
+        "rhi": solution.rhi,
+        "rti": solution.rti,
+        "rci_hi": solution.rci_hi,
+        "rci_lo": solution.rci_lo,
+        "mass_residual": solution.mass_residual,
+        "share_residual": solution.share_residual,
+        "energy_residual": solution.energy_residual,
+        "direct_difference_k": solution.direct_difference_k,
+        "provenance": solution.provenance,
+    }
+
+
+def _row_means(config: DataCenterConfig, values: F64) -> tuple[float | None, float]:
+    """Means over the inner and over the two outer rows; no inner rows below three."""
+    rows = values.reshape(config.hall.rows, -1)
+    outer = np.concatenate([rows[:1], rows[1:][-1:]])
+    inner = rows[1:-1]
+    return (float(inner.mean()) if inner.size else None), float(outer.mean())
+
+
+def _print_report(config: DataCenterConfig, solution: LayoutSolution) -> None:
+    # As wide as it needs: a pipe is no terminal of 80 columns.
+    console = Console(width=None if Console().is_terminal else 160)
+    grid = " x ".join(str(n) for n in solution.provenance["grid"])
+    hall = config.hall
+    console.print(
+        f"{config.name}: {hall.rows} rows of {hall.racks_per_row} racks, grid {grid}, "
+        f"{solution.cells:,} cells of air, {solution.seconds:.1f} s",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
+    table = Table("inlet over supply (K)", title=None)
+    for name in ("mean", "outer rows", "inner rows", "lowest rack", "highest rack"):
+        table.add_column(name, justify="right")
+    for label, values in (
+        ("solved", solution.approach_k),
+        ("supply_approach_k", hall.rack_approach_k()),
+    ):
+        inner, outer = _row_means(config, values)
+        cells = (float(values.mean()), outer, inner, float(values.min()), float(values.max()))
+        table.add_row(label, *("" if x is None else f"{x:.2f}" for x in cells))
+    console.print(table)
+    exhaust = 100 * solution.R.sum(axis=1)
+    lines = (
+        f"exhaust in the intake: {exhaust.min():.1f}..{exhaust.max():.1f} % per rack, mean "
+        f"{exhaust.mean():.1f} %",
+        f"supply {solution.supply_c:.2f} C, return {solution.return_c:.2f} C",
+        f"SHI {solution.shi:.3f}, RHI {solution.rhi:.3f}, RTI {solution.rti:.1f} %, "
+        f"RCI hi {solution.rci_hi:.1f} %, lo {solution.rci_lo:.1f} %",
+        f"residuals: mass {solution.mass_residual:.1e}, shares {solution.share_residual:.1e}, "
+        f"energy {solution.energy_residual:.1e}; inlets through R and on the grid differ by at "
+        f"most {solution.direct_difference_k:.1e} K",
+    )
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _check_target(out: Path, *, force: bool) -> None:
+    if out.suffix != ".npz":
+        raise ConfigError(f"--out {out}: valid is a name that ends in .npz")
+    if out.is_dir():
+        raise ConfigError(f"--out {out}: is a folder; valid is a file")
+    if out.exists() and not force:
+        raise ConfigError(f"--out {out}: exists; choose another name or replace it with --force")
+
+
+def _write_npz(out: Path, solution: LayoutSolution) -> None:
+    """Write the file so that a reader sees the old one or the whole new one."""
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    text = json.dumps(solution.provenance, sort_keys=True)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            np.savez(file, R=solution.R, provenance=np.array(text))
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(out)
+    except OSError as error:
+        raise SdcError(f"{out}: cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)

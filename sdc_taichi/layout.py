@@ -1,0 +1,93 @@
+"""Where racks and CRAC units stand, from the measures of ``hall.layout``.
+
+Coordinates in m: x along the rows, y across them, from one corner of the room. Even rows face
+towards larger y, odd rows towards smaller y, so that rows 0 and 1 share a cold aisle, rows 1 and 2
+a hot aisle, and so on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.config import HallConfig, LayoutConfig
+from sdc_taichi.types import F64
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Floor plan of a hall of R racks, row by row."""
+
+    centre_m: F64
+    """Rack centres, (R, 2)."""
+    front_m: F64
+    """Middle of the inlet faces, (R, 2)."""
+    back_m: F64
+    """Middle of the exhaust faces, (R, 2)."""
+    facing: npt.NDArray[np.int64]
+    """1 where the inlet faces larger y, -1 where it faces smaller y, (R,)."""
+    row_ends_m: tuple[float, float]
+    """x of both ends of the rows."""
+    length_m: float
+    """Of the room along x."""
+    width_m: float
+    """Of the room along y."""
+    air_m3: float
+    """Volume of the room less that of the racks."""
+
+
+def floor_plan(hall: HallConfig) -> Plan:
+    """Places of the racks."""
+    measures = hall.layout
+    row = np.arange(hall.rows)
+    facing = np.where(row % 2 == 0, 1, -1)
+    row_y = measures.side_margin_m + measures.rack_depth_m / 2 + row_distance_m(measures, row)
+    rack_x = measures.end_margin_m + (np.arange(hall.racks_per_row) + 0.5) * measures.rack_pitch_m
+    centre = np.stack(np.broadcast_arrays(rack_x[None, :], row_y[:, None]), axis=-1).reshape(-1, 2)
+    per_rack = np.repeat(facing, hall.racks_per_row)
+    half = np.zeros_like(centre)
+    half[:, 1] = per_rack * measures.rack_depth_m / 2
+    row_length_m = hall.racks_per_row * measures.rack_pitch_m
+    length_m = row_length_m + 2 * measures.end_margin_m
+    width_m = float(row_y[-1]) + measures.rack_depth_m / 2 + measures.side_margin_m
+    rack_m3 = measures.rack_pitch_m * measures.rack_depth_m * measures.rack_height_m
+    return Plan(
+        centre_m=centre,
+        front_m=centre + half,
+        back_m=centre - half,
+        facing=per_rack,
+        row_ends_m=(measures.end_margin_m, measures.end_margin_m + row_length_m),
+        length_m=length_m,
+        width_m=width_m,
+        air_m3=length_m * width_m * measures.ceiling_m - hall.racks * rack_m3,
+    )
+
+
+def row_distance_m(measures: LayoutConfig, row: npt.NDArray[np.int64]) -> F64:
+    """Distance of each row's middle from that of row 0, for any row number, below 0 too."""
+    cold = measures.rack_depth_m + measures.cold_aisle_m
+    hot = measures.rack_depth_m + measures.hot_aisle_m
+    return np.asarray(row // 2 * (cold + hot) + row % 2 * cold, dtype=np.float64)
+
+
+def unit_places_m(plan: Plan, units: int) -> F64:
+    """Places of the CRAC units, along both end walls in turn, (units, 2)."""
+    index = np.arange(units)
+    walls = index % 2
+    on_wall = np.array([(units + 1) // 2, units // 2])[walls]
+    y = (index // 2 + 0.5) / on_wall * plan.width_m
+    return np.stack([walls * plan.length_m, y], axis=1)
+
+
+def unit_shares(plan: Plan, units: int, length_m: float) -> F64:
+    """Share of each unit in the supply of each rack, (R, units); rows sum to 1.
+
+    A share falls with the distance from unit to inlet face as exp(-distance/length).
+    """
+    places = unit_places_m(plan, units)
+    distance = np.hypot(*np.moveaxis(plan.front_m[:, None] - places[None], -1, 0))
+    nearest = distance.min(axis=1, keepdims=True)
+    weight = np.exp(-(distance - nearest) / length_m)
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))

@@ -1,0 +1,252 @@
+"""Where in the hall a data center's work runs: its utilisation spread over racks or server groups.
+
+Bins are racks or groups of alike servers, those of all data centers end to end. What is placed is
+conserved: the loads, weighted by the servers of each bin, sum to the utilisation, as far as the
+usable servers suffice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.errors import SdcError
+from sdc_taichi.types import F64, I64
+
+POLICIES = ("uniform", "fill", "coolest-first", "inlet-aware", "weights")
+MIN_HEADROOM_K = 0.1
+"""Headroom that a bin at or above its limit counts as having under ``inlet-aware``."""
+_LEAST_WEIGHT = 1e-100
+"""Of the largest of a data center; any smaller positive weight counts as this."""
+
+Mask = npt.NDArray[np.bool_]
+
+
+class PlacementError(SdcError):
+    """Work cannot be placed as asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bins:
+    """Bins of B data centers, n in all; see ``layout``."""
+
+    start: I64
+    """First bin of each data center and their total, (B + 1,)."""
+    dc: I64
+    """Data center of each bin, (n,)."""
+    names: tuple[str, ...]
+    rows: tuple[I64, ...]
+    """Bins of the data centers of similar size, one row each; index n fills the shorter rows up."""
+
+    def sums(self, values: npt.NDArray[np.float64 | np.int64]) -> F64:
+        """Sum of each data center, (B,)."""
+        return np.asarray(np.add.reduceat(values, self.start[:-1]), dtype=np.float64)
+
+    def up_to(self, values: F64) -> F64:
+        """Running sum within each data center, the bin itself included, (n,)."""
+        out, padded = np.empty(len(values) + 1), np.append(values, 0.0)
+        for rows in self.rows:
+            out[rows] = np.cumsum(padded[rows], axis=1)
+        return out[:-1]
+
+    def after(self, values: F64) -> F64:
+        """Sum over the later bins of the same data center, (n,)."""
+        out, padded = np.empty(len(values) + 1), np.append(values, 0.0)
+        for rows in self.rows:
+            # Summed from the end: a difference from the total would lose small values.
+            later = np.cumsum(padded[rows][:, :0:-1], axis=1)[:, ::-1]
+            out[rows] = np.append(later, np.zeros((len(rows), 1)), axis=1)
+        return out[:-1]
+
+    def order(self, key: F64) -> I64:
+        """Bins by rising key within each data center, ties by index, (n,)."""
+        out, padded = np.empty(len(key) + 1, dtype=np.int64), np.append(key, np.inf)
+        for rows in self.rows:
+            by_key = np.argsort(padded[rows], axis=1, kind="stable")
+            out[rows] = np.take_along_axis(rows, by_key, axis=1)
+        return out[:-1]
+
+
+def layout(start: npt.NDArray[np.integer], names: Sequence[str] = ()) -> Bins:
+    """Lay bins out for ``place``; done once per fleet.
+
+    Args:
+        start: first bin of each data center and their total, (B + 1,), each with a bin or more.
+        names: of the data centers, for errors; none are their numbers.
+    """
+    starts = np.asarray(start, dtype=np.int64)
+    sizes = np.diff(starts)
+    # One class per power of two: rows are at most half empty, and the classes few.
+    size_class = np.ceil(np.log2(sizes)).astype(np.int64)
+    rows = []
+    for chosen in (np.flatnonzero(size_class == c) for c in np.unique(size_class)):
+        column = np.arange(sizes[chosen].max())
+        inside = column < sizes[chosen, None]
+        rows.append(np.where(inside, starts[chosen, None] + column, starts[-1]))
+    return Bins(
+        start=starts,
+        dc=np.repeat(np.arange(len(sizes)), sizes),
+        names=tuple(names) or tuple(f"data center {i}" for i in range(len(sizes))),
+        rows=tuple(rows),
+    )
+
+
+def place(
+    policy: str,
+    utilisation: F64,
+    *,
+    bins: Bins,
+    count: F64,
+    capacity: F64,
+    inlet_c: F64,
+    limit_c: npt.ArrayLike,
+    weights: npt.ArrayLike | None = None,
+) -> tuple[F64, F64]:
+    """Spread the utilisation of each data center over its bins.
+
+    - ``uniform``: the same load everywhere; where that exceeds a bin's capacity, the bins that have
+      room share the rest evenly.
+    - ``fill``: bins in order of their index, each up to its capacity.
+    - ``coolest-first``: bins in order of their inlet temperature, ties by index, likewise.
+    - ``inlet-aware``: loads in proportion to the headroom max(limit - inlet, ``MIN_HEADROOM_K``),
+      up to capacity.
+    - ``weights``: loads in proportion to ``weights``, up to capacity; weight 0 gets none, even when
+      the others are full.
+
+    In proportion and up to capacity is load = min(capacity, level*weight), the level exact: bins in
+    the order in which they fill up are taken as full as long as the work suffices.
+
+    Args:
+        policy: one of ``POLICIES``.
+        utilisation: work as a share of all servers, at least 0, (B,).
+        bins: see ``layout``.
+        count: servers of each bin, above 0, (n,).
+        capacity: utilisation each bin may reach, 0..1, (n,).
+        inlet_c: last known inlet temperature of each bin, (n,).
+        limit_c: inlet temperature that ``inlet-aware`` keeps away from, finite, () or (B,).
+        weights: at least 0, one or more per data center positive, (n,); for ``weights`` alone.
+
+    Returns:
+        Load of each bin, 0..capacity, (n,), and the utilisation really placed, (B,):
+        min(utilisation, sum(count*capacity)/sum(count)), the sum of capacities over the bins that
+        may be used. sum(count*load) = placed*sum(count) to rounding.
+
+    Raises:
+        PlacementError: an unknown policy, a limit that is not finite, or weights that are missing,
+            of the wrong shape, negative, not finite, or all 0 in a data center.
+    """
+    if policy not in POLICIES:
+        raise PlacementError(f"placement {policy!r}: valid are {', '.join(POLICIES)}")
+    if policy == "uniform":
+        return _uniform(utilisation, bins, count, capacity)
+    weight = np.ones(len(count))
+    if policy == "weights":
+        weight = _checked_weights(weights, bins)
+    elif policy == "inlet-aware":
+        weight = np.maximum(_checked_limit(limit_c, bins)[bins.dc] - inlet_c, MIN_HEADROOM_K)
+    usable = np.where(weight > 0.0, capacity, 0.0)
+    placed, work, full = _placeable(utilisation, bins, count, usable)
+    if policy in ("fill", "coolest-first"):
+        order = np.arange(len(count)) if policy == "fill" else bins.order(inlet_c)
+        load = _one_after_the_other(order, work, bins, count, usable)
+    else:
+        load = _in_proportion(weight, work, bins, count, usable)
+    return np.where(full[bins.dc], usable, load), placed
+
+
+def _uniform(utilisation: F64, bins: Bins, count: F64, capacity: F64) -> tuple[F64, F64]:
+    unhindered = utilisation <= np.minimum.reduceat(capacity, bins.start[:-1])
+    if np.all(unhindered):
+        return utilisation[bins.dc], utilisation.copy()
+    placed, work, full = _placeable(utilisation, bins, count, capacity)
+    load = _in_proportion(np.ones(len(count)), work, bins, count, capacity)
+    load = np.where(full[bins.dc], capacity, load)
+    # To the bit what a batch without a limited bin gets.
+    load = np.where(unhindered[bins.dc], utilisation[bins.dc], load)
+    return load, np.where(unhindered, utilisation, placed)
+
+
+def _placeable(utilisation: F64, bins: Bins, count: F64, capacity: F64) -> tuple[F64, F64, Mask]:
+    """Utilisation that fits, the same in servers, and where it takes all there is, each (B,)."""
+    servers = bins.sums(count)
+    highest = bins.sums(count * capacity) / servers
+    placed = np.minimum(utilisation, highest)
+    return placed, placed * servers, utilisation >= highest
+
+
+def _one_after_the_other(order: I64, work: F64, bins: Bins, count: F64, capacity: F64) -> F64:
+    """Fill bins in the given order, (n,)."""
+    room = count * capacity
+    in_order = bins.up_to(room[order]) <= work[bins.dc]
+    full = np.empty(len(room), dtype=np.bool_)
+    full[order] = in_order
+    load = np.where(full, capacity, 0.0)
+    # The running sum only tells which bins are full; what is left for the next one is exact.
+    rest = work - bins.sums(np.where(full, room, 0.0))
+    position = bins.start[:-1] + np.add.reduceat(in_order.astype(np.int64), bins.start[:-1])
+    some = position < bins.start[1:]
+    following = order[position[some]]
+    load[following] = np.clip(rest[some] / count[following], 0.0, capacity[following])
+    return load
+
+
+def _in_proportion(weight: F64, work: F64, bins: Bins, count: F64, capacity: F64) -> F64:
+    """min(capacity, level*weight) with the level that places all work, (n,).
+
+    Where the weight is 0, so is the capacity.
+    """
+    room, weighted = count * capacity, count * weight
+    level_full = capacity / np.where(weight > 0.0, weight, 1.0)
+    order = bins.order(level_full)
+    # Work done when the level just fills a bin: all before it are full, those after it are not.
+    at_level = bins.up_to(room[order]) + level_full[order] * bins.after(weighted[order])
+    full = np.empty(len(room), dtype=np.bool_)
+    full[order] = at_level <= work[bins.dc]
+    rest = work - bins.sums(np.where(full, room, 0.0))
+    open_weight = bins.sums(np.where(full, 0.0, weighted))
+    some = open_weight > 0.0
+    level = np.where(some, rest, 0.0) / np.where(some, open_weight, 1.0)
+    return np.where(full, capacity, np.clip(level[bins.dc] * weight, 0.0, capacity))
+
+
+def _checked_limit(limit_c: npt.ArrayLike, bins: Bins) -> F64:
+    limit = np.broadcast_to(np.asarray(limit_c, dtype=np.float64), (len(bins.start) - 1,))
+    wrong = np.flatnonzero(~np.isfinite(limit))
+    if len(wrong):
+        raise PlacementError(
+            f"{bins.names[wrong[0]]}: placement inlet-aware with a limit of {limit[wrong[0]]} C; "
+            "valid is a finite temperature"
+        )
+    return limit
+
+
+def _checked_weights(weights: npt.ArrayLike | None, bins: Bins) -> F64:
+    """Weights over the largest of their data center, (n,)."""
+    if weights is None:
+        raise PlacementError("placement weights: none given; valid is one per bin")
+    try:
+        given = np.asarray(weights, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise PlacementError(f"placement weights {weights!r}: valid are numbers") from None
+    if given.shape != bins.dc.shape:
+        raise PlacementError(
+            f"placement weights: shape {given.shape}, expected {bins.dc.shape}, one per bin"
+        )
+    wrong = np.flatnonzero(~(np.isfinite(given) & (given >= 0.0)))
+    if len(wrong):
+        dc = bins.dc[wrong[0]]
+        raise PlacementError(
+            f"{bins.names[dc]}: placement weight {wrong[0] - bins.start[dc]} is "
+            f"{given[wrong[0]]}; valid is a finite number of at least 0"
+        )
+    largest = np.maximum.reduceat(given, bins.start[:-1])
+    without = np.flatnonzero(largest == 0.0)
+    if len(without):
+        raise PlacementError(
+            f"{bins.names[without[0]]}: all placement weights are 0; valid is at least one above 0"
+        )
+    relative = given / largest[bins.dc]
+    return np.where(given > 0.0, np.maximum(relative, _LEAST_WEIGHT), 0.0)

@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from sdc_taichi import air_metrics
+
+CHECKS = Path(__file__).parent / "reference" / "physics_checks.json"
+
+
+def test_indices_of_a_hall_of_two_racks() -> None:
+    flow_m3s = np.array([2.0, 1.0])
+    inlet_c, outlet_c = np.array([20.0, 30.0]), np.array([32.0, 40.0])
+    inlet = air_metrics.rise_m3k_s(flow_m3s, inlet_c, 18.0)
+    outlet = air_metrics.rise_m3k_s(flow_m3s, outlet_c, 18.0)
+    assert (float(inlet), float(outlet)) == (16.0, 50.0)
+    assert float(air_metrics.shi(inlet, outlet)) == pytest.approx(0.32)
+    assert float(air_metrics.rhi(inlet, outlet)) == pytest.approx(0.68)
+    rise_k = air_metrics.it_rise_k(inlet, outlet, flow_m3s.sum())
+    assert float(rise_k) == pytest.approx(34.0 / 3.0)
+    # The CRAC units supply 4 m3/s, so 34 m3 K/s of heat warm it by 8.5 K.
+    assert float(air_metrics.rti(26.5, 18.0, rise_k)) == pytest.approx(75.0)
+    over_k = air_metrics.over_temperature_k(inlet_c)
+    assert float(over_k) == 3.0
+    for name, found in (("A1", 70.0), ("A2", 81.25), ("A3", 88.4615384615), ("A4", 91.6666666667)):
+        high_c = air_metrics.ALLOWABLE_C[name][1]
+        assert float(air_metrics.rci_hi(over_k, 2, allowable_c=high_c)) == pytest.approx(found)
+    under_k = air_metrics.under_temperature_k(np.array([16.0, 17.5, 30.0]))
+    assert float(air_metrics.rci_lo(under_k, 3, allowable_c=15.0)) == pytest.approx(
+        100.0 * (1.0 - 2.5 / 9.0)
+    )
+
+
+def test_rci_is_perfect_inside_zero_at_the_limit_and_negative_beyond() -> None:
+    low_c, high_c = air_metrics.ALLOWABLE_C["A1"]
+    for inlet_c, at_high, at_low in (
+        (18.0, 100.0, 100.0),
+        (27.0, 100.0, 100.0),
+        (high_c, 0.0, 100.0),
+        (high_c + 5.0, -100.0, 100.0),
+        (low_c, 100.0, 0.0),
+        (low_c - 3.0, 100.0, -100.0),
+    ):
+        inlets = np.full(4, inlet_c)
+        over, under = (
+            air_metrics.over_temperature_k(inlets),
+            air_metrics.under_temperature_k(inlets),
+        )
+        assert float(air_metrics.rci_hi(over, 4, allowable_c=high_c)) == pytest.approx(at_high)
+        assert float(air_metrics.rci_lo(under, 4, allowable_c=low_c)) == pytest.approx(at_low)
+
+
+def test_allowable_ranges_contain_the_recommended_one() -> None:
+    assert list(air_metrics.ALLOWABLE_C) == ["A1", "A2", "A3", "A4"]
+    for low, high in air_metrics.ALLOWABLE_C.values():
+        assert low < air_metrics.RECOMMENDED_C[0] < air_metrics.RECOMMENDED_C[1] < high
+
+
+def test_rti_of_the_reference_hall() -> None:
+    checks = {c["id"]: c for c in json.loads(CHECKS.read_text("utf-8"))["checks"]}
+    row = checks["RC-ROW-5.3"]
+    values, expected = row["inputs"], row["expected"]["RTI_local"]
+    # The return air is the outlet's, T_in + dT_IT, moved by the return approach temperature.
+    return_c = values["a"] + values["dT_IT"] + values["d"]
+    found = air_metrics.rti(return_c, 0.0, values["dT_IT"])
+    assert float(found) == pytest.approx(100.0 * expected, rel=1e-9)
+    sweep = checks["RC-FLOW-SWEEP"]["expected"]
+    found = air_metrics.rti(
+        18.0 + np.array(sweep["T_ret_minus_T_sup"]), 18.0, row["inputs"]["dT_IT"]
+    )
+    np.testing.assert_allclose(found, 100.0 * np.array(sweep["RTI"]), rtol=1e-6)
+
+
+def test_no_heat_and_no_airflow_have_defined_indices() -> None:
+    still, air_c = np.zeros((1, 3)), np.full((1, 3), 22.0)
+    rise = air_metrics.rise_m3k_s(still, air_c, 18.0)
+    np.testing.assert_array_equal(air_metrics.shi(rise, rise), [0.0])
+    np.testing.assert_array_equal(air_metrics.rhi(rise, rise), [1.0])
+    np.testing.assert_array_equal(air_metrics.it_rise_k(rise, rise, still.sum(axis=1)), [0.0])
+    np.testing.assert_array_equal(air_metrics.rti(np.array([20.0]), 18.0, np.zeros(1)), [0.0])
+    # What rounding leaves of no rise is none.
+    np.testing.assert_array_equal(air_metrics.shi(np.array([4e-15]), np.array([-5e-324])), [0.0])
+    np.testing.assert_array_equal(air_metrics.shi(np.array([4e-15]), np.array([5e-324])), [0.0])
+
+
+def test_sums_over_axes_and_offsets_agree() -> None:
+    rng = np.random.default_rng(3)
+    flow_m3s, air_c = rng.uniform(0.0, 5.0, (4, 7)), rng.uniform(10.0, 45.0, (4, 7))
+    supply_c = rng.uniform(14.0, 22.0, 4)
+    start = np.arange(5) * 7
+    dense = air_metrics.rise_m3k_s(flow_m3s, air_c, supply_c[:, None])
+    ragged = air_metrics.rise_m3k_s(flow_m3s.ravel(), air_c.ravel(), supply_c, start)
+    np.testing.assert_allclose(ragged, dense, rtol=1e-13)
+    per_rack = air_metrics.rise_m3k_s(
+        flow_m3s.ravel(), air_c.ravel(), np.repeat(supply_c, 7), start
+    )
+    np.testing.assert_array_equal(per_rack, ragged)
+    # From sums alone, as a simulator carries them.
+    from_sums = (flow_m3s * air_c).sum(axis=1) - supply_c * flow_m3s.sum(axis=1)
+    np.testing.assert_allclose(from_sums, dense, rtol=1e-11)
+    for sums in (air_metrics.over_temperature_k, air_metrics.under_temperature_k):
+        np.testing.assert_allclose(sums(air_c.ravel(), start), sums(air_c), rtol=1e-13)
+
+
+@given(
+    st.lists(st.integers(1, 40), min_size=1, max_size=6),
+    st.integers(0, 2**32 - 1),
+)
+def test_a_data_center_alone_has_the_sums_of_the_batch(sizes: list[int], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    start = np.concatenate([[0], np.cumsum(sizes)])
+    flow_m3s = rng.uniform(0.0, 5.0, start[-1])
+    air_c = rng.uniform(10.0, 45.0, start[-1])
+    supply_c = rng.uniform(14.0, 22.0, len(sizes))
+    rise = air_metrics.rise_m3k_s(flow_m3s, air_c, supply_c, start)
+    over = air_metrics.over_temperature_k(air_c, start)
+    for i, (low, high) in enumerate(itertools.pairwise(start)):
+        alone = np.array([0, high - low])
+        own = slice(low, high)
+        assert rise[i] == air_metrics.rise_m3k_s(
+            flow_m3s[own], air_c[own], supply_c[i : i + 1], alone
+        )
+        assert over[i] == air_metrics.over_temperature_k(air_c[own], alone)
+
+
+@given(
+    hnp.arrays(np.float64, 6, elements=st.floats(0.01, 10.0)),
+    hnp.arrays(np.float64, 6, elements=st.floats(0.0, 20.0)),
+    hnp.arrays(np.float64, 6, elements=st.floats(0.1, 20.0)),
+)
+def test_shi_is_a_share_and_grows_with_recirculation(
+    flow_m3s: np.ndarray, above_k: np.ndarray, it_k: np.ndarray
+) -> None:
+    def index(scale: float) -> float:
+        inlet_c = 18.0 + scale * above_k
+        inlet = air_metrics.rise_m3k_s(flow_m3s, inlet_c, 18.0)
+        outlet = air_metrics.rise_m3k_s(flow_m3s, inlet_c + it_k, 18.0)
+        return float(air_metrics.shi(inlet, outlet))
+
+    assert index(0.0) == 0.0
+    assert 0.0 <= index(1.0) <= index(2.0) + 1e-12 < 1.0
