@@ -19,6 +19,7 @@ from sdc_taichi.fleet import Fleet
 from sdc_taichi.hall import Hall
 
 SIZES = ((4096, 20, 200), (256, 1000, 40), (1, 100_000, 40))
+Z = 5
 QUICK_SIZES = ((16, 20, 200), (2, 100, 40), (1, 400, 40))
 
 
@@ -33,6 +34,7 @@ def fleet_of(n_dcs: int, racks: int, servers: int, *, mixed: bool) -> Fleet:
         "hall.supply_approach_k=5.15",
         "hall.return_approach_k=-3.1",
         "servers.power_w=[150, 10]",
+        f"hall.height_zones={Z}",
     ]
     if mixed:
         nameplates = rng.integers(120, 400, servers)

@@ -138,9 +138,7 @@ def solve_kernel() -> Any:
 
     @ti.func
     @no_type_check
-    def precondition(
-        beyond: ints_2d, off: reals_2d, diagonal: reals_1d, work: reals_3d, s, a, out
-    ):
+    def precondition(beyond: ints_2d, off: reals_2d, diagonal: reals_1d, work: reals_3d, s, a, out):
         cells = diagonal.shape[0]
         for c in range(cells):
             total = work[s, a, c]

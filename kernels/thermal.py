@@ -23,7 +23,7 @@ RACK_INTS = ("first_group", "first_run", "dc")
 RUN_INTS = ("first", "length", "offset")
 CHUNK_INTS = ("first_rack", "dc", "first_need")
 DC_INTS = ("first_chunk", "first_unit", "first_rack", "first_share")
-RACK_ROWS = ("approach_k", "norm", "load", "powered", "airflow")
+RACK_ROWS = ("approach_k", "norm", "load", "powered", "airflow", "strength")
 GROUP_ROWS = ("count", "full_w", "idle_w", "inlet_offset_k", "load_deviation", "captured", "load")
 DC_ROWS = (
     "cpu_slope_per_k",
@@ -45,12 +45,22 @@ DC_ROWS = (
     "effectiveness",
     "parcel_j_per_k",
 )
-DC_DOUBLES = ("room_j", "room_j_per_k", "coil_limit_w", "crac_fan_w", "it_airflow_m3s")
-"""Per data center in f64: heat held by the room, and what the coil needs in transient runs."""
+DC_DOUBLES = (
+    "room_j",
+    "room_j_per_k",
+    "coil_limit_w",
+    "crac_fan_w_per_m3s",
+    "it_airflow_m3s",
+    "overshoot",
+    "change_k",
+)
+"""Per data center in f64: heat held by the room and what the coil needs in transient runs, how far
+every second sweep goes beyond its mix, and by how much the last one moved it."""
 UNIT_ROWS = ("setpoint_c", "low", "high", "design_m3s", "running")
 UNIT_STATE = ("supply_c", "fresh_ratio", "fresh_ratio_used", "flow_m3s", "cubed_speed")
-RACK_STATE = ("mixed_c", "outlet_c", "outlet_c", "captured_m3s")
-"""Exhaust mix before a rack, outlets of the sweeps in turn, flow that the rack takes of the mix."""
+RACK_STATE = ("mixed_c", "exhaust_c", "exhaust_c", "captured_m3s")
+"""Exhaust mix before a rack, outlets times strength of the sweeps in turn, flow that the rack takes
+of the mix."""
 RACK_OUT = ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "inlet_max_c", "outlet_c")
 GROUP_OUT = ("inlet_c", "outlet_c", "power_w")
 SUMS = (
@@ -200,6 +210,9 @@ def hall_kernel(precision: str) -> Any:
                         limit_c = dcs[13, n]
                         step_s = ti.cast(substep_s, real)
                         still_per_s = real(1.0 / 128.0)
+                        # Most of what is left after a sweep is the same for all racks and shrinks
+                        # by a known factor, so every second sweep goes all the way.
+                        beyond = ti.cast(doubles[5, n], real) * ti.cast(source, real)
                         cpu_sum = ti.cast(0.0, ti.f64)
                         fan_sum = ti.cast(0.0, ti.f64)
                         flow_sum = ti.cast(0.0, ti.f64)
@@ -259,7 +272,7 @@ def hall_kernel(precision: str) -> Any:
                                         change = ti.max(
                                             change, ti.cast(ti.abs(target - mixed), ti.f64)
                                         )
-                                        mixed = target
+                                        mixed = target + beyond * (target - mixed)
                                         rack_state[0, q] = mixed
                             else:
                                 base = ti.cast(unit_state[0, unit_0], real) + racks[0, q]
@@ -367,7 +380,7 @@ def hall_kernel(precision: str) -> Any:
                             if ti.static(recirculates):
                                 captured = flow - cover * fresh_flow
                                 if ti.static(advance):
-                                    rack_state[2 - source, q] = outlet
+                                    rack_state[2 - source, q] = outlet * racks[5, q]
                                     rack_state[3, q] = captured
                                 captured_sum += ti.cast(captured * mixed + parcel_w / air, ti.f64)
                                 for j in range(n_units):
@@ -512,7 +525,11 @@ def hall_kernel(precision: str) -> Any:
                                 + doubles[0, n] / doubles[1, n]
                             )
                     else:
-                        active[n] = ti.cast(change_dc > tolerance_k, ti.i32)
+                        to_come = change_dc
+                        if first_substep == 0:
+                            to_come *= change_dc / doubles[6, n]
+                        active[n] = ti.cast(to_come > tolerance_k, ti.i32)
+                        doubles[6, n] = change_dc
                 scale = ti.cast(1.0, ti.f64)
                 keep = ti.cast(0.0, ti.f64)
                 if ti.static(transient):

@@ -17,7 +17,7 @@ import sdc_taichi
 from sdc_taichi import air_metrics, runtime
 from sdc_taichi.airflow_grid import LEAST_LEAK, Grid, build_grid
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import ConfigError, RuntimeStateError
+from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.recirculation import MOST_MATRIX_RACKS
 from sdc_taichi.types import F64
 
@@ -88,7 +88,8 @@ def solve(
         cell_m: longest cell.
 
     Raises:
-        ConfigError: values out of range, too many cells or racks, or a solve that cannot converge.
+        ConfigError: values out of range, or too many cells or racks.
+        SdcError: a system that cannot be solved to the tolerance.
     """
     begun = time.perf_counter()
     airflow_m3s, power_w = _checked(config, airflow_m3s, power_w, supply_m3s, supply_c)
@@ -100,7 +101,7 @@ def solve(
 
     air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
     rise_k = power_w / (air * airflow_m3s)
-    approach_k = np.linalg.solve(np.eye(hall.racks) - R, R @ rise_k)
+    approach_k: F64 = np.asarray(np.linalg.solve(np.eye(hall.racks) - R, R @ rise_k), np.float64)
     outlet_k = approach_k + rise_k
     direct_k, direct_returned = system.temperatures(rise_k)
     returned = float(returned_m3s @ outlet_k)
@@ -122,20 +123,14 @@ def solve(
         rhi=float(air_metrics.rhi(inlet, outlet)),
         rti=float(air_metrics.rti(return_c, supply_c, mean_rise_k)),
         rci_hi=float(
-            air_metrics.rci_hi(
-                air_metrics.over_temperature_k(inlet_c), racks, allowable_c=high_c
-            )
+            air_metrics.rci_hi(air_metrics.over_temperature_k(inlet_c), racks, allowable_c=high_c)
         ),
         rci_lo=float(
-            air_metrics.rci_lo(
-                air_metrics.under_temperature_k(inlet_c), racks, allowable_c=low_c
-            )
+            air_metrics.rci_lo(air_metrics.under_temperature_k(inlet_c), racks, allowable_c=low_c)
         ),
         mass_residual=mass_residual,
         share_residual=float(np.abs(R.sum(axis=1) + supply_share - 1.0).max()),
-        energy_residual=max(
-            abs(returned / it_m3k_s - 1.0), abs(direct_returned / it_m3k_s - 1.0)
-        ),
+        energy_residual=max(abs(returned / it_m3k_s - 1.0), abs(direct_returned / it_m3k_s - 1.0)),
         direct_difference_k=float(np.abs(direct_k - approach_k).max()),
         cells=grid.cells,
         seconds=time.perf_counter() - begun,
@@ -255,7 +250,7 @@ class _System:
         )
         worst = int(np.argmax(np.where(np.isfinite(residual), residual, np.inf)))
         if not residual[worst] <= 100 * _TOLERANCE:
-            raise RuntimeStateError(
+            raise SdcError(
                 f"layout solver: {what} {worst} of {tags} stopped at a residual of "
                 f"{residual[worst]:.3g} after {iterations[worst]} iterations; valid is at most "
                 f"{100 * _TOLERANCE:g}: change cell_m, or measures of very different size"
@@ -282,25 +277,24 @@ def _checked(
             f"{config.name}: {racks:,} racks; the layout solver takes at most "
             f"{MOST_MATRIX_RACKS:,}, the largest matrix that a hall can use"
         )
-    given = {
-        "airflow_m3s": np.ascontiguousarray(airflow_m3s, dtype=np.float64),
-        "power_w": np.ascontiguousarray(power_w, dtype=np.float64),
-        "supply_m3s": np.array([supply_m3s], dtype=np.float64),
-        "supply_c": np.array([supply_c], dtype=np.float64),
-    }
-    for name, values in given.items():
-        if values.ndim != 1 or len(values) not in (1, racks):
-            raise ConfigError(f"{name} has shape {values.shape}, expected ({racks},)")
-    for name in ("airflow_m3s", "power_w"):
-        if len(given[name]) != racks:
-            raise ConfigError(f"{name} has {len(given[name])} entries, expected {racks}")
-    for name, values in given.items():
-        valid = np.isfinite(values) & ((values > 0) | (name == "supply_c"))
-        if not valid.all():
-            place = int(np.argmin(valid))
-            want = "a finite number" if name == "supply_c" else "a finite number above 0"
-            raise ConfigError(f"{name}[{place}] is {values[place]:g}; valid is {want}")
-    return given["airflow_m3s"], given["power_w"]
+    for name, value, want in (
+        ("supply_m3s", supply_m3s, "a finite number above 0"),
+        ("supply_c", supply_c, "a finite number"),
+    ):
+        if not np.isfinite(value) or (name == "supply_m3s" and value <= 0):
+            raise ConfigError(f"{name} is {value:g}; valid is {want}")
+    return _per_rack("airflow_m3s", airflow_m3s, racks), _per_rack("power_w", power_w, racks)
+
+
+def _per_rack(name: str, given: F64, racks: int) -> F64:
+    values: F64 = np.ascontiguousarray(given, dtype=np.float64)
+    if values.shape != (racks,):
+        raise ConfigError(f"{name} has shape {values.shape}, expected ({racks},)")
+    valid = np.isfinite(values) & (values > 0)
+    if not valid.all():
+        rack = int(np.argmin(valid))
+        raise ConfigError(f"{name}[{rack}] is {values[rack]:g}; valid is a finite number above 0")
+    return values
 
 
 def _ashrae_class(config: DataCenterConfig) -> str:

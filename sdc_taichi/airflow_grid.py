@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -217,9 +216,7 @@ def _links(
     return beyond, conductance, area
 
 
-def _place(
-    boundary: F64, numbers: I32, m3s: F64, face: int, sign: float
-) -> tuple[I32, F64]:
+def _place(boundary: F64, numbers: I32, m3s: F64, face: int, sign: float) -> tuple[I32, F64]:
     """Let air through the faces where ``m3s`` is positive; gives the cells and their flows."""
     there = m3s > 0
     cell, flow = numbers[there], m3s[there]

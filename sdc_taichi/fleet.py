@@ -67,13 +67,21 @@ class HallAir:
     """Share of each unit in each rack's supply, rack by rack."""
     share_start: I32
     """First entry of each data center in ``unit_shares``, (B,)."""
-    outlet_rise_k: F64
-    """Mean outlet over supply at the design point, (R,)."""
-    rise_over_design: F64
-    """How much the air warms at loads of LOADS over full load, (B, len(LOADS))."""
+    strength: F64
+    """Exhaust airflow of each rack over the mean of its hall, (R,)."""
+    rise_k: F64
+    """How much each rack warms its air at the design point, (R,)."""
+    table: I32
+    """Entry of each data center in the next three, (B,)."""
+    supply_c: F64
+    """Supply air of the expectations, (H, n)."""
+    expected: F64
+    """Approach and rise of a mean rack over those at the design point, and what is left of a
+    deviation of the exhaust mix after it has passed the racks once; by supply air and load of
+    LOADS, (H, 3, n, len(LOADS))."""
 
 
-LOADS = np.linspace(0.0, 1.0, 9)
+LOADS = np.linspace(0.0, 1.0, 17)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +174,7 @@ class _HallArrays:
     it_airflow_m3s: float
     shares: F64
     recirculation: Recirculation | None
-    rise_over_design: F64
+    expected: tuple[F64, F64]
 
 
 def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet:
@@ -368,21 +376,55 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         it_airflow_m3s=float(design.airflow_m3s.sum()),
         shares=shares,
         recirculation=flows,
-        rise_over_design=np.array([_mean_rise_k(config, racks, design, u) for u in LOADS])
-        / _mean_rise_k(config, racks, design, 1.0),
+        expected=_expectations(config, racks, design),
     )
 
 
-def _mean_rise_k(
-    config: DataCenterConfig, racks: RackServers, design: DesignPoint, load: float
-) -> float:
-    """How much servers warm their air at a load and the inlets of the design point, mean."""
-    servers = config.servers
+def _expectations(
+    config: DataCenterConfig, racks: RackServers, design: DesignPoint
+) -> tuple[F64, F64]:
+    """Where sweeps of the hall start: one mean rack, from up to 64 of the hall, in steady state.
+
+    Returns:
+        Supply temperatures, (n,), and what ``HallAir.expected`` holds, (3, n, len(LOADS)).
+    """
+    servers, setpoint = config.servers, config.hvac.setpoint
     slope, offset, shift = cpu_coefficients(servers)
-    inlet_c = design.supply_c + racks.per_group(design.approach_k) * design.height
-    ratio = config.airflow_ratio(inlet_c, np.full(len(inlet_c), load))
-    cpu_w = np.maximum(racks.idle_w, racks.full_w * (slope * inlet_c + offset + shift * load))
-    return float(np.sum(racks.count * cpu_w) / np.sum(racks.count * ratio))
+    every = max(1, config.hall.racks // 64)
+    chosen = np.zeros(config.hall.racks, dtype=np.bool_)
+    chosen[::every] = True
+    group = racks.per_group(chosen.astype(np.float64)) > 0
+    count, full_w, idle_w = racks.count[group], racks.full_w[group], racks.idle_w[group]
+    approach_k = (racks.per_group(design.approach_k) * design.height)[group]
+    mean_k, rise_k = design.approach_k[chosen].mean(), 1.0
+    limit_c = np.inf if servers.curve_limit_c is None else servers.curve_limit_c
+
+    def rise(scale: F64, supply_c: F64, load: F64) -> F64:
+        inlet_c = supply_c + scale * approach_k
+        ratio = config.airflow_ratio(inlet_c, load)
+        cpu_w = full_w * (slope * np.minimum(inlet_c, limit_c) + offset + shift * load)
+        return np.asarray(
+            np.sum(count * np.maximum(idle_w, cpu_w), axis=-1) / np.sum(count * ratio, axis=-1)
+        )[..., None]
+
+    full, warmest = np.ones((1, 1, 1)), np.full((1, 1, 1), design.supply_c)
+    rise_k = rise(full, warmest, full)
+    # In a rise of 1 at the design point; the approach in the same unit.
+    ratio = mean_k / max(float((design.outlet_rise_k - design.approach_k)[chosen].mean()), 1e-9)
+    share = ratio / (1.0 + ratio)
+    supply_c = np.linspace(setpoint.min_c, setpoint.max_c, 8)
+    at, load = supply_c[:, None, None], LOADS[None, :, None]
+    scale = np.ones((len(supply_c), len(LOADS), 1))
+    if mean_k <= 0:
+        scale[:] = 0.0
+    else:
+        for _ in range(40):
+            scale = share * (scale + rise(scale, at, load) / rise_k / ratio)
+    warming = rise(scale, at, load) / rise_k
+    step = 1e-3
+    slope_of_rise = (rise(scale + step, at, load) / rise_k - warming) / step
+    kept = share * (1.0 + (slope_of_rise / ratio if ratio > 0 else 0.0))
+    return supply_c, np.stack([scale, warming, np.broadcast_to(kept, scale.shape)])[..., 0]
 
 
 def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
@@ -405,6 +447,8 @@ def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
         runs.append(np.diff(exchange.run_start))
         first_rack += len(exchange.norm)
     sizes = np.array([h.shares.size for h in halls])
+    distinct = list({id(h): h for h in halls}.values())
+    entries = {id(h): i for i, h in enumerate(distinct)}
     return HallAir(
         run_start=_starts(np.concatenate(runs)),
         run_first=np.concatenate(firsts).astype(np.int32),
@@ -412,10 +456,13 @@ def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
         run_offset=np.concatenate(offsets).astype(np.int32),
         weights=np.concatenate(weights),
         norm=np.concatenate([f.exchange.norm for f in found]),
+        strength=np.concatenate([f.exchange.strength for f in found]),
         unit_shares=np.concatenate([h.shares.reshape(-1) for h in halls]),
         share_start=_starts(sizes)[:-1],
-        outlet_rise_k=np.concatenate([f.design.outlet_rise_k for f in found]),
-        rise_over_design=np.stack([h.rise_over_design for h in halls]),
+        rise_k=np.concatenate([f.design.outlet_rise_k - f.design.approach_k for f in found]),
+        table=np.array([entries[id(h)] for h in halls], dtype=np.int32),
+        supply_c=np.stack([h.expected[0] for h in distinct]),
+        expected=np.stack([h.expected[1] for h in distinct]),
     )
 
 

@@ -20,8 +20,8 @@ _RELEASED_OUTLET_FIT = (1.918, 1.096, 0.526, 0.824, -14.01)
 _RACKS_PER_CHUNK = 64
 """Fewer racks than this are not worth a thread of their own."""
 
-TOLERANCE_K: dict[Precision, float] = {"f32": 5e-4, "f64": 1e-11}
-"""How little the exhaust mix may move in the last sweep; another would move it far less."""
+TOLERANCE_K: dict[Precision, float] = {"f32": 1e-4, "f64": 1e-12}
+"""How little another sweep would move the exhaust mix before any rack."""
 MOST_SWEEPS = 2000
 
 
@@ -57,8 +57,8 @@ class HallState:
     """Temperature of the servers of each group, (G,)."""
     mixed_c: Reals
     """Recirculated air before each rack, (R,)."""
-    outlet_c: Reals
-    """(R,)."""
+    exhaust_c: Reals
+    """Outlet temperature times the strength of the rack, (R,)."""
     captured_m3s: Reals
     """Recirculated air that each rack takes in, (R,)."""
     fresh_ratio: F64
@@ -171,7 +171,8 @@ class Hall:
         self._shares = self._real(np.zeros(1) if air is None else air.unit_shares)
         self._racks = self._real(np.ones((len(thermal.RACK_ROWS), fleet.racks)))
         self._racks[0] = fleet.approach_k
-        self._racks[1] = 0.0 if air is None else air.norm
+        if air is not None:
+            self._racks[1], self._racks[5] = air.norm, air.strength
         self._groups = self._real(
             np.concatenate([fleet.groups, np.zeros((1, fleet.groups.shape[1]))])
         )
@@ -212,23 +213,36 @@ class Hall:
         return self._results(out)
 
     def _guess(self, met: Conditions) -> None:
-        """Outlets to start from: those of the design point, by the load."""
+        """Outlets to start from: the racks of the design point, moved as a mean rack would be."""
         fleet, air = self._fleet, self._fleet.air
         assert air is not None
-        position = met.utilisation * (len(LOADS) - 1)
-        low = np.minimum(position.astype(np.int64), len(LOADS) - 2)
-        dc = np.arange(fleet.size)
-        table = air.rise_over_design
-        rise = table[dc, low] + (position - low) * (table[dc, low + 1] - table[dc, low])
         supply_c = met.unit_supply_c[fleet.unit_start[:-1]]
-        self._rack_state[1] = supply_c[fleet.rack_dc] + rise[fleet.rack_dc] * air.outlet_rise_k
+        grid = air.supply_c[air.table]
+        low, high, last = grid[:, 0], grid[:, -1], grid.shape[1] - 1
+        y = np.clip((supply_c - low) / np.maximum(high - low, 1e-9), 0.0, 1.0) * last
+        x = np.clip(met.utilisation, 0.0, 1.0) * (len(LOADS) - 1)
+        i = np.minimum(y.astype(np.int64), last - 1)
+        j = np.minimum(x.astype(np.int64), len(LOADS) - 2)
+        y, x = y - i, x - j
+        corner = air.expected[air.table]
+        dc = np.arange(fleet.size)
+        scale, warming, kept = (
+            (1 - y) * ((1 - x) * corner[dc, k, i, j] + x * corner[dc, k, i, j + 1])
+            + y * ((1 - x) * corner[dc, k, i + 1, j] + x * corner[dc, k, i + 1, j + 1])
+            for k in range(3)
+        )
+        rack = fleet.rack_dc
+        outlet_c = supply_c[rack] + scale[rack] * fleet.approach_k + warming[rack] * air.rise_k
+        self._rack_state[1] = air.strength * outlet_c
         self._rack_state[0] = -1e6
+        self._doubles[5] = np.clip(kept / (1.0 - np.minimum(kept, 0.9)), 0.0, 9.0)
 
     def _sweep(self, out: tuple[Any, Any]) -> None:
         """Repeat until the mix before every rack stands still."""
         self._active[:] = 1
         for sweep in range(MOST_SWEEPS):
-            self._run(out, advance=True, source=sweep % 2)
+            # What is left to come shows from the third sweep on.
+            self._run(out, advance=True, source=sweep % 2, first=sweep < 2)
             if not self._active.any():
                 break
         else:
@@ -305,7 +319,7 @@ class Hall:
         """
         self._set(met)
         self._server_c = state.server_c.copy()
-        self._rack_state[0], self._rack_state[1] = state.mixed_c, state.outlet_c
+        self._rack_state[0], self._rack_state[1] = state.mixed_c, state.exhaust_c
         self._rack_state[3] = state.captured_m3s
         self._unit_state[1] = state.fresh_ratio
         self._units[0] = coil.setpoint_c
@@ -335,7 +349,7 @@ class Hall:
         return HallState(
             server_c=self._server_c.copy(),
             mixed_c=self._rack_state[0].copy(),
-            outlet_c=self._rack_state[1].copy(),
+            exhaust_c=self._rack_state[1].copy(),
             captured_m3s=self._rack_state[3].copy(),
             fresh_ratio=self._unit_state[1].copy(),
         )

@@ -24,6 +24,7 @@ hall_app = typer.Typer(help="Air in the hall.", no_args_is_help=True)
 
 @hall_app.callback()
 def _hall() -> None:
+    # A group with one command would take that command's place.
     """Air in the hall."""
 
 
@@ -61,11 +62,11 @@ def solve_hall(
     if out is not None:
         _write_npz(out, solution)
     if as_json:
-        print(json.dumps(report(config, solution), indent=2))
+        typer.echo(json.dumps(report(config, solution), indent=2))
         return
     _print_report(config, solution)
     if out is not None:
-        print(f"Matrix: {out} (hall.recirculation.matrix_file)")
+        typer.echo(f"Matrix: {out} (for hall.recirculation.matrix_file)")
 
 
 def _solve(config: DataCenterConfig, cell_m: float) -> LayoutSolution:
@@ -119,23 +120,19 @@ def _row_means(config: DataCenterConfig, values: F64) -> tuple[float | None, flo
 
 
 def _print_report(config: DataCenterConfig, solution: LayoutSolution) -> None:
-    # As wide as it needs: a pipe is no terminal of 80 columns.
-    console = Console(width=None if Console().is_terminal else 160)
+    console = Console()
     grid = " x ".join(str(n) for n in solution.provenance["grid"])
     hall = config.hall
-    console.print(
+    typer.echo(
         f"{config.name}: {hall.rows} rows of {hall.racks_per_row} racks, grid {grid}, "
-        f"{solution.cells:,} cells of air, {solution.seconds:.1f} s",
-        markup=False,
-        highlight=False,
-        soft_wrap=True,
+        f"{solution.cells:,} cells of air, {solution.seconds:.1f} s"
     )
-    table = Table("inlet over supply (K)", title=None)
-    for name in ("mean", "outer rows", "inner rows", "lowest rack", "highest rack"):
+    table = Table("inlet over supply, K")
+    for name in ("mean", "outer rows", "inner rows", "lowest", "highest"):
         table.add_column(name, justify="right")
     for label, values in (
         ("solved", solution.approach_k),
-        ("supply_approach_k", hall.rack_approach_k()),
+        ("configured (supply_approach_k)", hall.rack_approach_k()),
     ):
         inner, outer = _row_means(config, values)
         cells = (float(values.mean()), outer, inner, float(values.min()), float(values.max()))
@@ -152,8 +149,7 @@ def _print_report(config: DataCenterConfig, solution: LayoutSolution) -> None:
         f"energy {solution.energy_residual:.1e}; inlets through R and on the grid differ by at "
         f"most {solution.direct_difference_k:.1e} K",
     )
-    for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    typer.echo("\n".join(lines))
 
 
 def _check_target(out: Path, *, force: bool) -> None:
@@ -171,12 +167,13 @@ def _write_npz(out: Path, solution: LayoutSolution) -> None:
     text = json.dumps(solution.provenance, sort_keys=True)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
-            np.savez(file, R=solution.R, provenance=np.array(text))
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(out)
+        try:
+            with part.open("wb") as file:
+                np.savez(file, R=solution.R, provenance=np.array(text))
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(out)
+        finally:
+            part.unlink(missing_ok=True)
     except OSError as error:
         raise SdcError(f"{out}: cannot be written: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)

@@ -87,8 +87,8 @@ class DesignPoint:
 class Exchange:
     """Weights w as runs of neighbouring racks.
 
-    (w x)_j = norm_j * sum of weights[offset + i] * x[first + i] over the runs of rack j and i below
-    their length. Racks that see the same surroundings share their weights.
+    (w x)_j = norm_j * sum of weights[offset + i] * strength[first + i] * x[first + i] over the runs
+    of rack j and i below their length. Racks that see the same surroundings share their weights.
     """
 
     run_start: I32
@@ -99,23 +99,25 @@ class Exchange:
     offset: I32
     """First weight of each run."""
     weights: F64
+    strength: F64
+    """Exhaust airflow of each rack over the mean, (R,)."""
     norm: F64
     """(R,)."""
 
     def apply(self, values: F64) -> F64:
-        """W @ values, (R,)."""
-        out = np.zeros(len(self.norm))
+        """The product w x, (R,)."""
+        out, strong = np.zeros(len(self.norm)), values * self.strength
         for racks, sources, weights in self._slices():
-            np.add.at(out, racks, weights * values[sources])
+            out += np.bincount(racks, weights * strong[sources], len(out))
         return out * self.norm
 
     def apply_transposed(self, values: F64) -> F64:
-        """w.T @ values, (R,)."""
+        """The product of the transposed w and x, (R,)."""
         out = np.zeros(len(self.norm))
         scaled = values * self.norm
         for racks, sources, weights in self._slices():
-            np.add.at(out, sources, weights * scaled[racks])
-        return out
+            out += np.bincount(sources, weights * scaled[racks], len(out))
+        return out * self.strength
 
     def dense(self) -> F64:
         """w, (R, R)."""
@@ -123,7 +125,7 @@ class Exchange:
         out = np.zeros((racks, racks))
         for rows, sources, weights in self._slices():
             out[rows, sources] += weights
-        return np.asarray(out * self.norm[:, None])
+        return np.asarray(out * self.strength * self.norm[:, None])
 
     def _slices(self) -> Iterator[tuple[Any, Any, F64]]:
         """Entries (row, column, weight), one position within the runs at a time."""
@@ -284,8 +286,8 @@ def calibrate(config: DataCenterConfig, groups: RackServers | None = None) -> Re
     settings = config.hall.recirculation
     approach_k = _approach_k(config)
     if settings.matrix_file is None:
-        exchange = layout_exchange(config.hall)
         design = _design_point(config, groups, approach_k)
+        exchange = layout_exchange(config.hall, design.airflow_m3s)
         share = approach_k / exchange.apply(design.outlet_rise_k)
     else:
         matrix = read_matrix(config, Path(settings.matrix_file), groups)
@@ -305,7 +307,8 @@ def calibrate(config: DataCenterConfig, groups: RackServers | None = None) -> Re
                 if np.max(np.abs(approach_k - before)) < 1e-12:
                     break
             design = _design_point(config, groups, approach_k)
-    share = share * (1.0 - config.hall.layout.containment)
+    if settings.matrix_file is None:
+        share = share * (1.0 - config.hall.layout.containment)
     captured = groups.per_group(share) * design.height
     _check_closes(config, design, exchange, share, captured)
     fresh = float(np.sum((1.0 - share) * design.airflow_m3s)) / design.crac_flow_m3s
@@ -346,12 +349,17 @@ def _rack_of(config: DataCenterConfig) -> npt.NDArray[np.int64]:
     return np.repeat(np.arange(len(start) - 1), np.diff(start))
 
 
-def layout_exchange(hall: HallConfig) -> Exchange:
-    """Weights exp(-d/decay) of the layout, rows summing to 1.
+def layout_exchange(hall: HallConfig, airflow_m3s: F64 | None = None) -> Exchange:
+    """Weights exp(-d/decay) times the exhaust airflow of the source, rows summing to 1.
 
     d is the shorter of two paths from exhaust face to inlet face: up and over the racks (rack
     height plus distance), or along the rows and around one of their ends.
+
+    Args:
+        hall: rows, measures and the decay length.
+        airflow_m3s: airflow of each rack at the design point, (R,); None is the same for all.
     """
+    flow = np.ones(hall.racks) if airflow_m3s is None else airflow_m3s
     if hall.racks <= DENSE_RACKS:
         plan = floor_plan(hall)
         front, back = plan.front_m, plan.back_m
@@ -362,22 +370,34 @@ def layout_exchange(hall: HallConfig) -> Exchange:
             np.abs(front[:, None, 1] - back[None, :, 1]),
             plan.row_ends_m,
         )
-        return dense_exchange(weights / weights.sum(axis=1, keepdims=True))
-    return _banded_exchange(hall)
+        return dense_exchange(weights, flow)
+    return _normalised(*_bands(hall), flow)
 
 
-def dense_exchange(weights: F64) -> Exchange:
-    """One run over all racks for each rack; rows of ``weights`` sum to 1, (R, R)."""
+def dense_exchange(weights: F64, airflow_m3s: F64 | None = None) -> Exchange:
+    """One run over all racks for each rack.
+
+    Args:
+        weights: relative weights of the sources (columns) for each rack (rows), (R, R).
+        airflow_m3s: exhaust airflow of the sources that multiplies them, (R,).
+    """
     racks = len(weights)
     index = np.arange(racks, dtype=np.int32)
-    return Exchange(
-        run_start=np.arange(racks + 1, dtype=np.int32),
-        first=np.zeros(racks, dtype=np.int32),
-        length=np.full(racks, racks, dtype=np.int32),
-        offset=index * np.int32(racks),
-        weights=np.ascontiguousarray(weights).reshape(-1),
-        norm=np.ones(racks),
+    flow = np.ones(racks) if airflow_m3s is None else airflow_m3s
+    runs = (
+        np.arange(racks + 1, dtype=np.int32),
+        np.zeros(racks, dtype=np.int32),
+        np.full(racks, racks, dtype=np.int32),
+        index * np.int32(racks),
     )
+    return _normalised(runs, np.ascontiguousarray(weights).reshape(-1), flow)
+
+
+def _normalised(runs: tuple[I32, I32, I32, I32], weights: F64, airflow_m3s: F64) -> Exchange:
+    strength = airflow_m3s / airflow_m3s.mean()
+    racks = len(strength)
+    sums = Exchange(*runs, weights, strength, np.ones(racks)).apply(np.ones(racks))
+    return Exchange(*runs, weights, strength, 1.0 / sums)
 
 
 def _path_weight(
@@ -391,8 +411,8 @@ def _path_weight(
     return np.asarray(np.exp(-np.minimum(over, around + across) / settings.decay_m))
 
 
-def _banded_exchange(hall: HallConfig) -> Exchange:
-    """Weights above the cutoff: the same tables for every second row, cut where the hall ends."""
+def _bands(hall: HallConfig) -> tuple[tuple[I32, I32, I32, I32], F64]:
+    """Runs and weights above the cutoff, with tables that every second row shares."""
     rows, per_row, layout = hall.rows, hall.racks_per_row, hall.layout
     cutoff, decay_m = hall.recirculation.cutoff, hall.recirculation.decay_m
     x = (np.arange(per_row) + 0.5) * layout.rack_pitch_m
@@ -448,16 +468,8 @@ def _banded_exchange(hall: HallConfig) -> Exchange:
         length = span[owner]
         offset = base[owner] + (shift + row_reach) * span[owner]
     run_start = np.concatenate([[0], np.cumsum(runs)])
-    upto = np.concatenate([[0.0], np.cumsum(weights)])
-    sums = np.add.reduceat(upto[offset + length] - upto[offset], run_start[:-1])
-    return Exchange(
-        run_start=run_start.astype(np.int32),
-        first=first.astype(np.int32),
-        length=length.astype(np.int32),
-        offset=offset.astype(np.int32),
-        weights=weights,
-        norm=1.0 / sums,
-    )
+    index = (run_start, first, length, offset)
+    return tuple(x.astype(np.int32) for x in index), weights  # type: ignore[return-value]
 
 
 def read_matrix(config: DataCenterConfig, path: Path, groups: RackServers) -> F64:

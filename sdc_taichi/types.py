@@ -112,8 +112,8 @@ class State:
     """Temperature of the servers of each group, (G,), in transient halls, as what follows."""
     mixed_c: Reals
     """Recirculated air before each rack, (R,)."""
-    outlet_c: Reals
-    """(R,)."""
+    exhaust_c: Reals
+    """Outlet temperature times the strength of the rack, (R,)."""
     captured_m3s: Reals
     """Recirculated air that each rack takes in, (R,)."""
     fresh_ratio: F64

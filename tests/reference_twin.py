@@ -1,17 +1,20 @@
 """The thermal kernel again, in plain NumPy f64, straight from the configuration.
 
-Every server on its own, no groups, no offsets, no Taichi: an independent way to the same numbers.
+Every server on its own, dense matrices over the racks, no groups, no offsets, no Taichi: an
+independent way to the same numbers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from sdc_taichi import DataCenterConfig
-from sdc_taichi.types import F64
+from sdc_taichi.config import HallConfig
+from sdc_taichi.types import F64, I64
 
 
 @dataclass(frozen=True)
@@ -132,3 +135,452 @@ def _data_center(racks: list[dict[str, float]]) -> dict[str, float]:
         "inlet_max_c": float(np.max(of("inlet_max_c"))),
         "outlet_mean_c": float(np.mean(of("outlet_c"))),
     }
+
+
+# --- recirculating halls ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class HallTwin:
+    """A calibrated recirculating hall, server by server (S,), with dense matrices over racks."""
+
+    config: DataCenterConfig
+    rack: I64
+    """Rack of each server, (S,)."""
+    full_w: F64
+    idle_w: F64
+    deviation: F64
+    """Load weight over the rack's mean, less 1, (S,)."""
+    captured: F64
+    """Share of each server's intake that is exhaust air at the design point, (S,)."""
+    weights: F64
+    """w, (R, R)."""
+    share: F64
+    """r, (R,)."""
+    fresh_share: float
+    unit_shares: F64
+    """(R, U)."""
+    unit_design_m3s: F64
+    full_m3s: float
+    """Airflow of one server at ratio 1."""
+    it_airflow_m3s: float
+    """Of all servers at the design point."""
+    air_j_per_m3_k: float
+    parcel_j_per_k: float
+    """Room air before each rack."""
+
+    def per_rack(self, values: F64) -> F64:
+        return np.bincount(self.rack, values, len(self.share))
+
+    def load(self, rack_load: F64) -> F64:
+        """Load of every server from that of its rack, (S,)."""
+        u = rack_load[self.rack]
+        return u + self.deviation * u * (1.0 - u)
+
+    def servers(self, inlet_c: F64, load: F64, powered: F64, breath: F64) -> tuple[F64, F64, F64]:
+        """CPU power, fan power and airflow of every server, (S,) each."""
+        s = self.config.servers
+        limit_c = np.inf if s.curve_limit_c is None else s.curve_limit_c
+        on_curve_c = np.minimum(inlet_c, limit_c)
+        ratio = airflow_ratio(self.config, on_curve_c, load)
+        fan = s.fan_reference_w * (ratio / s.fan_reference_ratio) ** s.fan_power_exponent
+        on = powered[self.rack]
+        return (
+            on * cpu_w(self.config, self.full_w, self.idle_w, on_curve_c, load),
+            on * breath[self.rack] * fan,
+            on * breath[self.rack] * self.full_m3s * ratio,
+        )
+
+
+def path_lengths_m(hall: HallConfig) -> F64:
+    """Shortest way from the exhaust of rack i to the inlet of rack j, (R, R) as [j, i]."""
+    m = hall.layout
+    row_y = [0.0]
+    for row in range(1, hall.rows):
+        aisle = m.cold_aisle_m if row % 2 else m.hot_aisle_m
+        row_y.append(row_y[-1] + m.rack_depth_m + aisle)
+    places = [
+        ((k + 0.5) * m.rack_pitch_m, row_y[row], 1 if row % 2 == 0 else -1)
+        for row in range(hall.rows)
+        for k in range(hall.racks_per_row)
+    ]
+    ends = (0.0, hall.racks_per_row * m.rack_pitch_m)
+    half = m.rack_depth_m / 2
+    out = np.empty((hall.racks, hall.racks))
+    for j, (xj, yj, facing) in enumerate(places):
+        for i, (xi, yi, other) in enumerate(places):
+            across = abs((yj + facing * half) - (yi - other * half))
+            over = m.rack_height_m + float(np.hypot(xj - xi, across))
+            around = min(abs(xi - end) + abs(xj - end) for end in ends) + across
+            out[j, i] = min(over, around)
+    return out
+
+
+def layout_weights(hall: HallConfig) -> F64:
+    """w of the layout, (R, R): rows sum to 1, those of large halls without the smallest."""
+    weight = np.exp(-path_lengths_m(hall) / hall.recirculation.decay_m)
+    if hall.racks > 64:
+        weight[weight < hall.recirculation.cutoff * _amid_the_hall(hall)] = 0.0
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+
+
+def _amid_the_hall(hall: HallConfig) -> float:
+    """Sum of the weights that a rack in the middle of the hall collects."""
+    per_row, middle = hall.racks_per_row, hall.racks_per_row // 2
+    sums = []
+    for parity in (0, 1):
+        # A hall with that row in its middle, extended by whole pairs of rows.
+        before = hall.rows // 2
+        shift = before + (before + parity) % 2
+        wide = hall.model_copy(update={"rows": shift + hall.rows - before})
+        d = path_lengths_m(wide)[shift * per_row + middle]
+        d = d[(shift - before) * per_row :]
+        sums.append(float(np.exp(-d / hall.recirculation.decay_m).sum()))
+    return max(sums)
+
+
+def _supply_shares(config: DataCenterConfig) -> F64:
+    """Share of every CRAC unit in the supply of each rack, (R, U)."""
+    hall, crac, m = config.hall, config.hvac.crac, config.hall.layout
+    if crac.unit_shares is not None:
+        return np.array(crac.unit_shares)
+    length_m = hall.racks_per_row * m.rack_pitch_m + 2 * m.end_margin_m
+    row_y = [m.side_margin_m + m.rack_depth_m / 2]
+    for row in range(1, hall.rows):
+        aisle = m.cold_aisle_m if row % 2 else m.hot_aisle_m
+        row_y.append(row_y[-1] + m.rack_depth_m + aisle)
+    width_m = row_y[-1] + m.rack_depth_m / 2 + m.side_margin_m
+    out = np.empty((hall.racks, crac.units))
+    for j in range(hall.racks):
+        row, k = divmod(j, hall.racks_per_row)
+        x = m.end_margin_m + (k + 0.5) * m.rack_pitch_m
+        y = row_y[row] + (0.5 if row % 2 == 0 else -0.5) * m.rack_depth_m
+        for u in range(crac.units):
+            on_wall = len(range(u % 2, crac.units, 2))
+            unit_y = (u // 2 + 0.5) * width_m / on_wall
+            unit_x = length_m if u % 2 else 0.0
+            out[j, u] = np.exp(-np.hypot(x - unit_x, y - unit_y) / crac.supply_length_m)
+    return np.asarray(out / out.sum(axis=1, keepdims=True))
+
+
+def calibrated(config: DataCenterConfig, matrix: F64 | None = None) -> HallTwin:
+    """A hall at its design point; ``matrix`` is the R of a user's file."""
+    hall, s = config.hall, config.servers
+    racks = hall.racks
+    columns: list[F64] = []
+    for index, groups in enumerate(config.rack_groups()):
+        count = [g.count for g in groups]
+        weight = np.repeat([g.load_weight for g in groups], count)
+        servers = len(weight)
+        zones = min(hall.height_zones, servers)
+        ends = [round(servers * (z + 1) / zones) for z in range(zones)]
+        zone = np.array([next(z for z in range(zones) if n < ends[z]) for n in range(servers)])
+        level = (2 * zone + 1) / zones - 1.0
+        full_w, idle_w = (np.repeat([float(getattr(g, n)) for g in groups], count) for n in POWERS)
+        columns.append(
+            np.stack(
+                [
+                    np.full(servers, float(index)),
+                    full_w,
+                    idle_w,
+                    weight / weight.mean() - 1.0,
+                    1.0 + hall.height_gradient * level,
+                ]
+            )
+        )
+    rack_number, full_w, idle_w, deviation, raw_height = np.concatenate(columns, axis=1)
+    rack = rack_number.astype(np.int64)
+    air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
+    supply_c = config.hvac.setpoint.max_c
+    twin = HallTwin(
+        config, rack, full_w, idle_w, deviation, raw_height, np.zeros((racks, racks)),
+        np.zeros(racks), 1.0, _supply_shares(config), np.zeros(0), 1.0, 1.0, air,
+        air * _air_m3(hall) / racks,
+    )  # fmt: skip
+    approach_k = np.broadcast_to(np.asarray(hall.supply_approach_k, np.float64), (racks,)).copy()
+    load, on = np.ones(len(rack)), np.ones(racks)
+
+    def design(approach_k: F64) -> tuple[F64, F64, F64, F64, float]:
+        """Height factor (S,), and airflow, IT power, outlet rise (R,), and full airflow."""
+        height = raw_height
+        for _ in range(300):
+            inlet_c = supply_c + approach_k[rack] * height
+            ratio = twin.servers(inlet_c, load, on, on)[2]
+            mean = twin.per_rack(ratio * raw_height) / twin.per_rack(ratio)
+            height = raw_height / mean[rack]
+        inlet_c = supply_c + approach_k[rack] * height
+        cpu, fan, ratio = twin.servers(inlet_c, load, on, on)
+        it_w, moved = twin.per_rack(cpu + fan), twin.per_rack(ratio)
+        full_m3s = s.fan_full_airflow_m3s
+        if full_m3s is None:
+            given = np.asarray(hall.supply_approach_k, np.float64)
+            rise_k = 1.0 / (air * config.hvac.crac.supply_m3s_per_w) - (
+                np.broadcast_to(given, (racks,)).mean()
+                + np.broadcast_to(np.asarray(hall.return_approach_k, np.float64), (racks,)).mean()
+            )
+            full_m3s = float(np.mean(it_w / moved)) / (air * rise_k)
+        airflow = full_m3s * moved
+        mean_in_k = twin.per_rack(ratio * (inlet_c - supply_c)) / moved
+        return height, airflow, it_w, mean_in_k + it_w / (air * airflow), full_m3s
+
+    weights = layout_weights(hall) if matrix is None else matrix.copy()
+    if matrix is not None:
+        for j in range(racks):
+            total = matrix[j].sum()
+            weights[j] = matrix[j] / total if total > 0 else 1.0 / racks
+    if config.hall.recirculation.calibrate:
+        height, airflow, it_w, rise, full_m3s = design(approach_k)
+        share = approach_k / (weights @ rise)
+    else:
+        assert matrix is not None
+        share = matrix.sum(axis=1)
+        for _ in range(300):
+            height, airflow, it_w, rise, full_m3s = design(approach_k)
+            approach_k = share * (weights @ rise)
+    share = share * (1.0 - hall.layout.containment)
+    crac_m3s = config.hvac.crac.supply_m3s_per_w * float(it_w.sum())
+    fresh_m3s = (1.0 - share) * airflow
+    need = twin.unit_shares.T @ fresh_m3s
+    return replace(
+        twin,
+        captured=share[rack] * height,
+        weights=weights,
+        share=share,
+        fresh_share=min(1.0, float(fresh_m3s.sum()) / crac_m3s),
+        unit_design_m3s=crac_m3s * need / need.sum(),
+        full_m3s=full_m3s,
+        it_airflow_m3s=float(airflow.sum()),
+    )
+
+
+def _air_m3(hall: HallConfig) -> float:
+    m = hall.layout
+    aisles = sum(m.cold_aisle_m if row % 2 else m.hot_aisle_m for row in range(1, hall.rows))
+    width_m = hall.rows * m.rack_depth_m + aisles + 2 * m.side_margin_m
+    length_m = hall.racks_per_row * m.rack_pitch_m + 2 * m.end_margin_m
+    rack_m3 = m.rack_pitch_m * m.rack_depth_m * m.rack_height_m
+    return length_m * width_m * m.ceiling_m - hall.racks * rack_m3
+
+
+@dataclass(frozen=True)
+class Flows:
+    """Where the air of a hall goes, m3/s."""
+
+    unit: F64
+    """Through each CRAC unit, (U,)."""
+    speed: F64
+    """Of its fan over design speed, (U,)."""
+    fresh_ratio: F64
+    """Share of its racks' need that a unit covers, (U,)."""
+    bypass: F64
+    """From each unit past the racks, (U,)."""
+    from_unit: F64
+    """Share of each server's intake that a unit supplies, (S, U)."""
+    exhaust: F64
+    """Share of each server's intake that is exhaust, (S,)."""
+    captured: F64
+    """Exhaust that each rack takes in, (R,)."""
+
+
+def flows(
+    hall: HallTwin, airflow: F64, low: F64, high: F64, fresh_ratio: F64 | None = None
+) -> Flows:
+    """Mass balance for the airflow of every server; units cover what they can, or a given share."""
+    unit_share = hall.unit_shares[hall.rack]
+    fresh_need = (1.0 - hall.captured) * airflow
+    need = fresh_need @ unit_share
+    speed = np.clip(airflow.sum() / hall.it_airflow_m3s, low, high)
+    unit = hall.unit_design_m3s * speed
+    offered = hall.fresh_share * unit
+    able = np.where(need > offered, offered / np.where(need > 0, need, 1.0), 1.0)
+    covered = able if fresh_ratio is None else fresh_ratio
+    from_unit = (1.0 - hall.captured)[:, None] * unit_share * covered
+    exhaust = 1.0 - from_unit.sum(axis=1)
+    return Flows(
+        unit, speed, able, unit - covered * need, from_unit, exhaust,
+        hall.per_rack(airflow * exhaust),
+    )  # fmt: skip
+
+
+def steady(
+    hall: HallTwin,
+    unit_supply_c: F64,
+    load: F64,
+    *,
+    low: F64,
+    high: F64,
+    powered: F64 | None = None,
+    breath: F64 | None = None,
+) -> Twin:
+    """Temperatures that reproduce themselves, with a dense solve for the outlets in each round.
+
+    Args:
+        hall: the hall.
+        unit_supply_c: supply air, (U,).
+        load: load of every server, (S,).
+        low: lowest fan speed of every unit, (U,).
+        high: highest fan speed of every unit, (U,).
+        powered: share of the step that each rack is on, (R,).
+        breath: airflow left to the fans of each rack, (R,).
+    """
+    racks, rack, air = len(hall.share), hall.rack, hall.air_j_per_m3_k
+    on = np.ones(racks) if powered is None else powered
+    breath = np.ones(racks) if breath is None else breath
+    count = np.bincount(rack)
+    inlet_c = np.full(len(rack), unit_supply_c.mean() + 4.0)
+    for _ in range(20000):
+        cpu, fan, flow = hall.servers(inlet_c, load, on, breath)
+        moved = flows(hall, flow, low, high)
+        rack_flow = hall.per_rack(flow)
+        still = rack_flow == 0
+        part = np.where(still[rack], 1.0 / count[rack], 0.0)
+        part = part + flow / np.where(still, 1.0, rack_flow)[rack]
+        power = hall.per_rack(cpu + fan)
+        rise = np.where(still, 0.0, power / (air * np.where(still, 1.0, rack_flow)))
+        matrix = hall.per_rack(part * moved.exhaust)[:, None] * hall.weights
+        supplied = moved.from_unit @ unit_supply_c
+        outlet_c = np.linalg.solve(np.eye(racks) - matrix, hall.per_rack(part * supplied) + rise)
+        before = inlet_c
+        inlet_c = moved.exhaust * (hall.weights @ outlet_c)[rack] + supplied
+        if np.max(np.abs(inlet_c - before)) < 1e-13 * np.max(np.abs(inlet_c)):
+            break
+    else:
+        raise AssertionError("the twin finds no steady state")
+    heat = cpu + fan
+    blown = flow > 0
+    server_outlet_c = inlet_c + np.where(blown, heat / (air * np.where(blown, flow, 1.0)), 0.0)
+    return_c, left_over = return_air(hall, moved, rack_flow, outlet_c, unit_supply_c)
+    supply_c = float(moved.unit @ unit_supply_c / moved.unit.sum())
+    found = {
+        "cpu_w": hall.per_rack(cpu),
+        "fan_w": hall.per_rack(fan),
+        "airflow_m3s": rack_flow,
+        "inlet_c": hall.per_rack(part * inlet_c),
+        "inlet_max_c": np.array([inlet_c[rack == j].max() for j in range(racks)]),
+        "outlet_c": outlet_c,
+    }
+    dcs = {
+        **_data_center([{k: float(v[j]) for k, v in found.items()} for j in range(racks)]),
+        "hot_k": float(np.maximum(inlet_c - 27.0, 0.0).sum()),
+        "cold_k": float(np.maximum(18.0 - inlet_c, 0.0).sum()),
+        "inlet_m3k_s": float(flow @ (inlet_c - supply_c)),
+        "outlet_m3k_s": float(rack_flow @ (outlet_c - supply_c)),
+        "crac_flow_m3s": float(moved.unit.sum()),
+        "supply_c": supply_c,
+        "return_c": return_c,
+        "least_exhaust_m3s": float(left_over.min()),
+    }
+    return Twin(
+        {"inlet_c": inlet_c, "outlet_c": server_outlet_c, "power_w": heat},
+        found,
+        {name: np.array([value]) for name, value in dcs.items()}
+        | {"unit_flow_m3s": moved.unit, "unit_cubed_speed": moved.speed**3},
+    )
+
+
+def return_air(
+    hall: HallTwin, moved: Flows, rack_flow: F64, outlet_c: F64, unit_supply_c: F64
+) -> tuple[float, F64]:
+    """Return temperature from what no rack takes back, and those flows, (R,)."""
+    left_over = rack_flow - hall.weights.T @ moved.captured
+    warm = left_over @ outlet_c + moved.bypass @ unit_supply_c
+    return float(warm / moved.unit.sum()), left_over
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What a transient hall remembers."""
+
+    server_c: F64
+    """(S,)."""
+    mixed_c: F64
+    """Recirculated air before each rack, (R,), as the next two."""
+    outlet_c: F64
+    captured_m3s: F64
+    fresh_ratio: F64
+    """(U,)."""
+    room_j: float
+
+
+def advance(
+    hall: HallTwin,
+    memory: Memory,
+    setpoint_c: F64,
+    load: F64,
+    *,
+    low: F64,
+    high: F64,
+    running: F64,
+    powered: F64,
+    breath: F64,
+    room_j_per_k: float,
+    limit_w: float,
+    fan_w_per_m3s: float,
+    step_s: float,
+    substeps: int,
+) -> tuple[dict[str, Any], Memory]:
+    """Means over a step and the memory at its end; arguments as in ``steady``."""
+    h, air, s = step_s / substeps, hall.air_j_per_m3_k, hall.config.servers
+    capacity = s.heat_capacity_kj_per_k * 1e3
+    now, parts = memory, []
+    for _ in range(substeps):
+        supply_c = setpoint_c + now.room_j / room_j_per_k
+        target = hall.weights @ now.outlet_c
+        rate = np.maximum(now.captured_m3s * air / hall.parcel_j_per_k, 1.0 / 128.0)
+        mixed_end = target + (now.mixed_c - target) * np.exp(-rate * h)
+        mixed = target + (now.mixed_c - mixed_end) / (rate * h)
+        parcel_w = float(np.sum(mixed_end - now.mixed_c)) * hall.parcel_j_per_k / h
+        # Airflow is not known before the inlets, so the units cover what they did before.
+        covered = (1.0 - hall.captured)[:, None] * hall.unit_shares[hall.rack] * now.fresh_ratio
+        inlet_c = (1.0 - covered.sum(axis=1)) * mixed[hall.rack] + covered @ supply_c
+        cpu, fan, flow = hall.servers(inlet_c, load, powered, breath)
+        moved = flows(hall, flow, low, high, now.fresh_ratio)
+        k = s.heat_exchange_effectiveness * air * flow
+        blown = k > 0
+        tau = capacity / np.where(blown, k, 1.0)
+        final = inlet_c + cpu / np.where(blown, k, 1.0)
+        gone = -np.expm1(-h / tau)
+        mean_c = final + (now.server_c - final) * gone * tau / h
+        to_air = np.where(blown, k * (mean_c - inlet_c), 0.0)
+        warmer = np.where(blown, now.server_c + (final - now.server_c) * gone, now.server_c)
+        # Without air a server keeps its temperature: it draws nothing then.
+        rack_flow = hall.per_rack(flow)
+        still = rack_flow == 0
+        count = np.bincount(hall.rack)
+        carried = hall.per_rack(flow * inlet_c + (to_air + fan) / air)
+        plain = hall.per_rack(inlet_c) / count
+        outlet_c = np.where(still, plain, carried / np.where(still, 1.0, rack_flow))
+        inflow = hall.per_rack(flow * inlet_c) / np.where(still, 1.0, rack_flow)
+        rack_inlet = np.where(still, plain, inflow)
+        captured = hall.per_rack(flow * moved.exhaust)
+        warm = rack_flow @ outlet_c - captured @ mixed - parcel_w / air
+        return_c = float((warm + moved.bypass @ supply_c) / moved.unit.sum())
+        taken = air * moved.unit * (return_c - supply_c)
+        drawn = running * moved.speed**3 * fan_w_per_m3s * hall.unit_design_m3s
+        load_w = float(np.sum(taken + drawn))
+        wanted = float(running @ (taken + drawn)) + (now.room_j / h if running.any() else 0.0)
+        coil_w = min(max(wanted, 0.0), limit_w)
+        parts.append(
+            {
+                "cpu_w": cpu.sum(), "fan_w": fan.sum(), "airflow_m3s": flow.sum(),
+                "inlet_mean_c": rack_inlet.mean(), "outlet_mean_c": outlet_c.mean(),
+                "stored_w": capacity * np.sum(warmer - now.server_c) / h + parcel_w,
+                "crac_flow_m3s": moved.unit.sum(),
+                "supply_c": moved.unit @ supply_c / moved.unit.sum(),
+                "return_c": return_c, "coil_load_w": load_w, "coil_w": coil_w,
+                "unit_flow_m3s": moved.unit, "unit_cubed_speed": running * moved.speed**3,
+                "rack_cpu_w": hall.per_rack(cpu), "rack_fan_w": hall.per_rack(fan),
+                "rack_airflow_m3s": rack_flow, "rack_inlet_c": rack_inlet,
+                "rack_outlet_c": outlet_c,
+                "inlet_max_c": inlet_c.max(),
+            }
+        )  # fmt: skip
+        now = Memory(
+            warmer, mixed_end, outlet_c, captured, moved.fresh_ratio,
+            max(now.room_j + (load_w - coil_w) * h, 0.0),
+        )  # fmt: skip
+    found: dict[str, Any] = {
+        name: sum(p[name] for p in parts) / substeps for name in parts[0] if name != "inlet_max_c"
+    }
+    found["inlet_max_c"] = max(float(p["inlet_max_c"]) for p in parts)
+    return found, now

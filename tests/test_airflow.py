@@ -1,0 +1,342 @@
+"""The layout solver: conservation, limits, symmetry, grid convergence, and bad input."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sdc_taichi import DataCenterConfig, airflow, load_config, runtime
+from sdc_taichi.airflow import LayoutSolution, solve
+from sdc_taichi.airflow_grid import MOST_CELLS, Grid, build_grid
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.layout import floor_plan
+from sdc_taichi.recirculation import design_point
+from sdc_taichi.types import F64
+
+AIR_J_PER_M3_K = 1.225 * 1006.0
+COARSE_M = 0.6
+
+
+def hall_of(rows: int, racks_per_row: int, **layout: Any) -> DataCenterConfig:
+    return load_config(
+        "corrected",
+        [
+            f"hall.rows={rows}",
+            f"hall.racks_per_row={racks_per_row}",
+            "hall.supply_approach_k=5",
+            "hall.return_approach_k=-3",
+            "servers.power_w=[130, 10]",
+            *(f"hall.layout.{name}={value}" for name, value in layout.items()),
+        ],
+    )
+
+
+def solved(
+    config: DataCenterConfig,
+    *,
+    supply: float = 0.86,
+    airflow_m3s: F64 | None = None,
+    rise_k: float | F64 = 12.0,
+    cell_m: float = COARSE_M,
+) -> LayoutSolution:
+    """Solve with ``supply`` as a share of what the racks draw."""
+    flow = np.full(config.hall.racks, 1.8) if airflow_m3s is None else airflow_m3s
+    return solve(
+        config,
+        airflow_m3s=flow,
+        power_w=AIR_J_PER_M3_K * flow * rise_k,
+        supply_m3s=supply * float(flow.sum()),
+        supply_c=20.0,
+        cell_m=cell_m,
+    )
+
+
+def default_at(cell_m: float) -> LayoutSolution:
+    config = load_config("corrected")
+    design = design_point(config)
+    return solve(
+        config,
+        airflow_m3s=design.airflow_m3s,
+        power_w=design.it_w,
+        supply_m3s=design.crac_flow_m3s,
+        supply_c=design.supply_c,
+        cell_m=cell_m,
+    )
+
+
+def dense(grid: Grid, off: F64, diagonal: F64) -> F64:
+    matrix = np.zeros((grid.cells + 1, grid.cells + 1))
+    for face in range(6):
+        matrix[np.arange(grid.cells), grid.beyond[:-1, face]] -= off[: grid.cells, face]
+    matrix[np.arange(grid.cells), np.arange(grid.cells)] += diagonal
+    return matrix[:-1, :-1]
+
+
+# Grid
+
+
+@pytest.mark.parametrize("cell_m", [0.3, 0.45, 0.6, 1.0])
+@pytest.mark.parametrize("rows", [1, 2, 3, 4])
+def test_faces_of_racks_lie_on_faces_of_cells(rows: int, cell_m: float) -> None:
+    config = hall_of(rows, 3, hot_aisle_m=1.7, cold_aisle_m=1.25, side_margin_m=0.9)
+    hall, plan = config.hall, floor_plan(config.hall)
+    x, y, z = build_grid(hall, np.ones(hall.racks), 1.0, cell_m).widths_m
+    lines = [np.concatenate([[0.0], np.cumsum(w)]) for w in (x, y, z)]
+    np.testing.assert_allclose(
+        [line[-1] for line in lines], [plan.length_m, plan.width_m, hall.layout.ceiling_m]
+    )
+
+    def off_the_lines(places: F64, line: F64) -> float:
+        return float(np.abs(places[:, None] - line).min(axis=1).max())
+
+    half = hall.layout.rack_pitch_m / 2
+    assert off_the_lines(np.concatenate([plan.front_m, plan.back_m])[:, 1], lines[1]) < 1e-12
+    assert off_the_lines(plan.centre_m[:, 0] - half, lines[0]) < 1e-12
+    assert off_the_lines(plan.centre_m[:, 0] + half, lines[0]) < 1e-12
+    assert off_the_lines(np.array([hall.layout.rack_height_m]), lines[2]) < 1e-12
+    assert max(x.max(), y.max(), 2 * z.max()) <= cell_m + 1e-12
+
+
+@pytest.mark.parametrize("returns", ["ceiling", "end_wall"])
+def test_given_flows_balance(returns: str) -> None:
+    config = hall_of(3, 2, returns=returns)
+    flow = np.linspace(1.0, 2.0, 6)
+    grid = build_grid(config.hall, flow, 7.0, 0.6)
+    for runs in (grid.fronts, grid.backs):
+        np.testing.assert_allclose(np.add.reduceat(runs.m3s, runs.start[:-1]), flow)
+    assert grid.supply_m3s.sum() == pytest.approx(7.0)
+    assert grid.return_m3s.sum() == pytest.approx(7.0)
+    assert abs(grid.boundary_m3s.sum()) < 1e-12
+    volume = np.prod([w.sum() for w in grid.widths_m])
+    layout = config.hall.layout
+    racks = 6 * layout.rack_pitch_m * layout.rack_depth_m * layout.rack_height_m
+    cells = np.sqrt(np.prod(grid.area_m2[:-1], axis=1)).sum()
+    assert cells == pytest.approx(volume - racks)
+
+
+def test_links_are_mutual_and_containment_narrows_them() -> None:
+    config = hall_of(2, 2)
+    flow = np.ones(4)
+    free = build_grid(config.hall, flow, 3.0, 0.6)
+    cell, face = np.nonzero(free.conductance_m[:-1])
+    there = free.beyond[cell, face]
+    np.testing.assert_array_equal(free.beyond[there, (face + 3) % 6], cell)
+    np.testing.assert_allclose(
+        free.conductance_m[there, (face + 3) % 6], free.conductance_m[cell, face]
+    )
+    shut = build_grid(hall_of(2, 2, containment=0.75).hall, flow, 3.0, 0.6)
+    ratio = shut.conductance_m[cell, face] / free.conductance_m[cell, face]
+    assert set(np.round(ratio, 12)) == {0.25, 1.0}
+
+
+# Flow and tags
+
+
+@settings(max_examples=15)
+@given(
+    rows=st.integers(1, 4),
+    racks=st.integers(1, 3),
+    returns=st.sampled_from(["ceiling", "end_wall"]),
+    containment=st.sampled_from([0.0, 0.5, 1.0]),
+    end_margin_m=st.sampled_from([0.0, 0.7, 1.8]),
+    hot_aisle_m=st.floats(0.5, 2.5),
+    ceiling_m=st.floats(2.3, 4.5),
+    supply=st.floats(0.4, 1.8),
+    seed=st.integers(0, 1000),
+)
+def test_air_and_heat_are_conserved_in_any_hall(
+    rows: int,
+    racks: int,
+    returns: str,
+    containment: float,
+    end_margin_m: float,
+    hot_aisle_m: float,
+    ceiling_m: float,
+    supply: float,
+    seed: int,
+) -> None:
+    config = hall_of(
+        rows,
+        racks,
+        returns=returns,
+        containment=containment,
+        end_margin_m=end_margin_m,
+        hot_aisle_m=hot_aisle_m,
+        ceiling_m=ceiling_m,
+    )
+    rng = np.random.default_rng(seed)
+    flow = rng.uniform(0.5, 2.5, config.hall.racks)
+    rise_k = rng.uniform(2.0, 20.0, config.hall.racks)
+    found = solved(config, supply=supply, airflow_m3s=flow, rise_k=rise_k, cell_m=0.9)
+    assert found.mass_residual < 1e-10
+    assert found.energy_residual < 1e-9
+    assert found.share_residual < 1e-10
+    assert found.direct_difference_k < 1e-8
+    assert found.R.min() >= 0
+    assert found.supply_share.min() >= 0
+    # What racks take of an exhaust is at most that exhaust; the rest returns.
+    assert np.all(flow @ found.R <= flow * (1 + 1e-10))
+    # T_ret - T_sup = P/(rho*cp*V_crac) whatever R is.
+    heat_k = float(flow @ rise_k) / (supply * float(flow.sum()))
+    assert found.return_c - found.supply_c == pytest.approx(heat_k, rel=1e-9)
+    assert found.rti == pytest.approx(100.0 / supply, rel=1e-9)
+    assert found.shi + found.rhi == pytest.approx(1.0)
+    assert np.all(found.approach_k >= 0)
+
+
+def test_kernels_solve_what_a_dense_solver_solves() -> None:
+    """Flow, tags and temperatures against NumPy, with the equations written anew."""
+    config = hall_of(2, 1, end_margin_m=0.6, side_margin_m=0.6, ceiling_m=2.7)
+    flow = np.array([1.5, 2.0])
+    rise_k = np.array([10.0, 14.0])
+    found = solved(config, airflow_m3s=flow, rise_k=rise_k, cell_m=1.0)
+    grid = build_grid(config.hall, flow, 0.86 * float(flow.sum()), 1.0)
+    n = grid.cells
+    conductance, boundary = grid.conductance_m, grid.boundary_m3s[:-1]
+    laplace = dense(grid, conductance, conductance[:-1].sum(axis=1))
+    potential = np.zeros(n + 1)
+    potential[1:-1] = np.linalg.solve(laplace[1:, 1:], -boundary.sum(axis=1)[1:])
+    drop = potential[:-1, None] - np.where(grid.beyond[:-1] < n, potential[grid.beyond[:-1]], 0.0)
+    out = conductance[:-1] * drop
+    through = out + boundary
+    velocity = (through[:, 3:] - through[:, :3]) / (2.0 * grid.area_m2[:-1])
+    speed = np.append(np.linalg.norm(velocity, axis=1), 0.0)
+    mixing = airflow.MIXING_M * (speed[:-1, None] + speed[grid.beyond[:-1]]) / 2.0
+    spread = np.maximum(mixing * conductance[:-1], np.abs(out) / 2.0)
+    diagonal = (spread + out / 2.0).sum(axis=1) + np.maximum(boundary, 0.0).sum(axis=1)
+    transport = dense(grid, spread - out / 2.0, diagonal)
+
+    entering = np.zeros((n, 3))
+    for rack in range(2):
+        run = slice(grid.backs.start[rack], grid.backs.start[rack + 1])
+        np.add.at(entering[:, rack], grid.backs.cell[run], grid.backs.m3s[run])
+    np.add.at(entering[:, 2], grid.supply_cell, grid.supply_m3s)
+    tags = np.linalg.solve(transport, entering)
+    intake = np.zeros((2, n))
+    for rack in range(2):
+        run = slice(grid.fronts.start[rack], grid.fronts.start[rack + 1])
+        np.add.at(intake[rack], grid.fronts.cell[run], grid.fronts.m3s[run] / flow[rack])
+    np.testing.assert_allclose(found.R, (intake @ tags)[:, :2], rtol=1e-9)
+    np.testing.assert_allclose(found.supply_share, (intake @ tags)[:, 2], rtol=1e-9)
+    passing = transport - entering[:, :2] @ intake
+    inlet_k = intake @ np.linalg.solve(passing, entering[:, :2] @ rise_k)
+    np.testing.assert_allclose(found.approach_k, inlet_k, rtol=1e-9)
+
+
+def test_symmetric_hall_gives_symmetric_shares() -> None:
+    found = solved(hall_of(4, 4))
+    place = np.arange(16).reshape(4, 4)
+    for mirror in (place[:, ::-1].ravel(), place[::-1].ravel()):
+        mirrored = found.R[np.ix_(mirror, mirror)]
+        np.testing.assert_allclose(mirrored, found.R, rtol=1e-8, atol=1e-12)
+    assert not np.allclose(found.R, found.R[0, 0])
+
+
+def test_shares_depend_on_ratios_of_flows_alone() -> None:
+    config = hall_of(2, 3)
+    flow = np.linspace(1.0, 2.0, 6)
+    slow = solved(config, airflow_m3s=flow)
+    fast = solved(config, airflow_m3s=10 * flow)
+    np.testing.assert_allclose(fast.R, slow.R, rtol=1e-9)
+    np.testing.assert_allclose(fast.approach_k, slow.approach_k, rtol=1e-9)
+
+
+def test_containment_lowers_recirculation() -> None:
+    shares = [
+        solved(hall_of(4, 3, containment=c), supply=1.1).R.sum(axis=1) for c in (0.0, 0.5, 0.9, 1.0)
+    ]
+    for open_, closed in pairwise(shares):
+        assert np.all(closed < open_)
+    assert shares[-1].max() < 1e-6
+
+
+def test_more_supply_air_lowers_every_inlet() -> None:
+    config = hall_of(4, 3)
+    approach = [solved(config, supply=ratio).approach_k for ratio in (0.6, 0.86, 1.0, 1.3, 2.0)]
+    for less, more in pairwise(approach):
+        assert np.all(more < less)
+
+
+def test_a_rack_breathes_more_of_its_neighbours_than_of_far_racks() -> None:
+    R = solved(hall_of(2, 8)).R
+    own_row = R[0, :8]
+    assert np.all(np.diff(own_row) < 0)
+
+
+def test_too_little_supply_is_made_up_by_exhaust() -> None:
+    """With closed aisles the mean exhaust share is what supply leaves short, exactly."""
+    found = solved(hall_of(4, 3, containment=1.0), supply=0.7)
+    assert found.R.sum(axis=1).mean() == pytest.approx(0.3, abs=1e-3)
+    assert found.R.sum(axis=1).mean() >= 0.3 - 1e-9
+
+
+def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = hall_of(2, 3)
+    first = solved(config)
+    started = runtime.ensure_started()
+    monkeypatch.setattr(runtime, "ensure_started", lambda: started + 3)
+    second = solved(config)
+    assert first.R.tobytes() == second.R.tobytes()
+    assert first.provenance == second.provenance
+
+
+def test_default_hall_is_converged_in_the_grid() -> None:
+    found = {cell_m: default_at(cell_m) for cell_m in (0.6, 0.45, 0.3)}
+    fine = found[0.3].R.sum(axis=1)
+    for solution in found.values():
+        np.testing.assert_allclose(solution.R.sum(axis=1), fine, rtol=0.02)
+        np.testing.assert_allclose(solution.approach_k, found[0.3].approach_k, rtol=0.02)
+        assert solution.mass_residual < 1e-10
+        assert solution.energy_residual < 1e-8
+        assert solution.share_residual < 1e-10
+        assert solution.direct_difference_k < 1e-8
+        assert solution.seconds < 60
+    assert len({solution.cells for solution in found.values()}) == 3
+
+
+# Bad input
+
+
+def test_cell_out_of_range() -> None:
+    for cell_m in (0.0, -0.3, 0.01, 5.0, float("nan")):
+        with pytest.raises(ConfigError, match=r"cell_m .*valid is 0\.05\.\.2 m"):
+            solved(hall_of(1, 1), cell_m=cell_m)
+
+
+def test_too_many_cells() -> None:
+    with pytest.raises(ConfigError, match=rf"makes [0-9,]+ cells; valid is at most {MOST_CELLS:,}"):
+        solved(hall_of(10, 100), cell_m=0.1)
+
+
+def test_too_many_racks() -> None:
+    with pytest.raises(ConfigError, match="10,000 racks; the layout solver takes at most"):
+        solved(hall_of(100, 100), cell_m=2.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"airflow_m3s": np.ones(3)}, r"airflow_m3s has shape \(3,\), expected \(2,\)"),
+        ({"airflow_m3s": np.ones(1)}, r"airflow_m3s has shape \(1,\), expected \(2,\)"),
+        ({"power_w": np.ones((2, 1))}, r"power_w has shape \(2, 1\), expected \(2,\)"),
+        ({"airflow_m3s": np.array([1.0, 0.0])}, r"airflow_m3s\[1\] is 0; valid is .* above 0"),
+        ({"power_w": np.array([np.nan, 1.0])}, r"power_w\[0\] is nan"),
+        ({"supply_m3s": 0.0}, "supply_m3s is 0; valid is a finite number above 0"),
+        ({"supply_m3s": float("inf")}, "supply_m3s is inf"),
+        ({"supply_c": float("nan")}, "supply_c is nan; valid is a finite number"),
+    ],
+)
+def test_bad_design_point(change: dict[str, Any], message: str) -> None:
+    given: dict[str, Any] = {
+        "airflow_m3s": np.ones(2),
+        "power_w": np.ones(2),
+        "supply_m3s": 2.0,
+        "supply_c": 20.0,
+    }
+    with pytest.raises(ConfigError, match=message):
+        solve(hall_of(1, 2), **{**given, **change})

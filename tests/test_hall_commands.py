@@ -1,0 +1,130 @@
+"""``sdc-taichi hall solve``: its report, its file, and its errors."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from sdc_taichi import load_config
+from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.hall_commands import hall_app
+from sdc_taichi.recirculation import calibrate, design_point
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(hall_app, ["solve", *map(str, arguments)])
+
+
+def solved(*arguments: object) -> dict[str, Any]:
+    done = call("--json", "--cell", 0.8, *arguments)
+    assert done.exit_code == 0, done.output
+    report: dict[str, Any] = json.loads(done.stdout)
+    return report
+
+
+def failed(error: type[SdcError], *arguments: object) -> str:
+    done = call(*arguments)
+    assert isinstance(done.exception, error), done.output
+    message = str(done.exception)
+    assert "\n" not in message
+    return message
+
+
+def test_report_and_file_agree(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "hall.npz"
+    report = solved("--out", out)
+    with np.load(out) as file:
+        assert set(file.files) == {"R", "provenance"}
+        R, provenance = file["R"], json.loads(str(file["provenance"]))
+    assert R.shape == (20, 20)
+    assert R.dtype == np.float64
+    np.testing.assert_allclose(R.sum(axis=1), report["recirculated_share"])
+    assert provenance == report["provenance"]
+    assert provenance["cell_m"] == 0.8
+    assert provenance["layout"]["rack_pitch_m"] == 0.6
+    assert list(out.parent.iterdir()) == [out]
+
+    design = design_point(load_config("corrected"))
+    rise_k = design.it_w / (1.225 * 1006 * design.airflow_m3s)
+    inlet_k = np.array(report["approach_k"])
+    np.testing.assert_allclose(inlet_k, R @ (inlet_k + rise_k), rtol=1e-9)
+    rows = inlet_k.reshape(4, 5)
+    assert report["approach_inner_rows_k"] == pytest.approx(rows[1:3].mean())
+    assert report["approach_outer_rows_k"] == pytest.approx(rows[[0, 3]].mean())
+    assert report["energy_residual"] < 1e-8
+    assert report["mass_residual"] < 1e-8
+
+
+def test_equal_runs_write_equal_bytes(tmp_path: Path) -> None:
+    first, second = tmp_path / "a.npz", tmp_path / "b.npz"
+    solved("--out", first)
+    solved("--out", second)
+    assert first.read_bytes() == second.read_bytes()
+    other = solved("--set", "hall.layout.containment=0.5")
+    assert other["provenance"]["layout"]["containment"] == 0.5
+    before = json.loads(str(np.load(first)["provenance"]))
+    assert other["provenance"]["config_sha256"] != before["config_sha256"]
+
+
+def test_the_matrix_serves_as_matrix_file(tmp_path: Path) -> None:
+    out = tmp_path / "hall.npz"
+    solved("--out", out)
+    config = load_config(
+        "corrected",
+        ["hall.inlet_model=recirculation", f"hall.recirculation.matrix_file={out}"],
+    )
+    R = np.load(out)["R"]
+    np.testing.assert_allclose(
+        calibrate(config).exchange.dense(), R / R.sum(axis=1, keepdims=True), rtol=1e-12
+    )
+
+
+def test_printed_report_shows_what_was_found() -> None:
+    text = call("--cell", 0.8).stdout
+    report = solved()
+    assert f"{report['approach_mean_k']:.2f}" in text
+    assert f"SHI {report['shi']:.3f}, RHI {report['rhi']:.3f}" in text
+    assert f"RTI {report['rti']:.1f} %" in text
+    assert f"{report['cells']:,} cells" in text
+    assert "5.30" in text
+    assert "5.00" in text
+    assert re.search(r"energy \d\.\de-1\d", text)
+
+
+def test_a_hall_of_two_rows_has_no_inner_rows() -> None:
+    report = solved("tiny")
+    assert load_config("tiny").hall.rows <= 2
+    assert report["approach_inner_rows_k"] is None
+    assert call("tiny", "--cell", 0.8).exit_code == 0
+
+
+def test_an_existing_file_is_replaced_only_with_force(tmp_path: Path) -> None:
+    out = tmp_path / "hall.npz"
+    out.write_text("precious")
+    assert "exists; choose another name" in failed(ConfigError, "--out", out)
+    assert out.read_text() == "precious"
+    solved("--out", out, "--force")
+    assert np.load(out)["R"].shape == (20, 20)
+
+
+def test_bad_targets(tmp_path: Path) -> None:
+    assert "ends in .npz" in failed(ConfigError, "--out", tmp_path / "hall.csv")
+    folder = tmp_path / "folder.npz"
+    folder.mkdir()
+    assert "is a folder" in failed(ConfigError, "--out", folder, "--force")
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    message = failed(SdcError, "tiny", "--cell", 1, "--out", blocked / "hall.npz")
+    assert "cannot be written" in message
+
+
+def test_bad_values_are_named() -> None:
+    assert "cell_m 9" in failed(ConfigError, "--cell", 9)
+    assert "hall.layout.rack_pitch_m" in failed(ConfigError, "--set", "hall.layout.rack_pitch_m=0")
+    assert "no_such_preset" in failed(ConfigError, "no_such_preset")

@@ -1,0 +1,322 @@
+"""Floor plan of a hall to scale, racks coloured by their inlets at the design point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.hall_description import DesignHall, at_design
+from sdc_taichi.types import F64
+
+from .figures import BLUE, GREY, ORANGE, SKY, _colour_range, _figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LONG_SIDE_IN = 11.0
+SHORT_SIDE_IN = (2.2, 8.0)
+"""Least and largest height of the plan; a hall beyond them is stretched, and the axis says so."""
+MOST_STRETCH = 1.02
+RACK_LABEL_PX = (34.0, 15.0)
+"""Room that the number in a rack needs, width and height."""
+LINE_LABEL_PX = 13.0
+"""Height of a line of text."""
+UNIT_SIZE_M = (0.9, 2.0)
+"""Symbol of a CRAC unit, off the wall and along it."""
+_DPI = 100.0
+
+
+def draw(hall: DataCenterConfig | DesignHall) -> Figure:
+    """Walls, rows, aisles, floor tiles, returns and CRAC units, to scale.
+
+    The longer side of the room runs to the right. Labels that would not fit are left out.
+
+    Args:
+        hall: a data center, or what ``hall_description.at_design`` found of it.
+
+    Raises:
+        SdcError: matplotlib is missing, or the hall cannot be solved.
+    """
+    figure = _figure(1.0, 1.0)
+    found = at_design(hall) if isinstance(hall, DataCenterConfig) else hall
+    _Drawing(found, figure).draw()
+    return figure
+
+
+class _Drawing:
+    """One plan: what lies where on the page."""
+
+    def __init__(self, found: DesignHall, figure: Figure) -> None:
+        self._found, self._figure = found, figure
+        self._hall, self._size = found.config.hall, found.config.hall.layout
+        plan = found.plan
+        room = (plan.length_m, plan.width_m)
+        self._turned = plan.width_m > plan.length_m
+        self._room = room[::-1] if self._turned else room
+        # Units stand outside the end walls, so that the room is drawn clear; large halls get
+        # larger symbols.
+        deep, wide = self._room[::-1] if self._turned else self._room
+        self._unit_m = (
+            max(UNIT_SIZE_M[0], (0.15 if self._turned else 0.02) * deep),
+            max(UNIT_SIZE_M[1], 0.02 * wide),
+        )
+        near = 1.3 * self._unit_m[0]
+        far = near if len(found.unit_m3s) > 1 else 0.3 * near
+        # Left and right, then top and bottom of the page.
+        rims = ((0.3 * near, 0.3 * near), (near, far))
+        self._rims = rims if self._turned else rims[::-1]
+        wide, high = (r + sum(m) for r, m in zip(self._room, self._rims, strict=True))
+        high_in = float(np.clip(LONG_SIDE_IN * high / wide, *SHORT_SIDE_IN))
+        wide_in = min(LONG_SIDE_IN, high_in * wide / high)
+        self._stretch = (high_in / high) / (wide_in / wide)
+        self._px_per_m = (_DPI * wide_in / wide, _DPI * high_in / high)
+        figure.set_size_inches(wide_in + 1.9, high_in + 1.3)
+
+    def draw(self) -> None:
+        from matplotlib.ticker import MaxNLocator
+
+        axes = self._figure.subplots()
+        axes.set_aspect(self._stretch)
+        (left, right), (top, bottom) = self._rims
+        axes.set_xlim(-left, self._room[0] + right)
+        axes.set_ylim(self._room[1] + bottom, -top)
+        for axis, length_m in zip((axes.xaxis, axes.yaxis), self._room, strict=True):
+            ticks = MaxNLocator(8, steps=[1, 2, 5, 10]).tick_values(0.0, length_m)
+            axis.set_ticks([t for t in ticks if 0.0 <= t <= length_m])
+        self._draw_aisles(axes)
+        self._draw_racks(axes)
+        self._draw_walls(axes)
+        self._draw_units(axes)
+        self._write(axes)
+
+    def _place(self, x: float, y: float) -> tuple[float, float]:
+        """Coordinates on the page."""
+        return (float(y), float(x)) if self._turned else (float(x), float(y))
+
+    def _box(self, x0: float, x1: float, y0: float, y1: float) -> list[tuple[float, float]]:
+        corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+        return [(y, x) for x, y in corners] if self._turned else list(corners)
+
+    def _fits(self, x_m: float, y_m: float, px: tuple[float, float]) -> bool:
+        across, up = (y_m, x_m) if self._turned else (x_m, y_m)
+        return across * self._px_per_m[0] >= px[0] and up * self._px_per_m[1] >= px[1]
+
+    def _draw_aisles(self, axes: Axes) -> None:
+        """Tint the aisles; tiles lie in the cold ones, ceiling grilles above the hot ones."""
+        from matplotlib.collections import PolyCollection
+
+        hall, plan, depth = self._hall, self._found.plan, self._size.rack_depth_m
+        row_y = plan.centre_m[:: hall.racks_per_row, 1]
+        low = np.concatenate([[0.0], row_y + depth / 2])
+        high = np.concatenate([row_y - depth / 2, [plan.width_m]])
+        x0, x1 = plan.row_ends_m
+        ceiling = self._size.returns == "ceiling"
+        for first, name, colour in ((0, "hot aisle", ORANGE), (1, "cold aisle", SKY)):
+            mine = range(first, len(low), 2)
+            boxes = [self._box(x0, x1, low[i], high[i]) for i in mine]
+            tint = PolyCollection(boxes, facecolor=colour, alpha=0.22, edgecolor="none")
+            axes.add_collection(tint)
+            if name == "cold aisle" or ceiling:
+                pitch = self._size.rack_pitch_m
+                if self._fits(pitch, pitch, (9.0, 9.0)):
+                    self._draw_openings(axes, low[first::2], high[first::2], name, colour)
+            for i in mine:
+                self._label_aisle(axes, name, float(low[i]), float(high[i]))
+
+    def _draw_openings(self, axes: Axes, low: F64, high: F64, name: str, colour: str) -> None:
+        from matplotlib.collections import LineCollection
+
+        x0, x1 = self._found.plan.row_ends_m
+        cuts = x0 + self._size.rack_pitch_m * np.arange(self._hall.racks_per_row + 1)
+        lines = []
+        for y0, y1 in zip(low, high, strict=True):
+            middle = (y0 + y1) / 2
+            lines += [[self._place(x, y0), self._place(x, y1)] for x in cuts]
+            lines.append([self._place(x0, middle), self._place(x1, middle)])
+        style = "solid" if name == "cold aisle" else "dotted"
+        axes.add_collection(
+            LineCollection(lines, colors=colour, linewidths=0.7, linestyles=style, alpha=0.9)
+        )
+
+    def _label_aisle(self, axes: Axes, name: str, y0: float, y1: float) -> None:
+        x0, x1 = self._found.plan.row_ends_m
+        along_px = (x1 - x0) * self._px_per_m[1 if self._turned else 0]
+        across_px = (y1 - y0) * self._px_per_m[0 if self._turned else 1]
+        if across_px < LINE_LABEL_PX or along_px < 75.0:
+            return
+        axes.text(
+            *self._place((x0 + x1) / 2, (y0 + y1) / 2),
+            name,
+            ha="center",
+            va="center",
+            fontsize=9,
+            rotation=90 if self._turned else 0,
+            bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5},
+        )
+
+    def _draw_racks(self, axes: Axes) -> None:
+        from matplotlib.collections import LineCollection, PolyCollection
+        from matplotlib.ticker import MaxNLocator
+
+        found, plan, size = self._found, self._found.plan, self._size
+        half = np.array([size.rack_pitch_m / 2, size.rack_depth_m / 2])
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        boxes = plan.centre_m[:, None] + corners * half
+        edged = self._fits(size.rack_pitch_m, size.rack_depth_m, (8.0, 8.0))
+        low, high = _colour_range(found.inlet_c)
+        racks = PolyCollection(
+            boxes[..., ::-1] if self._turned else boxes,
+            array=found.inlet_c,
+            cmap="inferno",
+            clim=(low, high),
+            edgecolor="white" if edged else "face",
+            linewidth=0.8 if edged else 0.1,
+        )
+        axes.add_collection(racks)
+        # Fronts lie in a line along each row.
+        front_y = plan.front_m[:: self._hall.racks_per_row, 1]
+        ends = plan.row_ends_m
+        thick = float(np.clip(0.06 * self._px_per_m[0 if self._turned else 1], 0.3, 3.5))
+        axes.add_collection(
+            LineCollection(
+                [[self._place(x, y) for x in ends] for y in front_y],
+                colors=BLUE,
+                linewidths=thick,
+                label="front (inlet) of the racks",
+            )
+        )
+        if self._fits(size.rack_pitch_m, size.rack_depth_m, RACK_LABEL_PX):
+            for rack, value in enumerate(found.inlet_c):
+                ink = "black" if value > (low + high) / 2 else "white"
+                where = self._place(*plan.centre_m[rack])
+                axes.text(*where, f"{value:.1f}", color=ink, ha="center", va="center", fontsize=9)
+        self._mark_hottest(axes, boxes[found.hottest_rack])
+        self._figure.colorbar(
+            racks,
+            ax=axes,
+            label="rack inlet at the design point (°C)",
+            ticks=MaxNLocator(6, steps=[1, 2, 5, 10]),
+            shrink=0.85,
+            pad=0.01,
+        )
+
+    def _mark_hottest(self, axes: Axes, corners: F64) -> None:
+        """Outline the rack, or ring it where it is too small."""
+        from matplotlib.patches import Polygon
+
+        found = self._found
+        label = f"hottest server, {found.inlet_max_c.max():.1f} °C"
+        if self._fits(self._size.rack_pitch_m, self._size.rack_depth_m, (16.0, 16.0)):
+            box = 0.92 * corners + 0.08 * corners.mean(axis=0)
+            axes.add_patch(
+                Polygon(
+                    box[:, ::-1] if self._turned else box,
+                    fill=False, edgecolor=SKY, linewidth=3.0, zorder=3, label=label,
+                )
+            )  # fmt: skip
+            return
+        where = self._place(*corners.mean(axis=0))
+        axes.plot(*where, "o", color=SKY, markersize=13, mfc="none", mew=2.2, ls="none",
+                  label=label)  # fmt: skip
+
+    def _draw_walls(self, axes: Axes) -> None:
+        from matplotlib.collections import PolyCollection
+
+        plan = self._found.plan
+        room = self._box(0.0, plan.length_m, 0.0, plan.width_m)
+        axes.add_collection(
+            PolyCollection([room], facecolor="none", edgecolor="black", linewidth=2.0)
+        )
+        if self._size.returns != "end_wall":
+            return
+        for n, x in enumerate((0.0, plan.length_m)):
+            a, b = self._place(x, 0.0), self._place(x, plan.width_m)
+            axes.plot(
+                [a[0], b[0]], [a[1], b[1]], color=ORANGE, linewidth=4.5, linestyle=(0, (2, 1)),
+                label=None if n else "return grilles in the end walls",
+            )  # fmt: skip
+
+    def _draw_units(self, axes: Axes) -> None:
+        from matplotlib.collections import PolyCollection
+
+        found, plan = self._found, self._found.plan
+        depth, wide = self._unit_m
+        units = len(found.unit_m3s)
+        wide = min(wide, 0.8 * plan.width_m / max((units + 1) // 2, 1))
+        boxes, labels = [], []
+        for unit, (x, y) in enumerate(found.unit_places_m):
+            away = -depth if x == 0.0 else depth
+            boxes.append(self._box(x, x + away, y - wide / 2, y + wide / 2))
+            labels.append((unit, self._place(x + away / 2, y)))
+        axes.add_collection(
+            PolyCollection(
+                boxes, facecolor="#DDDDDD", edgecolor="black", linewidth=1.0, label="CRAC unit"
+            )
+        )
+        whole = self._fits(depth, wide, (72.0, 28.0) if self._turned else (28.0, 72.0))
+        brief = self._fits(depth, wide, (16.0, 12.0))
+        for unit, (x, y) in labels:
+            if not brief:
+                break
+            text = f"CRAC {unit}\n{_short(found.unit_m3s[unit])} m³/s" if whole else f"{unit}"
+            axes.text(
+                x, y, text, ha="center", va="center", fontsize=7.5,
+                rotation=0 if self._turned or not whole else 90,
+            )  # fmt: skip
+
+    def _write(self, axes: Axes) -> None:
+        found, hall = self._found, self._hall
+        names: list[Callable[..., object]] = [axes.set_xlabel, axes.set_ylabel]
+        words = ["y, across the rows (m)", "x, along the rows (m)"]
+        if not self._turned:
+            words = words[::-1]
+        if not 1 / MOST_STRETCH < self._stretch < MOST_STRETCH:
+            words[1] += f"\nstretched {self._stretch:.1f} times"
+        for name, text in zip(names, words, strict=True):
+            name(text)
+        axes.spines[:].set_visible(False)
+        row_y = found.plan.centre_m[:: hall.racks_per_row, 1]
+        self._label_rows(axes, row_y)
+        flow = found.unit_m3s.sum()
+        axes.set_title(
+            f"{found.config.name}: {hall.rows} rows of {hall.racks_per_row} racks, "
+            f"{found.plan.length_m:.4g} x {found.plan.width_m:.4g} m, "
+            f"{found.it_w.sum() / 1e3:,.0f} kW IT, {_short(flow)} m³/s supply "
+            f"at {found.supply_c:g} °C",
+            fontsize=10,
+            loc="left",
+            pad=22,
+        )
+        axes.legend(
+            loc="lower left",
+            bbox_to_anchor=(0, 1),
+            ncols=4,
+            fontsize=8.5,
+            frameon=False,
+            borderaxespad=0.2,
+            handlelength=1.6,
+        )
+
+    def _label_rows(self, axes: Axes, row_y: F64) -> None:
+        """Row numbers beside the row ends, as many as fit."""
+        per_m = self._px_per_m[0 if self._turned else 1]
+        if self._size.end_margin_m * self._px_per_m[1 if self._turned else 0] < 16.0:
+            return
+        gap_m = float(row_y[-1] - row_y[0]) / max(len(row_y) - 1, 1)
+        every = 1 if len(row_y) == 1 else int(np.ceil(max(1.0, 22.0 / max(gap_m * per_m, 1e-9))))
+        x = self._found.plan.row_ends_m[0] - 0.15 * self._size.end_margin_m
+        for row in range(0, len(row_y), every):
+            u, v = self._place(x, row_y[row])
+            axes.text(
+                u, v, f"row {row}" if gap_m * per_m > 40.0 else f"{row}",
+                ha="center" if self._turned else "right", va="bottom" if self._turned else "center",
+                fontsize=8, color=GREY,
+            )  # fmt: skip
+
+
+def _short(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"
