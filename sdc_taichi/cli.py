@@ -14,6 +14,7 @@ import typer
 import typer.core
 
 import sdc_taichi
+from sdc_taichi.command_options import Overrides, Source, read_config
 from sdc_taichi.config import (
     DataCenterConfig,
     first_step_day,
@@ -22,6 +23,7 @@ from sdc_taichi.config import (
 )
 from sdc_taichi.data_commands import data_app
 from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.hall_commands import hall_app
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -33,6 +35,9 @@ EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 MAX_DCS = 100_000
 TABLE_DCS = 12
 """Up to this many data centers have a column of their own in the summary."""
+
+EVENT_LINES = 8
+"""Up to this many events are listed in the summary."""
 
 _SUMMARY = (
     ("IT energy (kWh)", "it_kwh"),
@@ -51,6 +56,13 @@ _SUMMARY = (
     ("overdue (task hours)", "overdue_task_h"),
     ("hottest inlet (C)", "hottest_inlet_c"),
     ("inlet above 27 C (h)", "inlet_above_27_h"),
+    ("inlet over 27 C (degree hours per server)", "over_27_degree_h"),
+    ("SHI", "shi"),
+    ("RTI (%)", "rti_pct"),
+    ("RCI hi (%)", "rci_hi_pct"),
+    ("RCI lo (%)", "rci_lo_pct"),
+    ("lost (tasks)", "lost_tasks"),
+    ("unserved energy (kWh)", "unserved_kwh"),
     ("battery throughput (kWh)", "battery_throughput_kwh"),
 )
 
@@ -80,19 +92,8 @@ app = typer.Typer(
 config_app = typer.Typer(help="Show and check configurations.", no_args_is_help=True)
 app.add_typer(config_app, name="config")
 app.add_typer(data_app, name="data")
+app.add_typer(hall_app, name="hall")
 
-Source = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="[PRESET|FILE] [A.B=C]...",
-        help="Preset, YAML file or SustainDC dc_config.json, and overrides of its fields.",
-        show_default=False,
-    ),
-]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="A.B=C", help="Override a field of the config; repeatable."),
-]
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")]
 
 
@@ -194,7 +195,7 @@ def simulate(
     from sdc_taichi.run import Asked, prepare_folder, record, report_json
     from sdc_taichi.sim import Simulator
 
-    base, label = _read_config(source, overrides)
+    base, label = read_config(source, overrides)
     configs = _data_centers(base, site, start, dcs, sample, seed)
     configs = _with_files(configs, _site_names(site), weather, carbon, workload)
     fleet = build_fleet(configs)
@@ -237,7 +238,7 @@ def simulate(
 @config_app.command("show")
 def show_config(source: Source = None, overrides: Overrides = None) -> None:
     """Print a configuration in full, as YAML that can be read back."""
-    config, _ = _read_config(source, overrides)
+    config, _ = read_config(source, overrides)
     print(config.to_yaml(), end="")
 
 
@@ -247,7 +248,7 @@ def check_config(source: Source = None, overrides: Overrides = None) -> None:
     from sdc_taichi.drivers import load_drivers
     from sdc_taichi.fleet import build_fleet
 
-    config, label = _read_config(source, overrides)
+    config, label = read_config(source, overrides)
     fleet = build_fleet(config)
     drivers = load_drivers(fleet.configs)
     for note in drivers.notes:
@@ -282,22 +283,6 @@ def _report_error(error: Exception) -> int:
     if line:
         print(f"error: {line}", file=sys.stderr)
     return code
-
-
-def _read_config(
-    source: list[str] | None, overrides: list[str] | None
-) -> tuple[DataCenterConfig, str]:
-    """The config and the name of its preset or file, from arguments in any order."""
-    given = source or []
-    files = [text for text in given if "=" not in text or Path(text).is_file()]
-    if len(files) > 1:
-        raise ConfigError(
-            f"{files[1]!r}: a second preset or file after {files[0]!r}; valid is one, and "
-            "overrides section.key=value"
-        )
-    assigned = [text for text in given if text not in files]
-    name = files[0] if files else "corrected"
-    return load_config(name, [*(overrides or []), *assigned]), name
 
 
 def _site_names(site: str | None) -> list[str]:
@@ -486,6 +471,9 @@ def _print_summary(report: dict[str, Any], label: str, folder: Path, steps_per_h
     if len(dcs) > TABLE_DCS or console.measure(table).maximum > console.width:
         table = _aggregate_table(report)
     console.print(table)
+    console.print(_hottest_line(report))
+    for line in _event_lines(report):
+        console.print(line)
     if report["synthetic"]:
         console.print("These figures rest on SYNTHETIC inputs, not on measurements:")
     sources = dict.fromkeys(
@@ -497,6 +485,32 @@ def _print_summary(report: dict[str, Any], label: str, folder: Path, steps_per_h
         console.print(f"  and {len(sources) - TABLE_DCS} more, see metrics.json")
     config_file = "config.yaml" if len(dcs) == 1 else "configs.yaml"
     console.print(f"Files in {folder}: steps.parquet, metrics.json, {config_file}")
+
+
+def _hottest_line(report: dict[str, Any]) -> str:
+    total = report["total"]
+    where = f"{total['hottest_dc']}, " if len(report["data_centers"]) > 1 else ""
+    return (
+        f"Hottest inlet: {total['hottest_inlet_c']:.1f} C at {where}row {total['hottest_row']}, rack "
+        f"{total['hottest_rack']}, server {total['hottest_server']} from the floor, step "
+        f"{total['hottest_step']}"
+    )
+
+
+def _event_lines(report: dict[str, Any]) -> list[str]:
+    lines = []
+    for dc in report["data_centers"]:
+        for event in dc["events"]:
+            target = f" {event['target']}" if "target" in event else ""
+            amount = f", {event['share']:.0%} left" if "share" in event else ""
+            amount += f", {event['offset_k']:+g} K" if "offset_k" in event else ""
+            lines.append(
+                f"Event: {dc['name']}: {event['kind']}{target}{amount}, steps "
+                f"{event['start_step']}..{event['end_step'] - 1}"
+            )
+    if len(lines) > EVENT_LINES:
+        lines[EVENT_LINES:] = [f"and {len(lines) - EVENT_LINES} more events, see metrics.json"]
+    return lines
 
 
 def _per_dc_table(report: dict[str, Any]) -> Table:

@@ -198,13 +198,14 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     # One queue array serves the fleet; ages are read off its length.
     _shared(listed, "workload.age_horizon_h")
     _check_names(listed)
-    # Copies share their hall, server and HVAC sections, which are laid out once.
-    cache: dict[tuple[int, int, int], _HallArrays] = {}
+    # Data centers that share these sections share one hall, which is laid out once.
+    cache: dict[Any, _HallArrays] = {}
+    halls = []
     for config in listed:
-        key = (id(config.hall), id(config.servers), id(config.hvac))
+        key = (config.hall, config.servers, config.hvac)
         if key not in cache:
             cache[key] = _hall_arrays(config)
-    halls = [cache[id(c.hall), id(c.servers), id(c.hvac)] for c in listed]
+        halls.append(cache[key])
     racks = np.array([len(h.groups_per_rack) for h in halls])
     return Fleet(
         configs=listed,

@@ -12,7 +12,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from sdc_taichi.config import DataCenterConfig, load_config
+from sdc_taichi.command_options import Overrides, Source, read_config
+from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.types import F64
 
@@ -30,12 +31,7 @@ def _hall() -> None:
 
 @hall_app.command("solve")
 def solve_hall(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="[PRESET|FILE]", help="Preset, YAML file or SustainDC dc_config.json."
-        ),
-    ] = "corrected",
+    source: Source = None,
     cell: Annotated[float, typer.Option(metavar="M", help="Longest cell of the grid.")] = 0.3,
     out: Annotated[
         Path | None,
@@ -43,10 +39,7 @@ def solve_hall(
             metavar="FILE.npz", help="Write R and its provenance, for recirculation.matrix_file."
         ),
     ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="A.B=C", help="Override a field of the config; repeatable."),
-    ] = None,
+    overrides: Overrides = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
@@ -57,7 +50,7 @@ def solve_hall(
     """
     if out is not None:
         _check_target(out, force=force)
-    config = load_config(source, overrides or [])
+    config, _ = read_config(source, overrides)
     solution = _solve(config, cell)
     if out is not None:
         _write_npz(out, solution)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from dataclasses import dataclass
@@ -355,4 +356,6 @@ def _write_png(out: Path, found: DesignHall) -> None:
     except OSError as error:
         raise SdcError(f"{out}: cannot be written: {error.strerror or error}") from error
     finally:
-        part.unlink(missing_ok=True)
+        # Below a path that is no folder there is nothing to delete, and that fails too.
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)

@@ -14,6 +14,9 @@ Definitions (PUE, CUE and WUE after The Green Grid, white papers 49, 32 and 35):
     wue_l_per_kwh    make-up water / IT
     cue_kg_per_kwh   cfp_kg / IT, cfp_kg being grid energy times carbon intensity, step by step
     battery_throughput_kwh  energy delivered, as warranties count it
+    over_27_degree_h  what inlets exceed 27 C by, summed over time, mean over the servers
+    shi, rhi, rti_pct, rci_hi_pct, rci_lo_pct  means over the steps (see ``air_metrics``)
+    rci_hi_min_pct  the same of the worst step
 
 A ratio without IT energy is None.
 """
@@ -48,7 +51,18 @@ _SUMMED = (
     "chiller_w",
     "tower_fan_w",
     "unmet_w",
+    "lost_tasks",
+    "unserved_kwh",
+    "hot_k",
+    "throttled_racks",
+    "tripped_racks",
+    "shi",
+    "rti_pct",
+    "rci_hi_pct",
+    "rci_lo_pct",
 )
+_MEAN = ("shi", "rti_pct", "rci_hi_pct", "rci_lo_pct")
+"""Reported as means over the steps."""
 
 
 @dataclass(slots=True)
@@ -66,7 +80,10 @@ class Totals:
     hottest_inlet_c: F64
     hottest_rack: I64
     """Rack of the hottest inlet, counted from 0 in its data center, (B,)."""
+    hottest_server: I64
+    """Server of the hottest inlet, counted from the floor of its rack, (B,)."""
     hottest_step: I64
+    rci_hi_min_pct: F64
 
 
 def begin(size: int, step_h: float) -> Totals:
@@ -85,11 +102,13 @@ def begin(size: int, step_h: float) -> Totals:
         overdue_max_tasks=np.zeros(size),
         hottest_inlet_c=np.full(size, -np.inf),
         hottest_rack=np.zeros(size, dtype=np.int64),
+        hottest_server=np.zeros(size, dtype=np.int64),
         hottest_step=np.zeros(size, dtype=np.int64),
+        rci_hi_min_pct=np.full(size, np.inf),
     )
 
 
-def add(totals: Totals, result: StepResult, fleet: Fleet) -> None:
+def add(totals: Totals, result: StepResult) -> None:
     """Add one step to the totals, in place."""
     totals.steps += 1
     for name, total in totals.sums.items():
@@ -100,9 +119,9 @@ def add(totals: Totals, result: StepResult, fleet: Fleet) -> None:
     hotter = np.flatnonzero(result.inlet_max_c > totals.hottest_inlet_c)
     totals.hottest_inlet_c[hotter] = result.inlet_max_c[hotter]
     totals.hottest_step[hotter] = result.step
-    for dc in hotter:
-        racks = result.rack_inlet_max_c[fleet.rack_start[dc] : fleet.rack_start[dc + 1]]
-        totals.hottest_rack[dc] = int(np.argmax(racks))
+    totals.hottest_rack[hotter] = result.hottest_rack[hotter]
+    totals.hottest_server[hotter] = result.hottest_server[hotter]
+    np.minimum(totals.rci_hi_min_pct, result.rci_hi_pct, out=totals.rci_hi_min_pct)
 
 
 def per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
@@ -120,7 +139,10 @@ def per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
                 "overdue_max_tasks": float(totals.overdue_max_tasks[dc]),
                 "inlet_above_27_h": int(totals.hot_steps[dc]) * totals.step_h,
                 "hottest_inlet_c": float(totals.hottest_inlet_c[dc]),
-                "hottest_rack": int(totals.hottest_rack[dc]),
+                **_place(totals, dc, fleet),
+                **_means(totals, {name: float(totals.sums[name][dc]) for name in _MEAN}),
+                "over_27_degree_h": sums["hot_k"] * totals.step_h,
+                "rci_hi_min_pct": float(totals.rci_hi_min_pct[dc]),
                 "hottest_step": int(totals.hottest_step[dc]),
             }
         )
@@ -137,6 +159,7 @@ def overall(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
     sums = {name: float(values.sum()) for name, values in totals.sums.items()}
     behind_ups_kwh = float((totals.sums["it_kwh"] / fleet.values("hvac.ups_efficiency")).sum())
     hottest = int(np.argmax(totals.hottest_inlet_c))
+    servers = fleet.per_dc_servers()
     return _figures(sums, behind_ups_kwh, totals.step_h) | {
         "queue_mean_tasks": sums["queue_tasks"] / totals.steps / fleet.size,
         "queue_max_tasks": float(totals.queue_max_tasks.max()),
@@ -144,9 +167,27 @@ def overall(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
         "inlet_above_27_h": int(totals.hot_steps.sum()) * totals.step_h,
         "hottest_inlet_c": float(totals.hottest_inlet_c[hottest]),
         "hottest_dc": fleet.names[hottest],
-        "hottest_rack": int(totals.hottest_rack[hottest]),
+        **_place(totals, hottest, fleet),
+        **_means(totals, {name: sums[name] / fleet.size for name in _MEAN}),
+        "over_27_degree_h": float(totals.sums["hot_k"] @ servers) / servers.sum() * totals.step_h,
+        "rci_hi_min_pct": float(totals.rci_hi_min_pct.min()),
         "hottest_step": int(totals.hottest_step[hottest]),
     }
+
+
+def _place(totals: Totals, dc: int, fleet: Fleet) -> dict[str, Metric]:
+    """Where the hottest inlet was."""
+    rack = int(totals.hottest_rack[dc])
+    return {
+        "hottest_rack": rack,
+        "hottest_row": rack // fleet.configs[dc].hall.racks_per_row,
+        "hottest_server": int(totals.hottest_server[dc]),
+    }
+
+
+def _means(totals: Totals, sums: dict[str, float]) -> dict[str, Metric]:
+    means = {name: value / totals.steps for name, value in sums.items()}
+    return {**means, "rhi": 1.0 - means["shi"]}
 
 
 def _figures(sums: dict[str, float], behind_ups_kwh: float, step_h: float) -> dict[str, Metric]:
@@ -173,9 +214,13 @@ def _figures(sums: dict[str, float], behind_ups_kwh: float, step_h: float) -> di
         "battery_charge_kwh": sums["charge_kwh"],
         "battery_discharge_kwh": sums["discharge_kwh"],
         "battery_throughput_kwh": sums["discharge_kwh"],
+        "unserved_kwh": sums["unserved_kwh"],
         "unmet_cooling_kwh": sums["unmet_w"] * step_h / 1e3,
         "arrived_tasks": sums["arrived_tasks"],
         "executed_tasks": sums["executed_tasks"],
         "dropped_tasks": sums["dropped_tasks"],
+        "lost_tasks": sums["lost_tasks"],
+        "throttled_rack_h": sums["throttled_racks"] * step_h,
+        "tripped_rack_h": sums["tripped_racks"] * step_h,
         "overdue_task_h": sums["overdue_tasks"] * step_h,
     }

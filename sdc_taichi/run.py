@@ -12,8 +12,8 @@ import json
 import operator
 import os
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
@@ -26,6 +26,7 @@ from sdc_taichi import metrics
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import Controller, viewer
 from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.events import ActiveEvent
 from sdc_taichi.exogenous.files import sha256
 from sdc_taichi.sim import Simulator
 from sdc_taichi.types import F64, I64, StepResult
@@ -84,7 +85,7 @@ def run(
         if stop is not None and stop():
             break
         last = sim.step(controller.act(look(last)))
-        metrics.add(totals, last, sim.fleet)
+        metrics.add(totals, last)
         if on_step is not None:
             on_step(last)
     return totals
@@ -123,9 +124,11 @@ def record(
     names = ["config.yaml", "configs.yaml"]
     config_name, other_name = names if sim.size == 1 else names[::-1]
     with StepsWriter(out / "steps.parquet", sim, {**about, "configs_yaml": configs}) as writer:
+        met: dict[ActiveEvent, None] = {}
 
         def each(result: StepResult) -> None:
             writer.add(result)
+            met.update(dict.fromkeys(sim.active_events(result.step)))
             if on_step is not None:
                 on_step(result)
 
@@ -141,9 +144,9 @@ def record(
         **about,
         "steps_done": totals.steps,
         "data_centers": [
-            {**dc, "metrics": figures}
-            for dc, figures in zip(
-                about["data_centers"], metrics.per_dc(totals, sim.fleet), strict=True
+            {**dc, "metrics": figures, "events": _events_of(index, met)}
+            for index, (dc, figures) in enumerate(
+                zip(about["data_centers"], metrics.per_dc(totals, sim.fleet), strict=True)
             )
         ],
         "total": metrics.overall(totals, sim.fleet),
@@ -369,6 +372,12 @@ def write_text(path: Path, text: str) -> None:
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
+
+
+def _events_of(dc: int, met: Iterable[ActiveEvent]) -> list[dict[str, Any]]:
+    """Events that a data center met, in the order in which they began."""
+    own = [{k: v for k, v in asdict(e).items() if k != "dc"} for e in met if e.dc == dc]
+    return [{k: v for k, v in event.items() if v is not None} for event in own]
 
 
 def _input_files(config: DataCenterConfig) -> dict[str, str]:

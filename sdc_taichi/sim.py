@@ -19,7 +19,7 @@ from sdc_taichi.air_metrics import ALLOWABLE_C
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.drivers import Drivers, load_drivers
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
-from sdc_taichi.events import Disturbance, schedule
+from sdc_taichi.events import ActiveEvent, Disturbance, schedule
 from sdc_taichi.fleet import Fleet, build_fleet
 from sdc_taichi.hall import Coil, Conditions, Hall, HallState, HallSums, Precision
 from sdc_taichi.placement import Bins, layout, place
@@ -744,6 +744,10 @@ class Simulator:
             return per_unit
         first = self.fleet.unit_start
         return np.add.reduceat(per_unit, first[:-1]) / np.diff(first)
+
+    def active_events(self, step: int) -> list[ActiveEvent]:
+        """Events that cover step ``step`` of the present run."""
+        return self._timeline.active(step)
 
     def servers(self) -> ServerLayers:
         """Inlet, outlet and power of every server in the last step, each (S,).

@@ -104,8 +104,21 @@ def test_metrics_are_those_of_the_recorded_steps(two_sites: Path) -> None:
             "inlet_above_27_h": (rows["inlet_max_c"] > 27).sum() * h,
             "hottest_inlet_c": rows["inlet_max_c"].max(),
             "hottest_step": rows.set_index("step")["inlet_max_c"].idxmax(),
-            # Supply approach 5 K, and 0.4 K above in the highest part of the rack.
+            # Supply approach 5 K, and 0.4 K above in the highest part of the rack: its third server.
             "hottest_rack": 1,
+            "hottest_row": 0,
+            "hottest_server": 2,
+            "over_27_degree_h": total["hot_k"] * h,
+            "shi": rows["shi"].mean(),
+            "rhi": 1 - rows["shi"].mean(),
+            "rti_pct": rows["rti_pct"].mean(),
+            "rci_hi_pct": rows["rci_hi_pct"].mean(),
+            "rci_hi_min_pct": rows["rci_hi_pct"].min(),
+            "rci_lo_pct": rows["rci_lo_pct"].mean(),
+            "lost_tasks": total["lost_tasks"],
+            "unserved_kwh": total["unserved_kwh"],
+            "throttled_rack_h": total["throttled_racks"] * h,
+            "tripped_rack_h": total["tripped_racks"] * h,
         }
         assert found == pytest.approx(expected, rel=1e-12)
         assert found["grid_kwh"] == pytest.approx(found["facility_kwh"] + found["battery_net_kwh"])

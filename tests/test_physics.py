@@ -98,7 +98,8 @@ def test_a_room_that_overheats_recovers_when_load_falls() -> None:
     assert inlet_c.max() > 45.0
     assert max(float(r.it_w[0]) for r in results) < highest_w
     assert results[-1].room_heat_kwh[0] == 0.0
-    assert inlet_c[-1] == pytest.approx(inlet_c[0])
+    assert results[-1].supply_c[0] == results[0].supply_c[0]
+    assert inlet_c[-1] < inlet_c[0], "less load, less recirculated heat"
 
 
 @pytest.mark.parametrize("preset", ["corrected", "large", "tiny"])

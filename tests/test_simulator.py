@@ -125,6 +125,7 @@ def part_of(result: StepResult, configs: Sequence[DataCenterConfig], index: int)
     for f in fields(result):
         value = getattr(result, f.name)
         if isinstance(value, np.ndarray):
+            # Every data center here has one CRAC unit.
             is_rack = f.name.startswith("rack_")
             part = slice(start[index], start[index + 1]) if is_rack else slice(index, index + 1)
             value = value[part]
@@ -149,7 +150,9 @@ def test_a_day_of_a_batch_equals_each_data_center_alone(
     batch = results_of(configs, actions, precision)
     for i, config in enumerate(configs):
         own = [
-            Actions(*(np.asarray(getattr(a, f.name))[i : i + 1] for f in fields(a)))
+            Actions(
+                load=a.load[i : i + 1], cooling=a.cooling[i : i + 1], battery=a.battery[i : i + 1]
+            )  # type: ignore[index]
             for a in actions
         ]
         for together, alone in zip(batch, results_of([config], own, precision), strict=True):
