@@ -491,8 +491,8 @@ def _hottest_line(report: dict[str, Any]) -> str:
     total = report["total"]
     where = f"{total['hottest_dc']}, " if len(report["data_centers"]) > 1 else ""
     return (
-        f"Hottest inlet: {total['hottest_inlet_c']:.1f} C at {where}row {total['hottest_row']}, rack "
-        f"{total['hottest_rack']}, server {total['hottest_server']} from the floor, step "
+        f"Hottest inlet: {total['hottest_inlet_c']:.1f} C at {where}row {total['hottest_row']}, "
+        f"rack {total['hottest_rack']}, server {total['hottest_server']} from the floor, step "
         f"{total['hottest_step']}"
     )
 

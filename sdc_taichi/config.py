@@ -621,7 +621,8 @@ class DataCenterConfig(_Section):
         crac = self.hvac.crac
         wants: list[tuple[bool, str]] = []
         if self.hall.inlet_model == "approach":
-            kinds = {e.kind for e in (*self.events.scheduled, *self.events.sampled)}
+            kinds = {e.kind for e in self.events.scheduled}
+            kinds |= {e.kind for e in self.events.sampled}
             wants = [
                 (crac.units > 1, f"hvac.crac.units {crac.units}"),
                 (self.simulation.thermal == "transient", "simulation.thermal transient"),
@@ -1010,13 +1011,20 @@ def _is_union_branch(part: str | int) -> bool:
     return isinstance(part, str) and (part in {"int", "float"} or "[" in part)
 
 
+_LISTED: dict[str, type[BaseModel]] = {
+    "groups": ServerGroup,
+    "scheduled": ScheduledEvent,
+    "sampled": SampledEvent,
+}
+"""Fields that list sections."""
+
+
 def _fields_at(path: list[str]) -> list[str]:
     node: Any = DataCenterConfig
     for key in path:
         if key.isdigit():
             continue
-        annotation = node.model_fields[key].annotation
-        node = ServerGroup if key == "groups" else annotation
+        node = _LISTED.get(key, node.model_fields[key].annotation)
     return list(node.model_fields)
 
 

@@ -387,6 +387,7 @@ def _input_files(config: DataCenterConfig) -> dict[str, str]:
         "weather": site.weather_file,
         "carbon": site.carbon_file,
         "workload": site.workload_file,
+        "recirculation": config.hall.recirculation.matrix_file,
     }
     return {kind: path for kind, path in named.items() if path is not None}
 

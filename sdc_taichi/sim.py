@@ -435,7 +435,7 @@ class Simulator:
         status = state.rack_status
         lost = np.maximum(work.utilisation - placed, 0.0)
         if self._protected:
-            status = protect(status, air.rack_inlet_max_c, **self._protect)
+            status = protect(status, air.rack_inlet_max_c.astype(np.float64), **self._protect)
             lost = lost + self._lost_share(state.rack_status, status, loads, met, work.utilisation)
         lost_tasks = lost * workload.TASKS_PER_STEP
         self._state = State(
@@ -884,6 +884,9 @@ class Simulator:
         for config in self.fleet.configs:
             digest.update(config.model_dump_json().encode())
         digest.update(self.drivers.digest())
+        # A matrix that a config names may change under its name.
+        if self.fleet.air is not None:
+            digest.update(self.fleet.air.weights.tobytes())
         return digest.hexdigest()
 
 
