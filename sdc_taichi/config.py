@@ -291,7 +291,7 @@ class CracConfig(_Section):
     """Fan speed of one action step over design speed (flow model controlled)."""
     coasting_flow_ratio: Annotated[_Real, Field(gt=0, le=1)] = 0.1
     """Airflow through a unit that is down over its design airflow."""
-    fan_w_per_m3s: NonNegative = 800.0
+    fan_w_per_m3s: NonNegative = 1000.0
     """Design fan power per design airflow (specific fan power)."""
     released_fan_w: NonNegative = 150.0
     """CRAC_FAN_REF_P of the SustainDC format: one unscaled fan."""
