@@ -1,9 +1,8 @@
-"""``sdc-taichi hall``: solve the air of a hall from its layout."""
+"""``sdc-taichi hall``: describe a hall, and solve its air from the layout."""
 
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,19 +13,31 @@ from rich.table import Table
 
 from sdc_taichi.command_options import Overrides, Source, read_config
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.types import F64
+from sdc_taichi.whole_file import check_new_file, whole_file
 
 if TYPE_CHECKING:
     from sdc_taichi.airflow import LayoutSolution
 
-hall_app = typer.Typer(help="Air in the hall.", no_args_is_help=True)
+hall_app = typer.Typer(help="Describe a hall, solve its air.", no_args_is_help=True)
 
 
-@hall_app.callback()
-def _hall() -> None:
-    # A group with one command would take that command's place.
-    """Air in the hall."""
+@hall_app.command("show")
+def show_hall(
+    source: Source = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.png", help="Draw the floor plan."),
+    ] = None,
+    overrides: Overrides = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the description as JSON.")] = False,
+) -> None:
+    """Describe a hall: its measures, CRAC units, and racks at the design point."""
+    from sdc_taichi.hall_description import show
+
+    config, _ = read_config(source, overrides)
+    typer.echo(show(config, out, force=force, as_json=as_json))
 
 
 @hall_app.command("solve")
@@ -49,7 +60,7 @@ def solve_hall(
     at the highest setpoint. docs/layout-solver.md says what potential flow cannot tell.
     """
     if out is not None:
-        _check_target(out, force=force)
+        check_new_file(out, ".npz", force=force)
     config, _ = read_config(source, overrides)
     solution = _solve(config, cell)
     if out is not None:
@@ -145,28 +156,8 @@ def _print_report(config: DataCenterConfig, solution: LayoutSolution) -> None:
     typer.echo("\n".join(lines))
 
 
-def _check_target(out: Path, *, force: bool) -> None:
-    if out.suffix != ".npz":
-        raise ConfigError(f"--out {out}: valid is a name that ends in .npz")
-    if out.is_dir():
-        raise ConfigError(f"--out {out}: is a folder; valid is a file")
-    if out.exists() and not force:
-        raise ConfigError(f"--out {out}: exists; choose another name or replace it with --force")
-
-
 def _write_npz(out: Path, solution: LayoutSolution) -> None:
     """Write the file so that a reader sees the old one or the whole new one."""
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
     text = json.dumps(solution.provenance, sort_keys=True)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with part.open("wb") as file:
-                np.savez(file, R=solution.R, provenance=np.array(text))
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(out)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        raise SdcError(f"{out}: cannot be written: {error.strerror or error}") from error
+    with whole_file(out, parents=True) as file:
+        np.savez(file, R=solution.R, provenance=np.array(text))

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,12 +11,12 @@ import numpy as np
 
 from sdc_taichi import air_metrics
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.fleet import Fleet, build_fleet
 from sdc_taichi.hall import Conditions, Hall, HallSums
 from sdc_taichi.layout import Plan, floor_plan, unit_places_m
 from sdc_taichi.recirculation import Exchange, calibrate
 from sdc_taichi.types import F64
+from sdc_taichi.whole_file import check_new_file, whole_file
 
 LISTED_ROWS = 12
 """Halls up to this many rows list all of them, larger ones the hottest."""
@@ -170,7 +168,7 @@ def show(
             matplotlib is missing.
     """
     if out is not None:
-        _check_target(out, force=force)
+        check_new_file(out, ".png", force=force)
     found = at_design(config)
     if out is not None:
         _write_png(out, found)
@@ -334,28 +332,10 @@ def _count(number: int, what: str) -> str:
     return f"{number:,} {what}" + ("s" if number != 1 else "")
 
 
-def _check_target(out: Path, *, force: bool) -> None:
-    if out.suffix.lower() != ".png":
-        raise ConfigError(f"--out {out}: valid is a name that ends in .png")
-    if out.is_dir():
-        raise ConfigError(f"--out {out}: is a folder; valid is a file")
-    if out.exists() and not force:
-        raise ConfigError(f"--out {out}: exists; choose another name or replace it with --force")
-
-
 def _write_png(out: Path, found: DesignHall) -> None:
     """Write the file so that a reader sees the old one or the whole new one."""
     from sdc_taichi.viz.floor_plan import draw
 
     figure = draw(found)
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(part, format="png")
-        part.replace(out)
-    except OSError as error:
-        raise SdcError(f"{out}: cannot be written: {error.strerror or error}") from error
-    finally:
-        # Below a path that is no folder there is nothing to delete, and that fails too.
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
+    with whole_file(out, parents=True) as file:
+        figure.savefig(file, format="png")

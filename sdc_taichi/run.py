@@ -12,7 +12,7 @@ import json
 import operator
 import os
 import platform
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -25,11 +25,12 @@ import yaml
 from sdc_taichi import metrics
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import Controller, viewer
-from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.errors import ConfigError
 from sdc_taichi.events import ActiveEvent
 from sdc_taichi.exogenous.files import sha256
 from sdc_taichi.sim import Simulator
 from sdc_taichi.types import F64, I64, StepResult
+from sdc_taichi.whole_file import part_of, whole_file, writing
 
 FORMAT = "sdc-run/1"
 METADATA_KEY = b"sdc_taichi"
@@ -138,7 +139,7 @@ def record(
         writer.commit()
     write_text(out / config_name, configs)
     if former:
-        with _writing(out / other_name):
+        with writing(out / other_name):
             (out / other_name).unlink(missing_ok=True)
     report = {
         **about,
@@ -247,7 +248,7 @@ class StepsWriter:
     """
 
     def __init__(self, path: Path, sim: Simulator, metadata: Mapping[str, Any]) -> None:
-        self._path, self._part = path, _part_of(path)
+        self._path, self._part = path, part_of(path)
         self._fleet, self._start = sim.fleet, sim.drivers.start
         self._metadata = {METADATA_KEY: json.dumps(metadata, allow_nan=False).encode()}
         self._steps_per_group = max(1, _ROWS_PER_GROUP // sim.size)
@@ -256,7 +257,7 @@ class StepsWriter:
         self._filled = 0
         self._first = 0
         self._writer: Any = None
-        with _writing(path):
+        with writing(path):
             for leftover in path.parent.glob(f".{path.name}.*.part"):
                 leftover.unlink()
             self._file = self._part.open("wb")
@@ -286,7 +287,7 @@ class StepsWriter:
             SdcError: the file cannot be written.
         """
         self._flush()
-        with _writing(self._path):
+        with writing(self._path):
             self._writer.close()
             self._file.flush()
             os.fsync(self._file.fileno())
@@ -322,7 +323,7 @@ class StepsWriter:
         for name, values in zip(self._names, self._values, strict=True):
             columns[name] = values[:n].reshape(-1)
         table = pa.table(columns).replace_schema_metadata(self._metadata)
-        with _writing(self._path):
+        with writing(self._path):
             if self._writer is None:
                 self._writer = pq.ParquetWriter(
                     self._file, table.schema, compression="zstd", use_dictionary=["dc"]
@@ -341,7 +342,7 @@ def prepare_folder(out: Path, *, force: bool = False) -> bool:
         SdcError: it holds other files than those of a run and ``force`` is not set, or it cannot
             be created or read.
     """
-    with _writing(out):
+    with writing(out):
         if out.exists() and not out.is_dir():
             raise ConfigError(f"{out}: is a file; valid is a folder to write the run to")
         out.mkdir(parents=True, exist_ok=True)
@@ -362,16 +363,8 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         SdcError: it cannot be written.
     """
-    part = _part_of(path)
-    with _writing(path):
-        try:
-            with part.open("w", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+    with whole_file(path) as file:
+        file.write(text.encode())
 
 
 def _events_of(dc: int, met: Iterable[ActiveEvent]) -> list[dict[str, Any]]:
@@ -412,16 +405,3 @@ def _is_run(out: Path) -> bool:
     except (OSError, ValueError):
         return False
     return isinstance(report, dict) and str(report.get("format", "")).startswith("sdc-run/")
-
-
-def _part_of(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}.part")
-
-
-@contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Turn a failure of the file system into an error that names the file."""
-    try:
-        yield
-    except OSError as error:
-        raise SdcError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -45,6 +45,7 @@ from sdc_taichi.types import (
     Status,
     StepResult,
 )
+from sdc_taichi.whole_file import whole_file
 
 SNAPSHOT_VERSION = 2
 
@@ -355,8 +356,12 @@ class Simulator:
             unit_fan_w = self._fan_w_per_m3s[self._unit_dc] * fleet.unit_design_m3s
             fan_w = np.add.reduceat(unit_fan_w * air.unit_cubed_speed, first_unit) * powered
             return_c, load_w = air.return_c, it_w + fan_w
+            inlet_m3k_s, outlet_m3k_s = air.inlet_m3k_s, air.outlet_m3k_s
         else:
             supply_c = setpoint_c + warmed_k
+            rise_m3k_s = air.airflow_m3s * supply_c
+            inlet_m3k_s = air.inlet_m3k_s - rise_m3k_s
+            outlet_m3k_s = air.outlet_m3k_s - rise_m3k_s
             crac_flow, speed = self._flow_model(
                 it_w,
                 air.airflow_m3s,
@@ -484,11 +489,11 @@ class Simulator:
             hottest_rack=hottest_rack,
             hottest_server=hottest_server,
             hot_k=air.hot_k / self._servers,
-            shi=air_metrics.shi(air.inlet_m3k_s, air.outlet_m3k_s),
+            shi=air_metrics.shi(inlet_m3k_s, outlet_m3k_s),
             rti_pct=air_metrics.rti(
                 return_c,
                 supply_c,
-                air_metrics.it_rise_k(air.inlet_m3k_s, air.outlet_m3k_s, air.airflow_m3s),
+                air_metrics.it_rise_k(inlet_m3k_s, outlet_m3k_s, air.airflow_m3s),
             ),
             rci_hi_pct=air_metrics.rci_hi(
                 air.hot_k, self._servers, allowable_c=self._allowable_high_c
@@ -808,16 +813,9 @@ class Simulator:
         Raises:
             SdcError: the file cannot be written.
         """
-        values, target = self.state_dict(), Path(path)
-        part = target.with_name(f".{target.name}.{os.getpid()}.part")
-        try:
-            with part.open("wb") as file:
-                np.savez(file, **values)
-            part.replace(target)
-        except OSError as error:
-            raise SdcError(f"{path}: cannot be written ({error})") from None
-        finally:
-            part.unlink(missing_ok=True)
+        values = self.state_dict()
+        with whole_file(Path(path)) as file:
+            np.savez(file, **values)
 
     def load(self, path: str | os.PathLike[str]) -> None:
         """Continue from a file of ``save``.

@@ -173,7 +173,7 @@ class StepResult:
     hot_k: F64
     """Mean over the servers of what their inlets exceed 27 C by; times hours, degree-hours."""
     shi: F64
-    """Supply heat index, 0 without recirculation; see ``air_metrics``."""
+    """Supply heat index, 0 when all inlets get supply air; see ``air_metrics``."""
     rti_pct: F64
     """Return temperature index; above 100 air recirculates on balance."""
     rci_hi_pct: F64

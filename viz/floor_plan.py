@@ -23,6 +23,8 @@ SHORT_SIDE_IN = (2.2, 8.0)
 MOST_STRETCH = 1.02
 RACK_LABEL_PX = (34.0, 15.0)
 """Room that the number in a rack needs, width and height."""
+ROW_PX = 6.0
+"""Rows closer than this are drawn without aisles and fronts, which would make false patterns."""
 LINE_LABEL_PX = 13.0
 """Height of a line of text."""
 UNIT_SIZE_M = (0.9, 2.0)
@@ -74,6 +76,10 @@ class _Drawing:
         wide_in = min(LONG_SIDE_IN, high_in * wide / high)
         self._stretch = (high_in / high) / (wide_in / wide)
         self._px_per_m = (_DPI * wide_in / wide, _DPI * high_in / high)
+        rows = self._hall.rows
+        ends_y = plan.centre_m[[0, -1], 1]
+        self._row_gap_m = float(np.ptp(ends_y)) / (rows - 1) if rows > 1 else plan.width_m
+        self._coarse = self._row_gap_m * self._px_per_m[0 if self._turned else 1] < ROW_PX
         figure.set_size_inches(wide_in + 1.9, high_in + 1.3)
 
     def draw(self) -> None:
@@ -87,7 +93,9 @@ class _Drawing:
         for axis, length_m in zip((axes.xaxis, axes.yaxis), self._room, strict=True):
             ticks = MaxNLocator(8, steps=[1, 2, 5, 10]).tick_values(0.0, length_m)
             axis.set_ticks([t for t in ticks if 0.0 <= t <= length_m])
-        self._draw_aisles(axes)
+        if not self._coarse:
+            self._draw_aisles(axes)
+            self._draw_fronts(axes)
         self._draw_racks(axes)
         self._draw_walls(axes)
         self._draw_units(axes)
@@ -158,12 +166,31 @@ class _Drawing:
             bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5},
         )
 
+    def _draw_fronts(self, axes: Axes) -> None:
+        """A line along the inlet faces of each row."""
+        from matplotlib.collections import LineCollection
+
+        plan = self._found.plan
+        front_y = plan.front_m[:: self._hall.racks_per_row, 1]
+        ends = plan.row_ends_m
+        thick = float(np.clip(0.06 * self._px_per_m[0 if self._turned else 1], 0.3, 3.5))
+        axes.add_collection(
+            LineCollection(
+                [[self._place(x, y) for x in ends] for y in front_y],
+                colors=BLUE,
+                linewidths=thick,
+                label="front (inlet) of the racks",
+                zorder=3,
+            )
+        )
+
     def _draw_racks(self, axes: Axes) -> None:
-        from matplotlib.collections import LineCollection, PolyCollection
+        from matplotlib.collections import PolyCollection
         from matplotlib.ticker import MaxNLocator
 
         found, plan, size = self._found, self._found.plan, self._size
-        half = np.array([size.rack_pitch_m / 2, size.rack_depth_m / 2])
+        deep_m = self._row_gap_m if self._coarse else size.rack_depth_m
+        half = np.array([size.rack_pitch_m / 2, deep_m / 2])
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         boxes = plan.centre_m[:, None] + corners * half
         edged = self._fits(size.rack_pitch_m, size.rack_depth_m, (8.0, 8.0))
@@ -177,18 +204,6 @@ class _Drawing:
             linewidth=0.8 if edged else 0.1,
         )
         axes.add_collection(racks)
-        # Fronts lie in a line along each row.
-        front_y = plan.front_m[:: self._hall.racks_per_row, 1]
-        ends = plan.row_ends_m
-        thick = float(np.clip(0.06 * self._px_per_m[0 if self._turned else 1], 0.3, 3.5))
-        axes.add_collection(
-            LineCollection(
-                [[self._place(x, y) for x in ends] for y in front_y],
-                colors=BLUE,
-                linewidths=thick,
-                label="front (inlet) of the racks",
-            )
-        )
         if self._fits(size.rack_pitch_m, size.rack_depth_m, RACK_LABEL_PX):
             for rack, value in enumerate(found.inlet_c):
                 ink = "black" if value > (low + high) / 2 else "white"
@@ -276,6 +291,8 @@ class _Drawing:
             words = words[::-1]
         if not 1 / MOST_STRETCH < self._stretch < MOST_STRETCH:
             words[1] += f"\nstretched {self._stretch:.1f} times"
+        if self._coarse:
+            words[0] += "; rows too close to draw their aisles"
         for name, text in zip(names, words, strict=True):
             name(text)
         axes.spines[:].set_visible(False)

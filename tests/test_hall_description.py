@@ -1,0 +1,187 @@
+"""What ``hall show`` says agrees with the calibration, with linear algebra and with the heat."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sdc_taichi import DataCenterConfig, SdcError, load_config
+from sdc_taichi.hall_description import (
+    EXACT_RADIUS_RACKS,
+    LISTED_ROWS,
+    DesignHall,
+    at_design,
+    describe,
+    report,
+    show,
+)
+from sdc_taichi.recirculation import calibrate
+
+WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[400, 40]"]
+
+
+@pytest.fixture(scope="module")
+def corrected() -> DesignHall:
+    return at_design(load_config("corrected"))
+
+
+def heat_closes(found: DesignHall) -> None:
+    assert found.air is not None
+    hall = found.config.hall
+    air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
+    carried_w = air * found.unit_m3s.sum() * (found.air.return_c - found.supply_c)
+    assert carried_w == pytest.approx(found.it_w.sum(), rel=1e-10)
+
+
+def test_the_papers_hall_comes_out(corrected: DesignHall) -> None:
+    config = corrected.config
+    np.testing.assert_allclose(corrected.approach_k, config.hall.rack_approach_k(), atol=1e-9)
+    assert corrected.air is not None
+    assert corrected.air.return_c - corrected.outlet_c.mean() == pytest.approx(-3.1, abs=1e-9)
+    np.testing.assert_allclose(corrected.air.exhaust_share, calibrate(config).share, rtol=1e-9)
+    heat_closes(corrected)
+    # Racks alike: shares, bypass and RTI have a closed form.
+    alike = at_design(load_config("corrected", WIDE)).air
+    assert alike is not None
+    np.testing.assert_allclose(alike.exhaust_share, 0.29548, atol=1e-5)
+    assert alike.bypass_share == pytest.approx(0.17786, abs=1e-5)
+    assert alike.rti_pct == pytest.approx(116.695, abs=1e-3)
+    assert alike.shi == pytest.approx(0.29548, abs=1e-5)
+
+
+def test_spectral_radius_is_that_of_the_matrix(corrected: DesignHall) -> None:
+    assert corrected.air is not None
+    low, high = corrected.air.radius
+    exact = float(np.abs(np.linalg.eigvals(calibrate(corrected.config).matrix())).max())
+    assert low <= exact + 1e-12
+    assert exact <= high + 1e-12
+    assert high - low < 1e-8
+    share = corrected.air.exhaust_share
+    assert share.min() < exact < share.max()
+
+
+def test_containment_warms_less_and_still_closes(corrected: DesignHall) -> None:
+    closed = at_design(
+        load_config("corrected", ["hall.layout.containment=0.8", "hvac.crac.units=3"])
+    )
+    assert corrected.air is not None
+    assert closed.air is not None
+    assert np.all(closed.approach_k < 0.3 * corrected.approach_k)
+    assert closed.air.shi < 0.3 * corrected.air.shi
+    assert closed.unit_m3s.sum() == pytest.approx(corrected.unit_m3s.sum())
+    heat_closes(closed)
+
+
+def test_approach_model_has_inlets_and_no_flows() -> None:
+    found = at_design(load_config("tiny"))
+    assert found.air is None
+    np.testing.assert_allclose(
+        report(found)["approach_k"], found.config.hall.rack_approach_k(), atol=0.2
+    )
+    # Server 2 of rack 1 sits 0.4 K above its rack.
+    assert (found.hottest_rack, found.hottest_server) == (1, 2)
+    assert found.inlet_max_c.max() == pytest.approx(28.4)
+    text = describe(found)
+    assert "return air" not in text
+    assert "spectral" not in text
+    assert "inlet model approach" in text
+
+
+def test_rows_and_places(corrected: DesignHall) -> None:
+    lines = describe(corrected).splitlines()
+    rows = [line.split() for line in lines[-4:]]
+    for i, cells in enumerate(rows):
+        mine = slice(5 * i, 5 * i + 5)
+        assert cells[:2] == [str(i), "+y" if i % 2 == 0 else "-y"]
+        assert float(cells[2]) == pytest.approx(corrected.it_w[mine].sum() / 1e3, abs=0.05)
+        assert float(cells[4]) == pytest.approx(corrected.approach_k[mine].mean(), abs=0.005)
+        assert float(cells[6]) == pytest.approx(corrected.inlet_c[mine].mean(), abs=0.005)
+        assert float(cells[8]) == pytest.approx(corrected.inlet_max_c[mine].max(), abs=0.005)
+    # Top zone of five: servers 160..199 of 200.
+    assert corrected.hottest_server == 160
+    assert corrected.hottest_rack in range(5)
+
+
+def test_large_halls_list_their_hottest_rows() -> None:
+    rows, per_row = 30, 4
+    approach = np.full((rows, per_row), 5.0)
+    hot = np.arange(1, 2 * LISTED_ROWS, 2)
+    approach[hot] = 5.5
+    config = load_config(
+        "corrected",
+        [
+            f"hall.rows={rows}",
+            f"hall.racks_per_row={per_row}",
+            *WIDE[1:],
+            f"hall.supply_approach_k={approach.ravel().tolist()}",
+            "hvac.crac.units=20",
+        ],
+    )
+    text = describe(at_design(config))
+    table = text[text.index("row  faces") :].splitlines()
+    assert [int(line.split()[0]) for line in table[2:-1]] == hot.tolist()
+    assert table[-1] == f"({LISTED_ROWS} hottest of {rows} rows)"
+    assert "unit 0" not in text
+
+
+def test_radius_of_a_hall_too_large_to_iterate_is_bounded_by_its_rows() -> None:
+    config = load_config("large", ["hall.rows=101"])
+    assert config.hall.racks > EXACT_RADIUS_RACKS
+    found = at_design(config)
+    assert found.air is not None
+    share = found.air.exhaust_share
+    assert found.air.radius == (share.min(), share.max())
+
+
+def test_json_has_an_entry_per_rack_and_unit(corrected: DesignHall) -> None:
+    config = load_config("corrected", ["hvac.crac.units=4"])
+    values = json.loads(show(config, as_json=True))
+    assert {len(values[k]) for k in ("approach_k", "inlet_c", "rack_it_w", "exhaust_share")} == {20}
+    assert [u["x_m"] for u in values["crac_units"]] == [0.0, 6.6, 0.0, 6.6]
+    assert sum(u["airflow_m3s"] for u in values["crac_units"]) == pytest.approx(
+        values["crac_flow_m3s"]
+    )
+    np.testing.assert_allclose(values["inlet_c"], corrected.inlet_c, atol=1e-9)
+    assert values["hottest_inlet_c"] == pytest.approx(max(values["inlet_max_c"]))
+
+
+def test_picture_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    config = load_config("tiny")
+    out = tmp_path / "new" / "plan.png"
+    assert show(config, out).splitlines()[-1] == f"Floor plan: {out}"
+    assert out.read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(SdcError, match="exists; choose another name or replace it with --force"):
+        show(config, out)
+    show(config, out, force=True)
+    with pytest.raises(SdcError, match=r"valid is a name that ends in \.png"):
+        show(config, tmp_path / "plan.jpg")
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(SdcError, match="is a folder"):
+        show(config, tmp_path / "folder.png")
+    with pytest.raises(SdcError, match="cannot be written"):
+        show(config, out / "below.png")
+    assert [p.name for p in out.parent.iterdir()] == ["plan.png"]
+
+
+@pytest.mark.parametrize("units", [1, 9])
+def test_description_names_what_the_room_has(units: int) -> None:
+    config: DataCenterConfig = load_config(
+        "corrected",
+        [
+            f"hvac.crac.units={units}",
+            "hall.layout.returns=end_wall",
+            "hall.layout.containment=0.25",
+        ],
+    )
+    found = at_design(config)
+    text = describe(found)
+    assert "25 %; returns in the end walls" in text
+    assert f"CRAC units    {units}, " in text
+    assert ("unit 0" in text) == (units == 1)
+    bare = describe(replace(found, air=None))
+    assert "bypass" in text
+    assert "bypass" not in bare
