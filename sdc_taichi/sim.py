@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, Self
@@ -15,20 +15,19 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi import air_metrics
-from sdc_taichi.air_metrics import ALLOWABLE_C
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.drivers import Drivers, load_drivers
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
 from sdc_taichi.events import ActiveEvent, Disturbance, schedule
 from sdc_taichi.fleet import Fleet, build_fleet
+from sdc_taichi.floor import Floor
 from sdc_taichi.hall import Coil, Conditions, Hall, HallState, HallSums, Precision
-from sdc_taichi.placement import Bins, layout, place
-from sdc_taichi.plant import air as air_side
 from sdc_taichi.plant import cooling, water_side, workload
+from sdc_taichi.plant.air import crac_fan_w
 from sdc_taichi.plant.battery import BATTERIES
 from sdc_taichi.plant.carbon import emitted_g
 from sdc_taichi.plant.chiller import CHILLERS
-from sdc_taichi.plant.protection import THROTTLED, TRIPPED, capacity, protect
+from sdc_taichi.plant.protection import THROTTLED, TRIPPED
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER
 from sdc_taichi.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k, size
@@ -42,12 +41,31 @@ from sdc_taichi.types import (
     LoadAction,
     ServerLayers,
     State,
-    Status,
     StepResult,
 )
 from sdc_taichi.whole_file import whole_file
 
 SNAPSHOT_VERSION = 2
+_NONE = np.zeros(0)
+NO_MEMORY = HallState(*[_NONE] * len(fields(HallState)))
+"""Of quasi-steady halls."""
+
+
+@dataclass(frozen=True, slots=True)
+class _RoomAir:
+    """Air between the CRAC units and the racks, each (B,) unless stated."""
+
+    flow_m3s: F64
+    unit_flow_m3s: F64
+    """(U,)."""
+    fan_w: F64
+    supply_c: F64
+    return_c: F64
+    load_w: F64
+    """Heat of servers and CRAC fans, if nothing stores it."""
+    inlet_m3k_s: F64
+    """Airflow times inlet temperature over supply."""
+    outlet_m3k_s: F64
 
 
 class Simulator:
@@ -117,9 +135,7 @@ class Simulator:
         self._fan_step = v("hvac.crac.fan_step")[self._unit_dc]
         self._coasting = v("hvac.crac.coasting_flow_ratio")[self._unit_dc]
         self._servers = self.fleet.per_dc_servers()
-        self._rack_servers = np.add.reduceat(self.fleet.groups[0], self.fleet.group_start[:-1])
-        self._prepare_protection()
-        self._bins = self._placement_bins()
+        self._floor = Floor(self.fleet)
         self._air_j_per_m3_k = air_j_per_m3_k(self.fleet)
         self._return_approach_k = mean_return_approach_k(self.fleet)
         self._min_flow_ratio = v("hvac.crac.min_flow_ratio")
@@ -146,7 +162,6 @@ class Simulator:
         self._recirculates = models["inlet"] == "recirculation"
         self._transient = models["thermal"] == "transient"
         self._substep_s = float(np.min(v("simulation.substep_s")))
-        self._policy = models["placement"]
         self._stores_heat = models["cooling_load"] in cooling.STORES_UNMET_HEAT
         self._work_model = workload.MODELS[models["workload"]]
         self._setpoint_model = cooling.SETPOINTS[models["setpoint"]]
@@ -156,32 +171,6 @@ class Simulator:
         self._tower_model = TOWERS[models["tower"]]
         self._water_model = WATER[models["water"]]
         self._battery_model = BATTERIES[models["battery"]]
-
-    def _prepare_protection(self) -> None:
-        """Temperatures at which racks throttle, trip and restart, each (R,)."""
-        fleet = self.fleet
-        classes = [c.protection.ashrae_class for c in fleet.configs]
-        limit_c = np.array([np.inf if c is None else ALLOWABLE_C[c][1] for c in classes])
-        trip_c = limit_c + fleet.values("protection.trip_margin_k")
-        self._protected = bool(np.any(np.isfinite(limit_c)))
-        self._protect = {
-            "limit_c": limit_c[fleet.rack_dc],
-            "trip_c": trip_c[fleet.rack_dc],
-            "restart_c": fleet.values("protection.restart_c")[fleet.rack_dc],
-        }
-        self._throttle_share = fleet.values("protection.throttle_share")[fleet.rack_dc]
-        allowable = np.array([ALLOWABLE_C[c or "A2"] for c in classes])
-        self._allowable_low_c, self._allowable_high_c = allowable[:, 0], allowable[:, 1]
-
-    def _placement_bins(self) -> Bins:
-        """Racks where all are loaded alike, else server groups."""
-        fleet = self.fleet
-        start = fleet.rack_start if self._per_rack else fleet.group_start[fleet.rack_start]
-        return layout(start, fleet.names)
-
-    @property
-    def _per_rack(self) -> bool:
-        return self.fleet.models["placement"] == "uniform"
 
     @property
     def size(self) -> int:
@@ -237,9 +226,8 @@ class Simulator:
         setpoint_c = v("hvac.setpoint.initial_c")[self._unit_dc]
         inlet_c = v("hvac.setpoint.initial_c")[fleet.rack_dc] + fleet.approach_k
         groups = np.diff(fleet.group_start)
-        watches_groups = self._policy in ("coolest-first", "inlet-aware")
         none = np.zeros(0)
-        memory = HallState(none, none, none, none, none)
+        memory = NO_MEMORY
         if self._transient:
             demand = self.drivers.at(0).demand
             memory = hall.settle(Conditions(setpoint_c, demand, **self._fan_limits(None)))
@@ -255,7 +243,7 @@ class Simulator:
             stored_kwh=v("battery.initial_soc") * self.sizing.battery_kwh,
             room_heat_kwh=np.zeros(b),
             rack_status=np.zeros(fleet.racks, dtype=np.int8),
-            group_inlet_c=np.repeat(inlet_c, groups) if watches_groups else none,
+            group_inlet_c=np.repeat(inlet_c, groups) if self._floor.watches_inlets else none,
             **_fields(memory),
         )
         return self._state
@@ -274,7 +262,7 @@ class Simulator:
             raise SdcError(f"actions are a {type(actions).__name__}; valid is Actions(...)")
         given = actions or Actions()
         state, sized, step_h = self.state, self.sizing, self.step_h
-        hall, fleet, first_unit = self._start(), self.fleet, self.fleet.unit_start[:-1]
+        hall = self._start()
         load_command = self._command("load", given.load, LoadAction, 1.0)
         battery_command = self._command("battery", given.battery, BatteryAction, 1.0)
         cooling_command = self._unit_command("cooling", given.cooling, CoolAction)
@@ -285,7 +273,8 @@ class Simulator:
         wet_bulb_c = world.wet_bulb_c + event.outdoor_offset_k
 
         powered = self._powered(state, event)
-        capacity, highest = self._capacity(state, powered, given.placement)
+        floor, status = self._floor, state.rack_status
+        capacity, highest = floor.capacity(status, powered, given.placement)
         work = self._work_model(
             world.demand,
             load_command,
@@ -295,7 +284,9 @@ class Simulator:
                 "max_utilisation": np.minimum(self._work["max_utilisation"], highest),
             },
         )
-        loads, placed = self._place(work.utilisation, capacity, powered, state, given.placement)
+        placed = floor.place(
+            work.utilisation, capacity, powered, state.group_inlet_c, given.placement
+        )
 
         setpoint_c, run, last, scale = self._setpoint_model(
             state.setpoint_c,
@@ -310,20 +301,13 @@ class Simulator:
         met = Conditions(
             unit_supply_c=setpoint_c + warmed_k[self._unit_dc],
             utilisation=np.minimum(work.utilisation, 1.0),
-            powered=self._rack_powered(state, powered),
+            powered=floor.powered(status, powered),
             rack_airflow=None if self._timeline.quiet else event.rack_airflow,
-            **loads,
+            rack_load=placed.rack_load,
+            group_load=placed.group_load,
             **self._fan_limits(fan_speed, event.unit_up),
         )
-        # The water of the plant serves the coldest coil in use.
-        served_c = np.where(running > 0, setpoint_c, np.inf)
-        plant_c = np.minimum.reduceat(served_c, first_unit)
-        plant_c = np.where(
-            np.isfinite(plant_c), plant_c, np.minimum.reduceat(setpoint_c, first_unit)
-        )
-        coils = np.add.reduceat(running * fleet.unit_design_m3s, first_unit) / np.add.reduceat(
-            fleet.unit_design_m3s, first_unit
-        )
+        plant_c, coils = self._coils_in_use(setpoint_c, running)
         design = sized.water_side
         if not self._timeline.quiet:
             design = replace(design, chiller_w=design.chiller_w * event.chiller_share)
@@ -331,78 +315,37 @@ class Simulator:
         def plant(request_w: F64) -> water_side.WaterSide:
             return self._operate(request_w, powered, plant_c, outdoor_c, wet_bulb_c, design)
 
-        memory = HallState(none := np.zeros(0), none, none, none, none)
+        memory = _memory_of(state)
         if self._transient:
-            memory = HallState(**{f.name: getattr(state, f.name) for f in fields(HallState)})
-            air, memory = hall.advance(
-                met,
-                memory,
-                Coil(
-                    setpoint_c=setpoint_c,
-                    room_j=state.room_heat_kwh * 3.6e6,
-                    room_j_per_k=sized.room_kwh_per_k * 3.6e6,
-                    limit_w=plant(sized.water_side.cooling_w * coils).removed_w,
-                    fan_w_per_m3s=self._fan_w_per_m3s * powered,
-                ),
-                step_h * 3600.0,
-                self._substep_s,
+            coil = Coil(
+                setpoint_c=setpoint_c,
+                room_j=state.room_heat_kwh * 3.6e6,
+                room_j_per_k=sized.room_kwh_per_k * 3.6e6,
+                limit_w=plant(design.cooling_w * coils).removed_w,
+                fan_w_per_m3s=self._fan_w_per_m3s * powered,
             )
+            air, memory = hall.advance(met, memory, coil, step_h * 3600.0, self._substep_s)
         else:
             air = hall.solve(met)
         it_w = air.cpu_w + air.fan_w
-
-        if self._recirculates:
-            crac_flow, supply_c, unit_flow = air.crac_flow_m3s, air.supply_c, air.unit_flow_m3s
-            unit_fan_w = self._fan_w_per_m3s[self._unit_dc] * fleet.unit_design_m3s
-            fan_w = np.add.reduceat(unit_fan_w * air.unit_cubed_speed, first_unit) * powered
-            return_c, load_w = air.return_c, it_w + fan_w
-            inlet_m3k_s, outlet_m3k_s = air.inlet_m3k_s, air.outlet_m3k_s
-        else:
-            supply_c = setpoint_c + warmed_k
-            rise_m3k_s = air.airflow_m3s * supply_c
-            inlet_m3k_s = air.inlet_m3k_s - rise_m3k_s
-            outlet_m3k_s = air.outlet_m3k_s - rise_m3k_s
-            crac_flow, speed = self._flow_model(
-                it_w,
-                air.airflow_m3s,
-                design_flow_m3s=sized.crac_flow_m3s,
-                design_it_airflow_m3s=sized.it_airflow_m3s,
-                min_ratio=self._min_flow_ratio,
-                supply_m3s_per_w=self._supply_m3s_per_w,
-                speed=fan_speed,
-            )
-            unit_flow = crac_flow
-            fan_w = air_side.crac_fan_w(speed, design_flow_m3s=1.0, design_w=sized.crac_fan_w)
-            return_c, load_w = self._load_model(
-                it_w,
-                fan_w * powered,
-                crac_flow,
-                supply_c,
-                setpoint_c,
-                air.outlet_mean_c,
-                air_j_per_m3_k=self._air_j_per_m3_k,
-                return_approach_k=self._return_approach_k,
-            )
-            fan_w = fan_w * powered
+        room = self._room_air(air, met, setpoint_c, fan_speed, powered)
 
         if self._transient:
             load_w, wanted_w = air.coil_load_w, air.coil_w
-            kept_kwh = air.room_j / 3.6e6
-        else:
-            wanted_w = load_w + state.room_heat_kwh * 1e3 / step_h
-            if not np.all(running):
-                wanted_w = np.minimum(
-                    wanted_w - self._past_idle_coils_w(air, running, return_c, met.unit_supply_c),
-                    sized.water_side.cooling_w * coils,
-                )
-            kept_kwh = state.room_heat_kwh
-        device = plant(wanted_w)
-        if self._transient:
-            room_heat_kwh = kept_kwh + (wanted_w - device.removed_w) * step_h / 1e3
+            device = plant(wanted_w)
+            # The room has kept its heat within the step; here is what the plant fell short of.
+            short_w = wanted_w - device.removed_w
+            room_heat_kwh = air.room_j / 3.6e6 + short_w * step_h / 1e3
             unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, device.removed_w)
         else:
+            load_w = room.load_w
+            wanted_w = load_w + state.room_heat_kwh * 1e3 / step_h
+            if not np.all(running):
+                past_w = self._past_idle_coils_w(air, running, room.return_c, met.unit_supply_c)
+                wanted_w = np.clip(wanted_w - past_w, 0.0, design.cooling_w * coils)
+            device = plant(wanted_w)
             unmet_w, recovered_w, room_heat_kwh = cooling.hold_heat(
-                load_w, device.removed_w, kept_kwh, step_h
+                load_w, device.removed_w, state.room_heat_kwh, step_h
             )
 
         water = self._water_model(
@@ -410,7 +353,7 @@ class Simulator:
             range_k=device.tower_range_k,
             water_kg_s=device.tower_water_kg_s,
             wet_bulb_c=wet_bulb_c,
-            return_c=return_c,
+            return_c=room.return_c,
             supply_setpoint_c=plant_c,
             dt_s=step_h * 3600.0,
             **self._water,
@@ -421,7 +364,7 @@ class Simulator:
             "tower_fan": device.tower_fan_w,
             "chilled_pump": device.chilled_pump_w,
             "condenser_pump": device.condenser_pump_w,
-            "crac_fan": fan_w,
+            "crac_fan": room.fan_w,
         }
         hvac_w = sum((devices[name] for name in self._counted), np.zeros(self.size))
         facility_kw = (it_w + hvac_w) / 1e3
@@ -437,11 +380,9 @@ class Simulator:
         )
         grid_kwh = battery.grid_kwh * grid_up
 
-        status = state.rack_status
-        lost = np.maximum(work.utilisation - placed, 0.0)
-        if self._protected:
-            status = protect(status, air.rack_inlet_max_c.astype(np.float64), **self._protect)
-            lost = lost + self._lost_share(state.rack_status, status, loads, met, work.utilisation)
+        status = floor.protect(status, air.rack_inlet_max_c)
+        lost = np.maximum(work.utilisation - placed.utilisation, 0.0)
+        lost = lost + floor.tripped_work(state.rack_status, status, placed, met.powered)
         lost_tasks = lost * workload.TASKS_PER_STEP
         self._state = State(
             step=state.step + 1,
@@ -483,23 +424,23 @@ class Simulator:
             oldest_age_h=work.oldest_age_steps * step_h,
             mean_age_h=work.mean_age_steps * step_h,
             setpoint_c=self._per_dc(setpoint_c),
-            supply_c=supply_c,
+            supply_c=room.supply_c,
             inlet_mean_c=air.inlet_mean_c,
             inlet_max_c=air.inlet_max_c,
             hottest_rack=hottest_rack,
             hottest_server=hottest_server,
             hot_k=air.hot_k / self._servers,
-            shi=air_metrics.shi(inlet_m3k_s, outlet_m3k_s),
+            shi=air_metrics.shi(room.inlet_m3k_s, room.outlet_m3k_s),
             rti_pct=air_metrics.rti(
-                return_c,
-                supply_c,
-                air_metrics.it_rise_k(inlet_m3k_s, outlet_m3k_s, air.airflow_m3s),
+                room.return_c,
+                room.supply_c,
+                air_metrics.it_rise_k(room.inlet_m3k_s, room.outlet_m3k_s, air.airflow_m3s),
             ),
             rci_hi_pct=air_metrics.rci_hi(
-                air.hot_k, self._servers, allowable_c=self._allowable_high_c
+                air.hot_k, self._servers, allowable_c=floor.allowable_high_c
             ),
             rci_lo_pct=air_metrics.rci_lo(
-                air.cold_k, self._servers, allowable_c=self._allowable_low_c
+                air.cold_k, self._servers, allowable_c=floor.allowable_low_c
             ),
             throttled_racks=self._count_racks(status == THROTTLED),
             tripped_racks=self._count_racks(status == TRIPPED),
@@ -508,8 +449,8 @@ class Simulator:
             it_fan_w=air.fan_w,
             it_w=it_w,
             it_airflow_m3s=air.airflow_m3s,
-            crac_flow_m3s=crac_flow,
-            return_c=return_c,
+            crac_flow_m3s=room.flow_m3s,
+            return_c=room.return_c,
             cooling_load_w=load_w,
             chilled_water_c=device.chilled_water_c,
             condenser_water_c=device.condenser_water_c,
@@ -525,7 +466,7 @@ class Simulator:
             tower_fan_w=device.tower_fan_w,
             chilled_pump_w=device.chilled_pump_w,
             condenser_pump_w=device.condenser_pump_w,
-            crac_fan_w=fan_w,
+            crac_fan_w=room.fan_w,
             hvac_w=hvac_w,
             evaporation_l=water.evaporation_l,
             drift_l=water.drift_l,
@@ -545,7 +486,7 @@ class Simulator:
             powered=powered,
             unit_setpoint_c=setpoint_c,
             unit_supply_c=met.unit_supply_c,
-            unit_flow_m3s=unit_flow,
+            unit_flow_m3s=room.unit_flow_m3s,
             unit_running=running,
             rack_status=status,
             rack_cpu_w=air.rack_cpu_w,
@@ -554,6 +495,68 @@ class Simulator:
             rack_inlet_c=air.rack_inlet_c,
             rack_inlet_max_c=air.rack_inlet_max_c,
             rack_outlet_c=air.rack_outlet_c,
+        )
+
+    def _coils_in_use(self, setpoint_c: F64, running: F64) -> tuple[F64, F64]:
+        """Setpoint that the plant's water serves, and share of the coils in use, each (B,)."""
+        first = self.fleet.unit_start[:-1]
+        coldest_c = np.minimum.reduceat(np.where(running > 0, setpoint_c, np.inf), first)
+        none = np.isinf(coldest_c)
+        if np.any(none):
+            coldest_c = np.where(none, np.minimum.reduceat(setpoint_c, first), coldest_c)
+        design_m3s = self.fleet.unit_design_m3s
+        in_use = np.add.reduceat(running * design_m3s, first)
+        return coldest_c, in_use / np.add.reduceat(design_m3s, first)
+
+    def _room_air(
+        self, air: HallSums, met: Conditions, setpoint_c: F64, fan_speed: F64, powered: F64
+    ) -> _RoomAir:
+        """Airflow, supply and return air, fans and heat of the CRAC units."""
+        sized, first_unit = self.sizing, self.fleet.unit_start[:-1]
+        it_w = air.cpu_w + air.fan_w
+        if self._recirculates:
+            unit_fan_w = self._fan_w_per_m3s[self._unit_dc] * self.fleet.unit_design_m3s
+            fan_w = np.add.reduceat(unit_fan_w * air.unit_cubed_speed, first_unit) * powered
+            return _RoomAir(
+                flow_m3s=air.crac_flow_m3s,
+                unit_flow_m3s=air.unit_flow_m3s,
+                fan_w=fan_w,
+                supply_c=air.supply_c,
+                return_c=air.return_c,
+                load_w=it_w + fan_w,
+                inlet_m3k_s=air.inlet_m3k_s,
+                outlet_m3k_s=air.outlet_m3k_s,
+            )
+        supply_c = met.unit_supply_c
+        flow, speed = self._flow_model(
+            it_w,
+            air.airflow_m3s,
+            design_flow_m3s=sized.crac_flow_m3s,
+            design_it_airflow_m3s=sized.it_airflow_m3s,
+            min_ratio=self._min_flow_ratio,
+            supply_m3s_per_w=self._supply_m3s_per_w,
+            speed=fan_speed,
+        )
+        fan_w = powered * crac_fan_w(speed, design_flow_m3s=1.0, design_w=sized.crac_fan_w)
+        return_c, load_w = self._load_model(
+            it_w,
+            fan_w,
+            flow,
+            supply_c,
+            setpoint_c,
+            air.outlet_mean_c,
+            air_j_per_m3_k=self._air_j_per_m3_k,
+            return_approach_k=self._return_approach_k,
+        )
+        return _RoomAir(
+            flow_m3s=flow,
+            unit_flow_m3s=flow,
+            fan_w=fan_w,
+            supply_c=supply_c,
+            return_c=return_c,
+            load_w=load_w,
+            inlet_m3k_s=air.inlet_m3k_s - air.airflow_m3s * supply_c,
+            outlet_m3k_s=air.outlet_m3k_s - air.airflow_m3s * supply_c,
         )
 
     def _powered(self, state: State, event: Disturbance) -> F64:
@@ -574,101 +577,6 @@ class Simulator:
             **self._battery,
         ).discharge_kwh
         return np.where(event.grid_up, 1.0, np.minimum(carried / (design_kw * self.step_h), 1.0))
-
-    def _capacity(
-        self, state: State, powered: F64, weights: F64 | None
-    ) -> tuple[F64 | None, F64 | float]:
-        """Utilisation each bin may reach, (n,), None if all of it, and the data center, (B,)."""
-        limited = self._protected and bool(np.any(state.rack_status))
-        chosen = self._policy == "weights" and weights is not None
-        if not limited and not chosen and np.all(powered == 1.0):
-            return None, 1.0
-        per_rack = capacity(state.rack_status, self._throttle_share) * powered[self.fleet.rack_dc]
-        bins = per_rack if self._per_rack else self._spread(per_rack)
-        usable = bins if not chosen else np.where(self._bin_weights(weights) > 0, bins, 0.0)
-        highest = self._bins.sums(self._bin_servers * usable) / self._servers
-        return bins, highest
-
-    @property
-    def _bin_servers(self) -> F64:
-        return self._rack_servers if self._per_rack else self.fleet.groups[0]
-
-    def _spread(self, per_rack: F64) -> F64:
-        """Rack values for each server group, (G,)."""
-        return np.repeat(per_rack, np.diff(self.fleet.group_start))
-
-    def _bin_weights(self, weights: F64 | None) -> F64:
-        """Placement weights of the server groups, (G,), from one per rack or per group."""
-        groups = len(self.fleet.groups[0])
-        if weights is None:
-            return np.ones(groups)
-        try:
-            given = np.asarray(weights, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise SdcError(f"action placement: {weights!r} are no numbers") from None
-        if given.shape == (self.fleet.racks,) != (groups,):
-            return self._spread(given)
-        if given.shape != (groups,):
-            raise SdcError(
-                f"action placement: shape {given.shape}, expected ({self.fleet.racks},), one per "
-                f"rack, or ({groups},), one per server group"
-            )
-        return given
-
-    def _place(
-        self,
-        utilisation: F64,
-        bin_capacity: F64 | None,
-        powered: F64,
-        state: State,
-        weights: F64 | None,
-    ) -> tuple[dict[str, F64], F64]:
-        """Loads while servers are on, for ``Conditions``, and the utilisation placed, (B,)."""
-        if weights is not None and self._policy != "weights":
-            raise SdcError(
-                f"action placement: given, but workload.placement is {self._policy}; valid is None"
-            )
-        if self._per_rack and bin_capacity is None:
-            return {}, utilisation
-        bins = self._bins
-        load, placed = place(
-            self._policy,
-            utilisation,
-            bins=bins,
-            count=self._bin_servers,
-            capacity=np.ones(len(bins.dc)) if bin_capacity is None else bin_capacity,
-            inlet_c=state.group_inlet_c,
-            limit_c=self._allowable_high_c,
-            weights=self._bin_weights(weights) if self._policy == "weights" else None,
-        )
-        on = powered[bins.dc]
-        load = load / np.where(on > 0, on, 1.0)
-        return {"rack_load" if self._per_rack else "group_load": load}, placed
-
-    def _rack_powered(self, state: State, powered: F64) -> F64 | None:
-        """Share of the step that each rack is on, (R,); None if all are on."""
-        tripped = state.rack_status == TRIPPED
-        if not np.any(tripped) and np.all(powered == 1.0):
-            return None
-        return np.where(tripped, 0.0, powered[self.fleet.rack_dc])
-
-    def _lost_share(
-        self, before: Status, after: Status, loads: dict[str, F64], met: Conditions, work: F64
-    ) -> F64:
-        """Work of the racks that tripped in this step, as a share of capacity, (B,)."""
-        tripped = (after == TRIPPED) & (before != TRIPPED)
-        if not np.any(tripped):
-            return np.zeros(self.size)
-        fleet = self.fleet
-        if met.group_load is not None:
-            busy = np.add.reduceat(fleet.groups[0] * met.group_load, fleet.group_start[:-1])
-        else:
-            busy = self._rack_servers * (
-                work[fleet.rack_dc] if met.rack_load is None else met.rack_load
-            )
-        if met.powered is not None:
-            busy = busy * met.powered
-        return np.add.reduceat(busy * tripped, fleet.rack_start[:-1]) / self._servers
 
     def _operate(
         self,
@@ -886,6 +794,10 @@ class Simulator:
         if self.fleet.air is not None:
             digest.update(self.fleet.air.weights.tobytes())
         return digest.hexdigest()
+
+
+def _memory_of(state: State) -> HallState:
+    return HallState(**{f.name: getattr(state, f.name) for f in fields(HallState)})
 
 
 def _fields(record: Any) -> dict[str, Any]:

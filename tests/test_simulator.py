@@ -150,9 +150,7 @@ def test_a_day_of_a_batch_equals_each_data_center_alone(
     batch = results_of(configs, actions, precision)
     for i, config in enumerate(configs):
         own = [
-            Actions(
-                load=a.load[i : i + 1], cooling=a.cooling[i : i + 1], battery=a.battery[i : i + 1]
-            )  # type: ignore[index]
+            Actions(*(np.asarray(x)[i : i + 1] for x in (a.load, a.cooling, a.battery)))
             for a in actions
         ]
         for together, alone in zip(batch, results_of([config], own, precision), strict=True):
