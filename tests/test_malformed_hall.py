@@ -1,0 +1,156 @@
+"""Halls, events and matrices that are not valid: one line that names the place and the way out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sdc_taichi import ConfigError, build_fleet, load_config
+
+EVENT = "events.scheduled=[{{kind: {}, start_h: 1, duration_h: 1{}}}]"
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("hall.recirculation.calibrate=false", ["calibrate false needs a matrix_file"]),
+        ("hall.recirculation.cutoff=0.5", ["hall.recirculation.cutoff", "0.01", "0.5"]),
+        ("hall.layout.ceiling_m=1", ["ceiling_m 1 must be above rack_height_m 2.1"]),
+        ("hall.layout.containment=1.5", ["hall.layout.containment", "1.5"]),
+        ("hall.height_gradient=1", ["hall.height_gradient", "less than 1"]),
+        ("hvac.crac.units=70", ["hvac.crac.units", "64", "70"]),
+        ("hvac.crac.unit_shares=[[1]]", ["hvac.crac.unit_shares has 1 entries, expected 20"]),
+        (
+            f"hvac.crac.unit_shares={[[0.5]] * 20}",
+            ["unit_shares of rack 0", "1 entries that sum to 0.5", "sum to 1"],
+        ),
+        ("hvac.crac.flow_model=per_watt", ["another hvac.crac.flow_model than per_watt"]),
+        ("servers.outlet_model=rack", ["recirculation needs servers.outlet_model server"]),
+        ("hall.supply_approach_limits_k=[3, 5]", ["needs hall.supply_approach_limits_k null"]),
+        (
+            "servers.groups=[[{count: 3, full_w: 150, idle_w: 10, inlet_offset_k: 1}]]",
+            ["inlet_offset_k 0", "hall.height_zones takes its place"],
+        ),
+        ("simulation.substep_s=500", ["simulation.substep_s", "120", "500"]),
+        ("simulation.thermal=slow", ["simulation.thermal", "'quasi_steady' or 'transient'"]),
+        ("workload.placement=best", ["workload.placement", "'coolest-first'", "'best'"]),
+        ("protection.ashrae_class=A5", ["protection.ashrae_class", "'A4'", "'A5'"]),
+        (EVENT.format("crac_down", ", unit: 3"), ["events.scheduled.0.unit 3: valid is 0..0"]),
+        (
+            EVENT.format("rack_fan_failure", ", rack: 20, share: 0.5"),
+            ["events.scheduled.0.rack 20: valid is 0..19"],
+        ),
+        (EVENT.format("rack_fan_failure", ", rack: 2, share: 0"), ["share 0 leaves a rack"]),
+        (EVENT.format("chiller_derate", ""), ["chiller_derate needs share"]),
+        (EVENT.format("heat_wave", ", share: 0.5"), ["share has no meaning for heat_wave"]),
+        (EVENT.format("grid_outage", ", unit: 0"), ["unit has no meaning for grid_outage"]),
+        (EVENT.format("flood", ""), ["events.scheduled.0.kind", "'grid_outage'", "'flood'"]),
+        (
+            EVENT.format("crac_down", ", start: 2"),
+            ["events.scheduled.0.start: unknown key; did you mean 'start_h'?"],
+        ),
+        (
+            "events.sampled=[{kind: grid_outage, per_year: 2, duration_h: [3, 2]}]",
+            ["duration_h (3, 2) must be (low, high) with 0 < low <= high"],
+        ),
+        (
+            "events.sampled=[{kind: grid_outage, per_year: 2, hours: [3, 2]}]",
+            ["events.sampled.0.hours: unknown key"],
+        ),
+    ],
+)
+def test_field_is_refused(override: str, parts: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config("corrected", [override])
+    text = str(caught.value)
+    assert "\n" not in text
+    for part in parts:
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("override", "what"),
+    [
+        ("hvac.crac.units=2", "hvac.crac.units 2"),
+        ("simulation.thermal=transient", "simulation.thermal transient"),
+        (EVENT.format("crac_down", ""), "event crac_down"),
+        (EVENT.format("rack_fan_failure", ", rack: 0, share: 0.5"), "event rack_fan_failure"),
+    ],
+)
+def test_given_inlets_know_no_air(override: str, what: str) -> None:
+    with pytest.raises(ConfigError, match=f"{what} needs hall.inlet_model recirculation"):
+        load_config("corrected", ["hall.inlet_model=approach", override])
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        (
+            "servers.fan_full_airflow_m3s=0.051",
+            ["servers draw 44.7", "CRAC units give 32.2", "servers.fan_full_airflow_m3s"],
+        ),
+        ("hall.supply_approach_k=14", ["of rack 4 needs 1.04", "valid is below 1"]),
+        ("hall.supply_approach_k=18", ["fan_full_airflow_m3s null", "leave -0.", "above 0"]),
+    ],
+)
+def test_hall_that_cannot_close_is_refused(override: str, parts: list[str]) -> None:
+    config = load_config("corrected", [override])
+    with pytest.raises(ConfigError) as caught:
+        build_fleet(config)
+    for part in parts:
+        assert part in str(caught.value)
+
+
+def matrix_error(path: Path, *overrides: str) -> str:
+    config = load_config("corrected", [f"hall.recirculation.matrix_file={path}", *overrides])
+    with pytest.raises(ConfigError) as caught:
+        build_fleet(config)
+    text = str(caught.value)
+    assert text.startswith(str(path))
+    assert "\n" not in text
+    return text
+
+
+def test_matrix_file_that_is_missing_or_broken(tmp_path: Path) -> None:
+    assert "No such file" in matrix_error(tmp_path / "none.npz")
+    (tmp_path / "text.npz").write_text("no archive")
+    assert "cannot be read as a matrix" in matrix_error(tmp_path / "text.npz")
+    (tmp_path / "words.csv").write_text("a,b\nc,d\n")
+    assert "cannot be read as a matrix" in matrix_error(
+        tmp_path / "words.csv", "hall.recirculation.matrix_kind=R"
+    )
+
+
+def test_matrix_without_a_kind_or_with_another(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "r.csv", np.full((20, 20), 0.01), delimiter=",")
+    assert "a .csv needs hall.recirculation.matrix_kind R or D" in matrix_error(tmp_path / "r.csv")
+    np.savez(tmp_path / "x.npz", X=np.eye(20))
+    assert "holds ['X']; valid is one of the arrays R and D" in matrix_error(tmp_path / "x.npz")
+    np.savez(tmp_path / "r.npz", R=np.full((20, 20), 0.01))
+    assert "holds R, hall.recirculation.matrix_kind is D" in matrix_error(
+        tmp_path / "r.npz", "hall.recirculation.matrix_kind=D"
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (((3, 4), np.nan), "R[3, 4] is nan; valid is a finite number"),
+        (((3, 4), -0.1), "rack 3 takes a share of -0.1 of its air from rack 4"),
+        (((3, 4), 0.9), "row 3 sums to 1.09; valid is below 1"),
+    ],
+)
+def test_matrix_entries_are_checked(
+    change: tuple[tuple[int, int], float], text: str, tmp_path: Path
+) -> None:
+    matrix = np.full((20, 20), 0.01)
+    matrix[change[0]] = change[1]
+    np.savez(tmp_path / "r.npz", R=matrix)
+    assert text in matrix_error(tmp_path / "r.npz")
+
+
+def test_matrix_of_another_hall(tmp_path: Path) -> None:
+    np.savez(tmp_path / "r.npz", R=np.full((4, 4), 0.1))
+    assert "R has shape (4, 4), expected (20, 20)" in matrix_error(tmp_path / "r.npz")
