@@ -53,11 +53,21 @@ DC_DOUBLES = (
     "it_airflow_m3s",
     "overshoot",
     "change_k",
+    "shift",
 )
 """Per data center in f64: heat held by the room and what the coil needs in transient runs, how far
-every second sweep goes beyond its mix, and by how much the last one moved it."""
+every second sweep goes beyond its mix, and by how much the last one moved it and the cover."""
 UNIT_ROWS = ("setpoint_c", "low", "high", "design_m3s", "running")
-UNIT_STATE = ("supply_c", "fresh_ratio", "fresh_ratio_used", "flow_m3s", "cubed_speed")
+UNIT_STATE = (
+    "supply_c",
+    "fresh_ratio",
+    "fresh_ratio_used",
+    "flow_m3s",
+    "cubed_speed",
+    "need_m3s",
+    "following",
+)
+"""What units give and cover; need for supply air and the servers' airflow over that at design."""
 RACK_STATE = ("mixed_c", "exhaust_c", "exhaust_c", "captured_m3s")
 """Exhaust mix before a rack, outlets times strength of the sweeps in turn, flow that the rack takes
 of the mix."""
@@ -155,6 +165,7 @@ def hall_kernel(precision: str) -> Any:
         advance: ti.template(),
         slices: ti.i32,
         source: ti.i32,
+        first_sweep: ti.i32,
         first_substep: ti.i32,
         substep_s: ti.f64,
         weight: ti.f64,
@@ -462,6 +473,7 @@ def hall_kernel(precision: str) -> Any:
                     unit_first = dc_ints[1, n]
                     many_units = dc_ints[1, n + 1] - unit_first
                     following = total[2] / doubles[4, n]
+                    shift = ti.cast(0.0, ti.f64)
                     for j in range(many_units):
                         at = unit_first + j
                         need = ti.cast(0.0, ti.f64)
@@ -479,6 +491,9 @@ def hall_kernel(precision: str) -> Any:
                         unit_state[1, at] = ti.min(
                             ti.cast(1.0, ti.f64), offered / ti.max(need, ti.cast(1e-30, ti.f64))
                         )
+                        unit_state[5, at] = need
+                        unit_state[6, at] = following
+                        shift = ti.max(shift, ti.abs(unit_state[1, at] - unit_state[2, at]))
                         moved = flow_unit
                         cubed = fan_speed * fan_speed * fan_speed * ti.cast(units[4, at], ti.f64)
                         if ti.static(transient):
@@ -516,18 +531,25 @@ def hall_kernel(precision: str) -> Any:
                                 coil_w = ti.cast(1.0, ti.f64)
                         wanted = ti.max(running + coil_w * doubles[0, n] / substep_s, 0.0)
                         coil_w = ti.min(wanted, doubles[2, n])
-                        doubles[0, n] = ti.max(
-                            doubles[0, n] + (coil_load - coil_w) * substep_s, 0.0
-                        )
+                        doubles[0, n] += (coil_load - coil_w) * substep_s
                         for j in range(many_units):
                             unit_state[0, unit_first + j] = (
                                 ti.cast(units[0, unit_first + j], ti.f64)
                                 + doubles[0, n] / doubles[1, n]
                             )
                     else:
+                        # Where supply air falls short, its share must stand still as well.
+                        # The air of a rack feels it one sweep later.
+                        earlier = 0.0 * shift
+                        if first_sweep == 0:
+                            earlier = doubles[7, n]
+                        change_dc = ti.max(change_dc, 32.0 * ti.max(shift, earlier))
+                        doubles[7, n] = shift
+                        shrinks = doubles[5, n] / (1.0 + doubles[5, n])
                         to_come = change_dc
                         if first_substep == 0:
-                            to_come *= change_dc / doubles[6, n]
+                            shrinks = ti.min(ti.max(shrinks, change_dc / doubles[6, n]), 0.9375)
+                            to_come *= shrinks / (1.0 - shrinks)
                         active[n] = ti.cast(to_come > tolerance_k, ti.i32)
                         doubles[6, n] = change_dc
                 scale = ti.cast(1.0, ti.f64)

@@ -195,6 +195,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     models = {stage: _shared(listed, path) for stage, path in STAGE_MODELS.items()}
     steps_per_hour = _shared(listed, "simulation.steps_per_hour")
     _shared(listed, "hvac.total_of")
+    _shared(listed, "simulation.substep_s")
     # One queue array serves the fleet; ages are read off its length.
     _shared(listed, "workload.age_horizon_h")
     _check_names(listed)

@@ -61,8 +61,10 @@ class HallState:
     """Outlet temperature times the strength of the rack, (R,)."""
     captured_m3s: Reals
     """Recirculated air that each rack takes in, (R,)."""
-    fresh_ratio: F64
-    """Share of their need that each CRAC unit covers, (U,)."""
+    need_m3s: F64
+    """Supply air that the racks ask of each CRAC unit, (U,)."""
+    following: F64
+    """Airflow of the servers over that at the design point, for each CRAC unit, (U,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +137,7 @@ class Hall:
         self._precision: Precision = precision
         self._dtype = np.dtype(np.float32 if precision == "f32" else np.float64)
         self._fleet = fleet
+        self._fresh_row = thermal.DC_ROWS.index("fresh_share")
         self._kernel = thermal.hall_kernel(precision)
         self._outlet_model = thermal.OUTLETS.index(fleet.models["outlet"])
         self._recirculates = fleet.air is not None
@@ -321,7 +324,10 @@ class Hall:
         self._server_c = state.server_c.copy()
         self._rack_state[0], self._rack_state[1] = state.mixed_c, state.exhaust_c
         self._rack_state[3] = state.captured_m3s
-        self._unit_state[1] = state.fresh_ratio
+        speed = np.clip(state.following, self._units[1], self._units[2])
+        fresh_share = self._fleet.dcs[self._fresh_row][self._fleet.unit_dc]
+        offered = fresh_share * self._fleet.unit_design_m3s * speed
+        self._unit_state[1] = np.minimum(1.0, offered / np.maximum(state.need_m3s, 1e-30))
         self._units[0] = coil.setpoint_c
         rows = (coil.room_j, coil.room_j_per_k, coil.limit_w, coil.fan_w_per_m3s)
         for row, values in enumerate(rows):
@@ -351,7 +357,8 @@ class Hall:
             mixed_c=self._rack_state[0].copy(),
             exhaust_c=self._rack_state[1].copy(),
             captured_m3s=self._rack_state[3].copy(),
-            fresh_ratio=self._unit_state[1].copy(),
+            need_m3s=self._unit_state[5].copy(),
+            following=self._unit_state[6].copy(),
         )
 
     def _set(self, met: Conditions) -> None:
@@ -399,6 +406,7 @@ class Hall:
             advance,
             self._slices,
             source,
+            int(source == 0 and first),
             int(first),
             substep_s,
             weight,

@@ -161,7 +161,7 @@ class Simulator:
         self._flow_name = models["crac_flow"]
         self._recirculates = models["inlet"] == "recirculation"
         self._transient = models["thermal"] == "transient"
-        self._substep_s = float(np.min(v("simulation.substep_s")))
+        self._substep_s = self.fleet.configs[0].simulation.substep_s
         self._stores_heat = models["cooling_load"] in cooling.STORES_UNMET_HEAT
         self._work_model = workload.MODELS[models["workload"]]
         self._setpoint_model = cooling.SETPOINTS[models["setpoint"]]
@@ -705,8 +705,10 @@ class Simulator:
                     f"snapshot: {field.name} is {given.dtype} {given.shape}, "
                     f"expected {model.dtype} {model.shape}"
                 )
-            # The last command is not a number before the first step.
-            low = -np.inf if field.name.endswith("_c") else 0.0
+            # The last command is not a number before the first step; room heat is below zero while
+            # the air is colder than the setpoint.
+            signed = field.name.endswith("_c") or field.name == "room_heat_kwh"
+            low = -np.inf if signed else 0.0
             valid = np.all(np.isfinite(given) & (given >= low))
             if field.name != "cooling_last" and not valid:
                 raise SdcError(f"snapshot: {field.name} has values that are negative or not finite")

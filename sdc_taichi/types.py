@@ -116,8 +116,10 @@ class State:
     """Outlet temperature times the strength of the rack, (R,)."""
     captured_m3s: Reals
     """Recirculated air that each rack takes in, (R,)."""
-    fresh_ratio: F64
-    """Share of their need that each CRAC unit covers, (U,)."""
+    need_m3s: F64
+    """Supply air that the racks ask of each CRAC unit, (U,)."""
+    following: F64
+    """Airflow of the servers over that at the design point, for each CRAC unit, (U,)."""
 
 
 @dataclass(frozen=True, slots=True)
