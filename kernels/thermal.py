@@ -1,16 +1,19 @@
 """Server temperatures and power over all racks of all data centers.
 
 Servers of a rack that are alike form a group, which is computed once; ``expand`` copies its
-values to per-server layers. Racks point into groups and groups into servers by offsets, so halls
-may have any size. Every literal here is exact in binary, so that f64 runs lose nothing to the
-default f32 literals of the runtime.
+values to per-server layers. Halls may have any size: the racks of a data center are cut into blocks
+of LANES, filled up with racks without servers, and all arithmetic runs over the lanes of a block.
+Small local arrays hold a block, because only stores to them let the compiler vectorise a loop.
+Blocks whose groups are equal share a table. Every literal here is exact in binary, so that f64 runs
+lose nothing to the default f32 literals of the runtime.
 
 Arrays are two-dimensional with one row per quantity; the row names below are the interface. Sums
-run serially within a chunk of racks and over the chunks of a data center, so that a data center
+run serially within a chunk of blocks and over the chunks of a data center, so that a data center
 gives the same bits alone and in any batch.
 """
 
 from functools import cache
+from math import factorial, log
 from typing import Any, no_type_check
 
 from .backend import ti
@@ -19,12 +22,35 @@ INLETS = ("approach", "recirculation")
 THERMAL = ("quasi_steady", "transient")
 OUTLETS = ("server", "rack", "released")
 
-RACK_INTS = ("first_group", "first_run", "dc")
+LANES = 16
+"""Racks that are computed at a time; the same for all, so that results never depend on it."""
+
+BLOCK_INTS = ("racks", "groups", "table", "place", "even")
+"""Racks and groups per rack of each block, entry of its tables, first place of its groups, and 1 if
+its racks are equal."""
 RUN_INTS = ("first", "length", "offset")
-CHUNK_INTS = ("first_rack", "dc", "first_need")
-DC_INTS = ("first_chunk", "first_unit", "first_rack", "first_share")
-RACK_ROWS = ("approach_k", "norm", "load", "powered", "airflow", "strength")
-GROUP_ROWS = ("count", "full_w", "idle_w", "inlet_offset_k", "load_deviation", "captured", "load")
+CHUNK_INTS = ("first_block", "dc", "first_need")
+DC_INTS = ("first_chunk", "first_unit", "first_share", "racks")
+CONTROL = ("active", "exchange", "side", "sweep")
+"""Per data center: whether the next sweep computes it, whether it exchanges anew, which row of the
+exhaust its last exchange saw, sweeps since the start."""
+RACK_ROWS = (
+    "approach_k",
+    "norm",
+    "load",
+    "powered",
+    "airflow",
+    "strength",
+    "per_strength",
+    "captured",
+    "servers",
+    "start_approach_k",
+    "start_rise_k",
+    "mixed_approach_k",
+    "mixed_rise_k",
+)
+"""The last four start the sweeps: of a rack and of the exhaust mix before it."""
+GROUP_ROWS = ("count", "full_w", "idle_w", "inlet_offset_k", "load_deviation", "height")
 DC_ROWS = (
     "cpu_slope_per_k",
     "cpu_offset",
@@ -51,12 +77,17 @@ DC_DOUBLES = (
     "coil_limit_w",
     "crac_fan_w_per_m3s",
     "it_airflow_m3s",
-    "overshoot",
-    "change_k",
-    "shift",
+    "start_scale",
+    "start_warming",
+    "kept",
+    "start_c",
+    "shift_k",
+    "moved_k",
+    "shifted_k",
 )
-"""Per data center in f64: heat held by the room and what the coil needs in transient runs, how far
-every second sweep goes beyond its mix, and by how much the last one moved it and the cover."""
+"""Per data center in f64: heat held by the room and what the coil needs in transient runs; where
+the sweeps start and what they keep of a common deviation; common shift of the exhaust mixes since
+the last exchange, and by how much the outlets and the shift changed in the last sweep."""
 UNIT_ROWS = ("setpoint_c", "low", "high", "design_m3s", "running")
 UNIT_STATE = (
     "supply_c",
@@ -68,9 +99,9 @@ UNIT_STATE = (
     "following",
 )
 """What units give and cover; need for supply air and the servers' airflow over that at design."""
-RACK_STATE = ("mixed_c", "exhaust_c", "exhaust_c", "captured_m3s")
-"""Exhaust mix before a rack, outlets times strength of the sweeps in turn, flow that the rack takes
-of the mix."""
+RACK_STATE = ("mixed_c", "exhaust_c", "exhaust_c", "captured_m3s", "exchanged_c")
+"""Exhaust mix before a rack, outlets times strength at the last exchange and since in turn, flow
+that the rack takes of the mix, and the mix at the last exchange."""
 RACK_OUT = ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "inlet_max_c", "outlet_c")
 GROUP_OUT = ("inlet_c", "outlet_c", "power_w")
 SUMS = (
@@ -87,9 +118,10 @@ SUMS = (
     "stored_w",
     "inlet_max_c",
     "hottest_group",
-    "change_k",
+    "least_change_k",
+    "most_change_k",
 )
-"""Per chunk of racks; all but the last three add up."""
+"""Per chunk; all but the last four add up."""
 DC_OUT = (
     "cpu_w",
     "fan_w",
@@ -113,7 +145,17 @@ DC_OUT = (
 RECOMMENDED_HIGH_C = 27.0
 RECOMMENDED_LOW_C = 18.0
 
-# A parallel loop of at most 512 iterations runs on one thread, so each slice of racks gets 512.
+EXP_TERMS = {"f32": 8, "f64": 15}
+"""Terms of the series of exp on half an octave of 2 to the last digit."""
+
+
+def exp_constants(precision: str) -> list[float]:
+    """1/ln 2, ln 2 and the series of exp, for ``hall_kernel``."""
+    terms = range(EXP_TERMS[precision] - 1, -1, -1)
+    return [1.0 / log(2.0), log(2.0), *(1.0 / factorial(k) for k in terms)]
+
+
+# A parallel loop of at most 512 iterations runs on one thread, so each slice of chunks gets 512.
 _BLOCK = 512
 
 
@@ -134,25 +176,240 @@ def hall_kernel(precision: str) -> Any:
     Inlets, ``approach``: supply air plus the rack's approach temperature. ``recirculation``: of the
     intake of a server the share 1 - f (1 - c) is exhaust of the racks around, mixed by their
     weights; c is its share at the design point and f <= 1 how much of their need the CRAC units
-    cover. Sweeps repeat until the mix before every rack moves by less than ``tolerance_k``.
+    cover. Sweeps repeat until one more would move no mix by more than ``tolerance_k``. The weights
+    of a mix sum to 1, so it moves by no more than the outlets have moved since the last exchange;
+    where all of them moved alike, the mixes are shifted and nothing is exchanged.
 
     Outlets: ``server`` is T + P/(rho*cp*V) per group, ``rack`` the same with the rack's sums, and
     ``released`` the rack fit T + 1.918*P^1.096/(0.526*rho*cp*V^0.824) - 14.01 of the released
-    SustainDC, whose constants come in as ``fit``.
+    SustainDC, whose constants come in as ``constants``, followed by ``exp_constants``.
 
     ``transient``: a sweep is a substep. Servers follow C dT/dt = P_cpu - eps K (T - T_in); the
     recirculated air before a rack follows its mix with the time constant of its share of the room
     air, or that of a room without fans. Both by the exact exponential, and what leaves is the exact
     mean, so heat stored plus heat removed is heat generated. Supply air is the setpoint plus what
     the heat kept by the room warms it by; the coil takes what the plant can.
+
+    A data center of one chunk runs all its sweeps in one call, others one per call.
     """
     real = _real(precision)
+    whole = ti.i32 if precision == "f32" else ti.i64
+    mantissa, bias = (23, 127) if precision == "f32" else (52, 1023)
+    terms = EXP_TERMS[precision]
     reals_2d = ti.types.ndarray(dtype=real, ndim=2)
     reals_1d = ti.types.ndarray(dtype=real, ndim=1)
+    blocks_2d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=2)
+    blocks_1d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=1)
     ints_2d = ti.types.ndarray(dtype=ti.i32, ndim=2)
     ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
     doubles_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
     doubles_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
+
+    @ti.func
+    @no_type_check
+    def lanes(value):
+        return ti.Vector([ti.cast(value, real)] * LANES)
+
+    @ti.func
+    @no_type_check
+    def sums_of_lanes():
+        return ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
+
+    @ti.func
+    @no_type_check
+    def total_of(values):
+        total = ti.cast(0.0, ti.f64)
+        for i in ti.static(range(LANES)):
+            total += values[i]
+        return total
+
+    @ti.func
+    @no_type_check
+    def exp_of_minus(x, constants: ti.template()):
+        """exp(-x) for 0 <= x, by its series; calls would keep loops from being vectorised."""
+        y = -ti.min(x, real(80.0))
+        octave = ti.floor(y * constants[5] + real(0.5))
+        rest = y - octave * constants[6]
+        out = constants[7]
+        for i in ti.static(range(8, 7 + terms)):
+            out = out * rest + constants[i]
+        return out * ti.bit_cast((ti.cast(octave, whole) + bias) << mantissa, real)
+
+    @ti.func
+    @no_type_check
+    def close(
+        recirculates: ti.template(),
+        transient: ti.template(),
+        advance: ti.template(),
+        n,
+        first_substep,
+        substep_s,
+        weight,
+        tolerance_k,
+        chunk_ints: ti.template(),
+        dc_ints: ti.template(),
+        control: ti.template(),
+        dcs: ti.template(),
+        doubles: ti.template(),
+        units: ti.template(),
+        unit_state: ti.template(),
+        needs: ti.template(),
+        sums: ti.template(),
+        dc_out: ti.template(),
+    ):
+        """Sums of a data center, its CRAC units, and what its next sweep is."""
+        total = ti.Vector([ti.cast(0.0, ti.f64)] * 11)
+        hottest_dc = ti.cast(-1e30, ti.f64)
+        hottest_at = ti.cast(0.0, ti.f64)
+        least_k = ti.cast(1e30, ti.f64)
+        most_k = ti.cast(-1e30, ti.f64)
+        for chunk in range(dc_ints[0, n], dc_ints[0, n + 1]):
+            for r in ti.static(range(11)):
+                total[r] += sums[r, chunk]
+            if sums[11, chunk] > hottest_dc:
+                hottest_dc = sums[11, chunk]
+                hottest_at = sums[12, chunk]
+            least_k = ti.min(least_k, sums[13, chunk])
+            most_k = ti.max(most_k, sums[14, chunk])
+        n_racks = ti.cast(dc_ints[3, n], ti.f64)
+        air_dc = ti.cast(dcs[12, n], ti.f64)
+        crac_flow = ti.cast(0.0, ti.f64)
+        supply_flow = ti.cast(0.0, ti.f64)
+        passing = ti.cast(0.0, ti.f64)
+        return_c = ti.cast(0.0, ti.f64)
+        coil_load = ti.cast(0.0, ti.f64)
+        coil_w = ti.cast(0.0, ti.f64)
+        if ti.static(recirculates and advance):
+            unit_first = dc_ints[1, n]
+            many_units = dc_ints[1, n + 1] - unit_first
+            following = total[2] / doubles[4, n]
+            uncovered = ti.cast(0.0, ti.f64)
+            for j in range(many_units):
+                at = unit_first + j
+                need = ti.cast(0.0, ti.f64)
+                for chunk in range(dc_ints[0, n], dc_ints[0, n + 1]):
+                    need += needs[chunk_ints[2, chunk] + j]
+                low = ti.cast(units[1, at], ti.f64)
+                high = ti.cast(units[2, at], ti.f64)
+                fan_speed = ti.min(ti.max(following, low), high)
+                flow_unit = ti.cast(units[3, at], ti.f64) * fan_speed
+                offered = ti.cast(dcs[14, n], ti.f64) * flow_unit
+                crac_flow += flow_unit
+                supply_flow += flow_unit * unit_state[0, at]
+                used = unit_state[1, at]
+                passing += (flow_unit - used * need) * unit_state[0, at]
+                unit_state[2, at] = used
+                covers = ti.min(
+                    ti.cast(1.0, ti.f64), offered / ti.max(need, ti.cast(1e-30, ti.f64))
+                )
+                uncovered = ti.max(uncovered, ti.abs(covers - used))
+                unit_state[1, at] = covers
+                unit_state[5, at] = need
+                unit_state[6, at] = following
+                moved = flow_unit
+                cubed = fan_speed * fan_speed * fan_speed * ti.cast(units[4, at], ti.f64)
+                if ti.static(transient):
+                    moved *= weight
+                    cubed *= weight
+                    if first_substep == 0:
+                        moved += unit_state[3, at]
+                        cubed += unit_state[4, at]
+                unit_state[3, at] = moved
+                unit_state[4, at] = cubed
+            return_c = (total[6] - total[7] + passing) / crac_flow
+            # All mixes move by the middle of the outlets' changes, give or take half their spread.
+            middle_k = 0.5 * (least_k + most_k)
+            apart = 0.5 * (most_k - least_k) > 0.25 * tolerance_k
+            exchanged = control[1, n] != 0
+            if exchanged:
+                control[2, n] = 1 - control[2, n]
+            sweep = control[3, n]
+            control[3, n] = sweep + 1
+            if ti.static(transient):
+                running = ti.cast(0.0, ti.f64)
+                fans_w = ti.cast(0.0, ti.f64)
+                for j in range(many_units):
+                    at = unit_first + j
+                    low = ti.cast(units[1, at], ti.f64)
+                    high = ti.cast(units[2, at], ti.f64)
+                    fan_speed = ti.min(ti.max(following, low), high)
+                    design_m3s = ti.cast(units[3, at], ti.f64)
+                    is_on = ti.cast(units[4, at], ti.f64)
+                    taken = air_dc * design_m3s * fan_speed * (return_c - unit_state[0, at])
+                    drawn = is_on * fan_speed * fan_speed * fan_speed * doubles[3, n] * design_m3s
+                    fans_w += drawn
+                    coil_load += taken + drawn
+                    running += is_on * (taken + drawn)
+                    if is_on > 0.0:
+                        coil_w = ti.cast(1.0, ti.f64)
+                wanted = ti.max(running + coil_w * doubles[0, n] / substep_s, 0.0)
+                coil_w = ti.min(wanted, doubles[2, n])
+                doubles[0, n] += (coil_load - coil_w) * substep_s
+                for j in range(many_units):
+                    unit_state[0, unit_first + j] = (
+                        ti.cast(units[0, unit_first + j], ti.f64) + doubles[0, n] / doubles[1, n]
+                    )
+                doubles[9, n] = ti.select(apart, ti.cast(0.0, ti.f64), middle_k)
+                control[1, n] = ti.cast(apart, ti.i32)
+            else:
+                shift_k = doubles[9, n]
+                left_k = ti.max(most_k - shift_k, shift_k - least_k)
+                # The mixes cool or warm by less than what they lie above supply air.
+                above_k = ti.abs(total[4] / n_racks - supply_flow / crac_flow)
+                left_k = ti.max(left_k, uncovered * above_k)
+                control[0, n] = ti.cast(left_k > tolerance_k, ti.i32)
+                control[1, n] = ti.cast(apart, ti.i32)
+                # Most of what is left is the same for all racks and shrinks by a factor, so a sweep
+                # can go all the way: as expected, or as the last sweep showed, now and then not.
+                moved_k = middle_k - doubles[10, n]
+                kept = ti.min(doubles[7, n], 0.5)
+                if sweep > 0 and not exchanged and ti.abs(doubles[11, n]) > 32.0 * tolerance_k:
+                    kept = ti.min(ti.max(moved_k / doubles[11, n], 0.0), 0.75)
+                if sweep % 4 == 3:
+                    kept *= 0.0
+                beyond_k = kept / (1.0 - kept) * (middle_k - shift_k)
+                next_k = middle_k + beyond_k
+                doubles[11, n] = next_k - shift_k
+                doubles[10, n] = middle_k
+                if apart:
+                    next_k = beyond_k
+                    doubles[10, n] = 0.0
+                doubles[9, n] = next_k
+        scale = ti.cast(1.0, ti.f64)
+        keep = 0
+        if ti.static(transient):
+            scale = weight
+            keep = 1 - first_substep
+        supply_c = ti.cast(0.0, ti.f64)
+        if crac_flow > 0.0:
+            supply_c = supply_flow / crac_flow
+        now = ti.Vector(
+            [
+                total[0],
+                total[1],
+                total[2],
+                total[3] / n_racks,
+                total[4] / n_racks,
+                total[5] - total[2] * supply_c,
+                total[6] - total[2] * supply_c,
+                total[8],
+                total[9],
+                total[10],
+                crac_flow,
+                supply_c,
+                return_c,
+                coil_load,
+                coil_w,
+            ]
+        )
+        for r in ti.static(range(15)):
+            value = scale * now[r]
+            if keep != 0:
+                value += dc_out[r, n]
+            dc_out[r, n] = value
+        if keep == 0 or hottest_dc > dc_out[15, n]:
+            dc_out[15, n] = hottest_dc
+            dc_out[16, n] = hottest_at
 
     @ti.kernel
     @no_type_check
@@ -164,30 +421,34 @@ def hall_kernel(precision: str) -> Any:
         write_groups: ti.template(),
         advance: ti.template(),
         slices: ti.i32,
-        source: ti.i32,
+        sweeps: ti.i32,
         first_sweep: ti.i32,
-        first_substep: ti.i32,
         substep_s: ti.f64,
         weight: ti.f64,
         tolerance_k: ti.f64,
-        rack_ints: ints_2d,
+        run_start: ints_1d,
+        alike: ints_1d,
         run_ints: ints_2d,
+        block_ints: ints_2d,
         chunk_ints: ints_2d,
         dc_ints: ints_2d,
-        active: ints_1d,
+        control: ints_2d,
         weights: reals_1d,
-        shares: reals_1d,
-        racks: reals_2d,
-        groups: reals_2d,
+        shares: blocks_1d,
+        racks: blocks_2d,
+        tables: blocks_1d,
+        even_values: reals_1d,
+        group_load: blocks_1d,
         dcs: reals_2d,
         doubles: doubles_2d,
         units: reals_2d,
         unit_state: doubles_2d,
-        rack_state: reals_2d,
-        server_c: reals_1d,
-        fit: reals_1d,
-        rack_out: reals_2d,
-        group_out: reals_2d,
+        rack_state: reals_1d,
+        rack_store: blocks_2d,
+        server_c: blocks_1d,
+        constants: reals_1d,
+        rack_out: blocks_2d,
+        group_out: blocks_2d,
         needs: doubles_1d,
         sums: doubles_2d,
         dc_out: doubles_2d,
@@ -199,7 +460,12 @@ def hall_kernel(precision: str) -> Any:
                 last = ti.cast((ti.cast(k // 512, ti.i64) + 1) * n_chunks // slices, ti.i32)
                 for chunk in range(first, last):
                     n = chunk_ints[1, chunk]
-                    if active[n] != 0:
+                    alone = dc_ints[0, n + 1] - dc_ints[0, n] == 1
+                    # Chunks of one data center wait for each other after every sweep.
+                    rounds = sweeps if alone else 1
+                    for sweep_here in range(rounds):
+                        if control[0, n] == 0:
+                            break
                         unit_0 = dc_ints[1, n]
                         n_units = dc_ints[1, n + 1] - unit_0
                         need_0 = chunk_ints[2, chunk]
@@ -218,376 +484,514 @@ def hall_kernel(precision: str) -> Any:
                         fan_reference_w = dcs[10, n]
                         full_m3s = dcs[11, n]
                         air = dcs[12, n]
+                        per_air = real(1.0) / air
                         limit_c = dcs[13, n]
+                        server_j = dcs[15, n]
+                        taken_up = dcs[16, n] * air
+                        parcel_j = dcs[17, n]
                         step_s = ti.cast(substep_s, real)
-                        still_per_s = real(1.0 / 128.0)
-                        # Most of what is left after a sweep is the same for all racks and shrinks
-                        # by a known factor, so every second sweep goes all the way.
-                        beyond = ti.cast(doubles[5, n], real) * ti.cast(source, real)
-                        cpu_sum = ti.cast(0.0, ti.f64)
-                        fan_sum = ti.cast(0.0, ti.f64)
-                        flow_sum = ti.cast(0.0, ti.f64)
-                        inlet_sum = ti.cast(0.0, ti.f64)
-                        outlet_sum = ti.cast(0.0, ti.f64)
-                        inlet_flow_sum = ti.cast(0.0, ti.f64)
-                        outlet_flow_sum = ti.cast(0.0, ti.f64)
-                        captured_sum = ti.cast(0.0, ti.f64)
-                        hot_sum = ti.cast(0.0, ti.f64)
-                        cold_sum = ti.cast(0.0, ti.f64)
-                        stored_sum = ti.cast(0.0, ti.f64)
-                        change = ti.cast(0.0, ti.f64)
+                        per_step_s = real(1.0) / step_s
+                        # Air before racks that stand still is stirred by the CRAC air of the room.
+                        still_per_s = ti.min(
+                            real(1.0 / 128.0),
+                            air * ti.cast(doubles[8, n], real) / dcs[17, n],
+                        )
+                        begins = first_sweep + sweep_here == 0
+                        # What the last sweep left is read anew after it.
+                        shift = ti.cast(doubles[9, n], real)
+                        side = control[2, n]
+                        anew = control[1, n] != 0
+                        if anew:
+                            side = 1 - side
+                        cpu_sum = sums_of_lanes()
+                        fan_sum = sums_of_lanes()
+                        flow_sum = sums_of_lanes()
+                        inlet_sum = sums_of_lanes()
+                        outlet_sum = sums_of_lanes()
+                        inlet_flow_sum = sums_of_lanes()
+                        heat_sum = sums_of_lanes()
+                        captured_sum = sums_of_lanes()
+                        hot_sum = sums_of_lanes()
+                        cold_sum = sums_of_lanes()
+                        stored_sum = sums_of_lanes()
+                        least = lanes(1e30)
+                        most = lanes(-1e30)
                         chunk_max = real(-1e30)
                         hottest_group = 0
-                        for q in range(chunk_ints[0, chunk], chunk_ints[0, chunk + 1]):
-                            base = real(0.0)
-                            cover = real(0.0)
-                            supply = real(0.0)
-                            mixed = real(0.0)
-                            parcel_w = real(0.0)
-                            share_0 = dc_ints[3, n] + (q - dc_ints[2, n]) * n_units
+                        for block in range(chunk_ints[0, chunk], chunk_ints[0, chunk + 1]):
+                            q = block * LANES
+                            many = block_ints[0, block]
+                            n_groups = block_ints[1, block]
+                            table = block_ints[2, block]
+                            place = block_ints[3, block]
+                            even = block_ints[4, block] != 0
+                            cover = lanes(0.0)
+                            supply = lanes(0.0)
+                            mixed = lanes(0.0)
+                            share_0 = dc_ints[2, n] + n_units * (
+                                block - chunk_ints[0, dc_ints[0, n]]
+                            )
+                            parcel_w = lanes(0.0)
                             if ti.static(recirculates):
                                 for j in range(n_units):
-                                    part = shares[share_0 + j] * ti.cast(
+                                    ratio = ti.cast(
                                         unit_state[1 if ti.static(advance) else 2, unit_0 + j],
                                         real,
                                     )
-                                    cover += part
-                                    supply += part * ti.cast(unit_state[0, unit_0 + j], real)
-                                supply /= ti.max(cover, real(1e-30))
-                                mixed = rack_state[0, q]
+                                    air_c = ti.cast(unit_state[0, unit_0 + j], real)
+                                    share = shares[share_0 + j]
+                                    for i in range(LANES):
+                                        part = share[i] * ratio
+                                        cover[i] += part
+                                        supply[i] += part * air_c
+                                for i in range(LANES):
+                                    supply[i] /= ti.max(cover[i], real(1e-30))
                                 if ti.static(advance):
-                                    target = real(0.0)
-                                    for run in range(rack_ints[1, q], rack_ints[1, q + 1]):
-                                        from_rack = run_ints[0, run]
-                                        from_weight = run_ints[2, run]
-                                        total = real(0.0)
-                                        for i in range(run_ints[1, run]):
-                                            total += (
-                                                weights[from_weight + i]
-                                                * rack_state[1 + source, from_rack + i]
+                                    target = lanes(0.0)
+                                    if anew:
+                                        from_row = (1 + side) * (rack_store.shape[1] * LANES)
+                                        for half in range(LANES // 4):
+                                            a = q + 4 * half
+                                            run_0 = run_start[a]
+                                            run_1 = run_start[a + 1]
+                                            run_2 = run_start[a + 2]
+                                            run_3 = run_start[a + 3]
+                                            if alike[a // 4] != 0:
+                                                # Four racks with as many runs of the same length.
+                                                t0 = real(0.0)
+                                                t1 = real(0.0)
+                                                t2 = real(0.0)
+                                                t3 = real(0.0)
+                                                for r in range(run_1 - run_0):
+                                                    x0 = from_row + run_ints[0, run_0 + r]
+                                                    x1 = from_row + run_ints[0, run_1 + r]
+                                                    x2 = from_row + run_ints[0, run_2 + r]
+                                                    x3 = from_row + run_ints[0, run_3 + r]
+                                                    w0 = run_ints[2, run_0 + r]
+                                                    w1 = run_ints[2, run_1 + r]
+                                                    w2 = run_ints[2, run_2 + r]
+                                                    w3 = run_ints[2, run_3 + r]
+                                                    s0 = real(0.0)
+                                                    s1 = real(0.0)
+                                                    s2 = real(0.0)
+                                                    s3 = real(0.0)
+                                                    for i in range(run_ints[1, run_0 + r]):
+                                                        s0 += weights[w0 + i] * rack_state[x0 + i]
+                                                        s1 += weights[w1 + i] * rack_state[x1 + i]
+                                                        s2 += weights[w2 + i] * rack_state[x2 + i]
+                                                        s3 += weights[w3 + i] * rack_state[x3 + i]
+                                                    t0 += s0
+                                                    t1 += s1
+                                                    t2 += s2
+                                                    t3 += s3
+                                                target[4 * half] = t0
+                                                target[4 * half + 1] = t1
+                                                target[4 * half + 2] = t2
+                                                target[4 * half + 3] = t3
+                                            else:
+                                                for i in range(4):
+                                                    t = real(0.0)
+                                                    for run in range(
+                                                        run_start[a + i], run_start[a + i + 1]
+                                                    ):
+                                                        x = from_row + run_ints[0, run]
+                                                        w = run_ints[2, run]
+                                                        s = real(0.0)
+                                                        for e in range(run_ints[1, run]):
+                                                            s += weights[w + e] * rack_state[x + e]
+                                                        t += s
+                                                    target[4 * half + i] = t
+                                        norm = racks[1, block]
+                                        for i in range(LANES):
+                                            target[i] *= norm[i]
+                                    elif begins:
+                                        start_c = ti.cast(doubles[8, n], real)
+                                        scale = ti.cast(doubles[5, n], real)
+                                        warming = ti.cast(doubles[6, n], real)
+                                        strength = racks[5, block]
+                                        approach = racks[9, block]
+                                        rise = racks[10, block]
+                                        mixed_approach = racks[11, block]
+                                        mixed_rise = racks[12, block]
+                                        seen = lanes(0.0)
+                                        for i in range(LANES):
+                                            target[i] = (
+                                                start_c
+                                                + scale * mixed_approach[i]
+                                                + warming * mixed_rise[i]
                                             )
-                                        target += total
-                                    target *= racks[1, q]
+                                            seen[i] = strength[i] * (
+                                                start_c + scale * approach[i] + warming * rise[i]
+                                            )
+                                        rack_store[1 + side, block] = seen
+                                    else:
+                                        target = rack_store[4, block]
+                                    if anew or begins:
+                                        rack_store[4, block] = target
+                                    for i in range(LANES):
+                                        target[i] += shift
                                     if ti.static(transient):
                                         # The parcel of room air before the rack: enters at the mix,
                                         # leaves at its own temperature.
-                                        x = step_s * ti.max(
-                                            air * rack_state[3, q] / dcs[17, n], still_per_s
-                                        )
-                                        gone = real(1.0) - ti.exp(-x)
-                                        after = mixed + (target - mixed) * gone
-                                        parcel_w = dcs[17, n] * (after - mixed) / step_s
-                                        mixed = target + (mixed - target) * gone / x
-                                        rack_state[0, q] = after
+                                        after = lanes(0.0)
+                                        before_c = rack_store[0, block]
+                                        taken = rack_store[3, block]
+                                        for i in range(LANES):
+                                            was = before_c[i]
+                                            x = step_s * ti.max(
+                                                air * taken[i] / parcel_j, still_per_s
+                                            )
+                                            gone = real(1.0) - exp_of_minus(x, constants)
+                                            now_c = was + (target[i] - was) * gone
+                                            after[i] = now_c
+                                            parcel_w[i] = parcel_j * (now_c - was) * per_step_s
+                                            mixed[i] = target[i] + (was - target[i]) * gone / x
+                                        rack_store[0, block] = after
                                     else:
-                                        change = ti.max(
-                                            change, ti.cast(ti.abs(target - mixed), ti.f64)
-                                        )
-                                        mixed = target + beyond * (target - mixed)
-                                        rack_state[0, q] = mixed
+                                        rack_store[0, block] = target
+                                        for i in range(LANES):
+                                            mixed[i] = target[i]
+                                else:
+                                    mixed = rack_store[0, block]
                             else:
-                                base = ti.cast(unit_state[0, unit_0], real) + racks[0, q]
-                            u = racks[2, q]
-                            spread = u * (real(1.0) - u)
-                            powered = racks[3, q]
-                            breath = racks[4, q] * powered
-                            servers = real(0.0)
-                            cpu = real(0.0)
-                            fan = real(0.0)
-                            flow = real(0.0)
-                            inlet = real(0.0)
-                            inlet_flow = real(0.0)
-                            fresh_flow = real(0.0)
-                            heat = real(0.0)
-                            hot = real(0.0)
-                            cold = real(0.0)
-                            stored = real(0.0)
-                            hottest = real(-1e30)
-                            hottest_here = 0
-                            for g in range(rack_ints[0, q], rack_ints[0, q + 1]):
-                                t = base + groups[3, g]
-                                if ti.static(recirculates):
-                                    t = mixed + cover * (real(1.0) - groups[5, g]) * (
-                                        supply - mixed
-                                    )
-                                load = u + groups[4, g] * spread
+                                air_c = ti.cast(unit_state[0, unit_0], real)
+                                approach = racks[0, block]
+                                for i in range(LANES):
+                                    mixed[i] = air_c + approach[i]
+                            u = racks[2, block]
+                            powered = racks[3, block]
+                            breath = racks[4, block]
+                            rack_captured = racks[7, block]
+                            servers = racks[8, block]
+                            spread = lanes(0.0)
+                            fresh = lanes(0.0)
+                            for i in range(LANES):
+                                spread[i] = u[i] * (real(1.0) - u[i])
+                                breath[i] *= powered[i]
+                                fresh[i] = cover[i] * (supply[i] - mixed[i])
+                            cpu = lanes(0.0)
+                            fan = lanes(0.0)
+                            flow = lanes(0.0)
+                            inlet = lanes(0.0)
+                            inlet_flow = lanes(0.0)
+                            fresh_flow = lanes(0.0)
+                            heat = lanes(0.0)
+                            hot = lanes(0.0)
+                            cold = lanes(0.0)
+                            stored = lanes(0.0)
+                            hottest = lanes(-1e30)
+                            hottest_zone = ti.Vector([0] * LANES)
+                            for z in range(n_groups):
+                                row = (table + z) * 6
+                                count = lanes(0.0)
+                                full_w = lanes(0.0)
+                                idle_w = lanes(0.0)
+                                offset_k = lanes(0.0)
+                                deviation = lanes(0.0)
+                                height = lanes(0.0)
+                                if even:
+                                    count = lanes(even_values[row * LANES])
+                                    full_w = lanes(even_values[(row + 1) * LANES])
+                                    idle_w = lanes(even_values[(row + 2) * LANES])
+                                    offset_k = lanes(even_values[(row + 3) * LANES])
+                                    deviation = lanes(even_values[(row + 4) * LANES])
+                                    height = lanes(even_values[(row + 5) * LANES])
+                                else:
+                                    count = tables[row]
+                                    full_w = tables[row + 1]
+                                    idle_w = tables[row + 2]
+                                    offset_k = tables[row + 3]
+                                    deviation = tables[row + 4]
+                                    height = tables[row + 5]
+                                given_load = lanes(0.0)
                                 if ti.static(group_loads):
-                                    load = groups[6, g]
-                                on_curve = ti.min(t, limit_c)
-                                ratio = cpu_slope * on_curve + cpu_offset + cpu_shift * load
-                                cpu_1 = ti.max(groups[2, g], groups[1, g] * ratio)
-                                y = ti.min(
-                                    ti.max(
-                                        fan_slope * on_curve + fan_offset + fan_shift * load,
-                                        fan_low,
-                                    ),
-                                    fan_high,
-                                )
-                                speed = y * per_reference
-                                fan_1 = fan_reference_w
+                                    given_load = group_load[place + z]
+                                t = lanes(0.0)
+                                y = lanes(0.0)
+                                own = lanes(0.0)
+                                cpu_1 = lanes(0.0)
+                                fan_1 = lanes(0.0)
+                                flow_1 = lanes(0.0)
+                                to_air = lanes(0.0)
+                                for i in range(LANES):
+                                    if ti.static(recirculates):
+                                        own[i] = real(1.0) - rack_captured[i] * height[i]
+                                        t[i] = mixed[i] + own[i] * fresh[i]
+                                    else:
+                                        t[i] = mixed[i] + offset_k[i]
+                                for i in range(LANES):
+                                    load = u[i] + deviation[i] * spread[i]
+                                    if ti.static(group_loads):
+                                        load = given_load[i]
+                                    on_curve = ti.min(t[i], limit_c)
+                                    ratio = cpu_slope * on_curve + cpu_offset + cpu_shift * load
+                                    cpu_1[i] = powered[i] * ti.max(
+                                        idle_w[i],
+                                        full_w[i] * ratio,
+                                    )
+                                    y[i] = ti.min(
+                                        ti.max(
+                                            fan_slope * on_curve + fan_offset + fan_shift * load,
+                                            fan_low,
+                                        ),
+                                        fan_high,
+                                    )
                                 # A branch on data, not one kernel per exponent: compiled apart,
                                 # they would round apart, and a data center must not depend on its
                                 # batch.
                                 if exponent == real(3.0):
-                                    fan_1 *= speed * speed * speed
+                                    for i in range(LANES):
+                                        speed = y[i] * per_reference
+                                        fan_1[i] = speed * speed * speed
                                 elif exponent == real(1.0):
-                                    fan_1 *= speed
+                                    for i in range(LANES):
+                                        fan_1[i] = y[i] * per_reference
                                 else:
-                                    fan_1 *= ti.pow(speed, exponent)
-                                flow_1 = full_m3s * y
-                                cpu_1 *= powered
-                                fan_1 *= breath
-                                flow_1 *= breath
-                                many = groups[0, g]
-                                to_air = cpu_1
+                                    for i in range(LANES):
+                                        fan_1[i] = ti.pow(y[i] * per_reference, exponent)
+                                for i in range(LANES):
+                                    fan_1[i] *= fan_reference_w * breath[i]
+                                    flow_1[i] = full_m3s * y[i] * breath[i]
+                                    to_air[i] = cpu_1[i]
                                 if ti.static(transient):
-                                    exchange = dcs[16, n] * air * flow_1
-                                    x = step_s * exchange / dcs[15, n]
-                                    before = server_c[g]
-                                    to_air = exchange * (before - t)
-                                    if ti.static(advance) and x > real(0.0):
-                                        steady = t + cpu_1 / exchange
-                                        left = ti.exp(-x)
-                                        after = steady + (before - steady) * left
-                                        to_air = cpu_1 - dcs[15, n] * (after - before) / step_s
-                                        server_c[g] = after
-                                        stored += many * dcs[15, n] * (after - before) / step_s
-                                servers += many
-                                cpu += many * cpu_1
-                                fan += many * fan_1
-                                flow += many * flow_1
-                                inlet += many * t
-                                inlet_flow += many * flow_1 * t
-                                heat += many * (to_air + fan_1)
-                                if ti.static(recirculates):
-                                    fresh_flow += many * flow_1 * (real(1.0) - groups[5, g])
-                                hot += many * ti.max(t - real(27.0), real(0.0))
-                                cold += many * ti.max(real(18.0) - t, real(0.0))
-                                if t > hottest:
-                                    hottest = t
-                                    hottest_here = g
+                                    start_c = server_c[place + z]
+                                    end_c = lanes(0.0)
+                                    for i in range(LANES):
+                                        before = start_c[i]
+                                        exchange = taken_up * flow_1[i]
+                                        after = before
+                                        if ti.static(advance):
+                                            steady = t[i] + cpu_1[i] / ti.max(exchange, real(1e-30))
+                                            left = exp_of_minus(
+                                                step_s * exchange / server_j, constants
+                                            )
+                                            after = steady + (before - steady) * left
+                                            warmed_w = server_j * (after - before) * per_step_s
+                                            moves = exchange > real(0.0)
+                                            end_c[i] = ti.select(moves, after, before)
+                                            warmed_w = ti.select(moves, warmed_w, real(0.0))
+                                            to_air[i] = ti.select(
+                                                moves, cpu_1[i] - warmed_w, real(0.0)
+                                            )
+                                            stored[i] += count[i] * warmed_w
+                                        else:
+                                            to_air[i] = exchange * (before - t[i])
+                                    if ti.static(advance):
+                                        server_c[place + z] = end_c
+                                for i in range(LANES):
+                                    counted_flow = count[i] * flow_1[i]
+                                    cpu[i] += count[i] * cpu_1[i]
+                                    fan[i] += count[i] * fan_1[i]
+                                    flow[i] += counted_flow
+                                    inlet[i] += count[i] * t[i]
+                                    inlet_flow[i] += counted_flow * t[i]
+                                    heat[i] += count[i] * (to_air[i] + fan_1[i])
+                                    if ti.static(recirculates):
+                                        fresh_flow[i] += counted_flow * own[i]
+                                    hot[i] += count[i] * ti.max(t[i] - real(27.0), real(0.0))
+                                    cold[i] += count[i] * ti.max(real(18.0) - t[i], real(0.0))
+                                    here = ti.select(count[i] > real(0.0), t[i], real(-1e30))
+                                    hottest_zone[i] = ti.select(
+                                        here > hottest[i], z, hottest_zone[i]
+                                    )
+                                    hottest[i] = ti.max(hottest[i], here)
                                 if ti.static(write_groups):
-                                    group_out[0, g] = t
-                                    group_out[1, g] = t
-                                    if flow_1 > real(0.0):
-                                        group_out[1, g] = t + (to_air + fan_1) / (air * flow_1)
-                                    group_out[2, g] = cpu_1 + fan_1
-                            outlet = inlet / servers
-                            if flow > real(0.0):
-                                outlet = (inlet_flow + heat / air) / flow
+                                    out = lanes(0.0)
+                                    drawn = lanes(0.0)
+                                    for i in range(LANES):
+                                        out[i] = t[i] + ti.select(
+                                            flow_1[i] > real(0.0),
+                                            (to_air[i] + fan_1[i])
+                                            / ti.max(air * flow_1[i], real(1e-30)),
+                                            real(0.0),
+                                        )
+                                        drawn[i] = cpu_1[i] + fan_1[i]
+                                    group_out[0, place + z] = t
+                                    group_out[1, place + z] = out
+                                    group_out[2, place + z] = drawn
+                            outlet = lanes(0.0)
+                            for i in range(LANES):
+                                mean = inlet[i] / servers[i]
+                                moves = flow[i] > real(0.0)
+                                per_flow = real(1.0) / ti.max(flow[i], real(1e-30))
+                                leaves = (inlet_flow[i] + heat[i] * per_air) * per_flow
                                 if ti.static(outlet_model == 1):
-                                    outlet = inlet / servers + (cpu + fan) / (air * flow)
+                                    leaves = mean + (cpu[i] + fan[i]) * per_air * per_flow
                                 elif ti.static(outlet_model == 2):
-                                    outlet = (
-                                        inlet / servers
-                                        + fit[0]
-                                        * ti.pow(cpu + fan, fit[1])
-                                        / (fit[2] * air * ti.pow(flow, fit[3]))
-                                        + fit[4]
+                                    leaves = (
+                                        mean
+                                        + constants[0]
+                                        * ti.pow(cpu[i] + fan[i], constants[1])
+                                        / (
+                                            constants[2]
+                                            * air
+                                            * ti.pow(ti.max(flow[i], real(1e-30)), constants[3])
+                                        )
+                                        + constants[4]
                                     )
+                                outlet[i] = ti.select(moves, leaves, mean)
+                                inlet[i] = mean
+                                if ti.static(recirculates):
+                                    inlet[i] = ti.select(moves, inlet_flow[i] * per_flow, mean)
                             if ti.static(write_groups and outlet_model != 0):
-                                for g in range(rack_ints[0, q], rack_ints[0, q + 1]):
-                                    group_out[1, g] = outlet
-                            if ti.static(recirculates):
-                                captured = flow - cover * fresh_flow
-                                if ti.static(advance):
-                                    rack_state[2 - source, q] = outlet * racks[5, q]
-                                    rack_state[3, q] = captured
-                                captured_sum += ti.cast(captured * mixed + parcel_w / air, ti.f64)
-                                for j in range(n_units):
-                                    needs[need_0 + j] += ti.cast(
-                                        shares[share_0 + j] * fresh_flow, ti.f64
+                                for z in range(n_groups):
+                                    group_out[1, place + z] = outlet
+                            if ti.static(not write_groups):
+                                if ti.static(recirculates):
+                                    captured = lanes(0.0)
+                                    seen = lanes(0.0)
+                                    strength = racks[5, block]
+                                    for i in range(LANES):
+                                        captured[i] = flow[i] - cover[i] * fresh_flow[i]
+                                        seen[i] = outlet[i] * strength[i]
+                                    if ti.static(advance):
+                                        per_strength = racks[6, block]
+                                        exchanged = rack_store[1 + side, block]
+                                        for i in range(LANES):
+                                            change = (seen[i] - exchanged[i]) * per_strength[i]
+                                            there = i < many
+                                            least[i] = ti.min(
+                                                least[i], ti.select(there, change, real(1e30))
+                                            )
+                                            most[i] = ti.max(
+                                                most[i], ti.select(there, change, real(-1e30))
+                                            )
+                                        rack_store[2 - side, block] = seen
+                                        rack_store[3, block] = captured
+                                    for i in range(LANES):
+                                        captured_sum[i] += ti.cast(
+                                            captured[i] * mixed[i]
+                                            + ti.select(i < many, parcel_w[i], real(0.0)) * per_air,
+                                            ti.f64,
+                                        )
+                                    for j in range(n_units):
+                                        share = shares[share_0 + j]
+                                        needed = real(0.0)
+                                        for i in range(LANES):
+                                            needed += share[i] * fresh_flow[i]
+                                        needs[need_0 + j] += ti.cast(needed, ti.f64)
+                                for i in range(LANES):
+                                    cpu_sum[i] += ti.cast(cpu[i], ti.f64)
+                                    fan_sum[i] += ti.cast(fan[i], ti.f64)
+                                    flow_sum[i] += ti.cast(flow[i], ti.f64)
+                                    inlet_flow_sum[i] += ti.cast(inlet_flow[i], ti.f64)
+                                    heat_sum[i] += ti.cast(
+                                        inlet_flow[i] + heat[i] * per_air, ti.f64
                                     )
-                            inlet /= servers
-                            if ti.static(recirculates):
-                                if flow > real(0.0):
-                                    inlet = inlet_flow / flow
-                            cpu_sum += ti.cast(cpu, ti.f64)
-                            fan_sum += ti.cast(fan, ti.f64)
-                            flow_sum += ti.cast(flow, ti.f64)
-                            inlet_sum += ti.cast(inlet, ti.f64)
-                            outlet_sum += ti.cast(outlet, ti.f64)
-                            inlet_flow_sum += ti.cast(inlet_flow, ti.f64)
-                            outlet_flow_sum += ti.cast(inlet_flow + heat / air, ti.f64)
-                            hot_sum += ti.cast(hot, ti.f64)
-                            cold_sum += ti.cast(cold, ti.f64)
-                            stored_sum += ti.cast(stored + parcel_w, ti.f64)
-                            if hottest > chunk_max:
-                                chunk_max = hottest
-                                hottest_group = hottest_here
-                            if ti.static(transient):
-                                share = ti.cast(weight, real)
-                                if first_substep != 0:
-                                    for r in ti.static(range(6)):
-                                        rack_out[r, q] = real(0.0)
-                                    rack_out[4, q] = hottest
-                                rack_out[0, q] += share * cpu
-                                rack_out[1, q] += share * fan
-                                rack_out[2, q] += share * flow
-                                rack_out[3, q] += share * inlet
-                                rack_out[4, q] = ti.max(hottest, rack_out[4, q])
-                                rack_out[5, q] += share * outlet
-                            else:
-                                rack_out[0, q] = cpu
-                                rack_out[1, q] = fan
-                                rack_out[2, q] = flow
-                                rack_out[3, q] = inlet
-                                rack_out[4, q] = hottest
-                                rack_out[5, q] = outlet
-                        sums[0, chunk] = cpu_sum
-                        sums[1, chunk] = fan_sum
-                        sums[2, chunk] = flow_sum
-                        sums[3, chunk] = inlet_sum
-                        sums[4, chunk] = outlet_sum
-                        sums[5, chunk] = inlet_flow_sum
-                        sums[6, chunk] = outlet_flow_sum
-                        sums[7, chunk] = captured_sum
-                        sums[8, chunk] = hot_sum
-                        sums[9, chunk] = cold_sum
-                        sums[10, chunk] = stored_sum
-                        sums[11, chunk] = ti.cast(chunk_max, ti.f64)
-                        sums[12, chunk] = ti.cast(hottest_group, ti.f64)
-                        sums[13, chunk] = change
+                                for i in range(LANES):
+                                    there = ti.select(i < many, real(1.0), real(0.0))
+                                    inlet_sum[i] += ti.cast(there * inlet[i], ti.f64)
+                                    outlet_sum[i] += ti.cast(there * outlet[i], ti.f64)
+                                    hot_sum[i] += ti.cast(there * hot[i], ti.f64)
+                                    cold_sum[i] += ti.cast(there * cold[i], ti.f64)
+                                    stored_sum[i] += ti.cast(
+                                        there * (stored[i] + parcel_w[i]), ti.f64
+                                    )
+                                block_max = real(-1e30)
+                                for i in range(LANES):
+                                    block_max = ti.max(
+                                        block_max, ti.select(i < many, hottest[i], real(-1e30))
+                                    )
+                                if block_max > chunk_max:
+                                    chunk_max = block_max
+                                    hottest_group = -1
+                                    for i in range(LANES):
+                                        if (
+                                            hottest_group < 0
+                                            and i < many
+                                            and hottest[i] == block_max
+                                        ):
+                                            hottest_group = (place + hottest_zone[i]) * LANES + i
+                                if ti.static(transient):
+                                    share = ti.cast(weight, real)
+                                    for i in range(LANES):
+                                        cpu[i] = share * cpu[i]
+                                        fan[i] = share * fan[i]
+                                        flow[i] = share * flow[i]
+                                        inlet[i] = share * inlet[i]
+                                        outlet[i] = share * outlet[i]
+                                    if not begins:
+                                        cpu += rack_out[0, block]
+                                        fan += rack_out[1, block]
+                                        flow += rack_out[2, block]
+                                        inlet += rack_out[3, block]
+                                        hottest = ti.max(hottest, rack_out[4, block])
+                                        outlet += rack_out[5, block]
+                                rack_out[0, block] = cpu
+                                rack_out[1, block] = fan
+                                rack_out[2, block] = flow
+                                rack_out[3, block] = inlet
+                                rack_out[4, block] = hottest
+                                rack_out[5, block] = outlet
+                        if ti.static(not write_groups):
+                            totals = (
+                                cpu_sum,
+                                fan_sum,
+                                flow_sum,
+                                inlet_sum,
+                                outlet_sum,
+                                inlet_flow_sum,
+                                heat_sum,
+                                captured_sum,
+                                hot_sum,
+                                cold_sum,
+                                stored_sum,
+                            )
+                            for r in ti.static(range(11)):
+                                sums[r, chunk] = total_of(totals[r])
+                            least_k = real(1e30)
+                            most_k = real(-1e30)
+                            for i in range(LANES):
+                                least_k = ti.min(least_k, least[i])
+                                most_k = ti.max(most_k, most[i])
+                            sums[11, chunk] = ti.cast(chunk_max, ti.f64)
+                            sums[12, chunk] = ti.cast(hottest_group, ti.f64)
+                            sums[13, chunk] = ti.cast(least_k, ti.f64)
+                            sums[14, chunk] = ti.cast(most_k, ti.f64)
+                            if alone:
+                                close(
+                                    recirculates,
+                                    transient,
+                                    advance,
+                                    n,
+                                    ti.cast(begins, ti.i32),
+                                    substep_s,
+                                    weight,
+                                    tolerance_k,
+                                    chunk_ints,
+                                    dc_ints,
+                                    control,
+                                    dcs,
+                                    doubles,
+                                    units,
+                                    unit_state,
+                                    needs,
+                                    sums,
+                                    dc_out,
+                                )
         for n in range(dc_out.shape[1]):
-            if active[n] != 0:
-                total = ti.Vector([ti.cast(0.0, ti.f64)] * 11)
-                hottest_dc = ti.cast(-1e30, ti.f64)
-                hottest_at = ti.cast(0.0, ti.f64)
-                change_dc = ti.cast(0.0, ti.f64)
-                for chunk in range(dc_ints[0, n], dc_ints[0, n + 1]):
-                    for r in ti.static(range(11)):
-                        total[r] += sums[r, chunk]
-                    if sums[11, chunk] > hottest_dc:
-                        hottest_dc = sums[11, chunk]
-                        hottest_at = sums[12, chunk]
-                    change_dc = ti.max(change_dc, sums[13, chunk])
-                n_racks = ti.cast(dc_ints[2, n + 1] - dc_ints[2, n], ti.f64)
-                air_dc = ti.cast(dcs[12, n], ti.f64)
-                crac_flow = ti.cast(0.0, ti.f64)
-                supply_flow = ti.cast(0.0, ti.f64)
-                passing = ti.cast(0.0, ti.f64)
-                return_c = ti.cast(0.0, ti.f64)
-                coil_load = ti.cast(0.0, ti.f64)
-                coil_w = ti.cast(0.0, ti.f64)
-                if ti.static(recirculates and advance):
-                    unit_first = dc_ints[1, n]
-                    many_units = dc_ints[1, n + 1] - unit_first
-                    following = total[2] / doubles[4, n]
-                    shift = ti.cast(0.0, ti.f64)
-                    for j in range(many_units):
-                        at = unit_first + j
-                        need = ti.cast(0.0, ti.f64)
-                        for chunk in range(dc_ints[0, n], dc_ints[0, n + 1]):
-                            need += needs[chunk_ints[2, chunk] + j]
-                        low = ti.cast(units[1, at], ti.f64)
-                        high = ti.cast(units[2, at], ti.f64)
-                        fan_speed = ti.min(ti.max(following, low), high)
-                        flow_unit = ti.cast(units[3, at], ti.f64) * fan_speed
-                        offered = ti.cast(dcs[14, n], ti.f64) * flow_unit
-                        crac_flow += flow_unit
-                        supply_flow += flow_unit * unit_state[0, at]
-                        passing += (flow_unit - unit_state[1, at] * need) * unit_state[0, at]
-                        unit_state[2, at] = unit_state[1, at]
-                        unit_state[1, at] = ti.min(
-                            ti.cast(1.0, ti.f64), offered / ti.max(need, ti.cast(1e-30, ti.f64))
-                        )
-                        unit_state[5, at] = need
-                        unit_state[6, at] = following
-                        shift = ti.max(shift, ti.abs(unit_state[1, at] - unit_state[2, at]))
-                        moved = flow_unit
-                        cubed = fan_speed * fan_speed * fan_speed * ti.cast(units[4, at], ti.f64)
-                        if ti.static(transient):
-                            moved *= weight
-                            cubed *= weight
-                            if first_substep == 0:
-                                moved += unit_state[3, at]
-                                cubed += unit_state[4, at]
-                        unit_state[3, at] = moved
-                        unit_state[4, at] = cubed
-                    return_c = (total[6] - total[7] + passing) / crac_flow
-                    if ti.static(transient):
-                        running = ti.cast(0.0, ti.f64)
-                        fans_w = ti.cast(0.0, ti.f64)
-                        for j in range(many_units):
-                            at = unit_first + j
-                            low = ti.cast(units[1, at], ti.f64)
-                            high = ti.cast(units[2, at], ti.f64)
-                            fan_speed = ti.min(ti.max(following, low), high)
-                            design_m3s = ti.cast(units[3, at], ti.f64)
-                            is_on = ti.cast(units[4, at], ti.f64)
-                            taken = air_dc * design_m3s * fan_speed * (return_c - unit_state[0, at])
-                            drawn = (
-                                is_on
-                                * fan_speed
-                                * fan_speed
-                                * fan_speed
-                                * doubles[3, n]
-                                * design_m3s
-                            )
-                            fans_w += drawn
-                            coil_load += taken + drawn
-                            running += is_on * (taken + drawn)
-                            if is_on > 0.0:
-                                coil_w = ti.cast(1.0, ti.f64)
-                        wanted = ti.max(running + coil_w * doubles[0, n] / substep_s, 0.0)
-                        coil_w = ti.min(wanted, doubles[2, n])
-                        doubles[0, n] += (coil_load - coil_w) * substep_s
-                        for j in range(many_units):
-                            unit_state[0, unit_first + j] = (
-                                ti.cast(units[0, unit_first + j], ti.f64)
-                                + doubles[0, n] / doubles[1, n]
-                            )
-                    else:
-                        # Where supply air falls short, its share must stand still as well.
-                        # The air of a rack feels it one sweep later.
-                        earlier = 0.0 * shift
-                        if first_sweep == 0:
-                            earlier = doubles[7, n]
-                        change_dc = ti.max(change_dc, 32.0 * ti.max(shift, earlier))
-                        doubles[7, n] = shift
-                        shrinks = doubles[5, n] / (1.0 + doubles[5, n])
-                        to_come = change_dc
-                        if first_substep == 0:
-                            shrinks = ti.min(ti.max(shrinks, change_dc / doubles[6, n]), 0.9375)
-                            to_come *= shrinks / (1.0 - shrinks)
-                        active[n] = ti.cast(to_come > tolerance_k, ti.i32)
-                        doubles[6, n] = change_dc
-                scale = ti.cast(1.0, ti.f64)
-                keep = ti.cast(0.0, ti.f64)
-                if ti.static(transient):
-                    scale = weight
-                    if first_substep == 0:
-                        keep = ti.cast(1.0, ti.f64)
-                supply_c = ti.cast(0.0, ti.f64)
-                if crac_flow > 0.0:
-                    supply_c = supply_flow / crac_flow
-                now = ti.Vector(
-                    [
-                        total[0],
-                        total[1],
-                        total[2],
-                        total[3] / n_racks,
-                        total[4] / n_racks,
-                        total[5] - total[2] * supply_c,
-                        total[6] - total[2] * supply_c,
-                        total[8],
-                        total[9],
-                        total[10],
-                        crac_flow,
-                        supply_c,
-                        return_c,
-                        coil_load,
-                        coil_w,
-                    ]
-                )
-                for r in ti.static(range(15)):
-                    value = scale * now[r]
-                    if keep > 0.0:
-                        value += dc_out[r, n]
-                    dc_out[r, n] = value
-                if keep == 0.0 or hottest_dc > dc_out[15, n]:
-                    dc_out[15, n] = hottest_dc
-                    dc_out[16, n] = hottest_at
+            if ti.static(not write_groups):
+                if dc_ints[0, n + 1] - dc_ints[0, n] > 1 and control[0, n] != 0:
+                    close(
+                        recirculates,
+                        transient,
+                        advance,
+                        n,
+                        ti.cast(first_sweep == 0, ti.i32),
+                        substep_s,
+                        weight,
+                        tolerance_k,
+                        chunk_ints,
+                        dc_ints,
+                        control,
+                        dcs,
+                        doubles,
+                        units,
+                        unit_state,
+                        needs,
+                        sums,
+                        dc_out,
+                    )
 
     return hall
 
@@ -596,12 +1000,13 @@ def hall_kernel(precision: str) -> Any:
 def expand_kernel(precision: str) -> Any:
     """Kernel that copies the values of every group to its servers.
 
-    It stores at the speed of memory into the caller's arrays, one per layer; no field, whose
-    memory would outlive the simulator and whose kernels would be compiled per simulator.
+    It stores at the speed of memory into the caller's arrays, one per layer, which come in twice:
+    by servers and by LANES of them, stored at once.
     """
     real = _real(precision)
     reals_2d = ti.types.ndarray(dtype=real, ndim=2)
     reals_1d = ti.types.ndarray(dtype=real, ndim=1)
+    blocks_1d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=1)
     ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
     @ti.kernel
@@ -609,10 +1014,14 @@ def expand_kernel(precision: str) -> Any:
     def expand(
         slices: ti.i32,
         server_start: ints_1d,
+        group_at: ints_1d,
         group_out: reals_2d,
         inlet_c: reals_1d,
         outlet_c: reals_1d,
         power_w: reals_1d,
+        inlet_store: blocks_1d,
+        outlet_store: blocks_1d,
+        power_store: blocks_1d,
     ):
         n_groups = server_start.shape[0] - 1
         for k in range(slices * 512):
@@ -620,10 +1029,27 @@ def expand_kernel(precision: str) -> Any:
                 first = ti.cast(ti.cast(k // 512, ti.i64) * n_groups // slices, ti.i32)
                 last = ti.cast((ti.cast(k // 512, ti.i64) + 1) * n_groups // slices, ti.i32)
                 for g in range(first, last):
-                    inlet = group_out[0, g]
-                    outlet = group_out[1, g]
-                    power = group_out[2, g]
-                    for s in range(server_start[g], server_start[g + 1]):
+                    at = group_at[g]
+                    inlet = group_out[0, at]
+                    outlet = group_out[1, at]
+                    power = group_out[2, at]
+                    start = server_start[g]
+                    end = server_start[g + 1]
+                    # Whole vectors between the first and the last multiple of LANES.
+                    first_whole = (start + (LANES - 1)) // LANES
+                    last_whole = ti.max(end // LANES, first_whole)
+                    inlets = ti.Vector([inlet] * LANES)
+                    outlets = ti.Vector([outlet] * LANES)
+                    powers = ti.Vector([power] * LANES)
+                    for v in range(first_whole, last_whole):
+                        inlet_store[v] = inlets
+                        outlet_store[v] = outlets
+                        power_store[v] = powers
+                    for s in range(start, ti.min(first_whole * LANES, end)):
+                        inlet_c[s] = inlet
+                        outlet_c[s] = outlet
+                        power_w[s] = power
+                    for s in range(ti.max(last_whole * LANES, start), end):
                         inlet_c[s] = inlet
                         outlet_c[s] = outlet
                         power_w[s] = power

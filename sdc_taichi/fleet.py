@@ -71,17 +71,23 @@ class HallAir:
     """Exhaust airflow of each rack over the mean of its hall, (R,)."""
     rise_k: F64
     """How much each rack warms its air at the design point, (R,)."""
+    mixed_approach_k: F64
+    """Approach temperatures in the exhaust mix before each rack, (R,)."""
+    mixed_rise_k: F64
+    """Rises in the exhaust mix before each rack, (R,)."""
+    captured: F64
+    """Recirculated share of each rack's intake where ``height`` is 1, (R,)."""
     table: I32
     """Entry of each data center in the next three, (B,)."""
     supply_c: F64
     """Supply air of the expectations, (H, n)."""
     expected: F64
     """Approach and rise of a mean rack over those at the design point, and what is left of a
-    deviation of the exhaust mix after it has passed the racks once; by supply air and load of
-    LOADS, (H, 3, n, len(LOADS))."""
+    deviation of the exhaust mix after it has passed the racks once; by hall, supply air and load
+    of LOADS, (H n len(LOADS), 3)."""
 
 
-LOADS = np.linspace(0.0, 1.0, 17)
+LOADS = np.linspace(0.0, 1.0, 65)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +114,7 @@ class Fleet:
     approach_k: F64
     """Supply approach temperature, within the limits of the config, (R,)."""
     groups: F64
-    """The first six GROUP_ROWS of the thermal kernel, (6, G)."""
+    """Rows GROUP_ROWS of the thermal kernel, (6, G)."""
     dcs: F64
     """Rows DC_ROWS of the thermal kernel, (18, B)."""
     unit_design_m3s: F64
@@ -174,6 +180,8 @@ class _HallArrays:
     it_airflow_m3s: float
     shares: F64
     recirculation: Recirculation | None
+    captured: F64
+    mixed_k: F64
     expected: tuple[F64, F64]
 
 
@@ -370,7 +378,7 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
     return _HallArrays(
         groups_per_rack=np.diff(racks.start),
         groups=np.stack(
-            [racks.count, racks.full_w, racks.idle_w, racks.offset_k, racks.deviation, captured]
+            [racks.count, racks.full_w, racks.idle_w, racks.offset_k, racks.deviation, racks.height]
         ),
         approach_k=hall.rack_approach_k(),
         dc=np.array(dc),
@@ -378,55 +386,75 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         it_airflow_m3s=float(design.airflow_m3s.sum()),
         shares=shares,
         recirculation=flows,
-        expected=_expectations(config, racks, design),
+        captured=racks.per_rack(captured) / racks.per_rack(racks.height),
+        mixed_k=_mixed_k(hall.rack_approach_k(), design, flows),
+        expected=_expectations(config, racks, design) if flows else (np.zeros(0), np.zeros(0)),
     )
+
+
+def _mixed_k(approach_k: F64, design: DesignPoint, flows: Recirculation | None) -> F64:
+    """Approach temperatures and design rises in the exhaust mix before each rack, (2, R)."""
+    if flows is None:
+        return np.zeros((2, 0))
+    rise_k = design.outlet_rise_k - design.approach_k
+    return np.stack([flows.exchange.apply(approach_k), flows.exchange.apply(rise_k)])
 
 
 def _expectations(
     config: DataCenterConfig, racks: RackServers, design: DesignPoint
 ) -> tuple[F64, F64]:
-    """Where sweeps of the hall start: one mean rack, from up to 64 of the hall, in steady state.
+    """Where sweeps of the hall start: one mean rack, from up to 32 of the hall, in steady state.
 
     Returns:
         Supply temperatures, (n,), and what ``HallAir.expected`` holds, (3, n, len(LOADS)).
     """
     servers, setpoint = config.servers, config.hvac.setpoint
     slope, offset, shift = cpu_coefficients(servers)
-    every = max(1, config.hall.racks // 64)
+    every = max(1, config.hall.racks // 16)
     chosen = np.zeros(config.hall.racks, dtype=np.bool_)
     chosen[::every] = True
     group = racks.per_group(chosen.astype(np.float64)) > 0
     count, full_w, idle_w = racks.count[group], racks.full_w[group], racks.idle_w[group]
     approach_k = (racks.per_group(design.approach_k) * design.height)[group]
-    mean_k, rise_k = design.approach_k[chosen].mean(), 1.0
     limit_c = np.inf if servers.curve_limit_c is None else servers.curve_limit_c
+    approach = float(design.approach_k[chosen].mean())
+    rise_k = float((design.outlet_rise_k - design.approach_k)[chosen].mean())
 
-    def rise(scale: F64, supply_c: F64, load: F64) -> F64:
-        inlet_c = supply_c + scale * approach_k
-        ratio = config.airflow_ratio(inlet_c, load)
-        cpu_w = full_w * (slope * np.minimum(inlet_c, limit_c) + offset + shift * load)
-        return np.asarray(
-            np.sum(count * np.maximum(idle_w, cpu_w), axis=-1) / np.sum(count * ratio, axis=-1)
-        )[..., None]
+    def outlet(scale: F64, supply_c: F64, load: F64) -> tuple[F64, F64]:
+        """Inlet over supply air in K, weighted by airflow, and heat over airflow."""
+        inlet_k = scale[..., None] * approach_k
+        on_curve = np.minimum(supply_c[..., None] + inlet_k, limit_c)
+        load = load[..., None]
+        ratio = config.airflow_ratio(supply_c[..., None] + inlet_k, load)
+        heat_w = np.maximum(idle_w, full_w * (slope * on_curve + offset + shift * load))
+        fan_w = servers.fan_reference_w * (ratio / servers.fan_reference_ratio) ** (
+            servers.fan_power_exponent
+        )
+        flow = np.sum(count * ratio, axis=-1)
+        inlet = np.sum(count * ratio * inlet_k, axis=-1) / flow
+        return inlet, np.sum(count * (heat_w + fan_w), axis=-1) / flow
 
-    full, warmest = np.ones((1, 1, 1)), np.full((1, 1, 1), design.supply_c)
-    rise_k = rise(full, warmest, full)
-    # In a rise of 1 at the design point; the approach in the same unit.
-    ratio = mean_k / max(float((design.outlet_rise_k - design.approach_k)[chosen].mean()), 1e-9)
-    share = ratio / (1.0 + ratio)
-    supply_c = np.linspace(setpoint.min_c, setpoint.max_c, 8)
-    at, load = supply_c[:, None, None], LOADS[None, :, None]
-    scale = np.ones((len(supply_c), len(LOADS), 1))
-    if mean_k <= 0:
-        scale[:] = 0.0
-    else:
-        for _ in range(40):
-            scale = share * (scale + rise(scale, at, load) / rise_k / ratio)
-    warming = rise(scale, at, load) / rise_k
-    step = 1e-3
-    slope_of_rise = (rise(scale + step, at, load) / rise_k - warming) / step
-    kept = share * (1.0 + (slope_of_rise / ratio if ratio > 0 else 0.0))
-    return supply_c, np.stack([scale, warming, np.broadcast_to(kept, scale.shape)])[..., 0]
+    one = np.ones((1, 1))
+    per_w = rise_k / outlet(one, one * design.supply_c, one)[1]
+    setpoints_c = np.linspace(setpoint.min_c, setpoint.max_c, 16)
+    at, load = np.broadcast_arrays(setpoints_c[:, None], LOADS[None, :])
+
+    def mixed(scale: F64) -> F64:
+        inlet_k, heat = outlet(scale, at, load)
+        return np.asarray((inlet_k + heat * per_w) / (approach + rise_k))
+
+    def kept(scale: F64) -> F64:
+        return np.asarray(np.clip((mixed(scale + 1e-4) - mixed(scale)) / 1e-4, -0.9, 0.9))
+
+    scale = np.ones(at.shape)
+    for _ in range(8):
+        before = scale
+        scale = before + (mixed(before) - before) / (1.0 - kept(before))
+        if np.max(np.abs(scale - before)) < 1e-9:
+            break
+    inlet_k, heat = outlet(scale, at, load)
+    parts = inlet_k / max(approach, 1e-9), heat * per_w / rise_k, kept(scale)
+    return setpoints_c, np.stack(parts)
 
 
 def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
@@ -459,12 +487,15 @@ def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
         weights=np.concatenate(weights),
         norm=np.concatenate([f.exchange.norm for f in found]),
         strength=np.concatenate([f.exchange.strength for f in found]),
+        mixed_approach_k=np.concatenate([h.mixed_k[0] for h in halls]),
+        mixed_rise_k=np.concatenate([h.mixed_k[1] for h in halls]),
+        captured=np.concatenate([h.captured for h in halls]),
         unit_shares=np.concatenate([h.shares.reshape(-1) for h in halls]),
         share_start=_starts(sizes)[:-1],
         rise_k=np.concatenate([f.design.outlet_rise_k - f.design.approach_k for f in found]),
         table=np.array([entries[id(h)] for h in halls], dtype=np.int32),
         supply_c=np.stack([h.expected[0] for h in distinct]),
-        expected=np.stack([h.expected[1] for h in distinct]),
+        expected=np.concatenate([h.expected[1].reshape(3, -1).T for h in distinct]),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -17,8 +18,8 @@ Precision = Literal["f32", "f64"]
 _RELEASED_OUTLET_FIT = (1.918, 1.096, 0.526, 0.824, -14.01)
 """Rack outlet fit of the released SustainDC: factor, power exponent, divisor, flow exponent, K."""
 
-_RACKS_PER_CHUNK = 64
-"""Fewer racks than this are not worth a thread of their own."""
+_BLOCKS_PER_CHUNK = 8
+"""Fewer racks than in so many blocks are not worth a thread of their own."""
 
 TOLERANCE_K: dict[Precision, float] = {"f32": 1e-4, "f64": 1e-12}
 """How little another sweep would move the exhaust mix before any rack."""
@@ -142,58 +143,158 @@ class Hall:
         self._outlet_model = thermal.OUTLETS.index(fleet.models["outlet"])
         self._recirculates = fleet.air is not None
         self._server_slices = max(1, min(8 * threads, fleet.servers // 4096))
-        self._lay_out(thermal)
+        self._lay_out_racks(thermal.LANES)
+        self._lay_out_groups(thermal)
+        self._lay_out_air(thermal)
+        self._lay_out_values(thermal)
         self._slices = max(1, min(8 * threads, self._chunk_ints.shape[1] - 1))
         self._solved: bool | None = None
         """Whether the last step was transient; None without one."""
 
-    def _lay_out(self, thermal: Any) -> None:
-        fleet, air = self._fleet, self._fleet.air
-        chunks = [
-            np.arange(a, b, _RACKS_PER_CHUNK)
-            for a, b in zip(fleet.rack_start[:-1], fleet.rack_start[1:], strict=True)
-        ]
+    def _lay_out_racks(self, lanes: int) -> None:
+        """Blocks of racks, each data center filled up to whole ones, and chunks of blocks."""
+        fleet = self._fleet
+        racks = np.diff(fleet.rack_start)
+        self._blocks = -(-racks // lanes)
+        first_block = _starts(self._blocks)
+        within = np.arange(fleet.racks) - np.repeat(fleet.rack_start[:-1], racks)
+        self._rack_at = lanes * np.repeat(first_block[:-1], racks) + within
+        self._places = int(lanes * first_block[-1])
+        self._same_size = int(racks[0]) if np.all(racks == racks[0]) else None
+        chunks = [np.arange(a, b, _BLOCKS_PER_CHUNK) for a, b in pairwise(first_block)]
         per_dc = np.array([len(c) for c in chunks])
         chunk_dc = np.repeat(np.arange(fleet.size), per_dc)
-        units = np.diff(fleet.unit_start)
-        first_need = np.concatenate([[0], np.cumsum(units[chunk_dc])])
-        self._chunk_ints = _table(np.concatenate([*chunks, [fleet.racks]]), chunk_dc, first_need)
+        first_need = _starts(np.diff(fleet.unit_start)[chunk_dc])
+        self._chunk_ints = _table(np.concatenate([*chunks, first_block[-1:]]), chunk_dc, first_need)
+        self._needs = np.zeros(max(int(first_need[-1]), 1))
+        first_share = _starts(self._blocks * np.diff(fleet.unit_start))
+        self._dc_ints = _table(_starts(per_dc), fleet.unit_start, first_share, racks)
+
+    def _lay_out_groups(self, thermal: Any) -> None:
+        """Places of the groups, lane by lane, and the tables that equal blocks share."""
+        fleet, lanes = self._fleet, thermal.LANES
+        block, lane = np.divmod(self._rack_at, lanes)
+        groups = np.diff(fleet.group_start)
+        most = np.zeros(int(self._blocks.sum()), np.int64)
+        np.maximum.at(most, block, groups)
+        first_place = _starts(most)
+        zone = np.arange(fleet.groups.shape[1]) - np.repeat(fleet.group_start[:-1], groups)
+        self._group_at = (
+            np.repeat(lanes * first_place[block] + lane, groups) + lanes * zone
+        ).astype(np.int32)
+        count = lanes * int(first_place[-1])
+        self._group_of = np.zeros(count, np.int64)
+        self._group_of[self._group_at] = np.arange(len(self._group_at))
+        values = np.zeros((len(thermal.GROUP_ROWS), count), self._dtype)
+        values[:, self._group_at] = fleet.groups
+        # Places without a rack take the values of the last rack of their block, and no power.
+        filled = np.bincount(block, minlength=len(most))
+        last = (np.repeat(filled, most) - 1)[:, None]
+        values = values.reshape(len(values), -1, lanes)
+        values = np.take_along_axis(values, np.minimum(np.arange(lanes), last)[None], axis=2)
+        by_place = np.ascontiguousarray(values.swapaxes(0, 1))
+        known: dict[bytes, int] = {}
+        even = np.all(by_place == by_place[..., :1], axis=(1, 2)).astype(np.int32)
+        even_blocks = np.minimum.reduceat(even, first_place[:-1])
+        tables, table, total = [], np.zeros(len(most), np.int64), 0
+        for i, (a, b) in enumerate(pairwise(first_place)):
+            key = by_place[a:b].tobytes()
+            if key not in known:
+                known[key] = total
+                tables.append(by_place[a:b].reshape(-1, lanes))
+                total += int(b - a)
+            table[i] = known[key]
+        self._tables = np.concatenate(tables)
+        self._block_ints = _table(filled, most, table, first_place[:-1], even_blocks)
+        self._server_c = np.zeros((int(first_place[-1]), lanes), self._dtype)
+        self._group_load = np.zeros((1, lanes), self._dtype)
+        self._group_out: Any = None
+        self._no_groups = np.zeros((len(thermal.GROUP_OUT), 1, lanes), self._dtype)
+
+    def _lay_out_air(self, thermal: Any) -> None:
+        """Runs of weights and unit shares at the places of the racks."""
+        fleet, air, lanes = self._fleet, self._fleet.air, thermal.LANES
+        run_counts = np.zeros(self._places, np.int64)
         zeros = np.zeros(1, np.int32)
-        run_start = np.zeros(fleet.racks + 1, np.int32) if air is None else air.run_start
-        self._rack_ints = _table(fleet.group_start, run_start, fleet.rack_dc)
-        self._run_ints = (
-            _table(zeros, zeros, zeros)
-            if air is None
-            else _table(air.run_first, air.run_length, air.run_offset)
-        )
-        first_chunk = np.concatenate([[0], np.cumsum(per_dc)])
-        share_start = np.zeros(fleet.size, np.int32) if air is None else air.share_start
-        self._dc_ints = _table(first_chunk, fleet.unit_start, fleet.rack_start, share_start)
-        self._active = np.ones(fleet.size, np.int32)
-        self._weights = self._real(np.zeros(1) if air is None else air.weights)
-        self._shares = self._real(np.zeros(1) if air is None else air.unit_shares)
-        self._racks = self._real(np.ones((len(thermal.RACK_ROWS), fleet.racks)))
-        self._racks[0] = fleet.approach_k
+        if air is None:
+            self._run_start, self._run_ints = _starts(run_counts), _table(zeros, zeros, zeros)
+            self._alike, self._weights = np.zeros(1, np.int32), self._real(np.zeros(1))
+            self._shares = self._real(np.zeros((1, lanes)))
+            return
+        run_counts[self._rack_at] = np.diff(air.run_start)
+        self._run_start = _starts(run_counts)
+        moved = self._rack_at[fleet.rack_start[:-1]] - fleet.rack_start[:-1]
+        first = air.run_first + np.repeat(moved[fleet.rack_dc], np.diff(air.run_start))
+        self._run_ints = _table(first, air.run_length, air.run_offset)
+        self._alike = _alike_fours(self._run_start, air.run_length)
+        self._weights = self._real(air.weights)
+        shares = []
+        for dc, (racks, units) in enumerate(
+            zip(np.diff(fleet.rack_start), np.diff(fleet.unit_start), strict=True)
+        ):
+            own = np.zeros((int(self._blocks[dc]) * lanes, int(units)))
+            at = air.share_start[dc]
+            own[:racks] = air.unit_shares[at : at + racks * units].reshape(racks, units)
+            shares.append(own.reshape(-1, lanes, int(units)).swapaxes(1, 2).reshape(-1, lanes))
+        self._shares = self._real(np.concatenate(shares))
+
+    def _lay_out_values(self, thermal: Any) -> None:
+        fleet, air = self._fleet, self._fleet.air
+        blocks = self._places // thermal.LANES
+        self._racks = np.ones((len(thermal.RACK_ROWS), self._places), self._dtype)
+        self._is_rack = np.zeros(self._places, self._dtype)
+        self._is_rack[self._rack_at] = 1.0
+        self._racks[3] = self._racks[4] = self._is_rack
+        self._uniform = dict.fromkeys(range(len(self._racks)), True)
+        rows = {"approach_k": fleet.approach_k, "servers": _per_rack(fleet, fleet.groups[0])}
         if air is not None:
-            self._racks[1], self._racks[5] = air.norm, air.strength
-        self._groups = self._real(
-            np.concatenate([fleet.groups, np.zeros((1, fleet.groups.shape[1]))])
-        )
+            rows |= {
+                "norm": air.norm,
+                "strength": air.strength,
+                "per_strength": 1.0 / air.strength,
+                "captured": air.captured,
+                "start_approach_k": fleet.approach_k,
+                "start_rise_k": air.rise_k,
+                "mixed_approach_k": air.mixed_approach_k,
+                "mixed_rise_k": air.mixed_rise_k,
+            }
+        for name, values in rows.items():
+            self._racks[thermal.RACK_ROWS.index(name), self._rack_at] = values
         self._dcs = self._real(fleet.dcs)
         self._doubles = np.zeros((len(thermal.DC_DOUBLES), fleet.size))
         self._doubles[4] = fleet.it_airflow_m3s
+        self._control = np.zeros((len(thermal.CONTROL), fleet.size), np.int32)
         self._units = self._real(np.ones((len(thermal.UNIT_ROWS), fleet.units)))
         self._units[3] = fleet.unit_design_m3s
         self._unit_state = np.ones((len(thermal.UNIT_STATE), fleet.units))
-        self._rack_state = self._real(np.zeros((len(thermal.RACK_STATE), fleet.racks)))
-        self._server_c = self._real(np.zeros(1))
-        self._fit = self._real(np.array(_RELEASED_OUTLET_FIT))
-        self._needs = np.zeros(max(int(first_need[-1]), 1))
-        self._sums = np.zeros((len(thermal.SUMS), len(chunk_dc)))
-        self._no_groups = np.zeros((len(thermal.GROUP_OUT), 1), self._dtype)
+        state = (len(thermal.RACK_STATE), blocks, thermal.LANES)
+        self._rack_store = np.zeros(state, self._dtype)
+        self._rack_state = self._rack_store.reshape(len(self._rack_store), -1)
+        self._constants = self._real(
+            np.array([*_RELEASED_OUTLET_FIT, *thermal.exp_constants(self._precision)])
+        )
+        self._sums = np.zeros((len(thermal.SUMS), self._chunk_ints.shape[1] - 1))
 
     def _real(self, values: F64) -> Any:
         return np.array(values, dtype=self._dtype, order="C")
+
+    def _at_racks(self, rows: Any) -> Any:
+        """Values of the racks, (..., R), of rows by place."""
+        rows = rows.reshape(*rows.shape[:-1], -1) if rows.ndim < 3 else rows.reshape(len(rows), -1)
+        if self._same_size is None:
+            return rows[..., self._rack_at]
+        size = self._fleet.size
+        return rows.reshape(*rows.shape[:-1], size, -1)[..., : self._same_size].reshape(
+            *rows.shape[:-1], -1
+        )
+
+    def _put(self, row: Any, values: Any) -> None:
+        """Values of the racks, (R,), to their places."""
+        if self._same_size is None:
+            row[self._rack_at] = values
+        else:
+            size = self._fleet.size
+            row.reshape(size, -1)[:, : self._same_size] = values.reshape(size, -1)
 
     def solve(self, met: Conditions) -> HallSums:
         """Quasi-steady temperatures and power.
@@ -206,6 +307,7 @@ class Hall:
         """
         self._set(met)
         self._unit_state[1] = 1.0
+        self._begin(exchange=0)
         out = self._out()
         if self._recirculates:
             self._guess(met)
@@ -214,6 +316,12 @@ class Hall:
             self._run(out, advance=False)
         self._solved = False
         return self._results(out)
+
+    def _begin(self, exchange: int) -> None:
+        """The first sweep exchanges what row 1 holds, or starts from ``_guess``."""
+        self._control[0], self._control[1] = 1, exchange
+        self._control[2], self._control[3] = exchange, 0
+        self._doubles[9:12] = 0.0
 
     def _guess(self, met: Conditions) -> None:
         """Outlets to start from: the racks of the design point, moved as a mean rack would be."""
@@ -227,35 +335,28 @@ class Hall:
         i = np.minimum(y.astype(np.int64), last - 1)
         j = np.minimum(x.astype(np.int64), len(LOADS) - 2)
         y, x = y - i, x - j
-        corner = air.expected[air.table]
-        dc = np.arange(fleet.size)
-        scale, warming, kept = (
-            (1 - y) * ((1 - x) * corner[dc, k, i, j] + x * corner[dc, k, i, j + 1])
-            + y * ((1 - x) * corner[dc, k, i + 1, j] + x * corner[dc, k, i + 1, j + 1])
-            for k in range(3)
+        rows, columns = (
+            np.clip(at[:, None] + np.arange(-1, 3), 0, most)
+            for at, most in ((i, last), (j, len(LOADS) - 1))
         )
-        rack = fleet.rack_dc
-        outlet_c = supply_c[rack] + scale[rack] * fleet.approach_k + warming[rack] * air.rise_k
-        self._rack_state[1] = air.strength * outlet_c
-        self._rack_state[0] = -1e6
-        self._doubles[5] = np.clip(kept / (1.0 - np.minimum(kept, 0.9)), 0.0, 9.0)
+        at = ((air.table * (last + 1))[:, None] + rows)[:, :, None] * len(LOADS) + columns[:, None]
+        weights = _cubic(y)[:, :, None] * _cubic(x)[:, None, :]
+        found = np.matmul(weights.reshape(-1, 1, 16), air.expected[at.reshape(-1, 16)])
+        self._doubles[5:8] = found[:, 0].T
+        self._doubles[8] = supply_c
 
     def _sweep(self, out: tuple[Any, Any]) -> None:
         """Repeat until the mix before every rack stands still."""
-        self._active[:] = 1
         for sweep in range(MOST_SWEEPS):
-            # What is left to come shows from the third sweep on.
-            self._run(out, advance=True, source=sweep % 2, first=sweep < 2)
-            if not self._active.any():
-                break
-        else:
-            dc = self._fleet.names[int(np.argmax(self._active))]
-            raise SdcError(
-                f"{dc}: no steady air temperatures in {MOST_SWEEPS} sweeps; the CRAC units move "
-                "too little air (hvac.crac.coasting_flow_ratio, min_flow_ratio), or "
-                "simulation.thermal=transient"
-            )
-        self._active[:] = 1
+            self._run(out, advance=True, sweeps=MOST_SWEEPS, first_sweep=sweep)
+            if not self._control[0].any():
+                return
+        dc = self._fleet.names[int(np.argmax(self._control[0]))]
+        raise SdcError(
+            f"{dc}: no steady air temperatures in {MOST_SWEEPS} sweeps; the CRAC units move "
+            "too little air (hvac.crac.coasting_flow_ratio, min_flow_ratio), or "
+            "simulation.thermal=transient"
+        )
 
     def servers(self, into: ServerLayers | None = None) -> ServerLayers:
         """Per-server layers of the last ``solve`` or ``advance``, each (S,).
@@ -271,19 +372,35 @@ class Hall:
             into = ServerLayers(*(np.empty(self._fleet.servers, self._dtype) for _ in range(3)))
         expand = self._thermal.expand_kernel(self._precision)
         layers = (into.inlet_c, into.outlet_c, into.power_w)
-        expand(self._server_slices, self._fleet.server_start, group_out, *layers)
+        lanes = self._thermal.LANES
+        whole = self._fleet.servers // lanes * lanes
+        stores = (
+            [layer[:whole].reshape(-1, lanes) for layer in layers] if whole else self._no_groups
+        )
+        expand(
+            self._server_slices,
+            self._fleet.server_start,
+            self._group_at,
+            group_out.reshape(len(group_out), -1),
+            *layers,
+            *stores,
+        )
         return into
 
     def group_inlets(self) -> F64:
         """Inlet of every server group in the last step, (G,)."""
-        return self._group_values()[0].astype(np.float64)
+        inlets = self._group_values()[0].reshape(-1)[self._group_at]
+        return np.asarray(inlets, dtype=np.float64)
 
     def _group_values(self) -> Any:
         if self._solved is None:
             raise RuntimeStateError("no step has been done yet; server layers exist after one")
-        group_out = np.empty((len(self._thermal.GROUP_OUT), self._groups.shape[1]), self._dtype)
-        self._run(self._out(), group_out, advance=False, transient=self._solved)
-        return group_out
+        if self._group_out is None:
+            shape = (len(self._thermal.GROUP_OUT), *self._server_c.shape)
+            self._group_out = np.empty(shape, self._dtype)
+        self._control[0] = 1
+        self._run(self._out(), self._group_out, advance=False, transient=self._solved)
+        return self._group_out
 
     def forget(self) -> None:
         """Drop the last step, so that ``servers`` cannot show layers of another state."""
@@ -292,18 +409,16 @@ class Hall:
     def settle(self, met: Conditions) -> HallState:
         """State of transient halls that have been in the given conditions for ever."""
         self.solve(met)
-        self._server_c = self._real(np.zeros(self._groups.shape[1]))
         self._doubles[0], self._doubles[1], self._doubles[2] = 0.0, 1.0, 0.0
-        self._settle_servers()
-        return self._state()
-
-    def _settle_servers(self) -> None:
-        # A substep that lasts for ever brings servers to their steady temperatures.
+        self._server_c[:] = 0.0
         mixed, fresh = self._rack_state[0].copy(), self._unit_state[1].copy()
         supply_c = self._unit_state[0].copy()
+        self._rack_state[1] = self._exhaust()
+        # A substep that lasts for ever brings servers to their steady temperatures.
+        self._begin(exchange=1)
         self._run(self._out(), advance=True, transient=True, substep_s=1e9)
         self._rack_state[0], self._unit_state[1], self._unit_state[0] = mixed, fresh, supply_c
-        self._rack_state[1] = self._rack_state[2]
+        return self._state()
 
     def advance(
         self, met: Conditions, state: HallState, coil: Coil, step_s: float, substep_s: float
@@ -321,66 +436,82 @@ class Hall:
             Means over the step, and the memory at its end.
         """
         self._set(met)
-        self._server_c = state.server_c.copy()
-        self._rack_state[0], self._rack_state[1] = state.mixed_c, state.exhaust_c
-        self._rack_state[3] = state.captured_m3s
+        self._server_c.reshape(-1)[self._group_at] = state.server_c
+        for row, values in ((0, state.mixed_c), (1, state.exhaust_c), (3, state.captured_m3s)):
+            self._put(self._rack_state[row], values)
         speed = np.clip(state.following, self._units[1], self._units[2])
         fresh_share = self._fleet.dcs[self._fresh_row][self._fleet.unit_dc]
         offered = fresh_share * self._fleet.unit_design_m3s * speed
         self._unit_state[1] = np.minimum(1.0, offered / np.maximum(state.need_m3s, 1e-30))
         self._units[0] = coil.setpoint_c
         rows = (coil.room_j, coil.room_j_per_k, coil.limit_w, coil.fan_w_per_m3s)
-        for row, values in enumerate(rows):
-            self._doubles[row] = values
+        for row, held in enumerate(rows):
+            self._doubles[row] = held
         warmed = (coil.room_j / coil.room_j_per_k)[self._fleet.unit_dc]
         self._unit_state[0] = coil.setpoint_c + warmed
         count = int(np.ceil(step_s / substep_s - 1e-9))
         out = self._out()
-        for i in range(count):
+        self._begin(exchange=1)
+        # Small data centers do all substeps in one call, others one at a time.
+        chunks = np.diff(self._dc_ints[0])[: self._fleet.size]
+        small, large = chunks == 1, chunks > 1
+        calls = count if large.any() else 1
+        for i in range(calls):
+            self._control[0] = large if i else 1
             self._run(
                 out,
                 advance=True,
                 transient=True,
-                source=i % 2,
-                first=i == 0,
+                sweeps=count,
+                first_sweep=i,
                 substep_s=step_s / count,
                 weight=1.0 / count,
             )
-        if count % 2:
-            self._rack_state[1] = self._rack_state[2]
+        self._control[0] = small | large
         self._solved = True
         return self._results(out), self._state()
 
+    def _exhaust(self) -> Any:
+        """Outlets times strength of the last sweep, by place."""
+        lanes = self._thermal.LANES
+        side = np.repeat(self._control[2], lanes * self._blocks)
+        return np.where(side == 0, self._rack_state[2], self._rack_state[1])
+
     def _state(self) -> HallState:
         return HallState(
-            server_c=self._server_c.copy(),
-            mixed_c=self._rack_state[0].copy(),
-            exhaust_c=self._rack_state[1].copy(),
-            captured_m3s=self._rack_state[3].copy(),
+            server_c=self._server_c.reshape(-1)[self._group_at],
+            mixed_c=self._at_racks(self._rack_state[0]).copy(),
+            exhaust_c=self._at_racks(self._exhaust()).copy(),
+            captured_m3s=self._at_racks(self._rack_state[3]).copy(),
             need_m3s=self._unit_state[5].copy(),
             following=self._unit_state[6].copy(),
         )
 
     def _set(self, met: Conditions) -> None:
-        def put(rows: Any, row: int, values: F64 | None) -> None:
-            rows[row] = 1.0 if values is None else values
-
         self._group_loads = met.group_load is not None
         if met.group_load is not None:
-            self._groups[6] = met.group_load
+            if self._group_load.size < self._server_c.size:
+                self._group_load = np.zeros_like(self._server_c)
+            self._group_load.reshape(-1)[self._group_at] = met.group_load
         elif met.rack_load is not None:
-            self._racks[2] = met.rack_load
+            self._put(self._racks[2], met.rack_load)
+        elif self._same_size is not None:
+            self._racks[2].reshape(self._fleet.size, -1)[:] = met.utilisation[:, None]
         else:
-            self._racks[2] = met.utilisation[self._fleet.rack_dc]
-        put(self._racks, 3, met.powered)
-        put(self._racks, 4, met.rack_airflow)
-        put(self._units, 1, met.unit_low)
-        put(self._units, 2, met.unit_high)
-        put(self._units, 4, met.unit_running)
+            self._racks[2, self._rack_at] = met.utilisation[self._fleet.rack_dc]
+        for row, values in ((3, met.powered), (4, met.rack_airflow)):
+            if values is not None:
+                self._put(self._racks[row], values)
+            elif not self._uniform[row]:
+                self._racks[row] = self._is_rack
+            self._uniform[row] = values is None
+        for row, limits in ((1, met.unit_low), (2, met.unit_high), (4, met.unit_running)):
+            self._units[row] = 1.0 if limits is None else limits
         self._unit_state[0] = met.unit_supply_c
 
     def _out(self) -> tuple[Any, Any]:
-        racks = np.empty((len(self._thermal.RACK_OUT), self._fleet.racks), self._dtype)
+        shape = (len(self._thermal.RACK_OUT), *self._rack_store.shape[1:])
+        racks = np.empty(shape, self._dtype)
         return racks, np.empty((len(self._thermal.DC_OUT), self._fleet.size), np.float64)
 
     def _run(
@@ -390,8 +521,8 @@ class Hall:
         *,
         advance: bool,
         transient: bool = False,
-        source: int = 0,
-        first: bool = True,
+        sweeps: int = 1,
+        first_sweep: int = 0,
         substep_s: float = 1.0,
         weight: float = 1.0,
     ) -> None:
@@ -405,28 +536,32 @@ class Hall:
             group_out is not None,
             advance,
             self._slices,
-            source,
-            int(source == 0 and first),
-            int(first),
+            sweeps,
+            first_sweep,
             substep_s,
             weight,
             TOLERANCE_K[self._precision],
-            self._rack_ints,
+            self._run_start,
+            self._alike,
             self._run_ints,
+            self._block_ints,
             self._chunk_ints,
             self._dc_ints,
-            self._active,
+            self._control,
             self._weights,
             self._shares,
-            self._racks,
-            self._groups,
+            self._racks.reshape(len(self._racks), -1, self._thermal.LANES),
+            self._tables,
+            self._tables.reshape(-1),
+            self._group_load,
             self._dcs,
             self._doubles,
             self._units,
             self._unit_state,
-            self._rack_state,
+            self._rack_state.reshape(-1),
+            self._rack_store,
             self._server_c,
-            self._fit,
+            self._constants,
             racks,
             self._no_groups if group_out is None else group_out,
             self._needs,
@@ -435,10 +570,10 @@ class Hall:
         )
 
     def _results(self, out: tuple[Any, Any]) -> HallSums:
-        racks, dcs = out
+        racks, dcs = self._at_racks(out[0]), out[1]
         named = dict(zip(self._thermal.DC_OUT, dcs, strict=True))
         return HallSums(
-            **{**named, "hottest_group": named["hottest_group"].astype(np.int64)},
+            **{**named, "hottest_group": self._group_of[named["hottest_group"].astype(np.int64)]},
             unit_flow_m3s=self._unit_state[3].copy(),
             unit_cubed_speed=self._unit_state[4].copy(),
             room_j=self._doubles[0].copy(),
@@ -455,3 +590,39 @@ def _table(*rows: Any) -> Any:
     for i, row in enumerate(rows):
         out[i, : len(row)] = row
     return out
+
+
+def _cubic(x: F64) -> F64:
+    """Weights of four points for the place x between the inner two (Catmull and Rom 1974)."""
+    return np.stack(
+        [
+            0.5 * x * (x * (2.0 - x) - 1.0),
+            0.5 * (x * x * (3.0 * x - 5.0) + 2.0),
+            0.5 * x * (x * (4.0 - 3.0 * x) + 1.0),
+            0.5 * x * x * (x - 1.0),
+        ],
+        axis=-1,
+    )
+
+
+def _starts(counts: Any) -> Any:
+    """Where each of so many entries begins, and where the last ends."""
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+
+
+def _per_rack(fleet: Fleet, values: F64) -> F64:
+    return np.asarray(np.add.reduceat(values, fleet.group_start[:-1]))
+
+
+def _alike_fours(run_start: Any, length: Any) -> Any:
+    """1 for every four racks in a row that have as many runs, of the same lengths."""
+    counts = np.diff(run_start).reshape(-1, 4)
+    alike = np.all(counts == counts[:, :1], axis=1)
+    first = run_start[:-1].reshape(-1, 4)
+    many = np.where(alike, counts[:, 0], 0)
+    owner = np.repeat(np.arange(len(many)), many)
+    nth = np.arange(len(owner)) - np.repeat(np.cumsum(many) - many, many)
+    for other in (1, 2, 3):
+        differs = length[first[owner, 0] + nth] != length[first[owner, other] + nth]
+        alike[owner[differs]] = False
+    return alike.astype(np.int32)

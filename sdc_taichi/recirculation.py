@@ -442,11 +442,20 @@ def _bands(hall: HallConfig) -> tuple[tuple[I32, I32, I32, I32], F64]:
     low = np.zeros_like(place) if merged else np.maximum(place - rack_reach, 0)
     high = np.full_like(place, per_row) if merged else np.minimum(place + rack_reach + 1, per_row)
     tables = []
+    begins = np.zeros((2, per_row, len(shifts)), dtype=np.int64)
+    ends_at = np.zeros_like(begins)
     for parity in (0, 1):
         far = across(parity, shifts)[:, None]
         for p in place:
             block = _path_weight(hall, x[p], x[low[p] : high[p]], far, ends)
-            tables.append(np.where(block >= cutoff * total, block, 0.0).reshape(-1))
+            near = block >= cutoff * total
+            begins[parity, p] = np.argmax(near, axis=1)
+            ends_at[parity, p] = np.where(
+                near.any(axis=1),
+                near.shape[1] - np.argmax(near[:, ::-1], axis=1),
+                begins[parity, p],
+            )
+            tables.append(np.where(near, block, 0.0).reshape(-1))
     weights = np.concatenate(tables)
     table_start = np.cumsum([0, *(len(t) for t in tables)])[:-1].reshape(2, per_row)
 
@@ -464,9 +473,12 @@ def _bands(hall: HallConfig) -> tuple[tuple[I32, I32, I32, I32], F64]:
         owner = np.repeat(np.arange(hall.racks), runs)
         starts = np.cumsum(runs) - runs
         shift = first_shift[owner] + np.arange(len(owner)) - starts[owner]
-        first = (row[owner] + shift) * per_row + low[owner]
-        length = span[owner]
-        offset = base[owner] + (shift + row_reach) * span[owner]
+        # A run starts and ends with sources within reach.
+        table = (row[owner] % 2, place[owner], shift + row_reach)
+        begin, end = begins[table], ends_at[table]
+        first = (row[owner] + shift) * per_row + low[owner] + begin
+        length = end - begin
+        offset = base[owner] + (shift + row_reach) * span[owner] + begin
     run_start = np.concatenate([[0], np.cumsum(runs)])
     index = (run_start, first, length, offset)
     return tuple(x.astype(np.int32) for x in index), weights  # type: ignore[return-value]

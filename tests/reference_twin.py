@@ -94,6 +94,7 @@ def _rack(
     cpu = cpu_w(config, full_w, idle_w, on_curve_c, load)
     ratio = airflow_ratio(config, on_curve_c, load)
     fan = s.fan_reference_w * (ratio / s.fan_reference_ratio) ** s.fan_power_exponent
+    assert s.fan_full_airflow_m3s is not None, "this twin derives no airflow"
     flow = s.fan_full_airflow_m3s * ratio
     heat = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
     power, total_flow, mean_inlet = np.sum(cpu + fan), np.sum(flow), np.mean(inlet_c)
@@ -170,7 +171,8 @@ class HallTwin:
     """Room air before each rack."""
 
     def per_rack(self, values: F64) -> F64:
-        return np.bincount(self.rack, values, len(self.share))
+        """Sums over the servers of each rack, (R,)."""
+        return np.asarray(np.bincount(self.rack, values, len(self.share)), dtype=np.float64)
 
     def load(self, rack_load: F64) -> F64:
         """Load of every server from that of its rack, (S,)."""
@@ -216,11 +218,12 @@ def path_lengths_m(hall: HallConfig) -> F64:
     return out
 
 
-def layout_weights(hall: HallConfig) -> F64:
-    """w of the layout, (R, R): rows sum to 1, those of large halls without the smallest."""
+def layout_weights(hall: HallConfig, airflow: F64) -> F64:
+    """w of the layout and the airflow of the racks, (R, R): rows sum to 1."""
     weight = np.exp(-path_lengths_m(hall) / hall.recirculation.decay_m)
     if hall.racks > 64:
         weight[weight < hall.recirculation.cutoff * _amid_the_hall(hall)] = 0.0
+    weight = weight * airflow
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
@@ -303,7 +306,7 @@ def calibrated(config: DataCenterConfig, matrix: F64 | None = None) -> HallTwin:
     def design(approach_k: F64) -> tuple[F64, F64, F64, F64, float]:
         """Height factor (S,), and airflow, IT power, outlet rise (R,), and full airflow."""
         height = raw_height
-        for _ in range(300):
+        for _ in range(60):
             inlet_c = supply_c + approach_k[rack] * height
             ratio = twin.servers(inlet_c, load, on, on)[2]
             mean = twin.per_rack(ratio * raw_height) / twin.per_rack(ratio)
@@ -313,18 +316,18 @@ def calibrated(config: DataCenterConfig, matrix: F64 | None = None) -> HallTwin:
         it_w, moved = twin.per_rack(cpu + fan), twin.per_rack(ratio)
         full_m3s = s.fan_full_airflow_m3s
         if full_m3s is None:
-            given = np.asarray(hall.supply_approach_k, np.float64)
-            rise_k = 1.0 / (air * config.hvac.crac.supply_m3s_per_w) - (
-                np.broadcast_to(given, (racks,)).mean()
-                + np.broadcast_to(np.asarray(hall.return_approach_k, np.float64), (racks,)).mean()
-            )
+            crac_rise_k = 1.0 / (air * config.hvac.crac.supply_m3s_per_w)
+            back_k = np.broadcast_to(np.asarray(hall.return_approach_k, np.float64), (racks,))
+            rise_k = crac_rise_k - approach_k.mean() - back_k.mean()
             full_m3s = float(np.mean(it_w / moved)) / (air * rise_k)
         airflow = full_m3s * moved
         mean_in_k = twin.per_rack(ratio * (inlet_c - supply_c)) / moved
         return height, airflow, it_w, mean_in_k + it_w / (air * airflow), full_m3s
 
-    weights = layout_weights(hall) if matrix is None else matrix.copy()
-    if matrix is not None:
+    if matrix is None:
+        weights = layout_weights(hall, design(approach_k)[1])
+    else:
+        weights = matrix.copy()
         for j in range(racks):
             total = matrix[j].sum()
             weights[j] = matrix[j] / total if total > 0 else 1.0 / racks
@@ -334,10 +337,11 @@ def calibrated(config: DataCenterConfig, matrix: F64 | None = None) -> HallTwin:
     else:
         assert matrix is not None
         share = matrix.sum(axis=1)
-        for _ in range(300):
+        for _ in range(30):
             height, airflow, it_w, rise, full_m3s = design(approach_k)
             approach_k = share * (weights @ rise)
-    share = share * (1.0 - hall.layout.containment)
+    if matrix is None:
+        share = share * (1.0 - hall.layout.containment)
     crac_m3s = config.hvac.crac.supply_m3s_per_w * float(it_w.sum())
     fresh_m3s = (1.0 - share) * airflow
     need = twin.unit_shares.T @ fresh_m3s
@@ -370,8 +374,10 @@ class Flows:
     """Through each CRAC unit, (U,)."""
     speed: F64
     """Of its fan over design speed, (U,)."""
+    need: F64
+    """Supply air that the racks ask of each unit, (U,)."""
     fresh_ratio: F64
-    """Share of its racks' need that a unit covers, (U,)."""
+    """Share of its racks' need that a unit is able to cover, (U,)."""
     bypass: F64
     """From each unit past the racks, (U,)."""
     from_unit: F64
@@ -397,7 +403,7 @@ def flows(
     from_unit = (1.0 - hall.captured)[:, None] * unit_share * covered
     exhaust = 1.0 - from_unit.sum(axis=1)
     return Flows(
-        unit, speed, able, unit - covered * need, from_unit, exhaust,
+        unit, speed, need, able, unit - covered * need, from_unit, exhaust,
         hall.per_rack(airflow * exhaust),
     )  # fmt: skip
 
@@ -409,8 +415,9 @@ def steady(
     *,
     low: F64,
     high: F64,
-    powered: F64 | None = None,
-    breath: F64 | None = None,
+    running: F64,
+    powered: F64,
+    breath: F64,
 ) -> Twin:
     """Temperatures that reproduce themselves, with a dense solve for the outlets in each round.
 
@@ -420,21 +427,20 @@ def steady(
         load: load of every server, (S,).
         low: lowest fan speed of every unit, (U,).
         high: highest fan speed of every unit, (U,).
+        running: 1 for units that run, 0 for those that coast, (U,).
         powered: share of the step that each rack is on, (R,).
         breath: airflow left to the fans of each rack, (R,).
     """
     racks, rack, air = len(hall.share), hall.rack, hall.air_j_per_m3_k
-    on = np.ones(racks) if powered is None else powered
-    breath = np.ones(racks) if breath is None else breath
     count = np.bincount(rack)
     inlet_c = np.full(len(rack), unit_supply_c.mean() + 4.0)
     for _ in range(20000):
-        cpu, fan, flow = hall.servers(inlet_c, load, on, breath)
+        cpu, fan, flow = hall.servers(inlet_c, load, powered, breath)
         moved = flows(hall, flow, low, high)
         rack_flow = hall.per_rack(flow)
         still = rack_flow == 0
         part = np.where(still[rack], 1.0 / count[rack], 0.0)
-        part = part + flow / np.where(still, 1.0, rack_flow)[rack]
+        part += flow / np.where(still, 1.0, rack_flow)[rack]
         power = hall.per_rack(cpu + fan)
         rise = np.where(still, 0.0, power / (air * np.where(still, 1.0, rack_flow)))
         matrix = hall.per_rack(part * moved.exhaust)[:, None] * hall.weights
@@ -449,7 +455,8 @@ def steady(
     heat = cpu + fan
     blown = flow > 0
     server_outlet_c = inlet_c + np.where(blown, heat / (air * np.where(blown, flow, 1.0)), 0.0)
-    return_c, left_over = return_air(hall, moved, rack_flow, outlet_c, unit_supply_c)
+    outlets: F64 = np.asarray(outlet_c, dtype=np.float64)
+    return_c, _ = return_air(hall, moved, rack_flow, outlets, unit_supply_c)
     supply_c = float(moved.unit @ unit_supply_c / moved.unit.sum())
     found = {
         "cpu_w": hall.per_rack(cpu),
@@ -468,13 +475,12 @@ def steady(
         "crac_flow_m3s": float(moved.unit.sum()),
         "supply_c": supply_c,
         "return_c": return_c,
-        "least_exhaust_m3s": float(left_over.min()),
     }
     return Twin(
         {"inlet_c": inlet_c, "outlet_c": server_outlet_c, "power_w": heat},
         found,
         {name: np.array([value]) for name, value in dcs.items()}
-        | {"unit_flow_m3s": moved.unit, "unit_cubed_speed": moved.speed**3},
+        | {"unit_flow_m3s": moved.unit, "unit_cubed_speed": running * moved.speed**3},
     )
 
 
@@ -497,8 +503,10 @@ class Memory:
     """Recirculated air before each rack, (R,), as the next two."""
     outlet_c: F64
     captured_m3s: F64
-    fresh_ratio: F64
-    """(U,)."""
+    need_m3s: F64
+    """Supply air that the racks ask of each unit, (U,)."""
+    following: F64
+    """Airflow of the servers over that at the design point, alike for each unit, (U,)."""
     room_j: float
 
 
@@ -530,11 +538,14 @@ def advance(
         mixed_end = target + (now.mixed_c - target) * np.exp(-rate * h)
         mixed = target + (now.mixed_c - mixed_end) / (rate * h)
         parcel_w = float(np.sum(mixed_end - now.mixed_c)) * hall.parcel_j_per_k / h
-        # Airflow is not known before the inlets, so the units cover what they did before.
-        covered = (1.0 - hall.captured)[:, None] * hall.unit_shares[hall.rack] * now.fresh_ratio
+        # Airflow is not known before the inlets, so the units cover what was asked before.
+        offered = hall.fresh_share * hall.unit_design_m3s * np.clip(now.following, low, high)
+        asked = now.need_m3s > offered
+        ratio = np.where(asked, offered / np.where(asked, now.need_m3s, 1.0), 1.0)
+        covered = (1.0 - hall.captured)[:, None] * hall.unit_shares[hall.rack] * ratio
         inlet_c = (1.0 - covered.sum(axis=1)) * mixed[hall.rack] + covered @ supply_c
         cpu, fan, flow = hall.servers(inlet_c, load, powered, breath)
-        moved = flows(hall, flow, low, high, now.fresh_ratio)
+        moved = flows(hall, flow, low, high, ratio)
         k = s.heat_exchange_effectiveness * air * flow
         blown = k > 0
         tau = capacity / np.where(blown, k, 1.0)
@@ -558,16 +569,20 @@ def advance(
         taken = air * moved.unit * (return_c - supply_c)
         drawn = running * moved.speed**3 * fan_w_per_m3s * hall.unit_design_m3s
         load_w = float(np.sum(taken + drawn))
+        warmth = moved.unit @ supply_c / moved.unit.sum()
         wanted = float(running @ (taken + drawn)) + (now.room_j / h if running.any() else 0.0)
         coil_w = min(max(wanted, 0.0), limit_w)
         parts.append(
             {
                 "cpu_w": cpu.sum(), "fan_w": fan.sum(), "airflow_m3s": flow.sum(),
                 "inlet_mean_c": rack_inlet.mean(), "outlet_mean_c": outlet_c.mean(),
+                "inlet_m3k_s": flow @ (inlet_c - warmth),
+                "hot_k": np.maximum(inlet_c - 27, 0).sum(),
+                "cold_k": np.maximum(18 - inlet_c, 0).sum(),
+                "outlet_m3k_s": carried.sum() - rack_flow.sum() * warmth,
                 "stored_w": capacity * np.sum(warmer - now.server_c) / h + parcel_w,
                 "crac_flow_m3s": moved.unit.sum(),
-                "supply_c": moved.unit @ supply_c / moved.unit.sum(),
-                "return_c": return_c, "coil_load_w": load_w, "coil_w": coil_w,
+                "supply_c": warmth, "return_c": return_c, "coil_load_w": load_w, "coil_w": coil_w,
                 "unit_flow_m3s": moved.unit, "unit_cubed_speed": running * moved.speed**3,
                 "rack_cpu_w": hall.per_rack(cpu), "rack_fan_w": hall.per_rack(fan),
                 "rack_airflow_m3s": rack_flow, "rack_inlet_c": rack_inlet,
@@ -576,8 +591,9 @@ def advance(
             }
         )  # fmt: skip
         now = Memory(
-            warmer, mixed_end, outlet_c, captured, moved.fresh_ratio,
-            max(now.room_j + (load_w - coil_w) * h, 0.0),
+            warmer, mixed_end, outlet_c, captured, moved.need,
+            np.full(len(ratio), flow.sum() / hall.it_airflow_m3s),
+            now.room_j + (load_w - coil_w) * h,
         )  # fmt: skip
     found: dict[str, Any] = {
         name: sum(p[name] for p in parts) / substeps for name in parts[0] if name != "inlet_max_c"

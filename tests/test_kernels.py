@@ -97,15 +97,17 @@ def solve(
     configs: list[DataCenterConfig], supply_c: F64, load: F64, precision: Precision
 ) -> HallSums:
     """Sums per data center and rack of a fleet."""
-    return Hall(build_fleet(configs), precision).solve(Conditions(supply_c, load))
+    fleet = build_fleet(configs)
+    return Hall(fleet, precision).solve(Conditions(supply_c[fleet.unit_dc], load))
 
 
 def solve_servers(
     configs: list[DataCenterConfig], supply_c: F64, load: F64, precision: Precision
 ) -> tuple[HallSums, dict[str, Any]]:
     """Sums and server layers of a fleet."""
-    hall = Hall(build_fleet(configs), precision)
-    sums, layers = hall.solve(Conditions(supply_c, load)), hall.servers()
+    fleet = build_fleet(configs)
+    hall = Hall(fleet, precision)
+    sums, layers = hall.solve(Conditions(supply_c[fleet.unit_dc], load)), hall.servers()
     return sums, {f.name: getattr(layers, f.name) for f in fields(layers)}
 
 
@@ -238,12 +240,17 @@ def test_a_second_run_is_equal_to_the_bit(precision: Precision) -> None:
 
 
 def part_of(sums: HallSums, configs: list[DataCenterConfig], index: int) -> HallSums:
-    """The sums of one data center of a fleet."""
-    start = np.concatenate([[0], np.cumsum([c.hall.racks for c in configs])])
-    racks, dc = slice(start[index], start[index + 1]), slice(index, index + 1)
-    return HallSums(
-        *(getattr(sums, f.name)[racks if f.name.startswith("rack_") else dc] for f in fields(sums))
-    )
+    """The sums of one data center of a fleet, places counted from its own first."""
+    fleet = build_fleet(configs)
+    whole = np.arange(fleet.size + 1)
+    start: dict[str, Any] = {"rack": fleet.rack_start, "unit": fleet.unit_start}
+    found = {}
+    for f in fields(sums):
+        kind = f.name.split("_")[0]
+        begin, end = start.get(kind, whole)[index : index + 2]
+        found[f.name] = getattr(sums, f.name)[begin:end]
+    first_group = fleet.group_start[fleet.rack_start[index]]
+    return HallSums(**{**found, "hottest_group": found["hottest_group"] - first_group})
 
 
 @pytest.mark.parametrize("precision", ["f64", "f32"])

@@ -1,0 +1,578 @@
+"""What happens in a hall when something goes wrong, and where its work runs."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sdc_taichi import (
+    Actions,
+    DataCenterConfig,
+    Drivers,
+    SdcError,
+    Simulator,
+    StepResult,
+    drivers_from_arrays,
+    load_config,
+)
+from sdc_taichi.config import apply_overrides
+from sdc_taichi.hall import Precision
+from sdc_taichi.plant.protection import NORMAL, THROTTLED, TRIPPED
+from sdc_taichi.types import F64
+from test_transients import assert_same, part_of, run
+
+PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
+THERMAL = ("quasi_steady", "transient")
+POLICIES = ("uniform", "fill", "coolest-first", "inlet-aware", "weights")
+
+
+def constant(
+    demand: Any = 0.8, *, outdoor_c: float = 20.0, wet_bulb_c: float = 14.0, size: int = 1
+) -> Drivers:
+    series = np.broadcast_to(np.atleast_1d(np.asarray(demand, np.float64)), (size, np.size(demand)))
+    ones = np.ones(series.shape)
+    return drivers_from_arrays(outdoor_c * ones, wet_bulb_c * ones, 300.0 * ones, series.copy())
+
+
+def simulate(
+    overrides: list[str], steps: int, drivers: Drivers | None = None, **kwargs: Any
+) -> list[StepResult]:
+    config = load_config("corrected", overrides)
+    with Simulator(config, drivers=drivers or constant(), precision="f64") as sim:
+        sim.reset()
+        return [sim.step(Actions(**kwargs)) for _ in range(steps)]
+
+
+def column(results: list[StepResult], name: str) -> F64:
+    """A quantity over the steps, (T,) or (T, n)."""
+    return np.squeeze(np.array([getattr(r, name) for r in results]), axis=1 if name in _B else ())
+
+
+_B = {f.name for f in fields(StepResult)} - {
+    f.name for f in fields(StepResult) if f.name.startswith(("rack_", "unit_"))
+}
+
+
+def events(*listed: str) -> str:
+    return f"events.scheduled=[{', '.join('{' + e + '}' for e in listed)}]"
+
+
+# --- CRAC units ---------------------------------------------------------------------------------
+
+
+def test_a_unit_that_is_down_coasts_and_warms_its_racks_most() -> None:
+    overrides = ["hvac.crac.units=2", "hvac.crac.coasting_flow_ratio=0.25"]
+    down = simulate([*overrides, events("kind: crac_down, unit: 1, start_h: 1, duration_h: 1")], 40)
+    whole = simulate(overrides, 40)
+    running = column(down, "unit_running")
+    assert np.array_equal(running[:, 1] == 0, (np.arange(40) >= 4) & (np.arange(40) < 8))
+    assert np.all(running[:, 0] == 1)
+    design = column(whole, "unit_flow_m3s")[0] / (
+        whole[0].crac_flow_m3s / (5.663e-5 * full_load_w())
+    )
+    assert column(down, "unit_flow_m3s")[4, 1] == pytest.approx(0.25 * design[1], rel=1e-9)
+    warmer = column(down, "rack_inlet_c") - column(whole, "rack_inlet_c")
+    assert np.all(warmer[:4] == 0)
+    rows = warmer[4].reshape(4, 5)
+    assert np.all(rows > 1)
+    # Unit 1 stands at the far end of the rows.
+    assert np.all(np.diff(rows, axis=1) > 0)
+    # The coil of the other one takes what it can; the rest warms the room until both are back.
+    room = column(down, "room_heat_kwh")
+    assert np.all(np.diff(room[3:8]) > 0)
+    assert np.all(column(down, "unmet_w")[4:8] > 0)
+    assert room[-1] == 0
+    np.testing.assert_allclose(warmer[-1], 0, atol=1e-9)
+
+
+def full_load_w() -> float:
+    """IT power at the design point."""
+    with Simulator(load_config("corrected"), drivers=constant(), precision="f64") as sim:
+        return float(sim.sizing.it_w[0])
+
+
+@pytest.mark.parametrize("thermal", THERMAL)
+def test_without_any_unit_nothing_is_removed(thermal: str) -> None:
+    overrides = [f"simulation.thermal={thermal}", "hvac.crac.units=3", "protection.ashrae_class=A1"]
+    results = simulate([*overrides, events("kind: crac_down, start_h: 1, duration_h: 1")], 40)
+    removed, fan_w = column(results, "heat_removed_w"), column(results, "crac_fan_w")
+    down = slice(4, 8)
+    assert np.all(removed[down] == 0)
+    assert np.all(fan_w[down] == 0)
+    assert np.all(column(results, "chiller_w")[down] == 0)
+    assert np.all(removed[:4] > 0)
+    assert np.all(removed[8:] > 0)
+    assert np.all(column(results, "tripped_racks")[5:8] == 20)
+    assert np.all(column(results, "tripped_racks")[16:] == 0)
+    assert np.all(column(results, "utilisation")[-4:] == 0.8)
+
+
+def test_units_keep_setpoints_of_their_own() -> None:
+    config = load_config("corrected", ["hvac.crac.units=2"])
+    with Simulator(config, drivers=constant(), precision="f64") as sim:
+        sim.reset()
+        for _ in range(3):
+            result = sim.step(Actions(cooling=np.array([1.0, -0.5])))
+    assert result.unit_setpoint_c.tolist() == [21.0, 16.5]
+    assert result.setpoint_c[0] == 18.75
+    flow = result.unit_flow_m3s
+    assert result.supply_c[0] == pytest.approx(flow @ result.unit_setpoint_c / flow.sum())
+    rows = result.rack_inlet_c.reshape(4, 5)
+    assert np.all(np.diff(rows, axis=1) < 0)
+
+
+def test_fan_speed_is_a_control_of_its_own() -> None:
+    overrides = ["hvac.crac.flow_model=controlled", "hvac.crac.fan_step=0.1",
+                 "hvac.crac.min_flow_ratio=0.5", "hvac.crac.units=2"]  # fmt: skip
+    config = load_config("corrected", overrides)
+    with Simulator(config, drivers=constant(), precision="f64") as sim:
+        sim.reset()
+        results = [sim.step(Actions(fan=np.array([-1.0, 0.0]))) for _ in range(8)]
+        design_w = float(sim.sizing.crac_fan_w[0])
+        design = sim.fleet.unit_design_m3s
+    speed = column(results, "unit_flow_m3s") / design
+    np.testing.assert_allclose(speed[:, 0], [0.9, 0.8, 0.7, 0.6, 0.5, 0.5, 0.5, 0.5], rtol=1e-12)
+    np.testing.assert_allclose(speed[:, 1], 1.0, rtol=1e-12)
+    expected = design_w * (speed**3 @ design) / design.sum()
+    np.testing.assert_allclose(column(results, "crac_fan_w"), expected, rtol=1e-12)
+    assert np.all(np.diff(column(results, "inlet_mean_c")[:5]) >= 0)
+    assert np.ptp(column(results, "inlet_mean_c")) > 0.5
+    rise_k = column(results, "it_w") / (1225 * 1.006 * column(results, "crac_flow_m3s"))
+    np.testing.assert_allclose(column(results, "return_c") - 18.0, rise_k, rtol=1e-10)
+
+
+def test_fan_commands_need_the_flow_model_that_obeys_them() -> None:
+    with Simulator(load_config("corrected"), drivers=constant()) as sim:
+        sim.reset()
+        with pytest.raises(SdcError, match=r"action fan: given, but hvac\.crac\.flow_model is"):
+            sim.step(Actions(fan=1.0))
+
+
+# --- protection ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("thermal", "margin_k"), [("quasi_steady", 4.0), ("transient", 1.0)])
+def test_hot_racks_throttle_and_then_trip_with_their_work_counted(
+    thermal: str, margin_k: float
+) -> None:
+    results = simulate(
+        [
+            f"simulation.thermal={thermal}", "hvac.crac.units=2", "protection.ashrae_class=A1",
+            f"protection.trip_margin_k={margin_k}", "protection.throttle_share=0.4",
+            "workload.queue_limit_h=0.01",
+            events("kind: crac_down, unit: 0, start_h: 1, duration_h: 3"),
+        ],
+        48,
+    )  # fmt: skip
+    status, hottest = column(results, "rack_status"), column(results, "rack_inlet_max_c")
+    before = np.concatenate([np.zeros((1, 20), np.int8), status[:-1]])
+    seen = {NORMAL: False, THROTTLED: False, TRIPPED: False}
+    for t in range(48):
+        for j in range(20):
+            hot = hottest[t, j]
+            called = TRIPPED if hot > 32 + margin_k else THROTTLED if hot > 32 else NORMAL
+            kept_off = before[t, j] == TRIPPED and hot > 27
+            assert status[t, j] == (TRIPPED if kept_off else called)
+            seen[int(status[t, j])] = True
+    assert all(seen.values()), "a status was never reached"
+    for name, code in (("throttled_racks", THROTTLED), ("tripped_racks", TRIPPED)):
+        assert np.array_equal(column(results, name), (status == code).sum(axis=1))
+    cpu_w, fan_w = column(results, "rack_cpu_w"), column(results, "rack_fan_w")
+    off = before == TRIPPED
+    assert np.all(cpu_w[off] == 0)
+    assert np.all(fan_w[off] == 0)
+    assert np.all(cpu_w[~off] > 0)
+    executed, lost = column(results, "executed_tasks"), column(results, "lost_tasks")
+    # What racks could do at the start of the step, and what the tripping ones had done of it.
+    room = np.where(before == TRIPPED, 0.0, np.where(before == THROTTLED, 0.4, 1.0))
+    placed = np.minimum(0.8, room.mean(axis=1))
+    np.testing.assert_allclose(executed + lost, 100 * placed, rtol=1e-9)
+    tripping = (status == TRIPPED) & ~off
+    assert np.any(tripping)
+    assert np.array_equal(lost > 0, np.any(tripping, axis=1))
+    uniform = np.all(before == NORMAL, axis=1)
+    expected = 80.0 * tripping.sum(axis=1) / 20
+    np.testing.assert_allclose(lost[uniform], expected[uniform], rtol=1e-12)
+    # Nothing is met in silence: what did not fit was dropped.
+    dropped, queue = column(results, "dropped_tasks"), column(results, "queue_tasks")
+    change = np.diff(np.concatenate([[0.0], queue]))
+    np.testing.assert_allclose(executed + lost + dropped + change, 80.0, rtol=1e-12)
+    assert dropped.max() > 10
+
+
+def test_a_hardier_class_keeps_running() -> None:
+    throttled, unmet = {}, {}
+    for name in ("A1", "A2", "A3", "A4", "null"):
+        results = simulate(
+            [f"protection.ashrae_class={name}", "hvac.crac.units=3",
+             "simulation.thermal=transient", "workload.queue_limit_h=0.01",
+             events("kind: crac_down, unit: 0, start_h: 1, duration_h: 3")],
+            20,
+        )  # fmt: skip
+        throttled[name] = float(np.sum(column(results, "throttled_racks")))
+        unmet[name] = float(np.sum(column(results, "dropped_tasks")))
+    assert throttled["A1"] > throttled["A2"] > 0
+    assert throttled["A3"] == throttled["A4"] == throttled["null"] == 0
+    assert unmet["A1"] > unmet["A2"] == unmet["null"] == 0
+
+
+# --- grid ---------------------------------------------------------------------------------------
+
+
+def test_the_battery_carries_an_outage_as_far_as_it_reaches() -> None:
+    results = simulate(
+        ["battery.hours_of_design_load=0.5", "battery.initial_soc=1", "battery.lower_v=0",
+         events("kind: grid_outage, start_h: 1, duration_h: 2")],
+        20,
+        battery=0.3,
+    )  # fmt: skip
+    out = slice(4, 12)
+    assert np.array_equal(column(results, "grid_up"), np.r_[np.ones(4), np.zeros(8), np.ones(8)])
+    for name in ("grid_kwh", "carbon_g", "charge_kwh", "unserved_kwh"):
+        assert np.all(column(results, name)[out] == 0), name
+    powered = column(results, "powered")
+    assert np.all(np.diff(powered[out]) <= 0)
+    assert powered[4] == 1.0 > powered[11]
+    facility = column(results, "it_kwh") + column(results, "hvac_kwh")
+    np.testing.assert_allclose(facility[out], column(results, "discharge_kwh")[out], rtol=1e-9)
+    assert column(results, "soc")[11] < 0.05
+    executed = column(results, "executed_tasks")
+    np.testing.assert_allclose(executed[out], 100 * np.minimum(0.8, powered[out]), rtol=1e-9)
+    assert np.all(column(results, "grid_kwh")[12:] > 0)
+    assert column(results, "powered")[12] == 1.0
+
+
+@pytest.mark.parametrize("thermal", THERMAL)
+def test_an_outage_without_battery_stops_everything(thermal: str) -> None:
+    results = simulate(
+        [f"simulation.thermal={thermal}", "battery.capacity_kwh=0", "workload.queue_limit_h=0.5",
+         events("kind: grid_outage, start_h: 1, duration_h: 1.5")],
+        14,
+    )  # fmt: skip
+    dark = slice(4, 10)
+    for name in ("it_w", "hvac_w", "heat_removed_w", "executed_tasks", "grid_kwh", "lost_tasks",
+                 "it_airflow_m3s", "water_l"):  # fmt: skip
+        assert np.all(column(results, name)[dark] == 0), name
+    assert np.all(column(results, "powered")[dark] == 0)
+    queue, dropped = column(results, "queue_tasks"), column(results, "dropped_tasks")
+    assert queue[9] == 200.0
+    assert dropped[dark].sum() == pytest.approx(6 * 80 - 200)
+    assert np.all(column(results, "executed_tasks")[10:] >= 80)
+
+
+# --- racks, chiller, weather --------------------------------------------------------------------
+
+
+def test_a_rack_whose_fans_fail_blows_less_and_hotter() -> None:
+    event = events("kind: rack_fan_failure, rack: 7, share: 0.3, start_h: 1, duration_h: 0.5")
+    failed, whole = simulate([event], 10), simulate([], 10)
+    flow = column(failed, "rack_airflow_m3s") / column(whole, "rack_airflow_m3s")
+    fans = column(failed, "rack_fan_w") / column(whole, "rack_fan_w")
+    during = slice(4, 6)
+    # Its inlet moves a little, and the curve with it.
+    np.testing.assert_allclose(flow[during, 7], 0.3, rtol=0.05)
+    np.testing.assert_allclose(fans[during, 7], 0.3, rtol=0.15)
+    others = np.delete(np.arange(20), 7)
+    np.testing.assert_allclose(flow[during][:, others], 1.0, rtol=0.05)
+    hotter = column(failed, "rack_outlet_c") - column(whole, "rack_outlet_c")
+    assert np.all(hotter[during, 7] > 20)
+    assert np.all(hotter[:4] == 0)
+    np.testing.assert_allclose(hotter[6:], 0, atol=1e-9)
+    moved = np.abs(column(failed, "rack_inlet_c") - column(whole, "rack_inlet_c"))[4]
+    assert moved[[6, 8]].min() > moved[[10, 19]].max() > 0
+
+
+def test_a_heat_wave_warms_dry_and_wet_bulb_alike() -> None:
+    event = events("kind: heat_wave, offset_k: 7.5, start_h: 0.5, duration_h: 1")
+    hot, normal = simulate([event], 8), simulate([], 8)
+    during = (np.arange(8) >= 2) & (np.arange(8) < 6)
+    for name in ("outdoor_c", "wet_bulb_c"):
+        offset = column(hot, name) - column(normal, name)
+        np.testing.assert_allclose(offset, np.where(during, 7.5, 0.0), atol=1e-12)
+    more = column(hot, "chiller_w") - column(normal, "chiller_w")
+    assert np.all(more[during] > 1000)
+    assert np.all(more[~during] == 0)
+
+
+def test_a_derated_chiller_leaves_heat_behind_and_fetches_it_later() -> None:
+    weather = constant(outdoor_c=30.0, wet_bulb_c=24.0)
+    event = "kind: chiller_derate, share: {}, start_h: 1, duration_h: 1"
+    base = ["hvac.sizing.design_wet_bulb_c=24"]
+    derated = simulate([*base, events(event.format(0.3))], 60, weather)
+    whole = simulate(base, 60, weather)
+    same = simulate([*base, events(event.format(1))], 60, weather)
+    assert_same(whole, same)
+    during = slice(4, 8)
+    assert np.all(column(derated, "unmet_w")[during] > 1e5)
+    removed, able = column(derated, "heat_removed_w"), column(whole, "heat_removed_w")
+    assert np.all(removed[during] < 0.5 * able[during])
+    assert np.all(np.diff(column(derated, "room_heat_kwh")[3:8]) > 0)
+    assert np.all(np.diff(column(derated, "supply_c")[4:8]) > 0)
+    assert np.all(column(derated, "recovered_w")[8:12] > 0)
+    kept = np.sum(column(derated, "unmet_w") - column(derated, "recovered_w")) / 4000
+    assert kept == pytest.approx(column(derated, "room_heat_kwh")[-1], abs=1e-9)
+    assert column(derated, "room_heat_kwh")[-1] < 1e-9
+
+
+# --- placement ----------------------------------------------------------------------------------
+
+LINEAR = [
+    "servers.cpu_power_ratio_lb=[0, 1]", "servers.cpu_power_ratio_ub=[0, 1]",
+    "servers.power_w=[150, 0]", "hall.height_zones=2",
+]  # fmt: skip
+"""CPU power in proportion to the load, wherever it runs."""
+
+
+def rack_loads(results: list[StepResult]) -> F64:
+    return np.asarray(column(results, "rack_cpu_w") / (200 * 150.0))
+
+
+@pytest.mark.parametrize("thermal", THERMAL)
+@pytest.mark.parametrize("policy", POLICIES)
+def test_placement_conserves_work_and_keeps_to_capacity(policy: str, thermal: str) -> None:
+    weights = np.linspace(0.1, 3, 20) if policy == "weights" else None
+    demand = np.array([0.05, 0.3, 0.62, 0.97, 1.0])
+    results = simulate(
+        [*LINEAR, f"workload.placement={policy}", f"simulation.thermal={thermal}"],
+        5,
+        constant(demand),
+        placement=weights,
+    )
+    loads = rack_loads(results)
+    np.testing.assert_allclose(loads.mean(axis=1), column(results, "utilisation"), rtol=1e-12)
+    np.testing.assert_allclose(column(results, "executed_tasks"), 100 * demand, rtol=1e-12)
+    assert np.all((loads >= 0) & (loads <= 1 + 1e-12))
+    spread = np.ptp(loads, axis=1)
+    if policy == "uniform":
+        assert np.all(spread < 1e-12)
+    else:
+        assert np.all(spread[:3] > 1e-4)
+
+
+def test_fill_and_weights_say_where_work_goes() -> None:
+    filled = rack_loads(simulate([*LINEAR, "workload.placement=fill"], 1, constant(0.52)))[0]
+    np.testing.assert_allclose(filled, np.r_[np.ones(10), 0.4, np.zeros(9)], atol=1e-12)
+    weights = np.r_[0.0, 0.0, np.ones(9), 2 * np.ones(9)]
+    loads = rack_loads(
+        simulate([*LINEAR, "workload.placement=weights"], 1, constant(0.27), placement=weights)
+    )[0]
+    np.testing.assert_allclose(loads, 0.27 * 20 / 27 * weights, rtol=1e-12)
+    # By server group, and more work than the chosen ones can do: the rest waits.
+    groups = np.zeros(40)
+    groups[5] = 1.0
+    result = simulate([*LINEAR, "workload.placement=weights"], 1, constant(0.3), placement=groups)
+    assert result[0].utilisation[0] == pytest.approx(1 / 40)
+    assert rack_loads(result)[0][2] == pytest.approx(0.5)
+    assert result[0].queue_tasks[0] == pytest.approx(30 - 2.5)
+
+
+def test_policies_by_temperature_look_at_the_step_before() -> None:
+    steps = 6
+    base = [*LINEAR, "hall.supply_approach_k=[1,1,1,1,1,2,2,2,2,2,3,3,3,3,3,4,4,4,4,4]"]
+    config = load_config("corrected", [*base, "workload.placement=coolest-first"])
+    with Simulator(config, drivers=constant(0.5), precision="f64") as sim:
+        sim.reset()
+        for step in range(steps):
+            known = sim.state.group_inlet_c.copy()
+            result = sim.step()
+            layers = sim.servers().power_w
+            idle = float(layers.min())
+            busy = layers.reshape(40, 100).mean(axis=1) > idle + 75
+            # Equal groups at half load: one half runs, and none outside it is cooler.
+            assert busy.sum() == 20, step
+            assert known[busy].max() <= known[~busy].min()
+            np.testing.assert_array_equal(
+                sim.state.group_inlet_c, sim.servers().inlet_c.reshape(40, 100)[:, 0]
+            )
+    results = simulate([*base, "workload.placement=inlet-aware"], steps, constant(0.5))
+    loads, inlets = rack_loads(results)[1:], column(results, "rack_inlet_c")[:-1]
+    for load, inlet in zip(loads, inlets, strict=True):
+        order = np.argsort(inlet)
+        assert load[order[0]] > load[order[-1]]
+        # In proportion to the headroom below the limit of class A2.
+        assert np.corrcoef(load, 35.0 - inlet)[0, 1] > 0.99
+    assert result.inlet_max_c[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("policy", "weights", "message"),
+    [
+        ("uniform", np.ones(20), r"action placement: given, but workload\.placement is uniform"),
+        ("weights", np.ones(7), r"action placement: shape \(7,\), expected \(20,\), one per rack"),
+        ("weights", -np.ones(20), "placement weight 0 is -1"),
+        ("weights", np.zeros(20), "all placement weights are 0"),
+    ],
+)
+def test_wrong_placements_are_refused(policy: str, weights: F64, message: str) -> None:
+    config = load_config("corrected", [*LINEAR, f"workload.placement={policy}"])
+    with Simulator(config, drivers=constant()) as sim:
+        sim.reset()
+        sim.step()
+        before = sim.state_dict()
+        with pytest.raises(SdcError, match=message):
+            sim.step(Actions(placement=weights))
+        after = sim.state_dict()
+        assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_throttled_racks_get_what_they_may_do() -> None:
+    results = simulate(
+        [*LINEAR, "workload.placement=fill", "hvac.crac.units=2", "protection.ashrae_class=A1",
+         "protection.trip_margin_k=50", "protection.throttle_share=0.25",
+         events("kind: crac_down, unit: 0, start_h: 0.5, duration_h: 4")],
+        18,
+        constant(0.6),
+    )  # fmt: skip
+    status, loads = column(results, "rack_status"), rack_loads(results)
+    throttled = status[:-1] == THROTTLED
+    assert np.any(throttled)
+    assert np.all(loads[1:][throttled] <= 0.25 + 1e-12)
+    room = np.where(throttled, 0.25, 1.0).mean(axis=1)
+    waiting = column(results, "queue_tasks")[:-1] > 0
+    expected = np.minimum(0.6, room)
+    assert np.all(loads[1:].mean(axis=1) >= expected - 1e-9)
+    assert np.all(loads[1:].mean(axis=1) <= room + 1e-9)
+    assert np.any(waiting)
+
+
+# --- the hottest place --------------------------------------------------------------------------
+
+
+def test_hottest_server_is_where_the_layers_say() -> None:
+    config = load_config("corrected", ["workload.placement=weights"])
+    rng = np.random.default_rng(0)
+    with Simulator(config, drivers=constant(0.5), precision="f64") as sim:
+        sim.reset()
+        places = set()
+        for _ in range(6):
+            result = sim.step(Actions(placement=rng.uniform(0, 1, 20) ** 4))
+            inlets = sim.servers().inlet_c
+            index = int(np.argmax(inlets))
+            place = (int(result.hottest_rack[0]), int(result.hottest_server[0]))
+            assert place == divmod(index, 200)
+            assert result.inlet_max_c[0] == inlets[index]
+            assert result.hot_k[0] == pytest.approx(np.maximum(inlets - 27, 0).mean())
+            places.add(place)
+    assert len(places) > 1
+
+
+# --- batches, repetition, snapshots -------------------------------------------------------------
+
+
+def troubled_fleet(thermal: str, policy: str) -> list[DataCenterConfig]:
+    """Halls of different size with failures of their own, planned and sampled."""
+    base = load_config(
+        "corrected", [f"simulation.thermal={thermal}", f"workload.placement={policy}"]
+    )
+    sampled = (
+        "events.sampled=[{kind: crac_down, per_year: 900, duration_h: [0.5, 2]},"
+        "{kind: rack_fan_failure, per_year: 2000, duration_h: [0.25, 3], share: 0.4},"
+        "{kind: grid_outage, per_year: 400, duration_h: [0.25, 1]}]"
+    )
+    small = ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
+             "hall.return_approach_k=-3", "servers.power_w=[300, 60]",
+             "hall.servers_per_rack=7"]  # fmt: skip
+    changes: list[list[str]] = [
+        ["hvac.crac.units=2", "protection.ashrae_class=A1", "battery.initial_soc=0.3",
+         events("kind: crac_down, start_h: 1, duration_h: 1.5",
+                "kind: grid_outage, start_h: 4, duration_h: 0.75")],
+        [],
+        [*small, "hvac.crac.units=3", "protection.ashrae_class=A3", sampled],
+        [*small, "site.location=AZ", "site.start=07-01",
+         events("kind: heat_wave, offset_k: 9, start_h: 1, duration_h: 3",
+                "kind: chiller_derate, share: 0.2, start_h: 2, duration_h: 2")],
+    ]  # fmt: skip
+    return [
+        apply_overrides(base, change).model_copy(update={"name": f"dc{i}"})
+        for i, change in enumerate(changes)
+    ]
+
+
+def troubled_actions(
+    configs: list[DataCenterConfig], policy: str, steps: int, seed: int = 0
+) -> list[Actions]:
+    rng = np.random.default_rng(seed)
+    size, racks = len(configs), sum(c.hall.racks for c in configs)
+    return [
+        Actions(
+            rng.uniform(-1, 1, size),
+            rng.integers(-1, 2, size).astype(np.float64),
+            rng.uniform(-1, 1, size),
+            placement=rng.uniform(0, 1, racks) if policy == "weights" else None,
+        )
+        for _ in range(steps)
+    ]
+
+
+def own_actions(actions: Actions, configs: list[DataCenterConfig], index: int) -> Actions:
+    racks, one = np.cumsum([0, *(c.hall.racks for c in configs)]), slice(index, index + 1)
+    load, cooling, battery = (
+        np.asarray(getattr(actions, n))[one] for n in ("load", "cooling", "battery")
+    )
+    given = actions.placement
+    placement = None if given is None else given[racks[index] : racks[index + 1]]
+    return Actions(load, cooling, battery, placement=placement)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("thermal", THERMAL)
+@pytest.mark.parametrize("policy", POLICIES)
+def test_a_troubled_day_of_a_batch_equals_each_data_center_alone(
+    policy: str, thermal: str, precision: Precision
+) -> None:
+    configs = troubled_fleet(thermal, policy)
+    actions = troubled_actions(configs, policy, 30)
+    with Simulator(configs, precision=precision) as sim:
+        sim.reset(seed=4)
+        batch = run(sim, actions)
+    if policy == "uniform":
+        for name in ("tripped_racks", "lost_tasks"):
+            assert np.any([getattr(r, name) > 0 for r in batch]), f"{name}: nothing happened"
+        assert np.any([r.grid_up < 1 for r in batch])
+    for i, config in enumerate(configs):
+        with Simulator(config, precision=precision) as sim:
+            sim.reset(seed=4)
+            alone = run(sim, [own_actions(a, configs, i) for a in actions])
+        assert_same(alone, [part_of(r, configs, i) for r in batch])
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("thermal", THERMAL)
+@pytest.mark.parametrize("at", [5, 11, 17], ids=["unit down", "recovering", "outage"])
+def test_snapshots_in_the_midst_of_events_continue_to_the_bit(
+    at: int, thermal: str, precision: Precision, tmp_path: Path
+) -> None:
+    configs = troubled_fleet(thermal, "coolest-first")
+    actions = troubled_actions(configs, "coolest-first", 26)
+    with Simulator(configs, precision=precision) as sim:
+        sim.reset(seed=9)
+        first = run(sim, actions[:at])
+        sim.save(tmp_path / "state.npz")
+        snapshot = sim.state_dict()
+        second = run(sim, actions[at:])
+        sim.reset(seed=1)
+        run(sim, actions[:3])
+        sim.load_state_dict(snapshot)
+        assert_same(second, run(sim, actions[at:]))
+        sim.reset(seed=9)
+        assert_same(first + second, run(sim, actions))
+    with Simulator(configs, precision=precision) as other:
+        other.load(tmp_path / "state.npz")
+        assert_same(second, run(other, actions[at:]))
+
+
+def test_the_seed_decides_what_goes_wrong() -> None:
+    config = troubled_fleet("quasi_steady", "uniform")[2]
+    found = []
+    with Simulator(config, drivers=constant()) as sim:
+        for seed in (0, 1, 0):
+            sim.reset(seed=seed)
+            results = [sim.step() for _ in range(200)]
+            parts = ("unit_running", "rack_airflow_m3s", "grid_up")
+            found.append(np.concatenate([np.ravel(column(results, n)) for n in parts]))
+    assert np.array_equal(found[0], found[2])
+    assert not np.array_equal(found[0], found[1])

@@ -1,0 +1,611 @@
+"""Transient halls: against twin and differential equations, energy, time constants, memory."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import reference_twin
+from sdc_taichi import (
+    Actions,
+    ConfigError,
+    DataCenterConfig,
+    Drivers,
+    Simulator,
+    StepResult,
+    build_fleet,
+    drivers_from_arrays,
+    load_config,
+)
+from sdc_taichi.config import apply_overrides
+from sdc_taichi.fleet import Fleet
+from sdc_taichi.hall import Coil, Conditions, Hall, HallState, HallSums, Precision
+from sdc_taichi.types import F64
+from test_recirculation import (
+    AS_FOUND,
+    PRECISIONS,
+    SMALL,
+    Part,
+    flat,
+    own_conditions,
+    own_part,
+    parts,
+    random_conditions,
+    random_hall,
+    random_halls,
+)
+
+SEEDS = st.integers(0, 2**32 - 1)
+TOLERANCE: dict[Precision, float] = {"f64": 1e-12, "f32": 1e-5}
+
+
+def random_coil(rng: np.random.Generator, fleet: Fleet, setpoint_c: F64) -> Coil:
+    """Plants that suffice and plants that do not, rooms that are and are not warmed."""
+    servers = fleet.per_dc_servers()
+    design_w = fleet.unit_design_m3s.sum() / fleet.size * 1.7e4
+    return Coil(
+        setpoint_c=setpoint_c,
+        room_j=rng.choice([0.0, 3e3], fleet.size) * servers,
+        room_j_per_k=2e3 * servers,
+        limit_w=rng.choice([0.0, 0.5, 10.0], fleet.size) * design_w,
+        fan_w_per_m3s=rng.uniform(400, 1000, fleet.size),
+    )
+
+
+def random_state(rng: np.random.Generator, fleet: Fleet, precision: Precision) -> HallState:
+    """A memory that no steady state leaves behind."""
+    real = np.float64 if precision == "f64" else np.float32
+    assert fleet.air is not None
+    groups = len(fleet.groups[0])
+    return HallState(
+        server_c=rng.uniform(22, 50, groups).astype(real),
+        mixed_c=rng.uniform(20, 40, fleet.racks).astype(real),
+        exhaust_c=(fleet.air.strength * rng.uniform(25, 45, fleet.racks)).astype(real),
+        captured_m3s=rng.uniform(0, 1, fleet.racks).astype(real),
+        need_m3s=fleet.unit_design_m3s * rng.uniform(0.2, 1.2, fleet.units),
+        following=rng.uniform(0.2, 1.1, fleet.size)[fleet.unit_dc],
+    )
+
+
+def twin_memory(fleet: Fleet, part: Part, state: HallState, room_j: float) -> reference_twin.Memory:
+    assert fleet.air is not None
+    counts = np.diff(fleet.server_start)[part.groups]
+    return reference_twin.Memory(
+        server_c=np.repeat(np.asarray(state.server_c, np.float64)[part.groups], counts),
+        mixed_c=np.asarray(state.mixed_c, np.float64)[part.racks],
+        outlet_c=(np.asarray(state.exhaust_c, np.float64) / fleet.air.strength)[part.racks],
+        captured_m3s=np.asarray(state.captured_m3s, np.float64)[part.racks],
+        need_m3s=state.need_m3s[part.units],
+        following=state.following[part.units],
+        room_j=room_j,
+    )
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("substeps", [1, 4, 15])
+@settings(phases=AS_FOUND, max_examples=4)
+@given(seed=SEEDS)
+def test_transient_halls_agree_with_the_twin(
+    substeps: int, precision: Precision, seed: int
+) -> None:
+    rel = {"f64": 1e-10, "f32": 1e-4}[precision]
+    configs, rng = random_halls(seed), np.random.default_rng(seed + 1)
+    fleet, met = build_fleet(configs), random_conditions(rng, configs)
+    coil = random_coil(rng, fleet, met.unit_supply_c)
+    before = random_state(rng, fleet, precision)
+    sums, after = Hall(fleet, precision).advance(met, before, coil, 900.0, 900.0 / substeps)
+    for i, part in enumerate(parts(configs, met)):
+        found, left = reference_twin.advance(
+            part.twin,
+            twin_memory(fleet, part, before, coil.room_j[i]),
+            part.supply_c,
+            part.load,
+            low=part.low,
+            high=part.high,
+            running=part.running,
+            powered=part.powered,
+            breath=part.breath,
+            room_j_per_k=coil.room_j_per_k[i],
+            limit_w=coil.limit_w[i],
+            fan_w_per_m3s=coil.fan_w_per_m3s[i],
+            step_s=900.0,
+            substeps=substeps,
+        )
+        own = twin_memory(fleet, part, after, sums.room_j[i])
+        # Heat that flows in and out counts against what passes through.
+        through = float(np.sum(found["outlet_m3k_s"])) * part.twin.air_j_per_m3_k
+        through += coil.room_j[i] / 900.0
+        for name, expected in found.items():
+            where: Any = slice(i, i + 1)
+            if name.startswith(("rack_", "unit_")):
+                where = part.racks if name.startswith("rack_") else part.units
+            scale = through if name in ("stored_w", "coil_load_w", "coil_w") else 0.0
+            np.testing.assert_allclose(
+                getattr(sums, name)[where], expected, rtol=rel, atol=rel * scale + 1e-9,
+                err_msg=f"{configs[i].name} {name}",
+            )  # fmt: skip
+        for f in fields(reference_twin.Memory):
+            scale = 900.0 * through if f.name == "room_j" else 0.0
+            np.testing.assert_allclose(
+                getattr(own, f.name), getattr(left, f.name), rtol=rel, atol=rel * scale + 1e-9,
+                err_msg=f"{configs[i].name} {f.name}",
+            )  # fmt: skip
+
+
+# --- against the differential equations ---------------------------------------------------------
+
+
+def rates(
+    part: Part, state: F64, supply_c: F64, capacity: float
+) -> tuple[F64, reference_twin.Flows]:
+    """Time derivatives of server and mix temperatures, every flow at its present temperature."""
+    twin, air = part.twin, part.twin.air_j_per_m3_k
+    server_c, mixed_c = np.split(state, [len(twin.rack)])
+    following = np.ones(len(supply_c))
+    for _ in range(60):
+        ratio = following
+        unit_share = twin.unit_shares[twin.rack]
+        from_unit = (1.0 - twin.captured)[:, None] * unit_share * ratio
+        inlet_c = (1.0 - from_unit.sum(axis=1)) * mixed_c[twin.rack] + from_unit @ supply_c
+        cpu, fan, flow = twin.servers(inlet_c, part.load, part.powered, part.breath)
+        moved = reference_twin.flows(twin, flow, part.low, part.high, ratio)
+        following = moved.fresh_ratio
+        if np.max(np.abs(following - ratio)) < 1e-13:
+            break
+    effectiveness = twin.config.servers.heat_exchange_effectiveness
+    to_air = effectiveness * air * flow * (server_c - inlet_c)
+    outlet_c = twin.per_rack(flow * inlet_c + (to_air + fan) / air) / twin.per_rack(flow)
+    through = np.maximum(moved.captured * air / twin.parcel_j_per_k, 1.0 / 128.0)
+    mixing = through * (twin.weights @ outlet_c - mixed_c)
+    return np.concatenate([(cpu - to_air) / capacity, mixing]), moved
+
+
+@pytest.mark.parametrize("low", [1.0, 0.6], ids=["enough air", "too little air"])
+def test_substeps_converge_to_the_differential_equations(low: float) -> None:
+    rng = np.random.default_rng(6)
+    config = random_hall(rng, "dc", (2, 3))
+    fleet, units = build_fleet(config), config.hvac.crac.units
+    supply_c, speed = np.full(units, 20.0), np.full(units, low)
+    before, after = (
+        Conditions(
+            supply_c, np.array([u]), unit_low=speed, unit_high=speed,
+            unit_running=np.ones(units),
+        )
+        for u in (0.2, 0.9)
+    )  # fmt: skip
+    hall = Hall(fleet, "f64")
+    settled = hall.settle(before)
+    part = parts([config], after)[0]
+    capacity = config.servers.heat_capacity_kj_per_k * 1e3
+    counts = np.diff(fleet.server_start)
+    state = np.concatenate([np.repeat(settled.server_c, counts), settled.mixed_c])
+    change, _ = rates(parts([config], before)[0], state, supply_c, capacity)
+    assert np.max(np.abs(change)) < 1e-9, "the hall was not settled"
+    h = 3.0
+    for _ in range(300):
+        k1 = rates(part, state, supply_c, capacity)[0]
+        k2 = rates(part, state + h / 2 * k1, supply_c, capacity)[0]
+        k3 = rates(part, state + h / 2 * k2, supply_c, capacity)[0]
+        k4 = rates(part, state + h * k3, supply_c, capacity)[0]
+        state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    coil = Coil(supply_c, np.zeros(1), np.ones(1), np.full(1, 1e9), np.zeros(1))
+    errors = []
+    for substep_s in (60.0, 30.0, 15.0, 7.5):
+        _, end = hall.advance(after, settled, coil, 900.0, substep_s)
+        found = np.concatenate([np.repeat(end.server_c, counts), end.mixed_c])
+        errors.append(np.max(np.abs(found - state)))
+    assert np.max(np.abs(state[: len(part.load)] - np.repeat(settled.server_c, counts))) > 5
+    assert errors[0] < 1.5
+    # First order: what one substep does to the air, the servers learn in the next.
+    ratios = np.array(errors[:-1]) / np.array(errors[1:])
+    assert np.all((ratios > 1.6) & (ratios < 2.6)), errors
+
+
+def breathing_supply_air(*overrides: str) -> DataCenterConfig:
+    """Servers whose inlet is the supply air, whatever the others do."""
+    return load_config("corrected", ["hall.supply_approach_k=0", *overrides])
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_servers_follow_the_exact_exponential_in_any_number_of_substeps(
+    precision: Precision,
+) -> None:
+    config = breathing_supply_air()
+    fleet, hall = build_fleet(config), Hall(build_fleet(config), precision)
+    settled = hall.settle(Conditions(np.array([20.0]), np.array([0.1])))
+    met = Conditions(np.array([20.0]), np.array([0.8]))
+    coil = Coil(np.array([20.0]), np.zeros(1), np.ones(1), np.full(1, 1e9), np.zeros(1))
+    ends = []
+    for substeps in (1, 3, 15, 60):
+        _, state = hall.advance(met, settled, coil, 900.0, 900.0 / substeps)
+        ends.append(state.server_c.astype(np.float64))
+    rel = {"f64": 1e-12, "f32": 3e-6}[precision]
+    for end in ends[1:]:
+        np.testing.assert_allclose(end, ends[0], rtol=rel)
+    twin = reference_twin.calibrated(config)
+    on = np.ones(20)
+    cpu, _, flow = twin.servers(np.full(4000, 20.0), twin.load(0.8 * on), on, on)
+    per_k = config.servers.heat_exchange_effectiveness * twin.air_j_per_m3_k * flow
+    start = np.repeat(np.asarray(settled.server_c, np.float64), np.diff(fleet.server_start))
+    final = 20.0 + cpu / per_k
+    expected = final + (start - final) * np.exp(-900.0 * per_k / 9750.0)
+    found = np.repeat(ends[0], np.diff(fleet.server_start))
+    np.testing.assert_allclose(found, expected, rtol=rel)
+    assert np.all((expected > start + 1) & (expected < final - 1))
+
+
+# --- energy -------------------------------------------------------------------------------------
+
+
+def held_j(fleet: Fleet, state: HallState, room_j: F64) -> F64:
+    """Heat in servers, recirculated air and room, from temperatures, (B,)."""
+    per_group = fleet.groups[0] * np.asarray(state.server_c, np.float64)
+    servers = np.add.reduceat(per_group, fleet.group_start[fleet.rack_start[:-1]])
+    parcels = np.add.reduceat(np.asarray(state.mixed_c, np.float64), fleet.rack_start[:-1])
+    capacity = fleet.values("servers.heat_capacity_kj_per_k") * 1e3
+    twins = [reference_twin.calibrated(c) for c in fleet.configs]
+    per_parcel = np.array([t.parcel_j_per_k for t in twins])
+    return np.asarray(servers * capacity + parcels * per_parcel + room_j, dtype=np.float64)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@settings(phases=AS_FOUND, max_examples=10)
+@given(seed=SEEDS)
+def test_heat_that_comes_in_stays_or_leaves(precision: Precision, seed: int) -> None:
+    configs, rng = random_halls(seed), np.random.default_rng(seed + 1)
+    fleet = build_fleet(configs)
+    state = random_state(rng, fleet, precision)
+    hall = Hall(fleet, precision)
+    room_j = np.zeros(fleet.size)
+    for _ in range(3):
+        met = random_conditions(rng, configs)
+        coil = replace(random_coil(rng, fleet, met.unit_supply_c), room_j=room_j)
+        before = held_j(fleet, state, room_j)
+        sums, state = hall.advance(met, state, coil, 900.0, 60.0)
+        room_j = sums.room_j
+        running = np.ones(fleet.units) if met.unit_running is None else met.unit_running
+        fans = coil.fan_w_per_m3s[fleet.unit_dc] * fleet.unit_design_m3s * sums.unit_cubed_speed
+        assert np.all(fans[running == 0] == 0)
+        generated = sums.cpu_w + sums.fan_w + np.add.reduceat(fans, fleet.unit_start[:-1])
+        kept = held_j(fleet, state, room_j) - before
+        # Against all heat that moves, for some halls are idle.
+        moved = np.abs(generated) + np.abs(sums.coil_w) + np.abs(kept) / 900.0
+        left = np.abs((generated - sums.coil_w) * 900.0 - kept)
+        largest = np.maximum(900.0 * moved, np.abs(before) * {"f64": 1e-3, "f32": 0.1}[precision])
+        assert np.max(left / largest) < TOLERANCE[precision]
+
+
+def test_a_warmer_setpoint_than_the_room_loses_no_heat() -> None:
+    # Air that comes back colder than the setpoint must be warmed by something.
+    config = load_config(
+        "corrected", ["simulation.thermal=transient", "hvac.setpoint.initial_c=16"]
+    )
+    with Simulator(config, drivers=constant_drivers(demand=0.0), precision="f64") as sim:
+        sim.reset()
+        fleet, before = sim.fleet, sim.state
+        for step in range(12):
+            result = sim.step(Actions(cooling=7.0 if step == 2 else 0.0))
+            kept_kwh = (
+                held_j(fleet, memory_of(sim), sim.state.room_heat_kwh * 3.6e6)
+                - held_j(fleet, memory_of(before), before.room_heat_kwh * 3.6e6)
+            ) / 3.6e6
+            in_kwh = (result.it_w + result.crac_fan_w) * 0.25e-3
+            out_kwh = result.heat_removed_w * 0.25e-3
+            assert kept_kwh[0] == pytest.approx((in_kwh - out_kwh)[0], abs=1e-9), f"step {step}"
+            before = sim.state
+
+
+def memory_of(source: Any) -> HallState:
+    """The hall's part of the state of a simulator."""
+    state = source.state if isinstance(source, Simulator) else source
+    return HallState(**{f.name: getattr(state, f.name) for f in fields(HallState)})
+
+
+def constant_drivers(size: int = 1, demand: Any = 0.7) -> Drivers:
+    series = np.broadcast_to(np.asarray(demand, np.float64), (size, np.size(demand)))
+    steps = series.shape[1]
+    return drivers_from_arrays(
+        np.full((size, steps), 20.0), np.full((size, steps), 14.0),
+        np.full((size, steps), 300.0), series.copy(),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_an_uncooled_hall_warms_by_its_power_over_its_heat_capacity(precision: Precision) -> None:
+    rng = np.random.default_rng(8)
+    config = flat(random_hall(rng, "dc", (3, 4)))
+    fleet, hall = build_fleet(config), Hall(build_fleet(config), precision)
+    units = np.ones(fleet.units)
+    met = Conditions(
+        20 * units, np.array([0.6]), unit_low=0.3 * units, unit_high=0.3 * units,
+        unit_running=0 * units,
+    )  # fmt: skip
+    state, room_j = hall.settle(replace(met, unit_low=units, unit_high=units)), np.zeros(1)
+    servers = fleet.per_dc_servers()
+    coil = Coil(20 * units, room_j, 2e3 * servers, np.full(1, 1e9), np.full(1, 800.0))
+    means = []
+    for _ in range(24):
+        sums, state = hall.advance(met, state, replace(coil, room_j=room_j), 900.0, 60.0)
+        room_j = sums.room_j
+        assert sums.coil_w[0] == 0.0
+        means.append((sums.inlet_mean_c[0], sums.outlet_mean_c[0], sums.supply_c[0]))
+    parcels = reference_twin.calibrated(config).parcel_j_per_k * fleet.racks
+    capacity = servers * (9750.0 + 2000.0) + parcels
+    expected = 900.0 * (sums.cpu_w + sums.fan_w) / capacity
+    rel = {"f64": 1e-6, "f32": 1e-3}[precision]
+    np.testing.assert_allclose(np.diff(means, axis=0)[-1], np.full(3, expected[0]), rtol=rel)
+
+
+# --- in the long run ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@settings(phases=AS_FOUND, max_examples=5)
+@given(seed=SEEDS)
+def test_constant_conditions_end_in_the_quasi_steady_state(precision: Precision, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    config = random_hall(rng, "dc", SMALL[int(rng.integers(len(SMALL)))])
+    fleet, hall = build_fleet(config), Hall(build_fleet(config), precision)
+    met = replace(random_conditions(rng, [config]), powered=None)
+    met = replace(met, unit_running=np.ones(fleet.units))
+    expected = hall.solve(met)
+    other = replace(met, utilisation=1.0 - met.utilisation, rack_load=None, group_load=None)
+    state = hall.settle(other)
+    coil = Coil(
+        met.unit_supply_c, np.zeros(1), np.ones(1), np.full(1, 1e12), np.zeros(1)
+    )  # fmt: skip
+    for _ in range(80):
+        sums, state = hall.advance(met, state, coil, 900.0, 100.0)
+    rel = {"f64": 1e-7, "f32": 1e-4}[precision]
+    through = float(expected.cpu_w[0] + expected.fan_w[0]) + 1.0
+    for f in fields(HallSums):
+        if f.name in ("hottest_group", "coil_w", "coil_load_w", "room_j"):
+            continue
+        scale = through if f.name == "stored_w" else 1.0
+        np.testing.assert_allclose(
+            getattr(sums, f.name), getattr(expected, f.name), rtol=rel, atol=30 * rel * scale,
+            err_msg=f.name,
+        )  # fmt: skip
+    assert sums.coil_w[0] == pytest.approx(through - 1.0, rel=rel)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@settings(phases=AS_FOUND, max_examples=4)
+@given(seed=SEEDS)
+def test_settled_halls_stay_settled(precision: Precision, seed: int) -> None:
+    configs, rng = random_halls(seed), np.random.default_rng(seed)
+    fleet = build_fleet(configs)
+    met = replace(random_conditions(rng, configs), powered=None)
+    met = replace(met, unit_running=np.ones(fleet.units))
+    hall = Hall(fleet, precision)
+    state = hall.settle(met)
+    coil = Coil(
+        met.unit_supply_c, np.zeros(fleet.size), np.ones(fleet.size),
+        np.full(fleet.size, 1e12), np.zeros(fleet.size),
+    )  # fmt: skip
+    sums, after = hall.advance(met, state, coil, 900.0, 60.0)
+    atol = {"f64": 1e-4, "f32": 1e-2}[precision]
+    np.testing.assert_allclose(after.server_c, state.server_c, rtol=0, atol=atol)
+    np.testing.assert_allclose(after.mixed_c, state.mixed_c, rtol=0, atol=atol)
+    assert np.all(np.abs(sums.stored_w) <= 1e-4 * (sums.cpu_w + sums.fan_w) + 1e-6)
+
+
+def test_a_failed_unit_is_felt_over_steps_and_forgotten_again() -> None:
+    event = "[{kind: crac_down, unit: 0, start_h: 2, duration_h: 1.5}]"
+    base = load_config("corrected", ["simulation.thermal=transient", "hvac.crac.units=2"])
+    runs = []
+    for config in (base, apply_overrides(base, [f"events.scheduled={event}"])):
+        with Simulator(config, drivers=constant_drivers(), precision="f64") as sim:
+            sim.reset()
+            runs.append(np.array([sim.step().rack_inlet_c for _ in range(48)]))
+    warmer = runs[1] - runs[0]
+    assert np.array_equal(runs[0][:8], runs[1][:8])
+    down, mean = slice(8, 14), warmer.mean(axis=1)
+    assert np.all(np.diff(mean[down]) > 0), "warms step by step"
+    assert mean[8] < 0.6 * mean[13]
+    assert np.all(warmer[13] > 0.5), "every rack feels it"
+    # Unit 0 stands at the low end of the rows.
+    rows = warmer[9].reshape(4, 5)
+    assert np.all(rows[:, 0] > rows[:, 4])
+    assert np.all(np.diff(mean[14:30]) < 0), "recovers step by step"
+    assert mean[14] > 0.05
+    assert np.max(np.abs(warmer[-1])) < 1e-3
+
+
+@pytest.mark.parametrize("servers", [3, 7, 20, 200])
+def test_air_in_a_dark_hall_stays_between_what_it_was(servers: int) -> None:
+    # Few servers have a room with little heat capacity around them, which the air may outweigh.
+    config = load_config(
+        "corrected",
+        ["hall.rows=1", "hall.racks_per_row=1", "hall.supply_approach_k=3",
+         "hall.return_approach_k=-3", f"hall.servers_per_rack={servers}",
+         "servers.power_w=[300, 60]", "simulation.thermal=transient", "battery.capacity_kwh=0",
+         "events.scheduled=[{kind: grid_outage, start_h: 1, duration_h: 2}]"],
+    )  # fmt: skip
+    with Simulator(config, drivers=constant_drivers(), precision="f64") as sim:
+        hottest = float(sim.reset().server_c.max()) + 1e-6
+        for step in range(20):
+            result = sim.step()
+            assert 18.0 - 1e-6 <= result.supply_c[0] <= hottest, step
+            assert 18.0 - 1e-6 <= result.inlet_max_c[0] <= hottest, step
+        assert result.inlet_max_c[0] < 25
+
+
+# --- server layers ------------------------------------------------------------------------------
+
+
+def test_server_layers_are_those_of_the_end_of_the_step() -> None:
+    config = load_config("corrected", ["simulation.thermal=transient"])
+    demand = np.repeat([0.2, 0.9], [2, 80])[None]
+    with Simulator(config, drivers=constant_drivers(demand=demand), precision="f64") as sim:
+        sim.reset()
+        rack = sim.fleet.server_rack()
+        for step in range(82):
+            before = sim.state.server_c.copy() if step == 2 else None
+            result, layers = sim.step(), None
+            if before is not None:
+                layers = sim.servers()
+                # Power leaves the servers later than it enters them.
+                air = 1.225 * 1006.0
+                warming = layers.outlet_c - layers.inlet_c
+                share = air * result.rack_airflow_m3s.sum() * np.mean(warming) / result.it_w[0]
+                assert share < 0.9
+        layers = sim.servers()
+        warming = layers.outlet_c - layers.inlet_c
+        flow = layers.power_w / (1.225 * 1006.0 * warming)
+        moved = np.bincount(rack, flow)
+        np.testing.assert_allclose(moved, result.rack_airflow_m3s, rtol=1e-6)
+        for name in ("inlet_c", "outlet_c"):
+            mean = np.bincount(rack, flow * getattr(layers, name)) / moved
+            np.testing.assert_allclose(mean, getattr(result, f"rack_{name}"), rtol=1e-6)
+        power = np.bincount(rack, layers.power_w)
+        np.testing.assert_allclose(power, result.rack_power_w, rtol=1e-6)
+
+
+# --- batches and memory -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@settings(phases=AS_FOUND, max_examples=5)
+@given(seed=SEEDS)
+def test_a_transient_hall_of_a_batch_equals_itself_alone(precision: Precision, seed: int) -> None:
+    configs, rng = random_halls(seed), np.random.default_rng(seed + 1)
+    fleet, met = build_fleet(configs), random_conditions(rng, configs)
+    coil = random_coil(rng, fleet, met.unit_supply_c)
+    batch = Hall(fleet, precision)
+    settled = batch.settle(replace(met, powered=None))
+    together, after = batch.advance(met, settled, coil, 900.0, 60.0)
+    layers = batch.servers()
+    for i, (config, part) in enumerate(zip(configs, parts(configs, met), strict=True)):
+        alone = Hall(build_fleet(config), precision)
+        where = {"server_c": part.groups, "need_m3s": part.units, "following": part.units}
+        own = own_conditions(met, configs, i)
+        start = alone.settle(replace(own, powered=None))
+        one = slice(i, i + 1)
+        sums, end = alone.advance(
+            own,
+            start,
+            Coil(
+                coil.setpoint_c[part.units], coil.room_j[one], coil.room_j_per_k[one],
+                coil.limit_w[one], coil.fan_w_per_m3s[one],
+            ),
+            900.0,
+            60.0,
+        )  # fmt: skip
+        for state, other in ((start, settled), (end, after)):
+            for f in fields(state):
+                found = getattr(other, f.name)[where.get(f.name, part.racks)]
+                assert np.array_equal(getattr(state, f.name), found), (config.name, f.name)
+        for name, expected in own_part(together, configs, i).items():
+            assert np.array_equal(getattr(sums, name), expected), (config.name, name)
+        for f in fields(layers):
+            found = getattr(layers, f.name)[part.servers]
+            assert np.array_equal(getattr(alone.servers(), f.name), found), (config.name, f.name)
+
+
+def run(sim: Simulator, actions: list[Actions]) -> list[StepResult]:
+    return [sim.step(a) for a in actions]
+
+
+def random_actions(steps: int, size: int, seed: int = 0) -> list[Actions]:
+    rng = np.random.default_rng(seed)
+    return [
+        Actions(
+            rng.uniform(-1, 1, size),
+            rng.integers(-1, 2, size).astype(np.float64),
+            rng.uniform(-1, 1, size),
+        )
+        for _ in range(steps)
+    ]
+
+
+def assert_same(ones: list[StepResult], others: list[StepResult]) -> None:
+    for one, other in zip(ones, others, strict=True):
+        for f in fields(one):
+            a, b = getattr(one, f.name), getattr(other, f.name)
+            assert np.array_equal(a, b), (f.name, one.step)
+
+
+def transient_fleet() -> list[DataCenterConfig]:
+    """Halls of different size, units, servers and season."""
+    base = load_config("corrected", ["simulation.thermal=transient"])
+    changes: list[list[str]] = [
+        [],
+        ["hvac.crac.units=3", "site.location=AZ", "site.start=07-01"],
+        ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
+         "hall.return_approach_k=-3", "servers.power_w=[300, 60]", "hall.servers_per_rack=7",
+         "servers.heat_capacity_kj_per_k=4"],
+    ]  # fmt: skip
+    return [
+        apply_overrides(base, change).model_copy(update={"name": f"dc{i}"})
+        for i, change in enumerate(changes)
+    ]
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_transient_runs_repeat_and_resume_to_the_bit(precision: Precision, tmp_path: Path) -> None:
+    configs = transient_fleet()
+    actions = random_actions(30, len(configs))
+    with Simulator(configs, precision=precision) as sim:
+        sim.reset()
+        first = run(sim, actions[:13])
+        snapshot = sim.state_dict()
+        sim.save(tmp_path / "state.npz")
+        second = run(sim, actions[13:])
+        sim.load_state_dict(snapshot)
+        assert_same(second, run(sim, actions[13:]))
+        sim.reset()
+        assert_same(first + second, run(sim, actions))
+    with Simulator(configs, precision=precision) as other:
+        other.load(tmp_path / "state.npz")
+        assert_same(second, run(other, actions[13:]))
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_a_transient_day_of_a_batch_equals_each_data_center_alone(precision: Precision) -> None:
+    configs = transient_fleet()
+    actions = random_actions(24, len(configs), seed=2)
+    with Simulator(configs, precision=precision) as sim:
+        sim.reset()
+        batch = run(sim, actions)
+    for i, config in enumerate(configs):
+        own = [
+            Actions(*(np.asarray(getattr(a, n))[i : i + 1] for n in ("load", "cooling", "battery")))
+            for a in actions
+        ]
+        with Simulator(config, precision=precision) as sim:
+            sim.reset()
+            assert_same(run(sim, own), [part_of(r, configs, i) for r in batch])
+
+
+def test_substeps_are_those_of_the_whole_fleet() -> None:
+    base = load_config("corrected", ["simulation.thermal=transient"])
+    configs = [
+        apply_overrides(base, [f"simulation.substep_s={s}"]).model_copy(update={"name": f"dc{s}"})
+        for s in (60, 20)
+    ]
+    with pytest.raises(ConfigError, match=r"simulation\.substep_s is 60\.0 in dc60 and 20\.0 in"):
+        build_fleet(configs)
+
+
+def part_of(result: StepResult, configs: list[DataCenterConfig], index: int) -> StepResult:
+    """What one data center did in a step of a fleet."""
+    racks = np.cumsum([0, *(c.hall.racks for c in configs)])
+    units = np.cumsum([0, *(c.hvac.crac.units for c in configs)])
+    values: dict[str, Any] = {}
+    for f in fields(result):
+        value = getattr(result, f.name)
+        if isinstance(value, np.ndarray):
+            where = slice(index, index + 1)
+            if f.name.startswith(("rack_", "unit_")):
+                start = racks if f.name.startswith("rack_") else units
+                where = slice(start[index], start[index + 1])
+            value = value[where]
+        values[f.name] = value
+    return StepResult(**values)
