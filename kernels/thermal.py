@@ -84,10 +84,12 @@ DC_DOUBLES = (
     "shift_k",
     "moved_k",
     "shifted_k",
+    "stirring_m3s",
 )
 """Per data center in f64: heat held by the room and what the coil needs in transient runs; where
 the sweeps start and what they keep of a common deviation; common shift of the exhaust mixes since
-the last exchange, and by how much the outlets and the shift changed in the last sweep."""
+the last exchange, and by how much the outlets and the shift changed in the last sweep; CRAC
+air per rack."""
 UNIT_ROWS = ("setpoint_c", "low", "high", "design_m3s", "running")
 UNIT_STATE = (
     "supply_c",
@@ -317,6 +319,7 @@ def hall_kernel(precision: str) -> Any:
                 unit_state[3, at] = moved
                 unit_state[4, at] = cubed
             return_c = (total[6] - total[7] + passing) / crac_flow
+            doubles[12, n] = crac_flow / n_racks
             # All mixes move by the middle of the outlets' changes, give or take half their spread.
             middle_k = 0.5 * (least_k + most_k)
             apart = 0.5 * (most_k - least_k) > 0.25 * tolerance_k
@@ -494,7 +497,7 @@ def hall_kernel(precision: str) -> Any:
                         # Air before racks that stand still is stirred by the CRAC air of the room.
                         still_per_s = ti.min(
                             real(1.0 / 128.0),
-                            air * ti.cast(doubles[8, n], real) / dcs[17, n],
+                            air * ti.cast(doubles[12, n], real) / dcs[17, n],
                         )
                         begins = first_sweep + sweep_here == 0
                         # What the last sweep left is read anew after it.

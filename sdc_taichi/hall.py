@@ -443,6 +443,8 @@ class Hall:
         fresh_share = self._fleet.dcs[self._fresh_row][self._fleet.unit_dc]
         offered = fresh_share * self._fleet.unit_design_m3s * speed
         self._unit_state[1] = np.minimum(1.0, offered / np.maximum(state.need_m3s, 1e-30))
+        flow = np.add.reduceat(self._fleet.unit_design_m3s * speed, self._fleet.unit_start[:-1])
+        self._doubles[12] = flow / np.diff(self._fleet.rack_start)
         self._units[0] = coil.setpoint_c
         rows = (coil.room_j, coil.room_j_per_k, coil.limit_w, coil.fan_w_per_m3s)
         for row, held in enumerate(rows):

@@ -12,7 +12,7 @@ r are such that the given approach temperatures come out exactly at the design p
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -284,35 +284,49 @@ def calibrate(config: DataCenterConfig, groups: RackServers | None = None) -> Re
     """
     groups = rack_servers(config) if groups is None else groups
     settings = config.hall.recirculation
-    approach_k = _approach_k(config)
+    design = _design_point(config, groups, _approach_k(config))
     if settings.matrix_file is None:
-        design = _design_point(config, groups, approach_k)
         exchange = layout_exchange(config.hall, design.airflow_m3s)
-        share = approach_k / exchange.apply(design.outlet_rise_k)
+        share = design.approach_k / exchange.apply(design.outlet_rise_k)
     else:
-        matrix = read_matrix(config, Path(settings.matrix_file), groups)
+        path = Path(settings.matrix_file)
+        kind, given = read_numbers(config, path)
+        if kind == "D" and not settings.calibrate:
+            design = _settled(config, groups, lambda at: given @ at.it_w)
+        matrix = _share_matrix(config, path, kind, given, design)
         sums = matrix.sum(axis=1)
         weights = matrix / np.where(sums > 0, sums, 1.0)[:, None]
         # A rack that breathes supply air alone needs weights all the same.
         weights[sums == 0] = 1.0 / len(sums)
         exchange = dense_exchange(weights)
         if settings.calibrate:
-            design = _design_point(config, groups, approach_k)
-            share = approach_k / exchange.apply(design.outlet_rise_k)
+            share = design.approach_k / exchange.apply(design.outlet_rise_k)
         else:
             share = sums
-            for _ in range(200):
-                design = _design_point(config, groups, approach_k)
-                before, approach_k = approach_k, share * exchange.apply(design.outlet_rise_k)
-                if np.max(np.abs(approach_k - before)) < 1e-12:
-                    break
-            design = _design_point(config, groups, approach_k)
+            design = _settled(config, groups, lambda at: share * exchange.apply(at.outlet_rise_k))
     if settings.matrix_file is None:
         share = share * (1.0 - config.hall.layout.containment)
     captured = groups.per_group(share) * design.height
     _check_closes(config, design, exchange, share, captured)
     fresh = float(np.sum((1.0 - share) * design.airflow_m3s)) / design.crac_flow_m3s
     return Recirculation(exchange, share, captured, min(fresh, 1.0), design)
+
+
+def _settled(
+    config: DataCenterConfig, groups: RackServers, approach_k: Callable[[DesignPoint], F64]
+) -> DesignPoint:
+    """Design point whose approach temperatures are those that follow from it."""
+    before = _approach_k(config)
+    for _ in range(500):
+        design = _design_point(config, groups, before)
+        after = approach_k(design)
+        if np.max(np.abs(after - before)) < 1e-12:
+            return design
+        before = after
+    raise ConfigError(
+        f"{config.hall.recirculation.matrix_file}: the hall finds no steady state at full load; "
+        "valid is less recirculation"
+    )
 
 
 def _check_closes(
@@ -408,7 +422,8 @@ def _path_weight(
     around = np.minimum(
         *(np.abs(back_x - end) + np.abs(front_x - end) for end in ends),
     )
-    return np.asarray(np.exp(-np.minimum(over, around + across) / settings.decay_m))
+    path_m = np.minimum(over, around + across)
+    return np.asarray(np.exp(-path_m / settings.decay_m), dtype=np.float64)
 
 
 def _bands(hall: HallConfig) -> tuple[tuple[I32, I32, I32, I32], F64]:
@@ -484,12 +499,45 @@ def _bands(hall: HallConfig) -> tuple[tuple[I32, I32, I32, I32], F64]:
     return tuple(x.astype(np.int32) for x in index), weights  # type: ignore[return-value]
 
 
-def read_matrix(config: DataCenterConfig, path: Path, groups: RackServers) -> F64:
-    """R of a user's file, (R, R).
+def _share_matrix(
+    config: DataCenterConfig, path: Path, kind: str, given: F64, design: DesignPoint
+) -> F64:
+    """R of a user's R or D, (R, R).
+
+    D is in K/W at the design airflow: T_in = T_sup + D P, from which R = M (1 + M)^-1 with
+    M = D rho cp V.
+
+    Raises:
+        ConfigError: naming the file and what is wrong with it.
+    """
+    matrix = given
+    if kind == "D":
+        hall = config.hall
+        air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
+        rise = given * (air * design.airflow_m3s)
+        matrix = np.linalg.solve(np.eye(len(rise)) + rise.T, rise.T).T
+    j, i = np.unravel_index(np.argmin(matrix), matrix.shape)
+    if matrix[j, i] < -1e-9:
+        raise ConfigError(
+            f"{path}: rack {j} takes a share of {matrix[j, i]:.3g} of its air from rack {i}; valid "
+            "is at least 0"
+        )
+    # Rounding of the inverse alone.
+    matrix = np.maximum(matrix, 0.0)
+    worst = int(np.argmax(matrix.sum(axis=1)))
+    total = float(matrix[worst].sum())
+    if total >= 1.0:
+        raise ConfigError(
+            f"{path}: row {worst} sums to {total:.6g}; valid is below 1, the rest being supply air"
+        )
+    return matrix
+
+
+def read_numbers(config: DataCenterConfig, path: Path) -> tuple[str, F64]:
+    """Kind, R or D, and numbers of a user's file, (R, R).
 
     An .npz file holds an array ``R`` or ``D``, a .csv file the numbers alone, one row per receiving
-    rack, with ``hall.recirculation.matrix_kind``. D is in K/W at the design airflow: T_in = T_sup +
-    D P, from which R = M (1 + M)^-1 with M = D rho cp V.
+    rack, with ``hall.recirculation.matrix_kind``.
 
     Raises:
         ConfigError: naming the file and what is wrong with it.
@@ -501,27 +549,7 @@ def read_matrix(config: DataCenterConfig, path: Path, groups: RackServers) -> F6
     if not np.all(np.isfinite(given)):
         j, i = np.argwhere(~np.isfinite(given))[0]
         raise ConfigError(f"{path}: {kind}[{j}, {i}] is {given[j, i]}; valid is a finite number")
-    matrix = given
-    if kind == "D":
-        hall = config.hall
-        air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
-        airflow = _design_point(config, groups, _approach_k(config)).airflow_m3s
-        rise = given * (air * airflow)
-        matrix = np.linalg.solve(np.eye(racks) + rise.T, rise.T).T
-    j, i = np.unravel_index(np.argmin(matrix), matrix.shape)
-    if matrix[j, i] < -1e-9:
-        raise ConfigError(
-            f"{path}: rack {j} takes a share of {matrix[j, i]:.3g} of its air from rack {i}; valid "
-            "is at least 0"
-        )
-    matrix = np.maximum(matrix, 0.0)
-    worst = int(np.argmax(matrix.sum(axis=1)))
-    total = float(matrix[worst].sum())
-    if total >= 1.0:
-        raise ConfigError(
-            f"{path}: row {worst} sums to {total:.6g}; valid is below 1, the rest being supply air"
-        )
-    return matrix
+    return kind, given
 
 
 def _read_numbers(config: DataCenterConfig, path: Path) -> tuple[str, F64]:

@@ -534,7 +534,10 @@ def advance(
     for _ in range(substeps):
         supply_c = setpoint_c + now.room_j / room_j_per_k
         target = hall.weights @ now.outlet_c
-        rate = np.maximum(now.captured_m3s * air / hall.parcel_j_per_k, 1.0 / 128.0)
+        # A still parcel is stirred by its part of the CRAC air.
+        units_m3s = hall.unit_design_m3s * np.clip(now.following, low, high)
+        stirred = units_m3s.sum() / len(now.mixed_c) * air / hall.parcel_j_per_k
+        rate = np.maximum(now.captured_m3s * air / hall.parcel_j_per_k, min(stirred, 1.0 / 128.0))
         mixed_end = target + (now.mixed_c - target) * np.exp(-rate * h)
         mixed = target + (now.mixed_c - mixed_end) / (rate * h)
         parcel_w = float(np.sum(mixed_end - now.mixed_c)) * hall.parcel_j_per_k / h

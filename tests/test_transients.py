@@ -161,7 +161,8 @@ def rates(
     effectiveness = twin.config.servers.heat_exchange_effectiveness
     to_air = effectiveness * air * flow * (server_c - inlet_c)
     outlet_c = twin.per_rack(flow * inlet_c + (to_air + fan) / air) / twin.per_rack(flow)
-    through = np.maximum(moved.captured * air / twin.parcel_j_per_k, 1.0 / 128.0)
+    stirred = moved.unit.sum() / len(mixed_c) * air / twin.parcel_j_per_k
+    through = np.maximum(moved.captured * air / twin.parcel_j_per_k, min(stirred, 1.0 / 128.0))
     mixing = through * (twin.weights @ outlet_c - mixed_c)
     return np.concatenate([(cpu - to_air) / capacity, mixing]), moved
 
