@@ -430,7 +430,7 @@ def _bands(hall: HallConfig) -> tuple[tuple[I32, I32, I32, I32], F64]:
     """Runs and weights above the cutoff, with tables that every second row shares."""
     rows, per_row, layout = hall.rows, hall.racks_per_row, hall.layout
     cutoff, decay_m = hall.recirculation.cutoff, hall.recirculation.decay_m
-    x = (np.arange(per_row) + 0.5) * layout.rack_pitch_m
+    x: F64 = (np.arange(per_row, dtype=np.float64) + 0.5) * layout.rack_pitch_m
     ends = (0.0, per_row * layout.rack_pitch_m)
 
     def across(parity: int, shifts: npt.NDArray[np.int64]) -> F64:
@@ -515,7 +515,7 @@ def _share_matrix(
         hall = config.hall
         air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
         rise = given * (air * design.airflow_m3s)
-        matrix = np.linalg.solve(np.eye(len(rise)) + rise.T, rise.T).T
+        matrix = np.asarray(np.linalg.solve(np.eye(len(rise)) + rise.T, rise.T).T, np.float64)
     j, i = np.unravel_index(np.argmin(matrix), matrix.shape)
     if matrix[j, i] < -1e-9:
         raise ConfigError(

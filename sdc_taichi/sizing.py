@@ -290,8 +290,8 @@ def _room_kwh_per_k(fleet: Fleet) -> F64:
     per_server = fleet.values("hall.room_heat_capacity_kj_per_k_per_server")
     if fleet.models["thermal"] == "quasi_steady":
         per_server = per_server + fleet.values("servers.heat_capacity_kj_per_k")
-        return per_server * fleet.per_dc_servers() / 3600.0
+        return np.asarray(per_server * fleet.per_dc_servers() / 3600.0)
     # The air under floor and ceiling too: a room of few servers holds little else.
     air_m3 = np.array([floor_plan(c.hall).air_m3 for c in fleet.configs])
     air_kj_per_k = air_j_per_m3_k(fleet) * air_m3 / 1e3
-    return (per_server * fleet.per_dc_servers() + air_kj_per_k) / 3600.0
+    return np.asarray((per_server * fleet.per_dc_servers() + air_kj_per_k) / 3600.0)
