@@ -6,8 +6,12 @@ SHELL := bash
 VENV := .venv
 PY := $(VENV)/bin/python
 READY := $(VENV)/.installed
+READY_TRAIN := $(VENV)/.installed-train
 PIP_FLAGS := -qq --disable-pip-version-check
 SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
+# Installed before the libraries on top of it, which would take the newest build. May carry options
+# of pip, such as an index of builds for the CPU alone.
+TORCH ?= torch==2.13.0
 # The first suitable Python unless PYTHON names one.
 PYTHON ?= python3.13 python3.12 python3.11 python3 python
 
@@ -15,7 +19,7 @@ TYPED := build/typecheck
 SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
 
-.PHONY: help demo test lint wheel-test clean
+.PHONY: help demo test test-train lint wheel-test clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -25,6 +29,9 @@ demo: $(READY) ## Simulate July in New York and California; results in runs/demo
 
 test: $(READY) ## Run all tests; those on measured files need SDC_REAL_DATA.
 	$(PY) -m pytest
+
+test-train: $(READY_TRAIN) ## Install the training libraries and test the examples that use them.
+	$(PY) -m pytest tests/test_training.py
 
 lint: $(READY) ## Check style, format and types.
 	$(PY) -m ruff check
@@ -41,6 +48,12 @@ wheel-test: $(READY) ## Build the wheel and run the tests against it, away from 
 clean: ## Remove everything that can be built again, the environment included.
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(READY_TRAIN): $(READY)
+	@echo "Installing the training libraries into $(VENV) (once, a few minutes at most)"
+	@$(PY) -m pip install $(PIP_FLAGS) $(TORCH)
+	@$(PY) -m pip install $(PIP_FLAGS) --editable '.[plot,dev,train]'
+	@touch $@
 
 $(READY): pyproject.toml
 	@if [ ! -x $(PY) ]; then \

@@ -28,6 +28,7 @@ from sdc_taichi import (
     drivers_from_arrays,
     load_config,
 )
+from sdc_taichi.config import cpu_coefficients
 from sdc_taichi.control import Controller, View, make_controller
 from sdc_taichi.layout import floor_plan
 from sdc_taichi.metrics import Metric, per_dc
@@ -87,7 +88,7 @@ def move_load() -> MovedLoad:
     )
     racks, source, target = config.hall.racks, 12, 67
     rack_kw = 1e-3 * sum(g.count * g.full_w for g in config.rack_groups()[0])
-    step = MOVED_KW / (rack_kw * (config.servers.cpu_power_ratio_lb[1] - 0.01))
+    step = MOVED_KW / (rack_kw * cpu_coefficients(config.servers)[2])
     load = np.full((2, racks), 0.5)
     load[:, source] += np.array([0.5, -0.5]) * step
     load[:, target] += np.array([-0.5, 0.5]) * step

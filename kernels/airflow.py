@@ -10,11 +10,9 @@ from typing import Any, no_type_check
 
 from .backend import ti
 
-FACES = 6
 VECTORS = 9
 """Work vectors of one thread: solution, residual, shadow residual, direction, and products."""
 
-# A parallel loop of at most 512 iterations runs on one thread, so each slice of tags gets 512.
 _X, _R, _SHADOW, _P, _V, _T, _Y, _Z, _PIVOT = range(VECTORS)
 
 
@@ -181,6 +179,7 @@ def solve_kernel() -> Any:
         residual: reals_1d,
         iterations: ints_1d,
     ):
+        # A parallel loop of at most 512 iterations runs on one thread: each slice of tags gets 512.
         for k in range(slices * 512):
             if k % 512 == 0:
                 s = k // 512

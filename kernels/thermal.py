@@ -25,15 +25,15 @@ OUTLETS = ("server", "rack", "released")
 LANES = 16
 """Racks that are computed at a time; the same for all, so that results never depend on it."""
 
-BLOCK_INTS = ("racks", "groups", "table", "place", "even")
-"""Racks and groups per rack of each block, entry of its tables, first place of its groups, and 1 if
-its racks are equal."""
+BLOCK_INTS = ("racks", "groups", "table", "place")
+"""Racks and groups per rack of each block, entry of its tables, and first place of its groups."""
 RUN_INTS = ("first", "length", "offset")
 CHUNK_INTS = ("first_block", "dc", "first_need")
 DC_INTS = ("first_chunk", "first_unit", "first_share", "racks")
-CONTROL = ("active", "exchange", "side", "sweep")
-"""Per data center: whether the next sweep computes it, whether it exchanges anew, which row of the
-exhaust its last exchange saw, sweeps since the start."""
+CONTROL = ("active", "exchange", "side", "sweep", "chunks")
+"""Per data center: whether the next sweep computes it (1), it has ended (0) or come to no end (-1);
+whether the next sweep exchanges anew; which row of the exhaust its last exchange saw; sweeps since
+the start; chunks that have done the present sweep."""
 RACK_ROWS = (
     "approach_k",
     "norm",
@@ -101,9 +101,9 @@ UNIT_STATE = (
     "following",
 )
 """What units give and cover; need for supply air and the servers' airflow over that at design."""
-RACK_STATE = ("mixed_c", "exhaust_c", "exhaust_c", "captured_m3s", "exchanged_c")
-"""Exhaust mix before a rack, outlets times strength at the last exchange and since in turn, flow
-that the rack takes of the mix, and the mix at the last exchange."""
+RACK_STATE = ("mixed_c", "exhaust_c", "exhaust_odd_c", "captured_m3s", "exchanged_c")
+"""Exhaust mix before a rack, what it gives to the mixes times strength at the last exchange and
+since in turn, flow that the rack takes of the mix, and the mix at the last exchange."""
 RACK_OUT = ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "inlet_max_c", "outlet_c")
 GROUP_OUT = ("inlet_c", "outlet_c", "power_w")
 SUMS = (
@@ -146,6 +146,24 @@ DC_OUT = (
 
 RECOMMENDED_HIGH_C = 27.0
 RECOMMENDED_LOW_C = 18.0
+"""Ends of the range that ASHRAE TC 9.9 (2021) recommends for inlets, beyond which degrees count."""
+
+ALIKE = 0.25
+"""Where the outlets' moves differ from their middle by less than this share of the tolerance, the
+mixes are shifted instead of exchanged: the errors of four such sweeps stay within the tolerance."""
+EXPECTED_KEPT, SEEN_KEPT = 0.5, 0.75
+"""Most of a common deviation that a sweep may keep by expectation, and as the last one showed: the
+step that ends it at once is then at most 2 and 4 times the sweep's own. Bounds against overshoot
+where the airflow curves bend; a sweep that takes no such step never overshoots."""
+SEEN_FROM = 32.0
+"""Moves of fewer tolerances than this are too coarse in f32 to tell what a sweep keeps."""
+PLAIN_EVERY = 4
+"""Of so many sweeps one takes no step of that kind, so that wrong ones cannot go on for ever."""
+STILL_PER_S = 1.0 / 128.0
+"""Fastest rate at which CRAC air stirs the air before racks that stand still, as without fans in
+the room; a power of two, exact in both precisions."""
+NO_RACK_C = 20.0
+"""Temperature of the places that hold no rack: any at which all curves are finite."""
 
 EXP_TERMS = {"f32": 8, "f64": 15}
 """Terms of the series of exp on half an octave of 2 to the last digit."""
@@ -157,8 +175,8 @@ def exp_constants(precision: str) -> list[float]:
     return [1.0 / log(2.0), log(2.0), *(1.0 / factorial(k) for k in terms)]
 
 
-# A parallel loop of at most 512 iterations runs on one thread, so each slice of chunks gets 512.
-_BLOCK = 512
+SLICE = 512
+"""Iterations of a slice of chunks: a parallel loop of at most so many runs on one thread."""
 
 
 def _real(precision: str) -> Any:
@@ -178,9 +196,11 @@ def hall_kernel(precision: str) -> Any:
     Inlets, ``approach``: supply air plus the rack's approach temperature. ``recirculation``: of the
     intake of a server the share 1 - f (1 - c) is exhaust of the racks around, mixed by their
     weights; c is its share at the design point and f <= 1 how much of their need the CRAC units
-    cover. Sweeps repeat until one more would move no mix by more than ``tolerance_k``. The weights
-    of a mix sum to 1, so it moves by no more than the outlets have moved since the last exchange;
-    where all of them moved alike, the mixes are shifted and nothing is exchanged.
+    cover. Where a rack's fans move less air than there, the mix before it takes the place of what
+    its exhaust lacks, so that no rack gives more heat than it has. Sweeps repeat until one more
+    would move no mix by more than ``tolerance_k``, at most ``sweeps`` times. The weights of a mix
+    sum to 1, so it moves by no more than the exhausts have moved since the last exchange; where all
+    of them moved alike, the mixes are shifted and nothing is exchanged.
 
     Outlets: ``server`` is T + P/(rho*cp*V) per group, ``rack`` the same with the rack's sums, and
     ``released`` the rack fit T + 1.918*P^1.096/(0.526*rho*cp*V^0.824) - 14.01 of the released
@@ -188,11 +208,11 @@ def hall_kernel(precision: str) -> Any:
 
     ``transient``: a sweep is a substep. Servers follow C dT/dt = P_cpu - eps K (T - T_in); the
     recirculated air before a rack follows its mix with the time constant of its share of the room
-    air, or that of a room without fans. Both by the exact exponential, and what leaves is the exact
-    mean, so heat stored plus heat removed is heat generated. Supply air is the setpoint plus what
-    the heat kept by the room warms it by; the coil takes what the plant can.
+    air; before racks that take in none, the CRAC air stirs it. Both by the exact exponential, and
+    what leaves is the exact mean, so heat stored plus heat removed is heat generated. Supply air is
+    the setpoint plus what the heat kept by the room warms it by; the coil takes what the plant can.
 
-    A data center of one chunk runs all its sweeps in one call, others one per call.
+    A data center of one chunk runs all its ``sweeps`` in one call, others one per call.
     """
     real = _real(precision)
     whole = ti.i32 if precision == "f32" else ti.i64
@@ -244,7 +264,7 @@ def hall_kernel(precision: str) -> Any:
         transient: ti.template(),
         advance: ti.template(),
         n,
-        first_substep,
+        sweeps,
         substep_s,
         weight,
         tolerance_k,
@@ -274,6 +294,7 @@ def hall_kernel(precision: str) -> Any:
             least_k = ti.min(least_k, sums[13, chunk])
             most_k = ti.max(most_k, sums[14, chunk])
         n_racks = ti.cast(dc_ints[3, n], ti.f64)
+        sweep = control[3, n]
         air_dc = ti.cast(dcs[12, n], ti.f64)
         crac_flow = ti.cast(0.0, ti.f64)
         supply_flow = ti.cast(0.0, ti.f64)
@@ -313,7 +334,7 @@ def hall_kernel(precision: str) -> Any:
                 if ti.static(transient):
                     moved *= weight
                     cubed *= weight
-                    if first_substep == 0:
+                    if sweep > 0:
                         moved += unit_state[3, at]
                         cubed += unit_state[4, at]
                 unit_state[3, at] = moved
@@ -322,13 +343,15 @@ def hall_kernel(precision: str) -> Any:
             doubles[12, n] = crac_flow / n_racks
             # All mixes move by the middle of the outlets' changes, give or take half their spread.
             middle_k = 0.5 * (least_k + most_k)
-            apart = 0.5 * (most_k - least_k) > 0.25 * tolerance_k
+            apart = 0.5 * (most_k - least_k) > ALIKE * tolerance_k
             exchanged = control[1, n] != 0
             if exchanged:
                 control[2, n] = 1 - control[2, n]
-            sweep = control[3, n]
             control[3, n] = sweep + 1
+            control[1, n] = ti.cast(apart, ti.i32)
+            more = ti.cast(sweep + 1 < sweeps, ti.i32)
             if ti.static(transient):
+                control[0, n] = more
                 running = ti.cast(0.0, ti.f64)
                 fans_w = ti.cast(0.0, ti.f64)
                 for j in range(many_units):
@@ -353,23 +376,24 @@ def hall_kernel(precision: str) -> Any:
                         ti.cast(units[0, unit_first + j], ti.f64) + doubles[0, n] / doubles[1, n]
                     )
                 doubles[9, n] = ti.select(apart, ti.cast(0.0, ti.f64), middle_k)
-                control[1, n] = ti.cast(apart, ti.i32)
             else:
                 shift_k = doubles[9, n]
                 left_k = ti.max(most_k - shift_k, shift_k - least_k)
                 # The mixes cool or warm by less than what they lie above supply air.
                 above_k = ti.abs(total[4] / n_racks - supply_flow / crac_flow)
                 left_k = ti.max(left_k, uncovered * above_k)
-                control[0, n] = ti.cast(left_k > tolerance_k, ti.i32)
-                control[1, n] = ti.cast(apart, ti.i32)
+                control[0, n] = 0
+                if not left_k <= tolerance_k:
+                    control[0, n] = 2 * more - 1
                 # Most of what is left is the same for all racks and shrinks by a factor, so a sweep
                 # can go all the way: as expected, or as the last sweep showed, now and then not.
                 moved_k = middle_k - doubles[10, n]
-                kept = ti.min(doubles[7, n], 0.5)
-                if sweep > 0 and not exchanged and ti.abs(doubles[11, n]) > 32.0 * tolerance_k:
-                    kept = ti.min(ti.max(moved_k / doubles[11, n], 0.0), 0.75)
-                if sweep % 4 == 3:
-                    kept *= 0.0
+                kept = ti.min(doubles[7, n], EXPECTED_KEPT)
+                moved_far = ti.abs(doubles[11, n]) > SEEN_FROM * tolerance_k
+                if sweep > 0 and not exchanged and moved_far:
+                    kept = ti.min(ti.max(moved_k / doubles[11, n], 0.0), SEEN_KEPT)
+                if sweep % PLAIN_EVERY == PLAIN_EVERY - 1:
+                    kept = ti.cast(0.0, ti.f64)
                 beyond_k = kept / (1.0 - kept) * (middle_k - shift_k)
                 next_k = middle_k + beyond_k
                 doubles[11, n] = next_k - shift_k
@@ -379,10 +403,10 @@ def hall_kernel(precision: str) -> Any:
                     doubles[10, n] = 0.0
                 doubles[9, n] = next_k
         scale = ti.cast(1.0, ti.f64)
-        keep = 0
+        adds = False
         if ti.static(transient):
             scale = weight
-            keep = 1 - first_substep
+            adds = sweep > 0
         supply_c = ti.cast(0.0, ti.f64)
         if crac_flow > 0.0:
             supply_c = supply_flow / crac_flow
@@ -407,10 +431,10 @@ def hall_kernel(precision: str) -> Any:
         )
         for r in ti.static(range(15)):
             value = scale * now[r]
-            if keep != 0:
+            if adds:
                 value += dc_out[r, n]
             dc_out[r, n] = value
-        if keep == 0 or hottest_dc > dc_out[15, n]:
+        if not adds or hottest_dc > dc_out[15, n]:
             dc_out[15, n] = hottest_dc
             dc_out[16, n] = hottest_at
 
@@ -425,12 +449,10 @@ def hall_kernel(precision: str) -> Any:
         advance: ti.template(),
         slices: ti.i32,
         sweeps: ti.i32,
-        first_sweep: ti.i32,
         substep_s: ti.f64,
         weight: ti.f64,
         tolerance_k: ti.f64,
         run_start: ints_1d,
-        alike: ints_1d,
         run_ints: ints_2d,
         block_ints: ints_2d,
         chunk_ints: ints_2d,
@@ -440,7 +462,6 @@ def hall_kernel(precision: str) -> Any:
         shares: blocks_1d,
         racks: blocks_2d,
         tables: blocks_1d,
-        even_values: reals_1d,
         group_load: blocks_1d,
         dcs: reals_2d,
         doubles: doubles_2d,
@@ -457,17 +478,17 @@ def hall_kernel(precision: str) -> Any:
         dc_out: doubles_2d,
     ):
         n_chunks = sums.shape[1]
-        for k in range(slices * 512):
-            if k % 512 == 0:
-                first = ti.cast(ti.cast(k // 512, ti.i64) * n_chunks // slices, ti.i32)
-                last = ti.cast((ti.cast(k // 512, ti.i64) + 1) * n_chunks // slices, ti.i32)
+        for k in range(slices * SLICE):
+            if k % SLICE == 0:
+                first = ti.cast(ti.cast(k // SLICE, ti.i64) * n_chunks // slices, ti.i32)
+                last = ti.cast((ti.cast(k // SLICE, ti.i64) + 1) * n_chunks // slices, ti.i32)
                 for chunk in range(first, last):
                     n = chunk_ints[1, chunk]
-                    alone = dc_ints[0, n + 1] - dc_ints[0, n] == 1
+                    n_parts = dc_ints[0, n + 1] - dc_ints[0, n]
                     # Chunks of one data center wait for each other after every sweep.
-                    rounds = sweeps if alone else 1
-                    for sweep_here in range(rounds):
-                        if control[0, n] == 0:
+                    rounds = sweeps if n_parts == 1 else 1
+                    for _ in range(rounds):
+                        if control[0, n] <= 0:
                             break
                         unit_0 = dc_ints[1, n]
                         n_units = dc_ints[1, n + 1] - unit_0
@@ -496,10 +517,10 @@ def hall_kernel(precision: str) -> Any:
                         per_step_s = real(1.0) / step_s
                         # Air before racks that stand still is stirred by the CRAC air of the room.
                         still_per_s = ti.min(
-                            real(1.0 / 128.0),
+                            real(STILL_PER_S),
                             air * ti.cast(doubles[12, n], real) / dcs[17, n],
                         )
-                        begins = first_sweep + sweep_here == 0
+                        begins = control[3, n] == 0
                         # What the last sweep left is read anew after it.
                         shift = ti.cast(doubles[9, n], real)
                         side = control[2, n]
@@ -527,7 +548,6 @@ def hall_kernel(precision: str) -> Any:
                             n_groups = block_ints[1, block]
                             table = block_ints[2, block]
                             place = block_ints[3, block]
-                            even = block_ints[4, block] != 0
                             cover = lanes(0.0)
                             supply = lanes(0.0)
                             mixed = lanes(0.0)
@@ -553,57 +573,18 @@ def hall_kernel(precision: str) -> Any:
                                     target = lanes(0.0)
                                     if anew:
                                         from_row = (1 + side) * (rack_store.shape[1] * LANES)
-                                        for half in range(LANES // 4):
-                                            a = q + 4 * half
-                                            run_0 = run_start[a]
-                                            run_1 = run_start[a + 1]
-                                            run_2 = run_start[a + 2]
-                                            run_3 = run_start[a + 3]
-                                            if alike[a // 4] != 0:
-                                                # Four racks with as many runs of the same length.
-                                                t0 = real(0.0)
-                                                t1 = real(0.0)
-                                                t2 = real(0.0)
-                                                t3 = real(0.0)
-                                                for r in range(run_1 - run_0):
-                                                    x0 = from_row + run_ints[0, run_0 + r]
-                                                    x1 = from_row + run_ints[0, run_1 + r]
-                                                    x2 = from_row + run_ints[0, run_2 + r]
-                                                    x3 = from_row + run_ints[0, run_3 + r]
-                                                    w0 = run_ints[2, run_0 + r]
-                                                    w1 = run_ints[2, run_1 + r]
-                                                    w2 = run_ints[2, run_2 + r]
-                                                    w3 = run_ints[2, run_3 + r]
-                                                    s0 = real(0.0)
-                                                    s1 = real(0.0)
-                                                    s2 = real(0.0)
-                                                    s3 = real(0.0)
-                                                    for i in range(run_ints[1, run_0 + r]):
-                                                        s0 += weights[w0 + i] * rack_state[x0 + i]
-                                                        s1 += weights[w1 + i] * rack_state[x1 + i]
-                                                        s2 += weights[w2 + i] * rack_state[x2 + i]
-                                                        s3 += weights[w3 + i] * rack_state[x3 + i]
-                                                    t0 += s0
-                                                    t1 += s1
-                                                    t2 += s2
-                                                    t3 += s3
-                                                target[4 * half] = t0
-                                                target[4 * half + 1] = t1
-                                                target[4 * half + 2] = t2
-                                                target[4 * half + 3] = t3
-                                            else:
-                                                for i in range(4):
-                                                    t = real(0.0)
-                                                    for run in range(
-                                                        run_start[a + i], run_start[a + i + 1]
-                                                    ):
-                                                        x = from_row + run_ints[0, run]
-                                                        w = run_ints[2, run]
-                                                        s = real(0.0)
-                                                        for e in range(run_ints[1, run]):
-                                                            s += weights[w + e] * rack_state[x + e]
-                                                        t += s
-                                                    target[4 * half + i] = t
+                                        for i in range(LANES):
+                                            t = real(0.0)
+                                            for run in range(
+                                                run_start[q + i], run_start[q + i + 1]
+                                            ):
+                                                x = from_row + run_ints[0, run]
+                                                w = run_ints[2, run]
+                                                s = real(0.0)
+                                                for e in range(run_ints[1, run]):
+                                                    s += weights[w + e] * rack_state[x + e]
+                                                t += s
+                                            target[i] = t
                                         norm = racks[1, block]
                                         for i in range(LANES):
                                             target[i] *= norm[i]
@@ -661,16 +642,19 @@ def hall_kernel(precision: str) -> Any:
                                 approach = racks[0, block]
                                 for i in range(LANES):
                                     mixed[i] = air_c + approach[i]
+                            for i in range(LANES):
+                                mixed[i] = ti.select(i < many, mixed[i], real(NO_RACK_C))
                             u = racks[2, block]
                             powered = racks[3, block]
-                            breath = racks[4, block]
+                            air_left = racks[4, block]
+                            breath = lanes(0.0)
                             rack_captured = racks[7, block]
                             servers = racks[8, block]
                             spread = lanes(0.0)
                             fresh = lanes(0.0)
                             for i in range(LANES):
                                 spread[i] = u[i] * (real(1.0) - u[i])
-                                breath[i] *= powered[i]
+                                breath[i] = air_left[i] * powered[i]
                                 fresh[i] = cover[i] * (supply[i] - mixed[i])
                             cpu = lanes(0.0)
                             fan = lanes(0.0)
@@ -686,26 +670,12 @@ def hall_kernel(precision: str) -> Any:
                             hottest_zone = ti.Vector([0] * LANES)
                             for z in range(n_groups):
                                 row = (table + z) * 6
-                                count = lanes(0.0)
-                                full_w = lanes(0.0)
-                                idle_w = lanes(0.0)
-                                offset_k = lanes(0.0)
-                                deviation = lanes(0.0)
-                                height = lanes(0.0)
-                                if even:
-                                    count = lanes(even_values[row * LANES])
-                                    full_w = lanes(even_values[(row + 1) * LANES])
-                                    idle_w = lanes(even_values[(row + 2) * LANES])
-                                    offset_k = lanes(even_values[(row + 3) * LANES])
-                                    deviation = lanes(even_values[(row + 4) * LANES])
-                                    height = lanes(even_values[(row + 5) * LANES])
-                                else:
-                                    count = tables[row]
-                                    full_w = tables[row + 1]
-                                    idle_w = tables[row + 2]
-                                    offset_k = tables[row + 3]
-                                    deviation = tables[row + 4]
-                                    height = tables[row + 5]
+                                count = tables[row]
+                                full_w = tables[row + 1]
+                                idle_w = tables[row + 2]
+                                offset_k = tables[row + 3]
+                                deviation = tables[row + 4]
+                                height = tables[row + 5]
                                 given_load = lanes(0.0)
                                 if ti.static(group_loads):
                                     given_load = group_load[place + z]
@@ -791,8 +761,12 @@ def hall_kernel(precision: str) -> Any:
                                     heat[i] += count[i] * (to_air[i] + fan_1[i])
                                     if ti.static(recirculates):
                                         fresh_flow[i] += counted_flow * own[i]
-                                    hot[i] += count[i] * ti.max(t[i] - real(27.0), real(0.0))
-                                    cold[i] += count[i] * ti.max(real(18.0) - t[i], real(0.0))
+                                    hot[i] += count[i] * ti.max(
+                                        t[i] - real(RECOMMENDED_HIGH_C), real(0.0)
+                                    )
+                                    cold[i] += count[i] * ti.max(
+                                        real(RECOMMENDED_LOW_C) - t[i], real(0.0)
+                                    )
                                     here = ti.select(count[i] > real(0.0), t[i], real(-1e30))
                                     hottest_zone[i] = ti.select(
                                         here > hottest[i], z, hottest_zone[i]
@@ -846,7 +820,9 @@ def hall_kernel(precision: str) -> Any:
                                     strength = racks[5, block]
                                     for i in range(LANES):
                                         captured[i] = flow[i] - cover[i] * fresh_flow[i]
-                                        seen[i] = outlet[i] * strength[i]
+                                        # Of air that failing fans do not move, the mix is left.
+                                        gives_c = mixed[i] + air_left[i] * (outlet[i] - mixed[i])
+                                        seen[i] = gives_c * strength[i]
                                     if ti.static(advance):
                                         per_strength = racks[6, block]
                                         exchanged = rack_store[1 + side, block]
@@ -951,13 +927,15 @@ def hall_kernel(precision: str) -> Any:
                             sums[12, chunk] = ti.cast(hottest_group, ti.f64)
                             sums[13, chunk] = ti.cast(least_k, ti.f64)
                             sums[14, chunk] = ti.cast(most_k, ti.f64)
-                            if alone:
+                            # The chunk that comes last does what is left for its data center.
+                            if ti.atomic_add(control[4, n], 1) == n_parts - 1:
+                                control[4, n] = 0
                                 close(
                                     recirculates,
                                     transient,
                                     advance,
                                     n,
-                                    ti.cast(begins, ti.i32),
+                                    sweeps,
                                     substep_s,
                                     weight,
                                     tolerance_k,
@@ -972,29 +950,6 @@ def hall_kernel(precision: str) -> Any:
                                     sums,
                                     dc_out,
                                 )
-        for n in range(dc_out.shape[1]):
-            if ti.static(not write_groups):
-                if dc_ints[0, n + 1] - dc_ints[0, n] > 1 and control[0, n] != 0:
-                    close(
-                        recirculates,
-                        transient,
-                        advance,
-                        n,
-                        ti.cast(first_sweep == 0, ti.i32),
-                        substep_s,
-                        weight,
-                        tolerance_k,
-                        chunk_ints,
-                        dc_ints,
-                        control,
-                        dcs,
-                        doubles,
-                        units,
-                        unit_state,
-                        needs,
-                        sums,
-                        dc_out,
-                    )
 
     return hall
 
@@ -1027,10 +982,10 @@ def expand_kernel(precision: str) -> Any:
         power_store: blocks_1d,
     ):
         n_groups = server_start.shape[0] - 1
-        for k in range(slices * 512):
-            if k % 512 == 0:
-                first = ti.cast(ti.cast(k // 512, ti.i64) * n_groups // slices, ti.i32)
-                last = ti.cast((ti.cast(k // 512, ti.i64) + 1) * n_groups // slices, ti.i32)
+        for k in range(slices * SLICE):
+            if k % SLICE == 0:
+                first = ti.cast(ti.cast(k // SLICE, ti.i64) * n_groups // slices, ti.i32)
+                last = ti.cast((ti.cast(k // SLICE, ti.i64) + 1) * n_groups // slices, ti.i32)
                 for g in range(first, last):
                     at = group_at[g]
                     inlet = group_out[0, at]

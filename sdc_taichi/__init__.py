@@ -1,9 +1,12 @@
 """Simulate data centers in batches: workload, cooling, battery, carbon, and every server's air."""
 
+from importlib import import_module
 from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
 
 from sdc_taichi.config import DataCenterConfig, load_config, preset_names
 from sdc_taichi.drivers import Drivers, drivers_from_arrays, load_drivers
+from sdc_taichi.envs import registration
 from sdc_taichi.errors import ConfigError, DataError, RuntimeStateError, SdcError
 from sdc_taichi.fleet import Fleet, build_fleet, make_configs
 from sdc_taichi.sim import Simulator
@@ -19,7 +22,14 @@ from sdc_taichi.types import (
     StepResult,
 )
 
+if TYPE_CHECKING:
+    from sdc_taichi.envs.parallel import aec_env, parallel_env
+    from sdc_taichi.envs.rewards import register_reward
+    from sdc_taichi.envs.vector import vector_env
+
 __version__ = version("sdc-taichi")
+
+registration.register()
 
 __all__ = [
     "Actions",
@@ -39,10 +49,32 @@ __all__ = [
     "Simulator",
     "State",
     "StepResult",
+    "aec_env",
     "build_fleet",
     "drivers_from_arrays",
     "load_config",
     "load_drivers",
     "make_configs",
+    "parallel_env",
     "preset_names",
+    "register_reward",
+    "vector_env",
 ]
+
+# Imported on first use, as they bring PettingZoo and the environments with them.
+_LAZY = {
+    "aec_env": "sdc_taichi.envs.parallel",
+    "parallel_env": "sdc_taichi.envs.parallel",
+    "register_reward": "sdc_taichi.envs.rewards",
+    "vector_env": "sdc_taichi.envs.vector",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_LAZY[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY})

@@ -1,8 +1,7 @@
 """Indices of air management in a hall: SHI, RHI, RTI, RCI, and the temperature ranges of ASHRAE.
 
 The indices are functions of sums, so that whoever carries only sums per data center and whoever has
-an entry per rack use the same; the first functions make the sums from racks. Racks are the last
-axis, or those of all data centers end to end with ``start``, the first rack of each.
+an entry per rack use the same; functions of inlets and flows make the sums from racks.
 """
 
 from __future__ import annotations
@@ -19,8 +18,15 @@ RECOMMENDED_C = (18.0, 27.0)
 ALLOWABLE_C = {"A1": (15.0, 32.0), "A2": (10.0, 35.0), "A3": (5.0, 40.0), "A4": (5.0, 45.0)}
 """Allowable inlet temperatures by class (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
 
+_USUAL_CLASS = "A2"
+
 _NO_RISE = 1e-9
 """Rises (K, m3 K/s) up to this are none: a ratio to what rounding left would mean nothing."""
+
+
+def allowable_c(ashrae_class: str | None) -> tuple[float, float]:
+    """Allowable inlet temperatures of a class of ``ALLOWABLE_C``; None is A2."""
+    return ALLOWABLE_C[ashrae_class or _USUAL_CLASS]
 
 
 def rise_m3k_s(
@@ -45,33 +51,20 @@ def rise_m3k_s(
     supply = np.asarray(supply_c, dtype=np.float64)
     if start is not None and supply.shape == (len(start) - 1,):
         supply = np.repeat(supply, np.diff(start))
-    return _sum(airflow_m3s * (temperature_c - supply), start)
+    rise = airflow_m3s * (temperature_c - supply)
+    if start is None:
+        return np.asarray(rise.sum(axis=-1))
+    return np.asarray(np.add.reduceat(rise, start[:-1]))
 
 
-def over_temperature_k(
-    inlet_c: F64,
-    start: npt.NDArray[np.integer] | None = None,
-    *,
-    above_c: float = RECOMMENDED_C[1],
-) -> F64:
-    """Sum over racks of max(0, T_in - above_c), K; times hours it is degree-hours.
-
-    Args:
-        inlet_c: inlet temperatures, (..., N) or (R,) with ``start``.
-        start: first rack of each data center and their total, (B + 1,).
-        above_c: upper end of the recommended range.
-    """
-    return _sum(np.maximum(inlet_c - above_c, 0.0), start)
+def over_temperature_k(inlet_c: F64) -> F64:
+    """Sum over racks of what inlets, (..., N), exceed ``RECOMMENDED_C`` by, K, (...)."""
+    return np.asarray(np.maximum(inlet_c - RECOMMENDED_C[1], 0.0).sum(axis=-1))
 
 
-def under_temperature_k(
-    inlet_c: F64,
-    start: npt.NDArray[np.integer] | None = None,
-    *,
-    below_c: float = RECOMMENDED_C[0],
-) -> F64:
-    """Sum over racks of max(0, below_c - T_in), K; arguments as in ``over_temperature_k``."""
-    return _sum(np.maximum(below_c - inlet_c, 0.0), start)
+def under_temperature_k(inlet_c: F64) -> F64:
+    """Sum over racks of what inlets, (..., N), are below ``RECOMMENDED_C`` by, K, (...)."""
+    return np.asarray(np.maximum(RECOMMENDED_C[0] - inlet_c, 0.0).sum(axis=-1))
 
 
 def shi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:
@@ -135,7 +128,7 @@ def rci_hi(over_k: Values, racks: Values, *, allowable_c: Values) -> F64:
     is over-temperatures that average to the allowable limit, and worse is negative.
 
     Args:
-        over_k: ``over_temperature_k`` above ``RECOMMENDED_C``.
+        over_k: ``over_temperature_k``.
         racks: number of inlets in that sum, at least 1.
         allowable_c: upper end of the allowable range, above the recommended one.
     """
@@ -146,7 +139,7 @@ def rci_lo(under_k: Values, racks: Values, *, allowable_c: Values) -> F64:
     """Rack cooling index at the low end, 100*(1 - under/(n*(T_recommended - T_allowable))), %.
 
     Args:
-        under_k: ``under_temperature_k`` below ``RECOMMENDED_C``.
+        under_k: ``under_temperature_k``.
         racks: number of inlets in that sum, at least 1.
         allowable_c: lower end of the allowable range, below the recommended one.
 
@@ -159,9 +152,3 @@ def rci_lo(under_k: Values, racks: Values, *, allowable_c: Values) -> F64:
 def _ratio(part: Values, whole: Values) -> F64:
     some = np.greater(whole, _NO_RISE)
     return np.asarray(np.where(some, part / np.where(some, whole, 1.0), 0.0))
-
-
-def _sum(values: F64, start: npt.NDArray[np.integer] | None) -> F64:
-    if start is None:
-        return np.asarray(values.sum(axis=-1))
-    return np.asarray(np.add.reduceat(values, start[:-1]))

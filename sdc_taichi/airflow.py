@@ -15,13 +15,12 @@ import numpy as np
 
 import sdc_taichi
 from sdc_taichi import air_metrics, runtime
-from sdc_taichi.airflow_grid import LEAST_LEAK, Grid, build_grid
+from sdc_taichi.airflow_grid import DEFAULT_CELL_M, LEAST_LEAK, Grid, build_grid
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.recirculation import MOST_MATRIX_RACKS
 from sdc_taichi.types import F64
 
-DEFAULT_CELL_M = 0.3
 MIXING_M = 0.3
 """Eddy diffusivity over air speed: half a floor tile. It is what upwind differences add on cells of
 0.6 m, so that it bounds theirs at any finer one and results do not drift with the cell."""
@@ -44,9 +43,9 @@ class LayoutSolution:
     return_c: float
     shi: float
     rhi: float
-    rti: float
-    rci_hi: float
-    rci_lo: float
+    rti_pct: float
+    rci_hi_pct: float
+    rci_lo_pct: float
     """Indices as in ``air_metrics``; RCI against the allowable range of the ASHRAE class."""
     mass_residual: float
     """Sum over the cells of air that appears or vanishes, over supply."""
@@ -111,7 +110,7 @@ def solve(
     inlet = air_metrics.rise_m3k_s(airflow_m3s, inlet_c, supply_c)
     outlet = air_metrics.rise_m3k_s(airflow_m3s, inlet_c + rise_k, supply_c)
     mean_rise_k = air_metrics.it_rise_k(inlet, outlet, airflow_m3s.sum())
-    low_c, high_c = air_metrics.ALLOWABLE_C[_ashrae_class(config)]
+    low_c, high_c = air_metrics.allowable_c(config.protection.ashrae_class)
     racks = hall.racks
     return LayoutSolution(
         R=R,
@@ -121,11 +120,11 @@ def solve(
         return_c=return_c,
         shi=float(air_metrics.shi(inlet, outlet)),
         rhi=float(air_metrics.rhi(inlet, outlet)),
-        rti=float(air_metrics.rti(return_c, supply_c, mean_rise_k)),
-        rci_hi=float(
+        rti_pct=float(air_metrics.rti(return_c, supply_c, mean_rise_k)),
+        rci_hi_pct=float(
             air_metrics.rci_hi(air_metrics.over_temperature_k(inlet_c), racks, allowable_c=high_c)
         ),
-        rci_lo=float(
+        rci_lo_pct=float(
             air_metrics.rci_lo(air_metrics.under_temperature_k(inlet_c), racks, allowable_c=low_c)
         ),
         mass_residual=mass_residual,
@@ -295,10 +294,6 @@ def _per_rack(name: str, given: F64, racks: int) -> F64:
         rack = int(np.argmin(valid))
         raise ConfigError(f"{name}[{rack}] is {values[rack]:g}; valid is a finite number above 0")
     return values
-
-
-def _ashrae_class(config: DataCenterConfig) -> str:
-    return config.protection.ashrae_class or "A2"
 
 
 def _provenance(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.layout import Plan, floor_plan
 from sdc_taichi.types import F64
 
 I32 = npt.NDArray[np.int32]
@@ -17,6 +18,7 @@ I32 = npt.NDArray[np.int32]
 MOST_CELLS = 4_000_000
 """About 2 GB on two threads."""
 CELL_RANGE_M = (0.05, 2.0)
+DEFAULT_CELL_M = 0.3
 LEAST_LEAK = 1e-3
 """Share of its free area that containment always leaves open: gaps, and a flow that must balance
 even where racks draw more than their closed aisle is given."""
@@ -89,7 +91,8 @@ def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: fl
     measures = hall.layout
     margin, pitch = measures.end_margin_m, measures.rack_pitch_m
     along = [margin, *[pitch] * hall.racks_per_row, margin]
-    across = _strips_m(hall)
+    plan = floor_plan(hall)
+    across = _strips_m(plan, hall)
     up = [measures.rack_height_m, measures.ceiling_m - measures.rack_height_m]
     ends = (0, hall.racks_per_row) if margin else ()
     x, rack_of_x = _cut(along, cell_m, ends)
@@ -98,8 +101,9 @@ def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: fl
     boxes = len(x) * len(y) * len(z)
     if boxes > MOST_CELLS:
         raise ConfigError(
-            f"cell_m {cell_m:g}: a hall of {sum(along):.4g} x {sum(across):.4g} x {sum(up):.4g} m "
-            f"makes {boxes:,} cells; valid is at most {MOST_CELLS:,}, with longer cells"
+            f"cell_m {cell_m:g}: a hall of {plan.length_m:.4g} x {plan.width_m:.4g} x "
+            f"{measures.ceiling_m:.4g} m makes {boxes:,} cells; valid is at most {MOST_CELLS:,}, "
+            "with longer cells"
         )
     rack_of_x -= 1
     beside = (rack_of_x >= 0) & (rack_of_x < hall.racks_per_row)
@@ -116,7 +120,6 @@ def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: fl
     beyond, conductance, area = _links((x, y, z), number, cells, cold, leak)
 
     boundary = np.zeros((cells + 1, 6))
-    facing = np.where(np.arange(hall.rows) % 2 == 0, 1, -1)
     fronts, backs = [], []
     for rack, flow in enumerate(airflow_m3s):
         row, place = divmod(rack, hall.racks_per_row)
@@ -124,11 +127,12 @@ def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: fl
         share = x[xs][:, None] * z[low]
         m3s = (flow * share / share.sum()).ravel()
         after, before = ys[-1] + 1, ys[0] - 1
-        ahead, behind = (after, before) if facing[row] > 0 else (before, after)
+        forward = plan.facing[rack] > 0
+        ahead, behind = (after, before) if forward else (before, after)
         front = number[xs[:, None], ahead, np.flatnonzero(low)].ravel()
         back = number[xs[:, None], behind, np.flatnonzero(low)].ravel()
-        boundary[front, _FRONT if facing[row] > 0 else _BACK] += m3s
-        boundary[back, _BACK if facing[row] > 0 else _FRONT] -= m3s
+        boundary[front, _FRONT if forward else _BACK] += m3s
+        boundary[back, _BACK if forward else _FRONT] -= m3s
         fronts.append((front, m3s))
         backs.append((back, m3s))
 
@@ -155,18 +159,15 @@ def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: fl
     )  # fmt: skip
 
 
-def _strips_m(hall: HallConfig) -> list[float]:
-    """Depths of aisles and rows, across the hall; as in ``layout.floor_plan``."""
-    measures = hall.layout
-    aisles = [measures.cold_aisle_m, measures.hot_aisle_m]
-    between = [aisles[row % 2] for row in range(hall.rows - 1)]
-    strips = [measures.side_margin_m]
-    for aisle in [*between, measures.side_margin_m]:
-        strips += [measures.rack_depth_m, aisle]
-    return strips
+def _strips_m(plan: Plan, hall: HallConfig) -> F64:
+    """Depths of aisles and rows in turn, across the hall."""
+    row_y = plan.centre_m[:: hall.racks_per_row, 1]
+    half = hall.layout.rack_depth_m / 2
+    sides = np.stack([row_y - half, row_y + half], axis=1).ravel()
+    return np.diff(sides, prepend=0.0, append=plan.width_m)
 
 
-def _cut(lengths_m: Sequence[float], cell_m: float, edges: Sequence[int]) -> tuple[F64, I32]:
+def _cut(lengths_m: Iterable[float], cell_m: float, edges: Sequence[int]) -> tuple[F64, I32]:
     """Widths of the cells of consecutive segments, and the segment of each.
 
     ``edges`` are the segments after which an edge of a rack lies. Each segment has two cells or

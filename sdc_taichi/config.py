@@ -121,19 +121,25 @@ class RecirculationConfig(_Section):
     decay_m: Positive = 3.0
     """Length over which the exhaust of another rack loses weight by a factor of e."""
     cutoff: Annotated[_Real, Field(ge=0, le=0.01)] = 1e-4
-    """Weights below this are dropped in large halls."""
+    """In halls of more than 64 racks, sources go whose weight is below this share of what a rack
+    amid the hall collects; 0 keeps all."""
     matrix_file: FileName | None = None
     """R or D of a CFD study (.npz, .csv) in place of the weights of the layout."""
     matrix_kind: Literal["R", "D"] | None = None
     """What a .csv file holds; an .npz file names it."""
     calibrate: bool = True
-    """Scale the weights to supply_approach_k; False takes the magnitude from the file."""
+    """Take the magnitude from supply_approach_k and the weights alone from the file; False takes
+    both from the file, and the approach temperatures are what follows."""
 
     @model_validator(mode="after")
     def _magnitude_is_known(self) -> Self:
         if not self.calibrate and self.matrix_file is None:
             raise ValueError(
                 "calibrate false needs a matrix_file; the layout alone gives weights, no magnitude"
+            )
+        if self.matrix_kind is not None and self.matrix_file is None:
+            raise ValueError(
+                f"matrix_kind {self.matrix_kind} needs a matrix_file; valid without one is null"
             )
         return self
 
@@ -186,6 +192,15 @@ class HallConfig(_Section):
         return _check_ordered(value)
 
     @model_validator(mode="after")
+    def _containment_acts_once(self) -> Self:
+        if self.layout.containment > 0 and self.recirculation.matrix_file is not None:
+            raise ValueError(
+                f"layout.containment {self.layout.containment:g} with recirculation.matrix_file: "
+                "a matrix holds what containment does; valid is containment 0"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _one_entry_per_rack(self) -> Self:
         for name in ("servers_per_rack", "supply_approach_k", "return_approach_k"):
             _check_length(name, getattr(self, name), self.racks)
@@ -212,6 +227,7 @@ class ServerConfig(_Section):
     fan_model: Literal["linear", "released"] = "linear"
     """Airflow ratio against inlet temperature and load: config curve, or the released scaling."""
     fan_airflow_ratio_limits: Pair | None = None
+    """None bounds the ratio at 0 alone: fans never blow backwards."""
     fan_power_exponent: Annotated[_Real, Field(ge=1, le=3)] = 3.0
     fan_full_airflow_m3s: Positive | None = 0.051
     """None takes what the supply and return approach temperatures close on at the design point."""
@@ -533,7 +549,8 @@ class SampledEvent(_Section):
     """Something that goes wrong at random times: a Poisson process with uniform durations."""
 
     kind: EventKind
-    per_year: Positive
+    per_year: Annotated[_Real, Field(gt=0, le=8760)]
+    """At most one an hour."""
     duration_h: Pair
     """Shortest and longest duration; units and racks are drawn evenly."""
     share: Share | None = None
@@ -725,10 +742,29 @@ class DataCenterConfig(_Section):
     def airflow_ratio(self, inlet_c: np.ndarray, utilisation: np.ndarray) -> np.ndarray:
         """Server airflow over full airflow, the curve that the kernels use (dimensionless)."""
         slope, offset, shift = fan_coefficients(self.servers)
-        limits = self.servers.fan_airflow_ratio_limits or (-np.inf, np.inf)
         highest = np.inf if self.servers.curve_limit_c is None else self.servers.curve_limit_c
-        on_curve_c = np.minimum(inlet_c, highest)
-        return np.asarray(np.clip(slope * on_curve_c + offset + shift * utilisation, *limits))
+        ratio = slope * np.minimum(inlet_c, highest) + offset + shift * utilisation
+        return np.asarray(np.clip(ratio, *airflow_limits(self.servers)))
+
+    def server_power_w(
+        self, inlet_c: np.ndarray, utilisation: np.ndarray, full_w: np.ndarray, idle_w: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Power of servers with their fans, W, and airflow ratio, as the kernels compute them.
+
+        Args:
+            inlet_c: inlet temperatures, any shape, as all that follow.
+            utilisation: 0..1.
+            full_w: CPU power at full load and a power ratio of 1.
+            idle_w: least CPU power.
+        """
+        servers = self.servers
+        slope, offset, shift = cpu_coefficients(servers)
+        highest = np.inf if servers.curve_limit_c is None else servers.curve_limit_c
+        on_curve = slope * np.minimum(inlet_c, highest) + offset + shift * utilisation
+        ratio = self.airflow_ratio(inlet_c, utilisation)
+        speed = ratio / servers.fan_reference_ratio
+        fan_w = servers.fan_reference_w * speed**servers.fan_power_exponent
+        return np.maximum(idle_w, full_w * on_curve) + fan_w, ratio
 
     def rack_groups(self) -> tuple[tuple[ServerGroup, ...], ...]:
         """Server groups of every rack, with capacity_mw applied to the counts."""
@@ -775,6 +811,12 @@ def cpu_coefficients(servers: ServerConfig) -> tuple[float, float, float]:
     return slope + servers.cpu_slope_offset_per_k, offset, shift
 
 
+def airflow_limits(servers: ServerConfig) -> tuple[float, float]:
+    """Lowest and highest airflow ratio; fans never blow backwards."""
+    low, high = servers.fan_airflow_ratio_limits or (0.0, np.inf)
+    return max(low, 0.0), high
+
+
 def fan_coefficients(servers: ServerConfig) -> tuple[float, float, float]:
     """Slope (1/K), offset and load shift of the airflow ratio.
 
@@ -790,7 +832,8 @@ def fan_coefficients(servers: ServerConfig) -> tuple[float, float, float]:
     return slope, offset, shift
 
 
-_MONTH_DAYS = (31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31)
+MONTH_DAYS = (31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31)
+"""Of the 365-day year."""
 
 
 def first_step_day(start: object) -> int:
@@ -802,8 +845,8 @@ def first_step_day(start: object) -> int:
     match = re.fullmatch(r"(\d{1,2})-(\d{1,2})", str(start).strip())
     if match:
         month, day = int(match[1]), int(match[2])
-        if 1 <= month <= 12 and 1 <= day <= _MONTH_DAYS[month - 1]:
-            return sum(_MONTH_DAYS[: month - 1]) + day - 1
+        if 1 <= month <= 12 and 1 <= day <= MONTH_DAYS[month - 1]:
+            return sum(MONTH_DAYS[: month - 1]) + day - 1
     raise ValueError(
         f"start {start!r} is no day of a 365-day year; valid is MM-DD, for example 07-01"
     )
@@ -842,7 +885,7 @@ def config_from_dict(values: dict[str, Any], label: str = "config") -> DataCente
     try:
         return DataCenterConfig.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(_explain(error, label)) from None
+        raise ConfigError(explain(error, label)) from None
 
 
 def apply_overrides(config: DataCenterConfig, overrides: list[str]) -> DataCenterConfig:
@@ -978,14 +1021,15 @@ def _list_index(node: list[Any], key: str, override: str) -> int:
     return int(key)
 
 
-def _explain(error: ValidationError, label: str) -> str:
+def explain(error: ValidationError, label: str, model: type[BaseModel] | None = None) -> str:
+    """One line on what is wrong with values for ``model``, None being ``DataCenterConfig``."""
     parts = []
     seen = set()
     for item in error.errors(include_url=False):
         names = [str(p) for p in item["loc"] if not _is_union_branch(p)]
         where = ".".join(names)
         if item["type"] == "extra_forbidden":
-            valid = _fields_at(names[:-1])
+            valid = _fields_at(names[:-1], model or DataCenterConfig)
             near = difflib.get_close_matches(names[-1], valid, n=1, cutoff=0.5)
             hint = f"; did you mean {near[0]!r}?" if near else f"; valid: {', '.join(valid)}"
             text = f"{where}: unknown key{hint}"
@@ -1019,8 +1063,8 @@ _LISTED: dict[str, type[BaseModel]] = {
 """Fields that list sections."""
 
 
-def _fields_at(path: list[str]) -> list[str]:
-    node: Any = DataCenterConfig
+def _fields_at(path: list[str], model: type[BaseModel]) -> list[str]:
+    node: Any = model
     for key in path:
         if key.isdigit():
             continue

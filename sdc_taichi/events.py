@@ -16,11 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig, EventKind, SampledEvent, ScheduledEvent
-from sdc_taichi.errors import ConfigError
 from sdc_taichi.types import F64, I64
 
-MOST_PER_YEAR = 8760.0
-"""Highest rate of a sampled event, one an hour."""
 HOURS_PER_BLOCK = 8760
 """Sampled events are drawn in blocks of 365 days, each from a stream of its own."""
 _HOURS_PER_WINDOW = 120  # Divides a block. Events are looked up once per window.
@@ -101,9 +98,11 @@ class Timeline:
         rack_start: I64,
         unit_start: I64,
         steps_per_hour: int,
-        seed: int,
+        seed: I64 | int,
     ) -> None:
-        self._scheduled, self._rules, self._seed = scheduled, rules, seed
+        self._scheduled, self._rules = scheduled, rules
+        size = len(rack_start) - 1
+        self._seed = np.broadcast_to(np.asarray(seed, dtype=np.int64), (size,))
         self._rack_start, self._unit_start = rack_start, unit_start
         self._steps_per_hour = steps_per_hour
         longest_h = max((rule.event.duration_h[1] for rule in rules), default=0.0)
@@ -111,7 +110,6 @@ class Timeline:
         self._blocks: dict[int, _Events] = {}
         self._window = -1
         self._near = scheduled
-        size = len(rack_start) - 1
         self._normal = _read_only(
             Disturbance(
                 unit_up=np.ones(unit_start[-1], dtype=np.bool_),
@@ -127,8 +125,8 @@ class Timeline:
         """Whether no event can ever happen."""
         return not self._rules and not len(self._scheduled.kind)
 
-    def reseeded(self, seed: int) -> Timeline:
-        """The same events with sampled ones of another seed."""
+    def reseeded(self, seed: I64 | int) -> Timeline:
+        """The same events with sampled ones of other seeds, (B,) or one for all."""
         if not self._rules:
             return self
         return Timeline(
@@ -214,7 +212,7 @@ class Timeline:
 
     def _drawn(self, rule: _Rule, block: int) -> _Events:
         """Events of one rule that start in one block of 365 days."""
-        sequence = np.random.SeedSequence([self._seed, *rule.key, block])
+        sequence = np.random.SeedSequence([int(self._seed[rule.dc]), *rule.key, block])
         rng = np.random.Generator(np.random.PCG64(sequence))
         event = rule.event
         n = int(rng.poisson(event.per_year))
@@ -232,7 +230,7 @@ def schedule(
     rack_start: npt.NDArray[np.integer],
     unit_start: npt.NDArray[np.integer],
     steps_per_hour: int,
-    seed: int,
+    seed: I64 | int,
 ) -> Timeline:
     """Events of a fleet.
 
@@ -246,18 +244,12 @@ def schedule(
         rack_start: first rack of each data center and their total, (B + 1,).
         unit_start: first CRAC unit of each data center and their total, (B + 1,).
         steps_per_hour: steps per hour.
-        seed: decides the sampled events, at least 0.
-
-    Raises:
-        ConfigError: an event names a unit or rack that its data center lacks, or happens too often.
+        seed: decides the sampled events, at least 0, (B,) or one for all.
     """
     racks, units = np.diff(rack_start), np.diff(unit_start)
     listed, rules = [_EMPTY], []
     for dc, config in enumerate(configs):
-        for i, event in enumerate(config.events.scheduled):
-            where = f"{config.name}: events.scheduled.{i}"
-            _check_target(where, "unit", event.unit, int(units[dc]), "CRAC units")
-            _check_target(where, "rack", event.rack, int(racks[dc]), "racks")
+        for event in config.events.scheduled:
             target = event.rack if event.kind == "rack_fan_failure" else event.unit
             listed.append(
                 _events(
@@ -272,11 +264,6 @@ def schedule(
         key = zlib.crc32(config.name.encode())
         targets = {"crac_down": int(units[dc]), "rack_fan_failure": int(racks[dc])}
         for i, rule in enumerate(config.events.sampled):
-            if rule.per_year > MOST_PER_YEAR:
-                raise ConfigError(
-                    f"{config.name}: events.sampled.{i}.per_year is {rule.per_year:g}; "
-                    f"valid is at most {MOST_PER_YEAR:g}, one an hour"
-                )
             rules.append(_Rule(dc, (key, i), targets.get(rule.kind, 0), rule))
     return Timeline(
         _joined(listed),
@@ -286,14 +273,6 @@ def schedule(
         steps_per_hour=steps_per_hour,
         seed=seed,
     )
-
-
-def _check_target(where: str, name: str, index: int | None, number: int, of: str) -> None:
-    if index is not None and index >= number:
-        raise ConfigError(
-            f"{where}.{name} is {index}; valid is 0..{number - 1}, the data center has "
-            f"{number} {of}"
-        )
 
 
 def _events(

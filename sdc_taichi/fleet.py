@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from sdc_taichi.config import (
     DataCenterConfig,
+    airflow_limits,
     cpu_coefficients,
     fan_coefficients,
     with_values,
@@ -20,18 +21,17 @@ from sdc_taichi.config import (
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.layout import floor_plan, unit_shares
 from sdc_taichi.recirculation import (
-    DesignPoint,
     RackServers,
     Recirculation,
     calibrate,
     design_point,
     rack_servers,
 )
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, I64
 
 I32 = npt.NDArray[np.int32]
 
-MOST_SERVERS = int(np.iinfo(np.int32).max)
+MOST_ENTRIES = int(np.iinfo(np.int32).max)
 STAGE_MODELS = {
     "inlet": "hall.inlet_model",
     "outlet": "servers.outlet_model",
@@ -68,7 +68,7 @@ class HallAir:
     share_start: I32
     """First entry of each data center in ``unit_shares``, (B,)."""
     strength: F64
-    """Exhaust airflow of each rack over the mean of its hall, (R,)."""
+    """Exhaust airflow of each rack over the mean of its hall, 1 with a user's matrix, (R,)."""
     rise_k: F64
     """How much each rack warms its air at the design point, (R,)."""
     mixed_approach_k: F64
@@ -88,6 +88,12 @@ class HallAir:
 
 
 LOADS = np.linspace(0.0, 1.0, 65)
+"""Loads of the expectations: airflow and power bend where their limits set in."""
+SETPOINTS = 9
+"""Supply temperatures of the expectations, from the lowest to the highest setpoint: with 5, racks
+loaded alike take 2.1 sweeps in f32 instead of 1.4."""
+EXPECTED_RACKS = 4
+"""Racks whose mean the expectations take for the hall."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +118,8 @@ class Fleet:
     server_start: I32
     """First server of each group, (G + 1,)."""
     approach_k: F64
-    """Supply approach temperature, within the limits of the config, (R,)."""
+    """Mean inlet over supply of each rack, (R,): as given, within the limits of the config; with
+    recirculation what the hall has at its design point."""
     groups: F64
     """Rows GROUP_ROWS of the thermal kernel, (6, G)."""
     dcs: F64
@@ -141,7 +148,7 @@ class Fleet:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the data centers, unique."""
+        """Names of the data centers; only records need them to differ."""
         return tuple(c.name for c in self.configs)
 
     @property
@@ -154,10 +161,44 @@ class Fleet:
         """Number of servers of all data centers."""
         return int(self.server_start[-1])
 
+    def require_distinct_names(self) -> None:
+        """Make sure that names tell the data centers apart.
+
+        Raises:
+            ConfigError: a name that is used twice.
+        """
+        seen: set[str] = set()
+        for name in self.names:
+            if name in seen:
+                raise ConfigError(f"fleet: the name {name!r} is used twice; names must differ")
+            seen.add(name)
+
     def values(self, path: str) -> F64:
         """A numeric config field of every data center, (B,); None becomes nan."""
         found = [reduce(getattr, path.split("."), c) for c in self.configs]
         return np.array([np.nan if v is None else v for v in found], dtype=np.float64)
+
+    def unit_sums(self, values: npt.ArrayLike) -> F64:
+        """Sum of unit values, (U,), over each data center, (B,)."""
+        return _sums(values, self.unit_start)
+
+    def rack_sums(self, values: npt.ArrayLike) -> F64:
+        """Sum of rack values, (R,), over each data center, (B,)."""
+        return _sums(values, self.rack_start)
+
+    def group_sums(self, values: npt.ArrayLike) -> F64:
+        """Sum of group values, (G,), over each rack, (R,)."""
+        return _sums(values, self.group_start)
+
+    def place_of_group(self, group: npt.NDArray[Any]) -> tuple[I64, I64]:
+        """Where groups, (n,), begin: rack within its data center and server within its rack.
+
+        Both count from 0, servers from the floor.
+        """
+        rack = np.searchsorted(self.group_start, group, side="right") - 1
+        first = self.rack_start[self.rack_dc[rack]]
+        server = self.server_start[group] - self.server_start[self.group_start[rack]]
+        return (rack - first).astype(np.int64), server.astype(np.int64)
 
     def per_dc_servers(self) -> F64:
         """Servers of each data center, (B,)."""
@@ -178,19 +219,28 @@ class _HallArrays:
     dc: F64
     unit_design_m3s: F64
     it_airflow_m3s: float
+    air: _Air | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Air:
+    """Recirculation of one hall, for ``HallAir``."""
+
+    flows: Recirculation
     shares: F64
-    recirculation: Recirculation | None
     captured: F64
-    mixed_k: F64
-    expected: tuple[F64, F64]
+    rise_k: F64
+    mixed_approach_k: F64
+    mixed_rise_k: F64
+    supply_c: F64
+    expected: F64
 
 
 def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet:
     """Lay data centers out as flat arrays.
 
     Raises:
-        ConfigError: no data center, equal names, or stage models, time steps or age horizons that
-            differ.
+        ConfigError: no data center, or stage models, time steps or age horizons that differ.
     """
     listed = (configs,) if isinstance(configs, DataCenterConfig) else tuple(configs)
     for config in listed:
@@ -206,7 +256,6 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     _shared(listed, "simulation.substep_s")
     # One queue array serves the fleet; ages are read off its length.
     _shared(listed, "workload.age_horizon_h")
-    _check_names(listed)
     # Data centers that share these sections share one hall, which is laid out once.
     cache: dict[Any, _HallArrays] = {}
     halls = []
@@ -220,14 +269,14 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         configs=listed,
         models=models,
         steps_per_hour=steps_per_hour,
-        rack_start=_starts(racks),
+        rack_start=starts(racks, "racks"),
         rack_dc=np.repeat(np.arange(len(listed), dtype=np.int32), racks),
-        group_start=_starts(np.concatenate([h.groups_per_rack for h in halls])),
-        server_start=_starts(np.concatenate([h.groups[0] for h in halls])),
+        group_start=starts(np.concatenate([h.groups_per_rack for h in halls]), "server groups"),
+        server_start=starts(np.concatenate([h.groups[0] for h in halls]), "servers"),
         approach_k=np.concatenate([h.approach_k for h in halls]),
         groups=np.concatenate([h.groups for h in halls], axis=1),
         dcs=np.stack([h.dc for h in halls], axis=1),
-        unit_start=_starts(np.array([len(h.unit_design_m3s) for h in halls])),
+        unit_start=starts(np.array([len(h.unit_design_m3s) for h in halls]), "CRAC units"),
         unit_design_m3s=np.concatenate([h.unit_design_m3s for h in halls]),
         it_airflow_m3s=np.array([h.it_airflow_m3s for h in halls]),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
@@ -325,26 +374,17 @@ def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
     return found[0]
 
 
-def _check_names(configs: Sequence[DataCenterConfig]) -> None:
-    seen: set[str] = set()
-    for config in configs:
-        if config.name in seen:
-            raise ConfigError(f"fleet: the name {config.name!r} is used twice; names must differ")
-        seen.add(config.name)
-
-
 def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
     hall, servers, crac = config.hall, config.servers, config.hvac.crac
     racks = rack_servers(config)
-    if racks.count.sum() > MOST_SERVERS:
+    if racks.count.sum() > MOST_ENTRIES:
         raise ConfigError(
-            f"{config.name}: {racks.count.sum():.4g} servers; valid is at most {MOST_SERVERS:,}"
+            f"{config.name}: {racks.count.sum():.4g} servers; valid is at most {MOST_ENTRIES:,}"
         )
-    shares = np.ones((hall.racks, 1))
+    air_parts, approach_k, fresh_share = None, hall.rack_approach_k(), 1.0
     if hall.inlet_model == "recirculation":
-        flows: Recirculation | None = calibrate(config, racks)
-        assert flows is not None
-        design, captured, fresh_share = flows.design, flows.captured, flows.fresh_share
+        flows = calibrate(config, racks)
+        design, approach_k, fresh_share = flows.design, flows.approach_k, flows.fresh_share
         shares = (
             unit_shares(floor_plan(hall), crac.units, crac.supply_length_m)
             if crac.unit_shares is None
@@ -353,17 +393,15 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         # Units are sized for the racks they supply.
         need = shares.T @ ((1.0 - flows.share) * design.airflow_m3s)
         unit_design_m3s = design.crac_flow_m3s * need / need.sum()
+        air_parts = _air(config, racks, flows, shares)
     else:
-        flows, captured, fresh_share = None, np.zeros(len(racks.count)), 1.0
-        design = design_point(config)
+        design = design_point(config, racks)
         unit_design_m3s = np.array([design.crac_flow_m3s])
-    fan_low, fan_high = servers.fan_airflow_ratio_limits or (-np.inf, np.inf)
     air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
     dc = (
         *cpu_coefficients(servers),
         *fan_coefficients(servers),
-        fan_low,
-        fan_high,
+        *airflow_limits(servers),
         servers.fan_reference_ratio,
         servers.fan_power_exponent,
         servers.fan_reference_w,
@@ -380,127 +418,123 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         groups=np.stack(
             [racks.count, racks.full_w, racks.idle_w, racks.offset_k, racks.deviation, racks.height]
         ),
-        approach_k=hall.rack_approach_k(),
+        approach_k=approach_k,
         dc=np.array(dc),
         unit_design_m3s=unit_design_m3s,
         it_airflow_m3s=float(design.airflow_m3s.sum()),
-        shares=shares,
-        recirculation=flows,
-        captured=racks.per_rack(captured) / racks.per_rack(racks.height),
-        mixed_k=_mixed_k(hall.rack_approach_k(), design, flows),
-        expected=_expectations(config, racks, design) if flows else (np.zeros(0), np.zeros(0)),
+        air=air_parts,
     )
 
 
-def _mixed_k(approach_k: F64, design: DesignPoint, flows: Recirculation | None) -> F64:
-    """Approach temperatures and design rises in the exhaust mix before each rack, (2, R)."""
-    if flows is None:
-        return np.zeros((2, 0))
-    rise_k = design.outlet_rise_k - design.approach_k
-    return np.stack([flows.exchange.apply(approach_k), flows.exchange.apply(rise_k)])
+def _air(config: DataCenterConfig, racks: RackServers, flows: Recirculation, shares: F64) -> _Air:
+    rise_k = flows.design.outlet_rise_k - flows.design.approach_k
+    supply_c, expected = _expectations(config, racks, flows)
+    return _Air(
+        flows=flows,
+        shares=shares,
+        captured=racks.per_rack(flows.captured) / racks.per_rack(racks.height),
+        rise_k=rise_k,
+        mixed_approach_k=flows.exchange.apply(flows.approach_k),
+        mixed_rise_k=flows.exchange.apply(rise_k),
+        supply_c=supply_c,
+        expected=expected,
+    )
 
 
 def _expectations(
-    config: DataCenterConfig, racks: RackServers, design: DesignPoint
+    config: DataCenterConfig, racks: RackServers, flows: Recirculation
 ) -> tuple[F64, F64]:
-    """Where sweeps of the hall start: one mean rack, from up to 32 of the hall, in steady state.
+    """Where sweeps of the hall start: the mean of EXPECTED_RACKS of its racks, in steady state.
 
     Returns:
-        Supply temperatures, (n,), and what ``HallAir.expected`` holds, (3, n, len(LOADS)).
+        Supply temperatures, (n,), and what ``HallAir.expected`` holds, (n len(LOADS), 3).
     """
-    servers, setpoint = config.servers, config.hvac.setpoint
-    slope, offset, shift = cpu_coefficients(servers)
-    every = max(1, config.hall.racks // 16)
+    setpoint, design = config.hvac.setpoint, flows.design
     chosen = np.zeros(config.hall.racks, dtype=np.bool_)
-    chosen[::every] = True
+    chosen[:: -(-config.hall.racks // EXPECTED_RACKS)] = True
     group = racks.per_group(chosen.astype(np.float64)) > 0
     count, full_w, idle_w = racks.count[group], racks.full_w[group], racks.idle_w[group]
-    approach_k = (racks.per_group(design.approach_k) * design.height)[group]
-    limit_c = np.inf if servers.curve_limit_c is None else servers.curve_limit_c
-    approach = float(design.approach_k[chosen].mean())
+    approach_k = (racks.per_group(flows.approach_k) * design.height)[group]
+    approach = float(flows.approach_k[chosen].mean())
     rise_k = float((design.outlet_rise_k - design.approach_k)[chosen].mean())
 
     def outlet(scale: F64, supply_c: F64, load: F64) -> tuple[F64, F64]:
         """Inlet over supply air in K, weighted by airflow, and heat over airflow."""
         inlet_k = scale[..., None] * approach_k
-        on_curve = np.minimum(supply_c[..., None] + inlet_k, limit_c)
-        load = load[..., None]
-        ratio = config.airflow_ratio(supply_c[..., None] + inlet_k, load)
-        heat_w = np.maximum(idle_w, full_w * (slope * on_curve + offset + shift * load))
-        fan_w = servers.fan_reference_w * (ratio / servers.fan_reference_ratio) ** (
-            servers.fan_power_exponent
+        power_w, ratio = config.server_power_w(
+            supply_c[..., None] + inlet_k, load[..., None], full_w, idle_w
         )
         flow = np.sum(count * ratio, axis=-1)
         inlet = np.sum(count * ratio * inlet_k, axis=-1) / flow
-        return inlet, np.sum(count * (heat_w + fan_w), axis=-1) / flow
+        return inlet, np.sum(count * power_w, axis=-1) / flow
 
     one = np.ones((1, 1))
     per_w = rise_k / outlet(one, one * design.supply_c, one)[1]
-    setpoints_c = np.linspace(setpoint.min_c, setpoint.max_c, 16)
-    at, load = np.broadcast_arrays(setpoints_c[:, None], LOADS[None, :])
+    supply_c = np.linspace(setpoint.min_c, setpoint.max_c, SETPOINTS)
+    at, load = np.broadcast_arrays(supply_c[:, None], LOADS[None, :])
 
     def mixed(scale: F64) -> F64:
         inlet_k, heat = outlet(scale, at, load)
         return np.asarray((inlet_k + heat * per_w) / (approach + rise_k))
 
-    def kept(scale: F64) -> F64:
-        return np.asarray(np.clip((mixed(scale + 1e-4) - mixed(scale)) / 1e-4, -0.9, 0.9))
-
-    scale = np.ones(at.shape)
+    # Newton steps, by the slope from a thousandth of a percent further on.
+    scale, beyond = np.ones(at.shape), 1e-5
     for _ in range(8):
-        before = scale
-        scale = before + (mixed(before) - before) / (1.0 - kept(before))
-        if np.max(np.abs(scale - before)) < 1e-9:
+        found = mixed(scale)
+        kept = np.clip((mixed(scale + beyond) - found) / beyond, -0.9, 0.9)
+        change = (found - scale) / (1.0 - kept)
+        scale = scale + change
+        if np.max(np.abs(change)) < 1e-9:
             break
     inlet_k, heat = outlet(scale, at, load)
-    parts = inlet_k / max(approach, 1e-9), heat * per_w / rise_k, kept(scale)
-    return setpoints_c, np.stack(parts)
+    parts = inlet_k / max(approach, 1e-9), heat * per_w / rise_k, kept
+    return supply_c, np.stack(parts, axis=-1).reshape(-1, 3)
 
 
 def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
-    """Exchanges end to end; copies of a hall share its weights."""
-    found = [h.recirculation for h in halls if h.recirculation is not None]
-    tables: dict[int, int] = {}
-    weights: list[F64] = []
-    total = 0
-    first_rack = 0
-    firsts, offsets, lengths, runs = [], [], [], []
-    for flows in found:
-        exchange = flows.exchange
-        if id(exchange) not in tables:
-            tables[id(exchange)] = total
-            weights.append(exchange.weights)
-            total += len(exchange.weights)
-        firsts.append(exchange.first + first_rack)
-        offsets.append(exchange.offset.astype(np.int64) + tables[id(exchange)])
-        lengths.append(exchange.length)
-        runs.append(np.diff(exchange.run_start))
-        first_rack += len(exchange.norm)
-    sizes = np.array([h.shares.size for h in halls])
-    distinct = list({id(h): h for h in halls}.values())
-    entries = {id(h): i for i, h in enumerate(distinct)}
+    """Exchanges end to end; copies of a hall share its weights and expectations."""
+    found = [h.air for h in halls if h.air is not None]
+    distinct = list({id(air): air for air in found}.values())
+    entries = {id(air): i for i, air in enumerate(distinct)}
+    table = np.array([entries[id(air)] for air in found], dtype=np.int32)
+    first_weight = starts([len(a.flows.exchange.weights) for a in distinct], "weights")[table]
+    exchanges = [a.flows.exchange for a in found]
+    first_rack = starts([len(e.norm) for e in exchanges], "racks")
     return HallAir(
-        run_start=_starts(np.concatenate(runs)),
-        run_first=np.concatenate(firsts).astype(np.int32),
-        run_length=np.concatenate(lengths),
-        run_offset=np.concatenate(offsets).astype(np.int32),
-        weights=np.concatenate(weights),
-        norm=np.concatenate([f.exchange.norm for f in found]),
-        strength=np.concatenate([f.exchange.strength for f in found]),
-        mixed_approach_k=np.concatenate([h.mixed_k[0] for h in halls]),
-        mixed_rise_k=np.concatenate([h.mixed_k[1] for h in halls]),
-        captured=np.concatenate([h.captured for h in halls]),
-        unit_shares=np.concatenate([h.shares.reshape(-1) for h in halls]),
-        share_start=_starts(sizes)[:-1],
-        rise_k=np.concatenate([f.design.outlet_rise_k - f.design.approach_k for f in found]),
-        table=np.array([entries[id(h)] for h in halls], dtype=np.int32),
-        supply_c=np.stack([h.expected[0] for h in distinct]),
-        expected=np.concatenate([h.expected[1].reshape(3, -1).T for h in distinct]),
+        run_start=starts(np.concatenate([np.diff(e.run_start) for e in exchanges]), "runs"),
+        run_first=np.concatenate(
+            [e.first + rack for e, rack in zip(exchanges, first_rack, strict=False)]
+        ),
+        run_length=np.concatenate([e.length for e in exchanges]),
+        run_offset=np.concatenate(
+            [e.offset + weight for e, weight in zip(exchanges, first_weight, strict=True)]
+        ),
+        weights=np.concatenate([a.flows.exchange.weights for a in distinct]),
+        norm=np.concatenate([e.norm for e in exchanges]),
+        strength=np.concatenate([e.strength for e in exchanges]),
+        mixed_approach_k=np.concatenate([a.mixed_approach_k for a in found]),
+        mixed_rise_k=np.concatenate([a.mixed_rise_k for a in found]),
+        captured=np.concatenate([a.captured for a in found]),
+        unit_shares=np.concatenate([a.shares.reshape(-1) for a in found]),
+        share_start=starts([a.shares.size for a in found], "unit shares")[:-1],
+        rise_k=np.concatenate([a.rise_k for a in found]),
+        table=table,
+        supply_c=np.stack([a.supply_c for a in distinct]),
+        expected=np.concatenate([a.expected for a in distinct]),
     )
 
 
-def _starts(counts: npt.NDArray[Any]) -> I32:
-    starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-    if starts[-1] > MOST_SERVERS:
-        raise ConfigError(f"fleet: {starts[-1]:,} servers; valid is at most {MOST_SERVERS:,}")
-    return starts.astype(np.int32)
+def _sums(values: npt.ArrayLike, start: I32) -> F64:
+    return np.asarray(np.add.reduceat(np.asarray(values, dtype=np.float64), start[:-1]))
+
+
+def starts(counts: npt.ArrayLike, what: str) -> I32:
+    """Where each of so many entries begins, and where the last ends, (n + 1,).
+
+    Raises:
+        ConfigError: naming ``what`` when there are more than the kernels can index.
+    """
+    found = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    if found[-1] > MOST_ENTRIES:
+        raise ConfigError(f"fleet: {found[-1]:,} {what}; valid is at most {MOST_ENTRIES:,}")
+    return found.astype(np.int32)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.air_metrics import ALLOWABLE_C
+from sdc_taichi.air_metrics import allowable_c
 from sdc_taichi.errors import SdcError
 from sdc_taichi.fleet import Fleet
 from sdc_taichi.placement import layout, place
@@ -42,12 +42,12 @@ class Floor:
         self._policy = fleet.models["placement"]
         self._per_rack = self._policy == "uniform"
         self._servers = fleet.per_dc_servers()
-        self._rack_servers = np.add.reduceat(fleet.groups[0], fleet.group_start[:-1])
+        self._rack_servers = fleet.group_sums(fleet.groups[0])
         self._bin_servers = self._rack_servers if self._per_rack else fleet.groups[0]
         starts = fleet.rack_start if self._per_rack else fleet.group_start[fleet.rack_start]
         self._bins = layout(starts, fleet.names)
         classes = [c.protection.ashrae_class for c in fleet.configs]
-        limit_c = np.array([np.inf if c is None else ALLOWABLE_C[c][1] for c in classes])
+        limit_c = np.array([np.inf if c is None else allowable_c(c)[1] for c in classes])
         trip_c = limit_c + fleet.values("protection.trip_margin_k")
         self._protected = bool(np.any(np.isfinite(limit_c)))
         self._limits = {
@@ -56,7 +56,7 @@ class Floor:
             "restart_c": fleet.values("protection.restart_c")[fleet.rack_dc],
         }
         self._throttle_share = fleet.values("protection.throttle_share")[fleet.rack_dc]
-        allowable = np.array([ALLOWABLE_C[c or "A2"] for c in classes])
+        allowable = np.array([allowable_c(c) for c in classes])
         self.allowable_low_c: F64 = allowable[:, 0]
         """Allowable inlet range of the class, A2 unless given, (B,)."""
         self.allowable_high_c: F64 = allowable[:, 1]
@@ -159,14 +159,14 @@ class Floor:
             return np.zeros(len(self._servers))
         fleet = self._fleet
         if placed.group_load is not None:
-            busy = np.add.reduceat(fleet.groups[0] * placed.group_load, fleet.group_start[:-1])
+            busy = fleet.group_sums(fleet.groups[0] * placed.group_load)
         elif placed.rack_load is not None:
             busy = self._rack_servers * placed.rack_load
         else:
             busy = self._rack_servers * placed.utilisation[fleet.rack_dc]
         if rack_powered is not None:
             busy = busy * rack_powered
-        return np.add.reduceat(busy * tripped, fleet.rack_start[:-1]) / self._servers
+        return fleet.rack_sums(busy * tripped) / self._servers
 
     def _spread(self, per_rack: F64) -> F64:
         """Rack values for each server group, (G,)."""

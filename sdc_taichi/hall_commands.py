@@ -11,8 +11,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from sdc_taichi.airflow_grid import DEFAULT_CELL_M
 from sdc_taichi.command_options import Overrides, Source, read_config
 from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.errors import ConfigError
 from sdc_taichi.types import F64
 from sdc_taichi.whole_file import check_new_file, whole_file
 
@@ -43,7 +45,9 @@ def show_hall(
 @hall_app.command("solve")
 def solve_hall(
     source: Source = None,
-    cell: Annotated[float, typer.Option(metavar="M", help="Longest cell of the grid.")] = 0.3,
+    cell: Annotated[
+        float, typer.Option(metavar="M", help="Longest cell of the grid.")
+    ] = DEFAULT_CELL_M,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -77,6 +81,12 @@ def _solve(config: DataCenterConfig, cell_m: float) -> LayoutSolution:
     from sdc_taichi.airflow import solve
     from sdc_taichi.recirculation import design_point
 
+    outlets = config.servers.outlet_model
+    if outlets != "server":
+        raise ConfigError(
+            f"{config.name}: servers.outlet_model {outlets}: hall solve heats the air of every "
+            "server by its own power; valid is server"
+        )
     design = design_point(config)
     return solve(
         config,
@@ -104,9 +114,9 @@ def report(config: DataCenterConfig, solution: LayoutSolution) -> dict[str, Any]
         "recirculated_share": solution.R.sum(axis=1).tolist(),
         "shi": solution.shi,
         "rhi": solution.rhi,
-        "rti": solution.rti,
-        "rci_hi": solution.rci_hi,
-        "rci_lo": solution.rci_lo,
+        "rti_pct": solution.rti_pct,
+        "rci_hi_pct": solution.rci_hi_pct,
+        "rci_lo_pct": solution.rci_lo_pct,
         "mass_residual": solution.mass_residual,
         "share_residual": solution.share_residual,
         "energy_residual": solution.energy_residual,
@@ -147,8 +157,8 @@ def _print_report(config: DataCenterConfig, solution: LayoutSolution) -> None:
         f"exhaust in the intake: {exhaust.min():.1f}..{exhaust.max():.1f} % per rack, mean "
         f"{exhaust.mean():.1f} %",
         f"supply {solution.supply_c:.2f} C, return {solution.return_c:.2f} C",
-        f"SHI {solution.shi:.3f}, RHI {solution.rhi:.3f}, RTI {solution.rti:.1f} %, "
-        f"RCI hi {solution.rci_hi:.1f} %, lo {solution.rci_lo:.1f} %",
+        f"SHI {solution.shi:.3f}, RHI {solution.rhi:.3f}, RTI {solution.rti_pct:.1f} %, "
+        f"RCI hi {solution.rci_hi_pct:.1f} %, lo {solution.rci_lo_pct:.1f} %",
         f"residuals: mass {solution.mass_residual:.1e}, shares {solution.share_residual:.1e}, "
         f"energy {solution.energy_residual:.1e}; inlets through R and on the grid differ by at "
         f"most {solution.direct_difference_k:.1e} K",

@@ -14,7 +14,7 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.fleet import Fleet, build_fleet
 from sdc_taichi.hall import Conditions, Hall, HallSums
 from sdc_taichi.layout import Plan, floor_plan, unit_places_m
-from sdc_taichi.recirculation import Exchange, calibrate
+from sdc_taichi.recirculation import Exchange
 from sdc_taichi.types import F64
 from sdc_taichi.whole_file import check_new_file, whole_file
 
@@ -26,6 +26,7 @@ EXACT_RADIUS_RACKS = 2000
 _RADIUS_TOLERANCE = 1e-9
 _MOST_ITERATIONS = 1000
 _TIE_DIGITS = 6
+_NO_APPROACH_K = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,9 @@ def at_design(config: DataCenterConfig) -> DesignHall:
     sums = hall.solve(Conditions(np.full(fleet.units, supply_c), np.ones(1)))
     plan = floor_plan(config.hall)
     inlet_c = np.asarray(sums.rack_inlet_c, dtype=np.float64)
+    approach_k = inlet_c - supply_c
+    # What rounding leaves, of either sign, is none.
+    approach_k[np.abs(approach_k) < _NO_APPROACH_K] = 0.0
     # Racks that are alike differ in the last bits; the first of them is named.
     group = int(np.argmax(np.round(hall.group_inlets(), _TIE_DIGITS)))
     rack = int(np.searchsorted(fleet.group_start, group, side="right")) - 1
@@ -94,7 +98,7 @@ def at_design(config: DataCenterConfig) -> DesignHall:
         supply_c=supply_c,
         it_w=np.asarray(sums.rack_cpu_w + sums.rack_fan_w, dtype=np.float64),
         airflow_m3s=np.asarray(sums.rack_airflow_m3s, dtype=np.float64),
-        approach_k=inlet_c - supply_c,
+        approach_k=approach_k,
         inlet_c=inlet_c,
         inlet_max_c=np.asarray(sums.rack_inlet_max_c, dtype=np.float64),
         outlet_c=np.asarray(sums.rack_outlet_c, dtype=np.float64),
@@ -102,19 +106,22 @@ def at_design(config: DataCenterConfig) -> DesignHall:
         unit_places_m=unit_places_m(plan, fleet.units),
         hottest_rack=rack,
         hottest_server=int(fleet.server_start[group] - first_server),
-        air=_air_flows(fleet, sums, supply_c),
+        air=_air_flows(fleet, sums, approach_k, supply_c),
     )
 
 
-def _air_flows(fleet: Fleet, sums: HallSums, supply_c: float) -> AirFlows | None:
-    if fleet.air is None:
+def _air_flows(fleet: Fleet, sums: HallSums, approach_k: F64, supply_c: float) -> AirFlows | None:
+    air = fleet.air
+    if air is None:
         return None
-    exchange = calibrate(fleet.configs[0]).exchange
+    exchange = Exchange(
+        air.run_start, air.run_first, air.run_length, air.run_offset, air.weights, air.strength,
+        air.norm,
+    )  # fmt: skip
     airflow_m3s = np.asarray(sums.rack_airflow_m3s, dtype=np.float64)
-    inlet_c, outlet_c = sums.rack_inlet_c, sums.rack_outlet_c
     # A rack's inlet lies between supply air and the mix before it, by the share it takes of each.
-    mix_over_supply_k = exchange.apply(np.asarray(outlet_c - supply_c, dtype=np.float64))
-    share = np.asarray((inlet_c - supply_c) / mix_over_supply_k)
+    mix_over_supply_k = exchange.apply(np.asarray(sums.rack_outlet_c - supply_c, dtype=np.float64))
+    share = np.maximum(approach_k / mix_over_supply_k, 0.0)
     flow_m3s = float(sums.crac_flow_m3s[0])
     return_c = float(sums.return_c[0])
     inlet_rise, outlet_rise = sums.inlet_m3k_s, sums.outlet_m3k_s

@@ -21,11 +21,7 @@ from zipfile import BadZipFile
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.config import (
-    DataCenterConfig,
-    HallConfig,
-    cpu_coefficients,
-)
+from sdc_taichi.config import DataCenterConfig, HallConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.layout import floor_plan, row_distance_m
 from sdc_taichi.types import F64
@@ -38,6 +34,8 @@ MERGED_RACKS_PER_ROW = 64
 """Rows up to this length are summed whole, rows beside each other in one go."""
 MOST_MATRIX_RACKS = 8192
 """Largest hall with a matrix of the user's: half a gigabyte in f64."""
+MOST_WEIGHTS = 2**27
+"""Weights, or runs of them, that a hall may keep: a gigabyte in f64."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +98,8 @@ class Exchange:
     """First weight of each run."""
     weights: F64
     strength: F64
-    """Exhaust airflow of each rack over the mean, (R,)."""
+    """Exhaust airflow of each rack over the mean, 1 where the weights hold it as those of a user's
+    matrix do, (R,)."""
     norm: F64
     """(R,)."""
 
@@ -146,7 +145,11 @@ class Recirculation:
     """The same for each server group, by height, (G,)."""
     fresh_share: float
     """Share of CRAC air that reaches inlets at the design point; the rest bypasses them."""
+    approach_k: F64
+    """Mean inlet over supply of each rack at the design point, below ``design.approach_k`` where
+    containment closes paths, (R,)."""
     design: DesignPoint
+    """Of the open hall."""
 
     def matrix(self) -> F64:
         """R in receptor form, (R, R)."""
@@ -197,52 +200,44 @@ def _rack_columns(groups: F64, zones: int) -> F64:
     )
 
 
-def design_point(config: DataCenterConfig) -> DesignPoint:
+def design_point(
+    config: DataCenterConfig, groups: RackServers | None = None, approach_k: F64 | None = None
+) -> DesignPoint:
     """Power, airflow and temperatures of every rack at full load and the highest setpoint.
+
+    Args:
+        config: the data center.
+        groups: its ``rack_servers``, if at hand.
+        approach_k: inlet over supply, (R,); None is as given in the config.
 
     Raises:
         ConfigError: approach temperatures that leave no room for heating the air.
     """
-    return _design_point(config, rack_servers(config), _approach_k(config))
-
-
-def _approach_k(config: DataCenterConfig) -> F64:
-    return config.hall.rack_approach_k()
-
-
-def _design_point(config: DataCenterConfig, groups: RackServers, approach_k: F64) -> DesignPoint:
-    hall, servers = config.hall, config.servers
-    supply_c = config.hvac.setpoint.max_c
-    slope, offset, shift = cpu_coefficients(servers)
-    limit_c = np.inf if servers.curve_limit_c is None else servers.curve_limit_c
+    groups = rack_servers(config) if groups is None else groups
+    approach_k = config.hall.rack_approach_k() if approach_k is None else approach_k
+    hall, supply_c = config.hall, config.hvac.setpoint.max_c
     approach = groups.per_group(approach_k)
     one = np.ones(len(groups.count))
 
-    def ratio_at(height: F64) -> tuple[F64, F64]:
-        inlet_c = supply_c + approach * height + groups.offset_k
-        return inlet_c, config.airflow_ratio(inlet_c, one)
+    def inlets_c(height: F64) -> F64:
+        return np.asarray(supply_c + approach * height + groups.offset_k)
 
     height = np.ones(len(groups.count))
     if hall.inlet_model == "recirculation":
         # Airflow depends on the inlet, which depends on the mean that airflow weights.
         for _ in range(100):
-            _, ratio = ratio_at(height)
-            moved = groups.count * ratio
+            moved = groups.count * config.airflow_ratio(inlets_c(height), one)
             mean = groups.per_rack(moved * groups.height) / groups.per_rack(moved)
             before, height = height, groups.height / groups.per_group(mean)
             if np.max(np.abs(height - before)) < 1e-15:
                 break
-    inlet_c, ratio = ratio_at(height)
-    on_curve = slope * np.minimum(inlet_c, limit_c) + offset + shift
-    cpu_w = np.maximum(groups.idle_w, groups.full_w * on_curve)
-    fan_w = servers.fan_reference_w * (ratio / servers.fan_reference_ratio) ** (
-        servers.fan_power_exponent
-    )
-    it_w = groups.per_rack(groups.count * (cpu_w + fan_w))
+    inlet_c = inlets_c(height)
+    power_w, ratio = config.server_power_w(inlet_c, one, groups.full_w, groups.idle_w)
+    it_w = groups.per_rack(groups.count * power_w)
     moved = groups.per_rack(groups.count * ratio)
     air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
     per_w = config.hvac.crac.supply_m3s_per_w
-    full_m3s = servers.fan_full_airflow_m3s
+    full_m3s = config.servers.fan_full_airflow_m3s
     if full_m3s is None:
         crac_rise_k = 1.0 / (air * per_w)
         rise_k = crac_rise_k - np.mean(approach_k) - np.mean(np.asarray(hall.return_approach_k))
@@ -283,58 +278,104 @@ def calibrate(config: DataCenterConfig, groups: RackServers | None = None) -> Re
             temperatures that the airflows cannot close on.
     """
     groups = rack_servers(config) if groups is None else groups
-    settings = config.hall.recirculation
-    design = _design_point(config, groups, _approach_k(config))
-    if settings.matrix_file is None:
+    design = design_point(config, groups)
+    if config.hall.recirculation.matrix_file is None:
         exchange = layout_exchange(config.hall, design.airflow_m3s)
         share = design.approach_k / exchange.apply(design.outlet_rise_k)
-    else:
-        path = Path(settings.matrix_file)
-        kind, given = read_numbers(config, path)
-        if kind == "D" and not settings.calibrate:
-            design = _settled(config, groups, lambda at: given @ at.it_w)
-        matrix = _share_matrix(config, path, kind, given, design)
-        sums = matrix.sum(axis=1)
-        weights = matrix / np.where(sums > 0, sums, 1.0)[:, None]
-        # A rack that breathes supply air alone needs weights all the same.
-        weights[sums == 0] = 1.0 / len(sums)
-        exchange = dense_exchange(weights)
-        if settings.calibrate:
-            share = design.approach_k / exchange.apply(design.outlet_rise_k)
-        else:
-            share = sums
-            design = _settled(config, groups, lambda at: share * exchange.apply(at.outlet_rise_k))
-    if settings.matrix_file is None:
         share = share * (1.0 - config.hall.layout.containment)
+    else:
+        exchange, share, design = _of_a_file(config, groups, design)
     captured = groups.per_group(share) * design.height
-    _check_closes(config, design, exchange, share, captured)
+    _check_closes(config, groups, design, exchange, share, captured)
     fresh = float(np.sum((1.0 - share) * design.airflow_m3s)) / design.crac_flow_m3s
-    return Recirculation(exchange, share, captured, min(fresh, 1.0), design)
+    fresh, approach_k = min(fresh, 1.0), design.approach_k
+    if config.hall.layout.containment > 0:
+        approach_k = _contained_approach_k(config, groups, design, exchange, share, fresh)
+    return Recirculation(exchange, share, captured, fresh, approach_k, design)
+
+
+def _of_a_file(
+    config: DataCenterConfig, groups: RackServers, design: DesignPoint
+) -> tuple[Exchange, F64, DesignPoint]:
+    """Weights, shares and design point by a user's R or D."""
+    settings = config.hall.recirculation
+    path = Path(settings.matrix_file or "")
+    kind, given = read_numbers(config, path)
+    if kind == "D" and not settings.calibrate:
+        design = _settled(config, groups, lambda at: given @ at.it_w)
+    matrix = _share_matrix(config, path, kind, given, design)
+    sums = matrix.sum(axis=1)
+    none = sums == 0
+    wanted_k = design.approach_k * none
+    if settings.calibrate and np.any(wanted_k > 0):
+        rack = int(np.argmax(wanted_k))
+        raise ConfigError(
+            f"{path}: row {rack} is zero, so that exhaust air cannot warm rack {rack} by the "
+            f"{wanted_k[rack]:g} K of hall.supply_approach_k; valid is 0 K there or "
+            "hall.recirculation.calibrate false"
+        )
+    # A rack that breathes supply air alone has a mix before it all the same: that of all racks.
+    weights = np.where(none[:, None], 1.0 / len(sums), matrix / np.where(none, 1.0, sums)[:, None])
+    exchange = dense_exchange(weights)
+    if settings.calibrate:
+        return exchange, design.approach_k / exchange.apply(design.outlet_rise_k), design
+    settled = _settled(config, groups, lambda at: sums * exchange.apply(at.outlet_rise_k))
+    return exchange, sums, settled
 
 
 def _settled(
-    config: DataCenterConfig, groups: RackServers, approach_k: Callable[[DesignPoint], F64]
+    config: DataCenterConfig,
+    groups: RackServers,
+    approach_k: Callable[[DesignPoint], F64],
+    within_k: float = 1e-12,
 ) -> DesignPoint:
     """Design point whose approach temperatures are those that follow from it."""
-    before = _approach_k(config)
+    before = config.hall.rack_approach_k()
     for _ in range(500):
-        design = _design_point(config, groups, before)
+        design = design_point(config, groups, before)
         after = approach_k(design)
-        if np.max(np.abs(after - before)) < 1e-12:
+        if np.max(np.abs(after - before)) < within_k:
             return design
         before = after
     raise ConfigError(
-        f"{config.hall.recirculation.matrix_file}: the hall finds no steady state at full load; "
-        "valid is less recirculation"
+        f"{config.hall.recirculation.matrix_file or config.name}: the hall finds no steady state "
+        "at full load; valid is less recirculation"
     )
 
 
+def _contained_approach_k(
+    config: DataCenterConfig,
+    groups: RackServers,
+    design: DesignPoint,
+    exchange: Exchange,
+    share: F64,
+    fresh_share: float,
+) -> F64:
+    """Inlet over supply behind containment, (R,), to a thousandth of a kelvin."""
+    full = {"fan_full_airflow_m3s": design.fan_full_airflow_m3s}
+    servers = config.servers.model_copy(update=full)
+
+    def approach_k(at: DesignPoint) -> F64:
+        # What the units cannot supply comes from the exhaust mix too.
+        need = float(np.sum((1.0 - share) * at.airflow_m3s))
+        covered = min(1.0, fresh_share * design.crac_flow_m3s / need)
+        return (1.0 - (1.0 - share) * covered) * exchange.apply(at.outlet_rise_k)
+
+    hall = config.model_copy(update={"servers": servers})
+    return _settled(hall, groups, approach_k, within_k=1e-3).approach_k
+
+
 def _check_closes(
-    config: DataCenterConfig, design: DesignPoint, exchange: Exchange, share: F64, captured: F64
+    config: DataCenterConfig,
+    groups: RackServers,
+    design: DesignPoint,
+    exchange: Exchange,
+    share: F64,
+    captured: F64,
 ) -> None:
     name, worst = config.name, int(np.argmax(captured))
     if captured[worst] >= 1.0:
-        rack = int(np.searchsorted(np.cumsum(np.bincount(_rack_of(config))), worst, side="right"))
+        rack = int(np.searchsorted(groups.start, worst, side="right")) - 1
         raise ConfigError(
             f"{name}: hall.supply_approach_k of rack {rack} needs {captured[worst]:.3g} of the top "
             "servers' intake to be exhaust air; valid is below 1 (lower the approach temperature "
@@ -358,11 +399,6 @@ def _check_closes(
         )
 
 
-def _rack_of(config: DataCenterConfig) -> npt.NDArray[np.int64]:
-    start = rack_servers(config).start
-    return np.repeat(np.arange(len(start) - 1), np.diff(start))
-
-
 def layout_exchange(hall: HallConfig, airflow_m3s: F64 | None = None) -> Exchange:
     """Weights exp(-d/decay) times the exhaust airflow of the source, rows summing to 1.
 
@@ -372,19 +408,22 @@ def layout_exchange(hall: HallConfig, airflow_m3s: F64 | None = None) -> Exchang
     Args:
         hall: rows, measures and the decay length.
         airflow_m3s: airflow of each rack at the design point, (R,); None is the same for all.
+
+    Raises:
+        ConfigError: a cutoff that leaves a rack no source, or more weights than fit.
     """
     flow = np.ones(hall.racks) if airflow_m3s is None else airflow_m3s
     if hall.racks <= DENSE_RACKS:
         plan = floor_plan(hall)
         front, back = plan.front_m, plan.back_m
-        weights = _path_weight(
+        path_m = _path_m(
             hall,
             front[:, None, 0],
             back[None, :, 0],
             np.abs(front[:, None, 1] - back[None, :, 1]),
             plan.row_ends_m,
         )
-        return dense_exchange(weights, flow)
+        return dense_exchange(_weights(hall, path_m, path_m.min(axis=1, keepdims=True)), flow)
     return _normalised(*_bands(hall), flow)
 
 
@@ -414,16 +453,19 @@ def _normalised(runs: tuple[I32, I32, I32, I32], weights: F64, airflow_m3s: F64)
     return Exchange(*runs, weights, strength, 1.0 / sums)
 
 
-def _path_weight(
+def _path_m(
     hall: HallConfig, front_x: F64, back_x: F64, across: F64, ends: tuple[float, float]
 ) -> F64:
-    settings = hall.recirculation
     over = hall.layout.rack_height_m + np.hypot(front_x - back_x, across)
     around = np.minimum(
         *(np.abs(back_x - end) + np.abs(front_x - end) for end in ends),
     )
-    path_m = np.minimum(over, around + across)
-    return np.asarray(np.exp(-path_m / settings.decay_m), dtype=np.float64)
+    return np.asarray(np.minimum(over, around + across), dtype=np.float64)
+
+
+def _weights(hall: HallConfig, path_m: F64, shortest_m: F64) -> F64:
+    """Weights of a rack's sources over that of its nearest; the scale cancels in its norm."""
+    return np.asarray(np.exp((shortest_m - path_m) / hall.recirculation.decay_m))
 
 
 def _bands(hall: HallConfig) -> tuple[tuple[I32, I32, I32, I32], F64]:
@@ -441,36 +483,53 @@ def _bands(hall: HallConfig) -> tuple[tuple[I32, I32, I32, I32], F64]:
         exhaust = row_distance_m(layout, source) - np.where(source % 2 == 0, half, -half)
         return np.abs(inlet - exhaust)
 
-    # Largest sum of weights that a rack amid the hall collects: weights below the cutoff of it go.
+    # Sources go that are below the cutoff of what a rack amid the hall collects. In lengths, since
+    # a weight by itself may be too small for a number.
     every = np.arange(-(rows // 2), rows - rows // 2)
-    total = max(
-        float(_path_weight(hall, x[per_row // 2], x, across(parity, every)[:, None], ends).sum())
-        for parity in (0, 1)
-    )
-    reach_m = max(-decay_m * np.log(max(cutoff * total, 1e-12)), 0.0)
+    reach_m = np.inf
+    for parity in (0, 1) if cutoff > 0 else ():
+        path_m = _path_m(hall, x[per_row // 2], x, across(parity, every)[:, None], ends)
+        total = _weights(hall, path_m, path_m.min()).sum()
+        reach_m = min(reach_m, float(path_m.min() - decay_m * np.log(cutoff * total)))
+    # Racks are nearer than their rows by the depth of one.
     spacing_m = layout.rack_depth_m + min(layout.cold_aisle_m, layout.hot_aisle_m)
-    row_reach = min(rows - 1, int(np.ceil(reach_m / spacing_m)))
+    row_reach = int(np.clip((reach_m + layout.rack_depth_m) / spacing_m, 0, rows - 1))
     shifts = np.arange(-row_reach, row_reach + 1)
     merged = per_row <= MERGED_RACKS_PER_ROW
-    rack_reach = per_row if merged else int(np.ceil(reach_m / layout.rack_pitch_m))
+    rack_reach = per_row if merged else int(np.clip(reach_m / layout.rack_pitch_m, 0, per_row))
     place = np.arange(per_row)
     low = np.zeros_like(place) if merged else np.maximum(place - rack_reach, 0)
     high = np.full_like(place, per_row) if merged else np.minimum(place + rack_reach + 1, per_row)
+    kept = 2 * len(shifts) * int(np.sum(high - low))
+    if max(kept, hall.racks * (1 if merged else len(shifts))) > MOST_WEIGHTS:
+        raise ConfigError(
+            f"hall.recirculation.cutoff {cutoff:g} with decay_m {decay_m:g} keeps {kept:.3g} "
+            f"weights for {hall.racks:,} racks; valid is at most {MOST_WEIGHTS:,} (raise cutoff or "
+            "lower decay_m)"
+        )
     tables = []
     begins = np.zeros((2, per_row, len(shifts)), dtype=np.int64)
     ends_at = np.zeros_like(begins)
     for parity in (0, 1):
         far = across(parity, shifts)[:, None]
         for p in place:
-            block = _path_weight(hall, x[p], x[low[p] : high[p]], far, ends)
-            near = block >= cutoff * total
+            path_m = _path_m(hall, x[p], x[low[p] : high[p]], far, ends)
+            near = path_m <= reach_m
+            if not near.any():
+                raise ConfigError(
+                    f"hall.recirculation.cutoff {cutoff:g} with decay_m {decay_m:g} leaves racks "
+                    f"at place {p} of their rows without any source: their largest weight is "
+                    f"{cutoff * np.exp((reach_m - path_m.min()) / decay_m):.3g}; valid is a cutoff "
+                    "below that"
+                )
             begins[parity, p] = np.argmax(near, axis=1)
             ends_at[parity, p] = np.where(
                 near.any(axis=1),
                 near.shape[1] - np.argmax(near[:, ::-1], axis=1),
                 begins[parity, p],
             )
-            tables.append(np.where(near, block, 0.0).reshape(-1))
+            block = np.where(near, _weights(hall, path_m, path_m.min()), 0.0)
+            tables.append(block.reshape(-1))
     weights = np.concatenate(tables)
     table_start = np.cumsum([0, *(len(t) for t in tables)])[:-1].reshape(2, per_row)
 
@@ -512,10 +571,20 @@ def _share_matrix(
     """
     matrix = given
     if kind == "D":
+        j, i = np.unravel_index(np.argmin(given), given.shape)
+        if given[j, i] < -1e-9 * np.max(np.abs(given)):
+            raise ConfigError(f"{path}: D[{j}, {i}] is {given[j, i]:.3g} K/W; valid is at least 0")
         hall = config.hall
         air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
         rise = given * (air * design.airflow_m3s)
-        matrix = np.asarray(np.linalg.solve(np.eye(len(rise)) + rise.T, rise.T).T, np.float64)
+        try:
+            solved = np.linalg.solve(np.eye(len(rise)) + rise.T, rise.T).T
+        except np.linalg.LinAlgError:
+            raise ConfigError(
+                f"{path}: no R belongs to this D, since 1 + D rho cp V is singular; valid is D of "
+                "a hall in which every rack gives its heat to the air"
+            ) from None
+        matrix = np.asarray(solved, dtype=np.float64)
     j, i = np.unravel_index(np.argmin(matrix), matrix.shape)
     if matrix[j, i] < -1e-9:
         raise ConfigError(
@@ -558,24 +627,34 @@ def _read_numbers(config: DataCenterConfig, path: Path) -> tuple[str, F64]:
         raise ConfigError(
             f"{path}: a matrix for {racks:,} racks; valid is at most {MOST_MATRIX_RACKS:,}"
         )
+    suffix = path.suffix.lower()
+    if suffix not in (".npz", ".csv"):
+        raise ConfigError(f"{path}: ends in {path.suffix!r}; valid are .npz and .csv")
+    if suffix == ".csv" and wanted is None:
+        raise ConfigError(f"{path}: a .csv needs hall.recirculation.matrix_kind R or D")
     try:
-        if path.suffix == ".npz":
-            with open(path, "rb") as raw:
-                file = np.load(raw, allow_pickle=False)
-                found = [name for name in ("R", "D") if name in file.files]
-                if len(found) != 1:
-                    raise ConfigError(
-                        f"{path}: holds {sorted(file.files)}; valid is one of the arrays R and D"
-                    )
-                if wanted not in (None, found[0]):
-                    raise ConfigError(
-                        f"{path}: holds {found[0]}, hall.recirculation.matrix_kind is {wanted}"
-                    )
-                return found[0], np.asarray(file[found[0]], dtype=np.float64)
-        if wanted is None:
-            raise ConfigError(f"{path}: a .csv needs hall.recirculation.matrix_kind R or D")
-        return wanted, np.loadtxt(path, delimiter=",", ndmin=2, dtype=np.float64)
+        if suffix == ".csv":
+            return str(wanted), np.loadtxt(path, delimiter=",", ndmin=2, dtype=np.float64)
+        with open(path, "rb") as raw:
+            file = np.load(raw, allow_pickle=False)
+            if not isinstance(file, np.lib.npyio.NpzFile):
+                raise ConfigError(
+                    f"{path}: holds one array without a name; valid is an .npz with R or D"
+                )
+            found = [name for name in ("R", "D") if name in file.files]
+            if len(found) != 1:
+                raise ConfigError(
+                    f"{path}: holds {sorted(file.files)}; valid is one of the arrays R and D"
+                )
+            if wanted not in (None, found[0]):
+                raise ConfigError(
+                    f"{path}: holds {found[0]}, hall.recirculation.matrix_kind is {wanted}"
+                )
+            given = file[found[0]]
     except (OSError, ValueError, EOFError, KeyError, BadZipFile) as error:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"{path}: cannot be read as a matrix ({error})") from None
+    if given.dtype.kind not in "fiu":
+        raise ConfigError(f"{path}: {found[0]} holds {given.dtype}; valid are real numbers")
+    return found[0], np.asarray(given, dtype=np.float64)

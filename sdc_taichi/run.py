@@ -119,6 +119,7 @@ def record(
     Raises:
         SdcError: the folder is not free, a file cannot be written, or a command is not valid.
     """
+    sim.fleet.require_distinct_names()
     former = prepare_folder(out, force=force)
     about = describe(sim, asked)
     configs = configs_yaml(sim.fleet.configs)
@@ -141,13 +142,14 @@ def record(
     if former:
         with writing(out / other_name):
             (out / other_name).unlink(missing_ok=True)
+    events = _events_by_dc(met, sim.size)
     report = {
         **about,
         "steps_done": totals.steps,
         "data_centers": [
-            {**dc, "metrics": figures, "events": _events_of(index, met)}
-            for index, (dc, figures) in enumerate(
-                zip(about["data_centers"], metrics.per_dc(totals, sim.fleet), strict=True)
+            {**dc, "metrics": figures, "events": own}
+            for dc, figures, own in zip(
+                about["data_centers"], metrics.per_dc(totals, sim.fleet), events, strict=True
             )
         ],
         "total": metrics.overall(totals, sim.fleet),
@@ -367,10 +369,14 @@ def write_text(path: Path, text: str) -> None:
         file.write(text.encode())
 
 
-def _events_of(dc: int, met: Iterable[ActiveEvent]) -> list[dict[str, Any]]:
-    """Events that a data center met, in the order in which they began."""
-    own = [{k: v for k, v in asdict(e).items() if k != "dc"} for e in met if e.dc == dc]
-    return [{k: v for k, v in event.items() if v is not None} for event in own]
+def _events_by_dc(met: Iterable[ActiveEvent], size: int) -> list[list[dict[str, Any]]]:
+    """Events that each data center met, in the order in which they began."""
+    out: list[list[dict[str, Any]]] = [[] for _ in range(size)]
+    for event in met:
+        given = asdict(event)
+        dc = given.pop("dc")
+        out[dc].append({k: v for k, v in given.items() if v is not None})
+    return out
 
 
 def _input_files(config: DataCenterConfig) -> dict[str, str]:

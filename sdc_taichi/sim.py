@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import Enum
 from pathlib import Path
@@ -39,6 +39,7 @@ from sdc_taichi.types import (
     CoolAction,
     FanAction,
     LoadAction,
+    Reals,
     ServerLayers,
     State,
     StepResult,
@@ -60,12 +61,27 @@ class _RoomAir:
     """(U,)."""
     fan_w: F64
     supply_c: F64
+    unit_supply_c: F64
+    """(U,)."""
     return_c: F64
     load_w: F64
     """Heat of servers and CRAC fans, if nothing stores it."""
     inlet_m3k_s: F64
     """Airflow times inlet temperature over supply."""
     outlet_m3k_s: F64
+
+
+@dataclass(frozen=True, slots=True)
+class _Heat:
+    """Heat that the plant takes, each (B,)."""
+
+    load_w: F64
+    """Heat that comes back to the CRAC units."""
+    device: water_side.WaterSide
+    unmet_w: F64
+    recovered_w: F64
+    held_kwh: F64
+    """Heat that the room holds at the end of the step."""
 
 
 class Simulator:
@@ -95,6 +111,7 @@ class Simulator:
             raise ConfigError(
                 f"drivers of {self.drivers.size} data centers for a fleet of {self.fleet.size}"
             )
+        self._initial_start = self.drivers.start
         self.precision: Precision = precision
         self.step_h = 1.0 / self.fleet.steps_per_hour
         self._timeline = schedule(
@@ -126,12 +143,12 @@ class Simulator:
         }
         horizon = float(np.max(np.rint(v("workload.age_horizon_h") * per_hour)))
         self._queue_length = int(horizon) + 2
-        self._setpoint = {
-            "step_k": v("hvac.setpoint.step_k")[self.fleet.unit_dc],
-            "low_c": v("hvac.setpoint.min_c")[self.fleet.unit_dc],
-            "high_c": v("hvac.setpoint.max_c")[self.fleet.unit_dc],
-        }
         self._unit_dc = self.fleet.unit_dc
+        self._setpoint = {
+            "step_k": v("hvac.setpoint.step_k")[self._unit_dc],
+            "low_c": v("hvac.setpoint.min_c")[self._unit_dc],
+            "high_c": v("hvac.setpoint.max_c")[self._unit_dc],
+        }
         self._fan_step = v("hvac.crac.fan_step")[self._unit_dc]
         self._coasting = v("hvac.crac.coasting_flow_ratio")[self._unit_dc]
         self._servers = self.fleet.per_dc_servers()
@@ -206,22 +223,33 @@ class Simulator:
             self._hall = hall
         return self._hall
 
-    def reset(self, seed: int | None = None) -> State:
+    def reset(
+        self, seed: int | Sequence[int] | I64 | None = None, start: I64 | None = None
+    ) -> State:
         """Go back to the first step.
 
         Args:
-            seed: decides the sampled events, a non-negative integer; None is 0. The stages are
-                deterministic.
+            seed: decides the sampled events, an integer of 0..2**63 - 1, or one for each data
+                center; None is 0. The stages are deterministic.
+            start: index of the first step in the year, (B,); None is the start of the drivers.
 
         Returns:
             The initial state.
+
+        Raises:
+            ConfigError: a seed or start that is not valid.
         """
-        if seed is not None and (not isinstance(seed, int | np.integer) or seed < 0):
-            raise ConfigError(f"seed {seed!r}: valid is a non-negative integer")
+        seeds = self._seeds(0 if seed is None else seed)
+        first = self._initial_start if start is None else np.asarray(start)
+        if first.shape != (self.size,) or first.dtype.kind not in "iu" or np.any(first < 0):
+            raise ConfigError(
+                f"start {start!r}: valid is one integer of at least 0 for each of {self.size} "
+                "data centers"
+            )
         hall = self._start()
         hall.forget()
-        seed = 0 if seed is None else int(seed)
-        self._timeline = self._timeline.reseeded(seed)
+        self._timeline = self._timeline.reseeded(seeds)
+        self.drivers = replace(self.drivers, start=first.astype(np.int64))
         v, b, fleet = self.fleet.values, self.size, self.fleet
         setpoint_c = v("hvac.setpoint.initial_c")[self._unit_dc]
         inlet_c = v("hvac.setpoint.initial_c")[fleet.rack_dc] + fleet.approach_k
@@ -233,7 +261,8 @@ class Simulator:
             memory = hall.settle(Conditions(setpoint_c, demand, **self._fan_limits(None)))
         self._state = State(
             step=0,
-            seed=seed,
+            seed=seeds,
+            start=self.drivers.start,
             setpoint_c=setpoint_c,
             cooling_run=np.zeros(fleet.units, dtype=np.int64),
             cooling_last=np.full(fleet.units, np.nan),
@@ -247,6 +276,17 @@ class Simulator:
             **_fields(memory),
         )
         return self._state
+
+    def _seeds(self, given: int | Sequence[int] | I64) -> I64:
+        """Seeds of the data centers, (B,)."""
+        listed: list[Any] = np.ravel(given).tolist() if np.ndim(given) else [given] * self.size
+        whole = all(isinstance(x, int | np.integer) and not isinstance(x, bool) for x in listed)
+        if len(listed) != self.size or not whole or not all(0 <= x < 2**63 for x in listed):
+            raise ConfigError(
+                f"seed {given!r}: valid is an integer of 0..2**63 - 1, or one for each of "
+                f"{self.size} data centers"
+            )
+        return np.array(listed, dtype=np.int64)
 
     def step(self, actions: Actions | None = None) -> StepResult:
         """Advance all data centers by one step.
@@ -296,7 +336,8 @@ class Simulator:
             state.cooling_scale,
             **self._setpoint,
         )
-        running = event.unit_up.astype(np.float64)
+        unit_up = event.unit_up & (powered > 0)[self._unit_dc]
+        running = unit_up.astype(np.float64)
         warmed_k = state.room_heat_kwh / sized.room_kwh_per_k
         met = Conditions(
             unit_supply_c=setpoint_c + warmed_k[self._unit_dc],
@@ -305,12 +346,13 @@ class Simulator:
             rack_airflow=None if self._timeline.quiet else event.rack_airflow,
             rack_load=placed.rack_load,
             group_load=placed.group_load,
-            **self._fan_limits(fan_speed, event.unit_up),
+            **self._fan_limits(fan_speed, unit_up),
         )
         plant_c, coils = self._coils_in_use(setpoint_c, running)
         design = sized.water_side
         if not self._timeline.quiet:
             design = replace(design, chiller_w=design.chiller_w * event.chiller_share)
+        coils_w = design.cooling_w * coils * powered
 
         def plant(request_w: F64) -> water_side.WaterSide:
             return self._operate(request_w, powered, plant_c, outdoor_c, wet_bulb_c, design)
@@ -321,7 +363,7 @@ class Simulator:
                 setpoint_c=setpoint_c,
                 room_j=state.room_heat_kwh * 3.6e6,
                 room_j_per_k=sized.room_kwh_per_k * 3.6e6,
-                limit_w=plant(design.cooling_w * coils).removed_w,
+                limit_w=plant(coils_w).removed_w,
                 fan_w_per_m3s=self._fan_w_per_m3s * powered,
             )
             air, memory = hall.advance(met, memory, coil, step_h * 3600.0, self._substep_s)
@@ -330,23 +372,8 @@ class Simulator:
         it_w = air.cpu_w + air.fan_w
         room = self._room_air(air, met, setpoint_c, fan_speed, powered)
 
-        if self._transient:
-            load_w, wanted_w = air.coil_load_w, air.coil_w
-            device = plant(wanted_w)
-            # The room has kept its heat within the step; here is what the plant fell short of.
-            short_w = wanted_w - device.removed_w
-            room_heat_kwh = air.room_j / 3.6e6 + short_w * step_h / 1e3
-            unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, device.removed_w)
-        else:
-            load_w = room.load_w
-            wanted_w = load_w + state.room_heat_kwh * 1e3 / step_h
-            if not np.all(running):
-                past_w = self._past_idle_coils_w(air, running, room.return_c, met.unit_supply_c)
-                wanted_w = np.clip(wanted_w - past_w, 0.0, design.cooling_w * coils)
-            device = plant(wanted_w)
-            unmet_w, recovered_w, room_heat_kwh = cooling.hold_heat(
-                load_w, device.removed_w, state.room_heat_kwh, step_h
-            )
+        heat = self._remove_heat(air, room, state.room_heat_kwh, running, coils_w, plant)
+        device = heat.device
 
         water = self._water_model(
             rejected_w=device.rejected_w,
@@ -387,6 +414,7 @@ class Simulator:
         self._state = State(
             step=state.step + 1,
             seed=state.seed,
+            start=state.start,
             setpoint_c=setpoint_c,
             cooling_run=run,
             cooling_last=last,
@@ -394,13 +422,13 @@ class Simulator:
             fan_speed=fan_speed,
             queue=work.queue,
             stored_kwh=battery.stored_kwh,
-            room_heat_kwh=room_heat_kwh,
+            room_heat_kwh=heat.held_kwh,
             rack_status=status,
             group_inlet_c=hall.group_inlets() if len(state.group_inlet_c) else state.group_inlet_c,
             **_fields(memory),
         )
         battery_kwh = np.where(sized.battery_kwh > 0, sized.battery_kwh, 1.0)
-        hottest_rack, hottest_server = self._hottest(air.hottest_group)
+        hottest_rack, hottest_server = self.fleet.place_of_group(air.hottest_group)
         return StepResult(
             step=state.step,
             step_h=step_h,
@@ -427,8 +455,8 @@ class Simulator:
             supply_c=room.supply_c,
             inlet_mean_c=air.inlet_mean_c,
             inlet_max_c=air.inlet_max_c,
-            hottest_rack=hottest_rack,
-            hottest_server=hottest_server,
+            hottest_rack=hottest_rack.astype(np.float64),
+            hottest_server=hottest_server.astype(np.float64),
             hot_k=air.hot_k / self._servers,
             shi=air_metrics.shi(room.inlet_m3k_s, room.outlet_m3k_s),
             rti_pct=air_metrics.rti(
@@ -442,8 +470,8 @@ class Simulator:
             rci_lo_pct=air_metrics.rci_lo(
                 air.cold_k, self._servers, allowable_c=floor.allowable_low_c
             ),
-            throttled_racks=self._count_racks(status == THROTTLED),
-            tripped_racks=self._count_racks(status == TRIPPED),
+            throttled_racks=self.fleet.rack_sums(status == THROTTLED),
+            tripped_racks=self.fleet.rack_sums(status == TRIPPED),
             outlet_mean_c=air.outlet_mean_c,
             cpu_w=air.cpu_w,
             it_fan_w=air.fan_w,
@@ -451,16 +479,16 @@ class Simulator:
             it_airflow_m3s=air.airflow_m3s,
             crac_flow_m3s=room.flow_m3s,
             return_c=room.return_c,
-            cooling_load_w=load_w,
+            cooling_load_w=heat.load_w,
             chilled_water_c=device.chilled_water_c,
             condenser_water_c=device.condenser_water_c,
             economiser_w=device.economiser_w,
             chiller_load_w=device.chiller_load_w,
-            unmet_w=unmet_w if self._stores_heat else np.zeros(self.size),
-            recovered_w=recovered_w if self._stores_heat else np.zeros(self.size),
+            unmet_w=heat.unmet_w,
+            recovered_w=heat.recovered_w,
             heat_removed_w=device.removed_w,
             rejected_w=device.rejected_w,
-            room_heat_kwh=room_heat_kwh,
+            room_heat_kwh=heat.held_kwh,
             stored_w=air.stored_w,
             chiller_w=device.chiller_w,
             tower_fan_w=device.tower_fan_w,
@@ -485,7 +513,7 @@ class Simulator:
             grid_up=grid_up,
             powered=powered,
             unit_setpoint_c=setpoint_c,
-            unit_supply_c=met.unit_supply_c,
+            unit_supply_c=room.unit_supply_c,
             unit_flow_m3s=room.unit_flow_m3s,
             unit_running=running,
             rack_status=status,
@@ -505,23 +533,27 @@ class Simulator:
         if np.any(none):
             coldest_c = np.where(none, np.minimum.reduceat(setpoint_c, first), coldest_c)
         design_m3s = self.fleet.unit_design_m3s
-        in_use = np.add.reduceat(running * design_m3s, first)
-        return coldest_c, in_use / np.add.reduceat(design_m3s, first)
+        in_use = self.fleet.unit_sums(running * design_m3s)
+        return coldest_c, in_use / self.fleet.unit_sums(design_m3s)
 
     def _room_air(
         self, air: HallSums, met: Conditions, setpoint_c: F64, fan_speed: F64, powered: F64
     ) -> _RoomAir:
         """Airflow, supply and return air, fans and heat of the CRAC units."""
-        sized, first_unit = self.sizing, self.fleet.unit_start[:-1]
+        sized = self.sizing
         it_w = air.cpu_w + air.fan_w
         if self._recirculates:
             unit_fan_w = self._fan_w_per_m3s[self._unit_dc] * self.fleet.unit_design_m3s
-            fan_w = np.add.reduceat(unit_fan_w * air.unit_cubed_speed, first_unit) * powered
+            fan_w = self.fleet.unit_sums(unit_fan_w * air.unit_cubed_speed) * powered
+            # Units differ by their setpoints alone; the room warms the air of all alike.
+            mixed_c = self.fleet.unit_sums(air.unit_flow_m3s * setpoint_c)
+            warmed_k = air.supply_c - mixed_c / air.crac_flow_m3s
             return _RoomAir(
                 flow_m3s=air.crac_flow_m3s,
                 unit_flow_m3s=air.unit_flow_m3s,
                 fan_w=fan_w,
                 supply_c=air.supply_c,
+                unit_supply_c=setpoint_c + warmed_k[self._unit_dc],
                 return_c=air.return_c,
                 load_w=it_w + fan_w,
                 inlet_m3k_s=air.inlet_m3k_s,
@@ -553,11 +585,47 @@ class Simulator:
             unit_flow_m3s=flow,
             fan_w=fan_w,
             supply_c=supply_c,
+            unit_supply_c=supply_c,
             return_c=return_c,
             load_w=load_w,
-            inlet_m3k_s=air.inlet_m3k_s - air.airflow_m3s * supply_c,
-            outlet_m3k_s=air.outlet_m3k_s - air.airflow_m3s * supply_c,
+            inlet_m3k_s=self._rise_m3k_s(air, air.rack_inlet_c, supply_c),
+            outlet_m3k_s=self._rise_m3k_s(air, air.rack_outlet_c, supply_c),
         )
+
+    def _rise_m3k_s(self, air: HallSums, rack_c: Reals, supply_c: F64) -> F64:
+        """Airflow times temperature over supply of all racks, (B,)."""
+        over_k = rack_c.astype(np.float64) - supply_c[self.fleet.rack_dc]
+        return self.fleet.rack_sums(air.rack_airflow_m3s * over_k)
+
+    def _remove_heat(
+        self,
+        air: HallSums,
+        room: _RoomAir,
+        held_kwh: F64,
+        running: F64,
+        coils_w: F64,
+        plant: Callable[[F64], water_side.WaterSide],
+    ) -> _Heat:
+        """What the plant takes of the heat that comes back and of the heat held by the room."""
+        step_h = self.step_h
+        if self._transient:
+            load_w, device = air.coil_load_w, plant(air.coil_w)
+            # The room has kept its heat within the step; here is what the plant fell short of.
+            held_kwh = air.room_j / 3.6e6 + (air.coil_w - device.removed_w) * step_h / 1e3
+            unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, device.removed_w)
+        else:
+            load_w = room.load_w
+            wanted_w = load_w + held_kwh * 1e3 / step_h
+            if not np.all(running):
+                past_w = self._past_idle_coils_w(air, running, room.return_c, room.unit_supply_c)
+                wanted_w = np.clip(wanted_w - past_w, 0.0, coils_w)
+            device = plant(wanted_w)
+            unmet_w, recovered_w, held_kwh = cooling.hold_heat(
+                load_w, device.removed_w, held_kwh, step_h
+            )
+        if not self._stores_heat:
+            unmet_w = recovered_w = np.zeros(self.size)
+        return _Heat(load_w, device, unmet_w, recovered_w, held_kwh)
 
     def _powered(self, state: State, event: Disturbance) -> F64:
         """Share of the step with power, (B,).
@@ -605,7 +673,7 @@ class Simulator:
     def _past_idle_coils_w(self, air: HallSums, running: F64, return_c: F64, supply_c: F64) -> F64:
         """Heat of the air that passes units that are down, (B,); it stays in the room."""
         passed = (1.0 - running) * air.unit_flow_m3s * (return_c[self._unit_dc] - supply_c)
-        return self._air_j_per_m3_k * np.add.reduceat(passed, self.fleet.unit_start[:-1])
+        return self._air_j_per_m3_k * self.fleet.unit_sums(passed)
 
     def _fan_limits(
         self, speed: F64 | None, unit_up: npt.NDArray[np.bool_] | None = None
@@ -641,22 +709,11 @@ class Simulator:
     def _fan_w_per_m3s(self) -> F64:
         return self.sizing.crac_fan_w / self.sizing.crac_flow_m3s
 
-    def _hottest(self, group: I64) -> tuple[F64, F64]:
-        """Rack within its data center and server within its rack of server groups, (B,) each."""
-        fleet = self.fleet
-        rack = np.searchsorted(fleet.group_start, group, side="right") - 1
-        server = fleet.server_start[group] - fleet.server_start[fleet.group_start[rack]]
-        return (rack - fleet.rack_start[:-1]).astype(np.float64), server.astype(np.float64)
-
-    def _count_racks(self, chosen: npt.NDArray[np.bool_]) -> F64:
-        return np.add.reduceat(chosen.astype(np.float64), self.fleet.rack_start[:-1])
-
     def _per_dc(self, per_unit: F64) -> F64:
         """Mean over the CRAC units, (B,)."""
         if self.fleet.units == self.size:
             return per_unit
-        first = self.fleet.unit_start
-        return np.add.reduceat(per_unit, first[:-1]) / np.diff(first)
+        return self.fleet.unit_sums(per_unit) / np.diff(self.fleet.unit_start)
 
     def active_events(self, step: int) -> list[ActiveEvent]:
         """Events that cover step ``step`` of the present run."""
@@ -670,9 +727,13 @@ class Simulator:
         """
         return self._start().servers()
 
-    def state_dict(self) -> dict[str, Any]:
-        """The state as plain arrays, for ``load_state_dict`` or ``numpy.savez``."""
-        state = self.state
+    def state_dict(self, state: State | None = None) -> dict[str, Any]:
+        """A state as plain arrays, for ``load_state_dict`` or ``numpy.savez``.
+
+        Args:
+            state: one of this simulator's; None is the present one.
+        """
+        state = self.state if state is None else state
         out = {f.name: np.array(getattr(state, f.name)) for f in fields(State)}
         out["version"] = np.array(SNAPSHOT_VERSION)
         out["fingerprint"] = np.array(self.fingerprint())
@@ -716,6 +777,7 @@ class Simulator:
         self._start().forget()
         self._state = State(**loaded)
         self._timeline = self._timeline.reseeded(self._state.seed)
+        self.drivers = replace(self.drivers, start=self._state.start)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to an .npz file, atomically and without pickle.
@@ -793,8 +855,9 @@ class Simulator:
             digest.update(config.model_dump_json().encode())
         digest.update(self.drivers.digest())
         # A matrix that a config names may change under its name.
-        if self.fleet.air is not None:
-            digest.update(self.fleet.air.weights.tobytes())
+        if (air := self.fleet.air) is not None:
+            for part in (air.weights, air.norm, air.strength, air.captured, self.fleet.dcs):
+                digest.update(part.tobytes())
         return digest.hexdigest()
 
 

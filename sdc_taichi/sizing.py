@@ -9,7 +9,6 @@ import numpy as np
 
 from sdc_taichi.fleet import Fleet
 from sdc_taichi.hall import Conditions, Hall, HallSums
-from sdc_taichi.layout import floor_plan
 from sdc_taichi.plant import chiller, tower
 from sdc_taichi.plant.air import hydraulic_pump_w
 from sdc_taichi.plant.water_side import Design
@@ -64,7 +63,7 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     v = fleet.values
     full = _solve(fleet, hall, v("hvac.setpoint.max_c"), np.ones(fleet.size))
     it_w = full.cpu_w + full.fan_w
-    crac_flow = np.add.reduceat(fleet.unit_design_m3s, fleet.unit_start[:-1])
+    crac_flow = fleet.unit_sums(fleet.unit_design_m3s)
     crac_fan_w = v("hvac.crac.fan_w_per_m3s") * crac_flow
     cooling_w = (it_w + crac_fan_w) * v("hvac.sizing.margin")
 
@@ -286,12 +285,12 @@ def _battery_kwh(fleet: Fleet, sized_kwh: F64) -> F64:
 
 
 def _room_kwh_per_k(fleet: Fleet) -> F64:
-    """Room alone where servers have temperatures of their own, else with them."""
+    """Heat capacity that follows the supply air, (B,).
+
+    Quasi-steady halls: with the servers. Transient ones: servers and the air before the racks,
+    which is that of the room, have temperatures of their own.
+    """
     per_server = fleet.values("hall.room_heat_capacity_kj_per_k_per_server")
     if fleet.models["thermal"] == "quasi_steady":
         per_server = per_server + fleet.values("servers.heat_capacity_kj_per_k")
-        return np.asarray(per_server * fleet.per_dc_servers() / 3600.0)
-    # The air under floor and ceiling too: a room of few servers holds little else.
-    air_m3 = np.array([floor_plan(c.hall).air_m3 for c in fleet.configs])
-    air_kj_per_k = air_j_per_m3_k(fleet) * air_m3 / 1e3
-    return np.asarray((per_server * fleet.per_dc_servers() + air_kj_per_k) / 3600.0)
+    return np.asarray(per_server * fleet.per_dc_servers() / 3600.0)

@@ -86,8 +86,10 @@ class State:
 
     step: int
     """Steps done since reset."""
-    seed: int
-    """Decides the sampled events."""
+    seed: I64
+    """Decides the sampled events, (B,)."""
+    start: I64
+    """Index of the first step in the year, (B,)."""
     setpoint_c: F64
     """Setpoint of each CRAC unit, (U,)."""
     cooling_run: I64
@@ -103,7 +105,7 @@ class State:
     stored_kwh: F64
     """Energy in the battery, (B,)."""
     room_heat_kwh: F64
-    """Heat that the cooling failed to remove, held by the room, (B,)."""
+    """Heat held by the room over that at the setpoint, (B,); below 0 while its air is colder."""
     rack_status: Status
     """0 normal, 1 throttled, 2 tripped, (R,)."""
     group_inlet_c: F64
@@ -142,7 +144,7 @@ class StepResult:
     battery_command: F64
 
     utilisation: F64
-    """Executed work as a share of capacity."""
+    """Work that was started, as a share of capacity; ``lost_tasks`` of it went down."""
     arrived_tasks: F64
     executed_tasks: F64
     deferred_tasks: F64
@@ -207,6 +209,7 @@ class StepResult:
     rejected_w: F64
     """Heat that the tower gives to the outside."""
     room_heat_kwh: F64
+    """As in ``State``, at the end of the step."""
     stored_w: F64
     """Heat that went into servers and recirculated air (transient)."""
     chiller_w: F64

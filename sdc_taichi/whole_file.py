@@ -61,6 +61,6 @@ def whole_file(path: Path, *, parents: bool = False) -> Iterator[IO[bytes]]:
                 os.fsync(file.fileno())
             part.replace(path)
     finally:
-        # After success there is nothing left; below a file there never was.
+        # Missing after success; NotADirectoryError when a parent is a file.
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)

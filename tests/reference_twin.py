@@ -53,9 +53,8 @@ def airflow_ratio(config: DataCenterConfig, inlet_c: F64, load: F64) -> F64:
         slope = (s.fan_airflow_ratio_ub[0] - s.fan_airflow_ratio_lb[0]) / (high - low)
         offset = s.fan_airflow_ratio_lb[0] - slope * low
         ratio = 10.0 * slope * inlet_c + 5.0 * offset + shift * (100.0 * load) / 20.0
-    if s.fan_airflow_ratio_limits is not None:
-        ratio = np.clip(ratio, *s.fan_airflow_ratio_limits)
-    return np.asarray(ratio)
+    low, high = s.fan_airflow_ratio_limits or (0.0, np.inf)
+    return np.asarray(np.clip(ratio, low, high))
 
 
 def evaluate(configs: Sequence[DataCenterConfig], supply_c: F64, utilisation: F64) -> Twin:
@@ -408,6 +407,16 @@ def flows(
     )  # fmt: skip
 
 
+def mixing(hall: HallTwin, breath: F64) -> F64:
+    """Share of each rack's exhaust in the mix before every other, (R, R): rows sum to 1.
+
+    What failing fans lack of a rack's exhaust is made up from the mix before that rack, which may
+    hold such air itself: mix = w (k outlet + (1 - k) mix).
+    """
+    missing = np.eye(len(breath)) - hall.weights * (1.0 - breath)
+    return np.asarray(np.linalg.solve(missing, hall.weights * breath), dtype=np.float64)
+
+
 def steady(
     hall: HallTwin,
     unit_supply_c: F64,
@@ -432,7 +441,7 @@ def steady(
         breath: airflow left to the fans of each rack, (R,).
     """
     racks, rack, air = len(hall.share), hall.rack, hall.air_j_per_m3_k
-    count = np.bincount(rack)
+    count, mix = np.bincount(rack), mixing(hall, breath)
     inlet_c = np.full(len(rack), unit_supply_c.mean() + 4.0)
     for _ in range(20000):
         cpu, fan, flow = hall.servers(inlet_c, load, powered, breath)
@@ -443,11 +452,11 @@ def steady(
         part += flow / np.where(still, 1.0, rack_flow)[rack]
         power = hall.per_rack(cpu + fan)
         rise = np.where(still, 0.0, power / (air * np.where(still, 1.0, rack_flow)))
-        matrix = hall.per_rack(part * moved.exhaust)[:, None] * hall.weights
+        matrix = hall.per_rack(part * moved.exhaust)[:, None] * mix
         supplied = moved.from_unit @ unit_supply_c
         outlet_c = np.linalg.solve(np.eye(racks) - matrix, hall.per_rack(part * supplied) + rise)
         before = inlet_c
-        inlet_c = moved.exhaust * (hall.weights @ outlet_c)[rack] + supplied
+        inlet_c = moved.exhaust * (mix @ outlet_c)[rack] + supplied
         if np.max(np.abs(inlet_c - before)) < 1e-13 * np.max(np.abs(inlet_c)):
             break
     else:
@@ -456,7 +465,7 @@ def steady(
     blown = flow > 0
     server_outlet_c = inlet_c + np.where(blown, heat / (air * np.where(blown, flow, 1.0)), 0.0)
     outlets: F64 = np.asarray(outlet_c, dtype=np.float64)
-    return_c, _ = return_air(hall, moved, rack_flow, outlets, unit_supply_c)
+    return_c, _ = return_air(hall, moved, rack_flow, outlets, unit_supply_c, breath)
     supply_c = float(moved.unit @ unit_supply_c / moved.unit.sum())
     found = {
         "cpu_w": hall.per_rack(cpu),
@@ -485,10 +494,16 @@ def steady(
 
 
 def return_air(
-    hall: HallTwin, moved: Flows, rack_flow: F64, outlet_c: F64, unit_supply_c: F64
+    hall: HallTwin,
+    moved: Flows,
+    rack_flow: F64,
+    outlet_c: F64,
+    unit_supply_c: F64,
+    breath: F64 | None = None,
 ) -> tuple[float, F64]:
     """Return temperature from what no rack takes back, and those flows, (R,)."""
-    left_over = rack_flow - hall.weights.T @ moved.captured
+    mix = hall.weights if breath is None else mixing(hall, breath)
+    left_over = rack_flow - mix.T @ moved.captured
     warm = left_over @ outlet_c + moved.bypass @ unit_supply_c
     return float(warm / moved.unit.sum()), left_over
 
@@ -501,7 +516,8 @@ class Memory:
     """(S,)."""
     mixed_c: F64
     """Recirculated air before each rack, (R,), as the next two."""
-    outlet_c: F64
+    given_c: F64
+    """What each rack gives to the mixes: its outlet and, for air it does not move, its own mix."""
     captured_m3s: F64
     need_m3s: F64
     """Supply air that the racks ask of each unit, (U,)."""
@@ -533,7 +549,7 @@ def advance(
     now, parts = memory, []
     for _ in range(substeps):
         supply_c = setpoint_c + now.room_j / room_j_per_k
-        target = hall.weights @ now.outlet_c
+        target = hall.weights @ now.given_c
         # A still parcel is stirred by its part of the CRAC air.
         units_m3s = hall.unit_design_m3s * np.clip(now.following, low, high)
         stirred = units_m3s.sum() / len(now.mixed_c) * air / hall.parcel_j_per_k
@@ -594,7 +610,7 @@ def advance(
             }
         )  # fmt: skip
         now = Memory(
-            warmer, mixed_end, outlet_c, captured, moved.need,
+            warmer, mixed_end, mixed + breath * (outlet_c - mixed), captured, moved.need,
             np.full(len(ratio), flow.sum() / hall.it_airflow_m3s),
             now.room_j + (load_w - coil_w) * h,
         )  # fmt: skip

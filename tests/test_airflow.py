@@ -184,7 +184,7 @@ def test_air_and_heat_are_conserved_in_any_hall(
     # T_ret - T_sup = P/(rho*cp*V_crac) whatever R is.
     heat_k = float(flow @ rise_k) / (supply * float(flow.sum()))
     assert found.return_c - found.supply_c == pytest.approx(heat_k, rel=1e-9)
-    assert found.rti == pytest.approx(100.0 / supply, rel=1e-9)
+    assert found.rti_pct == pytest.approx(100.0 / supply, rel=1e-9)
     assert found.shi + found.rhi == pytest.approx(1.0)
     assert np.all(found.approach_k >= 0)
 

@@ -21,7 +21,15 @@ from typer.testing import CliRunner, Result
 
 import exogenous_builders as build
 import sdc_taichi
-from sdc_taichi import Actions, Simulator, StepResult, config, load_config, preset_names
+from sdc_taichi import (
+    Actions,
+    DataCenterConfig,
+    Simulator,
+    StepResult,
+    config,
+    load_config,
+    preset_names,
+)
 from sdc_taichi.cli import app
 from sdc_taichi.control import View, make_controller
 from sdc_taichi.run import Asked, record, run, step_times
@@ -501,6 +509,31 @@ def test_stopped_before_the_first_step_writes_nothing(tmp_path: Path) -> None:
         report = record(sim, controller, Asked("idle", 5), tmp_path / "run", stop=lambda: True)
     assert report is None
     assert names_in(tmp_path / "run") == set()
+
+
+def test_each_data_center_lists_the_events_that_it_met(tmp_path: Path) -> None:
+    def hall(name: str, *events: str) -> DataCenterConfig:
+        return load_config("tiny", [f"name={name}", f"events.scheduled=[{', '.join(events)}]"])
+
+    outage = "{{kind: grid_outage, start_h: {}, duration_h: 0.5}}"
+    wave = "{kind: heat_wave, start_h: 0.25, duration_h: 1, offset_k: 4}"
+    halls = [
+        hall("a", outage.format(1), wave),
+        hall("b"),
+        hall("c", outage.format(0), outage.format(9)),
+    ]
+    with Simulator(halls) as sim:
+        controller = make_controller("idle", sim.fleet)
+        report = record(sim, controller, Asked("idle", 8), tmp_path / "run")
+    assert report is not None
+    assert [dc["events"] for dc in report["data_centers"]] == [
+        [
+            {"kind": "heat_wave", "offset_k": 4.0, "start_step": 1, "end_step": 5},
+            {"kind": "grid_outage", "start_step": 4, "end_step": 6},
+        ],
+        [],
+        [{"kind": "grid_outage", "start_step": 0, "end_step": 2}],
+    ]
 
 
 def test_failing_run_leaves_the_former_one_whole(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.events import HOURS_PER_BLOCK, ActiveEvent, Timeline, schedule
 
 BASE = load_config("corrected")
+HOURLY = "{kind: grid_outage, per_year: 8760, duration_h: [1, 2]}"
 KINDS: dict[str, dict[str, Any]] = {
     "crac_down": {},
     "chiller_derate": {"share": 0.3},
@@ -305,24 +306,21 @@ def test_rules_of_a_data_center_are_independent() -> None:
     ("events", "message"),
     [
         (
-            {
-                "scheduled": (
-                    scheduled("heat_wave", 0, 1, offset_k=1),
-                    scheduled("crac_down", 0, 1, unit=2),
-                )
-            },
-            r"^oslo: events\.scheduled\.1\.unit is 2; valid is 0\.\.1, .* 2 CRAC units$",
+            "scheduled=[{kind: heat_wave, start_h: 0, duration_h: 1, offset_k: 1},"
+            " {kind: crac_down, start_h: 0, duration_h: 1, unit: 2}]",
+            r"events\.scheduled\.1\.unit 2: valid is 0\.\.1$",
         ),
         (
-            {"scheduled": (scheduled("rack_fan_failure", 0, 1, rack=3, share=0.5),)},
-            r"^oslo: events\.scheduled\.0\.rack is 3; valid is 0\.\.2, .* 3 racks$",
+            "scheduled=[{kind: rack_fan_failure, start_h: 0, duration_h: 1, rack: 20, share: 0.5}]",
+            r"events\.scheduled\.0\.rack 20: valid is 0\.\.19$",
         ),
         (
-            {"sampled": (sampled("grid_outage", 1e9, 1.0, 2.0),)},
-            r"^oslo: events\.sampled\.0\.per_year is 1e\+09; valid is at most 8760",
+            "sampled=[{kind: grid_outage, per_year: 9000, duration_h: [1, 2]}]",
+            r"events\.sampled\.0\.per_year: .* 8760 \(got 9000\)$",
         ),
     ],
 )
-def test_events_that_do_not_fit_are_named(events: dict[str, Any], message: str) -> None:
+def test_events_that_do_not_fit_are_named(events: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        timeline(data_center("bergen"), data_center("oslo", **events))
+        load_config("corrected", ["hvac.crac.units=2", f"events.{events}"])
+    assert load_config("corrected", [f"events.sampled=[{HOURLY}]"]).events.sampled[0].per_year

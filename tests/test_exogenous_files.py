@@ -10,6 +10,7 @@ import pytest
 import exogenous_builders as build
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import read_carbon, read_epw, read_workload, statistics, wet_bulb_c
+from sdc_taichi.exogenous.files import read_metadata, write_parquet
 from sdc_taichi.exogenous.statistics import DAYS_PER_MONTH
 
 
@@ -446,3 +447,18 @@ def test_missing_folder_and_bad_arguments(tmp_path: Path) -> None:
             read_carbon(path, **kwargs)
     with pytest.raises(DataError, match="minutes"):
         read_workload(path, minutes=0.0)
+
+
+def test_series_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "x.parquet"
+    write_parquet(path, {"x": np.arange(3.0)}, {"kind": "weather"})
+    before = path.read_bytes()
+    assert (read_metadata(path) or {})["kind"] == "weather"
+    with pytest.raises(DataError, match=r"y\.parquet: cannot be written: "):
+        write_parquet(path / "y.parquet", {"x": np.arange(3.0)}, {})
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(DataError, match="folder: cannot be written: "):
+        write_parquet(tmp_path / "folder", {"x": np.arange(3.0)}, {})
+    assert [p.name for p in path.parent.iterdir()] == ["x.parquet"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["folder", "new"]
+    assert path.read_bytes() == before

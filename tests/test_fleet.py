@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.config import apply_overrides, config_from_dict
+from sdc_taichi.hall import Conditions, Hall
 from sdc_taichi.kernels.thermal import DC_ROWS, GROUP_ROWS
 from sdc_taichi.plant.water_side import Design
 
@@ -81,7 +83,7 @@ def test_parameters_of_each_data_center_reach_the_kernel() -> None:
     np.testing.assert_allclose(row["fan_slope_per_k"], 0.215 / 12)
     np.testing.assert_allclose(row["fan_offset"], 0.225 - 28 * 0.215 / 12)
     np.testing.assert_allclose(row["fan_shift"], 0.215)
-    assert row["fan_low"].tolist() == [0.2, -np.inf]
+    assert row["fan_low"].tolist() == [0.2, 0.0]
     assert row["fan_high"].tolist() == [1.0, np.inf]
     assert row["fan_exponent"].tolist() == [3.0, 2.5]
     assert row["fan_reference_w"].tolist() == [10.0, 7.0]
@@ -130,13 +132,47 @@ def test_fleets_that_cannot_be() -> None:
     with pytest.raises(ConfigError, match="no data center given"):
         build_fleet([])
     with pytest.raises(ConfigError, match="'tiny' is used twice"):
-        build_fleet([TINY, TINY])
+        build_fleet([TINY, TINY]).require_distinct_names()
     huge = named(TINY, "huge", "servers.groups=[[{count: 2000000000, full_w: 99, idle_w: 9}]]")
     with pytest.raises(ConfigError, match=r"8e\+09 servers; valid is at most 2,147,483,647"):
         build_fleet(huge)
     half = [named(huge, name, "servers.groups.0.0.count=400000000") for name in "ab"]
     with pytest.raises(ConfigError, match="fleet: 3,200,000,000 servers; valid is at most"):
         build_fleet(half)
+
+
+def test_sums_and_places_of_a_ragged_fleet() -> None:
+    fleet = build_fleet(ragged())
+    assert fleet.unit_sums([1.0, 2.0, 4.0]).tolist() == [1, 2, 4]
+    assert fleet.rack_sums(np.arange(8)).tolist() == [6, 4, 18]
+    assert fleet.rack_sums(np.arange(8) > 2).tolist() == [1, 1, 3]
+    assert fleet.group_sums(fleet.groups[0]).tolist() == [3, 3, 3, 3, 1, 5, 6, 7]
+    rack, server = fleet.place_of_group(np.array([2, 7, 10, 0]))
+    assert rack.tolist() == [1, 0, 2, 0]
+    assert server.tolist() == [2, 0, 0, 0]
+    assert fleet.place_of_group(np.array([6]))[1].tolist() == [2]
+
+
+def test_approach_temperatures_are_those_that_the_hall_has(tmp_path: Path) -> None:
+    np.savez(tmp_path / "r.npz", R=np.full((20, 20), 0.012))
+    matrix = [f"hall.recirculation.matrix_file={tmp_path / 'r.npz'}",
+              "hall.recirculation.calibrate=false"]  # fmt: skip
+    for changes in ([], ["hall.layout.containment=0.6", "hvac.crac.units=2"], matrix):
+        config = load_config("corrected", changes)
+        fleet = build_fleet(config)
+        met = Conditions(np.full(fleet.units, config.hvac.setpoint.max_c), np.ones(1))
+        found = Hall(fleet, "f64").solve(met).rack_inlet_c - config.hvac.setpoint.max_c
+        np.testing.assert_allclose(fleet.approach_k, found, rtol=0.01)
+        given = np.allclose(fleet.approach_k, config.hall.rack_approach_k(), rtol=0.2)
+        assert given == (not changes)
+
+
+def test_rooms_hold_what_has_no_temperature_of_its_own() -> None:
+    for thermal, kj_per_k in (("quasi_steady", 11.75), ("transient", 2.0)):
+        config = load_config("corrected", [f"simulation.thermal={thermal}"])
+        drivers = drivers_from_arrays([20.0], [15.0], [300.0], [0.5])
+        with Simulator(config, drivers=drivers) as sim:
+            assert sim.sizing.room_kwh_per_k * 3600 == pytest.approx(4000 * kj_per_k)
 
 
 def test_equal_halls_are_laid_out_once_and_equal() -> None:

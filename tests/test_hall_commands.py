@@ -90,7 +90,9 @@ def test_printed_report_shows_what_was_found() -> None:
     report = solved()
     assert f"{report['approach_mean_k']:.2f}" in text
     assert f"SHI {report['shi']:.3f}, RHI {report['rhi']:.3f}" in text
-    assert f"RTI {report['rti']:.1f} %" in text
+    assert f"RTI {report['rti_pct']:.1f} %" in text
+    for name in ("hi", "lo"):
+        assert f"{name} {report[f'rci_{name}_pct']:.1f} %" in text
     assert f"{report['cells']:,} cells" in text
     assert "5.30" in text
     assert "5.00" in text
@@ -128,3 +130,13 @@ def test_bad_values_are_named() -> None:
     assert "cell_m 9" in failed(ConfigError, "--cell", 9)
     assert "hall.layout.rack_pitch_m" in failed(ConfigError, "--set", "hall.layout.rack_pitch_m=0")
     assert "no_such_preset" in failed(ConfigError, "no_such_preset")
+
+
+@pytest.mark.parametrize(("preset", "model"), [("sustaindc", "released"), ("paper", "rack")])
+def test_outlet_models_without_a_balance_per_server_are_refused(
+    tmp_path: Path, preset: str, model: str
+) -> None:
+    message = failed(ConfigError, preset, "--cell", 1, "--out", tmp_path / "hall.npz")
+    assert message.startswith(f"{preset}: servers.outlet_model {model}: ")
+    assert message.endswith("valid is server")
+    assert not list(tmp_path.iterdir())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -74,6 +75,18 @@ def test_containment_warms_less_and_still_closes(corrected: DesignHall) -> None:
     assert closed.air.shi < 0.3 * corrected.air.shi
     assert closed.unit_m3s.sum() == pytest.approx(corrected.unit_m3s.sum())
     heat_closes(closed)
+
+
+@pytest.mark.parametrize("overrides", [["hall.layout.containment=1"], ["hall.supply_approach_k=0"]])
+def test_no_recirculation_is_zero_of_no_sign(overrides: list[str]) -> None:
+    found = at_design(load_config("corrected", [*overrides, "hvac.crac.units=3"]))
+    assert found.air is not None
+    for values in (found.approach_k, found.air.exhaust_share, np.array(found.air.radius)):
+        np.testing.assert_array_equal(values, 0.0)
+        assert not np.signbit(values).any()
+    text = describe(found)
+    assert "over supply 0.00 K" in text
+    assert not re.search(r"-0\.?0*(?![0-9.])", text)
 
 
 def test_approach_model_has_inlets_and_no_flows() -> None:

@@ -258,6 +258,13 @@ def test_an_outage_without_battery_stops_everything(thermal: str) -> None:
                  "it_airflow_m3s", "water_l"):  # fmt: skip
         assert np.all(column(results, name)[dark] == 0), name
     assert np.all(column(results, "powered")[dark] == 0)
+    running = np.array([r.unit_running for r in results])
+    assert np.all(running[dark] == 0)
+    assert np.all(running[:4] == 1)
+    coasting = load_config("corrected").hvac.crac.coasting_flow_ratio
+    flow = column(results, "crac_flow_m3s")
+    assert np.all(flow[dark] < 1.5 * coasting / 0.2 * flow[0])
+    assert np.all(np.isfinite(column(results, "return_c")))
     queue, dropped = column(results, "queue_tasks"), column(results, "dropped_tasks")
     assert queue[9] == 200.0
     assert dropped[dark].sum() == pytest.approx(6 * 80 - 200)
@@ -576,3 +583,28 @@ def test_the_seed_decides_what_goes_wrong() -> None:
             found.append(np.concatenate([np.ravel(column(results, n)) for n in parts]))
     assert np.array_equal(found[0], found[2])
     assert not np.array_equal(found[0], found[1])
+
+
+def test_a_dark_hall_of_flow_by_power_returns_supply_air() -> None:
+    results = simulate(
+        ["hall.inlet_model=approach", "hvac.crac.flow_model=per_watt", "battery.capacity_kwh=0",
+         events("kind: grid_outage, start_h: 0.5, duration_h: 0.5")],
+        5,
+    )  # fmt: skip
+    assert column(results, "crac_flow_m3s")[2] == 0
+    assert column(results, "return_c")[2] == column(results, "supply_c")[2]
+
+
+@pytest.mark.parametrize("thermal", THERMAL)
+def test_supply_of_the_units_averages_to_that_of_the_hall(thermal: str) -> None:
+    results = simulate(
+        [f"simulation.thermal={thermal}", "hvac.crac.units=3",
+         events("kind: crac_down, start_h: 0.5, duration_h: 0.5")],
+        8,
+    )  # fmt: skip
+    flow = np.array([r.unit_flow_m3s for r in results])
+    supply = np.array([r.unit_supply_c for r in results])
+    mean = (flow * supply).sum(axis=1) / flow.sum(axis=1)
+    np.testing.assert_allclose(mean, column(results, "supply_c"), rtol=1e-9)
+    if thermal == "transient":
+        assert supply[2].min() > supply[0].max() + 1.0

@@ -19,7 +19,7 @@ MAPPED = ("configs", "data", "kernels", "viz")
 PYPROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PACKAGES: list[str] = PYPROJECT["tool"]["setuptools"]["packages"]
 # Imported by the functions that need them, so that `import sdc_taichi` stays light.
-LAZY = {"matplotlib", "pandas", "psychrolib", "pyarrow", "rerun", "taichi"}
+LAZY = {"matplotlib", "pandas", "pettingzoo", "psychrolib", "pyarrow", "rerun", "taichi"}
 
 
 def run_python(code: str, cwd: Path) -> str:
@@ -106,6 +106,22 @@ def test_import_is_light(tmp_path: Path) -> None:
     loaded = {name.partition(".")[0] for name in run_python(code, tmp_path).split()}
     assert "sdc_taichi" in loaded
     assert loaded & LAZY == set()
+
+
+def test_public_names_are_there(tmp_path: Path) -> None:
+    code = """
+import sdc_taichi
+for name in sdc_taichi.__all__:
+    assert name in dir(sdc_taichi), name
+    assert getattr(sdc_taichi, name) is not None, name
+assert not hasattr(sdc_taichi, "paralel_env")
+import gymnasium, sys
+print(*(name for name in gymnasium.registry if name.startswith("sdc_taichi/")))
+print("taichi" in sys.modules)
+"""
+    ids, taichi = run_python(code, tmp_path).splitlines()
+    assert ids.split() == [f"sdc_taichi/{n}-v0" for n in ("Joint", "Load", "Cooling", "Battery")]
+    assert taichi == "False"
 
 
 def test_works_without_rerun(tmp_path: Path) -> None:

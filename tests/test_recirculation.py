@@ -14,9 +14,9 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import reference_twin
-from sdc_taichi import ConfigError, DataCenterConfig, build_fleet, load_config
+from sdc_taichi import ConfigError, DataCenterConfig, SdcError, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
-from sdc_taichi.hall import Conditions, Hall, HallSums, Precision
+from sdc_taichi.hall import MOST_SWEEPS, Conditions, Hall, HallSums, Precision
 from sdc_taichi.recirculation import DENSE_RACKS, calibrate, layout_exchange
 from sdc_taichi.types import F64, ServerLayers
 
@@ -120,7 +120,7 @@ def random_conditions(
         rack_load=rng.uniform(0, 1, racks) if kind == 1 else None,
         group_load=rng.uniform(0, 1, len(fleet.groups[0])) if kind == 2 else None,
         powered=rng.choice([0.0, 0.4, 1.0, 1.0, 1.0], racks),
-        rack_airflow=rng.choice([0.5, 1.0, 1.0], racks),
+        rack_airflow=rng.choice([0.05, 0.5, 1.0, 1.0, 1.0], racks),
         unit_low=low,
         unit_high=np.minimum(low + rng.choice([0.0, 0.3], units), 1.2),
         unit_running=rng.choice([0.0, 1.0], units),
@@ -258,6 +258,47 @@ def test_every_server_may_be_its_own(precision: Precision) -> None:
     assert_agrees([config], random_conditions(rng, [config], kind=2), precision)
 
 
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_fans_without_limits_of_their_airflow(precision: Precision) -> None:
+    # Twenty racks leave places of blocks empty.
+    config = load_config(
+        "corrected", ["servers.fan_power_exponent=2.5", "servers.fan_airflow_ratio_limits=null"]
+    )
+    assert_agrees([config], Conditions(np.array([18.0]), np.array([0.05])), precision)
+    # The curve is below 0 here, and fans do not blow backwards; heat goes to the room all the same.
+    sums = Hall(build_fleet(config), precision).solve(Conditions(np.array([4.0]), np.zeros(1)))
+    assert sums.airflow_m3s[0] == sums.fan_w[0] == 0.0
+    carried = 1.225 * 1006.0 * sums.crac_flow_m3s[0] * (sums.return_c[0] - 4.0)
+    assert carried == pytest.approx(sums.cpu_w[0], rel=TOLERANCE[precision])
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("shape", [(4, 5), (10, 14)], ids=["one chunk", "two chunks"])
+def test_halls_of_any_size_give_up_after_as_many_sweeps(
+    shape: tuple[int, int], precision: Precision
+) -> None:
+    config = load_config(
+        "corrected",
+        [f"hall.rows={shape[0]}", f"hall.racks_per_row={shape[1]}", "hall.supply_approach_k=5",
+         "hall.return_approach_k=-3", "servers.power_w=[200, 20]"],
+    )  # fmt: skip
+    hall, least = Hall(build_fleet(config), precision), np.array([1e-3])
+    still = Conditions(np.array([20.0]), np.ones(1), unit_low=least, unit_high=least)
+    with pytest.raises(SdcError, match=r"or set simulation\.thermal") as error:
+        hall.solve(still)
+    assert f"no steady air temperatures in {MOST_SWEEPS} sweeps" in str(error.value)
+    assert hall.solve(Conditions(np.array([20.0]), np.ones(1))).inlet_mean_c[0] < 26
+
+
+@pytest.mark.parametrize("inlet_model", ["approach", "recirculation"])
+def test_conditions_that_are_no_numbers_are_refused(inlet_model: str) -> None:
+    config = load_config("corrected", [f"hall.inlet_model={inlet_model}"])
+    for supply_c, load in ((np.nan, 0.5), (18.0, np.nan)):
+        hall = Hall(build_fleet(config), "f32")
+        with pytest.raises(SdcError, match="is not finite; valid are finite numbers"):
+            hall.solve(Conditions(np.array([supply_c]), np.array([load])))
+
+
 def test_twin_sees_a_change_of_any_measure_of_the_hall() -> None:
     values = random_values(np.random.default_rng(0), "dc", (3, 4))
     values["hall"]["layout"]["containment"] = 0.2
@@ -303,6 +344,62 @@ def test_weights_are_those_of_the_paths(shape: tuple[int, int]) -> None:
     assert_close(found, expected.T @ values, 1e-11, "transposed", scale=1.0)
 
 
+@pytest.mark.parametrize("shape", [(14, 8), (5, 70)])
+@pytest.mark.parametrize("cutoff", [0.0, 1e-3, 4e-3])
+def test_rows_of_deep_racks_are_within_reach(shape: tuple[int, int], cutoff: float) -> None:
+    values = random_values(np.random.default_rng(6), "dc", shape)
+    values["hall"]["layout"] |= {"rack_depth_m": 6.0, "cold_aisle_m": 1.0, "hot_aisle_m": 1.0}
+    values["hall"]["recirculation"] = {"decay_m": 3.0, "cutoff": cutoff}
+    hall = config_from_dict(values).hall
+    expected = reference_twin.layout_weights(hall, np.ones(hall.racks))
+    assert_close(layout_exchange(hall).dense(), expected, 1e-12, "weights", scale=1.0)
+    assert np.all(expected > 0) == (cutoff == 0)
+
+
+@pytest.mark.parametrize("shape", [(4, 5), *MERGED, *LONG])
+def test_paths_of_many_decay_lengths_leave_weights(shape: tuple[int, int]) -> None:
+    # Measures in mm, as they come by mistake: exp(-path / decay) is below any number.
+    values = random_values(np.random.default_rng(7), "dc", shape, even=True)
+    layout = values["hall"]["layout"]
+    values["hall"]["layout"] = {
+        k: v if k in ("containment", "returns") else 1e3 * v for k, v in layout.items()
+    }
+    config = config_from_dict(values)
+    dense = layout_exchange(config.hall).dense()
+    assert_close(dense.sum(axis=1), np.ones(config.hall.racks), 1e-12, "rows sum to 1")
+
+
+def test_a_cutoff_that_leaves_no_source_is_refused() -> None:
+    for shape, cutoff in (((10, 100), 0.01), ((200, 500), 1e-4)):
+        values = random_values(np.random.default_rng(8), "dc", (10, 100), even=True)
+        values["hall"] |= {
+            "rows": shape[0], "racks_per_row": shape[1], "layout": {},
+            "supply_approach_k": 5.0, "return_approach_k": -3.0,
+            "recirculation": {"decay_m": 50.0, "cutoff": cutoff},
+        }  # fmt: skip
+        values["hvac"]["crac"]["unit_shares"] = None
+        hall = config_from_dict(values).hall
+        with pytest.raises(ConfigError, match="without any source: their largest") as error:
+            layout_exchange(hall)
+        assert f"hall.recirculation.cutoff {cutoff:g} with decay_m 50" in str(error.value)
+        largest = float(str(error.value).split("weight is ")[1].split(";")[0])
+        if shape == (10, 100):
+            smaller = hall.recirculation.model_copy(update={"cutoff": 0.5 * largest})
+            exchange = layout_exchange(hall.model_copy(update={"recirculation": smaller}))
+            assert np.all(np.isfinite(exchange.norm))
+
+
+def test_more_weights_than_fit_are_refused() -> None:
+    values = random_values(np.random.default_rng(8), "dc", (1, 2), even=True)
+    values["hall"] |= {
+        "rows": 400, "racks_per_row": 2000, "layout": {}, "supply_approach_k": 5.0,
+        "return_approach_k": -3.0, "recirculation": {"cutoff": 0.0},
+    }  # fmt: skip
+    values["hvac"]["crac"]["unit_shares"] = None
+    with pytest.raises(ConfigError, match=r"keeps 6.39e.09 weights for 800,000 racks; valid is at"):
+        layout_exchange(config_from_dict(values).hall)
+
+
 @pytest.mark.parametrize("shape", MERGED + LONG)
 @pytest.mark.parametrize("cutoff", [1e-4, 1e-3, 1e-2])
 def test_large_halls_drop_small_weights_alone(shape: tuple[int, int], cutoff: float) -> None:
@@ -310,6 +407,7 @@ def test_large_halls_drop_small_weights_alone(shape: tuple[int, int], cutoff: fl
     values = random_values(np.random.default_rng(4), "dc", shape)
     values["hall"]["recirculation"] = {"decay_m": 1.5, "cutoff": 0.0}
     every = layout_exchange(config_from_dict(values).hall).dense()
+    assert np.all(every > 0)
     values["hall"]["recirculation"]["cutoff"] = cutoff
     cut = layout_exchange(config_from_dict(values).hall).dense()
     kept = cut > 0
@@ -417,7 +515,7 @@ def test_matrix_of_a_file_agrees_with_the_twin(kind: str, scaled: bool, tmp_path
         matrix[1] = matrix[0]
     overrides = [
         "hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
-        "hall.return_approach_k=-3", "servers.power_w=[200, 20]", "hall.layout.containment=0.5",
+        "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
     ]  # fmt: skip
     name, path = kind[0], tmp_path / kind
     given = matrix if name == "R" else heat_matrix(matrix, overrides, scaled, tmp_path)
@@ -498,6 +596,9 @@ def test_d_holds_at_the_design_point_of_servers_with_curves(
     [
         ({"R": np.full((4, 4), 0.1)}, r"R has shape \(4, 4\), expected \(6, 6\)"),
         ({"R": np.full((6, 6), np.nan)}, r"R\[0, 0\] is nan; valid is a finite number"),
+        ({"D": np.full((6, 6), -0.1)}, r"D\[0, 0\] is -0.1 K/W; valid is at least 0"),
+        ({"R": np.full((6, 6), 0.1j)}, "R holds complex128; valid are real numbers"),
+        ({"R": np.full((6, 6), True)}, "R holds bool; valid are real numbers"),
         ({"R": np.full((6, 6), -0.1)}, "rack 0 takes a share of -0.1 of its air from rack 0"),
         ({"R": np.full((6, 6), 0.2)}, "row 0 sums to 1.2; valid is below 1"),
         ({"R": np.zeros((6, 6)), "D": np.zeros((6, 6))}, "valid is one of the arrays R and D"),
@@ -526,6 +627,43 @@ def test_a_matrix_that_cannot_be_is_refused(
     assert "\n" not in str(error.value)
 
 
+def matrix_hall(path: Path, *more: str) -> DataCenterConfig:
+    return load_config(
+        "corrected",
+        ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=[0, 3, 3, 3, 3, 3]",
+         "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
+         f"hall.recirculation.matrix_file={json.dumps(str(path))}", *more],
+    )  # fmt: skip
+
+
+def test_files_that_are_no_matrix_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "one.npy", np.full((6, 6), 0.1))
+    (tmp_path / "one.npy").rename(tmp_path / "one.npz")
+    with pytest.raises(ConfigError, match=r"one\.npz: holds one array without a name; valid is an"):
+        build_fleet(matrix_hall(tmp_path / "one.npz"))
+    with pytest.raises(ConfigError, match=r"ends in '.txt'; valid are .npz and .csv"):
+        build_fleet(matrix_hall(tmp_path / "r.txt", "hall.recirculation.matrix_kind=R"))
+
+
+def test_a_rack_without_exhaust_air_cannot_be_warmed_by_it(tmp_path: Path) -> None:
+    path, matrix = tmp_path / "r.npz", np.full((6, 6), 0.05)
+    matrix[[0, 2]] = 0.0
+    np.savez(path, R=matrix)
+    with pytest.raises(ConfigError, match=r"row 2 is zero, so .* rack 2 by the 3 K of hall.supply"):
+        build_fleet(matrix_hall(path))
+    matrix[2] = 0.05
+    np.savez(path, R=matrix)
+    found = at_design([matrix_hall(path)]).rack_inlet_c - 23.0
+    np.testing.assert_allclose(found, [0, 3, 3, 3, 3, 3], atol=1e-9)
+
+
+def test_settings_that_a_matrix_leaves_without_effect_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"containment 0.5 with recirculation.matrix_file: .* 0$"):
+        matrix_hall(tmp_path / "r.npz", "hall.layout.containment=0.5")
+    with pytest.raises(ConfigError, match="matrix_kind D needs a matrix_file; valid without one"):
+        load_config("corrected", ["hall.recirculation.matrix_kind=D"])
+
+
 # --- conservation -------------------------------------------------------------------------------
 
 
@@ -544,7 +682,7 @@ def leaving(part: Part, sums: HallSums, layers: ServerLayers) -> tuple[float, fl
     moved = reference_twin.flows(twin, flow, part.low, part.high)
     outlets = np.asarray(sums.rack_outlet_c[part.racks], dtype=np.float64)
     _, left_over = reference_twin.return_air(
-        twin, moved, twin.per_rack(flow), outlets, part.supply_c
+        twin, moved, twin.per_rack(flow), outlets, part.supply_c, part.breath
     )
     heat = left_over @ outlets + (moved.bypass - moved.unit) @ part.supply_c
     return air * float(heat), float(power.sum()), left_over
@@ -570,6 +708,34 @@ def test_all_power_leaves_with_the_air(precision: Precision, seed: int) -> None:
         carried = part.twin.air_j_per_m3_k * sums.crac_flow_m3s[i]
         found = carried * (sums.return_c[i] - sums.supply_c[i])
         assert found == pytest.approx(it_w, rel=TOLERANCE[precision], abs=1e-6 * carried)
+
+
+@pytest.mark.parametrize("failed", [[10], [0], [5, 6, 7, 8, 9]], ids=["one", "corner", "row"])
+@pytest.mark.parametrize("share", [0.5, 0.1, 0.02])
+def test_racks_with_failing_fans_give_no_more_heat_than_they_have(
+    share: float, failed: list[int]
+) -> None:
+    config, breath = load_config("corrected"), np.ones(20)
+    breath[failed] = share
+    hall = Hall(build_fleet(config), "f64")
+    before = hall.solve(Conditions(np.array([18.0]), np.ones(1)))
+    met = Conditions(np.array([18.0]), np.ones(1), rack_airflow=breath)
+    sums, layers = hall.solve(met), hall.servers()
+    part = parts([config], met)[0]
+    heat_w, power_w, left_over = leaving(part, sums, layers)
+    assert heat_w == pytest.approx(power_w, rel=1e-12)
+    assert np.all(left_over >= -1e-9)
+    # Heat in the intakes of others, over what the exhaust of the failed racks carries.
+    flow = np.repeat(sums.rack_airflow_m3s / 200, 200)
+    moved = reference_twin.flows(part.twin, flow, part.low, part.high)
+    taken = moved.captured[:, None] * reference_twin.mixing(part.twin, breath)
+    np.fill_diagonal(taken, 0.0)
+    assert np.all(taken.sum(axis=0)[failed] <= sums.rack_airflow_m3s[failed])
+    assert np.all(sums.rack_outlet_c[failed] > before.rack_outlet_c[failed] + 5)
+    if len(failed) == 1:
+        # Most of what it gives off goes back to the units and not to its neighbours.
+        others = np.delete(sums.rack_inlet_c - before.rack_inlet_c, failed)
+        assert np.all(np.abs(others) < 0.6)
 
 
 @settings(phases=AS_FOUND, max_examples=15)

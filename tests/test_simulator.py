@@ -451,11 +451,11 @@ def test_a_closed_simulator_says_so() -> None:
             use()
 
 
-@pytest.mark.parametrize("seed", [-1, 1.5, "7"])
+@pytest.mark.parametrize("seed", [-1, 1.5, "7", True, 2**63])
 def test_a_wrong_seed_is_refused(seed: Any) -> None:
     with (
         Simulator(load_config("tiny"), drivers=short_drivers()) as sim,
-        pytest.raises(ConfigError, match="valid is a non-negative integer"),
+        pytest.raises(ConfigError, match=r"valid is an integer of 0\.\.2\*\*63 - 1"),
     ):
         sim.reset(seed=seed)
 
@@ -639,3 +639,31 @@ def test_tables_gather_one_entry_per_data_center() -> None:
     table = Table(np.array([1.0, 2.0, 3.0, 10.0, 20.0]), np.array([0, 3]), np.array([3, 2]))
     found = [table.at(np.array([i, i])).tolist() for i in range(4)]
     assert found == [[1, 10], [2, 20], [3, 10], [1, 20]]
+
+
+@pytest.mark.parametrize("preset", ["corrected", "paper", "sustaindc"])
+def test_heat_indices_are_those_of_the_racks(preset: str) -> None:
+    with Simulator(load_config(preset), drivers=short_drivers(), precision="f64") as sim:
+        sim.reset()
+        result = [sim.step() for _ in range(3)][-1]
+    flow, supply_c = result.rack_airflow_m3s, result.supply_c[0]
+    inlet = np.sum(flow * (result.rack_inlet_c - supply_c))
+    outlet = np.sum(flow * (result.rack_outlet_c - supply_c))
+    assert result.shi[0] == pytest.approx(inlet / outlet, rel=1e-6)
+    rise_k = (outlet - inlet) / flow.sum()
+    assert result.rti_pct[0] == pytest.approx(
+        100.0 * (result.return_c[0] - supply_c) / rise_k, rel=1e-6
+    )
+
+
+def test_matrices_of_different_magnitude_are_told_apart(tmp_path: Path) -> None:
+    path, found = tmp_path / "hall.npz", set()
+    config = load_config(
+        "corrected",
+        [f"hall.recirculation.matrix_file={path}", "hall.recirculation.calibrate=false"],
+    )
+    for share in (0.005, 0.01):
+        np.savez(path, R=np.full((20, 20), share))
+        with Simulator(config, drivers=short_drivers()) as sim:
+            found.add(sim.fingerprint())
+    assert len(found) == 2

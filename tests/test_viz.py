@@ -26,7 +26,7 @@ from sdc_taichi import (
     load_config,
     make_configs,
 )
-from sdc_taichi.viz import figures, recorder
+from sdc_taichi.viz import figures, hall_figures, recorder
 from sdc_taichi.viz.recorder import Recorder
 
 STEPS = 110  # more than a block, and no multiple of one
@@ -472,6 +472,24 @@ def test_bad_results_and_tables(run: tuple[Simulator, list[StepResult]]) -> None
         figures.overview(pd.concat([steps, steps]))
     with pytest.raises(SdcError, match="1 rows"):
         figures.overview(steps[:1])
+
+
+def test_outages_are_shaded_for_their_own_data_center() -> None:
+    down = "events.scheduled=[{kind: crac_down, unit: 0, start_h: 1, duration_h: 1}]"
+    base = ["hvac.crac.units=2", "hvac.sizing.design_wet_bulb_c=26"]
+    halls = [load_config("corrected", [*base, "name=a"]), load_config("corrected", [*base, down])]
+    with Simulator(halls) as sim:
+        sim.reset()
+        results = [sim.step() for _ in range(10)]
+
+    def shaded(dc: int) -> list[Any]:
+        figure = hall_figures.failure_curves({"run": results}, sim.fleet, dc)
+        return [c.get_paths() for axes in figure.axes for c in axes.collections]
+
+    assert shaded(0) == [[], []]
+    for paths in shaded(1):
+        (path,) = paths
+        assert 1.0 <= path.vertices[:, 0].min() < path.vertices[:, 0].max() == 2.0
 
 
 @pytest.mark.repo

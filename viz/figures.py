@@ -1,20 +1,23 @@
 """Pictures of results with matplotlib: a hall's rack temperatures and a dashboard of a run.
 
-Every function returns a ``matplotlib.figure.Figure``; ``figure.savefig(path)`` writes it. pyplot is
-not used, so no window or global state is touched. Colours are those of Okabe and Ito (2008), "Color
+``hall_map``, ``overview`` and ``readme_picture`` return a ``matplotlib.figure.Figure``, which
+``figure.savefig(path)`` writes; the other functions are what all pictures share. pyplot is not
+used, so no window or global state is touched. Colours are those of Okabe and Ito (2008), "Color
 Universal Design", and the inferno map, which readers with colour vision deficiency can tell apart.
 """
 
 from __future__ import annotations
 
 from datetime import datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.config import first_step_day
 from sdc_taichi.errors import SdcError
 from sdc_taichi.fleet import Fleet
+from sdc_taichi.layout import Plan
 from sdc_taichi.types import F64, Reals, StepResult
 
 if TYPE_CHECKING:
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+DPI = 100
 LABELLED_RACKS = 60
 """Largest hall whose racks show their temperature as a number."""
 MIN_COLOUR_RANGE_K = 2.0
@@ -67,7 +71,7 @@ def hall_map(result: StepResult, fleet: Fleet, dc: int = 0) -> Figure:
     Raises:
         SdcError: matplotlib is missing, or result, fleet and index do not fit together.
     """
-    figure = _figure(9.6, 4.2)
+    figure = new_figure(9.6, 4.2)
     _check_result(result, fleet, dc)
     for what, axes in zip(("inlet", "outlet"), figure.subplots(1, 2), strict=True):
         _draw_hall(axes, what, result, fleet, dc)
@@ -85,7 +89,7 @@ def overview(steps: pd.DataFrame) -> Figure:
         SdcError: matplotlib is missing, a column is missing, fewer than two rows, or times that do
             not increase.
     """
-    figure = _figure(12.0, 9.0)
+    figure = new_figure(12.0, 9.0)
     _check_steps(steps)
     draws = (_draw_temperatures, _draw_power, _draw_carbon, _draw_storage)
     all_axes = figure.subplots(4, 1, sharex=True, height_ratios=[3, 4, 3, 3])
@@ -107,7 +111,7 @@ def readme_picture(result: StepResult, fleet: Fleet, steps: pd.DataFrame, dc: in
     Raises:
         SdcError: as ``hall_map`` and ``overview``, or a step that the run does not have.
     """
-    figure = _figure(16.0, 7.0)
+    figure = new_figure(16.0, 7.0)
     _check_result(result, fleet, dc)
     _check_steps(steps)
     when = _step_time(result, fleet, dc)
@@ -126,14 +130,43 @@ def readme_picture(result: StepResult, fleet: Fleet, steps: pd.DataFrame, dc: in
     return figure
 
 
-def _figure(width_in: float, height_in: float) -> Figure:
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure of ``DPI``.
+
+    Raises:
+        SdcError: matplotlib is missing.
+    """
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise SdcError(
             f'pictures need matplotlib ({error}); install it with: pip install "sdc-taichi[plot]"'
         ) from None
-    return Figure(figsize=(width_in, height_in), dpi=100, layout="constrained")
+    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+
+
+def colour_range(values: F64) -> tuple[float, float]:
+    """Range of the values, widened so that differences of a few tenths look small."""
+    middle = (values.min() + values.max()) / 2
+    half = max((values.max() - values.min()) / 2, MIN_COLOUR_RANGE_K / 2)
+    return float(middle - half), float(middle + half)
+
+
+def is_turned(plan: Plan) -> bool:
+    """Whether y runs to the right on the page, where the longer side of the room lies."""
+    return plan.width_m > plan.length_m
+
+
+def on_page(plan: Plan, xy: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Coordinates on the page of those in the room, (..., 2)."""
+    return xy[..., ::-1] if is_turned(plan) else xy
+
+
+def rack_boxes(plan: Plan, pitch_m: float, depth_m: float) -> F64:
+    """Corners of the racks on the page, (R, 4, 2)."""
+    half = np.array([pitch_m / 2, depth_m / 2])
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    return on_page(plan, plan.centre_m[:, None] + corners * half)
 
 
 def _check_result(result: StepResult, fleet: Fleet, dc: int) -> None:
@@ -176,7 +209,7 @@ def _draw_hall(axes: Axes, what: str, result: StepResult, fleet: Fleet, dc: int)
     every: Reals = result.rack_inlet_c if what == "inlet" else result.rack_outlet_c
     grid = np.asarray(every[slice(*fleet.rack_start[dc : dc + 2])], dtype=np.float64)
     grid = grid.reshape(hall.rows, hall.racks_per_row)
-    low, high = _colour_range(grid)
+    low, high = colour_range(grid)
     image = axes.pcolormesh(
         grid,
         cmap="inferno",
@@ -199,13 +232,6 @@ def _draw_hall(axes: Axes, what: str, result: StepResult, fleet: Fleet, dc: int)
     _outline_hottest(axes, what, grid)
     ticks = MaxNLocator(6, steps=[1, 2, 5, 10])
     axes.figure.colorbar(image, ax=axes, label=f"{what} (°C)", ticks=ticks)
-
-
-def _colour_range(grid: F64) -> tuple[float, float]:
-    """Range of the values, widened so that differences of a few tenths look small."""
-    middle = (grid.min() + grid.max()) / 2
-    half = max((grid.max() - grid.min()) / 2, MIN_COLOUR_RANGE_K / 2)
-    return float(middle - half), float(middle + half)
 
 
 def _outline_hottest(axes: Axes, what: str, grid: F64) -> None:

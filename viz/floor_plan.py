@@ -11,7 +11,18 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.hall_description import DesignHall, at_design
 from sdc_taichi.types import F64
 
-from .figures import BLUE, GREY, ORANGE, SKY, _colour_range, _figure
+from .figures import (
+    BLUE,
+    DPI,
+    GREY,
+    ORANGE,
+    SKY,
+    colour_range,
+    is_turned,
+    new_figure,
+    on_page,
+    rack_boxes,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +40,6 @@ LINE_LABEL_PX = 13.0
 """Height of a line of text."""
 UNIT_SIZE_M = (0.9, 2.0)
 """Symbol of a CRAC unit, off the wall and along it."""
-_DPI = 100.0
 
 
 def draw(hall: DataCenterConfig | DesignHall) -> Figure:
@@ -43,7 +53,7 @@ def draw(hall: DataCenterConfig | DesignHall) -> Figure:
     Raises:
         SdcError: matplotlib is missing, or the hall cannot be solved.
     """
-    figure = _figure(1.0, 1.0)
+    figure = new_figure(1.0, 1.0)
     found = at_design(hall) if isinstance(hall, DataCenterConfig) else hall
     _Drawing(found, figure).draw()
     return figure
@@ -57,7 +67,7 @@ class _Drawing:
         self._hall, self._size = found.config.hall, found.config.hall.layout
         plan = found.plan
         room = (plan.length_m, plan.width_m)
-        self._turned = plan.width_m > plan.length_m
+        self._turned = is_turned(plan)
         self._room = room[::-1] if self._turned else room
         # Units stand outside the end walls, so that the room is drawn clear; large halls get
         # larger symbols.
@@ -75,7 +85,7 @@ class _Drawing:
         high_in = float(np.clip(LONG_SIDE_IN * high / wide, *SHORT_SIDE_IN))
         wide_in = min(LONG_SIDE_IN, high_in * wide / high)
         self._stretch = (high_in / high) / (wide_in / wide)
-        self._px_per_m = (_DPI * wide_in / wide, _DPI * high_in / high)
+        self._px_per_m = (DPI * wide_in / wide, DPI * high_in / high)
         rows = self._hall.rows
         ends_y = plan.centre_m[[0, -1], 1]
         self._row_gap_m = float(np.ptp(ends_y)) / (rows - 1) if rows > 1 else plan.width_m
@@ -103,11 +113,11 @@ class _Drawing:
 
     def _place(self, x: float, y: float) -> tuple[float, float]:
         """Coordinates on the page."""
-        return (float(y), float(x)) if self._turned else (float(x), float(y))
+        across, up = on_page(self._found.plan, np.array([x, y]))
+        return float(across), float(up)
 
-    def _box(self, x0: float, x1: float, y0: float, y1: float) -> list[tuple[float, float]]:
-        corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
-        return [(y, x) for x, y in corners] if self._turned else list(corners)
+    def _box(self, x0: float, x1: float, y0: float, y1: float) -> F64:
+        return on_page(self._found.plan, np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]))
 
     def _fits(self, x_m: float, y_m: float, px: tuple[float, float]) -> bool:
         across, up = (y_m, x_m) if self._turned else (x_m, y_m)
@@ -190,13 +200,11 @@ class _Drawing:
 
         found, plan, size = self._found, self._found.plan, self._size
         deep_m = self._row_gap_m if self._coarse else size.rack_depth_m
-        half = np.array([size.rack_pitch_m / 2, deep_m / 2])
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        boxes = plan.centre_m[:, None] + corners * half
+        boxes = rack_boxes(plan, size.rack_pitch_m, deep_m)
         edged = self._fits(size.rack_pitch_m, size.rack_depth_m, (8.0, 8.0))
-        low, high = _colour_range(found.inlet_c)
+        low, high = colour_range(found.inlet_c)
         racks = PolyCollection(
-            boxes[..., ::-1] if self._turned else boxes,
+            list(boxes),
             array=found.inlet_c,
             cmap="inferno",
             clim=(low, high),
@@ -228,15 +236,11 @@ class _Drawing:
         if self._fits(self._size.rack_pitch_m, self._size.rack_depth_m, (16.0, 16.0)):
             box = 0.92 * corners + 0.08 * corners.mean(axis=0)
             axes.add_patch(
-                Polygon(
-                    box[:, ::-1] if self._turned else box,
-                    fill=False, edgecolor=SKY, linewidth=3.0, zorder=3, label=label,
-                )
-            )  # fmt: skip
+                Polygon(box, fill=False, edgecolor=SKY, linewidth=3.0, zorder=3, label=label)
+            )
             return
-        where = self._place(*corners.mean(axis=0))
-        axes.plot(*where, "o", color=SKY, markersize=13, mfc="none", mew=2.2, ls="none",
-                  label=label)  # fmt: skip
+        axes.plot(*corners.mean(axis=0), "o", color=SKY, markersize=13, mfc="none", mew=2.2,
+                  ls="none", label=label)  # fmt: skip
 
     def _draw_walls(self, axes: Axes) -> None:
         from matplotlib.collections import PolyCollection

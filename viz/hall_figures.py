@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import SdcError
@@ -14,7 +13,7 @@ from sdc_taichi.fleet import Fleet
 from sdc_taichi.layout import Plan, floor_plan, unit_places_m
 from sdc_taichi.types import F64, StepResult
 
-from .figures import BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY, _figure
+from .figures import BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY, new_figure, on_page, rack_boxes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,14 +37,14 @@ def moved_load(hall: HallConfig, change_k: F64, distance_m: F64, racks: tuple[in
     """
     _check_length("change_k", change_k, hall.racks)
     _check_length("distance_m", distance_m, hall.racks)
-    figure = _figure(11.0, 4.6)
+    figure = new_figure(11.0, 4.6)
     left, right = figure.subplots(1, 2, width_ratios=[5, 6])
     plan = floor_plan(hall)
     reach = float(np.abs(change_k).max())
     image = _draw_racks(left, hall, plan, change_k, "PuOr_r", (-reach, reach))
     for rack, sign in zip(racks, "−+", strict=True):
         ink = "white" if abs(change_k[rack]) > 0.6 * reach else "black"
-        where = _on_page(plan, plan.centre_m[rack])
+        where = on_page(plan, plan.centre_m[rack])
         left.text(*where, sign, color=ink, ha="center", va="center", fontsize=13, weight="bold")
     left.set_title("Change of the inlet; load moves from − to +", fontsize=10, loc="left")
     figure.colorbar(
@@ -74,7 +73,7 @@ def failure_maps(
     Args:
         results: steps of the run, in order.
         fleet: the fleet they belong to.
-        hours: times to show, in hours since the first step.
+        hours: times to show, in hours since reset.
         dc: index of the data center.
 
     Raises:
@@ -88,7 +87,7 @@ def failure_maps(
     limits = float(np.min(values)), float(np.max(values))
     columns = min(3, len(shown))
     lines = -(-len(shown) // columns)
-    figure = _figure(11.0, 0.4 + 2.6 * lines)
+    figure = new_figure(11.0, 0.4 + 2.6 * lines)
     grid = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes in grid[len(shown) :]:
         axes.set_visible(False)
@@ -100,7 +99,7 @@ def failure_maps(
             strict=True,
         ):
             marker, colour = ("s", GREY) if runs else ("X", RED)
-            where = _on_page(plan, place)
+            where = on_page(plan, place)
             axes.plot(*where, marker, color=colour, markersize=11, clip_on=False)
         minutes = round(60 * (result.step + 1) * result.step_h)
         axes.set(xlabel="", ylabel="")
@@ -123,7 +122,7 @@ def failure_curves(runs: Mapping[str, Sequence[StepResult]], fleet: Fleet, dc: i
     Raises:
         SdcError: matplotlib is missing, or a run without steps.
     """
-    figure = _figure(11.0, 6.0)
+    figure = new_figure(11.0, 6.0)
     grid = figure.subplots(2, len(runs), sharex="col", height_ratios=[3, 2], squeeze=False)
     for (title, results), (top, bottom) in zip(runs.items(), grid.T, strict=True):
         if not results:
@@ -135,7 +134,8 @@ def failure_curves(runs: Mapping[str, Sequence[StepResult]], fleet: Fleet, dc: i
             ("supply_c", BLUE, "supply air"),
         ):
             top.plot(hours, [getattr(r, name)[dc] for r in results], color=colour, label=label)
-        down = np.array([not np.all(r.unit_running) for r in results])
+        units = slice(*fleet.unit_start[dc : dc + 2])
+        down = np.array([not np.all(r.unit_running[units]) for r in results])
         for axes in (top, bottom):
             axes.fill_between(
                 hours, 0, 1, where=down, transform=axes.get_xaxis_transform(), color=GREY,
@@ -167,7 +167,7 @@ def modes(series: Mapping[str, tuple[F64, F64]], title: str) -> Figure:
     Raises:
         SdcError: matplotlib is missing.
     """
-    figure = _figure(11.0, 5.0)
+    figure = new_figure(11.0, 5.0)
     top, bottom = figure.subplots(2, 1, sharex=True)
     for mode, (inlet_c, hvac_w) in series.items():
         edges = 0.25 * np.arange(len(inlet_c) + 1)
@@ -189,13 +189,12 @@ def _draw_racks(
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.patches import Rectangle
 
-    half = np.array([hall.layout.rack_pitch_m, hall.layout.rack_depth_m]) / 2
-    boxes = plan.centre_m[:, None] + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    boxes = rack_boxes(plan, hall.layout.rack_pitch_m, hall.layout.rack_depth_m)
     front_y = plan.front_m[:: hall.racks_per_row, 1]
     fronts = np.array([[(x, y) for x in plan.row_ends_m] for y in front_y])
-    room = _on_page(plan, np.array([plan.length_m, plan.width_m]))
+    room = on_page(plan, np.array([plan.length_m, plan.width_m]))
     image = PolyCollection(
-        list(_on_page(plan, boxes)),
+        list(boxes),
         array=values,
         cmap=cmap,
         clim=limits,
@@ -203,19 +202,14 @@ def _draw_racks(
         linewidth=0.4,
     )
     axes.add_collection(image)
-    axes.add_collection(LineCollection(list(_on_page(plan, fronts)), colors=SKY, linewidths=2))
+    axes.add_collection(LineCollection(list(on_page(plan, fronts)), colors=SKY, linewidths=2))
     axes.add_patch(Rectangle((0, 0), *room, fill=False, linewidth=1.2))
     rim = 0.04 * float(room.max())
     axes.set(aspect="equal", xlim=(-rim, room[0] + rim), ylim=(room[1] + rim, -rim))
-    names = _on_page(plan, np.array(["along the rows (m)", "across the rows (m)"]))
+    names = on_page(plan, np.array(["along the rows (m)", "across the rows (m)"]))
     axes.set(xlabel=names[0], ylabel=names[1])
     axes.spines[:].set_visible(False)
     return image
-
-
-def _on_page(plan: Plan, xy: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Coordinates with the longer side of the room to the right, (..., 2)."""
-    return xy[..., ::-1] if plan.width_m > plan.length_m else xy
 
 
 def _at(results: Sequence[StepResult], hour: float) -> StepResult:

@@ -19,6 +19,7 @@ from sdc_taichi.config import first_step_day
 from sdc_taichi.errors import SdcError
 from sdc_taichi.fleet import Fleet
 from sdc_taichi.types import F64, I64, StepResult
+from sdc_taichi.whole_file import writing
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -105,6 +106,7 @@ class Recorder:
         sources: Sequence[dict[str, str]] | None = None,
     ) -> None:
         rr = _import_rerun()
+        fleet.require_distinct_names()
         self._target = _check_path(path)
         self._fleet = fleet
         self._focus = _check_focus(fleet, focus)
@@ -341,10 +343,8 @@ def _check_writable(target: Path, temporary: Path) -> None:
         raise SdcError(
             f"{target}: {free / 1e6:.1f} MB left on the disk, expected {MIN_FREE_BYTES / 1e6:g} MB"
         )
-    try:
+    with writing(target):
         temporary.touch(exist_ok=False)
-    except OSError as error:
-        raise SdcError(f"{target}: cannot be written ({error.strerror})") from None
 
 
 def _check_focus(fleet: Fleet, focus: Sequence[str] | None) -> tuple[int, ...]:

@@ -6,13 +6,13 @@ neutral: work neither deferred nor drained, setpoint held, battery idle.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.control.view import View
-from sdc_taichi.types import F64, Actions
+from sdc_taichi.types import F64, I64, Actions
 
 SLOT_MIN = 5.0
 """Interval of trim and respond, minutes."""
@@ -24,8 +24,13 @@ _DRAWN_STEPS = 256
 class Controller(Protocol):
     """What drives a simulator."""
 
-    def reset(self, seed: int) -> None:
-        """Forget earlier episodes; ``seed`` decides everything that is random."""
+    def reset(self, seed: Any) -> None:
+        """Forget earlier episodes.
+
+        Args:
+            seed: decides everything that is random; an integer, or in environments one for each
+                data center, (B,).
+        """
 
     def act(self, view: View) -> Actions:
         """Commands for the step to come, each (B,) or one for all."""
@@ -34,7 +39,7 @@ class Controller(Protocol):
 class Idle:
     """Moves no work, holds the setpoint, leaves the battery alone."""
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int | I64) -> None:
         """Nothing to forget."""
 
     def act(self, view: View) -> Actions:
@@ -45,32 +50,39 @@ class Idle:
 class Random:
     """Each command drawn evenly from its three named actions.
 
-    Data center i draws from ``SeedSequence([seed, i])``, whatever the batch it is in.
+    Data center i draws from ``SeedSequence([seed, i])``, or with a seed of its own from
+    ``SeedSequence([seed, 0])``, whatever the batch it is in.
     """
 
     def __init__(self) -> None:
         self.reset(0)
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int | I64) -> None:
         """Start the streams of ``seed``."""
         self._seed = seed
         self._streams: list[np.random.Generator] = []
         self._drawn = np.empty((0, 0, 3))
-        self._next = 0
+        self._block = -1
 
     def act(self, view: View) -> Actions:
-        """The next draw of each stream."""
-        if len(self._streams) != view.size:
-            seeds = [np.random.SeedSequence([self._seed, i]) for i in range(view.size)]
-            self._streams = [np.random.Generator(np.random.PCG64(s)) for s in seeds]
-            self._next = _DRAWN_STEPS
-        if self._next == _DRAWN_STEPS:
+        """The draw of this step of each stream."""
+        block, at = divmod(view.state.step, _DRAWN_STEPS)
+        if len(self._streams) != view.size or block < self._block:
+            self._streams = [np.random.Generator(np.random.PCG64(s)) for s in self._seeds(view)]
+            self._block = -1
+        while self._block < block:
             draws = [s.integers(-1, 2, size=(_DRAWN_STEPS, 3)) for s in self._streams]
             self._drawn = np.stack(draws).astype(np.float64)
-            self._next = 0
-        load, cooling, battery = self._drawn[:, self._next].T
-        self._next += 1
+            self._block += 1
+        load, cooling, battery = self._drawn[:, at].T
         return Actions(load=load, cooling=cooling, battery=battery)
+
+    def _seeds(self, view: View) -> list[np.random.SeedSequence]:
+        if np.ndim(self._seed) == 0:
+            pairs = [(int(self._seed), i) for i in range(view.size)]
+        else:
+            pairs = [(int(seed), 0) for seed in np.asarray(self._seed)]
+        return [np.random.SeedSequence(pair) for pair in pairs]
 
 
 class TrimAndRespond:
@@ -80,7 +92,7 @@ class TrimAndRespond:
     slots on the requests of the step before. A rack whose hottest inlet is above 27 C requests.
     """
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int | I64) -> None:
         """Nothing to forget: the setpoint is part of the simulator's state."""
 
     def act(self, view: View) -> Actions:
@@ -111,7 +123,7 @@ class FixedSetpoint:
     def __init__(self, setpoint_c: float | str) -> None:
         self._setpoint_c = setpoint_c
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int | I64) -> None:
         """Nothing to forget."""
 
     def act(self, view: View) -> Actions:
@@ -140,7 +152,7 @@ class Lookahead:
     def __init__(self, hours: float) -> None:
         self._hours = hours
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int | I64) -> None:
         """Nothing to forget."""
 
     def act(self, view: View) -> Actions:
@@ -162,7 +174,7 @@ class GreedyCarbon:
     def __init__(self, hours: float = 24.0) -> None:
         self._hours = hours
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int | I64) -> None:
         """Nothing to forget."""
 
     def act(self, view: View) -> Actions:
@@ -186,7 +198,7 @@ class PerAgent:
     def __init__(self, load: Controller, cooling: Controller, battery: Controller) -> None:
         self._load, self._cooling, self._battery = load, cooling, battery
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int | I64) -> None:
         """Reset each with the same seed."""
         for controller in (self._load, self._cooling, self._battery):
             controller.reset(seed)

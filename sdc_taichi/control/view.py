@@ -65,6 +65,8 @@ class View:
     """Inputs of the step to come."""
     forecast: Callable[[float], Forecast]
     """Inputs of the coming hours, the step to come first."""
+    drivers: Drivers
+    """Inputs of all steps; a controller that reads on sees the future."""
     fleet: Fleet
     sizing: Sizing
     limits: Limits
@@ -103,11 +105,11 @@ def viewer(sim: Simulator) -> Callable[[StepResult | None], View]:
     Args:
         sim: a simulator that has been reset.
     """
-    drivers, step_h = sim.drivers, sim.step_h
+    step_h = sim.step_h
     limits, sizing = limits_of(sim.fleet), sim.sizing
 
     def look(last: StepResult | None) -> View:
-        state = sim.state
+        state, drivers = sim.state, sim.drivers
         first = drivers.start + state.step
 
         def forecast(hours: float) -> Forecast:
@@ -121,6 +123,7 @@ def viewer(sim: Simulator) -> Callable[[StepResult | None], View]:
             state=state,
             now=drivers.at(state.step),
             forecast=forecast,
+            drivers=drivers,
             fleet=sim.fleet,
             sizing=sizing,
             limits=limits,

@@ -10,7 +10,6 @@ import calendar
 import hashlib
 import json
 import math
-import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sdc_taichi.errors import DataError
+from sdc_taichi.errors import DataError, SdcError
 from sdc_taichi.exogenous.series import MINUTES_PER_YEAR, FloatArray, Series
+from sdc_taichi.whole_file import whole_file
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -384,16 +384,11 @@ def write_parquet(
     table = pa.table(dict(columns)).replace_schema_metadata(
         {METADATA_KEY: json.dumps({"format": FORMAT, **metadata}).encode()}
     )
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            pq.write_table(table, part)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error})") from None
+        with whole_file(path, parents=True) as file:
+            pq.write_table(table, file)
+    except SdcError as error:
+        raise DataError(str(error)) from None
 
 
 def read_metadata(path: Path) -> dict[str, Any] | None:

@@ -141,9 +141,11 @@ def balanced_load(
     Servers and CRAC fans heat the air: T_ret = T_sup + P_it/(rho cp V_crac), Q = P_it + P_fan.
 
     Returns:
-        Return temperature C and cooling load W, each (B,).
+        Return temperature C, that of the supply without airflow, and cooling load W, each (B,).
     """
-    return supply_c + it_w / (air_j_per_m3_k * crac_flow_m3s), it_w + crac_fan_w
+    flows = crac_flow_m3s > 0
+    rise_k = np.where(flows, it_w, 0.0) / np.where(flows, air_j_per_m3_k * crac_flow_m3s, 1.0)
+    return supply_c + rise_k, it_w + crac_fan_w
 
 
 def released_load(

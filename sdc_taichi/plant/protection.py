@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Values = Array | float
-Status = NDArray[np.int8]
+from sdc_taichi.types import F64, Status
+
+Values = F64 | float
 
 NORMAL, THROTTLED, TRIPPED = 0, 1, 2
 """Status of a rack."""
 
 
 def protect(
-    status: Status, inlet_max_c: Array, *, limit_c: Values, trip_c: Values, restart_c: Values
+    status: Status, inlet_max_c: F64, *, limit_c: Values, trip_c: Values, restart_c: Values
 ) -> Status:
     """Status of each rack after its hottest inlet has been seen.
 
@@ -40,7 +39,7 @@ def protect(
     return np.where(stays_off, TRIPPED, called_for).astype(np.int8)
 
 
-def capacity(status: Status, throttle_share: Values) -> Array:
+def capacity(status: Status, throttle_share: Values) -> F64:
     """Utilisation each rack may reach: 1, ``throttle_share`` throttled, and 0 tripped, (R,).
 
     Args:

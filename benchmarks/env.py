@@ -1,0 +1,94 @@
+"""Environment steps per second with full observations and rewards, in one run.
+
+    python benchmarks/env.py [--quick] [--preset corrected] [--transient]
+
+For each number of environments N: the native batch (``vector_env``: three agents, dict of arrays),
+the same through ``gym.make_vec`` (joint agent), and the same loop over single environments in
+Gymnasium's ``SyncVectorEnv``, which is the peer. Figures are environment steps per second of wall
+time, best of several runs; "to sync" is the ratio of the native batch to the peer at that N, whose
+rate beyond SYNC_MOST environments is that at SYNC_MOST. The released SustainDC does 680 steps/s on
+one core of such a machine (its ``sustaindc_env.py`` with random actions, measured by us).
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+
+import gymnasium as gym
+import numpy as np
+
+import sdc_taichi
+
+SIZES = (1, 64, 1024, 4096, 16384)
+QUICK_SIZES = (1, 8)
+SYNC_MOST = 64
+RELEASED_PER_S = 680.0
+
+
+def rate(step: Callable[[], object], num_envs: int, seconds: float) -> float:
+    """Best environment steps per second over three runs."""
+    for _ in range(3):
+        step()
+    best = 0.0
+    for _ in range(3):
+        done, start = 0, time.perf_counter()
+        while (spent := time.perf_counter() - start) < seconds or done == 0:
+            step()
+            done += 1
+        best = max(best, done * num_envs / spent)
+    return best
+
+
+def native(config: sdc_taichi.DataCenterConfig, num_envs: int, seconds: float) -> float:
+    """Rate of the multi-agent batch."""
+    env = sdc_taichi.vector_env(num_envs, config)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    actions = [{a: rng.integers(0, 3, num_envs) for a in env.possible_agents} for _ in range(8)]
+    turn = iter(range(10**12))
+    found = rate(lambda: env.step(actions[next(turn) % 8]), num_envs, seconds)
+    env.close()
+    return found
+
+
+def joint(
+    config: sdc_taichi.DataCenterConfig, num_envs: int, seconds: float, mode: str | None
+) -> float:
+    """Rate of Gymnasium's joint environment; mode None is the native batch."""
+    env = gym.make_vec(
+        "sdc_taichi/Joint-v0", num_envs=num_envs, vectorization_mode=mode, config=config
+    )
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(8)]
+    turn = iter(range(10**12))
+    found = rate(lambda: env.step(actions[next(turn) % 8]), num_envs, seconds)
+    env.close()
+    return found
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, to see that it runs")
+    parser.add_argument("--preset", default="corrected")
+    parser.add_argument("--transient", action="store_true", help="halls with thermal memory")
+    given = parser.parse_args()
+    overrides = ["simulation.thermal=transient"] if given.transient else []
+    config = sdc_taichi.load_config(given.preset, overrides)
+    seconds = 0.05 if given.quick else 1.0
+    print(f"{'N':>6} {'vector_env':>12} {'make_vec':>12} {'sync':>10} {'to sync':>8} {'to 680/s':>9}")
+    peer = 0.0
+    for num_envs in QUICK_SIZES if given.quick else SIZES:
+        batch = native(config, num_envs, seconds)
+        vector = joint(config, num_envs, seconds, None)
+        if num_envs <= SYNC_MOST:
+            peer = joint(config, num_envs, seconds, "sync")
+        print(
+            f"{num_envs:>6} {batch:>12,.0f} {vector:>12,.0f} {peer:>10,.0f} "
+            f"{batch / peer:>8.1f} {batch / RELEASED_PER_S:>9.0f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,393 @@
+"""Episodes of many data centers at once: what all environments are thin covers of.
+
+A step decodes actions, lets a named controller play what nobody learns, advances the simulator, and
+takes rewards and observations from the view after the step. Arrays have the environments first.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from sdc_taichi.config import DataCenterConfig, first_step_day, load_config
+from sdc_taichi.control import Idle, View, make_controller, viewer
+from sdc_taichi.envs.features import AGENTS, Observer
+from sdc_taichi.envs.options import EnvOptions
+from sdc_taichi.envs.released import ReleasedObserver
+from sdc_taichi.envs.rewards import Rewards
+from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
+from sdc_taichi.hall import Precision
+from sdc_taichi.sim import Simulator
+from sdc_taichi.types import F64, I64, Actions, State, StepResult
+
+F32 = npt.NDArray[np.float32]
+Observation = F32 | dict[str, F32]
+"""(B, n), or with the heat map a dict of ``features`` (B, n) and ``heat_map`` (B, rows, racks per
+row, channels)."""
+Source = str | os.PathLike[str] | DataCenterConfig | Sequence[DataCenterConfig]
+
+COMMANDS = {"agent_ls": "load", "agent_dc": "cooling", "agent_bat": "battery"}
+"""Command of ``Actions`` that each agent gives."""
+BATTERY_ORDERS = {"paper": (1.0, 0.0, -1.0), "sustaindc": (1.0, -1.0, 0.0)}
+"""Commands of the battery's discrete actions."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What a step gives."""
+
+    observations: dict[str, Observation]
+    rewards: dict[str, F64]
+    """(B,) by learning agent."""
+    ended: bool
+    """Whether the episodes are over; all have the same length."""
+    result: StepResult
+
+
+class Core:
+    """Data centers that go through episodes together.
+
+    Args:
+        config: a preset, a file, or configs; environment i takes config i modulo their number.
+        options: what agents do, see and get.
+        num_envs: number of environments; None is one per config.
+        precision: of the server kernels.
+
+    Raises:
+        SdcError: a config, option or number that is not valid.
+    """
+
+    def __init__(
+        self,
+        config: Source,
+        options: EnvOptions,
+        num_envs: int | None = None,
+        precision: Precision = "f32",
+    ) -> None:
+        listed = _configs(config)
+        size = len(listed) if num_envs is None else num_envs
+        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+            raise ConfigError(f"num_envs {size!r}: valid is a whole number of at least 1")
+        self.options = options
+        self.agents: tuple[str, ...] = options.agents
+        self.sim = Simulator([listed[i % len(listed)] for i in range(size)], precision=precision)
+        fleet = self.sim.fleet
+        self.num_envs = size
+        self._units = int(fleet.units // size)
+        if np.any(np.diff(fleet.unit_start) != self._units):
+            raise ConfigError(
+                "environments of one batch have the same number of CRAC units; hvac.crac.units "
+                f"is {np.diff(fleet.unit_start).tolist()[:8]}"
+            )
+        self._others = make_controller(options.others, fleet)
+        self._alone = set(self.agents) == set(AGENTS) or isinstance(self._others, Idle)
+        self._rewards = Rewards(options.rewards, options.collaboration, options.tariff)
+        self._observer: Observer | ReleasedObserver
+        if options.observations == "sustaindc":
+            self._observer = ReleasedObserver()
+            self.state_space = _joined([self._observer.spaces[a] for a in AGENTS])
+        else:
+            self._observer = Observer(
+                fleet,
+                agents=AGENTS,
+                features=options.features,
+                ci_leads_h=options.ci_leads_h,
+                weather_leads_h=options.weather_leads_h,
+                forecast_error=options.forecast_error,
+            )
+            self.state_space = self._observer.state_space
+        self._map = Observer(fleet) if options.heat_map else None
+        self.features = {a: self._observer.features[a] for a in self.agents}
+        self.observation_spaces: dict[str, spaces.Space[Any]] = {
+            a: self._observation_space(a) for a in self.agents
+        }
+        self.action_spaces: dict[str, spaces.Space[Any]] = {
+            a: self._action_space(a) for a in self.agents
+        }
+        self._commands = self._discrete_commands()
+        self._steps_per_day = 24 * fleet.steps_per_hour
+        self._steps = options.days * self._steps_per_day
+        self._start_days = np.array(options.start_days())
+        self._rngs: list[np.random.Generator] = []
+        self._look: Any = None
+        self._view: View | None = None
+        self._last: tuple[State, Actions] | None = None
+        self._drawn_from: list[Any] = []
+
+    # --- episodes ---
+
+    def reset(
+        self, seed: int | Sequence[int | None] | None = None, start_day: Any = None
+    ) -> dict[str, Observation]:
+        """Start an episode in all environments.
+
+        Args:
+            seed: environment i takes ``seed + i``, or entry i; None goes on with its generator, or
+                takes one from the system's entropy before the first.
+            start_day: day of the year as ``MM-DD`` or counted from 0, or one for each environment,
+                in place of what the options say.
+
+        Raises:
+            SdcError: a seed or day that is not valid.
+        """
+        self._seed(seed)
+        drawn = [rng.integers(2**63 - 1, size=2) for rng in self._rngs]
+        events, which = np.array(drawn, dtype=np.int64).T
+        days = self._days(start_day, which)
+        self.sim.reset(events, days * self._steps_per_day)
+        self._begin()
+        return self._observe(self.view)
+
+    def _begin(self) -> None:
+        """Start what goes along with the simulator, which has been reset."""
+        self._drawn_from = [rng.bit_generator.state for rng in self._rngs]
+        self._others.reset(self.sim.state.seed)
+        if self._look is None:
+            self._look = viewer(self.sim)
+        self._last = None
+        self._view = view = self._look(None)
+        self._observer.reset(view, self._rngs)
+        self._rewards.reset(view)
+
+    def step(self, actions: Mapping[str, Any]) -> Step:
+        """Advance all environments.
+
+        Args:
+            actions: one entry per learning agent, (B,) whole numbers, or (B, k) numbers with
+                continuous actions or several CRAC units.
+
+        Raises:
+            SdcError: actions that are missing, too many, or outside their space.
+            RuntimeStateError: before ``reset``, or after the end of the episode.
+        """
+        view = self.view
+        if self.over:
+            raise RuntimeStateError("the episode is over; call reset() first")
+        commands = {COMMANDS[agent]: self._decode(agent, actions) for agent in self.agents}
+        if len(actions) > len(commands):
+            extra = sorted(set(map(str, actions)) - set(self.agents))
+            raise SdcError(f"actions: {extra} do not learn here; valid: {list(self.agents)}")
+        if not self._alone:
+            rest = self._others.act(view)
+            for name in COMMANDS.values():
+                commands.setdefault(name, getattr(rest, name))
+        given = Actions(**commands)
+        result = self.sim.step(given)
+        self._last = (view.state, given)
+        self._view = view = self._look(result)
+        rewards = self._rewards.rewards(result, view)
+        return Step(
+            observations=self._observe(view),
+            rewards={agent: rewards[agent] for agent in self.agents},
+            ended=self.over,
+            result=result,
+        )
+
+    @property
+    def view(self) -> View:
+        """The situation before the next step.
+
+        Raises:
+            RuntimeStateError: before ``reset``.
+        """
+        if self._view is None:
+            raise RuntimeStateError("the environment has not been reset; call reset() first")
+        return self._view
+
+    @property
+    def over(self) -> bool:
+        """Whether an episode has ended and the next has not begun."""
+        return self._view is not None and self._view.state.step >= self._steps
+
+    def state(self) -> F32:
+        """Shared state for centralised critics, (B, m): all features, whoever learns."""
+        if isinstance(self._observer, Observer):
+            return self._observer.state(self.view)
+        found = self._observer.observe(self.view)
+        return np.concatenate([found[agent] for agent in AGENTS], axis=1)
+
+    def terms(self) -> dict[str, F64]:
+        """Reward terms of the last step by name, (B,) each; empty before the first."""
+        last = self.view.last
+        return {} if last is None else self._rewards.terms(last, self.view)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides how the episode goes on, for ``load_state_dict``; picklable."""
+        state, actions = self._last or (self.view.state, None)
+        return {
+            "simulator": self.sim.state_dict(state),
+            "actions": actions,
+            "rewards": self._rewards.state(),
+            "generators": self._drawn_from,
+        }
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
+        """Go on from a ``state_dict`` of environments with the same configs and options.
+
+        Returns:
+            Observations before the next step.
+
+        Raises:
+            SdcError: made by other environments, or incomplete.
+        """
+        missing = sorted({"simulator", "actions", "rewards", "generators"} - set(values))
+        if missing or len(values["generators"]) != self.num_envs:
+            raise SdcError(f"state: missing {missing}, or of another number of environments")
+        self.sim.load_state_dict(values["simulator"])
+        self._rngs = [np.random.Generator(np.random.PCG64()) for _ in range(self.num_envs)]
+        for rng, state in zip(self._rngs, values["generators"], strict=True):
+            rng.bit_generator.state = state
+        self._begin()
+        if values["actions"] is not None:
+            # The last step once more: what agents see of it is no part of the state.
+            self._last = (self.sim.state, values["actions"])
+            self._view = self._look(self.sim.step(values["actions"]))
+        self._rewards.load(values["rewards"])
+        return self._observe(self.view)
+
+    def close(self) -> None:
+        """Let go of the simulator."""
+        self.sim.close()
+
+    # --- spaces and actions ---
+
+    def _observation_space(self, agent: str) -> spaces.Space[Any]:
+        features = self._observer.spaces[agent]
+        if self._map is None:
+            return features
+        return spaces.Dict({"features": features, "heat_map": self._map.heat_map_space})
+
+    def _action_space(self, agent: str) -> spaces.Space[Any]:
+        units = self._units if agent == "agent_dc" else 1
+        if self.options.actions == "continuous":
+            high = self.options.setpoint_change_k if agent == "agent_dc" else 1.0
+            return spaces.Box(-high, high, (units,), dtype=np.float32)
+        return spaces.Discrete(3) if units == 1 else spaces.MultiDiscrete([3] * units)
+
+    def _discrete_commands(self) -> dict[str, F64]:
+        order = self.options.action_order
+        if order is None:
+            models = {c.battery.model for c in self.sim.fleet.configs}
+            order = "sustaindc" if models == {"released"} else "paper"
+        return {
+            "agent_ls": np.array([-1.0, 0.0, 1.0]),
+            "agent_dc": np.array([-1.0, 0.0, 1.0]),
+            "agent_bat": np.array(BATTERY_ORDERS[order]),
+        }
+
+    def _decode(self, agent: str, actions: Mapping[str, Any]) -> F64:
+        """Command of an agent, (B,), or (U,) for the units of all environments."""
+        if agent not in actions:
+            raise SdcError(f"actions: none for {agent}; valid: {list(self.agents)}")
+        given = as_array(actions[agent], f"action of {agent}")
+        space = self.action_spaces[agent]
+        shape = (self.num_envs, *(space.shape or ()))
+        if given.shape != shape:
+            raise SdcError(f"action of {agent}: shape {given.shape}, expected {shape}")
+        if isinstance(space, spaces.Box):
+            if given.dtype.kind not in "iuf":
+                raise SdcError(f"action of {agent}: {given.flat[0]!r}; valid is a number")
+            high = float(space.high[0])
+            # Bounds in f32, as agents have them.
+            if not np.all(np.abs(given) <= high * (1.0 + 1e-6)):
+                wrong = given[~(np.abs(given) <= high * (1.0 + 1e-6))].flat[0]
+                raise SdcError(f"action of {agent}: {wrong}; valid is within {-high:g}..{high:g}")
+            command: F64 = np.clip(given.astype(np.float64).reshape(-1), -high, high)
+            if agent == "agent_dc":
+                command /= np.repeat(self.sim.fleet.values("hvac.setpoint.step_k"), self._units)
+            return command
+        if given.dtype.kind not in "iu" or given.min() < 0 or given.max() > 2:
+            bad = given[(given < 0) | (given > 2)] if given.dtype.kind in "iu" else given
+            raise SdcError(f"action of {agent}: {bad.flat[0]}; valid is 0, 1 or 2")
+        return np.asarray(self._commands[agent][given.reshape(-1)])
+
+    def _observe(self, view: View) -> dict[str, Observation]:
+        found = self._observer.observe(view)
+        if self._map is None:
+            return {agent: found[agent] for agent in self.agents}
+        image = self._map.heat_map(view)
+        return {a: {"features": found[a], "heat_map": image.copy()} for a in self.agents}
+
+    # --- randomness ---
+
+    def _seed(self, seed: int | Sequence[int | None] | None) -> None:
+        if seed is None and not self._rngs:
+            seed = int(np.random.SeedSequence().generate_state(1, np.uint32)[0])
+        if seed is None:
+            return
+        if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
+            listed = list(seed)
+        else:
+            listed = [_checked(seed) + i for i in range(self.num_envs)]
+        if len(listed) != self.num_envs:
+            raise ConfigError(f"seed: {len(listed)} for {self.num_envs} environments")
+        fresh = self._rngs or [np.random.default_rng() for _ in listed]
+        self._rngs = [
+            rng if given is None else np.random.Generator(np.random.PCG64(_checked(given)))
+            for given, rng in zip(listed, fresh, strict=True)
+        ]
+
+    def _days(self, given: Any, drawn: I64) -> I64:
+        """First day of each episode, (B,)."""
+        if given is None:
+            if self.options.start == "fixed":
+                starts = [c.site.start for c in self.sim.fleet.configs]
+                return np.array([first_step_day(s) for s in starts], dtype=np.int64)
+            return np.asarray(self._start_days[drawn % len(self._start_days)], dtype=np.int64)
+        many = isinstance(given, list | tuple | np.ndarray)
+        days = np.array([_day(d) for d in (given if many else [given])], dtype=np.int64)
+        if len(days) not in (1, self.num_envs):
+            raise ConfigError(f"start_day: {len(days)} days for {self.num_envs} environments")
+        return np.broadcast_to(days, (self.num_envs,))
+
+
+def _configs(source: Source) -> list[DataCenterConfig]:
+    if isinstance(source, DataCenterConfig):
+        return [source]
+    if isinstance(source, str | os.PathLike):
+        return [load_config(source)]
+    listed = list(source)
+    if not listed:
+        raise ConfigError("config: an empty list; valid is at least one data center")
+    return listed
+
+
+def as_array(given: Any, name: str) -> npt.NDArray[Any]:
+    """Numbers of any kind as an array.
+
+    Raises:
+        SdcError: nested lists of differing lengths.
+    """
+    try:
+        return np.asarray(given)
+    except ValueError as error:
+        raise SdcError(f"{name}: is no array ({error})") from None
+
+
+def _joined(parts: Sequence[spaces.Box]) -> spaces.Box:
+    low, high = (np.concatenate([getattr(p, name) for p in parts]) for name in ("low", "high"))
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def _checked(seed: Any) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**63:
+        raise ConfigError(f"seed {seed!r}: valid is an integer of 0..2**63 - 1")
+    return int(seed)
+
+
+def _day(given: Any) -> int:
+    if isinstance(given, int | np.integer) and not isinstance(given, bool):
+        if 0 <= given < 365:
+            return int(given)
+    elif isinstance(given, str):
+        try:
+            return first_step_day(given)
+        except ValueError:
+            pass
+    raise ConfigError(f"start_day {given!r}: valid is MM-DD or a day of the year, 0..364")

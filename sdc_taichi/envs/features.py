@@ -1,0 +1,546 @@
+"""Observations: named features with fixed ranges, computed from what a controller may see.
+
+Every feature has a range in its unit that no data and no result changes. A value v is scaled to
+``(v - low) / (high - low)``, 0..1, or, where the range lies evenly about zero, to ``v / high``,
+-1..1. What exceeds the range is cut at it. Nothing looks ahead but the demand of the step to come
+and the forecasts.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from sdc_taichi.control.view import View
+from sdc_taichi.drivers import Drivers
+from sdc_taichi.envs.forecasts import (
+    CI_LEADS_H,
+    F32,
+    PERFECT,
+    WEATHER_LEADS_H,
+    ForecastError,
+    Forecasts,
+)
+from sdc_taichi.errors import ConfigError, RuntimeStateError
+from sdc_taichi.fleet import Fleet
+from sdc_taichi.plant.workload import TASKS_PER_STEP, age_histogram
+from sdc_taichi.sizing import Sizing
+from sdc_taichi.types import F64, I64
+
+
+@dataclass(frozen=True, slots=True)
+class Feature:
+    """One named entry of an observation, or several of one kind side by side."""
+
+    name: str
+    unit: str
+    low: float
+    """In ``unit``; what lies below is cut at it, and above ``high`` alike."""
+    high: float
+    description: str
+    size: int = 1
+
+
+AGENTS = ("agent_ls", "agent_dc", "agent_bat")
+AGE_EDGES_H = (0.0, 6.0, 12.0, 18.0, 24.0)
+"""Lower edges of the age bins; the last is open."""
+UNLIMITED_QUEUE_H = 10.0
+"""Hours of full work that a queue without limit is measured by."""
+TABLE_BYTES = 2**28
+"""Most memory for tables of what depends on time alone; more series are read step by step."""
+_NEGLIGIBLE_TASKS = 1e-9
+"""Left in the queue by rounding; no ages are read off it."""
+
+_CLOCK = ("time_of_day", "time_of_year")
+_CI = ("ci", "ci_forecast")
+_WEATHER = ("outdoor", "outdoor_forecast", "wet_bulb", "wet_bulb_forecast")
+DEFAULT_FEATURES: dict[str, tuple[str, ...]] = {
+    "agent_ls": (
+        *_CLOCK,
+        "workload",
+        "queue",
+        "oldest_age",
+        "mean_age",
+        "age_histogram",
+        *_CI,
+        "ci_change",
+        "outdoor",
+        "outdoor_forecast",
+        "soc",
+    ),
+    "agent_dc": (
+        *_CLOCK,
+        "workload",
+        *_CI,
+        *_WEATHER,
+        "room",
+        "hottest_inlet",
+        "setpoint",
+        "it_energy",
+        "hvac_energy",
+    ),
+    "agent_bat": (*_CLOCK, *_CI, "ci_change", "dc_load", "soc"),
+}
+"""What each agent observes unless told otherwise: the paper's lists (A.1.2, A.2.4, A.3.3), ages,
+weather for the load agent, the work to come for the cooling agent, and the change of the CI."""
+
+HEAT_MAP_FEATURES = (
+    Feature("rack_inlet", "C", 10.0, 50.0, "inlet of the rack, mean over its servers"),
+    Feature("rack_outlet", "C", 10.0, 70.0, "outlet of the rack"),
+    Feature("rack_power", "share", 0.0, 2.0, "IT power over the hall's design power per rack"),
+)
+"""Channels of the heat map; all of the last step."""
+
+
+def catalogue(
+    ci_leads_h: Sequence[float] = CI_LEADS_H,
+    weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
+    units: int = 1,
+) -> tuple[Feature, ...]:
+    """All features in the order of the shared state.
+
+    Args:
+        ci_leads_h: leads of the CI forecast, hours.
+        weather_leads_h: leads of the weather forecasts, hours.
+        units: setpoints side by side.
+    """
+    return (*_CLOCK_FEATURES, *_outside(ci_leads_h, weather_leads_h), *_inside(units))
+
+
+_CLOCK_FEATURES = (
+    Feature("time_of_day", "1", -1.0, 1.0, "sine and cosine of the local time", 2),
+    Feature("time_of_year", "1", -1.0, 1.0, "sine and cosine of the share of the year", 2),
+)
+
+
+def _outside(ci_leads_h: Sequence[float], weather_leads_h: Sequence[float]) -> tuple[Feature, ...]:
+    """Carbon intensity and weather, which depend on time alone."""
+    ci, weather = (", ".join(f"{h:g}" for h in leads) for leads in (ci_leads_h, weather_leads_h))
+    n, k = len(ci_leads_h), len(weather_leads_h)
+    found = (
+        Feature("ci", "g/kWh", 0.0, 1000.0, "carbon intensity of the step to come"),
+        Feature("ci_forecast", "g/kWh", 0.0, 1000.0, f"CI in {ci} h", n),
+        Feature("ci_change", "g/kWh", -300.0, 300.0, f"CI in {ci} h less `ci`", n),
+        Feature("outdoor", "C", -30.0, 50.0, "dry bulb of the step to come"),
+        Feature("outdoor_forecast", "C", -30.0, 50.0, f"dry bulb in {weather} h", k),
+        Feature("wet_bulb", "C", -30.0, 40.0, "wet bulb of the step to come"),
+        Feature("wet_bulb_forecast", "C", -30.0, 40.0, f"wet bulb in {weather} h", k),
+    )
+    return tuple(feature for feature in found if feature.size)
+
+
+def _inside(units: int) -> tuple[Feature, ...]:
+    """Work, hall and battery."""
+    bins = [f"{a:g}-{b:g}" for a, b in pairwise(AGE_EDGES_H)]
+    ages = f"{', '.join(bins)}, over {AGE_EDGES_H[-1]:g} h"
+    limit = f"`workload.queue_limit_h`, or {UNLIMITED_QUEUE_H:g} h of full work where there is none"
+    setpoint = "of the CRAC unit, mean of several" if units == 1 else "of each CRAC unit"
+    return (
+        Feature("workload", "share", 0.0, 1.0, "work that arrives in the step to come"),
+        Feature("queue", "share", 0.0, 1.0, f"queued work over {limit}"),
+        Feature("oldest_age", "h", 0.0, 24.0, "age of the oldest queued work"),
+        Feature("mean_age", "h", 0.0, 24.0, "mean age of queued work"),
+        Feature("age_histogram", "share", 0.0, 1.0, f"of the queue by age: {ages}", 5),
+        Feature("room", "C", 10.0, 60.0, "return air of the last step"),
+        Feature("hottest_inlet", "C", 10.0, 50.0, "hottest server inlet of the last step"),
+        Feature("setpoint", "C", 10.0, 30.0, f"supply setpoint {setpoint}", units),
+        Feature("it_energy", "share", 0.0, 1.2, "IT energy of the last step over design"),
+        Feature("hvac_energy", "share", 0.0, 1.2, "HVAC energy of the last step over design"),
+        Feature("dc_load", "share", 0.0, 1.2, "IT and HVAC power of the last step over design"),
+        Feature("soc", "share", 0.0, 1.0, "state of charge; 0 without a battery"),
+    )
+
+
+def bounds(features: Sequence[Feature]) -> tuple[F32, F32]:
+    """Lowest and highest scaled value of each entry, (n,) each."""
+    low = np.concatenate([np.full(f.size, -1.0 if _signed(f) else 0.0) for f in features])
+    return low.astype(np.float32), np.ones(len(low), dtype=np.float32)
+
+
+def space(features: Sequence[Feature]) -> Box:
+    """The space of an observation made of ``features``."""
+    return Box(*bounds(features), dtype=np.float32)
+
+
+def select(
+    chosen: Mapping[str, Sequence[str]] | None, known: Sequence[Feature]
+) -> dict[str, tuple[Feature, ...]]:
+    """Features of each agent by name; agents not mentioned keep the default.
+
+    Raises:
+        ConfigError: an unknown agent or feature, a feature named twice, or no feature.
+    """
+    given = dict(chosen or {})
+    for agent in given:
+        if agent not in AGENTS:
+            raise ConfigError(f"features: unknown agent {agent!r}; {_nearest(agent, AGENTS)}")
+    by_name = {feature.name: feature for feature in known}
+    out: dict[str, tuple[Feature, ...]] = {}
+    for agent in AGENTS:
+        names = given.get(agent, [n for n in DEFAULT_FEATURES[agent] if n in by_name])
+        if isinstance(names, str) or not names:
+            raise ConfigError(f"features of {agent}: {names!r}; valid is a list of names")
+        for name in names:
+            if name not in by_name:
+                raise ConfigError(
+                    f"features of {agent}: unknown {name!r}; {_nearest(str(name), list(by_name))}"
+                )
+        twice = next((name for name in names if list(names).count(name) > 1), None)
+        if twice is not None:
+            raise ConfigError(f"features of {agent}: {twice!r} is named twice")
+        out[agent] = tuple(by_name[name] for name in names)
+    return out
+
+
+class Observer:
+    """Observations of each agent, the shared state and the heat map of a fleet.
+
+    Args:
+        fleet: the data centers.
+        agents: who observes; the shared state is the same whoever does.
+        features: names of the features of each agent; None is ``DEFAULT_FEATURES``.
+        ci_leads_h: leads of the CI forecast, rising multiples of the step.
+        weather_leads_h: leads of the weather forecasts, likewise.
+        forecast_error: how forecasts err.
+
+    Attributes:
+        features: features of each agent, in the order of its observation.
+        spaces: space of each agent's observation.
+        state_features: all features, in the order of the shared state.
+        state_space: space of the shared state.
+
+    Raises:
+        ConfigError: an unknown agent or feature, or leads that are not valid.
+    """
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        *,
+        agents: Sequence[str] = AGENTS,
+        features: Mapping[str, Sequence[str]] | None = None,
+        ci_leads_h: Sequence[float] = CI_LEADS_H,
+        weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
+        forecast_error: ForecastError = PERFECT,
+    ) -> None:
+        forecasts = Forecasts(
+            fleet.steps_per_hour,
+            ci_leads_h=ci_leads_h,
+            weather_leads_h=weather_leads_h,
+            error=forecast_error,
+        )
+        self._fleet = fleet
+        per_dc = np.diff(fleet.unit_start)
+        self._units = int(per_dc[0]) if np.all(per_dc == per_dc[0]) else 1
+        self.state_features = catalogue(ci_leads_h, weather_leads_h, self._units)
+        self.state_space = space(self.state_features)
+        for agent in agents:
+            if agent not in AGENTS:
+                raise ConfigError(f"agents: unknown {agent!r}; {_nearest(str(agent), AGENTS)}")
+        chosen = select(features, self.state_features)
+        self.features = {agent: chosen[agent] for agent in AGENTS if agent in agents}
+        self.spaces = {agent: space(found) for agent, found in self.features.items()}
+
+        inside = _inside(self._units)
+        self._at, width = _places(self.state_features)
+        self._columns = {
+            agent: np.concatenate([np.arange(width)[self._at[f.name]] for f in found])
+            for agent, found in self.features.items()
+        }
+        self._outside = _Outside(_outside(ci_leads_h, weather_leads_h), forecasts)
+        self._row, self._inside_width = _places(inside)
+        self._width = width
+        sizes = [f.size for f in inside]
+        low = np.repeat([f.low for f in inside], sizes)
+        span = np.repeat([f.high - f.low for f in inside], sizes)
+        self._scale = (1.0 / span).astype(np.float32)[:, None]
+        self._shift = (-low / span).astype(np.float32)[:, None]
+
+        per_hour = fleet.steps_per_hour
+        self._day = _circle(24 * per_hour)
+        self._year = _circle(365 * 24 * per_hour)
+        limit_h = fleet.values("workload.queue_limit_h")
+        limit_h = np.where(np.isnan(limit_h), UNLIMITED_QUEUE_H, limit_h)
+        self._per_task = 1.0 / (limit_h * per_hour * TASKS_PER_STEP)
+        self._edges_steps = np.asarray(AGE_EDGES_H) * per_hour
+        self._design: _Design | None = None
+        self._seen: View | None = None
+        self._built: F32 = np.empty((0, 0), dtype=np.float32)
+
+    def reset(self, view: View, rngs: Sequence[np.random.Generator]) -> None:
+        """Start an episode.
+
+        Args:
+            view: the view before the first step.
+            rngs: one generator per data center, drawn from if forecasts err.
+
+        Raises:
+            ConfigError: another number of generators than of data centers.
+        """
+        self._outside.reset(view.drivers, rngs)
+        self._design = _design(view.sizing, view.step_h)
+        self._seen = None
+
+    def observe(self, view: View) -> dict[str, F32]:
+        """Observation of each agent, (B, n) each.
+
+        Raises:
+            RuntimeStateError: before ``reset``.
+        """
+        everything = self._everything(view)
+        return {a: everything.take(columns, axis=1) for a, columns in self._columns.items()}
+
+    def state(self, view: View) -> F32:
+        """All features side by side, (B, m).
+
+        Raises:
+            RuntimeStateError: before ``reset``.
+        """
+        return self._everything(view).copy()
+
+    def heat_map(self, view: View) -> F32:
+        """Racks of the last step as an image, 0..1, (B, rows, racks per row, channels).
+
+        Float rather than bytes: 8 bits would leave steps of 0.16 K. Before the first step all air
+        has the temperature of the setpoint and no rack draws power.
+
+        Raises:
+            ConfigError: halls that differ in rows or racks per row.
+        """
+        shape = _hall_shape(self._fleet)
+        racks = shape[0] * shape[1]
+        channels = np.empty((view.size, racks, len(HEAT_MAP_FEATURES)), dtype=np.float32)
+        if view.last is None:
+            channels[...] = _setpoint_mean_c(view)[:, None, None]
+            channels[:, :, 2] = 0.0
+        else:
+            design_w = view.sizing.it_w[:, None] / racks
+            channels[:, :, 0] = view.last.rack_inlet_c.reshape(view.size, racks)
+            channels[:, :, 1] = view.last.rack_outlet_c.reshape(view.size, racks)
+            channels[:, :, 2] = view.last.rack_power_w.reshape(view.size, racks) / design_w
+        for k, feature in enumerate(HEAT_MAP_FEATURES):
+            channels[:, :, k] = _scaled(channels[:, :, k], feature)
+        return channels.reshape(view.size, *shape, len(HEAT_MAP_FEATURES))
+
+    @property
+    def heat_map_space(self) -> Box:
+        """Space of the heat map of one data center.
+
+        Raises:
+            ConfigError: halls that differ in rows or racks per row.
+        """
+        shape = (*_hall_shape(self._fleet), len(HEAT_MAP_FEATURES))
+        return Box(0.0, 1.0, shape, dtype=np.float32)
+
+    def _everything(self, view: View) -> F32:
+        """All features of a view, scaled; kept until the next view."""
+        if self._seen is not view:
+            self._built = self._build(view)
+            self._seen = view
+        return self._built
+
+    def _build(self, view: View) -> F32:
+        design = self._design
+        if design is None:
+            raise RuntimeStateError("the observer has not been reset; call reset() first")
+        index = view.drivers.start + view.state.step
+        out = np.empty((view.size, self._width), dtype=np.float32)
+        out[:, 0:2] = self._day.take(index % len(self._day), axis=0)
+        out[:, 2:4] = self._year.take(index % len(self._year), axis=0)
+        out[:, 4 : -self._inside_width] = self._outside.at(index, view.state.step)
+        _put(out, self._width - self._inside_width, self._inside(view, design))
+        return out
+
+    def _inside(self, view: View, design: _Design) -> F32:
+        """Scaled work, hall and battery, (n, B): one contiguous row each."""
+        state, at = view.state, self._row
+        out = np.empty((self._inside_width, view.size), dtype=np.float32)
+        waiting = state.queue[:, -1]
+        some = waiting > _NEGLIGIBLE_TASKS
+        shares = (
+            age_histogram(state.queue, self._edges_steps) / np.where(some, waiting, 1.0)[:, None]
+        )
+        out[at["age_histogram"]] = np.where(some, shares.T, 0.0)
+        out[at["workload"]] = view.now.demand
+        out[at["queue"]] = waiting * self._per_task
+        out[at["soc"]] = state.stored_kwh * design.per_battery_kwh
+        same = len(state.setpoint_c) == view.size * self._units
+        out[at["setpoint"]] = (
+            state.setpoint_c.reshape(view.size, self._units).T if same else _setpoint_mean_c(view)
+        )
+        for name, values in self._measured(view, design).items():
+            out[at[name]] = values
+        out *= self._scale
+        out += self._shift
+        return np.asarray(np.clip(out, 0.0, 1.0, out=out))
+
+    def _measured(self, view: View, design: _Design) -> dict[str, F64]:
+        """What the last step left; before the first, a hall at rest at the setpoint."""
+        last = view.last
+        if last is None:
+            zero, setpoint_c = np.zeros(view.size), _setpoint_mean_c(view)
+            energies = dict.fromkeys(("it_energy", "hvac_energy", "dc_load"), zero)
+            ages = dict.fromkeys(("oldest_age", "mean_age"), zero)
+            return {**energies, **ages, "room": setpoint_c, "hottest_inlet": setpoint_c}
+        return {
+            "oldest_age": last.oldest_age_h,
+            "mean_age": last.mean_age_h,
+            "room": last.return_c,
+            "hottest_inlet": last.inlet_max_c,
+            "it_energy": last.it_kwh * design.per_it_kwh,
+            "hvac_energy": last.hvac_kwh * design.per_hvac_kwh,
+            "dc_load": last.facility_kwh * design.per_facility_kwh,
+        }
+
+
+class _Outside:
+    """Scaled carbon intensity and weather: a table of all steps if it is small, else step by step.
+
+    Args:
+        features: what ``_outside`` gives.
+        forecasts: of the same leads.
+    """
+
+    def __init__(self, features: Sequence[Feature], forecasts: Forecasts) -> None:
+        self._features = {f.name: f for f in features}
+        self._at, self._width = _places(features)
+        self._forecasts = forecasts
+
+    def reset(self, drivers: Drivers, rngs: Sequence[np.random.Generator]) -> None:
+        """Start an episode."""
+        if self._forecasts.reset(drivers, rngs):
+            self._rows, self._offset, self._length = self._tabulated(drivers)
+
+    def at(self, index: I64, step: int) -> F32:
+        """Entries of all data centers, (B, n)."""
+        if len(self._rows):
+            return np.asarray(self._rows.take(self._offset + index % self._length, axis=0))
+        return self._scaled(*self._forecasts.look(index, step))
+
+    def _tabulated(self, drivers: Drivers) -> tuple[F32, I64, I64]:
+        """Rows of every distinct site, end to end, and where each data center's begin and end."""
+        ci, others = drivers.ci_g_per_kwh, (drivers.outdoor_c, drivers.wet_bulb_c)
+        alike = all(
+            np.array_equal(ci.offset, t.offset) and np.array_equal(ci.length, t.length)
+            for t in others
+        )
+        _, first, which = np.unique(ci.offset, return_index=True, return_inverse=True)
+        lengths = ci.length[first]
+        offsets = np.cumsum(lengths) - lengths
+        small = int(lengths.sum()) * self._width * 4 <= TABLE_BYTES
+        if not (alike and small and self._forecasts.perfect):
+            return np.empty((0, self._width), dtype=np.float32), ci.offset, ci.length
+        parts = [
+            self._scaled(*self._forecasts.truth(np.arange(n), np.full(n, dc)))
+            for dc, n in zip(first, lengths, strict=True)
+        ]
+        return np.concatenate(parts), offsets[which], ci.length
+
+    def _scaled(self, ci: F32, outdoor: F32, wet_bulb: F32) -> F32:
+        """Entries (n, width) from the present and the leads, (1 + k, n) each."""
+        out = np.empty((ci.shape[1], self._width), dtype=np.float32)
+        found = {
+            "ci": ci[:1],
+            "ci_forecast": ci[1:],
+            "ci_change": ci[1:] - ci[:1],
+            "outdoor": outdoor[:1],
+            "outdoor_forecast": outdoor[1:],
+            "wet_bulb": wet_bulb[:1],
+            "wet_bulb_forecast": wet_bulb[1:],
+        }
+        for name, feature in self._features.items():
+            _put(out, self._at[name].start, _scaled(found[name], feature))
+        return out
+
+
+def _put(out: F32, first: int, rows: F32) -> None:
+    """Write rows (n, B) into columns of ``out`` (B, m): one by one, which suits the cache."""
+    for column, row in enumerate(rows, first):
+        out[:, column] = row
+
+
+def _scaled(values: F32, feature: Feature) -> F32:
+    if _signed(feature):
+        return np.asarray(np.clip(values / feature.high, -1.0, 1.0))
+    return np.asarray(np.clip((values - feature.low) / (feature.high - feature.low), 0.0, 1.0))
+
+
+def _places(features: Sequence[Feature]) -> tuple[dict[str, slice], int]:
+    """Entries of each feature among those of all, and the number of entries."""
+    ends = np.cumsum([0, *(f.size for f in features)])
+    starts = zip(features, ends, strict=False)
+    return {f.name: slice(int(start), int(start) + f.size) for f, start in starts}, int(ends[-1])
+
+
+@dataclass(frozen=True, slots=True)
+class _Design:
+    """Inverse of the energies of a step at the design point and of the battery, each (B,)."""
+
+    per_it_kwh: F64
+    per_hvac_kwh: F64
+    per_facility_kwh: F64
+    per_battery_kwh: F64
+
+
+def _design(sizing: Sizing, step_h: float) -> _Design:
+    def inverse(kwh: F64) -> F64:
+        return np.where(kwh > 0, 1.0 / np.where(kwh > 0, kwh, 1.0), 0.0)
+
+    kwh_per_w = step_h / 1e3
+    return _Design(
+        per_it_kwh=inverse(sizing.it_w * kwh_per_w),
+        per_hvac_kwh=inverse((sizing.facility_w - sizing.it_w) * kwh_per_w),
+        per_facility_kwh=inverse(sizing.facility_w * kwh_per_w),
+        per_battery_kwh=inverse(sizing.battery_kwh),
+    )
+
+
+def _circle(steps: int) -> F32:
+    """Sine and cosine of each step of a period, (steps, 2)."""
+    angle = 2.0 * np.pi * np.arange(steps) / steps
+    return np.stack([np.sin(angle), np.cos(angle)], axis=1).astype(np.float32)
+
+
+def _setpoint_mean_c(view: View) -> F64:
+    """Mean setpoint of the CRAC units, (B,)."""
+    first = view.fleet.unit_start
+    return np.asarray(np.add.reduceat(view.state.setpoint_c, first[:-1]) / np.diff(first))
+
+
+def _hall_shape(fleet: Fleet) -> tuple[int, int]:
+    shapes = [(c.hall.rows, c.hall.racks_per_row) for c in fleet.configs]
+    for config, shape in zip(fleet.configs, shapes, strict=True):
+        if shape != shapes[0]:
+            raise ConfigError(
+                f"heat map: {config.name} has {shape[0]} x {shape[1]} racks, "
+                f"{fleet.configs[0].name} has {shapes[0][0]} x {shapes[0][1]}; "
+                "valid is one shape for all"
+            )
+    return shapes[0]
+
+
+def _signed(feature: Feature) -> bool:
+    return feature.low == -feature.high
+
+
+def _nearest(name: str, valid: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    return f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(valid)}"
+
+
+def table_markdown() -> str:
+    """The default features as a Markdown table; a dot marks who observes what."""
+    lines = [
+        "| feature | entries | what it is | unit | range | load | cooling | battery |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for f in catalogue():
+        seen = [" " if f.name not in DEFAULT_FEATURES[agent] else "●" for agent in AGENTS]
+        cells = (f"`{f.name}`", str(f.size), f.description, f.unit, f"{f.low:g}..{f.high:g}", *seen)
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"

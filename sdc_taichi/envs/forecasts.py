@@ -1,0 +1,252 @@
+"""Carbon intensity and weather, now and some hours ahead: known exactly, or with errors.
+
+The error of the forecast that is issued at time t for t + h is ``s (W(t + h) - W(t))`` with a
+standard deviation s at 24 h and a random walk W of unit variance per 24 h. It is zero for the
+present, grows with the square root of the lead, and a later forecast of the same hour differs from
+an earlier one by what the walk has done in between. W is a realisation of each environment: it
+depends on the generator given at reset and on the step alone.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.drivers import Drivers, Table
+from sdc_taichi.errors import ConfigError, RuntimeStateError
+from sdc_taichi.types import F64, I64
+
+F32 = npt.NDArray[np.float32]
+
+CI_LEADS_H = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0)
+WEATHER_LEADS_H = (3.0, 6.0, 12.0, 24.0)
+LONGEST_LEAD_H = 8760.0
+_DRAWN_STEPS = 128
+_ALL = slice(None)
+
+
+@dataclass(frozen=True, slots=True)
+class ForecastError:
+    """Standard deviations of the error at a lead of 24 h; zero is perfect foresight.
+
+    Raises:
+        ConfigError: a value that is negative or not finite.
+    """
+
+    ci_share: float = 0.0
+    """Of the carbon intensity, as a share of its true value; forecasts are cut at zero."""
+    temperature_k: float = 0.0
+    """Of dry and wet bulb, which err alike, so that the wet bulb stays below."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ("ci_share", "temperature_k"):
+            value: Any = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+                raise ConfigError(f"forecast error {name}: {value!r} is no number")
+            if not 0.0 <= value < np.inf:
+                raise ConfigError(
+                    f"forecast error {name}: {value:g}; valid is a finite number from 0 on"
+                )
+
+
+PERFECT = ForecastError()
+
+
+def lead_steps(name: str, leads_h: Sequence[float], steps_per_hour: int) -> I64:
+    """Leads in steps, (n,).
+
+    Raises:
+        ConfigError: leads that do not rise, or that are no positive multiples of the step.
+    """
+    if isinstance(leads_h, str) or any(
+        isinstance(h, bool) or not isinstance(h, int | float | np.number) for h in leads_h
+    ):
+        raise ConfigError(f"{name} {leads_h!r}: valid is a list of hours")
+    last = 0
+    steps = []
+    for hours in leads_h:
+        wanted = float(hours) * steps_per_hour
+        longest = LONGEST_LEAD_H * steps_per_hour
+        if not (0.0 < wanted <= longest and abs(wanted - round(wanted)) < 1e-6):
+            raise ConfigError(
+                f"{name}: {hours:g} h; valid is a positive multiple of the step, "
+                f"{60 // steps_per_hour} min, up to {LONGEST_LEAD_H:g} h"
+            )
+        if round(wanted) <= last:
+            raise ConfigError(f"{name}: {hours:g} h after {last / steps_per_hour:g} h; leads rise")
+        last = round(wanted)
+        steps.append(last)
+    return np.array(steps, dtype=np.int64)
+
+
+class Forecasts:
+    """Carbon intensity, dry bulb and wet bulb of a fleet, the present first, then the leads.
+
+    Args:
+        steps_per_hour: of the simulation.
+        ci_leads_h: leads of the carbon intensity, rising multiples of the step.
+        weather_leads_h: leads of both temperatures, likewise.
+        error: how forecasts err.
+
+    Raises:
+        ConfigError: leads that are not valid.
+    """
+
+    def __init__(
+        self,
+        steps_per_hour: int,
+        *,
+        ci_leads_h: Sequence[float] = CI_LEADS_H,
+        weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
+        error: ForecastError = PERFECT,
+    ) -> None:
+        now = np.zeros(1, dtype=np.int64)
+        self._ci_leads = np.append(now, lead_steps("ci_leads_h", ci_leads_h, steps_per_hour))
+        self._weather_leads = np.append(
+            now, lead_steps("weather_leads_h", weather_leads_h, steps_per_hour)
+        )
+        self._error = error
+        self._step_h = 1.0 / steps_per_hour
+        self._tables: tuple[Table, ...] = ()
+        self._walks: _Walks | None = None
+
+    def reset(self, drivers: Drivers, rngs: Sequence[np.random.Generator]) -> bool:
+        """Start an episode.
+
+        Args:
+            drivers: inputs of the fleet.
+            rngs: one generator per data center; with errors, each is drawn from once, else not.
+
+        Returns:
+            Whether the series are others than in the episode before.
+
+        Raises:
+            ConfigError: another number of generators than of data centers.
+        """
+        if not self.perfect and len(rngs) != drivers.size:
+            raise ConfigError(
+                f"{len(rngs)} random generators for {drivers.size} data centers; valid is one each"
+            )
+        tables = (drivers.ci_g_per_kwh, drivers.outdoor_c, drivers.wet_bulb_c)
+        new = not all(map(operator.is_, tables, self._tables)) or not self._tables
+        if new:
+            self._tables = tables
+            self._ci = _Series(tables[0], self._ci_leads)
+            self._outdoor = _Series(tables[1], self._weather_leads)
+            self._wet_bulb = _Series(tables[2], self._weather_leads)
+        self._walks = None
+        if not self.perfect:
+            ahead = int(max(self._ci_leads[-1], self._weather_leads[-1]))
+            self._walks = _Walks(rngs, self._step_h, ahead)
+        return new
+
+    @property
+    def perfect(self) -> bool:
+        """Whether forecasts do not err."""
+        return self._error == PERFECT
+
+    def truth(self, index: I64, dc: I64 | slice = _ALL) -> tuple[F32, F32, F32]:
+        """Carbon intensity (1 + k, n) in g/kWh, dry and wet bulb (1 + l, n) in C, without error.
+
+        Args:
+            index: steps since the start of the year, (n,).
+            dc: data center of each index.
+        """
+        if not self._tables:
+            raise RuntimeStateError("the forecasts have not been reset; call reset() first")
+        return self._ci.at(index, dc), self._outdoor.at(index, dc), self._wet_bulb.at(index, dc)
+
+    def look(self, index: I64, step: int) -> tuple[F32, F32, F32]:
+        """As ``truth`` for all data centers, with the errors of forecasts issued now.
+
+        Args:
+            index: steps since the start of the year, (B,).
+            step: steps since reset.
+
+        Raises:
+            RuntimeStateError: before ``reset``, or, with errors, a step before one seen already.
+        """
+        ci, outdoor, wet_bulb = self.truth(index)
+        if self._walks is None:
+            return ci, outdoor, wet_bulb
+        self._walks.reach(step)
+        if self._error.ci_share > 0:
+            ci *= 1.0 + float(self._error.ci_share) * self._walks.moved(0, step, self._ci_leads)
+            np.maximum(ci, 0.0, out=ci)
+        if self._error.temperature_k > 0:
+            error = float(self._error.temperature_k) * self._walks.moved(
+                1, step, self._weather_leads
+            )
+            outdoor += error
+            wet_bulb += error
+        return ci, outdoor, wet_bulb
+
+
+class _Series:
+    """A table in f32 with each series continued past its end, so that no lead wraps."""
+
+    def __init__(self, table: Table, leads: I64) -> None:
+        offsets, first, which = np.unique(table.offset, return_index=True, return_inverse=True)
+        lengths = table.length[first]
+        ahead = int(leads[-1])
+        parts = [
+            np.resize(table.values[start : start + length].astype(np.float32), length + ahead)
+            for start, length in zip(offsets, lengths, strict=True)
+        ]
+        starts = np.cumsum([0, *(len(part) for part in parts[:-1])])
+        self._values = np.concatenate(parts)
+        self._offset = starts[which]
+        self._length = table.length
+        self._leads = leads
+
+    def at(self, index: I64, dc: I64 | slice) -> F32:
+        """Entry ``index`` of data center ``dc`` and those at its leads, (1 + k, n)."""
+        first = self._offset[dc] + index % self._length[dc]
+        out = np.empty((len(self._leads), len(first)), dtype=np.float32)
+        for row, lead in zip(out, self._leads, strict=True):
+            row[:] = self._values.take(first + lead)
+        return out
+
+
+class _Walks:
+    """Two random walks per environment, of unit variance per 24 h, from reset on.
+
+    Args:
+        rngs: one generator per environment.
+        step_h: time step.
+        ahead: longest lead in steps.
+    """
+
+    def __init__(self, rngs: Sequence[np.random.Generator], step_h: float, ahead: int) -> None:
+        # A stream of its own: what else is drawn from the generator leaves the walk alone.
+        keys = [int(rng.integers(2**63)) for rng in rngs]
+        self._streams = [np.random.Generator(np.random.PCG64(key)) for key in keys]
+        self._scale = np.sqrt(step_h / 24.0)
+        self._ahead = ahead
+        self._first = 0
+        self._walk: F64 = np.zeros((2, 1, len(keys)))
+
+    def reach(self, step: int) -> None:
+        """Draw as far as the longest lead of ``step`` needs, and forget what lies before it."""
+        if step < self._first:
+            raise RuntimeStateError(
+                f"forecasts of step {step} after those of a later one; reset starts again"
+            )
+        while self._first + self._walk.shape[1] <= step + self._ahead:
+            keep = min(step - self._first, self._walk.shape[1] - 1)
+            drawn = np.stack([s.standard_normal((2, _DRAWN_STEPS)) for s in self._streams], axis=2)
+            more = self._walk[:, -1:] + np.cumsum(drawn * self._scale, axis=1)
+            self._walk = np.concatenate([self._walk[:, keep:], more], axis=1)
+            self._first += keep
+
+    def moved(self, which: int, step: int, leads: I64) -> F32:
+        """What walk ``which`` does between ``step`` and each lead, (n, B)."""
+        now = step - self._first
+        walk = self._walk[which]
+        return np.asarray(walk[now + leads] - walk[now], dtype=np.float32)

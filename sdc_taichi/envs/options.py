@@ -1,0 +1,136 @@
+"""What an environment lets agents do, see and be rewarded for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from sdc_taichi.config import MONTH_DAYS, explain
+from sdc_taichi.envs.features import AGENTS
+from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, ForecastError
+from sdc_taichi.errors import ConfigError
+
+Agent = Literal["agent_ls", "agent_dc", "agent_bat"]
+Month = Annotated[int, Field(ge=1, le=12)]
+Price = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class Tariff(BaseModel):
+    """Price of electricity, for the reward term ``cost``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    price_per_kwh: tuple[Price, ...] = (
+        *(0.08,) * 7, *(0.12,) * 9, *(0.20,) * 5, *(0.12,) * 3,
+    )  # fmt: skip
+    """One price, or one for each local hour of the day from midnight on."""
+    demand_charge_per_kw: Price = 12.0
+    """Of the highest mean power of a step in the episode, which is the billing period."""
+
+    @field_validator("price_per_kwh")
+    @classmethod
+    def _hours(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if len(value) not in (1, 24):
+            raise ValueError(f"{len(value)} prices; valid is 1, or 24 from midnight on")
+        return value
+
+
+class EnvOptions(BaseModel):
+    """Options of every environment; see docs/environments.md."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+    agents: tuple[Agent, ...] = AGENTS  # type: ignore[assignment]
+    """Who learns; ``others`` plays the rest."""
+    others: str = "idle"
+    """Controller of what nobody learns, as on the command line: a name or ``agent=name`` parts."""
+    actions: Literal["discrete", "continuous"] = "discrete"
+    action_order: Literal["paper", "sustaindc"] | None = None
+    """Order of the battery's discrete actions: charge, hold, discharge as in the paper, or charge,
+    discharge, hold as in the released code; None is that of the preset."""
+    setpoint_change_k: Annotated[float, Field(gt=0, le=20)] = 2.0
+    """Largest change of a continuous setpoint action in one step."""
+    days: Annotated[int, Field(ge=1, le=365)] = 7
+    """Length of an episode."""
+    start: Literal["sampled", "fixed"] = "sampled"
+    """Episodes start at midnight of a day of ``months`` or on ``site.start``."""
+    months: tuple[Month, ...] = tuple(range(1, 13))
+    """Months that sampled episodes lie in from start to end."""
+    observations: Literal["default", "sustaindc"] = "default"
+    features: Mapping[str, tuple[str, ...]] | None = None
+    """Names of the features of agents, in place of the default."""
+    ci_leads_h: tuple[float, ...] = CI_LEADS_H
+    weather_leads_h: tuple[float, ...] = WEATHER_LEADS_H
+    forecast_error: ForecastError = PERFECT
+    heat_map: bool = False
+    """Adds an image of the hall to every observation, which becomes a dict."""
+    rewards: (
+        Literal["default", "sustaindc"]
+        | str
+        | Mapping[str, Mapping[str, float]]
+        | Callable[..., Any]
+    ) = "default"
+    """A named set, agent to term to scale, or a function or its import path ``module:name``."""
+    collaboration: Annotated[float, Field(ge=0, le=1)] = 0.8
+    """Share a of an agent's own reward in what it gets; the others' share the rest evenly (paper,
+    section 4.5). 1 is no collaboration."""
+    tariff: Tariff = Tariff()
+
+    @field_validator("agents", "months")
+    @classmethod
+    def _some_once(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
+        if not value or len(set(value)) < len(value):
+            raise ValueError(f"{list(value)}; valid is one or more, each once")
+        return value
+
+    @field_validator("agents")
+    @classmethod
+    def _in_order(cls, value: tuple[Agent, ...]) -> tuple[Agent, ...]:
+        return tuple(sorted(value, key=AGENTS.index))
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.observations == "sustaindc":
+            given = [
+                name
+                for name in ("features", "ci_leads_h", "weather_leads_h", "forecast_error")
+                if getattr(self, name) != type(self).model_fields[name].default
+            ]
+            if given:
+                raise ValueError(
+                    f"{', '.join(given)}: without effect on observations sustaindc; valid with "
+                    "observations default"
+                )
+        if self.start == "fixed" and len(self.months) < 12:
+            raise ValueError("months: without effect with start fixed; valid with start sampled")
+        if self.start == "sampled" and not self.start_days():
+            raise ValueError(
+                f"days {self.days}: no episode of that length lies in the months "
+                f"{list(self.months)}; valid is fewer days or more months"
+            )
+        return self
+
+    def start_days(self) -> list[int]:
+        """Days of the year, from 0, on which a sampled episode may start.
+
+        All year round, episodes may run past 31 December, where the inputs repeat.
+        """
+        if len(self.months) == 12:
+            return list(range(365))
+        month_of = [m for m, days in enumerate(MONTH_DAYS, 1) for _ in range(days)]
+        inside = [month in self.months for month in month_of]
+        return [d for d in range(366 - self.days) if all(inside[d : d + self.days])]
+
+
+def make_options(**given: Any) -> EnvOptions:
+    """Options by keyword.
+
+    Raises:
+        ConfigError: an unknown option or a value that is not valid.
+    """
+    try:
+        return EnvOptions.model_validate(given)
+    except ValidationError as error:
+        raise ConfigError(explain(error, "environment", EnvOptions)) from None

@@ -1,0 +1,28 @@
+"""Names of the environments in Gymnasium."""
+
+from __future__ import annotations
+
+import gymnasium
+
+IDS: dict[str, str | None] = {
+    "sdc_taichi/Joint-v0": None,
+    "sdc_taichi/Load-v0": "agent_ls",
+    "sdc_taichi/Cooling-v0": "agent_dc",
+    "sdc_taichi/Battery-v0": "agent_bat",
+}
+"""Who learns, None being all ``agents`` as one."""
+
+
+def register() -> None:
+    """Register the ids that are not yet registered; nothing else is imported before ``make``.
+
+    Episodes end by themselves, so there is no ``max_episode_steps``.
+    """
+    for name, agent in IDS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(
+                name,
+                entry_point="sdc_taichi.envs.single:SdcEnv",
+                vector_entry_point="sdc_taichi.envs.vector:SdcVectorEnv",
+                kwargs={} if agent is None else {"agent": agent},
+            )

@@ -1,0 +1,330 @@
+"""Many data centers as one environment, without a Python object for each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, iterate
+
+from sdc_taichi.envs import rendering
+from sdc_taichi.envs.core import F32, Core, Observation, Source
+from sdc_taichi.envs.options import make_options
+from sdc_taichi.envs.single import learner, options_for
+from sdc_taichi.envs.standards import start_day, start_days
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.hall import Precision
+from sdc_taichi.types import F64
+
+Flags = npt.NDArray[np.bool_]
+Seed = int | Sequence[int | None] | None
+
+
+class SdcVectorEnv(VectorEnv[Any, Any, npt.NDArray[Any]]):
+    """Data centers with one learner each that step together, as ``gymnasium.make_vec`` gives them.
+
+    Gives what Gymnasium's ``SyncVectorEnv`` gives for single environments. All episodes have the
+    same length and end, by truncation, in the same step.
+
+    Args:
+        num_envs: number of environments.
+        config: a preset, a file, or configs; environment i takes config i modulo their number.
+        agent: who learns while ``others`` plays the rest; None is all ``agents`` as one.
+        precision: of the server kernels, ``f32`` or ``f64``.
+        render_mode: None or ``rgb_array``.
+        autoreset_mode: when the next episodes start, as the enum or its value: in the step that
+            ends the last ones, in the step after it, or only by ``reset``.
+        options: fields of ``EnvOptions``.
+
+    Raises:
+        SdcError: a config, number or option that is not valid.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        config: Source = "corrected",
+        *,
+        agent: str | None = None,
+        precision: Precision = "f32",
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        **options: Any,
+    ) -> None:
+        rendering.check_render_mode(render_mode)
+        self._mode = _autoreset_mode(autoreset_mode)
+        chosen = make_options(**options_for(agent, options))
+        self.core = Core(config, chosen, num_envs, precision)
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.metadata = {
+            "render_modes": list(rendering.RENDER_MODES),
+            "render_fps": 8,
+            "autoreset_mode": self._mode,
+        }
+        self._learner = learner(self.core, agent)
+        self.single_observation_space = self._learner.observation_space
+        self.single_action_space = self._learner.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.state_space = self.core.state_space
+        self._all = np.ones(num_envs, dtype=np.bool_)
+        self._all.flags.writeable = False
+
+    def reset(
+        self, *, seed: Seed = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode in all environments.
+
+        Args:
+            seed: environment i takes ``seed + i``, or entry i; None goes on as before.
+            options: ``start_day``, a day of the year as ``MM-DD`` or counted from 0, or one for
+                each environment; ``reset_mask`` of Gymnasium if it selects all.
+
+        Raises:
+            ConfigError: a seed, option or day that is not valid.
+        """
+        given = dict(options or {})
+        mask = given.pop("reset_mask", None)
+        if mask is not None and not (np.shape(mask) == (self.num_envs,) and np.all(mask)):
+            raise ConfigError(
+                "reset_mask: episodes of a batch start and end together; valid selects all "
+                f"{self.num_envs} environments"
+            )
+        observations = self.core.reset(seed, start_day(given))
+        super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
+        return self._learner.observation(observations), self._infos(self._started())
+
+    def step(self, actions: Any) -> tuple[Observation, F64, Flags, Flags, dict[str, Any]]:
+        """Advance all environments.
+
+        Args:
+            actions: of ``action_space``.
+
+        Raises:
+            SdcError: actions outside their space.
+            RuntimeStateError: before ``reset``, or after the end of the episodes if nothing else
+                starts the next ones.
+        """
+        none = np.zeros(self.num_envs, dtype=np.bool_)
+        if self._mode is AutoresetMode.NEXT_STEP and self.core.over:
+            observation, infos = self.reset()
+            return observation, np.zeros(self.num_envs), none, none.copy(), infos
+        done = self.core.step(self._learner.actions(actions))
+        observation = self._learner.observation(done.observations)
+        infos = self._infos(done.result.per_dc())
+        if done.ended and self._mode is AutoresetMode.SAME_STEP:
+            final = {"final_obs": self._each(observation), "final_info": infos}
+            observation = self._learner.observation(self.core.reset())
+            infos = self._infos({**final, **self._started()})
+        ended = np.full(self.num_envs, done.ended)
+        return observation, self._learner.reward(done.rewards), none, ended, infos
+
+    def _started(self) -> dict[str, Any]:
+        return {"start_day": start_days(self.core)}
+
+    def _infos(self, found: Mapping[str, Any]) -> dict[str, Any]:
+        """Infos with Gymnasium's masks of who has them, which is everyone."""
+        return {**found, **{f"_{name}": self._all for name in found}}
+
+    def _each(self, observation: Observation) -> npt.NDArray[np.object_]:
+        """Observations one by one, as Gymnasium hands out ``final_obs``."""
+        out = np.empty(self.num_envs, dtype=object)
+        for i, one in enumerate(iterate(self.observation_space, observation)):
+            out[i] = one
+        return out
+
+    def state(self) -> F32:
+        """Shared state for centralised critics, (B, m)."""
+        return self.core.state()
+
+    def reward_terms(self) -> dict[str, F64]:
+        """All reward terms of the last step of the episode by name, (B,) each, unscaled."""
+        return self.core.terms()
+
+    def render(self) -> tuple[rendering.Image, ...]:
+        """The hall of each environment after the last step.
+
+        Raises:
+            ConfigError: made without ``render_mode``.
+        """
+        rendering.require_render_mode(self.render_mode)
+        return tuple(rendering.frame(self.core, i) for i in range(self.num_envs))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides how the episodes go on; picklable."""
+        return self.core.state_dict()
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> Observation:
+        """Go on from the ``state_dict`` of a batch made alike.
+
+        Returns:
+            Observations before the next step.
+
+        Raises:
+            SdcError: made by another batch, or incomplete.
+        """
+        return self._learner.observation(self.core.load_state_dict(values))
+
+    def close_extras(self, **_: Any) -> None:
+        """Let go of the simulator."""
+        self.core.close()
+
+
+class MultiAgentVectorEnv:
+    """Data centers with several learning agents each that step together; see ``vector_env``.
+
+    Attributes:
+        num_envs: number of environments, B.
+        possible_agents: the learning agents; ``agents`` is the same, as episodes follow each other.
+        observation_spaces: of one environment, by agent.
+        action_spaces: of one environment, by agent.
+        state_space: of one environment.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012  as Gymnasium has it
+        "name": "sdc_taichi_v0",
+        "render_modes": list(rendering.RENDER_MODES),
+        "render_fps": 8,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+
+    def __init__(self, core: Core, render_mode: str | None = None) -> None:
+        rendering.check_render_mode(render_mode)
+        self.core = core
+        self.render_mode = render_mode
+        self.num_envs = core.num_envs
+        self.possible_agents: list[str] = list(core.agents)
+        self.agents: list[str] = list(core.agents)
+        self.observation_spaces = core.observation_spaces
+        self.action_spaces = core.action_spaces
+        self.state_space = core.state_space
+
+    def reset(
+        self, seed: Seed = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, Any]]:
+        """Start an episode in all environments.
+
+        Args:
+            seed: environment i takes ``seed + i``, or entry i; None goes on as before.
+            options: ``start_day``, a day of the year as ``MM-DD`` or counted from 0, or one for
+                each environment.
+
+        Returns:
+            Observations by agent, (B, n) each, and infos: ``start_day``, (B,).
+
+        Raises:
+            ConfigError: a seed, option or day that is not valid.
+        """
+        observations = self.core.reset(seed, start_day(options))
+        return observations, {"start_day": start_days(self.core)}
+
+    def step(
+        self, actions: Mapping[str, Any]
+    ) -> tuple[
+        dict[str, Observation], dict[str, F32], dict[str, Flags], dict[str, Flags], dict[str, Any]
+    ]:
+        """Advance all environments; those whose episode ends start the next one.
+
+        Args:
+            actions: by agent, (B,) whole numbers, or (B, k) numbers with continuous actions or
+                several CRAC units.
+
+        Returns:
+            Observations, rewards, terminations and truncations by agent, and infos. Infos have
+            every (B,) quantity of ``StepResult`` of this step by name and, when the episodes ended
+            with it, ``final_obs`` (by agent), ``final_state``, and ``start_day`` of the next ones,
+            to which the observations belong then.
+
+        Raises:
+            SdcError: actions that are missing, too many, or outside their space.
+            RuntimeStateError: before ``reset``.
+        """
+        done = self.core.step(actions)
+        observations = done.observations
+        infos: dict[str, Any] = done.result.per_dc()
+        if done.ended:
+            infos["final_obs"], infos["final_state"] = observations, self.core.state()
+            observations = self.core.reset()
+            infos["start_day"] = start_days(self.core)
+        return (
+            observations,
+            {agent: reward.astype(np.float32) for agent, reward in done.rewards.items()},
+            {agent: np.zeros(self.num_envs, dtype=np.bool_) for agent in self.agents},
+            {agent: np.full(self.num_envs, done.ended) for agent in self.agents},
+            infos,
+        )
+
+    def state(self) -> F32:
+        """Shared state for centralised critics, (B, m)."""
+        return self.core.state()
+
+    def reward_terms(self) -> dict[str, F64]:
+        """All reward terms of the last step of the episode by name, (B,) each, unscaled."""
+        return self.core.terms()
+
+    def render(self) -> tuple[rendering.Image, ...]:
+        """The hall of each environment after the last step.
+
+        Raises:
+            ConfigError: made without ``render_mode``.
+        """
+        rendering.require_render_mode(self.render_mode)
+        return tuple(rendering.frame(self.core, i) for i in range(self.num_envs))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides how the episodes go on; picklable."""
+        return self.core.state_dict()
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
+        """Go on from the ``state_dict`` of a batch made alike.
+
+        Returns:
+            Observations before the next step.
+
+        Raises:
+            SdcError: made by another batch, or incomplete.
+        """
+        return self.core.load_state_dict(values)
+
+    def close(self) -> None:
+        """Let go of the simulator."""
+        self.core.close()
+
+
+def vector_env(
+    num_envs: int | None = None,
+    config: Source = "corrected",
+    *,
+    precision: Precision = "f32",
+    render_mode: str | None = None,
+    **options: Any,
+) -> MultiAgentVectorEnv:
+    """A batch of data centers with several learning agents each.
+
+    All episodes have the same length and end, by truncation, in the same step, which also starts
+    the next ones.
+
+    Args:
+        num_envs: number of environments; None is one per config.
+        config: a preset, a file, or configs; environment i takes config i modulo their number.
+        precision: of the server kernels, ``f32`` or ``f64``.
+        render_mode: None or ``rgb_array``.
+        options: fields of ``EnvOptions``.
+
+    Raises:
+        SdcError: a config, number or option that is not valid.
+    """
+    core = Core(config, make_options(**options), num_envs, precision)
+    return MultiAgentVectorEnv(core, render_mode)
+
+
+def _autoreset_mode(given: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(given)
+    except ValueError:
+        valid = ", ".join(repr(mode.value) for mode in AutoresetMode)
+        raise ConfigError(f"autoreset_mode {given!r}: valid is {valid}") from None

@@ -1,0 +1,761 @@
+"""Environments against the libraries' own checkers, and the same trajectories whichever is used."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+import pytest
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
+from pettingzoo.test.state_test import state_test
+
+import sdc_taichi
+from sdc_taichi import ConfigError, RuntimeStateError, SdcError, load_config
+from sdc_taichi.envs import rendering, rewards
+from sdc_taichi.envs.features import AGENTS
+from sdc_taichi.envs.forecasts import ForecastError
+from sdc_taichi.envs.options import EnvOptions
+from sdc_taichi.envs.parallel import SdcParallelEnv
+from sdc_taichi.envs.registration import IDS
+from sdc_taichi.envs.single import SdcEnv
+from sdc_taichi.envs.vector import SdcVectorEnv
+
+ROOT = Path(__file__).resolve().parents[1]
+STEPS = 96
+SUBSETS = [subset for n in (1, 2, 3) for subset in combinations(AGENTS, n)]
+SEEN: dict[str, dict[str, Any]] = {
+    "default": {},
+    "sustaindc": {"observations": "sustaindc"},
+    "heat_map": {"heat_map": True},
+}
+MODES = ("discrete", "continuous")
+EVENTFUL = load_config(
+    "corrected",
+    [
+        "hall.rows=2",
+        "hall.racks_per_row=2",
+        "hall.supply_approach_k=5",
+        "hall.return_approach_k=-3",
+        "servers.power_w=[300, 40]",
+        "hvac.crac.units=2",
+        "events.sampled=[{kind: crac_down, per_year: 2000, duration_h: [1, 4]}]",
+    ],
+)
+BUSY: dict[str, Any] = {
+    "config": EVENTFUL,
+    "days": 1,
+    "others": "random",
+    "forecast_error": ForecastError(ci_share=0.2, temperature_k=3.0),
+    "rewards": {"agent_dc": {"cost": 1.0, "hot_inlets": 0.1}},
+}
+"""Everything at once that is random or goes on from step to step."""
+
+bounds_warning = pytest.mark.filterwarnings(
+    # Gymnasium recommends -1..1; a setpoint change is in K.
+    "ignore:.*For Box action spaces, we recommend using a symmetric and normalized:UserWarning"
+)
+probe_warning = pytest.mark.filterwarnings(
+    # What PettingZoo's checkers pass as a reset option.
+    "ignore:reset options. 'options' is without effect:UserWarning"
+)
+advice = pytest.mark.filterwarnings(
+    # PettingZoo recommends agents that are alike, and named like player_0.
+    "ignore:We recommend agents to be named in the format:UserWarning",
+    "ignore:Agents have different observation space sizes:UserWarning",
+    "ignore:Observations are different shapes:UserWarning",
+    # It knows arrays and single numbers; a heat map comes in a dict, several CRAC units have a
+    # number each.
+    "ignore:Observation is not a NumPy array:UserWarning",
+    "ignore:Observation space for each agent probably should be:UserWarning",
+    "ignore:Action space for each agent probably should be:UserWarning",
+)
+
+
+def tiny(**options: Any) -> dict[str, Any]:
+    return {"config": "tiny", "days": 1, **options}
+
+
+def same(a: Any, b: Any) -> bool:
+    return bool(data_equivalence(a, b, exact=True))
+
+
+def rows(values: Any, i: int) -> Any:
+    """Environment i of nested dicts of arrays."""
+    if isinstance(values, Mapping):
+        return {name: rows(value, i) for name, value in values.items()}
+    return values[i]
+
+
+# --- the libraries' checkers ---
+
+
+@probe_warning
+@pytest.mark.parametrize("agents", SUBSETS, ids="+".join)
+@pytest.mark.parametrize("seen", SEEN)
+@pytest.mark.parametrize("mode", MODES)
+def test_parallel_api(agents: tuple[str, ...], seen: str, mode: str) -> None:
+    def make() -> SdcParallelEnv:
+        return sdc_taichi.parallel_env(**tiny(agents=agents, actions=mode, **SEEN[seen]))
+
+    env = make()
+    whole_episode = seen == "default" and mode == "discrete"
+    parallel_api_test(env, num_cycles=STEPS + 1 if whole_episode else 10)
+    assert env.agents == ([] if whole_episode else list(agents))
+    env.close()
+    parallel_seed_test(make, num_cycles=10)
+
+
+@advice
+@probe_warning
+@pytest.mark.parametrize("agents", SUBSETS, ids="+".join)
+@pytest.mark.parametrize("seen", SEEN)
+@pytest.mark.parametrize("mode", MODES)
+def test_aec_api(agents: tuple[str, ...], seen: str, mode: str) -> None:
+    def make() -> Any:
+        return sdc_taichi.aec_env(**tiny(agents=agents, actions=mode, **SEEN[seen]))
+
+    whole_episode = seen == "default" and mode == "discrete"
+    api_test(make(), num_cycles=STEPS + 1 if whole_episode else 10)
+    parallel = sdc_taichi.parallel_env(**tiny(agents=agents, actions=mode, **SEEN[seen]))
+    state_test(make(), parallel, num_cycles=5)
+
+
+@bounds_warning
+@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("seen", SEEN)
+@pytest.mark.parametrize("mode", MODES)
+def test_gymnasium_api(name: str, seen: str, mode: str) -> None:
+    env = gymnasium.make(name, **tiny(actions=mode, **SEEN[seen]))
+    check_env(env.unwrapped)
+    env.close()
+
+
+@bounds_warning
+@advice
+@probe_warning
+@pytest.mark.parametrize("mode", MODES)
+def test_several_crac_units(mode: str) -> None:
+    options = {**BUSY, "actions": mode}
+    parallel_api_test(sdc_taichi.parallel_env(**options), num_cycles=STEPS + 1)
+    api_test(sdc_taichi.aec_env(**options), num_cycles=10)
+    for name in IDS:
+        check_env(gymnasium.make(name, **options).unwrapped)
+    space = sdc_taichi.parallel_env(**options).action_space("agent_dc")
+    assert space.shape == (2,)
+
+
+@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize(
+    ("seen", "mode", "autoreset"),
+    [
+        ("default", "discrete", AutoresetMode.SAME_STEP),
+        ("default", "continuous", AutoresetMode.NEXT_STEP),
+        ("sustaindc", "discrete", AutoresetMode.NEXT_STEP),
+        ("heat_map", "continuous", AutoresetMode.SAME_STEP),
+    ],
+)
+def test_batch_is_what_gymnasium_makes_of_single_environments(
+    name: str, seen: str, mode: str, autoreset: AutoresetMode
+) -> None:
+    options = tiny(actions=mode, **SEEN[seen])
+    native = gymnasium.make_vec(name, num_envs=2, autoreset_mode=autoreset, **options)
+    one_by_one = SyncVectorEnv(
+        [lambda: gymnasium.make(name, disable_env_checker=True, **options)] * 2,
+        autoreset_mode=autoreset,
+    )
+    assert isinstance(native, SdcVectorEnv)
+    assert native.metadata["autoreset_mode"] is autoreset
+    for part in ("observation_space", "action_space"):
+        for prefix in ("", "single_"):
+            assert getattr(native, prefix + part) == getattr(one_by_one, prefix + part)
+    assert same(native.reset(seed=3), one_by_one.reset(seed=3))
+    native.action_space.seed(0)
+    ends = 0
+    for step in range(STEPS + 4):
+        actions = native.action_space.sample()
+        given, expected = native.step(actions), one_by_one.step(actions)
+        assert same(given, expected), step
+        assert native.observation_space.contains(given[0])
+        assert ("final_obs" in given[4]) == (given[3].all() and autoreset.value == "SameStep")
+        ends += int(given[3].all())
+    assert ends == 1
+    native.close()
+    one_by_one.close()
+
+
+def test_without_autoreset_the_batch_waits_for_reset() -> None:
+    env = gymnasium.make_vec(
+        "sdc_taichi/Battery-v0", num_envs=2, autoreset_mode="Disabled", **tiny()
+    )
+    env.reset(seed=0)
+    for _ in range(STEPS):
+        *_, truncated, infos = env.step(np.array([1, 1]))
+    assert truncated.all()
+    assert "final_obs" not in infos
+    with pytest.raises(RuntimeStateError, match="call reset"):
+        env.step(np.array([1, 1]))
+    with pytest.raises(ConfigError, match=r"reset_mask: .*valid selects all 2"):
+        env.reset(options={"reset_mask": np.array([True, False])})
+    env.reset(options={"reset_mask": np.array([True, True])})
+    env.step(np.array([1, 1]))
+
+
+def test_ids_carry_no_time_limit_of_their_own() -> None:
+    for name in IDS:
+        env = gymnasium.make(f"sdc_taichi:{name}", **tiny())
+        assert env.spec is not None
+        assert env.spec.max_episode_steps is None
+        assert "TimeLimit" not in str(env)
+
+
+def test_bounds_are_finite() -> None:
+    for options in SEEN.values():
+        for agents in SUBSETS:
+            env = SdcEnv(**tiny(agents=agents, actions="continuous", **options))
+            for space in (env.observation_space, env.action_space, env.state_space):
+                parts = space.values() if isinstance(space, gymnasium.spaces.Dict) else [space]
+                for part in parts:
+                    assert isinstance(part, gymnasium.spaces.Box)
+                    assert part.is_bounded()
+                    assert part.dtype == np.float32
+
+
+# --- the same trajectories ---
+
+
+def multi_agent(num_envs: int, **options: Any) -> Any:
+    return sdc_taichi.vector_env(num_envs, **options)
+
+
+@pytest.mark.parametrize("agents", [("agent_ls", "agent_dc"), ("agent_bat",), AGENTS], ids="+".join)
+@pytest.mark.parametrize("heat_map", [False, True])
+def test_alone_as_in_a_batch(agents: tuple[str, ...], heat_map: bool) -> None:
+    options = {**BUSY, "agents": agents, "heat_map": heat_map}
+    batch = multi_agent(3, **options)
+    singles = [sdc_taichi.parallel_env(**options) for _ in range(3)]
+    found, infos = batch.reset(seed=11)
+    for i, env in enumerate(singles):
+        alone, info = env.reset(seed=11 + i)
+        assert same(rows(found, i), alone)
+        assert info == {a: {"start_day": infos["start_day"][i]} for a in agents}
+    assert len(set(infos["start_day"])) > 1
+    rng = np.random.default_rng(0)
+    for step in range(STEPS + 5):
+        actions = {a: rng.integers(0, 3, size=(3, *(batch.action_spaces[a].shape))) for a in agents}
+        found, gained, terminated, truncated, infos = batch.step(actions)
+        ended = step == STEPS - 1
+        seen = infos["final_obs"] if ended else found
+        state = infos["final_state"] if ended else batch.state()
+        assert ("final_obs" in infos) == ended
+        for i, env in enumerate(singles):
+            o, r, d, t, info = env.step(rows(actions, i))
+            assert same(rows(seen, i), o), step
+            assert {a: gained[a][i] for a in agents} == {a: np.float32(r[a]) for a in agents}
+            assert d == {a: bool(terminated[a][i]) for a in agents}
+            assert t == {a: bool(truncated[a][i]) for a in agents} == dict.fromkeys(agents, ended)
+            assert np.array_equal(state[i], env.state())
+            assert info[agents[0]] == {name: infos[name][i] for name in info[agents[0]]}
+            if ended:
+                again, begun = env.reset()
+                assert same(rows(found, i), again)
+                assert begun[agents[0]]["start_day"] == infos["start_day"][i]
+                assert np.array_equal(batch.state()[i], env.state())
+
+
+def test_the_same_seed_gives_the_same_episodes_after_reset() -> None:
+    env = multi_agent(2, **BUSY)
+    first = trajectory(env, env.reset(seed=5), STEPS + 3)
+    assert same(first, trajectory(env, env.reset(seed=5), STEPS + 3))
+    assert not same(first, trajectory(env, env.reset(seed=6), STEPS + 3))
+    assert not same(first, trajectory(env, env.reset(), STEPS + 3))
+    assert same(first, trajectory(env, env.reset(seed=[5, 6]), STEPS + 3))
+
+
+def test_seeds_by_environment() -> None:
+    env: Any = gymnasium.make_vec("sdc_taichi/Joint-v0", num_envs=3, **tiny())
+    alone = gymnasium.make("sdc_taichi/Joint-v0", **tiny())
+    found, _ = env.reset(seed=[9, 4, 9])
+    assert np.array_equal(found[0], found[2])
+    assert np.array_equal(found[1], alone.reset(seed=4)[0])
+    # None goes on with the generator that is there.
+    found, _ = env.reset(seed=[None, 4, 9])
+    assert np.array_equal(found[1], alone.reset(seed=4)[0])
+    assert not np.array_equal(found[0], found[2])
+
+
+def trajectory(env: Any, start: Any, steps: int) -> list[Any]:
+    """What a multi-agent batch gives to the same actions."""
+    rng = np.random.default_rng(1)
+    out = [start]
+    for _ in range(steps):
+        actions = {
+            a: rng.integers(0, 3, size=(env.num_envs, *space.shape))
+            for a, space in env.action_spaces.items()
+        }
+        out.append((env.step(actions), env.state()))
+    return out
+
+
+@pytest.mark.parametrize("saved_after", [0, 1, 40, STEPS - 1])
+def test_goes_on_from_what_was_saved(saved_after: int) -> None:
+    env = multi_agent(2, **{**BUSY, "agents": ("agent_ls", "agent_dc")})
+    trajectory(env, env.reset(seed=2), saved_after)
+    saved = pickle.dumps(env.state_dict())
+    expected = trajectory(env, None, STEPS + 10)
+
+    other = multi_agent(2, **{**BUSY, "agents": ("agent_ls", "agent_dc")})
+    seen = other.load_state_dict(pickle.loads(saved))
+    assert same(trajectory(other, None, STEPS + 10), expected)
+    # Once more into an environment that is elsewhere.
+    assert same(other.load_state_dict(pickle.loads(saved)), seen)
+    assert same(trajectory(other, None, STEPS + 10), expected)
+
+
+def test_single_environments_go_on_from_what_was_saved() -> None:
+    action = {"agent_ls": 0, "agent_dc": 2, "agent_bat": 0}
+    env, other = (sdc_taichi.parallel_env(**tiny()) for _ in range(2))
+    env.reset(seed=1)
+    found: dict[str, Any] = {}
+    for _ in range(STEPS):
+        middle, found = found, env.step(action)[0]
+    assert env.agents == []
+    assert same(other.load_state_dict(env.state_dict()), found)
+    assert other.agents == []
+    env.reset(seed=1)
+    assert not same(middle, found)
+    saved = env.state_dict()
+    other.load_state_dict(saved)
+    assert other.agents == list(AGENTS)
+    assert same(other.step(action), env.step(action))
+
+    makers: list[Callable[[], Any]] = [
+        lambda: gymnasium.make("sdc_taichi/Joint-v0", **tiny()).unwrapped,
+        lambda: gymnasium.make_vec("sdc_taichi/Joint-v0", num_envs=2, **tiny()),
+    ]
+    for make in makers:
+        one, two = make(), make()
+        one.reset(seed=3)
+        begun = one.step(one.action_space.sample())
+        assert same(two.load_state_dict(one.state_dict()), begun[0])
+        action_of_both = one.action_space.sample()
+        assert same(two.step(action_of_both), one.step(action_of_both))
+
+
+def test_saved_by_another_environment() -> None:
+    env, other = sdc_taichi.parallel_env(**tiny()), multi_agent(2, **tiny())
+    env.reset(seed=0)
+    before = env.state_dict()
+    with pytest.raises(SdcError, match="number of environments"):
+        other.load_state_dict(before)
+    with pytest.raises(SdcError, match=r"missing \['actions'"):
+        env.load_state_dict({"simulator": before["simulator"]})
+    with pytest.raises(SdcError, match="another fleet"):
+        sdc_taichi.parallel_env(**{**tiny(), "config": "corrected"}).load_state_dict(before)
+
+
+def test_across_spawned_processes() -> None:
+    options = {**BUSY, "agents": AGENTS}
+    name = "sdc_taichi:sdc_taichi/Joint-v0"
+    native = gymnasium.make_vec(name, num_envs=2, autoreset_mode="NextStep", **options)
+
+    def make() -> Any:
+        return gymnasium.make(name, **options)
+
+    spawned = AsyncVectorEnv([make, make], context="spawn")
+    try:
+        assert same(spawned.reset(seed=8), native.reset(seed=8))
+        native.action_space.seed(0)
+        for step in range(STEPS + 3):
+            actions = native.action_space.sample()
+            assert same(spawned.step(actions), native.step(actions)), step
+    finally:
+        spawned.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no fork on Windows")
+def test_a_fork_after_the_start_is_refused() -> None:
+    code = """
+import gymnasium, sdc_taichi
+from gymnasium.vector import AsyncVectorEnv
+make = lambda: gymnasium.make("sdc_taichi/Joint-v0", config="tiny", days=1)
+make().reset(seed=0)
+forked = AsyncVectorEnv([make, make], context="fork")
+try:
+    forked.reset(seed=0)
+except sdc_taichi.RuntimeStateError as error:
+    print("refused:", error)
+forked.close(terminate=True)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout.startswith("refused: this process was forked after Taichi started")
+    assert "'spawn'" in done.stdout
+
+
+# --- what one learner sees of several agents ---
+
+
+@pytest.mark.parametrize("agents", SUBSETS, ids="+".join)
+@pytest.mark.parametrize("seen", SEEN)
+def test_joint_observation_has_every_feature_of_its_agents_once(
+    agents: tuple[str, ...], seen: str
+) -> None:
+    options = tiny(agents=agents, **SEEN[seen])
+    joint, parallel = SdcEnv(**options), sdc_taichi.parallel_env(**options)
+    rng = np.random.default_rng(0)
+    whole: Any = joint.reset(seed=4)[0]
+    parts: Any = parallel.reset(seed=4)[0]
+    for _ in range(60):
+        action = rng.integers(0, 3, size=len(agents))
+        whole, reward, *_ = joint.step(action)
+        parts, rewarded, *_ = parallel.step(dict(zip(agents, action, strict=True)))
+        assert reward == pytest.approx(sum(rewarded.values()), rel=1e-12)
+    features = parallel.core.features
+    columns: dict[Any, npt.NDArray[np.float32]] = {}
+    at = 0
+    flat: Callable[[Any], npt.NDArray[np.float32]] = (
+        (lambda o: o["features"]) if seen == "heat_map" else (lambda o: o)
+    )
+    for feature in dict.fromkeys(f for found in features.values() for f in found):
+        columns[feature] = flat(whole)[at : at + feature.size]
+        at += feature.size
+    assert at == len(flat(whole))
+    for agent, found in features.items():
+        expected = np.concatenate([columns[f] for f in found])
+        assert np.array_equal(flat(parts[agent]), expected)
+        if seen == "heat_map":
+            assert np.array_equal(whole["heat_map"], parts[agent]["heat_map"])
+
+
+def test_one_agent_is_that_agent_of_the_parallel_environment() -> None:
+    for name, agent in IDS.items():
+        if agent is None:
+            continue
+        env = gymnasium.make(name, **tiny(others="greedy-ci"))
+        parallel = sdc_taichi.parallel_env(**tiny(others="greedy-ci", agents=[agent]))
+        found, _ = env.reset(seed=7)
+        assert same(found, parallel.reset(seed=7)[0][agent])
+        for action in (0, 1, 2, 2, 0):
+            found, reward, *_, info = env.step(action)
+            seen, rewarded, *_, infos = parallel.step({agent: action})
+            assert same(found, seen[agent])
+            assert reward == rewarded[agent]
+            assert info == infos[agent]
+
+
+def test_infos_are_quantities_of_the_step() -> None:
+    env = multi_agent(2, **tiny())
+    env.reset(seed=0)
+    *_, infos = env.step(dict.fromkeys(AGENTS, np.array([1, 1])))
+    view = env.core.view
+    assert infos.keys() == view.last.per_dc().keys()
+    assert np.array_equal(infos["carbon_g"], view.last.carbon_g)
+    assert np.all(infos["it_kwh"] > 0)
+    assert env.reward_terms().keys() == rewards.TERMS.keys()
+    single = SdcEnv(**tiny())
+    assert single.reset(seed=0)[1].keys() == {"start_day"}
+    *_, info = single.step(np.array([1, 1, 1]))
+    assert all(type(value) is float for value in info.values())
+    assert info == {name: infos[name][0] for name in info}
+
+
+def test_start_day() -> None:
+    env = sdc_taichi.parallel_env(**tiny(months=[6]))
+    days = {env.reset(seed=s)[1]["agent_ls"]["start_day"] for s in range(20)}
+    assert len(days) > 5
+    assert all(151 <= day < 181 for day in days)
+    assert env.reset(options={"start_day": "03-01"})[1]["agent_ls"] == {"start_day": 59}
+    assert env.reset(options={"start_day": 200})[1]["agent_ls"] == {"start_day": 200}
+    batch = multi_agent(2, **tiny())
+    _, infos = batch.reset(options={"start_day": ["01-01", "12-31"]})
+    assert infos["start_day"].tolist() == [0, 364]
+    fixed = SdcEnv(config=load_config("tiny", ["site.start=05-02"]), days=1, start="fixed")
+    assert fixed.reset(seed=0)[1] == fixed.reset(seed=1)[1] == {"start_day": 121}
+
+
+# --- bad input ---
+
+
+MADE: list[tuple[dict[str, Any], str]] = [
+    ({"dayss": 3}, "dayss"),
+    ({"agents": ["agent_x"]}, "agent_x"),
+    ({"agents": []}, "agents"),
+    ({"others": "g37"}, "'g37': unknown"),
+    ({"actions": "both"}, "actions"),
+    ({"days": 0}, "days"),
+    ({"render_mode": "human"}, "render_mode 'human': valid is None or rgb_array"),
+    ({"precision": "f16"}, "precision 'f16'"),
+    ({"config": "tinny"}, "tinny"),
+    ({"config": []}, "empty list"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), MADE)
+def test_made_of_bad_options(options: dict[str, Any], message: str) -> None:
+    for make in (
+        sdc_taichi.parallel_env,
+        sdc_taichi.aec_env,
+        SdcEnv,
+        lambda **given: sdc_taichi.vector_env(2, **given),
+        lambda **given: gymnasium.make_vec("sdc_taichi/Joint-v0", num_envs=2, **given),
+    ):
+        with pytest.raises(ConfigError, match=re.escape(message)):
+            make(**tiny(**options))
+
+
+def test_made_of_bad_numbers() -> None:
+    for number in (0, -1, 2.5, True):
+        with pytest.raises(ConfigError, match=f"num_envs {number}: valid is a whole number"):
+            multi_agent(number, **tiny())  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="num_envs 0: valid"):
+        gymnasium.make_vec("sdc_taichi/Load-v0", num_envs=0, **tiny())
+    with pytest.raises(ConfigError, match="autoreset_mode 'never': valid is 'NextStep'"):
+        gymnasium.make_vec("sdc_taichi/Load-v0", num_envs=1, autoreset_mode="never", **tiny())
+    with pytest.raises(ConfigError, match="the one agent here is agent_ls"):
+        gymnasium.make("sdc_taichi/Load-v0", **tiny(agents=["agent_dc"]))
+    configs = [load_config("tiny")] * 2
+    with pytest.raises(ConfigError, match="config: 2 data centers; valid is one"):
+        sdc_taichi.parallel_env(configs)
+    assert multi_agent(None, config=configs, days=1).num_envs == 2  # type: ignore[arg-type]
+    units = [load_config("corrected"), load_config("corrected", ["hvac.crac.units=2"])]
+    with pytest.raises(ConfigError, match=r"hvac\.crac\.units is \[1, 2\]"):
+        multi_agent(2, config=units)
+
+
+RESET: list[tuple[dict[str, Any], str]] = [
+    ({"options": {"start_day": "13-01"}}, "start_day '13-01': valid is MM-DD"),
+    ({"options": {"start_day": 365}}, "start_day 365"),
+    ({"options": {"start_day": 1.5}}, "start_day 1.5"),
+    ({"options": {"start_day": [1, 2, 3]}}, "start_day: 3 days"),
+    ({"seed": -1}, "seed -1"),
+    ({"seed": "x"}, "seed 'x'"),
+    ({"seed": 1.0}, "seed 1.0"),
+    ({"seed": [1, 2, 3]}, "3 for"),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), RESET)
+def test_reset_with_bad_values(given: dict[str, Any], message: str) -> None:
+    envs: list[Any] = [
+        sdc_taichi.parallel_env(**tiny()),
+        SdcEnv(**tiny()),
+        multi_agent(2, **tiny()),
+        SdcVectorEnv(2, **tiny()),
+    ]
+    for env in envs:
+        with pytest.raises(ConfigError, match=re.escape(message)):
+            env.reset(**given)
+
+
+def test_unknown_reset_option() -> None:
+    message = "reset options: unknown 'start_dy'; did you mean 'start_day'?"
+    for env in (SdcEnv(**tiny()), multi_agent(2, **tiny()), SdcVectorEnv(2, **tiny())):
+        with pytest.raises(ConfigError, match=re.escape(message)):
+            env.reset(options={"start_dy": 3})
+    # PettingZoo's own checkers pass an option that no environment knows.
+    parallel = sdc_taichi.parallel_env(**tiny())
+    with pytest.warns(UserWarning, match="'start_dy' is without effect; did you mean 'start_day'"):
+        parallel.reset(options={"start_dy": 3})
+
+
+ACTED: list[tuple[str, Any, str]] = [
+    ("discrete", {}, "none for agent_ls"),
+    ("discrete", {"agent_ls": 1, "agent_bat": 1}, "none for agent_dc"),
+    ("discrete", {a: 1 for a in (*AGENTS, "agent_x")}, "['agent_x'] do not learn here"),
+    ("discrete", dict.fromkeys(AGENTS, 3), "agent_ls: 3"),
+    ("discrete", dict.fromkeys(AGENTS, -1), "valid is 0, 1 or 2"),
+    ("discrete", dict.fromkeys(AGENTS, 1.0), "1.0"),
+    ("discrete", dict.fromkeys(AGENTS, None), "valid is 0, 1 or 2"),
+    ("discrete", dict.fromkeys(AGENTS, "up"), "up"),
+    ("discrete", {key: [1] for key in AGENTS}, "agent_ls: shape (1, 1), expected (1,)"),
+    ("continuous", {key: [1.5] for key in AGENTS}, "agent_ls: 1.5; valid is within -1..1"),
+    ("continuous", {key: [np.nan] for key in AGENTS}, "nan"),
+    ("continuous", dict.fromkeys(AGENTS, 0.5), "shape (1,), expected (1, 1)"),
+    ("continuous", {key: ["up"] for key in AGENTS}, "up"),
+    ("continuous", {key: [None] for key in AGENTS}, "None"),
+]
+
+
+@pytest.mark.parametrize(("mode", "actions", "message"), ACTED)
+def test_bad_actions(mode: str, actions: dict[str, Any], message: str) -> None:
+    env = sdc_taichi.parallel_env(**tiny(actions=mode))
+    env.reset(seed=0)
+    with pytest.raises(SdcError, match=re.escape(message)):
+        env.step(actions)
+    batch = multi_agent(1, **tiny(actions=mode))
+    batch.reset(seed=0)
+    with pytest.raises(SdcError, match=re.escape(message)):
+        batch.step({agent: [action] for agent, action in actions.items()})
+
+
+def test_bad_actions_of_one_learner() -> None:
+    joint = SdcEnv(**tiny())
+    joint.reset(seed=0)
+    for action, message in (
+        (np.array([1, 1]), "shape (1, 2), expected (1, 3)"),
+        (np.array([1, 1, 3]), "agent_bat: 3; valid is 0, 1 or 2"),
+        (np.array([1.0, 1.0, 1.0]), "1.0"),
+        ([[1, 1], [1]], "is no array"),
+        (1, "shape (1,), expected (1, 3)"),
+    ):
+        with pytest.raises(SdcError, match=re.escape(message)):
+            joint.step(action)
+    batch = SdcVectorEnv(2, **tiny(), agent="agent_bat")
+    batch.reset(seed=0)
+    with pytest.raises(SdcError, match=re.escape("shape (3,), expected (2,)")):
+        batch.step(np.array([1, 1, 1]))
+
+
+def test_out_of_order() -> None:
+    idle = dict.fromkeys(AGENTS, 1)
+    envs: list[tuple[Any, Any]] = [
+        (sdc_taichi.parallel_env(**tiny(), render_mode="rgb_array"), idle),
+        (SdcEnv(**tiny(), render_mode="rgb_array"), np.array([1, 1, 1])),
+        (SdcVectorEnv(1, **tiny(), render_mode="rgb_array"), np.array([[1, 1, 1]])),
+        (
+            SdcVectorEnv(1, **tiny(), render_mode="rgb_array", autoreset_mode="NextStep"),
+            np.array([[1, 1, 1]]),
+        ),
+        (
+            sdc_taichi.vector_env(1, **tiny(), render_mode="rgb_array"),
+            {a: np.array([1]) for a in AGENTS},
+        ),
+    ]
+    for env, action in envs:
+        for too_early in (
+            lambda env=env, action=action: env.step(action),
+            env.state,
+            env.render,
+            env.reward_terms,
+            env.state_dict,
+        ):
+            with pytest.raises(RuntimeStateError, match="call reset"):
+                too_early()
+        env.reset(seed=0)
+        assert env.reward_terms() == {}
+        env.step(action)
+        env.close()
+        env.close()
+        with pytest.raises(RuntimeStateError, match="closed"):
+            env.reset()
+    for env, action in envs[:2]:
+        again: Any = type(env)(**tiny())
+        again.reset(seed=0)
+        for _ in range(STEPS):
+            again.step(action)
+        with pytest.raises(RuntimeStateError, match="the episode is over; call reset"):
+            again.step(action)
+
+
+def test_unknown_agent() -> None:
+    env = sdc_taichi.parallel_env(**tiny(agents=["agent_bat"]))
+    for space in (env.observation_space, env.action_space):
+        with pytest.raises(ConfigError, match=r"agent 'agent_ls': does not learn here; valid: \["):
+            space("agent_ls")
+
+
+# --- pictures ---
+
+
+def test_render() -> None:
+    options = tiny(render_mode="rgb_array")
+    single = SdcEnv(**options)
+    single.reset(seed=0)
+    before = single.render()
+    single.step(np.array([1, 1, 1]))
+    image = single.render()
+    assert image.dtype == np.uint8
+    assert image.shape == before.shape
+    assert image.ndim == 3
+    assert image.shape[2] == 3
+    assert not np.array_equal(image, before)
+    batch = SdcVectorEnv(2, **options)
+    batch.reset(seed=0)
+    batch.step(np.array([[1, 1, 1]] * 2))
+    assert np.array_equal(batch.render()[0], image)
+    multi = sdc_taichi.vector_env(2, **options)
+    multi.reset(seed=0)
+    multi.step({a: np.array([1, 1]) for a in AGENTS})
+    assert np.array_equal(multi.render()[1], batch.render()[1])
+    parallel = sdc_taichi.parallel_env(**options)
+    parallel.reset(seed=0)
+    parallel.step(dict.fromkeys(AGENTS, 1))
+    assert np.array_equal(parallel.render(), image)
+    silent = SdcEnv(**tiny())
+    silent.reset(seed=0)
+    with pytest.raises(ConfigError, match="render_mode='rgb_array'"):
+        silent.render()
+
+
+def test_racks_have_the_colour_of_their_inlet() -> None:
+    hall = load_config("corrected").hall
+    inlet_c = np.linspace(16.0, 34.0, hall.racks)
+    image = rendering.hall_image(hall, inlet_c)
+    colour = rendering.colours(inlet_c)
+    # Along the turned page: rows of racks from left to right, racks of a row from the top down.
+    measures = hall.layout
+    px = rendering.PX_PER_M
+    for rack in range(hall.racks):
+        row, place = divmod(rack, hall.racks_per_row)
+        aisles = {0: 0.0, 1: measures.cold_aisle_m}
+        pair = measures.cold_aisle_m + measures.hot_aisle_m
+        y_m = (
+            measures.side_margin_m
+            + (row + 0.5) * measures.rack_depth_m
+            + row // 2 * pair
+            + aisles[row % 2]
+        )
+        x_m = measures.end_margin_m + (place + 0.5) * measures.rack_pitch_m
+        assert image[int(x_m * px), int(y_m * px)].tolist() == colour[rack].tolist()
+    brightness = rendering.colours(np.linspace(*rendering.RANGE_C, 50)).astype(float) @ [
+        0.3,
+        0.6,
+        0.1,
+    ]
+    assert np.all(np.diff(brightness) > 0)
+    ends = rendering.colours(np.array([-5.0, 15.0, 35.0, 90.0]))
+    assert np.array_equal(ends[0], ends[1])
+    assert np.array_equal(ends[2], ends[3])
+
+
+def test_colours_are_those_of_the_figures() -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    celsius = np.linspace(*rendering.RANGE_C, 256)
+    expected = 255 * matplotlib.colormaps["inferno"](np.arange(256))[:, :3]
+    assert np.abs(rendering.colours(celsius) - expected).max() < 10
+
+
+def test_large_halls_are_drawn_smaller() -> None:
+    hall = load_config("large").hall
+    image = rendering.hall_image(hall, np.full(hall.racks, 35.0))
+    assert max(image.shape) == rendering.LONGEST_PX
+    racks = np.all(image == rendering.colours(np.array([35.0]))[0], axis=2)
+    assert 0.2 < racks.mean() < 0.6
+
+
+# --- docs ---
+
+
+@pytest.mark.repo
+def test_docs_have_every_option_and_term() -> None:
+    text = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
+    table = text.partition("## Options")[2].partition("\n## ")[0]
+    listed = re.findall(r"^\| `(\w+)` \| (.*?) \|", table, re.MULTILINE)
+    assert [name for name, _ in listed] == list(EnvOptions.model_fields)
+    for name, shown in listed:
+        default = EnvOptions.model_fields[name].default
+        if isinstance(default, str | int | float | bool | None):
+            assert shown == f"`{default}`", name
+    assert rewards.table_markdown() in text
+    for name in IDS:
+        assert f"`{name}`" in text

@@ -1,0 +1,734 @@
+"""Observations: every feature against a computation of its own, forecasts, heat map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+
+from sdc_taichi import (
+    Actions,
+    ConfigError,
+    DataCenterConfig,
+    Drivers,
+    RuntimeStateError,
+    SdcError,
+    Simulator,
+    drivers_from_arrays,
+    load_config,
+    make_configs,
+)
+from sdc_taichi.control import View, viewer
+from sdc_taichi.drivers import Table
+from sdc_taichi.envs import features as module
+from sdc_taichi.envs.features import (
+    AGENTS,
+    DEFAULT_FEATURES,
+    HEAT_MAP_FEATURES,
+    Feature,
+    Observer,
+    catalogue,
+    table_markdown,
+)
+from sdc_taichi.envs.forecasts import (
+    CI_LEADS_H,
+    WEATHER_LEADS_H,
+    ForecastError,
+    Forecasts,
+    lead_steps,
+)
+
+SITES = ("ny", "ca", "az")
+STARTS = ("01-01", "07-01", "12-31")
+STEPS = 150
+Seen = list[tuple[View, dict[str, np.ndarray], np.ndarray, np.ndarray]]
+
+
+def fleet_of(preset: str, **changes: Any) -> list[DataCenterConfig]:
+    """Three sites that start on different days and differ in queue, deadline and battery."""
+    unlimited = ["workload.queue_limit_h=null", "workload.deadline_h=null"]
+    overrides: tuple[list[str], ...] = ([], unlimited, ["battery.capacity_kwh=0"])
+    made = []
+    for site, start, extra in zip(SITES, STARTS, overrides, strict=True):
+        listed = [f"site.location={site.upper()}", f"site.start={start}", f"name={site}"]
+        listed += [*extra, *(f"{k}={v}" for k, v in changes.items())]
+        made.append(load_config(preset, listed))
+    return made
+
+
+def generators(count: int, seed: int = 0) -> list[np.random.Generator]:
+    return [np.random.default_rng([seed, i]) for i in range(count)]
+
+
+def commands(step: int, size: int, first: int = 0) -> Actions:
+    """Deferring for a day, draining in between, everything moving; ``first`` is the number of the
+    first data center."""
+    load = -1.0 if step % 110 < 100 else 1.0
+    phase = first + np.arange(size) + step
+    return Actions(
+        load=np.full(size, load),
+        cooling=np.where(phase % 3 == 0, 1.0, np.where(phase % 3 == 1, -1.0, 0.0)),
+        battery=np.where(phase // 8 % 2 == 0, 1.0, -1.0),
+    )
+
+
+def watch(
+    configs: list[DataCenterConfig],
+    steps: int = STEPS,
+    drivers: Drivers | None = None,
+    first: int = 0,
+    **options: Any,
+) -> tuple[Observer, Seen]:
+    """Observations of an episode, the first before any step."""
+    with Simulator(configs, drivers=drivers) as sim:
+        sim.reset(0)
+        look = viewer(sim)
+        observer = Observer(sim.fleet, **options)
+        view = look(None)
+        observer.reset(view, generators(first + sim.size)[first:])
+        seen: Seen = []
+        for step in range(steps + 1):
+            seen.append(
+                (view, observer.observe(view), observer.state(view), observer.heat_map(view))
+            )
+            if step < steps:
+                view = look(sim.step(commands(step, sim.size, first)))
+    return observer, seen
+
+
+@pytest.fixture(scope="module", params=["tiny", "corrected"])
+def episode(request: pytest.FixtureRequest) -> tuple[Observer, Seen]:
+    return watch(fleet_of(request.param))
+
+
+def parts(array: np.ndarray, features: tuple[Feature, ...]) -> dict[str, np.ndarray]:
+    """Entries of each feature, (B, size)."""
+    ends = np.cumsum([f.size for f in features])
+    assert array.shape[1] == ends[-1]
+    split = np.split(array, ends[:-1], axis=1)
+    return {f.name: part for f, part in zip(features, split, strict=True)}
+
+
+def at(table: Table, dc: int, index: int) -> float:
+    return float(table.values[table.offset[dc] + index % table.length[dc]])
+
+
+def by_hand(view: View, dc: int, work: list[list[float]]) -> dict[str, list[float]]:
+    """Unscaled features of one data center, from configs, drivers and results in plain Python.
+
+    Args:
+        view: before the step.
+        dc: the data center.
+        work: of each past step, what it put into the queue of ``dc`` and what it took out.
+    """
+    config, drivers, sizing = view.fleet.configs[dc], view.drivers, view.sizing
+    per_hour = config.simulation.steps_per_hour
+    index = int(drivers.start[dc]) + view.state.step
+    hour = index / per_hour
+
+    layers: list[list[float]] = []  # [step that put it in, tasks], oldest first
+    for step, (put, taken) in enumerate(work):
+        while taken > 1e-12 and layers:
+            part = min(taken, layers[0][1])
+            layers[0][1] -= part
+            taken -= part
+            if layers[0][1] <= 1e-9:
+                layers.pop(0)
+        layers.append([step, put])
+    layers = [layer for layer in layers if layer[1] > 1e-9]
+    oldest_h = config.workload.age_horizon_h + 1.0 / per_hour
+    ages = [(min((len(work) - 1 - step) / per_hour, oldest_h), tasks) for step, tasks in layers]
+    total = sum(tasks for _, tasks in ages)
+    edges = [0.0, 6.0, 12.0, 18.0, 24.0, math.inf]
+    limit_h = config.workload.queue_limit_h or 10.0
+
+    def ahead(table: Table, leads_h: tuple[float, ...]) -> list[float]:
+        return [at(table, dc, index + round(h * per_hour)) for h in leads_h]
+
+    ci = at(drivers.ci_g_per_kwh, dc, index)
+    ci_ahead = ahead(drivers.ci_g_per_kwh, CI_LEADS_H)
+    last = view.last
+    kwh_per_w = 1.0 / per_hour / 1000.0
+    hvac_w = float(sizing.facility_w[dc] - sizing.it_w[dc])
+    battery_kwh = float(sizing.battery_kwh[dc])
+    units = view.state.setpoint_c[view.fleet.unit_start[dc] : view.fleet.unit_start[dc + 1]]
+    return {
+        "time_of_day": [math.sin(2 * math.pi * hour / 24), math.cos(2 * math.pi * hour / 24)],
+        "time_of_year": [math.sin(2 * math.pi * hour / 8760), math.cos(2 * math.pi * hour / 8760)],
+        "ci": [ci],
+        "ci_forecast": ci_ahead,
+        "ci_change": [value - ci for value in ci_ahead],
+        "outdoor": [at(drivers.outdoor_c, dc, index)],
+        "outdoor_forecast": ahead(drivers.outdoor_c, WEATHER_LEADS_H),
+        "wet_bulb": [at(drivers.wet_bulb_c, dc, index)],
+        "wet_bulb_forecast": ahead(drivers.wet_bulb_c, WEATHER_LEADS_H),
+        "workload": [at(drivers.demand, dc, index)],
+        "queue": [total / (limit_h * per_hour * 100.0)],
+        "oldest_age": [ages[0][0] if ages else 0.0],
+        "mean_age": [sum(age * tasks for age, tasks in ages) / total if ages else 0.0],
+        "age_histogram": [
+            sum(tasks for age, tasks in ages if low <= age < high) / total if ages else 0.0
+            for low, high in pairwise(edges)
+        ],
+        "room": [float(units.mean() if last is None else last.return_c[dc])],
+        "hottest_inlet": [float(units.mean() if last is None else last.inlet_max_c[dc])],
+        "setpoint": [float(units.mean())],
+        "it_energy": [
+            0.0 if last is None else float(last.it_kwh[dc] / (sizing.it_w[dc] * kwh_per_w))
+        ],
+        "hvac_energy": [0.0 if last is None else float(last.hvac_kwh[dc] / (hvac_w * kwh_per_w))],
+        "dc_load": [
+            0.0 if last is None else float((last.it_w + last.hvac_w)[dc] / sizing.facility_w[dc])
+        ],
+        "soc": [float(view.state.stored_kwh[dc]) / battery_kwh if battery_kwh else 0.0],
+    }
+
+
+def scaled(feature: Feature, value: float) -> float:
+    if feature.low == -feature.high:
+        return max(-1.0, min(1.0, value / feature.high))
+    return max(0.0, min(1.0, (value - feature.low) / (feature.high - feature.low)))
+
+
+def test_every_feature_is_what_its_description_says(episode: tuple[Observer, Seen]) -> None:
+    observer, seen = episode
+    by_name = {f.name: f for f in observer.state_features}
+    put_and_taken: list[list[list[float]]] = [[], [], []]
+    largest: dict[str, float] = dict.fromkeys(by_name, 0.0)
+    for step, (view, _, state, _) in enumerate(seen):
+        found = parts(state, observer.state_features)
+        for dc in range(3):
+            if view.last is not None:
+                taken = view.last.drained_tasks + view.last.due_tasks - view.last.overdue_tasks
+                put_and_taken[dc].append([float(view.last.deferred_tasks[dc]), float(taken[dc])])
+            expected = by_hand(view, dc, put_and_taken[dc])
+            assert expected.keys() == by_name.keys()
+            for name, values in expected.items():
+                want = [scaled(by_name[name], value) for value in values]
+                np.testing.assert_allclose(
+                    found[name][dc], want, atol=3e-6, err_msg=f"{name}, step {step}, {SITES[dc]}"
+                )
+                largest[name] = max([largest[name], *map(abs, want)])
+    # The run goes through the ranges: nothing is compared at zero alone.
+    assert min(largest.values()) > 0.02, largest
+    histogram = parts(seen[100][2], observer.state_features)["age_histogram"]
+    assert np.all(histogram[1] > 0.02)
+
+
+def test_agents_get_their_part_of_the_state(episode: tuple[Observer, Seen]) -> None:
+    observer, seen = episode
+    for view, observed, state, _ in seen[::50]:
+        found = parts(state, observer.state_features)
+        assert tuple(observed) == AGENTS
+        for agent, array in observed.items():
+            assert [f.name for f in observer.features[agent]] == list(DEFAULT_FEATURES[agent])
+            want = np.concatenate([found[name] for name in DEFAULT_FEATURES[agent]], axis=1)
+            np.testing.assert_array_equal(array, want)
+            assert array.dtype == np.float32
+            assert array.flags.c_contiguous
+            assert array.shape == (view.size, *observer.spaces[agent].shape)
+
+
+def test_everything_lies_in_its_space(episode: tuple[Observer, Seen]) -> None:
+    observer, seen = episode
+    for _, observed, state, image in seen:
+        assert observer.state_space.dtype == np.float32
+        assert all(observer.state_space.contains(row) for row in state)
+        for agent, space in observer.spaces.items():
+            assert isinstance(space, Box)
+            assert np.all(np.isfinite(space.low))
+            assert np.all(np.isfinite(space.high))
+            assert all(space.contains(row) for row in observed[agent])
+        assert all(observer.heat_map_space.contains(one) for one in image)
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [
+        ["sustaindc"],
+        ["paper"],
+        ["corrected", "simulation.thermal=transient"],
+        ["tiny", "workload.age_horizon_h=8", "workload.deadline_h=8"],
+    ],
+    ids=["sustaindc", "paper", "transient", "short-horizon"],
+)
+def test_other_presets_and_models_fit_too(listed: list[str]) -> None:
+    observer, seen = watch([load_config(listed[0], listed[1:])], 110)
+    states = np.stack([state for _, _, state, _ in seen])
+    assert all(observer.state_space.contains(row) for row in states[:, 0])
+    found = parts(states[:, 0], observer.state_features)
+    for name in ("room", "hottest_inlet", "it_energy", "hvac_energy", "dc_load"):
+        middle = (found[name][1:] > 0.02) & (found[name][1:] < 0.98)
+        assert np.all(middle), name
+    filled = found["queue"][:, 0] > 1e-6
+    np.testing.assert_allclose(found["age_histogram"][filled].sum(axis=1), 1.0, atol=1e-5)
+    np.testing.assert_array_equal(found["age_histogram"][0], 0.0)
+
+
+def test_values_beyond_a_range_are_cut_at_it() -> None:
+    n = 200
+    ci = np.where(np.arange(n) % 2 == 0, 0.0, 3000.0)
+    outdoor = np.where(np.arange(n) % 2 == 0, -60.0, 65.0)
+    drivers = drivers_from_arrays(outdoor, outdoor - 1.0, ci, np.full(n, 0.5))
+    leads: dict[str, Any] = {"ci_leads_h": [0.25], "weather_leads_h": [0.25]}
+    observer, seen = watch([load_config("tiny")], 1, drivers, **leads)
+    first, second = (parts(state, observer.state_features) for _, _, state, _ in seen)
+    for name in ("ci", "outdoor", "wet_bulb"):
+        assert (first[name].item(), second[name].item()) == (0.0, 1.0)
+        assert (first[f"{name}_forecast"].item(), second[f"{name}_forecast"].item()) == (1.0, 0.0)
+    assert (first["ci_change"].item(), second["ci_change"].item()) == (1.0, -1.0)
+
+
+def test_batch_equals_alone() -> None:
+    configs = fleet_of("tiny")
+    error = ForecastError(0.2, 3.0)
+    choices: tuple[dict[str, Any], ...] = ({}, {"forecast_error": error})
+    for options in choices:
+        _, together = watch(configs, 40, **options)
+        for dc, config in enumerate(configs):
+            _, alone = watch([config], 40, first=dc, **options)
+            for (_, a, state, image), (_, b, one_state, one_image) in zip(
+                together, alone, strict=True
+            ):
+                np.testing.assert_array_equal(state[dc], one_state[0])
+                np.testing.assert_array_equal(image[dc], one_image[0])
+                for agent in AGENTS:
+                    np.testing.assert_array_equal(a[agent][dc], b[agent][0])
+
+
+@pytest.mark.parametrize("error", [ForecastError(), ForecastError(0.2, 3.0)])
+def test_same_seed_same_observations_also_after_reset(error: ForecastError) -> None:
+    with Simulator(fleet_of("tiny")) as sim:
+        observer = Observer(sim.fleet, forecast_error=error)
+        runs = []
+        for seed in (1, 1, 2):
+            sim.reset(0)
+            see = viewer(sim)
+            view = see(None)
+            observer.reset(view, generators(3, seed))
+            states = [observer.state(view)]
+            for step in range(30):
+                view = see(sim.step(commands(step, 3)))
+                states.append(observer.state(view))
+            runs.append(np.stack(states))
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert np.array_equal(runs[0], runs[2]) == (error == ForecastError())
+
+
+def test_forecasts_of_one_view_follow_the_generators_of_the_last_reset() -> None:
+    with Simulator(fleet_of("tiny")) as sim:
+        sim.reset(0)
+        view = viewer(sim)(None)
+        observer = Observer(sim.fleet, forecast_error=ForecastError(0.2, 3.0))
+        states = []
+        for seed in (1, 2, 1):
+            observer.reset(view, generators(3, seed))
+            states.append(observer.state(view))
+    np.testing.assert_array_equal(states[0], states[2])
+    assert not np.array_equal(states[0], states[1])
+
+
+def test_start_may_move_between_episodes() -> None:
+    with Simulator(fleet_of("tiny")) as sim:
+        sim.reset(0)
+        view = viewer(sim)(None)
+        observer = Observer(sim.fleet)
+        observer.reset(view, [])
+        before = observer.state(view)
+        moved = replace(view.drivers, start=view.drivers.start + 96)
+        later = replace(view, drivers=moved, now=moved.at(0))
+        observer.reset(later, [])
+        after = parts(observer.state(later), observer.state_features)
+    old = parts(before, observer.state_features)
+    np.testing.assert_array_equal(after["time_of_day"], old["time_of_day"])
+    np.testing.assert_array_equal(after["ci"][:, 0], old["ci_forecast"][:, -1])
+    np.testing.assert_array_equal(after["outdoor"][:, 0], old["outdoor_forecast"][:, -1])
+
+
+def test_what_is_handed_out_belongs_to_the_caller() -> None:
+    with Simulator(fleet_of("tiny")) as sim:
+        sim.reset(0)
+        view = viewer(sim)(None)
+        observer = Observer(sim.fleet)
+        observer.reset(view, [])
+        first = observer.state(view), observer.observe(view)
+        kept = first[0].copy(), {a: x.copy() for a, x in first[1].items()}
+        first[0][:] = 7.0
+        for array in first[1].values():
+            array[:] = 7.0
+        np.testing.assert_array_equal(observer.state(view), kept[0])
+        for agent, array in observer.observe(view).items():
+            np.testing.assert_array_equal(array, kept[1][agent])
+
+
+# Nothing looks ahead
+
+
+def changed(drivers: Drivers, name: str, from_index: int) -> Drivers:
+    """Other values from ``from_index`` of the year on; design days stay."""
+    table: Table = getattr(drivers, name)
+    values = table.values.copy()
+    for offset, length in set(zip(table.offset.tolist(), table.length.tolist(), strict=True)):
+        part = values[offset + from_index : offset + length]
+        part += 0.1 if name == "demand" else 5.0
+    if name == "demand":
+        values = np.minimum(values, 1.0)
+    other: dict[str, Any] = {name: replace(table, values=values)}
+    return replace(drivers, **other)
+
+
+@pytest.mark.parametrize("error", [ForecastError(), ForecastError(0.2, 3.0)])
+@pytest.mark.parametrize(
+    ("name", "lead_h"),
+    [("demand", 0.0), ("ci_g_per_kwh", 24.0), ("outdoor_c", 24.0), ("wet_bulb_c", 24.0)],
+)
+def test_nothing_beyond_the_longest_lead_is_seen(
+    name: str, lead_h: float, error: ForecastError
+) -> None:
+    configs = make_configs(load_config("tiny"), sites=SITES)
+    steps = 20
+    with Simulator(configs) as sim:
+        drivers = sim.drivers
+        if name == "wet_bulb_c":  # room for a warmer wet bulb
+            drivers = changed(drivers, "outdoor_c", 0)
+    last = steps + round(lead_h * 4)
+    options: dict[str, Any] = {"forecast_error": error}
+    seen = watch(configs, steps, drivers, **options)[1]
+    unseen = watch(configs, steps, changed(drivers, name, last + 1), **options)[1]
+    nearer = watch(configs, steps, changed(drivers, name, last), **options)[1]
+    for (_, _, a, _), (_, _, b, _) in zip(seen, unseen, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(seen[-1][2], nearer[-1][2])
+
+
+# Forecasts
+
+
+def walk_forecast(error: ForecastError, seeds: int, step: int = 0) -> tuple[Any, ...]:
+    """Forecasts of a flat world for many seeds."""
+    n = 400
+    drivers = drivers_from_arrays(
+        np.full(n, 20.0), np.full(n, 15.0), np.full(n, 400.0), np.full(n, 0.5), size=seeds
+    )
+    made = Forecasts(4, error=error)
+    made.reset(drivers, generators(seeds, 5))
+    ci, outdoor, wet_bulb = made.look(drivers.start + step, step)
+    return ci.T, outdoor.T, wet_bulb.T
+
+
+def test_perfect_forecasts_are_what_comes() -> None:
+    """A forecast of the state before is the present of the state then, entry by entry."""
+    observer, seen = watch(fleet_of("tiny"), 100)
+    found = [parts(state, observer.state_features) for _, _, state, _ in seen]
+    for name, leads in (
+        ("ci", CI_LEADS_H),
+        ("outdoor", WEATHER_LEADS_H),
+        ("wet_bulb", WEATHER_LEADS_H),
+    ):
+        for k, lead_h in enumerate(leads):
+            lead = round(lead_h * 4)
+            for step in range(101 - lead):
+                np.testing.assert_array_equal(
+                    found[step][f"{name}_forecast"][:, k], found[step + lead][name][:, 0]
+                )
+
+
+def test_errors_grow_with_the_square_root_of_the_lead() -> None:
+    count = 4000
+    ci, outdoor, wet_bulb = walk_forecast(ForecastError(0.1, 2.0), count, step=100)
+    np.testing.assert_array_equal(ci[:, 0], 400.0)
+    np.testing.assert_array_equal(outdoor[:, 0], 20.0)
+    # Five standard errors of a standard deviation and of a mean.
+    for values, truth, at_24_h, leads in (
+        (ci, 400.0, 40.0, CI_LEADS_H),
+        (outdoor, 20.0, 2.0, WEATHER_LEADS_H),
+        (wet_bulb, 15.0, 2.0, WEATHER_LEADS_H),
+    ):
+        for k, lead_h in enumerate(leads):
+            wanted = at_24_h * math.sqrt(lead_h / 24.0)
+            error = values[:, k + 1].astype(np.float64) - truth
+            assert abs(error.std() / wanted - 1.0) < 5 / math.sqrt(2 * count)
+            assert abs(error.mean()) < 5 * wanted / math.sqrt(count)
+    np.testing.assert_allclose(outdoor - wet_bulb, 5.0, atol=1e-5)
+    independent = np.corrcoef(ci[:, -1], outdoor[:, -1])[0, 1]
+    assert abs(independent) < 5 / math.sqrt(count)
+
+
+def test_successive_forecasts_of_one_hour_are_consistent() -> None:
+    """What the error loses from one issue to the next is what the walk did in between."""
+    count, error = 3000, ForecastError(0.1, 0.0)
+    issued = [
+        walk_forecast(error, count, step)[0] / 400.0 - 1.0 for step in (60, 92, 124, 140, 148)
+    ]
+    leads = [CI_LEADS_H.index(h) + 1 for h in (24.0, 16.0, 8.0, 4.0, 2.0)]
+    errors = np.stack([e[:, k] for e, k in zip(issued, leads, strict=True)]).astype(np.float64)
+    revisions = -np.diff(errors, axis=0)
+    spans_h = [8.0, 8.0, 4.0, 2.0]
+    for revision, hours in zip(revisions, spans_h, strict=True):
+        assert revision.std() == pytest.approx(0.1 * math.sqrt(hours / 24), rel=0.08)
+    mixed = np.corrcoef(np.vstack([revisions, errors[-1:]])) - np.eye(5)
+    assert np.max(np.abs(mixed)) < 5 / math.sqrt(count)
+
+
+def test_forecast_of_a_step_does_not_depend_on_the_steps_looked_at() -> None:
+    n = 1000
+    drivers = drivers_from_arrays(
+        np.full(n, 20.0), np.full(n, 15.0), np.full(n, 400.0), np.full(n, 0.5), size=2
+    )
+    each, only = Forecasts(4, error=ForecastError(0.1, 2.0)), None
+    each.reset(drivers, generators(2))
+    found = [each.look(drivers.start + step, step) for step in range(501)]
+    for step in (1, 127, 128, 300, 500):
+        only = Forecasts(4, error=ForecastError(0.1, 2.0))
+        only.reset(drivers, generators(2))
+        for a, b in zip(found[step], only.look(drivers.start + step, step), strict=True):
+            np.testing.assert_array_equal(a, b)
+    with pytest.raises(RuntimeStateError, match="reset starts again"):
+        each.look(drivers.start, 0)
+
+
+def test_ci_forecasts_are_never_negative() -> None:
+    ci, _, _ = walk_forecast(ForecastError(2.0, 0.0), 500)
+    assert ci.min() == 0.0
+    assert np.count_nonzero(ci == 0.0) > 100
+
+
+def test_a_generator_gives_one_number_to_forecasts_that_err_and_none_to_perfect_ones() -> None:
+    n = 10
+    drivers = drivers_from_arrays(
+        np.full(n, 20.0), np.full(n, 15.0), np.full(n, 400.0), np.full(n, 0.5)
+    )
+    for error, draws in ((ForecastError(), 0), (ForecastError(0.1, 0.0), 1)):
+        (rng,) = generators(1)
+        made = Forecasts(4, error=error)
+        made.reset(drivers, [rng])
+        for step in (0, 200):
+            made.look(drivers.start + step, step)
+        (other,) = generators(1)
+        other.integers(2**63, size=draws)
+        assert rng.random() == other.random()
+
+
+def test_series_that_end_repeat_from_their_own_start() -> None:
+    """Series of unlike length, shorter than a lead, and read past their ends."""
+    rng = np.random.default_rng(3)
+    with Simulator([load_config("tiny")]) as sim:
+        drivers = sim.drivers
+
+    def table(n: int, low: float, high: float) -> Table:
+        values = rng.uniform(low, high, n)
+        return Table(values, np.zeros(1, np.int64), np.array([n]))
+
+    odd = replace(
+        drivers,
+        ci_g_per_kwh=table(31, 100, 400),
+        outdoor_c=table(50, 20, 30),
+        wet_bulb_c=table(13, 5, 15),
+        start=np.array([7]),
+    )
+    observer, seen = watch([load_config("tiny")], 60, odd)
+    spans = {f.name: (f.low, f.high - f.low) for f in observer.state_features}
+    for step, (_, _, state, _) in enumerate(seen):
+        found = parts(state, observer.state_features)
+        for name, leads, series in (
+            ("ci", CI_LEADS_H, odd.ci_g_per_kwh),
+            ("outdoor", WEATHER_LEADS_H, odd.outdoor_c),
+            ("wet_bulb", WEATHER_LEADS_H, odd.wet_bulb_c),
+        ):
+            low, span = spans[name]
+            want = [at(series, 0, 7 + step + round(h * 4)) for h in (0.0, *leads)]
+            got = np.append(found[name], found[f"{name}_forecast"]) * span + low
+            np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-4)
+
+
+def test_tables_and_reading_step_by_step_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, fast = watch(fleet_of("tiny"), 30)
+    monkeypatch.setattr(module, "TABLE_BYTES", 0)
+    _, slow = watch(fleet_of("tiny"), 30)
+    for (_, _, a, _), (_, _, b, _) in zip(fast, slow, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+# Choice of features
+
+
+def test_features_of_an_agent_are_those_named_in_their_order() -> None:
+    names = ["soc", "ci_forecast", "time_of_day"]
+    options: dict[str, Any] = {"agents": ["agent_bat"], "features": {"agent_bat": names}}
+    observer, seen = watch(fleet_of("tiny"), 3, ci_leads_h=[0.5, 3], **options)
+    assert [f.name for f in observer.features["agent_bat"]] == names
+    assert tuple(observer.spaces) == ("agent_bat",)
+    assert len(observer.state_features) == len(catalogue())
+    _, observed, state, _ = seen[-1]
+    found = parts(state, observer.state_features)
+    np.testing.assert_array_equal(
+        observed["agent_bat"], np.concatenate([found[name] for name in names], axis=1)
+    )
+    assert observed["agent_bat"].shape == (3, 1 + 2 + 2)
+    np.testing.assert_array_equal(observer.spaces["agent_bat"].low, [0, 0, 0, -1, -1])
+
+
+def test_no_leads_leave_the_forecasts_out() -> None:
+    observer, seen = watch(fleet_of("tiny"), 2, ci_leads_h=[], weather_leads_h=[])
+    names = {f.name for f in observer.state_features}
+    assert not any("forecast" in name or "change" in name for name in names)
+    assert all(f.name in names for found in observer.features.values() for f in found)
+    assert all(observer.state_space.contains(row) for row in seen[-1][2])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"features": {"agent_ls": ["queu"]}}, "did you mean 'queue'"),
+        ({"features": {"agent_ls": ["xyzzy"]}}, "valid: time_of_day, .*, soc"),
+        ({"features": {"agent_bt": ["soc"]}}, "did you mean 'agent_bat'"),
+        ({"features": {"agent_ls": []}}, "agent_ls: .*list of names"),
+        ({"features": {"agent_ls": "soc"}}, "agent_ls: 'soc'; valid is a list of names"),
+        ({"features": {"agent_ls": ["soc", "soc"]}}, "'soc' is named twice"),
+        ({"agents": ["agent_dcc"]}, "did you mean 'agent_dc'"),
+        ({"ci_leads_h": [0.1]}, "ci_leads_h: 0.1 h; valid is a positive multiple .* 15 min"),
+        ({"ci_leads_h": [0.0]}, "ci_leads_h: 0 h"),
+        ({"ci_leads_h": [float("nan")]}, "ci_leads_h: nan h"),
+        ({"ci_leads_h": [1e9]}, "up to 8760 h"),
+        ({"weather_leads_h": [3, 3]}, "weather_leads_h: 3 h after 3 h"),
+        ({"weather_leads_h": ["3"]}, "weather_leads_h .*list of hours"),
+    ],
+)
+def test_wrong_choices_name_what_is_valid(options: dict[str, Any], message: str) -> None:
+    with Simulator([load_config("tiny")]) as sim, pytest.raises(ConfigError, match=message):
+        Observer(sim.fleet, **options)
+
+
+@pytest.mark.parametrize("value", [-0.1, math.nan, math.inf, "big", True])
+def test_wrong_errors_are_refused(value: Any) -> None:
+    with pytest.raises(ConfigError, match="forecast error ci_share"):
+        ForecastError(ci_share=value)
+    with pytest.raises(ConfigError, match="forecast error temperature_k"):
+        ForecastError(temperature_k=value)
+
+
+def test_leads_follow_the_step() -> None:
+    np.testing.assert_array_equal(lead_steps("x", [0.25, 1, 24], 4), [1, 4, 96])
+    np.testing.assert_array_equal(lead_steps("x", [0.25, 1, 24], 60), [15, 60, 1440])
+    with pytest.raises(ConfigError, match="60 min"):
+        lead_steps("x", [0.25], 1)
+
+
+def test_reset_comes_first_and_brings_a_generator_each() -> None:
+    with Simulator(fleet_of("tiny")) as sim:
+        sim.reset(0)
+        view = viewer(sim)(None)
+        observer = Observer(sim.fleet, forecast_error=ForecastError(0.1, 0.0))
+        with pytest.raises(RuntimeStateError, match="reset"):
+            observer.observe(view)
+        with pytest.raises(ConfigError, match="2 random generators for 3 data centers"):
+            observer.reset(view, generators(2))
+        observer.reset(view, generators(3))
+        assert observer.observe(view)["agent_ls"].shape == (3, 40)
+
+
+def test_no_other_step_and_no_other_length_of_step_changes_meaning() -> None:
+    """With steps of 1 h and 5 min, leads and energies mean the same."""
+    hourly = watch(fleet_of("tiny", **{"simulation.steps_per_hour": 1}), 5)
+    fine = watch(fleet_of("tiny", **{"simulation.steps_per_hour": 12}), 60)
+    a, b = (parts(seen[-1][2], o.state_features) for o, seen in (hourly, fine))
+    np.testing.assert_allclose(a["time_of_day"], b["time_of_day"], atol=1e-6)
+    # Interpolated series differ from the mean of their hour by little.
+    for name in ("ci_forecast", "outdoor_forecast", "wet_bulb_forecast"):
+        np.testing.assert_allclose(a[name], b[name], atol=0.03)
+    for name in ("it_energy", "hvac_energy", "dc_load"):
+        np.testing.assert_allclose(a[name], b[name], atol=0.12)
+        assert np.all(a[name] > 0.02)
+
+
+# Several CRAC units
+
+
+def units(count: int, name: str) -> DataCenterConfig:
+    return load_config("corrected", [f"hvac.crac.units={count}", f"name={name}"])
+
+
+def test_setpoints_of_equal_numbers_of_units_stand_side_by_side() -> None:
+    with Simulator([units(2, "a"), units(2, "b")]) as sim:
+        sim.reset(0)
+        view = viewer(sim)(sim.step(Actions(cooling=np.array([1.0, -1.0, 0.0, 2.0]))))
+        observer = Observer(sim.fleet)
+        observer.reset(view, [])
+        found = parts(observer.state(view), observer.state_features)["setpoint"]
+        np.testing.assert_allclose(found * 20.0 + 10.0, [[19, 17], [18, 20]], atol=1e-5)
+
+
+def test_setpoints_of_unlike_numbers_of_units_are_means() -> None:
+    with Simulator([units(1, "a"), units(3, "b")]) as sim:
+        sim.reset(0)
+        view = viewer(sim)(sim.step(Actions(cooling=np.array([2.0, 1.0, 1.0, -2.0]))))
+        observer = Observer(sim.fleet)
+        observer.reset(view, [])
+        found = parts(observer.state(view), observer.state_features)["setpoint"]
+        np.testing.assert_allclose(found * 20.0 + 10.0, [[20], [18]], atol=1e-5)
+
+
+# Heat map
+
+
+def test_heat_map_shows_each_rack_in_its_place(episode: tuple[Observer, Seen]) -> None:
+    observer, seen = episode
+    for view, _, _, image in seen[::75]:
+        assert image.dtype == np.float32
+        for dc, config in enumerate(view.fleet.configs):
+            rows, per_row = config.hall.rows, config.hall.racks_per_row
+            assert image[dc].shape == (rows, per_row, 3) == observer.heat_map_space.shape
+            for row in range(rows):
+                for place in range(per_row):
+                    rack = int(view.fleet.rack_start[dc]) + row * per_row + place
+                    if view.last is None:
+                        raw = [18.0, 18.0, 0.0]
+                    else:
+                        design_w = float(view.sizing.it_w[dc]) / (rows * per_row)
+                        raw = [
+                            float(view.last.rack_inlet_c[rack]),
+                            float(view.last.rack_outlet_c[rack]),
+                            float(view.last.rack_power_w[rack]) / design_w,
+                        ]
+                    want = [scaled(f, x) for f, x in zip(HEAT_MAP_FEATURES, raw, strict=True)]
+                    np.testing.assert_allclose(image[dc, row, place], want, atol=2e-6)
+
+
+def test_heat_map_needs_halls_of_one_shape() -> None:
+    small = load_config("tiny")
+    other = load_config("corrected", ["hall.inlet_model=approach"])
+    with Simulator([small, other]) as sim:
+        sim.reset(0)
+        observer = Observer(sim.fleet)
+        with pytest.raises(ConfigError, match="corrected has 4 x 5 racks, tiny has 2 x 2"):
+            _ = observer.heat_map_space
+        with pytest.raises(SdcError, match="heat map"):
+            observer.heat_map(viewer(sim)(None))
+
+
+# Documentation
+
+
+@pytest.mark.repo
+def test_the_page_has_the_table_as_generated() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "observations.md").read_text("utf-8")
+    assert f"\n\n{table_markdown()}\n" in page
+    for feature in HEAT_MAP_FEATURES:
+        assert f"`{feature.name}` {feature.low:g}..{feature.high:g}" in page
+
+
+def test_the_table_names_who_observes_what() -> None:
+    lines = table_markdown().splitlines()[2:]
+    assert len(lines) == len(catalogue())
+    for line, feature in zip(lines, catalogue(), strict=True):
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        assert cells[:2] == [f"`{feature.name}`", str(feature.size)]
+        assert [bool(cell) for cell in cells[-3:]] == [
+            feature.name in DEFAULT_FEATURES[agent] for agent in AGENTS
+        ]

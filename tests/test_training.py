@@ -1,0 +1,320 @@
+"""The examples with training libraries, each at a tiny size.
+
+A test is skipped, naming the package, when what it trains with is not installed: `make test-train`
+installs all of it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import sdc_taichi
+
+pytestmark = pytest.mark.repo
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+AGENTS = ("agent_ls", "agent_dc", "agent_bat")
+DAY = 96
+Load = Callable[..., Any]
+
+
+@pytest.fixture
+def example(monkeypatch: pytest.MonkeyPatch) -> Iterator[Load]:
+    """Imports an example, or skips the test when a package it needs is missing."""
+    threads: list[int] = []
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+
+    def load(name: str, *packages: str) -> ModuleType:
+        for package in ("torch", *packages):
+            found = pytest.importorskip(
+                package, reason=f"{package} is not installed: make test-train"
+            )
+            if package == "torch":
+                threads.append(found.get_num_threads())
+        return importlib.import_module(name)
+
+    yield load
+    if threads:
+        importlib.import_module("torch").set_num_threads(threads[0])
+
+
+# --- Stable-Baselines3 ---
+
+
+def test_sb3_adapter_hands_on_what_the_batch_gives(example: Load) -> None:
+    sb3 = example("train_sb3", "stable_baselines3")
+    env = sb3.BatchVecEnv(gymnasium.make_vec("sdc_taichi/Battery-v0", num_envs=3, days=1))
+    twin = gymnasium.make_vec("sdc_taichi/Battery-v0", num_envs=3, days=1)
+    env.seed(5)
+    np.testing.assert_array_equal(env.reset(), twin.reset(seed=5)[0])
+    rng = np.random.default_rng(0)
+    for step in range(DAY + 2):
+        actions = rng.integers(0, 3, 3)
+        observations, rewards, done, infos = env.step(actions)
+        expected = twin.step(actions)
+        np.testing.assert_array_equal(observations, expected[0])
+        np.testing.assert_array_equal(rewards, expected[1].astype(np.float32))
+        assert rewards.dtype == np.float32
+        assert done.tolist() == [step == DAY - 1] * 3
+        for i, info in enumerate(infos):
+            if done[i]:
+                np.testing.assert_array_equal(
+                    info["terminal_observation"], expected[4]["final_obs"][i]
+                )
+                assert not np.array_equal(info["terminal_observation"], observations[i])
+                assert info["TimeLimit.truncated"] is True
+            else:
+                assert info == {}
+    env.close()
+    twin.close()
+
+
+@pytest.mark.parametrize("agent", ["Load", "Cooling", "Battery"])
+def test_sb3_trains_one_agent_reproducibly(example: Load, agent: str) -> None:
+    sb3 = example("train_sb3", "stable_baselines3")
+
+    def weights(steps: int) -> Any:
+        model, outcome = sb3.train(agent, num_envs=2, steps=steps, days=1, rollout=16, seed=3)
+        assert outcome.steps == steps
+        assert np.isfinite([outcome.untrained, outcome.trained]).all()
+        return np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()])
+
+    once, again, longer = weights(32), weights(32), weights(64)
+    np.testing.assert_array_equal(once, again)
+    assert not np.array_equal(once, longer)
+
+
+def test_sb3_runs_from_the_command_line(example: Load, capsys: pytest.CaptureFixture[str]) -> None:
+    sb3 = example("train_sb3", "stable_baselines3")
+    sb3.main(["--num-envs", "2", "--steps", "32", "--rollout", "16", "--days", "1"])
+    assert capsys.readouterr().out.startswith("Battery: mean episode reward -")
+
+
+# --- skrl ---
+
+
+@pytest.mark.parametrize("algorithm", ["ippo", "mappo"])
+def test_skrl_trains_all_agents(
+    example: Load, algorithm: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    skrl = example("train_skrl", "skrl")
+    skrl.main(
+        [
+            *("--algorithm", algorithm, "--num-envs", "2", "--days", "1"),
+            *("--rollout", "24", "--steps", "240", "--hidden", "8"),
+        ]
+    )
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"{algorithm}: ")
+    assert [line.partition(":")[0] for line in lines[1:]] == list(AGENTS)
+
+
+@pytest.mark.parametrize("algorithm", ["ippo", "mappo"])
+def test_skrl_updates_every_policy_from_the_right_inputs(example: Load, algorithm: str) -> None:
+    skrl = example("train_skrl", "skrl")
+    skrl.prepare(1)
+    env = skrl.BatchEnv(sdc_taichi.vector_env(2, days=1), seed=1)
+    agent = skrl.learner(env, algorithm, rollout=8, hidden=(8,))
+    before = {a: agent.policies[a].net[0].weight.detach().clone() for a in AGENTS}
+    skrl.trainer(env, agent, 16).train()
+    for a in AGENTS:
+        assert not np.array_equal(before[a], agent.policies[a].net[0].weight.detach())
+        assert agent.policies[a].net[0].in_features == env.observation_space(a).shape[0]
+        seen = env.state_space(a) if algorithm == "mappo" else env.observation_space(a)
+        assert agent.values[a].net[0].in_features == seen.shape[0]
+    env.close()
+
+
+@pytest.mark.parametrize("algorithm", ["ippo", "mappo"])
+def test_skrl_values_the_state_in_which_an_episode_was_cut_off(
+    example: Load, algorithm: str
+) -> None:
+    skrl = example("train_skrl", "skrl")
+    torch = importlib.import_module("torch")
+    skrl.prepare(2)
+    env = skrl.BatchEnv(sdc_taichi.vector_env(2, days=1), seed=2)
+    ends: list[Any] = []
+    plain_step = env.step
+
+    def step(actions: Any) -> Any:
+        given = plain_step(actions)
+        if "final" in given[4]:
+            ends.append((given[0], {a: r.clone() for a, r in given[1].items()}, given[4]["final"]))
+        return given
+
+    env.step = step
+    # Without scaling, and without an update before the episode ends, critics stay as they are.
+    agent = skrl.learner(
+        env, algorithm, rollout=DAY + 4, hidden=(8,), observation_preprocessor=None,
+        state_preprocessor=None, value_preprocessor=None,
+    )  # fmt: skip
+    skrl.trainer(env, agent, DAY + 2).train()
+    ((next_episode, paid, (observations, states)),) = ends
+    for a in AGENTS:
+        inputs = {"observations": observations[a], "states": states[a]}
+        with torch.no_grad():
+            value = agent.values[a].act(inputs, role="value")[0]
+        recorded = agent.memories[a].get_tensor_by_name("rewards")[DAY - 1]
+        assert torch.allclose(recorded, paid[a] + 0.995 * value, atol=1e-6)
+        assert not torch.equal(observations[a], next_episode[a])
+    env.close()
+
+
+# --- TorchRL ---
+
+
+def test_torchrl_env_passes_its_check(example: Load, capsys: pytest.CaptureFixture[str]) -> None:
+    rl = example("torchrl_env", "torchrl", "tensordict")
+    rl.main(["--num-envs", "2", "--steps", str(DAY + 4)])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-4].startswith(f"{2 * (DAY + 4)} steps, ")
+    assert [line.partition(":")[0] for line in lines[-3:]] == list(AGENTS)
+
+
+def test_torchrl_env_gives_what_the_batch_gives(example: Load) -> None:
+    rl = example("torchrl_env", "torchrl", "tensordict")
+    env = rl.BatchEnv(sdc_taichi.vector_env(2, days=1), seed=4)
+    twin = sdc_taichi.vector_env(2, days=1)
+    observations, _ = twin.reset(seed=4)
+    rollout = env.rollout(DAY + 2, break_when_any_done=False)
+    for t in range(DAY + 2):
+        now, after = rollout[:, t], rollout["next"][:, t]
+        np.testing.assert_array_equal(now["state"], twin.state())
+        for a in AGENTS:
+            np.testing.assert_array_equal(now[a, "observation"], observations[a])
+        actions = {a: now[a, "action"].numpy() for a in AGENTS}
+        observations, rewards, _, truncated, infos = twin.step(actions)
+        last = infos.get("final_obs", observations)
+        assert ("final_obs" in infos) == (t == DAY - 1)
+        for a in AGENTS:
+            np.testing.assert_array_equal(after[a, "observation"], last[a])
+            np.testing.assert_array_equal(after[a, "reward"][:, 0], rewards[a])
+            np.testing.assert_array_equal(after["truncated"][:, 0], truncated[a])
+        assert not after["terminated"].any()
+        assert bool(after["done"].all()) == (t == DAY - 1)
+    env.close()
+    twin.close()
+
+
+def test_torchrl_env_starts_anew_within_an_episode_and_refuses_a_part(example: Load) -> None:
+    rl = example("torchrl_env", "torchrl", "tensordict")
+    env = rl.BatchEnv(sdc_taichi.vector_env(2, days=1), seed=4)
+    start = env.reset()
+    env.rollout(5, auto_reset=False, tensordict=start.clone())
+    env.set_seed(4)
+    np.testing.assert_array_equal(env.reset()["state"], start["state"])
+    part = env.reset()
+    part["_reset"] = importlib.import_module("torch").tensor([[True], [False]])
+    with pytest.raises(ValueError, match="single ones cannot be reset"):
+        env.reset(part)
+    env.close()
+
+
+# --- the training of docs/training.md ---
+
+
+def test_carbon_reward_pays_each_agent_for_its_own_part(example: Load) -> None:
+    carbon = example("train_carbon", "skrl", "matplotlib")
+    configs = carbon.data_centers(("CA",), (10,))
+
+    def rewards(**commands: int) -> dict[str, Any]:
+        env = sdc_taichi.vector_env(
+            1, config=configs, days=7, start="fixed", rewards=carbon.carbon_reward
+        )
+        env.reset(seed=0)
+        kept: dict[str, list[Any]] = {a: [] for a in (*AGENTS, "ci")}
+        for _ in range(DAY):
+            hold = dict.fromkeys(AGENTS, np.ones(1, dtype=np.int64))
+            acts = hold | {a: np.full(1, c) for a, c in commands.items()}
+            _, paid, _, _, infos = env.step(acts)
+            for a in AGENTS:
+                kept[a].append(float(paid[a][0]))
+            kept["ci"].append(float(infos["ci_g_per_kwh"][0]))
+        env.close()
+        return {name: np.array(values) for name, values in kept.items()}
+
+    idle = rewards()
+    np.testing.assert_array_equal(idle["agent_bat"], 0.0)
+    np.testing.assert_allclose(idle["agent_ls"], 0.0, atol=1e-9)
+    assert np.all(idle["agent_dc"] < 0)
+    # Deferring pays where the grid is dirtier than the coming day is on average, and only there.
+    deferring = rewards(agent_ls=0)
+    np.testing.assert_array_equal(deferring["agent_bat"], 0.0)
+    assert deferring["agent_ls"][idle["ci"].argmax()] > 0
+    assert deferring["agent_ls"][idle["ci"].argmin()] < 0
+    # The first charge costs or earns by the intensity; later ones find the battery full.
+    charging = rewards(agent_bat=0)
+    np.testing.assert_allclose(charging["agent_ls"], 0.0, atol=1e-9)
+    assert charging["agent_bat"][0] != 0
+    assert abs(charging["agent_bat"][-1]) < 1e-3 * abs(charging["agent_bat"][0])
+
+
+def test_held_out_weeks_are_not_trained_on(example: Load, tmp_path: Path) -> None:
+    carbon = example("train_carbon", "skrl", "matplotlib")
+    assert not {*carbon.TRAINED} & {*carbon.HELD_OUT}
+    assert sorted((*carbon.TRAINED, *carbon.HELD_OUT)) == list(range(52))
+    first, second = carbon.data_centers(("NY", "CA"), (0, 51))[1:3]
+    assert (first.site.location, first.site.start) == ("NY", "12-24")
+    assert (second.site.location, second.site.start) == ("CA", "01-01")
+    with pytest.raises(SystemExit):
+        carbon.main([str(tmp_path), "--train-weeks", "1", "2", "--held-out-weeks", "2"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_idle_policies_score_as_the_idle_controller(example: Load) -> None:
+    carbon = example("train_carbon", "skrl", "matplotlib")
+    torch = importlib.import_module("torch")
+    sites = ("CA", "WA")
+    configs = carbon.data_centers(sites, (3,))
+    env = carbon.make_env(configs)
+    agent = carbon.learner(env, "ippo", **carbon.SETTINGS)
+    agent.init()
+    for policy in agent.policies.values():
+        for parameter in policy.parameters():
+            torch.nn.init.zeros_(parameter)
+        policy.net[-1].bias.data[1] = 1.0  # the action in the middle changes nothing
+    idle = carbon.run_rules("idle", configs)
+    same = carbon.against_idle(carbon.run_policies(agent, env), idle, sites)
+    found = [v for v in same.values() if not isinstance(v, dict)]
+    np.testing.assert_allclose(found, 0.0, atol=1e-9)
+    env.close()
+    less = idle | {"carbon_g": 0.9 * idle["carbon_g"], "executed_tasks": idle["executed_tasks"]}
+    assert carbon.against_idle(less, idle, sites)["cfp"] == pytest.approx(-10.0)
+    undone = less | {"executed_tasks": 0.9 * idle["executed_tasks"]}
+    found = carbon.against_idle(undone, idle, sites)
+    assert found["cfp_per_work"] == pytest.approx(0.0, abs=1e-9)
+    assert list(found["cfp_per_work_by_site"].values()) == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+@pytest.mark.slow
+def test_carbon_training_writes_results_and_curve(
+    example: Load, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    carbon = example("train_carbon", "skrl", "matplotlib")
+    carbon.main(
+        [
+            *(str(tmp_path / "out"), "--seeds", "0", "1", "--steps", "1", "--points", "1"),
+            *("--sites", "NY", "CA", "--train-weeks", "0", "--held-out-weeks", "3"),
+        ]
+    )
+    report = json.loads((tmp_path / "out" / "training.json").read_text("utf-8"))
+    assert (tmp_path / "out" / "training.png").read_bytes().startswith(b"\x89PNG")
+    assert [seed["seed"] for seed in report["seeds"]] == [0, 1]
+    for seed in report["seeds"]:
+        assert [point["steps"] for point in seed["curve"]] == [0, 2 * carbon.STEPS]
+        assert list(seed["curve"][-1]["cfp_per_work_by_site"]) == ["NY", "CA"]
+    ends = [seed["curve"][-1]["cfp_per_work"] for seed in report["seeds"]]
+    assert ends[0] != ends[1]
+    assert report["summary"]["cfp_per_work"]["mean"] == pytest.approx(np.mean(ends))
+    assert set(report["rules"]) == set(carbon.RULES)
+    text = capsys.readouterr().out
+    assert text.count("\n| ") == 1 + len(carbon.RULES) + 2
