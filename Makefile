@@ -15,6 +15,8 @@ TORCH ?= torch==2.13.0
 # The first suitable Python unless PYTHON names one.
 PYTHON ?= python3.13 python3.12 python3.11 python3 python
 
+# A file stays with one process, because its fixtures are shared; each process may take 1 GB.
+SPREAD := --numprocesses auto --maxprocesses 4 --dist loadfile
 TYPED := build/typecheck
 SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
@@ -28,7 +30,7 @@ demo: $(READY) ## Simulate July in New York and California; results in runs/demo
 	$(VENV)/bin/sdc-taichi simulate --site ny,ca --days 31 --start 07-01 --out runs/demo --record runs/demo/hall.rrd
 
 test: $(READY) ## Run all tests; those on measured files need SDC_REAL_DATA.
-	$(PY) -m pytest
+	$(PY) -m pytest $(SPREAD)
 
 test-train: $(READY_TRAIN) ## Install the training libraries and test the examples that use them.
 	$(PY) -m pytest tests/test_training.py
@@ -43,7 +45,7 @@ lint: $(READY) ## Check style, format and types.
 	    | sed -E 's#^sdc_taichi/($(MAPPED))/#\1/#; s#^\.\./\.\./##'
 
 wheel-test: $(READY) ## Build the wheel and run the tests against it, away from the sources.
-	.ci/wheel-test $(PY)
+	.ci/wheel-test $(PY) $(SPREAD)
 
 clean: ## Remove everything that can be built again, the environment included.
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -77,7 +77,7 @@ def main() -> None:
     overrides = ["simulation.thermal=transient"] if given.transient else []
     config = sdc_taichi.load_config(given.preset, overrides)
     seconds = 0.05 if given.quick else 1.0
-    print(f"{'N':>6} {'vector_env':>12} {'make_vec':>12} {'sync':>10} {'to sync':>8} {'to 680/s':>9}")
+    print("     N   vector_env     make_vec       sync  to sync  to 680/s")
     peer = 0.0
     for num_envs in QUICK_SIZES if given.quick else SIZES:
         batch = native(config, num_envs, seconds)

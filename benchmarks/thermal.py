@@ -24,11 +24,7 @@ from sdc_taichi.hall import Coil, Conditions, Hall
 
 SIZES = ((4096, 20, 200), (256, 1000, 40), (1, 100_000, 40))
 QUICK_SIZES = ((16, 20, 200), (2, 100, 40), (1, 400, 40))
-SUBSTEPS = 15
-HEADS = (
-    "roof", "flat", "of roof", "steady", "to flat", "of roof", "transient", "to flat", "of roof",
-    "uneven steady", "to flat", "uneven trans.", "to flat",
-)  # fmt: skip
+STEP_S, SUBSTEPS = 900.0, 15
 
 
 def fleet_of(n_dcs: int, racks: int, servers: int, inlet_model: str) -> Fleet:
@@ -80,46 +76,57 @@ def roof_s(servers: int, repeats: int) -> float:
     return out
 
 
-def measure(n_dcs: int, racks: int, servers: int, repeats: int) -> tuple[float, ...]:
-    """The figures of one line."""
-    load, rng = np.linspace(0.1, 0.9, n_dcs), np.random.default_rng(0)
+def measure(n_dcs: int, racks: int, servers: int, repeats: int) -> dict[str, float]:
+    """Core time of a step in ns per server, by what is computed."""
+    load = np.linspace(0.1, 0.9, n_dcs)
     flat = Hall(fleet_of(n_dcs, racks, servers, "approach"), "f32")
-    met = Conditions(np.full(n_dcs, 18.0), load)
-    layers = (flat.solve(met), flat.servers())[1]
+    alike = Conditions(np.full(n_dcs, 18.0), load)
+    flat.solve(alike)
+    layers = flat.servers()
 
-    def expanded(hall: Hall, step: Callable[[], object]) -> float:
-        return core_s(step, repeats) + core_s(lambda: hall.servers(layers), repeats)
-
-    ns = 1e9 / (n_dcs * racks * servers)
-    roof = roof_s(n_dcs * racks * servers, repeats) * ns
-    flat_ns = expanded(flat, lambda: flat.solve(met)) * ns
     fleet = fleet_of(n_dcs, racks, servers, "recirculation")
     hall = Hall(fleet, "f32")
-    at_units = Conditions(np.full(fleet.units, 18.0), load)
-    uneven = replace(
-        at_units,
-        rack_load=np.clip(load[fleet.rack_dc] + rng.uniform(-0.1, 0.1, fleet.racks), 0.0, 1.0),
+    off = np.random.default_rng(0).uniform(-0.1, 0.1, fleet.racks)
+    uneven = replace(alike, rack_load=np.clip(load[fleet.rack_dc] + off, 0.0, 1.0))
+    settled = hall.settle(alike)
+    none, ample = np.zeros(n_dcs), np.full(n_dcs, 1e12)
+    coil = Coil(
+        setpoint_c=alike.unit_supply_c,
+        room_j=none,
+        room_j_per_k=np.full(n_dcs, 1e9),
+        limit_w=ample,
+        fan_w_per_m3s=np.full(n_dcs, 500.0),
     )
-    state = hall.settle(at_units)
-    every = np.ones(n_dcs)
-    coil = Coil(at_units.unit_supply_c, 0.0 * every, 1e9 * every, 1e12 * every, 500.0 * every)
-    steady, transient = [], []
-    for now in (at_units, uneven):
-        steady.append(expanded(hall, lambda now=now: hall.solve(now)) * ns)  # type: ignore[misc]
-    for now in (at_units, uneven):
-        transient.append(
-            expanded(
-                hall,
-                lambda now=now: hall.advance(now, state, coil, 900.0, 900.0 / SUBSTEPS),  # type: ignore[misc]
-            )
-            * ns
-        )
-    return (
-        roof, flat_ns, roof / flat_ns,
-        steady[0], steady[0] / flat_ns, roof / steady[0],
-        transient[0], transient[0] / flat_ns, roof / transient[0],
-        steady[1], steady[1] / flat_ns, transient[1], transient[1] / flat_ns,
-    )  # fmt: skip
+
+    def advance(met: Conditions) -> object:
+        return hall.advance(met, settled, coil, STEP_S, STEP_S / SUBSTEPS)
+
+    # In this order: server layers are those of the step before.
+    steps: dict[str, tuple[Hall, Callable[[], object]]] = {
+        "flat": (flat, lambda: flat.solve(alike)),
+        "steady": (hall, lambda: hall.solve(alike)),
+        "uneven steady": (hall, lambda: hall.solve(uneven)),
+        "transient": (hall, lambda: advance(alike)),
+        "uneven transient": (hall, lambda: advance(uneven)),
+    }
+    in_all = n_dcs * racks * servers
+    spent_s = {"roof": roof_s(in_all, repeats)}
+    for name, (one, step) in steps.items():
+        spent_s[name] = core_s(step, repeats)
+        spent_s[name] += core_s(lambda one=one: one.servers(layers), repeats)  # type: ignore[misc]
+    return {name: 1e9 * spent / in_all for name, spent in spent_s.items()}
+
+
+def row(ns: dict[str, float]) -> list[tuple[str, float]]:
+    """Heads and figures of one line."""
+    out = [("roof", ns["roof"]), ("flat", ns["flat"]), ("of roof", ns["roof"] / ns["flat"])]
+    for name in ("steady", "transient"):
+        out.append((name, ns[name]))
+        out.append(("to flat", ns[name] / ns["flat"]))
+        out.append(("of roof", ns["roof"] / ns[name]))
+    for name, head in (("uneven steady", "uneven steady"), ("uneven transient", "uneven trans.")):
+        out += [(head, ns[name]), ("to flat", ns[name] / ns["flat"])]
+    return out
 
 
 def main() -> None:
@@ -133,11 +140,13 @@ def main() -> None:
 
     threads = runtime.ensure_started()
     print(f"{threads} threads, f32, {SUBSTEPS} substeps; core time in ns per server")
-    row = "{:>22}" + "".join(f" {{:>{max(len(head), 7)}}}" for head in HEADS)
-    print(row.format("DCs x racks x servers", *HEADS))
-    for size in QUICK_SIZES if quick else SIZES:
-        figures = measure(*size, 3 if quick else 10)
-        print(row.format(" x ".join(map(str, size)), *(f"{x:.2f}" for x in figures)), flush=True)
+    for number, size in enumerate(QUICK_SIZES if quick else SIZES):
+        cells = row(measure(*size, repeats=3 if quick else 10))
+        if number == 0:
+            heads = "".join(f" {head:>{max(len(head), 7)}}" for head, _ in cells)
+            print(f"{'DCs x racks x servers':>22}{heads}")
+        figures = "".join(f" {value:>{max(len(head), 7)}.2f}" for head, value in cells)
+        print(f"{' x '.join(map(str, size)):>22}{figures}", flush=True)
 
 
 if __name__ == "__main__":

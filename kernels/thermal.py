@@ -149,8 +149,9 @@ RECOMMENDED_LOW_C = 18.0
 """Ends of the range that ASHRAE TC 9.9 (2021) recommends for inlets, beyond which degrees count."""
 
 ALIKE = 0.25
-"""Where the outlets' moves differ from their middle by less than this share of the tolerance, the
-mixes are shifted instead of exchanged: the errors of four such sweeps stay within the tolerance."""
+"""Where the outlets' moves since the last exchange differ from their middle by less than this share
+of the tolerance, the mixes are shifted instead of exchanged; they err by no more than that, which
+leaves the sweeps room to settle within the tolerance."""
 EXPECTED_KEPT, SEEN_KEPT = 0.5, 0.75
 """Most of a common deviation that a sweep may keep by expectation, and as the last one showed: the
 step that ends it at once is then at most 2 and 4 times the sweep's own. Bounds against overshoot
@@ -212,7 +213,8 @@ def hall_kernel(precision: str) -> Any:
     what leaves is the exact mean, so heat stored plus heat removed is heat generated. Supply air is
     the setpoint plus what the heat kept by the room warms it by; the coil takes what the plant can.
 
-    A data center of one chunk runs all its ``sweeps`` in one call, others one per call.
+    A data center whose chunks are one task runs all its ``sweeps`` in one call, others one per
+    call. ``tasks``: first chunk of each, and the end of the last.
     """
     real = _real(precision)
     whole = ti.i32 if precision == "f32" else ti.i64
@@ -247,9 +249,20 @@ def hall_kernel(precision: str) -> Any:
 
     @ti.func
     @no_type_check
+    def larger(a, b):
+        """As ``ti.max`` of numbers; one instruction, where that looks for NaN as well."""
+        return ti.select(a > b, a, b)
+
+    @ti.func
+    @no_type_check
+    def smaller(a, b):
+        return ti.select(a < b, a, b)
+
+    @ti.func
+    @no_type_check
     def exp_of_minus(x, constants: ti.template()):
         """exp(-x) for 0 <= x, by its series; calls would keep loops from being vectorised."""
-        y = -ti.min(x, real(80.0))
+        y = -smaller(x, real(80.0))
         octave = ti.floor(y * constants[5] + real(0.5))
         rest = y - octave * constants[6]
         out = constants[7]
@@ -452,6 +465,7 @@ def hall_kernel(precision: str) -> Any:
         substep_s: ti.f64,
         weight: ti.f64,
         tolerance_k: ti.f64,
+        tasks: ints_1d,
         run_start: ints_1d,
         run_ints: ints_2d,
         block_ints: ints_2d,
@@ -461,7 +475,7 @@ def hall_kernel(precision: str) -> Any:
         weights: reals_1d,
         shares: blocks_1d,
         racks: blocks_2d,
-        tables: blocks_1d,
+        tables: reals_1d,
         group_load: blocks_1d,
         dcs: reals_2d,
         doubles: doubles_2d,
@@ -477,479 +491,480 @@ def hall_kernel(precision: str) -> Any:
         sums: doubles_2d,
         dc_out: doubles_2d,
     ):
-        n_chunks = sums.shape[1]
+        n_tasks = tasks.shape[0] - 1
         for k in range(slices * SLICE):
             if k % SLICE == 0:
-                first = ti.cast(ti.cast(k // SLICE, ti.i64) * n_chunks // slices, ti.i32)
-                last = ti.cast((ti.cast(k // SLICE, ti.i64) + 1) * n_chunks // slices, ti.i32)
-                for chunk in range(first, last):
-                    n = chunk_ints[1, chunk]
+                first = ti.cast(ti.cast(k // SLICE, ti.i64) * n_tasks // slices, ti.i32)
+                last = ti.cast((ti.cast(k // SLICE, ti.i64) + 1) * n_tasks // slices, ti.i32)
+                for task in range(first, last):
+                    n = chunk_ints[1, tasks[task]]
                     n_parts = dc_ints[0, n + 1] - dc_ints[0, n]
-                    # Chunks of one data center wait for each other after every sweep.
-                    rounds = sweeps if n_parts == 1 else 1
+                    # Chunks that are tasks of their own wait for each other after every sweep.
+                    rounds = sweeps if tasks[task + 1] - tasks[task] == n_parts else 1
                     for _ in range(rounds):
                         if control[0, n] <= 0:
                             break
-                        unit_0 = dc_ints[1, n]
-                        n_units = dc_ints[1, n + 1] - unit_0
-                        need_0 = chunk_ints[2, chunk]
-                        for j in range(n_units):
-                            needs[need_0 + j] = 0.0
-                        cpu_slope = dcs[0, n]
-                        cpu_offset = dcs[1, n]
-                        cpu_shift = dcs[2, n]
-                        fan_slope = dcs[3, n]
-                        fan_offset = dcs[4, n]
-                        fan_shift = dcs[5, n]
-                        fan_low = dcs[6, n]
-                        fan_high = dcs[7, n]
-                        per_reference = real(1.0) / dcs[8, n]
-                        exponent = dcs[9, n]
-                        fan_reference_w = dcs[10, n]
-                        full_m3s = dcs[11, n]
-                        air = dcs[12, n]
-                        per_air = real(1.0) / air
-                        limit_c = dcs[13, n]
-                        server_j = dcs[15, n]
-                        taken_up = dcs[16, n] * air
-                        parcel_j = dcs[17, n]
-                        step_s = ti.cast(substep_s, real)
-                        per_step_s = real(1.0) / step_s
-                        # Air before racks that stand still is stirred by the CRAC air of the room.
-                        still_per_s = ti.min(
-                            real(STILL_PER_S),
-                            air * ti.cast(doubles[12, n], real) / dcs[17, n],
-                        )
-                        begins = control[3, n] == 0
-                        # What the last sweep left is read anew after it.
-                        shift = ti.cast(doubles[9, n], real)
-                        side = control[2, n]
-                        anew = control[1, n] != 0
-                        if anew:
-                            side = 1 - side
-                        cpu_sum = sums_of_lanes()
-                        fan_sum = sums_of_lanes()
-                        flow_sum = sums_of_lanes()
-                        inlet_sum = sums_of_lanes()
-                        outlet_sum = sums_of_lanes()
-                        inlet_flow_sum = sums_of_lanes()
-                        heat_sum = sums_of_lanes()
-                        captured_sum = sums_of_lanes()
-                        hot_sum = sums_of_lanes()
-                        cold_sum = sums_of_lanes()
-                        stored_sum = sums_of_lanes()
-                        least = lanes(1e30)
-                        most = lanes(-1e30)
-                        chunk_max = real(-1e30)
-                        hottest_group = 0
-                        for block in range(chunk_ints[0, chunk], chunk_ints[0, chunk + 1]):
-                            q = block * LANES
-                            many = block_ints[0, block]
-                            n_groups = block_ints[1, block]
-                            table = block_ints[2, block]
-                            place = block_ints[3, block]
-                            cover = lanes(0.0)
-                            supply = lanes(0.0)
-                            mixed = lanes(0.0)
-                            share_0 = dc_ints[2, n] + n_units * (
-                                block - chunk_ints[0, dc_ints[0, n]]
+                        for chunk in range(tasks[task], tasks[task + 1]):
+                            unit_0 = dc_ints[1, n]
+                            n_units = dc_ints[1, n + 1] - unit_0
+                            need_0 = chunk_ints[2, chunk]
+                            for j in range(n_units):
+                                needs[need_0 + j] = 0.0
+                            cpu_slope = dcs[0, n]
+                            cpu_offset = dcs[1, n]
+                            cpu_shift = dcs[2, n]
+                            fan_slope = dcs[3, n]
+                            fan_offset = dcs[4, n]
+                            fan_shift = dcs[5, n]
+                            fan_low = dcs[6, n]
+                            fan_high = dcs[7, n]
+                            per_reference = real(1.0) / dcs[8, n]
+                            exponent = dcs[9, n]
+                            cubic = exponent == real(3.0)
+                            fan_reference_w = dcs[10, n]
+                            full_m3s = dcs[11, n]
+                            air = dcs[12, n]
+                            per_air = real(1.0) / air
+                            limit_c = dcs[13, n]
+                            server_j = dcs[15, n]
+                            taken_up = dcs[16, n] * air
+                            parcel_j = dcs[17, n]
+                            step_s = ti.cast(substep_s, real)
+                            per_step_s = real(1.0) / step_s
+                            # CRAC air of the room stirs the air before racks that stand still.
+                            still_per_s = smaller(
+                                real(STILL_PER_S),
+                                air * ti.cast(doubles[12, n], real) / dcs[17, n],
                             )
-                            parcel_w = lanes(0.0)
-                            if ti.static(recirculates):
-                                for j in range(n_units):
-                                    ratio = ti.cast(
-                                        unit_state[1 if ti.static(advance) else 2, unit_0 + j],
-                                        real,
-                                    )
-                                    air_c = ti.cast(unit_state[0, unit_0 + j], real)
-                                    share = shares[share_0 + j]
-                                    for i in range(LANES):
-                                        part = share[i] * ratio
-                                        cover[i] += part
-                                        supply[i] += part * air_c
-                                for i in range(LANES):
-                                    supply[i] /= ti.max(cover[i], real(1e-30))
-                                if ti.static(advance):
-                                    target = lanes(0.0)
-                                    if anew:
-                                        from_row = (1 + side) * (rack_store.shape[1] * LANES)
-                                        for i in range(LANES):
-                                            t = real(0.0)
-                                            for run in range(
-                                                run_start[q + i], run_start[q + i + 1]
-                                            ):
-                                                x = from_row + run_ints[0, run]
-                                                w = run_ints[2, run]
-                                                s = real(0.0)
-                                                for e in range(run_ints[1, run]):
-                                                    s += weights[w + e] * rack_state[x + e]
-                                                t += s
-                                            target[i] = t
-                                        norm = racks[1, block]
-                                        for i in range(LANES):
-                                            target[i] *= norm[i]
-                                    elif begins:
-                                        start_c = ti.cast(doubles[8, n], real)
-                                        scale = ti.cast(doubles[5, n], real)
-                                        warming = ti.cast(doubles[6, n], real)
-                                        strength = racks[5, block]
-                                        approach = racks[9, block]
-                                        rise = racks[10, block]
-                                        mixed_approach = racks[11, block]
-                                        mixed_rise = racks[12, block]
-                                        seen = lanes(0.0)
-                                        for i in range(LANES):
-                                            target[i] = (
-                                                start_c
-                                                + scale * mixed_approach[i]
-                                                + warming * mixed_rise[i]
-                                            )
-                                            seen[i] = strength[i] * (
-                                                start_c + scale * approach[i] + warming * rise[i]
-                                            )
-                                        rack_store[1 + side, block] = seen
-                                    else:
-                                        target = rack_store[4, block]
-                                    if anew or begins:
-                                        rack_store[4, block] = target
-                                    for i in range(LANES):
-                                        target[i] += shift
-                                    if ti.static(transient):
-                                        # The parcel of room air before the rack: enters at the mix,
-                                        # leaves at its own temperature.
-                                        after = lanes(0.0)
-                                        before_c = rack_store[0, block]
-                                        taken = rack_store[3, block]
-                                        for i in range(LANES):
-                                            was = before_c[i]
-                                            x = step_s * ti.max(
-                                                air * taken[i] / parcel_j, still_per_s
-                                            )
-                                            gone = real(1.0) - exp_of_minus(x, constants)
-                                            now_c = was + (target[i] - was) * gone
-                                            after[i] = now_c
-                                            parcel_w[i] = parcel_j * (now_c - was) * per_step_s
-                                            mixed[i] = target[i] + (was - target[i]) * gone / x
-                                        rack_store[0, block] = after
-                                    else:
-                                        rack_store[0, block] = target
-                                        for i in range(LANES):
-                                            mixed[i] = target[i]
-                                else:
-                                    mixed = rack_store[0, block]
-                            else:
-                                air_c = ti.cast(unit_state[0, unit_0], real)
-                                approach = racks[0, block]
-                                for i in range(LANES):
-                                    mixed[i] = air_c + approach[i]
-                            for i in range(LANES):
-                                mixed[i] = ti.select(i < many, mixed[i], real(NO_RACK_C))
-                            u = racks[2, block]
-                            powered = racks[3, block]
-                            air_left = racks[4, block]
-                            breath = lanes(0.0)
-                            rack_captured = racks[7, block]
-                            servers = racks[8, block]
-                            spread = lanes(0.0)
-                            fresh = lanes(0.0)
-                            for i in range(LANES):
-                                spread[i] = u[i] * (real(1.0) - u[i])
-                                breath[i] = air_left[i] * powered[i]
-                                fresh[i] = cover[i] * (supply[i] - mixed[i])
-                            cpu = lanes(0.0)
-                            fan = lanes(0.0)
-                            flow = lanes(0.0)
-                            inlet = lanes(0.0)
-                            inlet_flow = lanes(0.0)
-                            fresh_flow = lanes(0.0)
-                            heat = lanes(0.0)
-                            hot = lanes(0.0)
-                            cold = lanes(0.0)
-                            stored = lanes(0.0)
-                            hottest = lanes(-1e30)
-                            hottest_zone = ti.Vector([0] * LANES)
-                            for z in range(n_groups):
-                                row = (table + z) * 6
-                                count = tables[row]
-                                full_w = tables[row + 1]
-                                idle_w = tables[row + 2]
-                                offset_k = tables[row + 3]
-                                deviation = tables[row + 4]
-                                height = tables[row + 5]
-                                given_load = lanes(0.0)
-                                if ti.static(group_loads):
-                                    given_load = group_load[place + z]
-                                t = lanes(0.0)
-                                y = lanes(0.0)
-                                own = lanes(0.0)
-                                cpu_1 = lanes(0.0)
-                                fan_1 = lanes(0.0)
-                                flow_1 = lanes(0.0)
-                                to_air = lanes(0.0)
-                                for i in range(LANES):
-                                    if ti.static(recirculates):
-                                        own[i] = real(1.0) - rack_captured[i] * height[i]
-                                        t[i] = mixed[i] + own[i] * fresh[i]
-                                    else:
-                                        t[i] = mixed[i] + offset_k[i]
-                                for i in range(LANES):
-                                    load = u[i] + deviation[i] * spread[i]
-                                    if ti.static(group_loads):
-                                        load = given_load[i]
-                                    on_curve = ti.min(t[i], limit_c)
-                                    ratio = cpu_slope * on_curve + cpu_offset + cpu_shift * load
-                                    cpu_1[i] = powered[i] * ti.max(
-                                        idle_w[i],
-                                        full_w[i] * ratio,
-                                    )
-                                    y[i] = ti.min(
-                                        ti.max(
-                                            fan_slope * on_curve + fan_offset + fan_shift * load,
-                                            fan_low,
-                                        ),
-                                        fan_high,
-                                    )
-                                # A branch on data, not one kernel per exponent: compiled apart,
-                                # they would round apart, and a data center must not depend on its
-                                # batch.
-                                if exponent == real(3.0):
-                                    for i in range(LANES):
-                                        speed = y[i] * per_reference
-                                        fan_1[i] = speed * speed * speed
-                                elif exponent == real(1.0):
-                                    for i in range(LANES):
-                                        fan_1[i] = y[i] * per_reference
-                                else:
-                                    for i in range(LANES):
-                                        fan_1[i] = ti.pow(y[i] * per_reference, exponent)
-                                for i in range(LANES):
-                                    fan_1[i] *= fan_reference_w * breath[i]
-                                    flow_1[i] = full_m3s * y[i] * breath[i]
-                                    to_air[i] = cpu_1[i]
-                                if ti.static(transient):
-                                    start_c = server_c[place + z]
-                                    end_c = lanes(0.0)
-                                    for i in range(LANES):
-                                        before = start_c[i]
-                                        exchange = taken_up * flow_1[i]
-                                        after = before
-                                        if ti.static(advance):
-                                            steady = t[i] + cpu_1[i] / ti.max(exchange, real(1e-30))
-                                            left = exp_of_minus(
-                                                step_s * exchange / server_j, constants
-                                            )
-                                            after = steady + (before - steady) * left
-                                            warmed_w = server_j * (after - before) * per_step_s
-                                            moves = exchange > real(0.0)
-                                            end_c[i] = ti.select(moves, after, before)
-                                            warmed_w = ti.select(moves, warmed_w, real(0.0))
-                                            to_air[i] = ti.select(
-                                                moves, cpu_1[i] - warmed_w, real(0.0)
-                                            )
-                                            stored[i] += count[i] * warmed_w
-                                        else:
-                                            to_air[i] = exchange * (before - t[i])
-                                    if ti.static(advance):
-                                        server_c[place + z] = end_c
-                                for i in range(LANES):
-                                    counted_flow = count[i] * flow_1[i]
-                                    cpu[i] += count[i] * cpu_1[i]
-                                    fan[i] += count[i] * fan_1[i]
-                                    flow[i] += counted_flow
-                                    inlet[i] += count[i] * t[i]
-                                    inlet_flow[i] += counted_flow * t[i]
-                                    heat[i] += count[i] * (to_air[i] + fan_1[i])
-                                    if ti.static(recirculates):
-                                        fresh_flow[i] += counted_flow * own[i]
-                                    hot[i] += count[i] * ti.max(
-                                        t[i] - real(RECOMMENDED_HIGH_C), real(0.0)
-                                    )
-                                    cold[i] += count[i] * ti.max(
-                                        real(RECOMMENDED_LOW_C) - t[i], real(0.0)
-                                    )
-                                    here = ti.select(count[i] > real(0.0), t[i], real(-1e30))
-                                    hottest_zone[i] = ti.select(
-                                        here > hottest[i], z, hottest_zone[i]
-                                    )
-                                    hottest[i] = ti.max(hottest[i], here)
-                                if ti.static(write_groups):
-                                    out = lanes(0.0)
-                                    drawn = lanes(0.0)
-                                    for i in range(LANES):
-                                        out[i] = t[i] + ti.select(
-                                            flow_1[i] > real(0.0),
-                                            (to_air[i] + fan_1[i])
-                                            / ti.max(air * flow_1[i], real(1e-30)),
-                                            real(0.0),
-                                        )
-                                        drawn[i] = cpu_1[i] + fan_1[i]
-                                    group_out[0, place + z] = t
-                                    group_out[1, place + z] = out
-                                    group_out[2, place + z] = drawn
-                            outlet = lanes(0.0)
-                            for i in range(LANES):
-                                mean = inlet[i] / servers[i]
-                                moves = flow[i] > real(0.0)
-                                per_flow = real(1.0) / ti.max(flow[i], real(1e-30))
-                                leaves = (inlet_flow[i] + heat[i] * per_air) * per_flow
-                                if ti.static(outlet_model == 1):
-                                    leaves = mean + (cpu[i] + fan[i]) * per_air * per_flow
-                                elif ti.static(outlet_model == 2):
-                                    leaves = (
-                                        mean
-                                        + constants[0]
-                                        * ti.pow(cpu[i] + fan[i], constants[1])
-                                        / (
-                                            constants[2]
-                                            * air
-                                            * ti.pow(ti.max(flow[i], real(1e-30)), constants[3])
-                                        )
-                                        + constants[4]
-                                    )
-                                outlet[i] = ti.select(moves, leaves, mean)
-                                inlet[i] = mean
-                                if ti.static(recirculates):
-                                    inlet[i] = ti.select(moves, inlet_flow[i] * per_flow, mean)
-                            if ti.static(write_groups and outlet_model != 0):
-                                for z in range(n_groups):
-                                    group_out[1, place + z] = outlet
-                            if ti.static(not write_groups):
-                                if ti.static(recirculates):
-                                    captured = lanes(0.0)
-                                    seen = lanes(0.0)
-                                    strength = racks[5, block]
-                                    for i in range(LANES):
-                                        captured[i] = flow[i] - cover[i] * fresh_flow[i]
-                                        # Of air that failing fans do not move, the mix is left.
-                                        gives_c = mixed[i] + air_left[i] * (outlet[i] - mixed[i])
-                                        seen[i] = gives_c * strength[i]
-                                    if ti.static(advance):
-                                        per_strength = racks[6, block]
-                                        exchanged = rack_store[1 + side, block]
-                                        for i in range(LANES):
-                                            change = (seen[i] - exchanged[i]) * per_strength[i]
-                                            there = i < many
-                                            least[i] = ti.min(
-                                                least[i], ti.select(there, change, real(1e30))
-                                            )
-                                            most[i] = ti.max(
-                                                most[i], ti.select(there, change, real(-1e30))
-                                            )
-                                        rack_store[2 - side, block] = seen
-                                        rack_store[3, block] = captured
-                                    for i in range(LANES):
-                                        captured_sum[i] += ti.cast(
-                                            captured[i] * mixed[i]
-                                            + ti.select(i < many, parcel_w[i], real(0.0)) * per_air,
-                                            ti.f64,
-                                        )
-                                    for j in range(n_units):
-                                        share = shares[share_0 + j]
-                                        needed = real(0.0)
-                                        for i in range(LANES):
-                                            needed += share[i] * fresh_flow[i]
-                                        needs[need_0 + j] += ti.cast(needed, ti.f64)
-                                for i in range(LANES):
-                                    cpu_sum[i] += ti.cast(cpu[i], ti.f64)
-                                    fan_sum[i] += ti.cast(fan[i], ti.f64)
-                                    flow_sum[i] += ti.cast(flow[i], ti.f64)
-                                    inlet_flow_sum[i] += ti.cast(inlet_flow[i], ti.f64)
-                                    heat_sum[i] += ti.cast(
-                                        inlet_flow[i] + heat[i] * per_air, ti.f64
-                                    )
-                                for i in range(LANES):
-                                    there = ti.select(i < many, real(1.0), real(0.0))
-                                    inlet_sum[i] += ti.cast(there * inlet[i], ti.f64)
-                                    outlet_sum[i] += ti.cast(there * outlet[i], ti.f64)
-                                    hot_sum[i] += ti.cast(there * hot[i], ti.f64)
-                                    cold_sum[i] += ti.cast(there * cold[i], ti.f64)
-                                    stored_sum[i] += ti.cast(
-                                        there * (stored[i] + parcel_w[i]), ti.f64
-                                    )
-                                block_max = real(-1e30)
-                                for i in range(LANES):
-                                    block_max = ti.max(
-                                        block_max, ti.select(i < many, hottest[i], real(-1e30))
-                                    )
-                                if block_max > chunk_max:
-                                    chunk_max = block_max
-                                    hottest_group = -1
-                                    for i in range(LANES):
-                                        if (
-                                            hottest_group < 0
-                                            and i < many
-                                            and hottest[i] == block_max
-                                        ):
-                                            hottest_group = (place + hottest_zone[i]) * LANES + i
-                                if ti.static(transient):
-                                    share = ti.cast(weight, real)
-                                    for i in range(LANES):
-                                        cpu[i] = share * cpu[i]
-                                        fan[i] = share * fan[i]
-                                        flow[i] = share * flow[i]
-                                        inlet[i] = share * inlet[i]
-                                        outlet[i] = share * outlet[i]
-                                    if not begins:
-                                        cpu += rack_out[0, block]
-                                        fan += rack_out[1, block]
-                                        flow += rack_out[2, block]
-                                        inlet += rack_out[3, block]
-                                        hottest = ti.max(hottest, rack_out[4, block])
-                                        outlet += rack_out[5, block]
-                                rack_out[0, block] = cpu
-                                rack_out[1, block] = fan
-                                rack_out[2, block] = flow
-                                rack_out[3, block] = inlet
-                                rack_out[4, block] = hottest
-                                rack_out[5, block] = outlet
-                        if ti.static(not write_groups):
-                            totals = (
-                                cpu_sum,
-                                fan_sum,
-                                flow_sum,
-                                inlet_sum,
-                                outlet_sum,
-                                inlet_flow_sum,
-                                heat_sum,
-                                captured_sum,
-                                hot_sum,
-                                cold_sum,
-                                stored_sum,
-                            )
-                            for r in ti.static(range(11)):
-                                sums[r, chunk] = total_of(totals[r])
-                            least_k = real(1e30)
-                            most_k = real(-1e30)
-                            for i in range(LANES):
-                                least_k = ti.min(least_k, least[i])
-                                most_k = ti.max(most_k, most[i])
-                            sums[11, chunk] = ti.cast(chunk_max, ti.f64)
-                            sums[12, chunk] = ti.cast(hottest_group, ti.f64)
-                            sums[13, chunk] = ti.cast(least_k, ti.f64)
-                            sums[14, chunk] = ti.cast(most_k, ti.f64)
-                            # The chunk that comes last does what is left for its data center.
-                            if ti.atomic_add(control[4, n], 1) == n_parts - 1:
-                                control[4, n] = 0
-                                close(
-                                    recirculates,
-                                    transient,
-                                    advance,
-                                    n,
-                                    sweeps,
-                                    substep_s,
-                                    weight,
-                                    tolerance_k,
-                                    chunk_ints,
-                                    dc_ints,
-                                    control,
-                                    dcs,
-                                    doubles,
-                                    units,
-                                    unit_state,
-                                    needs,
-                                    sums,
-                                    dc_out,
+                            begins = control[3, n] == 0
+                            # What the last sweep left is read anew after it.
+                            shift = ti.cast(doubles[9, n], real)
+                            side = control[2, n]
+                            anew = control[1, n] != 0
+                            if anew:
+                                side = 1 - side
+                            cpu_sum = sums_of_lanes()
+                            fan_sum = sums_of_lanes()
+                            flow_sum = sums_of_lanes()
+                            inlet_sum = sums_of_lanes()
+                            outlet_sum = sums_of_lanes()
+                            inlet_flow_sum = sums_of_lanes()
+                            heat_sum = sums_of_lanes()
+                            captured_sum = sums_of_lanes()
+                            hot_sum = sums_of_lanes()
+                            cold_sum = sums_of_lanes()
+                            stored_sum = sums_of_lanes()
+                            least = lanes(1e30)
+                            most = lanes(-1e30)
+                            chunk_hottest = lanes(-1e30)
+                            hottest_at = ti.Vector([0] * LANES)
+                            for block in range(chunk_ints[0, chunk], chunk_ints[0, chunk + 1]):
+                                q = block * LANES
+                                many = block_ints[0, block]
+                                n_groups = block_ints[1, block]
+                                table = block_ints[2, block]
+                                place = block_ints[3, block]
+                                cover = lanes(0.0)
+                                supply = lanes(0.0)
+                                mixed = lanes(0.0)
+                                share_0 = dc_ints[2, n] + n_units * (
+                                    block - chunk_ints[0, dc_ints[0, n]]
                                 )
+                                parcel_w = lanes(0.0)
+                                if ti.static(recirculates):
+                                    for j in range(n_units):
+                                        ratio = ti.cast(
+                                            unit_state[1 if ti.static(advance) else 2, unit_0 + j],
+                                            real,
+                                        )
+                                        air_c = ti.cast(unit_state[0, unit_0 + j], real)
+                                        share = shares[share_0 + j]
+                                        for i in range(LANES):
+                                            part = share[i] * ratio
+                                            cover[i] += part
+                                            supply[i] += part * air_c
+                                    for i in range(LANES):
+                                        supply[i] /= larger(cover[i], real(1e-30))
+                                    if ti.static(advance):
+                                        target = lanes(0.0)
+                                        if anew:
+                                            from_row = (1 + side) * (rack_store.shape[1] * LANES)
+                                            for i in range(LANES):
+                                                t = real(0.0)
+                                                for run in range(
+                                                    run_start[q + i], run_start[q + i + 1]
+                                                ):
+                                                    x = from_row + run_ints[0, run]
+                                                    w = run_ints[2, run]
+                                                    s = real(0.0)
+                                                    for e in range(run_ints[1, run]):
+                                                        s += weights[w + e] * rack_state[x + e]
+                                                    t += s
+                                                target[i] = t
+                                            norm = racks[1, block]
+                                            for i in range(LANES):
+                                                target[i] *= norm[i]
+                                        elif begins:
+                                            start_c = ti.cast(doubles[8, n], real)
+                                            scale = ti.cast(doubles[5, n], real)
+                                            warming = ti.cast(doubles[6, n], real)
+                                            strength = racks[5, block]
+                                            approach = racks[9, block]
+                                            rise = racks[10, block]
+                                            mixed_approach = racks[11, block]
+                                            mixed_rise = racks[12, block]
+                                            seen = lanes(0.0)
+                                            for i in range(LANES):
+                                                target[i] = (
+                                                    start_c
+                                                    + scale * mixed_approach[i]
+                                                    + warming * mixed_rise[i]
+                                                )
+                                                seen[i] = strength[i] * (
+                                                    start_c
+                                                    + scale * approach[i]
+                                                    + warming * rise[i]
+                                                )
+                                            rack_store[1 + side, block] = seen
+                                        else:
+                                            target = rack_store[4, block]
+                                        if anew or begins:
+                                            rack_store[4, block] = target
+                                        for i in range(LANES):
+                                            target[i] += shift
+                                        if ti.static(transient):
+                                            # The parcel of room air before the rack: enters at the
+                                            # mix, leaves at its own temperature.
+                                            after = lanes(0.0)
+                                            before_c = rack_store[0, block]
+                                            taken = rack_store[3, block]
+                                            for i in range(LANES):
+                                                was = before_c[i]
+                                                x = step_s * larger(
+                                                    air * taken[i] / parcel_j, still_per_s
+                                                )
+                                                gone = real(1.0) - exp_of_minus(x, constants)
+                                                now_c = was + (target[i] - was) * gone
+                                                after[i] = now_c
+                                                parcel_w[i] = parcel_j * (now_c - was) * per_step_s
+                                                mixed[i] = target[i] + (was - target[i]) * gone / x
+                                            rack_store[0, block] = after
+                                        else:
+                                            rack_store[0, block] = target
+                                            for i in range(LANES):
+                                                mixed[i] = target[i]
+                                    else:
+                                        mixed = rack_store[0, block]
+                                else:
+                                    air_c = ti.cast(unit_state[0, unit_0], real)
+                                    approach = racks[0, block]
+                                    for i in range(LANES):
+                                        mixed[i] = air_c + approach[i]
+                                for i in range(LANES):
+                                    mixed[i] = ti.select(i < many, mixed[i], real(NO_RACK_C))
+                                u = racks[2, block]
+                                powered = racks[3, block]
+                                air_left = racks[4, block]
+                                breath = lanes(0.0)
+                                rack_captured = racks[7, block]
+                                servers = racks[8, block]
+                                spread = lanes(0.0)
+                                fresh = lanes(0.0)
+                                for i in range(LANES):
+                                    spread[i] = u[i] * (real(1.0) - u[i])
+                                    breath[i] = air_left[i] * powered[i]
+                                    fresh[i] = cover[i] * (supply[i] - mixed[i])
+                                cpu = lanes(0.0)
+                                fan = lanes(0.0)
+                                flow = lanes(0.0)
+                                inlet = lanes(0.0)
+                                inlet_flow = lanes(0.0)
+                                fresh_flow = lanes(0.0)
+                                heat = lanes(0.0)
+                                hot = lanes(0.0)
+                                cold = lanes(0.0)
+                                stored = lanes(0.0)
+                                hottest = lanes(-1e30)
+                                hottest_zone = ti.Vector([0] * LANES)
+                                for z in range(n_groups):
+                                    row = (table + z) * (6 * LANES)
+                                    full_row = row + LANES
+                                    idle_row = row + 2 * LANES
+                                    offset_row = row + 3 * LANES
+                                    deviation_row = row + 4 * LANES
+                                    height_row = row + 5 * LANES
+                                    given_load = lanes(0.0)
+                                    if ti.static(group_loads):
+                                        given_load = group_load[place + z]
+                                    t = lanes(0.0)
+                                    own = lanes(0.0)
+                                    speed = lanes(0.0)
+                                    cpu_1 = lanes(0.0)
+                                    fan_1 = lanes(0.0)
+                                    flow_1 = lanes(0.0)
+                                    to_air = lanes(0.0)
+                                    for i in range(LANES):
+                                        if ti.static(recirculates):
+                                            own[i] = (
+                                                real(1.0)
+                                                - rack_captured[i] * tables[height_row + i]
+                                            )
+                                            t[i] = mixed[i] + own[i] * fresh[i]
+                                        else:
+                                            t[i] = mixed[i] + tables[offset_row + i]
+                                        load = u[i] + tables[deviation_row + i] * spread[i]
+                                        if ti.static(group_loads):
+                                            load = given_load[i]
+                                        on_curve = smaller(t[i], limit_c)
+                                        ratio = cpu_slope * on_curve + cpu_offset + cpu_shift * load
+                                        cpu_1[i] = powered[i] * larger(
+                                            tables[idle_row + i], tables[full_row + i] * ratio
+                                        )
+                                        y = fan_slope * on_curve + fan_offset + fan_shift * load
+                                        y = smaller(larger(y, fan_low), fan_high)
+                                        flow_1[i] = full_m3s * y * breath[i]
+                                        speed[i] = y * per_reference
+                                        cube = speed[i] * speed[i] * speed[i]
+                                        fan_1[i] = ti.select(cubic, cube, speed[i])
+                                    # A branch on data, not one kernel per exponent: compiled
+                                    # apart, they would round apart, and a data center must not
+                                    # depend on its batch.
+                                    if exponent != real(1.0) and not cubic:
+                                        for i in range(LANES):
+                                            fan_1[i] = ti.pow(speed[i], exponent)
+                                    start_c = lanes(0.0)
+                                    end_c = lanes(0.0)
+                                    if ti.static(transient):
+                                        start_c = server_c[place + z]
+                                    for i in range(LANES):
+                                        count = tables[row + i]
+                                        fan_1[i] *= fan_reference_w * breath[i]
+                                        to_air[i] = cpu_1[i]
+                                        if ti.static(transient):
+                                            before = start_c[i]
+                                            exchange = taken_up * flow_1[i]
+                                            if ti.static(advance):
+                                                steady = t[i] + cpu_1[i] / larger(
+                                                    exchange, real(1e-30)
+                                                )
+                                                left = exp_of_minus(
+                                                    step_s * exchange / server_j, constants
+                                                )
+                                                moves = exchange > real(0.0)
+                                                after = ti.select(
+                                                    moves, steady + (before - steady) * left, before
+                                                )
+                                                warmed_w = server_j * (after - before) * per_step_s
+                                                to_air[i] = ti.select(
+                                                    moves, cpu_1[i] - warmed_w, real(0.0)
+                                                )
+                                                stored[i] += count * warmed_w
+                                                end_c[i] = after
+                                            else:
+                                                to_air[i] = exchange * (before - t[i])
+                                        counted_flow = count * flow_1[i]
+                                        cpu[i] += count * cpu_1[i]
+                                        fan[i] += count * fan_1[i]
+                                        flow[i] += counted_flow
+                                        inlet[i] += count * t[i]
+                                        inlet_flow[i] += counted_flow * t[i]
+                                        heat[i] += count * (to_air[i] + fan_1[i])
+                                        if ti.static(recirculates):
+                                            fresh_flow[i] += counted_flow * own[i]
+                                        hot[i] += count * larger(
+                                            t[i] - real(RECOMMENDED_HIGH_C), real(0.0)
+                                        )
+                                        cold[i] += count * larger(
+                                            real(RECOMMENDED_LOW_C) - t[i], real(0.0)
+                                        )
+                                        here = ti.select(count > real(0.0), t[i], real(-1e30))
+                                        hottest_zone[i] = ti.select(
+                                            here > hottest[i], z, hottest_zone[i]
+                                        )
+                                        hottest[i] = larger(here, hottest[i])
+                                    if ti.static(transient and advance):
+                                        server_c[place + z] = end_c
+                                    if ti.static(write_groups):
+                                        out = lanes(0.0)
+                                        drawn = lanes(0.0)
+                                        for i in range(LANES):
+                                            out[i] = t[i] + ti.select(
+                                                flow_1[i] > real(0.0),
+                                                (to_air[i] + fan_1[i])
+                                                / larger(air * flow_1[i], real(1e-30)),
+                                                real(0.0),
+                                            )
+                                            drawn[i] = cpu_1[i] + fan_1[i]
+                                        group_out[0, place + z] = t
+                                        group_out[1, place + z] = out
+                                        group_out[2, place + z] = drawn
+                                outlet = lanes(0.0)
+                                for i in range(LANES):
+                                    mean = inlet[i] / servers[i]
+                                    moves = flow[i] > real(0.0)
+                                    per_flow = real(1.0) / larger(flow[i], real(1e-30))
+                                    leaves = (inlet_flow[i] + heat[i] * per_air) * per_flow
+                                    if ti.static(outlet_model == 1):
+                                        leaves = mean + (cpu[i] + fan[i]) * per_air * per_flow
+                                    elif ti.static(outlet_model == 2):
+                                        leaves = (
+                                            mean
+                                            + constants[0]
+                                            * ti.pow(cpu[i] + fan[i], constants[1])
+                                            / (
+                                                constants[2]
+                                                * air
+                                                * ti.pow(larger(flow[i], real(1e-30)), constants[3])
+                                            )
+                                            + constants[4]
+                                        )
+                                    outlet[i] = ti.select(moves, leaves, mean)
+                                    inlet[i] = mean
+                                    if ti.static(recirculates):
+                                        inlet[i] = ti.select(moves, inlet_flow[i] * per_flow, mean)
+                                if ti.static(write_groups and outlet_model != 0):
+                                    for z in range(n_groups):
+                                        group_out[1, place + z] = outlet
+                                if ti.static(not write_groups):
+                                    if ti.static(recirculates):
+                                        captured = lanes(0.0)
+                                        seen = lanes(0.0)
+                                        strength = racks[5, block]
+                                        for i in range(LANES):
+                                            captured[i] = flow[i] - cover[i] * fresh_flow[i]
+                                            # Of air that failing fans do not move, the mix is left.
+                                            gives_c = mixed[i] + air_left[i] * (
+                                                outlet[i] - mixed[i]
+                                            )
+                                            seen[i] = gives_c * strength[i]
+                                        if ti.static(advance):
+                                            per_strength = racks[6, block]
+                                            exchanged = rack_store[1 + side, block]
+                                            for i in range(LANES):
+                                                change = (seen[i] - exchanged[i]) * per_strength[i]
+                                                there = i < many
+                                                least[i] = smaller(
+                                                    least[i], ti.select(there, change, real(1e30))
+                                                )
+                                                most[i] = larger(
+                                                    most[i], ti.select(there, change, real(-1e30))
+                                                )
+                                            rack_store[2 - side, block] = seen
+                                            rack_store[3, block] = captured
+                                        for i in range(LANES):
+                                            captured_sum[i] += ti.cast(
+                                                captured[i] * mixed[i]
+                                                + ti.select(i < many, parcel_w[i], real(0.0))
+                                                * per_air,
+                                                ti.f64,
+                                            )
+                                        for j in range(n_units):
+                                            share = shares[share_0 + j]
+                                            needed = real(0.0)
+                                            for i in range(LANES):
+                                                needed += share[i] * fresh_flow[i]
+                                            needs[need_0 + j] += ti.cast(needed, ti.f64)
+                                    for i in range(LANES):
+                                        cpu_sum[i] += ti.cast(cpu[i], ti.f64)
+                                        fan_sum[i] += ti.cast(fan[i], ti.f64)
+                                        flow_sum[i] += ti.cast(flow[i], ti.f64)
+                                        inlet_flow_sum[i] += ti.cast(inlet_flow[i], ti.f64)
+                                        heat_sum[i] += ti.cast(
+                                            inlet_flow[i] + heat[i] * per_air, ti.f64
+                                        )
+                                    for i in range(LANES):
+                                        there = ti.select(i < many, real(1.0), real(0.0))
+                                        inlet_sum[i] += ti.cast(there * inlet[i], ti.f64)
+                                        outlet_sum[i] += ti.cast(there * outlet[i], ti.f64)
+                                        hot_sum[i] += ti.cast(there * hot[i], ti.f64)
+                                        cold_sum[i] += ti.cast(there * cold[i], ti.f64)
+                                        stored_sum[i] += ti.cast(
+                                            there * (stored[i] + parcel_w[i]), ti.f64
+                                        )
+                                    for i in range(LANES):
+                                        here = ti.select(i < many, hottest[i], real(-1e30))
+                                        at = (place + hottest_zone[i]) * LANES + i
+                                        hottest_at[i] = ti.select(
+                                            here > chunk_hottest[i], at, hottest_at[i]
+                                        )
+                                        chunk_hottest[i] = larger(here, chunk_hottest[i])
+                                    if ti.static(transient):
+                                        share = ti.cast(weight, real)
+                                        for i in range(LANES):
+                                            cpu[i] = share * cpu[i]
+                                            fan[i] = share * fan[i]
+                                            flow[i] = share * flow[i]
+                                            inlet[i] = share * inlet[i]
+                                            outlet[i] = share * outlet[i]
+                                        if not begins:
+                                            cpu += rack_out[0, block]
+                                            fan += rack_out[1, block]
+                                            flow += rack_out[2, block]
+                                            inlet += rack_out[3, block]
+                                            hottest = larger(hottest, rack_out[4, block])
+                                            outlet += rack_out[5, block]
+                                    rack_out[0, block] = cpu
+                                    rack_out[1, block] = fan
+                                    rack_out[2, block] = flow
+                                    rack_out[3, block] = inlet
+                                    rack_out[4, block] = hottest
+                                    rack_out[5, block] = outlet
+                            if ti.static(not write_groups):
+                                totals = (
+                                    cpu_sum,
+                                    fan_sum,
+                                    flow_sum,
+                                    inlet_sum,
+                                    outlet_sum,
+                                    inlet_flow_sum,
+                                    heat_sum,
+                                    captured_sum,
+                                    hot_sum,
+                                    cold_sum,
+                                    stored_sum,
+                                )
+                                for r in ti.static(range(11)):
+                                    sums[r, chunk] = total_of(totals[r])
+                                least_k = real(1e30)
+                                most_k = real(-1e30)
+                                for i in range(LANES):
+                                    least_k = smaller(least_k, least[i])
+                                    most_k = larger(most_k, most[i])
+                                chunk_max = chunk_hottest[0]
+                                hottest_group = hottest_at[0]
+                                for i in range(LANES):
+                                    first_of_all = chunk_hottest[i] == chunk_max
+                                    first_of_all = first_of_all and hottest_at[i] < hottest_group
+                                    if chunk_hottest[i] > chunk_max or first_of_all:
+                                        chunk_max = chunk_hottest[i]
+                                        hottest_group = hottest_at[i]
+                                sums[11, chunk] = ti.cast(chunk_max, ti.f64)
+                                sums[12, chunk] = ti.cast(hottest_group, ti.f64)
+                                sums[13, chunk] = ti.cast(least_k, ti.f64)
+                                sums[14, chunk] = ti.cast(most_k, ti.f64)
+                                # The chunk that comes last does what is left for its data center.
+                                if ti.atomic_add(control[4, n], 1) == n_parts - 1:
+                                    control[4, n] = 0
+                                    close(
+                                        recirculates,
+                                        transient,
+                                        advance,
+                                        n,
+                                        sweeps,
+                                        substep_s,
+                                        weight,
+                                        tolerance_k,
+                                        chunk_ints,
+                                        dc_ints,
+                                        control,
+                                        dcs,
+                                        doubles,
+                                        units,
+                                        unit_state,
+                                        needs,
+                                        sums,
+                                        dc_out,
+                                    )
 
     return hall
 

@@ -147,15 +147,15 @@ class Hall:
         self._outlet_model = thermal.OUTLETS.index(fleet.models["outlet"])
         self._recirculates = fleet.air is not None
         self._server_slices = max(1, min(8 * threads, fleet.servers // 4096))
-        self._lay_out_racks(thermal.LANES)
+        self._lay_out_racks(thermal.LANES, 8 * threads)
         self._lay_out_groups(thermal)
         self._lay_out_air(thermal)
         self._lay_out_values(thermal)
-        self._slices = max(1, min(8 * threads, self._chunk_ints.shape[1] - 1))
+        self._slices = max(1, min(8 * threads, len(self._tasks) - 1))
         self._solved: bool | None = None
         """Whether the last step was transient; None without one."""
 
-    def _lay_out_racks(self, lanes: int) -> None:
+    def _lay_out_racks(self, lanes: int, slices: int) -> None:
         """Blocks of racks, each data center filled up to whole ones, and chunks of blocks."""
         fleet = self._fleet
         racks = np.diff(fleet.rack_start)
@@ -168,6 +168,11 @@ class Hall:
         chunks = [np.arange(a, b, _BLOCKS_PER_CHUNK) for a, b in pairwise(first_block)]
         per_dc = np.array([len(c) for c in chunks])
         chunk_dc = np.repeat(np.arange(fleet.size), per_dc)
+        # Data centers of up to a slice are one task, larger ones a task per chunk.
+        whole = per_dc * slices <= max(per_dc.sum(), slices)
+        chunk_starts_task = ~np.repeat(whole, per_dc)
+        chunk_starts_task[np.cumsum(per_dc) - per_dc] = True
+        self._tasks = np.append(np.flatnonzero(chunk_starts_task), per_dc.sum()).astype(np.int32)
         first_need = starts(np.diff(fleet.unit_start)[chunk_dc], "needs of chunks")
         self._chunk_ints = _table(np.concatenate([*chunks, first_block[-1:]]), chunk_dc, first_need)
         self._needs = np.zeros(max(int(first_need[-1]), 1))
@@ -347,7 +352,10 @@ class Hall:
             self._dc[name][:] = 0.0
 
     def _guess(self, met: Conditions) -> None:
-        """Outlets to start from: the racks of the design point, moved as a mean rack would be."""
+        """Outlets to start from: the racks of the design point, moved as a mean rack would be.
+
+        By the supply air of the first unit, which tells where the others are near enough to start.
+        """
         fleet, air = self._fleet, self._fleet.air
         assert air is not None
         supply_c = met.unit_supply_c[fleet.unit_start[:-1]]
@@ -558,6 +566,7 @@ class Hall:
             substep_s,
             weight,
             TOLERANCE_K[self._precision],
+            self._tasks,
             self._run_start,
             self._run_ints,
             self._block_ints,
@@ -567,7 +576,7 @@ class Hall:
             self._weights,
             self._shares,
             self._racks.reshape(len(self._racks), -1, self._thermal.LANES),
-            self._tables,
+            self._tables.reshape(-1),
             self._group_load,
             self._dcs,
             self._doubles,

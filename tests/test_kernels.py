@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import reference_twin
 from sdc_taichi import DataCenterConfig, RuntimeStateError, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
-from sdc_taichi.hall import Conditions, Hall, HallSums, Precision
+from sdc_taichi.hall import Coil, Conditions, Hall, HallSums, Precision
 from sdc_taichi.types import F64
 
 OUTLETS = ("server", "rack", "released")
@@ -319,12 +319,34 @@ def test_large_and_small_halls_in_one_fleet_equal_themselves_alone(precision: Pr
         assert results_equal(alone, part_of(batch, configs, i)), f"{sizes[i]} racks"
 
 
-def digest_of_large_hall() -> str:
-    """Fingerprint of everything the kernels compute for a large hall, in both precisions."""
+def digest_of_large_halls() -> str:
+    """Fingerprint of everything the kernels compute for large halls, in both precisions."""
     config = hall_of_many_racks(1500)
     digest = hashlib.sha256()
+    # Air couples the racks of these, in one task or several by the number of threads.
+    coupled = build_fleet(
+        [
+            load_config(
+                "corrected",
+                [f"name=dc{rows}", f"hall.rows={rows}", "hall.racks_per_row=30",
+                 "hall.supply_approach_k=5", "hall.return_approach_k=-3",
+                 "servers.power_w=[200, 20]"],
+            )
+            for rows in (2, 5, 9, 40)
+        ]
+    )  # fmt: skip
+    met = Conditions(
+        np.full(4, 20.0), np.full(4, 0.5),
+        rack_load=np.random.default_rng(0).uniform(0.3, 0.9, coupled.racks),
+    )  # fmt: skip
+    coil = Coil(met.unit_supply_c, np.zeros(4), np.full(4, 1e9), np.full(4, 1e12), np.zeros(4))
     precisions: tuple[Precision, ...] = ("f32", "f64")
     for precision in precisions:
+        hall = Hall(coupled, precision)
+        steady, state = hall.solve(met), hall.settle(met)
+        for found in (steady, *hall.advance(met, state, coil, 900.0, 300.0)):
+            for f in fields(found):
+                digest.update(np.ascontiguousarray(getattr(found, f.name)).tobytes())
         sums, servers = solve_servers([config], np.array([19.0]), np.array([0.55]), precision)
         for f in fields(sums):
             digest.update(np.ascontiguousarray(getattr(sums, f.name)).tobytes())
@@ -336,7 +358,7 @@ def digest_of_large_hall() -> str:
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
     code = (
         "import test_kernels as t; from sdc_taichi import runtime;"
-        "print(runtime.ensure_started(), t.digest_of_large_hall())"
+        "print(runtime.ensure_started(), t.digest_of_large_halls())"
     )
     found = {}
     for threads in (1, 2, 3):

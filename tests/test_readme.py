@@ -17,13 +17,13 @@ pytestmark = pytest.mark.repo
 
 def test_python_of_the_readme_runs(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
-    assert blocks
-    for code in blocks:
+    printed = ["8000 servers", "'agent_ls': (64, 40)"]
+    for code, text in zip(blocks, printed, strict=True):
         done = subprocess.run(
             [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
         )
         assert done.returncode == 0, done.stderr
-        assert "8000 servers" in done.stdout
+        assert text in done.stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -46,10 +46,11 @@ def test_examples_draw_their_pictures(script: str, tmp_path: Path) -> None:
     assert all(p.stat().st_size > 10_000 for p in pictures)
 
 
-def test_kernel_benchmark_runs_at_small_size() -> None:
-    path = ROOT / "benchmarks" / "thermal.py"
+@pytest.mark.parametrize(("name", "lines"), [("thermal", 5), ("env", 3)])
+def test_benchmarks_run_at_small_size(name: str, lines: int) -> None:
+    path = ROOT / "benchmarks" / f"{name}.py"
     done = subprocess.run(
         [sys.executable, str(path), "--quick"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) == 5
+    assert len(done.stdout.splitlines()) == lines
