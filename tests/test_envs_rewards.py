@@ -122,12 +122,6 @@ def test_default_rewards_are_those_of_the_paper() -> None:
     assert terms["queue"][0] < 0
 
 
-def test_collaboration_of_the_paper() -> None:
-    own = dict(zip(AGENTS, np.array([[-1.0], [-2.0], [-3.0]]), strict=True))
-    got = [float(r[0]) for r in share(own, 0.8).values()]
-    np.testing.assert_allclose(got, [-1.3, -2.0, -2.7], rtol=1e-12)
-
-
 @given(
     st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3),
     st.floats(0, 1),
