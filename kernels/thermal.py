@@ -18,8 +18,8 @@ from typing import Any, no_type_check
 
 from .backend import ti
 
-INLETS = ("approach", "recirculation")
-THERMAL = ("quasi_steady", "transient")
+HALL_TEMPLATES = 6
+"""Template arguments of ``hall_kernel``, which come first."""
 OUTLETS = ("server", "rack", "released")
 
 LANES = 16

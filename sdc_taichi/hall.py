@@ -138,12 +138,13 @@ class Hall:
     def __init__(self, fleet: Fleet, precision: Precision) -> None:
         threads = runtime.ensure_started()
         from sdc_taichi.kernels import thermal
+        from sdc_taichi.kernels.backend import BoundKernel
 
         self._thermal = thermal
         self._precision: Precision = precision
         self._dtype = np.dtype(np.float32 if precision == "f32" else np.float64)
         self._fleet = fleet
-        self._kernel = thermal.hall_kernel(precision)
+        self._kernel = BoundKernel(thermal.hall_kernel(precision), thermal.HALL_TEMPLATES)
         self._outlet_model = thermal.OUTLETS.index(fleet.models["outlet"])
         self._recirculates = fleet.air is not None
         self._server_slices = max(1, min(8 * threads, fleet.servers // 4096))
@@ -212,7 +213,7 @@ class Hall:
                 tables.append(by_place[a:b].reshape(-1, lanes))
                 total += int(b - a)
             table[i] = known[key]
-        self._tables = np.concatenate(tables)
+        self._tables = np.concatenate(tables).reshape(-1)
         self._block_ints = _table(filled, most, table, first_place[:-1])
         self._server_c = np.zeros((int(first_place[-1]), lanes), self._dtype)
         self._group_load = np.zeros((1, lanes), self._dtype)
@@ -250,6 +251,7 @@ class Hall:
         fleet, air = self._fleet, self._fleet.air
         blocks = self._places // thermal.LANES
         self._racks = np.ones((len(thermal.RACK_ROWS), self._places), self._dtype)
+        self._rack_blocks = self._racks.reshape(len(self._racks), -1, thermal.LANES)
         self._rack = dict(zip(thermal.RACK_ROWS, self._racks, strict=True))
         self._is_rack = np.zeros(self._places, self._dtype)
         self._is_rack[self._rack_at] = 1.0
@@ -287,6 +289,7 @@ class Hall:
         state = (len(thermal.RACK_STATE), blocks, thermal.LANES)
         self._rack_store = np.zeros(state, self._dtype)
         self._rack_state = self._rack_store.reshape(len(self._rack_store), -1)
+        self._flat_state = self._rack_store.reshape(-1)
         self._memory = dict(zip(thermal.RACK_STATE, self._rack_state, strict=True))
         self._constants = self._real(
             np.array([*_RELEASED_OUTLET_FIT, *thermal.exp_constants(self._precision)])
@@ -575,14 +578,14 @@ class Hall:
             self._controls,
             self._weights,
             self._shares,
-            self._racks.reshape(len(self._racks), -1, self._thermal.LANES),
-            self._tables.reshape(-1),
+            self._rack_blocks,
+            self._tables,
             self._group_load,
             self._dcs,
             self._doubles,
             self._units,
             self._unit_state,
-            self._rack_state.reshape(-1),
+            self._flat_state,
             self._rack_store,
             self._server_c,
             self._constants,

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import reference_twin
-from sdc_taichi import DataCenterConfig, RuntimeStateError, build_fleet, load_config
+from sdc_taichi import DataCenterConfig, RuntimeStateError, build_fleet, load_config, runtime
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.hall import Coil, Conditions, Hall, HallSums, Precision
 from sdc_taichi.types import F64
@@ -402,3 +402,32 @@ def test_server_layers_need_a_solve() -> None:
     hall.forget()
     with pytest.raises(RuntimeStateError, match="no step has been done yet"):
         hall.servers()
+
+
+def test_a_bound_kernel_takes_new_arrays_and_refuses_other_types() -> None:
+    runtime.ensure_started()
+    from sdc_taichi.kernels import thermal
+    from sdc_taichi.kernels.backend import BoundKernel
+
+    bound = BoundKernel(thermal.expand_kernel("f32"), 0)
+    start, at = np.array([0, 3, 8], np.int32), np.array([0, 1], np.int32)
+    none = [np.zeros((1, thermal.LANES), np.float32) for _ in range(3)]
+
+    def expand(values: Any) -> list[Any]:
+        layers = [np.zeros(8, np.float32) for _ in range(3)]
+        bound(1, start, at, values, *layers, *none)
+        return layers
+
+    values = np.arange(6, dtype=np.float32).reshape(3, 2)
+    expected = [np.repeat(row, [3, 5]) for row in values]
+    first = expand(values)
+    second = expand(values + 10)
+    values *= 2
+    third = expand(values)
+    for k, row in enumerate(expected):
+        np.testing.assert_array_equal(first[k], row)
+        np.testing.assert_array_equal(second[k], row + 10)
+        np.testing.assert_array_equal(third[k], 2 * row)
+    for wrong in (values.astype(np.float64), values[0], np.zeros((3, 4), np.float32)[:, ::2]):
+        with pytest.raises(TypeError, match="other type or order"):
+            expand(wrong)

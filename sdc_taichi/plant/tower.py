@@ -102,9 +102,7 @@ def yorkcalc_approach_k(wet_bulb_c: Values, range_k: Values, liquid_gas_ratio: V
     Returns:
         Approach within 1.1..40 K.
     """
-    a, b, c = _approach_parabola(wet_bulb_c, range_k)
-    x = np.minimum(liquid_gas_ratio, MAX_LIQUID_GAS_RATIO)
-    return np.asarray(np.clip(a + x * (b + x * c), *APPROACH_BOUNDS_K))
+    return _approach_at(liquid_gas_ratio, *_approach_parabola(wet_bulb_c, range_k))
 
 
 def yorkcalc_liquid_gas_ratio(wet_bulb_c: Values, range_k: Values, approach_k: Values) -> Array:
@@ -123,7 +121,15 @@ def yorkcalc_liquid_gas_ratio(wet_bulb_c: Values, range_k: Values, approach_k: V
         The ratio, 0..8. It is 0 where no airflow reaches the approach, and 8, the bound of the
         correlation, where less air than that would do.
     """
-    a, b, c = _approach_parabola(wet_bulb_c, range_k)
+    return _ratio_at(approach_k, *_approach_parabola(wet_bulb_c, range_k))
+
+
+def _approach_at(liquid_gas_ratio: Values, a: Values, b: Values, c: Values) -> Array:
+    x = np.minimum(liquid_gas_ratio, MAX_LIQUID_GAS_RATIO)
+    return np.asarray(np.clip(a + x * (b + x * c), *APPROACH_BOUNDS_K))
+
+
+def _ratio_at(approach_k: Values, a: Values, b: Values, c: Values) -> Array:
     above_intercept = np.clip(approach_k, *APPROACH_BOUNDS_K) - a
     discriminant = b**2 + 4.0 * c * above_intercept
     # A negative discriminant has two meanings. The parabola opens downwards and stays below the
@@ -219,13 +225,14 @@ def yorkcalc(
     range_k = _range_k(heat_w, water_kg_s)
     water_ratio = water_kg_s / reference_water_kg_s
     wanted_k = condenser_setpoint_c - wet_bulb_c
-    full_speed_k = yorkcalc_approach_k(wet_bulb_c, range_k, water_ratio)
+    parabola = _approach_parabola(wet_bulb_c, range_k)
+    full_speed_k = _approach_at(water_ratio, *parabola)
 
     free_k = full_speed_k + range_k * (1.0 - FREE_CONVECTION_SHARE) / FREE_CONVECTION_SHARE
     fan_off = (wanted_k >= free_k) | (range_k <= 0.0)
     saturated = ~fan_off & (wanted_k <= full_speed_k)
 
-    ratio = yorkcalc_liquid_gas_ratio(wet_bulb_c, range_k, wanted_k)
+    ratio = _ratio_at(wanted_k, *parabola)
     modulating = ~fan_off & ~saturated & (ratio > 0.0)
     part_speed = np.minimum(water_ratio / np.where(modulating, ratio, 1.0), 1.0)
     air_ratio = np.where(fan_off, 0.0, np.where(modulating, part_speed, 1.0))
@@ -342,9 +349,9 @@ def _approach_parabola(wet_bulb_c: Values, range_k: Values) -> tuple[Values, Val
     """Coefficients of the approach in powers 0, 1, 2 of the liquid to gas ratio."""
     t = np.clip(wet_bulb_c, *WET_BULB_BOUNDS_C)
     r = np.clip(range_k, *RANGE_BOUNDS_K)
-    a, b, c = (
-        sum(r**j * (k[j, 0] + t * (k[j, 1] + t * k[j, 2])) for j in range(3)) for k in YORKCALC
-    )
+    k = YORKCALC.reshape(*YORKCALC.shape, *(1,) * max(np.ndim(t), np.ndim(r)))
+    in_range = k[:, :, 0] + t * (k[:, :, 1] + t * k[:, :, 2])
+    a, b, c = in_range[:, 0] + r * (in_range[:, 1] + r * in_range[:, 2])
     return a, b, c
 
 

@@ -164,10 +164,13 @@ def _older_than(queue: F64, steps: F64) -> F64:
 
 def _queue_after(queue: F64, taken: F64, deferred: F64) -> tuple[F64, F64, F64]:
     """Oldest age and mean age in steps, (B,), and the queue, (B, L), at the end of the step."""
-    left = np.maximum(queue - taken[:, None], 0.0)
-    after = np.concatenate([left[:, 1:], (left[:, -1] + deferred)[:, None]], axis=1)
+    after = np.empty_like(queue)
+    older = after[:, :-1]
+    np.maximum(np.subtract(queue[:, 1:], taken[:, None], out=older), 0.0, out=older)
+    after[:, -1] = older[:, -1] + deferred
     # Work of the newest step has age 0; each older task is counted once per step it has waited.
-    aged = np.where(after[:, :-1] > _NEGLIGIBLE_TASKS, after[:, :-1], 0.0)
+    aged = older > _NEGLIGIBLE_TASKS
     total = after[:, -1]
-    mean = np.divide(aged.sum(axis=1), total, out=np.zeros_like(total), where=total > 0)
+    waited = np.einsum("bl,bl->b", older, aged)
+    mean = np.divide(waited, total, out=np.zeros_like(total), where=total > 0)
     return np.count_nonzero(aged, axis=1).astype(np.float64), mean, after
