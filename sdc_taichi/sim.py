@@ -840,8 +840,9 @@ class Simulator:
             raise SdcError(
                 f"action {name}: shape {command.shape}, expected {' or '.join(map(str, valid))}"
             )
-        wrong = ~(np.abs(command) <= limit) | ~np.isfinite(command)
-        if np.any(wrong):
+        largest = np.abs(command).max()
+        if not (largest <= limit and largest < np.inf):
+            wrong = ~(np.abs(command) <= limit) | ~np.isfinite(command)
             value = command[wrong].flat[0] if command.ndim else command
             raise SdcError(
                 f"action {name}: {value}; valid is a finite number within -{limit:g}..{limit:g}"
@@ -851,8 +852,12 @@ class Simulator:
     def fingerprint(self) -> str:
         """SHA-256 of configs, inputs and precision, which tells simulators apart."""
         digest = hashlib.sha256(self.precision.encode())
+        # Environments of a batch share their configs.
+        texts: dict[int, bytes] = {}
         for config in self.fleet.configs:
-            digest.update(config.model_dump_json().encode())
+            if id(config) not in texts:
+                texts[id(config)] = config.model_dump_json().encode()
+            digest.update(texts[id(config)])
         digest.update(self.drivers.digest())
         # A matrix that a config names may change under its name.
         if (air := self.fleet.air) is not None:
