@@ -399,18 +399,16 @@ class Hall:
             into = ServerLayers(*(np.empty(self._fleet.servers, self._dtype) for _ in range(3)))
         expand = self._thermal.expand_kernel(self._precision)
         layers = (into.inlet_c, into.outlet_c, into.power_w)
-        lanes = self._thermal.LANES
-        whole = self._fleet.servers // lanes * lanes
-        stores = (
-            [layer[:whole].reshape(-1, lanes) for layer in layers] if whole else self._no_groups
-        )
+        per_word = 8 // self._dtype.itemsize
+        whole = self._fleet.servers // per_word * per_word
+        words = [layer[:whole].view(np.float64) if whole else np.zeros(1) for layer in layers]
         expand(
             self._server_slices,
             self._fleet.server_start,
             self._group_at,
             group_out.reshape(len(group_out), -1),
             *layers,
-            *stores,
+            *words,
         )
         return into
 

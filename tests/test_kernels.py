@@ -411,11 +411,10 @@ def test_a_bound_kernel_takes_new_arrays_and_refuses_other_types() -> None:
 
     bound = BoundKernel(thermal.expand_kernel("f32"), 0)
     start, at = np.array([0, 3, 8], np.int32), np.array([0, 1], np.int32)
-    none = [np.zeros((1, thermal.LANES), np.float32) for _ in range(3)]
 
     def expand(values: Any) -> list[Any]:
         layers = [np.zeros(8, np.float32) for _ in range(3)]
-        bound(1, start, at, values, *layers, *none)
+        bound(1, start, at, values, *layers, *(layer.view(np.float64) for layer in layers))
         return layers
 
     values = np.arange(6, dtype=np.float32).reshape(3, 2)
