@@ -21,7 +21,7 @@ TYPED := build/typecheck
 SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
 
-.PHONY: help demo test test-train lint wheel-test clean
+.PHONY: help demo test test-train bench lint wheel-test clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -34,6 +34,9 @@ test: $(READY) ## Run all tests; those on measured files need SDC_REAL_DATA.
 
 test-train: $(READY_TRAIN) ## Install the training libraries and test the examples that use them.
 	$(PY) -m pytest tests/test_training.py
+
+bench: $(READY) ## Measure every speed target; tables, JSON and plot in runs/bench.
+	$(PY) benchmarks/bench.py
 
 lint: $(READY) ## Check style, format and types.
 	$(PY) -m ruff check

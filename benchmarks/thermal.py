@@ -11,12 +11,11 @@ else the machine does.
 """
 
 import argparse
-import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import no_type_check
 
 import numpy as np
+from roof import core_s, store_s
 
 from sdc_taichi import build_fleet, load_config, make_configs
 from sdc_taichi.fleet import Fleet
@@ -41,39 +40,6 @@ def fleet_of(n_dcs: int, racks: int, servers: int, inlet_model: str) -> Fleet:
         "servers.power_w=[150, 10]",
     ]
     return build_fleet(make_configs(load_config("corrected", settings), count=n_dcs))
-
-
-def core_s(call: Callable[[], object], repeats: int) -> float:
-    """Least core time of several runs, s."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        call()
-        times.append(time.process_time() - start)
-    return min(times)
-
-
-def roof_s(servers: int, repeats: int) -> float:
-    """A plain store of three layers, s."""
-    from sdc_taichi.kernels.backend import ti
-
-    @ti.kernel
-    @no_type_check
-    def store(a: ti.template(), b: ti.template(), c: ti.template(), x: ti.f32):
-        for i in a:
-            a[i] = x
-            b[i] = x
-            c[i] = x
-
-    fields = [ti.field(ti.f32) for _ in range(3)]
-    builder = ti.FieldsBuilder()
-    for field in fields:
-        builder.dense(ti.i, servers).place(field)
-    tree = builder.finalize()
-    out = core_s(lambda: (store(*fields, 1.0), ti.sync()), repeats)
-    tree.destroy()
-    return out
 
 
 def measure(n_dcs: int, racks: int, servers: int, repeats: int) -> dict[str, float]:
@@ -110,7 +76,7 @@ def measure(n_dcs: int, racks: int, servers: int, repeats: int) -> dict[str, flo
         "uneven transient": (hall, lambda: advance(uneven)),
     }
     in_all = n_dcs * racks * servers
-    spent_s = {"roof": roof_s(in_all, repeats)}
+    spent_s = {"roof": store_s(in_all, repeats)}
     for name, (one, step) in steps.items():
         spent_s[name] = core_s(step, repeats)
         spent_s[name] += core_s(lambda one=one: one.servers(layers), repeats)  # type: ignore[misc]

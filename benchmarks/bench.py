@@ -1,0 +1,483 @@
+"""Every speed target beside what this machine does, in one run; docs/performance.md explains them.
+
+    python benchmarks/bench.py [--quick] [--out runs/bench]
+
+Prints tables, and writes them as bench.json and bench.md, and cost against size as bench.png.
+Nothing here fails for being slow: "met" and "not met" are for people to read. Figures of the kernel
+and its peers are core time, which other jobs on the machine disturb least; others are wall time.
+"""
+
+import argparse
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import env
+import fresh
+import numpy as np
+from peers import PEERS, Arguments, MissingError
+from roof import core_s, store_s
+from thermal import QUICK_SIZES, SIZES, fleet_of
+
+import sdc_taichi
+from sdc_taichi import runtime
+from sdc_taichi.hall import Hall
+from sdc_taichi.types import ServerLayers
+
+HERE = Path(__file__).parent
+LIBRARIES = ("numpy", "taichi", "gymnasium", "pettingzoo", "numba")
+CURVE = (3, 25, 250, 2500, 25_000)
+"""Data centers of 4,000 servers of the curve of cost against size: 1e4 to 1e8 servers."""
+BYTES_PER_SERVER_AT_WORK = 30
+"""Of the largest size: layers, and what its build takes at the most."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A measured value and its target, if it has one; without a value the note says why."""
+
+    part: str
+    name: str
+    value: float | None
+    unit: str = ""
+    at_most: float | None = None
+    at_least: float | None = None
+    note: str = ""
+
+    @property
+    def target(self) -> str:
+        """The target as text, empty without one."""
+        if self.at_most is not None:
+            return f"<= {number(self.at_most)}"
+        return "" if self.at_least is None else f">= {number(self.at_least)}"
+
+    def met(self, quick: bool) -> bool | None:
+        """Whether the target is met; None without one, or for a speed at tiny size."""
+        if self.value is None or not self.target or (quick and self.unit != "relative"):
+            return None
+        if self.at_most is not None:
+            return self.value <= self.at_most
+        return self.at_least is not None and self.value >= self.at_least
+
+
+def number(value: float) -> str:
+    """Three significant digits, none after the point from 100 on."""
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.2g}" if 0 < abs(value) < 0.01 else f"{value:.3g}"
+
+
+def child(part: str, *arguments: Any, **variables: str) -> Any:
+    """Result of a function of fresh.py in a process of its own."""
+    return result(start(part, *arguments, **variables))
+
+
+def result(process: subprocess.Popen[str]) -> Any:
+    """What a process of fresh.py hands back."""
+    printed = process.communicate()[0]
+    if process.returncode:
+        raise SystemExit(f"benchmarks/fresh.py ended with exit code {process.returncode}")
+    return json.loads(printed.splitlines()[-1])
+
+
+def start(part: str, *arguments: Any, **variables: str) -> subprocess.Popen[str]:
+    """That process, running."""
+    return subprocess.Popen(
+        [sys.executable, str(HERE / "fresh.py"), part, json.dumps(arguments)],
+        env=os.environ | variables,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def kernel_and_peers(quick: bool) -> Iterator[Figure]:
+    """Flat halls: share of the memory roof, reduction alone, and the peers."""
+    threads, repeats = runtime.ensure_started(), 3 if quick else 20
+    fleets = {
+        " x ".join(map(str, size)): fleet_of(*size, "approach")
+        for size in (QUICK_SIZES if quick else SIZES)
+    }
+    count, servers = (4, 20) if quick else (1024, 200)
+    unlike = fresh.unlike(["hall.inlet_model=approach"], servers)
+    fleets[f"{count} x 20 x {servers}, each server its own"] = sdc_taichi.build_fleet(
+        sdc_taichi.make_configs(unlike, count=count)
+    )
+    for name, fleet in fleets.items():
+        alike = "own" not in name
+        roof = store_s(fleet.servers, repeats)
+        met = fresh.conditions(fleet)
+        hall = Hall(fleet, "f32")
+        sums = hall.solve(met)
+        layers = hall.servers()
+        reduction, whole = fresh.stepped(fleet)
+        sums_s, step_s = core_s(reduction, repeats), core_s(whole, repeats)
+        ns = 1e9 / fleet.servers
+        if alike:
+            yield Figure("kernel", f"{name}: memory roof", roof * ns, "ns/server")
+        yield Figure("kernel", f"{name}: step with layers", step_s * ns, "ns/server")
+        yield Figure(
+            "kernel", f"{name}: share of the roof", roof / step_s, at_least=0.75 if alike else None
+        )
+        yield Figure(
+            "kernel",
+            f"{name}: reduction over step",
+            sums_s / step_s,
+            at_most=0.4 if alike else None,
+        )
+        for peer, make in PEERS.items():
+            where = f"{name}: {peer}"
+            try:
+                given = Arguments(fleet, met)
+                step = make(given, threads)
+            except MissingError as error:
+                yield Figure("kernel", where, None, note=f"skipped: {error}")
+                continue
+            peer_s = core_s(step, repeats)
+            yield Figure("kernel", where, peer_s * ns, "ns/server")
+            yield Figure("kernel", f"{where}, ours over it", step_s / peer_s, at_most=1.3)
+            apart = difference(given, layers, np.stack([sums.cpu_w, sums.fan_w, sums.airflow_m3s]))
+            yield Figure("kernel", f"{where}, largest difference", apart, "relative", at_most=1e-5)
+
+
+def difference(given: Arguments, layers: ServerLayers, sums: Any) -> float:
+    """Largest relative difference of a peer's layers and sums from ours."""
+    pairs = [
+        (given.layers.inlet_c, layers.inlet_c),
+        (given.layers.outlet_c, layers.outlet_c),
+        (given.layers.power_w, layers.power_w),
+        (given.sums.T, sums),
+    ]
+    return max(float(np.max(np.abs(theirs / ours - 1.0))) for theirs, ours in pairs)
+
+
+def environments(quick: bool) -> Iterator[Figure]:
+    """Environment steps per second, three agents with observations and rewards."""
+    seconds = 0.02 if quick else 1.0
+    many, some, most = (8, 2, 4) if quick else (4096, 64, 1024)
+    corrected = sdc_taichi.load_config("corrected")
+    transient = ["simulation.thermal=transient"]
+
+    one = sdc_taichi.parallel_env(corrected)
+    one.reset(seed=0)
+    actions = dict.fromkeys(one.possible_agents, 1)
+
+    def step() -> None:
+        if not one.agents:
+            one.reset()
+        one.step(actions)
+
+    per_s = env.rate(step, 1, seconds)
+    one.close()
+    yield Figure("environments", "corrected, PettingZoo, N = 1", 1e6 / per_s, "us/step", 300.0)
+    yield Figure("environments", "the same over the released 680/s", per_s / env.RELEASED_PER_S)
+    runs = (
+        ("corrected", corrected, some, 150e3),
+        ("corrected", corrected, many, 1e6),
+        ("corrected, transient", sdc_taichi.load_config("corrected", transient), many, 250e3),
+        ("sustaindc", sdc_taichi.load_config("sustaindc"), many, 1e6),
+        ("corrected, each server its own", fresh.unlike([], 4 if quick else 200), most, 150e3),
+    )
+    for name, config, num_envs, target in runs:
+        found = env.native(config, num_envs, seconds)
+        where = f"{name}, N = {num_envs}"
+        yield Figure("environments", where, found, "steps/s", at_least=target)
+        if num_envs == many:
+            ratio = found / env.RELEASED_PER_S
+            yield Figure("environments", f"{where} over the released 680/s", ratio)
+            yield from breakdown(where, config, num_envs, num_envs / found, seconds)
+
+
+def breakdown(
+    name: str, config: sdc_taichi.DataCenterConfig, count: int, env_s: float, seconds: float
+) -> Iterator[Figure]:
+    """What of an environment step are simulator and, in quasi-steady halls, thermal kernel."""
+    fleet = sdc_taichi.build_fleet(sdc_taichi.make_configs(config, count=count))
+    parts = {}
+    if fleet.models["thermal"] == "quasi_steady":
+        parts["thermal kernel"] = env.rate(fresh.stepped(fleet)[0], 1, seconds)
+    sim = sdc_taichi.Simulator(fleet)
+    sim.reset()
+    parts["simulator"] = env.rate(sim.step, 1, seconds)
+    for part, per_s in parts.items():
+        share = 1.0 / per_s / env_s
+        yield Figure("environments", f"{name}: {part} of the step", share)
+
+
+def scaling(quick: bool) -> Iterator[Figure]:
+    """Cost against size, threads, processes, memory, and growth."""
+    repeats = 3 if quick else 10
+    per_server = {}
+    for count in CURVE[:3] if quick else CURVE:
+        servers = 4000 * count
+        if servers * BYTES_PER_SERVER_AT_WORK > free_bytes():
+            yield Figure("scaling", size_name(servers), None, note="skipped: too little memory")
+            continue
+        fleet = fleet_of(count, 20, 200, "approach")
+        step = fresh.stepped(fleet)[1]
+        per_server[servers] = 1e9 * wall_s(step, repeats) / servers
+        yield Figure("scaling", size_name(servers), per_server[servers], "ns/server")
+        del fleet, step
+    costs = list(per_server.values())
+    fixed_us = 1e-3 * (costs[0] - costs[-1]) * min(per_server)
+    yield Figure("scaling", "fixed cost of a step", fixed_us, "us")
+    yield Figure("scaling", "dearest size over cheapest", max(costs) / min(costs), at_most=1.2)
+    larger = costs[2:] or costs
+    yield Figure("scaling", "the same from 1e6 servers on", max(larger) / min(larger))
+    yield from side_by_side(quick)
+    if not fresh.MEMORY.exists():
+        yield Figure("scaling", "memory", None, note="skipped: read from /proc, which is Linux's")
+        return
+    for name, count, each, at_most in (
+        ("alike", 10 if quick else 2500, False, 24.0),
+        ("each its own, transient", 2 if quick else 256, True, 40.0),
+    ):
+        used = child("memory", count, each)
+        note = f"{number(used['most'])} while it is built"
+        yield Figure(
+            "scaling", f"memory, servers {name}", used["held"], "B/server", at_most, None, note
+        )
+    count = 100 if quick else 10_000
+    grown = child("cycles", count) / 2**20
+    yield Figure("scaling", f"growth over {count:,} reset and close cycles", grown, "MB", 1.0)
+
+
+def side_by_side(quick: bool) -> Iterator[Figure]:
+    """Two threads, and two processes of one thread, over one."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    if (cores or 1) < 2:
+        yield Figure("scaling", "two threads over one", None, note="skipped: one core")
+        return
+    seconds = 0.05 if quick else 1.0
+    size = [16, 20, 200] if quick else [4096, 20, 200]
+    one, two = (child("roof", int(np.prod(size)), 10, SDC_TAICHI_THREADS=t) for t in "12")
+    yield Figure("scaling", "memory roof, two threads over one", 2.0 * one / two)
+    for what in ("kernel", "environments"):
+        alone = rates(what, size, seconds, 1, 1)
+        of_what = f"{what} {' x '.join(map(str, size)) if what == 'kernel' else f'N = {size[0]}'}"
+        target = 1.7 if what == "kernel" else None
+        for name, processes, threads in (("two threads", 1, 2), ("two processes", 2, 1)):
+            found = rates(what, size, seconds, processes, threads) / alone
+            yield Figure(
+                "scaling",
+                f"{of_what}, {name} over one",
+                found,
+                at_least=1.7 if name == "two processes" else target,
+            )
+
+
+def rates(what: str, size: list[int], seconds: float, processes: int, threads: int) -> float:
+    """Steps per second of all processes at the same time."""
+    running = [
+        start("rate", what, size, seconds, SDC_TAICHI_THREADS=str(threads))
+        for _ in range(processes)
+    ]
+    for process in running:
+        assert process.stdout is not None
+        while (line := process.stdout.readline()) and line != "ready\n":
+            pass
+    for process in running:
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+    return float(sum(result(process) for process in running))
+
+
+def size_name(servers: int) -> str:
+    """For example 1e+06 servers."""
+    return f"{servers:.0e} servers"
+
+
+def wall_s(call: Callable[[], object], repeats: int) -> float:
+    """Least wall time of several runs of about 10 ms or more, s."""
+    call()
+    begin = time.perf_counter()
+    call()
+    times = max(1, int(0.01 / max(time.perf_counter() - begin, 1e-9)))
+    spent = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        for _ in range(times):
+            call()
+        spent.append((time.perf_counter() - begin) / times)
+    return min(spent)
+
+
+def free_bytes() -> int:
+    """Memory that is free; without a way to know, none."""
+    try:
+        found = re.search(r"MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text())
+    except OSError:
+        return 2**30
+    return 1024 * int(found[1]) if found else 2**30
+
+
+def starting(quick: bool) -> Iterator[Figure]:
+    """Import, init and first step in a new process, with an empty and a filled kernel cache."""
+    for what in ("environment",) if quick else ("simulator", "environment"):
+        with tempfile.TemporaryDirectory() as cache:
+            for state, at_most in (("cold", 3.0), ("warm", 1.0)):
+                spent = []
+                for _ in range(1 if quick or state == "cold" else 3):
+                    begin = time.time()
+                    end = child("first_step", what, TI_OFFLINE_CACHE_FILE_PATH=cache)
+                    spent.append(end - begin)
+                yield Figure("start", f"{what}, {state}", min(spent), "s", at_most=at_most)
+
+
+def recording(quick: bool) -> Iterator[Figure]:
+    """Simulators with a recorder and without."""
+    from sdc_taichi.viz.recorder import Recorder
+
+    steps, repeats = (8, 1) if quick else (384, 5)
+    for count in (1, 4, 64):
+        sim = sdc_taichi.Simulator(
+            sdc_taichi.make_configs(sdc_taichi.load_config("corrected"), count=count)
+        )
+        spent: dict[bool, list[float]] = {False: [], True: []}
+        with tempfile.TemporaryDirectory() as folder:
+            for _ in range(repeats):
+                for recorded in spent:
+                    sim.reset()
+                    begin = time.perf_counter()
+                    if recorded:
+                        with Recorder(Path(folder, "run.rrd"), sim.fleet) as recorder:
+                            for _ in range(steps):
+                                recorder.log(sim.step())
+                    else:
+                        for _ in range(steps):
+                            sim.step()
+                    spent[recorded].append(time.perf_counter() - begin)
+        sim.close()
+        ratio = min(spent[True]) / min(spent[False])
+        yield Figure(
+            "recording", f"corrected, {count} data centers, {steps} steps", ratio, at_most=1.3
+        )
+
+
+def machine() -> dict[str, Any]:
+    """Facts of the machine and versions."""
+    model = platform.processor()
+    if Path("/proc/cpuinfo").exists():
+        found = re.search(r"model name\s*:\s*(.*)", Path("/proc/cpuinfo").read_text())
+        model = found[1].strip() if found else model
+    versions = {"python": platform.python_version(), "sdc-taichi": sdc_taichi.__version__}
+    for name in LIBRARIES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return {
+        "cpu": model,
+        "cores": os.cpu_count(),
+        "threads": runtime.ensure_started(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "load_before": load(),
+        "versions": versions,
+    }
+
+
+def load() -> float | None:
+    """Processes that want a core, mean over a minute."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+
+
+def show(figure: Figure, last: str, quick: bool) -> None:
+    """One line of the table, under a head when a part begins."""
+    if figure.part != last:
+        print(f"\n{figure.part:<66}{'value':>12} {'unit':<10}{'target':>14}")
+    value = "-" if figure.value is None else number(figure.value)
+    met = {True: "met", False: "NOT MET", None: ""}[figure.met(quick)]
+    line = f"  {figure.name:<64}{value:>12} {figure.unit:<10}{figure.target:>14} {met:<8}"
+    print(f"{line}{figure.note}".rstrip(), flush=True)
+
+
+def markdown(figures: list[Figure], quick: bool) -> str:
+    """The tables for docs/performance.md."""
+    lines = []
+    for part in dict.fromkeys(f.part for f in figures):
+        lines += [
+            f"\n**{part.capitalize()}**\n",
+            "| figure | value | target | |",
+            "|---|---|---|---|",
+        ]
+        for f in figures:
+            if f.part == part:
+                value = f.note if f.value is None else f"{number(f.value)} {f.unit}".strip()
+                met = {True: "met", False: "not met", None: ""}[f.met(quick)]
+                lines.append(f"| {f.name} | {value} | {f.target} | {met} |")
+    return "\n".join(lines).lstrip() + "\n"
+
+
+def plot(figures: list[Figure], path: Path) -> None:
+    """Cost per server against size, with the memory roof at all threads."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as Canvas
+
+    points = [
+        (float(f.name.split()[0]), f.value)
+        for f in figures
+        if f.unit == "ns/server" and f.part == "scaling" and f.value is not None
+    ]
+    roofs = [f.value for f in figures if f.name.endswith("memory roof") and f.value is not None]
+    canvas = Canvas(figsize=(6.4, 4.0), layout="constrained")
+    FigureCanvasAgg(canvas)
+    axes = canvas.subplots()
+    axes.loglog(*zip(*points, strict=True), "o-", color="#0072b2", label="step with layers")
+    axes.axhline(
+        min(roofs) / runtime.ensure_started(), color="#d55e00", ls="--", label="memory roof"
+    )
+    axes.set_xlabel("servers")
+    axes.set_ylabel("wall time per server and step [ns]")
+    axes.set_title("Halls of 4,000 servers, inlet model approach")
+    axes.grid(which="major", alpha=0.3)
+    axes.legend()
+    canvas.savefig(path, dpi=150)
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, for correctness only")
+    parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder to write to")
+    given = parser.parse_args()
+    quick: bool = given.quick
+    given.out.mkdir(parents=True, exist_ok=True)
+    facts = machine()
+    print(json.dumps(facts, indent=1))
+    figures: list[Figure] = []
+    for part in (kernel_and_peers, environments, scaling, starting, recording):
+        for figure in part(quick):
+            show(figure, figures[-1].part if figures else "", quick)
+            figures.append(figure)
+    facts["load_after"] = load()
+    facts["roof_gb_per_s_and_core"] = {
+        f.name.split(":")[0]: round(12.0 / f.value, 1)
+        for f in figures
+        if f.name.endswith("memory roof") and f.value
+    }
+    missed = [f for f in figures if f.met(quick) is False]
+    judged = sum(f.met(quick) is not None for f in figures)
+    print(f"\n{judged - len(missed)} of {judged} targets met")
+    out = [asdict(f) | {"target": f.target, "met": f.met(quick)} for f in figures]
+    text = json.dumps({"quick": quick, "machine": facts, "figures": out}, indent=1)
+    (given.out / "bench.json").write_text(f"{text}\n", encoding="utf-8")
+    (given.out / "bench.md").write_text(markdown(figures, quick), encoding="utf-8")
+    plot(figures, given.out / "bench.png")
+    print(f"{given.out}: bench.json, bench.md, bench.png")
+
+
+if __name__ == "__main__":
+    main()

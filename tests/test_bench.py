@@ -1,0 +1,151 @@
+"""The benchmark at tiny size: what it writes, and that peers compute what the kernel computes."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sdc_taichi import build_fleet, make_configs
+from sdc_taichi.hall import Hall
+
+pytestmark = pytest.mark.repo
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What one run writes."""
+    folder = tmp_path_factory.mktemp("bench")
+    done = subprocess.run(
+        [sys.executable, str(BENCHMARKS / "bench.py"), "--quick", "--out", str(folder)],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (folder / "bench.png").read_bytes().startswith(b"\x89PNG")
+    found = json.loads((folder / "bench.json").read_text(encoding="utf-8"))
+    # Every figure is printed as well.
+    for figure in found["figures"]:
+        assert figure["name"] in done.stdout
+    return dict(found)
+
+
+@pytest.mark.slow
+def test_machine_facts_say_what_the_figures_are_of(written: dict[str, Any]) -> None:
+    machine = written["machine"]
+    assert written["quick"] is True
+    assert machine["cores"] >= 1
+    assert machine["threads"] >= 1
+    assert machine["cpu"]
+    assert {"python", "numpy", "taichi", "gymnasium"} <= set(machine["versions"])
+    roofs = machine["roof_gb_per_s_and_core"]
+    assert len(roofs) == 3
+    assert min(roofs.values()) > 0
+
+
+@pytest.mark.slow
+def test_every_part_has_figures_that_are_numbers_or_say_why_not(written: dict[str, Any]) -> None:
+    figures = written["figures"]
+    assert {f["part"] for f in figures} == {
+        "kernel",
+        "environments",
+        "scaling",
+        "start",
+        "recording",
+    }
+    assert len({f["name"] for f in figures}) == len(figures)
+    for figure in figures:
+        if figure["value"] is None:
+            assert figure["note"].startswith("skipped: "), figure
+        else:
+            assert np.isfinite(figure["value"]), figure
+
+
+@pytest.mark.slow
+def test_only_agreement_is_judged_at_tiny_size(written: dict[str, Any]) -> None:
+    figures = written["figures"]
+    judged = [f for f in figures if f["met"] is not None]
+    assert all(f["unit"] == "relative" and f["met"] for f in judged)
+    peers = [
+        f for f in figures if f["name"].endswith((": numba", ": c")) and f["value"] is not None
+    ]
+    assert len(judged) == len(peers)
+    # What is judged at full size has a target here, too.
+    assert sum(f["target"] != "" for f in figures) > 20
+
+
+@pytest.mark.parametrize("peer", ["numba", "c"])
+@pytest.mark.parametrize("each_its_own", [False, True])
+def test_peers_compute_what_the_kernel_computes(
+    monkeypatch: pytest.MonkeyPatch, peer: str, each_its_own: bool
+) -> None:
+    if peer == "numba" and importlib.util.find_spec("numba") is None:
+        pytest.skip("numba is not installed")
+    if peer == "c" and shutil.which("cc") is None:
+        pytest.skip("no C compiler (cc)")
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    peers, fresh, thermal = map(importlib.import_module, ("peers", "fresh", "thermal"))
+    if each_its_own:
+        fleet = build_fleet(make_configs(fresh.unlike(["hall.inlet_model=approach"], 7), count=3))
+    else:
+        fleet = thermal.fleet_of(3, 10, 7, "approach")
+    met = fresh.conditions(fleet)
+    hall = Hall(fleet, "f64")
+    sums, layers = hall.solve(met), hall.servers()
+    given = peers.Arguments(fleet, met)
+    peers.PEERS[peer](given, 2)()
+    for name in ("inlet_c", "outlet_c", "power_w"):
+        np.testing.assert_allclose(getattr(given.layers, name), getattr(layers, name), rtol=2e-6)
+    for column, name in enumerate(("cpu_w", "fan_w", "airflow_m3s")):
+        np.testing.assert_allclose(given.sums[:, column], getattr(sums, name), rtol=2e-6)
+    for column, name in enumerate(
+        ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "inlet_max_c", "outlet_c")
+    ):
+        theirs, ours = given.racks[:, column], getattr(sums, f"rack_{name}")
+        np.testing.assert_allclose(theirs, ours, rtol=2e-6, err_msg=name)
+
+
+def test_peers_refuse_halls_whose_equations_they_do_not_have(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    peers, fresh, thermal = map(importlib.import_module, ("peers", "fresh", "thermal"))
+    fleet = thermal.fleet_of(1, 4, 5, "recirculation")
+    with pytest.raises(ValueError, match="approach"):
+        peers.Arguments(fleet, fresh.conditions(fleet))
+
+
+@pytest.mark.parametrize(
+    ("at_most", "at_least", "value", "met"),
+    [
+        (1.3, None, 1.3, True),
+        (1.3, None, 1.4, False),
+        (None, 0.75, 0.75, True),
+        (None, 0.75, 0.7, False),
+        (None, None, 1.0, None),
+        (1.3, None, None, None),
+    ],
+)
+def test_targets_are_met_or_not(
+    monkeypatch: pytest.MonkeyPatch,
+    at_most: float | None,
+    at_least: float | None,
+    value: float | None,
+    met: bool | None,
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    figure = importlib.import_module("bench").Figure(
+        "kernel", "x", value, at_most=at_most, at_least=at_least
+    )
+    assert figure.met(quick=False) is met
+    assert figure.met(quick=True) is None
