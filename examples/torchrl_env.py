@@ -1,6 +1,6 @@
 """A TorchRL environment over a batch of data centers, checked and run with random actions.
 
-    python examples/torchrl_env.py [--num-envs 64] [--steps 96]
+    python examples/torchrl_env.py [--num-envs 64] [--steps 192]
 
 Observations, actions and rewards are nested under the agents' names, the shared state is ``state``.
 """
@@ -67,10 +67,12 @@ class BatchEnv(EnvBase):
 
     def _spec(self, space: gymnasium.Space[Any]) -> Any:
         size = self._env.num_envs
+        if isinstance(space, gymnasium.spaces.Dict):
+            return self._nest(**space.spaces)
         if isinstance(space, gymnasium.spaces.Discrete):
             return Categorical(int(space.n), shape=(size,), dtype=torch.int64)
         if not isinstance(space, gymnasium.spaces.Box):
-            raise TypeError(f"{space}: valid is a Box or Discrete space")
+            raise TypeError(f"{space}: valid is a Box, Discrete or Dict space")
         low, high = (
             torch.from_numpy(x).expand(size, *space.shape) for x in (space.low, space.high)
         )
@@ -111,10 +113,17 @@ class BatchEnv(EnvBase):
         return after
 
     def _situation(self, observations: Mapping[str, Any], state: npt.NDArray[Any]) -> TensorDict:
-        by_agent = {a: {"observation": torch.from_numpy(x)} for a, x in observations.items()}
+        by_agent = {a: {"observation": tensors(x)} for a, x in observations.items()}
         return TensorDict(
             {"state": torch.from_numpy(state), **by_agent}, batch_size=self.batch_size
         )
+
+
+def tensors(values: Any) -> Any:
+    """Arrays as tensors, of a heat map by name."""
+    if isinstance(values, Mapping):
+        return {name: torch.from_numpy(array) for name, array in values.items()}
+    return torch.from_numpy(values)
 
 
 def column(values: npt.NDArray[Any]) -> torch.Tensor:

@@ -4,8 +4,10 @@
 
 trains the three agents with skrl on preset ``corrected``, one data center per site and training
 week, and runs them and rule-based controllers in every fourth week of the year, which is left out
-of training. Writes ``training.json`` (settings, results by seed, curves) and ``training.png`` to
-FOLDER and prints the tables of docs/training.md.
+of training. Forecasts and rewards on the last day of a training week read ahead into the first day
+of the held-out week that follows, so only days 2 to 7 are scored, whoever acts. Writes
+``training.json`` (settings, results by seed, curves) and ``training.png`` to FOLDER and prints the
+tables of docs/training.md.
 
 Weather, carbon intensity and work are the synthetic years of the sites.
 """
@@ -34,13 +36,18 @@ from sdc_taichi.types import F64
 SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
 DAYS = 7
 STEPS = DAYS * 96
+UNSCORED_STEPS = 96
+"""First day of a held-out week, which training has seen ahead."""
 HELD_OUT = tuple(range(3, 52, 4))
 """Weeks of the year that are left out of training."""
 TRAINED = tuple(week for week in range(52) if week not in HELD_OUT)
 LATE_WEIGHT = 3.0
 """Dropped and overdue work costs this many times its energy at the mean carbon intensity."""
 RULES = ("g36", "lookahead-24h", "greedy-ci", "load=greedy-ci,cooling=g36,battery=lookahead-24h")
-SUMMED = ("carbon_g", "it_kwh", "hvac_kwh", "arrived_tasks", "executed_tasks", "dropped_tasks")
+SUMMED = (
+    *("carbon_g", "it_kwh", "hvac_kwh", "charge_kwh", "discharge_kwh", "battery_loss_kwh"),
+    *("arrived_tasks", "executed_tasks", "dropped_tasks"),
+)
 SETTINGS: dict[str, Any] = {
     "rollout": 48,
     "hidden": (64, 64),
@@ -52,7 +59,7 @@ SETTINGS: dict[str, Any] = {
 }
 
 Sums = dict[str, F64]
-"""Sums over a week of what ``SUMMED`` names, (B,) each, site by site."""
+"""Sums over the scored days of a week of what ``SUMMED`` names, (B,) each, site by site."""
 
 
 def carbon_reward(result: StepResult, view: View) -> dict[str, F64]:
@@ -107,9 +114,16 @@ def make_env(configs: Sequence[DataCenterConfig]) -> BatchEnv:
 def run_rules(name: str, configs: Sequence[DataCenterConfig]) -> Sums:
     """The weeks under a named controller."""
     fleet = build_fleet(list(configs))
+    sums = {key: np.zeros(fleet.size) for key in SUMMED}
+
+    def score(result: StepResult) -> None:
+        if result.step >= UNSCORED_STEPS:
+            for key, total in sums.items():
+                total += getattr(result, key)
+
     with Simulator(fleet) as sim:
-        sums = run(sim, make_controller(name, fleet), STEPS).sums
-    return {key: sums[key] for key in SUMMED}
+        run(sim, make_controller(name, fleet), STEPS, on_step=score)
+    return sums
 
 
 def run_policies(agent: Any, env: BatchEnv) -> Sums:
@@ -118,19 +132,22 @@ def run_policies(agent: Any, env: BatchEnv) -> Sums:
     agent.enable_training_mode(False)
     observations, _ = env.reset()
     with torch.no_grad():
-        for _ in range(STEPS):
+        for step in range(STEPS):
             _, outputs = agent.act(observations, env.state(), timestep=0, timesteps=STEPS)
             best = {a: out["net_output"].argmax(-1, keepdim=True) for a, out in outputs.items()}
             observations, *_, infos = env.step(best)
-            for name, total in sums.items():
-                total += infos[name]
+            if step >= UNSCORED_STEPS:
+                for name, total in sums.items():
+                    total += infos[name]
     return sums
 
 
 def against_idle(sums: Sums, idle: Sums, sites: Sequence[str]) -> dict[str, Any]:
     """Changes against idle over all data centers, in percent.
 
-    ``cfp_per_work`` is carbon over executed work: work left in the queue saves nothing.
+    ``cfp_per_work`` is carbon over executed work: work left in the queue saves nothing. ``stored``
+    is what batteries gain over the scored days, as a share of idle's energy: carbon that a loss of
+    stored energy saves has been emitted before.
     """
 
     def change(name: str) -> float:
@@ -141,11 +158,15 @@ def against_idle(sums: Sums, idle: Sums, sites: Sequence[str]) -> dict[str, Any]
         for s in (sums, idle)
     ]
     (mine, done), (its, all_work) = by_site
+    drawn_kwh = sums["charge_kwh"] - sums["discharge_kwh"]
+    stored_kwh = np.sum(drawn_kwh - sums["battery_loss_kwh"])
+    idle_kwh = np.sum(idle["it_kwh"] + idle["hvac_kwh"])
     return {
         "cfp": change("carbon_g"),
         "cfp_per_work": 100 * float(mine.sum() / its.sum() * all_work.sum() / done.sum() - 1),
         "it": change("it_kwh"),
         "hvac": change("hvac_kwh"),
+        "stored": 100 * float(stored_kwh / idle_kwh),
         "dropped": 100 * float(sums["dropped_tasks"].sum() / sums["arrived_tasks"].sum()),
         "cfp_per_work_by_site": dict(
             zip(sites, (100 * (mine / its * all_work / done - 1)).tolist(), strict=True)
@@ -217,9 +238,11 @@ def draw(report: Mapping[str, Any]) -> Figure:
 
 def print_tables(report: Mapping[str, Any]) -> None:
     """Rules and seeds against idle, then mean and spread of the seeds."""
-    columns = ("cfp", "cfp_per_work", "it", "hvac", "dropped")
-    print("| held-out weeks, against idle (%) | CFP | CFP per work | IT | HVAC | dropped |")
-    print("|---|---|---|---|---|---|")
+    columns = ("cfp", "cfp_per_work", "it", "hvac", "stored", "dropped")
+    print(
+        "| held-out weeks, against idle (%) | CFP | CFP per work | IT | HVAC | stored | dropped |"
+    )
+    print("|---|---|---|---|---|---|---|")
     rows = dict(report["rules"])
     rows |= {f"seed {s['seed']}": s["curve"][-1] for s in report["seeds"]}
     for name, row in rows.items():
@@ -289,6 +312,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "sites": list(given.sites),
         "train_weeks": list(given.train_weeks),
         "held_out_weeks": list(given.held_out_weeks),
+        "unscored_steps": UNSCORED_STEPS,
         "idle_cfp_kg": float(idle["carbon_g"].sum() / 1e3),
         "rules": rules,
         "seeds": seeds,

@@ -33,8 +33,17 @@ class Table:
     length: I64
 
     def at(self, index: I64) -> F64:
-        """Entry ``index`` of every data center, repeating, (B,)."""
+        """Entry ``index`` of every data center, repeating, (B,), or entries, (B, n)."""
+        if index.ndim > 1:
+            return self.values[self.offset[:, None] + index % self.length[:, None]]
         return self.values[self.offset + index % self.length]
+
+    def distinct(self) -> tuple[list[F64], I64]:
+        """The distinct series, and which of them each data center reads, (B,)."""
+        parts, which = np.unique(
+            np.stack([self.offset, self.length], axis=1), axis=0, return_inverse=True
+        )
+        return [self.values[first : first + n] for first, n in parts], which.reshape(-1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,15 +24,16 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.control import (
-    AGENTS,
+    CONTROLLED,
     Controller,
     View,
+    controlled,
     controller_names,
     make_controller,
     trim_and_respond,
     viewer,
 )
-from sdc_taichi.control.rules import quarter_command, slots_in_step
+from sdc_taichi.control.rules import quarter_command, slots_in_step, unrepeated
 from sdc_taichi.run import run
 
 CHECKS = json.loads((Path(__file__).parent / "reference" / "physics_checks.json").read_text())
@@ -64,6 +65,20 @@ def one_with(ci: np.ndarray) -> tuple[DataCenterConfig, Drivers]:
 
 
 # Trim and respond
+
+
+def test_what_a_spec_controls() -> None:
+    assert controlled("g36") == controlled("constant:20") == ("cooling",)
+    assert controlled("greedy-ci") == ("load", "battery")
+    assert controlled("random") == CONTROLLED
+    assert controlled("load=greedy-ci, cooling=g36") == ("load", "cooling")
+
+
+def test_commands_that_are_not_repeated_stay_as_they_are() -> None:
+    command = np.array([0.5, 0.5, -0.5, 0.0, 1.0])
+    found = unrepeated(command, np.array([0.5, 0.25, -0.5, 0.0, np.nan]))
+    assert (found == command).tolist() == [False, True, False, True, True]
+    np.testing.assert_allclose(found, command, rtol=1e-15)
 
 
 def test_trim_and_respond_gives_the_reference_sequence() -> None:
@@ -341,4 +356,4 @@ def test_own_controllers_need_no_base_class(sim: Simulator) -> None:
 
     kept = results(sim, Alternate(), 4)
     assert [float(r.battery_command[0]) for r in kept] == [-1.0, 1.0, -1.0, 1.0]
-    assert AGENTS == ("load", "cooling", "battery")
+    assert CONTROLLED == ("load", "cooling", "battery")

@@ -55,7 +55,6 @@ EVENTFUL = load_config(
 BUSY: dict[str, Any] = {
     "config": EVENTFUL,
     "days": 1,
-    "others": "random",
     "forecast_error": ForecastError(ci_share=0.2, temperature_k=3.0),
     "rewards": {"agent_dc": {"cost": 1.0, "hot_inlets": 0.1}},
 }
@@ -84,6 +83,11 @@ advice = pytest.mark.filterwarnings(
 
 def tiny(**options: Any) -> dict[str, Any]:
     return {"config": "tiny", "days": 1, **options}
+
+
+def playing(agents: tuple[str, ...]) -> dict[str, Any]:
+    """These learn, and chance plays the rest if there is any."""
+    return {"agents": agents} | ({} if agents == AGENTS else {"others": "random"})
 
 
 def same(a: Any, b: Any) -> bool:
@@ -149,8 +153,9 @@ def test_several_crac_units(mode: str) -> None:
     options = {**BUSY, "actions": mode}
     parallel_api_test(sdc_taichi.parallel_env(**options), num_cycles=STEPS + 1)
     api_test(sdc_taichi.aec_env(**options), num_cycles=10)
-    for name in IDS:
-        check_env(gymnasium.make(name, **options).unwrapped)
+    for name, agent in IDS.items():
+        others: dict[str, Any] = {} if agent is None else {"others": "random"}
+        check_env(gymnasium.make(name, **options, **others).unwrapped)
     space = sdc_taichi.parallel_env(**options).action_space("agent_dc")
     assert space.shape == (2,)
 
@@ -241,7 +246,7 @@ def multi_agent(num_envs: int, **options: Any) -> Any:
 @pytest.mark.parametrize("agents", [("agent_ls", "agent_dc"), ("agent_bat",), AGENTS], ids="+".join)
 @pytest.mark.parametrize("heat_map", [False, True])
 def test_alone_as_in_a_batch(agents: tuple[str, ...], heat_map: bool) -> None:
-    options = {**BUSY, "agents": agents, "heat_map": heat_map}
+    options = {**BUSY, **playing(agents), "heat_map": heat_map}
     batch = multi_agent(3, **options)
     singles = [sdc_taichi.parallel_env(**options) for _ in range(3)]
     found, infos = batch.reset(seed=11)
@@ -309,12 +314,12 @@ def trajectory(env: Any, start: Any, steps: int) -> list[Any]:
 
 @pytest.mark.parametrize("saved_after", [0, 1, 40, STEPS - 1])
 def test_goes_on_from_what_was_saved(saved_after: int) -> None:
-    env = multi_agent(2, **{**BUSY, "agents": ("agent_ls", "agent_dc")})
+    env = multi_agent(2, **{**BUSY, **playing(("agent_ls", "agent_dc"))})
     trajectory(env, env.reset(seed=2), saved_after)
     saved = pickle.dumps(env.state_dict())
     expected = trajectory(env, None, STEPS + 10)
 
-    other = multi_agent(2, **{**BUSY, "agents": ("agent_ls", "agent_dc")})
+    other = multi_agent(2, **{**BUSY, **playing(("agent_ls", "agent_dc"))})
     seen = other.load_state_dict(pickle.loads(saved))
     assert same(trajectory(other, None, STEPS + 10), expected)
     # Once more into an environment that is elsewhere.
@@ -356,12 +361,81 @@ def test_saved_by_another_environment() -> None:
     env, other = sdc_taichi.parallel_env(**tiny()), multi_agent(2, **tiny())
     env.reset(seed=0)
     before = env.state_dict()
-    with pytest.raises(SdcError, match="number of environments"):
+    with pytest.raises(SdcError, match="made by 1 environments; valid is 2"):
         other.load_state_dict(before)
-    with pytest.raises(SdcError, match=r"missing \['actions'"):
+    with pytest.raises(SdcError, match=r"missing \['options', 'actions'"):
         env.load_state_dict({"simulator": before["simulator"]})
     with pytest.raises(SdcError, match="another fleet"):
         sdc_taichi.parallel_env(**{**tiny(), "config": "corrected"}).load_state_dict(before)
+    one_unit = sdc_taichi.parallel_env("corrected", days=1)
+    one_unit.reset(seed=0)
+    one_unit.step(dict.fromkeys(AGENTS, 1))
+    with pytest.raises(SdcError, match="another fleet"):
+        sdc_taichi.parallel_env(EVENTFUL, days=1).load_state_dict(one_unit.state_dict())
+
+
+OTHERWISE: list[tuple[dict[str, Any], str]] = [
+    ({"days": 2}, "made with days 1; valid is 2, as here"),
+    ({"agents": ["agent_bat"]}, "made with agents"),
+    ({"actions": "continuous"}, "made with actions 'discrete'"),
+    ({"forecast_error": ForecastError(0.1)}, "made with forecast_error"),
+    ({"collaboration": 1.0}, "made with collaboration 0.8"),
+    ({"rewards": {"agent_dc": {"pue": 1.0}}}, "made with rewards {"),
+    ({"rewards": lambda result, view: -result.grid_kwh}, "made with rewards {"),
+    ({"tariff": {"price_per_kwh": [0.1]}}, "made with tariff"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), OTHERWISE)
+def test_saved_with_other_options(options: dict[str, Any], message: str) -> None:
+    env, other = sdc_taichi.parallel_env(**tiny()), sdc_taichi.parallel_env(**tiny(**options))
+    env.reset(seed=0)
+    with pytest.raises(SdcError, match=re.escape(message)):
+        other.load_state_dict(env.state_dict())
+
+
+SPOILT: list[tuple[str, Any, str]] = [
+    ("options", None, "options is a NoneType"),
+    ("simulator", 3, "simulator is a int"),
+    ("simulator", {}, "snapshot: missing"),
+    ("generators", None, "generators is a NoneType"),
+    ("generators", [{}, {}], "a generator is not valid"),
+    ("generators", ["x", 3], "a generator is not valid"),
+    ("keys", None, "keys are object"),
+    ("keys", np.array([1.5, 2.0]), "keys are float64"),
+    ("keys", np.array([1, 2, 3]), r"keys are int64 \(3,\)"),
+    ("rewards", None, "rewards are object"),
+    ("rewards", np.full((2, 2), np.nan), "valid is finite numbers"),
+    ("rewards", np.zeros((1, 2)), r"rewards are float64 \(1, 2\)"),
+    ("actions", 3, "actions are not valid"),
+    ("actions", {"jump": np.zeros(2)}, "actions are not valid"),
+    ("actions", {"load": np.array([2.0, 0.0])}, "actions of load"),
+    ("actions", {"cooling": np.array([np.inf, 0.0])}, "actions of cooling"),
+    ("actions", {"battery": "charge"}, "actions of battery"),
+]
+
+
+@pytest.mark.parametrize(("part", "value", "message"), SPOILT)
+def test_a_spoilt_state_leaves_everything_as_it_was(part: str, value: Any, message: str) -> None:
+    env, twin = (multi_agent(2, **tiny()) for _ in range(2))
+    for one in (env, twin):
+        trajectory(one, one.reset(seed=2), 3)
+    other = multi_agent(2, **tiny())
+    trajectory(other, other.reset(seed=7), 5)
+    with pytest.raises(SdcError, match=message):
+        env.load_state_dict({**other.state_dict(), part: value})
+    assert same(trajectory(env, None, STEPS), trajectory(twin, None, STEPS))
+    with pytest.raises(SdcError, match="state: is a int; valid is what state_dict"):
+        env.load_state_dict(3)
+
+
+def test_a_state_is_not_changed_by_going_on() -> None:
+    env = multi_agent(2, **tiny(rewards={"agent_dc": {"demand_charge": 1.0}}))
+    trajectory(env, env.reset(seed=2), 3)
+    saved = env.state_dict()
+    kept = pickle.dumps(saved)
+    trajectory(env, None, STEPS)
+    assert pickle.dumps(saved) == kept
 
 
 def test_across_spawned_processes() -> None:
@@ -400,6 +474,98 @@ forked.close(terminate=True)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.stdout.startswith("refused: this process was forked after Taichi started")
     assert "'spawn'" in done.stdout
+
+
+@pytest.mark.parametrize("agents", [("agent_dc",), AGENTS], ids="+".join)
+def test_continuous_setpoint_changes_are_what_was_asked_for(agents: tuple[str, ...]) -> None:
+    """Under the accelerating model too, which multiplies commands that are repeated exactly."""
+    config = load_config("sustaindc", ["hvac.setpoint.initial_c=18"])
+    env = sdc_taichi.parallel_env(config, agents=agents, actions="continuous", days=1)
+    env.reset(seed=0)
+    hold = dict.fromkeys(agents, np.zeros(1, dtype=np.float32))
+    raised = hold | {"agent_dc": np.array([0.5], dtype=np.float32)}
+    found = [env.step(raised)[4]["agent_dc"]["setpoint_c"] for _ in range(6)]
+    assert found == pytest.approx([18.5, 19.0, 19.5, 20.0, 20.5, 21.0], abs=1e-6)
+
+
+def test_forecast_errors_leave_the_days_alone() -> None:
+    erring = ForecastError(ci_share=0.2, temperature_k=3.0)
+    envs = [multi_agent(3, **tiny(forecast_error=e)) for e in (ForecastError(), erring)]
+    drawn = [[env.reset(seed=s)[1]["start_day"] for s in (4, None, None)] for env in envs]
+    assert np.array_equal(drawn[0], drawn[1])
+    assert len(np.unique(drawn[0])) > 5
+
+
+def test_a_reset_that_fails_changes_nothing() -> None:
+    env, twin = (multi_agent(2, **tiny()) for _ in range(2))
+    for one in (env, twin):
+        one.reset(seed=1)
+    wrong: list[dict[str, Any]] = [
+        {"seed": 5, "options": {"start_day": "13-01"}},
+        {"options": {"start_day": [1, 2, 3]}},
+        {"seed": [1, "x"]},
+    ]
+    for given in wrong:
+        with pytest.raises(ConfigError):
+            env.reset(**given)
+    for _ in range(3):
+        assert same(env.reset(), twin.reset())
+
+
+def test_single_values_may_come_as_arrays() -> None:
+    env = multi_agent(2, **tiny())
+    found, infos = env.reset(seed=np.array(3), options={"start_day": np.array(5)})
+    assert infos["start_day"].tolist() == [5, 5]
+    assert same(found, env.reset(seed=3, options={"start_day": 5})[0])
+    assert env.reset(options={"start_day": np.array("03-01")})[1]["start_day"].tolist() == [59] * 2
+    with pytest.raises(ConfigError, match="start_day"):
+        env.reset(options={"start_day": np.array(1.5)})
+
+
+def test_terms_of_the_step_that_ends_an_episode() -> None:
+    batches: list[Any] = [
+        gymnasium.make_vec("sdc_taichi/Joint-v0", num_envs=2, **tiny()),
+        multi_agent(2, **tiny()),
+    ]
+    single = SdcEnv(**tiny())
+    single.reset(seed=3)
+    expected: dict[str, float] = {}
+    for _ in range(STEPS):
+        single.step([0, 2, 0])
+        expected = single.reward_terms()
+    for env in batches:
+        env.reset(seed=3)
+        action: Any = np.array([[0, 2, 0]] * 2)
+        if not isinstance(env, SdcVectorEnv):
+            action = {a: action[:, i] for i, a in enumerate(AGENTS)}
+        for _ in range(STEPS):
+            env.step(action)
+        assert env.core.view.last is None  # The next episode has begun.
+        assert rows(env.reward_terms(), 0) == expected
+        env.step(action)
+        assert rows(env.reward_terms(), 0) != expected
+        env.reset()
+        assert env.reward_terms() == {}
+
+
+def test_what_the_standards_do_not_know_is_reached_through_unwrapped() -> None:
+    wrapped = gymnasium.make("sdc_taichi/Joint-v0", render_mode="rgb_array", **tiny())
+    wrapped.reset(seed=0)
+    wrapped.step(np.array([1, 1, 1]))
+    env: Any = wrapped.unwrapped
+    assert env.state_space.contains(env.state())
+    assert env.reward_terms().keys() == rewards.TERMS.keys()
+    assert env.load_state_dict(env.state_dict()).shape == env.observation_space.shape
+    for name in ("state", "reward_terms", "state_dict"):
+        assert not hasattr(wrapped, name)
+
+    turns: Any = sdc_taichi.aec_env(**tiny())
+    turns.reset(seed=0)
+    assert env.state_space.contains(turns.state())
+    for name in ("reward_terms", "state_dict"):
+        assert not hasattr(turns, name)
+    assert isinstance(turns.unwrapped, SdcParallelEnv)
+    assert turns.unwrapped.reward_terms() == {}
 
 
 # --- what one learner sees of several agents ---
@@ -490,14 +656,56 @@ MADE: list[tuple[dict[str, Any], str]] = [
     ({"dayss": 3}, "dayss"),
     ({"agents": ["agent_x"]}, "agent_x"),
     ({"agents": []}, "agents"),
-    ({"others": "g37"}, "'g37': unknown"),
+    ({"others": "g37", "agents": ["agent_ls"]}, "'g37': unknown"),
     ({"actions": "both"}, "actions"),
     ({"days": 0}, "days"),
     ({"render_mode": "human"}, "render_mode 'human': valid is None or rgb_array"),
     ({"precision": "f16"}, "precision 'f16'"),
     ({"config": "tinny"}, "tinny"),
     ({"config": []}, "empty list"),
+    ({"config": None}, "config None: valid is a preset"),
+    ({"config": 3}, "config 3: valid is a preset"),
+    ({"config": ["tiny"]}, "config 'tiny': valid is"),
+    ({"days": True}, "days"),
+    ({"days": "7"}, "days"),
+    ({"months": [1.0]}, "months"),
+    ({"others": "idle"}, "others: without effect as all agents learn"),
+    ({"others": 3, "agents": ["agent_ls"]}, "others"),
+    ({"others": "load=greedy-ci", "agents": ["agent_ls"]}, "without effect on load"),
+    ({"others": "load=idle,cooling=g36", "agents": ["agent_ls"]}, "without effect on load"),
+    ({"others": "g36", "agents": ["agent_dc"]}, "without effect on cooling"),
+    ({"others": "constant:20", "agents": ["agent_dc"]}, "valid is for load, battery"),
+    ({"action_order": "paper", "actions": "continuous"}, "action_order: without effect"),
+    ({"action_order": "paper", "agents": ["agent_ls"]}, "as agent_bat does not learn"),
+    ({"setpoint_change_k": 1.0}, "setpoint_change_k: without effect"),
+    (
+        {"setpoint_change_k": 1.0, "actions": "continuous", "agents": ["agent_ls"]},
+        "as agent_dc does not learn",
+    ),
+    ({"collaboration": 0.5, "rewards": "no:such"}, "collaboration: without effect"),
+    ({"collaboration": 0.5, "rewards": len}, "collaboration: without effect"),
+    (
+        {"features": {"agent_ls": ["ci"]}, "agents": ["agent_bat"]},
+        "without effect for agent_ls, which does not learn",
+    ),
+    ({"observations": "sustaindc", "ci_leads_h": [1.0]}, "ci_leads_h: without effect"),
+    ({"start": "fixed", "months": [1]}, "months: without effect"),
 ]
+
+
+def test_options_that_do_have_an_effect() -> None:
+    for options in (
+        {"others": "load=greedy-ci", "agents": ["agent_bat"]},
+        {"others": "greedy-ci", "agents": ["agent_bat"]},
+        {"others": "random", "agents": ["agent_bat"]},
+        {"others": "idle", "agents": ["agent_bat"]},
+        {"action_order": "sustaindc", "agents": ["agent_bat"]},
+        {"setpoint_change_k": 1.0, "actions": "continuous", "agents": ["agent_dc"]},
+        {"collaboration": 0.5, "rewards": "sustaindc"},
+        {"features": {"agent_bat": ["ci"]}, "agents": ["agent_bat"]},
+        {"days": np.int64(1), "months": [np.int64(2)]},
+    ):
+        sdc_taichi.parallel_env(**{**tiny(), **options})
 
 
 @pytest.mark.parametrize(("options", "message"), MADE)
@@ -523,7 +731,16 @@ def test_made_of_bad_numbers() -> None:
         gymnasium.make_vec("sdc_taichi/Load-v0", num_envs=1, autoreset_mode="never", **tiny())
     with pytest.raises(ConfigError, match="the one agent here is agent_ls"):
         gymnasium.make("sdc_taichi/Load-v0", **tiny(agents=["agent_dc"]))
+    with pytest.raises(ConfigError, match="agent 'agent_bat': the one agent here is agent_ls"):
+        gymnasium.make("sdc_taichi/Load-v0", **tiny(agent="agent_bat"))
+    with pytest.raises(ConfigError, match="agent 'agent_bat': the one agent here is agent_ls"):
+        gymnasium.make_vec("sdc_taichi/Load-v0", num_envs=1, **tiny(agent="agent_bat"))
+    assert multi_agent(np.int64(3), **tiny()).num_envs == 3  # type: ignore[arg-type]
     configs = [load_config("tiny")] * 2
+    with pytest.raises(ConfigError, match="num_envs 1: valid is at least 2, one for each config"):
+        multi_agent(1, config=configs)
+    with pytest.raises(ConfigError, match="num_envs 1: valid is at least 2"):
+        SdcVectorEnv(config=configs)
     with pytest.raises(ConfigError, match="config: 2 data centers; valid is one"):
         sdc_taichi.parallel_env(configs)
     assert multi_agent(None, config=configs, days=1).num_envs == 2  # type: ignore[arg-type]
@@ -541,6 +758,8 @@ RESET: list[tuple[dict[str, Any], str]] = [
     ({"seed": "x"}, "seed 'x'"),
     ({"seed": 1.0}, "seed 1.0"),
     ({"seed": [1, 2, 3]}, "3 for"),
+    ({"seed": np.array(1.0)}, "seed np.float64(1.0)"),
+    ({"options": [1]}, "reset options [1]: valid is a dict"),
 ]
 
 
@@ -592,6 +811,9 @@ def test_bad_actions(mode: str, actions: dict[str, Any], message: str) -> None:
     env.reset(seed=0)
     with pytest.raises(SdcError, match=re.escape(message)):
         env.step(actions)
+    for nothing in (None, 3, [1]):
+        with pytest.raises(SdcError, match="valid is a dict of"):
+            env.step(nothing)  # type: ignore[arg-type]
     batch = multi_agent(1, **tiny(actions=mode))
     batch.reset(seed=0)
     with pytest.raises(SdcError, match=re.escape(message)):

@@ -23,6 +23,7 @@ from sdc_taichi.envs.rewards import (
     register_reward,
     share,
 )
+from sdc_taichi.envs.single import SdcEnv
 from sdc_taichi.types import F64
 
 DEFER = dict.fromkeys(AGENTS, np.array([0]))
@@ -85,7 +86,7 @@ def test_an_hourly_step_has_its_whole_penalty_at_23() -> None:
 
 def test_cost_follows_the_hour_and_the_peak_of_the_episode() -> None:
     prices = tuple(0.01 * hour for hour in range(24))
-    scales = {agent: {"cost": 1.0} for agent in AGENTS}
+    scales = {"agent_ls": {"cost": 1.0}, "agent_bat": {"demand_charge": 1.0}}
     env = core(
         rewards=scales,
         collaboration=1.0,
@@ -93,17 +94,24 @@ def test_cost_follows_the_hour_and_the_peak_of_the_episode() -> None:
     )
     for _ in range(2):  # An episode does not know the peak of the one before.
         env.reset(0)
-        peak_kw = 0.0
+        design_kw = env.sim.sizing.facility_w[0] / 1e3
+        peak_kw, charged = 0.5 * design_kw, 0.0
         for step in range(12):
             done = env.step(act(1, 2 * (step % 2)))
             kwh = done.result.grid_kwh[0]
             above_kw = max(0.0, kwh * 4 - peak_kw)
             peak_kw = max(peak_kw, kwh * 4)
-            paid = kwh * prices[step // 4] + 3.0 * above_kw
             design_kwh = env.sim.sizing.facility_w[0] / 4e3
+            paid = kwh * prices[step // 4]
             assert done.rewards["agent_ls"][0] == pytest.approx(-paid / (0.1 * design_kwh))
             assert env.terms()["cost"][0] == done.rewards["agent_ls"][0]
-        assert peak_kw > 0
+            # A day's part of a bill of 30 days.
+            charge = 3.0 * above_kw / 30.0
+            assert done.rewards["agent_bat"][0] == pytest.approx(-charge / (0.1 * design_kwh))
+            charged += done.rewards["agent_bat"][0]
+        # Half the design power is billed anyway.
+        assert peak_kw > 0.5 * design_kw
+        assert charged == pytest.approx((0.5 * design_kw - peak_kw) / (design_kw / 4))
 
 
 def test_default_rewards_are_those_of_the_paper() -> None:
@@ -157,10 +165,52 @@ def test_functions_of_the_user() -> None:
         done = env.step(act(1, 1))
         for agent in AGENTS:
             np.testing.assert_array_equal(done.rewards[agent], -done.result.water_l)
-    register_reward("saved_water", water_saved)
-    assert core(rewards="saved_water") is not None
-    with pytest.raises(ConfigError, match="'saved_water': valid is a name that is not taken"):
+    for _ in range(2):  # A notebook cell may run twice.
         register_reward("saved_water", water_saved)
+    assert core(rewards="saved_water") is not None
+    for name in ("saved_water", "default", "not a name", 3):
+        with pytest.raises(ConfigError, match=f"{name!r}: valid is a name that is not taken"):
+            register_reward(name, lambda result, view: -result.water_l)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="'water_x': is a float; valid is a function"):
+        register_reward("water_x", 1.0)  # type: ignore[arg-type]
+
+
+def test_functions_of_the_user_answer_for_those_that_learn() -> None:
+    def by_agent(result: StepResult, view: View) -> dict[str, F64]:
+        return {"agent_bat": -result.carbon_g, "agent_dc": -result.hvac_kwh}
+
+    env = core(rewards=by_agent, agents=["agent_bat"])
+    env.reset(0)
+    done = env.step({"agent_bat": np.array([1])})
+    assert set(done.rewards) == {"agent_bat"}
+    np.testing.assert_array_equal(done.rewards["agent_bat"], -done.result.carbon_g)
+
+
+def test_a_joint_learner_gets_one_value_for_all_once() -> None:
+    alike = core(rewards=water_saved)
+    each = core(rewards=lambda result, view: dict.fromkeys(AGENTS, -result.water_l))
+    for env, times in ((alike, 1), (each, 3)):
+        env.reset(0)
+        done = env.step(act(1, 1))
+        np.testing.assert_allclose(done.joint_reward, -times * done.result.water_l, rtol=1e-12)
+    single = SdcEnv(load_config("tiny"), days=1, start="fixed", rewards=water_saved)
+    single.reset(seed=0)
+    _, reward, *_ = single.step([1, 1, 1])
+    assert reward == -done.result.water_l[0] != 0
+
+
+def test_the_first_step_of_an_episode_pays_no_more_than_others() -> None:
+    env = core(["hvac.setpoint.initial_c=20"], days=7, start="fixed")
+    env.reset(0)
+    found = []
+    for _ in range(96):
+        env.step(act(1, 1))
+        found.append(env.terms())
+    cost = np.array([terms["cost"][0] for terms in found])
+    assert cost[0] > 2 * np.median(cost)
+    # However it goes, a week pays no more than what lies between half and full design power.
+    charged = sum(float(terms["demand_charge"][0]) for terms in found)
+    assert -0.6 * 12.0 * (7 / 30) / (0.1 / 4) < charged <= 0
 
 
 @pytest.mark.parametrize(
@@ -172,6 +222,14 @@ def test_functions_of_the_user() -> None:
         ({"agent_xy": {}}, "unknown agent 'agent_xy'"),
         ({"agent_dc": {"watr": 1.0}}, "unknown term 'watr'; did you mean 'water'"),
         ({"agent_dc": {"water": math.inf}}, "water is inf"),
+        ({"agent_ls": {"carbon": "x"}}, "rewards of agent_ls: carbon is 'x'; valid is a number"),
+        ({"agent_ls": {"carbon": True}}, "carbon is True; valid is a number"),
+        ({"agent_ls": ["carbon"]}, "valid is a dict of term to scale"),
+        ({"carbon": 1.0}, "unknown agent 'carbon'; valid: agent_ls, agent_dc, agent_bat"),
+        (":f", "rewards ':f': unknown; valid: default"),
+        ("os:", "rewards 'os:': unknown"),
+        (".os:x", "rewards '.os:x': unknown"),
+        (3, "rewards 3: unknown; valid: default, sustaindc"),
     ],
 )
 def test_wrong_rewards_are_named(rewards: Any, message: str) -> None:
@@ -182,7 +240,12 @@ def test_wrong_rewards_are_named(rewards: Any, message: str) -> None:
 @pytest.mark.parametrize(
     ("returned", "message"),
     [
-        (np.zeros(3), r"\(3,\) for agent_ls; valid is \(1,\)"),
+        (np.zeros(3), r"\(3,\) for all agents; valid is \(1,\)"),
+        ("much", "returned 'much' for all agents; valid is"),
+        (None, "for all agents; valid is"),
+        ({**dict.fromkeys(AGENTS, 0.0), "agent_dc": "x"}, "returned 'x' for agent_dc"),
+        ({**dict.fromkeys(AGENTS, 0.0), "agent_x": 0.0}, "unknown agent 'agent_x'"),
+        ({"agent_ls": np.zeros(2), "agent_dc": 0.0, "agent_bat": 0.0}, r"\(2,\) for agent_ls"),
         (np.array([np.nan]), "of finite numbers"),
         ({"agent_ls": np.zeros(1)}, "returned none for agent_dc"),
     ],

@@ -1,6 +1,6 @@
 """Controllers that are not learned, and what a controller sees."""
 
-from sdc_taichi.control.registry import AGENTS, controller_names, make_controller
+from sdc_taichi.control.registry import CONTROLLED, controlled, controller_names, make_controller
 from sdc_taichi.control.rules import (
     Controller,
     FixedSetpoint,
@@ -15,7 +15,7 @@ from sdc_taichi.control.rules import (
 from sdc_taichi.control.view import Forecast, Limits, View, viewer
 
 __all__ = [
-    "AGENTS",
+    "CONTROLLED",
     "Controller",
     "FixedSetpoint",
     "Forecast",
@@ -27,6 +27,7 @@ __all__ = [
     "Random",
     "TrimAndRespond",
     "View",
+    "controlled",
     "controller_names",
     "make_controller",
     "trim_and_respond",

@@ -23,7 +23,8 @@ from sdc_taichi.control.view import limits_of
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.fleet import Fleet
 
-AGENTS = ("load", "cooling", "battery")
+CONTROLLED = ("load", "cooling", "battery")
+"""What a controller may give commands for, as specs name it."""
 
 
 class _Entry(NamedTuple):
@@ -33,8 +34,8 @@ class _Entry(NamedTuple):
 
 
 _ENTRIES: dict[str, _Entry] = {
-    "idle": _Entry(Idle, AGENTS),
-    "random": _Entry(Random, AGENTS),
+    "idle": _Entry(Idle, CONTROLLED),
+    "random": _Entry(Random, CONTROLLED),
     "g36": _Entry(TrimAndRespond, ("cooling",)),
     "coldest": _Entry(lambda: FixedSetpoint("low"), ("cooling",)),
     "warmest": _Entry(lambda: FixedSetpoint("high"), ("cooling",)),
@@ -63,19 +64,27 @@ def make_controller(spec: str, fleet: Fleet) -> Controller:
             constant setpoint that is out of range.
     """
     if "=" not in spec:
-        return _make(spec.strip(), fleet, AGENTS)
+        return _make(spec.strip(), fleet, CONTROLLED)
     chosen: dict[str, Controller] = {}
     for part in spec.split(","):
         agent, sign, name = (text.strip() for text in part.partition("="))
-        if not sign or agent not in AGENTS:
+        if not sign or agent not in CONTROLLED:
             raise ConfigError(
                 f"controller {spec!r}: {part.strip()!r}: valid is agent=name with one of the "
-                f"agents {', '.join(AGENTS)}{_nearest(agent, AGENTS)}"
+                f"agents {', '.join(CONTROLLED)}{_nearest(agent, CONTROLLED)}"
             )
         if agent in chosen:
             raise ConfigError(f"controller {spec!r}: {agent} is given twice")
         chosen[agent] = _make(name, fleet, (agent,))
-    return PerAgent(*(chosen.get(agent, Idle()) for agent in AGENTS))
+    return PerAgent(*(chosen.get(agent, Idle()) for agent in CONTROLLED))
+
+
+def controlled(spec: str) -> tuple[str, ...]:
+    """What a valid spec of ``make_controller`` controls; ``idle`` and ``random`` do everything."""
+    if "=" in spec:
+        return tuple(part.partition("=")[0].strip() for part in spec.split(","))
+    entry = _ENTRIES.get(spec.strip())
+    return ("cooling",) if entry is None else entry.agents
 
 
 def _make(name: str, fleet: Fleet, agents: tuple[str, ...]) -> Controller:

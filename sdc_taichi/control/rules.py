@@ -255,10 +255,20 @@ def slots_in_step(step: int, step_h: float) -> int:
 def steps_to(target_c: F64, view: View) -> F64:
     """Setpoint command that reaches ``target_c`` in one step, (B,)."""
     command = (target_c - view.setpoint_c) / view.limits.setpoint_step_k
-    # The accelerating setpoint multiplies a command that is repeated exactly.
-    repeated = command == view.cooling_last
-    command[repeated] = np.nextafter(command[repeated], 0.0)
-    return command
+    return unrepeated(command, view.cooling_last)
+
+
+def unrepeated(command: F64, last: F64) -> F64:
+    """Setpoint commands that mean what they say, (n,).
+
+    The accelerating setpoint multiplies a command that is repeated exactly; such a one differs in
+    its last bit here.
+
+    Args:
+        command: setpoint changes in steps, (n,).
+        last: those of the step before, (n,), not a number before the first.
+    """
+    return np.where(command == last, np.nextafter(command, 0.0), command)
 
 
 def quarter_command(ci_g_per_kwh: F64) -> F64:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.drivers import Drivers, Table
+from sdc_taichi.drivers import Drivers
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.fleet import Fleet
 from sdc_taichi.sim import Simulator
@@ -41,17 +41,17 @@ class Forecast:
     @property
     def ci_g_per_kwh(self) -> F64:
         """Carbon intensity."""
-        return _gather(self.drivers.ci_g_per_kwh, self.index)
+        return self.drivers.ci_g_per_kwh.at(self.index)
 
     @property
     def outdoor_c(self) -> F64:
         """Dry bulb."""
-        return _gather(self.drivers.outdoor_c, self.index)
+        return self.drivers.outdoor_c.at(self.index)
 
     @property
     def wet_bulb_c(self) -> F64:
         """Wet bulb."""
-        return _gather(self.drivers.wet_bulb_c, self.index)
+        return self.drivers.wet_bulb_c.at(self.index)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,3 @@ def viewer(sim: Simulator) -> Callable[[StepResult | None], View]:
         )
 
     return look
-
-
-def _gather(table: Table, index: I64) -> F64:
-    return table.values[table.offset[:, None] + index % table.length[:, None]]

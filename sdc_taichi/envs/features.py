@@ -12,6 +12,7 @@ import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -48,7 +49,7 @@ class Feature:
 
 AGENTS = ("agent_ls", "agent_dc", "agent_bat")
 AGE_EDGES_H = (0.0, 6.0, 12.0, 18.0, 24.0)
-"""Lower edges of the age bins; the last is open."""
+"""Lower edges of the age bins, those of the released code (``carbon_ls.py``); the last is open."""
 UNLIMITED_QUEUE_H = 10.0
 """Hours of full work that a queue without limit is measured by."""
 TABLE_BYTES = 2**28
@@ -178,7 +179,7 @@ def select(
     given = dict(chosen or {})
     for agent in given:
         if agent not in AGENTS:
-            raise ConfigError(f"features: unknown agent {agent!r}; {_nearest(agent, AGENTS)}")
+            raise ConfigError(f"features: unknown agent {agent!r}; {hint(agent, AGENTS)}")
     by_name = {feature.name: feature for feature in known}
     out: dict[str, tuple[Feature, ...]] = {}
     for agent in AGENTS:
@@ -188,7 +189,7 @@ def select(
         for name in names:
             if name not in by_name:
                 raise ConfigError(
-                    f"features of {agent}: unknown {name!r}; {_nearest(str(name), list(by_name))}"
+                    f"features of {agent}: unknown {name!r}; {hint(name, list(by_name))}"
                 )
         twice = next((name for name in names if list(names).count(name) > 1), None)
         if twice is not None:
@@ -198,11 +199,10 @@ def select(
 
 
 class Observer:
-    """Observations of each agent, the shared state and the heat map of a fleet.
+    """Observations of each agent and the shared state of a fleet.
 
     Args:
         fleet: the data centers.
-        agents: who observes; the shared state is the same whoever does.
         features: names of the features of each agent; None is ``DEFAULT_FEATURES``.
         ci_leads_h: leads of the CI forecast, rising multiples of the step.
         weather_leads_h: leads of the weather forecasts, likewise.
@@ -222,7 +222,6 @@ class Observer:
         self,
         fleet: Fleet,
         *,
-        agents: Sequence[str] = AGENTS,
         features: Mapping[str, Sequence[str]] | None = None,
         ci_leads_h: Sequence[float] = CI_LEADS_H,
         weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
@@ -234,16 +233,11 @@ class Observer:
             weather_leads_h=weather_leads_h,
             error=forecast_error,
         )
-        self._fleet = fleet
         per_dc = np.diff(fleet.unit_start)
         self._units = int(per_dc[0]) if np.all(per_dc == per_dc[0]) else 1
         self.state_features = catalogue(ci_leads_h, weather_leads_h, self._units)
         self.state_space = space(self.state_features)
-        for agent in agents:
-            if agent not in AGENTS:
-                raise ConfigError(f"agents: unknown {agent!r}; {_nearest(str(agent), AGENTS)}")
-        chosen = select(features, self.state_features)
-        self.features = {agent: chosen[agent] for agent in AGENTS if agent in agents}
+        self.features = select(features, self.state_features)
         self.spaces = {agent: space(found) for agent, found in self.features.items()}
 
         inside = _inside(self._units)
@@ -272,17 +266,17 @@ class Observer:
         self._seen: View | None = None
         self._built: F32 = np.empty((0, 0), dtype=np.float32)
 
-    def reset(self, view: View, rngs: Sequence[np.random.Generator]) -> None:
+    def reset(self, view: View, keys: Sequence[int] | I64 = ()) -> None:
         """Start an episode.
 
         Args:
             view: the view before the first step.
-            rngs: one generator per data center, drawn from if forecasts err.
+            keys: one per data center, seeds of the errors of forecasts that err.
 
         Raises:
-            ConfigError: another number of generators than of data centers.
+            ConfigError: another number of keys than of data centers.
         """
-        self._outside.reset(view.drivers, rngs)
+        self._outside.reset(view.drivers, keys)
         self._design = _design(view.sizing, view.step_h)
         self._seen = None
 
@@ -302,40 +296,6 @@ class Observer:
             RuntimeStateError: before ``reset``.
         """
         return self._everything(view).copy()
-
-    def heat_map(self, view: View) -> F32:
-        """Racks of the last step as an image, 0..1, (B, rows, racks per row, channels).
-
-        Float rather than bytes: 8 bits would leave steps of 0.16 K. Before the first step all air
-        has the temperature of the setpoint and no rack draws power.
-
-        Raises:
-            ConfigError: halls that differ in rows or racks per row.
-        """
-        shape = _hall_shape(self._fleet)
-        racks = shape[0] * shape[1]
-        channels = np.empty((view.size, racks, len(HEAT_MAP_FEATURES)), dtype=np.float32)
-        if view.last is None:
-            channels[...] = _setpoint_mean_c(view)[:, None, None]
-            channels[:, :, 2] = 0.0
-        else:
-            design_w = view.sizing.it_w[:, None] / racks
-            channels[:, :, 0] = view.last.rack_inlet_c.reshape(view.size, racks)
-            channels[:, :, 1] = view.last.rack_outlet_c.reshape(view.size, racks)
-            channels[:, :, 2] = view.last.rack_power_w.reshape(view.size, racks) / design_w
-        for k, feature in enumerate(HEAT_MAP_FEATURES):
-            channels[:, :, k] = _scaled(channels[:, :, k], feature)
-        return channels.reshape(view.size, *shape, len(HEAT_MAP_FEATURES))
-
-    @property
-    def heat_map_space(self) -> Box:
-        """Space of the heat map of one data center.
-
-        Raises:
-            ConfigError: halls that differ in rows or racks per row.
-        """
-        shape = (*_hall_shape(self._fleet), len(HEAT_MAP_FEATURES))
-        return Box(0.0, 1.0, shape, dtype=np.float32)
 
     def _everything(self, view: View) -> F32:
         """All features of a view, scaled; kept until the next view."""
@@ -398,6 +358,40 @@ class Observer:
         }
 
 
+def heat_map(view: View) -> F32:
+    """Racks of the last step as an image, 0..1, (B, rows, racks per row, channels).
+
+    Float rather than bytes: 8 bits would leave steps of 0.16 K. Before the first step all air has
+    the temperature of the setpoint and no rack draws power.
+
+    Raises:
+        ConfigError: halls that differ in rows or racks per row.
+    """
+    shape = _hall_shape(view.fleet)
+    racks = shape[0] * shape[1]
+    channels = np.empty((view.size, racks, len(HEAT_MAP_FEATURES)), dtype=np.float32)
+    if view.last is None:
+        channels[...] = _setpoint_mean_c(view)[:, None, None]
+        channels[:, :, 2] = 0.0
+    else:
+        design_w = view.sizing.it_w[:, None] / racks
+        channels[:, :, 0] = view.last.rack_inlet_c.reshape(view.size, racks)
+        channels[:, :, 1] = view.last.rack_outlet_c.reshape(view.size, racks)
+        channels[:, :, 2] = view.last.rack_power_w.reshape(view.size, racks) / design_w
+    for k, feature in enumerate(HEAT_MAP_FEATURES):
+        channels[:, :, k] = _scaled(channels[:, :, k], feature)
+    return channels.reshape(view.size, *shape, len(HEAT_MAP_FEATURES))
+
+
+def heat_map_space(fleet: Fleet) -> Box:
+    """Space of the heat map of one data center.
+
+    Raises:
+        ConfigError: halls that differ in rows or racks per row.
+    """
+    return Box(0.0, 1.0, (*_hall_shape(fleet), len(HEAT_MAP_FEATURES)), dtype=np.float32)
+
+
 class _Outside:
     """Scaled carbon intensity and weather: a table of all steps if it is small, else step by step.
 
@@ -411,9 +405,9 @@ class _Outside:
         self._at, self._width = _places(features)
         self._forecasts = forecasts
 
-    def reset(self, drivers: Drivers, rngs: Sequence[np.random.Generator]) -> None:
+    def reset(self, drivers: Drivers, keys: Sequence[int] | I64) -> None:
         """Start an episode."""
-        if self._forecasts.reset(drivers, rngs):
+        if self._forecasts.reset(drivers, keys):
             self._rows, self._offset, self._length = self._tabulated(drivers)
 
     def at(self, index: I64, step: int) -> F32:
@@ -429,8 +423,9 @@ class _Outside:
             np.array_equal(ci.offset, t.offset) and np.array_equal(ci.length, t.length)
             for t in others
         )
-        _, first, which = np.unique(ci.offset, return_index=True, return_inverse=True)
-        lengths = ci.length[first]
+        series, which = ci.distinct()
+        first = np.unique(which, return_index=True)[1]
+        lengths = np.array([len(one) for one in series], dtype=np.int64)
         offsets = np.cumsum(lengths) - lengths
         small = int(lengths.sum()) * self._width * 4 <= TABLE_BYTES
         if not (alike and small and self._forecasts.perfect):
@@ -528,8 +523,9 @@ def _signed(feature: Feature) -> bool:
     return feature.low == -feature.high
 
 
-def _nearest(name: str, valid: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+def hint(name: Any, valid: Sequence[str]) -> str:
+    """What was meant by an unknown name, or else all that is valid."""
+    near = difflib.get_close_matches(str(name), valid, n=1, cutoff=0.5)
     return f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(valid)}"
 
 

@@ -4,7 +4,7 @@ The error of the forecast that is issued at time t for t + h is ``s (W(t + h) - 
 standard deviation s at 24 h and a random walk W of unit variance per 24 h. It is zero for the
 present, grows with the square root of the lead, and a later forecast of the same hour differs from
 an earlier one by what the walk has done in between. W is a realisation of each environment: it
-depends on the generator given at reset and on the step alone.
+depends on the key given at reset and on the step alone.
 """
 
 from __future__ import annotations
@@ -116,22 +116,22 @@ class Forecasts:
         self._tables: tuple[Table, ...] = ()
         self._walks: _Walks | None = None
 
-    def reset(self, drivers: Drivers, rngs: Sequence[np.random.Generator]) -> bool:
+    def reset(self, drivers: Drivers, keys: Sequence[int] | I64 = ()) -> bool:
         """Start an episode.
 
         Args:
             drivers: inputs of the fleet.
-            rngs: one generator per data center; with errors, each is drawn from once, else not.
+            keys: one per data center, seeds of the errors; not looked at without errors.
 
         Returns:
             Whether the series are others than in the episode before.
 
         Raises:
-            ConfigError: another number of generators than of data centers.
+            ConfigError: another number of keys than of data centers.
         """
-        if not self.perfect and len(rngs) != drivers.size:
+        if not self.perfect and len(keys) != drivers.size:
             raise ConfigError(
-                f"{len(rngs)} random generators for {drivers.size} data centers; valid is one each"
+                f"{len(keys)} random keys for {drivers.size} data centers; valid is one each"
             )
         tables = (drivers.ci_g_per_kwh, drivers.outdoor_c, drivers.wet_bulb_c)
         new = not all(map(operator.is_, tables, self._tables)) or not self._tables
@@ -143,7 +143,7 @@ class Forecasts:
         self._walks = None
         if not self.perfect:
             ahead = int(max(self._ci_leads[-1], self._weather_leads[-1]))
-            self._walks = _Walks(rngs, self._step_h, ahead)
+            self._walks = _Walks(keys, self._step_h, ahead)
         return new
 
     @property
@@ -192,13 +192,9 @@ class _Series:
     """A table in f32 with each series continued past its end, so that no lead wraps."""
 
     def __init__(self, table: Table, leads: I64) -> None:
-        offsets, first, which = np.unique(table.offset, return_index=True, return_inverse=True)
-        lengths = table.length[first]
+        series, which = table.distinct()
         ahead = int(leads[-1])
-        parts = [
-            np.resize(table.values[start : start + length].astype(np.float32), length + ahead)
-            for start, length in zip(offsets, lengths, strict=True)
-        ]
+        parts = [np.resize(one.astype(np.float32), len(one) + ahead) for one in series]
         starts = np.cumsum([0, *(len(part) for part in parts[:-1])])
         self._values = np.concatenate(parts)
         self._offset = starts[which]
@@ -218,15 +214,13 @@ class _Walks:
     """Two random walks per environment, of unit variance per 24 h, from reset on.
 
     Args:
-        rngs: one generator per environment.
+        keys: one seed per environment.
         step_h: time step.
         ahead: longest lead in steps.
     """
 
-    def __init__(self, rngs: Sequence[np.random.Generator], step_h: float, ahead: int) -> None:
-        # A stream of its own: what else is drawn from the generator leaves the walk alone.
-        keys = [int(rng.integers(2**63)) for rng in rngs]
-        self._streams = [np.random.Generator(np.random.PCG64(key)) for key in keys]
+    def __init__(self, keys: Sequence[int] | I64, step_h: float, ahead: int) -> None:
+        self._streams = [np.random.Generator(np.random.PCG64(int(key))) for key in keys]
         self._scale = np.sqrt(step_h / 24.0)
         self._ahead = ahead
         self._first = 0

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+import numpy as np
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from sdc_taichi.config import MONTH_DAYS, explain
 from sdc_taichi.envs.features import AGENTS
@@ -13,12 +22,19 @@ from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, Fore
 from sdc_taichi.errors import ConfigError
 
 Agent = Literal["agent_ls", "agent_dc", "agent_bat"]
-Month = Annotated[int, Field(ge=1, le=12)]
+
+
+def _plain(value: Any) -> Any:
+    return int(value) if isinstance(value, np.integer) else value
+
+
+Whole = Annotated[int, Field(strict=True), BeforeValidator(_plain)]
+Month = Annotated[Whole, Field(ge=1, le=12)]
 Price = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class Tariff(BaseModel):
-    """Price of electricity, for the reward term ``cost``."""
+    """Price of electricity, for the reward terms ``cost`` and ``demand_charge``."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -27,7 +43,7 @@ class Tariff(BaseModel):
     )  # fmt: skip
     """One price, or one for each local hour of the day from midnight on."""
     demand_charge_per_kw: Price = 12.0
-    """Of the highest mean power of a step in the episode, which is the billing period."""
+    """Price of the highest mean power of a step, per bill of 30 days."""
 
     @field_validator("price_per_kwh")
     @classmethod
@@ -52,7 +68,7 @@ class EnvOptions(BaseModel):
     discharge, hold as in the released code; None is that of the preset."""
     setpoint_change_k: Annotated[float, Field(gt=0, le=20)] = 2.0
     """Largest change of a continuous setpoint action in one step."""
-    days: Annotated[int, Field(ge=1, le=365)] = 7
+    days: Annotated[Whole, Field(ge=1, le=365)] = 7
     """Length of an episode."""
     start: Literal["sampled", "fixed"] = "sampled"
     """Episodes start at midnight of a day of ``months`` or on ``site.start``."""
@@ -66,12 +82,7 @@ class EnvOptions(BaseModel):
     forecast_error: ForecastError = PERFECT
     heat_map: bool = False
     """Adds an image of the hall to every observation, which becomes a dict."""
-    rewards: (
-        Literal["default", "sustaindc"]
-        | str
-        | Mapping[str, Mapping[str, float]]
-        | Callable[..., Any]
-    ) = "default"
+    rewards: Any = "default"
     """A named set, agent to term to scale, or a function or its import path ``module:name``."""
     collaboration: Annotated[float, Field(ge=0, le=1)] = 0.8
     """Share a of an agent's own reward in what it gets; the others' share the rest evenly (paper,
@@ -92,25 +103,59 @@ class EnvOptions(BaseModel):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        if self.observations == "sustaindc":
-            given = [
-                name
-                for name in ("features", "ci_leads_h", "weather_leads_h", "forecast_error")
-                if getattr(self, name) != type(self).model_fields[name].default
-            ]
-            if given:
+        for names, without_effect, why in self._idle_options():
+            given = [name for name in names if name in self.model_fields_set]
+            if given and without_effect:
+                raise ValueError(f"{', '.join(given)}: without effect {why}")
+        for agent in self.features or {}:
+            if agent in AGENTS and agent not in self.agents:
                 raise ValueError(
-                    f"{', '.join(given)}: without effect on observations sustaindc; valid with "
-                    "observations default"
+                    f"features: without effect for {agent}, which does not learn; valid for "
+                    f"{', '.join(self.agents)}"
                 )
-        if self.start == "fixed" and len(self.months) < 12:
-            raise ValueError("months: without effect with start fixed; valid with start sampled")
         if self.start == "sampled" and not self.start_days():
             raise ValueError(
                 f"days {self.days}: no episode of that length lies in the months "
                 f"{list(self.months)}; valid is fewer days or more months"
             )
         return self
+
+    def _idle_options(self) -> list[tuple[tuple[str, ...], bool, str]]:
+        """Names of options, whether they change nothing here, and why."""
+        continuous = self.actions == "continuous"
+        named = isinstance(self.rewards, Mapping) or (
+            isinstance(self.rewards, str) and self.rewards in ("default", "sustaindc")
+        )
+        return [
+            (
+                ("features", "ci_leads_h", "weather_leads_h", "forecast_error"),
+                self.observations == "sustaindc",
+                "on observations sustaindc; valid with observations default",
+            ),
+            (("months",), self.start == "fixed", "with start fixed; valid with start sampled"),
+            (("others",), set(self.agents) == set(AGENTS), "as all agents learn; valid with fewer"),
+            (("action_order",), continuous, "with actions continuous; valid with discrete"),
+            (
+                ("action_order",),
+                "agent_bat" not in self.agents,
+                "as agent_bat does not learn; valid where it does",
+            ),
+            (
+                ("setpoint_change_k",),
+                not continuous,
+                "with actions discrete; valid with continuous",
+            ),
+            (
+                ("setpoint_change_k",),
+                "agent_dc" not in self.agents,
+                "as agent_dc does not learn; valid where it does",
+            ),
+            (
+                ("collaboration",),
+                not named,
+                "on a function's rewards; valid with rewards default, sustaindc or a dict",
+            ),
+        ]
 
     def start_days(self) -> list[int]:
         """Days of the year, from 0, on which a sampled episode may start.

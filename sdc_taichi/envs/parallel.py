@@ -5,25 +5,33 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from sdc_taichi.envs import rendering
-from sdc_taichi.envs.core import F32, Core, Observation, Source
+from sdc_taichi.envs.core import Core, Observation, Source
 from sdc_taichi.envs.options import make_options
-from sdc_taichi.envs.standards import first, floats, start_day, start_days
+from sdc_taichi.envs.standards import OneDataCenter, first, floats, start_day, start_days
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall import Precision
 
 
-class SdcParallelEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
-    """The learning agents of one data center, which act at the same time.
+class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
+    """A PettingZoo environment: the learning agents of one data center act at the same time.
 
-    See ``parallel_env``. Episodes end by truncation: their length is a choice, the data center goes
-    on. Infos are the same for all agents: ``start_day`` after ``reset``, then every (B,) quantity
-    of ``StepResult`` by name.
+    Episodes end by truncation: their length is a choice, the data center goes on. Infos are the
+    same for all agents: ``start_day`` after ``reset``, then every (B,) quantity of ``StepResult``
+    by name.
+
+    Args:
+        config: a preset, a file or a config.
+        precision: of the server kernels, ``f32`` or ``f64``.
+        render_mode: None or ``rgb_array``.
+        options: fields of ``EnvOptions``.
+
+    Raises:
+        SdcError: a config or option that is not valid.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  as the base class has it
@@ -85,7 +93,9 @@ class SdcParallelEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
             SdcError: actions that are missing, too many, or outside their space.
             RuntimeStateError: before ``reset``, or after the end of the episode.
         """
-        done = self.core.step({agent: [action] for agent, action in actions.items()})
+        if isinstance(actions, Mapping):
+            actions = {agent: [action] for agent, action in actions.items()}
+        done = self.core.step(actions)
         agents, info = self.agents, floats(done.result.per_dc())
         if done.ended:
             self.agents = []
@@ -118,27 +128,6 @@ class SdcParallelEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
             raise ConfigError(f"agent {agent!r}: does not learn here; valid: {list(found)}")
         return found[agent]
 
-    def state(self) -> F32:
-        """Shared state for centralised critics, of ``state_space``."""
-        return np.asarray(self.core.state()[0])
-
-    def reward_terms(self) -> dict[str, float]:
-        """All reward terms of the last step by name, unscaled; empty before the first."""
-        return floats(self.core.terms())
-
-    def render(self) -> rendering.Image:
-        """The hall after the last step, (height, width, 3).
-
-        Raises:
-            ConfigError: made without ``render_mode``.
-        """
-        rendering.require_render_mode(self.render_mode)
-        return rendering.frame(self.core, 0)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the episode goes on; picklable."""
-        return self.core.state_dict()
-
     def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
         """Go on from the ``state_dict`` of an environment made alike.
 
@@ -152,53 +141,21 @@ class SdcParallelEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
         self.agents = [] if self.core.over else list(self.possible_agents)
         return _first(observations)
 
-    def close(self) -> None:
-        """Let go of the simulator."""
-        self.core.close()
+
+parallel_env = SdcParallelEnv
 
 
-def parallel_env(
-    config: Source = "corrected",
-    *,
-    precision: Precision = "f32",
-    render_mode: str | None = None,
-    **options: Any,
-) -> SdcParallelEnv:
-    """A PettingZoo environment whose agents act at the same time.
-
-    Args:
-        config: a preset, a file or a config.
-        precision: of the server kernels, ``f32`` or ``f64``.
-        render_mode: None or ``rgb_array``.
-        options: fields of ``EnvOptions``.
-
-    Raises:
-        SdcError: a config or option that is not valid.
-    """
-    return SdcParallelEnv(config, precision=precision, render_mode=render_mode, **options)
-
-
-def aec_env(
-    config: Source = "corrected",
-    *,
-    precision: Precision = "f32",
-    render_mode: str | None = None,
-    **options: Any,
-) -> AECEnv[str, Observation, Any]:
+def aec_env(config: Source = "corrected", **options: Any) -> AECEnv[str, Observation, Any]:
     """A PettingZoo environment whose agents act in turn, by PettingZoo's own conversion.
 
     Args:
         config: a preset, a file or a config.
-        precision: of the server kernels, ``f32`` or ``f64``.
-        render_mode: None or ``rgb_array``.
-        options: fields of ``EnvOptions``.
+        options: as ``parallel_env`` takes them.
 
     Raises:
         SdcError: a config or option that is not valid.
     """
-    return parallel_to_aec(
-        parallel_env(config, precision=precision, render_mode=render_mode, **options)
-    )
+    return parallel_to_aec(parallel_env(config, **options))
 
 
 def core_of_one(config: Source, precision: Precision, options: Mapping[str, Any]) -> Core:

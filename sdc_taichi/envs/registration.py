@@ -24,5 +24,5 @@ def register() -> None:
                 name,
                 entry_point="sdc_taichi.envs.single:SdcEnv",
                 vector_entry_point="sdc_taichi.envs.vector:SdcVectorEnv",
-                kwargs={} if agent is None else {"agent": agent},
+                kwargs={} if agent is None else {"registered_agent": agent},
             )

@@ -16,20 +16,18 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium.spaces import Box
 
 from sdc_taichi.control.view import View
 from sdc_taichi.drivers import Table
-from sdc_taichi.envs.features import Feature
+from sdc_taichi.envs.features import AGE_EDGES_H, Feature
+from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.errors import DataError, RuntimeStateError
 from sdc_taichi.fleet import Fleet, build_fleet
 from sdc_taichi.hall import Hall
 from sdc_taichi.plant.workload import TASKS_PER_STEP, age_histogram
 from sdc_taichi.sizing import Sizing, released_ranges
 from sdc_taichi.types import F64, I64, StepResult
-
-F32 = npt.NDArray[np.float32]
 
 CI_STEPS = 8
 """Steps of carbon intensity ahead (``sustaindc_env.py``)."""
@@ -43,8 +41,6 @@ SCALING_DAYS = 30
 """Days from the first step that scale the inputs, fewer where the year ends (``managers.py``)."""
 Z_SCORE_EPSILON = 1e-8
 """Added to the standard deviation below the z-score, in scaled units (``sustaindc_env.py``)."""
-AGE_EDGES_H = (0.0, 6.0, 12.0, 18.0, 24.0)
-"""Lower edges of the age bins of queued tasks (``carbon_ls.py``)."""
 
 _NEGLIGIBLE_TASKS = 1e-9
 """Queues of divisible work keep rounding errors; nothing is read off those."""
@@ -201,18 +197,9 @@ class _Lookup:
         )
 
 
-def _series(table: Table) -> tuple[list[F64], I64]:
-    """The distinct series of a table, and which one each data center reads, (B,)."""
-    parts, which = np.unique(
-        np.stack([table.offset, table.length], axis=1), axis=0, return_inverse=True
-    )
-    series = [table.values[offset : offset + length] for offset, length in parts]
-    return series, which.reshape(-1)
-
-
 def _look_up(table: Table, build: Callable[[F64], F64]) -> _Lookup:
     """Build the rows of each distinct series once."""
-    series, which = _series(table)
+    series, which = table.distinct()
     parts = [build(values) for values in series]
     starts = np.concatenate([[0], np.cumsum([len(part) for part in parts[:-1]])])
     return _Lookup(table, np.concatenate(parts), starts.astype(np.int64)[which])
@@ -380,12 +367,12 @@ class ReleasedObserver:
         self._ci = self._outdoor = _Scale(np.zeros(0), np.zeros(0))
         self._queue_limit = np.zeros(0)
 
-    def reset(self, view: View, rngs: Sequence[np.random.Generator] = ()) -> None:
+    def reset(self, view: View, keys: Sequence[int] | I64 = ()) -> None:
         """Scale the inputs by what follows the first step.
 
         Args:
             view: the view before the first step.
-            rngs: unused, the vectors have no randomness.
+            keys: unused, the vectors have no randomness.
         """
         if self._tables is None or not self._tables.serves(view):
             self._tables = _tables(view)
@@ -572,7 +559,7 @@ class ReleasedRewards:
         if self._fleet is not view.fleet:
             self._bounds_kw = load_bounds_kw(view.fleet, view.sizing)
             self._fleet = view.fleet
-        series, which = _series(view.drivers.ci_g_per_kwh)
+        series, which = view.drivers.ci_g_per_kwh.distinct()
         low = np.array([values.min() for values in series])[which]
         high = np.array([values.max() for values in series])[which]
         flat = np.flatnonzero(high == low)

@@ -1,13 +1,15 @@
 """Rewards: named terms of a step, weighed by scales and shared between agents.
 
-Every term is at most 0 where its quantity is a cost, and about -1 at full load, so that sites and
-halls of any size give rewards of one size. Terms that refer to energy are shares of what the data
-center would use in a step at its design point; nothing is scaled by data of the run.
+Every term is 0 or less. Energies, carbon, cost, fossil share and water are shares of what the data
+center would use, emit or pay in a step at its design point, about -1 at full load, so that sites
+and halls of any size give rewards of one size; ``sla`` is a share of the work of a full step. The
+others have units: ``pue`` is a ratio, ``hot_inlets`` in K, ``queue`` and ``dropped`` in tasks, and
+``demand_charge`` is in the money of ``cost``, due in the few steps that raise the highest power.
+Nothing is scaled by data of the run.
 """
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.control.view import View
-from sdc_taichi.envs.features import AGENTS
+from sdc_taichi.envs.features import AGENTS, hint
 from sdc_taichi.envs.options import Tariff
 from sdc_taichi.envs.released import ReleasedRewards
 from sdc_taichi.errors import ConfigError, SdcError
@@ -24,8 +26,8 @@ from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64, StepResult
 
 Reward = Callable[[StepResult, View], Any]
-"""Rewards of a step, (B,), the same for all agents or by agent in a dict; gets the step and the
-view after it."""
+"""Rewards of a step, (B,), the same for all agents or by learning agent in a dict; gets the step
+and the view after it."""
 
 CI_G_PER_KWH = 500.0
 """Carbon intensity at which the design energy gives a carbon term of -1, a grid run on gas."""
@@ -38,6 +40,12 @@ RUSH_START_H = 23.0
 """Hour of the day from which queued tasks cost, more and more (paper, F.1)."""
 QUEUE_SCALE_TASKS = 10.0
 """Queued tasks that cost 1 at the end of the day (paper, F.2)."""
+PRICE_PER_KWH = 0.1
+"""Price at which the design energy gives a cost of -1."""
+BILLED_SHARE = 0.5
+"""Share of the design power that is billed whatever the episode draws."""
+BILL_DAYS = 30.0
+"""Days between two bills."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +56,10 @@ class Context:
     """Energy of a step at the design point, (B,)."""
     tariff: Tariff
     peak_kw: F64
-    """Highest power of the episode before this step, (B,)."""
+    """Highest power of the episode before this step, at least ``BILLED_SHARE`` of the design power,
+    (B,)."""
+    bills: float
+    """Length of the episode over that of a bill."""
     hour: F64
     """Local hour of the day at the start of the step, (B,)."""
     last_hour: float
@@ -81,19 +92,25 @@ def it_energy(r: StepResult, c: Context) -> F64:
 
 
 def cost(r: StepResult, c: Context) -> F64:
-    """Energy by the time-of-use tariff and what the step adds to the demand charge.
-
-    Over the price of the design energy at 0.1 per kWh.
-    """
+    """Energy by the time-of-use tariff, over the price of the design energy at 0.1 per kWh."""
     prices = np.array(c.tariff.price_per_kwh)
     price = prices[np.floor(c.hour).astype(np.int64) % len(prices)]
+    return np.asarray(-r.grid_kwh * price / (PRICE_PER_KWH * c.design_kwh))
+
+
+def demand_charge(r: StepResult, c: Context) -> F64:
+    """What the step adds to the highest power above half the design power, in units of `cost`.
+
+    The charge of a bill times the length of the episode over 30 days. Half the design power is
+    billed in any case, so it is no part of the reward.
+    """
     above_kw = np.maximum(r.grid_kwh / r.step_h - c.peak_kw, 0.0)
-    paid = r.grid_kwh * price + above_kw * c.tariff.demand_charge_per_kw
-    return np.asarray(-paid / (0.1 * c.design_kwh))
+    charge = above_kw * c.tariff.demand_charge_per_kw * c.bills
+    return np.asarray(-charge / (PRICE_PER_KWH * c.design_kwh))
 
 
 def fossil_share(r: StepResult, c: Context) -> F64:
-    """Energy from the grid less its renewable share, estimated as 1 - CI/FOSSIL_G_PER_KWH."""
+    """Energy from the grid less its renewable share, estimated as 1 - CI/(800 g/kWh)."""
     share = np.minimum(r.ci_g_per_kwh / FOSSIL_G_PER_KWH, 1.0)
     return -share * r.grid_kwh / c.design_kwh
 
@@ -104,7 +121,7 @@ def pue(r: StepResult, c: Context) -> F64:
 
 
 def water(r: StepResult, c: Context) -> F64:
-    """Make-up water, over WATER_L_PER_KWH times the design energy."""
+    """Make-up water, over the design energy times 1.8 L/kWh."""
     return -r.water_l / (WATER_L_PER_KWH * c.design_kwh)
 
 
@@ -114,7 +131,7 @@ def hot_inlets(r: StepResult, c: Context) -> F64:
 
 
 def queue(r: StepResult, c: Context) -> F64:
-    """Tasks queued in the last hour of the day, weighed from 0 up to 1 (paper, F.1 and F.2)."""
+    """Tasks queued in the last hour of the day over 10, weighed from 0 to 1 (paper, F.1, F.2)."""
     span_h = c.last_hour - RUSH_START_H
     late = c.hour >= RUSH_START_H
     weight = np.where(late, (c.hour - RUSH_START_H) / span_h if span_h > 0 else 1.0, 0.0)
@@ -141,6 +158,7 @@ TERMS: dict[str, Term] = {
         it_energy,
         hvac_energy,
         cost,
+        demand_charge,
         fossil_share,
         pue,
         water,
@@ -165,27 +183,41 @@ def register_reward(name: str, reward: Reward) -> None:
     """Make a function available as ``rewards=name``.
 
     Raises:
-        ConfigError: a name that is taken.
+        ConfigError: a name that another function has, or no function.
     """
-    if name in ("default", "sustaindc") or name in _registered or not name.isidentifier():
+    if not callable(reward):
+        raise ConfigError(f"reward {name!r}: is a {type(reward).__name__}; valid is a function")
+    taken = name in ("default", "sustaindc") or _registered.get(name, reward) is not reward
+    if not isinstance(name, str) or not name.isidentifier() or taken:
         raise ConfigError(f"reward {name!r}: valid is a name that is not taken")
     _registered[name] = reward
 
 
 class Rewards:
-    """Rewards of all agents.
+    """Rewards of the agents that learn.
 
     Args:
         spec: ``EnvOptions.rewards``.
         collaboration: share of an agent's own reward in what it gets.
-        tariff: prices for the term ``cost``.
+        tariff: prices for the terms ``cost`` and ``demand_charge``.
+        agents: who learns.
+        days: length of the episodes.
 
     Raises:
         ConfigError: an unknown name, agent or term, or a path without a function.
     """
 
-    def __init__(self, spec: Any, collaboration: float, tariff: Tariff) -> None:
-        self._own, self._tariff = collaboration, tariff
+    def __init__(
+        self,
+        spec: Any,
+        collaboration: float,
+        tariff: Tariff,
+        *,
+        agents: Sequence[str],
+        days: float,
+    ) -> None:
+        self._own, self._tariff, self._agents = collaboration, tariff, tuple(agents)
+        self._bills = days / BILL_DAYS
         self._released = ReleasedRewards() if spec == "sustaindc" else None
         self._scales: dict[str, dict[str, float]] | None = None
         self._function: Reward | None = None
@@ -195,23 +227,29 @@ class Rewards:
             self._scales = _checked_scales(spec)
         elif self._released is None:
             self._function = spec if callable(spec) else _find(spec)
-        # Highest power of the episode, before its last step and with it.
+        # What decides the rewards, to tell environments apart.
+        self.name = _name(self._function) if self._function else self._scales or "sustaindc"
+        # Highest power that is billed, before the last step and with it.
         self._peaks_kw = np.zeros((2, 0))
         self._design_kwh = np.zeros(0)
 
     def reset(self, view: View) -> None:
         """Start an episode."""
-        self._peaks_kw = np.zeros((2, view.size))
+        self._peaks_kw = np.tile(BILLED_SHARE * view.sizing.facility_w / 1e3, (2, 1))
         self._design_kwh = view.sizing.facility_w * view.step_h / 1e3
         if self._released is not None:
             self._released.reset(view)
 
-    def rewards(self, result: StepResult, view: View) -> dict[str, F64]:
-        """Rewards of a step by agent, (B,) each, shared between agents.
+    def rewards(self, result: StepResult, view: View) -> tuple[dict[str, F64], F64]:
+        """Rewards of a step.
 
         Args:
             result: the step.
             view: the view after it.
+
+        Returns:
+            By learning agent, (B,) each, and of all of them as one learner, (B,): the sum, or what
+            a user's function gives for all agents alike.
 
         Raises:
             SdcError: a user's function returned something of another shape, or not finite.
@@ -221,20 +259,25 @@ class Rewards:
             [before_kw, np.maximum(before_kw, result.grid_kwh / result.step_h)]
         )
         if self._function is not None:
-            return _by_agent(self._function(result, view), view.size)
+            found = self._function(result, view)
+            if not isinstance(found, Mapping):
+                alike = _values(found, "all agents", view.size)
+                return dict.fromkeys(self._agents, alike), alike
+            return _together(_by_agent(found, self._agents, view.size))
         if self._released is not None:
             own = self._released.rewards(result, view)
         else:
             own = self._weighed(result, view)
-        return share(own, self._own)
+        shared = share(own, self._own)
+        return _together({agent: shared[agent] for agent in self._agents})
 
     def state(self) -> F64:
         """What an episode leaves behind for its rewards: its highest power, kW, (2, B)."""
         return self._peaks_kw.copy()
 
     def load(self, state: F64) -> None:
-        """Go on from ``state``."""
-        self._peaks_kw = np.array(state)
+        """Go on from ``state``, of the shape that it has."""
+        self._peaks_kw = state.copy()
 
     def terms(self, result: StepResult, view: View) -> dict[str, F64]:
         """All terms of the last step by name, (B,) each, whatever the rewards are made of."""
@@ -260,6 +303,7 @@ class Rewards:
             design_kwh=self._design_kwh,
             tariff=self._tariff,
             peak_kw=self._peaks_kw[0],
+            bills=self._bills,
             hour=np.asarray((view.state.start + result.step) % per_day * view.step_h, np.float64),
             last_hour=24.0 - view.step_h,
         )
@@ -280,28 +324,30 @@ def share(own: Mapping[str, F64], a: float) -> dict[str, F64]:
 def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
     for agent, scales in given.items():
         if agent not in AGENTS:
-            raise ConfigError(f"rewards: unknown agent {agent!r}; {_hint(agent, AGENTS)}")
+            raise ConfigError(f"rewards: unknown agent {agent!r}; {hint(agent, AGENTS)}")
         if not isinstance(scales, Mapping):
             raise ConfigError(f"rewards of {agent}: {scales!r}; valid is a dict of term to scale")
         for name, scale in scales.items():
             if name not in TERMS:
                 raise ConfigError(
-                    f"rewards of {agent}: unknown term {name!r}; {_hint(name, list(TERMS))}"
+                    f"rewards of {agent}: unknown term {name!r}; {hint(name, list(TERMS))}"
                 )
-            if not np.isfinite(scale):
-                raise ConfigError(f"rewards of {agent}: {name} is {scale}; valid is a number")
+            number = isinstance(scale, int | float | np.number) and not isinstance(scale, bool)
+            if not number or not np.isfinite(scale):
+                raise ConfigError(f"rewards of {agent}: {name} is {scale!r}; valid is a number")
     return {agent: dict(given.get(agent, DEFAULT_SCALES[agent])) for agent in AGENTS}
 
 
-def _find(spec: str) -> Reward:
+def _find(spec: Any) -> Reward:
     """A registered function, or one by import path."""
-    if spec in _registered:
+    module, _, name = spec.partition(":") if isinstance(spec, str) else ("", "", "")
+    if isinstance(spec, str) and spec in _registered:
         return _registered[spec]
-    module, colon, name = spec.partition(":")
-    if not colon:
+    if not module or not name or module.startswith("."):
         valid = ["default", "sustaindc", *_registered]
         raise ConfigError(
-            f"rewards {spec!r}: unknown; valid: {', '.join(valid)}, or an import path module:name"
+            f"rewards {spec!r}: unknown; valid: {', '.join(valid)}, a dict of agent to term to "
+            "scale, a function, or its import path module:name"
         )
     try:
         found = getattr(importlib.import_module(module), name)
@@ -312,25 +358,40 @@ def _find(spec: str) -> Reward:
     return found  # type: ignore[no-any-return]
 
 
-def _by_agent(found: Any, size: int) -> dict[str, F64]:
-    given = found if isinstance(found, Mapping) else dict.fromkeys(AGENTS, found)
-    out = {}
-    for agent in AGENTS:
+def _name(function: Reward) -> str:
+    """Where a function comes from."""
+    kind = function if hasattr(function, "__qualname__") else type(function)
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def _by_agent(given: Mapping[Any, Any], agents: Sequence[str], size: int) -> dict[str, F64]:
+    """What a user's function gives to each learning agent; what it gives to others is left out."""
+    for agent in given:
+        if agent not in AGENTS:
+            raise SdcError(f"rewards function: unknown agent {agent!r}; {hint(agent, AGENTS)}")
+    for agent in agents:
         if agent not in given:
             raise SdcError(f"rewards function: returned none for {agent}")
-        values = np.asarray(given[agent], dtype=np.float64)
-        if values.shape not in ((), (size,)) or not np.all(np.isfinite(values)):
-            raise SdcError(
-                f"rewards function: returned {values.dtype} {values.shape} for {agent}; valid is "
-                f"({size},) of finite numbers"
-            )
-        out[agent] = np.broadcast_to(values, (size,))
-    return out
+    return {agent: _values(given[agent], agent, size) for agent in agents}
 
 
-def _hint(name: str, valid: Sequence[str]) -> str:
-    near = difflib.get_close_matches(str(name), list(valid), n=1)
-    return f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(valid)}"
+def _values(given: Any, whose: str, size: int) -> F64:
+    try:
+        values = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise SdcError(
+            f"rewards function: returned {given!r} for {whose}; valid is ({size},) of numbers"
+        ) from None
+    if values.shape not in ((), (size,)) or not np.all(np.isfinite(values)):
+        raise SdcError(
+            f"rewards function: returned {values.dtype} {values.shape} for {whose}; valid is "
+            f"({size},) of finite numbers"
+        )
+    return np.broadcast_to(values, (size,))
+
+
+def _together(by_agent: dict[str, F64]) -> tuple[dict[str, F64], F64]:
+    return by_agent, np.sum(list(by_agent.values()), axis=0)
 
 
 def table_markdown() -> str:

@@ -11,9 +11,10 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sdc_taichi.envs import rendering
-from sdc_taichi.envs.core import F32, Core, Observation, Source, as_array
+from sdc_taichi.envs.core import Core, Observation, Source, Step, as_array
+from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.envs.parallel import core_of_one
-from sdc_taichi.envs.standards import first, floats, start_day, start_days
+from sdc_taichi.envs.standards import OneDataCenter, first, floats, start_day, start_days
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.hall import Precision
 from sdc_taichi.types import F64
@@ -31,8 +32,8 @@ class Learner(Protocol):
     def observation(self, found: Mapping[str, Observation]) -> Observation:
         """What the learner sees of what the agents see."""
 
-    def reward(self, found: Mapping[str, F64]) -> F64:
-        """What the learner gets of what the agents get, (B,)."""
+    def reward(self, done: Step) -> F64:
+        """What the learner gets of a step, (B,)."""
 
 
 class OneAgent:
@@ -55,9 +56,9 @@ class OneAgent:
         """The observation as it is."""
         return found[self._agent]
 
-    def reward(self, found: Mapping[str, F64]) -> F64:
+    def reward(self, done: Step) -> F64:
         """The reward as it is."""
-        return np.array(found[self._agent])
+        return np.array(done.rewards[self._agent])
 
 
 class Joint:
@@ -65,7 +66,8 @@ class Joint:
 
     It sees their observations side by side, each feature once, rather than the shared state, which
     would show it features that the option ``features`` left out. Its reward is their sum; with all
-    three agents the weights of ``collaboration`` cancel.
+    three agents the weights of ``collaboration`` cancel. What a reward function of the user's gives
+    for all agents alike, it gets once.
 
     Args:
         core: in which the agents learn.
@@ -110,14 +112,27 @@ class Joint:
         whole = found[self._core.agents[0]]
         return {**whole, "features": seen} if isinstance(whole, dict) else seen
 
-    def reward(self, found: Mapping[str, F64]) -> F64:
-        """The sum."""
-        return np.asarray(sum(found.values(), np.zeros(self._core.num_envs)))
+    def reward(self, done: Step) -> F64:
+        """That of all agents together."""
+        return np.array(done.joint_reward)
 
 
 def learner(core: Core, agent: str | None) -> Learner:
     """The learner of an environment for one agent, or with None for all that learn."""
     return Joint(core) if agent is None else OneAgent(core)
+
+
+def one_agent(agent: str | None, registered_agent: str | None) -> str | None:
+    """Who is the one learner, None being all agents.
+
+    Raises:
+        ConfigError: another agent than that of the id.
+    """
+    if registered_agent is not None and agent not in (None, registered_agent):
+        raise ConfigError(
+            f"agent {agent!r}: the one agent here is {registered_agent}; valid with another id"
+        )
+    return registered_agent or agent
 
 
 def options_for(agent: str | None, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,7 +182,7 @@ def _side_by_side(parts: list[spaces.Space[Any]]) -> spaces.Space[Any]:
     return spaces.MultiDiscrete([3] * sum(widths))
 
 
-class SdcEnv(gymnasium.Env[Any, Any]):
+class SdcEnv(OneDataCenter, gymnasium.Env[Any, Any]):
     """One data center with one learner.
 
     Episodes end by truncation: their length is a choice, the data center goes on. Infos:
@@ -178,6 +193,7 @@ class SdcEnv(gymnasium.Env[Any, Any]):
         agent: who learns while ``others`` plays the rest; None is all ``agents`` as one.
         precision: of the server kernels, ``f32`` or ``f64``.
         render_mode: None or ``rgb_array``.
+        registered_agent: set by the ids of one agent.
         options: fields of ``EnvOptions``.
 
     Raises:
@@ -196,9 +212,11 @@ class SdcEnv(gymnasium.Env[Any, Any]):
         agent: str | None = None,
         precision: Precision = "f32",
         render_mode: str | None = None,
+        registered_agent: str | None = None,
         **options: Any,
     ) -> None:
         rendering.check_render_mode(render_mode)
+        agent = one_agent(agent, registered_agent)
         self.core = core_of_one(config, precision, options_for(agent, options))
         self.render_mode = render_mode
         self._learner = learner(self.core, agent)
@@ -232,29 +250,8 @@ class SdcEnv(gymnasium.Env[Any, Any]):
         """
         done = self.core.step(self._learner.actions([action]))
         observation = first(self._learner.observation(done.observations))
-        reward = float(self._learner.reward(done.rewards)[0])
+        reward = float(self._learner.reward(done)[0])
         return observation, reward, False, done.ended, floats(done.result.per_dc())
-
-    def state(self) -> F32:
-        """Shared state for centralised critics, of ``state_space``."""
-        return np.asarray(self.core.state()[0])
-
-    def reward_terms(self) -> dict[str, float]:
-        """All reward terms of the last step by name, unscaled; empty before the first."""
-        return floats(self.core.terms())
-
-    def render(self) -> rendering.Image:
-        """The hall after the last step, (height, width, 3).
-
-        Raises:
-            ConfigError: made without ``render_mode``.
-        """
-        rendering.require_render_mode(self.render_mode)
-        return rendering.frame(self.core, 0)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the episode goes on; picklable."""
-        return self.core.state_dict()
 
     def load_state_dict(self, values: Mapping[str, Any]) -> Observation:
         """Go on from the ``state_dict`` of an environment made alike.
@@ -266,7 +263,3 @@ class SdcEnv(gymnasium.Env[Any, Any]):
             SdcError: made by another environment, or incomplete.
         """
         return first(self._learner.observation(self.core.load_state_dict(values)))
-
-    def close(self) -> None:
-        """Let go of the simulator."""
-        self.core.close()

@@ -1,19 +1,81 @@
-"""What the environment standards share: reset options and infos."""
+"""What the environments of all standards share: reset options, infos, and what goes beyond them."""
 
 from __future__ import annotations
 
-import difflib
 import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from sdc_taichi.envs import rendering
 from sdc_taichi.envs.core import Core, Observation
+from sdc_taichi.envs.features import hint
+from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.types import F64, I64
 
 RESET_OPTIONS = ("start_day",)
+
+
+class _Extended:
+    """What environments offer beyond their standards."""
+
+    core: Core
+    render_mode: str | None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides how the episodes go on; picklable."""
+        return self.core.state_dict()
+
+
+class OneDataCenter(_Extended):
+    """Of an environment with a batch of one."""
+
+    def state(self) -> F32:
+        """Shared state for centralised critics, of ``state_space``."""
+        return np.asarray(self.core.state()[0])
+
+    def reward_terms(self) -> dict[str, float]:
+        """All reward terms of the last step by name, unscaled; empty before the first."""
+        return floats(self.core.terms())
+
+    def render(self) -> rendering.Image:
+        """The hall after the last step, (height, width, 3).
+
+        Raises:
+            ConfigError: made without ``render_mode``.
+        """
+        rendering.require_render_mode(self.render_mode)
+        return rendering.frame(self.core, 0)
+
+    def close(self) -> None:
+        """Let go of the simulator."""
+        self.core.close()
+
+
+class ManyDataCenters(_Extended):
+    """Of a batch."""
+
+    def state(self) -> F32:
+        """Shared state for centralised critics, (B, m)."""
+        return self.core.state()
+
+    def reward_terms(self) -> dict[str, F64]:
+        """All reward terms of the last step by name, (B,) each, unscaled; empty before the first.
+
+        Where a step that ends episodes starts the next ones, they are those of that step still.
+        """
+        return self.core.terms()
+
+    def render(self) -> tuple[rendering.Image, ...]:
+        """The hall of each environment after the last step.
+
+        Raises:
+            ConfigError: made without ``render_mode``.
+        """
+        rendering.require_render_mode(self.render_mode)
+        return tuple(rendering.frame(self.core, i) for i in range(self.core.num_envs))
 
 
 def start_day(options: Mapping[str, Any] | None, *, strict: bool = True) -> Any:
@@ -27,14 +89,15 @@ def start_day(options: Mapping[str, Any] | None, *, strict: bool = True) -> Any:
     Raises:
         ConfigError: an unknown option.
     """
+    if options is not None and not isinstance(options, Mapping):
+        raise ConfigError(f"reset options {options!r}: valid is a dict")
     given = dict(options or {})
     for name in given:
         if name not in RESET_OPTIONS:
-            near = difflib.get_close_matches(str(name), RESET_OPTIONS, n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(RESET_OPTIONS)}"
+            meant = hint(name, RESET_OPTIONS)
             if strict:
-                raise ConfigError(f"reset options: unknown {name!r}; {hint}")
-            warnings.warn(f"reset options: {name!r} is without effect; {hint}", stacklevel=3)
+                raise ConfigError(f"reset options: unknown {name!r}; {meant}")
+            warnings.warn(f"reset options: {name!r} is without effect; {meant}", stacklevel=3)
     return given.get("start_day")
 
 

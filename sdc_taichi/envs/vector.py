@@ -11,10 +11,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 
 from sdc_taichi.envs import rendering
-from sdc_taichi.envs.core import F32, Core, Observation, Source
+from sdc_taichi.envs.core import Core, Observation, Source
+from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.envs.options import make_options
-from sdc_taichi.envs.single import learner, options_for
-from sdc_taichi.envs.standards import start_day, start_days
+from sdc_taichi.envs.single import learner, one_agent, options_for
+from sdc_taichi.envs.standards import ManyDataCenters, start_day, start_days
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall import Precision
 from sdc_taichi.types import F64
@@ -23,7 +24,7 @@ Flags = npt.NDArray[np.bool_]
 Seed = int | Sequence[int | None] | None
 
 
-class SdcVectorEnv(VectorEnv[Any, Any, npt.NDArray[Any]]):
+class SdcVectorEnv(ManyDataCenters, VectorEnv[Any, Any, npt.NDArray[Any]]):
     """Data centers with one learner each that step together, as ``gymnasium.make_vec`` gives them.
 
     Gives what Gymnasium's ``SyncVectorEnv`` gives for single environments. All episodes have the
@@ -35,6 +36,7 @@ class SdcVectorEnv(VectorEnv[Any, Any, npt.NDArray[Any]]):
         agent: who learns while ``others`` plays the rest; None is all ``agents`` as one.
         precision: of the server kernels, ``f32`` or ``f64``.
         render_mode: None or ``rgb_array``.
+        registered_agent: set by the ids of one agent.
         autoreset_mode: when the next episodes start, as the enum or its value: in the step that
             ends the last ones, in the step after it, or only by ``reset``.
         options: fields of ``EnvOptions``.
@@ -51,14 +53,16 @@ class SdcVectorEnv(VectorEnv[Any, Any, npt.NDArray[Any]]):
         agent: str | None = None,
         precision: Precision = "f32",
         render_mode: str | None = None,
+        registered_agent: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         **options: Any,
     ) -> None:
         rendering.check_render_mode(render_mode)
         self._mode = _autoreset_mode(autoreset_mode)
+        agent = one_agent(agent, registered_agent)
         chosen = make_options(**options_for(agent, options))
         self.core = Core(config, chosen, num_envs, precision)
-        self.num_envs = num_envs
+        self.num_envs = num_envs = self.core.num_envs
         self.render_mode = render_mode
         self.metadata = {
             "render_modes": list(rendering.RENDER_MODES),
@@ -87,8 +91,8 @@ class SdcVectorEnv(VectorEnv[Any, Any, npt.NDArray[Any]]):
         Raises:
             ConfigError: a seed, option or day that is not valid.
         """
-        given = dict(options or {})
-        mask = given.pop("reset_mask", None)
+        given: Any = dict(options) if isinstance(options, Mapping) else options
+        mask = given.pop("reset_mask", None) if isinstance(given, dict) else None
         if mask is not None and not (np.shape(mask) == (self.num_envs,) and np.all(mask)):
             raise ConfigError(
                 "reset_mask: episodes of a batch start and end together; valid selects all "
@@ -118,10 +122,10 @@ class SdcVectorEnv(VectorEnv[Any, Any, npt.NDArray[Any]]):
         infos = self._infos(done.result.per_dc())
         if done.ended and self._mode is AutoresetMode.SAME_STEP:
             final = {"final_obs": self._each(observation), "final_info": infos}
-            observation = self._learner.observation(self.core.reset())
+            observation = self._learner.observation(self.core.next_episode())
             infos = self._infos({**final, **self._started()})
         ended = np.full(self.num_envs, done.ended)
-        return observation, self._learner.reward(done.rewards), none, ended, infos
+        return observation, self._learner.reward(done), none, ended, infos
 
     def _started(self) -> dict[str, Any]:
         return {"start_day": start_days(self.core)}
@@ -136,27 +140,6 @@ class SdcVectorEnv(VectorEnv[Any, Any, npt.NDArray[Any]]):
         for i, one in enumerate(iterate(self.observation_space, observation)):
             out[i] = one
         return out
-
-    def state(self) -> F32:
-        """Shared state for centralised critics, (B, m)."""
-        return self.core.state()
-
-    def reward_terms(self) -> dict[str, F64]:
-        """All reward terms of the last step of the episode by name, (B,) each, unscaled."""
-        return self.core.terms()
-
-    def render(self) -> tuple[rendering.Image, ...]:
-        """The hall of each environment after the last step.
-
-        Raises:
-            ConfigError: made without ``render_mode``.
-        """
-        rendering.require_render_mode(self.render_mode)
-        return tuple(rendering.frame(self.core, i) for i in range(self.num_envs))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the episodes go on; picklable."""
-        return self.core.state_dict()
 
     def load_state_dict(self, values: Mapping[str, Any]) -> Observation:
         """Go on from the ``state_dict`` of a batch made alike.
@@ -174,7 +157,7 @@ class SdcVectorEnv(VectorEnv[Any, Any, npt.NDArray[Any]]):
         self.core.close()
 
 
-class MultiAgentVectorEnv:
+class MultiAgentVectorEnv(ManyDataCenters):
     """Data centers with several learning agents each that step together; see ``vector_env``.
 
     Attributes:
@@ -248,7 +231,7 @@ class MultiAgentVectorEnv:
         infos: dict[str, Any] = done.result.per_dc()
         if done.ended:
             infos["final_obs"], infos["final_state"] = observations, self.core.state()
-            observations = self.core.reset()
+            observations = self.core.next_episode()
             infos["start_day"] = start_days(self.core)
         return (
             observations,
@@ -257,27 +240,6 @@ class MultiAgentVectorEnv:
             {agent: np.full(self.num_envs, done.ended) for agent in self.agents},
             infos,
         )
-
-    def state(self) -> F32:
-        """Shared state for centralised critics, (B, m)."""
-        return self.core.state()
-
-    def reward_terms(self) -> dict[str, F64]:
-        """All reward terms of the last step of the episode by name, (B,) each, unscaled."""
-        return self.core.terms()
-
-    def render(self) -> tuple[rendering.Image, ...]:
-        """The hall of each environment after the last step.
-
-        Raises:
-            ConfigError: made without ``render_mode``.
-        """
-        rendering.require_render_mode(self.render_mode)
-        return tuple(rendering.frame(self.core, i) for i in range(self.num_envs))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the episodes go on; picklable."""
-        return self.core.state_dict()
 
     def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
         """Go on from the ``state_dict`` of a batch made alike.
