@@ -256,7 +256,6 @@ class Simulator:
         setpoint_c = v("hvac.setpoint.initial_c")[self._unit_dc]
         inlet_c = v("hvac.setpoint.initial_c")[fleet.rack_dc] + fleet.approach_k
         groups = np.diff(fleet.group_start)
-        none = np.zeros(0)
         memory = NO_MEMORY
         if self._transient:
             demand = self.drivers.at(0).demand
@@ -274,7 +273,7 @@ class Simulator:
             stored_kwh=v("battery.initial_soc") * self.sizing.battery_kwh,
             room_heat_kwh=np.zeros(b),
             rack_status=np.zeros(fleet.racks, dtype=np.int8),
-            group_inlet_c=np.repeat(inlet_c, groups) if self._floor.watches_inlets else none,
+            group_inlet_c=np.repeat(inlet_c, groups) if self._floor.watches_inlets else _NONE,
             **_fields(memory),
         )
         return self._state
