@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, as_array
 
 Values = F64 | float
 
@@ -86,7 +86,7 @@ def shi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:
 
 def rhi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:
     """Return heat index, 1 - SHI (Sharma, Bash and Patel 2002); arguments as in ``shi``."""
-    return np.asarray(1.0 - shi(inlet_rise_m3k_s, outlet_rise_m3k_s))
+    return as_array(1.0 - shi(inlet_rise_m3k_s, outlet_rise_m3k_s))
 
 
 def it_rise_k(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values, airflow_m3s: Values) -> F64:
@@ -132,7 +132,7 @@ def rci_hi(over_k: Values, racks: Values, *, allowable_c: Values) -> F64:
         racks: number of inlets in that sum, at least 1.
         allowable_c: upper end of the allowable range, above the recommended one.
     """
-    return np.asarray(100.0 * (1.0 - over_k / (racks * (allowable_c - RECOMMENDED_C[1]))))
+    return as_array(100.0 * (1.0 - over_k / (racks * (allowable_c - RECOMMENDED_C[1]))))
 
 
 def rci_lo(under_k: Values, racks: Values, *, allowable_c: Values) -> F64:
@@ -146,9 +146,9 @@ def rci_lo(under_k: Values, racks: Values, *, allowable_c: Values) -> F64:
     Returns:
         RCI (Herrlin 2005, as ``rci_hi``).
     """
-    return np.asarray(100.0 * (1.0 - under_k / (racks * (RECOMMENDED_C[0] - allowable_c))))
+    return as_array(100.0 * (1.0 - under_k / (racks * (RECOMMENDED_C[0] - allowable_c))))
 
 
 def _ratio(part: Values, whole: Values) -> F64:
     some = np.greater(whole, _NO_RISE)
-    return np.asarray(np.where(some, part / np.where(some, whole, 1.0), 0.0))
+    return as_array(np.where(some, part / np.where(some, whole, 1.0), 0.0))

@@ -143,6 +143,12 @@ class Floor:
             return status
         return protection.protect(status, inlet_max_c.astype(np.float64), **self._limits)
 
+    def racks_in(self, status: Status, which: int) -> F64:
+        """Racks of each data center that have a status of ``plant.protection``, (B,)."""
+        if not np.any(status):
+            return np.zeros(len(self._servers))
+        return self._fleet.rack_sums(status == which)
+
     def tripped_work(
         self, before: Status, after: Status, placed: Placed, rack_powered: F64 | None
     ) -> F64:
@@ -154,6 +160,8 @@ class Floor:
             placed: the work of the step.
             rack_powered: share of the step that each rack was on, None if all were.
         """
+        if after is before:
+            return np.zeros(len(self._servers))
         tripped = (after == TRIPPED) & (before != TRIPPED)
         if not np.any(tripped):
             return np.zeros(len(self._servers))

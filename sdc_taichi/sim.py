@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, Self
@@ -14,23 +14,18 @@ from zipfile import BadZipFile
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi import air_metrics
+from sdc_taichi import runtime
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.drivers import Drivers, load_drivers
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
 from sdc_taichi.events import ActiveEvent, Disturbance, schedule
+from sdc_taichi.facility import Facility, Met
 from sdc_taichi.fleet import Fleet, build_fleet
 from sdc_taichi.floor import Floor
 from sdc_taichi.hall import Coil, Conditions, Hall, HallState, HallSums, Precision
-from sdc_taichi.plant import cooling, water_side, workload
-from sdc_taichi.plant.air import crac_fan_w
-from sdc_taichi.plant.battery import BATTERIES
-from sdc_taichi.plant.carbon import emitted_g
-from sdc_taichi.plant.chiller import CHILLERS
+from sdc_taichi.plant import cooling, workload
 from sdc_taichi.plant.protection import THROTTLED, TRIPPED
-from sdc_taichi.plant.tower import TOWERS
-from sdc_taichi.plant.water import WATER
-from sdc_taichi.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k, size
+from sdc_taichi.sizing import Sizing, size
 from sdc_taichi.types import (
     F64,
     I64,
@@ -50,38 +45,6 @@ SNAPSHOT_VERSION = 2
 _NONE = np.zeros(0)
 NO_MEMORY = HallState(*[_NONE] * len(fields(HallState)))
 """Of quasi-steady halls."""
-
-
-@dataclass(frozen=True, slots=True)
-class _RoomAir:
-    """Air between the CRAC units and the racks, each (B,) unless stated."""
-
-    flow_m3s: F64
-    unit_flow_m3s: F64
-    """(U,)."""
-    fan_w: F64
-    supply_c: F64
-    unit_supply_c: F64
-    """(U,)."""
-    return_c: F64
-    load_w: F64
-    """Heat of servers and CRAC fans, if nothing stores it."""
-    inlet_m3k_s: F64
-    """Airflow times inlet temperature over supply."""
-    outlet_m3k_s: F64
-
-
-@dataclass(frozen=True, slots=True)
-class _Heat:
-    """Heat that the plant takes, each (B,)."""
-
-    load_w: F64
-    """Heat that comes back to the CRAC units."""
-    device: water_side.WaterSide
-    unmet_w: F64
-    recovered_w: F64
-    held_kwh: F64
-    """Heat that the room holds at the end of the step."""
 
 
 class Simulator:
@@ -121,7 +84,9 @@ class Simulator:
             steps_per_hour=self.fleet.steps_per_hour,
             seed=0,
         )
+        self._calm = self._timeline.quiet
         self._hall: Hall | None = None
+        self._stages: _Stages | None = None
         self._sizing: Sizing | None = None
         self._state: State | None = None
         self._closed = False
@@ -135,14 +100,16 @@ class Simulator:
         limit_h, deadline_h = v("workload.queue_limit_h"), v("workload.deadline_h")
         self._work = {
             "flexible_share": v("workload.flexible_share"),
-            "max_utilisation": v("workload.max_utilisation"),
-            "queue_limit": np.where(np.isnan(limit_h), np.inf, limit_h * tasks_per_h),
-            "deadline_steps": np.where(
-                np.isnan(deadline_h), np.inf, np.rint(deadline_h * per_hour)
+            "queue_limit": np.where(
+                np.isnan(limit_h), workload.UNLIMITED_TASKS, limit_h * tasks_per_h
             ),
         }
+        self._max_utilisation = v("workload.max_utilisation")
         horizon = float(np.max(np.rint(v("workload.age_horizon_h") * per_hour)))
         self._queue_length = int(horizon) + 2
+        deadline_steps = np.where(np.isnan(deadline_h), np.inf, np.rint(deadline_h * per_hour))
+        due_steps = deadline_steps + workload.DUE_AFTER_STEPS[models["workload"]]
+        self._queue = workload.Queue(self._queue_length, due_steps)
         self._unit_dc = self.fleet.unit_dc
         self._setpoint = {
             "step_k": v("hvac.setpoint.step_k")[self._unit_dc],
@@ -151,43 +118,17 @@ class Simulator:
         }
         self._fan_step = v("hvac.crac.fan_step")[self._unit_dc]
         self._coasting = v("hvac.crac.coasting_flow_ratio")[self._unit_dc]
-        self._servers = self.fleet.per_dc_servers()
         self._floor = Floor(self.fleet)
-        self._air_j_per_m3_k = air_j_per_m3_k(self.fleet)
-        self._return_approach_k = mean_return_approach_k(self.fleet)
+        self._all = np.ones(self.size)
+        self._all_units = np.ones(self.fleet.units)
+        self._all_up = np.ones(self.fleet.units, dtype=np.bool_)
         self._min_flow_ratio = v("hvac.crac.min_flow_ratio")
-        self._supply_m3s_per_w = v("hvac.crac.supply_m3s_per_w")
-        self._water = {
-            "cycles_of_concentration": v("hvac.water.cycles_of_concentration"),
-            "drift_share": v("hvac.water.drift_share"),
-        }
-        self._battery = {
-            name: v(f"battery.{name}")
-            for name in (
-                "charge_efficiency",
-                "discharge_factor",
-                "charge_limit_c_rate",
-                "discharge_limit_c_rate",
-                "upper_u_h",
-                "upper_v",
-                "lower_u_h",
-                "lower_v",
-            )
-        }
-        self._counted = self.fleet.configs[0].hvac.total_of
         self._flow_name = models["crac_flow"]
         self._recirculates = models["inlet"] == "recirculation"
         self._transient = models["thermal"] == "transient"
         self._substep_s = self.fleet.configs[0].simulation.substep_s
-        self._stores_heat = models["cooling_load"] in cooling.STORES_UNMET_HEAT
         self._work_model = workload.MODELS[models["workload"]]
         self._setpoint_model = cooling.SETPOINTS[models["setpoint"]]
-        self._flow_model = cooling.FLOWS[models["crac_flow"]]
-        self._load_model = cooling.LOADS[models["cooling_load"]]
-        self._chiller_model = CHILLERS[models["chiller"]]
-        self._tower_model = TOWERS[models["tower"]]
-        self._water_model = WATER[models["water"]]
-        self._battery_model = BATTERIES[models["battery"]]
 
     @property
     def size(self) -> int:
@@ -222,6 +163,9 @@ class Simulator:
             d = self.drivers
             self._sizing = size(self.fleet, exact, d.design_outdoor_c, d.design_wet_bulb_c)
             exact.forget()
+            self._stages = _Stages(
+                self.fleet, self._sizing, self._work_model, self._work, calm=self._calm
+            )
             self._hall = hall
         return self._hall
 
@@ -301,33 +245,39 @@ class Simulator:
         """
         if actions is not None and not isinstance(actions, Actions):
             raise SdcError(f"actions are a {type(actions).__name__}; valid is Actions(...)")
+        # Another user of Taichi may have ended the runtime; a forked child has none.
+        runtime.ensure_started()
         given = actions or Actions()
         state, sized, step_h = self.state, self.sizing, self.step_h
-        hall = self._start()
+        hall, stages = self._start(), self._stages
+        assert stages is not None
         load_command = self._command("load", given.load, LoadAction, 1.0)
         battery_command = self._command("battery", given.battery, BatteryAction, 1.0)
         cooling_command = self._unit_command("cooling", given.cooling, CoolAction)
         fan_speed = self._fan_speed(state, given.fan)
+        calm = self._calm
         event = self._timeline.at(state.step)
         world = self.drivers.at(state.step)
-        outdoor_c = world.outdoor_c + event.outdoor_offset_k
-        wet_bulb_c = world.wet_bulb_c + event.outdoor_offset_k
+        outdoor_c, wet_bulb_c = world.outdoor_c, world.wet_bulb_c
+        if not calm:
+            outdoor_c = outdoor_c + event.outdoor_offset_k
+            wet_bulb_c = wet_bulb_c + event.outdoor_offset_k
 
-        powered = self._powered(state, event)
+        powered = self._all if calm else self._powered(state, event)
         floor, status = self._floor, state.rack_status
         capacity, highest = floor.capacity(status, powered, given.placement)
-        work = self._work_model(
-            world.demand,
-            load_command,
-            state.queue,
-            **{
-                **self._work,
-                "max_utilisation": np.minimum(self._work["max_utilisation"], highest),
-            },
+        work = stages.work(
+            demand=world.demand,
+            command=load_command,
+            waiting=state.queue[:, -1].copy(),
+            due=self._queue.due(state.queue),
+            max_utilisation=np.minimum(self._max_utilisation, highest),
         )
-        placed = floor.place(
-            work.utilisation, capacity, powered, state.group_inlet_c, given.placement
+        oldest_steps, mean_steps, queue = self._queue.after(
+            state.queue, work["taken"], work["deferred"]
         )
+        utilisation = work["utilisation"]
+        placed = floor.place(utilisation, capacity, powered, state.group_inlet_c, given.placement)
 
         setpoint_c, run, last, scale = self._setpoint_model(
             state.setpoint_c,
@@ -337,26 +287,31 @@ class Simulator:
             state.cooling_scale,
             **self._setpoint,
         )
-        unit_up = event.unit_up & (powered > 0)[self._unit_dc]
-        running = unit_up.astype(np.float64)
-        warmed_k = state.room_heat_kwh / sized.room_kwh_per_k
+        unit_up = self._all_up if calm else event.unit_up & (powered > 0)[self._unit_dc]
+        running = self._all_units if calm else unit_up.astype(np.float64)
+        supply_c = setpoint_c + self._per_unit(state.room_heat_kwh / sized.room_kwh_per_k)
         met = Conditions(
-            unit_supply_c=setpoint_c + warmed_k[self._unit_dc],
-            utilisation=np.minimum(work.utilisation, 1.0),
+            unit_supply_c=supply_c,
+            utilisation=np.minimum(utilisation, 1.0),
             powered=floor.powered(status, powered),
-            rack_airflow=None if self._timeline.quiet else event.rack_airflow,
+            rack_airflow=None if calm else event.rack_airflow,
             rack_load=placed.rack_load,
             group_load=placed.group_load,
             **self._fan_limits(fan_speed, unit_up),
         )
-        plant_c, coils = self._coils_in_use(setpoint_c, running)
-        design = sized.water_side
-        if not self._timeline.quiet:
-            design = replace(design, chiller_w=design.chiller_w * event.chiller_share)
-        coils_w = design.cooling_w * coils * powered
-
-        def plant(request_w: F64) -> water_side.WaterSide:
-            return self._operate(request_w, powered, plant_c, outdoor_c, wet_bulb_c, design)
+        plant_setpoint_c, coils = self._coils_in_use(setpoint_c, running)
+        around = {
+            "plant_setpoint_c": plant_setpoint_c,
+            "outdoor_c": outdoor_c,
+            "wet_bulb_c": wet_bulb_c,
+        }
+        if not calm:
+            around |= {
+                "powered": powered,
+                "grid_up": event.grid_up.astype(np.float64),
+                "chiller_share": event.chiller_share,
+                "coils": coils,
+            }
 
         memory = _memory_of(state)
         if self._transient:
@@ -364,54 +319,27 @@ class Simulator:
                 setpoint_c=setpoint_c,
                 room_j=state.room_heat_kwh * 3.6e6,
                 room_j_per_k=sized.room_kwh_per_k * 3.6e6,
-                limit_w=plant(coils_w).removed_w,
-                fan_w_per_m3s=self._fan_w_per_m3s * powered,
+                limit_w=stages.removable(**around)["removed_w"],
+                fan_w_per_m3s=sized.crac_fan_w / sized.crac_flow_m3s * powered,
             )
             air, memory = hall.advance(met, memory, coil, step_h * 3600.0, self._substep_s)
         else:
             air = hall.solve(met)
-        it_w = air.cpu_w + air.fan_w
-        room = self._room_air(air, met, setpoint_c, fan_speed, powered)
-
-        heat = self._remove_heat(air, room, state.room_heat_kwh, running, coils_w, plant)
-        device = heat.device
-
-        water = self._water_model(
-            rejected_w=device.rejected_w,
-            range_k=device.tower_range_k,
-            water_kg_s=device.tower_water_kg_s,
-            wet_bulb_c=wet_bulb_c,
-            return_c=room.return_c,
-            supply_setpoint_c=plant_c,
-            dt_s=step_h * 3600.0,
-            **self._water,
+        after = stages.facility(
+            **around,
+            **self._of_the_air(air, setpoint_c, supply_c, fan_speed, running),
+            ci_g_per_kwh=world.ci_g_per_kwh,
+            battery_command=battery_command,
+            stored_kwh=state.stored_kwh,
+            room_heat_kwh=state.room_heat_kwh,
         )
-
-        devices = {
-            "chiller": device.chiller_w,
-            "tower_fan": device.tower_fan_w,
-            "chilled_pump": device.chilled_pump_w,
-            "condenser_pump": device.condenser_pump_w,
-            "crac_fan": room.fan_w,
-        }
-        hvac_w = sum((devices[name] for name in self._counted), np.zeros(self.size))
-        facility_kw = (it_w + hvac_w) / 1e3
-
-        grid_up = event.grid_up.astype(np.float64)
-        battery = self._battery_model(
-            state.stored_kwh,
-            np.where(event.grid_up, battery_command, -1.0),
-            capacity_kwh=sized.battery_kwh,
-            load_kw=facility_kw,
-            dt_h=step_h,
-            **self._battery,
-        )
-        grid_kwh = battery.grid_kwh * grid_up
+        warmed_k = after.pop("warmed_k")
 
         status = floor.protect(status, air.rack_inlet_max_c)
-        lost = np.maximum(work.utilisation - placed.utilisation, 0.0)
-        lost = lost + floor.tripped_work(state.rack_status, status, placed, met.powered)
-        lost_tasks = lost * workload.TASKS_PER_STEP
+        lost_tasks = workload.TASKS_PER_STEP * (
+            np.maximum(utilisation - placed.utilisation, 0.0)
+            + floor.tripped_work(state.rack_status, status, placed, met.powered)
+        )
         self._state = State(
             step=state.step + 1,
             seed=state.seed,
@@ -421,14 +349,13 @@ class Simulator:
             cooling_last=last,
             cooling_scale=scale,
             fan_speed=fan_speed,
-            queue=work.queue,
-            stored_kwh=battery.stored_kwh,
-            room_heat_kwh=heat.held_kwh,
+            queue=queue,
+            stored_kwh=after["stored_kwh"],
+            room_heat_kwh=after["room_heat_kwh"],
             rack_status=status,
             group_inlet_c=hall.group_inlets() if len(state.group_inlet_c) else state.group_inlet_c,
             **_fields(memory),
         )
-        battery_kwh = np.where(sized.battery_kwh > 0, sized.battery_kwh, 1.0)
         hottest_rack, hottest_server = self.fleet.place_of_group(air.hottest_group)
         return StepResult(
             step=state.step,
@@ -440,82 +367,35 @@ class Simulator:
             load_command=load_command,
             cooling_command=self._per_dc(cooling_command),
             battery_command=battery_command,
-            utilisation=work.utilisation,
-            arrived_tasks=work.arrived,
-            executed_tasks=work.executed - lost_tasks,
-            deferred_tasks=work.deferred,
-            drained_tasks=work.drained,
-            due_tasks=work.due,
-            overdue_tasks=work.overdue,
-            dropped_tasks=work.dropped,
+            utilisation=utilisation,
+            arrived_tasks=work["arrived"],
+            executed_tasks=work["executed"] - lost_tasks,
+            deferred_tasks=work["deferred"],
+            drained_tasks=work["drained"],
+            due_tasks=work["due"],
+            overdue_tasks=work["overdue"],
+            dropped_tasks=work["dropped"],
             lost_tasks=lost_tasks,
-            queue_tasks=work.queue[:, -1].copy(),
-            oldest_age_h=work.oldest_age_steps * step_h,
-            mean_age_h=work.mean_age_steps * step_h,
+            queue_tasks=queue[:, -1].copy(),
+            oldest_age_h=oldest_steps * step_h,
+            mean_age_h=mean_steps * step_h,
             setpoint_c=self._per_dc(setpoint_c),
-            supply_c=room.supply_c,
             inlet_mean_c=air.inlet_mean_c,
             inlet_max_c=air.inlet_max_c,
             hottest_rack=hottest_rack.astype(np.float64),
             hottest_server=hottest_server.astype(np.float64),
-            hot_k=air.hot_k / self._servers,
-            shi=air_metrics.shi(room.inlet_m3k_s, room.outlet_m3k_s),
-            rti_pct=air_metrics.rti(
-                room.return_c,
-                room.supply_c,
-                air_metrics.it_rise_k(room.inlet_m3k_s, room.outlet_m3k_s, air.airflow_m3s),
-            ),
-            rci_hi_pct=air_metrics.rci_hi(
-                air.hot_k, self._servers, allowable_c=floor.allowable_high_c
-            ),
-            rci_lo_pct=air_metrics.rci_lo(
-                air.cold_k, self._servers, allowable_c=floor.allowable_low_c
-            ),
-            throttled_racks=self.fleet.rack_sums(status == THROTTLED),
-            tripped_racks=self.fleet.rack_sums(status == TRIPPED),
+            throttled_racks=floor.racks_in(status, THROTTLED),
+            tripped_racks=floor.racks_in(status, TRIPPED),
             outlet_mean_c=air.outlet_mean_c,
             cpu_w=air.cpu_w,
             it_fan_w=air.fan_w,
-            it_w=it_w,
             it_airflow_m3s=air.airflow_m3s,
-            crac_flow_m3s=room.flow_m3s,
-            return_c=room.return_c,
-            cooling_load_w=heat.load_w,
-            chilled_water_c=device.chilled_water_c,
-            condenser_water_c=device.condenser_water_c,
-            economiser_w=device.economiser_w,
-            chiller_load_w=device.chiller_load_w,
-            unmet_w=heat.unmet_w,
-            recovered_w=heat.recovered_w,
-            heat_removed_w=device.removed_w,
-            rejected_w=device.rejected_w,
-            room_heat_kwh=heat.held_kwh,
             stored_w=air.stored_w,
-            chiller_w=device.chiller_w,
-            tower_fan_w=device.tower_fan_w,
-            chilled_pump_w=device.chilled_pump_w,
-            condenser_pump_w=device.condenser_pump_w,
-            crac_fan_w=room.fan_w,
-            hvac_w=hvac_w,
-            evaporation_l=water.evaporation_l,
-            drift_l=water.drift_l,
-            blowdown_l=water.blowdown_l,
-            water_l=water.makeup_l,
-            stored_kwh=battery.stored_kwh,
-            soc=battery.stored_kwh / battery_kwh,
-            charge_kwh=battery.charge_kwh,
-            discharge_kwh=battery.discharge_kwh,
-            battery_loss_kwh=battery.loss_kwh,
-            it_kwh=it_w * step_h / 1e3,
-            hvac_kwh=hvac_w * step_h / 1e3,
-            grid_kwh=grid_kwh,
-            unserved_kwh=battery.grid_kwh - grid_kwh,
-            carbon_g=emitted_g(grid_kwh, world.ci_g_per_kwh),
-            grid_up=grid_up,
+            grid_up=event.grid_up.astype(np.float64),
             powered=powered,
             unit_setpoint_c=setpoint_c,
-            unit_supply_c=room.unit_supply_c,
-            unit_flow_m3s=room.unit_flow_m3s,
+            unit_supply_c=setpoint_c + self._per_unit(warmed_k),
+            unit_flow_m3s=air.unit_flow_m3s if self._recirculates else after["crac_flow_m3s"],
             unit_running=running,
             rack_status=status,
             rack_cpu_w=air.rack_cpu_w,
@@ -524,10 +404,13 @@ class Simulator:
             rack_inlet_c=air.rack_inlet_c,
             rack_inlet_max_c=air.rack_inlet_max_c,
             rack_outlet_c=air.rack_outlet_c,
+            **after,
         )
 
     def _coils_in_use(self, setpoint_c: F64, running: F64) -> tuple[F64, F64]:
         """Setpoint that the plant's water serves, and share of the coils in use, each (B,)."""
+        if self._calm and self.fleet.units == self.size:
+            return setpoint_c, self._all
         first = self.fleet.unit_start[:-1]
         coldest_c = np.minimum.reduceat(np.where(running > 0, setpoint_c, np.inf), first)
         none = np.isinf(coldest_c)
@@ -537,96 +420,53 @@ class Simulator:
         in_use = self.fleet.unit_sums(running * design_m3s)
         return coldest_c, in_use / self.fleet.unit_sums(design_m3s)
 
-    def _room_air(
-        self, air: HallSums, met: Conditions, setpoint_c: F64, fan_speed: F64, powered: F64
-    ) -> _RoomAir:
-        """Airflow, supply and return air, fans and heat of the CRAC units."""
-        sized = self.sizing
-        it_w = air.cpu_w + air.fan_w
+    def _of_the_air(
+        self, air: HallSums, setpoint_c: F64, supply_c: F64, fan_speed: F64, running: F64
+    ) -> dict[str, F64]:
+        """What the facility reads of the halls, see ``Met``."""
+        sums = self._unit_sums
+        out = {
+            "cpu_w": air.cpu_w,
+            "it_fan_w": air.fan_w,
+            "airflow_m3s": air.airflow_m3s,
+            "hot_k": air.hot_k,
+            "cold_k": air.cold_k,
+        }
+        flow_m3s = air.unit_flow_m3s
         if self._recirculates:
-            unit_fan_w = self._fan_w_per_m3s[self._unit_dc] * self.fleet.unit_design_m3s
-            fan_w = self.fleet.unit_sums(unit_fan_w * air.unit_cubed_speed) * powered
-            # Units differ by their setpoints alone; the room warms the air of all alike.
-            mixed_c = self.fleet.unit_sums(air.unit_flow_m3s * setpoint_c)
-            warmed_k = air.supply_c - mixed_c / air.crac_flow_m3s
-            return _RoomAir(
-                flow_m3s=air.crac_flow_m3s,
-                unit_flow_m3s=air.unit_flow_m3s,
-                fan_w=fan_w,
-                supply_c=air.supply_c,
-                unit_supply_c=setpoint_c + warmed_k[self._unit_dc],
-                return_c=air.return_c,
-                load_w=it_w + fan_w,
-                inlet_m3k_s=air.inlet_m3k_s,
-                outlet_m3k_s=air.outlet_m3k_s,
-            )
-        supply_c = met.unit_supply_c
-        flow, speed = self._flow_model(
-            it_w,
-            air.airflow_m3s,
-            design_flow_m3s=sized.crac_flow_m3s,
-            design_it_airflow_m3s=sized.it_airflow_m3s,
-            min_ratio=self._min_flow_ratio,
-            supply_m3s_per_w=self._supply_m3s_per_w,
-            speed=fan_speed,
-        )
-        fan_w = powered * crac_fan_w(speed, design_flow_m3s=1.0, design_w=sized.crac_fan_w)
-        return_c, load_w = self._load_model(
-            it_w,
-            fan_w,
-            flow,
-            supply_c,
-            setpoint_c,
-            air.outlet_mean_c,
-            air_j_per_m3_k=self._air_j_per_m3_k,
-            return_approach_k=self._return_approach_k,
-        )
-        return _RoomAir(
-            flow_m3s=flow,
-            unit_flow_m3s=flow,
-            fan_w=fan_w,
-            supply_c=supply_c,
-            unit_supply_c=supply_c,
-            return_c=return_c,
-            load_w=load_w,
-            inlet_m3k_s=self._rise_m3k_s(air, air.rack_inlet_c, supply_c),
-            outlet_m3k_s=self._rise_m3k_s(air, air.rack_outlet_c, supply_c),
-        )
+            out |= {
+                "inlet_m3k_s": air.inlet_m3k_s,
+                "outlet_m3k_s": air.outlet_m3k_s,
+                "supply_c": air.supply_c,
+                "crac_flow_m3s": air.crac_flow_m3s,
+                "return_c": air.return_c,
+                "cubed_m3s": sums(self.fleet.unit_design_m3s * air.unit_cubed_speed),
+                "mixed_m3k_s": sums(flow_m3s * setpoint_c),
+            }
+        else:
+            # Such halls have one unit for all of a data center.
+            out |= {
+                "inlet_m3k_s": self._rise_m3k_s(air, air.rack_inlet_c, supply_c),
+                "outlet_m3k_s": self._rise_m3k_s(air, air.rack_outlet_c, supply_c),
+                "supply_c": supply_c,
+                "outlet_mean_c": air.outlet_mean_c,
+                "fan_speed": fan_speed,
+            }
+        if self._transient:
+            out |= {"coil_load_w": air.coil_load_w, "coil_w": air.coil_w, "room_j": air.room_j}
+        if not self._calm:
+            idle_m3s = (1.0 - running) * flow_m3s
+            out |= {
+                "all_running": np.minimum.reduceat(running, self.fleet.unit_start[:-1]),
+                "idle_m3s": sums(idle_m3s),
+                "idle_m3k_s": sums(idle_m3s * setpoint_c),
+            }
+        return out
 
     def _rise_m3k_s(self, air: HallSums, rack_c: Reals, supply_c: F64) -> F64:
         """Airflow times temperature over supply of all racks, (B,)."""
         over_k = rack_c.astype(np.float64) - supply_c[self.fleet.rack_dc]
         return self.fleet.rack_sums(air.rack_airflow_m3s * over_k)
-
-    def _remove_heat(
-        self,
-        air: HallSums,
-        room: _RoomAir,
-        held_kwh: F64,
-        running: F64,
-        coils_w: F64,
-        plant: Callable[[F64], water_side.WaterSide],
-    ) -> _Heat:
-        """What the plant takes of the heat that comes back and of the heat held by the room."""
-        step_h = self.step_h
-        if self._transient:
-            load_w, device = air.coil_load_w, plant(air.coil_w)
-            # The room has kept its heat within the step; here is what the plant fell short of.
-            held_kwh = air.room_j / 3.6e6 + (air.coil_w - device.removed_w) * step_h / 1e3
-            unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, device.removed_w)
-        else:
-            load_w = room.load_w
-            wanted_w = load_w + held_kwh * 1e3 / step_h
-            if not np.all(running):
-                past_w = self._past_idle_coils_w(air, running, room.return_c, room.unit_supply_c)
-                wanted_w = np.clip(wanted_w - past_w, 0.0, coils_w)
-            device = plant(wanted_w)
-            unmet_w, recovered_w, held_kwh = cooling.hold_heat(
-                load_w, device.removed_w, held_kwh, step_h
-            )
-        if not self._stores_heat:
-            unmet_w = recovered_w = np.zeros(self.size)
-        return _Heat(load_w, device, unmet_w, recovered_w, held_kwh)
 
     def _powered(self, state: State, event: Disturbance) -> F64:
         """Share of the step with power, (B,).
@@ -636,45 +476,12 @@ class Simulator:
         """
         if np.all(event.grid_up):
             return np.ones(self.size)
-        design_kw = self.sizing.facility_w / 1e3
-        carried = self._battery_model(
-            state.stored_kwh,
-            np.full(self.size, -1.0),
-            capacity_kwh=self.sizing.battery_kwh,
-            load_kw=design_kw,
-            dt_h=self.step_h,
-            **self._battery,
+        design_kw, stages = self.sizing.facility_w / 1e3, self._stages
+        assert stages is not None
+        carried = stages.run_battery(
+            state.stored_kwh, np.full(self.size, -1.0), load_kw=design_kw
         ).discharge_kwh
         return np.where(event.grid_up, 1.0, np.minimum(carried / (design_kw * self.step_h), 1.0))
-
-    def _operate(
-        self,
-        request_w: F64,
-        powered: F64,
-        setpoint_c: F64,
-        outdoor_c: F64,
-        wet_bulb_c: F64,
-        design: water_side.Design,
-    ) -> water_side.WaterSide:
-        """The plant, which stands still while there is no power."""
-        dark = bool(np.any(powered < 1.0))
-        on = np.where(powered > 0, powered, 1.0)
-        found = water_side.operate(
-            np.where(powered > 0, request_w / on, 0.0) if dark else request_w,
-            setpoint_c=setpoint_c,
-            outdoor_c=outdoor_c,
-            wet_bulb_c=wet_bulb_c,
-            design=design,
-            chiller=self._chiller_model,
-            tower=self._tower_model,
-            limited=self._stores_heat,
-        )
-        return found.scaled(powered) if dark else found
-
-    def _past_idle_coils_w(self, air: HallSums, running: F64, return_c: F64, supply_c: F64) -> F64:
-        """Heat of the air that passes units that are down, (B,); it stays in the room."""
-        passed = (1.0 - running) * air.unit_flow_m3s * (return_c[self._unit_dc] - supply_c)
-        return self._air_j_per_m3_k * self.fleet.unit_sums(passed)
 
     def _fan_limits(
         self, speed: F64 | None, unit_up: npt.NDArray[np.bool_] | None = None
@@ -706,15 +513,19 @@ class Simulator:
         low = self._min_flow_ratio[self._unit_dc]
         return np.clip(state.fan_speed + command * self._fan_step, low, 1.0)
 
-    @property
-    def _fan_w_per_m3s(self) -> F64:
-        return self.sizing.crac_fan_w / self.sizing.crac_flow_m3s
-
     def _per_dc(self, per_unit: F64) -> F64:
         """Mean over the CRAC units, (B,)."""
         if self.fleet.units == self.size:
             return per_unit
         return self.fleet.unit_sums(per_unit) / np.diff(self.fleet.unit_start)
+
+    def _per_unit(self, per_dc: F64) -> F64:
+        """For each CRAC unit the value of its data center, (U,)."""
+        return per_dc if self.fleet.units == self.size else per_dc[self._unit_dc]
+
+    def _unit_sums(self, per_unit: F64) -> F64:
+        """Sum over the CRAC units, (B,)."""
+        return per_unit if self.fleet.units == self.size else self.fleet.unit_sums(per_unit)
 
     def active_events(self, step: int) -> list[ActiveEvent]:
         """Events that cover step ``step`` of the present run."""
@@ -865,6 +676,35 @@ class Simulator:
             for part in (air.weights, air.norm, air.strength, air.captured, self.fleet.dcs):
                 digest.update(part.tobytes())
         return digest.hexdigest()
+
+
+class _Stages:
+    """What runs compiled: decisions about work, and the facility behind the halls.
+
+    Args:
+        fleet: B data centers.
+        sized: their devices.
+        decide: model of ``plant.workload``.
+        limits: its constant arguments.
+        calm: whether no event can ever happen.
+    """
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        sized: Sizing,
+        decide: workload.WorkModel,
+        limits: Mapping[str, F64],
+        *,
+        calm: bool,
+    ) -> None:
+        from sdc_taichi.kernels.stage import CompiledStage
+
+        models = Facility(fleet, sized, 1.0 / fleet.steps_per_hour, calm=calm)
+        self.run_battery = models.run_battery
+        self.work = CompiledStage(lambda **x: _fields(decide(**x, **limits)), fleet.size)
+        self.facility = CompiledStage(lambda **x: models.step(Met(**x)), fleet.size)
+        self.removable = CompiledStage(lambda **x: models.removable_w(Met(**x)), fleet.size)
 
 
 def _memory_of(state: State) -> HallState:

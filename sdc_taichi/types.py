@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,11 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 Status = npt.NDArray[np.int8]
 Reals = npt.NDArray[np.floating[Any]]
+
+
+def as_array(values: F64 | float) -> F64:
+    """An array of what may be a number; quantities of a compiled stage stay what they are."""
+    return np.asarray(values) if isinstance(values, float) else values
 
 
 class LoadAction(Enum):
@@ -283,13 +289,15 @@ class StepResult:
 
     def per_dc(self) -> dict[str, F64]:
         """All (B,) quantities by name, in the order of the fields."""
-        names = (f.name for f in fields(self))
-        values = ((name, getattr(self, name)) for name in names)
-        return {
-            name: value
-            for name, value in values
-            if isinstance(value, np.ndarray) and not name.startswith(("rack_", "unit_"))
-        }
+        return dict(zip(_PER_DC, _values_per_dc(self), strict=True))
+
+
+_PER_DC = tuple(
+    f.name
+    for f in fields(StepResult)
+    if f.name not in ("step", "step_h") and not f.name.startswith(("rack_", "unit_"))
+)
+_values_per_dc = attrgetter(*_PER_DC)
 
 
 @dataclass(frozen=True, slots=True)

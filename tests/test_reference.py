@@ -46,6 +46,7 @@ from sdc_taichi.plant.carbon import emitted_g
 from sdc_taichi.recirculation import calibrate, layout_exchange
 from sdc_taichi.sizing import released_ranges
 from sdc_taichi.types import F64
+from work_steps import work_step
 
 Check = dict[str, Any]
 Values = dict[str, Any]
@@ -663,7 +664,8 @@ def check_load_shifting(check: Check) -> Values:
     queue[:, -1] = given["queue0"]
     found = []
     for action in given["actions"]:
-        work = workload.MODELS[config.model](
+        work = work_step(
+            config.model,
             np.array([float(given["w"])]),
             np.array([float(LOAD[action].value)]),
             queue,

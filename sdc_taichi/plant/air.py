@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sdc_taichi.types import as_array
+
 Array = NDArray[np.float64]
 Values = Array | float
 
@@ -26,7 +28,7 @@ def crac_fan_w(flow_m3s: Values, *, design_flow_m3s: Values, design_w: Values) -
     Returns:
         design_w * (flow/design)^3.
     """
-    return np.asarray(design_w * (flow_m3s / design_flow_m3s) ** 3)
+    return as_array(design_w * (flow_m3s / design_flow_m3s) ** 3)
 
 
 def hydraulic_pump_w(pressure_pa: Values, flow_m3s: Values, *, efficiency: Values) -> Array:
@@ -43,7 +45,7 @@ def hydraulic_pump_w(pressure_pa: Values, flow_m3s: Values, *, efficiency: Value
     Returns:
         Electric power, W.
     """
-    return np.asarray(pressure_pa * flow_m3s / efficiency)
+    return as_array(pressure_pa * flow_m3s / efficiency)
 
 
 def pump_w(flow: Values, *, design_flow: Values, design_w: Values, min_flow_ratio: Values) -> Array:
@@ -59,7 +61,7 @@ def pump_w(flow: Values, *, design_flow: Values, design_w: Values, min_flow_rati
         design_w * max(flow/design, min_flow_ratio)^3, or 0 without flow.
     """
     running = np.greater(flow, 0.0)
-    return np.asarray(
+    return as_array(
         np.where(running, design_w * np.maximum(flow / design_flow, min_flow_ratio) ** 3, 0.0)
     )
 
@@ -81,9 +83,9 @@ def economiser_share(
     Returns:
         0..1, and 0 where the water does not come back warmer than it left.
     """
-    span_k = np.asarray(return_water_c - chilled_water_c)
+    span_k = as_array(return_water_c - chilled_water_c)
     loaded = span_k > 0.0
     precooled_k = return_water_c - tower_water_c
-    return np.asarray(
+    return as_array(
         np.where(loaded, np.clip(precooled_k / np.where(loaded, span_k, 1.0), 0.0, 1.0), 0.0)
     )

@@ -37,7 +37,8 @@ def symmetric_setpoint(
     Returns:
         The new setpoint, run, last command and scale, each (B,).
     """
-    return np.clip(setpoint_c + command * step_k, low_c, high_c), run, command, scale
+    moved_c = np.minimum(np.maximum(setpoint_c + command * step_k, low_c), high_c)
+    return moved_c, run, command, scale
 
 
 def accelerating_setpoint(
@@ -83,7 +84,7 @@ def constant_flow(
     Returns:
         Airflow m3/s and fan speed over design speed, each (B,).
     """
-    return np.broadcast_to(design_flow_m3s, it_w.shape).copy(), np.ones(it_w.shape)
+    return design_flow_m3s, np.ones_like(design_flow_m3s)
 
 
 def following_flow(
@@ -111,7 +112,7 @@ def per_watt_flow(
 
     See ``constant_flow``.
     """
-    return supply_m3s_per_w * it_w, np.ones(it_w.shape)
+    return supply_m3s_per_w * it_w, np.ones_like(supply_m3s_per_w)
 
 
 def controlled_flow(
@@ -121,7 +122,7 @@ def controlled_flow(
 
     See ``constant_flow``.
     """
-    return design_flow_m3s * speed, speed.copy()
+    return design_flow_m3s * speed, speed
 
 
 FLOWS: dict[str, Callable[..., tuple[F64, F64]]] = {

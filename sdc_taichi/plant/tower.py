@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sdc_taichi.errors import SdcError
+from sdc_taichi.types import as_array
 
 Array = NDArray[np.float64]
 Values = Array | float
@@ -126,7 +127,7 @@ def yorkcalc_liquid_gas_ratio(wet_bulb_c: Values, range_k: Values, approach_k: V
 
 def _approach_at(liquid_gas_ratio: Values, a: Values, b: Values, c: Values) -> Array:
     x = np.minimum(liquid_gas_ratio, MAX_LIQUID_GAS_RATIO)
-    return np.asarray(np.clip(a + x * (b + x * c), *APPROACH_BOUNDS_K))
+    return as_array(np.clip(a + x * (b + x * c), *APPROACH_BOUNDS_K))
 
 
 def _ratio_at(approach_k: Values, a: Values, b: Values, c: Values) -> Array:
@@ -138,7 +139,7 @@ def _ratio_at(approach_k: Values, a: Values, b: Values, c: Values) -> Array:
     reached = discriminant >= 0.0
     root = 2.0 * above_intercept / (b + np.sqrt(np.where(reached, discriminant, 0.0)))
     ratio = np.where(reached, np.minimum(root, MAX_LIQUID_GAS_RATIO), MAX_LIQUID_GAS_RATIO)
-    return np.asarray(np.where(above_intercept > 0.0, ratio, 0.0))
+    return as_array(np.where(above_intercept > 0.0, ratio, 0.0))
 
 
 def yorkcalc_reference_water_kg_s(
@@ -167,7 +168,7 @@ def yorkcalc_reference_water_kg_s(
             f"{t.flat[i]:g} C and range {r.flat[i]:g} K; the approach must be above "
             f"{_approach_parabola(t.flat[i], r.flat[i])[0]:.2f} K there"
         )
-    return np.asarray(water_kg_s / ratio)
+    return as_array(water_kg_s / ratio)
 
 
 def design_water_kg_s(heat_w: Values, *, range_k: Values) -> Values:
@@ -349,16 +350,15 @@ def _approach_parabola(wet_bulb_c: Values, range_k: Values) -> tuple[Values, Val
     """Coefficients of the approach in powers 0, 1, 2 of the liquid to gas ratio."""
     t = np.clip(wet_bulb_c, *WET_BULB_BOUNDS_C)
     r = np.clip(range_k, *RANGE_BOUNDS_K)
-    k = YORKCALC.reshape(*YORKCALC.shape, *(1,) * max(np.ndim(t), np.ndim(r)))
-    in_range = k[:, :, 0] + t * (k[:, :, 1] + t * k[:, :, 2])
-    a, b, c = in_range[:, 0] + r * (in_range[:, 1] + r * in_range[:, 2])
+    in_range = [[p + t * (q + t * u) for p, q, u in powers] for powers in YORKCALC]
+    a, b, c = (p + r * (q + r * u) for p, q, u in in_range)
     return a, b, c
 
 
 def _range_k(heat_w: Values, water_kg_s: Values) -> Array:
     flowing = np.greater(water_kg_s, 0.0)
     carried = np.maximum(heat_w, 0.0) / (WATER_J_PER_KG_K * np.where(flowing, water_kg_s, 1.0))
-    return np.asarray(np.where(flowing, carried, 0.0))
+    return as_array(np.where(flowing, carried, 0.0))
 
 
 def _air_m3s(
@@ -368,7 +368,7 @@ def _air_m3s(
     air_j_per_m3_k: Values,
 ) -> Array:
     delta_k = np.maximum(50.0 - (outdoor_c - supply_setpoint_c), 1.0)
-    return np.asarray(np.maximum(heat_w, 0.0) / (air_j_per_m3_k * delta_k))
+    return as_array(np.maximum(heat_w, 0.0) / (air_j_per_m3_k * delta_k))
 
 
 def _tower(

@@ -3,16 +3,19 @@
 The queue is one array per data center: entry k is the work still queued that was put in by the end
 of step k, oldest step first. It never decreases along k, so length, due part and age histogram are
 read off it or are differences of two entries.
-Work is counted in tasks: 1 task is 1 % of the data center's capacity for one step.
+Work is counted in tasks: 1 task is 1 % of the data center's capacity for one step. A model decides
+what happens to work from what waits and what is due; ``Queue`` does it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from sdc_taichi import runtime
 from sdc_taichi.types import F64
 
 TASKS_PER_STEP = 100.0
@@ -31,10 +34,8 @@ class Work:
     due: F64
     overdue: F64
     dropped: F64
-    oldest_age_steps: F64
-    mean_age_steps: F64
-    queue: F64
-    """Work still queued by the step that put it in, (B, L)."""
+    taken: F64
+    """Work that left the queue."""
 
 
 WorkModel = Callable[..., Work]
@@ -43,12 +44,12 @@ WorkModel = Callable[..., Work]
 def fluid(
     demand: F64,
     command: F64,
-    queue: F64,
+    waiting: F64,
+    due: F64,
     *,
     flexible_share: F64,
     max_utilisation: F64,
     queue_limit: F64,
-    deadline_steps: F64,
 ) -> Work:
     """Divisible work, conserved exactly: arrived = executed + queued + dropped.
 
@@ -59,16 +60,14 @@ def fluid(
     Args:
         demand: arriving work as a share of capacity, (B,).
         command: -1 defer all flexible work .. 0 .. 1 drain all that fits, (B,).
-        queue: work still queued by the step that put it in, oldest first, (B, L).
+        waiting: work in the queue, (B,).
+        due: part of it whose deadline has come, (B,).
         flexible_share: share of the demand that may wait, (B,).
         max_utilisation: capacity limit, (B,).
-        queue_limit: longest queue in tasks, inf for none, (B,).
-        deadline_steps: age at which work is due, inf for none, (B,).
+        queue_limit: longest queue in tasks, (B,).
     """
     arrived = demand * TASKS_PER_STEP
     capacity = max_utilisation * TASKS_PER_STEP
-    waiting = queue[:, -1]
-    due = _older_than(queue, deadline_steps)
     flexible = flexible_share * arrived
     wanted = arrived - np.maximum(-command, 0.0) * flexible
     forced = np.minimum(due, capacity)
@@ -87,19 +86,19 @@ def fluid(
         due,
         due - forced,
         held_back - deferred,
-        *_queue_after(queue, forced + drained, deferred),
+        forced + drained,
     )
 
 
 def tasks(
     demand: F64,
     command: F64,
-    queue: F64,
+    waiting: F64,
+    due: F64,
     *,
     flexible_share: F64,
     max_utilisation: F64,
     queue_limit: F64,
-    deadline_steps: F64,
 ) -> Work:
     """Whole tasks as the released SustainDC counts them; arguments as in ``fluid``.
 
@@ -112,8 +111,6 @@ def tasks(
     flexible = np.floor(demand * flexible_share * TASKS_PER_STEP)
     cap = np.floor(max_utilisation * TASKS_PER_STEP)
     arrived = fixed + flexible
-    waiting = queue[:, -1]
-    due = _older_than(queue, deadline_steps + 1.0)
     forced = np.minimum(due, np.maximum(cap - arrived, 0.0))
     held_back = np.floor(np.maximum(-command, 0.0) * flexible)
     deferred = np.minimum(held_back, queue_limit - (waiting - forced))
@@ -131,11 +128,58 @@ def tasks(
         due,
         due - forced,
         held_back - deferred,
-        *_queue_after(queue, forced + drained, deferred),
+        forced + drained,
     )
 
 
 MODELS: dict[str, WorkModel] = {"fluid": fluid, "tasks": tasks}
+DUE_AFTER_STEPS = {"fluid": 0.0, "tasks": 1.0}
+"""Steps between the deadline and when the models take work as due."""
+UNLIMITED_TASKS = 1e30
+"""Limit of a queue without one; larger than any, and still a number."""
+
+
+class Queue:
+    """What every step does to the queues of a fleet.
+
+    A queue is the work still queued by the step that put it in, oldest first, (B, L).
+
+    Args:
+        length: L.
+        due_steps: age at which work is due, inf for never, (B,).
+    """
+
+    def __init__(self, length: int, due_steps: F64) -> None:
+        due_at = length - np.minimum(due_steps, length + 1.0).astype(np.int64)
+        self._dcs = np.arange(len(due_steps))
+        self._due_at = np.maximum(due_at, 0)
+        self._never = due_at < 0
+        self._after: Any = None
+
+    def due(self, queue: F64) -> F64:
+        """Work that is due when the coming step starts, (B,)."""
+        return np.where(self._never, 0.0, queue[self._dcs, self._due_at])
+
+    def after(self, queue: F64, taken: F64, deferred: F64) -> tuple[F64, F64, F64]:
+        """The queue at the end of a step, a new array.
+
+        Args:
+            queue: at its start.
+            taken: work that leaves it, oldest first, (B,).
+            deferred: work that enters it, (B,).
+
+        Returns:
+            Age of the oldest work and mean age in steps, (B,), and the queue.
+        """
+        from sdc_taichi.kernels.queue import SERIAL_UP_TO, bound_queue_kernel
+
+        if self._after is None:
+            runtime.ensure_started()
+            self._after = bound_queue_kernel()
+        after, ages = np.empty_like(queue), np.empty((2, len(queue)))
+        serial = len(queue) <= SERIAL_UP_TO
+        self._after(serial, _NEGLIGIBLE_TASKS, queue, taken, deferred, after, ages[0], ages[1])
+        return ages[0], ages[1], after
 
 
 def age_histogram(queue: F64, edges_steps: F64) -> F64:
@@ -146,31 +190,11 @@ def age_histogram(queue: F64, edges_steps: F64) -> F64:
         edges_steps: lower edges of the age bins in steps, rising from 0; the last bin is open.
     """
     last = queue.shape[1] - 1
-    at_least = queue[:, np.clip(last - np.asarray(edges_steps).astype(np.int64), 0, last)]
-    return at_least - np.append(at_least[:, 1:], np.zeros((len(queue), 1)), axis=1)
+    edges = np.asarray(edges_steps).astype(np.int64)
+    found: F64 = queue.take(np.maximum(last - edges, 0), axis=1)
+    found[:, :-1] -= found[:, 1:]
+    return found
 
 
 _NEGLIGIBLE_TASKS = 1e-9
 """Left by rounding where a step's work was taken out in parts; no age is read off it."""
-
-
-def _older_than(queue: F64, steps: F64) -> F64:
-    """Queued work that has waited ``steps`` or more when the coming step starts, (B,)."""
-    length = queue.shape[1]
-    position = length - np.minimum(steps, length + 1.0).astype(np.int64)
-    due = queue[np.arange(len(queue)), np.maximum(position, 0)]
-    return np.where(position < 0, 0.0, due)
-
-
-def _queue_after(queue: F64, taken: F64, deferred: F64) -> tuple[F64, F64, F64]:
-    """Oldest age and mean age in steps, (B,), and the queue, (B, L), at the end of the step."""
-    after = np.empty_like(queue)
-    older = after[:, :-1]
-    np.maximum(np.subtract(queue[:, 1:], taken[:, None], out=older), 0.0, out=older)
-    after[:, -1] = older[:, -1] + deferred
-    # Work of the newest step has age 0; each older task is counted once per step it has waited.
-    aged = older > _NEGLIGIBLE_TASKS
-    total = after[:, -1]
-    waited = np.einsum("bl,bl->b", older, aged)
-    mean = np.divide(waited, total, out=np.zeros_like(total), where=total > 0)
-    return np.count_nonzero(aged, axis=1).astype(np.float64), mean, after

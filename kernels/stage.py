@@ -1,0 +1,218 @@
+"""Stage functions compiled: the same function over arrays, in one pass over its entries.
+
+A stage is a plain function whose arrays all have one entry per data center. It is called once with
+quantities that write down what is done to them; from that record a kernel is made, which computes
+entry after entry and keeps nothing in between. Whatever the stage reads apart from its arguments
+is taken as constant. NumPy needs a call and a temporary per operation, and some hundred of them
+cost more than the arithmetic unless there are thousands of data centers.
+"""
+
+import linecache
+from collections.abc import Callable, Mapping
+from functools import cache
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.mixins import NDArrayOperatorsMixin
+
+from .backend import BoundKernel, ti
+
+Arrays = Mapping[str, Any]
+
+SERIAL_UP_TO = 512
+"""Entries that one thread computes sooner than several are woken."""
+
+_NUMBERS = {
+    np.add: "{} + {}",
+    np.subtract: "{} - {}",
+    np.multiply: "{} * {}",
+    np.divide: "{} / {}",
+    np.maximum: "ti.max({}, {})",
+    np.minimum: "ti.min({}, {})",
+    np.negative: "-{}",
+    np.sqrt: "ti.sqrt({})",
+    np.exp: "ti.exp({})",
+    np.floor: "ti.floor({})",
+    np.ceil: "ti.ceil({})",
+}
+_TRUTHS = {
+    np.greater: "{} > {}",
+    np.greater_equal: "{} >= {}",
+    np.less: "{} < {}",
+    np.less_equal: "{} <= {}",
+    np.equal: "{} == {}",
+    np.bitwise_and: "{} & {}",
+    np.bitwise_or: "{} | {}",
+    np.invert: "{} == 0",
+}
+
+
+class CompiledStage:
+    """A stage function that runs as one kernel.
+
+    Args:
+        stage: function of arrays (n,) by name that returns arrays (n,), or numbers, by name. It may
+            use arithmetic, comparisons and the functions of NumPy in this module, but no branch on
+            values. It never changes its arguments, and infinities and NaN are no numbers here.
+        size: n.
+
+    Raises:
+        TypeError: on the first call, if the stage does something else.
+    """
+
+    def __init__(self, stage: Callable[..., Arrays], size: int) -> None:
+        self._stage, self._size = stage, size
+        self._kernel: BoundKernel | None = None
+
+    def __call__(self, **given: npt.NDArray[np.float64]) -> dict[str, npt.NDArray[np.float64]]:
+        """Results by name, each (n,): rows of one new array."""
+        if self._kernel is None:
+            self._compile(tuple(given))
+        assert self._kernel is not None
+        out = np.empty((len(self._results), self._size))
+        serial = self._size <= SERIAL_UP_TO
+        self._kernel(serial, self._size, self._constants, *given.values(), out)
+        return dict(zip(self._results, out, strict=True))
+
+    def _compile(self, names: tuple[str, ...]) -> None:
+        record = _Record(self._size)
+        given = {name: record.entry(f"a{i}[i]") for i, name in enumerate(names)}
+        results = {name: record.lift(x) for name, x in self._stage(**given).items()}
+        self._results = tuple(results)
+        constants = record.constants or [np.zeros(self._size)]
+        self._constants = np.array(constants, dtype=np.float64)
+        source = _source(record.lines(list(results.values())), len(names))
+        self._kernel = BoundKernel(_kernel(source), templates=1)
+
+
+class Recorded(NDArrayOperatorsMixin):
+    """A quantity of a stage; what is done to it is written down, not done."""
+
+    def __init__(self, record: "_Record", at: int, truth: bool) -> None:
+        self.record, self.at, self.truth = record, at, truth
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *given: Any, **more: Any) -> "Recorded":
+        if method != "__call__" or more:
+            raise TypeError(f"{ufunc.__name__}: only plain calls can be compiled")
+        if ufunc is np.power:
+            return _power(self.record.lift(given[0]), given[1])
+        if ufunc is np.rint:
+            return _rint(self.record.lift(given[0]))
+        known = _NUMBERS.get(ufunc) or _TRUTHS.get(ufunc)
+        if known is None:
+            raise TypeError(f"{ufunc.__name__}: cannot be compiled")
+        return self.record.operation(known, given, truth=ufunc in _TRUTHS)
+
+    def __array_function__(
+        self, function: Any, types: Any, given: tuple[Any, ...], more: dict[str, Any]
+    ) -> Any:
+        if function is np.where and len(given) == 3:
+            return self.record.operation("ti.select({}, {}, {})", given)
+        if function is np.clip and len(given) == 3:
+            return np.minimum(np.maximum(given[0], given[1]), given[2])
+        if function is np.round and len(given) == 2:
+            scale = 10.0 ** given[1]
+            return np.rint(given[0] * scale) / scale
+        if function is np.broadcast_arrays:
+            return given
+        raise TypeError(f"{function.__name__}: cannot be compiled")
+
+    def __bool__(self) -> bool:
+        raise TypeError("a compiled stage cannot branch on values; use np.where")
+
+
+class _Record:
+    """What a stage does, each different operation once."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._operations: dict[tuple[str, tuple[int, ...]], int] = {}
+        self._rows: dict[int, int] = {}
+        self.constants: list[Any] = []
+
+    def entry(self, text: str, *, of: tuple[int, ...] = (), truth: bool = False) -> Recorded:
+        at = self._operations.setdefault((text, of), len(self._operations))
+        return Recorded(self, at, truth)
+
+    def operation(self, text: str, given: tuple[Any, ...], *, truth: bool = False) -> Recorded:
+        return self.entry(text, of=tuple(self.lift(x).at for x in given), truth=truth)
+
+    def lift(self, value: Any) -> Recorded:
+        """A quantity, from a number or an array that is constant."""
+        if isinstance(value, Recorded):
+            return value
+        array = np.asarray(value)
+        if array.ndim == 0:
+            # Literals without a type would be rounded to f32.
+            return self.entry(f"ti.f64({float(array)!r})")
+        if array.shape != (self._size,):
+            raise TypeError(f"constant of shape {array.shape}, expected ({self._size},)")
+        row = self._rows.get(id(value))
+        if row is None:
+            row = self._rows[id(value)] = len(self.constants)
+            self.constants.append(value)
+        read = self.entry(f"constants[{row}, i]")
+        return read > 0.5 if array.dtype == np.bool_ else read
+
+    def lines(self, results: list[Recorded]) -> list[str]:
+        """Statements that compute the results and store them, without what none of them needs."""
+        known = list(self._operations)
+        needed: set[int] = set()
+        open_ends = [result.at for result in results]
+        while open_ends:
+            at = open_ends.pop()
+            if at not in needed:
+                needed.add(at)
+                open_ends += known[at][1]
+        body = []
+        for at in sorted(needed):
+            text, of = known[at]
+            body.append(f"v{at} = " + text.format(*(f"v{x}" for x in of)))
+        return body + [f"out[{row}, i] = v{result.at}" for row, result in enumerate(results)]
+
+
+def _power(base: Recorded, exponent: Any) -> Recorded:
+    if isinstance(exponent, Recorded) or np.ndim(exponent) or float(exponent) % 1.0 or not exponent:
+        raise TypeError(f"power {exponent}: only whole numbers other than 0 can be compiled")
+    out = base
+    for _ in range(abs(int(exponent)) - 1):
+        out = out * base
+    return out if exponent > 0 else 1.0 / out
+
+
+def _rint(x: Recorded) -> Recorded:
+    """The nearest whole number, the even one of two, as NumPy has it."""
+    up = np.floor(x + 0.5)
+    tie = (up - x == 0.5) & (up - 2.0 * np.floor(0.5 * up) == 1.0)
+    rounded: Recorded = np.where(tie, up - 1.0, up)
+    return rounded
+
+
+def _source(body: list[str], inputs: int) -> str:
+    """A kernel that does these statements for every entry i."""
+    arrays = "".join(f"a{i}: Reals, " for i in range(inputs))
+    head = (
+        "@ti.kernel\n"
+        f"def stage(serial: ti.template(), n: ti.i32, constants: Rows, {arrays}out: Rows):\n"
+        "    ti.loop_config(serialize=serial)\n"
+        "    for i in range(n):\n"
+    )
+    return head + "".join(f"        {line}\n" for line in body)
+
+
+@cache
+def _kernel(source: str) -> Any:
+    """The Taichi kernel of this source, compiled once for all fleets whose stages are the same."""
+    # Taichi reads the source of a kernel by the name of its file.
+    name = f"<stage {sha256(source.encode()).hexdigest()}>"
+    linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
+    scope = {
+        "ti": ti,
+        "Reals": ti.types.ndarray(dtype=ti.f64, ndim=1),
+        "Rows": ti.types.ndarray(dtype=ti.f64, ndim=2),
+        "__name__": __name__,
+    }
+    exec(compile(source, name, "exec"), scope)
+    return scope["stage"]

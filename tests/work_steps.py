@@ -1,0 +1,19 @@
+"""Whole steps of delay-tolerant work, for tests: a model's decision and the queue after it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from sdc_taichi.plant import workload
+from sdc_taichi.types import F64
+
+
+def work_step(
+    model: str, demand: F64, command: F64, queue: F64, *, deadline_steps: F64, **limits: F64
+) -> SimpleNamespace:
+    """Fields of ``Work``, ages in steps, and the queue at the end of a step."""
+    queues = workload.Queue(queue.shape[1], deadline_steps + workload.DUE_AFTER_STEPS[model])
+    work = workload.MODELS[model](demand, command, queue[:, -1], queues.due(queue), **limits)
+    oldest, mean, after = queues.after(queue, work.taken, work.deferred)
+    own = {name: getattr(work, name) for name in work.__slots__}
+    return SimpleNamespace(**own, oldest_age_steps=oldest, mean_age_steps=mean, queue=after)
