@@ -71,19 +71,20 @@ class CompiledStage:
         if self._kernel is None:
             self._compile(tuple(given))
         assert self._kernel is not None
+        inputs = np.array([given[name] for name in self._names])
         out = np.empty((len(self._results), self._size))
         serial = self._size <= SERIAL_UP_TO
-        self._kernel(serial, self._size, self._constants, *given.values(), out)
+        self._kernel(serial, self._size, self._constants, inputs, out)
         return dict(zip(self._results, out, strict=True))
 
     def _compile(self, names: tuple[str, ...]) -> None:
         record = _Record(self._size)
-        given = {name: record.entry(f"a{i}[i]") for i, name in enumerate(names)}
+        given = {name: record.entry(f"given[{row}, i]") for row, name in enumerate(names)}
         results = {name: record.lift(x) for name, x in self._stage(**given).items()}
-        self._results = tuple(results)
+        self._names, self._results = names, tuple(results)
         constants = record.constants or [np.zeros(self._size)]
         self._constants = np.array(constants, dtype=np.float64)
-        source = _source(record.lines(list(results.values())), len(names))
+        source = _source(record.lines(list(results.values())))
         self._kernel = BoundKernel(_kernel(source), templates=1)
 
 
@@ -190,12 +191,11 @@ def _rint(x: Recorded) -> Recorded:
     return rounded
 
 
-def _source(body: list[str], inputs: int) -> str:
+def _source(body: list[str]) -> str:
     """A kernel that does these statements for every entry i."""
-    arrays = "".join(f"a{i}: Reals, " for i in range(inputs))
     head = (
         "@ti.kernel\n"
-        f"def stage(serial: ti.template(), n: ti.i32, constants: Rows, {arrays}out: Rows):\n"
+        "def stage(serial: ti.template(), n: ti.i32, constants: Rows, given: Rows, out: Rows):\n"
         "    ti.loop_config(serialize=serial)\n"
         "    for i in range(n):\n"
     )
@@ -210,7 +210,6 @@ def _kernel(source: str) -> Any:
     linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
     scope = {
         "ti": ti,
-        "Reals": ti.types.ndarray(dtype=ti.f64, ndim=1),
         "Rows": ti.types.ndarray(dtype=ti.f64, ndim=2),
         "__name__": __name__,
     }

@@ -67,13 +67,13 @@ class Floor:
         return self._policy in ("coolest-first", "inlet-aware")
 
     def capacity(
-        self, status: Status, powered: F64, weights: F64 | None
+        self, status: Status, powered: F64 | None, weights: F64 | None
     ) -> tuple[F64 | None, F64 | float]:
         """How much work fits.
 
         Args:
             status: of each rack, see ``plant.protection``, (R,).
-            powered: share of the step with power, (B,).
+            powered: share of the step with power, (B,); None is all of it.
             weights: of the action, per rack or server group.
 
         Returns:
@@ -83,9 +83,11 @@ class Floor:
             SdcError: weights that are no numbers or of the wrong shape.
         """
         chosen = self._policy == "weights" and weights is not None
-        if not np.any(status) and not chosen and np.all(powered == 1.0):
+        if not chosen and self._all_on(status, powered):
             return None, 1.0
-        per_rack = protection.capacity(status, self._throttle_share) * powered[self._fleet.rack_dc]
+        per_rack = protection.capacity(status, self._throttle_share)
+        if powered is not None:
+            per_rack = per_rack * powered[self._fleet.rack_dc]
         bins = per_rack if self._per_rack else self._spread(per_rack)
         usable = np.where(self._weights(weights) > 0, bins, 0.0) if chosen else bins
         return bins, self._bins.sums(self._bin_servers * usable) / self._servers
@@ -94,7 +96,7 @@ class Floor:
         self,
         utilisation: F64,
         capacity: F64 | None,
-        powered: F64,
+        powered: F64 | None,
         group_inlet_c: F64,
         weights: F64 | None,
     ) -> Placed:
@@ -126,16 +128,22 @@ class Floor:
             limit_c=self.allowable_high_c,
             weights=self._weights(weights) if self._policy == "weights" else None,
         )
-        on = powered[self._bins.dc]
-        load = load / np.where(on > 0, on, 1.0)
+        if powered is not None:
+            on = powered[self._bins.dc]
+            load = load / np.where(on > 0, on, 1.0)
         return Placed(placed, *((load, None) if self._per_rack else (None, load)))
 
-    def powered(self, status: Status, powered: F64) -> F64 | None:
+    def powered(self, status: Status, powered: F64 | None) -> F64 | None:
         """Share of the step that each rack is on, (R,); None if all are on throughout."""
-        tripped = status == TRIPPED
-        if not np.any(tripped) and np.all(powered == 1.0):
+        if self._all_on(status, powered):
             return None
-        return np.where(tripped, 0.0, powered[self._fleet.rack_dc])
+        on = np.ones(self._fleet.racks) if powered is None else powered[self._fleet.rack_dc]
+        return np.where(status == TRIPPED, 0.0, on)
+
+    def _all_on(self, status: Status, powered: F64 | None) -> bool:
+        """Whether all racks are in order and on throughout the step."""
+        lit = powered is None or bool(np.all(powered == 1.0))
+        return lit and not np.any(status)
 
     def protect(self, status: Status, inlet_max_c: Reals) -> Status:
         """Status of each rack after a step with the given hottest inlets, (R,)."""

@@ -43,7 +43,8 @@ from sdc_taichi.whole_file import whole_file
 
 SNAPSHOT_VERSION = 2
 _NONE = np.zeros(0)
-NO_MEMORY = HallState(*[_NONE] * len(fields(HallState)))
+_MEMORY = tuple(f.name for f in fields(HallState))
+_NO_MEMORY = dict.fromkeys(_MEMORY, _NONE)
 """Of quasi-steady halls."""
 
 
@@ -119,11 +120,14 @@ class Simulator:
         self._fan_step = v("hvac.crac.fan_step")[self._unit_dc]
         self._coasting = v("hvac.crac.coasting_flow_ratio")[self._unit_dc]
         self._floor = Floor(self.fleet)
+        self._single = self.fleet.units == self.size
         self._all = np.ones(self.size)
         self._all_units = np.ones(self.fleet.units)
-        self._all_up = np.ones(self.fleet.units, dtype=np.bool_)
         self._min_flow_ratio = v("hvac.crac.min_flow_ratio")
         self._flow_name = models["crac_flow"]
+        follows = self._flow_name == "follow_servers"
+        lowest = self._min_flow_ratio[self._unit_dc] if follows else self._all_units
+        self._fan_range = (lowest, self._all_units)
         self._recirculates = models["inlet"] == "recirculation"
         self._transient = models["thermal"] == "transient"
         self._substep_s = self.fleet.configs[0].simulation.substep_s
@@ -200,10 +204,11 @@ class Simulator:
         setpoint_c = v("hvac.setpoint.initial_c")[self._unit_dc]
         inlet_c = v("hvac.setpoint.initial_c")[fleet.rack_dc] + fleet.approach_k
         groups = np.diff(fleet.group_start)
-        memory = NO_MEMORY
+        memory = _NO_MEMORY
         if self._transient:
             demand = self.drivers.at(0).demand
-            memory = hall.settle(Conditions(setpoint_c, demand, **self._fan_limits(None)))
+            settled = hall.settle(Conditions(setpoint_c, demand, **self._fan_limits(None)))
+            memory = _fields(settled)
         self._state = State(
             step=0,
             seed=seeds,
@@ -218,7 +223,7 @@ class Simulator:
             room_heat_kwh=np.zeros(b),
             rack_status=np.zeros(fleet.racks, dtype=np.int8),
             group_inlet_c=np.repeat(inlet_c, groups) if self._floor.watches_inlets else _NONE,
-            **_fields(memory),
+            **memory,
         )
         return self._state
 
@@ -263,7 +268,7 @@ class Simulator:
             outdoor_c = outdoor_c + event.outdoor_offset_k
             wet_bulb_c = wet_bulb_c + event.outdoor_offset_k
 
-        powered = self._all if calm else self._powered(state, event)
+        powered = None if calm else self._powered(state, event)
         floor, status = self._floor, state.rack_status
         capacity, highest = floor.capacity(status, powered, given.placement)
         work = stages.work(
@@ -287,8 +292,10 @@ class Simulator:
             state.cooling_scale,
             **self._setpoint,
         )
-        unit_up = self._all_up if calm else event.unit_up & (powered > 0)[self._unit_dc]
-        running = self._all_units if calm else unit_up.astype(np.float64)
+        unit_up, running = None, self._all_units
+        if powered is not None:
+            unit_up = event.unit_up & (powered > 0)[self._unit_dc]
+            running = unit_up.astype(np.float64)
         supply_c = setpoint_c + self._per_unit(state.room_heat_kwh / sized.room_kwh_per_k)
         met = Conditions(
             unit_supply_c=supply_c,
@@ -305,7 +312,7 @@ class Simulator:
             "outdoor_c": outdoor_c,
             "wet_bulb_c": wet_bulb_c,
         }
-        if not calm:
+        if powered is not None:
             around |= {
                 "powered": powered,
                 "grid_up": event.grid_up.astype(np.float64),
@@ -313,16 +320,20 @@ class Simulator:
                 "coils": coils,
             }
 
-        memory = _memory_of(state)
+        memory = _NO_MEMORY
         if self._transient:
             coil = Coil(
                 setpoint_c=setpoint_c,
                 room_j=state.room_heat_kwh * 3.6e6,
                 room_j_per_k=sized.room_kwh_per_k * 3.6e6,
                 limit_w=stages.removable(**around)["removed_w"],
-                fan_w_per_m3s=sized.crac_fan_w / sized.crac_flow_m3s * powered,
+                fan_w_per_m3s=sized.crac_fan_w
+                / sized.crac_flow_m3s
+                * (1.0 if powered is None else powered),
             )
-            air, memory = hall.advance(met, memory, coil, step_h * 3600.0, self._substep_s)
+            before = HallState(**{name: getattr(state, name) for name in _MEMORY})
+            air, left = hall.advance(met, before, coil, step_h * 3600.0, self._substep_s)
+            memory = _fields(left)
         else:
             air = hall.solve(met)
         after = stages.facility(
@@ -354,7 +365,7 @@ class Simulator:
             room_heat_kwh=after["room_heat_kwh"],
             rack_status=status,
             group_inlet_c=hall.group_inlets() if len(state.group_inlet_c) else state.group_inlet_c,
-            **_fields(memory),
+            **memory,
         )
         hottest_rack, hottest_server = self.fleet.place_of_group(air.hottest_group)
         return StepResult(
@@ -392,11 +403,11 @@ class Simulator:
             it_airflow_m3s=air.airflow_m3s,
             stored_w=air.stored_w,
             grid_up=event.grid_up.astype(np.float64),
-            powered=powered,
+            powered=self._all.copy() if powered is None else powered,
             unit_setpoint_c=setpoint_c,
             unit_supply_c=setpoint_c + self._per_unit(warmed_k),
             unit_flow_m3s=air.unit_flow_m3s if self._recirculates else after["crac_flow_m3s"],
-            unit_running=running,
+            unit_running=running.copy(),
             rack_status=status,
             rack_cpu_w=air.rack_cpu_w,
             rack_fan_w=air.rack_fan_w,
@@ -409,7 +420,7 @@ class Simulator:
 
     def _coils_in_use(self, setpoint_c: F64, running: F64) -> tuple[F64, F64]:
         """Setpoint that the plant's water serves, and share of the coils in use, each (B,)."""
-        if self._calm and self.fleet.units == self.size:
+        if self._calm and self._single:
             return setpoint_c, self._all
         first = self.fleet.unit_start[:-1]
         coldest_c = np.minimum.reduceat(np.where(running > 0, setpoint_c, np.inf), first)
@@ -487,11 +498,8 @@ class Simulator:
         self, speed: F64 | None, unit_up: npt.NDArray[np.bool_] | None = None
     ) -> dict[str, F64]:
         """Speeds between which each CRAC fan follows the servers' airflow, for ``Conditions``."""
-        low = np.ones(self.fleet.units)
-        high = low
-        if self._flow_name == "follow_servers":
-            low = self._min_flow_ratio[self._unit_dc]
-        elif self._flow_name == "controlled" and speed is not None:
+        low, high = self._fan_range
+        if self._flow_name == "controlled" and speed is not None:
             low = high = speed
         if unit_up is None or np.all(unit_up):
             return {"unit_low": low, "unit_high": high}
@@ -502,6 +510,8 @@ class Simulator:
         }
 
     def _fan_speed(self, state: State, given: Any) -> F64:
+        if given is FanAction.HOLD:
+            return state.fan_speed
         command = self._unit_command("fan", given, FanAction)
         if self._flow_name != "controlled":
             if np.any(command):
@@ -515,17 +525,17 @@ class Simulator:
 
     def _per_dc(self, per_unit: F64) -> F64:
         """Mean over the CRAC units, (B,)."""
-        if self.fleet.units == self.size:
+        if self._single:
             return per_unit
         return self.fleet.unit_sums(per_unit) / np.diff(self.fleet.unit_start)
 
     def _per_unit(self, per_dc: F64) -> F64:
         """For each CRAC unit the value of its data center, (U,)."""
-        return per_dc if self.fleet.units == self.size else per_dc[self._unit_dc]
+        return per_dc if self._single else per_dc[self._unit_dc]
 
     def _unit_sums(self, per_unit: F64) -> F64:
         """Sum over the CRAC units, (B,)."""
-        return per_unit if self.fleet.units == self.size else self.fleet.unit_sums(per_unit)
+        return per_unit if self._single else self.fleet.unit_sums(per_unit)
 
     def active_events(self, step: int) -> list[ActiveEvent]:
         """Events that cover step ``step`` of the present run."""
@@ -705,10 +715,6 @@ class _Stages:
         self.work = CompiledStage(lambda **x: _fields(decide(**x, **limits)), fleet.size)
         self.facility = CompiledStage(lambda **x: models.step(Met(**x)), fleet.size)
         self.removable = CompiledStage(lambda **x: models.removable_w(Met(**x)), fleet.size)
-
-
-def _memory_of(state: State) -> HallState:
-    return HallState(**{f.name: getattr(state, f.name) for f in fields(HallState)})
 
 
 def _fields(record: Any) -> dict[str, Any]:
