@@ -35,8 +35,20 @@ class Table:
     def at(self, index: I64) -> F64:
         """Entry ``index`` of every data center, repeating, (B,), or entries, (B, n)."""
         if index.ndim > 1:
-            return self.values[self.offset[:, None] + index % self.length[:, None]]
-        return self.values[self.offset + index % self.length]
+            return self.values.take(self.offset[:, None] + index % self.length[:, None])
+        return self.values.take(self.entries(index))
+
+    def entries(self, index: I64) -> I64:
+        """Where in ``values`` entry ``index`` of every data center is, (B,)."""
+        return self.offset + index % self.length
+
+    def aligned(self, other: Table) -> Table:
+        """This table, with the very places of ``other`` where they are the same."""
+        offset, length = (
+            theirs if np.array_equal(mine, theirs) else mine
+            for mine, theirs in ((self.offset, other.offset), (self.length, other.length))
+        )
+        return Table(self.values, offset, length)
 
     def distinct(self) -> tuple[list[F64], I64]:
         """The distinct series, and which of them each data center reads, (B,)."""
@@ -80,12 +92,18 @@ class Drivers:
 
     def at(self, step: int) -> Exogenous:
         """Inputs of step ``step`` after reset."""
-        index = self.start + step
+        index, first = self.start + step, self.outdoor_c
+        entries = first.entries(index)
+
+        def read(table: Table) -> F64:
+            alike = table.offset is first.offset and table.length is first.length
+            return table.values.take(entries if alike else table.entries(index))
+
         return Exogenous(
-            outdoor_c=self.outdoor_c.at(index),
-            wet_bulb_c=self.wet_bulb_c.at(index),
-            ci_g_per_kwh=self.ci_g_per_kwh.at(index),
-            demand=self.demand.at(index),
+            outdoor_c=read(first),
+            wet_bulb_c=read(self.wet_bulb_c),
+            ci_g_per_kwh=read(self.ci_g_per_kwh),
+            demand=read(self.demand),
         )
 
 
@@ -121,11 +139,12 @@ def load_drivers(configs: Sequence[DataCenterConfig]) -> Drivers:
             traces[trace_key] = (trace, resample(trace, steps_per_hour))
         chosen.append((sites[site_key], traces[trace_key]))
     days = np.array([first_step_day(c.site.start) for c in configs], dtype=np.int64)
+    outdoor_c = _table([site.outdoor_c for site, _ in chosen])
     return Drivers(
-        outdoor_c=_table([site.outdoor_c for site, _ in chosen]),
-        wet_bulb_c=_table([site.wet_bulb_c for site, _ in chosen]),
-        ci_g_per_kwh=_table([site.ci_g_per_kwh for site, _ in chosen]),
-        demand=_table([values for _, (_, values) in chosen]),
+        outdoor_c=outdoor_c,
+        wet_bulb_c=_table([site.wet_bulb_c for site, _ in chosen]).aligned(outdoor_c),
+        ci_g_per_kwh=_table([site.ci_g_per_kwh for site, _ in chosen]).aligned(outdoor_c),
+        demand=_table([values for _, (_, values) in chosen]).aligned(outdoor_c),
         start=days * 24 * steps_per_hour,
         design_outdoor_c=np.array([site.design_outdoor_c for site, _ in chosen]),
         design_wet_bulb_c=np.array([site.design_wet_bulb_c for site, _ in chosen]),

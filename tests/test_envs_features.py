@@ -26,7 +26,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.control import View, viewer
 from sdc_taichi.drivers import Table
-from sdc_taichi.envs import features as module
+from sdc_taichi.envs import timed
 from sdc_taichi.envs.features import (
     AGENTS,
     DEFAULT_FEATURES,
@@ -342,7 +342,7 @@ def test_start_may_move_between_episodes() -> None:
         observer.reset(view, [])
         before = observer.state(view)
         moved = replace(view.drivers, start=view.drivers.start + 96)
-        later = replace(view, drivers=moved, now=moved.at(0))
+        later = replace(view, drivers=moved)
         observer.reset(later, [])
         after = parts(observer.state(later), observer.state_features)
     old = parts(before, observer.state_features)
@@ -533,7 +533,7 @@ def test_series_that_end_repeat_from_their_own_start() -> None:
 
 def test_tables_and_reading_step_by_step_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     _, fast = watch(fleet_of("tiny"), 30)
-    monkeypatch.setattr(module, "TABLE_BYTES", 0)
+    monkeypatch.setattr(timed, "TABLE_BYTES", 0)
     _, slow = watch(fleet_of("tiny"), 30)
     for (_, _, a, _), (_, _, b, _) in zip(fast, slow, strict=True):
         np.testing.assert_array_equal(a, b)

@@ -281,7 +281,7 @@ def bare_view(config: DataCenterConfig, d: Drivers, step: int) -> View:
         sim.reset()
         _VIEWS["tiny"] = viewer(sim)(None)
     view = _VIEWS["tiny"]
-    return replace(view, drivers=d, state=replace(view.state, step=step), now=d.at(step))
+    return replace(view, drivers=d, state=replace(view.state, step=step))
 
 
 @given(

@@ -135,11 +135,11 @@ def test_default_rewards_are_those_of_the_paper() -> None:
     st.floats(0, 1),
 )
 def test_sharing_keeps_the_sum(own: list[float], a: float) -> None:
-    given = {agent: np.array([r]) for agent, r in zip(AGENTS, own, strict=True)}
-    total = sum(float(r[0]) for r in share(given, a).values())
-    assert total == pytest.approx(math.fsum(own), abs=1e-9)
-    for agent, r in share(given, 1.0).items():
-        assert r[0] == pytest.approx(given[agent][0], abs=1e-12)
+    given = [np.array([r]) for r in own]
+    assert math.fsum(share(given, a)[:, 0]) == pytest.approx(math.fsum(own), abs=1e-9)
+    assert share(given, 1.0) == pytest.approx(np.array(given), abs=1e-12)
+    # To the bit what several at once get.
+    assert np.array_equal(share([np.tile(r, 3) for r in given], a)[:, 1:2], share(given, a))
 
 
 def test_agents_not_mentioned_keep_their_default() -> None:

@@ -35,7 +35,6 @@ from sdc_taichi import (
 )
 from sdc_taichi.control.rules import trim_and_respond
 from sdc_taichi.drivers import Table
-from sdc_taichi.envs.features import AGENTS
 from sdc_taichi.envs.rewards import share
 from sdc_taichi.exogenous.psychrometrics import humidity_ratio, stull_wet_bulb_c, wet_bulb_c
 from sdc_taichi.hall import Conditions, Hall, HallSums, Precision
@@ -702,8 +701,7 @@ def check_setpoint(check: Check) -> Values:
 
 def check_collaboration(check: Check) -> Values:
     given = check["inputs"]
-    own = {agent: np.array([r]) for agent, r in zip(AGENTS, given["r"], strict=True)}
-    return {"R": [float(r[0]) for r in share(own, given["a"]).values()]}
+    return {"R": share([np.array([r]) for r in given["r"]], given["a"])[:, 0].tolist()}
 
 
 def check_trim_and_respond(check: Check) -> Values:

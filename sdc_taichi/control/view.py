@@ -61,16 +61,29 @@ class View:
     last: StepResult | None
     """Result of the step before; None before the first."""
     state: State
-    now: Exogenous
-    """Inputs of the step to come."""
-    forecast: Callable[[float], Forecast]
-    """Inputs of the coming hours, the step to come first."""
     drivers: Drivers
     """Inputs of all steps; a controller that reads on sees the future."""
     fleet: Fleet
     sizing: Sizing
     limits: Limits
     step_h: float
+
+    @property
+    def now(self) -> Exogenous:
+        """Inputs of the step to come."""
+        return self.drivers.at(self.state.step)
+
+    def forecast(self, hours: float) -> Forecast:
+        """Inputs of the coming hours, the step to come first.
+
+        Raises:
+            ConfigError: less than a step.
+        """
+        steps = round(hours / self.step_h)
+        if steps < 1:
+            raise ConfigError(f"forecast of {hours:g} h: valid is at least {self.step_h:g} h")
+        first = self.drivers.start + self.state.step
+        return Forecast(self.drivers, first[:, None] + np.arange(steps))
 
     @property
     def setpoint_c(self) -> F64:
@@ -109,25 +122,6 @@ def viewer(sim: Simulator) -> Callable[[StepResult | None], View]:
     limits, sizing = limits_of(sim.fleet), sim.sizing
 
     def look(last: StepResult | None) -> View:
-        state, drivers = sim.state, sim.drivers
-        first = drivers.start + state.step
-
-        def forecast(hours: float) -> Forecast:
-            steps = round(hours / step_h)
-            if steps < 1:
-                raise ConfigError(f"forecast of {hours:g} h: valid is at least {step_h:g} h")
-            return Forecast(drivers, first[:, None] + np.arange(steps))
-
-        return View(
-            last=last,
-            state=state,
-            now=drivers.at(state.step),
-            forecast=forecast,
-            drivers=drivers,
-            fleet=sim.fleet,
-            sizing=sizing,
-            limits=limits,
-            step_h=step_h,
-        )
+        return View(last, sim.state, sim.drivers, sim.fleet, sizing, limits, step_h)
 
     return look

@@ -109,17 +109,17 @@ class Core:
         self._made_of = options.model_dump(exclude={"rewards"}) | {"rewards": self._rewards.name}
         self._observer: Observer | ReleasedObserver
         if options.observations == "sustaindc":
-            self._observer = ReleasedObserver()
-            self.state_space = _joined([self._observer.spaces[a] for a in AGENTS])
+            self._observer = ReleasedObserver(options.agents)
         else:
             self._observer = Observer(
                 fleet,
+                agents=options.agents,
                 features=options.features,
                 ci_leads_h=options.ci_leads_h,
                 weather_leads_h=options.weather_leads_h,
                 forecast_error=options.forecast_error,
             )
-            self.state_space = self._observer.state_space
+        self.state_space = self._observer.state_space
         self.features = {a: self._observer.features[a] for a in self.agents}
         self.observation_spaces: dict[str, spaces.Space[Any]] = {
             a: self._observation_space(a) for a in self.agents
@@ -128,6 +128,9 @@ class Core:
             a: self._action_space(a) for a in self.agents
         }
         self._commands = self._discrete_commands()
+        self._shapes = {
+            agent: (size, *(space.shape or ())) for agent, space in self.action_spaces.items()
+        }
         self._setpoint_step_k = np.repeat(fleet.values("hvac.setpoint.step_k"), self._units)
         self._steps_per_day = 24 * fleet.steps_per_hour
         self._steps = options.days * self._steps_per_day
@@ -236,10 +239,7 @@ class Core:
 
     def state(self) -> F32:
         """Shared state for centralised critics, (B, m): all features, whoever learns."""
-        if isinstance(self._observer, Observer):
-            return self._observer.state(self.view)
-        found = self._observer.observe(self.view)
-        return np.concatenate([found[agent] for agent in AGENTS], axis=1)
+        return self._observer.state(self.view)
 
     def terms(self) -> dict[str, F64]:
         """Reward terms of the last step by name, (B,) each; empty before the first.
@@ -380,32 +380,41 @@ class Core:
         if agent not in actions:
             raise SdcError(f"actions: none for {agent}; valid: {list(self.agents)}")
         given = as_array(actions[agent], f"action of {agent}")
+        if given.shape != self._shapes[agent]:
+            raise SdcError(
+                f"action of {agent}: shape {given.shape}, expected {self._shapes[agent]}"
+            )
+        if self.options.actions == "continuous":
+            return self._decode_numbers(agent, given)
+        if given.dtype.kind in "iu":
+            chosen = given.reshape(-1).astype(np.int64)
+            # Read without sign, what is below 0 is beyond 2 too.
+            if np.maximum.reduce(chosen.view(np.uint64)) <= 2:
+                return self._commands[agent].take(chosen)
+            given = given[(given < 0) | (given > 2)]
+        raise SdcError(f"action of {agent}: {given.flat[0]}; valid is 0, 1 or 2")
+
+    def _decode_numbers(self, agent: str, given: npt.NDArray[Any]) -> F64:
+        if given.dtype.kind not in "iuf":
+            raise SdcError(f"action of {agent}: {given.flat[0]!r}; valid is a number")
         space = self.action_spaces[agent]
-        shape = (self.num_envs, *(space.shape or ()))
-        if given.shape != shape:
-            raise SdcError(f"action of {agent}: shape {given.shape}, expected {shape}")
-        if isinstance(space, spaces.Box):
-            if given.dtype.kind not in "iuf":
-                raise SdcError(f"action of {agent}: {given.flat[0]!r}; valid is a number")
-            high = float(space.high[0])
-            # Bounds in f32, as agents have them.
-            if not np.all(np.abs(given) <= high * (1.0 + 1e-6)):
-                wrong = given[~(np.abs(given) <= high * (1.0 + 1e-6))].flat[0]
-                raise SdcError(f"action of {agent}: {wrong}; valid is within {-high:g}..{high:g}")
-            command: F64 = np.clip(given.astype(np.float64).reshape(-1), -high, high)
-            if agent == "agent_dc":
-                command /= self._setpoint_step_k
-                command = unrepeated(command, self.view.state.cooling_last)
-            return command
-        if given.dtype.kind not in "iu" or given.min() < 0 or given.max() > 2:
-            bad = given[(given < 0) | (given > 2)] if given.dtype.kind in "iu" else given
-            raise SdcError(f"action of {agent}: {bad.flat[0]}; valid is 0, 1 or 2")
-        return np.asarray(self._commands[agent][given.reshape(-1)])
+        assert isinstance(space, spaces.Box)
+        high = float(space.high[0])
+        # Bounds in f32, as agents have them.
+        if not np.all(np.abs(given) <= high * (1.0 + 1e-6)):
+            wrong = given[~(np.abs(given) <= high * (1.0 + 1e-6))].flat[0]
+            raise SdcError(f"action of {agent}: {wrong}; valid is within {-high:g}..{high:g}")
+        command: F64 = given.astype(np.float64).reshape(-1)
+        command = np.minimum(np.maximum(command, -high), high)
+        if agent == "agent_dc":
+            command /= self._setpoint_step_k
+            command = unrepeated(command, self.view.state.cooling_last)
+        return command
 
     def _observe(self, view: View) -> dict[str, Observation]:
         found = self._observer.observe(view)
         if not self.options.heat_map:
-            return {agent: found[agent] for agent in self.agents}
+            return {**found}
         image = heat_map(view)
         return {a: {"features": found[a], "heat_map": image.copy()} for a in self.agents}
 
@@ -512,11 +521,6 @@ def as_array(given: Any, name: str) -> npt.NDArray[Any]:
         return np.asarray(given)
     except ValueError as error:
         raise SdcError(f"{name}: is no array ({error})") from None
-
-
-def _joined(parts: Sequence[spaces.Box]) -> spaces.Box:
-    low, high = (np.concatenate([getattr(p, name) for p in parts]) for name in ("low", "high"))
-    return spaces.Box(low, high, dtype=np.float32)
 
 
 def _checked(seed: Any) -> int:

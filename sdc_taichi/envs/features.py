@@ -12,13 +12,13 @@ import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.spaces import Box
 
 from sdc_taichi.control.view import View
-from sdc_taichi.drivers import Drivers
+from sdc_taichi.drivers import Drivers, Table
 from sdc_taichi.envs.forecasts import (
     CI_LEADS_H,
     F32,
@@ -27,6 +27,7 @@ from sdc_taichi.envs.forecasts import (
     ForecastError,
     Forecasts,
 )
+from sdc_taichi.envs.timed import Layout, TimeRows, time_rows
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 from sdc_taichi.fleet import Fleet
 from sdc_taichi.plant.workload import TASKS_PER_STEP, age_histogram
@@ -52,9 +53,7 @@ AGE_EDGES_H = (0.0, 6.0, 12.0, 18.0, 24.0)
 """Lower edges of the age bins, those of the released code (``carbon_ls.py``); the last is open."""
 UNLIMITED_QUEUE_H = 10.0
 """Hours of full work that a queue without limit is measured by."""
-TABLE_BYTES = 2**28
-"""Most memory for tables of what depends on time alone; more series are read step by step."""
-_NEGLIGIBLE_TASKS = 1e-9
+NEGLIGIBLE_TASKS = 1e-9
 """Left in the queue by rounding; no ages are read off it."""
 
 _CLOCK = ("time_of_day", "time_of_year")
@@ -110,20 +109,16 @@ def catalogue(
         weather_leads_h: leads of the weather forecasts, hours.
         units: setpoints side by side.
     """
-    return (*_CLOCK_FEATURES, *_outside(ci_leads_h, weather_leads_h), *_inside(units))
+    return (*_timed(ci_leads_h, weather_leads_h), *_inside(units))
 
 
-_CLOCK_FEATURES = (
-    Feature("time_of_day", "1", -1.0, 1.0, "sine and cosine of the local time", 2),
-    Feature("time_of_year", "1", -1.0, 1.0, "sine and cosine of the share of the year", 2),
-)
-
-
-def _outside(ci_leads_h: Sequence[float], weather_leads_h: Sequence[float]) -> tuple[Feature, ...]:
-    """Carbon intensity and weather, which depend on time alone."""
+def _timed(ci_leads_h: Sequence[float], weather_leads_h: Sequence[float]) -> tuple[Feature, ...]:
+    """What depends on time alone: clock, carbon intensity, weather and arriving work."""
     ci, weather = (", ".join(f"{h:g}" for h in leads) for leads in (ci_leads_h, weather_leads_h))
     n, k = len(ci_leads_h), len(weather_leads_h)
     found = (
+        Feature("time_of_day", "1", -1.0, 1.0, "sine and cosine of the local time", 2),
+        Feature("time_of_year", "1", -1.0, 1.0, "sine and cosine of the share of the year", 2),
         Feature("ci", "g/kWh", 0.0, 1000.0, "carbon intensity of the step to come"),
         Feature("ci_forecast", "g/kWh", 0.0, 1000.0, f"CI in {ci} h", n),
         Feature("ci_change", "g/kWh", -300.0, 300.0, f"CI in {ci} h less `ci`", n),
@@ -131,18 +126,18 @@ def _outside(ci_leads_h: Sequence[float], weather_leads_h: Sequence[float]) -> t
         Feature("outdoor_forecast", "C", -30.0, 50.0, f"dry bulb in {weather} h", k),
         Feature("wet_bulb", "C", -30.0, 40.0, "wet bulb of the step to come"),
         Feature("wet_bulb_forecast", "C", -30.0, 40.0, f"wet bulb in {weather} h", k),
+        Feature("workload", "share", 0.0, 1.0, "work that arrives in the step to come"),
     )
     return tuple(feature for feature in found if feature.size)
 
 
 def _inside(units: int) -> tuple[Feature, ...]:
-    """Work, hall and battery."""
+    """Queue, hall and battery."""
     bins = [f"{a:g}-{b:g}" for a, b in pairwise(AGE_EDGES_H)]
     ages = f"{', '.join(bins)}, over {AGE_EDGES_H[-1]:g} h"
     limit = f"`workload.queue_limit_h`, or {UNLIMITED_QUEUE_H:g} h of full work where there is none"
     setpoint = "of the CRAC unit, mean of several" if units == 1 else "of each CRAC unit"
     return (
-        Feature("workload", "share", 0.0, 1.0, "work that arrives in the step to come"),
         Feature("queue", "share", 0.0, 1.0, f"queued work over {limit}"),
         Feature("oldest_age", "h", 0.0, 24.0, "age of the oldest queued work"),
         Feature("mean_age", "h", 0.0, 24.0, "mean age of queued work"),
@@ -203,6 +198,7 @@ class Observer:
 
     Args:
         fleet: the data centers.
+        agents: whose observations are wanted.
         features: names of the features of each agent; None is ``DEFAULT_FEATURES``.
         ci_leads_h: leads of the CI forecast, rising multiples of the step.
         weather_leads_h: leads of the weather forecasts, likewise.
@@ -222,6 +218,7 @@ class Observer:
         self,
         fleet: Fleet,
         *,
+        agents: Sequence[str] = AGENTS,
         features: Mapping[str, Sequence[str]] | None = None,
         ci_leads_h: Sequence[float] = CI_LEADS_H,
         weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
@@ -234,37 +231,40 @@ class Observer:
             error=forecast_error,
         )
         per_dc = np.diff(fleet.unit_start)
-        self._units = int(per_dc[0]) if np.all(per_dc == per_dc[0]) else 1
+        self._alike = bool(np.all(per_dc == per_dc[0]))
+        self._units = int(per_dc[0]) if self._alike else 1
         self.state_features = catalogue(ci_leads_h, weather_leads_h, self._units)
         self.state_space = space(self.state_features)
         self.features = select(features, self.state_features)
         self.spaces = {agent: space(found) for agent, found in self.features.items()}
 
         inside = _inside(self._units)
-        self._at, width = _places(self.state_features)
-        self._columns = {
-            agent: np.concatenate([np.arange(width)[self._at[f.name]] for f in found])
-            for agent, found in self.features.items()
-        }
-        self._outside = _Outside(_outside(ci_leads_h, weather_leads_h), forecasts)
         self._row, self._inside_width = _places(inside)
-        self._width = width
+        self._timed = _Timed(_timed(ci_leads_h, weather_leads_h), forecasts, fleet.steps_per_hour)
+        at, _ = _places(self.state_features)
+        self._layouts = {
+            agent: Layout(
+                [i for f in self.features[agent] for i in range(at[f.name].start, at[f.name].stop)],
+                self._timed.width,
+            )
+            for agent in agents
+        }
+        self._rows: dict[str, F32] = {}
         sizes = [f.size for f in inside]
         low = np.repeat([f.low for f in inside], sizes)
         span = np.repeat([f.high - f.low for f in inside], sizes)
         self._scale = (1.0 / span).astype(np.float32)[:, None]
         self._shift = (-low / span).astype(np.float32)[:, None]
+        self._low = np.zeros((len(low), 1), dtype=np.float32)
+        self._high = self._low + 1.0
 
         per_hour = fleet.steps_per_hour
-        self._day = _circle(24 * per_hour)
-        self._year = _circle(365 * 24 * per_hour)
         limit_h = fleet.values("workload.queue_limit_h")
         limit_h = np.where(np.isnan(limit_h), UNLIMITED_QUEUE_H, limit_h)
         self._per_task = 1.0 / (limit_h * per_hour * TASKS_PER_STEP)
         self._edges_steps = np.asarray(AGE_EDGES_H) * per_hour
         self._design: _Design | None = None
-        self._seen: View | None = None
-        self._built: F32 = np.empty((0, 0), dtype=np.float32)
+        self._seen: _Seen | None = None
 
     def reset(self, view: View, keys: Sequence[int] | I64 = ()) -> None:
         """Start an episode.
@@ -276,7 +276,11 @@ class Observer:
         Raises:
             ConfigError: another number of keys than of data centers.
         """
-        self._outside.reset(view.drivers, keys)
+        layouts, timed = self._layouts, self._timed
+        if timed.reset(view.drivers, keys, sum(layout.width for layout in layouts.values())):
+            self._rows = {}
+            if timed.rows is not None:
+                self._rows = {a: layout.of(timed.rows.values) for a, layout in layouts.items()}
         self._design = _design(view.sizing, view.step_h)
         self._seen = None
 
@@ -286,8 +290,15 @@ class Observer:
         Raises:
             RuntimeStateError: before ``reset``.
         """
-        everything = self._everything(view)
-        return {a: everything.take(columns, axis=1) for a, columns in self._columns.items()}
+        seen = self._look(view)
+        return {
+            agent: layout.filled(
+                layout.of(seen.timed) if seen.entries is None else self._rows[agent],
+                seen.entries,
+                seen.inside,
+            )
+            for agent, layout in self._layouts.items()
+        }
 
     def state(self, view: View) -> F32:
         """All features side by side, (B, m).
@@ -295,67 +306,72 @@ class Observer:
         Raises:
             RuntimeStateError: before ``reset``.
         """
-        return self._everything(view).copy()
-
-    def _everything(self, view: View) -> F32:
-        """All features of a view, scaled; kept until the next view."""
-        if self._seen is not view:
-            self._built = self._build(view)
-            self._seen = view
-        return self._built
-
-    def _build(self, view: View) -> F32:
-        design = self._design
-        if design is None:
-            raise RuntimeStateError("the observer has not been reset; call reset() first")
-        index = view.drivers.start + view.state.step
-        out = np.empty((view.size, self._width), dtype=np.float32)
-        out[:, 0:2] = self._day.take(index % len(self._day), axis=0)
-        out[:, 2:4] = self._year.take(index % len(self._year), axis=0)
-        out[:, 4 : -self._inside_width] = self._outside.at(index, view.state.step)
-        _put(out, self._width - self._inside_width, self._inside(view, design))
+        seen, first = self._look(view), self._timed.width
+        out = np.empty((seen.inside.shape[1], first + self._inside_width), dtype=np.float32)
+        out[:, :first] = (
+            seen.timed if seen.entries is None else seen.timed.take(seen.entries, axis=0)
+        )
+        out[:, first:] = seen.inside.T
         return out
 
+    def _look(self, view: View) -> _Seen:
+        """What there is to observe; kept until the next view."""
+        seen, design, timed = self._seen, self._design, self._timed
+        if seen is not None and seen.view is view:
+            return seen
+        if design is None:
+            raise RuntimeStateError("the observer has not been reset; call reset() first")
+        index, rows = view.drivers.start + view.state.step, timed.rows
+        inside = self._inside(view, design)
+        if rows is None:
+            seen = _Seen(view, timed.look(index, view.state.step), None, inside)
+        else:
+            seen = _Seen(view, rows.values, rows.entries(index), inside)
+        self._seen = seen
+        return seen
+
     def _inside(self, view: View, design: _Design) -> F32:
-        """Scaled work, hall and battery, (n, B): one contiguous row each."""
-        state, at = view.state, self._row
-        out = np.empty((self._inside_width, view.size), dtype=np.float32)
+        """Scaled queue, hall and battery, (n, B): one contiguous row each."""
+        state, last, at = view.state, view.last, self._row
+        out = np.empty((self._inside_width, len(state.stored_kwh)), dtype=np.float32)
         waiting = state.queue[:, -1]
-        some = waiting > _NEGLIGIBLE_TASKS
-        shares = (
-            age_histogram(state.queue, self._edges_steps) / np.where(some, waiting, 1.0)[:, None]
-        )
-        out[at["age_histogram"]] = np.where(some, shares.T, 0.0)
-        out[at["workload"]] = view.now.demand
         out[at["queue"]] = waiting * self._per_task
-        out[at["soc"]] = state.stored_kwh * design.per_battery_kwh
-        same = len(state.setpoint_c) == view.size * self._units
-        out[at["setpoint"]] = (
-            state.setpoint_c.reshape(view.size, self._units).T if same else _setpoint_mean_c(view)
+        out[at["age_histogram"]] = age_histogram(state.queue, self._edges_steps).T / counted(
+            waiting
         )
-        for name, values in self._measured(view, design).items():
-            out[at[name]] = values
+        out[at["soc"]] = state.stored_kwh * design.per_battery_kwh
+        if self._alike:
+            out[at["setpoint"]] = state.setpoint_c.reshape(-1, self._units).T
+        else:
+            out[at["setpoint"]] = _setpoint_mean_c(view)
+        if last is None:
+            # A hall at rest at the setpoint.
+            for name in ("oldest_age", "mean_age", "it_energy", "hvac_energy", "dc_load"):
+                out[at[name]] = 0.0
+            out[at["room"]] = out[at["hottest_inlet"]] = _setpoint_mean_c(view)
+        else:
+            out[at["oldest_age"]] = last.oldest_age_h
+            out[at["mean_age"]] = last.mean_age_h
+            out[at["room"]] = last.return_c
+            out[at["hottest_inlet"]] = last.inlet_max_c
+            out[at["it_energy"]] = last.it_kwh * design.per_it_kwh
+            out[at["hvac_energy"]] = last.hvac_kwh * design.per_hvac_kwh
+            out[at["dc_load"]] = last.facility_kwh * design.per_facility_kwh
         out *= self._scale
         out += self._shift
-        return np.asarray(np.clip(out, 0.0, 1.0, out=out))
+        return cut(out, self._low, self._high)
 
-    def _measured(self, view: View, design: _Design) -> dict[str, F64]:
-        """What the last step left; before the first, a hall at rest at the setpoint."""
-        last = view.last
-        if last is None:
-            zero, setpoint_c = np.zeros(view.size), _setpoint_mean_c(view)
-            energies = dict.fromkeys(("it_energy", "hvac_energy", "dc_load"), zero)
-            ages = dict.fromkeys(("oldest_age", "mean_age"), zero)
-            return {**energies, **ages, "room": setpoint_c, "hottest_inlet": setpoint_c}
-        return {
-            "oldest_age": last.oldest_age_h,
-            "mean_age": last.mean_age_h,
-            "room": last.return_c,
-            "hottest_inlet": last.inlet_max_c,
-            "it_energy": last.it_kwh * design.per_it_kwh,
-            "hvac_energy": last.hvac_kwh * design.per_hvac_kwh,
-            "dc_load": last.facility_kwh * design.per_facility_kwh,
-        }
+
+class _Seen(NamedTuple):
+    """What there is to observe in a view."""
+
+    view: View
+    timed: F32
+    """What depends on time alone: rows that data centers read, or one for each, (B, n)."""
+    entries: I64 | None
+    """Row of each data center, (B,); None if each has its own."""
+    inside: F32
+    """The rest, (m, B)."""
 
 
 def heat_map(view: View) -> F32:
@@ -392,53 +408,68 @@ def heat_map_space(fleet: Fleet) -> Box:
     return Box(0.0, 1.0, (*_hall_shape(fleet), len(HEAT_MAP_FEATURES)), dtype=np.float32)
 
 
-class _Outside:
-    """Scaled carbon intensity and weather: a table of all steps if it is small, else step by step.
+class _Timed:
+    """Scaled features that depend on time alone: rows of all steps if they are few.
 
     Args:
-        features: what ``_outside`` gives.
+        features: what ``_timed`` gives.
         forecasts: of the same leads.
+        steps_per_hour: of the simulation.
+
+    Attributes:
+        width: number of entries.
+        rows: of all steps, once per site; None if they are read step by step.
     """
 
-    def __init__(self, features: Sequence[Feature], forecasts: Forecasts) -> None:
+    def __init__(
+        self, features: Sequence[Feature], forecasts: Forecasts, steps_per_hour: int
+    ) -> None:
         self._features = {f.name: f for f in features}
-        self._at, self._width = _places(features)
+        self._at, self.width = _places(features)
         self._forecasts = forecasts
+        self._day = _circle(24 * steps_per_hour)
+        self._year = _circle(365 * 24 * steps_per_hour)
+        self._demand: Table | None = None
+        self.rows: TimeRows | None = None
 
-    def reset(self, drivers: Drivers, keys: Sequence[int] | I64) -> None:
-        """Start an episode."""
-        if self._forecasts.reset(drivers, keys):
-            self._rows, self._offset, self._length = self._tabulated(drivers)
+    def reset(self, drivers: Drivers, keys: Sequence[int] | I64, kept: int) -> bool:
+        """Start an episode.
 
-    def at(self, index: I64, step: int) -> F32:
+        Args:
+            drivers: inputs of the fleet.
+            keys: seeds of the errors of forecasts.
+            kept: entries per row that are kept besides those of ``rows``.
+
+        Returns:
+            Whether ``rows`` are others than before.
+        """
+        demand = drivers.demand
+        new = self._forecasts.reset(drivers, keys) or demand is not self._demand
+        self._demand = demand
+        if new and self._forecasts.perfect:
+            self.rows = time_rows(
+                (drivers.ci_g_per_kwh, drivers.outdoor_c, drivers.wet_bulb_c, demand),
+                lambda index, dc: self._scaled(
+                    index,
+                    demand.values[demand.offset[dc] + index],
+                    self._forecasts.truth(index, dc),
+                ),
+                period=len(self._year),
+                row_bytes=4 * (self.width + kept),
+            )
+        return new
+
+    def look(self, index: I64, step: int) -> F32:
         """Entries of all data centers, (B, n)."""
-        if len(self._rows):
-            return np.asarray(self._rows.take(self._offset + index % self._length, axis=0))
-        return self._scaled(*self._forecasts.look(index, step))
+        assert self._demand is not None
+        return self._scaled(index, self._demand.at(index), self._forecasts.look(index, step))
 
-    def _tabulated(self, drivers: Drivers) -> tuple[F32, I64, I64]:
-        """Rows of every distinct site, end to end, and where each data center's begin and end."""
-        ci, others = drivers.ci_g_per_kwh, (drivers.outdoor_c, drivers.wet_bulb_c)
-        alike = all(
-            np.array_equal(ci.offset, t.offset) and np.array_equal(ci.length, t.length)
-            for t in others
-        )
-        series, which = ci.distinct()
-        first = np.unique(which, return_index=True)[1]
-        lengths = np.array([len(one) for one in series], dtype=np.int64)
-        offsets = np.cumsum(lengths) - lengths
-        small = int(lengths.sum()) * self._width * 4 <= TABLE_BYTES
-        if not (alike and small and self._forecasts.perfect):
-            return np.empty((0, self._width), dtype=np.float32), ci.offset, ci.length
-        parts = [
-            self._scaled(*self._forecasts.truth(np.arange(n), np.full(n, dc)))
-            for dc, n in zip(first, lengths, strict=True)
-        ]
-        return np.concatenate(parts), offsets[which], ci.length
-
-    def _scaled(self, ci: F32, outdoor: F32, wet_bulb: F32) -> F32:
-        """Entries (n, width) from the present and the leads, (1 + k, n) each."""
-        out = np.empty((ci.shape[1], self._width), dtype=np.float32)
+    def _scaled(self, index: I64, demand: F64, seen: tuple[F32, F32, F32]) -> F32:
+        """Entries (n, width) from demand, (n,), and present and leads seen, (1 + k, n) each."""
+        ci, outdoor, wet_bulb = seen
+        out = np.empty((len(index), self.width), dtype=np.float32)
+        out[:, self._at["time_of_day"]] = self._day.take(index % len(self._day), axis=0)
+        out[:, self._at["time_of_year"]] = self._year.take(index % len(self._year), axis=0)
         found = {
             "ci": ci[:1],
             "ci_forecast": ci[1:],
@@ -447,16 +478,29 @@ class _Outside:
             "outdoor_forecast": outdoor[1:],
             "wet_bulb": wet_bulb[:1],
             "wet_bulb_forecast": wet_bulb[1:],
+            "workload": demand[None].astype(np.float32),
         }
-        for name, feature in self._features.items():
-            _put(out, self._at[name].start, _scaled(found[name], feature))
+        for name, values in found.items():
+            if name in self._features:
+                out[:, self._at[name]] = _scaled(values, self._features[name]).T
         return out
 
 
-def _put(out: F32, first: int, rows: F32) -> None:
-    """Write rows (n, B) into columns of ``out`` (B, m): one by one, which suits the cache."""
-    for column, row in enumerate(rows, first):
-        out[:, column] = row
+def counted(waiting: F64) -> F64:
+    """What shares of the queued tasks are taken of, (B,).
+
+    Infinity, of which every share is 0, where rounding alone has left some: nothing is read off
+    those.
+    """
+    out = waiting.copy()
+    out[waiting <= NEGLIGIBLE_TASKS] = np.inf
+    return out
+
+
+def cut(values: F32, low: F32, high: F32) -> F32:
+    """Values within bounds, in place; bounds are arrays, which NumPy cuts at faster."""
+    np.minimum(values, high, out=values)
+    return np.maximum(values, low, out=values)
 
 
 def _scaled(values: F32, feature: Feature) -> F32:

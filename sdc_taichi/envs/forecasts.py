@@ -199,15 +199,12 @@ class _Series:
         self._values = np.concatenate(parts)
         self._offset = starts[which]
         self._length = table.length
-        self._leads = leads
+        self._leads = leads[:, None]
 
     def at(self, index: I64, dc: I64 | slice) -> F32:
         """Entry ``index`` of data center ``dc`` and those at its leads, (1 + k, n)."""
         first = self._offset[dc] + index % self._length[dc]
-        out = np.empty((len(self._leads), len(first)), dtype=np.float32)
-        for row, lead in zip(out, self._leads, strict=True):
-            row[:] = self._values.take(first + lead)
-        return out
+        return np.asarray(self._values.take(first + self._leads))
 
 
 class _Walks:

@@ -13,15 +13,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from gymnasium.spaces import Box
 
 from sdc_taichi.control.view import View
 from sdc_taichi.drivers import Table
-from sdc_taichi.envs.features import AGE_EDGES_H, Feature
+from sdc_taichi.envs.features import AGE_EDGES_H, AGENTS, NEGLIGIBLE_TASKS, Feature, counted, cut
 from sdc_taichi.envs.forecasts import F32
+from sdc_taichi.envs.timed import Layout, TimeRows, time_rows
 from sdc_taichi.errors import DataError, RuntimeStateError
 from sdc_taichi.fleet import Fleet, build_fleet
 from sdc_taichi.hall import Hall
@@ -41,9 +44,6 @@ SCALING_DAYS = 30
 """Days from the first step that scale the inputs, fewer where the year ends (``managers.py``)."""
 Z_SCORE_EPSILON = 1e-8
 """Added to the standard deviation below the z-score, in scaled units (``sustaindc_env.py``)."""
-
-_NEGLIGIBLE_TASKS = 1e-9
-"""Queues of divisible work keep rounding errors; nothing is read off those."""
 
 
 def _trend_of_smoothed(points: int) -> F64:
@@ -134,40 +134,63 @@ def _age_bins() -> tuple[Feature, ...]:
     return (*closed, _share(f"queue_{edges[-1]}h", f"1 with a task aged {edges[-1]} h or more"))
 
 
+_AGES = (
+    _age("oldest_age", "age of the oldest queued task"),
+    _age("mean_age", "mean age of the queued tasks"),
+    _share("queue", "queued tasks over the longest queue; 0 where it has no limit"),
+)
+_OUTDOOR_AHEAD = (
+    _slope(
+        "outdoor_slope_next",
+        f"trend of the {_DRY_BULB} over this and the next {TEMPERATURE_STEPS} steps",
+    ),
+    *_window("outdoor", _DRY_BULB, TEMPERATURE_STEPS),
+)
+_WORKLOAD_NEXT = _share("workload_next", "work that arrives one step later, as a share of capacity")
+_OUTDOOR_NEXT = _scaled("outdoor_next", f"{_DRY_BULB} one step later")
+_SOC = _share("soc", "state of charge of the battery")
+
 FEATURES: dict[str, tuple[Feature, ...]] = {
-    "agent_ls": (
-        *_SHARED,
-        _age("oldest_age", "age of the oldest queued task"),
-        _age("mean_age", "mean age of the queued tasks"),
-        _share("queue", "queued tasks over the longest queue; 0 where it has no limit"),
-        _WORKLOAD,
-        _OUTDOOR,
-        _slope(
-            "outdoor_slope_next",
-            f"trend of the {_DRY_BULB} over this and the next {TEMPERATURE_STEPS} steps",
-        ),
-        *_window("outdoor", _DRY_BULB, TEMPERATURE_STEPS),
-        *_age_bins(),
-    ),
-    "agent_dc": (
-        *_SHARED,
-        _WORKLOAD,
-        _share("workload_next", "work that arrives one step later, as a share of capacity"),
-        _OUTDOOR,
-        _scaled("outdoor_next", f"{_DRY_BULB} one step later"),
-    ),
-    "agent_bat": (
-        *_SHARED,
-        _WORKLOAD,
-        _OUTDOOR,
-        _share("soc", "state of charge of the battery"),
-    ),
+    "agent_ls": (*_SHARED, *_AGES, _WORKLOAD, _OUTDOOR, *_OUTDOOR_AHEAD, *_age_bins()),
+    "agent_dc": (*_SHARED, _WORKLOAD, _WORKLOAD_NEXT, _OUTDOOR, _OUTDOOR_NEXT),
+    "agent_bat": (*_SHARED, _WORKLOAD, _OUTDOOR, _SOC),
 }
 """The entries of each agent's vector in order; ranges are those of the values as observed.
 
 ``scaled`` is the input less its minimum over the 30 days from the first step, over the range of
 these days.
 """
+
+
+_TIMED = (*_SHARED, _WORKLOAD, _OUTDOOR, *_OUTDOOR_AHEAD, _WORKLOAD_NEXT, _OUTDOOR_NEXT)
+"""What depends on time and the first step alone, in the order of ``_Tables.read``."""
+_OTHERS = (*_AGES, *_age_bins(), _SOC)
+_AT = {feature.name: i for i, feature in enumerate((*_TIMED, *_OTHERS))}
+
+
+@dataclass(frozen=True, slots=True)
+class _Entries:
+    """Where entries of an input are that its range scales."""
+
+    levels: tuple[int, ...]
+    """0 at the minimum and 1 at the maximum."""
+    differences: tuple[int, ...]
+    """Differences of levels."""
+    std: int
+    z_score: int
+
+
+def _entries(name: str, levels: Sequence[str], slopes: Sequence[str]) -> _Entries:
+    return _Entries(
+        levels=tuple(_AT[n] for n in (name, f"{name}_mean_next", *levels)),
+        differences=tuple(_AT[n] for n in (*slopes, f"{name}_std_next")),
+        std=_AT[f"{name}_std_next"],
+        z_score=_AT[f"{name}_z_score"],
+    )
+
+
+_CI_ENTRIES = _entries("ci", (), ("ci_slope_next", "ci_slope_past"))
+_OUTDOOR_ENTRIES = _entries("outdoor", ("outdoor_next",), ("outdoor_slope_next",))
 
 
 # --- tables of what depends on time alone -------------------------------------------------------
@@ -184,9 +207,9 @@ class _Lookup:
     start: I64
     """Row of the first entry of each data center's series, (B,)."""
 
-    def at(self, index: I64) -> F64:
-        """Row ``index`` of every data center's series, repeating, (B, columns)."""
-        return self.rows[self.start + index % self.table.length]
+    def at(self, index: I64, dc: I64) -> F64:
+        """Rows ``index`` of the series of data centers ``dc``, repeating, (n, columns)."""
+        return self.rows.take(self.start[dc] + index % self.table.length[dc], axis=0)
 
     def serves(self, table: Table) -> bool:
         """Whether the rows are those of this table."""
@@ -289,67 +312,130 @@ def _time_rows(steps_per_day: int) -> F64:
     return np.stack([0.5 + 0.5 * np.cos(angle), 0.5 + 0.5 * np.sin(angle)], axis=1)
 
 
-@dataclass(frozen=True, slots=True)
 class _Tables:
-    """Rows of the inputs of a fleet, in their own units."""
+    """What depends on time alone, for the inputs of a fleet, in their own units."""
 
-    steps_per_hour: int
-    time: F64
-    ci: _Lookup
-    ci_extremes: _Lookup
-    outdoor: _Lookup
-    outdoor_extremes: _Lookup
+    def __init__(self, view: View) -> None:
+        drivers, per_hour = view.drivers, view.fleet.steps_per_hour
+        window = SCALING_DAYS * 24 * per_hour
+
+        def extremes(series: F64) -> F64:
+            return _extremes(series, window)
+
+        self._steps_per_hour = per_hour
+        self._time = _time_rows(24 * per_hour)
+        self._demand = drivers.demand
+        self._ci = _look_up(drivers.ci_g_per_kwh, _ci_rows)
+        self._outdoor = _look_up(drivers.outdoor_c, _temperature_rows)
+        self.ci_extremes = _look_up(drivers.ci_g_per_kwh, extremes)
+        self.outdoor_extremes = _look_up(drivers.outdoor_c, extremes)
+        self.rows = time_rows(
+            (drivers.ci_g_per_kwh, drivers.outdoor_c, drivers.demand),
+            self.read,
+            period=len(self._time),
+            row_bytes=8 * len(_TIMED),
+        )
+        """Of all steps; None if they are read step by step."""
 
     def serves(self, view: View) -> bool:
         """Whether the tables are those of the view's inputs."""
         return (
-            self.steps_per_hour == view.fleet.steps_per_hour
-            and self.ci.serves(view.drivers.ci_g_per_kwh)
-            and self.outdoor.serves(view.drivers.outdoor_c)
+            self._steps_per_hour == view.fleet.steps_per_hour
+            and self._demand is view.drivers.demand
+            and self._ci.serves(view.drivers.ci_g_per_kwh)
+            and self._outdoor.serves(view.drivers.outdoor_c)
+        )
+
+    def read(self, index: I64, dc: I64) -> F64:
+        """Entries of steps ``index`` of data centers ``dc``, each (n,), ordered as ``_TIMED``."""
+        demand = self._demand
+
+        def arriving(step: I64) -> F64:
+            return demand.values.take(demand.offset[dc] + step % demand.length[dc])
+
+        return np.column_stack(
+            [
+                self._time.take(index % len(self._time), axis=0),
+                self._ci.at(index, dc),
+                arriving(index),
+                self._outdoor.at(index, dc),
+                arriving(index + 1),
+                self._outdoor.at(index + 1, dc)[:, 0],
+            ]
         )
 
 
-def _tables(view: View) -> _Tables:
-    per_hour, drivers = view.fleet.steps_per_hour, view.drivers
-    window = SCALING_DAYS * 24 * per_hour
+class _Episode:
+    """What depends on time alone in an episode, scaled by what follows its first step.
 
-    def extremes(series: F64) -> F64:
-        return _extremes(series, window)
+    Args:
+        tables: of the inputs.
+        start: first step, counted from the start of the year, (B,).
 
-    return _Tables(
-        steps_per_hour=per_hour,
-        time=_time_rows(24 * per_hour),
-        ci=_look_up(drivers.ci_g_per_kwh, _ci_rows),
-        ci_extremes=_look_up(drivers.ci_g_per_kwh, extremes),
-        outdoor=_look_up(drivers.outdoor_c, _temperature_rows),
-        outdoor_extremes=_look_up(drivers.outdoor_c, extremes),
-    )
+    Attributes:
+        row: of each data center among those of ``at``, (B,).
+    """
 
+    def __init__(self, tables: _Tables, start: I64) -> None:
+        dcs = self.row = np.arange(len(start))
+        if tables.rows is not None:
+            # Data centers that read the same entries from the same step on see the same.
+            _, dcs, self.row = np.unique(
+                tables.rows.entries(start), return_index=True, return_inverse=True
+            )
+            rows = tables.rows
+            self._read = TimeRows(rows.values, rows.offset[dcs], rows.length[dcs]).at
+        else:
+            self._read = partial(tables.read, dc=dcs)
+        self._start = start[dcs]
+        shape = (len(dcs), len(_TIMED))
+        self._low, self._span = np.zeros(shape), np.ones(shape)
+        found = ((_CI_ENTRIES, tables.ci_extremes), (_OUTDOOR_ENTRIES, tables.outdoor_extremes))
+        for entries, extremes in found:
+            low, high = extremes.at(self._start, dcs).T
+            # Without a range all reads 0, as any part of infinity does.
+            span = np.where(high > low, high - low, np.inf)
+            self._low[:, entries.levels] = low[:, None]
+            self._span[:, [*entries.levels, *entries.differences]] = span[:, None]
+        ci, outdoor = _CI_ENTRIES, _OUTDOOR_ENTRIES
+        self._std = slice(ci.std, outdoor.std + 1, outdoor.std - ci.std)
+        self._z_score = slice(ci.z_score, outdoor.z_score + 1, outdoor.z_score - ci.z_score)
+        self._least_std = Z_SCORE_EPSILON * self._span[:, self._std]
 
-@dataclass(frozen=True, slots=True)
-class _Scale:
-    """Minimum and range of an input in each environment, (B,); without a range all reads 0."""
-
-    low: F64
-    span: F64
-
-    def of(self, value: F64) -> F64:
-        """Level, 0 at the minimum and 1 at the maximum."""
-        return self.of_difference(value - self.low)
-
-    def of_difference(self, value: F64) -> F64:
-        """Difference of levels, over the range."""
-        return np.divide(value, self.span, out=np.zeros_like(value), where=self.span > 0)
-
-    def window(self, columns: F64) -> list[F64]:
-        """Scaled mean, standard deviation, z-score, steps to peak and valley, (B,) each."""
-        mean, std, excess, peak, valley = columns.T
-        spread = std + Z_SCORE_EPSILON * self.span
-        z_score = np.divide(excess, spread, out=np.zeros_like(excess), where=self.span > 0)
-        return [self.of(mean), self.of_difference(std), z_score, peak, valley]
+    def at(self, step: int) -> F32:
+        """Rows of step ``step`` of the episode within their ranges."""
+        found = self._read(self._start + step)
+        np.add(found[:, self._std], self._least_std, out=self._span[:, self._z_score])
+        found -= self._low
+        found /= self._span
+        return cut(found.astype(np.float32), *_TIMED_RANGES)
 
 
 # --- observer -----------------------------------------------------------------------------------
+
+
+def _ranges(features: Sequence[Feature]) -> tuple[F32, F32]:
+    """Lowest and highest value of each entry, (n,) each."""
+    low, high = ([getattr(f, side) for f in features] for side in ("low", "high"))
+    return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)
+
+
+_TIMED_RANGES = _ranges(_TIMED)
+_LOW, _HIGH = (side[:, None] for side in _ranges(_OTHERS))
+_LAYOUTS = {
+    agent: Layout([_AT[f.name] for f in features], len(_TIMED))
+    for agent, features in FEATURES.items()
+}
+
+
+class _Seen(NamedTuple):
+    """What there is to observe in a view."""
+
+    view: View
+    timed: F32
+    """Rows of what depends on time alone."""
+    others: F32
+    """The rest, (m, B)."""
 
 
 class ReleasedObserver:
@@ -358,14 +444,20 @@ class ReleasedObserver:
     The inputs are taken from the drivers as they are; the released code cuts its dry bulb at 0 C
     and 45 C beforehand. An input that is constant over the 30 days from the first step has no range
     and reads 0. Entries outside ``FEATURES``' ranges are cut at them.
+
+    Args:
+        agents: whose vectors are wanted.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, agents: Sequence[str] = AGENTS) -> None:
+        self._agents = tuple(agents)
         self.features = FEATURES
-        self.spaces = {agent: _space(features) for agent, features in FEATURES.items()}
+        self.spaces = {agent: Box(*_ranges(features)) for agent, features in FEATURES.items()}
+        self.state_space = Box(*_ranges([f for agent in AGENTS for f in FEATURES[agent]]))
         self._tables: _Tables | None = None
-        self._ci = self._outdoor = _Scale(np.zeros(0), np.zeros(0))
-        self._queue_limit = np.zeros(0)
+        self._episode: _Episode | None = None
+        self._seen: _Seen | None = None
+        self._edges_steps = self._queue_limit = self._capacity_kwh = np.zeros(0)
 
     def reset(self, view: View, keys: Sequence[int] | I64 = ()) -> None:
         """Scale the inputs by what follows the first step.
@@ -375,15 +467,15 @@ class ReleasedObserver:
             keys: unused, the vectors have no randomness.
         """
         if self._tables is None or not self._tables.serves(view):
-            self._tables = _tables(view)
-        tables, start = self._tables, view.drivers.start
-        low, high = tables.ci_extremes.at(start).T
-        self._ci = _Scale(low, high - low)
-        low, high = tables.outdoor_extremes.at(start).T
-        self._outdoor = _Scale(low, high - low)
+            self._tables = _Tables(view)
+        self._episode = _Episode(self._tables, view.drivers.start)
+        self._seen = None
+        per_hour = view.fleet.steps_per_hour
+        self._edges_steps = np.array(AGE_EDGES_H) * per_hour
         limit_h = view.fleet.values("workload.queue_limit_h")
-        limit = limit_h * TASKS_PER_STEP * tables.steps_per_hour
-        self._queue_limit = np.where(np.isnan(limit_h), np.inf, limit)
+        self._queue_limit = np.where(np.isnan(limit_h), np.inf, limit_h * TASKS_PER_STEP * per_hour)
+        battery_kwh = view.sizing.battery_kwh
+        self._capacity_kwh = np.where(battery_kwh > 0, battery_kwh, 1.0)
 
     def observe(self, view: View) -> dict[str, F32]:
         """The vectors before a step.
@@ -397,76 +489,42 @@ class ReleasedObserver:
         Raises:
             RuntimeStateError: before ``reset``.
         """
-        if self._tables is None:
+        return self._vectors(view, self._agents)
+
+    def state(self, view: View) -> F32:
+        """The vectors of all agents side by side, (B, m).
+
+        Raises:
+            RuntimeStateError: before ``reset``.
+        """
+        return np.concatenate(list(self._vectors(view, AGENTS).values()), axis=1)
+
+    def _vectors(self, view: View, agents: Sequence[str]) -> dict[str, F32]:
+        episode, seen = self._episode, self._seen
+        if episode is None:
             raise RuntimeStateError("the observer has not been reset; call reset() first")
-        tables, drivers = self._tables, view.drivers
-        index = drivers.start + view.state.step
-        shared = self._shared(tables, index)
-        workload = [drivers.demand.at(index)]
-        temperature = self._temperature(tables, index)
-        outdoor, outdoor_next = temperature[:1], drivers.outdoor_c.at(index + 1)
-        battery_kwh = view.sizing.battery_kwh
-        soc = view.state.stored_kwh / np.where(battery_kwh > 0, battery_kwh, 1.0)
-        ages, shares = self._queue(view, tables.steps_per_hour)
-        entries = {
-            "agent_ls": [*shared, *ages, *workload, *temperature, *shares],
-            "agent_dc": [
-                *shared,
-                *workload,
-                drivers.demand.at(index + 1),
-                *outdoor,
-                self._outdoor.of(outdoor_next),
-            ],
-            "agent_bat": [*shared, *workload, *outdoor, soc],
+        if seen is None or seen.view is not view:
+            self._seen = seen = _Seen(view, episode.at(view.state.step), self._others(view))
+        return {
+            agent: (layout := _LAYOUTS[agent]).filled(
+                layout.of(seen.timed), episode.row, seen.others
+            )
+            for agent in agents
         }
-        return {agent: self._cut(agent, columns) for agent, columns in entries.items()}
 
-    def _cut(self, agent: str, columns: Sequence[F64]) -> F32:
-        """The entries of an agent within their ranges, (B, entries)."""
-        space, entries = self.spaces[agent], np.array(columns, dtype=np.float32)
-        np.clip(entries, space.low[:, None], space.high[:, None], out=entries)
-        return np.ascontiguousarray(entries.T)
-
-    def _shared(self, tables: _Tables, index: I64) -> list[F64]:
-        """Time and carbon intensity, which all agents see."""
-        columns, scale = tables.ci.at(index), self._ci
-        return [
-            *tables.time[index % len(tables.time)].T,
-            scale.of(columns[:, 0]),
-            scale.of_difference(columns[:, 1]),
-            scale.of_difference(columns[:, 2]),
-            *scale.window(columns[:, 3:]),
-        ]
-
-    def _temperature(self, tables: _Tables, index: I64) -> list[F64]:
-        """Dry bulb, its slope and its window."""
-        columns, scale = tables.outdoor.at(index), self._outdoor
-        return [
-            scale.of(columns[:, 0]),
-            scale.of_difference(columns[:, 1]),
-            *scale.window(columns[:, 2:]),
-        ]
-
-    def _queue(self, view: View, steps_per_hour: int) -> tuple[list[F64], list[F64]]:
-        """Ages in days and share of the longest queue; shares by age."""
-        queue = view.state.queue
-        waiting = queue[:, -1]
-        some = waiting > _NEGLIGIBLE_TASKS
-        tasks = age_histogram(queue, np.array(AGE_EDGES_H) * steps_per_hour)
-        shares = tasks / np.where(some, waiting, 1.0)[:, None]
-        *closed, _ = np.where(some[:, None], shares, 0.0).T
-        days = (
-            [np.zeros(view.size)] * 2
-            if view.last is None
-            else [view.last.oldest_age_h / 24.0, view.last.mean_age_h / 24.0]
-        )
-        old = (tasks[:, -1] > _NEGLIGIBLE_TASKS).astype(np.float64)
-        return [*days, waiting / self._queue_limit], [*closed, old]
-
-
-def _space(features: Sequence[Feature]) -> Box:
-    low, high = ([getattr(f, side) for f in features] for side in ("low", "high"))
-    return Box(np.array(low, dtype=np.float32), np.array(high, dtype=np.float32))
+    def _others(self, view: View) -> F32:
+        """Entries in the order of ``_OTHERS`` within their ranges, (n, B)."""
+        state, last = view.state, view.last
+        waiting = state.queue[:, -1]
+        tasks = age_histogram(state.queue, self._edges_steps).T
+        out = np.empty((len(_OTHERS), len(waiting)), dtype=np.float32)
+        out[0] = 0.0 if last is None else last.oldest_age_h / 24.0
+        out[1] = 0.0 if last is None else last.mean_age_h / 24.0
+        out[2] = waiting / self._queue_limit
+        out[3:7] = tasks[:-1] / counted(waiting)
+        out[7] = tasks[-1] > NEGLIGIBLE_TASKS
+        out[8] = state.stored_kwh / self._capacity_kwh
+        return cut(out, _LOW, _HIGH)
 
 
 # --- rewards ------------------------------------------------------------------------------------
@@ -548,7 +606,7 @@ class ReleasedRewards:
     def __init__(self) -> None:
         self._fleet: Fleet | None = None
         self._bounds_kw = (np.zeros(0), np.zeros(0))
-        self._ci = _Scale(np.zeros(0), np.zeros(0))
+        self._low_ci = self._ci_span = np.zeros(0)
 
     def reset(self, view: View) -> None:
         """Take the ranges of the fleet and its inputs.
@@ -569,7 +627,7 @@ class ReleasedRewards:
                 f"{low[flat[0]]:g} g/kWh throughout; valid is one that varies, as its range scales "
                 "the rewards"
             )
-        self._ci = _Scale(low, high - low)
+        self._low_ci, self._ci_span = low, high - low
 
     def rewards(self, result: StepResult, view: View) -> dict[str, F64]:
         """Rewards of a step.
@@ -588,7 +646,7 @@ class ReleasedRewards:
             raise RuntimeStateError("the rewards have not been reset; call reset() first")
         low_kw, high_kw = self._bounds_kw
         footprint = footprint_reward(
-            self._ci.of(result.ci_g_per_kwh),
+            (result.ci_g_per_kwh - self._low_ci) / self._ci_span,
             result.grid_kwh,
             low_kw * result.step_h,
             high_kw * result.step_h,

@@ -23,7 +23,7 @@ from sdc_taichi.envs.options import Tariff
 from sdc_taichi.envs.released import ReleasedRewards
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.plant.workload import TASKS_PER_STEP
-from sdc_taichi.types import F64, StepResult
+from sdc_taichi.types import F64, I64, StepResult
 
 Reward = Callable[[StepResult, View], Any]
 """Rewards of a step, (B,), the same for all agents or by learning agent in a dict; gets the step
@@ -60,10 +60,12 @@ class Context:
     (B,)."""
     bills: float
     """Length of the episode over that of a bill."""
-    hour: F64
-    """Local hour of the day at the start of the step, (B,)."""
-    last_hour: float
-    """Hour at the start of the last step of a day."""
+    step_of_day: int | I64
+    """Of this step, counted from 0 at midnight, of all or (B,)."""
+    price_per_kwh: F64
+    """By step of the day."""
+    rush: F64
+    """Weight of queued tasks, by step of the day."""
 
 
 def carbon(r: StepResult, c: Context) -> F64:
@@ -93,8 +95,7 @@ def it_energy(r: StepResult, c: Context) -> F64:
 
 def cost(r: StepResult, c: Context) -> F64:
     """Energy by the time-of-use tariff, over the price of the design energy at 0.1 per kWh."""
-    prices = np.array(c.tariff.price_per_kwh)
-    price = prices[np.floor(c.hour).astype(np.int64) % len(prices)]
+    price = c.price_per_kwh[c.step_of_day]
     return np.asarray(-r.grid_kwh * price / (PRICE_PER_KWH * c.design_kwh))
 
 
@@ -132,10 +133,7 @@ def hot_inlets(r: StepResult, c: Context) -> F64:
 
 def queue(r: StepResult, c: Context) -> F64:
     """Tasks queued in the last hour of the day over 10, weighed from 0 to 1 (paper, F.1, F.2)."""
-    span_h = c.last_hour - RUSH_START_H
-    late = c.hour >= RUSH_START_H
-    weight = np.where(late, (c.hour - RUSH_START_H) / span_h if span_h > 0 else 1.0, 0.0)
-    return -weight * r.queue_tasks / QUEUE_SCALE_TASKS
+    return np.asarray(-c.rush[c.step_of_day] * r.queue_tasks / QUEUE_SCALE_TASKS)
 
 
 def dropped(r: StepResult, c: Context) -> F64:
@@ -229,14 +227,25 @@ class Rewards:
             self._function = spec if callable(spec) else _find(spec)
         # What decides the rewards, to tell environments apart.
         self.name = _name(self._function) if self._function else self._scales or "sustaindc"
+        self._wanted = {name for scales in (self._scales or {}).values() for name in scales}
         # Highest power that is billed, before the last step and with it.
-        self._peaks_kw = np.zeros((2, 0))
+        self._peak_before_kw = self._peak_kw = np.zeros(0)
         self._design_kwh = np.zeros(0)
+        self._first: int | I64 = 0
+        """Step of the day of the first step."""
+        self._price_per_kwh = self._rush = np.zeros(0)
 
     def reset(self, view: View) -> None:
         """Start an episode."""
-        self._peaks_kw = np.tile(BILLED_SHARE * view.sizing.facility_w / 1e3, (2, 1))
+        self._peak_before_kw = self._peak_kw = BILLED_SHARE * view.sizing.facility_w / 1e3
         self._design_kwh = view.sizing.facility_w * view.step_h / 1e3
+        per_hour = view.fleet.steps_per_hour
+        step = np.arange(24 * per_hour)
+        prices = np.array(self._tariff.price_per_kwh)
+        self._price_per_kwh = prices[step // per_hour % len(prices)]
+        self._rush = _rush(step, view.step_h)
+        first = view.state.start % len(step)
+        self._first = int(first[0]) if np.all(first == first[0]) else first
         if self._released is not None:
             self._released.reset(view)
 
@@ -254,10 +263,8 @@ class Rewards:
         Raises:
             SdcError: a user's function returned something of another shape, or not finite.
         """
-        before_kw = self._peaks_kw[1]
-        self._peaks_kw = np.stack(
-            [before_kw, np.maximum(before_kw, result.grid_kwh / result.step_h)]
-        )
+        self._peak_before_kw = self._peak_kw
+        self._peak_kw = np.maximum(self._peak_kw, result.grid_kwh / result.step_h)
         if self._function is not None:
             found = self._function(result, view)
             if not isinstance(found, Mapping):
@@ -265,60 +272,72 @@ class Rewards:
                 return dict.fromkeys(self._agents, alike), alike
             return _together(_by_agent(found, self._agents, view.size))
         if self._released is not None:
-            own = self._released.rewards(result, view)
+            own = list(self._released.rewards(result, view).values())
         else:
-            own = self._weighed(result, view)
-        shared = share(own, self._own)
-        return _together({agent: shared[agent] for agent in self._agents})
+            own = self._weighed(result)
+        by_agent = dict(zip(AGENTS, share(own, self._own), strict=True))
+        return _together({agent: by_agent[agent] for agent in self._agents})
 
     def state(self) -> F64:
         """What an episode leaves behind for its rewards: its highest power, kW, (2, B)."""
-        return self._peaks_kw.copy()
+        return np.stack([self._peak_before_kw, self._peak_kw])
 
     def load(self, state: F64) -> None:
         """Go on from ``state``, of the shape that it has."""
-        self._peaks_kw = state.copy()
+        self._peak_before_kw, self._peak_kw = state.copy()
 
     def terms(self, result: StepResult, view: View) -> dict[str, F64]:
         """All terms of the last step by name, (B,) each, whatever the rewards are made of."""
-        context = self._context(result, view)
+        context = self._context(result)
         return {name: term(result, context) for name, term in TERMS.items()}
 
-    def _weighed(self, result: StepResult, view: View) -> dict[str, F64]:
+    def _weighed(self, result: StepResult) -> list[F64]:
+        """Weighed terms of each agent, (B,)."""
         assert self._scales is not None
-        context = self._context(result, view)
-        wanted = {name for scales in self._scales.values() for name in scales}
-        found = {name: TERMS[name](result, context) for name in wanted}
-        return {
-            agent: sum(
-                (scale * found[name] for name, scale in self._scales[agent].items()),
-                np.zeros(view.size),
+        context = self._context(result)
+        found = {name: TERMS[name](result, context) for name in self._wanted}
+        return [
+            _sum(
+                [
+                    found[name] if scale == 1.0 else scale * found[name]
+                    for name, scale in self._scales[agent].items()
+                ]
+                or [np.zeros(len(self._design_kwh))]
             )
             for agent in AGENTS
-        }
+        ]
 
-    def _context(self, result: StepResult, view: View) -> Context:
-        per_day = 24 * view.fleet.steps_per_hour
+    def _context(self, result: StepResult) -> Context:
         return Context(
             design_kwh=self._design_kwh,
             tariff=self._tariff,
-            peak_kw=self._peaks_kw[0],
+            peak_kw=self._peak_before_kw,
             bills=self._bills,
-            hour=np.asarray((view.state.start + result.step) % per_day * view.step_h, np.float64),
-            last_hour=24.0 - view.step_h,
+            step_of_day=(self._first + result.step) % len(self._rush),
+            price_per_kwh=self._price_per_kwh,
+            rush=self._rush,
         )
 
 
-def share(own: Mapping[str, F64], a: float) -> dict[str, F64]:
+def _rush(step: I64, step_h: float) -> F64:
+    """Weight of queued tasks by step of the day; 1 at the last."""
+    hour, span_h = step * step_h, 24.0 - step_h - RUSH_START_H
+    weight = (hour - RUSH_START_H) / span_h if span_h > 0 else np.ones(len(hour))
+    return np.where(hour >= RUSH_START_H, weight, 0.0)
+
+
+def share(own: Sequence[F64], a: float) -> F64:
     """Collaborative rewards: R_i = a r_i + (1 - a)/2 sum of the others' (paper, section 4.5).
 
     Args:
-        own: r_LS, r_DC and r_BAT by agent.
+        own: r_LS, r_DC and r_BAT, (B,) each.
         a: share of the own reward, 0..1.
+
+    Returns:
+        R_LS, R_DC and R_BAT, (3, B).
     """
-    total = sum(own.values(), np.zeros(1))
-    rest = (1.0 - a) / (len(own) - 1)
-    return {agent: a * r + rest * (total - r) for agent, r in own.items()}
+    each, rest = np.array(own), (1.0 - a) / (len(own) - 1)
+    return np.asarray(a * each + rest * (_sum(own) - each))
 
 
 def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
@@ -391,7 +410,15 @@ def _values(given: Any, whose: str, size: int) -> F64:
 
 
 def _together(by_agent: dict[str, F64]) -> tuple[dict[str, F64], F64]:
-    return by_agent, np.sum(list(by_agent.values()), axis=0)
+    return by_agent, _sum(list(by_agent.values()))
+
+
+def _sum(values: Sequence[F64]) -> F64:
+    """In order, whatever the size of the batch; ``np.sum`` adds up single entries in another."""
+    first, *others = values
+    for other in others:
+        first = first + other
+    return first
 
 
 def table_markdown() -> str:
