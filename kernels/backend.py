@@ -1,5 +1,6 @@
 """The one place that imports Taichi, so that a maintained fork could take its place."""
 
+import math
 import os
 from typing import Any
 
@@ -12,9 +13,22 @@ import taichi as ti
 __all__ = ["BoundKernel", "ti"]
 
 
-OPTIONS = {"cfg_optimization": False}
+OPTIONS = {"cfg_optimization": False, "real_matrix_scalarize": False}
 """How bound kernels are compiled, whoever started the runtime. Taichi's analysis of the control
-flow takes four fifths of the time and finds nothing that LLVM does not."""
+flow takes four fifths of the time and finds nothing that LLVM does not. Vectors stay vectors of the
+processor, which load and store as one and take one statement each; LLVM vectors know no casts, no
+negation and no functions but floor and sqrt: those go element by element."""
+ALIGNMENT = 64
+"""Bytes; compiled code takes arrays of vectors to start at a multiple of the vector's length."""
+
+
+def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
+    """Array of any content that may be handed over as one of vectors."""
+    of = np.dtype(dtype)
+    length = math.prod(shape) * of.itemsize
+    raw = np.empty(length + ALIGNMENT, np.uint8)
+    start = -raw.ctypes.data % ALIGNMENT
+    return raw[start : start + length].view(of).reshape(shape)
 
 
 class BoundKernel:
@@ -80,10 +94,12 @@ class _Launch:
                 alike = former is None or (former.dtype, former.ndim) == (value.dtype, value.ndim)
                 if not (alike and value.flags.c_contiguous):
                     raise TypeError(f"argument {i}: {value.dtype} array of other type or order")
-                shape = value.shape[: value.ndim - self._element_dims[i]]
-                context.set_arg_external_array_with_shape(
-                    (i,), value.ctypes.data, value.nbytes, shape, 0
-                )
+                shape, address = value.shape, value.ctypes.data
+                if self._element_dims[i]:
+                    if address % (shape[-1] * value.itemsize):
+                        raise TypeError(f"argument {i}: vectors that do not start at whole ones")
+                    shape = shape[:-1]
+                context.set_arg_external_array_with_shape((i,), address, value.nbytes, shape, 0)
             elif isinstance(value, float):
                 context.set_arg_float((i,), value)
             else:

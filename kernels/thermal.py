@@ -1,35 +1,43 @@
 """Server temperatures and power over all racks of all data centers.
 
-Servers of a rack that are alike form a group, which is computed once; ``expand`` copies its
-values to per-server layers. Halls may have any size: the racks of a data center are cut into blocks
-of LANES, filled up with racks without servers, and all arithmetic runs over the lanes of a block.
-Small local arrays hold a block, because only stores to them let the compiler vectorise a loop.
-Blocks whose groups are equal share a table. Every literal here is exact in binary, so that f64 runs
-lose nothing to the default f32 literals of the runtime.
+Servers of a rack that are alike form a group, which is computed once. Halls may have any size: the
+racks of a data center are cut into blocks of LANES, filled up with places without a rack, and all
+arithmetic is on vectors of the lanes of a block. Blocks whose groups are equal share a table. Every
+literal here is exact in binary, so that f64 runs lose nothing to the default f32 literals of the
+runtime; in arithmetic with vectors literals must be of their type, since vectors are not cast.
 
 Arrays are two-dimensional with one row per quantity; the row names below are the interface. Sums
-run serially within a chunk of blocks and over the chunks of a data center, so that a data center
-gives the same bits alone and in any batch.
+run serially over the blocks of a chunk, lane by lane, then over the lanes, and over the chunks of a
+data center, so that a data center gives the same bits alone and in any batch.
 """
 
 from functools import cache
 from math import factorial, log
+from types import SimpleNamespace
 from typing import Any, no_type_check
 
 from .backend import ti
 
-HALL_TEMPLATES = 6
+HALL_TEMPLATES = 3
 """Template arguments of ``hall_kernel``, which come first."""
 OUTLETS = ("server", "rack", "released")
+LOADS_OF = ("dc", "rack", "group")
+"""Whose utilisation is given."""
 
-LANES = 16
+LANES = 8
 """Racks that are computed at a time; the same for all, so that results never depend on it."""
+CHUNK_BLOCKS = 16
+"""Most blocks of a chunk; fewer racks are not worth a thread of their own."""
 
 BLOCK_INTS = ("racks", "groups", "table", "place")
 """Racks and groups per rack of each block, entry of its tables, and first place of its groups."""
+RACK_INTS = ("first_group", "first_server")
+"""Of each place; those without a rack have the groups of the last rack of their block."""
 RUN_INTS = ("first", "length", "offset")
 CHUNK_INTS = ("first_block", "dc", "first_need")
-DC_INTS = ("first_chunk", "first_unit", "first_share", "racks")
+DC_INTS = ("first_chunk", "first_unit", "first_share", "racks", "mix", "start")
+"""``mix``: first of the weights of halls that keep every weight, -1 of others; ``start``: entry of
+the table of where the sweeps start."""
 CONTROL = ("active", "exchange", "side", "sweep", "chunks")
 """Per data center: whether the next sweep computes it (1), it has ended (0) or come to no end (-1);
 whether the next sweep exchanges anew; which row of the exhaust its last exchange saw; sweeps since
@@ -43,14 +51,16 @@ RACK_ROWS = (
     "strength",
     "per_strength",
     "captured",
-    "servers",
+    "per_server",
     "start_approach_k",
     "start_rise_k",
     "mixed_approach_k",
     "mixed_rise_k",
 )
-"""The last four start the sweeps: of a rack and of the exhaust mix before it."""
+"""``per_server``: 1 over the servers, 0 in places without a rack. The last four start the sweeps:
+of a rack and of the exhaust mix before it."""
 GROUP_ROWS = ("count", "full_w", "idle_w", "inlet_offset_k", "load_deviation", "height")
+"""In places without a rack or group all are those of another one, but ``count`` is 0."""
 DC_ROWS = (
     "cpu_slope_per_k",
     "cpu_offset",
@@ -72,24 +82,27 @@ DC_ROWS = (
     "parcel_j_per_k",
 )
 DC_DOUBLES = (
+    "utilisation",
     "room_j",
     "room_j_per_k",
     "coil_limit_w",
     "crac_fan_w_per_m3s",
     "it_airflow_m3s",
+    "start_low_c",
+    "start_per_k",
     "start_scale",
     "start_warming",
     "kept",
     "start_c",
+    "stirring_m3s",
     "shift_k",
     "moved_k",
     "shifted_k",
-    "stirring_m3s",
 )
-"""Per data center in f64: heat held by the room and what the coil needs in transient runs; where
-the sweeps start and what they keep of a common deviation; common shift of the exhaust mixes since
-the last exchange, and by how much the outlets and the shift changed in the last sweep; CRAC
-air per rack."""
+"""Per data center in f64: heat held by the room and what the coil needs in transient runs; lowest
+supply air of the table of starts and its rows per K, where the sweeps start and what they keep of a
+common deviation; CRAC air per rack; common shift of the exhaust mixes since the last exchange, and
+by how much the outlets and the shift changed in the last sweep."""
 UNIT_ROWS = ("setpoint_c", "low", "high", "design_m3s", "running")
 UNIT_STATE = (
     "supply_c",
@@ -101,12 +114,20 @@ UNIT_STATE = (
     "following",
 )
 """What units give and cover; need for supply air and the servers' airflow over that at design."""
-RACK_STATE = ("mixed_c", "exhaust_c", "exhaust_odd_c", "captured_m3s", "exchanged_c")
+RACK_STATE = (
+    "mixed_c",
+    "exhaust_c",
+    "exhaust_odd_c",
+    "captured_m3s",
+    "exchanged_c",
+    "change_k",
+)
 """Exhaust mix before a rack, what it gives to the mixes times strength at the last exchange and
-since in turn, flow that the rack takes of the mix, and the mix at the last exchange."""
+since in turn, flow that the rack takes of the mix, the mix at the last exchange, and what the
+exhaust has changed by since."""
 RACK_OUT = ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "inlet_max_c", "outlet_c")
 GROUP_OUT = ("inlet_c", "outlet_c", "power_w")
-SUMS = (
+TERMS = (
     "cpu_w",
     "fan_w",
     "airflow_m3s",
@@ -118,12 +139,11 @@ SUMS = (
     "hot_k",
     "cold_k",
     "stored_w",
-    "inlet_max_c",
-    "hottest_group",
-    "least_change_k",
-    "most_change_k",
 )
-"""Per chunk; all but the last four add up."""
+"""Of each rack, what adds up over a chunk."""
+SUMS = (*TERMS, "inlet_max_c", "hottest_block", "hottest_lane", "hottest_zone", "least_k", "most_k")
+"""Per chunk: sums, hottest group, and the range of what the exhaust changed by since the last
+exchange, or of what the mixes change by in the next one."""
 DC_OUT = (
     "cpu_w",
     "fan_w",
@@ -163,8 +183,6 @@ PLAIN_EVERY = 4
 STILL_PER_S = 1.0 / 128.0
 """Fastest rate at which CRAC air stirs the air before racks that stand still, as without fans in
 the room; a power of two, exact in both precisions."""
-NO_RACK_C = 20.0
-"""Temperature of the places that hold no rack: any at which all curves are finite."""
 
 EXP_TERMS = {"f32": 8, "f64": 15}
 """Terms of the series of exp on half an octave of 2 to the last digit."""
@@ -178,6 +196,18 @@ def exp_constants(precision: str) -> list[float]:
 
 SLICE = 512
 """Iterations of a slice of chunks: a parallel loop of at most so many runs on one thread."""
+
+
+def _rows(names: tuple[str, ...]) -> SimpleNamespace:
+    return SimpleNamespace(**{name: row for row, name in enumerate(names)})
+
+
+BLOCK, RACK_INT, RUN = map(_rows, (BLOCK_INTS, RACK_INTS, RUN_INTS))
+CHUNK, DC, CTL = map(_rows, (CHUNK_INTS, DC_INTS, CONTROL))
+RACK, GROUP, VALUE, EXACT = map(_rows, (RACK_ROWS, GROUP_ROWS, DC_ROWS, DC_DOUBLES))
+UNIT, SUPPLY, STATE = map(_rows, (UNIT_ROWS, UNIT_STATE, RACK_STATE))
+OUT, PER_GROUP, SUM, TOTAL = map(_rows, (RACK_OUT, GROUP_OUT, SUMS, DC_OUT))
+"""Places of the rows by their names."""
 
 
 def _real(precision: str) -> Any:
@@ -199,9 +229,14 @@ def hall_kernel(precision: str) -> Any:
     weights; c is its share at the design point and f <= 1 how much of their need the CRAC units
     cover. Where a rack's fans move less air than there, the mix before it takes the place of what
     its exhaust lacks, so that no rack gives more heat than it has. Sweeps repeat until one more
-    would move no mix by more than ``tolerance_k``, at most ``sweeps`` times. The weights of a mix
-    sum to 1, so it moves by no more than the exhausts have moved since the last exchange; where all
-    of them moved alike, the mixes are shifted and nothing is exchanged.
+    would move no mix by more than ``tolerance_k``, at most ``sweeps`` times.
+
+    Halls that keep every weight exchange after each sweep, which tells exactly what the next would
+    move. Their next sweep starts from where the mixes go when the share ``kept`` of what they
+    change by comes back from the racks, to the third pass. In larger halls, whose exchange costs
+    more than a sweep: the weights of a mix sum to 1, so it moves by no more than the exhausts have
+    moved since the last exchange; where all of them moved alike, the mixes are shifted and nothing
+    is exchanged.
 
     Outlets: ``server`` is T + P/(rho*cp*V) per group, ``rack`` the same with the rack's sums, and
     ``released`` the rack fit T + 1.918*P^1.096/(0.526*rho*cp*V^0.824) - 14.01 of the released
@@ -215,11 +250,17 @@ def hall_kernel(precision: str) -> Any:
 
     A data center whose chunks are one task runs all its ``sweeps`` in one call, others one per
     call. ``tasks``: first chunk of each, and the end of the last.
+
+    ``write``: instead, compute all groups again as in the last sweep or substep, and store their
+    values to their servers, or with ``each_once`` to themselves; ``..._blocks`` are the layers
+    again as vectors.
     """
     real = _real(precision)
     whole = ti.i32 if precision == "f32" else ti.i64
     mantissa, bias = (23, 127) if precision == "f32" else (52, 1023)
-    terms = EXP_TERMS[precision]
+    exp_terms = EXP_TERMS[precision]
+    n_terms, n_rows, n_values = len(TERMS), len(GROUP_ROWS), len(GROUP_OUT)
+    reals_4d = ti.types.ndarray(dtype=ti.f64, ndim=4)
     reals_2d = ti.types.ndarray(dtype=real, ndim=2)
     reals_1d = ti.types.ndarray(dtype=real, ndim=1)
     blocks_2d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=2)
@@ -231,26 +272,8 @@ def hall_kernel(precision: str) -> Any:
 
     @ti.func
     @no_type_check
-    def lanes(value):
-        return ti.Vector([ti.cast(value, real)] * LANES)
-
-    @ti.func
-    @no_type_check
-    def sums_of_lanes():
-        return ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
-
-    @ti.func
-    @no_type_check
-    def total_of(values):
-        total = ti.cast(0.0, ti.f64)
-        for i in ti.static(range(LANES)):
-            total += values[i]
-        return total
-
-    @ti.func
-    @no_type_check
     def larger(a, b):
-        """As ``ti.max`` of numbers; one instruction, where that looks for NaN as well."""
+        """As ``ti.max`` of vectors; one instruction, where that looks for NaN as well."""
         return ti.select(a > b, a, b)
 
     @ti.func
@@ -261,27 +284,166 @@ def hall_kernel(precision: str) -> Any:
     @ti.func
     @no_type_check
     def exp_of_minus(x, constants: ti.template()):
-        """exp(-x) for 0 <= x, by its series; calls would keep loops from being vectorised."""
-        y = -smaller(x, real(80.0))
+        """exp(-x) of a vector, 0 <= x, by its series; calls would go lane by lane."""
+        y = smaller(x, real(80.0) + real(0.0) * x) * real(-1.0)
         octave = ti.floor(y * constants[5] + real(0.5))
         rest = y - octave * constants[6]
-        out = constants[7]
-        for i in ti.static(range(8, 7 + terms)):
+        out = rest * constants[7] + constants[8]
+        for i in range(9, 7 + exp_terms):
             out = out * rest + constants[i]
-        return out * ti.bit_cast((ti.cast(octave, whole) + bias) << mantissa, real)
+        for i in range(LANES):
+            out[i] *= ti.bit_cast((ti.cast(octave[i], whole) + bias) << mantissa, real)
+        return out
+
+    @ti.func
+    @no_type_check
+    def cubic(x):
+        """Weights of four points for the place x between the inner two (Catmull and Rom 1974).
+
+        Racks loaded alike take fewer sweeps from here than from a straight line.
+        """
+        return ti.Vector(
+            [
+                0.5 * x * (x * (2.0 - x) - 1.0),
+                0.5 * (x * x * (3.0 * x - 5.0) + 2.0),
+                0.5 * x * (x * (4.0 - 3.0 * x) + 1.0),
+                0.5 * x * x * (x - 1.0),
+            ]
+        )
+
+    @ti.func
+    @no_type_check
+    def expect(
+        n,
+        dc_ints: ti.template(),
+        doubles: ti.template(),
+        unit_state: ti.template(),
+        starts: ti.template(),
+    ):
+        """Outlets to start from: the racks of the design point, moved as a mean rack would be.
+
+        By the supply air of the first unit, which tells where the others are near enough to start.
+        """
+        supply_c = unit_state[SUPPLY.supply_c, dc_ints[DC.first_unit, n]]
+        table, rows, columns = dc_ints[DC.start, n], starts.shape[1], starts.shape[2]
+        y = (supply_c - doubles[EXACT.start_low_c, n]) * doubles[EXACT.start_per_k, n]
+        y = ti.min(ti.max(y, 0.0), ti.cast(rows - 1, ti.f64))
+        x = ti.min(ti.max(doubles[EXACT.utilisation, n], 0.0), 1.0) * ti.cast(columns - 1, ti.f64)
+        row = ti.min(ti.cast(y, ti.i32), rows - 2)
+        column = ti.min(ti.cast(x, ti.i32), columns - 2)
+        of_rows, of_columns = cubic(y - row), cubic(x - column)
+        scale = ti.cast(0.0, ti.f64)
+        warming = ti.cast(0.0, ti.f64)
+        kept = ti.cast(0.0, ti.f64)
+        for a in range(4):
+            i = ti.min(ti.max(row + a - 1, 0), rows - 1)
+            for b in range(4):
+                j = ti.min(ti.max(column + b - 1, 0), columns - 1)
+                w = of_rows[a] * of_columns[b]
+                scale += w * starts[table, i, j, 0]
+                warming += w * starts[table, i, j, 1]
+                kept += w * starts[table, i, j, 2]
+        doubles[EXACT.start_c, n] = supply_c
+        doubles[EXACT.start_scale, n] = scale
+        doubles[EXACT.start_warming, n] = warming
+        doubles[EXACT.kept, n] = kept
+
+    @ti.func
+    @no_type_check
+    def mixed_from(mix: ti.template(), at, rack_state: ti.template(), first, count):
+        """Mixes before the racks of a block, or what they change by, from all racks of the hall."""
+        out = mix[at] * rack_state[first]
+        for e in range(1, count):
+            out += mix[at + e] * rack_state[first + e]
+        return out
+
+    @ti.func
+    @no_type_check
+    def foresee(
+        n,
+        chunk,
+        chunk_ints: ti.template(),
+        dc_ints: ti.template(),
+        mix: ti.template(),
+        rack_state: ti.template(),
+        rack_store: ti.template(),
+        sums: ti.template(),
+    ):
+        """How far the next exchange would move the mixes, for the data centers of one chunk."""
+        least = ti.Vector([ti.cast(0.0, real)] * LANES)
+        most = least
+        block_0 = chunk_ints[CHUNK.first_block, chunk]
+        n_racks = dc_ints[DC.racks, n]
+        first = STATE.change_k * rack_store.shape[1] * LANES + block_0 * LANES
+        for block in range(block_0, chunk_ints[CHUNK.first_block, chunk + 1]):
+            at = dc_ints[DC.mix, n] + (block - block_0) * n_racks
+            moves = mixed_from(mix, at, rack_state, first, n_racks)
+            rack_store[STATE.exchanged_c, block] = moves
+            least = smaller(moves, least)
+            most = larger(moves, most)
+        least_k, most_k = real(0.0), real(0.0)
+        for i in range(LANES):
+            least_k = ti.min(least_k, least[i])
+            most_k = ti.max(most_k, most[i])
+        sums[SUM.least_k, chunk] = ti.cast(least_k, ti.f64)
+        sums[SUM.most_k, chunk] = ti.cast(most_k, ti.f64)
+
+    @ti.func
+    @no_type_check
+    def exchange(
+        n,
+        chunk,
+        chunk_ints: ti.template(),
+        dc_ints: ti.template(),
+        control: ti.template(),
+        doubles: ti.template(),
+        mix: ti.template(),
+        racks: ti.template(),
+        rack_state: ti.template(),
+        rack_store: ti.template(),
+    ):
+        """Exhausts that may be expected once the mixes have settled, and their mixes.
+
+        What ``foresee`` found comes back from the racks by the share ``kept``, now and then not.
+        """
+        kept = ti.min(doubles[EXACT.kept, n], EXPECTED_KEPT)
+        if control[CTL.sweep, n] % PLAIN_EVERY == 0:
+            kept = 0.0
+        back = ti.cast(kept, real)
+        block_0 = chunk_ints[CHUNK.first_block, chunk]
+        block_1 = chunk_ints[CHUNK.first_block, chunk + 1]
+        n_racks = dc_ints[DC.racks, n]
+        places = rack_store.shape[1] * LANES
+        for again in range(2):
+            row = STATE.change_k if again == 0 else STATE.exhaust_c
+            for block in range(block_0, block_1):
+                moves = rack_store[STATE.exchanged_c, block] * racks[RACK.strength, block]
+                was = rack_store[STATE.exhaust_c, block]
+                change = rack_store[STATE.exhaust_odd_c, block] - was + moves * back
+                rack_store[STATE.change_k, block] = change
+                if again == 1:
+                    rack_store[STATE.exhaust_c, block] = was + change
+            for block in range(block_0, block_1):
+                rack_store[STATE.exchanged_c, block] = mixed_from(
+                    mix,
+                    dc_ints[DC.mix, n] + (block - block_0) * n_racks,
+                    rack_state,
+                    row * places + block_0 * LANES,
+                    n_racks,
+                )
 
     @ti.func
     @no_type_check
     def close(
         recirculates: ti.template(),
         transient: ti.template(),
-        advance: ti.template(),
         n,
         sweeps,
         substep_s,
         weight,
         tolerance_k,
         chunk_ints: ti.template(),
+        rack_ints: ti.template(),
         dc_ints: ti.template(),
         control: ti.template(),
         dcs: ti.template(),
@@ -293,175 +455,638 @@ def hall_kernel(precision: str) -> Any:
         dc_out: ti.template(),
     ):
         """Sums of a data center, its CRAC units, and what its next sweep is."""
-        total = ti.Vector([ti.cast(0.0, ti.f64)] * 11)
-        hottest_dc = ti.cast(-1e30, ti.f64)
-        hottest_at = ti.cast(0.0, ti.f64)
-        least_k = ti.cast(1e30, ti.f64)
-        most_k = ti.cast(-1e30, ti.f64)
-        for chunk in range(dc_ints[0, n], dc_ints[0, n + 1]):
-            for r in ti.static(range(11)):
+        chunk_0, chunk_1 = dc_ints[DC.first_chunk, n], dc_ints[DC.first_chunk, n + 1]
+        total = ti.Vector([ti.cast(0.0, ti.f64)] * n_terms)
+        for r in range(n_terms):
+            for chunk in range(chunk_0, chunk_1):
                 total[r] += sums[r, chunk]
-            if sums[11, chunk] > hottest_dc:
-                hottest_dc = sums[11, chunk]
-                hottest_at = sums[12, chunk]
-            least_k = ti.min(least_k, sums[13, chunk])
-            most_k = ti.max(most_k, sums[14, chunk])
-        n_racks = ti.cast(dc_ints[3, n], ti.f64)
-        sweep = control[3, n]
-        air_dc = ti.cast(dcs[12, n], ti.f64)
+        n_racks = ti.cast(dc_ints[DC.racks, n], ti.f64)
+        sweep = control[CTL.sweep, n]
         crac_flow = ti.cast(0.0, ti.f64)
-        supply_flow = ti.cast(0.0, ti.f64)
-        passing = ti.cast(0.0, ti.f64)
+        supply_c = ti.cast(0.0, ti.f64)
         return_c = ti.cast(0.0, ti.f64)
         coil_load = ti.cast(0.0, ti.f64)
         coil_w = ti.cast(0.0, ti.f64)
-        if ti.static(recirculates and advance):
-            unit_first = dc_ints[1, n]
-            many_units = dc_ints[1, n + 1] - unit_first
-            following = total[2] / doubles[4, n]
+        adds = False
+        if ti.static(recirculates):
+            least_k = ti.cast(1e30, ti.f64)
+            most_k = ti.cast(-1e30, ti.f64)
+            for chunk in range(chunk_0, chunk_1):
+                least_k = ti.min(least_k, sums[SUM.least_k, chunk])
+                most_k = ti.max(most_k, sums[SUM.most_k, chunk])
+            unit_first, unit_end = dc_ints[DC.first_unit, n], dc_ints[DC.first_unit, n + 1]
+            following = total[SUM.airflow_m3s] / doubles[EXACT.it_airflow_m3s, n]
             uncovered = ti.cast(0.0, ti.f64)
-            for j in range(many_units):
-                at = unit_first + j
+            supply_flow = ti.cast(0.0, ti.f64)
+            passing = ti.cast(0.0, ti.f64)
+            for at in range(unit_first, unit_end):
                 need = ti.cast(0.0, ti.f64)
-                for chunk in range(dc_ints[0, n], dc_ints[0, n + 1]):
-                    need += needs[chunk_ints[2, chunk] + j]
-                low = ti.cast(units[1, at], ti.f64)
-                high = ti.cast(units[2, at], ti.f64)
-                fan_speed = ti.min(ti.max(following, low), high)
-                flow_unit = ti.cast(units[3, at], ti.f64) * fan_speed
-                offered = ti.cast(dcs[14, n], ti.f64) * flow_unit
-                crac_flow += flow_unit
-                supply_flow += flow_unit * unit_state[0, at]
-                used = unit_state[1, at]
-                passing += (flow_unit - used * need) * unit_state[0, at]
-                unit_state[2, at] = used
-                covers = ti.min(
-                    ti.cast(1.0, ti.f64), offered / ti.max(need, ti.cast(1e-30, ti.f64))
-                )
+                for chunk in range(chunk_0, chunk_1):
+                    need += needs[chunk_ints[CHUNK.first_need, chunk] + at - unit_first]
+                low = ti.cast(units[UNIT.low, at], ti.f64)
+                high = ti.cast(units[UNIT.high, at], ti.f64)
+                speed = ti.min(ti.max(following, low), high)
+                flow = ti.cast(units[UNIT.design_m3s, at], ti.f64) * speed
+                offered = ti.cast(dcs[VALUE.fresh_share, n], ti.f64) * flow
+                crac_flow += flow
+                supply_flow += flow * unit_state[SUPPLY.supply_c, at]
+                used = unit_state[SUPPLY.fresh_ratio, at]
+                passing += (flow - used * need) * unit_state[SUPPLY.supply_c, at]
+                unit_state[SUPPLY.fresh_ratio_used, at] = used
+                covers = ti.min(1.0, offered / ti.max(need, 1e-30))
                 uncovered = ti.max(uncovered, ti.abs(covers - used))
-                unit_state[1, at] = covers
-                unit_state[5, at] = need
-                unit_state[6, at] = following
-                moved = flow_unit
-                cubed = fan_speed * fan_speed * fan_speed * ti.cast(units[4, at], ti.f64)
+                unit_state[SUPPLY.fresh_ratio, at] = covers
+                unit_state[SUPPLY.need_m3s, at] = need
+                unit_state[SUPPLY.following, at] = following
+                cubed = speed * speed * speed * ti.cast(units[UNIT.running, at], ti.f64)
                 if ti.static(transient):
-                    moved *= weight
+                    flow *= weight
                     cubed *= weight
                     if sweep > 0:
-                        moved += unit_state[3, at]
-                        cubed += unit_state[4, at]
-                unit_state[3, at] = moved
-                unit_state[4, at] = cubed
-            return_c = (total[6] - total[7] + passing) / crac_flow
-            doubles[12, n] = crac_flow / n_racks
+                        flow += unit_state[SUPPLY.flow_m3s, at]
+                        cubed += unit_state[SUPPLY.cubed_speed, at]
+                unit_state[SUPPLY.flow_m3s, at] = flow
+                unit_state[SUPPLY.cubed_speed, at] = cubed
+            supply_c = supply_flow / crac_flow
+            return_c = (total[SUM.outlet_m3k_s] - total[SUM.captured_m3k_s] + passing) / crac_flow
+            doubles[EXACT.stirring_m3s, n] = crac_flow / n_racks
+            control[CTL.sweep, n] = sweep + 1
+            more = ti.cast(sweep + 1 < sweeps, ti.i32)
             # All mixes move by the middle of the outlets' changes, give or take half their spread.
             middle_k = 0.5 * (least_k + most_k)
             apart = 0.5 * (most_k - least_k) > ALIKE * tolerance_k
-            exchanged = control[1, n] != 0
+            exchanged = control[CTL.exchange, n] != 0
             if exchanged:
-                control[2, n] = 1 - control[2, n]
-            control[3, n] = sweep + 1
-            control[1, n] = ti.cast(apart, ti.i32)
-            more = ti.cast(sweep + 1 < sweeps, ti.i32)
+                control[CTL.side, n] = 1 - control[CTL.side, n]
             if ti.static(transient):
-                control[0, n] = more
+                control[CTL.exchange, n] = ti.cast(apart, ti.i32)
+                control[CTL.active, n] = more
+                adds = sweep > 0
                 running = ti.cast(0.0, ti.f64)
-                fans_w = ti.cast(0.0, ti.f64)
-                for j in range(many_units):
-                    at = unit_first + j
-                    low = ti.cast(units[1, at], ti.f64)
-                    high = ti.cast(units[2, at], ti.f64)
-                    fan_speed = ti.min(ti.max(following, low), high)
-                    design_m3s = ti.cast(units[3, at], ti.f64)
-                    is_on = ti.cast(units[4, at], ti.f64)
-                    taken = air_dc * design_m3s * fan_speed * (return_c - unit_state[0, at])
-                    drawn = is_on * fan_speed * fan_speed * fan_speed * doubles[3, n] * design_m3s
-                    fans_w += drawn
+                for at in range(unit_first, unit_end):
+                    low = ti.cast(units[UNIT.low, at], ti.f64)
+                    high = ti.cast(units[UNIT.high, at], ti.f64)
+                    speed = ti.min(ti.max(following, low), high)
+                    design_m3s = ti.cast(units[UNIT.design_m3s, at], ti.f64)
+                    is_on = ti.cast(units[UNIT.running, at], ti.f64)
+                    warmer_k = return_c - unit_state[SUPPLY.supply_c, at]
+                    air = ti.cast(dcs[VALUE.air_j_per_m3_k, n], ti.f64)
+                    taken = air * design_m3s * speed * warmer_k
+                    fan_w = doubles[EXACT.crac_fan_w_per_m3s, n] * design_m3s
+                    drawn = is_on * speed * speed * speed * fan_w
                     coil_load += taken + drawn
                     running += is_on * (taken + drawn)
                     if is_on > 0.0:
                         coil_w = ti.cast(1.0, ti.f64)
-                wanted = ti.max(running + coil_w * doubles[0, n] / substep_s, 0.0)
-                coil_w = ti.min(wanted, doubles[2, n])
-                doubles[0, n] += (coil_load - coil_w) * substep_s
-                for j in range(many_units):
-                    unit_state[0, unit_first + j] = (
-                        ti.cast(units[0, unit_first + j], ti.f64) + doubles[0, n] / doubles[1, n]
-                    )
-                doubles[9, n] = ti.select(apart, ti.cast(0.0, ti.f64), middle_k)
+                wanted = ti.max(running + coil_w * doubles[EXACT.room_j, n] / substep_s, 0.0)
+                coil_w = ti.min(wanted, doubles[EXACT.coil_limit_w, n])
+                doubles[EXACT.room_j, n] += (coil_load - coil_w) * substep_s
+                warmed_k = doubles[EXACT.room_j, n] / doubles[EXACT.room_j_per_k, n]
+                for at in range(unit_first, unit_end):
+                    setpoint_c = ti.cast(units[UNIT.setpoint_c, at], ti.f64)
+                    unit_state[SUPPLY.supply_c, at] = setpoint_c + warmed_k
+                doubles[EXACT.shift_k, n] = ti.select(apart, 0.0, middle_k)
             else:
-                shift_k = doubles[9, n]
+                shift_k = doubles[EXACT.shift_k, n]
                 left_k = ti.max(most_k - shift_k, shift_k - least_k)
                 # The mixes cool or warm by less than what they lie above supply air.
-                above_k = ti.abs(total[4] / n_racks - supply_flow / crac_flow)
+                above_k = ti.abs(total[SUM.outlet_c] / n_racks - supply_c)
                 left_k = ti.max(left_k, uncovered * above_k)
-                control[0, n] = 0
+                control[CTL.active, n] = 0
                 if not left_k <= tolerance_k:
-                    control[0, n] = 2 * more - 1
-                # Most of what is left is the same for all racks and shrinks by a factor, so a sweep
-                # can go all the way: as expected, or as the last sweep showed, now and then not.
-                moved_k = middle_k - doubles[10, n]
-                kept = ti.min(doubles[7, n], EXPECTED_KEPT)
-                moved_far = ti.abs(doubles[11, n]) > SEEN_FROM * tolerance_k
-                if sweep > 0 and not exchanged and moved_far:
-                    kept = ti.min(ti.max(moved_k / doubles[11, n], 0.0), SEEN_KEPT)
-                if sweep % PLAIN_EVERY == PLAIN_EVERY - 1:
-                    kept = ti.cast(0.0, ti.f64)
-                beyond_k = kept / (1.0 - kept) * (middle_k - shift_k)
-                next_k = middle_k + beyond_k
-                doubles[11, n] = next_k - shift_k
-                doubles[10, n] = middle_k
-                if apart:
-                    next_k = beyond_k
-                    doubles[10, n] = 0.0
-                doubles[9, n] = next_k
-        scale = ti.cast(1.0, ti.f64)
-        adds = False
-        if ti.static(transient):
-            scale = weight
-            adds = sweep > 0
-        supply_c = ti.cast(0.0, ti.f64)
-        if crac_flow > 0.0:
-            supply_c = supply_flow / crac_flow
-        now = ti.Vector(
-            [
-                total[0],
-                total[1],
-                total[2],
-                total[3] / n_racks,
-                total[4] / n_racks,
-                total[5] - total[2] * supply_c,
-                total[6] - total[2] * supply_c,
-                total[8],
-                total[9],
-                total[10],
-                crac_flow,
-                supply_c,
-                return_c,
-                coil_load,
-                coil_w,
-            ]
+                    control[CTL.active, n] = 2 * more - 1
+                if dc_ints[DC.mix, n] < 0:
+                    control[CTL.exchange, n] = ti.cast(apart, ti.i32)
+                    # Most of what is left is the same for all racks and shrinks by a factor, so a
+                    # sweep can go all the way: as expected, or as the last sweep showed, now and
+                    # then not.
+                    moved_k = middle_k - doubles[EXACT.moved_k, n]
+                    kept = ti.min(doubles[EXACT.kept, n], EXPECTED_KEPT)
+                    moved_far = ti.abs(doubles[EXACT.shifted_k, n]) > SEEN_FROM * tolerance_k
+                    if sweep > 0 and not exchanged and moved_far:
+                        kept = ti.max(moved_k / doubles[EXACT.shifted_k, n], 0.0)
+                        kept = ti.min(kept, SEEN_KEPT)
+                    if sweep % PLAIN_EVERY == PLAIN_EVERY - 1:
+                        kept = 0.0
+                    beyond_k = kept / (1.0 - kept) * (middle_k - shift_k)
+                    next_k = middle_k + beyond_k
+                    doubles[EXACT.shifted_k, n] = next_k - shift_k
+                    doubles[EXACT.moved_k, n] = middle_k
+                    if apart:
+                        next_k = beyond_k
+                        doubles[EXACT.moved_k, n] = 0.0
+                    doubles[EXACT.shift_k, n] = next_k
+        ends = True
+        if ti.static(recirculates and not transient):
+            ends = control[CTL.active, n] != 1
+        if ends:
+            inlet_m3k_s = total[SUM.inlet_m3k_s] - total[SUM.airflow_m3s] * supply_c
+            outlet_m3k_s = total[SUM.outlet_m3k_s] - total[SUM.airflow_m3s] * supply_c
+            now = ti.Vector(
+                [
+                    total[SUM.cpu_w],
+                    total[SUM.fan_w],
+                    total[SUM.airflow_m3s],
+                    total[SUM.inlet_c] / n_racks,
+                    total[SUM.outlet_c] / n_racks,
+                    inlet_m3k_s,
+                    outlet_m3k_s,
+                    total[SUM.hot_k],
+                    total[SUM.cold_k],
+                    total[SUM.stored_w],
+                    crac_flow,
+                    supply_c,
+                    return_c,
+                    coil_load,
+                    coil_w,
+                ]
+            )
+            for r in range(15):
+                value = now[r]
+                if ti.static(transient):
+                    value *= weight
+                    if adds:
+                        value += dc_out[r, n]
+                dc_out[r, n] = value
+            for chunk in range(chunk_0, chunk_1):
+                hottest = sums[SUM.inlet_max_c, chunk]
+                if (not adds and chunk == chunk_0) or hottest > dc_out[TOTAL.inlet_max_c, n]:
+                    block = ti.cast(sums[SUM.hottest_block, chunk], ti.i32)
+                    zone = ti.cast(sums[SUM.hottest_zone, chunk], ti.i32)
+                    lane = ti.cast(sums[SUM.hottest_lane, chunk], ti.i32)
+                    group = rack_ints[RACK_INT.first_group, block * LANES + lane] + zone
+                    dc_out[TOTAL.inlet_max_c, n] = hottest
+                    dc_out[TOTAL.hottest_group, n] = ti.cast(group, ti.f64)
+
+    @ti.func
+    @no_type_check
+    def spread(
+        each_once,
+        block,
+        n_groups,
+        table,
+        scratch,
+        block_ints: ti.template(),
+        counts: ti.template(),
+        rack_ints: ti.template(),
+        values: ti.template(),
+        layers: ti.template(),
+        layer_blocks: ti.template(),
+    ):
+        """Values of the groups of a block to their servers, whole vectors where a run has them."""
+        apart = values.shape[0] // n_values
+        first_row = RACK_INT.first_server
+        if each_once != 0:
+            first_row = RACK_INT.first_group
+        for lane in range(block_ints[BLOCK.racks, block]):
+            end = rack_ints[first_row, block * LANES + lane]
+            count_at = table * (n_rows * LANES) + lane
+            at = scratch * LANES + lane
+            for _ in range(n_groups):
+                count = ti.cast(counts[count_at], ti.i32)
+                inlet_c, outlet_c, power_w = values[at], values[at + apart], values[at + 2 * apart]
+                count_at += n_rows * LANES
+                at += LANES
+                start = end
+                if count == 1 or each_once != 0:
+                    if count > 0:
+                        layers[0][start] = inlet_c
+                        layers[1][start] = outlet_c
+                        layers[2][start] = power_w
+                        end = start + 1
+                    continue
+                end = start + count
+                first_block = (start + (LANES - 1)) // LANES
+                last_block = ti.max(end // LANES, first_block)
+                inlets = ti.Vector([inlet_c] * LANES)
+                outlets = ti.Vector([outlet_c] * LANES)
+                powers = ti.Vector([power_w] * LANES)
+                for b in range(first_block, last_block):
+                    layer_blocks[0][b] = inlets
+                    layer_blocks[1][b] = outlets
+                    layer_blocks[2][b] = powers
+                for s in range(start, ti.min(first_block * LANES, end)):
+                    layers[0][s] = inlet_c
+                    layers[1][s] = outlet_c
+                    layers[2][s] = power_w
+                for s in range(ti.max(last_block * LANES, start), end):
+                    layers[0][s] = inlet_c
+                    layers[1][s] = outlet_c
+                    layers[2][s] = power_w
+
+    @ti.func
+    @no_type_check
+    def evaluate(
+        recirculates: ti.template(),
+        transient: ti.template(),
+        write: ti.template(),
+        slice_at,
+        n,
+        chunk,
+        outlet_model,
+        loads_of,
+        each_once,
+        sweeps,
+        substep_s,
+        weight,
+        run_start: ti.template(),
+        run_ints: ti.template(),
+        block_ints: ti.template(),
+        rack_ints: ti.template(),
+        chunk_ints: ti.template(),
+        dc_ints: ti.template(),
+        control: ti.template(),
+        weights: ti.template(),
+        mix: ti.template(),
+        shares: ti.template(),
+        racks: ti.template(),
+        tables: ti.template(),
+        group_load: ti.template(),
+        dcs: ti.template(),
+        doubles: ti.template(),
+        unit_state: ti.template(),
+        rack_state: ti.template(),
+        rack_store: ti.template(),
+        server_c: ti.template(),
+        servers_before: ti.template(),
+        servers_after: ti.template(),
+        constants: ti.template(),
+        terms: ti.template(),
+        rack_out: ti.template(),
+        needs: ti.template(),
+        sums: ti.template(),
+        counts: ti.template(),
+        group_values: ti.template(),
+        values: ti.template(),
+        layers: ti.template(),
+        layer_blocks: ti.template(),
+    ):
+        """One sweep of a chunk, or the values of its servers."""
+        zeros = ti.Vector([ti.cast(0.0, real)] * LANES)
+        ones = zeros + real(1.0)
+        unit_0 = dc_ints[DC.first_unit, n]
+        n_units = dc_ints[DC.first_unit, n + 1] - unit_0
+        need_0 = chunk_ints[CHUNK.first_need, chunk]
+        block_0 = chunk_ints[CHUNK.first_block, chunk]
+        block_1 = chunk_ints[CHUNK.first_block, chunk + 1]
+        dc_block_0 = chunk_ints[CHUNK.first_block, dc_ints[DC.first_chunk, n]]
+        places = rack_store.shape[1] * LANES
+        utilisation = zeros + ti.cast(doubles[EXACT.utilisation, n], real)
+        cpu_slope = dcs[VALUE.cpu_slope_per_k, n]
+        cpu_offset = dcs[VALUE.cpu_offset, n]
+        cpu_shift = dcs[VALUE.cpu_shift, n]
+        fan_slope = dcs[VALUE.fan_slope_per_k, n]
+        fan_offset = dcs[VALUE.fan_offset, n]
+        fan_shift = dcs[VALUE.fan_shift, n]
+        fan_low = zeros + dcs[VALUE.fan_low, n]
+        fan_high = zeros + dcs[VALUE.fan_high, n]
+        per_reference = real(1.0) / dcs[VALUE.fan_reference_ratio, n]
+        exponent = dcs[VALUE.fan_exponent, n]
+        fan_w = dcs[VALUE.fan_reference_w, n]
+        full_m3s = dcs[VALUE.fan_full_m3s, n]
+        air = dcs[VALUE.air_j_per_m3_k, n]
+        per_air = real(1.0) / air
+        limit_c = zeros + dcs[VALUE.curve_limit_c, n]
+        server_j = dcs[VALUE.server_j_per_k, n]
+        taken_up = dcs[VALUE.effectiveness, n] * air
+        parcel_j = dcs[VALUE.parcel_j_per_k, n]
+        step_s = ti.cast(substep_s, real)
+        per_step_s = real(1.0) / step_s
+        # CRAC air of the room stirs the air before racks that stand still.
+        still_per_s = ti.min(
+            real(STILL_PER_S), air * ti.cast(doubles[EXACT.stirring_m3s, n], real) / parcel_j
         )
-        for r in ti.static(range(15)):
-            value = scale * now[r]
-            if adds:
-                value += dc_out[r, n]
-            dc_out[r, n] = value
-        if not adds or hottest_dc > dc_out[15, n]:
-            dc_out[15, n] = hottest_dc
-            dc_out[16, n] = hottest_at
+        begins = control[CTL.sweep, n] == 0
+        ends = control[CTL.sweep, n] == sweeps - 1
+        # What the last sweep left is read anew after it.
+        shift = ti.cast(doubles[EXACT.shift_k, n], real)
+        side = control[CTL.side, n]
+        anew = control[CTL.exchange, n] != 0
+        if anew:
+            side = 1 - side
+        least = zeros + real(1e30)
+        most = zeros - real(1e30)
+        chunk_hottest = zeros - real(1e30)
+        chunk_zone = zeros
+        chunk_block = ti.Vector([0] * LANES)
+        for j in range(n_units):
+            needs[need_0 + j] = 0.0
+        for block in range(block_0, block_1):
+            n_groups = block_ints[BLOCK.groups, block]
+            table = block_ints[BLOCK.table, block]
+            place = block_ints[BLOCK.place, block]
+            share_0 = dc_ints[DC.first_share, n] + n_units * (block - dc_block_0)
+            per_server = racks[RACK.per_server, block]
+            u = utilisation
+            if loads_of == 1:
+                u = racks[RACK.load, block]
+            powered = racks[RACK.powered, block]
+            air_left = racks[RACK.airflow, block]
+            breath = air_left * powered
+            uneven = u * (real(1.0) - u)
+            cover = zeros
+            mixed = zeros
+            fresh = zeros
+            captured_share = zeros
+            parcel_w = zeros
+            if ti.static(recirculates):
+                captured_share = racks[RACK.captured, block]
+                for j in range(n_units):
+                    used = SUPPLY.fresh_ratio_used if ti.static(write) else SUPPLY.fresh_ratio
+                    ratio = ti.cast(unit_state[used, unit_0 + j], real)
+                    part = shares[share_0 + j] * ratio
+                    cover += part
+                    fresh += part * ti.cast(unit_state[SUPPLY.supply_c, unit_0 + j], real)
+                if ti.static(write):
+                    mixed = rack_store[STATE.mixed_c, block]
+                else:
+                    target = zeros
+                    if anew:
+                        if dc_ints[DC.mix, n] >= 0:
+                            n_racks = dc_ints[DC.racks, n]
+                            target = mixed_from(
+                                mix,
+                                dc_ints[DC.mix, n] + (block - dc_block_0) * n_racks,
+                                rack_state,
+                                (1 + side) * places + dc_block_0 * LANES,
+                                n_racks,
+                            )
+                        else:
+                            for i in range(LANES):
+                                t = real(0.0)
+                                at = block * LANES + i
+                                for run in range(run_start[at], run_start[at + 1]):
+                                    x = (1 + side) * places + run_ints[RUN.first, run]
+                                    w = run_ints[RUN.offset, run]
+                                    s = real(0.0)
+                                    for e in range(run_ints[RUN.length, run]):
+                                        s += weights[w + e] * rack_state[x + e]
+                                    t += s
+                                target[i] = t
+                            target *= racks[RACK.norm, block]
+                        rack_store[STATE.exchanged_c, block] = target
+                    elif begins:
+                        start_c = ti.cast(doubles[EXACT.start_c, n], real)
+                        scale = ti.cast(doubles[EXACT.start_scale, n], real)
+                        warming = ti.cast(doubles[EXACT.start_warming, n], real)
+                        approach = racks[RACK.start_approach_k, block]
+                        rise = racks[RACK.start_rise_k, block]
+                        gives = approach * scale + rise * warming + start_c
+                        rack_store[1 + side, block] = gives * racks[RACK.strength, block]
+                        approach = racks[RACK.mixed_approach_k, block]
+                        rise = racks[RACK.mixed_rise_k, block]
+                        target = approach * scale + rise * warming + start_c
+                        rack_store[STATE.exchanged_c, block] = target
+                    else:
+                        target = rack_store[STATE.exchanged_c, block]
+                    target += shift
+                    if ti.static(transient):
+                        # The parcel of room air before the rack: enters at the mix, leaves at its
+                        # own temperature.
+                        was = rack_store[STATE.mixed_c, block]
+                        rate = rack_store[STATE.captured_m3s, block] * (air / parcel_j)
+                        x = larger(rate, zeros + still_per_s) * step_s
+                        gone = real(1.0) - exp_of_minus(x, constants)
+                        now_c = was + (target - was) * gone
+                        is_rack = ti.select(per_server > real(0.0), ones, zeros)
+                        parcel_w = is_rack * (now_c - was) * (parcel_j * per_step_s)
+                        mixed = target + (was - target) * gone / x
+                        rack_store[STATE.mixed_c, block] = now_c
+                    else:
+                        mixed = target
+                        rack_store[STATE.mixed_c, block] = target
+                fresh = fresh - cover * mixed
+            else:
+                air_c = ti.cast(unit_state[SUPPLY.supply_c, unit_0], real)
+                mixed = racks[RACK.approach_k, block] + air_c
+            cpu = zeros
+            fan = zeros
+            flow = zeros
+            inlet = zeros
+            inlet_flow = zeros
+            fresh_flow = zeros
+            heat = zeros
+            hot = zeros
+            cold = zeros
+            stored = zeros
+            hottest = zeros - real(1e30)
+            zone = zeros
+            if ti.static(transient and not write):
+                if begins:
+                    for z in range(n_groups):
+                        before = zeros
+                        for i in range(LANES):
+                            group = rack_ints[RACK_INT.first_group, block * LANES + i] + z
+                            before[i] = servers_before[ti.min(group, servers_before.shape[0] - 1)]
+                        server_c[place + z] = before
+            for z in range(n_groups):
+                count = tables[table + z, GROUP.count]
+                t = mixed
+                own = zeros
+                if ti.static(recirculates):
+                    own = real(1.0) - captured_share * tables[table + z, GROUP.height]
+                    t = mixed + own * fresh
+                else:
+                    t = mixed + tables[table + z, GROUP.inlet_offset_k]
+                load = u + tables[table + z, GROUP.load_deviation] * uneven
+                if loads_of == 2:
+                    for i in range(LANES):
+                        group = rack_ints[RACK_INT.first_group, block * LANES + i] + z
+                        load[i] = group_load[ti.min(group, group_load.shape[0] - 1)]
+                on_curve = smaller(t, limit_c)
+                ratio = on_curve * cpu_slope + (load * cpu_shift + cpu_offset)
+                idle = tables[table + z, GROUP.idle_w]
+                cpu_1 = powered * larger(idle, tables[table + z, GROUP.full_w] * ratio)
+                y = on_curve * fan_slope + (load * fan_shift + fan_offset)
+                y = smaller(larger(y, fan_low), fan_high)
+                flow_1 = y * breath * full_m3s
+                speed = y * per_reference
+                fan_1 = speed
+                # A branch on data, not one kernel per exponent: compiled apart, they would round
+                # apart, and a data center must not depend on its batch.
+                if exponent == real(3.0):
+                    fan_1 = speed * speed * speed
+                elif exponent != real(1.0):
+                    for i in range(LANES):
+                        fan_1[i] = ti.pow(speed[i], exponent)
+                fan_1 *= breath * fan_w
+                to_air = cpu_1
+                if ti.static(transient):
+                    before = server_c[place + z]
+                    exchange = flow_1 * taken_up
+                    if ti.static(write):
+                        to_air = exchange * (before - t)
+                    else:
+                        steady = t + cpu_1 / larger(exchange, zeros + real(1e-30))
+                        left = exp_of_minus(exchange * (step_s / server_j), constants)
+                        after = steady + (before - steady) * left
+                        after = ti.select(exchange > real(0.0), after, before)
+                        warmed_w = (after - before) * (server_j * per_step_s)
+                        to_air = ti.select(exchange > real(0.0), cpu_1 - warmed_w, zeros)
+                        stored += count * warmed_w
+                        server_c[place + z] = after
+                        if ends:
+                            for i in range(LANES):
+                                if count[i] > real(0.0):
+                                    group = rack_ints[RACK_INT.first_group, block * LANES + i] + z
+                                    servers_after[group] = after[i]
+                warm = to_air + fan_1
+                if ti.static(write):
+                    rise = warm / larger(flow_1 * air, zeros + real(1e-30))
+                    group_values[PER_GROUP.inlet_c, slice_at + z] = t
+                    group_values[PER_GROUP.outlet_c, slice_at + z] = t + rise
+                    group_values[PER_GROUP.power_w, slice_at + z] = cpu_1 + fan_1
+                counted = count * flow_1
+                cpu += count * cpu_1
+                fan += count * fan_1
+                flow += counted
+                inlet += count * t
+                inlet_flow += counted * t
+                heat += count * warm
+                if ti.static(not write):
+                    fresh_flow += counted * own
+                    hot += count * larger(t - real(RECOMMENDED_HIGH_C), zeros)
+                    cold += count * larger(real(RECOMMENDED_LOW_C) - t, zeros)
+                    here = ti.select(count > real(0.0), t, zeros - real(1e30))
+                    zone = ti.select(here > hottest, zeros + ti.cast(z, real), zone)
+                    hottest = larger(here, hottest)
+            mean = inlet * per_server
+            per_flow = real(1.0) / larger(flow, zeros + real(1e-30))
+            outlet = (inlet_flow + heat * per_air) * per_flow
+            if outlet_model != 0:
+                if outlet_model == 1:
+                    outlet = mean + (cpu + fan) * per_flow * per_air
+                else:
+                    for i in range(LANES):
+                        outlet[i] = (
+                            mean[i]
+                            + constants[0]
+                            * ti.pow(cpu[i] + fan[i], constants[1])
+                            / (
+                                constants[2]
+                                * air
+                                * ti.pow(ti.max(flow[i], real(1e-30)), constants[3])
+                            )
+                            + constants[4]
+                        )
+            outlet = ti.select(flow > real(0.0), outlet, mean)
+            if ti.static(write):
+                if outlet_model != 0:
+                    for z in range(n_groups):
+                        group_values[PER_GROUP.outlet_c, slice_at + z] = outlet
+                spread(
+                    each_once,
+                    block,
+                    n_groups,
+                    table,
+                    slice_at,
+                    block_ints,
+                    counts,
+                    rack_ints,
+                    values,
+                    layers,
+                    layer_blocks,
+                )
+            else:
+                b = block - block_0
+                terms[slice_at + SUM.captured_m3k_s, b] = zeros
+                if ti.static(recirculates):
+                    mean = ti.select(flow > real(0.0), inlet_flow * per_flow, mean)
+                    captured = flow - cover * fresh_flow
+                    # Of air that failing fans do not move, the mix is left.
+                    seen = mixed + air_left * (outlet - mixed)
+                    seen *= racks[RACK.strength, block]
+                    change = seen - rack_store[1 + side, block]
+                    rack_store[2 - side, block] = seen
+                    rack_store[STATE.captured_m3s, block] = captured
+                    rack_store[STATE.change_k, block] = change
+                    change *= racks[RACK.per_strength, block]
+                    least = smaller(
+                        ti.select(per_server > real(0.0), change, zeros + real(1e30)), least
+                    )
+                    most = larger(
+                        ti.select(per_server > real(0.0), change, zeros - real(1e30)), most
+                    )
+                    terms[slice_at + SUM.captured_m3k_s, b] = captured * mixed + parcel_w * per_air
+                    for j in range(n_units):
+                        need = shares[share_0 + j] * fresh_flow
+                        needed = real(0.0)
+                        for i in range(LANES):
+                            needed += need[i]
+                        needs[need_0 + j] += ti.cast(needed, ti.f64)
+                terms[slice_at + SUM.cpu_w, b] = cpu
+                terms[slice_at + SUM.fan_w, b] = fan
+                terms[slice_at + SUM.airflow_m3s, b] = flow
+                terms[slice_at + SUM.inlet_c, b] = mean
+                terms[slice_at + SUM.outlet_c, b] = outlet
+                terms[slice_at + SUM.inlet_m3k_s, b] = inlet_flow
+                terms[slice_at + SUM.outlet_m3k_s, b] = inlet_flow + heat * per_air
+                terms[slice_at + SUM.hot_k, b] = hot
+                terms[slice_at + SUM.cold_k, b] = cold
+                terms[slice_at + SUM.stored_w, b] = stored + parcel_w
+                chunk_block = ti.select(hottest > chunk_hottest, block, chunk_block)
+                chunk_zone = ti.select(hottest > chunk_hottest, zone, chunk_zone)
+                chunk_hottest = larger(hottest, chunk_hottest)
+                if ti.static(transient):
+                    share = ti.cast(weight, real)
+                    cpu *= share
+                    fan *= share
+                    flow *= share
+                    mean *= share
+                    outlet *= share
+                    if not begins:
+                        cpu += rack_out[OUT.cpu_w, block]
+                        fan += rack_out[OUT.fan_w, block]
+                        flow += rack_out[OUT.airflow_m3s, block]
+                        mean += rack_out[OUT.inlet_c, block]
+                        hottest = larger(hottest, rack_out[OUT.inlet_max_c, block])
+                        outlet += rack_out[OUT.outlet_c, block]
+                rack_out[OUT.cpu_w, block] = cpu
+                rack_out[OUT.fan_w, block] = fan
+                rack_out[OUT.airflow_m3s, block] = flow
+                rack_out[OUT.inlet_c, block] = mean
+                rack_out[OUT.inlet_max_c, block] = hottest
+                rack_out[OUT.outlet_c, block] = outlet
+        if ti.static(not write):
+            for r in range(n_terms):
+                lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
+                for b in range(block_1 - block_0):
+                    term = terms[slice_at + r, b]
+                    for i in range(LANES):
+                        lanes[i] += ti.cast(term[i], ti.f64)
+                total = ti.cast(0.0, ti.f64)
+                for i in range(LANES):
+                    total += lanes[i]
+                sums[r, chunk] = total
+            # The first of the racks with the hottest inlet.
+            hottest = real(-1e30)
+            of_block, of_lane, of_zone = 0, 0, real(0.0)
+            least_k, most_k = real(1e30), real(-1e30)
+            for i in range(LANES):
+                least_k = ti.min(least_k, least[i])
+                most_k = ti.max(most_k, most[i])
+                first = chunk_hottest[i] == hottest and chunk_block[i] < of_block
+                if chunk_hottest[i] > hottest or first:
+                    hottest = chunk_hottest[i]
+                    of_block, of_lane, of_zone = chunk_block[i], i, chunk_zone[i]
+            sums[SUM.inlet_max_c, chunk] = ti.cast(hottest, ti.f64)
+            sums[SUM.hottest_block, chunk] = ti.cast(of_block, ti.f64)
+            sums[SUM.hottest_lane, chunk] = ti.cast(of_lane, ti.f64)
+            sums[SUM.hottest_zone, chunk] = ti.cast(of_zone, ti.f64)
+            sums[SUM.least_k, chunk] = ti.cast(least_k, ti.f64)
+            sums[SUM.most_k, chunk] = ti.cast(most_k, ti.f64)
 
     @ti.kernel
     @no_type_check
     def hall(
         recirculates: ti.template(),
         transient: ti.template(),
-        outlet_model: ti.template(),
-        group_loads: ti.template(),
-        write_groups: ti.template(),
-        advance: ti.template(),
+        write: ti.template(),
         slices: ti.i32,
         sweeps: ti.i32,
+        outlet_model: ti.i32,
+        loads_of: ti.i32,
+        each_once: ti.i32,
         substep_s: ti.f64,
         weight: ti.f64,
         tolerance_k: ti.f64,
@@ -469,492 +1094,137 @@ def hall_kernel(precision: str) -> Any:
         run_start: ints_1d,
         run_ints: ints_2d,
         block_ints: ints_2d,
+        rack_ints: ints_2d,
         chunk_ints: ints_2d,
         dc_ints: ints_2d,
         control: ints_2d,
         weights: reals_1d,
+        mix: blocks_1d,
         shares: blocks_1d,
         racks: blocks_2d,
-        tables: reals_1d,
-        group_load: blocks_1d,
+        tables: blocks_2d,
+        group_load: reals_1d,
         dcs: reals_2d,
         doubles: doubles_2d,
         units: reals_2d,
         unit_state: doubles_2d,
+        starts: reals_4d,
         rack_state: reals_1d,
         rack_store: blocks_2d,
         server_c: blocks_1d,
+        servers_before: reals_1d,
+        servers_after: reals_1d,
         constants: reals_1d,
+        terms: blocks_2d,
         rack_out: blocks_2d,
-        group_out: blocks_2d,
         needs: doubles_1d,
         sums: doubles_2d,
         dc_out: doubles_2d,
+        counts: reals_1d,
+        group_values: blocks_2d,
+        values: reals_1d,
+        inlet_c: reals_1d,
+        outlet_c: reals_1d,
+        power_w: reals_1d,
+        inlet_blocks: blocks_1d,
+        outlet_blocks: blocks_1d,
+        power_blocks: blocks_1d,
     ):
         n_tasks = tasks.shape[0] - 1
         for k in range(slices * SLICE):
             if k % SLICE == 0:
                 first = ti.cast(ti.cast(k // SLICE, ti.i64) * n_tasks // slices, ti.i32)
                 last = ti.cast((ti.cast(k // SLICE, ti.i64) + 1) * n_tasks // slices, ti.i32)
+                slice_at = k // SLICE * n_terms
+                if ti.static(write):
+                    slice_at = k // SLICE * (group_values.shape[1] // slices)
                 for task in range(first, last):
-                    n = chunk_ints[1, tasks[task]]
-                    n_parts = dc_ints[0, n + 1] - dc_ints[0, n]
+                    n = chunk_ints[CHUNK.dc, tasks[task]]
+                    chunk_0 = dc_ints[DC.first_chunk, n]
+                    n_parts = dc_ints[DC.first_chunk, n + 1] - chunk_0
+                    is_dense = False
+                    if ti.static(recirculates and not transient and not write):
+                        is_dense = dc_ints[DC.mix, n] >= 0
+                        if control[CTL.sweep, n] == 0:
+                            expect(n, dc_ints, doubles, unit_state, starts)
                     # Chunks that are tasks of their own wait for each other after every sweep.
                     rounds = sweeps if tasks[task + 1] - tasks[task] == n_parts else 1
                     for _ in range(rounds):
-                        if control[0, n] <= 0:
-                            break
+                        if ti.static(not write):
+                            if control[CTL.active, n] <= 0:
+                                break
                         for chunk in range(tasks[task], tasks[task + 1]):
-                            unit_0 = dc_ints[1, n]
-                            n_units = dc_ints[1, n + 1] - unit_0
-                            need_0 = chunk_ints[2, chunk]
-                            for j in range(n_units):
-                                needs[need_0 + j] = 0.0
-                            cpu_slope = dcs[0, n]
-                            cpu_offset = dcs[1, n]
-                            cpu_shift = dcs[2, n]
-                            fan_slope = dcs[3, n]
-                            fan_offset = dcs[4, n]
-                            fan_shift = dcs[5, n]
-                            fan_low = dcs[6, n]
-                            fan_high = dcs[7, n]
-                            per_reference = real(1.0) / dcs[8, n]
-                            exponent = dcs[9, n]
-                            cubic = exponent == real(3.0)
-                            fan_reference_w = dcs[10, n]
-                            full_m3s = dcs[11, n]
-                            air = dcs[12, n]
-                            per_air = real(1.0) / air
-                            limit_c = dcs[13, n]
-                            server_j = dcs[15, n]
-                            taken_up = dcs[16, n] * air
-                            parcel_j = dcs[17, n]
-                            step_s = ti.cast(substep_s, real)
-                            per_step_s = real(1.0) / step_s
-                            # CRAC air of the room stirs the air before racks that stand still.
-                            still_per_s = smaller(
-                                real(STILL_PER_S),
-                                air * ti.cast(doubles[12, n], real) / dcs[17, n],
+                            evaluate(
+                                recirculates,
+                                transient,
+                                write,
+                                slice_at,
+                                n,
+                                chunk,
+                                outlet_model,
+                                loads_of,
+                                each_once,
+                                sweeps,
+                                substep_s,
+                                weight,
+                                run_start,
+                                run_ints,
+                                block_ints,
+                                rack_ints,
+                                chunk_ints,
+                                dc_ints,
+                                control,
+                                weights,
+                                mix,
+                                shares,
+                                racks,
+                                tables,
+                                group_load,
+                                dcs,
+                                doubles,
+                                unit_state,
+                                rack_state,
+                                rack_store,
+                                server_c,
+                                servers_before,
+                                servers_after,
+                                constants,
+                                terms,
+                                rack_out,
+                                needs,
+                                sums,
+                                counts,
+                                group_values,
+                                values,
+                                (inlet_c, outlet_c, power_w),
+                                (inlet_blocks, outlet_blocks, power_blocks),
                             )
-                            begins = control[3, n] == 0
-                            # What the last sweep left is read anew after it.
-                            shift = ti.cast(doubles[9, n], real)
-                            side = control[2, n]
-                            anew = control[1, n] != 0
-                            if anew:
-                                side = 1 - side
-                            cpu_sum = sums_of_lanes()
-                            fan_sum = sums_of_lanes()
-                            flow_sum = sums_of_lanes()
-                            inlet_sum = sums_of_lanes()
-                            outlet_sum = sums_of_lanes()
-                            inlet_flow_sum = sums_of_lanes()
-                            heat_sum = sums_of_lanes()
-                            captured_sum = sums_of_lanes()
-                            hot_sum = sums_of_lanes()
-                            cold_sum = sums_of_lanes()
-                            stored_sum = sums_of_lanes()
-                            least = lanes(1e30)
-                            most = lanes(-1e30)
-                            chunk_hottest = lanes(-1e30)
-                            hottest_at = ti.Vector([0] * LANES)
-                            for block in range(chunk_ints[0, chunk], chunk_ints[0, chunk + 1]):
-                                q = block * LANES
-                                many = block_ints[0, block]
-                                n_groups = block_ints[1, block]
-                                table = block_ints[2, block]
-                                place = block_ints[3, block]
-                                cover = lanes(0.0)
-                                supply = lanes(0.0)
-                                mixed = lanes(0.0)
-                                share_0 = dc_ints[2, n] + n_units * (
-                                    block - chunk_ints[0, dc_ints[0, n]]
-                                )
-                                parcel_w = lanes(0.0)
-                                if ti.static(recirculates):
-                                    for j in range(n_units):
-                                        ratio = ti.cast(
-                                            unit_state[1 if ti.static(advance) else 2, unit_0 + j],
-                                            real,
+                            if ti.static(not write):
+                                if ti.static(recirculates and not transient):
+                                    if is_dense:
+                                        foresee(
+                                            n,
+                                            chunk,
+                                            chunk_ints,
+                                            dc_ints,
+                                            mix,
+                                            rack_state,
+                                            rack_store,
+                                            sums,
                                         )
-                                        air_c = ti.cast(unit_state[0, unit_0 + j], real)
-                                        share = shares[share_0 + j]
-                                        for i in range(LANES):
-                                            part = share[i] * ratio
-                                            cover[i] += part
-                                            supply[i] += part * air_c
-                                    for i in range(LANES):
-                                        supply[i] /= larger(cover[i], real(1e-30))
-                                    if ti.static(advance):
-                                        target = lanes(0.0)
-                                        if anew:
-                                            from_row = (1 + side) * (rack_store.shape[1] * LANES)
-                                            for i in range(LANES):
-                                                t = real(0.0)
-                                                for run in range(
-                                                    run_start[q + i], run_start[q + i + 1]
-                                                ):
-                                                    x = from_row + run_ints[0, run]
-                                                    w = run_ints[2, run]
-                                                    s = real(0.0)
-                                                    for e in range(run_ints[1, run]):
-                                                        s += weights[w + e] * rack_state[x + e]
-                                                    t += s
-                                                target[i] = t
-                                            norm = racks[1, block]
-                                            for i in range(LANES):
-                                                target[i] *= norm[i]
-                                        elif begins:
-                                            start_c = ti.cast(doubles[8, n], real)
-                                            scale = ti.cast(doubles[5, n], real)
-                                            warming = ti.cast(doubles[6, n], real)
-                                            strength = racks[5, block]
-                                            approach = racks[9, block]
-                                            rise = racks[10, block]
-                                            mixed_approach = racks[11, block]
-                                            mixed_rise = racks[12, block]
-                                            seen = lanes(0.0)
-                                            for i in range(LANES):
-                                                target[i] = (
-                                                    start_c
-                                                    + scale * mixed_approach[i]
-                                                    + warming * mixed_rise[i]
-                                                )
-                                                seen[i] = strength[i] * (
-                                                    start_c
-                                                    + scale * approach[i]
-                                                    + warming * rise[i]
-                                                )
-                                            rack_store[1 + side, block] = seen
-                                        else:
-                                            target = rack_store[4, block]
-                                        if anew or begins:
-                                            rack_store[4, block] = target
-                                        for i in range(LANES):
-                                            target[i] += shift
-                                        if ti.static(transient):
-                                            # The parcel of room air before the rack: enters at the
-                                            # mix, leaves at its own temperature.
-                                            after = lanes(0.0)
-                                            before_c = rack_store[0, block]
-                                            taken = rack_store[3, block]
-                                            for i in range(LANES):
-                                                was = before_c[i]
-                                                x = step_s * larger(
-                                                    air * taken[i] / parcel_j, still_per_s
-                                                )
-                                                gone = real(1.0) - exp_of_minus(x, constants)
-                                                now_c = was + (target[i] - was) * gone
-                                                after[i] = now_c
-                                                parcel_w[i] = parcel_j * (now_c - was) * per_step_s
-                                                mixed[i] = target[i] + (was - target[i]) * gone / x
-                                            rack_store[0, block] = after
-                                        else:
-                                            rack_store[0, block] = target
-                                            for i in range(LANES):
-                                                mixed[i] = target[i]
-                                    else:
-                                        mixed = rack_store[0, block]
-                                else:
-                                    air_c = ti.cast(unit_state[0, unit_0], real)
-                                    approach = racks[0, block]
-                                    for i in range(LANES):
-                                        mixed[i] = air_c + approach[i]
-                                for i in range(LANES):
-                                    mixed[i] = ti.select(i < many, mixed[i], real(NO_RACK_C))
-                                u = racks[2, block]
-                                powered = racks[3, block]
-                                air_left = racks[4, block]
-                                breath = lanes(0.0)
-                                rack_captured = racks[7, block]
-                                servers = racks[8, block]
-                                spread = lanes(0.0)
-                                fresh = lanes(0.0)
-                                for i in range(LANES):
-                                    spread[i] = u[i] * (real(1.0) - u[i])
-                                    breath[i] = air_left[i] * powered[i]
-                                    fresh[i] = cover[i] * (supply[i] - mixed[i])
-                                cpu = lanes(0.0)
-                                fan = lanes(0.0)
-                                flow = lanes(0.0)
-                                inlet = lanes(0.0)
-                                inlet_flow = lanes(0.0)
-                                fresh_flow = lanes(0.0)
-                                heat = lanes(0.0)
-                                hot = lanes(0.0)
-                                cold = lanes(0.0)
-                                stored = lanes(0.0)
-                                hottest = lanes(-1e30)
-                                hottest_zone = ti.Vector([0] * LANES)
-                                for z in range(n_groups):
-                                    row = (table + z) * (6 * LANES)
-                                    full_row = row + LANES
-                                    idle_row = row + 2 * LANES
-                                    offset_row = row + 3 * LANES
-                                    deviation_row = row + 4 * LANES
-                                    height_row = row + 5 * LANES
-                                    given_load = lanes(0.0)
-                                    if ti.static(group_loads):
-                                        given_load = group_load[place + z]
-                                    t = lanes(0.0)
-                                    own = lanes(0.0)
-                                    speed = lanes(0.0)
-                                    cpu_1 = lanes(0.0)
-                                    fan_1 = lanes(0.0)
-                                    flow_1 = lanes(0.0)
-                                    to_air = lanes(0.0)
-                                    for i in range(LANES):
-                                        if ti.static(recirculates):
-                                            own[i] = (
-                                                real(1.0)
-                                                - rack_captured[i] * tables[height_row + i]
-                                            )
-                                            t[i] = mixed[i] + own[i] * fresh[i]
-                                        else:
-                                            t[i] = mixed[i] + tables[offset_row + i]
-                                        load = u[i] + tables[deviation_row + i] * spread[i]
-                                        if ti.static(group_loads):
-                                            load = given_load[i]
-                                        on_curve = smaller(t[i], limit_c)
-                                        ratio = cpu_slope * on_curve + cpu_offset + cpu_shift * load
-                                        cpu_1[i] = powered[i] * larger(
-                                            tables[idle_row + i], tables[full_row + i] * ratio
-                                        )
-                                        y = fan_slope * on_curve + fan_offset + fan_shift * load
-                                        y = smaller(larger(y, fan_low), fan_high)
-                                        flow_1[i] = full_m3s * y * breath[i]
-                                        speed[i] = y * per_reference
-                                        cube = speed[i] * speed[i] * speed[i]
-                                        fan_1[i] = ti.select(cubic, cube, speed[i])
-                                    # A branch on data, not one kernel per exponent: compiled
-                                    # apart, they would round apart, and a data center must not
-                                    # depend on its batch.
-                                    if exponent != real(1.0) and not cubic:
-                                        for i in range(LANES):
-                                            fan_1[i] = ti.pow(speed[i], exponent)
-                                    start_c = lanes(0.0)
-                                    end_c = lanes(0.0)
-                                    if ti.static(transient):
-                                        start_c = server_c[place + z]
-                                    for i in range(LANES):
-                                        count = tables[row + i]
-                                        fan_1[i] *= fan_reference_w * breath[i]
-                                        to_air[i] = cpu_1[i]
-                                        if ti.static(transient):
-                                            before = start_c[i]
-                                            exchange = taken_up * flow_1[i]
-                                            if ti.static(advance):
-                                                steady = t[i] + cpu_1[i] / larger(
-                                                    exchange, real(1e-30)
-                                                )
-                                                left = exp_of_minus(
-                                                    step_s * exchange / server_j, constants
-                                                )
-                                                moves = exchange > real(0.0)
-                                                after = ti.select(
-                                                    moves, steady + (before - steady) * left, before
-                                                )
-                                                warmed_w = server_j * (after - before) * per_step_s
-                                                to_air[i] = ti.select(
-                                                    moves, cpu_1[i] - warmed_w, real(0.0)
-                                                )
-                                                stored[i] += count * warmed_w
-                                                end_c[i] = after
-                                            else:
-                                                to_air[i] = exchange * (before - t[i])
-                                        counted_flow = count * flow_1[i]
-                                        cpu[i] += count * cpu_1[i]
-                                        fan[i] += count * fan_1[i]
-                                        flow[i] += counted_flow
-                                        inlet[i] += count * t[i]
-                                        inlet_flow[i] += counted_flow * t[i]
-                                        heat[i] += count * (to_air[i] + fan_1[i])
-                                        if ti.static(recirculates):
-                                            fresh_flow[i] += counted_flow * own[i]
-                                        hot[i] += count * larger(
-                                            t[i] - real(RECOMMENDED_HIGH_C), real(0.0)
-                                        )
-                                        cold[i] += count * larger(
-                                            real(RECOMMENDED_LOW_C) - t[i], real(0.0)
-                                        )
-                                        here = ti.select(count > real(0.0), t[i], real(-1e30))
-                                        hottest_zone[i] = ti.select(
-                                            here > hottest[i], z, hottest_zone[i]
-                                        )
-                                        hottest[i] = larger(here, hottest[i])
-                                    if ti.static(transient and advance):
-                                        server_c[place + z] = end_c
-                                    if ti.static(write_groups):
-                                        out = lanes(0.0)
-                                        drawn = lanes(0.0)
-                                        for i in range(LANES):
-                                            out[i] = t[i] + ti.select(
-                                                flow_1[i] > real(0.0),
-                                                (to_air[i] + fan_1[i])
-                                                / larger(air * flow_1[i], real(1e-30)),
-                                                real(0.0),
-                                            )
-                                            drawn[i] = cpu_1[i] + fan_1[i]
-                                        group_out[0, place + z] = t
-                                        group_out[1, place + z] = out
-                                        group_out[2, place + z] = drawn
-                                outlet = lanes(0.0)
-                                for i in range(LANES):
-                                    mean = inlet[i] / servers[i]
-                                    moves = flow[i] > real(0.0)
-                                    per_flow = real(1.0) / larger(flow[i], real(1e-30))
-                                    leaves = (inlet_flow[i] + heat[i] * per_air) * per_flow
-                                    if ti.static(outlet_model == 1):
-                                        leaves = mean + (cpu[i] + fan[i]) * per_air * per_flow
-                                    elif ti.static(outlet_model == 2):
-                                        leaves = (
-                                            mean
-                                            + constants[0]
-                                            * ti.pow(cpu[i] + fan[i], constants[1])
-                                            / (
-                                                constants[2]
-                                                * air
-                                                * ti.pow(larger(flow[i], real(1e-30)), constants[3])
-                                            )
-                                            + constants[4]
-                                        )
-                                    outlet[i] = ti.select(moves, leaves, mean)
-                                    inlet[i] = mean
-                                    if ti.static(recirculates):
-                                        inlet[i] = ti.select(moves, inlet_flow[i] * per_flow, mean)
-                                if ti.static(write_groups and outlet_model != 0):
-                                    for z in range(n_groups):
-                                        group_out[1, place + z] = outlet
-                                if ti.static(not write_groups):
-                                    if ti.static(recirculates):
-                                        captured = lanes(0.0)
-                                        seen = lanes(0.0)
-                                        strength = racks[5, block]
-                                        for i in range(LANES):
-                                            captured[i] = flow[i] - cover[i] * fresh_flow[i]
-                                            # Of air that failing fans do not move, the mix is left.
-                                            gives_c = mixed[i] + air_left[i] * (
-                                                outlet[i] - mixed[i]
-                                            )
-                                            seen[i] = gives_c * strength[i]
-                                        if ti.static(advance):
-                                            per_strength = racks[6, block]
-                                            exchanged = rack_store[1 + side, block]
-                                            for i in range(LANES):
-                                                change = (seen[i] - exchanged[i]) * per_strength[i]
-                                                there = i < many
-                                                least[i] = smaller(
-                                                    least[i], ti.select(there, change, real(1e30))
-                                                )
-                                                most[i] = larger(
-                                                    most[i], ti.select(there, change, real(-1e30))
-                                                )
-                                            rack_store[2 - side, block] = seen
-                                            rack_store[3, block] = captured
-                                        for i in range(LANES):
-                                            captured_sum[i] += ti.cast(
-                                                captured[i] * mixed[i]
-                                                + ti.select(i < many, parcel_w[i], real(0.0))
-                                                * per_air,
-                                                ti.f64,
-                                            )
-                                        for j in range(n_units):
-                                            share = shares[share_0 + j]
-                                            needed = real(0.0)
-                                            for i in range(LANES):
-                                                needed += share[i] * fresh_flow[i]
-                                            needs[need_0 + j] += ti.cast(needed, ti.f64)
-                                    for i in range(LANES):
-                                        cpu_sum[i] += ti.cast(cpu[i], ti.f64)
-                                        fan_sum[i] += ti.cast(fan[i], ti.f64)
-                                        flow_sum[i] += ti.cast(flow[i], ti.f64)
-                                        inlet_flow_sum[i] += ti.cast(inlet_flow[i], ti.f64)
-                                        heat_sum[i] += ti.cast(
-                                            inlet_flow[i] + heat[i] * per_air, ti.f64
-                                        )
-                                    for i in range(LANES):
-                                        there = ti.select(i < many, real(1.0), real(0.0))
-                                        inlet_sum[i] += ti.cast(there * inlet[i], ti.f64)
-                                        outlet_sum[i] += ti.cast(there * outlet[i], ti.f64)
-                                        hot_sum[i] += ti.cast(there * hot[i], ti.f64)
-                                        cold_sum[i] += ti.cast(there * cold[i], ti.f64)
-                                        stored_sum[i] += ti.cast(
-                                            there * (stored[i] + parcel_w[i]), ti.f64
-                                        )
-                                    for i in range(LANES):
-                                        here = ti.select(i < many, hottest[i], real(-1e30))
-                                        at = (place + hottest_zone[i]) * LANES + i
-                                        hottest_at[i] = ti.select(
-                                            here > chunk_hottest[i], at, hottest_at[i]
-                                        )
-                                        chunk_hottest[i] = larger(here, chunk_hottest[i])
-                                    if ti.static(transient):
-                                        share = ti.cast(weight, real)
-                                        for i in range(LANES):
-                                            cpu[i] = share * cpu[i]
-                                            fan[i] = share * fan[i]
-                                            flow[i] = share * flow[i]
-                                            inlet[i] = share * inlet[i]
-                                            outlet[i] = share * outlet[i]
-                                        if not begins:
-                                            cpu += rack_out[0, block]
-                                            fan += rack_out[1, block]
-                                            flow += rack_out[2, block]
-                                            inlet += rack_out[3, block]
-                                            hottest = larger(hottest, rack_out[4, block])
-                                            outlet += rack_out[5, block]
-                                    rack_out[0, block] = cpu
-                                    rack_out[1, block] = fan
-                                    rack_out[2, block] = flow
-                                    rack_out[3, block] = inlet
-                                    rack_out[4, block] = hottest
-                                    rack_out[5, block] = outlet
-                            if ti.static(not write_groups):
-                                totals = (
-                                    cpu_sum,
-                                    fan_sum,
-                                    flow_sum,
-                                    inlet_sum,
-                                    outlet_sum,
-                                    inlet_flow_sum,
-                                    heat_sum,
-                                    captured_sum,
-                                    hot_sum,
-                                    cold_sum,
-                                    stored_sum,
-                                )
-                                for r in ti.static(range(11)):
-                                    sums[r, chunk] = total_of(totals[r])
-                                least_k = real(1e30)
-                                most_k = real(-1e30)
-                                for i in range(LANES):
-                                    least_k = smaller(least_k, least[i])
-                                    most_k = larger(most_k, most[i])
-                                chunk_max = chunk_hottest[0]
-                                hottest_group = hottest_at[0]
-                                for i in range(LANES):
-                                    first_of_all = chunk_hottest[i] == chunk_max
-                                    first_of_all = first_of_all and hottest_at[i] < hottest_group
-                                    if chunk_hottest[i] > chunk_max or first_of_all:
-                                        chunk_max = chunk_hottest[i]
-                                        hottest_group = hottest_at[i]
-                                sums[11, chunk] = ti.cast(chunk_max, ti.f64)
-                                sums[12, chunk] = ti.cast(hottest_group, ti.f64)
-                                sums[13, chunk] = ti.cast(least_k, ti.f64)
-                                sums[14, chunk] = ti.cast(most_k, ti.f64)
                                 # The chunk that comes last does what is left for its data center.
-                                if ti.atomic_add(control[4, n], 1) == n_parts - 1:
-                                    control[4, n] = 0
+                                if ti.atomic_add(control[CTL.chunks, n], 1) == n_parts - 1:
+                                    control[CTL.chunks, n] = 0
                                     close(
                                         recirculates,
                                         transient,
-                                        advance,
                                         n,
                                         sweeps,
                                         substep_s,
                                         weight,
                                         tolerance_k,
                                         chunk_ints,
+                                        rack_ints,
                                         dc_ints,
                                         control,
                                         dcs,
@@ -965,76 +1235,19 @@ def hall_kernel(precision: str) -> Any:
                                         sums,
                                         dc_out,
                                     )
+                                if ti.static(recirculates and not transient):
+                                    if is_dense and control[CTL.active, n] > 0:
+                                        exchange(
+                                            n,
+                                            chunk,
+                                            chunk_ints,
+                                            dc_ints,
+                                            control,
+                                            doubles,
+                                            mix,
+                                            racks,
+                                            rack_state,
+                                            rack_store,
+                                        )
 
     return hall
-
-
-@cache
-def expand_kernel(precision: str) -> Any:
-    """Kernel that copies the values of every group to its servers.
-
-    The layers come in twice, by servers and by words of eight bytes: two f32 values are stored at
-    once, because the compiler does not join stores to arrays, and single ones reach a third of the
-    memory's speed.
-    """
-    real = _real(precision)
-    per_word = 2 if precision == "f32" else 1
-    reals_2d = ti.types.ndarray(dtype=real, ndim=2)
-    reals_1d = ti.types.ndarray(dtype=real, ndim=1)
-    words_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
-    ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
-
-    @ti.func
-    @no_type_check
-    def word_of(value):
-        """The value as often as it fits into a word."""
-        word = ti.cast(value, ti.f64)
-        if ti.static(per_word == 2):
-            bits = ti.cast(ti.bit_cast(value, ti.u32), ti.u64)
-            word = ti.bit_cast(bits | (bits << ti.u64(32)), ti.f64)
-        return word
-
-    @ti.kernel
-    @no_type_check
-    def expand(
-        slices: ti.i32,
-        server_start: ints_1d,
-        group_at: ints_1d,
-        group_out: reals_2d,
-        inlet_c: reals_1d,
-        outlet_c: reals_1d,
-        power_w: reals_1d,
-        inlet_words: words_1d,
-        outlet_words: words_1d,
-        power_words: words_1d,
-    ):
-        n_groups = server_start.shape[0] - 1
-        for k in range(slices * SLICE):
-            if k % SLICE == 0:
-                first = ti.cast(ti.cast(k // SLICE, ti.i64) * n_groups // slices, ti.i32)
-                last = ti.cast((ti.cast(k // SLICE, ti.i64) + 1) * n_groups // slices, ti.i32)
-                for g in range(first, last):
-                    at = group_at[g]
-                    inlet = group_out[0, at]
-                    outlet = group_out[1, at]
-                    power = group_out[2, at]
-                    start = server_start[g]
-                    end = server_start[g + 1]
-                    # Whole words between the first and the last multiple of their length.
-                    first_word = (start + (per_word - 1)) // per_word
-                    last_word = ti.max(end // per_word, first_word)
-                    inlets, outlets, powers = word_of(inlet), word_of(outlet), word_of(power)
-                    for w in range(first_word, last_word):
-                        inlet_words[w] = inlets
-                        outlet_words[w] = outlets
-                        power_words[w] = powers
-                    for s in range(start, ti.min(first_word * per_word, end)):
-                        inlet_c[s] = inlet
-                        outlet_c[s] = outlet
-                        power_w[s] = power
-                    for s in range(ti.max(last_word * per_word, start), end):
-                        inlet_c[s] = inlet
-                        outlet_c[s] = outlet
-                        power_w[s] = power
-
-    return expand

@@ -11,15 +11,13 @@ import numpy as np
 from sdc_taichi import runtime
 from sdc_taichi.errors import RuntimeStateError, SdcError
 from sdc_taichi.fleet import LOADS, Fleet, starts
+from sdc_taichi.recirculation import DENSE_RACKS
 from sdc_taichi.types import F64, I64, Reals, ServerLayers
 
 Precision = Literal["f32", "f64"]
 
 _RELEASED_OUTLET_FIT = (1.918, 1.096, 0.526, 0.824, -14.01)
 """Rack outlet fit of the released SustainDC: factor, power exponent, divisor, flow exponent, K."""
-
-_BLOCKS_PER_CHUNK = 8
-"""Fewer racks than in so many blocks are not worth a thread of their own."""
 
 TOLERANCE_K: dict[Precision, float] = {"f32": 1e-4, "f64": 1e-12}
 """How little another sweep would move the exhaust mix before any rack."""
@@ -147,18 +145,18 @@ class Hall:
         self._kernel = BoundKernel(thermal.hall_kernel(precision), thermal.HALL_TEMPLATES)
         self._outlet_model = thermal.OUTLETS.index(fleet.models["outlet"])
         self._recirculates = fleet.air is not None
-        self._server_slices = max(1, min(8 * threads, fleet.servers // 4096))
-        self._lay_out_racks(thermal.LANES, 8 * threads)
+        self._lay_out_racks(thermal, 8 * threads)
         self._lay_out_groups(thermal)
         self._lay_out_air(thermal)
         self._lay_out_values(thermal)
         self._slices = max(1, min(8 * threads, len(self._tasks) - 1))
+        self._terms = self._lanes(self._slices * len(thermal.TERMS), thermal.CHUNK_BLOCKS)
         self._solved: bool | None = None
         """Whether the last step was transient; None without one."""
 
-    def _lay_out_racks(self, lanes: int, slices: int) -> None:
+    def _lay_out_racks(self, thermal: Any, slices: int) -> None:
         """Blocks of racks, each data center filled up to whole ones, and chunks of blocks."""
-        fleet = self._fleet
+        fleet, lanes = self._fleet, thermal.LANES
         racks = np.diff(fleet.rack_start)
         self._blocks = -(-racks // lanes)
         first_block = starts(self._blocks, "blocks of racks")
@@ -166,7 +164,7 @@ class Hall:
         self._rack_at = lanes * np.repeat(first_block[:-1], racks) + within
         self._places = int(lanes * first_block[-1])
         self._same_size = int(racks[0]) if np.all(racks == racks[0]) else None
-        chunks = [np.arange(a, b, _BLOCKS_PER_CHUNK) for a, b in pairwise(first_block)]
+        chunks = [np.arange(a, b, thermal.CHUNK_BLOCKS) for a, b in pairwise(first_block)]
         per_dc = np.array([len(c) for c in chunks])
         chunk_dc = np.repeat(np.arange(fleet.size), per_dc)
         # Data centers of up to a slice are one task, larger ones a task per chunk.
@@ -174,62 +172,69 @@ class Hall:
         chunk_starts_task = ~np.repeat(whole, per_dc)
         chunk_starts_task[np.cumsum(per_dc) - per_dc] = True
         self._tasks = np.append(np.flatnonzero(chunk_starts_task), per_dc.sum()).astype(np.int32)
-        first_need = starts(np.diff(fleet.unit_start)[chunk_dc], "needs of chunks")
+        units = np.diff(fleet.unit_start)
+        first_need = starts(units[chunk_dc], "needs of chunks")
         self._chunk_ints = _table(np.concatenate([*chunks, first_block[-1:]]), chunk_dc, first_need)
         self._needs = np.zeros(max(int(first_need[-1]), 1))
-        units = np.diff(fleet.unit_start)
         first_share = starts(self._blocks * units, "unit shares of blocks")
-        self._dc_ints = _table(starts(per_dc, "chunks"), fleet.unit_start, first_share, racks)
+        first_chunk = starts(per_dc, "chunks")
+        self._dc_ints = np.zeros((len(thermal.DC_INTS), fleet.size + 1), np.int32)
+        for row, values in enumerate((first_chunk, fleet.unit_start, first_share, racks)):
+            self._dc_ints[row, : len(values)] = values
 
     def _lay_out_groups(self, thermal: Any) -> None:
         """Places of the groups, lane by lane, and the tables that equal blocks share."""
         fleet, lanes = self._fleet, thermal.LANES
-        block, lane = np.divmod(self._rack_at, lanes)
+        block = self._rack_at // lanes
         groups = np.diff(fleet.group_start)
         most = np.zeros(int(self._blocks.sum()), np.int64)
         np.maximum.at(most, block, groups)
-        first_place = starts(most, "groups of blocks")
-        zone = np.arange(fleet.groups.shape[1]) - np.repeat(fleet.group_start[:-1], groups)
-        self._group_at = (
-            np.repeat(lanes * first_place[block] + lane, groups) + lanes * zone
-        ).astype(np.int32)
-        count = lanes * int(first_place[-1])
-        self._group_of = np.zeros(count, np.int64)
-        self._group_of[self._group_at] = np.arange(len(self._group_at))
-        values = np.zeros((len(thermal.GROUP_ROWS), count), self._dtype)
-        values[:, self._group_at] = fleet.groups
-        # Places without a rack take the values of the last rack of their block, and no power.
         filled = np.bincount(block, minlength=len(most))
-        last = (np.repeat(filled, most) - 1)[:, None]
-        values = values.reshape(len(values), -1, lanes)
-        values = np.take_along_axis(values, np.minimum(np.arange(lanes), last)[None], axis=2)
-        by_place = np.ascontiguousarray(values.swapaxes(0, 1))
-        known: dict[bytes, int] = {}
+        first_rack = np.cumsum(filled) - filled
+        # Places without a rack take the values of the last rack of their block, and no servers.
+        lane = np.arange(lanes)
+        rack = first_rack[:, None] + np.minimum(lane, filled[:, None] - 1)
+        self._rack_ints = np.stack(
+            [fleet.group_start[rack], fleet.server_start[fleet.group_start[rack]]]
+        ).reshape(2, -1)
+        known: dict[Any, int] = {}
         tables, table, total = [], np.zeros(len(most), np.int64), 0
-        for i, (a, b) in enumerate(pairwise(first_place)):
-            key = by_place[a:b].tobytes()
+        for i, (a, n) in enumerate(zip(rack[:, 0], filled, strict=True)):
+            ends = fleet.group_start[a : a + n + 1]
+            values = fleet.groups[:, ends[0] : ends[-1]]
+            key = (values.tobytes(), (ends - ends[0]).tobytes())
             if key not in known:
                 known[key] = total
-                tables.append(by_place[a:b].reshape(-1, lanes))
-                total += int(b - a)
+                zone = np.arange(most[i])
+                group = ends[:-1] + np.minimum(zone[:, None], np.diff(ends) - 1) - ends[0]
+                entry = np.zeros((most[i], len(values), lanes), self._dtype)
+                entry[:, :, :n] = values[:, group].swapaxes(0, 1)
+                entry[:, 1:, n:] = entry[:, 1:, n - 1 : n]
+                entry[:, 0, :n] *= zone[:, None] < np.diff(ends)
+                tables.append(entry)
+                total += int(most[i])
             table[i] = known[key]
-        self._tables = np.concatenate(tables).reshape(-1)
+        self._tables = self._lanes(total, len(thermal.GROUP_ROWS))
+        self._tables[:] = np.concatenate(tables)
+        first_place = starts(most, "groups of blocks")
         self._block_ints = _table(filled, most, table, first_place[:-1])
-        self._server_c = np.zeros((int(first_place[-1]), lanes), self._dtype)
-        self._group_load = np.zeros((1, lanes), self._dtype)
-        self._group_out: Any = None
-        self._no_groups = np.zeros((len(thermal.GROUP_OUT), 1, lanes), self._dtype)
+        self._group_places, self._most_groups = int(first_place[-1]), int(most.max())
+        self._server_c = self._lanes(1)
+        self._no_groups = np.zeros(1, self._dtype)
 
     def _lay_out_air(self, thermal: Any) -> None:
-        """Runs of weights and unit shares at the places of the racks."""
+        """Weights and unit shares at the places of the racks."""
         fleet, air, lanes = self._fleet, self._fleet.air, thermal.LANES
         run_counts = np.zeros(self._places, np.int64)
         zeros = np.zeros(1, np.int32)
+        mix = self._dc_ints[thermal.DC_INTS.index("mix")]
+        mix[:] = -1
         if air is None:
             self._run_start = starts(run_counts, "runs of weights")
             self._run_ints = _table(zeros, zeros, zeros)
             self._weights = self._real(np.zeros(1))
-            self._shares = self._real(np.zeros((1, lanes)))
+            self._mix, self._shares = self._lanes(1), self._lanes(1)
+            self._starts = np.zeros((1, 1, 1, 3))
             return
         run_counts[self._rack_at] = np.diff(air.run_start)
         self._run_start = starts(run_counts, "runs of weights")
@@ -237,7 +242,7 @@ class Hall:
         first = air.run_first + np.repeat(moved[fleet.rack_dc], np.diff(air.run_start))
         self._run_ints = _table(first, air.run_length, air.run_offset)
         self._weights = self._real(air.weights)
-        shares = []
+        shares, mixes, known, total = [], [], {}, 0
         for dc, (racks, units) in enumerate(
             zip(np.diff(fleet.rack_start), np.diff(fleet.unit_start), strict=True)
         ):
@@ -245,13 +250,30 @@ class Hall:
             at = air.share_start[dc]
             own[:racks] = air.unit_shares[at : at + racks * units].reshape(racks, units)
             shares.append(own.reshape(-1, lanes, int(units)).swapaxes(1, 2).reshape(-1, lanes))
-        self._shares = self._real(np.concatenate(shares))
+            if racks > DENSE_RACKS:
+                continue
+            entry = int(air.table[dc])
+            if entry not in known:
+                weights = np.zeros((int(self._blocks[dc]) * lanes, int(racks)))
+                weights[:racks] = _dense(fleet, dc)
+                mixes.append(weights.reshape(-1, lanes, int(racks)).swapaxes(1, 2))
+                known[entry] = total
+                total += int(self._blocks[dc]) * int(racks)
+            mix[dc] = known[entry]
+        self._shares = self._lanes(sum(map(len, shares)))
+        self._shares[:] = np.concatenate(shares)
+        self._mix = self._lanes(max(total, 1))
+        if mixes:
+            self._mix[:] = np.concatenate([m.reshape(-1, lanes) for m in mixes])
+        self._dc_ints[thermal.DC_INTS.index("start"), :-1] = air.table
+        n_supply = air.supply_c.shape[1]
+        self._starts = np.ascontiguousarray(air.expected).reshape(-1, n_supply, len(LOADS), 3)
 
     def _lay_out_values(self, thermal: Any) -> None:
         fleet, air = self._fleet, self._fleet.air
         blocks = self._places // thermal.LANES
-        self._racks = np.ones((len(thermal.RACK_ROWS), self._places), self._dtype)
-        self._rack_blocks = self._racks.reshape(len(self._racks), -1, thermal.LANES)
+        self._rack_blocks = self._lanes(len(thermal.RACK_ROWS), blocks)
+        self._racks = self._rack_blocks.reshape(len(self._rack_blocks), -1)
         self._rack = dict(zip(thermal.RACK_ROWS, self._racks, strict=True))
         self._is_rack = np.zeros(self._places, self._dtype)
         self._is_rack[self._rack_at] = 1.0
@@ -259,7 +281,8 @@ class Hall:
             self._rack[name][:] = self._is_rack
         self._of_a_step: set[str] = set()
         """Of these two, what the last step set to other values."""
-        rows = {"approach_k": fleet.approach_k, "servers": fleet.group_sums(fleet.groups[0])}
+        servers = fleet.group_sums(fleet.groups[0])
+        rows = {"approach_k": fleet.approach_k, "per_server": 1.0 / servers}
         if air is not None:
             rows |= {
                 "norm": air.norm,
@@ -277,6 +300,12 @@ class Hall:
         self._doubles = np.zeros((len(thermal.DC_DOUBLES), fleet.size))
         self._dc = dict(zip(thermal.DC_DOUBLES, self._doubles, strict=True))
         self._dc["it_airflow_m3s"][:] = fleet.it_airflow_m3s
+        if air is not None:
+            low, high = air.supply_c[air.table, 0], air.supply_c[air.table, -1]
+            rows_apart = air.supply_c.shape[1] - 1
+            self._dc["start_low_c"][:] = low
+            self._dc["start_per_k"][:] = rows_apart / np.maximum(high - low, 1e-9)
+        self._moves = self._doubles[thermal.DC_DOUBLES.index("shift_k") :]
         self._controls = np.zeros((len(thermal.CONTROL), fleet.size), np.int32)
         self._control = dict(zip(thermal.CONTROL, self._controls, strict=True))
         self._units = self._real(np.ones((len(thermal.UNIT_ROWS), fleet.units)))
@@ -286,8 +315,7 @@ class Hall:
         self._supply = dict(zip(thermal.UNIT_STATE, self._unit_state, strict=True))
         fresh_share = thermal.DC_ROWS.index("fresh_share")
         self._fresh_m3s = fleet.dcs[fresh_share][fleet.unit_dc] * fleet.unit_design_m3s
-        state = (len(thermal.RACK_STATE), blocks, thermal.LANES)
-        self._rack_store = np.zeros(state, self._dtype)
+        self._rack_store = self._lanes(len(thermal.RACK_STATE), blocks)
         self._rack_state = self._rack_store.reshape(len(self._rack_store), -1)
         self._flat_state = self._rack_store.reshape(-1)
         self._memory = dict(zip(thermal.RACK_STATE, self._rack_state, strict=True))
@@ -296,8 +324,16 @@ class Hall:
         )
         self._sums = np.zeros((len(thermal.SUMS), self._chunk_ints.shape[1] - 1))
 
-    def _real(self, values: F64) -> Any:
+    def _real(self, values: Reals) -> Any:
         return np.array(values, dtype=self._dtype, order="C")
+
+    def _lanes(self, *shape: int) -> Any:
+        """Zeros that the kernel takes as vectors of lanes."""
+        from sdc_taichi.kernels.backend import aligned
+
+        out = aligned((*shape, self._thermal.LANES), self._dtype)
+        out[:] = 0.0
+        return out
 
     def _at_racks(self, rows: Any) -> Any:
         """Values of the racks, (..., R), of rows by place."""
@@ -331,7 +367,6 @@ class Hall:
         self._begin(exchange=0)
         out = self._out()
         if self._recirculates:
-            self._guess(met)
             self._sweep(out, MOST_SWEEPS)
             ended = self._control["active"]
             if np.any(ended < 0):
@@ -342,48 +377,22 @@ class Hall:
                     "simulation.thermal=transient"
                 )
         else:
-            self._run(out, advance=False)
+            self._run(out)
         self._solved = False
         return self._results(out)
 
     def _begin(self, exchange: int) -> None:
-        """The first sweep exchanges what the exhaust row holds, or starts from ``_guess``."""
+        """The first sweep exchanges what the exhaust row holds, or starts as may be expected."""
         first = {"active": 1, "exchange": exchange, "side": exchange, "sweep": 0, "chunks": 0}
         for name, flag in first.items():
             self._control[name][:] = flag
-        for name in ("shift_k", "moved_k", "shifted_k"):
-            self._dc[name][:] = 0.0
-
-    def _guess(self, met: Conditions) -> None:
-        """Outlets to start from: the racks of the design point, moved as a mean rack would be.
-
-        By the supply air of the first unit, which tells where the others are near enough to start.
-        """
-        fleet, air = self._fleet, self._fleet.air
-        assert air is not None
-        supply_c = met.unit_supply_c[fleet.unit_start[:-1]]
-        grid = air.supply_c[air.table]
-        low, high, last = grid[:, 0], grid[:, -1], grid.shape[1] - 1
-        y = np.clip((supply_c - low) / np.maximum(high - low, 1e-9), 0.0, 1.0) * last
-        x = np.clip(met.utilisation, 0.0, 1.0) * (len(LOADS) - 1)
-        i = np.minimum(y.astype(np.int64), last - 1)
-        j = np.minimum(x.astype(np.int64), len(LOADS) - 2)
-        rows, columns = (
-            np.clip(at[:, None] + np.arange(-1, 3), 0, most)
-            for at, most in ((i, last), (j, len(LOADS) - 1))
-        )
-        at = ((air.table * (last + 1))[:, None] + rows)[:, :, None] * len(LOADS) + columns[:, None]
-        weights = _cubic(y - i)[:, :, None] * _cubic(x - j)[:, None, :]
-        found = np.matmul(weights.reshape(-1, 1, 16), air.expected[at.reshape(-1, 16)])[:, 0]
-        for name, values in zip(("start_scale", "start_warming", "kept"), found.T, strict=True):
-            self._dc[name][:] = values
-        self._dc["start_c"][:] = supply_c
+        self._moves[:] = 0.0
 
     def _sweep(self, out: tuple[Any, Any], sweeps: int, **how: Any) -> None:
         """Call the kernel until every data center has come to its end."""
         active = self._control["active"]
         while np.any(active > 0):
-            self._run(out, advance=True, sweeps=sweeps, **how)
+            self._run(out, sweeps=sweeps, **how)
 
     def servers(self, into: ServerLayers | None = None) -> ServerLayers:
         """Per-server layers of the last ``solve`` or ``advance``, each (S,).
@@ -394,38 +403,45 @@ class Hall:
         Raises:
             RuntimeStateError: before the first step.
         """
-        group_out = self._group_values()
+        servers = self._fleet.servers
         if into is None:
-            into = ServerLayers(*(np.empty(self._fleet.servers, self._dtype) for _ in range(3)))
-        expand = self._thermal.expand_kernel(self._precision)
-        layers = (into.inlet_c, into.outlet_c, into.power_w)
-        per_word = 8 // self._dtype.itemsize
-        whole = self._fleet.servers // per_word * per_word
-        words = [layer[:whole].view(np.float64) if whole else np.zeros(1) for layer in layers]
-        expand(
-            self._server_slices,
-            self._fleet.server_start,
-            self._group_at,
-            group_out.reshape(len(group_out), -1),
-            *layers,
-            *words,
-        )
+            into = ServerLayers(*(self._aligned(servers) for _ in range(3)))
+        layers = [into.inlet_c, into.outlet_c, into.power_w]
+        lanes = self._thermal.LANES
+        fit = [layer.ctypes.data % (lanes * layer.itemsize) == 0 for layer in layers]
+        stored = [
+            layer if fits else self._aligned(servers)
+            for layer, fits in zip(layers, fit, strict=True)
+        ]
+        self._write(stored, each_once=0)
+        for layer, values, fits in zip(layers, stored, fit, strict=True):
+            if not fits:
+                layer[:] = values
         return into
 
     def group_inlets(self) -> F64:
         """Inlet of every server group in the last step, (G,)."""
-        inlets = self._group_values()[0].reshape(-1)[self._group_at]
-        return np.asarray(inlets, dtype=np.float64)
+        layers = [self._aligned(self._fleet.groups.shape[1]) for _ in range(3)]
+        self._write(layers, each_once=1)
+        return np.asarray(layers[0], dtype=np.float64)
 
-    def _group_values(self) -> Any:
+    def _aligned(self, count: int) -> Any:
+        from sdc_taichi.kernels.backend import aligned
+
+        return aligned((count,), self._dtype)
+
+    def _write(self, layers: list[Any], each_once: int) -> None:
+        """Values of the last step to servers, or to each group once."""
         if self._solved is None:
             raise RuntimeStateError("no step has been done yet; server layers exist after one")
-        if self._group_out is None:
-            shape = (len(self._thermal.GROUP_OUT), *self._server_c.shape)
-            self._group_out = np.empty(shape, self._dtype)
-        self._control["active"][:] = 1
-        self._run(self._out(), self._group_out, advance=False, transient=self._solved)
-        return self._group_out
+        lanes = self._thermal.LANES
+        whole = len(layers[0]) // lanes * lanes
+        blocks = [layer[:whole].reshape(-1, lanes) if whole else self._lanes(1) for layer in layers]
+        values = self._lanes(len(self._thermal.GROUP_OUT), self._slices * self._most_groups)
+        self._run(
+            None, transient=self._solved, write=(*layers, *blocks), values=values,
+            each_once=each_once,
+        )  # fmt: skip
 
     def forget(self) -> None:
         """Drop the last step, so that ``servers`` cannot show layers of another state."""
@@ -436,17 +452,17 @@ class Hall:
         self.solve(met)
         for name, value in (("room_j", 0.0), ("room_j_per_k", 1.0), ("coil_limit_w", 0.0)):
             self._dc[name][:] = value
-        self._server_c[:] = 0.0
+        servers = np.zeros(self._fleet.groups.shape[1], self._dtype)
         # A substep that lasts for ever brings servers to their steady temperatures; what it makes
         # of the air is not wanted.
         kept = [self._memory["mixed_c"], self._supply["fresh_ratio"], self._supply["supply_c"]]
         steady = [row.copy() for row in kept]
         self._memory["exhaust_c"][:] = self._exhaust()
         self._begin(exchange=1)
-        self._sweep(self._out(), 1, transient=True, substep_s=1e9)
+        self._sweep(self._out(), 1, transient=True, servers=(servers, servers), substep_s=1e9)
         for row, values in zip(kept, steady, strict=True):
             row[:] = values
-        return self._state()
+        return self._state(servers)
 
     def advance(
         self, met: Conditions, state: HallState, coil: Coil, step_s: float, substep_s: float
@@ -465,7 +481,6 @@ class Hall:
         """
         fleet = self._fleet
         self._set(met)
-        self._server_c.reshape(-1)[self._group_at] = state.server_c
         for name in ("mixed_c", "exhaust_c", "captured_m3s"):
             self._put(self._memory[name], getattr(state, name))
         low, high = (self._unit[name] for name in ("low", "high"))
@@ -487,18 +502,26 @@ class Hall:
         count = int(np.ceil(step_s / substep_s - 1e-9))
         out = self._out()
         self._begin(exchange=1)
-        self._sweep(out, count, transient=True, substep_s=step_s / count, weight=1.0 / count)
+        servers = np.empty(fleet.groups.shape[1], self._dtype)
+        self._sweep(
+            out,
+            count,
+            transient=True,
+            servers=(self._real(state.server_c), servers),
+            substep_s=step_s / count,
+            weight=1.0 / count,
+        )
         self._solved = True
-        return self._results(out), self._state()
+        return self._results(out), self._state(servers)
 
     def _exhaust(self) -> Any:
         """What the racks gave to the mixes in the last sweep, times strength, by place."""
         side = np.repeat(self._control["side"], self._thermal.LANES * self._blocks)
         return np.where(side == 0, self._memory["exhaust_odd_c"], self._memory["exhaust_c"])
 
-    def _state(self) -> HallState:
+    def _state(self, servers: Any) -> HallState:
         return HallState(
-            server_c=self._server_c.reshape(-1)[self._group_at],
+            server_c=servers,
             mixed_c=self._at_racks(self._memory["mixed_c"]).copy(),
             exhaust_c=self._at_racks(self._exhaust()).copy(),
             captured_m3s=self._at_racks(self._memory["captured_m3s"]).copy(),
@@ -511,19 +534,13 @@ class Hall:
             given = getattr(met, f.name)
             if given is not None and not np.isfinite(np.sum(given)):
                 raise SdcError(f"conditions: {f.name} is not finite; valid are finite numbers")
-        self._group_loads = met.group_load is not None
+        self._loads_of, self._loads = 0, self._no_groups
+        self._dc["utilisation"][:] = met.utilisation
         if met.group_load is not None:
-            if self._group_load.size < self._server_c.size:
-                self._group_load = np.zeros_like(self._server_c)
-            self._group_load.reshape(-1)[self._group_at] = met.group_load
+            self._loads_of, self._loads = 2, self._real(met.group_load)
         elif met.rack_load is not None:
+            self._loads_of = 1
             self._put(self._rack["load"], met.rack_load)
-        elif self._same_size is not None:
-            loads = self._rack["load"].reshape(self._fleet.size, -1)
-            loads[:] = met.utilisation[:, None]
-        else:
-            loads = self._rack["load"]
-            loads[self._rack_at] = met.utilisation[self._fleet.rack_dc]
         for name, values in (("powered", met.powered), ("airflow", met.rack_airflow)):
             row = self._rack[name]
             if values is not None:
@@ -538,32 +555,39 @@ class Hall:
         self._supply["supply_c"][:] = met.unit_supply_c
 
     def _out(self) -> tuple[Any, Any]:
+        from sdc_taichi.kernels.backend import aligned
+
         shape = (len(self._thermal.RACK_OUT), *self._rack_store.shape[1:])
-        racks = np.empty(shape, self._dtype)
+        racks = aligned(shape, self._dtype)
         return racks, np.empty((len(self._thermal.DC_OUT), self._fleet.size), np.float64)
 
     def _run(
         self,
-        out: tuple[Any, Any],
-        group_out: Any = None,
+        out: tuple[Any, Any] | None,
         *,
-        advance: bool,
         transient: bool = False,
         sweeps: int = 1,
         substep_s: float = 1.0,
         weight: float = 1.0,
+        servers: tuple[Any, Any] | None = None,
+        write: tuple[Any, ...] | None = None,
+        values: Any = None,
+        each_once: int = 0,
     ) -> None:
         runtime.ensure_started()
-        racks, dcs = out
+        racks, dcs = (self._rack_store, self._sums) if out is None else out
+        none, no_lanes = self._no_groups, self._mix
+        if transient and len(self._server_c) < self._group_places:
+            self._server_c = self._lanes(self._group_places)
         self._kernel(
             self._recirculates,
             transient,
-            self._outlet_model,
-            self._group_loads,
-            group_out is not None,
-            advance,
+            write is not None,
             self._slices,
             sweeps,
+            self._outlet_model,
+            self._loads_of,
+            each_once,
             substep_s,
             weight,
             TOLERANCE_K[self._precision],
@@ -571,27 +595,35 @@ class Hall:
             self._run_start,
             self._run_ints,
             self._block_ints,
+            self._rack_ints,
             self._chunk_ints,
             self._dc_ints,
             self._controls,
             self._weights,
+            self._mix,
             self._shares,
             self._rack_blocks,
             self._tables,
-            self._group_load,
+            self._loads,
             self._dcs,
             self._doubles,
             self._units,
             self._unit_state,
+            self._starts,
             self._flat_state,
             self._rack_store,
             self._server_c,
+            *((none, none) if servers is None else servers),
             self._constants,
+            self._terms,
             racks,
-            self._no_groups if group_out is None else group_out,
             self._needs,
             self._sums,
             dcs,
+            self._tables.reshape(-1),
+            self._rack_store if values is None else values,
+            none if values is None else values.reshape(-1),
+            *((none, none, none, no_lanes, no_lanes, no_lanes) if write is None else write),
         )
 
     def _results(self, out: tuple[Any, Any]) -> HallSums:
@@ -604,7 +636,7 @@ class Hall:
             )
         named = dict(zip(self._thermal.DC_OUT, dcs, strict=True))
         return HallSums(
-            **{**named, "hottest_group": self._group_of[named["hottest_group"].astype(np.int64)]},
+            **{**named, "hottest_group": named["hottest_group"].astype(np.int64)},
             unit_flow_m3s=self._supply["flow_m3s"].copy(),
             unit_cubed_speed=self._supply["cubed_speed"].copy(),
             room_j=self._dc["room_j"].copy(),
@@ -614,20 +646,19 @@ class Hall:
         )
 
 
-def _cubic(x: F64) -> F64:
-    """Weights of four points for the place x between the inner two (Catmull and Rom 1974).
-
-    Racks loaded alike take 1.4 sweeps in f32 from here, 1.9 from a straight line.
-    """
-    return np.stack(
-        [
-            0.5 * x * (x * (2.0 - x) - 1.0),
-            0.5 * (x * x * (3.0 * x - 5.0) + 2.0),
-            0.5 * x * (x * (4.0 - 3.0 * x) + 1.0),
-            0.5 * x * x * (x - 1.0),
-        ],
-        axis=-1,
-    )
+def _dense(fleet: Fleet, dc: int) -> F64:
+    """Mix before every rack of a data center from what all its racks give, (R, R)."""
+    air = fleet.air
+    assert air is not None
+    first, end = fleet.rack_start[dc : dc + 2]
+    out = np.zeros((end - first, end - first))
+    for rack in range(first, end):
+        for run in range(air.run_start[rack], air.run_start[rack + 1]):
+            at, count, weight = air.run_first[run], air.run_length[run], air.run_offset[run]
+            out[rack - first, at - first : at - first + count] += air.weights[
+                weight : weight + count
+            ]
+    return out * air.norm[first:end, None]
 
 
 def _table(*rows: Any) -> Any:

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import reference_twin
-from sdc_taichi import DataCenterConfig, RuntimeStateError, build_fleet, load_config, runtime
+from sdc_taichi import DataCenterConfig, RuntimeStateError, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.hall import Coil, Conditions, Hall, HallSums, Precision
 from sdc_taichi.types import F64
@@ -405,28 +405,32 @@ def test_server_layers_need_a_solve() -> None:
 
 
 def test_a_bound_kernel_takes_new_arrays_and_refuses_other_types() -> None:
-    runtime.ensure_started()
-    from sdc_taichi.kernels import thermal
-    from sdc_taichi.kernels.backend import BoundKernel
+    hall = Hall(build_fleet(load_config("tiny")), "f32")
+    bound, calls = hall._kernel, []
 
-    bound = BoundKernel(thermal.expand_kernel("f32"), 0)
-    start, at = np.array([0, 3, 8], np.int32), np.array([0, 1], np.int32)
+    def kernel(*args: Any) -> None:
+        calls.append(list(args))
+        bound(*args)
 
-    def expand(values: Any) -> list[Any]:
-        layers = [np.zeros(8, np.float32) for _ in range(3)]
-        bound(1, start, at, values, *layers, *(layer.view(np.float64) for layer in layers))
-        return layers
+    hall._kernel = kernel  # type: ignore[assignment]
+    met = Conditions(np.array([20.0]), np.array([0.5]))
+    first = hall.solve(met)
+    before = [getattr(first, f.name).copy() for f in fields(first)]
+    hall.solve(Conditions(np.array([25.0]), np.array([0.9])))
+    assert all(
+        np.array_equal(getattr(first, f.name), kept)
+        for f, kept in zip(fields(first), before, strict=True)
+    )
+    assert results_equal(first, hall.solve(met))
 
-    values = np.arange(6, dtype=np.float32).reshape(3, 2)
-    expected = [np.repeat(row, [3, 5]) for row in values]
-    first = expand(values)
-    second = expand(values + 10)
-    values *= 2
-    third = expand(values)
-    for k, row in enumerate(expected):
-        np.testing.assert_array_equal(first[k], row)
-        np.testing.assert_array_equal(second[k], row + 10)
-        np.testing.assert_array_equal(third[k], 2 * row)
-    for wrong in (values.astype(np.float64), values[0], np.zeros((3, 4), np.float32)[:, ::2]):
-        with pytest.raises(TypeError, match="other type or order"):
-            expand(wrong)
+    at = next(i for i, given in enumerate(calls[0]) if given is hall._rack_blocks)
+    racks = hall._rack_blocks
+    wrong = (racks.astype(np.float64), racks[0], np.repeat(racks, 2, axis=2)[:, :, ::2])
+    unaligned = np.zeros(racks.size + 1, np.float32)
+    unaligned = unaligned[int(unaligned.ctypes.data % 32 == 0) :][: racks.size]
+    for value, match in (
+        *((value, "other type or order") for value in wrong),
+        (unaligned.reshape(racks.shape), "start at whole ones"),
+    ):
+        with pytest.raises(TypeError, match=match):
+            bound(*calls[0][:at], value, *calls[0][at + 1 :])
