@@ -539,6 +539,40 @@ def test_tables_and_reading_step_by_step_agree(monkeypatch: pytest.MonkeyPatch) 
         np.testing.assert_array_equal(a, b)
 
 
+def test_data_centers_of_a_site_share_rows() -> None:
+    with Simulator(make_configs(load_config("tiny"), count=9, sites=SITES)) as sim:
+        sim.reset(0)
+        d = sim.drivers
+        tables = (d.ci_g_per_kwh, d.outdoor_c, d.wet_bulb_c, d.demand)
+
+        def read(index: np.ndarray, dc: np.ndarray) -> np.ndarray:
+            return np.stack([index, dc], axis=1)
+
+        rows = timed.time_rows(tables, read, period=96, row_bytes=8)
+        assert rows is not None
+        assert rows.values.shape == (3 * 35040, 2)
+        found = rows.at(np.full(9, 35040 + 7))
+        assert found[:, 0].tolist() == [7] * 9
+        assert [SITES[dc] for dc in found[:, 1]] == list(SITES) * 3
+        # Series that end within a day, or more of them than there is room for.
+        assert timed.time_rows(tables, read, period=97, row_bytes=8) is None
+        assert timed.time_rows(tables, read, period=96, row_bytes=2**28) is None
+
+
+@pytest.mark.parametrize("columns", [[0, 1, 2, 3, 4], [4, 0, 3, 1], [3], [1, 2], [2, 3, 0, 4]])
+def test_entries_are_put_where_they_belong(columns: list[int]) -> None:
+    """Of three that depend on time alone and two others."""
+    rows = np.arange(12.0, dtype=np.float32).reshape(4, 3)
+    others = np.array([[100.0, 101.0], [200.0, 201.0]], dtype=np.float32)
+    entries = np.array([3, 1])
+    everything = np.concatenate([rows[entries], others.T], axis=1)
+    layout = timed.Layout(columns, 3)
+    found = layout.filled(layout.of(rows), entries, others)
+    np.testing.assert_array_equal(found, everything[:, columns])
+    own = layout.filled(layout.of(rows[entries]), None, others)
+    np.testing.assert_array_equal(own, found)
+
+
 # Choice of features
 
 

@@ -334,7 +334,7 @@ class Observer:
         """Scaled queue, hall and battery, (n, B): one contiguous row each."""
         state, last, at = view.state, view.last, self._row
         out = np.empty((self._inside_width, len(state.stored_kwh)), dtype=np.float32)
-        waiting = state.queue[:, -1]
+        waiting = state.queue[:, -1].copy()
         out[at["queue"]] = waiting * self._per_task
         out[at["age_histogram"]] = age_histogram(state.queue, self._edges_steps).T / counted(
             waiting

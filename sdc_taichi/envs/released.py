@@ -515,7 +515,7 @@ class ReleasedObserver:
     def _others(self, view: View) -> F32:
         """Entries in the order of ``_OTHERS`` within their ranges, (n, B)."""
         state, last = view.state, view.last
-        waiting = state.queue[:, -1]
+        waiting = state.queue[:, -1].copy()
         tasks = age_histogram(state.queue, self._edges_steps).T
         out = np.empty((len(_OTHERS), len(waiting)), dtype=np.float32)
         out[0] = 0.0 if last is None else last.oldest_age_h / 24.0

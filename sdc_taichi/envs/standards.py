@@ -109,7 +109,7 @@ def start_days(core: Core) -> I64:
 
 def floats(quantities: Mapping[str, F64]) -> dict[str, float]:
     """Quantities of a batch of one."""
-    return {name: float(values[0]) for name, values in quantities.items()}
+    return {name: values.item() for name, values in quantities.items()}
 
 
 def first(observation: Observation) -> Observation:
