@@ -568,6 +568,35 @@ def test_what_the_standards_do_not_know_is_reached_through_unwrapped() -> None:
     assert turns.unwrapped.reward_terms() == {}
 
 
+@pytest.mark.parametrize("seen", ["default", "sustaindc"])
+def test_calls_per_step_are_few_whatever_the_batch(
+    seen: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a step costs above the simulator, counted: calls of Python and C functions."""
+    counted = []
+    for num_envs in (1, 3, 64):
+        env = multi_agent(num_envs, **tiny(), **SEEN[seen], rewards=seen)
+        env.reset(seed=0)
+        actions = {agent: np.ones(num_envs, dtype=np.int64) for agent in AGENTS}
+        env.step(actions)
+        result, calls = env.core.view.last, 0
+
+        def count(frame: Any, event: str, arg: Any) -> None:
+            nonlocal calls
+            calls += event in ("call", "c_call")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(env.core.sim, "step", lambda actions, result=result: result)
+            env.step(actions)
+            former = sys.getprofile()
+            sys.setprofile(count)
+            env.step(actions)
+            sys.setprofile(former)
+        counted.append(calls)
+    assert len(set(counted)) == 1
+    assert counted[0] < 160
+
+
 # --- what one learner sees of several agents ---
 
 
