@@ -22,8 +22,8 @@ def queue_kernel() -> Any:
     Work of no more than ``negligible`` is left by rounding, and has no age.
 
     Arguments: whether one thread does it; negligible work; the queues before and the work taken and
-    deferred; and for the results the queues after, (B, L), the age of the oldest work and the mean
-    age in steps, (B,).
+    deferred, (B,); and for the results the queues after, (B, L), and two rows, (2, B): the age of
+    the oldest work and the mean age in steps.
     """
     rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
     reals = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -37,8 +37,7 @@ def queue_kernel() -> Any:
         taken: reals,
         deferred: reals,
         after: rows,
-        oldest_steps: reals,
-        mean_steps: reals,
+        ages: rows,
     ):
         ti.loop_config(serialize=serial)
         for b in range(before.shape[0]):
@@ -56,9 +55,9 @@ def queue_kernel() -> Any:
                     waited += left
             total = left + deferred[b]
             after[b, last] = total
-            oldest_steps[b] = ti.cast(aged, ti.f64)
-            mean_steps[b] = ti.f64(0.0)
+            ages[0, b] = ti.cast(aged, ti.f64)
+            ages[1, b] = ti.f64(0.0)
             if total > 0.0:
-                mean_steps[b] = waited / total
+                ages[1, b] = waited / total
 
     return queue_after

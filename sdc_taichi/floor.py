@@ -142,8 +142,8 @@ class Floor:
 
     def _all_on(self, status: Status, powered: F64 | None) -> bool:
         """Whether all racks are in order and on throughout the step."""
-        lit = powered is None or bool(np.all(powered == 1.0))
-        return lit and not np.any(status)
+        lit = powered is None or bool((powered == 1.0).all())
+        return lit and not status.any()
 
     def protect(self, status: Status, inlet_max_c: Reals) -> Status:
         """Status of each rack after a step with the given hottest inlets, (R,)."""
@@ -153,7 +153,7 @@ class Floor:
 
     def racks_in(self, status: Status, which: int) -> F64:
         """Racks of each data center that have a status of ``plant.protection``, (B,)."""
-        if not np.any(status):
+        if not status.any():
             return np.zeros(len(self._servers))
         return self._fleet.rack_sums(status == which)
 
@@ -171,7 +171,7 @@ class Floor:
         if after is before:
             return np.zeros(len(self._servers))
         tripped = (after == TRIPPED) & (before != TRIPPED)
-        if not np.any(tripped):
+        if not tripped.any():
             return np.zeros(len(self._servers))
         fleet = self._fleet
         if placed.group_load is not None:

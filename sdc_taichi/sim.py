@@ -639,12 +639,11 @@ class Simulator:
 
     def _unit_command(self, name: str, given: Any, kind: type[Enum]) -> F64:
         """A command for each CRAC unit, (U,), given for all, per data center or per unit."""
-        command = self._command(name, given, kind, np.inf, (self.fleet.units,))
-        return command if len(command) == self.fleet.units else command[self._unit_dc]
+        units = self.fleet.units
+        command = self._command(name, given, kind, np.inf, units)
+        return command if len(command) == units else command[self._unit_dc]
 
-    def _command(
-        self, name: str, given: Any, kind: type[Enum], limit: float, also: tuple[int, ...] = ()
-    ) -> F64:
+    def _command(self, name: str, given: Any, kind: type[Enum], limit: float, *also: int) -> F64:
         if isinstance(given, Enum):
             if not isinstance(given, kind):
                 raise SdcError(f"action {name}: {given} is no {kind.__name__}")
@@ -657,13 +656,14 @@ class Simulator:
             raise SdcError(
                 f"action {name}: {given!r} is neither {kind.__name__} nor numbers"
             ) from None
-        valid = dict.fromkeys([(), (self.size,), *((n,) for n in also)])
-        if command.shape not in valid:
+        if len(command.shape) > 1 or (command.shape and command.shape[0] not in (self.size, *also)):
+            valid = dict.fromkeys([(), (self.size,), *((n,) for n in also)])
             raise SdcError(
                 f"action {name}: shape {command.shape}, expected {' or '.join(map(str, valid))}"
             )
-        largest = np.abs(command).max()
-        if not (largest <= limit and largest < np.inf):
+        low, high = command.min(), command.max()
+        # Not so of NaN either.
+        if not (-limit <= low and high <= limit and -np.inf < low and high < np.inf):
             wrong = ~(np.abs(command) <= limit) | ~np.isfinite(command)
             value = command[wrong].flat[0] if command.ndim else command
             raise SdcError(

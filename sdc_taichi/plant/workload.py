@@ -178,7 +178,7 @@ class Queue:
             self._after = bound_queue_kernel()
         after, ages = np.empty_like(queue), np.empty((2, len(queue)))
         serial = len(queue) <= SERIAL_UP_TO
-        self._after(serial, _NEGLIGIBLE_TASKS, queue, taken, deferred, after, ages[0], ages[1])
+        self._after(serial, _NEGLIGIBLE_TASKS, queue, taken, deferred, after, ages)
         return ages[0], ages[1], after
 
 
@@ -191,9 +191,9 @@ def age_histogram(queue: F64, edges_steps: F64) -> F64:
     """
     last = queue.shape[1] - 1
     edges = np.asarray(edges_steps).astype(np.int64)
-    found: F64 = queue.take(np.maximum(last - edges, 0), axis=1)
-    found[:, :-1] -= found[:, 1:]
-    return found
+    found = queue.T[np.maximum(last - edges, 0)]
+    found[:-1] -= found[1:]
+    return found.T
 
 
 _NEGLIGIBLE_TASKS = 1e-9
