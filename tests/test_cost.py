@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
 import sys
 import tracemalloc
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -108,3 +111,31 @@ def test_a_step_has_no_temporary_of_the_size_of_the_servers(thermal: str) -> Non
         tracemalloc.stop()
     assert sim.fleet.servers >= 100_000
     assert most < sim.fleet.servers
+
+
+SHOW_CODE = """
+import taichi as ti
+ti.init(arch=ti.cpu, offline_cache=False, print_kernel_llvm_ir_optimized=True, log_level=ti.ERROR)
+from sdc_taichi import Simulator, load_config
+sim = Simulator(load_config("corrected"))
+sim.reset()
+sim.step()
+"""
+
+
+def test_arithmetic_of_the_halls_is_on_vectors(tmp_path: Path) -> None:
+    """Nearly all of what the compiled f32 kernel multiplies and adds is eight racks at once."""
+    subprocess.run(
+        [sys.executable, "-c", SHOW_CODE],
+        cwd=tmp_path,
+        check=True,
+        capture_output=True,
+        timeout=300,
+    )
+    shown = (path.read_text() for path in sorted(tmp_path.glob("*.ll")))
+    # The last is the kernel of the run; one in f64 sizes the devices before.
+    code = [text for text in shown if "@hall_c" in text][-1]
+    on_vectors = len(re.findall(r" = f(?:mul|add|sub|div) .*<8 x float>", code))
+    one_by_one = len(re.findall(r" = f(?:mul|add|sub|div) (?:[a-z]+ )*float ", code))
+    assert on_vectors > 200
+    assert on_vectors > 10 * one_by_one
