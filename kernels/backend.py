@@ -2,6 +2,8 @@
 
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -9,8 +11,9 @@ import numpy as np
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
 
 import taichi as ti
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
-__all__ = ["BoundKernel", "ti"]
+__all__ = ["BoundKernel", "aligned", "ti"]
 
 
 OPTIONS = {"cfg_optimization": False, "real_matrix_scalarize": False}
@@ -29,6 +32,38 @@ def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     raw = np.empty(length + ALIGNMENT, np.uint8)
     start = -raw.ctypes.data % ALIGNMENT
     return raw[start : start + length].view(of).reshape(shape)
+
+
+@contextmanager
+def _options(config: Any) -> Iterator[Any]:
+    """The runtime's configuration with OPTIONS."""
+    before = {name: getattr(config, name) for name in OPTIONS}
+    try:
+        for name, value in OPTIONS.items():
+            setattr(config, name, value)
+        yield config
+    finally:
+        for name, value in before.items():
+            setattr(config, name, value)
+
+
+@contextmanager
+def _short_positions() -> Iterator[None]:
+    """File and line alone for each node of the source.
+
+    Taichi writes an excerpt of the source for every node, in case of an error, which takes half of
+    the time of translating a kernel; this is done at every start.
+    """
+
+    def position(context: Any, node: Any) -> str:
+        return f'File "{context.file}", line {node.lineno + context.lineno_offset}:\n'
+
+    excerpt = ASTTransformerContext.get_pos_info
+    try:
+        ASTTransformerContext.get_pos_info = position
+        yield
+    finally:
+        ASTTransformerContext.get_pos_info = excerpt
 
 
 class BoundKernel:
@@ -61,19 +96,14 @@ class _Launch:
 
     def __init__(self, kernel: Any, args: tuple[Any, ...], templates: int) -> None:
         primal = kernel._primal
-        compiled = primal.compiled_kernels[primal.ensure_compiled(*args)]
+        with _short_positions():
+            key = primal.ensure_compiled(*args)
+        compiled = primal.compiled_kernels[key]
         self.program = ti.lang.impl.get_runtime().prog
-        config = self.program.config()
-        before = {name: getattr(config, name) for name in OPTIONS}
-        try:
-            for name, value in OPTIONS.items():
-                setattr(config, name, value)
+        with _options(self.program.config()) as config:
             self._compiled = self.program.compile_kernel(
                 config, self.program.get_device_caps(), compiled
             )
-        finally:
-            for name, value in before.items():
-                setattr(config, name, value)
         self._context = compiled.make_launch_context()
         annotations = [argument.annotation for argument in primal.arguments[templates:]]
         self._element_dims = [getattr(getattr(a, "dtype", None), "ndim", 0) for a in annotations]

@@ -36,8 +36,8 @@ RACK_INTS = ("first_group", "first_server")
 RUN_INTS = ("first", "length", "offset")
 CHUNK_INTS = ("first_block", "dc", "first_need")
 DC_INTS = ("first_chunk", "first_unit", "first_share", "racks", "mix", "start")
-"""``mix``: first of the weights of halls that keep every weight, -1 of others; ``start``: entry of
-the table of where the sweeps start."""
+"""``mix``: first of the weights of halls that keep every weight, -1 of others; ``start``: first
+row of the table of where the sweeps start."""
 CONTROL = ("active", "exchange", "side", "sweep", "chunks")
 """Per data center: whether the next sweep computes it (1), it has ended (0) or come to no end (-1);
 whether the next sweep exchanges anew; which row of the exhaust its last exchange saw; sweeps since
@@ -128,11 +128,11 @@ exhaust has changed by since."""
 RACK_OUT = ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "inlet_max_c", "outlet_c")
 GROUP_OUT = ("inlet_c", "outlet_c", "power_w")
 TERMS = (
+    "airflow_m3s",
+    "outlet_c",
     "cpu_w",
     "fan_w",
-    "airflow_m3s",
     "inlet_c",
-    "outlet_c",
     "inlet_m3k_s",
     "outlet_m3k_s",
     "captured_m3k_s",
@@ -141,6 +141,8 @@ TERMS = (
     "stored_w",
 )
 """Of each rack, what adds up over a chunk."""
+SWEEP_TERMS = 2
+"""The first of these are what a steady sweep needs; the others are summed up after the last."""
 SUMS = (*TERMS, "inlet_max_c", "hottest_block", "hottest_lane", "hottest_zone", "least_k", "most_k")
 """Per chunk: sums, hottest group, and the range of what the exhaust changed by since the last
 exchange, or of what the mixes change by in the next one."""
@@ -260,7 +262,7 @@ def hall_kernel(precision: str) -> Any:
     mantissa, bias = (23, 127) if precision == "f32" else (52, 1023)
     exp_terms = EXP_TERMS[precision]
     n_terms, n_rows, n_values = len(TERMS), len(GROUP_ROWS), len(GROUP_OUT)
-    reals_4d = ti.types.ndarray(dtype=ti.f64, ndim=4)
+    n_others = len(SUMS) - n_terms
     reals_2d = ti.types.ndarray(dtype=real, ndim=2)
     reals_1d = ti.types.ndarray(dtype=real, ndim=1)
     blocks_2d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=2)
@@ -268,6 +270,7 @@ def hall_kernel(precision: str) -> Any:
     ints_2d = ti.types.ndarray(dtype=ti.i32, ndim=2)
     ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
     doubles_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
+    starts_2d = ti.types.ndarray(dtype=ti.types.vector(4, ti.f64), ndim=2)
     doubles_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
 
     @ti.func
@@ -315,6 +318,7 @@ def hall_kernel(precision: str) -> Any:
     @no_type_check
     def expect(
         n,
+        start_rows,
         dc_ints: ti.template(),
         doubles: ti.template(),
         unit_state: ti.template(),
@@ -325,28 +329,21 @@ def hall_kernel(precision: str) -> Any:
         By the supply air of the first unit, which tells where the others are near enough to start.
         """
         supply_c = unit_state[SUPPLY.supply_c, dc_ints[DC.first_unit, n]]
-        table, rows, columns = dc_ints[DC.start, n], starts.shape[1], starts.shape[2]
+        rows, columns = start_rows - 2, starts.shape[1] - 2
         y = (supply_c - doubles[EXACT.start_low_c, n]) * doubles[EXACT.start_per_k, n]
         y = ti.min(ti.max(y, 0.0), ti.cast(rows - 1, ti.f64))
         x = ti.min(ti.max(doubles[EXACT.utilisation, n], 0.0), 1.0) * ti.cast(columns - 1, ti.f64)
         row = ti.min(ti.cast(y, ti.i32), rows - 2)
         column = ti.min(ti.cast(x, ti.i32), columns - 2)
         of_rows, of_columns = cubic(y - row), cubic(x - column)
-        scale = ti.cast(0.0, ti.f64)
-        warming = ti.cast(0.0, ti.f64)
-        kept = ti.cast(0.0, ti.f64)
-        for a in range(4):
-            i = ti.min(ti.max(row + a - 1, 0), rows - 1)
-            for b in range(4):
-                j = ti.min(ti.max(column + b - 1, 0), columns - 1)
-                w = of_rows[a] * of_columns[b]
-                scale += w * starts[table, i, j, 0]
-                warming += w * starts[table, i, j, 1]
-                kept += w * starts[table, i, j, 2]
+        start = ti.Vector([ti.cast(0.0, ti.f64)] * 4)
+        for k in range(16):
+            w = of_rows[k // 4] * of_columns[k % 4]
+            start += w * starts[dc_ints[DC.start, n] + row + k // 4, column + k % 4]
         doubles[EXACT.start_c, n] = supply_c
-        doubles[EXACT.start_scale, n] = scale
-        doubles[EXACT.start_warming, n] = warming
-        doubles[EXACT.kept, n] = kept
+        doubles[EXACT.start_scale, n] = start[0]
+        doubles[EXACT.start_warming, n] = start[1]
+        doubles[EXACT.kept, n] = start[2]
 
     @ti.func
     @no_type_check
@@ -359,38 +356,8 @@ def hall_kernel(precision: str) -> Any:
 
     @ti.func
     @no_type_check
-    def foresee(
-        n,
-        chunk,
-        chunk_ints: ti.template(),
-        dc_ints: ti.template(),
-        mix: ti.template(),
-        rack_state: ti.template(),
-        rack_store: ti.template(),
-        sums: ti.template(),
-    ):
-        """How far the next exchange would move the mixes, for the data centers of one chunk."""
-        least = ti.Vector([ti.cast(0.0, real)] * LANES)
-        most = least
-        block_0 = chunk_ints[CHUNK.first_block, chunk]
-        n_racks = dc_ints[DC.racks, n]
-        first = STATE.change_k * rack_store.shape[1] * LANES + block_0 * LANES
-        for block in range(block_0, chunk_ints[CHUNK.first_block, chunk + 1]):
-            at = dc_ints[DC.mix, n] + (block - block_0) * n_racks
-            moves = mixed_from(mix, at, rack_state, first, n_racks)
-            rack_store[STATE.exchanged_c, block] = moves
-            least = smaller(moves, least)
-            most = larger(moves, most)
-        least_k, most_k = real(0.0), real(0.0)
-        for i in range(LANES):
-            least_k = ti.min(least_k, least[i])
-            most_k = ti.max(most_k, most[i])
-        sums[SUM.least_k, chunk] = ti.cast(least_k, ti.f64)
-        sums[SUM.most_k, chunk] = ti.cast(most_k, ti.f64)
-
-    @ti.func
-    @no_type_check
-    def exchange(
+    def exchange_mixes(
+        again,
         n,
         chunk,
         chunk_ints: ti.template(),
@@ -401,36 +368,82 @@ def hall_kernel(precision: str) -> Any:
         racks: ti.template(),
         rack_state: ti.template(),
         rack_store: ti.template(),
+        sums: ti.template(),
     ):
-        """Exhausts that may be expected once the mixes have settled, and their mixes.
+        """Mixes of a data center of one chunk that keeps every weight, in three passes.
 
-        What ``foresee`` found comes back from the racks by the share ``kept``, now and then not.
+        The first tells what the mixes change by if the racks answer no more. The others let the
+        share ``kept`` of that come back from the racks, now and then not, and the last gives the
+        exhausts that may be expected and their mixes.
         """
-        kept = ti.min(doubles[EXACT.kept, n], EXPECTED_KEPT)
-        if control[CTL.sweep, n] % PLAIN_EVERY == 0:
-            kept = 0.0
-        back = ti.cast(kept, real)
         block_0 = chunk_ints[CHUNK.first_block, chunk]
         block_1 = chunk_ints[CHUNK.first_block, chunk + 1]
         n_racks = dc_ints[DC.racks, n]
-        places = rack_store.shape[1] * LANES
-        for again in range(2):
-            row = STATE.change_k if again == 0 else STATE.exhaust_c
+        row = STATE.change_k
+        if again > 0:
+            kept = ti.min(doubles[EXACT.kept, n], EXPECTED_KEPT)
+            if control[CTL.sweep, n] % PLAIN_EVERY == 0:
+                kept = 0.0
+            back = ti.cast(kept, real)
+            if again == 2:
+                row = STATE.exhaust_c
             for block in range(block_0, block_1):
                 moves = rack_store[STATE.exchanged_c, block] * racks[RACK.strength, block]
                 was = rack_store[STATE.exhaust_c, block]
                 change = rack_store[STATE.exhaust_odd_c, block] - was + moves * back
                 rack_store[STATE.change_k, block] = change
-                if again == 1:
+                if again == 2:
                     rack_store[STATE.exhaust_c, block] = was + change
-            for block in range(block_0, block_1):
-                rack_store[STATE.exchanged_c, block] = mixed_from(
-                    mix,
-                    dc_ints[DC.mix, n] + (block - block_0) * n_racks,
-                    rack_state,
-                    row * places + block_0 * LANES,
-                    n_racks,
-                )
+        least = ti.Vector([ti.cast(0.0, real)] * LANES)
+        most = least
+        first = row * rack_store.shape[1] * LANES + block_0 * LANES
+        for block in range(block_0, block_1):
+            at = dc_ints[DC.mix, n] + (block - block_0) * n_racks
+            mixed = mixed_from(mix, at, rack_state, first, n_racks)
+            rack_store[STATE.exchanged_c, block] = mixed
+            least = smaller(mixed, least)
+            most = larger(mixed, most)
+        if again == 0:
+            least_k, most_k = real(0.0), real(0.0)
+            for i in range(LANES):
+                least_k = ti.min(least_k, least[i])
+                most_k = ti.max(most_k, most[i])
+            sums[SUM.least_k, chunk] = ti.cast(least_k, ti.f64)
+            sums[SUM.most_k, chunk] = ti.cast(most_k, ti.f64)
+
+    @ti.func
+    @no_type_check
+    def add_up(
+        chunk, slice_at, chunk_ints: ti.template(), terms: ti.template(), sums: ti.template()
+    ):
+        """Sums of the terms over a chunk; see ``close`` for the loops."""
+        first_block = chunk_ints[CHUNK.first_block, chunk]
+        n_blocks = chunk_ints[CHUNK.first_block, chunk + 1] - first_block
+        r = 0
+        while r < sums.shape[0] - n_others:
+            lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
+            for b in range(n_blocks):
+                term = terms[slice_at + r, b]
+                for i in range(LANES):
+                    lanes[i] += ti.cast(term[i], ti.f64)
+            total = ti.cast(0.0, ti.f64)
+            for i in range(LANES):
+                total += lanes[i]
+            sums[r, chunk] = total
+            r += 1
+
+    @ti.func
+    @no_type_check
+    def find_hottest(chunk, hottest, of_block, of_zone, sums: ti.template()):
+        """The first of the racks with the hottest inlet."""
+        most_c, block, lane, zone = real(-1e30), 0, 0, real(0.0)
+        for i in range(LANES):
+            if hottest[i] > most_c or (hottest[i] == most_c and of_block[i] < block):
+                most_c, block, lane, zone = hottest[i], of_block[i], i, of_zone[i]
+        sums[SUM.inlet_max_c, chunk] = ti.cast(most_c, ti.f64)
+        sums[SUM.hottest_block, chunk] = ti.cast(block, ti.f64)
+        sums[SUM.hottest_lane, chunk] = ti.cast(lane, ti.f64)
+        sums[SUM.hottest_zone, chunk] = ti.cast(zone, ti.f64)
 
     @ti.func
     @no_type_check
@@ -438,6 +451,12 @@ def hall_kernel(precision: str) -> Any:
         recirculates: ti.template(),
         transient: ti.template(),
         n,
+        late,
+        slice_at,
+        n_blocks,
+        hottest,
+        of_block,
+        of_zone,
         sweeps,
         substep_s,
         weight,
@@ -451,38 +470,58 @@ def hall_kernel(precision: str) -> Any:
         units: ti.template(),
         unit_state: ti.template(),
         needs: ti.template(),
+        terms: ti.template(),
         sums: ti.template(),
         dc_out: ti.template(),
     ):
-        """Sums of a data center, its CRAC units, and what its next sweep is."""
-        chunk_0, chunk_1 = dc_ints[DC.first_chunk, n], dc_ints[DC.first_chunk, n + 1]
-        total = ti.Vector([ti.cast(0.0, ti.f64)] * n_terms)
-        for r in range(n_terms):
-            for chunk in range(chunk_0, chunk_1):
-                total[r] += sums[r, chunk]
+        """CRAC units of a data center, what its next sweep is, and at its end what comes out.
+
+        ``late``: the terms that a sweep does not need are summed up at the end.
+        """
+        chunk_0 = dc_ints[DC.first_chunk, n]
+        # Loops whose ends are read anew from memory are compiled as they are, not to several copies
+        # for speed that is not needed here. `x = x + y`, since `x += y` would be atomic.
+        chunk = chunk_0 + 1
+        while chunk < dc_ints[DC.first_chunk, n + 1]:
+            r = 0
+            while r < sums.shape[0] - n_others:
+                sums[r, chunk_0] = sums[r, chunk_0] + sums[r, chunk]
+                r += 1
+            if sums[SUM.inlet_max_c, chunk] > sums[SUM.inlet_max_c, chunk_0]:
+                sums[SUM.inlet_max_c, chunk_0] = sums[SUM.inlet_max_c, chunk]
+                sums[SUM.hottest_block, chunk_0] = sums[SUM.hottest_block, chunk]
+                sums[SUM.hottest_lane, chunk_0] = sums[SUM.hottest_lane, chunk]
+                sums[SUM.hottest_zone, chunk_0] = sums[SUM.hottest_zone, chunk]
+            least_k = ti.min(sums[SUM.least_k, chunk_0], sums[SUM.least_k, chunk])
+            most_k = ti.max(sums[SUM.most_k, chunk_0], sums[SUM.most_k, chunk])
+            sums[SUM.least_k, chunk_0] = least_k
+            sums[SUM.most_k, chunk_0] = most_k
+            chunk += 1
         n_racks = ti.cast(dc_ints[DC.racks, n], ti.f64)
         sweep = control[CTL.sweep, n]
         crac_flow = ti.cast(0.0, ti.f64)
         supply_c = ti.cast(0.0, ti.f64)
+        passing = ti.cast(0.0, ti.f64)
         return_c = ti.cast(0.0, ti.f64)
         coil_load = ti.cast(0.0, ti.f64)
         coil_w = ti.cast(0.0, ti.f64)
         adds = False
+        ends = True
         if ti.static(recirculates):
-            least_k = ti.cast(1e30, ti.f64)
-            most_k = ti.cast(-1e30, ti.f64)
-            for chunk in range(chunk_0, chunk_1):
-                least_k = ti.min(least_k, sums[SUM.least_k, chunk])
-                most_k = ti.max(most_k, sums[SUM.most_k, chunk])
-            unit_first, unit_end = dc_ints[DC.first_unit, n], dc_ints[DC.first_unit, n + 1]
-            following = total[SUM.airflow_m3s] / doubles[EXACT.it_airflow_m3s, n]
+            least_k, most_k = sums[SUM.least_k, chunk_0], sums[SUM.most_k, chunk_0]
+            unit_first = dc_ints[DC.first_unit, n]
+            following = sums[SUM.airflow_m3s, chunk_0] / doubles[EXACT.it_airflow_m3s, n]
             uncovered = ti.cast(0.0, ti.f64)
             supply_flow = ti.cast(0.0, ti.f64)
-            passing = ti.cast(0.0, ti.f64)
-            for at in range(unit_first, unit_end):
-                need = ti.cast(0.0, ti.f64)
-                for chunk in range(chunk_0, chunk_1):
-                    need += needs[chunk_ints[CHUNK.first_need, chunk] + at - unit_first]
+            at = unit_first
+            while at < dc_ints[DC.first_unit, n + 1]:
+                need_at = chunk_ints[CHUNK.first_need, chunk_0] + at - unit_first
+                chunk = chunk_0 + 1
+                while chunk < dc_ints[DC.first_chunk, n + 1]:
+                    other = chunk_ints[CHUNK.first_need, chunk] + at - unit_first
+                    needs[need_at] = needs[need_at] + needs[other]
+                    chunk += 1
+                need = needs[need_at]
                 low = ti.cast(units[UNIT.low, at], ti.f64)
                 high = ti.cast(units[UNIT.high, at], ti.f64)
                 speed = ti.min(ti.max(following, low), high)
@@ -507,8 +546,8 @@ def hall_kernel(precision: str) -> Any:
                         cubed += unit_state[SUPPLY.cubed_speed, at]
                 unit_state[SUPPLY.flow_m3s, at] = flow
                 unit_state[SUPPLY.cubed_speed, at] = cubed
+                at += 1
             supply_c = supply_flow / crac_flow
-            return_c = (total[SUM.outlet_m3k_s] - total[SUM.captured_m3k_s] + passing) / crac_flow
             doubles[EXACT.stirring_m3s, n] = crac_flow / n_racks
             control[CTL.sweep, n] = sweep + 1
             more = ti.cast(sweep + 1 < sweeps, ti.i32)
@@ -519,17 +558,19 @@ def hall_kernel(precision: str) -> Any:
             if exchanged:
                 control[CTL.side, n] = 1 - control[CTL.side, n]
             if ti.static(transient):
+                leaves = sums[SUM.outlet_m3k_s, chunk_0] - sums[SUM.captured_m3k_s, chunk_0]
+                return_c = (leaves + passing) / crac_flow
                 control[CTL.exchange, n] = ti.cast(apart, ti.i32)
                 control[CTL.active, n] = more
                 adds = sweep > 0
                 running = ti.cast(0.0, ti.f64)
-                for at in range(unit_first, unit_end):
-                    low = ti.cast(units[UNIT.low, at], ti.f64)
-                    high = ti.cast(units[UNIT.high, at], ti.f64)
+                for unit in range(unit_first, dc_ints[DC.first_unit, n + 1]):
+                    low = ti.cast(units[UNIT.low, unit], ti.f64)
+                    high = ti.cast(units[UNIT.high, unit], ti.f64)
                     speed = ti.min(ti.max(following, low), high)
-                    design_m3s = ti.cast(units[UNIT.design_m3s, at], ti.f64)
-                    is_on = ti.cast(units[UNIT.running, at], ti.f64)
-                    warmer_k = return_c - unit_state[SUPPLY.supply_c, at]
+                    design_m3s = ti.cast(units[UNIT.design_m3s, unit], ti.f64)
+                    is_on = ti.cast(units[UNIT.running, unit], ti.f64)
+                    warmer_k = return_c - unit_state[SUPPLY.supply_c, unit]
                     air = ti.cast(dcs[VALUE.air_j_per_m3_k, n], ti.f64)
                     taken = air * design_m3s * speed * warmer_k
                     fan_w = doubles[EXACT.crac_fan_w_per_m3s, n] * design_m3s
@@ -540,21 +581,23 @@ def hall_kernel(precision: str) -> Any:
                         coil_w = ti.cast(1.0, ti.f64)
                 wanted = ti.max(running + coil_w * doubles[EXACT.room_j, n] / substep_s, 0.0)
                 coil_w = ti.min(wanted, doubles[EXACT.coil_limit_w, n])
-                doubles[EXACT.room_j, n] += (coil_load - coil_w) * substep_s
-                warmed_k = doubles[EXACT.room_j, n] / doubles[EXACT.room_j_per_k, n]
-                for at in range(unit_first, unit_end):
-                    setpoint_c = ti.cast(units[UNIT.setpoint_c, at], ti.f64)
-                    unit_state[SUPPLY.supply_c, at] = setpoint_c + warmed_k
+                held_j = doubles[EXACT.room_j, n] + (coil_load - coil_w) * substep_s
+                doubles[EXACT.room_j, n] = held_j
+                warmed_k = held_j / doubles[EXACT.room_j_per_k, n]
+                for unit in range(unit_first, dc_ints[DC.first_unit, n + 1]):
+                    setpoint_c = ti.cast(units[UNIT.setpoint_c, unit], ti.f64)
+                    unit_state[SUPPLY.supply_c, unit] = setpoint_c + warmed_k
                 doubles[EXACT.shift_k, n] = ti.select(apart, 0.0, middle_k)
             else:
                 shift_k = doubles[EXACT.shift_k, n]
                 left_k = ti.max(most_k - shift_k, shift_k - least_k)
                 # The mixes cool or warm by less than what they lie above supply air.
-                above_k = ti.abs(total[SUM.outlet_c] / n_racks - supply_c)
+                above_k = ti.abs(sums[SUM.outlet_c, chunk_0] / n_racks - supply_c)
                 left_k = ti.max(left_k, uncovered * above_k)
                 control[CTL.active, n] = 0
                 if not left_k <= tolerance_k:
                     control[CTL.active, n] = 2 * more - 1
+                    ends = more == 0
                 if dc_ints[DC.mix, n] < 0:
                     control[CTL.exchange, n] = ti.cast(apart, ti.i32)
                     # Most of what is left is the same for all racks and shrinks by a factor, so a
@@ -576,24 +619,26 @@ def hall_kernel(precision: str) -> Any:
                         next_k = beyond_k
                         doubles[EXACT.moved_k, n] = 0.0
                     doubles[EXACT.shift_k, n] = next_k
-        ends = True
-        if ti.static(recirculates and not transient):
-            ends = control[CTL.active, n] != 1
         if ends:
-            inlet_m3k_s = total[SUM.inlet_m3k_s] - total[SUM.airflow_m3s] * supply_c
-            outlet_m3k_s = total[SUM.outlet_m3k_s] - total[SUM.airflow_m3s] * supply_c
+            if ti.static(recirculates and not transient):
+                if late:
+                    add_up(chunk_0, slice_at, chunk_ints, terms, sums)
+                    find_hottest(chunk_0, hottest, of_block, of_zone, sums)
+                leaves = sums[SUM.outlet_m3k_s, chunk_0] - sums[SUM.captured_m3k_s, chunk_0]
+                return_c = (leaves + passing) / crac_flow
+            flow = sums[SUM.airflow_m3s, chunk_0]
             now = ti.Vector(
                 [
-                    total[SUM.cpu_w],
-                    total[SUM.fan_w],
-                    total[SUM.airflow_m3s],
-                    total[SUM.inlet_c] / n_racks,
-                    total[SUM.outlet_c] / n_racks,
-                    inlet_m3k_s,
-                    outlet_m3k_s,
-                    total[SUM.hot_k],
-                    total[SUM.cold_k],
-                    total[SUM.stored_w],
+                    sums[SUM.cpu_w, chunk_0],
+                    sums[SUM.fan_w, chunk_0],
+                    flow,
+                    sums[SUM.inlet_c, chunk_0] / n_racks,
+                    sums[SUM.outlet_c, chunk_0] / n_racks,
+                    sums[SUM.inlet_m3k_s, chunk_0] - flow * supply_c,
+                    sums[SUM.outlet_m3k_s, chunk_0] - flow * supply_c,
+                    sums[SUM.hot_k, chunk_0],
+                    sums[SUM.cold_k, chunk_0],
+                    sums[SUM.stored_w, chunk_0],
                     crac_flow,
                     supply_c,
                     return_c,
@@ -601,22 +646,21 @@ def hall_kernel(precision: str) -> Any:
                     coil_w,
                 ]
             )
-            for r in range(15):
+            for r in ti.static(range(TOTAL.inlet_max_c)):
                 value = now[r]
                 if ti.static(transient):
                     value *= weight
                     if adds:
                         value += dc_out[r, n]
                 dc_out[r, n] = value
-            for chunk in range(chunk_0, chunk_1):
-                hottest = sums[SUM.inlet_max_c, chunk]
-                if (not adds and chunk == chunk_0) or hottest > dc_out[TOTAL.inlet_max_c, n]:
-                    block = ti.cast(sums[SUM.hottest_block, chunk], ti.i32)
-                    zone = ti.cast(sums[SUM.hottest_zone, chunk], ti.i32)
-                    lane = ti.cast(sums[SUM.hottest_lane, chunk], ti.i32)
-                    group = rack_ints[RACK_INT.first_group, block * LANES + lane] + zone
-                    dc_out[TOTAL.inlet_max_c, n] = hottest
-                    dc_out[TOTAL.hottest_group, n] = ti.cast(group, ti.f64)
+            hottest_c = sums[SUM.inlet_max_c, chunk_0]
+            if not adds or hottest_c > dc_out[TOTAL.inlet_max_c, n]:
+                block = ti.cast(sums[SUM.hottest_block, chunk_0], ti.i32)
+                zone = ti.cast(sums[SUM.hottest_zone, chunk_0], ti.i32)
+                lane = ti.cast(sums[SUM.hottest_lane, chunk_0], ti.i32)
+                group = rack_ints[RACK_INT.first_group, block * LANES + lane] + zone
+                dc_out[TOTAL.inlet_max_c, n] = hottest_c
+                dc_out[TOTAL.hottest_group, n] = ti.cast(group, ti.f64)
 
     @ti.func
     @no_type_check
@@ -676,19 +720,21 @@ def hall_kernel(precision: str) -> Any:
 
     @ti.func
     @no_type_check
-    def evaluate(
+    def run(
         recirculates: ti.template(),
         transient: ti.template(),
         write: ti.template(),
         slice_at,
-        n,
-        chunk,
+        first_chunk,
+        end_chunk,
+        sweeps,
         outlet_model,
         loads_of,
         each_once,
-        sweeps,
+        start_rows,
         substep_s,
         weight,
+        tolerance_k,
         run_start: ti.template(),
         run_ints: ti.template(),
         block_ints: ti.template(),
@@ -704,7 +750,9 @@ def hall_kernel(precision: str) -> Any:
         group_load: ti.template(),
         dcs: ti.template(),
         doubles: ti.template(),
+        units: ti.template(),
         unit_state: ti.template(),
+        starts: ti.template(),
         rack_state: ti.template(),
         rack_store: ti.template(),
         server_c: ti.template(),
@@ -715,21 +763,31 @@ def hall_kernel(precision: str) -> Any:
         rack_out: ti.template(),
         needs: ti.template(),
         sums: ti.template(),
+        dc_out: ti.template(),
         counts: ti.template(),
         group_values: ti.template(),
         values: ti.template(),
         layers: ti.template(),
         layer_blocks: ti.template(),
     ):
-        """One sweep of a chunk, or the values of its servers."""
+        """Sweeps of a data center or chunks of it, or the values of its servers."""
+        n = chunk_ints[CHUNK.dc, first_chunk]
+        dc_chunk_0 = dc_ints[DC.first_chunk, n]
+        n_parts = dc_ints[DC.first_chunk, n + 1] - dc_chunk_0
+        dc_block_0 = chunk_ints[CHUNK.first_block, dc_chunk_0]
+        # Chunks that are tasks of their own wait for each other after every sweep.
+        rounds = sweeps if end_chunk - first_chunk == n_parts else 1
+        passes, late = 1, False
+        if ti.static(recirculates and not transient and not write):
+            late = n_parts == 1
+            if dc_ints[DC.mix, n] >= 0:
+                passes = 3
+            if control[CTL.sweep, n] == 0:
+                expect(n, start_rows, dc_ints, doubles, unit_state, starts)
         zeros = ti.Vector([ti.cast(0.0, real)] * LANES)
         ones = zeros + real(1.0)
         unit_0 = dc_ints[DC.first_unit, n]
         n_units = dc_ints[DC.first_unit, n + 1] - unit_0
-        need_0 = chunk_ints[CHUNK.first_need, chunk]
-        block_0 = chunk_ints[CHUNK.first_block, chunk]
-        block_1 = chunk_ints[CHUNK.first_block, chunk + 1]
-        dc_block_0 = chunk_ints[CHUNK.first_block, dc_ints[DC.first_chunk, n]]
         places = rack_store.shape[1] * LANES
         utilisation = zeros + ti.cast(doubles[EXACT.utilisation, n], real)
         cpu_slope = dcs[VALUE.cpu_slope_per_k, n]
@@ -752,329 +810,394 @@ def hall_kernel(precision: str) -> Any:
         parcel_j = dcs[VALUE.parcel_j_per_k, n]
         step_s = ti.cast(substep_s, real)
         per_step_s = real(1.0) / step_s
-        # CRAC air of the room stirs the air before racks that stand still.
-        still_per_s = ti.min(
-            real(STILL_PER_S), air * ti.cast(doubles[EXACT.stirring_m3s, n], real) / parcel_j
-        )
-        begins = control[CTL.sweep, n] == 0
-        ends = control[CTL.sweep, n] == sweeps - 1
-        # What the last sweep left is read anew after it.
-        shift = ti.cast(doubles[EXACT.shift_k, n], real)
-        side = control[CTL.side, n]
-        anew = control[CTL.exchange, n] != 0
-        if anew:
-            side = 1 - side
-        least = zeros + real(1e30)
-        most = zeros - real(1e30)
-        chunk_hottest = zeros - real(1e30)
-        chunk_zone = zeros
-        chunk_block = ti.Vector([0] * LANES)
-        for j in range(n_units):
-            needs[need_0 + j] = 0.0
-        for block in range(block_0, block_1):
-            n_groups = block_ints[BLOCK.groups, block]
-            table = block_ints[BLOCK.table, block]
-            place = block_ints[BLOCK.place, block]
-            share_0 = dc_ints[DC.first_share, n] + n_units * (block - dc_block_0)
-            per_server = racks[RACK.per_server, block]
-            u = utilisation
-            if loads_of == 1:
-                u = racks[RACK.load, block]
-            powered = racks[RACK.powered, block]
-            air_left = racks[RACK.airflow, block]
-            breath = air_left * powered
-            uneven = u * (real(1.0) - u)
-            cover = zeros
-            mixed = zeros
-            fresh = zeros
-            captured_share = zeros
-            parcel_w = zeros
-            if ti.static(recirculates):
-                captured_share = racks[RACK.captured, block]
+        for _ in range(rounds):
+            if ti.static(not write):
+                if control[CTL.active, n] <= 0:
+                    break
+            # CRAC air of the room stirs the air before racks that stand still.
+            still_per_s = ti.min(
+                real(STILL_PER_S), air * ti.cast(doubles[EXACT.stirring_m3s, n], real) / parcel_j
+            )
+            begins = control[CTL.sweep, n] == 0
+            ends = control[CTL.sweep, n] == sweeps - 1
+            # What the last sweep left is read anew after it.
+            shift = ti.cast(doubles[EXACT.shift_k, n], real)
+            side = control[CTL.side, n]
+            anew = control[CTL.exchange, n] != 0
+            if anew:
+                side = 1 - side
+            for chunk in range(first_chunk, end_chunk):
+                least = zeros + real(1e30)
+                most = zeros - real(1e30)
+                flow_lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
+                outlet_lanes = flow_lanes
+                chunk_hottest = zeros - real(1e30)
+                chunk_zone = zeros
+                chunk_block = ti.Vector([0] * LANES)
+                need_0 = chunk_ints[CHUNK.first_need, chunk]
+                block_0 = chunk_ints[CHUNK.first_block, chunk]
+                n_blocks = chunk_ints[CHUNK.first_block, chunk + 1] - block_0
                 for j in range(n_units):
-                    used = SUPPLY.fresh_ratio_used if ti.static(write) else SUPPLY.fresh_ratio
-                    ratio = ti.cast(unit_state[used, unit_0 + j], real)
-                    part = shares[share_0 + j] * ratio
-                    cover += part
-                    fresh += part * ti.cast(unit_state[SUPPLY.supply_c, unit_0 + j], real)
-                if ti.static(write):
-                    mixed = rack_store[STATE.mixed_c, block]
-                else:
-                    target = zeros
-                    if anew:
-                        if dc_ints[DC.mix, n] >= 0:
-                            n_racks = dc_ints[DC.racks, n]
-                            target = mixed_from(
-                                mix,
-                                dc_ints[DC.mix, n] + (block - dc_block_0) * n_racks,
-                                rack_state,
-                                (1 + side) * places + dc_block_0 * LANES,
-                                n_racks,
+                    needs[need_0 + j] = 0.0
+                for b in range(n_blocks):
+                    block = block_0 + b
+                    n_groups = block_ints[BLOCK.groups, block]
+                    table = block_ints[BLOCK.table, block]
+                    place = block_ints[BLOCK.place, block]
+                    share_0 = dc_ints[DC.first_share, n] + n_units * (block - dc_block_0)
+                    per_server = racks[RACK.per_server, block]
+                    u = utilisation
+                    if loads_of == 1:
+                        u = racks[RACK.load, block]
+                    powered = racks[RACK.powered, block]
+                    air_left = racks[RACK.airflow, block]
+                    breath = air_left * powered
+                    uneven = u * (real(1.0) - u)
+                    cover = zeros
+                    mixed = zeros
+                    fresh = zeros
+                    captured_share = zeros
+                    parcel_w = zeros
+                    if ti.static(recirculates):
+                        captured_share = racks[RACK.captured, block]
+                        for j in range(n_units):
+                            used = (
+                                SUPPLY.fresh_ratio_used if ti.static(write) else SUPPLY.fresh_ratio
                             )
+                            ratio = ti.cast(unit_state[used, unit_0 + j], real)
+                            part = shares[share_0 + j] * ratio
+                            cover += part
+                            fresh += part * ti.cast(unit_state[SUPPLY.supply_c, unit_0 + j], real)
+                        if ti.static(write):
+                            mixed = rack_store[STATE.mixed_c, block]
                         else:
-                            for i in range(LANES):
-                                t = real(0.0)
-                                at = block * LANES + i
-                                for run in range(run_start[at], run_start[at + 1]):
-                                    x = (1 + side) * places + run_ints[RUN.first, run]
-                                    w = run_ints[RUN.offset, run]
-                                    s = real(0.0)
-                                    for e in range(run_ints[RUN.length, run]):
-                                        s += weights[w + e] * rack_state[x + e]
-                                    t += s
-                                target[i] = t
-                            target *= racks[RACK.norm, block]
-                        rack_store[STATE.exchanged_c, block] = target
-                    elif begins:
-                        start_c = ti.cast(doubles[EXACT.start_c, n], real)
-                        scale = ti.cast(doubles[EXACT.start_scale, n], real)
-                        warming = ti.cast(doubles[EXACT.start_warming, n], real)
-                        approach = racks[RACK.start_approach_k, block]
-                        rise = racks[RACK.start_rise_k, block]
-                        gives = approach * scale + rise * warming + start_c
-                        rack_store[1 + side, block] = gives * racks[RACK.strength, block]
-                        approach = racks[RACK.mixed_approach_k, block]
-                        rise = racks[RACK.mixed_rise_k, block]
-                        target = approach * scale + rise * warming + start_c
-                        rack_store[STATE.exchanged_c, block] = target
+                            target = zeros
+                            if anew:
+                                at_once = False
+                                if ti.static(transient):
+                                    if dc_ints[DC.mix, n] >= 0:
+                                        at_once = True
+                                        n_racks = dc_ints[DC.racks, n]
+                                        target = mixed_from(
+                                            mix,
+                                            dc_ints[DC.mix, n] + (block - dc_block_0) * n_racks,
+                                            rack_state,
+                                            (1 + side) * places + dc_block_0 * LANES,
+                                            n_racks,
+                                        )
+                                if not at_once:
+                                    for i in range(LANES):
+                                        t = real(0.0)
+                                        at = block * LANES + i
+                                        for run in range(run_start[at], run_start[at + 1]):
+                                            x = (1 + side) * places + run_ints[RUN.first, run]
+                                            w = run_ints[RUN.offset, run]
+                                            s = real(0.0)
+                                            for e in range(run_ints[RUN.length, run]):
+                                                s += weights[w + e] * rack_state[x + e]
+                                            t += s
+                                        target[i] = t
+                                    target *= racks[RACK.norm, block]
+                                rack_store[STATE.exchanged_c, block] = target
+                            elif begins:
+                                start_c = ti.cast(doubles[EXACT.start_c, n], real)
+                                scale = ti.cast(doubles[EXACT.start_scale, n], real)
+                                warming = ti.cast(doubles[EXACT.start_warming, n], real)
+                                approach = racks[RACK.start_approach_k, block]
+                                rise = racks[RACK.start_rise_k, block]
+                                gives = approach * scale + rise * warming + start_c
+                                rack_store[1 + side, block] = gives * racks[RACK.strength, block]
+                                approach = racks[RACK.mixed_approach_k, block]
+                                rise = racks[RACK.mixed_rise_k, block]
+                                target = approach * scale + rise * warming + start_c
+                                rack_store[STATE.exchanged_c, block] = target
+                            else:
+                                target = rack_store[STATE.exchanged_c, block]
+                            target += shift
+                            if ti.static(transient):
+                                # The parcel of room air before the rack: enters at the mix,
+                                # leaves at its own temperature.
+                                was = rack_store[STATE.mixed_c, block]
+                                rate = rack_store[STATE.captured_m3s, block] * (air / parcel_j)
+                                x = larger(rate, zeros + still_per_s) * step_s
+                                gone = real(1.0) - exp_of_minus(x, constants)
+                                now_c = was + (target - was) * gone
+                                is_rack = ti.select(per_server > real(0.0), ones, zeros)
+                                parcel_w = is_rack * (now_c - was) * (parcel_j * per_step_s)
+                                mixed = target + (was - target) * gone / x
+                                rack_store[STATE.mixed_c, block] = now_c
+                            else:
+                                mixed = target
+                                rack_store[STATE.mixed_c, block] = target
+                        fresh = fresh - cover * mixed
                     else:
-                        target = rack_store[STATE.exchanged_c, block]
-                    target += shift
-                    if ti.static(transient):
-                        # The parcel of room air before the rack: enters at the mix, leaves at its
-                        # own temperature.
-                        was = rack_store[STATE.mixed_c, block]
-                        rate = rack_store[STATE.captured_m3s, block] * (air / parcel_j)
-                        x = larger(rate, zeros + still_per_s) * step_s
-                        gone = real(1.0) - exp_of_minus(x, constants)
-                        now_c = was + (target - was) * gone
-                        is_rack = ti.select(per_server > real(0.0), ones, zeros)
-                        parcel_w = is_rack * (now_c - was) * (parcel_j * per_step_s)
-                        mixed = target + (was - target) * gone / x
-                        rack_store[STATE.mixed_c, block] = now_c
-                    else:
-                        mixed = target
-                        rack_store[STATE.mixed_c, block] = target
-                fresh = fresh - cover * mixed
-            else:
-                air_c = ti.cast(unit_state[SUPPLY.supply_c, unit_0], real)
-                mixed = racks[RACK.approach_k, block] + air_c
-            cpu = zeros
-            fan = zeros
-            flow = zeros
-            inlet = zeros
-            inlet_flow = zeros
-            fresh_flow = zeros
-            heat = zeros
-            hot = zeros
-            cold = zeros
-            stored = zeros
-            hottest = zeros - real(1e30)
-            zone = zeros
-            if ti.static(transient and not write):
-                if begins:
-                    for z in range(n_groups):
-                        before = zeros
-                        for i in range(LANES):
-                            group = rack_ints[RACK_INT.first_group, block * LANES + i] + z
-                            before[i] = servers_before[ti.min(group, servers_before.shape[0] - 1)]
-                        server_c[place + z] = before
-            for z in range(n_groups):
-                count = tables[table + z, GROUP.count]
-                t = mixed
-                own = zeros
-                if ti.static(recirculates):
-                    own = real(1.0) - captured_share * tables[table + z, GROUP.height]
-                    t = mixed + own * fresh
-                else:
-                    t = mixed + tables[table + z, GROUP.inlet_offset_k]
-                load = u + tables[table + z, GROUP.load_deviation] * uneven
-                if loads_of == 2:
-                    for i in range(LANES):
-                        group = rack_ints[RACK_INT.first_group, block * LANES + i] + z
-                        load[i] = group_load[ti.min(group, group_load.shape[0] - 1)]
-                on_curve = smaller(t, limit_c)
-                ratio = on_curve * cpu_slope + (load * cpu_shift + cpu_offset)
-                idle = tables[table + z, GROUP.idle_w]
-                cpu_1 = powered * larger(idle, tables[table + z, GROUP.full_w] * ratio)
-                y = on_curve * fan_slope + (load * fan_shift + fan_offset)
-                y = smaller(larger(y, fan_low), fan_high)
-                flow_1 = y * breath * full_m3s
-                speed = y * per_reference
-                fan_1 = speed
-                # A branch on data, not one kernel per exponent: compiled apart, they would round
-                # apart, and a data center must not depend on its batch.
-                if exponent == real(3.0):
-                    fan_1 = speed * speed * speed
-                elif exponent != real(1.0):
-                    for i in range(LANES):
-                        fan_1[i] = ti.pow(speed[i], exponent)
-                fan_1 *= breath * fan_w
-                to_air = cpu_1
-                if ti.static(transient):
-                    before = server_c[place + z]
-                    exchange = flow_1 * taken_up
-                    if ti.static(write):
-                        to_air = exchange * (before - t)
-                    else:
-                        steady = t + cpu_1 / larger(exchange, zeros + real(1e-30))
-                        left = exp_of_minus(exchange * (step_s / server_j), constants)
-                        after = steady + (before - steady) * left
-                        after = ti.select(exchange > real(0.0), after, before)
-                        warmed_w = (after - before) * (server_j * per_step_s)
-                        to_air = ti.select(exchange > real(0.0), cpu_1 - warmed_w, zeros)
-                        stored += count * warmed_w
-                        server_c[place + z] = after
-                        if ends:
-                            for i in range(LANES):
-                                if count[i] > real(0.0):
+                        air_c = ti.cast(unit_state[SUPPLY.supply_c, unit_0], real)
+                        mixed = racks[RACK.approach_k, block] + air_c
+                    cpu = zeros
+                    fan = zeros
+                    flow = zeros
+                    inlet = zeros
+                    inlet_flow = zeros
+                    fresh_flow = zeros
+                    heat = zeros
+                    hot = zeros
+                    cold = zeros
+                    stored = zeros
+                    hottest = zeros - real(1e30)
+                    zone = zeros
+                    if ti.static(transient and not write):
+                        if begins:
+                            for z in range(n_groups):
+                                before = zeros
+                                for i in range(LANES):
                                     group = rack_ints[RACK_INT.first_group, block * LANES + i] + z
-                                    servers_after[group] = after[i]
-                warm = to_air + fan_1
-                if ti.static(write):
-                    rise = warm / larger(flow_1 * air, zeros + real(1e-30))
-                    group_values[PER_GROUP.inlet_c, slice_at + z] = t
-                    group_values[PER_GROUP.outlet_c, slice_at + z] = t + rise
-                    group_values[PER_GROUP.power_w, slice_at + z] = cpu_1 + fan_1
-                counted = count * flow_1
-                cpu += count * cpu_1
-                fan += count * fan_1
-                flow += counted
-                inlet += count * t
-                inlet_flow += counted * t
-                heat += count * warm
-                if ti.static(not write):
-                    fresh_flow += counted * own
-                    hot += count * larger(t - real(RECOMMENDED_HIGH_C), zeros)
-                    cold += count * larger(real(RECOMMENDED_LOW_C) - t, zeros)
-                    here = ti.select(count > real(0.0), t, zeros - real(1e30))
-                    zone = ti.select(here > hottest, zeros + ti.cast(z, real), zone)
-                    hottest = larger(here, hottest)
-            mean = inlet * per_server
-            per_flow = real(1.0) / larger(flow, zeros + real(1e-30))
-            outlet = (inlet_flow + heat * per_air) * per_flow
-            if outlet_model != 0:
-                if outlet_model == 1:
-                    outlet = mean + (cpu + fan) * per_flow * per_air
-                else:
-                    for i in range(LANES):
-                        outlet[i] = (
-                            mean[i]
-                            + constants[0]
-                            * ti.pow(cpu[i] + fan[i], constants[1])
-                            / (
-                                constants[2]
-                                * air
-                                * ti.pow(ti.max(flow[i], real(1e-30)), constants[3])
-                            )
-                            + constants[4]
-                        )
-            outlet = ti.select(flow > real(0.0), outlet, mean)
-            if ti.static(write):
-                if outlet_model != 0:
+                                    before[i] = servers_before[
+                                        ti.min(group, servers_before.shape[0] - 1)
+                                    ]
+                                server_c[place + z] = before
                     for z in range(n_groups):
-                        group_values[PER_GROUP.outlet_c, slice_at + z] = outlet
-                spread(
-                    each_once,
-                    block,
-                    n_groups,
-                    table,
-                    slice_at,
-                    block_ints,
-                    counts,
-                    rack_ints,
-                    values,
-                    layers,
-                    layer_blocks,
-                )
-            else:
-                b = block - block_0
-                terms[slice_at + SUM.captured_m3k_s, b] = zeros
-                if ti.static(recirculates):
-                    mean = ti.select(flow > real(0.0), inlet_flow * per_flow, mean)
-                    captured = flow - cover * fresh_flow
-                    # Of air that failing fans do not move, the mix is left.
-                    seen = mixed + air_left * (outlet - mixed)
-                    seen *= racks[RACK.strength, block]
-                    change = seen - rack_store[1 + side, block]
-                    rack_store[2 - side, block] = seen
-                    rack_store[STATE.captured_m3s, block] = captured
-                    rack_store[STATE.change_k, block] = change
-                    change *= racks[RACK.per_strength, block]
-                    least = smaller(
-                        ti.select(per_server > real(0.0), change, zeros + real(1e30)), least
-                    )
-                    most = larger(
-                        ti.select(per_server > real(0.0), change, zeros - real(1e30)), most
-                    )
-                    terms[slice_at + SUM.captured_m3k_s, b] = captured * mixed + parcel_w * per_air
-                    for j in range(n_units):
-                        need = shares[share_0 + j] * fresh_flow
-                        needed = real(0.0)
+                        count = tables[table + z, GROUP.count]
+                        t = mixed
+                        own = zeros
+                        if ti.static(recirculates):
+                            own = real(1.0) - captured_share * tables[table + z, GROUP.height]
+                            t = mixed + own * fresh
+                        else:
+                            t = mixed + tables[table + z, GROUP.inlet_offset_k]
+                        load = u + tables[table + z, GROUP.load_deviation] * uneven
+                        if loads_of == 2:
+                            for i in range(LANES):
+                                group = rack_ints[RACK_INT.first_group, block * LANES + i] + z
+                                load[i] = group_load[ti.min(group, group_load.shape[0] - 1)]
+                        on_curve = smaller(t, limit_c)
+                        ratio = on_curve * cpu_slope + (load * cpu_shift + cpu_offset)
+                        idle = tables[table + z, GROUP.idle_w]
+                        cpu_1 = powered * larger(idle, tables[table + z, GROUP.full_w] * ratio)
+                        y = on_curve * fan_slope + (load * fan_shift + fan_offset)
+                        y = smaller(larger(y, fan_low), fan_high)
+                        flow_1 = y * breath * full_m3s
+                        speed = y * per_reference
+                        fan_1 = speed
+                        # A branch on data, not one kernel per exponent: compiled apart, they
+                        # would round apart, and a data center must not depend on its batch.
+                        if exponent == real(3.0):
+                            fan_1 = speed * speed * speed
+                        elif exponent != real(1.0):
+                            powers = speed
+                            for i in range(block_ints[BLOCK.racks, block]):
+                                powers[i] = ti.pow(speed[i], exponent)
+                            fan_1 = powers
+                        fan_1 *= breath * fan_w
+                        to_air = cpu_1
+                        if ti.static(transient):
+                            before = server_c[place + z]
+                            exchange = flow_1 * taken_up
+                            if ti.static(write):
+                                to_air = exchange * (before - t)
+                            else:
+                                steady = t + cpu_1 / larger(exchange, zeros + real(1e-30))
+                                left = exp_of_minus(exchange * (step_s / server_j), constants)
+                                after = steady + (before - steady) * left
+                                after = ti.select(exchange > real(0.0), after, before)
+                                warmed_w = (after - before) * (server_j * per_step_s)
+                                to_air = ti.select(exchange > real(0.0), cpu_1 - warmed_w, zeros)
+                                stored += count * warmed_w
+                                server_c[place + z] = after
+                                if ends:
+                                    for i in range(LANES):
+                                        if count[i] > real(0.0):
+                                            group = (
+                                                rack_ints[RACK_INT.first_group, block * LANES + i]
+                                                + z
+                                            )
+                                            servers_after[group] = after[i]
+                        warm = to_air + fan_1
+                        if ti.static(write):
+                            rise = warm / larger(flow_1 * air, zeros + real(1e-30))
+                            group_values[PER_GROUP.inlet_c, slice_at + z] = t
+                            group_values[PER_GROUP.outlet_c, slice_at + z] = t + rise
+                            group_values[PER_GROUP.power_w, slice_at + z] = cpu_1 + fan_1
+                        counted = count * flow_1
+                        cpu += count * cpu_1
+                        fan += count * fan_1
+                        flow += counted
+                        inlet += count * t
+                        inlet_flow += counted * t
+                        heat += count * warm
+                        if ti.static(not write):
+                            fresh_flow += counted * own
+                            hot += count * larger(t - real(RECOMMENDED_HIGH_C), zeros)
+                            cold += count * larger(real(RECOMMENDED_LOW_C) - t, zeros)
+                            here = ti.select(count > real(0.0), t, zeros - real(1e30))
+                            zone = ti.select(here > hottest, zeros + ti.cast(z, real), zone)
+                            hottest = larger(here, hottest)
+                    mean = inlet * per_server
+                    per_flow = real(1.0) / larger(flow, zeros + real(1e-30))
+                    outlet = (inlet_flow + heat * per_air) * per_flow
+                    if outlet_model != 0:
+                        if outlet_model == 1:
+                            outlet = mean + (cpu + fan) * per_flow * per_air
+                        else:
+                            drawn = cpu + fan
+                            fit = zeros
+                            for i in range(block_ints[BLOCK.racks, block]):
+                                moved = ti.pow(ti.max(flow[i], real(1e-30)), constants[3])
+                                fit[i] = ti.pow(drawn[i], constants[1]) / moved
+                            outlet = mean + fit * (constants[0] / (constants[2] * air))
+                            outlet += constants[4]
+                    outlet = ti.select(flow > real(0.0), outlet, mean)
+                    if ti.static(write):
+                        if outlet_model != 0:
+                            for z in range(n_groups):
+                                group_values[PER_GROUP.outlet_c, slice_at + z] = outlet
+                        spread(
+                            each_once,
+                            block,
+                            n_groups,
+                            table,
+                            slice_at,
+                            block_ints,
+                            counts,
+                            rack_ints,
+                            values,
+                            layers,
+                            layer_blocks,
+                        )
+                    else:
+                        terms[slice_at + SUM.captured_m3k_s, b] = zeros
+                        if ti.static(recirculates):
+                            mean = ti.select(flow > real(0.0), inlet_flow * per_flow, mean)
+                            captured = flow - cover * fresh_flow
+                            # Of air that failing fans do not move, the mix is left.
+                            seen = mixed + air_left * (outlet - mixed)
+                            seen *= racks[RACK.strength, block]
+                            change = seen - rack_store[1 + side, block]
+                            rack_store[2 - side, block] = seen
+                            rack_store[STATE.captured_m3s, block] = captured
+                            rack_store[STATE.change_k, block] = change
+                            change *= racks[RACK.per_strength, block]
+                            least = smaller(
+                                ti.select(per_server > real(0.0), change, zeros + real(1e30)), least
+                            )
+                            most = larger(
+                                ti.select(per_server > real(0.0), change, zeros - real(1e30)), most
+                            )
+                            terms[slice_at + SUM.captured_m3k_s, b] = (
+                                captured * mixed + parcel_w * per_air
+                            )
+                            for j in range(n_units):
+                                need = shares[share_0 + j] * fresh_flow
+                                needed = real(0.0)
+                                for i in range(LANES):
+                                    needed += need[i]
+                                needs[need_0 + j] = needs[need_0 + j] + ti.cast(needed, ti.f64)
+                        terms[slice_at + SUM.cpu_w, b] = cpu
+                        terms[slice_at + SUM.fan_w, b] = fan
+                        terms[slice_at + SUM.airflow_m3s, b] = flow
+                        terms[slice_at + SUM.inlet_c, b] = mean
+                        terms[slice_at + SUM.outlet_c, b] = outlet
+                        terms[slice_at + SUM.inlet_m3k_s, b] = inlet_flow
+                        terms[slice_at + SUM.outlet_m3k_s, b] = inlet_flow + heat * per_air
+                        terms[slice_at + SUM.hot_k, b] = hot
+                        terms[slice_at + SUM.cold_k, b] = cold
+                        terms[slice_at + SUM.stored_w, b] = stored + parcel_w
                         for i in range(LANES):
-                            needed += need[i]
-                        needs[need_0 + j] += ti.cast(needed, ti.f64)
-                terms[slice_at + SUM.cpu_w, b] = cpu
-                terms[slice_at + SUM.fan_w, b] = fan
-                terms[slice_at + SUM.airflow_m3s, b] = flow
-                terms[slice_at + SUM.inlet_c, b] = mean
-                terms[slice_at + SUM.outlet_c, b] = outlet
-                terms[slice_at + SUM.inlet_m3k_s, b] = inlet_flow
-                terms[slice_at + SUM.outlet_m3k_s, b] = inlet_flow + heat * per_air
-                terms[slice_at + SUM.hot_k, b] = hot
-                terms[slice_at + SUM.cold_k, b] = cold
-                terms[slice_at + SUM.stored_w, b] = stored + parcel_w
-                chunk_block = ti.select(hottest > chunk_hottest, block, chunk_block)
-                chunk_zone = ti.select(hottest > chunk_hottest, zone, chunk_zone)
-                chunk_hottest = larger(hottest, chunk_hottest)
-                if ti.static(transient):
-                    share = ti.cast(weight, real)
-                    cpu *= share
-                    fan *= share
-                    flow *= share
-                    mean *= share
-                    outlet *= share
-                    if not begins:
-                        cpu += rack_out[OUT.cpu_w, block]
-                        fan += rack_out[OUT.fan_w, block]
-                        flow += rack_out[OUT.airflow_m3s, block]
-                        mean += rack_out[OUT.inlet_c, block]
-                        hottest = larger(hottest, rack_out[OUT.inlet_max_c, block])
-                        outlet += rack_out[OUT.outlet_c, block]
-                rack_out[OUT.cpu_w, block] = cpu
-                rack_out[OUT.fan_w, block] = fan
-                rack_out[OUT.airflow_m3s, block] = flow
-                rack_out[OUT.inlet_c, block] = mean
-                rack_out[OUT.inlet_max_c, block] = hottest
-                rack_out[OUT.outlet_c, block] = outlet
-        if ti.static(not write):
-            for r in range(n_terms):
-                lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
-                for b in range(block_1 - block_0):
-                    term = terms[slice_at + r, b]
+                            flow_lanes[i] += ti.cast(flow[i], ti.f64)
+                            outlet_lanes[i] += ti.cast(outlet[i], ti.f64)
+                        chunk_block = ti.select(hottest > chunk_hottest, block, chunk_block)
+                        chunk_zone = ti.select(hottest > chunk_hottest, zone, chunk_zone)
+                        chunk_hottest = larger(hottest, chunk_hottest)
+                        if ti.static(transient):
+                            share = ti.cast(weight, real)
+                            cpu *= share
+                            fan *= share
+                            flow *= share
+                            mean *= share
+                            outlet *= share
+                            if not begins:
+                                cpu += rack_out[OUT.cpu_w, block]
+                                fan += rack_out[OUT.fan_w, block]
+                                flow += rack_out[OUT.airflow_m3s, block]
+                                mean += rack_out[OUT.inlet_c, block]
+                                hottest = larger(hottest, rack_out[OUT.inlet_max_c, block])
+                                outlet += rack_out[OUT.outlet_c, block]
+                        rack_out[OUT.cpu_w, block] = cpu
+                        rack_out[OUT.fan_w, block] = fan
+                        rack_out[OUT.airflow_m3s, block] = flow
+                        rack_out[OUT.inlet_c, block] = mean
+                        rack_out[OUT.inlet_max_c, block] = hottest
+                        rack_out[OUT.outlet_c, block] = outlet
+                if ti.static(not write):
+                    if late:
+                        flow_sum = ti.cast(0.0, ti.f64)
+                        outlet_sum = ti.cast(0.0, ti.f64)
+                        for i in range(LANES):
+                            flow_sum += flow_lanes[i]
+                            outlet_sum += outlet_lanes[i]
+                        sums[SUM.airflow_m3s, chunk] = flow_sum
+                        sums[SUM.outlet_c, chunk] = outlet_sum
+                    else:
+                        add_up(chunk, slice_at, chunk_ints, terms, sums)
+                        find_hottest(chunk, chunk_hottest, chunk_block, chunk_zone, sums)
+                    least_k, most_k = real(1e30), real(-1e30)
                     for i in range(LANES):
-                        lanes[i] += ti.cast(term[i], ti.f64)
-                total = ti.cast(0.0, ti.f64)
-                for i in range(LANES):
-                    total += lanes[i]
-                sums[r, chunk] = total
-            # The first of the racks with the hottest inlet.
-            hottest = real(-1e30)
-            of_block, of_lane, of_zone = 0, 0, real(0.0)
-            least_k, most_k = real(1e30), real(-1e30)
-            for i in range(LANES):
-                least_k = ti.min(least_k, least[i])
-                most_k = ti.max(most_k, most[i])
-                first = chunk_hottest[i] == hottest and chunk_block[i] < of_block
-                if chunk_hottest[i] > hottest or first:
-                    hottest = chunk_hottest[i]
-                    of_block, of_lane, of_zone = chunk_block[i], i, chunk_zone[i]
-            sums[SUM.inlet_max_c, chunk] = ti.cast(hottest, ti.f64)
-            sums[SUM.hottest_block, chunk] = ti.cast(of_block, ti.f64)
-            sums[SUM.hottest_lane, chunk] = ti.cast(of_lane, ti.f64)
-            sums[SUM.hottest_zone, chunk] = ti.cast(of_zone, ti.f64)
-            sums[SUM.least_k, chunk] = ti.cast(least_k, ti.f64)
-            sums[SUM.most_k, chunk] = ti.cast(most_k, ti.f64)
+                        least_k = ti.min(least_k, least[i])
+                        most_k = ti.max(most_k, most[i])
+                    sums[SUM.least_k, chunk] = ti.cast(least_k, ti.f64)
+                    sums[SUM.most_k, chunk] = ti.cast(most_k, ti.f64)
+                    for again in range(passes):
+                        if ti.static(recirculates and not transient):
+                            if passes > 1:
+                                exchange_mixes(
+                                    again,
+                                    n,
+                                    chunk,
+                                    chunk_ints,
+                                    dc_ints,
+                                    control,
+                                    doubles,
+                                    mix,
+                                    racks,
+                                    rack_state,
+                                    rack_store,
+                                    sums,
+                                )
+                        if again > 0:
+                            continue
+                        # The chunk that comes last does what is left for its data center.
+                        if not late:
+                            if ti.atomic_add(control[CTL.chunks, n], 1) < n_parts - 1:
+                                break
+                            control[CTL.chunks, n] = 0
+                        close(
+                            recirculates,
+                            transient,
+                            n,
+                            late,
+                            slice_at,
+                            n_blocks,
+                            chunk_hottest,
+                            chunk_block,
+                            chunk_zone,
+                            sweeps,
+                            substep_s,
+                            weight,
+                            tolerance_k,
+                            chunk_ints,
+                            rack_ints,
+                            dc_ints,
+                            control,
+                            dcs,
+                            doubles,
+                            units,
+                            unit_state,
+                            needs,
+                            terms,
+                            sums,
+                            dc_out,
+                        )
+                        if control[CTL.active, n] <= 0:
+                            break
 
     @ti.kernel
     @no_type_check
@@ -1087,6 +1210,7 @@ def hall_kernel(precision: str) -> Any:
         outlet_model: ti.i32,
         loads_of: ti.i32,
         each_once: ti.i32,
+        start_rows: ti.i32,
         substep_s: ti.f64,
         weight: ti.f64,
         tolerance_k: ti.f64,
@@ -1108,7 +1232,7 @@ def hall_kernel(precision: str) -> Any:
         doubles: doubles_2d,
         units: reals_2d,
         unit_state: doubles_2d,
-        starts: reals_4d,
+        starts: starts_2d,
         rack_state: reals_1d,
         rack_store: blocks_2d,
         server_c: blocks_1d,
@@ -1139,115 +1263,55 @@ def hall_kernel(precision: str) -> Any:
                 if ti.static(write):
                     slice_at = k // SLICE * (group_values.shape[1] // slices)
                 for task in range(first, last):
-                    n = chunk_ints[CHUNK.dc, tasks[task]]
-                    chunk_0 = dc_ints[DC.first_chunk, n]
-                    n_parts = dc_ints[DC.first_chunk, n + 1] - chunk_0
-                    is_dense = False
-                    if ti.static(recirculates and not transient and not write):
-                        is_dense = dc_ints[DC.mix, n] >= 0
-                        if control[CTL.sweep, n] == 0:
-                            expect(n, dc_ints, doubles, unit_state, starts)
-                    # Chunks that are tasks of their own wait for each other after every sweep.
-                    rounds = sweeps if tasks[task + 1] - tasks[task] == n_parts else 1
-                    for _ in range(rounds):
-                        if ti.static(not write):
-                            if control[CTL.active, n] <= 0:
-                                break
-                        for chunk in range(tasks[task], tasks[task + 1]):
-                            evaluate(
-                                recirculates,
-                                transient,
-                                write,
-                                slice_at,
-                                n,
-                                chunk,
-                                outlet_model,
-                                loads_of,
-                                each_once,
-                                sweeps,
-                                substep_s,
-                                weight,
-                                run_start,
-                                run_ints,
-                                block_ints,
-                                rack_ints,
-                                chunk_ints,
-                                dc_ints,
-                                control,
-                                weights,
-                                mix,
-                                shares,
-                                racks,
-                                tables,
-                                group_load,
-                                dcs,
-                                doubles,
-                                unit_state,
-                                rack_state,
-                                rack_store,
-                                server_c,
-                                servers_before,
-                                servers_after,
-                                constants,
-                                terms,
-                                rack_out,
-                                needs,
-                                sums,
-                                counts,
-                                group_values,
-                                values,
-                                (inlet_c, outlet_c, power_w),
-                                (inlet_blocks, outlet_blocks, power_blocks),
-                            )
-                            if ti.static(not write):
-                                if ti.static(recirculates and not transient):
-                                    if is_dense:
-                                        foresee(
-                                            n,
-                                            chunk,
-                                            chunk_ints,
-                                            dc_ints,
-                                            mix,
-                                            rack_state,
-                                            rack_store,
-                                            sums,
-                                        )
-                                # The chunk that comes last does what is left for its data center.
-                                if ti.atomic_add(control[CTL.chunks, n], 1) == n_parts - 1:
-                                    control[CTL.chunks, n] = 0
-                                    close(
-                                        recirculates,
-                                        transient,
-                                        n,
-                                        sweeps,
-                                        substep_s,
-                                        weight,
-                                        tolerance_k,
-                                        chunk_ints,
-                                        rack_ints,
-                                        dc_ints,
-                                        control,
-                                        dcs,
-                                        doubles,
-                                        units,
-                                        unit_state,
-                                        needs,
-                                        sums,
-                                        dc_out,
-                                    )
-                                if ti.static(recirculates and not transient):
-                                    if is_dense and control[CTL.active, n] > 0:
-                                        exchange(
-                                            n,
-                                            chunk,
-                                            chunk_ints,
-                                            dc_ints,
-                                            control,
-                                            doubles,
-                                            mix,
-                                            racks,
-                                            rack_state,
-                                            rack_store,
-                                        )
+                    run(
+                        recirculates,
+                        transient,
+                        write,
+                        slice_at,
+                        tasks[task],
+                        tasks[task + 1],
+                        sweeps,
+                        outlet_model,
+                        loads_of,
+                        each_once,
+                        start_rows,
+                        substep_s,
+                        weight,
+                        tolerance_k,
+                        run_start,
+                        run_ints,
+                        block_ints,
+                        rack_ints,
+                        chunk_ints,
+                        dc_ints,
+                        control,
+                        weights,
+                        mix,
+                        shares,
+                        racks,
+                        tables,
+                        group_load,
+                        dcs,
+                        doubles,
+                        units,
+                        unit_state,
+                        starts,
+                        rack_state,
+                        rack_store,
+                        server_c,
+                        servers_before,
+                        servers_after,
+                        constants,
+                        terms,
+                        rack_out,
+                        needs,
+                        sums,
+                        dc_out,
+                        counts,
+                        group_values,
+                        values,
+                        (inlet_c, outlet_c, power_w),
+                        (inlet_blocks, outlet_blocks, power_blocks),
+                    )
 
     return hall

@@ -136,9 +136,9 @@ class Hall:
     def __init__(self, fleet: Fleet, precision: Precision) -> None:
         threads = runtime.ensure_started()
         from sdc_taichi.kernels import thermal
-        from sdc_taichi.kernels.backend import BoundKernel
+        from sdc_taichi.kernels.backend import BoundKernel, aligned
 
-        self._thermal = thermal
+        self._thermal, self._empty = thermal, aligned
         self._precision: Precision = precision
         self._dtype = np.dtype(np.float32 if precision == "f32" else np.float64)
         self._fleet = fleet
@@ -234,7 +234,7 @@ class Hall:
             self._run_ints = _table(zeros, zeros, zeros)
             self._weights = self._real(np.zeros(1))
             self._mix, self._shares = self._lanes(1), self._lanes(1)
-            self._starts = np.zeros((1, 1, 1, 3))
+            self._starts, self._start_rows = self._empty((1, 1, 4), np.float64), 1
             return
         run_counts[self._rack_at] = np.diff(air.run_start)
         self._run_start = starts(run_counts, "runs of weights")
@@ -265,9 +265,15 @@ class Hall:
         self._mix = self._lanes(max(total, 1))
         if mixes:
             self._mix[:] = np.concatenate([m.reshape(-1, lanes) for m in mixes])
-        self._dc_ints[thermal.DC_INTS.index("start"), :-1] = air.table
-        n_supply = air.supply_c.shape[1]
-        self._starts = np.ascontiguousarray(air.expected).reshape(-1, n_supply, len(LOADS), 3)
+        # Cubics reach one row and column beyond.
+        expected = air.expected.reshape(len(air.supply_c), -1, len(LOADS), 3)
+        expected = np.pad(expected, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
+        self._start_rows = expected.shape[1]
+        self._starts = self._empty(
+            (len(expected) * self._start_rows, expected.shape[2], 4), np.float64
+        )
+        self._starts[..., :3] = expected.reshape(*self._starts.shape[:2], 3)
+        self._dc_ints[thermal.DC_INTS.index("start"), :-1] = air.table * self._start_rows
 
     def _lay_out_values(self, thermal: Any) -> None:
         fleet, air = self._fleet, self._fleet.air
@@ -329,9 +335,7 @@ class Hall:
 
     def _lanes(self, *shape: int) -> Any:
         """Zeros that the kernel takes as vectors of lanes."""
-        from sdc_taichi.kernels.backend import aligned
-
-        out = aligned((*shape, self._thermal.LANES), self._dtype)
+        out = self._empty((*shape, self._thermal.LANES), self._dtype)
         out[:] = 0.0
         return out
 
@@ -405,12 +409,12 @@ class Hall:
         """
         servers = self._fleet.servers
         if into is None:
-            into = ServerLayers(*(self._aligned(servers) for _ in range(3)))
+            into = ServerLayers(*(self._empty((servers,), self._dtype) for _ in range(3)))
         layers = [into.inlet_c, into.outlet_c, into.power_w]
         lanes = self._thermal.LANES
         fit = [layer.ctypes.data % (lanes * layer.itemsize) == 0 for layer in layers]
         stored = [
-            layer if fits else self._aligned(servers)
+            layer if fits else self._empty((servers,), self._dtype)
             for layer, fits in zip(layers, fit, strict=True)
         ]
         self._write(stored, each_once=0)
@@ -421,14 +425,9 @@ class Hall:
 
     def group_inlets(self) -> F64:
         """Inlet of every server group in the last step, (G,)."""
-        layers = [self._aligned(self._fleet.groups.shape[1]) for _ in range(3)]
+        layers = [self._empty((self._fleet.groups.shape[1],), self._dtype) for _ in range(3)]
         self._write(layers, each_once=1)
         return np.asarray(layers[0], dtype=np.float64)
-
-    def _aligned(self, count: int) -> Any:
-        from sdc_taichi.kernels.backend import aligned
-
-        return aligned((count,), self._dtype)
 
     def _write(self, layers: list[Any], each_once: int) -> None:
         """Values of the last step to servers, or to each group once."""
@@ -555,10 +554,8 @@ class Hall:
         self._supply["supply_c"][:] = met.unit_supply_c
 
     def _out(self) -> tuple[Any, Any]:
-        from sdc_taichi.kernels.backend import aligned
-
         shape = (len(self._thermal.RACK_OUT), *self._rack_store.shape[1:])
-        racks = aligned(shape, self._dtype)
+        racks = self._empty(shape, self._dtype)
         return racks, np.empty((len(self._thermal.DC_OUT), self._fleet.size), np.float64)
 
     def _run(
@@ -588,6 +585,7 @@ class Hall:
             self._outlet_model,
             self._loads_of,
             each_once,
+            self._start_rows,
             substep_s,
             weight,
             TOLERANCE_K[self._precision],
