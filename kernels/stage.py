@@ -24,6 +24,10 @@ Arrays = Mapping[str, Any]
 SERIAL_UP_TO = 512
 """Entries that one thread computes sooner than several are woken."""
 
+_SAME_SETS, _ASIDE = 512, 8
+"""Rows that are multiples of 4 KiB apart compete for the same sets of the cache, and a stage reads
+and writes a hundred of them at a time: twice as slow. Such rows are set aside by a cache line."""
+
 _NUMBERS = {
     np.add: "{} + {}",
     np.subtract: "{} - {}",
@@ -64,6 +68,7 @@ class CompiledStage:
 
     def __init__(self, stage: Callable[..., Arrays], size: int) -> None:
         self._stage, self._size = stage, size
+        self._stride = size + (_ASIDE if size % _SAME_SETS == 0 else 0)
         self._kernel: BoundKernel | None = None
 
     def __call__(self, **given: npt.NDArray[np.float64]) -> dict[str, npt.NDArray[np.float64]]:
@@ -71,19 +76,26 @@ class CompiledStage:
         if self._kernel is None:
             self._compile(tuple(given))
         assert self._kernel is not None
-        inputs = np.array([given[name] for name in self._names])
-        out = np.empty((len(self._results), self._size))
+        inputs = self._rows([given[name] for name in self._names])
+        out = np.empty((len(self._results), self._stride))
         serial = self._size <= SERIAL_UP_TO
         self._kernel(serial, self._size, self._constants, inputs, out)
-        return dict(zip(self._results, out, strict=True))
+        return dict(zip(self._results, out[:, : self._size], strict=True))
+
+    def _rows(self, arrays: list[Any]) -> npt.NDArray[np.float64]:
+        """One array of these, with room at the end of each where the stride asks for it."""
+        if self._stride == self._size:
+            return np.array(arrays, dtype=np.float64)
+        rows = np.empty((len(arrays), self._stride))
+        np.stack(arrays, out=rows[:, : self._size], casting="unsafe")
+        return rows
 
     def _compile(self, names: tuple[str, ...]) -> None:
         record = _Record(self._size)
         given = {name: record.entry(f"given[{row}, i]") for row, name in enumerate(names)}
         results = {name: record.lift(x) for name, x in self._stage(**given).items()}
         self._names, self._results = names, tuple(results)
-        constants = record.constants or [np.zeros(self._size)]
-        self._constants = np.array(constants, dtype=np.float64)
+        self._constants = self._rows(record.constants or [np.zeros(self._size)])
         source = _source(record.lines(list(results.values())))
         self._kernel = BoundKernel(_kernel(source), templates=1)
 

@@ -190,15 +190,20 @@ class Fleet:
         """Sum of group values, (G,), over each rack, (R,)."""
         return _sums(values, self.group_start)
 
-    def place_of_group(self, group: npt.NDArray[Any]) -> tuple[I64, I64]:
+    def place_of_group(self, group: I64) -> tuple[F64, F64]:
         """Where groups, (n,), begin: rack within its data center and server within its rack.
 
         Both count from 0, servers from the floor.
         """
-        rack = np.searchsorted(self.group_start, group, side="right") - 1
-        first = self.rack_start[self.rack_dc[rack]]
-        server = self.server_start[group] - self.server_start[self.group_start[rack]]
-        return (rack - first).astype(np.int64), server.astype(np.int64)
+        # Right where all racks have equally many groups, as is usual.
+        rack = group * self.racks // self.groups.shape[1]
+        first = self.group_start[rack]
+        if np.any((group < first) | (group >= self.group_start[rack + 1])):
+            rack = np.searchsorted(self.group_start, group, side="right") - 1
+            first = self.group_start[rack]
+        server = self.server_start[group] - self.server_start[first]
+        rack = rack - self.rack_start[self.rack_dc[rack]]
+        return rack.astype(np.float64), server.astype(np.float64)
 
     def per_dc_servers(self) -> F64:
         """Servers of each data center, (B,)."""

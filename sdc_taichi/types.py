@@ -134,7 +134,8 @@ class State:
 class StepResult:
     """Every quantity of one step, (B,) unless stated; powers are means over the step.
 
-    Energy units: kWh per step. 1 task is 1 % of the data center's capacity for one step.
+    Energy units: kWh per step. 1 task is 1 % of the data center's capacity for one step. Arrays of
+    a step are parts of a few larger ones: whoever keeps some for long had better copy them.
     """
 
     step: int
