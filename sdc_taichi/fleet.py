@@ -198,7 +198,7 @@ class Fleet:
         # Right where all racks have equally many groups, as is usual.
         rack = group * self.racks // self.groups.shape[1]
         first = self.group_start[rack]
-        if np.any((group < first) | (group >= self.group_start[rack + 1])):
+        if ((group < first) | (group >= self.group_start[rack + 1])).any():
             rack = np.searchsorted(self.group_start, group, side="right") - 1
             first = self.group_start[rack]
         server = self.server_start[group] - self.server_start[first]

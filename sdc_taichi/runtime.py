@@ -10,6 +10,8 @@ import sys
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 
 _forked = False
+_known: tuple[object, int] = (None, 0)
+"""Runtime of the last call and its threads, which take a while to ask for."""
 
 
 def _mark_child() -> None:
@@ -33,6 +35,7 @@ def ensure_started() -> int:
         RuntimeStateError: in a child forked after the start, where Taichi would hang.
         ConfigError: ``SDC_TAICHI_THREADS`` is no positive integer.
     """
+    global _known
     if _forked:
         raise RuntimeStateError(
             "this process was forked after Taichi started and would hang; start workers with the "
@@ -47,7 +50,11 @@ def ensure_started() -> int:
         # ti.init prints a banner, which would end up in a user's piped output.
         with contextlib.redirect_stdout(io.StringIO()):
             ti.init(arch=ti.cpu, offline_cache=True, log_level=ti.ERROR, **options)
-    return int(ti.lang.impl.current_cfg().cpu_max_num_threads)
+    program, threads = _known
+    if program is not runtime.prog:
+        threads = int(ti.lang.impl.current_cfg().cpu_max_num_threads)
+        _known = (runtime.prog, threads)
+    return threads
 
 
 def _thread_limit() -> int:
