@@ -339,7 +339,7 @@ def recording(quick: bool) -> Iterator[Figure]:
     """Simulators with a recorder and without."""
     from sdc_taichi.viz.recorder import Recorder
 
-    steps, repeats = (8, 1) if quick else (384, 5)
+    steps, repeats = (8, 1) if quick else (31 * 96, 3)
     for count in (1, 4, 64):
         sim = sdc_taichi.Simulator(
             sdc_taichi.make_configs(sdc_taichi.load_config("corrected"), count=count)
@@ -351,9 +351,10 @@ def recording(quick: bool) -> Iterator[Figure]:
                     sim.reset()
                     begin = time.perf_counter()
                     if recorded:
-                        with Recorder(Path(folder, "run.rrd"), sim.fleet) as recorder:
+                        with Recorder(Path(folder, "run.rrd")) as recorder:
+                            recorder.begin(sim)
                             for _ in range(steps):
-                                recorder.log(sim.step())
+                                recorder.add(sim.step())
                     else:
                         for _ in range(steps):
                             sim.step()

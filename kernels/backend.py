@@ -16,12 +16,12 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 __all__ = ["BoundKernel", "aligned", "ti"]
 
 
-OPTIONS = {"cfg_optimization": False, "real_matrix_scalarize": False}
+OPTIONS = {"cfg_optimization": False, "fast_math": False, "real_matrix_scalarize": False}
 """How bound kernels are compiled, whoever started the runtime. Taichi's analysis of the control
 flow takes four fifths of the time and finds nothing that LLVM does not. Vectors stay vectors of the
 processor, which load and store as one and take one statement each; LLVM vectors know no casts, no
 negation and no functions but floor and sqrt: those go element by element."""
-ALIGNMENT = 64
+ALIGNMENT = 256
 """Bytes; compiled code takes arrays of vectors to start at a multiple of the vector's length."""
 
 

@@ -18,12 +18,14 @@ from typing import Any, no_type_check
 
 from .backend import ti
 
-HALL_TEMPLATES = 3
+HALL_TEMPLATES = 4
 """Template arguments of ``hall_kernel``, which come first."""
 OUTLETS = ("server", "rack", "released")
 LOADS_OF = ("dc", "rack", "group")
 """Whose utilisation is given."""
 
+SOURCES = 4
+"""Racks whose exhausts a weight vector of small halls takes at a time."""
 LANES = 8
 """Racks that are computed at a time; the same for all, so that results never depend on it."""
 CHUNK_BLOCKS = 16
@@ -34,6 +36,7 @@ BLOCK_INTS = ("racks", "groups", "table", "place")
 RACK_INTS = ("first_group", "first_server")
 """Of each place; those without a rack have the groups of the last rack of their block."""
 RUN_INTS = ("first", "length", "offset")
+"""Runs of weights in whole blocks: first block of sources, blocks, and first block of weights."""
 CHUNK_INTS = ("first_block", "dc", "first_need")
 DC_INTS = ("first_chunk", "first_unit", "first_share", "racks", "mix", "start")
 """``mix``: first of the weights of halls that keep every weight, -1 of others; ``start``: first
@@ -253,6 +256,8 @@ def hall_kernel(precision: str) -> Any:
     A data center whose chunks are one task runs all its ``sweeps`` in one call, others one per
     call. ``tasks``: first chunk of each, and the end of the last.
 
+    ``serial``: on the thread that calls; waking others takes longer than the step of a small hall.
+
     ``write``: instead, compute all groups again as in the last sweep or substep, and store their
     values to their servers, or with ``each_once`` to themselves; ``..._blocks`` are the layers
     again as vectors.
@@ -270,6 +275,8 @@ def hall_kernel(precision: str) -> Any:
     ints_2d = ti.types.ndarray(dtype=ti.i32, ndim=2)
     ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
     doubles_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
+    sources_1d = ti.types.ndarray(dtype=ti.types.vector(SOURCES, real), ndim=1)
+    mix_1d = ti.types.ndarray(dtype=ti.types.vector(SOURCES * LANES, real), ndim=1)
     starts_2d = ti.types.ndarray(dtype=ti.types.vector(4, ti.f64), ndim=2)
     doubles_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
 
@@ -347,11 +354,18 @@ def hall_kernel(precision: str) -> Any:
 
     @ti.func
     @no_type_check
-    def mixed_from(mix: ti.template(), at, rack_state: ti.template(), first, count):
+    def mixed_from(mix: ti.template(), at, rack_sources: ti.template(), first, count):
         """Mixes before the racks of a block, or what they change by, from all racks of the hall."""
-        out = mix[at] * rack_state[first]
-        for e in range(1, count):
-            out += mix[at + e] * rack_state[first + e]
+        sums = ti.Vector([ti.cast(0.0, real)] * (SOURCES * LANES))
+        for e in range(count):
+            x = rack_sources[first + e]
+            sums += mix[at + e] * ti.Vector(
+                [x[i // LANES] for i in ti.static(range(SOURCES * LANES))]
+            )
+        out = ti.Vector([ti.cast(0.0, real)] * LANES)
+        for i in range(LANES):
+            for source in ti.static(range(SOURCES)):
+                out[i] += sums[source * LANES + i]
         return out
 
     @ti.func
@@ -366,7 +380,7 @@ def hall_kernel(precision: str) -> Any:
         doubles: ti.template(),
         mix: ti.template(),
         racks: ti.template(),
-        rack_state: ti.template(),
+        rack_sources: ti.template(),
         rack_store: ti.template(),
         sums: ti.template(),
     ):
@@ -378,7 +392,7 @@ def hall_kernel(precision: str) -> Any:
         """
         block_0 = chunk_ints[CHUNK.first_block, chunk]
         block_1 = chunk_ints[CHUNK.first_block, chunk + 1]
-        n_racks = dc_ints[DC.racks, n]
+        n_sources = (dc_ints[DC.racks, n] + (SOURCES - 1)) // SOURCES
         row = STATE.change_k
         if again > 0:
             kept = ti.min(doubles[EXACT.kept, n], EXPECTED_KEPT)
@@ -396,10 +410,10 @@ def hall_kernel(precision: str) -> Any:
                     rack_store[STATE.exhaust_c, block] = was + change
         least = ti.Vector([ti.cast(0.0, real)] * LANES)
         most = least
-        first = row * rack_store.shape[1] * LANES + block_0 * LANES
+        first = (row * rack_store.shape[1] + block_0) * (LANES // SOURCES)
         for block in range(block_0, block_1):
-            at = dc_ints[DC.mix, n] + (block - block_0) * n_racks
-            mixed = mixed_from(mix, at, rack_state, first, n_racks)
+            at = dc_ints[DC.mix, n] + (block - block_0) * n_sources
+            mixed = mixed_from(mix, at, rack_sources, first, n_sources)
             rack_store[STATE.exchanged_c, block] = mixed
             least = smaller(mixed, least)
             most = larger(mixed, most)
@@ -753,7 +767,7 @@ def hall_kernel(precision: str) -> Any:
         units: ti.template(),
         unit_state: ti.template(),
         starts: ti.template(),
-        rack_state: ti.template(),
+        rack_sources: ti.template(),
         rack_store: ti.template(),
         server_c: ti.template(),
         servers_before: ti.template(),
@@ -788,7 +802,6 @@ def hall_kernel(precision: str) -> Any:
         ones = zeros + real(1.0)
         unit_0 = dc_ints[DC.first_unit, n]
         n_units = dc_ints[DC.first_unit, n + 1] - unit_0
-        places = rack_store.shape[1] * LANES
         utilisation = zeros + ti.cast(doubles[EXACT.utilisation, n], real)
         cpu_slope = dcs[VALUE.cpu_slope_per_k, n]
         cpu_offset = dcs[VALUE.cpu_offset, n]
@@ -877,25 +890,31 @@ def hall_kernel(precision: str) -> Any:
                                 if ti.static(transient):
                                     if dc_ints[DC.mix, n] >= 0:
                                         at_once = True
-                                        n_racks = dc_ints[DC.racks, n]
+                                        n_sources = dc_ints[DC.racks, n] + (SOURCES - 1)
+                                        n_sources //= SOURCES
+                                        first = (1 + side) * rack_store.shape[1] + dc_block_0
                                         target = mixed_from(
                                             mix,
-                                            dc_ints[DC.mix, n] + (block - dc_block_0) * n_racks,
-                                            rack_state,
-                                            (1 + side) * places + dc_block_0 * LANES,
-                                            n_racks,
+                                            dc_ints[DC.mix, n] + b * n_sources,
+                                            rack_sources,
+                                            first * (LANES // SOURCES),
+                                            n_sources,
                                         )
                                 if not at_once:
+                                    row = 1 + side
                                     for i in range(LANES):
-                                        t = real(0.0)
                                         at = block * LANES + i
+                                        parts = zeros
                                         for run in range(run_start[at], run_start[at + 1]):
-                                            x = (1 + side) * places + run_ints[RUN.first, run]
-                                            w = run_ints[RUN.offset, run]
-                                            s = real(0.0)
+                                            x, w = (
+                                                run_ints[RUN.first, run],
+                                                run_ints[RUN.offset, run],
+                                            )
                                             for e in range(run_ints[RUN.length, run]):
-                                                s += weights[w + e] * rack_state[x + e]
-                                            t += s
+                                                parts += weights[w + e] * rack_store[row, x + e]
+                                        t = real(0.0)
+                                        for j in range(LANES):
+                                            t += parts[j]
                                         target[i] = t
                                     target *= racks[RACK.norm, block]
                                 rack_store[STATE.exchanged_c, block] = target
@@ -1158,7 +1177,7 @@ def hall_kernel(precision: str) -> Any:
                                     doubles,
                                     mix,
                                     racks,
-                                    rack_state,
+                                    rack_sources,
                                     rack_store,
                                     sums,
                                 )
@@ -1205,6 +1224,7 @@ def hall_kernel(precision: str) -> Any:
         recirculates: ti.template(),
         transient: ti.template(),
         write: ti.template(),
+        serial: ti.template(),
         slices: ti.i32,
         sweeps: ti.i32,
         outlet_model: ti.i32,
@@ -1222,8 +1242,8 @@ def hall_kernel(precision: str) -> Any:
         chunk_ints: ints_2d,
         dc_ints: ints_2d,
         control: ints_2d,
-        weights: reals_1d,
-        mix: blocks_1d,
+        weights: blocks_1d,
+        mix: mix_1d,
         shares: blocks_1d,
         racks: blocks_2d,
         tables: blocks_2d,
@@ -1233,7 +1253,7 @@ def hall_kernel(precision: str) -> Any:
         units: reals_2d,
         unit_state: doubles_2d,
         starts: starts_2d,
-        rack_state: reals_1d,
+        rack_sources: sources_1d,
         rack_store: blocks_2d,
         server_c: blocks_1d,
         servers_before: reals_1d,
@@ -1255,6 +1275,8 @@ def hall_kernel(precision: str) -> Any:
         power_blocks: blocks_1d,
     ):
         n_tasks = tasks.shape[0] - 1
+        if ti.static(serial):
+            ti.loop_config(serialize=True)
         for k in range(slices * SLICE):
             if k % SLICE == 0:
                 first = ti.cast(ti.cast(k // SLICE, ti.i64) * n_tasks // slices, ti.i32)
@@ -1296,7 +1318,7 @@ def hall_kernel(precision: str) -> Any:
                         units,
                         unit_state,
                         starts,
-                        rack_state,
+                        rack_sources,
                         rack_store,
                         server_c,
                         servers_before,

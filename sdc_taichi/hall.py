@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from itertools import pairwise
+from math import isfinite
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +19,9 @@ Precision = Literal["f32", "f64"]
 
 _RELEASED_OUTLET_FIT = (1.918, 1.096, 0.526, 0.824, -14.01)
 """Rack outlet fit of the released SustainDC: factor, power exponent, divisor, flow exponent, K."""
+
+_SERIAL_GROUPS = 8192
+"""So many groups, or of layers servers, and less are not worth waking a second thread."""
 
 TOLERANCE_K: dict[Precision, float] = {"f32": 1e-4, "f64": 1e-12}
 """How little another sweep would move the exhaust mix before any rack."""
@@ -130,6 +134,9 @@ class HallSums:
     rack_outlet_c: Reals
 
 
+_CONDITIONS = tuple(f.name for f in fields(Conditions))
+
+
 class Hall:
     """Kernel arguments of a fleet: plain arrays, given back with the object."""
 
@@ -151,6 +158,7 @@ class Hall:
         self._lay_out_values(thermal)
         self._slices = max(1, min(8 * threads, len(self._tasks) - 1))
         self._terms = self._lanes(self._slices * len(thermal.TERMS), thermal.CHUNK_BLOCKS)
+        self._result_names = (*thermal.DC_OUT, *(f"rack_{name}" for name in thermal.RACK_OUT))
         self._solved: bool | None = None
         """Whether the last step was transient; None without one."""
 
@@ -225,23 +233,14 @@ class Hall:
     def _lay_out_air(self, thermal: Any) -> None:
         """Weights and unit shares at the places of the racks."""
         fleet, air, lanes = self._fleet, self._fleet.air, thermal.LANES
-        run_counts = np.zeros(self._places, np.int64)
-        zeros = np.zeros(1, np.int32)
         mix = self._dc_ints[thermal.DC_INTS.index("mix")]
         mix[:] = -1
+        self._lay_out_runs(lanes)
         if air is None:
-            self._run_start = starts(run_counts, "runs of weights")
-            self._run_ints = _table(zeros, zeros, zeros)
-            self._weights = self._real(np.zeros(1))
-            self._mix, self._shares = self._lanes(1), self._lanes(1)
+            self._shares = self._lanes(1)
+            self._mix = self._lanes(1, thermal.SOURCES).reshape(1, -1)
             self._starts, self._start_rows = self._empty((1, 1, 4), np.float64), 1
             return
-        run_counts[self._rack_at] = np.diff(air.run_start)
-        self._run_start = starts(run_counts, "runs of weights")
-        moved = self._rack_at[fleet.rack_start[:-1]] - fleet.rack_start[:-1]
-        first = air.run_first + np.repeat(moved[fleet.rack_dc], np.diff(air.run_start))
-        self._run_ints = _table(first, air.run_length, air.run_offset)
-        self._weights = self._real(air.weights)
         shares, mixes, known, total = [], [], {}, 0
         for dc, (racks, units) in enumerate(
             zip(np.diff(fleet.rack_start), np.diff(fleet.unit_start), strict=True)
@@ -254,17 +253,20 @@ class Hall:
                 continue
             entry = int(air.table[dc])
             if entry not in known:
-                weights = np.zeros((int(self._blocks[dc]) * lanes, int(racks)))
-                weights[:racks] = _dense(fleet, dc)
-                mixes.append(weights.reshape(-1, lanes, int(racks)).swapaxes(1, 2))
+                at_once = thermal.SOURCES
+                whole = -(-int(racks) // at_once) * at_once
+                weights = np.zeros((int(self._blocks[dc]) * lanes, whole))
+                weights[:racks, :racks] = _dense(fleet, dc)
+                by_block = weights.reshape(-1, lanes, whole).swapaxes(1, 2)
+                mixes.append(by_block.reshape(-1, at_once * lanes))
                 known[entry] = total
-                total += int(self._blocks[dc]) * int(racks)
+                total += len(mixes[-1])
             mix[dc] = known[entry]
         self._shares = self._lanes(sum(map(len, shares)))
         self._shares[:] = np.concatenate(shares)
-        self._mix = self._lanes(max(total, 1))
+        self._mix = self._lanes(max(total, 1), thermal.SOURCES).reshape(-1, thermal.SOURCES * lanes)
         if mixes:
-            self._mix[:] = np.concatenate([m.reshape(-1, lanes) for m in mixes])
+            self._mix[:] = np.concatenate(mixes)
         # Cubics reach one row and column beyond.
         expected = air.expected.reshape(len(air.supply_c), -1, len(LOADS), 3)
         expected = np.pad(expected, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
@@ -274,6 +276,37 @@ class Hall:
         )
         self._starts[..., :3] = expected.reshape(*self._starts.shape[:2], 3)
         self._dc_ints[thermal.DC_INTS.index("start"), :-1] = air.table * self._start_rows
+
+    def _lay_out_runs(self, lanes: int) -> None:
+        """Runs of weights in whole blocks, filled up with zeros, for halls of many racks."""
+        fleet, air = self._fleet, self._fleet.air
+        run_counts = np.zeros(self._places, np.int64)
+        large = np.diff(fleet.rack_start)[fleet.rack_dc] > DENSE_RACKS
+        if air is None or not large.any():
+            self._run_start = starts(run_counts, "runs of weights")
+            self._run_ints = np.zeros((3, 1), np.int32)
+            self._weights = self._lanes(1)
+            return
+        counts = np.diff(air.run_start)
+        run_counts[self._rack_at[large]] = counts[large]
+        self._run_start = starts(run_counts, "runs of weights")
+        of_large = np.repeat(large, counts)
+        moved = self._rack_at[fleet.rack_start[:-1]] - fleet.rack_start[:-1]
+        first = (air.run_first + np.repeat(moved[fleet.rack_dc], counts))[of_large]
+        length, offset = air.run_length[of_large], air.run_offset[of_large].astype(np.int64)
+        # Runs that share weights share their blocks where they begin at the same lane.
+        lane = first % lanes
+        key = (offset * (int(length.max()) + 1) + length) * lanes + lane
+        _, one, same = np.unique(key, return_index=True, return_inverse=True)
+        blocks = -(-(lane + length) // lanes)
+        begin = starts(blocks[one], "blocks of weights")
+        self._run_ints = _table(first // lanes, blocks, begin[same])
+        weights = self._lanes(int(begin[-1])).reshape(-1)
+        within = np.arange(int(length[one].sum()))
+        within -= np.repeat(np.cumsum(length[one]) - length[one], length[one])
+        to = np.repeat(begin[:-1].astype(np.int64) * lanes + lane[one], length[one]) + within
+        weights[to] = air.weights[np.repeat(offset[one], length[one]) + within]
+        self._weights = weights.reshape(-1, lanes)
 
     def _lay_out_values(self, thermal: Any) -> None:
         fleet, air = self._fleet, self._fleet.air
@@ -323,7 +356,7 @@ class Hall:
         self._fresh_m3s = fleet.dcs[fresh_share][fleet.unit_dc] * fleet.unit_design_m3s
         self._rack_store = self._lanes(len(thermal.RACK_STATE), blocks)
         self._rack_state = self._rack_store.reshape(len(self._rack_store), -1)
-        self._flat_state = self._rack_store.reshape(-1)
+        self._sources = self._rack_store.reshape(-1, thermal.SOURCES)
         self._memory = dict(zip(thermal.RACK_STATE, self._rack_state, strict=True))
         self._constants = self._real(
             np.array([*_RELEASED_OUTLET_FIT, *thermal.exp_constants(self._precision)])
@@ -388,8 +421,8 @@ class Hall:
     def _begin(self, exchange: int) -> None:
         """The first sweep exchanges what the exhaust row holds, or starts as may be expected."""
         first = {"active": 1, "exchange": exchange, "side": exchange, "sweep": 0, "chunks": 0}
-        for name, flag in first.items():
-            self._control[name][:] = flag
+        for row, name in zip(self._controls, self._thermal.CONTROL, strict=True):
+            row[:] = first[name]
         self._moves[:] = 0.0
 
     def _sweep(self, out: tuple[Any, Any], sweeps: int, **how: Any) -> None:
@@ -529,10 +562,10 @@ class Hall:
         )
 
     def _set(self, met: Conditions) -> None:
-        for f in fields(met):
-            given = getattr(met, f.name)
-            if given is not None and not np.isfinite(np.sum(given)):
-                raise SdcError(f"conditions: {f.name} is not finite; valid are finite numbers")
+        for name in _CONDITIONS:
+            given = getattr(met, name)
+            if given is not None and not isfinite(np.add.reduce(given)):
+                raise SdcError(f"conditions: {name} is not finite; valid are finite numbers")
         self._loads_of, self._loads = 0, self._no_groups
         self._dc["utilisation"][:] = met.utilisation
         if met.group_load is not None:
@@ -548,9 +581,10 @@ class Hall:
             elif name in self._of_a_step:
                 row[:] = self._is_rack
                 self._of_a_step.remove(name)
-        limits = (("low", met.unit_low), ("high", met.unit_high), ("running", met.unit_running))
-        for name, given in limits:
-            self._unit[name][:] = 1.0 if given is None else given
+        unit = self._unit
+        unit["low"][:] = 1.0 if met.unit_low is None else met.unit_low
+        unit["high"][:] = 1.0 if met.unit_high is None else met.unit_high
+        unit["running"][:] = 1.0 if met.unit_running is None else met.unit_running
         self._supply["supply_c"][:] = met.unit_supply_c
 
     def _out(self) -> tuple[Any, Any]:
@@ -572,14 +606,17 @@ class Hall:
         each_once: int = 0,
     ) -> None:
         runtime.ensure_started()
+        values_out = self._fleet.servers if write else self._group_places * self._thermal.LANES
+        serial = values_out * (sweeps if transient else 1) <= _SERIAL_GROUPS
         racks, dcs = (self._rack_store, self._sums) if out is None else out
-        none, no_lanes = self._no_groups, self._mix
+        none, no_lanes = self._no_groups, self._weights
         if transient and len(self._server_c) < self._group_places:
             self._server_c = self._lanes(self._group_places)
         self._kernel(
             self._recirculates,
             transient,
             write is not None,
+            serial,
             self._slices,
             sweeps,
             self._outlet_model,
@@ -608,7 +645,7 @@ class Hall:
             self._units,
             self._unit_state,
             self._starts,
-            self._flat_state,
+            self._sources,
             self._rack_store,
             self._server_c,
             *((none, none) if servers is None else servers),
@@ -626,21 +663,19 @@ class Hall:
 
     def _results(self, out: tuple[Any, Any]) -> HallSums:
         racks, dcs = self._at_racks(out[0]), out[1]
-        finite = np.isfinite(dcs).all(axis=0)
-        if not finite.all():
+        if not isfinite(np.add.reduce(dcs, axis=None)):
+            finite = np.isfinite(dcs).all(axis=0)
             raise SdcError(
                 f"{self._fleet.names[int(np.argmin(finite))]}: temperatures or power of the hall "
                 "are beyond any number; valid are smaller powers or larger airflows"
             )
-        named = dict(zip(self._thermal.DC_OUT, dcs, strict=True))
+        found = dict(zip(self._result_names, (*dcs, *racks), strict=True))
+        found["hottest_group"] = found["hottest_group"].astype(np.int64)
         return HallSums(
-            **{**named, "hottest_group": named["hottest_group"].astype(np.int64)},
             unit_flow_m3s=self._supply["flow_m3s"].copy(),
             unit_cubed_speed=self._supply["cubed_speed"].copy(),
             room_j=self._dc["room_j"].copy(),
-            **{
-                f"rack_{name}": row for name, row in zip(self._thermal.RACK_OUT, racks, strict=True)
-            },
+            **found,
         )
 
 

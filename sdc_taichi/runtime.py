@@ -44,17 +44,16 @@ def ensure_started() -> int:
         )
     from sdc_taichi.kernels.backend import ti
 
-    runtime = ti.lang.impl.get_runtime()
-    if runtime.prog is None:
+    if ti.lang.impl.get_runtime().prog is None:
         options = {"cpu_max_num_threads": _thread_limit()} if _thread_limit() else {}
         # ti.init prints a banner, which would end up in a user's piped output.
         with contextlib.redirect_stdout(io.StringIO()):
             ti.init(arch=ti.cpu, offline_cache=True, log_level=ti.ERROR, **options)
-    program, threads = _known
-    if program is not runtime.prog:
-        threads = int(ti.lang.impl.current_cfg().cpu_max_num_threads)
-        _known = (runtime.prog, threads)
-    return threads
+    # Starting makes another object of the runtime.
+    program = ti.lang.impl.get_runtime().prog
+    if _known[0] is not program:
+        _known = (program, int(ti.lang.impl.current_cfg().cpu_max_num_threads))
+    return _known[1]
 
 
 def _thread_limit() -> int:
