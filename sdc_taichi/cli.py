@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import signal
 import sys
+import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TextIO
 
 import typer
 import typer.core
@@ -24,12 +26,16 @@ from sdc_taichi.config import (
 from sdc_taichi.data_commands import data_app
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.hall_commands import hall_app
+from sdc_taichi.report_commands import report_command
+from sdc_taichi.view_commands import view_command
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from sdc_taichi.run import Asked
     from sdc_taichi.sim import Simulator
     from sdc_taichi.types import StepResult
+    from sdc_taichi.viz.recorder import Recorder
 
 EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 MAX_DCS = 100_000
@@ -93,6 +99,8 @@ config_app = typer.Typer(help="Show and check configurations.", no_args_is_help=
 app.add_typer(config_app, name="config")
 app.add_typer(data_app, name="data")
 app.add_typer(hall_app, name="hall")
+app.command("report")(report_command)
+app.command("view")(view_command)
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")]
 
@@ -172,8 +180,32 @@ def simulate(
         typer.Option(metavar="DIR", help="Output folder. [default: runs/PRESET-SITES-START]"),
     ] = None,
     recording: Annotated[
-        Path | None,
-        typer.Option("--record", metavar="FILE.rrd", help="Also write a Rerun recording."),
+        str | None,
+        typer.Option(
+            "--record",
+            metavar="FILE.rrd|ADDRESS",
+            help="Also write a Rerun recording, or show the run in a viewer that listens there.",
+        ),
+    ] = None,
+    focus: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME[,NAME...]", help="Data centers recorded in full. [default: the first 2]"
+        ),
+    ] = None,
+    every: Annotated[
+        int | None,
+        typer.Option(min=1, help="Steps between two recorded heat maps. [default: by size]"),
+    ] = None,
+    serve: Annotated[
+        bool,
+        typer.Option("--serve", help="Let viewers of this machine watch the run, until Ctrl-C."),
+    ] = False,
+    serve_port: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=65535, help="Serve on this port; 0 is any free one. [default: 9876]"
+        ),
     ] = None,
     force: Annotated[
         bool, typer.Option("--force", help="Write into a folder with other files.")
@@ -201,31 +233,37 @@ def simulate(
     fleet = build_fleet(configs)
     asked = Asked(controller, _whole_steps(days, fleet.steps_per_hour), seed)
     driver = make_controller(controller, fleet)
+    recorder = _recorder(recording, focus, every, serve, serve_port)
     folder = out if out is not None else _default_folder(label, configs)
     with Simulator(fleet, precision=precision) as sim:
         for note in sim.drivers.notes:
             print(f"note: {note}", file=sys.stderr)
-        prepare_folder(folder, force=force)
-        with (
-            _interruptible() as interrupted,
-            _recorded(recording, sim) as log,
-            _progress(asked.steps, shown=not quiet) as advance,
-        ):
+        with _interruptible() as interrupted, _recording(recorder, sim, asked):
+            prepare_folder(folder, force=force)
+            with _progress(asked.steps, shown=not quiet) as advance:
 
-            def each(result: StepResult) -> None:
-                log(result)
-                advance(result)
+                def each(result: StepResult) -> None:
+                    if recorder is not None:
+                        recorder.add(result)
+                    advance(result)
 
-            report = record(sim, driver, asked, folder, force=force, on_step=each, stop=interrupted)
-    if report is None:
-        print("interrupted before the first step; nothing written", file=sys.stderr)
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if as_json:
-        print(report_json(report))
-    elif not quiet:
-        _print_summary(report, label, folder, sim.fleet.steps_per_hour)
-        if recording is not None:
-            print(f"Recording: {recording} (open with: rerun {recording})")
+                report = record(
+                    sim, driver, asked, folder, force=force, on_step=each, stop=interrupted
+                )
+            if report is None:
+                print("interrupted before the first step; nothing written", file=sys.stderr)
+                raise typer.Exit(EXIT_INTERRUPTED)
+            if as_json:
+                print(report_json(report))
+            elif not quiet:
+                _print_summary(report, label, folder, sim.fleet.steps_per_hour)
+                if recorder is not None and recorder.file is not None and not recorder.lost:
+                    print(
+                        f"Recording: {recorder.file} (open with: sdc-taichi view {recorder.file})"
+                    )
+            if recorder is not None and recorder.served is not None and not recorder.lost:
+                recorder.flush()
+                _wait(interrupted, recorder.served)
     if report["steps_done"] < asked.steps:
         print(
             f"interrupted after {report['steps_done']} of {asked.steps} steps; {folder} holds the "
@@ -412,18 +450,66 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-@contextlib.contextmanager
-def _recorded(path: Path | None, sim: Simulator) -> Iterator[Callable[[StepResult], None]]:
-    """Log steps to a recording, if one is asked for."""
-    if path is None:
-        yield lambda _: None
-        return
+def _recorder(
+    target: str | None, focus: str | None, every: int | None, serve: bool, port: int | None
+) -> Recorder | None:
+    """None without a recording."""
+    from sdc_taichi.viz.streams import DEFAULT_PORT, is_address
+
+    if serve or port is not None:
+        port = DEFAULT_PORT if port is None else port
+    elif target is None:
+        for name, value in (("--focus", focus), ("--every", every)):
+            if value is not None:
+                raise ConfigError(
+                    f"{name}: given without a recording; valid with --record, --serve"
+                )
+        return None
     from sdc_taichi.viz.recorder import Recorder
 
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)  # the recorder says what is wrong with it
-    with Recorder(path, sim.fleet, sources=sim.drivers.sources) as recorder:
-        yield recorder.log
+    if target is not None and target.endswith(".rrd") and not is_address(target):
+        with contextlib.suppress(OSError):  # the recorder says what is wrong with it
+            Path(target).parent.mkdir(parents=True, exist_ok=True)
+    names = None if focus is None else [name.strip() for name in focus.split(",")]
+    return Recorder(target, focus=names, every=every, serve_port=port)
+
+
+@contextlib.contextmanager
+def _recording(recorder: Recorder | None, sim: Simulator, asked: Asked) -> Iterator[None]:
+    """Record while the context lasts, if there is a recorder."""
+    if recorder is None:
+        yield
+        return
+    from sdc_taichi.run import describe
+    from sdc_taichi.viz.streams import RecordingWarning
+
+    with warnings.catch_warnings(), recorder:
+        warnings.simplefilter("always", RecordingWarning)
+        warnings.showwarning = _show_warning
+        recorder.begin(sim, describe(sim, asked))
+        if recorder.served is not None:
+            command = f"sdc-taichi view {recorder.served}"
+            print(f"serving the run; watch it with: {command} [--web]", file=sys.stderr)
+        yield
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    print(f"warning: {message}", file=sys.stderr)
+
+
+def _wait(ended: Callable[[], bool], address: str) -> None:
+    """Until Ctrl-C."""
+    if not ended():
+        print(f"the run is done and still served at {address}; Ctrl-C ends it", file=sys.stderr)
+    while not ended():
+        time.sleep(0.1)
 
 
 @contextlib.contextmanager

@@ -34,6 +34,8 @@ from sdc_taichi.whole_file import part_of, whole_file, writing
 
 FORMAT = "sdc-run/1"
 METADATA_KEY = b"sdc_taichi"
+REPORT_FILE = "report.html"
+"""Made of the files of a run by ``sdc-taichi report``."""
 FIRST_YEAR = 2001
 """Calendar year of the first simulated year in time stamps; it has no other meaning."""
 _ROWS_PER_GROUP = 1 << 16
@@ -140,8 +142,10 @@ def record(
         writer.commit()
     write_text(out / config_name, configs)
     if former:
-        with writing(out / other_name):
-            (out / other_name).unlink(missing_ok=True)
+        # What a former run left, and what was made of it.
+        for name in (other_name, REPORT_FILE):
+            with writing(out / name):
+                (out / name).unlink(missing_ok=True)
     events = _events_by_dc(met, sim.size)
     report = {
         **about,
@@ -402,7 +406,7 @@ def _file_hashes(configs: Sequence[DataCenterConfig]) -> dict[str, str]:
 
 def _is_of_a_run(path: Path) -> bool:
     """Files that a run may leave without its metrics.json when it is broken off."""
-    return path.name == "steps.parquet" or path.suffix in (".part", ".rrd")
+    return path.name in ("steps.parquet", REPORT_FILE) or path.suffix in (".part", ".rrd")
 
 
 def _is_run(out: Path) -> bool:

@@ -1,9 +1,7 @@
-"""Recordings read back equal to the results, and pictures that show what they should."""
+"""Pictures that show what they should."""
 
 from __future__ import annotations
 
-import os
-import shutil
 import struct
 import subprocess
 import sys
@@ -26,8 +24,7 @@ from sdc_taichi import (
     load_config,
     make_configs,
 )
-from sdc_taichi.viz import figures, hall_figures, recorder
-from sdc_taichi.viz.recorder import Recorder
+from sdc_taichi.viz import figures, hall_figures
 
 STEPS = 110  # more than a block, and no multiple of one
 ODD_NAME = "hall/1 [a]"
@@ -55,266 +52,10 @@ def run() -> Iterator[tuple[Simulator, list[StepResult]]]:
         yield sim, simulate(sim, STEPS)
 
 
-@pytest.fixture(scope="module")
-def recording(
-    run: tuple[Simulator, list[StepResult]], tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    sim, results = run
-    path = tmp_path_factory.mktemp("recording") / "run.rrd"
-    with Recorder(path, sim.fleet, every=2, sources=sim.drivers.sources) as rec:
-        for result in results:
-            rec.log(result)
-    return path
-
-
 def frame(results: list[StepResult], dc: int = 0) -> pd.DataFrame:
     times = pd.date_range("2001-01-01", periods=len(results), freq="15min")
     columns = {name: [r.per_dc()[name][dc] for r in results] for name in results[0].per_dc()}
     return pd.DataFrame({"time": times, **columns})
-
-
-def read(path: Path) -> dict[str, dict[str, Any]]:
-    """Every entity's columns over the whole recording, in order of step; static ones too."""
-    from rerun.chunk import RrdReader
-
-    parts: dict[str, dict[str, list[Any]]] = {}
-    for chunk in RrdReader(path).stream().to_chunks():
-        for name, column in chunk.to_record_batch().to_pydict().items():
-            parts.setdefault(chunk.entity_path, {}).setdefault(name, []).extend(column)
-    for columns in parts.values():
-        if "step" in columns:
-            order = np.argsort(columns["step"])
-            for name, values in columns.items():
-                if len(values) == len(order):
-                    columns[name] = [values[i] for i in order]
-    return parts
-
-
-def scalars(entity: dict[str, Any]) -> npt.NDArray[np.float64]:
-    return np.array(entity["Scalars:scalars"])
-
-
-def test_series_read_back(run: tuple[Simulator, list[StepResult]], recording: Path) -> None:
-    entities = read(recording)
-    focus = {0: "ny-0", 1: r"hall\/1\ \[a\]", 2: "ny-2", 3: "ca-3"}
-    _, results = run
-    for dc, name in focus.items():
-        for plot, lines in recorder.PLOTS.items():
-            entity = entities[f"/dc/{name}/series/{plot}"]
-            assert entity["step"] == list(range(STEPS))
-            expected = [
-                [getattr(r, field)[dc] * factor for _, field, factor, _ in lines] for r in results
-            ]
-            np.testing.assert_array_equal(scalars(entity), expected)
-            assert entity["SeriesLines:names"] == [[line[0] for line in lines]]
-            assert all(line[0].endswith("]") for line in lines), "a unit in every name"
-    assert not [path for path in entities if "ny-4" in path or "ca-5" in path]
-    np.testing.assert_array_equal(
-        scalars(entities["/fleet/mean_pue"])[:, 0], [np.mean(r.pue) for r in results]
-    )
-    np.testing.assert_allclose(
-        scalars(entities["/fleet/carbon_kg"])[:, 0], [r.carbon_g.sum() / 1e3 for r in results]
-    )
-    np.testing.assert_array_equal(
-        scalars(entities["/fleet/hottest_inlet_c"])[:, 0], [max(r.inlet_max_c) for r in results]
-    )
-
-
-def test_times_are_the_clock_of_the_data_center(recording: Path) -> None:
-    entities = read(recording)
-    winter = entities["/dc/ny-0/series/pue"]["sim_time"]
-    summer = entities["/dc/ny-2/series/pue"]["sim_time"]
-    assert str(winter[0]) == "2001-01-01 00:00:00"
-    assert str(summer[0]) == "2001-07-01 00:00:00"
-    assert str(summer[97]) == "2001-07-02 00:15:00"
-    assert summer[0].tzinfo is None
-
-
-def test_heat_maps_read_back(run: tuple[Simulator, list[StepResult]], recording: Path) -> None:
-    sim, results = run
-    entities = read(recording)
-    for dc, name in ((0, "ny-0"), (3, "ca-3")):
-        hall = sim.fleet.configs[dc].hall
-        for what, limits in recorder.MAPS.items():
-            entity = entities[f"/dc/{name}/map/{what}"]
-            assert entity["step"] == list(range(0, STEPS, 2))
-            assert entity["DepthImage:depth_range"] == [[list(limits)]]
-            (((form,),)) = entity["DepthImage:format"]
-            height, width = form["height"], form["width"]
-            tile_h, tile_w = (height + 1) // hall.rows - 1, (width + 1) // hall.racks_per_row - 1
-            for shot, step in enumerate(entity["step"]):
-                ((raw,),) = (entity["DepthImage:buffer"][shot],)
-                pixels = np.frombuffer(bytes(raw), np.float16).reshape(height, width)
-                racks = getattr(results[step], f"rack_{what}_c")
-                first = sim.fleet.rack_start[dc]
-                for rack in range(hall.racks):
-                    row, column = divmod(rack, hall.racks_per_row)
-                    y, x = row * (tile_h + 1), column * (tile_w + 1)
-                    tile = pixels[y : y + tile_h, x : x + tile_w]
-                    assert np.ptp(tile) == 0
-                    assert abs(float(tile[0, 0]) - racks[first + rack]) <= recorder.QUANTUM_K / 2
-                assert np.all(pixels[tile_h, :] == limits[0])
-
-
-@pytest.mark.parametrize(("rows", "per_row"), [(4, 5), (20, 200), (50, 20), (1, 1), (40, 4)])
-def test_tiles_are_equal_and_legible(rows: int, per_row: int) -> None:
-    index = recorder.tile_index(rows, per_row)
-    counts = np.bincount(index.ravel())
-    assert np.all(counts[: rows * per_row] == counts[0])
-    assert counts[0] >= 16
-    assert 0.5 <= index.shape[1] / index.shape[0] <= 5.0
-
-
-def test_heat_maps_are_clamped() -> None:
-    racks = np.array([[-40.0, 20.03, 99.0, 30.0]], dtype=np.float32)
-    pixels = recorder.heat_map_pixels(racks, recorder.tile_index(2, 2), (10.0, 45.0))
-    assert set(np.unique(pixels)) == {10.0, 20.0, 45.0, 30.0}
-
-
-def test_recording_explains_itself(
-    run: tuple[Simulator, list[StepResult]], recording: Path
-) -> None:
-    from rerun.chunk import RrdReader
-
-    sim, _ = run
-    entities = read(recording)
-    (((text,),)) = entities["/summary"]["TextDocument:text"]
-    for expected in (ODD_NAME, "site CA", "synthetic year, seed 10", "carnot", "other 2 data"):
-        assert expected in text
-    assert sim.fleet.configs[0].description in text
-    assert "10 C" in entities["/legend/outlet/ticks"]["Points2D:labels"][0]
-    (blueprint,) = RrdReader(recording).blueprints()
-    chunks = RrdReader(recording).stream(store=blueprint).to_chunks()
-    shown = str([chunk.to_record_batch().to_pydict() for chunk in chunks])
-    for expected in ("ny-0", ODD_NAME, "fleet", "sim_time", "HVAC by device [kW]"):
-        assert expected in shown
-
-
-def test_without_sources_the_configured_ones_are_named(tmp_path: Path) -> None:
-    base = load_config("tiny", ["site.carbon_file=/data/ci.csv", "site.seed=4"])
-    with (
-        Simulator(load_config("tiny")) as sim,
-        Recorder(tmp_path / "x.rrd", build_fleet(base)) as r,
-    ):
-        sim.reset()
-        r.log(sim.step())
-    (((text,),)) = read(tmp_path / "x.rrd")["/summary"]["TextDocument:text"]
-    assert "weather (as configured): NY, synthetic, seed 4" in text
-    assert "carbon (as configured): file /data/ci.csv" in text
-
-
-def test_rerun_verifies_the_recording(recording: Path) -> None:
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    command = shutil.which("rerun", path=path)
-    if command is None:
-        pytest.skip("the rerun command is not installed")
-    done = subprocess.run(
-        [command, "rrd", "verify", str(recording)],
-        env={**os.environ, "RERUN_ANALYTICS": "0"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "1 file verified without error" in done.stdout + done.stderr
-
-
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_interrupted_recording_is_readable(
-    run: tuple[Simulator, list[StepResult]], tmp_path: Path, error: type[BaseException]
-) -> None:
-    sim, results = run
-    path = tmp_path / "cut.rrd"
-    path.write_text("older")
-
-    def cut() -> None:
-        with Recorder(path, sim.fleet) as rec:
-            for result in results[:100]:
-                rec.log(result)
-            assert path.read_text() == "older"
-            raise error
-
-    with pytest.raises(error):
-        cut()
-    assert [p.name for p in tmp_path.iterdir()] == ["cut.rrd"]
-    assert len(scalars(read(path)["/dc/ny-0/series/pue"])) == 100
-
-
-def test_failed_write_is_reported_and_leaves_nothing(
-    run: tuple[Simulator, list[StepResult]], tmp_path: Path
-) -> None:
-    sim, results = run
-    path = tmp_path / "x.rrd"
-    rec = Recorder(path, sim.fleet)
-    rec.log(results[0])
-    path.mkdir()
-    with pytest.raises(SdcError, match=r"x\.rrd: cannot be written"):
-        rec.close()
-    assert [p.name for p in tmp_path.iterdir()] == ["x.rrd"]
-    with pytest.raises(SdcError, match="closed"):
-        rec.log(results[1])
-
-
-def test_results_that_do_not_fit_are_refused(
-    run: tuple[Simulator, list[StepResult]], tmp_path: Path
-) -> None:
-    sim, results = run
-    with Recorder(tmp_path / "a.rrd", sim.fleet) as rec:
-        rec.log(results[5])
-        with pytest.raises(SdcError, match="step 5 after step 5"):
-            rec.log(results[5])
-    other = build_fleet(load_config("tiny"))
-    with (
-        Recorder(tmp_path / "b.rrd", other) as rec,
-        pytest.raises(SdcError, match="6 data centers and 24 racks, expected 1 and 4"),
-    ):
-        rec.log(results[0])
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments", "message"),
-    [
-        ("x.txt", {}, r"must end in \.rrd"),
-        ("none/x.rrd", {}, "is no folder"),
-        ("x.rrd", {"every": 0}, "every 0"),
-        ("x.rrd", {"every": 2.0}, "every 2.0"),
-        ("x.rrd", {"focus": ["ny-0", "ny"]}, "focus 'ny': no such data center; valid: ny-0"),
-        ("x.rrd", {"focus": ["ny-0"] * 2}, "up to 4 different"),
-        ("x.rrd", {"focus": [f"dc-{i}" for i in range(5)]}, "up to 4 different"),
-    ],
-)
-def test_bad_arguments(tmp_path: Path, name: str, arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(SdcError, match=message):
-        Recorder(tmp_path / name, build_fleet(configs()), **arguments)
-    assert not list(tmp_path.iterdir())
-
-
-def test_full_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usage = shutil.disk_usage(tmp_path)._replace(free=5000)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(SdcError, match="expected 2 MB"):
-        Recorder(tmp_path / "x.rrd", build_fleet(configs()))
-
-
-def test_focus_and_default_interval(tmp_path: Path) -> None:
-    large = make_configs(load_config("tiny", ["hall.rows=2", "name=a"]), count=2)
-    fleet = build_fleet(large)
-    with Simulator(fleet) as sim, Recorder(tmp_path / "x.rrd", fleet, focus=("ny-1",)) as rec:
-        for result in simulate(sim, 3):
-            rec.log(result)
-    entities = read(tmp_path / "x.rrd")
-    assert "/dc/ny-0/map/inlet" not in entities
-    assert entities["/dc/ny-1/map/inlet"]["step"] == [0, 1, 2]
-    assert recorder._check_every(None, 200) == 1
-    assert recorder._check_every(None, 201) == 4
-
-
-def test_missing_rerun_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(SdcError, match="pip install rerun-sdk"):
-        Recorder(tmp_path / "x.rrd", build_fleet(configs()))
-    assert not list(tmp_path.iterdir())
 
 
 def test_missing_matplotlib_is_explained(
@@ -412,9 +153,9 @@ def test_overview_shows_the_run(run: tuple[Simulator, list[StepResult]]) -> None
     panels: list[Any] = figure.axes
     weather, power, carbon, storage, emitted, charge = panels
     labels = [axes.get_ylabel() for axes in figure.axes]
-    for expected in ("(°C)", "(kW)", "g CO₂/kWh", "(tasks)", "kg CO₂/step", "(%)"):
+    for expected in ("(°C)", "(kW)", "g CO₂e/kWh", "(tasks)", "kg CO₂e/h", "(%)"):
         assert sum(expected in label for label in labels) == 1
-    named = {line.get_label(): line.get_ydata() for line in weather.lines}
+    named = {line.get_label(): line.get_ydata()[:-1] for line in weather.lines}
     for name in ("outdoor_c", "wet_bulb_c", "setpoint_c"):
         line = named[name.removesuffix("_c").replace("_", " ")]
         np.testing.assert_array_equal(line, steps[name])
@@ -425,9 +166,9 @@ def test_overview_shows_the_run(run: tuple[Simulator, list[StepResult]]) -> None
         name for name, _ in figures.POWERS.values()
     ]
     assert not power.lines
-    np.testing.assert_array_equal(carbon.lines[0].get_ydata(), steps["ci_g_per_kwh"])
+    np.testing.assert_array_equal(carbon.lines[0].get_ydata()[:-1], steps["ci_g_per_kwh"])
     np.testing.assert_array_equal(storage.lines[0].get_ydata(), steps["queue_tasks"])
-    assert filled_to(emitted.collections[0]) == pytest.approx(steps["carbon_g"].max() / 1e3)
+    assert filled_to(emitted.collections[0]) == pytest.approx(steps["carbon_g"].max() / 1e3 / 0.25)
     assert filled_to(charge.collections[0]) == pytest.approx(100 * steps["soc"].max())
     pixels = render(figure)
     for axes in figure.axes[:4]:
@@ -444,7 +185,7 @@ def test_overview_marks_devices_left_out_of_the_total(
     line: Any
     (line,) = figures.overview(steps).axes[1].lines
     assert line.get_label() == "counted in total"
-    np.testing.assert_allclose(line.get_ydata(), (steps["it_w"] + steps["chiller_w"]) / 1e3)
+    np.testing.assert_allclose(line.get_ydata()[:-1], (steps["it_w"] + steps["chiller_w"]) / 1e3)
 
 
 def test_readme_picture(run: tuple[Simulator, list[StepResult]], tmp_path: Path) -> None:

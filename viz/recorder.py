@@ -1,203 +1,226 @@
-"""Recordings of a run for the Rerun viewer: rack heat maps and series of a few data centers.
+"""Recordings of a run for the Rerun viewer, written as the run goes, in blocks of steps.
 
-Everything is written as the run goes, in blocks of steps, so memory does not grow with its length.
+Entities of a recording, NAME being a data center in focus:
+
+    dc/NAME/map/{inlet,outlet,power}   a pixel tile per rack
+    dc/NAME/hall/{inlet,outlet}        a voxel per rack and height, in 3D
+    dc/NAME/series/..., crac/...       lines, an entity per unit
+    dc/NAME/actions/...                what was done, as states
+    dc/NAME/events                     log
+    fleet/...                          sums and extremes over all data centers
+    legend/..., summary                static
+
+Timelines are ``step``, from 0 at reset, and ``sim_time``, the start of the step on the data
+center's own clock (see ``run.step_times``); the fleet has the clock of the first one in focus.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
-import uuid
-from collections.abc import Sequence
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.config import first_step_day
 from sdc_taichi.errors import SdcError
 from sdc_taichi.fleet import Fleet
+from sdc_taichi.layout import floor_plan
+from sdc_taichi.run import Asked, describe, step_times
 from sdc_taichi.types import F64, I64, StepResult
-from sdc_taichi.whole_file import writing
+
+from . import hall_layers as layers
+from .blueprint import Tab, blueprint
+from .recording_events import Entry, Watch
+from .recording_reader import Block, Cadence, Reader
+from .recording_series import (
+    FLEET,
+    PLOTS,
+    QUEUE,
+    REWARDS,
+    ROW,
+    STATES,
+    rows_and_factors,
+    with_pue,
+)
+from .recording_static import MAX_UNIT_LINES, data_center_entities, fleet_entities
+from .recording_summary import summary
+from .streams import (
+    Stream,
+    blobs,
+    check_address,
+    check_path,
+    check_port,
+    column,
+    import_rerun,
+    is_address,
+    served_at,
+)
 
 if TYPE_CHECKING:
     import rerun as rr
-    import rerun.blueprint as rrb
 
-BLOCK_STEPS = 96
-"""Steps per column of the file; every column costs some kB on top of its values."""
-MAX_FOCUS = 4
-MIN_FREE_BYTES = 2_000_000
-EVERY_STEP_UP_TO_RACKS = 200
-QUANTUM_K = 1 / 16
-"""Resolution of the heat maps: exact in half precision below 64 C, and it compresses well."""
+    from sdc_taichi.sim import Simulator
 
-MAPS = {"inlet": (10.0, 45.0), "outlet": (10.0, 60.0)}
-"""Heat maps and their fixed ranges in C, so that colours mean the same in every recording."""
+Real = TypeVar("Real", bound=np.floating[Any])
+Pictures: TypeAlias = dict[tuple[int, str], npt.NDArray[Real]]
+"""By hall in focus and quantity."""
 
-_BLUE, _ORANGE, _GREEN, _RED = 0x0072B2FF, 0xE69F00FF, 0x009E73FF, 0xD55E00FF
-_PINK, _SKY, _GREY = 0xCC79A7FF, 0x56B4E9FF, 0x999999FF
-
-PLOTS: dict[str, tuple[tuple[str, str, float, int], ...]] = {
-    "temperature_c": (
-        ("outdoor [C]", "outdoor_c", 1.0, _GREY),
-        ("wet bulb [C]", "wet_bulb_c", 1.0, _SKY),
-        ("setpoint [C]", "setpoint_c", 1.0, _BLUE),
-        ("inlet max [C]", "inlet_max_c", 1.0, _ORANGE),
-        ("outlet mean [C]", "outlet_mean_c", 1.0, _RED),
-    ),
-    "power_kw": (("IT [kW]", "it_w", 1e-3, _BLUE), ("HVAC [kW]", "hvac_w", 1e-3, _ORANGE)),
-    "hvac_kw": (
-        ("chiller [kW]", "chiller_w", 1e-3, _BLUE),
-        ("tower fan [kW]", "tower_fan_w", 1e-3, _SKY),
-        ("chilled-water pump [kW]", "chilled_pump_w", 1e-3, _GREEN),
-        ("condenser pump [kW]", "condenser_pump_w", 1e-3, _PINK),
-        ("CRAC fan [kW]", "crac_fan_w", 1e-3, _ORANGE),
-    ),
-    "pue": (("PUE [-]", "pue", 1.0, _BLUE),),
-    "carbon_intensity": (("grid carbon intensity [g/kWh]", "ci_g_per_kwh", 1.0, _RED),),
-    "grid_kwh": (
-        ("IT + HVAC [kWh/step]", "facility_kwh", 1.0, _GREY),
-        ("grid [kWh/step]", "grid_kwh", 1.0, _BLUE),
-    ),
-    "battery": (("state of charge [-]", "soc", 1.0, _GREEN),),
-    "queue": (("queue [tasks]", "queue_tasks", 1.0, _PINK),),
-}
-"""Series of a focus data center: entity to (name, field of StepResult, factor, colour)."""
-
-FLEET_PLOTS: dict[str, tuple[str, int]] = {
-    "mean_pue": ("mean PUE [-]", _BLUE),
-    "carbon_kg": ("total carbon [kg/step]", _RED),
-    "hottest_inlet_c": ("hottest inlet [C]", _ORANGE),
-}
-"""Series over all data centers of the fleet: entity to (name, colour)."""
+BLOCK_STEPS, LARGE_BLOCK_STEPS = 384, 96
+"""Steps per block: every block costs some kB per entity on top of its values."""
+LARGE_RACKS = 2_000
+"""Racks in focus above which blocks are the shorter ones, for their memory."""
+MAX_FOCUS, DEFAULT_FOCUS = 4, 2
+"""Data centers in full that may be asked for, and those that are taken unasked."""
+EVERY_H = ((200, 0.0), (2_000, 1.0), (20_000, 3.0))
+"""Racks in focus up to which heat maps are that many hours apart, 0 being every step."""
+LARGEST_EVERY_H = 6.0
+HALL_H, HALL_IN_EVENTS_H = 3.0, 1.0
+"""Hours between two shots of the 3D hall, at the least: they need a pass over all servers."""
+ZONES, LARGE_ZONES = 10, 5
+"""Heights of the 3D hall at which a rack shows its servers, in small and in larger halls."""
+SERVER_LAYERS_UP_TO = 100_000
+"""Servers of the fleet beyond which a rack of the 3D hall has a single value."""
+LIVE_S, FILE_S = 1.0, 60.0
+"""A block ends after so long, whatever it holds, if somebody may watch and if nobody does."""
+ROOM_BYTES, ROOM_PER_VALUE, ROOM_PER_DC = 8_000_000, 8, 20_000
+"""What a recording leaves free for the files of its run: something, each value, each config."""
+_NO_SIGN = 2
+"""Of an action before the first step."""
 
 
 class Recorder:
-    """Writes step results to a Rerun recording (.rrd) that ``rerun FILE`` shows.
+    """Writes step results to a Rerun recording, or to a viewer that shows them at once.
 
-    Focus data centers get rack heat maps and series; the whole fleet gets mean PUE, total carbon
-    and hottest inlet. Time ``step`` counts from reset and ``sim_time`` is the start of the step on
-    the data center's own clock in the year 2001 (fleet series: the first data center's clock).
-
-    The file appears under its name on ``close``, also after an exception when used as a context
-    manager, and then holds every step logged so far; an older file of that name is replaced.
+    A file has its name from the first block on, and holds every whole block whatever ends the run;
+    ``close`` adds the index that readers find their way by. Once it cannot go on (a full disk, a
+    viewer that was closed) there is one ``RecordingWarning``, and further steps are ignored.
 
     Args:
-        path: file to write, ending in .rrd.
-        fleet: the fleet of the simulator whose results are logged.
-        every: steps between two heat maps; None is 1 up to 200 racks in focus and 4 beyond. Series
-            always have every step.
-        focus: names of up to 4 data centers to record in full; None is the first 4.
-        sources: where the inputs come from, ``Drivers.sources``; None says what the configs name.
+        path_or_address: file to write, ending in .rrd, or the address of a running viewer such as
+            rerun+http://127.0.0.1:9876/proxy; None with ``serve_port`` alone.
+        focus: names of up to 4 data centers to record in full; None is the first 2. The others
+            count in the fleet series. Where names are not distinct, NAME#INDEX tells them apart.
+        every: steps between two heat maps, and between two shots of the 3D hall; None follows the
+            number of racks in focus. Series always have every step.
+        serve_port: also let viewers connect to this port of 127.0.0.1; 0 picks a free one.
 
     Raises:
-        SdcError: rerun-sdk is missing, or an argument is not valid, or the file cannot be written.
+        SdcError: rerun-sdk is missing, or an argument is not valid.
     """
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
-        fleet: Fleet,
+        path_or_address: str | os.PathLike[str] | None,
         *,
-        every: int | None = None,
         focus: Sequence[str] | None = None,
-        sources: Sequence[dict[str, str]] | None = None,
+        every: int | None = None,
+        serve_port: int | None = None,
     ) -> None:
-        rr = _import_rerun()
-        fleet.require_distinct_names()
-        self._target = _check_path(path)
-        self._fleet = fleet
-        self._focus = _check_focus(fleet, focus)
-        racks = sum(fleet.configs[dc].hall.racks for dc in self._focus)
-        self._every = _check_every(every, racks)
-        self._origin = {dc: _first_step(fleet, dc) for dc in {0, *self._focus}}
-        self._tiles = {dc: tile_index(*_grid(fleet, dc)) for dc in self._focus}
-        self._steps: list[int] = []
-        self._map_steps: list[int] = []
-        self._series: dict[str, list[F64]] = {plot: [] for plot in PLOTS}
-        self._fleet_series: list[tuple[float, ...]] = []
-        self._racks: dict[tuple[int, str], list[npt.NDArray[np.float32]]] = {
-            (dc, what): [] for dc in self._focus for what in MAPS
-        }
-        self._last_step = -1
-        self._open = False
-        # Hidden and of another ending, so that nothing takes an unfinished file for a recording.
-        self._temporary = self._target.with_name(f".{self._target.name}.{uuid.uuid4().hex}.part")
-        _check_writable(self._target, self._temporary)
-        self._stream = rr.RecordingStream("sdc_taichi")
+        import_rerun()
+        self._file: Path | None = None
+        self._address: str | None = None
+        if path_or_address is None:
+            if serve_port is None:
+                raise SdcError("recorder: neither a file, an address nor a port to serve is given")
+        elif is_address(path_or_address):
+            self._address = check_address(path_or_address)
+        else:
+            self._file = check_path(path_or_address)
+        if self._address is not None and serve_port is not None:
+            raise SdcError(f"recorder: {self._address} and a port to serve; valid is one of them")
+        self._port = None if serve_port is None else check_port(serve_port)
+        self._focus = None if focus is None else _check_focus(focus)
+        whole = isinstance(every, int) and not isinstance(every, bool)
+        if every is not None and not (whole and every > 0):
+            raise SdcError(f"every {every!r}: valid is a positive integer")
+        self._every = every
+        self._episodes = 0
+        self._episode: _Episode | None = None
+
+    @property
+    def file(self) -> Path | None:
+        """File of the present episode, or of the last one."""
+        if self._file is None or self._episodes < 2:
+            return self._file
+        return self._file.with_name(f"{self._file.stem}-{self._episodes}{self._file.suffix}")
+
+    @property
+    def served(self) -> str | None:
+        """Address that viewers connect to, if there is one."""
+        return None if self._port is None else served_at(self._port)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the present episode could not be recorded to here; there was a warning."""
+        return self._episode is not None and self._episode.lost
+
+    def begin(self, sim: Simulator, about: Mapping[str, Any] | None = None) -> None:
+        """Begin to record an episode of a simulator, before its first step.
+
+        An episode under way is closed. The first is written to the file that was named, the next to
+        NAME-2.rrd and so on; nothing is written before there is a step.
+
+        Args:
+            sim: its steps are those that ``add`` is given.
+            about: what ``run.describe`` says of the run; None is what the simulator knows.
+
+        Raises:
+            SdcError: a name in focus that there is not, a file that cannot be written, or too
+                little room on its disk.
+        """
+        self.close()
+        self._episodes += 1
+        described = describe(sim, Asked("", 0)) if about is None else about
+        if about is None:
+            described = {k: v for k, v in described.items() if k not in ("controller", "seed")}
+        fleet = sim.fleet
+        values = int(described.get("steps_asked", 0)) * fleet.size * len(fields(StepResult))
+        stream = Stream(
+            file=self.file,
+            address=self._address,
+            port=self._port,
+            name=self.file.stem if self.file is not None else "sdc-taichi",
+            keep_bytes=ROOM_BYTES + ROOM_PER_VALUE * values + ROOM_PER_DC * fleet.size,
+        )
         try:
-            self._stream.save(self._temporary, default_blueprint=_blueprint(fleet, self._focus))
-            self._open = True
-            self._log_static(_summary(fleet, self._focus, self._every, sources))
-        except BaseException as error:
-            self._discard()
-            if isinstance(error, OSError | RuntimeError):
-                raise SdcError(f"{self._target}: cannot be written ({error})") from None
+            self._episode = _Episode(sim, described, stream, self._focus, self._every)
+        except BaseException:
+            self._episodes -= 1
             raise
 
-    def log(self, result: StepResult) -> None:
-        """Add one step.
+    def add(self, result: StepResult, *, rewards: Mapping[str, F64] | None = None) -> None:
+        """Add a step, right after it was done.
+
+        Args:
+            result: the step.
+            rewards: reward terms by name, each (B,); of every step or of none.
 
         Raises:
-            SdcError: the recorder is closed, the result is of another fleet, or its step is not
-                after the one logged last.
+            SdcError: there is no episode, or the step is none of its simulator's, or does not
+                follow the step before.
         """
-        if not self._open:
-            raise SdcError(f"{self._target}: the recorder is closed; create a new one")
-        found = (len(result.it_w), len(result.rack_inlet_c))
-        expected = (self._fleet.size, self._fleet.racks)
-        if found != expected:
-            raise SdcError(
-                f"{self._target}: result of {found[0]} data centers and {found[1]} racks, "
-                f"expected {expected[0]} and {expected[1]}"
-            )
-        if result.step <= self._last_step:
-            raise SdcError(
-                f"{self._target}: step {result.step} after step {self._last_step}; "
-                "a recording holds one run, steps in order"
-            )
-        self._last_step = result.step
-        focus = list(self._focus)
-        self._steps.append(result.step)
-        for plot, lines in PLOTS.items():
-            columns = [getattr(result, field)[focus] * factor for _, field, factor, _ in lines]
-            self._series[plot].append(np.stack(columns, axis=1))
-        totals = (result.pue.mean(), result.carbon_g.sum() / 1e3, result.inlet_max_c.max())
-        self._fleet_series.append(tuple(map(float, totals)))
-        if result.step % self._every == 0:
-            self._map_steps.append(result.step)
-            rack_c = {"inlet": result.rack_inlet_c, "outlet": result.rack_outlet_c}
-            for dc, what in self._racks:
-                first, last = self._fleet.rack_start[dc : dc + 2]
-                self._racks[dc, what].append(rack_c[what][first:last].astype(np.float32))
-        if len(self._steps) == BLOCK_STEPS:
-            self._write_block()
+        if self._episode is None:
+            raise SdcError("recorder: begin(sim) comes before the first step")
+        self._episode.add(result, rewards)
+
+    def flush(self) -> None:
+        """Write the steps that wait for their block to be full."""
+        if self._episode is not None:
+            self._episode.flush()
 
     def close(self) -> None:
-        """Write what is left and give the file its name; closing again does nothing.
-
-        Without a step there is no file, and a former one stays.
-
-        Raises:
-            SdcError: the file cannot be written.
-        """
-        if not self._open:
+        """Write what is left; closing again does nothing."""
+        episode, self._episode = self._episode, None
+        if episode is None:
             return
-        self._open = False
-        if self._last_step < 0:
-            self._discard()
-            return
-        try:
-            self._write_block()
-            self._stream.flush()
-            self._stream.disconnect()
-            os.replace(self._temporary, self._target)
-        except (OSError, RuntimeError) as error:
-            raise SdcError(f"{self._target}: cannot be written ({error})") from None
-        finally:
-            self._discard()
+        episode.close()
+        if episode.steps_added == 0:
+            self._episodes -= 1
 
     def __enter__(self) -> Self:
         return self
@@ -205,317 +228,282 @@ class Recorder:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _discard(self) -> None:
-        self._open = False
-        self._stream.disconnect()
-        self._temporary.unlink(missing_ok=True)
 
-    def _entity(self, dc: int, *parts: str) -> str:
-        return "/".join((_dc_path(self._fleet, dc), *parts))
+class _Episode:
+    """One recording."""
 
-    def _log_static(self, summary: str) -> None:
-        import rerun as rr
+    def __init__(
+        self,
+        sim: Simulator,
+        about: Mapping[str, Any],
+        stream: Stream,
+        focus: Sequence[str] | None,
+        every: int | None,
+    ) -> None:
+        fleet = sim.fleet
+        self._fleet, self._about, self._stream = fleet, about, stream
+        self._names = distinct(fleet.names)
+        self._focus = _in_focus(self._names, focus)
+        self._start = sim.drivers.start[self._focus]
+        self._cadence = _cadence(fleet, self._focus, every)
+        self._reader = Reader(sim, self._names, self._focus, self._cadence)
+        self._plots = {e: rows_and_factors(plot, sim.step_h) for e, plot in PLOTS.items()}
+        self._scales = {what: layers.temperature_scale(what) for what in layers.LIMITS_C}
+        self._scales["power"] = layers.power_scale(fleet)
+        self._tiles = [layers.tiles(fleet.configs[dc].hall) for dc in self._focus]
+        self._watches = [Watch(fleet, dc) for dc in self._focus]
+        self._states: dict[tuple[int, str], int] = {}
+        self.steps_added = 0
+        self._limit_s = LIVE_S if stream.live else FILE_S
+        # The first step of a live recording is shown at once.
+        self._written = time.monotonic() - (self._limit_s if stream.live else 0.0)
 
-        rec = self._stream
-        rec.send_recording_name(self._target.stem)
-        rec.log("summary", rr.TextDocument(summary, media_type="text/markdown"), static=True)
-        for what in MAPS:
-            _log_colour_bar(rec, what)
-        for entity, (name, colour) in FLEET_PLOTS.items():
-            line = rr.SeriesLines(names=[name], colors=np.array([colour], np.uint32))
-            rec.log(f"fleet/{entity}", line, static=True)
-        for dc in self._focus:
-            height, width = self._tiles[dc].shape
-            for what, limits in MAPS.items():
-                image = rr.DepthImage.from_fields(
-                    format=rr.components.ImageFormat(
-                        width=width, height=height, color_model="L", channel_datatype="F16"
-                    ),
-                    colormap="inferno",
-                    depth_range=limits,
-                    meter=1.0,
-                    magnification_filter="Nearest",
-                )
-                rec.log(self._entity(dc, "map", what), image, static=True)
-            for plot, lines in PLOTS.items():
-                # An array, because a list of three or four numbers is read as one colour.
-                colours = np.array([colour for *_, colour in lines], np.uint32)
-                series = rr.SeriesLines(names=[name for name, *_ in lines], colors=colours)
-                rec.log(self._entity(dc, "series", plot), series, static=True)
-
-    def _write_block(self) -> None:
-        import rerun as rr
-
-        if not self._steps:
+    def add(self, result: StepResult, rewards: Mapping[str, F64] | None) -> None:
+        """Read a step, and write the block that it fills."""
+        if self._stream.lost:
             return
-        rec = self._stream
-        totals = np.array(self._fleet_series)
-        for column, entity in enumerate(FLEET_PLOTS):
-            values = rr.Scalars.columns(scalars=totals[:, column])
-            rec.send_columns(f"fleet/{entity}", self._times(0, self._steps), values)
-        for index, dc in enumerate(self._focus):
-            times = self._times(dc, self._steps)
-            for plot, blocks in self._series.items():
-                values = rr.Scalars.columns(scalars=np.stack([block[index] for block in blocks]))
-                rec.send_columns(self._entity(dc, "series", plot), times, values)
-        if self._map_steps:
-            for (dc, what), shots in self._racks.items():
-                pixels = heat_map_pixels(np.stack(shots), self._tiles[dc], MAPS[what])
-                buffer = pixels.reshape(len(shots), -1).view(np.uint8)
-                times = self._times(dc, self._map_steps)
-                images = rr.DepthImage.columns(buffer=buffer)
-                rec.send_columns(self._entity(dc, "map", what), times, images)
-        for kept in (self._steps, self._map_steps, self._fleet_series):
-            kept.clear()
-        for rows in self._series.values():
-            rows.clear()
-        for maps in self._racks.values():
-            maps.clear()
+        self._reader.add(result, rewards)
+        self.steps_added += 1
+        late = time.monotonic() - self._written > self._limit_s
+        if late or self._reader.held == self._cadence.block_steps:
+            self._write()
 
-    def _times(self, dc: int, steps: Sequence[int]) -> list[rr.TimeColumn]:
+    @property
+    def lost(self) -> bool:
+        """Whether the stream has ended early."""
+        return self._stream.lost
+
+    def flush(self) -> None:
+        """Write what is left."""
+        if self._reader.held and not self._stream.lost:
+            self._write()
+
+    def close(self) -> None:
+        """Write what is left, and the index."""
+        self.flush()
+        self._stream.close()
+
+    def _write(self) -> None:
+        """Write the block that was read."""
+        self._written = time.monotonic()
+        block = self._reader.take()
+        values = with_pue(block.values)
+        for index, watch in enumerate(self._watches):
+            block.entries.extend(watch.look(block.steps, values[:, :, index]))
+        images, cells = self._images(block), self._cells(block)
+        size_bytes = 2 * values.nbytes + sum(image.nbytes for image in images.values())
+        if not self._stream.room_for(size_bytes + sum(part.nbytes for part in cells.values())):
+            return
+        if not self._stream.started:
+            self._open()
+        every_step, map_steps, hall_steps = map(
+            self._clock, (block.steps, block.map_steps, block.hall_steps)
+        )
+        self._send_fleet(block, every_step[0], hall_steps[0])
+        for index, dc in enumerate(self._focus):
+            path, own = self._path(dc), values[:, :, index]
+            self._send_lines(block, index, path, every_step[index], own)
+            self._send_states(index, path, block.steps, own)
+            self._send_log(index, path, [e for e in block.entries if e.dc == dc])
+            self._send_pictures(index, path, images, map_steps[index], cells, hall_steps[index])
+        self._stream.end_block()
+
+    def _send_fleet(
+        self, block: Block, every_step: list[rr.TimeColumn], hall_steps: list[rr.TimeColumn]
+    ) -> None:
         import rerun as rr
 
-        step = np.array(steps, dtype=np.int64)
-        seconds = step * (3600 // self._fleet.steps_per_hour)
-        when = self._origin[dc] + seconds.astype("timedelta64[s]")
-        return [
-            rr.TimeColumn("step", sequence=step),
-            rr.TimeColumn("sim_time", timestamp=when.astype("datetime64[ns]")),
-        ]
+        for entity, line in FLEET.items():
+            self._lines(f"fleet/{entity}", every_step, line.value(block.total, block.most)[:, None])
+        if block.hottest:
+            kinds = ["text/markdown"] * len(block.hottest)
+            tables = rr.TextDocument.columns(text=block.hottest, media_type=kinds)
+            self._stream.columns("fleet/hottest", hall_steps, tables)
 
+    def _send_lines(
+        self, block: Block, index: int, path: str, times: list[rr.TimeColumn], values: F64
+    ) -> None:
+        for entity, (rows, factors) in self._plots.items():
+            self._lines(f"{path}/series/{entity}", times, values[:, rows] * factors)
+        self._lines(f"{path}/series/{QUEUE}", times, block.ages[:, index])
+        if block.rewards is not None:
+            self._lines(f"{path}/series/{REWARDS}", times, block.rewards[:, :, index])
+        units = self._reader.units[index]
+        supply_c, flow_m3s = block.supply_c[:, units], block.flow_m3s[:, units]
+        if units.stop - units.start > MAX_UNIT_LINES:
+            supply_c, flow_m3s = _range(supply_c), _range(flow_m3s)
+        air_c = np.concatenate([supply_c, values[:, ROW["return_c"], None]], axis=1)
+        self._lines(f"{path}/crac/temperature_c", times, air_c)
+        self._lines(f"{path}/crac/airflow_m3s", times, flow_m3s)
 
-def tile_index(rows: int, racks_per_row: int) -> I64:
-    """Rack of every pixel of a hall map, shape (height, width); gaps are ``rows * racks_per_row``.
+    def _lines(self, entity: str, times: list[rr.TimeColumn], values: F64) -> None:
+        import rerun as rr
 
-    A rack is a tile, with one pixel between tiles, shaped so that the hall is about 1.8 times as
-    wide as high however many rows it has (tiles at most 8:1).
-    """
-    ratio = min(max(1.8 * rows / racks_per_row, 1 / 8), 8.0)
-    short = 8 if rows * racks_per_row <= EVERY_STEP_UP_TO_RACKS else 4
-    height, width = round(short / min(ratio, 1.0)), round(short * max(ratio, 1.0))
-    racks = np.arange(rows * racks_per_row).reshape(rows, 1, racks_per_row, 1)
-    index = np.full((rows, height + 1, racks_per_row, width + 1), rows * racks_per_row)
-    index[:, :height, :, :width] = racks
-    return index.reshape(rows * (height + 1), racks_per_row * (width + 1))[:-1, :-1]
+        self._stream.columns(entity, times, [column(rr.Scalars.descriptor_scalars(), values)])
 
+    def _send_states(self, index: int, path: str, steps: I64, values: F64) -> None:
+        """Actions of a data center where they change."""
+        import rerun as rr
 
-def heat_map_pixels(
-    rack_c: npt.NDArray[np.float32], tiles: I64, limits: tuple[float, float]
-) -> npt.NDArray[np.float16]:
-    """Rack temperatures (T, racks) as images (T, height, width), clamped to ``limits``.
+        for entity, (command, names) in STATES.items():
+            signs = np.sign(values[:, ROW[command]]).astype(np.int64)
+            before = np.append(self._states.get((index, entity), _NO_SIGN), signs[:-1])
+            changed = np.flatnonzero(signs != before)
+            self._states[index, entity] = int(signs[-1])
+            if len(changed):
+                states = [names[sign + 1] for sign in signs[changed]]
+                times = self._clock(steps[changed])[index]
+                entity_path = f"{path}/actions/{entity}"
+                self._stream.columns(entity_path, times, rr.StateChange.columns(state=states))
 
-    Clamping and filling gaps with the lower limit is needed because the viewer in a browser draws
-    what is below the range, and nan, as hot.
-    """
-    rounded = np.rint(rack_c / QUANTUM_K) * QUANTUM_K
-    gap = np.full((len(rack_c), 1), limits[0])
-    padded = np.concatenate([np.clip(rounded, *limits), gap], axis=1).astype(np.float16)
-    return np.take(padded, tiles, axis=1)
+    def _send_log(self, index: int, path: str, entries: list[Entry]) -> None:
+        import rerun as rr
 
-
-def _import_rerun() -> Any:
-    # Recording reports nothing home unless the user has chosen otherwise.
-    os.environ.setdefault("RERUN_ANALYTICS", "0")
-    try:
-        import rerun
-    except ImportError as error:
-        raise SdcError(
-            f"recording needs rerun-sdk ({error}); install it with: pip install rerun-sdk"
-        ) from None
-    return rerun
-
-
-def _check_path(path: str | os.PathLike[str]) -> Path:
-    target = Path(path)
-    if target.suffix != ".rrd":
-        raise SdcError(f"{target}: a recording's name must end in .rrd")
-    if target.is_dir() or not target.parent.is_dir():
-        wrong = target if target.is_dir() else target.parent
-        state = "is a folder" if target.is_dir() else "is no folder"
-        raise SdcError(f"{target}: cannot be written ({wrong} {state})")
-    return target
-
-
-def _check_writable(target: Path, temporary: Path) -> None:
-    """Create the temporary file; Rerun waits for ever when the disk is full from the start."""
-    free = shutil.disk_usage(target.parent).free
-    if free < MIN_FREE_BYTES:
-        raise SdcError(
-            f"{target}: {free / 1e6:.1f} MB left on the disk, expected {MIN_FREE_BYTES / 1e6:g} MB"
+        if not entries:
+            return
+        entries.sort(key=lambda entry: entry.step)
+        steps = np.array([entry.step for entry in entries])
+        # Day and time of day are in the text, for which the viewer's column of times is too narrow.
+        clock = np.datetime_as_string(self._when(steps)[:, index], "m").tolist()
+        log = rr.TextLog.columns(
+            text=[f"{at[5:10]} {at[11:]} {e.text}" for at, e in zip(clock, entries, strict=True)],
+            level=[entry.level for entry in entries],
         )
-    with writing(target):
-        temporary.touch(exist_ok=False)
+        self._stream.columns(f"{path}/events", self._clock(steps)[index], log)
+
+    def _send_pictures(
+        self,
+        index: int,
+        path: str,
+        images: Pictures[np.float16],
+        map_steps: list[rr.TimeColumn],
+        cells: Pictures[np.float32],
+        hall_steps: list[rr.TimeColumn],
+    ) -> None:
+        import rerun as rr
+
+        buffer, values = rr.DepthImage.descriptor_buffer(), rr.VoxelGridMap.descriptor_values()
+        for what in self._scales:
+            if (index, what) in images:
+                shots = images[index, what]
+                shown = blobs(buffer, shots.reshape(len(shots), -1))
+                self._stream.columns(f"{path}/map/{what}", map_steps, [shown])
+            if (index, what) in cells:
+                shown = column(values, cells[index, what])
+                self._stream.columns(f"{path}/hall/{what}", hall_steps, [shown])
+
+    def _images(self, block: Block) -> Pictures[np.float16]:
+        """Heat maps, (M, height, width), by hall and quantity."""
+        if not len(block.map_steps):
+            return {}
+        return {
+            (index, what): layers.pixels(shots[:, racks], self._tiles[index], self._scales[what])
+            for index, racks in enumerate(self._reader.racks)
+            for what, shots in block.maps.items()
+        }
+
+    def _cells(self, block: Block) -> Pictures[np.float32]:
+        """Voxels, (H, racks zones), by hall and quantity."""
+        return {
+            (index, what): layers.quantised(shots, self._scales[what])
+            for index, hall in enumerate(block.halls)
+            for what, shots in hall.items()
+        }
+
+    def _when(self, steps: I64) -> npt.NDArray[np.datetime64]:
+        """Clock of each data center in focus, (T, n)."""
+        return step_times(self._start, steps, self._fleet.steps_per_hour)
+
+    def _clock(self, steps: I64) -> list[list[rr.TimeColumn]]:
+        """Both timelines for each data center in focus."""
+        import rerun as rr
+
+        step = rr.TimeColumn("step", sequence=steps)
+        own = self._when(steps).astype("datetime64[ns]").T
+        return [[step, rr.TimeColumn("sim_time", timestamp=times)] for times in own]
+
+    def _path(self, dc: int) -> str:
+        import rerun as rr
+
+        return f"dc/{rr.escape_entity_path_part(self._names[dc])}"
+
+    def _open(self) -> None:
+        """Open the stream and send what holds at all times."""
+        import rerun as rr
+
+        tabs = []
+        for dc, shape in zip(self._focus, self._tiles, strict=True):
+            hall = self._fleet.configs[dc].hall
+            plan = floor_plan(hall)
+            size_m = plan.length_m, plan.width_m, hall.layout.ceiling_m
+            tabs.append(Tab(self._names[dc], self._path(dc), size_m, self._scales, shape.image))
+        rewards = self._reader.reward_names or ()
+        self._stream.start(blueprint(tabs, hottest=self._fleet.size > 1, rewards=bool(rewards)))
+        names = {dc: self._names[dc] for dc in self._focus}
+        text = summary(self._about, self._fleet, names, self._scales, self._cadence)
+        self._stream.static("summary", rr.TextDocument(text, media_type="text/markdown"))
+        for entity, what in fleet_entities(self._scales):
+            self._stream.static(entity, what)
+        for dc, zones in zip(self._focus, self._cadence.zones, strict=True):
+            for entity, what in data_center_entities(
+                self._fleet, dc, self._path(dc), self._scales, zones, rewards
+            ):
+                self._stream.static(entity, what)
 
 
-def _check_focus(fleet: Fleet, focus: Sequence[str] | None) -> tuple[int, ...]:
+def _cadence(fleet: Fleet, focus: Sequence[int], every: int | None) -> Cadence:
+    """Defaults by the size of the halls in focus."""
+    racks = int(np.diff(fleet.rack_start)[focus].sum())
+    map_every = every or max(1, round(_every_h(racks) * fleet.steps_per_hour))
+    per_server = fleet.servers <= SERVER_LAYERS_UP_TO
+    most = ZONES if racks <= layers.SMALL_RACKS else LARGE_ZONES
+    fewest = [_fewest_servers(fleet, dc) for dc in focus]
+    return Cadence(
+        map_every=map_every,
+        hall_every=every or max(map_every, round(HALL_H * fleet.steps_per_hour)),
+        hall_every_in_events=every
+        or max(map_every, round(HALL_IN_EVENTS_H * fleet.steps_per_hour)),
+        zones=tuple(min(most, servers) if per_server else 1 for servers in fewest),
+        per_server=per_server,
+        block_steps=BLOCK_STEPS if racks <= LARGE_RACKS else LARGE_BLOCK_STEPS,
+    )
+
+
+def _fewest_servers(fleet: Fleet, dc: int) -> int:
+    """Servers of the smallest rack of a data center."""
+    first, last = fleet.rack_start[dc : dc + 2]
+    return int(np.diff(fleet.server_start[fleet.group_start[first : last + 1]]).min())
+
+
+def _range(units: F64) -> F64:
+    """Lowest, mean and highest of the units, (T, 3)."""
+    return np.stack([units.min(axis=1), units.mean(axis=1), units.max(axis=1)], axis=1)
+
+
+def distinct(names: Sequence[str]) -> tuple[str, ...]:
+    """Names, with their index where they are not distinct."""
+    counts = Counter(names)
+    return tuple(n if counts[n] == 1 else f"{n}#{i}" for i, n in enumerate(names))
+
+
+def _check_focus(focus: Sequence[str]) -> tuple[str, ...]:
+    names = (focus,) if isinstance(focus, str) else focus
+    listed = isinstance(names, Sequence) and all(isinstance(name, str) for name in names)
+    if not (listed and 0 < len(names) <= MAX_FOCUS and len(set(names)) == len(names)):
+        raise SdcError(f"focus {focus!r}: valid are 1 to {MAX_FOCUS} different names")
+    return tuple(names)
+
+
+def _in_focus(names: Sequence[str], focus: Sequence[str] | None) -> list[int]:
     if focus is None:
-        return tuple(range(min(fleet.size, MAX_FOCUS)))
-    names = (focus,) if isinstance(focus, str) else tuple(focus)
-    if len(names) > MAX_FOCUS or len(set(names)) < len(names):
-        raise SdcError(f"focus {', '.join(names)}: valid are up to {MAX_FOCUS} different names")
-    for name in names:
-        if name not in fleet.names:
-            shown = ", ".join(fleet.names[:10]) + (", ..." if fleet.size > 10 else "")
+        return list(range(min(len(names), DEFAULT_FOCUS)))
+    for name in focus:
+        if name not in names:
+            shown = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
             raise SdcError(f"focus {name!r}: no such data center; valid: {shown}")
-    return tuple(fleet.names.index(name) for name in names)
+    return [names.index(name) for name in focus]
 
 
-def _check_every(every: int | None, racks: int) -> int:
-    if every is None:
-        return 1 if racks <= EVERY_STEP_UP_TO_RACKS else 4
-    if isinstance(every, bool) or not isinstance(every, int) or every < 1:
-        raise SdcError(f"every {every!r}: valid is a positive integer")
-    return every
-
-
-def _grid(fleet: Fleet, dc: int) -> tuple[int, int]:
-    hall = fleet.configs[dc].hall
-    return hall.rows, hall.racks_per_row
-
-
-def _first_step(fleet: Fleet, dc: int) -> np.datetime64:
-    return np.datetime64("2001-01-01", "s") + np.timedelta64(
-        first_step_day(fleet.configs[dc].site.start), "D"
-    )
-
-
-def _dc_path(fleet: Fleet, dc: int) -> str:
-    import rerun as rr
-
-    return f"dc/{rr.escape_entity_path_part(fleet.names[dc])}"
-
-
-def _log_colour_bar(rec: rr.RecordingStream, what: str) -> None:
-    """The viewer has no colour bar: a gradient with labelled points."""
-    import rerun as rr
-
-    low, high = MAPS[what]
-    width, height = 240, 10
-    gradient = np.tile(np.linspace(low, high, width, dtype=np.float32), (height, 1))
-    bar = rr.DepthImage(gradient, meter=1.0, colormap="inferno", depth_range=(low, high))
-    rec.log(f"legend/{what}/bar", bar, static=True)
-    ticks = np.arange(low, high + 1.0, 5.0 if high - low <= 40 else 10.0)
-    x = (ticks - low) / (high - low) * width
-    points = rr.Points2D(
-        np.stack([x, np.full_like(x, height + 2.0)], axis=1),
-        radii=rr.Radius.ui_points(1.5),
-        colors=[200, 200, 200],
-        labels=[f"{tick:g} C" for tick in ticks],
-        show_labels=True,
-    )
-    rec.log(f"legend/{what}/ticks", points, static=True)
-
-
-def _summary(
-    fleet: Fleet, focus: Sequence[int], every: int, sources: Sequence[dict[str, str]] | None
-) -> str:
-    minutes = 60 // fleet.steps_per_hour
-    lines = [
-        "# sdc-taichi",
-        f"{fleet.size} data centers, {fleet.racks} racks, {fleet.servers} servers; "
-        f"a step is {minutes} minutes. Times are the start of the step, local standard time, "
-        "year 2001. Series have every step, heat maps every "
-        + ("step." if every == 1 else f"{every} steps."),
-        "",
-        "Stage models: " + ", ".join(f"{k} {v}" for k, v in fleet.models.items()) + ".",
-        "Counted as HVAC: " + ", ".join(fleet.configs[0].hvac.total_of) + ".",
-    ]
-    for dc in focus:
-        config = fleet.configs[dc]
-        named = _named_sources(fleet, dc) if sources is None else sources[dc]
-        rows, per_row = _grid(fleet, dc)
-        lines += [
-            "",
-            f"## {config.name}",
-            config.description,
-            "",
-            f"- site {config.site.location}, from {config.site.start}, seed {config.site.seed}",
-            f"- hall of {rows} rows with {per_row} racks each",
-            *(f"- {kind}: {source}" for kind, source in named.items()),
-        ]
-    if fleet.size > len(focus):
-        rest = fleet.size - len(focus)
-        lines += ["", f"The other {rest} data centers are recorded only in the fleet series."]
-    return "\n".join(lines)
-
-
-def _named_sources(fleet: Fleet, dc: int) -> dict[str, str]:
-    """What the config names as inputs, for callers that pass no sources."""
-    from sdc_taichi.exogenous.synthetic import synthetic_sites, synthetic_traces
-
-    site, trace = fleet.configs[dc].site, fleet.configs[dc].workload.trace
-    folded = {name.casefold() for name in (*synthetic_sites(), *synthetic_traces())}
-
-    def describe(file: str | None, name: str) -> str:
-        if file is not None:
-            return f"file {file}"
-        kind = "synthetic" if name.casefold() in folded else "imported"
-        return f"{name}, {kind}, seed {site.seed}" if kind == "synthetic" else f"{name}, {kind}"
-
-    return {
-        "weather (as configured)": describe(site.weather_file, site.location),
-        "carbon (as configured)": describe(site.carbon_file, site.location),
-        "workload (as configured)": describe(site.workload_file, trace),
-    }
-
-
-def _blueprint(fleet: Fleet, focus: Sequence[int]) -> rrb.Blueprint:
-    import rerun as rr
-    import rerun.blueprint as rrb
-
-    # On a timestamp timeline plots open on one minute around the cursor: pin the whole run.
-    whole_run = rrb.TimeAxis(
-        link="Independent",
-        view_range=rrb.TimeRange(
-            start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite()
-        ),
-    )
-
-    def plot(origin: str, name: str, limits: tuple[float, float] | None = None) -> Any:
-        return rrb.TimeSeriesView(
-            origin=origin,
-            name=name,
-            axis_x=whole_run,
-            axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
-            plot_legend=rrb.PlotLegend("RightTop"),
-        )
-
-    def heat_map(path: str, what: str) -> list[Any]:
-        low, high = MAPS[what]
-        scale = rrb.Spatial2DView(
-            origin=f"legend/{what}",
-            name=f"{what} scale, {low:g} to {high:g} C",
-            visual_bounds=rrb.VisualBounds2D(x_range=(-8, 252), y_range=(-4, 24)),
-        )
-        return [rrb.Spatial2DView(origin=f"{path}/map/{what}", name=f"rack {what} [C]"), scale]
-
-    tabs: list[Any] = []
-    for dc in focus:
-        path = _dc_path(fleet, dc)
-        series = f"{path}/series"
-        maps = rrb.Vertical(
-            *heat_map(path, "inlet"), *heat_map(path, "outlet"), row_shares=[4, 1, 4, 1]
-        )
-        plots = rrb.Grid(
-            plot(f"{series}/temperature_c", "temperature [C]"),
-            plot(f"{series}/power_kw", "power [kW]"),
-            plot(f"{series}/hvac_kw", "HVAC by device [kW]"),
-            plot(f"{series}/pue", "PUE [-]"),
-            plot(f"{series}/carbon_intensity", "grid carbon intensity [g/kWh]"),
-            plot(f"{series}/grid_kwh", "energy [kWh/step]"),
-            plot(f"{series}/battery", "battery state of charge [-]", (0.0, 1.0)),
-            plot(f"{series}/queue", "queue [tasks]"),
-            grid_columns=2,
-        )
-        tabs.append(rrb.Horizontal(maps, plots, column_shares=[4, 5], name=fleet.names[dc]))
-    overall = [plot(f"fleet/{entity}", name) for entity, (name, _) in FLEET_PLOTS.items()]
-    summary = rrb.TextDocumentView(origin="summary", name="summary")
-    tabs.append(rrb.Grid(*overall, summary, grid_columns=2, name="fleet"))
-    return rrb.Blueprint(
-        rrb.Tabs(*tabs, active_tab=0),
-        rrb.TimePanel(
-            timeline="sim_time", playback_speed=14_400.0, play_state="paused", state="collapsed"
-        ),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-    )
+def _every_h(racks: int) -> float:
+    """Hours between two heat maps of so many racks."""
+    return next((hours for most, hours in EVERY_H if racks <= most), LARGEST_EVERY_H)

@@ -1,0 +1,51 @@
+"""``sdc-taichi report``: one HTML file about a recorded run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.whole_file import check_new_file
+
+
+def report_command(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="DIR...",
+            help="Folder of a recorded run, and of others to compare it with.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Output file. [default: DIR/report.html]"),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace an existing file of --out.")
+    ] = False,
+) -> None:
+    """Write a report of a recorded run: one HTML file with summary, tables and pictures.
+
+    It reads steps.parquet and metrics.json of the first folder. Further folders, of runs of equal
+    length, are compared with it in a table and a radar. The file needs no network.
+    """
+    from sdc_taichi.viz.recorded import read_run
+    from sdc_taichi.viz.report import write_report
+
+    if force and out is None:
+        raise ConfigError("--force: valid with --out; DIR/report.html is replaced without it")
+    if out is not None:
+        check_new_file(out, ".html", force=force)
+    for index, folder in enumerate(folders):
+        if folder.resolve() in [other.resolve() for other in folders[:index]]:
+            raise ConfigError(f"{folder}: is given twice; valid is each run once")
+    runs = [read_run(folder) for folder in folders]
+    for run in runs:
+        done, asked = run.about["steps_done"], run.about["steps_asked"]
+        if done < asked:
+            typer.echo(f"note: {run.folder}: interrupted after {done} of {asked} steps", err=True)
+    typer.echo(f"Report: {write_report(runs[0], runs[1:], out)}")

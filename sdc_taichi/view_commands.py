@@ -1,0 +1,159 @@
+"""``sdc-taichi view``: show a recording in the native viewer or in a browser."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+from typing import Annotated
+from urllib.parse import quote
+
+import typer
+
+from sdc_taichi.errors import SdcError
+
+WEB_PORT = 9090
+_MAGIC = b"RRF"
+_STOP_S = 5.0
+
+
+def view_command(
+    recording: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE.rrd|ADDRESS",
+            help="Recording, or address that a run serves (simulate --serve).",
+        ),
+    ],
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve the viewer to browsers of this machine.")
+    ] = False,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=65535,
+            help=f"Of the page with --web; 0 is any free one. [default: {WEB_PORT}, or any]",
+        ),
+    ] = None,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")] = False,
+) -> None:
+    """Show a recording in Rerun's viewer, or serve it on 127.0.0.1 to a browser.
+
+    Ends with the viewer, or on Ctrl-C.
+    """
+    from sdc_taichi.viz.streams import check_address, is_address, listens
+
+    if port is not None and not web:
+        raise SdcError("--port: given without --web; valid is both")
+    if is_address(recording):
+        check_address(recording)
+        if not listens(recording):
+            raise SdcError(f"{recording}: nothing listens there; valid is the address of a run")
+    else:
+        check_recording(Path(recording))
+    command, page = viewer_command(recording, web=web, port=port)
+    if page is not None:
+        typer.echo(f"Viewer: {page} (Ctrl-C ends it)")
+    code = _run(command)
+    if code:
+        hint = "" if web else "; without a screen, serve it to a browser with --web"
+        raise SdcError(f"{recording}: the viewer ended with exit code {code}{hint}")
+
+
+def check_recording(path: Path) -> None:
+    """Make sure that a file is a recording.
+
+    Raises:
+        SdcError: it cannot be read, or is none.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(_MAGIC))
+    except OSError as error:
+        raise SdcError(f"{path}: cannot be read: {error.strerror}") from None
+    if start != _MAGIC:
+        raise SdcError(f"{path}: no Rerun recording; valid is a file of simulate --record")
+
+
+def viewer_command(recording: str, *, web: bool, port: int | None) -> tuple[list[str], str | None]:
+    """Command line of the viewer, and the page it serves, if it does.
+
+    Args:
+        recording: file or address.
+        web: whether to serve it to browsers.
+        port: of the page; 0 is any free one, None the usual one if that is free.
+
+    Raises:
+        SdcError: rerun-sdk is missing, or the port is taken.
+    """
+    from sdc_taichi.viz.streams import HOST, check_port, is_address, served_at
+
+    command = [str(viewer_program()), recording, "--bind", HOST]
+    data_port = check_port(0)
+    if not web:
+        return [*command, "--port", str(data_port)], None
+    page_port = _page_port() if port is None else check_port(port)
+    if page_port == data_port:
+        data_port = check_port(0)
+    command += ["--serve-web", "--web-viewer-port", str(page_port), "--port", str(data_port)]
+    data = recording if is_address(recording) else served_at(data_port)
+    return command, f"http://{HOST}:{page_port}/?url={quote(data, safe='')}"
+
+
+def _page_port() -> int:
+    from sdc_taichi.viz.streams import check_port
+
+    try:
+        return check_port(WEB_PORT)
+    except SdcError:
+        return check_port(0)
+
+
+def viewer_program() -> Path:
+    """The viewer's binary: Rerun's ``rerun`` script is a wrapper whose child outlives it.
+
+    Raises:
+        SdcError: rerun-sdk is missing.
+    """
+    if named := os.environ.get("RERUN_CLI_PATH"):
+        return Path(named)
+    try:
+        import rerun_cli
+    except ImportError as error:
+        raise SdcError(
+            f"viewing needs rerun-sdk ({error}); install it with: pip install rerun-sdk"
+        ) from None
+    folder = Path(rerun_cli.__file__).parent
+    candidates = [
+        folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun",
+        folder / "rerun.exe",
+        folder / "rerun",
+    ]
+    found = next((path for path in candidates if path.is_file()), None)
+    if found is None:
+        raise SdcError(f"{folder}: no viewer there; install it with: pip install rerun-sdk")
+    return found
+
+
+def _run(command: list[str]) -> int:
+    """Exit code of the viewer; 0 when it was ended with Ctrl-C or SIGTERM."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    environment = {"RERUN_ANALYTICS": "0", "RUST_LOG": "error", **os.environ}
+    try:
+        process = subprocess.Popen(command, env=environment)
+    except OSError as error:
+        raise SdcError(f"{command[0]}: cannot be run: {error.strerror}") from None
+    try:
+        return process.wait()
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(_STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()

@@ -1,0 +1,686 @@
+"""Dashboards, fleet and data pictures, and the animation show what the steps hold."""
+
+from __future__ import annotations
+
+import gc
+import importlib.util
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pytest
+
+from sdc_taichi import SdcError, Simulator, StepResult, load_config, make_configs
+from sdc_taichi.config import EventKind
+from sdc_taichi.control import make_controller, viewer
+from sdc_taichi.exogenous.synthetic import synthetic_site, synthetic_sites, synthetic_traces
+from sdc_taichi.fleet import Fleet
+from sdc_taichi.metrics import Metric
+from sdc_taichi.viz import animation, dashboards, data_figures, figures, fleet_figures
+
+DAYS = 3
+DOLLARS = "_x$_{$"
+
+Run = tuple[Fleet, list[StepResult]]
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    """Three days of a hall whose CRAC unit fails on the second, driven by all three agents."""
+    values = [
+        "hvac.crac.units=2",
+        "site.start=02-27",
+        f"name={DOLLARS}",
+        "events.scheduled=[{kind: crac_down, unit: 0, start_h: 36, duration_h: 2}]",
+    ]
+    with Simulator(load_config("corrected", values)) as sim:
+        controller = make_controller("load=greedy-ci,cooling=g36,battery=greedy-ci", sim.fleet)
+        sim.reset()
+        controller.reset(0)
+        look = viewer(sim)
+        results: list[StepResult] = []
+        for _ in range(96 * DAYS):
+            results.append(sim.step(controller.act(look(results[-1] if results else None))))
+        return sim.fleet, results
+
+
+@pytest.fixture(scope="module")
+def steps(run: Run) -> pd.DataFrame:
+    fleet, results = run
+    names = results[0].per_dc()
+    columns = {name: [getattr(r, name)[0] for r in results] for name in names}
+    times = [figures.step_time(r, fleet, 0) for r in results]
+    return pd.DataFrame({"step": [r.step for r in results], "time": times, **columns})
+
+
+def render(figure: Any) -> npt.NDArray[np.uint8]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())
+
+
+def labels(figure: Any) -> list[str]:
+    return [text for axes in figure.axes for text in (axes.get_ylabel(), axes.get_xlabel()) if text]
+
+
+def test_step_at_finds_the_step_of_a_time(run: Run) -> None:
+    fleet, results = run
+    assert figures.step_at(results, fleet, "02-27 00:00") is results[0]
+    assert figures.step_at(iter(results), fleet, "02-28 12:20") is results[96 + 49]
+    assert figures.step_at(results, fleet, "03-01 23:59") is results[-1]
+    title = figures.hall_map(figures.step_at(results, fleet, "02-28 12:20"), fleet).get_suptitle()
+    assert title == r"_x\$_{\$: 28 February 12:15"
+
+
+@pytest.mark.parametrize(
+    ("when", "message"),
+    [
+        ("03-02 00:00", "no step covers it; the steps are those from 02-27 00:00 to 03-01 23:45"),
+        ("02-28", "valid is MM-DD HH:MM"),
+        ("02-28 12:00:00", "valid is MM-DD HH:MM"),
+    ],
+)
+def test_times_that_are_not_in_the_run(run: Run, when: str, message: str) -> None:
+    with pytest.raises(SdcError, match=message):
+        figures.step_at(run[1], run[0], when)
+
+
+def test_no_steps_at_all(run: Run) -> None:
+    with pytest.raises(SdcError, match="there are no steps"):
+        figures.step_at([], run[0], "02-28 12:00")
+
+
+def test_step_times_skip_the_leap_day(run: Run) -> None:
+    """As in steps.parquet, whose years have 365 days."""
+    fleet, results = run
+    # 1 March 2004, after 1,095 days of 2001 to 2003 and 59 of 2004, less the 57 before the start.
+    later = (1095 + 59 - 57) * 96
+    moved = StepResult(
+        **{f: getattr(results[0], f) for f in StepResult.__dataclass_fields__} | {"step": later}
+    )
+    assert figures.step_time(moved, fleet, 0) == np.datetime64("2004-03-01T00:00")
+
+
+def clock(x: float) -> str:
+    from matplotlib import dates
+
+    num2date: Any = dates.num2date
+    return str(num2date(x).strftime("%m-%d %H:%M"))
+
+
+def test_day_shows_one_day_and_its_failure(steps: pd.DataFrame) -> None:
+    event = {"kind": "crac_down", "target": 0, "start_step": 144, "end_step": 152}
+    figure: Any = dashboards.day(steps, "02-28", DOLLARS, [event])
+    shown = steps[96:192]
+    temperatures, power, carbon, commands, storage = figure.axes[:5]
+    lines = {line.get_label(): line for line in (*temperatures.lines, *commands.lines)}
+    for name, label in (
+        ("outdoor_c", "outdoor"),
+        ("wet_bulb_c", "wet bulb"),
+        ("inlet_max_c", "hottest inlet"),
+        ("supply_c", "supply air"),
+        ("setpoint_c", "setpoint"),
+        ("cooling_command", "setpoint (steps)"),
+    ):
+        values = lines[label].get_ydata()
+        np.testing.assert_array_equal(values, [*shown[name], shown[name].iloc[-1]])
+    (span,) = temperatures.patches
+    edges = [clock(x) for x in (span.get_x(), span.get_x() + span.get_width())]
+    assert (span.get_label(), edges) == ("crac down", ["02-28 12:00", "02-28 14:00"])
+    for axes, unit in ((temperatures, "(°C)"), (power, "(kW)"), (carbon, "g CO₂e/kWh")):
+        assert unit in axes.get_ylabel()
+    assert storage.get_xlabel() == "local standard time on 28 February"
+    assert figure.get_suptitle() == r"_x\$_{\$"
+    assert render(figure).std() > 10
+
+
+def test_day_puts_effects_after_their_causes(steps: pd.DataFrame) -> None:
+    figure: Any = dashboards.day(steps, "02-28")
+    temperatures, power, carbon, commands, storage, emitted, _ = figure.axes
+    shown = steps[96:192]
+    for axes in figure.axes:
+        assert [clock(x) for x in axes.get_xlim()] == ["02-28 00:00", "03-01 00:00"]
+    for line in (*temperatures.lines[:5], *commands.lines, *carbon.lines):
+        assert line.get_drawstyle() == "steps-post"
+        assert clock(line.get_xdata(orig=False)[-1]) == "03-01 00:00"
+    for area, values in (
+        (power.collections[0], shown["it_w"] / 1e3),
+        (emitted.collections[0], shown["carbon_g"] / 1e3 / 0.25),
+    ):
+        (path,) = area.get_paths()
+        corners = {(clock(x), round(y, 6)) for x, y in path.vertices}
+        for begin, end, value in zip(
+            shown["time"], shown["time"] + pd.Timedelta("15min"), values, strict=True
+        ):
+            for time in (begin, end):
+                assert (time.strftime("%m-%d %H:%M"), round(value, 6)) in corners
+    # The queue is that at the end of a step, and the day begins with that of the evening before.
+    (queue,) = storage.lines
+    times = queue.get_xdata(orig=False)
+    assert [clock(times[0]), clock(times[-1])] == ["02-28 00:00", "03-01 00:00"]
+    np.testing.assert_array_equal(queue.get_ydata(), steps["queue_tasks"][95:192])
+
+
+def test_equal_commands_are_all_seen(steps: pd.DataFrame) -> None:
+    same = {f"{agent}_command": 0.0 for agent in ("load", "cooling", "battery")}
+    commands: Any = dashboards.day(steps.assign(**same), "02-28").axes[3]
+    widths = [line.get_linewidth() for line in commands.lines]
+    assert sorted(widths, reverse=True) == widths
+    assert min(-np.diff(widths)) > 1.0
+
+
+def test_events_of_each_kind_look_different(steps: pd.DataFrame) -> None:
+    kinds = [kind for kind in get_args(EventKind) if kind != "grid_outage"]
+    events = [{"kind": kind, "start_step": 100, "end_step": 110} for kind in kinds]
+    temperatures: Any = dashboards.day(steps, "02-28", events=events).axes[0]
+    looks = {(patch.get_facecolor(), patch.get_hatch()) for patch in temperatures.patches}
+    assert len(looks) == len(temperatures.patches) == len(kinds) == len(dashboards.EVENT_SHADES)
+
+
+def test_day_of_hottest_inlet(steps: pd.DataFrame) -> None:
+    hottest = steps["time"].iloc[int(steps["inlet_max_c"].to_numpy().argmax())]
+    assert dashboards.hottest_day(steps) == hottest.strftime("%Y-%m-%d")
+
+
+def test_day_of_the_second_year(steps: pd.DataFrame) -> None:
+    hot = steps[:96].assign(time=steps["time"][:96] + pd.Timedelta(days=365), inlet_max_c=60.0)
+    both = pd.concat([steps, hot])
+    assert dashboards.hottest_day(both) == "2002-02-27"
+    first: Any = dashboards.day(both, "02-27")
+    second: Any = dashboards.day(both, dashboards.hottest_day(both))
+    assert first.axes[4].get_xlabel() == "local standard time on 27 February (year 1)"
+    assert second.axes[4].get_xlabel() == "local standard time on 27 February (year 2)"
+    assert second.axes[0].lines[2].get_ydata().max() == 60.0
+
+
+@pytest.mark.parametrize("date", ["02-26", "03-02", "2-28", "x"])
+def test_days_that_the_run_does_not_have(steps: pd.DataFrame, date: str) -> None:
+    message = rf"date '{date}': valid is MM-DD of a day of the run, 02-27 to 03-01 \(3 days\)"
+    with pytest.raises(SdcError, match=message):
+        dashboards.day(steps, date)
+
+
+def test_year_puts_each_step_at_its_day_and_hour(steps: pd.DataFrame) -> None:
+    short = steps[:-5]  # the last hours of the last day are missing
+    figure: Any = dashboards.year(short, "ny")
+    for axes, (name, factor, label, _) in zip(figure.axes, dashboards.CARPETS, strict=False):
+        (image,) = axes.images
+        grid = image.get_array()
+        if name == "carbon_kg_per_h":
+            expected = short["carbon_g"] / 1e3 / 0.25
+        else:
+            expected = factor * short[name]
+        np.testing.assert_allclose(grid.T.ravel().compressed(), expected)
+        assert grid.shape == (96, 3)
+        assert np.count_nonzero(np.ma.getmaskarray(grid)) == 5
+        assert image.colorbar.ax.get_ylabel() == label
+        assert image.origin == "lower", "midnight below"
+    energy = figure.axes[6]
+    heights = [bar.get_height() for bar in energy.patches]
+    by_day = short.groupby(short["time"].dt.date)[["it_kwh", "hvac_kwh"]].sum() / 1e3
+    np.testing.assert_allclose(heights, [*by_day["it_kwh"], *by_day["hvac_kwh"]])
+    assert energy.get_ylabel() == "energy (MWh/day)"
+    assert render(figure).std() > 10
+
+
+def hourly(begin: str, days: int, it_kwh: float = 2.0) -> pd.DataFrame:
+    times = pd.date_range(begin, periods=24 * days, freq="h")
+    values = {name: 1.0 for name, *_ in dashboards.CARPETS if name != "carbon_kg_per_h"}
+    return pd.DataFrame(
+        {"time": times, **values, "it_kwh": it_kwh, "hvac_kwh": 1.0, "carbon_g": 5.0}
+    )
+
+
+def test_year_sums_months_of_long_runs() -> None:
+    steps = hourly("2001-11-01", 120)
+    figure: Any = dashboards.year(steps)
+    energy, emitted = figure.axes[6:8]
+    heights = [bar.get_height() for bar in energy.patches]
+    np.testing.assert_allclose(heights[:4], np.array([30, 31, 31, 28]) * 24 * 2 / 1e3)
+    assert [tick.get_text() for tick in energy.get_xticklabels()] == ["Nov", "Dec", "Jan", "Feb"]
+    assert energy.get_ylabel() == "energy (MWh/month)"
+    assert emitted.get_ylabel() == "emitted (kg CO₂e/month)"
+    with pytest.raises(SdcError, match="47 h; valid are two days or more"):
+        dashboards.year(steps[:47])
+
+
+@pytest.mark.parametrize(
+    ("begin", "days", "names", "span"),
+    [
+        (
+            "2001-07-15", 365, "Jul Aug Sep Oct Nov Dec Jan Feb Mar Apr May Jun Jul",
+            "15 July to 14 July",
+        ),
+        (
+            "2001-07-15", 600, "Jul Sep Nov Jan Mar May Jul Sep Nov Jan Mar",
+            "15 July (year 1) to 6 March (year 3)",
+        ),
+        ("2001-07-01", 31, "01 04 07 10 13 16 19 22 25 28 31", "1 July to 31 July"),
+    ],
+)  # fmt: skip
+def test_bars_have_names_that_fit(begin: str, days: int, names: str, span: str) -> None:
+    figure: Any = dashboards.year(hourly(begin, days))
+    energy = figure.axes[6]
+    assert [tick.get_text() for tick in energy.get_xticklabels()] == names.split()
+    assert energy.get_xlabel().endswith(f", {span}")
+    render(figure)
+    boxes = [tick.get_window_extent() for tick in energy.get_xticklabels()]
+    assert all(one.x1 < other.x0 for one, other in itertools.pairwise(boxes))
+
+
+def test_scatter_shows_every_step(steps: pd.DataFrame) -> None:
+    figure: Any = dashboards.setpoint_scatter(steps, "ny")
+    setpoint, share, inlet = (axes.collections[0] for axes in figure.axes[:3])
+    expected = sorted(
+        zip(steps["outdoor_c"], steps["it_w"] / 1e3, steps["setpoint_c"], strict=True)
+    )
+    points = np.column_stack([setpoint.get_offsets(), setpoint.get_array()])
+    np.testing.assert_allclose(sorted(map(tuple, points)), expected)
+    assert share.get_array().max() == pytest.approx(100 * (steps["hvac_w"] / steps["it_w"]).max())
+    assert inlet.get_array().max() == steps["inlet_max_c"].max()
+    assert [axes.get_xlabel() for axes in figure.axes[3:]] == [
+        "setpoint (°C)",
+        "HVAC over IT power (%)",
+        "hottest inlet (°C)",
+    ]
+    many = pd.concat(
+        [steps.assign(time=steps["time"] + pd.Timedelta(days=3 * i)) for i in range(50)]
+    )
+    hours = many["time"].dt.hour + many["time"].dt.minute / 60
+    figure = dashboards.setpoint_scatter(many.assign(outdoor_c=hours))
+    drawn = figure.axes[0].collections[0].get_offsets()
+    assert len(drawn) == dashboards.SCATTER_MARKS < len(many)
+    assert len(np.unique(drawn[:, 0])) == 96, "every time of day"
+
+
+def test_battery_profile_is_the_mean_day(steps: pd.DataFrame) -> None:
+    figure: Any = dashboards.battery_profile(steps)
+    carbon, power, charge = figure.axes
+    by_slot = {name: np.reshape(steps[name], (DAYS, 96)) for name in steps if name != "time"}
+    np.testing.assert_allclose(carbon.lines[0].get_ydata(), by_slot["ci_g_per_kwh"].mean(axis=0))
+    np.testing.assert_allclose(charge.lines[0].get_ydata(), 100 * by_slot["soc"].mean(axis=0))
+    charging, discharging = (patch.get_data().values for patch in power.patches)
+    assert charging.max() > 0 > discharging.min(), "the battery of this run works"
+    np.testing.assert_allclose(charging, by_slot["charge_kwh"].mean(axis=0) / 0.25)
+    np.testing.assert_allclose(discharging, -by_slot["discharge_kwh"].mean(axis=0) / 0.25)
+    assert carbon.lines[0].get_xdata()[0] == 0.125
+    assert charge.lines[0].get_xdata()[0] == 0.25, "at the end of the step"
+
+
+def test_hot_racks_counts_hours(run: Run, steps: pd.DataFrame) -> None:
+    hall = run[0].configs[0].hall
+    figure: Any = dashboards.hot_racks(steps, hall, "ny")
+    mesh = figure.axes[0].collections[0]
+    racks = steps["hottest_rack"].astype(int)
+    expected = 0.25 * np.bincount(racks, minlength=hall.racks)
+    np.testing.assert_array_equal(np.ma.filled(mesh.get_array(), 0.0).ravel(), expected)
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    assert len(texts) == racks.nunique()
+    hottest = int(racks.iloc[int(steps["inlet_max_c"].to_numpy().argmax())])
+    row, rack = divmod(hottest, hall.racks_per_row)
+    title = figure.axes[0].get_title(loc="left")
+    assert f"ny: hottest inlet {steps['inlet_max_c'].max():.1f} °C, row {row} rack {rack}" in title
+    with pytest.raises(SdcError, match=r"hottest_rack 20; the hall has racks 0\.\.19"):
+        dashboards.hot_racks(steps.assign(hottest_rack=20.0), hall)
+    wide = load_config(
+        "corrected",
+        ["hall.rows=10", "hall.racks_per_row=20", "hall.supply_approach_k=4",
+         "hall.return_approach_k=-3", "servers.power_w=[150, 10]"],
+    ).hall  # fmt: skip
+    figure = dashboards.hot_racks(steps, wide)
+    assert not figure.axes[0].texts
+    assert len(figure.axes[0].lines) == 1
+    assert render(figure).std() > 5
+
+
+def fleet_of(steps: pd.DataFrame) -> pd.DataFrame:
+    inlets = {f"inlet_{part}_c": steps["inlet_max_c"] for part in ("low", "mid", "high", "max")}
+    return steps[["time", "it_w", "hvac_w", "carbon_g"]].assign(**inlets)
+
+
+def series_of(steps: pd.DataFrame) -> dict[str, pd.Series]:
+    return {"ny": steps.set_index("time")["ci_g_per_kwh"]}
+
+
+@pytest.mark.parametrize(
+    ("draw", "without"),
+    [
+        (lambda steps: dashboards.day(steps, "02-28"), {"command"}),
+        (dashboards.year, {"time of day"}),
+        (dashboards.setpoint_scatter, set()),
+        (dashboards.battery_profile, set()),
+        (figures.overview, set()),
+        (lambda steps: fleet_figures.fleet_overview(fleet_of(steps)), {"PUE"}),
+        (
+            lambda steps: fleet_figures.fleet_map(
+                figures.step_edges(steps), steps[["inlet_max_c"]].to_numpy(), ["ny"]
+            ),
+            set(),
+        ),
+        (lambda steps: data_figures.panels(series_of(steps), data_figures.CARBON), set()),
+        (lambda steps: data_figures.comparison(series_of(steps), data_figures.WORKLOAD), set()),
+        (lambda steps: data_figures.week(series_of(steps), data_figures.TEMPERATURE), set()),
+        (lambda steps: data_figures.carbon_variation(series_of(steps)), set()),
+    ],
+)
+def test_every_axis_has_a_unit(
+    steps: pd.DataFrame, draw: Callable[[pd.DataFrame], Any], without: set[str]
+) -> None:
+    found = [x for x in labels(draw(steps)) if not x.startswith(("day of", "local standard time"))]
+    assert found
+    for label in found:
+        assert label.endswith(")") or label in without, label
+        assert "CO₂" not in label or "CO₂e" in label, label
+
+
+@pytest.mark.parametrize(("factor", "power"), [(1.0, "kW"), (1e4, "MW")])
+def test_fleet_overview_fits_the_size(steps: pd.DataFrame, factor: float, power: str) -> None:
+    given = fleet_of(steps)
+    given[["it_w", "hvac_w", "carbon_g"]] *= factor
+    figure: Any = fleet_figures.fleet_overview(given)
+    axes, pue, carbon, inlets = figure.axes
+    assert axes.get_ylabel() == f"power ({power})"
+    unit = 1e3 if power == "kW" else 1e6
+    highest = max(area.get_paths()[0].vertices[:, 1].max() for area in axes.collections)
+    assert highest == pytest.approx((given["it_w"] + given["hvac_w"]).max() / unit)
+    np.testing.assert_allclose(pue.lines[0].get_ydata()[:-1], 1 + steps["hvac_w"] / steps["it_w"])
+    assert carbon.get_ylabel() == f"emitted ({'kg' if power == 'kW' else 't'} CO₂e/h)"
+    assert clock(inlets.get_xlim()[1]) == "03-02 00:00"
+
+
+def test_tables_that_are_no_run(steps: pd.DataFrame) -> None:
+    with pytest.raises(SdcError, match="missing columns soc"):
+        dashboards.battery_profile(steps.drop(columns="soc"))
+    with pytest.raises(SdcError, match="missing columns load_command"):
+        dashboards.day(steps.drop(columns="load_command"), "02-28")
+    with pytest.raises(SdcError, match="increasing time"):
+        dashboards.year(pd.concat([steps, steps]))
+
+
+def totals(**changed: float) -> dict[str, Metric]:
+    given: dict[str, Metric] = {
+        "cfp_kg": 100.0,
+        "hvac_kwh": 50.0,
+        "it_kwh": 1000.0,
+        "water_l": 0.0,
+        "queue_mean_tasks": 2.0,
+    }
+    return given | changed
+
+
+def test_radar_is_scaled_to_the_worst() -> None:
+    runs = {"a": totals(), DOLLARS: totals(cfp_kg=97.0, it_kwh=980.0, queue_mean_tasks=0.0)}
+    figure: Any = fleet_figures.radar(runs)
+    (axes,) = figure.axes
+    first, second = (line.get_ydata() for line in axes.lines)
+    np.testing.assert_allclose(first, [1, 1, 1, 0, 1, 1])
+    # Middles: 95 % of the carbon, 95 % of the IT energy, since 98 leaves no room below the best.
+    np.testing.assert_allclose(second, [0.4, 1, 0.6, 0, 0, 0.4])
+    ticks = [tick.get_text() for tick in axes.get_xticklabels()]
+    assert ticks[0] == "carbon footprint\n100 kg CO₂e at the rim\n95 in the middle"
+    assert ticks[2] == "IT energy\n1,000 kWh at the rim\n950 in the middle"
+    assert ticks[3] == "water\n0 L for all"
+    assert ticks[4] == "task queue, mean\n2 tasks at the rim\n0 in the middle"
+    assert render(figure).std() > 5
+    assert [t.get_text() for t in figure.legends[0].get_texts()] == ["a", r" _x\$_{\$"]
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        ({"a": totals()}, "1 runs to compare"),
+        ({str(i): totals() for i in range(13)}, "13 runs to compare; valid are 2 to 12"),
+        ({"a": totals(), "b": totals(cfp_kg=-1.0)}, "run 'b': cfp_kg is -1.0"),
+        ({"a": totals(), "b": {}}, "run 'b': cfp_kg is None"),
+    ],
+)
+def test_runs_that_cannot_be_compared(runs: dict[str, Any], message: str) -> None:
+    with pytest.raises(SdcError, match=message):
+        fleet_figures.radar(runs)
+
+
+def test_fleet_map_shows_the_hottest_first() -> None:
+    hours = np.array([0, 24, 48, 72, 96, 102])
+    time = np.datetime64("2001-01-01", "ms") + hours * np.timedelta64(1, "h")
+    inlets = np.random.default_rng(0).uniform(20, 30, (5, 100))
+    figure: Any = fleet_figures.fleet_map(time, inlets, [f"dc{i}" for i in range(100)])
+    axes = figure.axes[0]
+    order = np.argsort(-inlets.max(axis=0))[: fleet_figures.MAP_ROWS]
+    assert [t.get_text() for t in axes.get_yticklabels()] == [f"dc{i}" for i in order]
+    np.testing.assert_array_equal(axes.collections[0].get_array(), inlets[:, order].T)
+    assert axes.get_ylabel() == "the 40 hottest of 100 data centers"
+    assert clock(axes.get_xlim()[1]) == "01-05 06:00", "the last interval ends with the run"
+    with pytest.raises(SdcError, match=r"expected \(5, 3\)"):
+        fleet_figures.fleet_map(time, inlets, ["a", "b", "c"])
+
+
+@pytest.mark.parametrize("steps", [2, 95, 200, 300, 385, 479, 500, 700, 3000, 9000, 12000])
+def test_every_length_has_ticks(steps: int) -> None:
+    """matplotlib warns of lengths that it finds no ticks for."""
+    times = pd.date_range("2001-02-27", periods=steps, freq="15min")
+    series = {"x": pd.Series(np.arange(steps) % 96 + 1.0, index=times)}
+    figure: Any = data_figures.comparison(series, data_figures.CARBON)
+    render(figure)
+    assert 2 <= len(figure.axes[0].get_xticks()) <= 11
+
+
+def test_lines_differ() -> None:
+    styles = [tuple(fleet_figures.line_style(i).items()) for i in range(32)]
+    assert len(set(styles)) == 32
+
+
+def test_panels_show_daily_means_and_ranges() -> None:
+    names = synthetic_sites()[:5]
+    series = data_figures.site_series(names, "outdoor_c")
+    figure: Any = data_figures.panels(series, data_figures.TEMPERATURE, "synthetic")
+    assert [axes.get_title(loc="left") for axes in figure.axes[:5]] == list(names)
+    hours = np.reshape(synthetic_site(names[1]).outdoor_c.values, (365, -1))
+    axes = figure.axes[1]
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), hours.mean(axis=1))
+    (band,) = axes.collections
+    spread = band.get_paths()[0].vertices[:, 1]
+    assert (spread.min(), spread.max()) == (hours.min(), hours.max())
+    assert not any(axes.get_visible() for axes in figure.axes[5:]), "no empty panels"
+    assert render(figure).std() > 5
+
+
+def test_comparison_shows_weeks_and_hours() -> None:
+    series = data_figures.site_series(["NY", "CA"], "ci_g_per_kwh")
+    figure: Any = data_figures.comparison(series, data_figures.CARBON)
+    left, right = figure.axes
+    values = synthetic_site("CA").ci_g_per_kwh.values
+    assert len(values) == 8760
+    by_hour = np.reshape(values, (365, 24)).mean(axis=0)
+    np.testing.assert_allclose(right.lines[1].get_ydata(), by_hour)
+    weeks = np.reshape(values[: 52 * 168], (52, 168)).mean(axis=1)
+    np.testing.assert_allclose(left.lines[1].get_ydata()[:52], weeks)
+    times = left.lines[1].get_xdata(orig=False)
+    assert [clock(x) for x in (times[0], times[-1])] == ["01-04 12:00", "12-31 12:00"], "middles"
+    assert left.get_ylabel() == right.get_ylabel() == "carbon intensity (g CO₂e/kWh)"
+
+
+def test_the_leap_day_is_no_gap(steps: pd.DataFrame) -> None:
+    """Two days on both sides of 29 February 2004, which no run has."""
+    times = [*pd.date_range("2004-02-28", periods=96, freq="15min"),
+             *pd.date_range("2004-03-01", periods=96, freq="15min")]  # fmt: skip
+    both = steps[:192].assign(time=times)
+    values = both.set_index("time")["ci_g_per_kwh"]
+    assert len(data_figures.daily(values).mean()) == 2
+    assert data_figures.mean_and_variation("x", values)[0] == pytest.approx(values.mean())
+    assert figures.step_hours(both[95:]) == 0.25
+    storage: Any = dashboards.day(both, "03-01").axes[4]
+    (queue,) = storage.lines
+    ends = queue.get_xdata(orig=False)
+    assert [clock(x) for x in (ends[0], ends[1], ends[-1])] == [
+        "03-01 00:00", "03-01 00:15", "03-02 00:00",
+    ]  # fmt: skip
+
+
+def test_week_of_workloads() -> None:
+    series = data_figures.trace_series(synthetic_traces())
+    figure: Any = data_figures.week(series, data_figures.WORKLOAD)
+    (axes,) = figure.axes
+    assert [line.get_label() for line in axes.lines] == list(synthetic_traces())
+    for line, values in zip(axes.lines, series.values(), strict=True):
+        per_day = round(pd.Timedelta(days=1) / (values.index[1] - values.index[0]))
+        np.testing.assert_array_equal(line.get_ydata(), 100 * values[: 7 * per_day])
+
+
+def test_variation_is_that_of_each_day() -> None:
+    times = pd.date_range("2001-01-01", periods=48, freq="h")
+    # Flat days of different level vary from day to day, not within.
+    flat = pd.Series(np.repeat([100.0, 300.0], 24), index=times)
+    assert data_figures.mean_and_variation("flat", flat) == (200.0, 0.0)
+    swing = pd.Series(np.tile([50.0, 150.0], 24), index=times)
+    assert data_figures.mean_and_variation("swing", swing) == pytest.approx((100.0, 0.5))
+    figure: Any = data_figures.carbon_variation({"flat": flat, "swing": swing})
+    points = [(line.get_xdata()[0], line.get_ydata()[0]) for line in figure.axes[0].lines]
+    assert points == [(0.0, 200.0), (pytest.approx(50.0), 100.0)]
+    with pytest.raises(SdcError, match="series 'zero': a day with a mean of 0"):
+        data_figures.carbon_variation({"zero": 0.0 * flat})
+
+
+def test_series_that_are_too_short() -> None:
+    one = pd.Series([1.0], index=pd.date_range("2001-01-01", periods=1, freq="h"))
+    with pytest.raises(SdcError, match="no series"):
+        data_figures.panels({}, data_figures.CARBON)
+    with pytest.raises(SdcError, match="series 'x': 1 values"):
+        data_figures.comparison({"x": one}, data_figures.CARBON)
+    early = pd.Series(1.0, index=pd.date_range("2001-01-01", periods=24, freq="h"))
+    late = pd.Series(1.0, index=pd.date_range("2001-07-01", periods=24, freq="h"))
+    with pytest.raises(SdcError, match="series 'early' ends before 2001-07-01"):
+        data_figures.week({"early": early, "late": late}, data_figures.CARBON)
+
+
+def test_names_are_written_as_they_are() -> None:
+    series = data_figures.site_series(["NY"], "ci_g_per_kwh")
+    figure = data_figures.week({DOLLARS: series["NY"]}, data_figures.CARBON)
+    assert render(figure).std() > 5
+    (text,) = figure.axes[0].get_legend().get_texts()  # type: ignore[union-attr]
+    assert text.get_text() == r" _x\$_{\$"
+    assert figures.short("a\n b" + 60 * "c") == "a b" + 46 * "c" + "…"
+
+
+def test_animation_shows_every_rack(run: Run, tmp_path: Path) -> None:
+    from PIL import Image
+
+    fleet, results = run
+    path = tmp_path / "hall.webp"
+    animation.write_animation(
+        path, iter(results[130:160]), fleet, frame_ms=50, limits_c=(15.0, 40.0)
+    )
+    picture: Any = Image.open(path)
+    assert (picture.n_frames, picture.format) == (30, "WEBP")
+    palette = animation._palette()
+    index = animation._pixel_index(4, 5)
+    for frame in (0, 14, 29):
+        picture.seek(frame)
+        pixels = np.asarray(picture.convert("RGB"))
+        inside = pixels[34 : 34 + index.shape[0], 12 : 12 + index.shape[1]]
+        values = results[130 + frame].rack_inlet_c.astype(np.float64)
+        levels = np.clip((values - 15.0) * 255 / 25.0 + 0.5, 0, 255).astype(int)
+        for rack in range(20):
+            drawn = np.unique(inside[index == rack], axis=0)
+            np.testing.assert_array_equal(drawn, [palette[levels[rack]]])
+        assert (inside[index == 20] == 255).all(), "gaps between the racks"
+    assert path.stat().st_size < 100_000
+    assert [p.name for p in tmp_path.iterdir()] == ["hall.webp"]
+
+
+def test_animation_holds_one_frame_at_a_time(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from PIL import Image, ImageDraw
+
+    draw, alive = ImageDraw.Draw, []
+
+    def counted(picture: Any) -> Any:
+        alive.append(sum(type(each) is Image.Image for each in gc.get_objects()))
+        return draw(picture)
+
+    monkeypatch.setattr(ImageDraw, "Draw", counted)
+    animation.write_animation(tmp_path / "hall.webp", run[1][:8], run[0])
+    assert len(alive) >= 8
+    assert max(alive) - alive[0] <= 2
+
+
+def test_animation_of_a_data_center_of_many(tmp_path: Path) -> None:
+    from PIL import Image
+
+    with Simulator(make_configs(load_config("tiny"), count=2)) as sim:
+        sim.reset()
+        results = [sim.step() for _ in range(3)]
+        animation.write_animation(tmp_path / "x.WEBP", results, sim.fleet, 1, what="outlet")
+    pixels = np.asarray(Image.open(tmp_path / "x.WEBP").convert("RGB")).astype(int)
+    outlets = results[0].rack_outlet_c[4:]
+    order = np.argsort(outlets, kind="stable")
+    index = animation._pixel_index(2, 2)
+    at = [np.argwhere(index == rack)[0] + (34, 12) for rack in order]
+    brightness = [pixels[y, x].sum() for y, x in at]
+    assert brightness == sorted(brightness)
+
+
+@pytest.mark.parametrize(("rows", "per_row"), [(4, 5), (250, 400), (1, 1), (2, 900), (900, 2)])
+def test_every_rack_has_pixels_alike(rows: int, per_row: int) -> None:
+    counts = np.bincount(animation._pixel_index(rows, per_row).ravel(), minlength=rows * per_row)
+    assert counts.min() > 0
+    assert np.ptp(counts[: rows * per_row]) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("x.gif", {}, r"valid is a name that ends in \.webp"),
+        ("x.webp", {"dc": 1}, r"data center 1: valid is 0\.\.0"),
+        ("x.webp", {"what": "power"}, "what 'power'"),
+        ("x.webp", {"limits_c": (30.0, 20.0)}, "limits_c"),
+        ("x.webp", {"frame_ms": 0}, "frame_ms 0"),
+        ("none/x.webp", {}, "cannot be written"),
+    ],
+)
+def test_bad_animations(
+    run: Run, tmp_path: Path, name: str, arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(SdcError, match=message):
+        animation.write_animation(tmp_path / name, run[1][:2], run[0], **arguments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_animation_without_steps_or_of_another_fleet(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(SdcError, match="no steps to show"):
+        animation.write_animation(tmp_path / "x.webp", [], run[0])
+    with Simulator(load_config("tiny")) as sim:
+        sim.reset()
+        with pytest.raises(SdcError, match="result of 4 racks, expected 20"):
+            animation.write_animation(tmp_path / "x.webp", [sim.step()], run[0])
+    with pytest.raises(SdcError, match="too large for WebP"):
+        animation._pixel_index(20_000, 1)
+
+
+@pytest.mark.repo
+def test_example_animates_a_failure(tmp_path: Path) -> None:
+    from PIL import Image
+
+    example = Path(__file__).parent.parent / "examples" / "plot_runs.py"
+    spec = importlib.util.spec_from_file_location("plot_runs", example)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.plot_failure(tmp_path)
+    (path,) = tmp_path.iterdir()
+    picture: Any = Image.open(path)
+    assert picture.n_frames == module.FAILURE_STEPS
+    assert path.stat().st_size < 300_000
+    brightness = []
+    for frame in (40, 60, 80):  # before the first failure, in it, after it
+        picture.seek(frame)
+        brightness.append(np.asarray(picture.convert("L"))[40:500].mean())
+    assert brightness[1] > brightness[2] > 0
+    assert brightness[1] > 2 * brightness[0]

@@ -1,0 +1,613 @@
+"""Recordings read back equal to the run, value by value."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import runpy
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pytest
+
+from rrd import images, read, scalars, texts, verify, voxels
+from sdc_taichi import (
+    Actions,
+    DataCenterConfig,
+    SdcError,
+    Simulator,
+    StepResult,
+    build_fleet,
+    load_config,
+    make_configs,
+)
+from sdc_taichi.control import View
+from sdc_taichi.plant.workload import age_histogram
+from sdc_taichi.run import Asked, describe, record
+from sdc_taichi.types import F64, ServerLayers
+from sdc_taichi.viz import hall_layers, recorder, recording_series
+from sdc_taichi.viz.recorder import Recorder
+from sdc_taichi.viz.recording_events import failure_entries, protection_entries
+
+STEPS = 130  # of blocks of 96 in this test: more than one, and no multiple
+ODD_NAME = "hall/1 [a]"
+HALL = (
+    "hall.rows=2",
+    "hall.racks_per_row=2",
+    "hall.servers_per_rack=12",
+    "hall.supply_approach_k=5.3",
+    "hall.return_approach_k=-3",
+    "hvac.crac.units=2",
+    "servers.power_w=[150, 10]",
+    "protection.ashrae_class=A1",
+)
+ZONES = 10
+FAILURES = (
+    "events.scheduled=["
+    "{kind: crac_down, unit: 0, start_h: 3, duration_h: 2},"
+    "{kind: crac_down, start_h: 6, duration_h: 2},"
+    "{kind: rack_fan_failure, rack: 2, share: 0.2, start_h: 10, duration_h: 4},"
+    "{kind: chiller_derate, share: 0.5, start_h: 20, duration_h: 5},"
+    "{kind: heat_wave, offset_k: 6, start_h: 23, duration_h: 3},"
+    "{kind: grid_outage, start_h: 28, duration_h: 1}]"
+)
+
+
+def configs() -> list[DataCenterConfig]:
+    """Six halls: one with failures and protection, a name that needs escaping, another season."""
+    base = load_config("corrected", HALL)
+    out = make_configs(base, count=6, sites=["NY", "CA"])
+    failing = load_config("corrected", [*HALL, FAILURES])
+    out[0] = failing.model_copy(update={"name": "ny-0"})
+    out[1] = out[1].model_copy(update={"name": ODD_NAME})
+    summer = out[2].site.model_copy(update={"start": "07-01"})
+    out[2] = out[2].model_copy(update={"site": summer})
+    return out
+
+
+class Wild:
+    """Defers work for ten hours, so that it grows old; all else is without pattern."""
+
+    def __init__(self) -> None:
+        self.reset(0)
+
+    def reset(self, seed: int) -> None:
+        self._rng, self._steps = np.random.default_rng(seed), 0
+
+    def act(self, view: View) -> Actions:
+        load, cooling, battery = np.round(self._rng.uniform(-1.0, 1.0, (3, 6)), 1)
+        self._steps += 1
+        return Actions(load=-1.0 if self._steps < 40 else load, cooling=cooling, battery=battery)
+
+
+@dataclass
+class Run:
+    """A run, its recording, and what it should hold."""
+
+    sim: Simulator
+    results: list[StepResult]
+    servers: list[ServerLayers]
+    queues: list[F64]
+    rewards: list[F64]
+    steps: pd.DataFrame
+    path: Path
+    recorded: dict[str, dict[str, list[Any]]]
+
+    def column(self, name: str, dc: int) -> npt.NDArray[Any]:
+        """A column of steps.parquet."""
+        rows = self.steps[self.steps["dc"] == self.sim.fleet.names[dc]]
+        return rows[name].to_numpy()
+
+
+FOCUS = {0: "ny-0", 1: r"hall\/1\ \[a\]", 2: "ny-2"}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    out = tmp_path_factory.mktemp("run")
+    path = out / "run.rrd"
+    results: list[StepResult] = []
+    servers: list[ServerLayers] = []
+    queues: list[F64] = []
+    rewards: list[F64] = []
+    with pytest.MonkeyPatch.context() as patch, Simulator(configs()) as sim:
+        patch.setattr(recorder, "BLOCK_STEPS", 96)
+        asked = Asked("wild", STEPS)
+        with Recorder(path, focus=["ny-0", ODD_NAME, "ny-2"], every=2) as rec:
+            rec.begin(sim, describe(sim, asked))
+
+            def each(result: StepResult) -> None:
+                results.append(result)
+                servers.append(sim.servers())
+                queues.append(sim.state.queue.copy())
+                rewards.append(-result.carbon_g / 7.0)
+                rec.add(result, rewards={"carbon": rewards[-1], "water": -result.water_l})
+
+            record(sim, Wild(), asked, out / "files", on_step=each)
+        steps = pd.read_parquet(out / "files" / "steps.parquet")
+        yield Run(sim, results, servers, queues, rewards, steps, path, read(path))
+
+
+def test_rerun_verifies_the_recording(run: Run) -> None:
+    done = verify(run.path)
+    assert done.returncode == 0, done.stderr
+    assert "1 file verified without error" in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("dc", FOCUS)
+def test_series_are_the_columns_of_the_run(run: Run, dc: int) -> None:
+    compared = 0
+    for entity, plot in recording_series.PLOTS.items():
+        found = run.recorded[f"/dc/{FOCUS[dc]}/series/{entity}"]
+        assert found["step"] == list(range(STEPS))
+        assert [np.datetime64(t) for t in found["sim_time"]] == list(run.column("time", dc))
+        assert found["SeriesLines:names"] == [[line.name for line in plot.lines]]
+        for line, values in zip(plot.lines, scalars(found).T, strict=True):
+            assert line.name.endswith("]"), "a unit in every name"
+            if line.field == "pue":
+                it_w, hvac_w = run.column("it_w", dc), run.column("hvac_w", dc)
+                some = it_w > 0
+                expected = np.where(some, 1.0 + hvac_w / np.where(some, it_w, 1.0), np.nan)
+            else:
+                hours = 0.25 if line.per_hour else 1.0
+                expected = run.column(line.field, dc) * line.factor / hours
+            np.testing.assert_allclose(values, expected, rtol=1e-15, err_msg=line.name)
+            compared += 1
+    assert compared > 30
+    assert run.recorded[f"/dc/{FOCUS[2]}/series/pue"]["sim_time"][0].month == 7
+
+
+def test_only_data_centers_in_focus_are_recorded_in_full(run: Run) -> None:
+    assert not [path for path in run.recorded if "ca-3" in path or "ny-4" in path]
+    (((text,),)) = run.recorded["/summary"]["TextDocument:text"]
+    assert "The 3 other data centers count in the fleet series only" in text
+
+
+def test_queue_by_age_adds_up(run: Run) -> None:
+    edges = np.array(recording_series.AGE_EDGES_H) * 4
+    for dc, name in FOCUS.items():
+        found = scalars(run.recorded[f"/dc/{name}/series/queue_tasks"])
+        expected = [age_histogram(queue, edges)[dc] for queue in run.queues]
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_allclose(found.sum(axis=1), run.column("queue_tasks", dc), atol=1e-9)
+    assert np.count_nonzero(found[:, 1:]) > 0, "work of more than one age"
+
+
+def test_units_rewards_and_fleet_are_recorded(run: Run) -> None:
+    first = run.sim.fleet.unit_start[1]
+    air = scalars(run.recorded[f"/dc/{FOCUS[1]}/crac/temperature_c"])
+    np.testing.assert_array_equal(air[:, 0], [r.unit_supply_c[first] for r in run.results])
+    np.testing.assert_array_equal(air[:, 1], [r.unit_supply_c[first + 1] for r in run.results])
+    np.testing.assert_array_equal(air[:, 2], run.column("return_c", 1))
+    flow = scalars(run.recorded[f"/dc/{FOCUS[1]}/crac/airflow_m3s"])
+    np.testing.assert_array_equal(flow[:, 0], [r.unit_flow_m3s[first] for r in run.results])
+    terms = run.recorded[f"/dc/{FOCUS[2]}/series/rewards"]
+    assert terms["SeriesLines:names"] == [["carbon [-]", "water [-]"]]
+    np.testing.assert_array_equal(scalars(terms)[:, 0], [r[2] for r in run.rewards])
+    np.testing.assert_array_equal(scalars(terms)[:, 1], -run.column("water_l", 2))
+    by_step = run.steps.groupby("step")
+    expected = {
+        "pue": 1.0 + by_step["hvac_w"].sum() / by_step["it_w"].sum(),
+        "hottest_inlet_c": by_step["inlet_max_c"].max(),
+        "it_kw": by_step["it_w"].sum() / 1e3,
+        "carbon_kg": by_step["carbon_g"].sum() / 1e3,
+        "water_l": by_step["water_l"].sum(),
+        "queue_tasks": by_step["queue_tasks"].sum(),
+        "lost_tasks": by_step["dropped_tasks"].sum() + by_step["lost_tasks"].sum(),
+        "protected_racks": by_step["throttled_racks"].sum() + by_step["tripped_racks"].sum(),
+    }
+    assert set(expected) == set(recording_series.FLEET)
+    for entity, values in expected.items():
+        found = scalars(run.recorded[f"/fleet/{entity}"])[:, 0]
+        np.testing.assert_allclose(found, values, rtol=1e-12, atol=1e-9, err_msg=entity)
+
+
+def test_hottest_halls_are_named_with_their_place(run: Run) -> None:
+    entity = run.recorded["/fleet/hottest"]
+    assert entity["step"] == list(range(0, STEPS, 2))
+    for step, (text,) in zip(entity["step"], entity["TextDocument:text"], strict=True):
+        result = run.results[step]
+        dc = int(np.argmax(result.inlet_max_c))
+        first = text.splitlines()[4].split("|")
+        assert first[1].strip() == run.sim.fleet.names[dc]
+        assert float(first[2]) == pytest.approx(result.inlet_max_c[dc], abs=0.0051)
+        assert [int(cell) for cell in first[4:6]] == [
+            result.hottest_rack[dc], result.hottest_server[dc],
+        ]  # fmt: skip
+
+
+@pytest.mark.parametrize("dc", FOCUS)
+def test_actions_are_states_that_change(run: Run, dc: int) -> None:
+    for entity, (command, states) in recording_series.STATES.items():
+        found = run.recorded[f"/dc/{FOCUS[dc]}/actions/{entity}"]
+        assert found["StateConfiguration:values"] == [list(states)]
+        changes = dict(zip(found["step"], (s for (s,) in found["StateChange:state"]), strict=True))
+        listed = list(changes.values())
+        assert all(a != b for a, b in itertools.pairwise(listed)), "only changes"
+        now = ""
+        for step, value in enumerate(run.column(command, dc)):
+            now = changes.get(step, now)
+            assert now == states[int(np.sign(value)) + 1], (entity, step)
+
+
+@pytest.mark.parametrize("dc", FOCUS)
+def test_heat_maps_are_the_racks_to_their_resolution(run: Run, dc: int) -> None:
+    fleet = run.sim.fleet
+    hall, racks = fleet.configs[dc].hall, slice(*fleet.rack_start[dc : dc + 2])
+    tiles = hall_layers.tiles(hall)
+    scales = {what: hall_layers.temperature_scale(what) for what in hall_layers.LIMITS_C}
+    scales["power"] = hall_layers.power_scale(fleet)
+    for what, scale in scales.items():
+        entity = run.recorded[f"/dc/{FOCUS[dc]}/map/{what}"]
+        assert entity["step"] == list(range(0, STEPS, 2))
+        assert entity["DepthImage:depth_range"] == [[[scale.low, scale.high]]]
+        shots = images(entity)
+        for step, pixels in zip(entity["step"], shots, strict=True):
+            result = run.results[step]
+            racks_now = {
+                "inlet": result.rack_inlet_c,
+                "outlet": result.rack_outlet_c,
+                "power": result.rack_power_w / 1e3,
+            }[what][racks]
+            for rack, value in enumerate(np.clip(racks_now, scale.low, scale.high)):
+                row, column = divmod(rack, hall.racks_per_row)
+                y, x = row * (tiles.height + 1), column * (tiles.width + 1)
+                tile = pixels[y : y + tiles.height, x : x + tiles.width]
+                assert np.ptp(tile) == 0
+                assert abs(float(tile[0, 0]) - value) <= scale.quantum / 2 * 1.0001
+            assert np.all(pixels[tiles.height] == scale.low)
+        assert np.ptp(shots[:, 0, 0]) > 0, "values change"
+
+
+@pytest.mark.parametrize("dc", FOCUS)
+def test_hall_shows_the_hottest_server_of_every_height(run: Run, dc: int) -> None:
+    fleet = run.sim.fleet
+    hall = fleet.configs[dc].hall
+    for what, layer in (("inlet", "inlet_c"), ("outlet", "outlet_c")):
+        entity = run.recorded[f"/dc/{FOCUS[dc]}/hall/{what}"]
+        scale = hall_layers.temperature_scale(what)
+        assert entity["VoxelGridMap:value_range"] == [[[scale.low, scale.high]]]
+        for step, cells in zip(entity["step"], voxels(entity), strict=True):
+            values = getattr(run.servers[step], layer)
+            expected = []
+            for rack in range(*fleet.rack_start[dc : dc + 2]):
+                first, last = fleet.server_start[fleet.group_start[rack : rack + 2]]
+                height = np.arange(12) * ZONES // 12
+                expected += [values[first:last][height == zone].max() for zone in range(ZONES)]
+            clipped = np.clip(expected, scale.low, scale.high)
+            np.testing.assert_allclose(cells, clipped, atol=scale.quantum / 2 * 1.0001)
+        (indices,) = entity["VoxelGridMap:voxel_indices"]
+        assert len({tuple(index) for index in indices}) == hall.racks * ZONES
+
+
+def test_log_tells_begin_and_end_of_everything_with_its_place(run: Run) -> None:
+    entity = run.recorded[f"/dc/{FOCUS[0]}/events"]
+    log = list(zip(entity["step"], texts(entity), strict=True))
+    told = {(step, text[12:]) for step, text in log}
+
+    def steps_with(part: str) -> list[int]:
+        return [step for step, text in log if part in text]
+
+    assert (12, "CRAC unit 0 down, steps 12 to 19") in told
+    assert (20, "over: CRAC unit 0 down") in told
+    assert (24, "all CRAC units down, steps 24 to 31") in told
+    where = "row 1, rack 2, airflow at 20%"
+    assert (40, f"rack fans failed: {where}, steps 40 to 55") in told
+    assert (56, f"over: rack fans failed: {where}") in told
+    assert (80, "chiller at 50% of its capacity, steps 80 to 99") in told
+    assert (92, "heat wave, +6 K, steps 92 to 103") in told
+    assert (112, "grid outage, steps 112 to 115") in told
+    for field, limit, begins, ends in (
+        ("inlet_max_c", 27.0, "inlet above recommended 27 C", "within recommended 27 C"),
+        ("inlet_max_c", 32.0, "inlet above allowable 32 C", "within allowable 32 C"),
+        ("unmet_w", 1.0, "plant at its limit", "plant below its limit"),
+        ("lost_tasks", 1e-6, "work lost:", "no work lost"),
+        ("dropped_tasks", 1e-6, "work dropped:", "no work dropped"),
+        ("overdue_tasks", 1e-6, "work overdue:", "no work overdue"),
+    ):
+        over = np.concatenate([[False], run.column(field, 0) > limit]).astype(int)
+        edges = np.diff(over)
+        assert steps_with(begins) == np.flatnonzero(edges > 0).tolist(), begins
+        assert steps_with(ends) == np.flatnonzero(edges < 0).tolist(), ends
+    assert len(steps_with("inlet above recommended")) > 1
+    for step in steps_with("inlet above allowable"):
+        rack = int(run.column("hottest_rack", 0)[step])
+        server = int(run.column("hottest_server", 0)[step])
+        row = rack // run.sim.fleet.configs[0].hall.racks_per_row
+        hottest = run.column("inlet_max_c", 0)[step]
+        place = f"{hottest:.1f} C at row {row}, rack {rack}, server {server} from the floor"
+        assert (step, f"inlet above allowable 32 C: {place}") in told
+
+
+def test_log_names_racks_that_protect_themselves(run: Run) -> None:
+    fleet = run.sim.fleet
+    changes = 0
+    for dc, name in FOCUS.items():
+        entity = run.recorded.get(f"/dc/{name}/events", {"step": [], "TextLog:text": []})
+        log = {(step, text[12:]) for step, text in zip(entity["step"], texts(entity), strict=True)}
+        before = np.zeros(4, dtype=np.int8)
+        for step, result in enumerate(run.results):
+            after = result.rack_status[slice(*fleet.rack_start[dc : dc + 2])]
+            for rack in np.flatnonzero(after != before):
+                first, last = fleet.server_start[
+                    fleet.group_start[fleet.rack_start[dc] + rack : fleet.rack_start[dc] + rack + 2]
+                ]
+                inlets = run.servers[step].inlet_c[first:last]
+                verb = ("back to normal", "throttled", "tripped")[after[rack]]
+                place = f"row {rack // 2}, rack {rack}, server {inlets.argmax()} from the floor"
+                assert (step, f"rack {verb}: {place}, inlet {inlets.max():.1f} C") in log
+                changes += 1
+            before = after
+    assert changes > 2
+
+
+def test_racks_beyond_the_named_ones_are_counted() -> None:
+    before, after = np.zeros(40, np.int8), np.ones(40, np.int8)
+    after[30:33] = 2
+    found = list(protection_entries(7, 0, 10, before, after, lambda rack: (None, 33.0)))
+    assert len(found) == 9
+    assert [e.text for e in found[:3]] == [
+        f"rack tripped: row 3, rack {rack}, inlet 33.0 C" for rack in (30, 31, 32)
+    ]
+    assert found[-1].text == "and more racks: 32 throttled"
+    assert not list(failure_entries(3, [], [], build_fleet(load_config("tiny"))))
+
+
+def test_recording_explains_itself(run: Run) -> None:
+    from rerun.chunk import RrdReader
+
+    (((text,),)) = run.recorded["/summary"]["TextDocument:text"]
+    about = describe(run.sim, Asked("wild", STEPS))
+    for expected in (
+        ODD_NAME, "site CA", "**synthetic**", "synthetic year, seed 10", "carnot", "wild",
+        about["fingerprint"], f"taichi {about['versions']['taichi']}", "inlet 10 to 45 C",
+        run.sim.fleet.configs[0].description, "every 2 steps",
+    ):  # fmt: skip
+        assert expected in text
+    for what, mark in (("inlet", "45 C"), ("outlet", "10 C"), ("power", "1 kW")):
+        assert mark in run.recorded[f"/legend/{what}/ticks"]["Points2D:labels"][0]
+    (blueprint,) = RrdReader(run.path).blueprints()
+    chunks = RrdReader(run.path).stream(store=blueprint).to_chunks()
+    shown = str([chunk.to_record_batch().to_pydict() for chunk in chunks])
+    for expected in (
+        "ny-0", ODD_NAME, "fleet", "sim_time", "HVAC by device [kW]", "reward terms",
+        "StateTimeline", "TextLog", "3D", "hottest halls",
+    ):  # fmt: skip
+        assert expected in shown
+
+
+def test_larger_halls_are_recorded_more_coarsely(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    large = load_config(
+        "corrected",
+        [
+            "hall.rows=30", "hall.racks_per_row=10", "hall.servers_per_rack=40",
+            "hall.inlet_model=approach", "hall.supply_approach_k=5", "hall.return_approach_k=-3",
+            "servers.power_w=[400, 40]",
+        ],
+    )  # fmt: skip
+    path = tmp_path / "large.rrd"
+    monkeypatch.setattr(recorder, "LARGE_RACKS", 299)
+    with Simulator(make_configs(large)) as sim, Recorder(path) as rec:
+        sim.reset()
+        rec.begin(sim)
+        results = []
+        for _ in range(100):
+            results.append(sim.step())
+            rec.add(results[-1])
+    entities = read(path)
+    assert entities["/dc/ny/series/pue"]["step"] == list(range(100))
+    inlets = entities["/dc/ny/map/inlet"]
+    assert inlets["step"] == list(range(0, 100, 4))
+    tiles = hall_layers.tiles(large.hall)
+    pixels = images(inlets)[-1][:: tiles.height + 1, :: tiles.width + 1].reshape(-1)
+    np.testing.assert_allclose(pixels, results[96].rack_inlet_c, atol=1 / 32)
+    assert entities["/dc/ny/hall/outlet"]["step"] == list(range(0, 100, 12))
+    assert voxels(entities["/dc/ny/hall/outlet"]).shape == (9, 300 * 5)
+    assert "/fleet/hottest" not in entities, "there is but one hall"
+    from rerun.chunk import RrdReader
+
+    blocks = [
+        chunk.num_rows
+        for chunk in RrdReader(path).stream().to_chunks()
+        if chunk.entity_path == "/dc/ny/series/pue" and not chunk.is_static
+    ]
+    assert sorted(blocks) == [4, 96], "shorter blocks"
+
+
+def test_hall_is_shown_more_often_in_events(tmp_path: Path) -> None:
+    wave = "events.scheduled=[{kind: heat_wave, offset_k: 5, start_h: 4.5, duration_h: 3}]"
+    path = tmp_path / "x.rrd"
+    with Simulator(load_config("tiny", [wave])) as sim, Recorder(path) as rec:
+        sim.reset()
+        rec.begin(sim)
+        for _ in range(48):
+            rec.add(sim.step())
+    (name,) = {entity.split("/")[2] for entity in read(path) if entity.startswith("/dc/")}
+    assert read(path)[f"/dc/{name}/hall/inlet"]["step"] == [0, 12, 20, 24, 28, 36]
+
+
+@pytest.mark.parametrize(
+    ("racks", "hours"), [(200, 0.0), (201, 1.0), (2_000, 1.0), (20_000, 3.0), (100_000, 6.0)]
+)
+def test_heat_maps_are_rarer_the_more_racks(racks: int, hours: float) -> None:
+    assert recorder._every_h(racks) == hours
+
+
+@pytest.mark.parametrize(("rows", "per_row"), [(4, 5), (20, 200), (50, 20), (1, 1), (250, 400)])
+def test_tiles_are_equal_and_legible(rows: int, per_row: int) -> None:
+    hall = load_config("tiny").hall.model_copy(update={"rows": rows, "racks_per_row": per_row})
+    scale = hall_layers.Scale(-1.0, 1e6, 1.0, "")
+    shape = hall_layers.tiles(hall)
+    values = np.arange(rows * per_row, dtype=np.float32)[None] % 2048
+    pixels = hall_layers.pixels(values, shape, scale)[0]
+    assert pixels.shape == shape.image
+    counts = np.bincount(pixels[pixels >= 0].astype(int).reshape(-1))
+    assert np.all(counts % (shape.height * shape.width) == 0)
+    assert 0.4 <= pixels.shape[1] / pixels.shape[0] <= 5.5
+    assert pixels.nbytes <= 1_000_000
+
+
+def test_values_are_clamped_to_the_range() -> None:
+    found = hall_layers.quantised(
+        np.array([-40.0, 20.03, 99.0, 30.0]), hall_layers.temperature_scale("inlet")
+    )
+    assert found.tolist() == [10.0, 20.0, 45.0, 30.0]
+
+
+@pytest.mark.parametrize("full_w", [15.0, 150.0, 9000.0])
+def test_power_range_covers_the_largest_rack(full_w: float) -> None:
+    power = ["servers.groups=null", f"servers.power_w=[{full_w}, 1]"]
+    fleet = build_fleet(load_config("tiny", [*power, "hall.servers_per_rack=40"]))
+    scale = hall_layers.power_scale(fleet)
+    largest_kw = fleet.group_sums(fleet.groups[0] * fleet.groups[1]).max() / 1e3
+    assert largest_kw * 1.1 <= scale.high <= largest_kw * 1.1 * 2.5 * 1.0001
+    exact = np.arange(0.0, scale.high, scale.quantum)
+    assert np.array_equal(exact.astype(np.float16).astype(np.float64), exact)
+
+
+def test_voxels_stand_where_the_racks_do() -> None:
+    hall = load_config("large").hall
+    grid = hall_layers.voxels(hall, 5)
+    from sdc_taichi.layout import floor_plan
+
+    plan, measures = floor_plan(hall), hall.layout
+    offset = np.array([measures.end_margin_m, 0.0])
+    for cells, middle in ((grid.front, plan.front_m), (grid.back, plan.back_m)):
+        centre = (cells + 0.5) * np.array(grid.size_m)
+        per_rack = centre.reshape(hall.racks, 5, 3)
+        np.testing.assert_allclose(
+            per_rack[..., 2], np.tile((np.arange(5) + 0.5) * 0.42, (1000, 1))
+        )
+        # A quarter of a rack's depth lies between a face and the middle of its half, and another
+        # is what aisles may be rounded by.
+        apart = np.abs(per_rack[:, 0, :2] + offset - middle)
+        assert np.all(apart <= [1e-9, measures.rack_depth_m / 2 + 1e-9])
+    assert not {tuple(c) for c in grid.front} & {tuple(c) for c in grid.back}
+
+
+def small(count: int = 1) -> Simulator:
+    return Simulator(make_configs(load_config("tiny"), count=count))
+
+
+def test_episodes_get_files_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with small() as sim, Recorder(path, every=1) as rec:
+        for steps in (0, 3, 5):
+            sim.reset()
+            rec.begin(sim)
+            for _ in range(steps):
+                rec.add(sim.step())
+        assert rec.file == tmp_path / "run-2.rrd"
+    assert {p.name for p in tmp_path.iterdir()} == {"run.rrd", "run-2.rrd"}
+    assert len(read(path)["/dc/ny/series/pue"]["step"]) == 3
+    assert len(read(tmp_path / "run-2.rrd")["/dc/ny/map/power"]["step"]) == 5
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_interrupted_recording_is_whole(tmp_path: Path, error: type[BaseException]) -> None:
+    path = tmp_path / "cut.rrd"
+    path.write_text("older")
+
+    def cut(sim: Simulator) -> None:
+        with Recorder(path) as rec:
+            sim.reset()
+            rec.begin(sim)
+            for step in range(400):
+                rec.add(sim.step())
+                if step < recorder.BLOCK_STEPS - 1:
+                    assert path.read_text() == "older", "replaced with the first block"
+            raise error
+
+    with small() as sim, pytest.raises(error):
+        cut(sim)
+    assert [p.name for p in tmp_path.iterdir()] == ["cut.rrd"]
+    assert verify(path).returncode == 0
+    assert len(read(path)["/dc/ny/series/pue"]["step"]) == 400
+
+
+def test_names_that_are_not_distinct_are_told_apart(tmp_path: Path) -> None:
+    twins = make_configs(load_config("tiny")) * 3
+    with Simulator(twins) as sim, Recorder(tmp_path / "x.rrd", focus=["ny#0", "ny#2"]) as rec:
+        sim.reset()
+        rec.begin(sim)
+        rec.add(sim.step())
+    maps = [path for path in read(tmp_path / "x.rrd") if path.endswith("map/inlet")]
+    assert sorted(maps) == [r"/dc/ny\#0/map/inlet", r"/dc/ny\#2/map/inlet"]
+
+
+def test_results_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    with small() as sim, small(2) as other, Recorder(tmp_path / "a.rrd") as rec:
+        sim.reset()
+        with pytest.raises(SdcError, match="begin"):
+            rec.add(sim.step())
+        sim.reset()
+        rec.begin(sim)
+        first = sim.step()
+        rec.add(first, rewards={"a": np.zeros(1)})
+        with pytest.raises(SdcError, match="step 0 after step 0"):
+            rec.add(first, rewards={"a": np.zeros(1)})
+        with pytest.raises(SdcError, match="rewards none, expected a"):
+            rec.add(sim.step())
+        with pytest.raises(SdcError, match="the simulator has done 2 steps"):
+            rec.add(first)
+        other.reset()
+        with pytest.raises(SdcError, match="2 data centers and 8 racks, expected 1 and 4"):
+            rec.add(other.step())
+
+
+@pytest.mark.parametrize(
+    ("target", "arguments", "message"),
+    [
+        ("x.txt", {}, r"must end in \.rrd"),
+        ("none/x.rrd", {}, "is no folder"),
+        ("", {}, "must end"),
+        (None, {}, "neither a file"),
+        ("x.rrd", {"every": 0}, "every 0"),
+        ("x.rrd", {"every": 2.0}, "every 2.0"),
+        ("x.rrd", {"focus": ["ny-0", "ny"]}, "focus 'ny': no such data center; valid: ny-0"),
+        ("x.rrd", {"focus": ["ny-0"] * 2}, "1 to 4 different"),
+        ("x.rrd", {"focus": []}, "1 to 4 different"),
+        ("x.rrd", {"focus": [1]}, "1 to 4 different"),
+        ("x.rrd", {"focus": [f"ny-{i}" for i in range(5)]}, "1 to 4 different"),
+        ("x.rrd", {"serve_port": 99999}, "port 99999"),
+        ("rerun+http://127.0.0.1:9876/proxy", {"serve_port": 0}, "valid is one of them"),
+        ("http://127.0.0.1:9876/proxy", {}, "no address of a viewer"),
+        ("rerun+http://127.0.0.1:port/proxy", {}, "no address of a viewer"),
+        ("rerun+http://127.0.0.1/proxy", {}, "no address of a viewer"),
+    ],
+)
+def test_bad_arguments(
+    tmp_path: Path, target: str | None, arguments: dict[str, Any], message: str
+) -> None:
+    address = target is None or "://" in target
+    with small(3) as sim, pytest.raises(SdcError, match=message):
+        Recorder(target if address else tmp_path / str(target), **arguments).begin(sim)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.repo
+def test_benchmark_measures_the_cost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = str(Path(__file__).parent.parent / "benchmarks" / "recording.py")
+    monkeypatch.setattr(sys, "argv", [script, "--quick", "--out", str(tmp_path)])
+    runpy.run_path(script, run_name="__main__")
+    (row,) = json.loads((tmp_path / "recording.json").read_text(encoding="utf-8"))
+    assert row["ratio"] == pytest.approx(row["on_us"] / row["off_us"])
+    assert row["on_us"] > row["off_us"] > 0
+    assert row["file_mb"] > 0.1
+    assert row["memory_mb"] > 10, "rerun-sdk at the least"
+    assert row["name"] in (tmp_path / "recording.md").read_text(encoding="utf-8")
+
+
+def test_missing_rerun_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(SdcError, match="pip install rerun-sdk"):
+        Recorder(tmp_path / "x.rrd")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,676 @@
+"""The report of a recorded run: it says what the files hold, and needs nothing beside itself."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner, Result
+
+from report_reader import Page, pictures, read_page
+from sdc_taichi import DataCenterConfig, SdcError, Simulator, load_config, make_configs
+from sdc_taichi.cli import app
+from sdc_taichi.control import make_controller
+from sdc_taichi.run import Asked, record
+from sdc_taichi.viz import dashboards, fleet_figures, recorded, report
+from sdc_taichi.viz.recorded import read_run, read_steps
+
+NASTY = '<script>alert("1")</script> & $x_{$\n</style>東'
+STEPS = 2 * 96
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["report", *map(str, arguments)])
+
+
+def simulate(
+    out: Path,
+    configs: list[DataCenterConfig],
+    steps: int,
+    controller: str = "idle",
+    done: int | None = None,
+) -> dict[str, Any]:
+    """Record a run that is stopped after ``done`` steps."""
+    count = 0
+
+    def stop() -> bool:
+        nonlocal count
+        count += 1
+        return done is not None and count > done
+
+    with Simulator(configs) as sim:
+        driver = make_controller(controller, sim.fleet)
+        written = record(sim, driver, Asked(controller, steps), out, stop=stop)
+    assert written is not None
+    return written
+
+
+def two_halls() -> list[DataCenterConfig]:
+    """Two sites, one with a name that is HTML and a heat wave at the end of February."""
+    heat = "events.scheduled=[{kind: heat_wave, start_h: 12, duration_h: 3, offset_k: 8}]"
+    ny, ca = make_configs(load_config("tiny", ["site.start=02-28"]), sites=["NY", "CA"])
+    hot = load_config("tiny", ["site.start=02-28", heat])
+    ca = ca.model_copy(update={"name": NASTY, "events": hot.events, "description": NASTY})
+    return [ny, ca]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs")
+    simulate(out / "greedy", two_halls(), STEPS, "load=greedy-ci,battery=greedy-ci")
+    simulate(out / "idle", two_halls(), STEPS)
+    return out
+
+
+@pytest.fixture(scope="module")
+def html(folder: Path) -> str:
+    done = call(folder / "greedy", folder / "idle")
+    assert done.exit_code == 0, done.output
+    assert done.stdout == f"Report: {folder / 'greedy' / 'report.html'}\n"
+    return (folder / "greedy" / "report.html").read_text("utf-8")
+
+
+@pytest.fixture(scope="module")
+def page(html: str) -> Page:
+    return read_page(html)
+
+
+def test_page_is_whole_and_needs_nothing_else(html: str, page: Page) -> None:
+    assert page.problems == []
+    assert html.startswith("<!DOCTYPE html>\n")
+    assert not page.all("script") + page.all("link") + page.all("iframe")
+    assert not any(name.startswith("on") for _, attributes in page.elements for name in attributes)
+    assert not re.search(r"https?:|@import|url\(", html)
+    assert not re.search(
+        r"""\b(src|srcset|href|data|action)\s*=\s*(?!"data:image/webp;base64,|"#)""", html
+    )
+    for tag, attributes in page.elements:
+        if tag == "a":
+            assert str(attributes["href"]).startswith("#")
+    (policy,) = [m for m in page.all("meta") if m.get("http-equiv")]
+    assert policy["content"] == "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+
+def test_page_is_accessible(page: Page) -> None:
+    assert page.all("html") == [{"lang": "en"}]
+    assert len(page.all("main")) == len(page.all("h1")) == 1
+    ids = [str(a["id"]) for _, a in page.elements if "id" in a]
+    assert len(ids) == len(set(ids))
+    assert [str(a["href"])[1:] for a in page.all("a")] == ids
+    assert {a.get("scope") for a in page.all("th")} == {"col", "row", "rowgroup"}
+    assert len(page.all("caption")) == len(page.all("table"))
+    for image in page.all("img"):
+        assert len(str(image["alt"])) > 40
+    assert len(page.all("figcaption")) == len(page.all("img"))
+
+
+def test_pictures_are_in_the_page(page: Page) -> None:
+    # Radar, two of the fleet, five of each data center, four of the inputs.
+    images = pictures(page)
+    assert len(images) == 1 + 2 + 2 * 5 + 4
+    for image in images:
+        assert len(image.convert("RGB").getcolors(1 << 20)) > 30
+
+
+def test_names_are_text(html: str, page: Page) -> None:
+    line = " ".join(NASTY.split())
+    assert f"Data center {line}" in page.text
+    assert f"Run of ny, {line} under" in page.text
+    assert "<script" not in html
+    assert html.count("</style>") == 1
+
+
+def test_tables_hold_the_metrics(folder: Path, page: Page) -> None:
+    about = json.loads((folder / "greedy" / "metrics.json").read_text("utf-8"))
+    columns = [dc["metrics"] for dc in about["data_centers"]] + [about["total"]]
+    for _, group in report.METRICS:
+        for key, label, unit in group:
+            expected = [fleet_figures.number(column[key]) for column in columns]
+            assert [label, unit, *expected] in page.rows(label), key
+    assert ["metric", "unit", "ny", NASTY, "all"] in page.rows("metric")
+
+
+def test_every_metric_is_in_the_tables(folder: Path) -> None:
+    about = json.loads((folder / "greedy" / "metrics.json").read_text("utf-8"))
+    listed = [key for _, group in report.METRICS for key, *_ in group]
+    assert len(set(listed)) == len(listed)
+    # Said elsewhere: where the hottest inlet was; the same as what the battery delivered.
+    others = {"hottest_dc", "hottest_row", "hottest_rack", "hottest_server", "hottest_step"}
+    others |= {"battery_throughput_kwh"}
+    assert set(about["total"]) == set(listed) | others
+
+
+def test_summary_says_what_ran(folder: Path, page: Page) -> None:
+    about = json.loads((folder / "greedy" / "metrics.json").read_text("utf-8"))
+    assert "2 data centers, 2 days from 28 February 00:00 to 2 March 00:00" in page.text
+    (row,) = page.rows("fingerprint of configs, inputs and precision")
+    assert row[1] == about["fingerprint"]
+    assert page.rows("controller") == [["controller", "load=greedy-ci,battery=greedy-ci"]]
+    assert "taichi" in page.rows("versions")[0][1]
+    assert "Inputs are SYNTHETIC" in page.text
+    for kind in ("weather", "carbon", "workload"):
+        for row in page.rows(kind):
+            assert "synthetic year, seed 10" in row[1]
+            assert row[2] == "–"
+    total = about["total"]
+    hot = pd.read_parquet(folder / "greedy" / "steps.parquet", columns=["time", "inlet_max_c"])
+    when = hot["time"].iloc[int(hot["inlet_max_c"].to_numpy().argmax())]
+    dc = total["hottest_dc"]
+    racks = next(c for c in two_halls() if c.name == dc).hall.racks_per_row
+    row, rack = divmod(total["hottest_rack"], racks)
+    assert (
+        f"The hottest inlet was {total['hottest_inlet_c']:.4g} °C in {' '.join(dc.split())}, "
+        f"row {row}, rack {rack}, server {total['hottest_server']} from the floor, on "
+        f"{when.day} {when:%B %H:%M}."
+    ) in page.text
+
+
+def test_work_adds_up(folder: Path, page: Page) -> None:
+    total = json.loads((folder / "greedy" / "metrics.json").read_text("utf-8"))["total"]
+    steps = pd.read_parquet(folder / "greedy" / "steps.parquet", columns=["step", "queue_tasks"])
+    left = steps["queue_tasks"][steps["step"] == STEPS - 1].sum()
+    assert left > 0, "this run leaves work"
+    number = fleet_figures.number
+    assert (
+        f"Of {number(total['arrived_tasks'])} tasks that arrived, "
+        f"{number(total['executed_tasks'])} were done, 0 dropped (0 %) and 0 lost with their "
+        f"servers; {number(left)} were queued at the end."
+    ) in page.text
+
+
+def test_small_powers_keep_their_digits(folder: Path, page: Page) -> None:
+    (steps,) = read_steps(read_run(folder / "greedy"), [0], ["inlet_max_c", "it_w", "hvac_w"])
+    at = steps.iloc[int(steps["inlet_max_c"].to_numpy().argmax())]
+    it, hvac = (fleet_figures.number(at[name] / 1e3) for name in ("it_w", "hvac_w"))
+    assert "." in hvac
+    assert f"IT {it} kW, HVAC {hvac} kW" in page.text
+    (alt,) = [str(i["alt"]) for i in page.all("img") if "Highest power" in str(i["alt"])]
+    assert re.search(r"Highest power \d+\.\d+ kW", alt)
+
+
+def test_equal_inputs_share_a_line(page: Page) -> None:
+    work, weather = (
+        next(str(i["alt"]) for i in page.all("img") if str(i["alt"]).startswith(what))
+        for what in ("Arriving work", "Outdoor temperature")
+    )
+    assert re.search(rf"Means: ny, {re.escape(NASTY)} [\d.]+\.", work)
+    assert re.search(rf"Means: ny [-\d.]+, {re.escape(NASTY)} [-\d.]+\.", weather)
+
+
+def test_words_stay_whole_but_for_long_ones(folder: Path) -> None:
+    run = read_run(folder / "greedy")
+    cells = re.findall(r'<t[hd][^>]*?(?: class="([^"]+)")?>([^<]*)</t', report._summary(run))
+    classes = {text: kind for kind, text in cells}
+    assert classes[run.about["fingerprint"]] == "long"
+    assert classes["fingerprint of configs, inputs and precision"] == ""
+
+
+def many_events(run: recorded.RecordedRun) -> recorded.RecordedRun:
+    about = json.loads(json.dumps(run.about))
+    first, second = about["data_centers"]
+    first["events"] = [
+        {"kind": "crac_down", "target": 1, "start_step": 4 * i, "end_step": 4 * i + 2}
+        for i in range(30, 0, -1)
+    ]
+    second["events"] += [{"kind": "grid_outage", "start_step": i, "end_step": i + 4}
+                         for i in range(20)]  # fmt: skip
+    return recorded.RecordedRun(run.folder, about)
+
+
+def test_many_events_are_told_by_kind(folder: Path) -> None:
+    page = read_page(report._events(many_events(read_run(folder / "greedy"))))
+    name = NASTY
+    assert page.tables[0][1:] == [
+        ["crac down", "30", "1", "15", "28 February 01:00 in ny"],
+        ["grid outage", "20", "1", "20", f"28 February 00:00 in {name}"],
+        ["heat wave", "1", "1", "3", f"28 February 12:00 in {name}"],
+    ]
+    assert "51 events that the run met, by kind; all are in metrics.json" in page.text
+
+
+def test_times_of_long_runs_have_a_year(folder: Path) -> None:
+    run = read_run(folder / "greedy")
+    long = recorded.RecordedRun(run.folder, run.about | {"steps_done": 400 * 96})
+    moment = report._local(long, 0, 366 * 96)
+    assert report._clock(long, moment) == "1 March (year 2) 00:00"
+    assert report._clock(run, moment) == "1 March 00:00"
+
+
+def test_events_are_listed(page: Page) -> None:
+    (row,) = page.rows(NASTY)
+    assert row[1:] == ["heat wave", "", "+8 K", "28 February 12:00", "3", "48 to 59"]
+    assert "1 event that the run met" in page.text
+
+
+def test_runs_are_compared(folder: Path, page: Page) -> None:
+    ours, theirs = (
+        json.loads((folder / name / "metrics.json").read_text("utf-8"))["total"]
+        for name in ("greedy", "idle")
+    )
+    change = 100 * (theirs["cfp_kg"] / ours["cfp_kg"] - 1)
+    label = "carbon footprint"
+    expected = [fleet_figures.number(t["cfp_kg"]) for t in (ours, theirs)]
+    assert [label, "kg CO₂e", expected[0], f"{expected[1]} ({change:+.2f} %)"] in page.rows(label)
+    (radar,) = [str(i["alt"]) for i in page.all("img") if "Radar" in str(i["alt"])]
+    assert f"carbon footprint {max(expected)} kg CO₂e" in radar
+    assert "Other configs" not in page.text, "both have the same inputs"
+
+
+def test_runs_of_other_configs_say_so(folder: Path, tmp_path: Path) -> None:
+    colder = [c.model_copy(update={"name": f"x{i}"}) for i, c in enumerate(two_halls())]
+    simulate(tmp_path / "colder", colder, STEPS)
+    page = read_page(report._comparison([read_run(folder / "idle"), read_run(tmp_path / "colder")]))
+    assert "Other configs, inputs or precision than idle (idle): idle (colder)." in page.text
+
+
+def test_runs_of_other_length_are_refused(folder: Path, tmp_path: Path) -> None:
+    simulate(tmp_path / "short", two_halls(), STEPS, done=50)
+    done = call(folder / "greedy", tmp_path / "short", "--out", tmp_path / "x.html")
+    assert done.exit_code == 2
+    assert "short: 12.5 h" in done.stderr
+    assert "must be of equal length" in done.stderr
+    assert not (tmp_path / "x.html").exists()
+
+
+def test_interrupted_run_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "_pictures", lambda *_: "")
+    simulate(tmp_path / "cut", [load_config("tiny")], 960, done=30)
+    (tmp_path / "cut" / "report.html").write_text("older")
+    done = call(tmp_path / "cut")
+    assert done.exit_code == 0, done.output
+    assert done.stderr == f"note: {tmp_path / 'cut'}: interrupted after 30 of 960 steps\n"
+    html = (tmp_path / "cut" / "report.html").read_text("utf-8")
+    assert "The run was interrupted: 30 of 960 steps" in read_page(html).text
+    assert sorted(p.name for p in (tmp_path / "cut").iterdir()) == [
+        "config.yaml", "metrics.json", "report.html", "steps.parquet",
+    ]  # fmt: skip
+
+
+def test_equal_runs_give_equal_bytes(folder: Path, html: str) -> None:
+    run = read_run(folder / "greedy")
+    dc = report._shown(run)[0]
+    for text in (report._summary(run), report._metrics(run), report._fleet(run)):
+        assert text in html
+    drawn = report.picture(dashboards.hot_racks(dc.steps, dc.config.hall, "ny"), "", "")
+    assert re.findall(r'src="[^"]+"', drawn)[0] in html
+
+
+def test_one_step_has_tables_alone(tmp_path: Path) -> None:
+    simulate(tmp_path / "run", [load_config("tiny")], 1)
+    page = read_page(report.report_html(read_run(tmp_path / "run")))
+    assert page.problems == []
+    assert "A single step has no pictures." in page.text
+    assert not page.all("img")
+
+
+def test_files_are_named_with_their_hashes(folder: Path) -> None:
+    run = read_run(folder / "idle")
+    digest = "ab" * 32
+    run.about["synthetic"] = False
+    for dc in run.about["data_centers"]:
+        dc["provenance"]["weather"] = "LGA.epw"
+        dc["sha256"] = {"weather": digest, "recirculation": digest}
+    page = read_page(report._provenance(run))
+    assert page.rows("weather") == [["weather", "LGA.epw", digest, f"ny, {NASTY}"]]
+    assert page.rows("recirculation")[0][2] == digest
+    assert "SYNTHETIC" not in read_page(report._summary(run)).text
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("fleet") / "run"
+    rules = {
+        "hvac.chiller.reference_cop": {"uniform": [4.0, 6.5]},
+        "hvac.setpoint.initial_c": {"choice": [18.0, 20.0, 22.0]},
+    }
+    configs = make_configs(load_config("tiny"), count=60, sites=["NY", "CA", "WA"], sample=rules)
+    simulate(out, configs, 24)
+    return out
+
+
+def test_large_fleet_shows_extremes(fleet: Path) -> None:
+    run = read_run(fleet)
+    page = read_page(report._metrics(run))
+    by_pue = sorted(run.about["data_centers"], key=lambda dc: dc["metrics"]["pue"])
+    worst, best = by_pue[-1], by_pue[0]
+    (row,) = page.rows("PUE")
+    number = fleet_figures.number
+    mean = np.mean([dc["metrics"]["pue"] for dc in by_pue])
+    assert row[2:] == [
+        f"{number(best['metrics']['pue'])} {best['name']}",
+        number(float(mean)),
+        f"{number(worst['metrics']['pue'])} {worst['name']}",
+        number(run.about["total"]["pue"]),
+    ]
+    first, third = page.rows("1"), page.rows("3")
+    assert first[0][2] == f"{worst['name']}:\u00a0{number(worst['metrics']['pue'])}"
+    assert first[1][2] == f"{best['name']}:\u00a0{number(best['metrics']['pue'])}"
+    assert third[0][2].startswith(by_pue[-3]["name"])
+    assert first[0][5] == "all 0", "nothing was dropped, so nobody is ranked"
+
+
+def test_large_fleet_has_few_pictures(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = read_run(fleet)
+    drawn = []
+
+    def draw(_: object, dc: Any, __: object) -> str:
+        drawn.append(dc.index)
+        return ""
+
+    monkeypatch.setattr(report, "_pictures", draw)
+    html = report.report_html(run)
+    page = read_page(html)
+    assert page.problems == []
+    assert "Run of 60 data centers under idle" in page.text
+    sections = re.findall(r"Data center ([a-z0-9-]+)</h2>", html)
+    assert sections == [run.names[index] for index in drawn]
+    assert 2 <= len(sections) <= report.SHOWN_DCS
+    worst = max(run.about["data_centers"], key=lambda dc: dc["metrics"]["pue"])
+    assert worst["name"] in sections
+    assert re.search(r"Shown because it has the [^.]*highest PUE[^.]* of 60\.", page.text)
+    assert "The 40 hottest of 60 are shown." in page.text
+
+
+def test_equal_data_centers_are_not_told_apart(tmp_path: Path) -> None:
+    simulate(tmp_path / "run", make_configs(load_config("tiny"), count=6), 2)
+    (shown,) = report._shown(read_run(tmp_path / "run"))
+    assert shown.index == 0
+    assert shown.why == "hottest inlet, PUE and carbon are equal in all"
+
+
+def test_fleet_sums_and_maxima(fleet: Path) -> None:
+    run = read_run(fleet)
+    found = recorded.read_fleet(run)
+    steps = pd.read_parquet(fleet / "steps.parquet")
+    by_step = steps.groupby("step")
+    for name in ("it_w", "hvac_w", "carbon_g"):
+        np.testing.assert_allclose(found.series[name], by_step[name].sum())
+    np.testing.assert_array_equal(found.series["inlet_max_c"], by_step["inlet_max_c"].max())
+    np.testing.assert_allclose(found.series["inlet_high_c"], by_step["inlet_max_c"].quantile(0.9))
+    inlets = steps["inlet_max_c"].to_numpy().reshape(24, 60)
+    np.testing.assert_array_equal(found.inlet_max_c, inlets)
+
+
+def test_rows_are_read_across_row_groups(fleet: Path, tmp_path: Path) -> None:
+    """Several row groups, and intervals that cross them."""
+    copy = copied(fleet.parent, tmp_path, fleet.name)
+    table = pq.read_table(fleet / "steps.parquet")
+    pq.write_table(table, copy / "steps.parquet", row_group_size=60 * 5)
+    assert pq.ParquetFile(copy / "steps.parquet").num_row_groups == 5
+    run = read_run(copy)
+    one, other = read_steps(run, [3, 59], ["soc", "inlet_max_c"])
+    steps = table.to_pandas()
+    for found, dc in ((one, 3), (other, 59)):
+        expected = steps[steps["dc"] == run.names[dc]].reset_index(drop=True)
+        for column in ("step", "time", "soc", "inlet_max_c"):
+            assert (found[column] == expected[column]).all()
+
+
+def test_long_runs_are_shown_in_intervals(tmp_path: Path) -> None:
+    simulate(tmp_path / "run", two_halls(), 900)
+    found = recorded.read_fleet(read_run(tmp_path / "run"))
+    inlets = pd.read_parquet(tmp_path / "run" / "steps.parquet")["inlet_max_c"].to_numpy()
+    # 900 steps of a quarter of an hour in at most 400 intervals: an hour each.
+    expected = np.reshape(inlets, (225, 4, 2)).max(axis=1)
+    np.testing.assert_array_equal(found.inlet_max_c, expected)
+    assert found.edges[1] - found.edges[0] == np.timedelta64(1, "h")
+    assert found.edges[-1] == np.datetime64("2001-03-09T09:00"), "the end of the run"
+
+
+# Bad input
+
+
+def copied(folder: Path, tmp_path: Path, name: str = "idle") -> Path:
+    return Path(shutil.copytree(folder / name, tmp_path / "copy"))
+
+
+def edit_metrics(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    path = folder / "metrics.json"
+    about = json.loads(path.read_text("utf-8"))
+    change(about)
+    path.write_text(json.dumps(about), "utf-8")
+
+
+def edit_event(folder: Path, **values: object) -> None:
+    edit_metrics(folder, lambda about: about["data_centers"][1]["events"][0].update(values))
+
+
+def edit_steps(folder: Path, change: Callable[[Any], Any]) -> None:
+    path = folder / "steps.parquet"
+    table = pq.read_table(path)
+    changed = change(table)
+    pq.write_table(changed.replace_schema_metadata(table.schema.metadata), path)
+
+
+def cut_in_half(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def flip(path: Path) -> None:
+    """Damage the pages of the columns that are read last, not the footer."""
+    data = bytearray(path.read_bytes())
+    for at in range(len(data) // 8, len(data) // 2):
+        data[at] ^= 0x5A
+    path.write_bytes(data)
+
+
+BAD: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no metrics": (lambda f: (f / "metrics.json").unlink(), r"metrics\.json: no such file"),
+    "no JSON": (lambda f: (f / "metrics.json").write_text("{"), r"metrics\.json: cannot be read"),
+    "not text": (
+        lambda f: (f / "metrics.json").write_bytes(b"\xff\xfe"),
+        r"metrics\.json: cannot be read",
+    ),
+    "older format": (
+        lambda f: edit_metrics(f, lambda a: a.update(format="sdc-run/0")),
+        r"metrics\.json: format 'sdc-run/0'; valid is 'sdc-run/1'",
+    ),
+    "a list": (
+        lambda f: (f / "metrics.json").write_text("[]"),
+        r"metrics\.json: format 'list'; valid is",
+    ),
+    "no seed": (
+        lambda f: edit_metrics(f, lambda a: a.pop("seed")),
+        r"metrics\.json: seed is missing; valid is of type int",
+    ),
+    "text for a number": (
+        lambda f: edit_metrics(f, lambda a: a.update(steps_done="all")),
+        r"metrics\.json: steps_done is 'all'",
+    ),
+    "more done than asked": (
+        lambda f: edit_metrics(f, lambda a: a.update(steps_done=10_000)),
+        r"metrics\.json: steps_done 10000 of steps_asked 192",
+    ),
+    "no data centers": (
+        lambda f: edit_metrics(f, lambda a: a.update(data_centers=[])),
+        r"metrics\.json: data_centers is empty",
+    ),
+    "no name": (
+        lambda f: edit_metrics(f, lambda a: a["data_centers"][1].pop("name")),
+        r"metrics\.json: data_centers\[1\]\.name is missing",
+    ),
+    "no PUE": (
+        lambda f: edit_metrics(f, lambda a: a["data_centers"][1]["metrics"].pop("pue")),
+        r"metrics\.json: data_centers\[1\]\.metrics\.pue is missing",
+    ),
+    "PUE as text": (
+        lambda f: edit_metrics(f, lambda a: a["total"].update(pue="low")),
+        r"metrics\.json: total\.pue is 'low'; valid is a number",
+    ),
+    "no energy": (
+        lambda f: edit_metrics(f, lambda a: a["total"].update(it_kwh=None)),
+        r"metrics\.json: total\.it_kwh is None",
+    ),
+    "event without steps": (
+        lambda f: edit_metrics(f, lambda a: a["data_centers"][1]["events"][0].pop("end_step")),
+        r"metrics\.json: data_centers\[1\]\.events\[0\]\.end_step is missing",
+    ),
+    "share as text": (
+        lambda f: edit_event(f, share="x"),
+        r"metrics\.json: data_centers\[1\]\.events\[0\]\.share is 'x'; valid is a number 0\.\.1",
+    ),
+    "no share": (lambda f: edit_event(f, share=None), r"metrics\.json: .*\.share is None"),
+    "huge offset": (lambda f: edit_event(f, offset_k=1e308), r"metrics\.json: .*\.offset_k is 1e"),
+    "event before the run": (
+        lambda f: edit_event(f, start_step=-(10**9)),
+        r"metrics\.json: .*events\[0\]: steps -1000000000 to 60; valid is a start in 0\.\.191",
+    ),
+    "event after the run": (
+        lambda f: edit_event(f, start_step=10**9, end_step=10**18),
+        r"metrics\.json: .*events\[0\]: steps 1000000000 to",
+    ),
+    "event without end": (
+        lambda f: edit_event(f, end_step=10**400),
+        r"metrics\.json: .*: steps 48",
+    ),
+    "infinite step": (
+        lambda f: edit_metrics(f, lambda a: a["total"].update(hottest_step=float("inf"))),
+        r"metrics\.json: total\.hottest_step is inf; valid is a whole number, 0\.\.191",
+    ),
+    "half a step": (
+        lambda f: edit_metrics(f, lambda a: a["total"].update(hottest_step=3.7)),
+        r"metrics\.json: total\.hottest_step is 3\.7",
+    ),
+    "step after the run": (
+        lambda f: edit_metrics(f, lambda a: a["total"].update(hottest_step=192)),
+        r"metrics\.json: total\.hottest_step is 192",
+    ),
+    "PUE that is no number": (
+        lambda f: edit_metrics(f, lambda a: a["total"].update(pue=float("nan"))),
+        r"metrics\.json: total\.pue is nan; valid is a number",
+    ),
+    "endless carbon": (
+        lambda f: edit_metrics(f, lambda a: a["total"].update(cfp_kg=float("inf"))),
+        r"metrics\.json: total\.cfp_kg is inf",
+    ),
+    "true carbon": (
+        lambda f: edit_metrics(f, lambda a: a["total"].update(cfp_kg=True)),
+        r"metrics\.json: total\.cfp_kg is True",
+    ),
+    "no PUE of used energy": (
+        lambda f: edit_metrics(f, lambda a: a["total"].update(pue=None)),
+        r"metrics\.json: total\.pue is None",
+    ),
+    "longer steps": (
+        lambda f: edit_metrics(f, lambda a: a.update(step_h=0.5)),
+        r"steps\.parquet: step_h 0\.25 is not that of metrics\.json, 0\.5",
+    ),
+    "another precision": (
+        lambda f: edit_metrics(f, lambda a: a.update(precision="f16")),
+        r"steps\.parquet: precision '\w+' is not that of metrics\.json, 'f16'",
+    ),
+    "another name": (
+        lambda f: edit_metrics(f, lambda a: a["data_centers"][0].update(name="x")),
+        r"steps\.parquet: data_centers\[0\]\.name 'ny' is not that of metrics\.json, 'x'",
+    ),
+    "another start": (
+        lambda f: edit_metrics(f, lambda a: a["data_centers"][0].update(start="02-30")),
+        r"steps\.parquet: data_centers\[0\]\.start '02-28' is not that of metrics\.json, '02-30'",
+    ),
+    "hottest nowhere": (
+        lambda f: edit_metrics(f, lambda a: a["total"].update(hottest_dc="x")),
+        r"metrics\.json: total\.hottest_dc 'x'",
+    ),
+    "no steps": (lambda f: (f / "steps.parquet").unlink(), r"steps\.parquet: no such file"),
+    "cut": (lambda f: cut_in_half(f / "steps.parquet"), r"steps\.parquet: cannot be read as Parq"),
+    "empty": (lambda f: (f / "steps.parquet").write_bytes(b""), r"steps\.parquet: cannot be read"),
+    "damaged": (lambda f: flip(f / "steps.parquet"), r"steps\.parquet: row group 0 is damaged"),
+    "not ours": (
+        lambda f: pq.write_table(pa.table({"x": [1]}), f / "steps.parquet"),
+        r"steps\.parquet: no sdc_taichi metadata",
+    ),
+    "another run": (
+        lambda f: edit_metrics(f, lambda a: a.update(fingerprint="0")),
+        r"steps\.parquet: fingerprint '[0-9a-f]{64}' is not that of metrics\.json, '0'",
+    ),
+    "fewer rows": (
+        lambda f: edit_steps(f, lambda t: t.slice(0, 100)),
+        r"steps\.parquet: 100 rows, expected 384",
+    ),
+    "other order": (
+        lambda f: edit_steps(f, lambda t: t.take(np.arange(384).reshape(-1, 2).T.ravel())),
+        r"steps\.parquet: row group 0: rows are not in order of step and data center",
+    ),
+    "no column": (
+        lambda f: edit_steps(f, lambda t: t.drop_columns(["inlet_max_c"])),
+        r"steps\.parquet: no column inlet_max_c",
+    ),
+    "whole numbers": (
+        lambda f: edit_steps(
+            f,
+            lambda t: t.set_column(
+                t.schema.get_field_index("it_w"), "it_w", pa.array(np.zeros(384, dtype=np.int32))
+            ),
+        ),
+        r"steps\.parquet: column it_w is int32 with 0 empty values; valid is double",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_runs_are_one_line(folder: Path, tmp_path: Path, case: str) -> None:
+    copy = copied(folder, tmp_path)
+    spoil, message = BAD[case]
+    spoil(copy)
+    done = call(copy)
+    assert done.exit_code == 2, done.output
+    assert re.match(rf"error: {re.escape(str(copy))}/{message}", done.stderr), done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (copy / "report.html").exists()
+
+
+def test_folders_that_hold_no_run(folder: Path, tmp_path: Path) -> None:
+    for arguments, message in (
+        ([tmp_path / "none"], "none: no such folder"),
+        ([folder / "idle" / "metrics.json"], "metrics.json: is a file; valid is a folder"),
+        ([tmp_path], "metrics.json: no such file"),
+        ([folder / "idle", folder / "idle"], "idle: is given twice"),
+        ([folder / "idle", "--force"], "--force: valid with --out; DIR/report.html is replaced"),
+        ([folder / "idle", "--out", tmp_path / "x.pdf"], r"valid is a name that ends in .html"),
+        ([folder / "idle", "--out", tmp_path / "none" / "x.html"], "cannot be written"),
+    ):
+        done = call(*arguments)
+        assert done.exit_code == 2
+        assert message in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_file_is_replaced_only_with_force(tmp_path: Path) -> None:
+    simulate(tmp_path / "run", [load_config("tiny")], 1)
+    out = tmp_path / "x.html"
+    out.write_text("older")
+    done = call(tmp_path / "run", "--out", out)
+    assert done.exit_code == 2
+    assert out.read_text() == "older"
+    assert call(tmp_path / "run", "--out", out, "--force").exit_code == 0
+    assert out.read_text().startswith("<!DOCTYPE html>")
+    assert not (tmp_path / "run" / "report.html").exists()
+
+
+def test_missing_matplotlib_is_explained(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    done = call(copied(folder, tmp_path))
+    assert done.exit_code == 2
+    assert 'pip install "sdc-taichi[plot]"' in done.stderr
+    assert not (tmp_path / "copy" / "report.html").exists()
+
+
+def test_configs_are_read_from_the_steps(folder: Path) -> None:
+    run = read_run(folder / "idle")
+    first, second = recorded.read_configs(run, [0, 1])
+    assert [first, second] == two_halls()
+    with pytest.raises(SdcError):
+        recorded.read_configs(recorded.RecordedRun(folder / "none", run.about), [0])

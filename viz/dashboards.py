@@ -1,0 +1,442 @@
+"""Dashboards of a run of one data center, from the rows that it has in steps.parquet.
+
+Every function takes a pandas table with a column ``time`` and the columns of
+``StepResult.per_dc()``, one row per step, and returns a matplotlib ``Figure``. Times are local
+standard time; the year is a placeholder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.config import HallConfig
+from sdc_taichi.errors import SdcError
+from sdc_taichi.metrics import HOT_INLET_C
+from sdc_taichi.types import F64
+
+from .figures import (
+    BLUE,
+    GREEN,
+    GREY,
+    LABELLED_RACKS,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    check_steps,
+    clean,
+    day_of_run,
+    draw_carbon,
+    draw_power,
+    draw_steps,
+    draw_storage,
+    finish,
+    format_time,
+    new_figure,
+    outline_hottest,
+    plain,
+    rack_grid,
+    scaled,
+    set_title,
+    short,
+    step_edges,
+    step_hours,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+DAY_COLUMNS = (
+    "supply_c",
+    "inlet_max_c",
+    "load_command",
+    "cooling_command",
+    "battery_command",
+    "throttled_racks",
+    "tripped_racks",
+    "grid_up",
+)
+"""Columns that ``day`` reads beyond ``figures.COLUMNS``."""
+
+CARPETS = (
+    ("outdoor_c", 1.0, "outdoor (°C)", "inferno"),
+    ("inlet_max_c", 1.0, "hottest inlet (°C)", "inferno"),
+    ("it_w", 1e-3, "IT power (kW)", "viridis"),
+    ("hvac_w", 1e-3, "HVAC power (kW)", "viridis"),
+    ("ci_g_per_kwh", 1.0, "carbon intensity (g CO₂e/kWh)", "cividis"),
+    ("carbon_kg_per_h", 1.0, "emitted (kg CO₂e/h)", "cividis"),
+)
+"""What ``year`` shows by day and hour: column, factor, label, colour map."""
+
+ENERGY_COLUMNS = ("it_kwh", "hvac_kwh", "carbon_g")
+SCATTER_MARKS = 6_000
+"""Most points of a scatter; of longer runs as many are drawn."""
+MOST_BARS_NAMED = 13
+EVENT_SHADES = {
+    "crac_down": (BLUE, "//"),
+    "chiller_derate": (GREEN, "\\\\"),
+    "rack_fan_failure": (GREY, ".."),
+    "heat_wave": ("#B8A800", "--"),
+}
+"""Colour and hatching; a grid outage is shaded where steps.parquet has it."""
+_DAY = np.timedelta64(1, "D")
+
+
+def day(
+    steps: pd.DataFrame, date: str, title: str = "", events: Sequence[Mapping[str, Any]] = ()
+) -> Figure:
+    """One day: temperatures, power by device, carbon, commands, queue and battery.
+
+    Hours in which racks are throttled or tripped, the grid is down or an event lasts are shaded.
+
+    Args:
+        steps: the run.
+        date: ``MM-DD``, the first such day of the run, or with the year of its times before it.
+        title: written above, such as the name of the data center.
+        events: those of the data center in metrics.json.
+
+    Raises:
+        SdcError: matplotlib or a column is missing, or the run does not have the day.
+    """
+    from matplotlib.dates import DateFormatter, HourLocator
+
+    figure = new_figure(12.0, 12.0)
+    check_steps(steps)
+    check_steps(steps, ("time", *DAY_COLUMNS))
+    first, after = _rows_of_day(steps, date)
+    shown = steps.iloc[first:after]
+    check_steps(shown)
+    panels = figure.subplots(5, 1, sharex=True, height_ratios=[4, 4, 3, 2, 3])
+    _draw_day_temperatures(panels[0], shown, events)
+    draw_power(panels[1], shown)
+    draw_carbon(panels[2], shown)
+    _draw_commands(panels[3], shown)
+    # What the day begins with is what the step before left.
+    draw_storage(panels[4], steps.iloc[max(first - 1, 0) : after])
+    panels[-1].xaxis.set_major_locator(HourLocator(range(0, 24, 3)))  # type: ignore[no-untyped-call]
+    panels[-1].xaxis.set_major_formatter(DateFormatter("%H:%M"))  # type: ignore[no-untyped-call]
+    begin = shown["time"].iloc[0].normalize()
+    panels[-1].set_xlim(begin, begin + _DAY)
+    name = day_of_run(begin, over_a_year=_is_over_a_year(steps))
+    panels[-1].set_xlabel(f"local standard time on {name}")
+    set_title(figure, short(title))
+    return figure
+
+
+def hottest_day(steps: pd.DataFrame) -> str:
+    """Day of the hottest inlet as ``day`` takes it, the first of equal ones."""
+    hottest = steps["time"].iloc[int(steps["inlet_max_c"].to_numpy().argmax())]
+    return str(hottest.strftime("%Y-%m-%d"))
+
+
+def year(steps: pd.DataFrame, title: str = "") -> Figure:
+    """A run of two days to years: what each hour of each day was like, and monthly totals.
+
+    Args:
+        steps: the run.
+        title: written above, such as the name of the data center.
+
+    Raises:
+        SdcError: matplotlib or a column is missing, or the run has fewer than two days.
+    """
+    figure = new_figure(14.0, 12.5)
+    columns = {name for name, *_ in CARPETS} - {"carbon_kg_per_h"}
+    check_steps(steps, ("time", *sorted(columns), *ENERGY_COLUMNS))
+    step_h = step_hours(steps)
+    if len(steps) * step_h < 48.0:
+        raise SdcError(
+            f"steps: {len(steps) * step_h:g} h; valid are two days or more, figures.overview shows "
+            "shorter runs"
+        )
+    shown = steps.assign(carbon_kg_per_h=steps["carbon_g"] / 1e3 / step_h)
+    grid = figure.subplots(4, 2, height_ratios=[3, 3, 3, 3])
+    for axes, (name, factor, label, cmap) in zip(grid[:3].ravel(), CARPETS, strict=True):
+        _draw_carpet(axes, shown["time"], factor * shown[name].to_numpy(), label, cmap)
+    for axes in grid[:2].ravel():
+        axes.tick_params(labelbottom=False)
+        axes.set_xlabel("")
+    _draw_totals(grid[3], steps)
+    set_title(figure, short(title))
+    return figure
+
+
+def setpoint_scatter(steps: pd.DataFrame, title: str = "") -> Figure:
+    """Which setpoint was used at which weather and load, and what it cost and did.
+
+    Every point is a step, at its outdoor temperature and IT power; three panels colour it by the
+    setpoint, by HVAC power over IT power and by the hottest inlet.
+
+    Args:
+        steps: the run.
+        title: written above, such as the name of the data center.
+
+    Raises:
+        SdcError: matplotlib or a column is missing.
+    """
+    figure = new_figure(14.0, 4.8)
+    check_steps(steps, ("time", "outdoor_c", "it_w", "hvac_w", "setpoint_c", "inlet_max_c"))
+    shown = steps[(steps["it_w"] > 0).to_numpy()]
+    # In a fixed random order, so that no season hides another.
+    shown = shown.iloc[np.random.default_rng(0).permutation(len(shown))[:SCATTER_MARKS]]
+    share = 100.0 * shown["hvac_w"] / shown["it_w"]
+    for axes, values, label, cmap in zip(
+        figure.subplots(1, 3, sharex=True, sharey=True),
+        (shown["setpoint_c"], share, shown["inlet_max_c"]),
+        ("setpoint (°C)", "HVAC over IT power (%)", "hottest inlet (°C)"),
+        ("viridis", "cividis", "inferno"),
+        strict=True,
+    ):
+        marks = axes.scatter(
+            shown["outdoor_c"],
+            shown["it_w"] / 1e3,
+            c=values,
+            cmap=cmap,
+            s=4.0 if len(shown) > 1500 else 12.0,
+            linewidths=0,
+        )
+        figure.colorbar(marks, ax=axes, label=label, orientation="horizontal", shrink=0.9)
+        axes.set_xlabel("outdoor (°C)")
+        axes.spines[:].set_visible(False)
+        axes.grid(alpha=0.25)
+        if axes.get_subplotspec().is_first_col():
+            axes.set_ylabel("IT power (kW)")
+    set_title(figure, short(title))
+    return figure
+
+
+def battery_profile(steps: pd.DataFrame, title: str = "") -> Figure:
+    """Carbon intensity, battery power and charge over the hours of a day.
+
+    Lines are means over the days of the run, bands hold 80 % of them.
+
+    Args:
+        steps: the run.
+        title: written above, such as the name of the data center.
+
+    Raises:
+        SdcError: matplotlib or a column is missing.
+    """
+    figure = new_figure(9.0, 8.0)
+    check_steps(steps, ("time", "ci_g_per_kwh", "charge_kwh", "discharge_kwh", "soc"))
+    step_h = step_hours(steps)
+    hours = _hour_of_day(steps)
+    panels = figure.subplots(3, 1, sharex=True)
+    _draw_daily_band(panels[0], steps["ci_g_per_kwh"], hours + step_h / 2, RED)
+    panels[0].set_ylabel("carbon intensity\n(g CO₂e/kWh)")
+    edges = np.append(np.unique(hours), np.unique(hours)[-1] + step_h)
+    for name, sign, colour, label in (
+        ("charge_kwh", 1.0, BLUE, "charging"),
+        ("discharge_kwh", -1.0, ORANGE, "discharging"),
+    ):
+        power = sign * (steps[name] / step_h).groupby(hours).mean().to_numpy()
+        panels[1].stairs(power, edges, fill=True, color=colour, label=label, alpha=0.85)
+    panels[1].axhline(0.0, color="black", linewidth=0.8)
+    panels[1].set_ylabel("battery, mean (kW)")
+    # At the ends of the steps, for which it stands.
+    _draw_daily_band(panels[2], 100.0 * steps["soc"], hours + step_h, GREEN)
+    panels[2].set_ylabel("battery charge (%)")
+    panels[2].set_ylim(0, 100)
+    for axes in panels:
+        finish(axes)
+    panels[-1].set_xticks(range(0, 25, 3), [f"{h:02d}:00" for h in range(0, 25, 3)])
+    panels[-1].set_xlim(0, 24)
+    panels[-1].set_xlabel("local standard time")
+    set_title(figure, short(title))
+    return figure
+
+
+def hot_racks(steps: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
+    """Where the hottest inlet was: hours that each rack had it, and how hot it was there.
+
+    Args:
+        steps: the run.
+        hall: the hall of the data center.
+        title: written above, such as the name of the data center.
+
+    Raises:
+        SdcError: matplotlib or a column is missing, or a rack that the hall does not have.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    figure = new_figure(9.6, 4.2)
+    check_steps(steps, ("time", "hottest_rack", "inlet_max_c"))
+    racks = steps["hottest_rack"].to_numpy().astype(np.int64)
+    if racks.min() < 0 or racks.max() >= hall.racks:
+        wrong = racks.min() if racks.min() < 0 else racks.max()
+        raise SdcError(f"steps: hottest_rack {wrong}; the hall has racks 0..{hall.racks - 1}")
+    shape = (hall.rows, hall.racks_per_row)
+    hours = np.bincount(racks, minlength=hall.racks) * step_hours(steps)
+    peak = np.full(hall.racks, -np.inf)
+    np.maximum.at(peak, racks, steps["inlet_max_c"].to_numpy())
+    axes = figure.subplots()
+    grid = hours.reshape(shape)
+    image = rack_grid(axes, np.ma.masked_equal(grid, 0.0), "viridis", (0.0, float(hours.max())))
+    axes.set_facecolor("#EEEEEE")
+    if hall.racks <= LABELLED_RACKS:
+        for rack in np.flatnonzero(hours):
+            row, column = divmod(int(rack), hall.racks_per_row)
+            ink = "black" if hours[rack] > 0.6 * hours.max() else "white"
+            text = f"{hours[rack]:,.4g} h\nto {peak[rack]:.1f} °C"
+            axes.text(column + 0.5, row + 0.5, text, color=ink, ha="center", va="center",
+                      fontsize=9)  # fmt: skip
+    where = outline_hottest(axes, peak.reshape(shape))
+    lead = f"{plain(title)}: " if title else ""
+    axes.set_title(f"{lead}hottest inlet {peak.max():.1f} °C, {where}", fontsize=10, loc="left")
+    ticks = MaxNLocator(6, steps=[1, 2, 5, 10])
+    figure.colorbar(image, ax=axes, label="time as the hottest rack (h)", ticks=ticks)
+    return figure
+
+
+def _is_over_a_year(steps: pd.DataFrame) -> bool:
+    return bool(steps["time"].iloc[-1] - steps["time"].iloc[0] >= 365 * _DAY)
+
+
+def _rows_of_day(steps: pd.DataFrame, date: str) -> tuple[int, int]:
+    """First row of a day, and the first after it."""
+    days, first = np.unique(steps["time"].to_numpy().astype("datetime64[D]"), return_index=True)
+    names = [str(each) for each in days]
+    found = [i for i, name in enumerate(names) if date in (name, name[-5:])]
+    if not found:
+        raise SdcError(
+            f"date {date!r}: valid is MM-DD of a day of the run, "
+            f"{names[0][-5:]} to {names[-1][-5:]} ({len(days)} days)"
+        )
+    rows = [*map(int, first), len(steps)]
+    return rows[found[0]], rows[found[0] + 1]
+
+
+def _draw_day_temperatures(
+    axes: Axes, steps: pd.DataFrame, events: Sequence[Mapping[str, Any]]
+) -> None:
+    for name, colour, label, width in (
+        ("outdoor_c", GREY, "outdoor", 1.4),
+        ("wet_bulb_c", SKY, "wet bulb", 1.4),
+        ("inlet_max_c", RED, "hottest inlet", 1.4),
+        # Mostly equal, so the wider line shows on both sides of the other.
+        ("supply_c", "#80B8D8", "supply air", 4.0),
+        ("setpoint_c", "black", "setpoint", 1.2),
+    ):
+        draw_steps(axes, steps, steps[name], color=colour, linewidth=width, label=label)
+    axes.axhline(HOT_INLET_C, color=RED, linewidth=0.8, linestyle=":")
+    flags = [
+        ((steps["throttled_racks"] > 0).to_numpy(), ORANGE, "", "racks throttled"),
+        ((steps["tripped_racks"] > 0).to_numpy(), RED, "", "racks tripped"),
+        ((steps["grid_up"] < 1).to_numpy(), PINK, "", "grid down"),
+    ]
+    if events:
+        step = steps["step"].to_numpy()
+        for kind in dict.fromkeys(str(event["kind"]) for event in events):
+            lasts = [
+                (step >= event["start_step"]) & (step < event["end_step"])
+                for event in events
+                if event["kind"] == kind
+            ]
+            if kind != "grid_outage":
+                shade = EVENT_SHADES.get(kind, (GREY, ""))
+                flags.append((np.any(lasts, axis=0), *shade, kind.replace("_", " ")))
+    edges = step_edges(steps)
+    for flag, colour, hatch, label in flags:
+        change = np.diff(flag.astype(np.int8), prepend=0, append=0)
+        spans = zip(np.flatnonzero(change == 1), np.flatnonzero(change == -1), strict=True)
+        for count, (first, after) in enumerate(spans):
+            axes.axvspan(edges[first], edges[after], facecolor=(colour, 0.25),
+                         edgecolor=(colour, 0.5), hatch=hatch, linewidth=0,
+                         label="" if count else label)  # fmt: skip
+    axes.set_ylabel("temperature (°C)")
+    finish(axes)
+
+
+def _draw_commands(axes: Axes, steps: pd.DataFrame) -> None:
+    # Of different width, because they are often equal.
+    for name, colour, label, width in (
+        ("load_command", PINK, "load (− defer, + drain)", 5.0),
+        ("cooling_command", SKY, "setpoint (steps)", 2.8),
+        ("battery_command", "black", "battery (− discharge, + charge)", 1.2),
+    ):
+        draw_steps(axes, steps, steps[name], color=colour, linewidth=width, label=label)
+    axes.set_ylabel("command")
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, -1.1), max(high, 1.1))
+    finish(axes)
+
+
+def _draw_carpet(axes: Axes, times: pd.Series, values: F64, label: str, cmap: str) -> None:
+    """Days to the right, hours of the day upwards; hours that the run does not have stay white."""
+    from matplotlib.dates import date2num
+    from matplotlib.ticker import MaxNLocator
+
+    moments = times.to_numpy()
+    dates = moments.astype("datetime64[D]")
+    interval = moments[1] - moments[0]
+    slots = (moments - dates) // interval
+    columns = ((dates - dates[0]) / _DAY).astype(np.int64)
+    shown = np.full((int(_DAY // interval), columns[-1] + 1), np.nan)
+    shown[slots, columns] = values
+    span = [float(date2num(d)) for d in (dates[0], dates[-1] + _DAY)]  # type: ignore[no-untyped-call]
+    image = axes.imshow(
+        np.ma.masked_invalid(shown),
+        aspect="auto",
+        origin="lower",
+        extent=(span[0], span[1], 0.0, 24.0),
+        cmap=cmap,
+        interpolation="nearest",
+    )
+    axes.xaxis_date()
+    format_time(axes)
+    axes.set_yticks(range(0, 25, 6), [f"{h:02d}:00" for h in range(0, 25, 6)])
+    axes.set_ylabel("time of day")
+    axes.spines[:].set_visible(False)
+    figure = axes.figure
+    figure.colorbar(image, ax=axes, label=label, ticks=MaxNLocator(5, steps=[1, 2, 5, 10]))
+
+
+def _draw_totals(both: npt.NDArray[np.object_], steps: pd.DataFrame) -> None:
+    """Energy and carbon per month, or per day of runs up to two months."""
+    import pandas as pd
+
+    times = steps["time"]
+    months = (times.iloc[-1] - times.iloc[0]).days >= 62
+    period = pd.PeriodIndex(times, freq="M" if months else "D")
+    sums = steps[list(ENERGY_COLUMNS)].groupby(period).sum()
+    names = [each.strftime("%b" if months else "%d") for each in pd.PeriodIndex(sums.index)]
+    places = np.arange(len(sums))
+    per = "month" if months else "day"
+    energy, carbon = both
+    tops, unit = scaled(sums[["it_kwh", "hvac_kwh"]].to_numpy().cumsum(axis=1), "kWh", "MWh")
+    energy.bar(places, tops[:, 0], color=BLUE, label="IT")
+    energy.bar(places, tops[:, 1] - tops[:, 0], bottom=tops[:, 0], color=ORANGE, label="HVAC")
+    energy.set_ylabel(f"energy ({unit}/{per})")
+    finish(energy)
+    emitted, unit = scaled(sums["carbon_g"].to_numpy() / 1e3, "kg", "t")
+    carbon.bar(places, emitted, color=GREY)
+    carbon.set_ylabel(f"emitted ({unit} CO₂e/{per})")
+    clean(carbon)
+    every = -(-len(sums) // MOST_BARS_NAMED)
+    over = _is_over_a_year(steps)
+    span = " to ".join(day_of_run(times.iloc[i], over_a_year=over) for i in (0, -1))
+    for axes in (energy, carbon):
+        axes.set_axisbelow(True)
+        axes.set_xticks(places[::every], names[::every])
+        axes.set_xlabel(f"{'month' if months else 'day of the month'}, {span}")
+
+
+def _hour_of_day(steps: pd.DataFrame) -> F64:
+    times = steps["time"].to_numpy()
+    since = times - times.astype("datetime64[D]")
+    return np.asarray(since / np.timedelta64(1, "h"), dtype=np.float64)
+
+
+def _draw_daily_band(axes: Axes, values: pd.Series, hours: F64, colour: str) -> None:
+    """Values by the hour of the day for which they stand."""
+    groups = values.groupby(hours)
+    mean, low, high = groups.mean(), groups.quantile(0.1), groups.quantile(0.9)
+    axes.fill_between(
+        mean.index, low, high, color=colour, alpha=0.25, linewidth=0, label="80 % of days"
+    )
+    axes.plot(mean.index, mean, color=colour, linewidth=1.6, label="mean")
