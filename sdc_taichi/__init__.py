@@ -24,6 +24,7 @@ from sdc_taichi.types import (
 
 if TYPE_CHECKING:
     from sdc_taichi.envs.parallel import aec_env, parallel_env
+    from sdc_taichi.envs.recording import EpisodeRecorder, RecordEpisodes
     from sdc_taichi.envs.rewards import register_reward
     from sdc_taichi.envs.vector import vector_env
 
@@ -39,10 +40,12 @@ __all__ = [
     "DataCenterConfig",
     "DataError",
     "Drivers",
+    "EpisodeRecorder",
     "Exogenous",
     "FanAction",
     "Fleet",
     "LoadAction",
+    "RecordEpisodes",
     "RuntimeStateError",
     "SdcError",
     "ServerLayers",
@@ -63,6 +66,8 @@ __all__ = [
 
 # Imported on first use, as they bring PettingZoo and the environments with them.
 _LAZY = {
+    "EpisodeRecorder": "sdc_taichi.envs.recording",
+    "RecordEpisodes": "sdc_taichi.envs.recording",
     "aec_env": "sdc_taichi.envs.parallel",
     "parallel_env": "sdc_taichi.envs.parallel",
     "register_reward": "sdc_taichi.envs.rewards",

@@ -10,8 +10,9 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from sdc_taichi.envs import rendering
-from sdc_taichi.envs.core import Core, Observation, Source
+from sdc_taichi.envs.core import Observation, Source
 from sdc_taichi.envs.options import make_options
+from sdc_taichi.envs.recording import RecordedCore, Recording
 from sdc_taichi.envs.standards import OneDataCenter, first, floats, start_day, start_days
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall import Precision
@@ -28,6 +29,7 @@ class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type
         config: a preset, a file or a config.
         precision: of the server kernels, ``f32`` or ``f64``.
         render_mode: None or ``rgb_array``.
+        recorder: records episodes: a file ending in .rrd, or what ``EpisodeRecorder`` says.
         options: fields of ``EnvOptions``.
 
     Raises:
@@ -47,10 +49,11 @@ class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type
         *,
         precision: Precision = "f32",
         render_mode: str | None = None,
+        recorder: Recording = None,
         **options: Any,
     ) -> None:
         rendering.check_render_mode(render_mode)
-        self.core = core_of_one(config, precision, options)
+        self.core = core_of_one(config, precision, options, recorder)
         self.render_mode = render_mode
         self.possible_agents: list[str] = list(self.core.agents)
         self.agents: list[str] = []
@@ -158,13 +161,15 @@ def aec_env(config: Source = "corrected", **options: Any) -> AECEnv[str, Observa
     return parallel_to_aec(parallel_env(config, **options))
 
 
-def core_of_one(config: Source, precision: Precision, options: Mapping[str, Any]) -> Core:
+def core_of_one(
+    config: Source, precision: Precision, options: Mapping[str, Any], recorder: Recording
+) -> RecordedCore:
     """The core of a single environment.
 
     Raises:
-        ConfigError: several configs, or an option that is not valid.
+        SdcError: several configs, or an option or recorder that is not valid.
     """
-    core = Core(config, make_options(**options), precision=precision)
+    core = RecordedCore(config, make_options(**options), precision=precision, recorder=recorder)
     if core.num_envs != 1:
         raise ConfigError(f"config: {core.num_envs} data centers; valid is one, or vector_env")
     return core

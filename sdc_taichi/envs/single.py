@@ -14,6 +14,7 @@ from sdc_taichi.envs import rendering
 from sdc_taichi.envs.core import Core, Observation, Source, Step, as_array
 from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.envs.parallel import core_of_one
+from sdc_taichi.envs.recording import Recording
 from sdc_taichi.envs.standards import OneDataCenter, first, floats, start_day, start_days
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.hall import Precision
@@ -151,13 +152,16 @@ def options_for(agent: str | None, options: Mapping[str, Any]) -> dict[str, Any]
     return {**options, "agents": (agent,)}
 
 
-def _new_columns(core: Core) -> dict[str, npt.NDArray[np.int64]]:
+def _new_columns(core: Core) -> dict[str, npt.NDArray[np.int64] | slice]:
     """Columns of each agent's observation whose features no agent before it has."""
     known: set[Any] = set()
-    out: dict[str, npt.NDArray[np.int64]] = {}
+    out: dict[str, npt.NDArray[np.int64] | slice] = {}
     for agent, features in core.features.items():
         new = np.repeat([f not in known for f in features], [f.size for f in features])
-        out[agent] = np.flatnonzero(new)
+        kept = np.flatnonzero(new)
+        # Side by side they need no copy of their own.
+        run = len(kept) > 0 and kept[-1] - kept[0] == len(kept) - 1
+        out[agent] = slice(int(kept[0]), int(kept[-1]) + 1) if run else kept
         known.update(features)
     return out
 
@@ -194,6 +198,7 @@ class SdcEnv(OneDataCenter, gymnasium.Env[Any, Any]):
         precision: of the server kernels, ``f32`` or ``f64``.
         render_mode: None or ``rgb_array``.
         registered_agent: set by the ids of one agent.
+        recorder: records episodes: a file ending in .rrd, or what ``EpisodeRecorder`` says.
         options: fields of ``EnvOptions``.
 
     Raises:
@@ -213,11 +218,12 @@ class SdcEnv(OneDataCenter, gymnasium.Env[Any, Any]):
         precision: Precision = "f32",
         render_mode: str | None = None,
         registered_agent: str | None = None,
+        recorder: Recording = None,
         **options: Any,
     ) -> None:
         rendering.check_render_mode(render_mode)
         agent = one_agent(agent, registered_agent)
-        self.core = core_of_one(config, precision, options_for(agent, options))
+        self.core = core_of_one(config, precision, options_for(agent, options), recorder)
         self.render_mode = render_mode
         self._learner = learner(self.core, agent)
         self.observation_space = self._learner.observation_space

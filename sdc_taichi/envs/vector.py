@@ -14,6 +14,7 @@ from sdc_taichi.envs import rendering
 from sdc_taichi.envs.core import Core, Observation, Source
 from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.envs.options import make_options
+from sdc_taichi.envs.recording import RecordedCore, Recording
 from sdc_taichi.envs.single import learner, one_agent, options_for
 from sdc_taichi.envs.standards import ManyDataCenters, start_day, start_days
 from sdc_taichi.errors import ConfigError
@@ -39,6 +40,8 @@ class SdcVectorEnv(ManyDataCenters, VectorEnv[Any, Any, npt.NDArray[Any]]):
         registered_agent: set by the ids of one agent.
         autoreset_mode: when the next episodes start, as the enum or its value: in the step that
             ends the last ones, in the step after it, or only by ``reset``.
+        recorder: records episodes of the first environment into a file ending in .rrd, or what
+            ``EpisodeRecorder`` says.
         options: fields of ``EnvOptions``.
 
     Raises:
@@ -55,13 +58,14 @@ class SdcVectorEnv(ManyDataCenters, VectorEnv[Any, Any, npt.NDArray[Any]]):
         render_mode: str | None = None,
         registered_agent: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        recorder: Recording = None,
         **options: Any,
     ) -> None:
         rendering.check_render_mode(render_mode)
         self._mode = _autoreset_mode(autoreset_mode)
         agent = one_agent(agent, registered_agent)
         chosen = make_options(**options_for(agent, options))
-        self.core = Core(config, chosen, num_envs, precision)
+        self.core = RecordedCore(config, chosen, num_envs, precision, recorder)
         self.num_envs = num_envs = self.core.num_envs
         self.render_mode = render_mode
         self.metadata = {
@@ -233,11 +237,12 @@ class MultiAgentVectorEnv(ManyDataCenters):
             infos["final_obs"], infos["final_state"] = observations, self.core.state()
             observations = self.core.next_episode()
             infos["start_day"] = start_days(self.core)
+        ended = np.ones if done.ended else np.zeros
         return (
             observations,
             {agent: reward.astype(np.float32) for agent, reward in done.rewards.items()},
             {agent: np.zeros(self.num_envs, dtype=np.bool_) for agent in self.agents},
-            {agent: np.full(self.num_envs, done.ended) for agent in self.agents},
+            {agent: ended(self.num_envs, dtype=np.bool_) for agent in self.agents},
             infos,
         )
 
@@ -263,6 +268,7 @@ def vector_env(
     *,
     precision: Precision = "f32",
     render_mode: str | None = None,
+    recorder: Recording = None,
     **options: Any,
 ) -> MultiAgentVectorEnv:
     """A batch of data centers with several learning agents each.
@@ -275,12 +281,14 @@ def vector_env(
         config: a preset, a file, or configs; environment i takes config i modulo their number.
         precision: of the server kernels, ``f32`` or ``f64``.
         render_mode: None or ``rgb_array``.
+        recorder: records episodes of the first environment into a file ending in .rrd, or what
+            ``EpisodeRecorder`` says.
         options: fields of ``EnvOptions``.
 
     Raises:
         SdcError: a config, number or option that is not valid.
     """
-    core = Core(config, make_options(**options), num_envs, precision)
+    core = RecordedCore(config, make_options(**options), num_envs, precision, recorder)
     return MultiAgentVectorEnv(core, render_mode)
 
 

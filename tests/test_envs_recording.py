@@ -1,0 +1,489 @@
+"""Recorded episodes: what is in the files, which there are, and that nothing else changes."""
+
+from __future__ import annotations
+
+import copy
+import gc
+import pickle
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+import pytest
+from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from rerun.chunk import RrdReader
+
+import sdc_taichi
+from rrd import read, scalars
+from sdc_taichi import EpisodeRecorder, RecordEpisodes, SdcError, load_config
+from sdc_taichi.envs.forecasts import ForecastError
+from sdc_taichi.envs.recording import cubes
+from sdc_taichi.viz import recorder as recorder_module
+from sdc_taichi.viz.recorder import Recorder
+from sdc_taichi.viz.streams import RecordingWarning
+
+STEPS = 96
+ALL: Callable[[int], bool] = lambda episode: True  # noqa: E731
+EVENTFUL = load_config(
+    "tiny",
+    [
+        "name=hall",
+        "events.sampled=[{kind: heat_wave, per_year: 2000, duration_h: [1, 4], offset_k: 5}]",
+    ],
+)
+BUSY: dict[str, Any] = {
+    "config": EVENTFUL,
+    "days": 1,
+    "actions": "continuous",
+    "forecast_error": ForecastError(ci_share=0.2, temperature_k=3.0),
+    "rewards": {"agent_dc": {"cost": 1.0, "hot_inlets": 0.1}},
+}
+"""Everything at once that is random, or goes on from step to step."""
+
+
+def lines(
+    entities: dict[str, dict[str, list[Any]]], path: str
+) -> dict[str, npt.NDArray[np.float64]]:
+    """Lines of a plot by name."""
+    (names,) = entities[path]["SeriesLines:names"]
+    return dict(zip(names, scalars(entities[path]).T, strict=True))
+
+
+def steps_of(path: Path, name: str = "tiny") -> list[int]:
+    """Steps that a recording of a data center holds, if it has been written to its end."""
+    RrdReader(path)  # warns of a recording without its index
+    return read(path)[f"/dc/{name}/series/pue"]["step"]
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def same(a: Any, b: Any) -> bool:
+    return bool(data_equivalence(a, b, exact=True))
+
+
+def play(env: Any, steps: int, seed: int | None = 7) -> list[Any]:
+    """All that an environment gives in a number of steps; what has ended is reset."""
+    random = np.random.default_rng(3)
+    spaces = getattr(env, "action_spaces", None)
+    out = [env.reset(seed=seed)]
+
+    def act(space: Any) -> Any:
+        size = getattr(env, "num_envs", None)
+        if spaces is None:
+            size = None  # Gymnasium's spaces of a batch are batched
+        shape = space.shape if size is None else (size, *space.shape)
+        if isinstance(space, gymnasium.spaces.Box):
+            return random.uniform(-1.0, 1.0, shape).astype(np.float32)
+        return random.integers(0, 3, shape)
+
+    for _ in range(steps):
+        if spaces is None:
+            action = act(env.action_space)
+        else:
+            action = {agent: act(spaces[agent]) for agent in env.agents}
+        out.append(copy.deepcopy(env.step(action)))
+        over = not env.agents if hasattr(env, "possible_agents") else out[-1][3] is True
+        if over:
+            out.append(env.reset())
+    return out
+
+
+def go_on(env: Any, steps: int) -> None:
+    for _ in range(steps):
+        env.step(dict.fromkeys(env.agents, 1))
+
+
+KINDS: dict[str, Callable[..., Any]] = {
+    "parallel_env": sdc_taichi.parallel_env,
+    "make": lambda **options: gymnasium.make("sdc_taichi/Joint-v0", **options),
+    "make_vec": lambda **options: gymnasium.make_vec("sdc_taichi/Joint-v0", num_envs=3, **options),
+    "vector_env": lambda **options: sdc_taichi.vector_env(3, **options),
+}
+
+
+@pytest.mark.filterwarnings(
+    # Gymnasium recommends -1..1; a setpoint change is in K.
+    "ignore:.*For Box action spaces, we recommend using a symmetric and normalized:UserWarning"
+)
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_bits_whether_recorded_or_not(kind: str, tmp_path: Path) -> None:
+    make = KINDS[kind]
+    recorder = EpisodeRecorder(tmp_path / "run.rrd", episode_trigger=ALL, every=1)
+    recorded, plain = make(recorder=recorder, **BUSY), make(**BUSY)
+    steps = 2 * STEPS + 10
+    assert same(play(recorded, steps), play(plain, steps))
+    recorded.close()
+    plain.close()
+    assert files(tmp_path) == [f"run-episode-{i}.rrd" for i in range(3)]
+
+
+def test_a_recording_holds_the_steps_and_the_rewards(tmp_path: Path) -> None:
+    env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
+    played = play(env, STEPS)
+    env.close()
+    path = tmp_path / "run-episode-0.rrd"
+    assert steps_of(path) == list(range(STEPS))
+    entities = read(path)
+    infos = [step[4]["agent_ls"] for step in played[1 : STEPS + 1]]
+    rewards = [step[1] for step in played[1 : STEPS + 1]]
+    power = lines(entities, "/dc/tiny/series/power_kw")
+    np.testing.assert_allclose(power["IT [kW]"], [i["it_w"] / 1e3 for i in infos], rtol=1e-12)
+    found = lines(entities, "/dc/tiny/series/rewards")
+    for agent in env.possible_agents:
+        np.testing.assert_array_equal(found.pop(f"{agent} [-]"), [r[agent] for r in rewards])
+    # The terms that the rewards are made of: in part of step carbon and energy shares.
+    assert list(found) == [f"{t} [-]" for t in ("carbon", "facility_energy", "queue", "dropped")]
+    np.testing.assert_array_equal(found["dropped [-]"], [-i["dropped_tasks"] for i in infos])
+    assert np.all(found["carbon [-]"] <= 0)
+    assert found["carbon [-]"].min() < 0
+    day = int(played[0][1]["agent_ls"]["start_day"])
+    first = entities["/dc/tiny/series/pue"]["sim_time"][0]
+    assert str(first) == str(np.datetime64("2001-01-01") + day) + " 00:00:00"
+
+
+def test_rewards_of_ones_own_are_recorded_by_agent(tmp_path: Path) -> None:
+    env = sdc_taichi.parallel_env(
+        "tiny", days=1, rewards=lambda result, view: -result.it_kwh, recorder=tmp_path / "a.rrd"
+    )
+    played = play(env, 3)
+    env.close()
+    found = lines(read(tmp_path / "a-episode-0.rrd"), "/dc/tiny/series/rewards")
+    assert list(found) == [f"{agent} [-]" for agent in env.possible_agents]
+    expected = [step[1]["agent_bat"] for step in played[1:]]
+    np.testing.assert_array_equal(found["agent_bat [-]"], expected)
+
+
+# --- which episodes, which environments ---
+
+
+def test_default_episodes_are_those_of_record_video() -> None:
+    found = [episode for episode in range(2100) if cubes(episode)]
+    assert found == [0, 1, 8, 27, 64, 125, 216, 343, 512, 729, 1000, 2000]
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_a_file_per_chosen_episode_in_every_autoreset_mode(
+    mode: AutoresetMode, tmp_path: Path
+) -> None:
+    env: Any = gymnasium.make_vec(
+        "sdc_taichi/Battery-v0",
+        num_envs=2,
+        config="tiny",
+        days=1,
+        autoreset_mode=mode,
+        recorder=EpisodeRecorder(tmp_path / "run.rrd", episode_trigger=lambda e: e != 1, every=8),
+    )
+    env.reset(seed=0)
+    started = 1
+    for _ in count():
+        ended = env.step(env.action_space.sample())[3].all()
+        if ended and started == 3:
+            break
+        if ended:
+            started += 1
+            if mode is AutoresetMode.DISABLED:
+                env.reset()
+    # The last episode is over: its file is whole before anything closes it.
+    assert steps_of(tmp_path / "run-episode-2.rrd", r"tiny\#0") == list(range(STEPS))
+    env.close()
+    names = [f"run-episode-{episode}.rrd" for episode in (0, 2)]
+    assert files(tmp_path) == names
+    for name in names:
+        assert steps_of(tmp_path / name, r"tiny\#0") == list(range(STEPS))
+
+
+def test_chosen_environments_of_one_config(tmp_path: Path) -> None:
+    recorder = EpisodeRecorder(tmp_path / "run.rrd", envs=[4, 1])
+    env = sdc_taichi.vector_env(6, "tiny", days=1, recorder=recorder)
+    played = play(env, 20)
+    env.close()
+    entities = read(tmp_path / "run-episode-0.rrd")
+    recorded = {path.split("/")[2] for path in entities if path.startswith("/dc/")}
+    assert recorded == {r"tiny\#1", r"tiny\#4"}
+    for i in (1, 4):
+        power = lines(entities, rf"/dc/tiny\#{i}/series/power_kw")["IT [kW]"]
+        expected = [step[4]["it_w"][i] / 1e3 for step in played[1:]]
+        np.testing.assert_allclose(power, expected, rtol=1e-12)
+        rewards = lines(entities, rf"/dc/tiny\#{i}/series/rewards")
+        # The recording has what the environment gives in single precision.
+        given = [step[1]["agent_dc"][i] for step in played[1:]]
+        np.testing.assert_array_equal(rewards["agent_dc [-]"].astype(np.float32), given)
+    one, other = (lines(entities, rf"/dc/tiny\#{i}/series/power_kw") for i in (1, 4))
+    assert np.any(one["IT [kW]"] != other["IT [kW]"])
+
+
+def test_environments_of_different_names_go_by_them(tmp_path: Path) -> None:
+    config = load_config("tiny")
+    listed = [config.model_copy(update={"name": name}) for name in ("a", "b", "b")]
+    recorder = EpisodeRecorder(tmp_path / "run.rrd", envs=(0, 2))
+    env = sdc_taichi.vector_env(None, listed, days=1, recorder=recorder)
+    play(env, 2)
+    env.close()
+    entities = read(tmp_path / "run-episode-0.rrd")
+    recorded = {path.split("/")[2] for path in entities if path.startswith("/dc/")}
+    assert recorded == {"a", r"b\#2"}
+
+
+def test_the_wrapper_is_the_argument(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"num_envs": 3, "config": "tiny", "days": 1}
+    settings: dict[str, Any] = {"episode_trigger": lambda e: e == 1, "envs": [2], "every": 4}
+    given = EpisodeRecorder(tmp_path / "given.rrd", **settings)
+    by_argument = gymnasium.make_vec("sdc_taichi/Cooling-v0", recorder=given, **options)
+    inside = gymnasium.make_vec("sdc_taichi/Cooling-v0", **options)
+    wrapped = RecordEpisodes(
+        gymnasium.wrappers.vector.RecordEpisodeStatistics(inside),
+        tmp_path / "wrapped.rrd",
+        **settings,
+    )
+    for env in (by_argument, wrapped):
+        play(env, STEPS + 5)
+        env.close()
+    names = ("given", "wrapped")
+    assert files(tmp_path) == [f"{name}-episode-1.rrd" for name in names]
+    found = [read(tmp_path / f"{name}-episode-1.rrd") for name in names]
+    for entity in ("series/power_kw", "series/rewards"):
+        a, b = (lines(entities, rf"/dc/tiny\#2/{entity}") for entities in found)
+        assert same(a, b)
+        assert len(next(iter(a.values()))) == 5
+
+
+def test_a_recorder_of_ones_own(tmp_path: Path) -> None:
+    env = sdc_taichi.parallel_env("tiny", days=1, recorder=Recorder(tmp_path / "run.rrd", every=2))
+    for seed in range(3):
+        play(env, 5 + seed, seed)
+    env.close()
+    assert files(tmp_path) == ["run-2.rrd", "run.rrd"]
+    assert steps_of(tmp_path / "run.rrd") == list(range(5))
+    assert steps_of(tmp_path / "run-2.rrd") == list(range(6))
+
+
+# --- ends ---
+
+
+def test_closed_and_reset_in_the_middle_of_an_episode(tmp_path: Path) -> None:
+    env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
+    play(env, 30)
+    play(env, 7)
+    assert steps_of(tmp_path / "run-episode-0.rrd") == list(range(30))
+    env.close()
+    env.close()
+    assert steps_of(tmp_path / "run-episode-1.rrd") == list(range(7))
+
+
+def test_an_episode_without_a_step_leaves_no_file(tmp_path: Path) -> None:
+    env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
+    env.reset(seed=0)
+    env.close()
+    assert files(tmp_path) == []
+
+
+def test_an_environment_that_is_dropped_leaves_a_whole_file(tmp_path: Path) -> None:
+    env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
+    play(env, 11)
+    del env
+    gc.collect()
+    assert steps_of(tmp_path / "run-episode-0.rrd") == list(range(11))
+
+
+SCRIPT = """
+import os, signal, sys
+import sdc_taichi
+
+plain = sdc_taichi.parallel_env("tiny", days=1)
+plain.reset(seed=0)
+assert "rerun" not in sys.modules, "imported without a recording"
+env = sdc_taichi.parallel_env("tiny", days=1, recorder=sys.argv[1])
+env.reset(seed=0)
+for step in range(96):
+    env.step({agent: 1 for agent in env.agents})
+    if step == 41:
+        os.kill(os.getpid(), signal.SIGINT)
+"""
+
+
+def test_interrupted_training_leaves_a_whole_file(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, tmp_path / "run.rrd"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode != 0
+    *_, last = done.stderr.splitlines()
+    assert last.startswith("KeyboardInterrupt"), done.stderr
+    assert done.stderr.count("Traceback") == 1, done.stderr
+    assert steps_of(tmp_path / "run-episode-0.rrd") == list(range(42))
+
+
+def test_going_on_from_a_saved_state_begins_a_recording(tmp_path: Path) -> None:
+    env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
+    play(env, 20)
+    saved = env.state_dict()
+    env.load_state_dict(saved)
+    go_on(env, 4)
+    env.close()
+    assert steps_of(tmp_path / "run-episode-0.rrd") == list(range(20))
+    assert steps_of(tmp_path / "run-episode-1.rrd") == list(range(20, 24))
+
+
+# --- copies and processes ---
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_copies(copied: Callable[[Any], Any], tmp_path: Path) -> None:
+    env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
+    other = copied(env)
+    env.reset(seed=0)
+    with pytest.raises(SdcError, match=r"is being recorded cannot be copied .*before reset"):
+        copied(env)
+    env.close()
+    play(other, 3)
+    other.close()
+    assert steps_of(tmp_path / "run-episode-0.rrd") == [0, 1, 2]
+
+
+def test_settings_survive_the_spec_of_gymnasium(tmp_path: Path) -> None:
+    recorder = EpisodeRecorder(tmp_path / "run.rrd", episode_trigger=ALL)
+    env = gymnasium.make("sdc_taichi/Load-v0", config="tiny", days=1, recorder=recorder)
+    env.reset(seed=0)
+    assert env.spec is not None
+    assert env.spec.kwargs["recorder"] == recorder
+    env.step(env.action_space.sample())
+    env.close()
+    assert files(tmp_path) == ["run-episode-0.rrd"]
+
+
+@pytest.mark.slow
+def test_recorded_in_a_spawned_process(tmp_path: Path) -> None:
+    make = partial(
+        gymnasium.make,
+        "sdc_taichi:sdc_taichi/Battery-v0",
+        config="tiny",
+        days=1,
+        recorder=str(tmp_path / "run.rrd"),
+    )
+    env = AsyncVectorEnv([make], context="spawn")
+    play(env, 9)
+    env.close()
+    assert steps_of(tmp_path / "run-episode-0.rrd") == list(range(9))
+
+
+# --- bad use ---
+
+
+@pytest.mark.parametrize(
+    ("recorder", "message"),
+    [
+        ("run.txt", r"must end in \.rrd"),
+        ("/nowhere/at/all/run.rrd", "is no folder"),
+        ("rerun+http://127.0.0.1", "no address of a viewer"),
+        (3, "recorder 3: valid is a file ending in .rrd"),
+        (EpisodeRecorder("run.rrd", episode_trigger=3), "episode_trigger 3: valid is a function"),  # type: ignore[arg-type]
+        ("", r"must end in \.rrd"),
+        (EpisodeRecorder(b"run.rrd"), "recorder b'run.rrd': valid is a file"),  # type: ignore[arg-type]
+        (EpisodeRecorder("run.rrd", envs=[6]), "different numbers of 0..5"),
+        (EpisodeRecorder("run.rrd", envs=[]), r"envs \[\]: valid is a list of 1 to 4"),
+        (EpisodeRecorder("run.rrd", envs=[0, 1, 2, 3, 4]), "valid is a list of 1 to 4"),
+        (EpisodeRecorder("run.rrd", envs=[-1]), r"envs \[-1\]: valid is a list"),
+        (EpisodeRecorder("run.rrd", envs=[1.0]), r"envs \[1\.0\]: valid is a list"),  # type: ignore[list-item]
+        (EpisodeRecorder("run.rrd", envs=[True]), r"envs \[True\]: valid is a list"),
+        (EpisodeRecorder("run.rrd", envs="ab"), "envs 'ab': valid is a list"),  # type: ignore[arg-type]
+        (EpisodeRecorder("run.rrd", envs=[1, 1]), "different numbers"),
+        (EpisodeRecorder("run.rrd", every=0), "every 0: valid is a positive integer"),
+    ],
+    ids=str,
+)
+def test_bad_recorders_are_refused_at_once(recorder: Any, message: str) -> None:
+    with pytest.raises(SdcError, match=message):
+        sdc_taichi.vector_env(6, "tiny", recorder=recorder)
+
+
+def test_settings_without_effect_on_a_recorder(tmp_path: Path) -> None:
+    own = EpisodeRecorder(Recorder(tmp_path / "run.rrd"), every=3)
+    with pytest.raises(SdcError, match="without effect on a Recorder"):
+        sdc_taichi.parallel_env("tiny", recorder=own)
+
+
+def test_two_environments_and_one_place(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"config": "tiny", "days": 1}
+    path, own = tmp_path / "run.rrd", Recorder(tmp_path / "own.rrd")
+    make = partial(gymnasium.make, "sdc_taichi/Load-v0", recorder=str(path), **options)
+    both = SyncVectorEnv([make, make])
+    with pytest.raises(SdcError, match=r"run-episode-0\.rrd: another environment"):
+        both.reset(seed=0)
+    both.close()
+    first, second = (sdc_taichi.parallel_env(recorder=own, **options) for _ in range(2))
+    first.reset(seed=0)
+    with pytest.raises(SdcError, match=r"own\.rrd: another environment"):
+        second.reset(seed=0)
+    play(first, 2)
+    first.close()
+    play(second, 3)
+    second.close()
+    assert files(tmp_path) == ["own-2.rrd", "own.rrd"]
+
+
+def test_wrapping_twice_or_something_else(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    env = gymnasium.make_vec("sdc_taichi/Load-v0", num_envs=2, config="tiny", recorder=path)
+    with pytest.raises(SdcError, match="recorded already"):
+        RecordEpisodes(env, path)
+    env.close()
+    singles = SyncVectorEnv([partial(gymnasium.make, "sdc_taichi/Load-v0", config="tiny")])
+    with pytest.raises(SdcError, match="SyncVectorEnv cannot be recorded"):
+        RecordEpisodes(singles, path)
+    singles.close()
+
+
+def test_without_a_viewer_the_episode_goes_on() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"rerun+http://127.0.0.1:{probe.getsockname()[1]}/proxy"
+    env = sdc_taichi.parallel_env("tiny", days=1, recorder=address)
+    with pytest.warns(RecordingWarning, match="no viewer listens") as warned:
+        play(env, 5)
+    assert len(warned) == 1
+    env.close()
+
+
+def test_the_folder_goes_away_before_the_first_episode(tmp_path: Path) -> None:
+    folder = tmp_path / "later"
+    folder.mkdir()
+    env = sdc_taichi.parallel_env("tiny", days=1, recorder=folder / "run.rrd")
+    folder.rmdir()
+    with pytest.raises(SdcError, match=re.escape(str(folder))):
+        env.reset(seed=0)
+    env.close()
+
+
+def test_the_folder_goes_away_in_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_module, "BLOCK_STEPS", 10)
+    folder, moved = tmp_path / "runs", tmp_path / "moved"
+    folder.mkdir()
+    settings = EpisodeRecorder(folder / "run.rrd", episode_trigger=ALL)
+    env = sdc_taichi.parallel_env("tiny", days=1, recorder=settings)
+    play(env, 15)
+    folder.rename(moved)
+    with pytest.warns(RecordingWarning, match=r"run-episode-0\.rrd: cannot be written") as warned:
+        go_on(env, 30)
+    assert len(warned) == 1
+    with pytest.warns(RecordingWarning, match="episode 1 goes on without a recording"):
+        play(env, 3)
+    folder.mkdir()
+    play(env, 2)
+    env.close()
+    assert files(folder) == ["run-episode-2.rrd"]
+    assert files(moved) == ["run-episode-0.rrd"]
