@@ -2,6 +2,7 @@
 
 import math
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -47,31 +48,39 @@ def _options(config: Any) -> Iterator[Any]:
             setattr(config, name, value)
 
 
+_compiling = threading.Lock()
+"""Taichi's settings are those of the process."""
+
+
 @contextmanager
-def _short_positions() -> Iterator[None]:
-    """File and line alone for each node of the source.
+def _translation() -> Iterator[None]:
+    """File and line alone for each node of the source, and whole numbers of 32 bits.
 
     Taichi writes an excerpt of the source for every node, in case of an error, which takes half of
-    the time of translating a kernel; this is done at every start.
+    the time of translating a kernel; this is done at every start. Literals have the type that
+    whoever started the runtime chose.
     """
 
     def position(context: Any, node: Any) -> str:
         return f'File "{context.file}", line {node.lineno + context.lineno_offset}:\n'
 
-    excerpt = ASTTransformerContext.get_pos_info
+    runtime = ti.lang.impl.get_runtime()
+    excerpt, whole = ASTTransformerContext.get_pos_info, runtime.default_ip
     try:
         ASTTransformerContext.get_pos_info = position
+        runtime.default_ip = ti.i32
         yield
     finally:
         ASTTransformerContext.get_pos_info = excerpt
+        runtime.default_ip = whole
 
 
 class BoundKernel:
     """A kernel that is called again and again with mostly the same arrays.
 
-    Taichi checks and hands over every argument on every call, which costs 0.4 ms for the 25 arrays
-    of a hall. A call keeps the launch context of the one before with the same template arguments,
-    and hands over scalars and those arrays that are other objects than then.
+    Taichi checks and hands over every argument on every call, 11 us for an array. A call keeps the
+    launch context of the one before with the same template arguments, and hands over scalars and
+    those arrays that are other objects than then.
 
     Args:
         kernel: a Taichi kernel with template arguments first, then scalars and NumPy arrays.
@@ -87,8 +96,14 @@ class BoundKernel:
         key, given = args[: self._templates], args[self._templates :]
         launch = self._launches.get(key)
         if launch is None or launch.program is not ti.lang.impl.get_runtime().prog:
-            launch = self._launches[key] = _Launch(self._kernel, args, self._templates)
+            with _compiling:
+                launch = self._launches[key] = _Launch(self._kernel, args, self._templates)
         launch.run(given)
+        self._last = launch
+
+    def let_go(self) -> None:
+        """Forget the arrays of the last call, which otherwise live as long as their place in it."""
+        self._last.let_go()
 
 
 class _Launch:
@@ -96,7 +111,7 @@ class _Launch:
 
     def __init__(self, kernel: Any, args: tuple[Any, ...], templates: int) -> None:
         primal = kernel._primal
-        with _short_positions():
+        with _translation():
             key = primal.ensure_compiled(*args)
         compiled = primal.compiled_kernels[key]
         self.program = ti.lang.impl.get_runtime().prog
@@ -108,21 +123,26 @@ class _Launch:
         annotations = [argument.annotation for argument in primal.arguments[templates:]]
         self._element_dims = [getattr(getattr(a, "dtype", None), "ndim", 0) for a in annotations]
         self._given: list[Any] = [None] * len(annotations)
+        self._kinds: list[Any] = [None] * len(annotations)
         self._put(args[templates:])
 
     def run(self, given: tuple[Any, ...]) -> None:
         self._put(given)
         self.program.launch_kernel(self._compiled, self._context)
 
+    def let_go(self) -> None:
+        self._given = [None] * len(self._given)
+
     def _put(self, given: tuple[Any, ...]) -> None:
-        context, held = self._context, self._given
+        context, held, kinds = self._context, self._given, self._kinds
         for i, value in enumerate(given):
             if value is held[i]:
                 continue
             if isinstance(value, np.ndarray):
-                former = held[i]
-                alike = former is None or (former.dtype, former.ndim) == (value.dtype, value.ndim)
-                if not (alike and value.flags.c_contiguous):
+                kind = (value.dtype, value.ndim)
+                if kinds[i] is None:
+                    kinds[i] = kind
+                if kinds[i] != kind or not value.flags.c_contiguous:
                     raise TypeError(f"argument {i}: {value.dtype} array of other type or order")
                 shape, address = value.shape, value.ctypes.data
                 if self._element_dims[i]:

@@ -41,12 +41,14 @@ _NUMBERS = {
     np.floor: "ti.floor({})",
     np.ceil: "ti.ceil({})",
 }
-_TRUTHS = {
+_COMPARISONS = {
     np.greater: "{} > {}",
     np.greater_equal: "{} >= {}",
     np.less: "{} < {}",
     np.less_equal: "{} <= {}",
     np.equal: "{} == {}",
+}
+_LOGIC = {
     np.bitwise_and: "{} & {}",
     np.bitwise_or: "{} | {}",
     np.invert: "{} == 0",
@@ -63,7 +65,7 @@ class CompiledStage:
         size: n.
 
     Raises:
-        TypeError: on the first call, if the stage does something else.
+        TypeError: the stage does something else, or arguments are not those of the first call.
     """
 
     def __init__(self, stage: Callable[..., Arrays], size: int) -> None:
@@ -76,7 +78,9 @@ class CompiledStage:
         if self._kernel is None:
             self._compile(tuple(given))
         assert self._kernel is not None
-        inputs = self._rows([given[name] for name in self._names])
+        if tuple(given) != self._names:
+            raise TypeError(f"arguments {[*given]}, expected {[*self._names]} as on the first call")
+        inputs = self._rows([*given.values()])
         out = np.empty((len(self._results), self._stride))
         serial = self._size <= SERIAL_UP_TO
         self._kernel(serial, self._size, self._constants, inputs, out)
@@ -113,16 +117,19 @@ class Recorded(NDArrayOperatorsMixin):
             return _power(self.record.lift(given[0]), given[1])
         if ufunc is np.rint:
             return _rint(self.record.lift(given[0]))
-        known = _NUMBERS.get(ufunc) or _TRUTHS.get(ufunc)
-        if known is None:
-            raise TypeError(f"{ufunc.__name__}: cannot be compiled")
-        return self.record.operation(known, given, truth=ufunc in _TRUTHS)
+        if ufunc in _NUMBERS:
+            return self.record.operation(_NUMBERS[ufunc], given)
+        if ufunc in _COMPARISONS:
+            return self.record.operation(_COMPARISONS[ufunc], given, truth=True)
+        if ufunc in _LOGIC:
+            return self.record.operation(_LOGIC[ufunc], given, of_truths=len(given), truth=True)
+        raise TypeError(f"{ufunc.__name__}: cannot be compiled")
 
     def __array_function__(
         self, function: Any, types: Any, given: tuple[Any, ...], more: dict[str, Any]
     ) -> Any:
         if function is np.where and len(given) == 3:
-            return self.record.operation("ti.select({}, {}, {})", given)
+            return self.record.operation("ti.select({}, {}, {})", given, of_truths=1)
         if function is np.clip and len(given) == 3:
             return np.minimum(np.maximum(given[0], given[1]), given[2])
         if function is np.round and len(given) == 2:
@@ -149,8 +156,14 @@ class _Record:
         at = self._operations.setdefault((text, of), len(self._operations))
         return Recorded(self, at, truth)
 
-    def operation(self, text: str, given: tuple[Any, ...], *, truth: bool = False) -> Recorded:
-        return self.entry(text, of=tuple(self.lift(x).at for x in given), truth=truth)
+    def operation(
+        self, text: str, given: tuple[Any, ...], *, of_truths: int = 0, truth: bool = False
+    ) -> Recorded:
+        """An operation on quantities, the first ``of_truths`` of which are true or false."""
+        quantities = [self.lift(x) for x in given]
+        if [x.truth for x in quantities] != [i < of_truths for i in range(len(given))]:
+            raise TypeError(f"{text}: truth values cannot be mixed with numbers; use np.where")
+        return self.entry(text, of=tuple(x.at for x in quantities), truth=truth)
 
     def lift(self, value: Any) -> Recorded:
         """A quantity, from a number or an array that is constant."""
@@ -158,6 +171,8 @@ class _Record:
             return value
         array = np.asarray(value)
         if array.ndim == 0:
+            if array.dtype == np.bool_ or not np.isfinite(array):
+                raise TypeError(f"{value}: only finite numbers can be compiled")
             # Literals without a type would be rounded to f32.
             return self.entry(f"ti.f64({float(array)!r})")
         if array.shape != (self._size,):

@@ -21,13 +21,16 @@ from .backend import ti
 HALL_TEMPLATES = 4
 """Template arguments of ``hall_kernel``, which come first."""
 OUTLETS = ("server", "rack", "released")
-LOADS_OF = ("dc", "rack", "group")
+OF_DATA_CENTERS, OF_RACKS, OF_GROUPS = range(3)
 """Whose utilisation is given."""
 
-SOURCES = 4
-"""Racks whose exhausts a weight vector of small halls takes at a time."""
 LANES = 8
 """Racks that are computed at a time; the same for all, so that results never depend on it."""
+SOURCES = 4
+"""Racks whose exhausts a vector of weights takes to all lanes of a block, in small halls."""
+RUN_LANES = 16
+"""Racks whose exhausts a vector of weights takes to one rack, in large halls."""
+RUN_BLOCKS = RUN_LANES // LANES
 CHUNK_BLOCKS = 16
 """Most blocks of a chunk; fewer racks are not worth a thread of their own."""
 
@@ -36,7 +39,8 @@ BLOCK_INTS = ("racks", "groups", "table", "place")
 RACK_INTS = ("first_group", "first_server")
 """Of each place; those without a rack have the groups of the last rack of their block."""
 RUN_INTS = ("first", "length", "offset")
-"""Runs of weights in whole blocks: first block of sources, blocks, and first block of weights."""
+"""Runs of weights in whole vectors of RUN_LANES: first vector of sources, how many, and first of
+weights."""
 CHUNK_INTS = ("first_block", "dc", "first_need")
 DC_INTS = ("first_chunk", "first_unit", "first_share", "racks", "mix", "start")
 """``mix``: first of the weights of halls that keep every weight, -1 of others; ``start``: first
@@ -144,8 +148,6 @@ TERMS = (
     "stored_w",
 )
 """Of each rack, what adds up over a chunk."""
-SWEEP_TERMS = 2
-"""The first of these are what a steady sweep needs; the others are summed up after the last."""
 SUMS = (*TERMS, "inlet_max_c", "hottest_block", "hottest_lane", "hottest_zone", "least_k", "most_k")
 """Per chunk: sums, hottest group, and the range of what the exhaust changed by since the last
 exchange, or of what the mixes change by in the next one."""
@@ -189,13 +191,13 @@ STILL_PER_S = 1.0 / 128.0
 """Fastest rate at which CRAC air stirs the air before racks that stand still, as without fans in
 the room; a power of two, exact in both precisions."""
 
-EXP_TERMS = {"f32": 8, "f64": 15}
-"""Terms of the series of exp on half an octave of 2 to the last digit."""
+EXP_TERMS = {"f32": 7, "f64": 14}
+"""Terms of the series of exp - 1 on half an octave of 2 to the last digit."""
 
 
 def exp_constants(precision: str) -> list[float]:
-    """1/ln 2, ln 2 and the series of exp, for ``hall_kernel``."""
-    terms = range(EXP_TERMS[precision] - 1, -1, -1)
+    """1/ln 2, ln 2 and the series of exp - 1, for ``hall_kernel``."""
+    terms = range(EXP_TERMS[precision], 0, -1)
     return [1.0 / log(2.0), log(2.0), *(1.0 / factorial(k) for k in terms)]
 
 
@@ -276,6 +278,7 @@ def hall_kernel(precision: str) -> Any:
     ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
     doubles_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
     sources_1d = ti.types.ndarray(dtype=ti.types.vector(SOURCES, real), ndim=1)
+    runs_1d = ti.types.ndarray(dtype=ti.types.vector(RUN_LANES, real), ndim=1)
     mix_1d = ti.types.ndarray(dtype=ti.types.vector(SOURCES * LANES, real), ndim=1)
     starts_2d = ti.types.ndarray(dtype=ti.types.vector(4, ti.f64), ndim=2)
     doubles_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -293,17 +296,28 @@ def hall_kernel(precision: str) -> Any:
 
     @ti.func
     @no_type_check
-    def exp_of_minus(x, constants: ti.template()):
-        """exp(-x) of a vector, 0 <= x, by its series; calls would go lane by lane."""
-        y = smaller(x, real(80.0) + real(0.0) * x) * real(-1.0)
+    def gone_after(x, constants: ti.template()):
+        """1 - exp(-x) of a vector, 0 <= x, by its series; calls would go lane by lane.
+
+        To the last digit of small results, by which large differences are multiplied.
+        """
+        y = smaller(x, ti.Vector([ti.cast(80.0, real)] * LANES)) * real(-1.0)
         octave = ti.floor(y * constants[5] + real(0.5))
         rest = y - octave * constants[6]
-        out = rest * constants[7] + constants[8]
-        for i in range(9, 7 + exp_terms):
-            out = out * rest + constants[i]
+        # Two sums by turns, of even and of odd powers, since each waits for its last addition.
+        square = rest * rest
+        one = square * constants[7] + constants[9]
+        other = square * constants[8] + constants[10]
+        for i in ti.static(range(11, 6 + exp_terms, 2)):
+            one = one * square + constants[i]
+            other = other * square + constants[i + 1]
+        series = one * rest + other
+        if ti.static(exp_terms % 2 == 1):
+            series = (one * square + constants[6 + exp_terms]) + other * rest
+        power = square
         for i in range(LANES):
-            out[i] *= ti.bit_cast((ti.cast(octave[i], whole) + bias) << mantissa, real)
-        return out
+            power[i] = ti.bit_cast((ti.cast(octave[i], whole) + bias) << mantissa, real)
+        return (real(1.0) - power) - power * (rest * series)
 
     @ti.func
     @no_type_check
@@ -768,6 +782,7 @@ def hall_kernel(precision: str) -> Any:
         unit_state: ti.template(),
         starts: ti.template(),
         rack_sources: ti.template(),
+        run_sources: ti.template(),
         rack_store: ti.template(),
         server_c: ti.template(),
         servers_before: ti.template(),
@@ -860,7 +875,7 @@ def hall_kernel(precision: str) -> Any:
                     share_0 = dc_ints[DC.first_share, n] + n_units * (block - dc_block_0)
                     per_server = racks[RACK.per_server, block]
                     u = utilisation
-                    if loads_of == 1:
+                    if loads_of == OF_RACKS:
                         u = racks[RACK.load, block]
                     powered = racks[RACK.powered, block]
                     air_left = racks[RACK.airflow, block]
@@ -901,19 +916,17 @@ def hall_kernel(precision: str) -> Any:
                                             n_sources,
                                         )
                                 if not at_once:
-                                    row = 1 + side
+                                    from_0 = (1 + side) * rack_store.shape[1] // RUN_BLOCKS
                                     for i in range(LANES):
                                         at = block * LANES + i
-                                        parts = zeros
+                                        parts = ti.Vector([ti.cast(0.0, real)] * RUN_LANES)
                                         for run in range(run_start[at], run_start[at + 1]):
-                                            x, w = (
-                                                run_ints[RUN.first, run],
-                                                run_ints[RUN.offset, run],
-                                            )
+                                            x = from_0 + run_ints[RUN.first, run]
+                                            w = run_ints[RUN.offset, run]
                                             for e in range(run_ints[RUN.length, run]):
-                                                parts += weights[w + e] * rack_store[row, x + e]
+                                                parts += weights[w + e] * run_sources[x + e]
                                         t = real(0.0)
-                                        for j in range(LANES):
+                                        for j in range(RUN_LANES):
                                             t += parts[j]
                                         target[i] = t
                                     target *= racks[RACK.norm, block]
@@ -939,7 +952,7 @@ def hall_kernel(precision: str) -> Any:
                                 was = rack_store[STATE.mixed_c, block]
                                 rate = rack_store[STATE.captured_m3s, block] * (air / parcel_j)
                                 x = larger(rate, zeros + still_per_s) * step_s
-                                gone = real(1.0) - exp_of_minus(x, constants)
+                                gone = gone_after(x, constants)
                                 now_c = was + (target - was) * gone
                                 is_rack = ti.select(per_server > real(0.0), ones, zeros)
                                 parcel_w = is_rack * (now_c - was) * (parcel_j * per_step_s)
@@ -984,7 +997,7 @@ def hall_kernel(precision: str) -> Any:
                         else:
                             t = mixed + tables[table + z, GROUP.inlet_offset_k]
                         load = u + tables[table + z, GROUP.load_deviation] * uneven
-                        if loads_of == 2:
+                        if loads_of == OF_GROUPS:
                             for i in range(LANES):
                                 group = rack_ints[RACK_INT.first_group, block * LANES + i] + z
                                 load[i] = group_load[ti.min(group, group_load.shape[0] - 1)]
@@ -1015,8 +1028,8 @@ def hall_kernel(precision: str) -> Any:
                                 to_air = exchange * (before - t)
                             else:
                                 steady = t + cpu_1 / larger(exchange, zeros + real(1e-30))
-                                left = exp_of_minus(exchange * (step_s / server_j), constants)
-                                after = steady + (before - steady) * left
+                                gone = gone_after(exchange * (step_s / server_j), constants)
+                                after = before + (steady - before) * gone
                                 after = ti.select(exchange > real(0.0), after, before)
                                 warmed_w = (after - before) * (server_j * per_step_s)
                                 to_air = ti.select(exchange > real(0.0), cpu_1 - warmed_w, zeros)
@@ -1242,7 +1255,7 @@ def hall_kernel(precision: str) -> Any:
         chunk_ints: ints_2d,
         dc_ints: ints_2d,
         control: ints_2d,
-        weights: blocks_1d,
+        weights: runs_1d,
         mix: mix_1d,
         shares: blocks_1d,
         racks: blocks_2d,
@@ -1254,6 +1267,7 @@ def hall_kernel(precision: str) -> Any:
         unit_state: doubles_2d,
         starts: starts_2d,
         rack_sources: sources_1d,
+        run_sources: runs_1d,
         rack_store: blocks_2d,
         server_c: blocks_1d,
         servers_before: reals_1d,
@@ -1319,6 +1333,7 @@ def hall_kernel(precision: str) -> Any:
                         unit_state,
                         starts,
                         rack_sources,
+                        run_sources,
                         rack_store,
                         server_c,
                         servers_before,

@@ -56,10 +56,7 @@ class Floor:
             "restart_c": fleet.values("protection.restart_c")[fleet.rack_dc],
         }
         self._throttle_share = fleet.values("protection.throttle_share")[fleet.rack_dc]
-        allowable = np.array([allowable_c(c) for c in classes])
-        self.allowable_low_c: F64 = allowable[:, 0]
-        """Allowable inlet range of the class, A2 unless given, (B,)."""
-        self.allowable_high_c: F64 = allowable[:, 1]
+        self._allowable_high_c = np.array([allowable_c(c)[1] for c in classes])
 
     @property
     def watches_inlets(self) -> bool:
@@ -125,7 +122,7 @@ class Floor:
             count=self._bin_servers,
             capacity=np.ones(len(self._bin_servers)) if capacity is None else capacity,
             inlet_c=group_inlet_c,
-            limit_c=self.allowable_high_c,
+            limit_c=self._allowable_high_c,
             weights=self._weights(weights) if self._policy == "weights" else None,
         )
         if powered is not None:

@@ -167,6 +167,9 @@ class Hall:
         fleet, lanes = self._fleet, thermal.LANES
         racks = np.diff(fleet.rack_start)
         self._blocks = -(-racks // lanes)
+        if racks.max() > DENSE_RACKS:
+            # Runs of weights need all halls to begin where their vectors do.
+            self._blocks = -(-self._blocks // thermal.RUN_BLOCKS) * thermal.RUN_BLOCKS
         first_block = starts(self._blocks, "blocks of racks")
         within = np.arange(fleet.racks) - np.repeat(fleet.rack_start[:-1], racks)
         self._rack_at = lanes * np.repeat(first_block[:-1], racks) + within
@@ -207,7 +210,9 @@ class Hall:
         ).reshape(2, -1)
         known: dict[Any, int] = {}
         tables, table, total = [], np.zeros(len(most), np.int64), 0
-        for i, (a, n) in enumerate(zip(rack[:, 0], filled, strict=True)):
+        for i, (a, n) in enumerate(zip(first_rack, filled, strict=True)):
+            if n == 0:
+                continue
             ends = fleet.group_start[a : a + n + 1]
             values = fleet.groups[:, ends[0] : ends[-1]]
             key = (values.tobytes(), (ends - ends[0]).tobytes())
@@ -235,7 +240,7 @@ class Hall:
         fleet, air, lanes = self._fleet, self._fleet.air, thermal.LANES
         mix = self._dc_ints[thermal.DC_INTS.index("mix")]
         mix[:] = -1
-        self._lay_out_runs(lanes)
+        self._lay_out_runs(thermal.RUN_LANES)
         if air is None:
             self._shares = self._lanes(1)
             self._mix = self._lanes(1, thermal.SOURCES).reshape(1, -1)
@@ -278,14 +283,14 @@ class Hall:
         self._dc_ints[thermal.DC_INTS.index("start"), :-1] = air.table * self._start_rows
 
     def _lay_out_runs(self, lanes: int) -> None:
-        """Runs of weights in whole blocks, filled up with zeros, for halls of many racks."""
+        """Runs of weights in whole vectors, filled up with zeros, for halls of many racks."""
         fleet, air = self._fleet, self._fleet.air
         run_counts = np.zeros(self._places, np.int64)
         large = np.diff(fleet.rack_start)[fleet.rack_dc] > DENSE_RACKS
         if air is None or not large.any():
             self._run_start = starts(run_counts, "runs of weights")
             self._run_ints = np.zeros((3, 1), np.int32)
-            self._weights = self._lanes(1)
+            self._weights = self._lanes(lanes).reshape(-1, lanes)[:1]
             return
         counts = np.diff(air.run_start)
         run_counts[self._rack_at[large]] = counts[large]
@@ -294,14 +299,15 @@ class Hall:
         moved = self._rack_at[fleet.rack_start[:-1]] - fleet.rack_start[:-1]
         first = (air.run_first + np.repeat(moved[fleet.rack_dc], counts))[of_large]
         length, offset = air.run_length[of_large], air.run_offset[of_large].astype(np.int64)
-        # Runs that share weights share their blocks where they begin at the same lane.
+        # Runs that share weights share their vectors where they begin at the same lane.
         lane = first % lanes
         key = (offset * (int(length.max()) + 1) + length) * lanes + lane
         _, one, same = np.unique(key, return_index=True, return_inverse=True)
-        blocks = -(-(lane + length) // lanes)
-        begin = starts(blocks[one], "blocks of weights")
-        self._run_ints = _table(first // lanes, blocks, begin[same])
-        weights = self._lanes(int(begin[-1])).reshape(-1)
+        vectors = -(-(lane + length) // lanes)
+        begin = starts(vectors[one], "vectors of weights")
+        self._run_ints = _table(first // lanes, vectors, begin[same])
+        weights = self._empty((int(begin[-1]) * lanes,), self._dtype)
+        weights[:] = 0.0
         within = np.arange(int(length[one].sum()))
         within -= np.repeat(np.cumsum(length[one]) - length[one], length[one])
         to = np.repeat(begin[:-1].astype(np.int64) * lanes + lane[one], length[one]) + within
@@ -357,6 +363,7 @@ class Hall:
         self._rack_store = self._lanes(len(thermal.RACK_STATE), blocks)
         self._rack_state = self._rack_store.reshape(len(self._rack_store), -1)
         self._sources = self._rack_store.reshape(-1, thermal.SOURCES)
+        self._run_sources = self._rack_store.reshape(-1, thermal.RUN_LANES)
         self._memory = dict(zip(thermal.RACK_STATE, self._rack_state, strict=True))
         self._constants = self._real(
             np.array([*_RELEASED_OUTLET_FIT, *thermal.exp_constants(self._precision)])
@@ -439,11 +446,21 @@ class Hall:
 
         Raises:
             RuntimeStateError: before the first step.
+            SdcError: layers of another shape, type or order.
         """
         servers = self._fleet.servers
         if into is None:
             into = ServerLayers(*(self._empty((servers,), self._dtype) for _ in range(3)))
         layers = [into.inlet_c, into.outlet_c, into.power_w]
+        for layer in layers:
+            if (layer.shape, layer.dtype) != (
+                (servers,),
+                self._dtype,
+            ) or not layer.flags.c_contiguous:
+                raise SdcError(
+                    f"layer: {layer.dtype} {layer.shape}; valid is contiguous {self._dtype} "
+                    f"({servers},)"
+                )
         lanes = self._thermal.LANES
         fit = [layer.ctypes.data % (lanes * layer.itemsize) == 0 for layer in layers]
         stored = [
@@ -474,6 +491,7 @@ class Hall:
             None, transient=self._solved, write=(*layers, *blocks), values=values,
             each_once=each_once,
         )  # fmt: skip
+        self._kernel.let_go()
 
     def forget(self) -> None:
         """Drop the last step, so that ``servers`` cannot show layers of another state."""
@@ -566,12 +584,13 @@ class Hall:
             given = getattr(met, name)
             if given is not None and not isfinite(np.add.reduce(given)):
                 raise SdcError(f"conditions: {name} is not finite; valid are finite numbers")
-        self._loads_of, self._loads = 0, self._no_groups
+        self._loads_of, self._loads = self._thermal.OF_DATA_CENTERS, self._no_groups
         self._dc["utilisation"][:] = met.utilisation
         if met.group_load is not None:
-            self._loads_of, self._loads = 2, self._real(met.group_load)
+            self._loads_of = self._thermal.OF_GROUPS
+            self._loads = self._real(met.group_load)
         elif met.rack_load is not None:
-            self._loads_of = 1
+            self._loads_of = self._thermal.OF_RACKS
             self._put(self._rack["load"], met.rack_load)
         for name, values in (("powered", met.powered), ("airflow", met.rack_airflow)):
             row = self._rack[name]
@@ -609,7 +628,7 @@ class Hall:
         values_out = self._fleet.servers if write else self._group_places * self._thermal.LANES
         serial = values_out * (sweeps if transient else 1) <= _SERIAL_GROUPS
         racks, dcs = (self._rack_store, self._sums) if out is None else out
-        none, no_lanes = self._no_groups, self._weights
+        none, no_lanes = self._no_groups, self._shares
         if transient and len(self._server_c) < self._group_places:
             self._server_c = self._lanes(self._group_places)
         self._kernel(
@@ -646,6 +665,7 @@ class Hall:
             self._unit_state,
             self._starts,
             self._sources,
+            self._run_sources,
             self._rack_store,
             self._server_c,
             *((none, none) if servers is None else servers),

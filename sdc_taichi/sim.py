@@ -361,8 +361,9 @@ class Simulator:
             cooling_scale=scale,
             fan_speed=fan_speed,
             queue=queue,
-            stored_kwh=after["stored_kwh"],
-            room_heat_kwh=after["room_heat_kwh"],
+            # Not the rows themselves, which would keep all results of the step.
+            stored_kwh=after["stored_kwh"].copy(),
+            room_heat_kwh=after["room_heat_kwh"].copy(),
             rack_status=status,
             group_inlet_c=hall.group_inlets() if len(state.group_inlet_c) else state.group_inlet_c,
             **memory,
@@ -390,7 +391,7 @@ class Simulator:
             queue_tasks=queue[:, -1].copy(),
             oldest_age_h=oldest_steps * step_h,
             mean_age_h=mean_steps * step_h,
-            setpoint_c=self._per_dc(setpoint_c),
+            setpoint_c=self._per_dc(setpoint_c).copy(),
             inlet_mean_c=air.inlet_mean_c,
             inlet_max_c=air.inlet_max_c,
             hottest_rack=hottest_rack,
@@ -404,7 +405,7 @@ class Simulator:
             stored_w=air.stored_w,
             grid_up=event.grid_up.astype(np.float64),
             powered=self._all.copy() if powered is None else powered,
-            unit_setpoint_c=setpoint_c,
+            unit_setpoint_c=setpoint_c.copy(),
             unit_supply_c=setpoint_c + self._per_unit(warmed_k),
             unit_flow_m3s=air.unit_flow_m3s if self._recirculates else after["crac_flow_m3s"],
             unit_running=running.copy(),
@@ -628,7 +629,8 @@ class Simulator:
 
     def close(self) -> None:
         """Let go of the kernel arrays; the simulator is unusable afterwards."""
-        self._hall = None
+        self._hall = self._stages = None
+        self._queue.forget()
         self._closed = True
 
     def __enter__(self) -> Self:

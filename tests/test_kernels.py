@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import subprocess
 import sys
+import weakref
 from dataclasses import fields
 from typing import Any
 
@@ -15,10 +17,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import reference_twin
-from sdc_taichi import DataCenterConfig, RuntimeStateError, build_fleet, load_config
+from sdc_taichi import DataCenterConfig, RuntimeStateError, Simulator, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
+from sdc_taichi.errors import SdcError
 from sdc_taichi.hall import Coil, Conditions, Hall, HallSums, Precision
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, ServerLayers
 
 OUTLETS = ("server", "rack", "released")
 EXPONENTS = (1.0, 2.5, 3.0)
@@ -319,6 +322,20 @@ def test_large_and_small_halls_in_one_fleet_equal_themselves_alone(precision: Pr
         assert results_equal(alone, part_of(batch, configs, i)), f"{sizes[i]} racks"
 
 
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_a_batch_for_all_threads_equals_small_ones_on_one(precision: Precision) -> None:
+    config = load_config("corrected")
+    count, rng = 80, np.random.default_rng(8)
+    supply_c, load = rng.uniform(15, 24, count), rng.uniform(0, 1, count)
+    batch, layers = solve_servers([config] * count, supply_c, load, precision)
+    assert build_fleet([config] * count).groups.shape[1] >= 8000
+    for i in (0, 41, count - 1):
+        alone, own = solve_servers([config], supply_c[i : i + 1], load[i : i + 1], precision)
+        assert results_equal(alone, part_of(batch, [config] * count, i)), i
+        for name, values in layers.items():
+            assert np.array_equal(own[name], values.reshape(count, -1)[i]), (i, name)
+
+
 def digest_of_large_halls() -> str:
     """Fingerprint of everything the kernels compute for large halls, in both precisions."""
     config = hall_of_many_racks(1500)
@@ -404,6 +421,24 @@ def test_server_layers_need_a_solve() -> None:
         hall.servers()
 
 
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_layers_may_lie_anywhere_in_memory(precision: Precision) -> None:
+    configs, supply_c, load = random_fleet(9)
+    fleet = build_fleet(configs)
+    hall = Hall(fleet, precision)
+    hall.solve(Conditions(supply_c[fleet.unit_dc], load))
+    expected = hall.servers()
+    dtype = np.float32 if precision == "f32" else np.float64
+    for shift in range(1, 4):
+        given: list[Any] = [np.zeros(fleet.servers + 9, dtype) for _ in range(3)]
+        hall.servers(ServerLayers(*(layer[shift : shift + fleet.servers] for layer in given)))
+        for layer, name in zip(given, ("inlet_c", "outlet_c", "power_w"), strict=True):
+            values = layer[shift : shift + fleet.servers]
+            assert np.array_equal(values, getattr(expected, name)), name
+            assert not layer[:shift].any()
+            assert not layer[shift + fleet.servers :].any()
+
+
 def test_a_bound_kernel_takes_new_arrays_and_refuses_other_types() -> None:
     hall = Hall(build_fleet(load_config("tiny")), "f32")
     bound, calls = hall._kernel, []
@@ -434,3 +469,42 @@ def test_a_bound_kernel_takes_new_arrays_and_refuses_other_types() -> None:
     ):
         with pytest.raises(TypeError, match=match):
             bound(*calls[0][:at], value, *calls[0][at + 1 :])
+
+
+def test_layers_that_were_handed_out_are_not_kept() -> None:
+    with Simulator(load_config("tiny")) as sim:
+        sim.reset()
+        sim.step()
+        layers = sim.servers()
+        left = weakref.ref(layers.inlet_c.base)
+        del layers
+        gc.collect()
+        assert left() is None
+
+
+def test_layers_that_do_not_fit_are_refused() -> None:
+    fleet = build_fleet(load_config("tiny"))
+    hall = Hall(fleet, "f32")
+    hall.solve(Conditions(np.array([20.0]), np.array([0.5])))
+    good = [np.zeros(fleet.servers, np.float32) for _ in range(2)]
+    wrong = [good[0][1:], np.zeros(fleet.servers), np.zeros(2 * fleet.servers, np.float32)[::2]]
+    for layer in wrong:
+        with pytest.raises(SdcError, match="layer: float"):
+            hall.servers(ServerLayers(good[0], good[1], layer))
+
+
+def test_another_user_of_taichi_may_have_chosen_other_literals() -> None:
+    code = (
+        "import taichi as ti\n"
+        "ti.init(arch=ti.cpu, default_ip=ti.i64, default_fp=ti.f64, log_level=ti.ERROR)\n"
+        "from sdc_taichi import Simulator, load_config\n"
+        "sim = Simulator(load_config('tiny'))\n"
+        "sim.reset()\n"
+        "print(sim.step().it_w.tobytes().hex(), ti.lang.impl.get_runtime().default_ip == ti.i64)\n"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300
+    ).stdout.splitlines()[-1]
+    with Simulator(load_config("tiny")) as sim:
+        sim.reset()
+        assert found == f"{sim.step().it_w.tobytes().hex()} True"

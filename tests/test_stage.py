@@ -73,7 +73,8 @@ def test_an_entry_is_the_same_alone_and_among_many() -> None:
     x = np.random.default_rng(0).uniform(0.1, 9.0, size)
 
     def stage(x: Any) -> Any:
-        return x * 1.1 + x**3 / (2.0 + np.sqrt(x)) - 0.3 * x * x
+        shared = np.where(np.floor(x) > 4.0, 1.1 * x, np.exp(-x))
+        return shared + x**3 / (2.0 + np.sqrt(x)) - 0.3 * x * x
 
     together = compiled(stage, x=x)["y"]
     alone = [compiled(stage, x=x[i : i + 1])["y"][0] for i in range(0, size, 97)]
@@ -89,6 +90,13 @@ def test_results_are_new_arrays_and_inputs_stay() -> None:
     assert np.array_equal(first["twice"], [0, 2, 4, 6])
     assert np.array_equal(second["same"], [1, 2, 3, 4])
     assert not np.shares_memory(first["same"], x)
+
+
+def test_other_arguments_than_those_of_the_first_call_are_an_error() -> None:
+    stage = CompiledStage(lambda x, y: {"sum": x + y}, 2)
+    stage(x=np.zeros(2), y=np.ones(2))
+    with pytest.raises(TypeError, match=r"arguments \['y', 'x'\]"):
+        stage(y=np.zeros(2), x=np.ones(2))
 
 
 def test_equal_stages_are_compiled_once() -> None:
@@ -107,6 +115,12 @@ def test_equal_stages_are_compiled_once() -> None:
         (lambda x: np.cumsum(x), "cumsum: cannot be compiled"),
         (lambda x: np.add.reduce(x), "only plain calls"),
         (lambda x: x**0.5, "only whole numbers"),
+        (lambda x: (x > 0.0) + (x > 1.0), "truth values cannot be mixed"),
+        (lambda x: np.minimum(x > 0.0, x > 1.0), "truth values cannot be mixed"),
+        (lambda x: x & (x > 0.0), "truth values cannot be mixed"),
+        (lambda x: np.where(x, 1.0, 2.0), "truth values cannot be mixed"),
+        (lambda x: (x > 0.0) & True, "only finite numbers"),
+        (lambda x: x + np.inf, "only finite numbers"),
         (lambda x: x + np.zeros(5), r"constant of shape \(5,\), expected \(3,\)"),
     ],
 )
@@ -172,6 +186,9 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
         ["hvac.chiller.model=electric_water_cooled", "battery.model=paper"],
         ["hvac.chiller.model=electric_air_cooled", "hvac.tower.economiser=false"],
         ["hvac.chiller.model=constant_cop", "hvac.total_of=[chiller,crac_fan]"],
+        ["hall.inlet_model=approach"],
+        ["hall.inlet_model=approach", "hvac.crac.flow_model=controlled"],
+        ["hall.inlet_model=approach", "hvac.crac.flow_model=constant"],
         "sustaindc",
         "paper",
     ],

@@ -181,6 +181,10 @@ class Queue:
         self._after(serial, _NEGLIGIBLE_TASKS, queue, taken, deferred, after, ages)
         return ages[0], ages[1], after
 
+    def forget(self) -> None:
+        """Let go of the kernel and the arrays that it was last given."""
+        self._after = None
+
 
 def age_histogram(queue: F64, edges_steps: F64) -> F64:
     """Queued tasks by age, (B, number of edges).
