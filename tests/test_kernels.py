@@ -487,7 +487,11 @@ def test_layers_that_do_not_fit_are_refused() -> None:
     hall = Hall(fleet, "f32")
     hall.solve(Conditions(np.array([20.0]), np.array([0.5])))
     good = [np.zeros(fleet.servers, np.float32) for _ in range(2)]
-    wrong = [good[0][1:], np.zeros(fleet.servers), np.zeros(2 * fleet.servers, np.float32)[::2]]
+    wrong: list[Any] = [
+        good[0][1:],
+        np.zeros(fleet.servers),
+        np.zeros(2 * fleet.servers, np.float32)[::2],
+    ]
     for layer in wrong:
         with pytest.raises(SdcError, match="layer: float"):
             hall.servers(ServerLayers(good[0], good[1], layer))
