@@ -101,9 +101,9 @@ class BoundKernel:
         launch.run(given)
         self._last = launch
 
-    def let_go(self) -> None:
-        """Forget the arrays of the last call, which otherwise live as long as their place in it."""
-        self._last.let_go()
+    def let_go(self, *arrays: Any) -> None:
+        """Forget arrays of the last call, which otherwise live until others take their places."""
+        self._last.let_go({id(array) for array in arrays})
 
 
 class _Launch:
@@ -130,8 +130,8 @@ class _Launch:
         self._put(given)
         self.program.launch_kernel(self._compiled, self._context)
 
-    def let_go(self) -> None:
-        self._given = [None] * len(self._given)
+    def let_go(self, arrays: set[int]) -> None:
+        self._given = [None if id(held) in arrays else held for held in self._given]
 
     def _put(self, given: tuple[Any, ...]) -> None:
         context, held, kinds = self._context, self._given, self._kinds

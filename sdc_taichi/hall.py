@@ -491,7 +491,7 @@ class Hall:
             None, transient=self._solved, write=(*layers, *blocks), values=values,
             each_once=each_once,
         )  # fmt: skip
-        self._kernel.let_go()
+        self._kernel.let_go(*layers, *blocks)
 
     def forget(self) -> None:
         """Drop the last step, so that ``servers`` cannot show layers of another state."""
