@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.types import F64, as_array
+from sdc_taichi.types import F64, Reals, as_array
 
 Values = F64 | float
 
@@ -30,8 +30,8 @@ def allowable_c(ashrae_class: str | None) -> tuple[float, float]:
 
 
 def rise_m3k_s(
-    airflow_m3s: F64,
-    temperature_c: F64,
+    airflow_m3s: Reals,
+    temperature_c: Reals,
     supply_c: Values,
     start: npt.NDArray[np.integer] | None = None,
 ) -> F64:

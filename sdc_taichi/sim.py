@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi import runtime
+from sdc_taichi import air_metrics, runtime
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.drivers import Drivers, load_drivers
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
@@ -34,7 +34,6 @@ from sdc_taichi.types import (
     CoolAction,
     FanAction,
     LoadAction,
-    Reals,
     ServerLayers,
     State,
     StepResult,
@@ -457,9 +456,13 @@ class Simulator:
             }
         else:
             # Such halls have one unit for all of a data center.
+            inlet_m3k_s, outlet_m3k_s = (
+                air_metrics.rise_m3k_s(air.rack_airflow_m3s, c, supply_c, self.fleet.rack_start)
+                for c in (air.rack_inlet_c, air.rack_outlet_c)
+            )
             out |= {
-                "inlet_m3k_s": self._rise_m3k_s(air, air.rack_inlet_c, supply_c),
-                "outlet_m3k_s": self._rise_m3k_s(air, air.rack_outlet_c, supply_c),
+                "inlet_m3k_s": inlet_m3k_s,
+                "outlet_m3k_s": outlet_m3k_s,
                 "supply_c": supply_c,
                 "outlet_mean_c": air.outlet_mean_c,
                 "fan_speed": fan_speed,
@@ -474,11 +477,6 @@ class Simulator:
                 "idle_m3k_s": sums(idle_m3s * setpoint_c),
             }
         return out
-
-    def _rise_m3k_s(self, air: HallSums, rack_c: Reals, supply_c: F64) -> F64:
-        """Airflow times temperature over supply of all racks, (B,)."""
-        over_k = rack_c.astype(np.float64) - supply_c[self.fleet.rack_dc]
-        return self.fleet.rack_sums(air.rack_airflow_m3s * over_k)
 
     def _powered(self, state: State, event: Disturbance) -> F64:
         """Share of the step with power, (B,).

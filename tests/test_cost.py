@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from call_counts import calls_of
 from sdc_taichi import Actions, Simulator, drivers_from_arrays, load_config
 from sdc_taichi.envs.core import Core
 from sdc_taichi.envs.options import make_options
@@ -27,22 +28,6 @@ def simulator(size: int, *overrides: str) -> Simulator:
     )
     sim.reset(0)
     return sim
-
-
-def python_calls(function: Callable[[], Any]) -> int:
-    """Python functions that are entered while another runs."""
-    count = 0
-
-    def seen(_frame: object, event: str, _argument: object) -> None:
-        nonlocal count
-        count += event == "call"
-
-    sys.setprofile(seen)
-    try:
-        function()
-    finally:
-        sys.setprofile(None)
-    return count
 
 
 def stepper(core: Core) -> Callable[[], Any]:
@@ -82,12 +67,12 @@ def test_python_calls_do_not_grow_with_the_number_of_data_centers() -> None:
     few, many = simulator(2), simulator(96)
     for sim in (few, many):
         sim.step()
-    assert python_calls(few.step) == python_calls(many.step) < 300
+    assert calls_of(few.step, "call") == calls_of(many.step, "call") < 300
 
 
 def test_python_calls_do_not_grow_with_the_number_of_environments() -> None:
     steps = [stepper(Core("corrected", make_options(), num_envs=n)) for n in (2, 96)]
-    few, many = (python_calls(step) for step in steps)
+    few, many = (calls_of(step, "call") for step in steps)
     assert few == many < 350
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import pickle
 import re
 import subprocess
@@ -21,6 +22,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from pettingzoo.test.state_test import state_test
 
 import sdc_taichi
+from call_counts import calls_of
 from sdc_taichi import ConfigError, RuntimeStateError, SdcError, load_config
 from sdc_taichi.envs import rendering, rewards
 from sdc_taichi.envs.features import AGENTS
@@ -579,20 +581,12 @@ def test_calls_per_step_are_few_whatever_the_batch(
         env.reset(seed=0)
         actions = {agent: np.ones(num_envs, dtype=np.int64) for agent in AGENTS}
         env.step(actions)
-        result, calls = env.core.view.last, 0
-
-        def count(frame: Any, event: str, arg: Any) -> None:
-            nonlocal calls
-            calls += event in ("call", "c_call")
-
+        result = env.core.view.last
         with monkeypatch.context() as patch:
             patch.setattr(env.core.sim, "step", lambda actions, result=result: result)
             env.step(actions)
-            former = sys.getprofile()
-            sys.setprofile(count)
-            env.step(actions)
-            sys.setprofile(former)
-        counted.append(calls)
+            step = functools.partial(env.step, actions)
+            counted.append(calls_of(step, "call", "c_call"))
     assert len(set(counted)) == 1
     assert counted[0] < 160
 
