@@ -225,10 +225,18 @@ def test_the_same_command_again_replaces_its_run(tmp_path: Path) -> None:
     simulate(out, "--site", "ny,ca")
     assert names_in(out) == FILES | {"configs.yaml"}
     (out / ".steps.parquet.123.part").write_bytes(b"left by a killed run")
+    (out / "report.html").write_text("of the run before")
     simulate(out, "--site", "ny", "--days", 0.5)
     assert names_in(out) == FILES | {"config.yaml"}
     assert len(steps_of(out)) == 48
     assert load_config(out / "config.yaml").site.location == "NY"
+
+
+def test_what_a_broken_off_run_left_may_be_replaced(tmp_path: Path) -> None:
+    for name in ("steps.parquet", "report.html", "hall.rrd"):
+        (tmp_path / name).write_text("left")
+    simulate(tmp_path, "--days", 0.25)
+    assert len(steps_of(tmp_path)) == 24
 
 
 def test_default_folder_names_preset_sites_and_start(
