@@ -72,6 +72,7 @@ class CompiledStage:
         self._stage, self._size = stage, size
         self._stride = size + (_ASIDE if size % _SAME_SETS == 0 else 0)
         self._kernel: BoundKernel | None = None
+        self._inputs = np.zeros(0)
 
     def __call__(self, **given: npt.NDArray[np.float64]) -> dict[str, npt.NDArray[np.float64]]:
         """Results by name, each (n,): rows of one new array."""
@@ -80,26 +81,29 @@ class CompiledStage:
         assert self._kernel is not None
         if tuple(given) != self._names:
             raise TypeError(f"arguments {[*given]}, expected {[*self._names]} as on the first call")
-        inputs = self._rows([*given.values()])
+        self._put([*given.values()], self._inputs)
         out = np.empty((len(self._results), self._stride))
         serial = self._size <= SERIAL_UP_TO
-        self._kernel(serial, self._size, self._constants, inputs, out)
-        return dict(zip(self._results, out[:, : self._size], strict=True))
+        self._kernel(serial, self._size, self._constants, self._inputs, out)
+        rows = out if self._stride == self._size else out[:, : self._size]
+        return dict(zip(self._results, rows, strict=True))
 
-    def _rows(self, arrays: list[Any]) -> npt.NDArray[np.float64]:
-        """One array of these, with room at the end of each where the stride asks for it."""
+    def _put(self, arrays: list[Any], rows: npt.NDArray[np.float64]) -> None:
+        """Copy arrays (n,) to rows, which have room at their ends where the stride asks for it."""
         if self._stride == self._size:
-            return np.array(arrays, dtype=np.float64)
-        rows = np.empty((len(arrays), self._stride))
-        np.stack(arrays, out=rows[:, : self._size], casting="unsafe")
-        return rows
+            np.concatenate(arrays, out=rows.reshape(-1), casting="unsafe")
+        else:
+            np.stack(arrays, out=rows[:, : self._size], casting="unsafe")
 
     def _compile(self, names: tuple[str, ...]) -> None:
         record = _Record(self._size)
         given = {name: record.entry(f"given[{row}, i]") for row, name in enumerate(names)}
         results = {name: record.lift(x) for name, x in self._stage(**given).items()}
         self._names, self._results = names, tuple(results)
-        self._constants = self._rows(record.constants or [np.zeros(self._size)])
+        constants = record.constants or [np.zeros(self._size)]
+        self._constants = np.empty((len(constants), self._stride))
+        self._put(constants, self._constants)
+        self._inputs = np.empty((len(names), self._stride))
         source = _source(record.lines(list(results.values())))
         self._kernel = BoundKernel(_kernel(source), templates=1)
 

@@ -168,8 +168,10 @@ DC_OUT = (
     "coil_load_w",
     "coil_w",
     "inlet_max_c",
-    "hottest_group",
+    "hottest_rack",
+    "hottest_server",
 )
+"""The hottest inlet at the end: rack within its data center and server within its rack, from 0."""
 
 RECOMMENDED_HIGH_C = 27.0
 RECOMMENDED_LOW_C = 18.0
@@ -489,14 +491,15 @@ def hall_kernel(precision: str) -> Any:
         substep_s,
         weight,
         tolerance_k,
+        block_ints: ti.template(),
         chunk_ints: ti.template(),
-        rack_ints: ti.template(),
         dc_ints: ti.template(),
         control: ti.template(),
         dcs: ti.template(),
         doubles: ti.template(),
         units: ti.template(),
         unit_state: ti.template(),
+        counts: ti.template(),
         needs: ti.template(),
         terms: ti.template(),
         sums: ti.template(),
@@ -686,9 +689,16 @@ def hall_kernel(precision: str) -> Any:
                 block = ti.cast(sums[SUM.hottest_block, chunk_0], ti.i32)
                 zone = ti.cast(sums[SUM.hottest_zone, chunk_0], ti.i32)
                 lane = ti.cast(sums[SUM.hottest_lane, chunk_0], ti.i32)
-                group = rack_ints[RACK_INT.first_group, block * LANES + lane] + zone
+                rack = (block - chunk_ints[CHUNK.first_block, chunk_0]) * LANES + lane
+                count_at = block_ints[BLOCK.table, block] * (n_rows * LANES) + lane
+                server = ti.cast(0.0, real)
+                z = 0
+                while z < zone:
+                    server += counts[count_at + z * (n_rows * LANES)]
+                    z += 1
                 dc_out[TOTAL.inlet_max_c, n] = hottest_c
-                dc_out[TOTAL.hottest_group, n] = ti.cast(group, ti.f64)
+                dc_out[TOTAL.hottest_rack, n] = ti.cast(rack, ti.f64)
+                dc_out[TOTAL.hottest_server, n] = ti.cast(server, ti.f64)
 
     @ti.func
     @no_type_check
@@ -1215,14 +1225,15 @@ def hall_kernel(precision: str) -> Any:
                             substep_s,
                             weight,
                             tolerance_k,
+                            block_ints,
                             chunk_ints,
-                            rack_ints,
                             dc_ints,
                             control,
                             dcs,
                             doubles,
                             units,
                             unit_state,
+                            counts,
                             needs,
                             terms,
                             sums,

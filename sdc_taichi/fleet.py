@@ -27,7 +27,7 @@ from sdc_taichi.recirculation import (
     design_point,
     rack_servers,
 )
-from sdc_taichi.types import F64, I64
+from sdc_taichi.types import F64
 
 I32 = npt.NDArray[np.int32]
 
@@ -189,21 +189,6 @@ class Fleet:
     def group_sums(self, values: npt.ArrayLike) -> F64:
         """Sum of group values, (G,), over each rack, (R,)."""
         return _sums(values, self.group_start)
-
-    def place_of_group(self, group: I64) -> tuple[F64, F64]:
-        """Where groups, (n,), begin: rack within its data center and server within its rack.
-
-        Both count from 0, servers from the floor.
-        """
-        # Right where all racks have equally many groups, as is usual.
-        rack = group * self.racks // self.groups.shape[1]
-        first = self.group_start[rack]
-        if ((group < first) | (group >= self.group_start[rack + 1])).any():
-            rack = np.searchsorted(self.group_start, group, side="right") - 1
-            first = self.group_start[rack]
-        server = self.server_start[group] - self.server_start[first]
-        rack = rack - self.rack_start[self.rack_dc[rack]]
-        return rack.astype(np.float64), server.astype(np.float64)
 
     def per_dc_servers(self) -> F64:
         """Servers of each data center, (B,)."""

@@ -140,7 +140,7 @@ class Floor:
     def _all_on(self, status: Status, powered: F64 | None) -> bool:
         """Whether all racks are in order and on throughout the step."""
         lit = powered is None or bool((powered == 1.0).all())
-        return lit and not status.any()
+        return lit and not (self._protected and status.any())
 
     def protect(self, status: Status, inlet_max_c: Reals) -> Status:
         """Status of each rack after a step with the given hottest inlets, (R,)."""
@@ -150,7 +150,7 @@ class Floor:
 
     def racks_in(self, status: Status, which: int) -> F64:
         """Racks of each data center that have a status of ``plant.protection``, (B,)."""
-        if not status.any():
+        if not (self._protected and status.any()):
             return np.zeros(len(self._servers))
         return self._fleet.rack_sums(status == which)
 

@@ -13,7 +13,7 @@ from sdc_taichi import runtime
 from sdc_taichi.errors import RuntimeStateError, SdcError
 from sdc_taichi.fleet import LOADS, Fleet, starts
 from sdc_taichi.recirculation import DENSE_RACKS
-from sdc_taichi.types import F64, I64, Reals, ServerLayers
+from sdc_taichi.types import F64, Reals, ServerLayers
 
 Precision = Literal["f32", "f64"]
 
@@ -107,8 +107,10 @@ class HallSums:
     """Sum over the servers of what their inlets exceed 27 C by."""
     cold_k: F64
     """Sum over the servers of what their inlets fall short of 18 C by."""
-    hottest_group: I64
-    """Server group with the hottest inlet."""
+    hottest_rack: F64
+    """Rack with the hottest inlet, counted from 0 in its data center."""
+    hottest_server: F64
+    """First server of the group with the hottest inlet, counted from 0 in its rack."""
     stored_w: F64
     """Heat that goes into servers and recirculated air."""
     crac_flow_m3s: F64
@@ -361,6 +363,7 @@ class Hall:
         fresh_share = thermal.DC_ROWS.index("fresh_share")
         self._fresh_m3s = fleet.dcs[fresh_share][fleet.unit_dc] * fleet.unit_design_m3s
         self._rack_store = self._lanes(len(thermal.RACK_STATE), blocks)
+        self._rack_out = self._lanes(len(thermal.RACK_OUT), blocks)
         self._rack_state = self._rack_store.reshape(len(self._rack_store), -1)
         self._sources = self._rack_store.reshape(-1, thermal.SOURCES)
         self._run_sources = self._rack_store.reshape(-1, thermal.RUN_LANES)
@@ -380,14 +383,14 @@ class Hall:
         return out
 
     def _at_racks(self, rows: Any) -> Any:
-        """Values of the racks, (..., R), of rows by place."""
-        rows = rows.reshape(*rows.shape[:-1], -1) if rows.ndim < 3 else rows.reshape(len(rows), -1)
+        """Values of the racks, (n, R), of n rows by place; a copy."""
+        rows, size = rows.reshape(len(rows), -1), self._fleet.size
         if self._same_size is None:
-            return rows[..., self._rack_at]
-        size = self._fleet.size
-        return rows.reshape(*rows.shape[:-1], size, -1)[..., : self._same_size].reshape(
-            *rows.shape[:-1], -1
-        )
+            return rows[:, self._rack_at]
+        # The racks of a data center as one item, in a third of the time of one by one.
+        apart, item = rows.strides[0], np.dtype((np.void, self._same_size * rows.itemsize))
+        parts: Any = np.ndarray((len(rows), size), item, rows, strides=(apart, apart // size))
+        return parts.copy().view(self._dtype)
 
     def _put(self, row: Any, values: Any) -> None:
         """Values of the racks, (R,), to their places."""
@@ -409,11 +412,11 @@ class Hall:
         self._set(met)
         self._supply["fresh_ratio"][:] = 1.0
         self._begin(exchange=0)
-        out = self._out()
+        out = self._new_sums()
         if self._recirculates:
             self._sweep(out, MOST_SWEEPS)
             ended = self._control["active"]
-            if np.any(ended < 0):
+            if np.minimum.reduce(ended) < 0:
                 raise SdcError(
                     f"{self._fleet.names[int(np.argmin(ended))]}: no steady air temperatures in "
                     f"{MOST_SWEEPS} sweeps; the CRAC units move too little air: raise "
@@ -432,10 +435,10 @@ class Hall:
             row[:] = first[name]
         self._moves[:] = 0.0
 
-    def _sweep(self, out: tuple[Any, Any], sweeps: int, **how: Any) -> None:
+    def _sweep(self, out: F64, sweeps: int, **how: Any) -> None:
         """Call the kernel until every data center has come to its end."""
         active = self._control["active"]
-        while np.any(active > 0):
+        while np.maximum.reduce(active) > 0:
             self._run(out, sweeps=sweeps, **how)
 
     def servers(self, into: ServerLayers | None = None) -> ServerLayers:
@@ -509,7 +512,7 @@ class Hall:
         steady = [row.copy() for row in kept]
         self._memory["exhaust_c"][:] = self._exhaust()
         self._begin(exchange=1)
-        self._sweep(self._out(), 1, transient=True, servers=(servers, servers), substep_s=1e9)
+        self._sweep(self._new_sums(), 1, transient=True, servers=(servers, servers), substep_s=1e9)
         for row, values in zip(kept, steady, strict=True):
             row[:] = values
         return self._state(servers)
@@ -550,7 +553,7 @@ class Hall:
         warmed = (coil.room_j / coil.room_j_per_k)[fleet.unit_dc]
         self._supply["supply_c"][:] = coil.setpoint_c + warmed
         count = int(np.ceil(step_s / substep_s - 1e-9))
-        out = self._out()
+        out = self._new_sums()
         self._begin(exchange=1)
         servers = np.empty(fleet.groups.shape[1], self._dtype)
         self._sweep(
@@ -572,9 +575,9 @@ class Hall:
     def _state(self, servers: Any) -> HallState:
         return HallState(
             server_c=servers,
-            mixed_c=self._at_racks(self._memory["mixed_c"]).copy(),
-            exhaust_c=self._at_racks(self._exhaust()).copy(),
-            captured_m3s=self._at_racks(self._memory["captured_m3s"]).copy(),
+            mixed_c=self._at_racks(self._memory["mixed_c"][None])[0],
+            exhaust_c=self._at_racks(self._exhaust()[None])[0],
+            captured_m3s=self._at_racks(self._memory["captured_m3s"][None])[0],
             need_m3s=self._supply["need_m3s"].copy(),
             following=self._supply["following"].copy(),
         )
@@ -606,14 +609,9 @@ class Hall:
         unit["running"][:] = 1.0 if met.unit_running is None else met.unit_running
         self._supply["supply_c"][:] = met.unit_supply_c
 
-    def _out(self) -> tuple[Any, Any]:
-        shape = (len(self._thermal.RACK_OUT), *self._rack_store.shape[1:])
-        racks = self._empty(shape, self._dtype)
-        return racks, np.empty((len(self._thermal.DC_OUT), self._fleet.size), np.float64)
-
     def _run(
         self,
-        out: tuple[Any, Any] | None,
+        out: F64 | None,
         *,
         transient: bool = False,
         sweeps: int = 1,
@@ -627,7 +625,6 @@ class Hall:
         runtime.ensure_started()
         values_out = self._fleet.servers if write else self._group_places * self._thermal.LANES
         serial = values_out * (sweeps if transient else 1) <= _SERIAL_GROUPS
-        racks, dcs = (self._rack_store, self._sums) if out is None else out
         none, no_lanes = self._no_groups, self._shares
         if transient and len(self._server_c) < self._group_places:
             self._server_c = self._lanes(self._group_places)
@@ -671,18 +668,21 @@ class Hall:
             *((none, none) if servers is None else servers),
             self._constants,
             self._terms,
-            racks,
+            self._rack_out,
             self._needs,
             self._sums,
-            dcs,
+            self._sums if out is None else out,
             self._tables.reshape(-1),
             self._rack_store if values is None else values,
             none if values is None else values.reshape(-1),
             *((none, none, none, no_lanes, no_lanes, no_lanes) if write is None else write),
         )
 
-    def _results(self, out: tuple[Any, Any]) -> HallSums:
-        racks, dcs = self._at_racks(out[0]), out[1]
+    def _new_sums(self) -> F64:
+        return np.empty((len(self._thermal.DC_OUT), self._fleet.size))
+
+    def _results(self, dcs: F64) -> HallSums:
+        racks = self._at_racks(self._rack_out)
         if not isfinite(np.add.reduce(dcs, axis=None)):
             finite = np.isfinite(dcs).all(axis=0)
             raise SdcError(
@@ -690,7 +690,6 @@ class Hall:
                 "are beyond any number; valid are smaller powers or larger airflows"
             )
         found = dict(zip(self._result_names, (*dcs, *racks), strict=True))
-        found["hottest_group"] = found["hottest_group"].astype(np.int64)
         return HallSums(
             unit_flow_m3s=self._supply["flow_m3s"].copy(),
             unit_cubed_speed=self._supply["cubed_speed"].copy(),

@@ -270,16 +270,15 @@ class Simulator:
         powered = None if calm else self._powered(state, event)
         floor, status = self._floor, state.rack_status
         capacity, highest = floor.capacity(status, powered, given.placement)
+        waiting, due = self._queue.at_start(state.queue)
         work = stages.work(
             demand=world.demand,
             command=load_command,
-            waiting=state.queue[:, -1].copy(),
-            due=self._queue.due(state.queue),
+            waiting=waiting,
+            due=due,
             max_utilisation=np.minimum(self._max_utilisation, highest),
         )
-        oldest_steps, mean_steps, queue = self._queue.after(
-            state.queue, work["taken"], work["deferred"]
-        )
+        queued = self._queue.after(state.queue, work["taken"], work["deferred"])
         utilisation = work["utilisation"]
         placed = floor.place(utilisation, capacity, powered, state.group_inlet_c, given.placement)
 
@@ -359,7 +358,7 @@ class Simulator:
             cooling_last=last,
             cooling_scale=scale,
             fan_speed=fan_speed,
-            queue=queue,
+            queue=queued.queue,
             # Not the rows themselves, which would keep all results of the step.
             stored_kwh=after["stored_kwh"].copy(),
             room_heat_kwh=after["room_heat_kwh"].copy(),
@@ -367,7 +366,6 @@ class Simulator:
             group_inlet_c=hall.group_inlets() if len(state.group_inlet_c) else state.group_inlet_c,
             **memory,
         )
-        hottest_rack, hottest_server = self.fleet.place_of_group(air.hottest_group)
         return StepResult(
             step=state.step,
             step_h=step_h,
@@ -387,14 +385,14 @@ class Simulator:
             overdue_tasks=work["overdue"],
             dropped_tasks=work["dropped"],
             lost_tasks=lost_tasks,
-            queue_tasks=queue[:, -1].copy(),
-            oldest_age_h=oldest_steps * step_h,
-            mean_age_h=mean_steps * step_h,
+            queue_tasks=queued.waiting,
+            oldest_age_h=queued.oldest_steps * step_h,
+            mean_age_h=queued.mean_steps * step_h,
             setpoint_c=self._per_dc(setpoint_c).copy(),
             inlet_mean_c=air.inlet_mean_c,
             inlet_max_c=air.inlet_max_c,
-            hottest_rack=hottest_rack,
-            hottest_server=hottest_server,
+            hottest_rack=air.hottest_rack,
+            hottest_server=air.hottest_server,
             throttled_racks=floor.racks_in(status, THROTTLED),
             tripped_racks=floor.racks_in(status, TRIPPED),
             outlet_mean_c=air.outlet_mean_c,

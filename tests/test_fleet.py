@@ -141,16 +141,12 @@ def test_fleets_that_cannot_be() -> None:
         build_fleet(half)
 
 
-def test_sums_and_places_of_a_ragged_fleet() -> None:
+def test_sums_of_a_ragged_fleet() -> None:
     fleet = build_fleet(ragged())
     assert fleet.unit_sums([1.0, 2.0, 4.0]).tolist() == [1, 2, 4]
     assert fleet.rack_sums(np.arange(8)).tolist() == [6, 4, 18]
     assert fleet.rack_sums(np.arange(8) > 2).tolist() == [1, 1, 3]
     assert fleet.group_sums(fleet.groups[0]).tolist() == [3, 3, 3, 3, 1, 5, 6, 7]
-    rack, server = fleet.place_of_group(np.array([2, 7, 10, 0]))
-    assert rack.tolist() == [1, 0, 2, 0]
-    assert server.tolist() == [2, 0, 0, 0]
-    assert fleet.place_of_group(np.array([6]))[1].tolist() == [2]
 
 
 def test_approach_temperatures_are_those_that_the_hall_has(tmp_path: Path) -> None:

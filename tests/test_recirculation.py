@@ -212,7 +212,10 @@ def assert_agrees(configs: list[DataCenterConfig], met: Conditions, precision: P
             found = getattr(layers, field)[part.servers]
             assert_close(found, expected, rel, (name, "server", field))
         hottest = layers.inlet_c[part.servers].max()
-        assert hall.group_inlets()[sums.hottest_group[i]] == hottest == sums.inlet_max_c[i]
+        fleet = build_fleet(configs)
+        rack = part.racks.start + int(sums.hottest_rack[i])
+        server = fleet.server_start[fleet.group_start[rack]] + int(sums.hottest_server[i])
+        assert layers.inlet_c[server] == hottest == sums.inlet_max_c[i]
 
 
 # --- against the twin ---------------------------------------------------------------------------
@@ -891,7 +894,7 @@ def test_servers_agree_with_their_racks_and_get_warmer_upwards(seed: int) -> Non
 
 
 def own_part(values: HallSums, configs: list[DataCenterConfig], index: int) -> dict[str, Any]:
-    """What a fleet computed for one of its data centers, places counted from its own first."""
+    """What a fleet computed for one of its data centers."""
     fleet = build_fleet(configs)
     racks = slice(*fleet.rack_start[index : index + 2])
     units = slice(*fleet.unit_start[index : index + 2])
@@ -903,7 +906,6 @@ def own_part(values: HallSums, configs: list[DataCenterConfig], index: int) -> d
         elif f.name.startswith("unit_"):
             where = units
         out[f.name] = getattr(values, f.name)[where]
-    out["hottest_group"] = out["hottest_group"] - fleet.group_start[racks.start]
     return out
 
 

@@ -13,7 +13,12 @@ def work_step(
 ) -> SimpleNamespace:
     """Fields of ``Work``, ages in steps, and the queue at the end of a step."""
     queues = workload.Queue(queue.shape[1], deadline_steps + workload.DUE_AFTER_STEPS[model])
-    work = workload.MODELS[model](demand, command, queue[:, -1], queues.due(queue), **limits)
-    oldest, mean, after = queues.after(queue, work.taken, work.deferred)
+    work = workload.MODELS[model](demand, command, *queues.at_start(queue), **limits)
+    after = queues.after(queue, work.taken, work.deferred)
     own = {name: getattr(work, name) for name in work.__slots__}
-    return SimpleNamespace(**own, oldest_age_steps=oldest, mean_age_steps=mean, queue=after)
+    return SimpleNamespace(
+        **own,
+        oldest_age_steps=after.oldest_steps,
+        mean_age_steps=after.mean_steps,
+        queue=after.queue,
+    )

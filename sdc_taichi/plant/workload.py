@@ -139,51 +139,106 @@ UNLIMITED_TASKS = 1e30
 """Limit of a queue without one; larger than any, and still a number."""
 
 
+@dataclass(frozen=True, slots=True)
+class Queued:
+    """Work in the queues of a fleet between two steps, (B,) unless stated."""
+
+    queue: F64
+    """Work still queued by the step that put it in, oldest first and accumulated, (B, L)."""
+    waiting: F64
+    due: F64
+    """Part of it whose deadline has come when the next step starts."""
+    oldest_steps: F64
+    """Age of the oldest work."""
+    mean_steps: F64
+
+
 class Queue:
     """What every step does to the queues of a fleet.
 
-    A queue is the work still queued by the step that put it in, oldest first, (B, L).
-
     Args:
-        length: L.
+        length: steps that a queue tells apart, L.
         due_steps: age at which work is due, inf for never, (B,).
     """
 
     def __init__(self, length: int, due_steps: F64) -> None:
         due_at = length - np.minimum(due_steps, length + 1.0).astype(np.int64)
-        self._dcs = np.arange(len(due_steps))
-        self._due_at = np.maximum(due_at, 0)
-        self._never = due_at < 0
-        self._after: Any = None
+        self._size, self._length = len(due_steps), length
+        self._due_row = np.where(due_at < 0, length, due_at).astype(np.float64)
+        self._kernel: Any = None
+        self._rows: Any = None
+        """Rows of the queue that the last step left, as the kernel takes them."""
+        self._known: F64 | None = None
+        """That queue as others see it."""
+        self._start = (np.zeros(0), np.zeros(0))
 
-    def due(self, queue: F64) -> F64:
-        """Work that is due when the coming step starts, (B,)."""
-        return np.where(self._never, 0.0, queue[self._dcs, self._due_at])
-
-    def after(self, queue: F64, taken: F64, deferred: F64) -> tuple[F64, F64, F64]:
-        """The queue at the end of a step, a new array.
+    def at_start(self, queue: F64) -> tuple[F64, F64]:
+        """Work that waits when a step starts, and what of it is due, (B,).
 
         Args:
-            queue: at its start.
+            queue: work still queued by the step that put it in, oldest first, (B, L).
+        """
+        if queue is not self._known:
+            never = np.zeros((1, self._size))
+            due_row = self._due_row.astype(np.int64)
+            due = np.concatenate([queue.T, never])[due_row, np.arange(self._size)]
+            self._take(queue)
+            self._start = queue[:, -1].copy(), due
+        return self._start
+
+    def after(self, queue: F64, taken: F64, deferred: F64) -> Queued:
+        """The queues at the end of a step.
+
+        Args:
+            queue: at its start, (B, L).
             taken: work that leaves it, oldest first, (B,).
             deferred: work that enters it, (B,).
-
-        Returns:
-            Age of the oldest work and mean age in steps, (B,), and the queue.
         """
         from sdc_taichi.kernels.queue import SERIAL_UP_TO, bound_queue_kernel
 
-        if self._after is None:
+        if self._kernel is None:
             runtime.ensure_started()
-            self._after = bound_queue_kernel()
-        after, ages = np.empty_like(queue), np.empty((2, len(queue)))
-        serial = len(queue) <= SERIAL_UP_TO
-        self._after(serial, _NEGLIGIBLE_TASKS, queue, taken, deferred, after, ages)
-        return ages[0], ages[1], after
+            self._kernel = bound_queue_kernel()
+        if queue is not self._known:
+            self._take(queue)
+        after, found = self._empty(), np.empty((4, self._size))
+        self._kernel(
+            self._size <= SERIAL_UP_TO,
+            _NEGLIGIBLE_TASKS,
+            self._size,
+            self._due_row,
+            self._rows,
+            taken,
+            deferred,
+            after,
+            found,
+        )
+        waiting, due, oldest_steps, mean_steps = found
+        self._rows, self._known = after, self._seen(after)
+        self._start = waiting, due
+        return Queued(self._known, waiting, due, oldest_steps, mean_steps)
+
+    def _empty(self) -> Any:
+        """Rows of any content for the kernel, (L, blocks of data centers, LANES)."""
+        from sdc_taichi.kernels.backend import aligned
+        from sdc_taichi.kernels.queue import LANES
+
+        return aligned((self._length, -(-self._size // LANES), LANES), np.float64)
+
+    def _seen(self, rows: Any) -> F64:
+        seen: F64 = rows.reshape(self._length, -1)[:, : self._size].T
+        return seen
+
+    def _take(self, queue: F64) -> None:
+        """Go on from a queue that was not left by the last step."""
+        self._rows = self._empty()
+        self._rows[:] = 0.0
+        self._seen(self._rows)[:] = queue
+        self._known = queue
 
     def forget(self) -> None:
         """Let go of the kernel and the arrays that it was last given."""
-        self._after = None
+        self._kernel = self._rows = self._known = None
 
 
 def age_histogram(queue: F64, edges_steps: F64) -> F64:
