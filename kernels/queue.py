@@ -7,7 +7,9 @@ from .backend import BoundKernel, ti
 
 LANES = 8
 """Data centers that are computed at a time."""
-SERIAL_UP_TO = 64
+BLOCKS_AT_ONCE = 64
+"""Least that a thread takes on."""
+SERIAL_UP_TO = 256
 """Data centers that one thread computes sooner than several are woken."""
 
 
@@ -46,7 +48,7 @@ def queue_kernel() -> Any:
         after: blocks,
         found: rows,
     ):
-        ti.loop_config(serialize=serial)
+        ti.loop_config(serialize=serial, block_dim=BLOCKS_AT_ONCE)
         for block in range(before.shape[1]):
             last = before.shape[0] - 1
             zeros = ti.Vector([ti.f64(0.0)] * LANES)

@@ -223,7 +223,10 @@ class Queue:
         from sdc_taichi.kernels.backend import aligned
         from sdc_taichi.kernels.queue import LANES
 
-        return aligned((self._length, -(-self._size // LANES), LANES), np.float64)
+        blocks = -(-self._size // LANES)
+        # Rows that are multiples of 4 KiB apart compete for the same sets of the cache.
+        blocks += blocks % (4096 // (8 * LANES)) == 0
+        return aligned((self._length, blocks, LANES), np.float64)
 
     def _seen(self, rows: Any) -> F64:
         seen: F64 = rows.reshape(self._length, -1)[:, : self._size].T
