@@ -27,12 +27,19 @@ ALIGNMENT = 256
 """Bytes; compiled code takes arrays of vectors to start at a multiple of the vector's length."""
 
 
+def address_of(array: Any) -> int:
+    """Where an array begins; ``ndarray.ctypes`` takes four times as long."""
+    if array.flags.writeable and array.nbytes:
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+    return int(array.ctypes.data)
+
+
 def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     """Array of any content that may be handed over as one of vectors."""
     of = np.dtype(dtype)
     length = math.prod(shape) * of.itemsize
     raw = np.empty(length + ALIGNMENT, np.uint8)
-    start = -raw.ctypes.data % ALIGNMENT
+    start = -address_of(raw) % ALIGNMENT
     return raw[start : start + length].view(of).reshape(shape)
 
 
@@ -74,13 +81,6 @@ def _translation() -> Iterator[None]:
     finally:
         ASTTransformerContext.get_pos_info = excerpt
         runtime.default_ip = whole
-
-
-def _address(array: Any) -> int:
-    """Where an array begins; ``ndarray.ctypes`` takes four times as long."""
-    if array.flags.writeable and array.nbytes:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))
-    return int(array.ctypes.data)
 
 
 class BoundKernel:
@@ -152,7 +152,7 @@ class _Launch:
                     kinds[i] = kind
                 if kinds[i] != kind or not value.flags.c_contiguous:
                     raise TypeError(f"argument {i}: {value.dtype} array of other type or order")
-                shape, address = value.shape, _address(value)
+                shape, address = value.shape, address_of(value)
                 if self._element_dims[i]:
                     if address % (shape[-1] * value.itemsize):
                         raise TypeError(f"argument {i}: vectors that do not start at whole ones")

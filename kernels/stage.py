@@ -2,44 +2,47 @@
 
 A stage is a plain function whose arrays all have one entry per data center. It is called once with
 quantities that write down what is done to them; from that record a kernel is made, which computes
-entry after entry and keeps nothing in between. Whatever the stage reads apart from its arguments
-is taken as constant. NumPy needs a call and a temporary per operation, and some hundred of them
-cost more than the arithmetic unless there are thousands of data centers.
+LANES entries at a time, as vectors of the processor, and keeps nothing in between. Whatever the
+stage reads apart from its arguments is taken as constant. NumPy needs a call and a temporary per
+operation, and some hundred of them cost more than the arithmetic unless there are thousands of data
+centers.
 """
 
 import linecache
 from collections.abc import Callable, Mapping
 from functools import cache
 from hashlib import sha256
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from .backend import BoundKernel, ti
+from .backend import BoundKernel, aligned, ti
 
 Arrays = Mapping[str, Any]
 
-SERIAL_UP_TO = 512
+LANES = 8
+SERIAL_UP_TO = 1024
 """Entries that one thread computes sooner than several are woken."""
-
-_SAME_SETS, _ASIDE = 512, 8
+_BLOCKS_AT_ONCE = 64
+"""Least that a thread takes on."""
+_SAME_SETS = 64
 """Rows that are multiples of 4 KiB apart compete for the same sets of the cache, and a stage reads
-and writes a hundred of them at a time: twice as slow. Such rows are set aside by a cache line."""
+and writes a hundred of them at a time: twice as slow. Such rows get a block more."""
 
 _NUMBERS = {
     np.add: "{} + {}",
     np.subtract: "{} - {}",
     np.multiply: "{} * {}",
     np.divide: "{} / {}",
-    np.maximum: "ti.max({}, {})",
-    np.minimum: "ti.min({}, {})",
-    np.negative: "-{}",
+    np.maximum: "larger({}, {})",
+    np.minimum: "smaller({}, {})",
+    np.negative: "minus({})",
     np.sqrt: "ti.sqrt({})",
-    np.exp: "ti.exp({})",
+    np.exp: "each_exp({})",
     np.floor: "ti.floor({})",
-    np.ceil: "ti.ceil({})",
+    np.ceil: "minus(ti.floor(minus({})))",
 }
 _COMPARISONS = {
     np.greater: "{} > {}",
@@ -70,9 +73,9 @@ class CompiledStage:
 
     def __init__(self, stage: Callable[..., Arrays], size: int) -> None:
         self._stage, self._size = stage, size
-        self._stride = size + (_ASIDE if size % _SAME_SETS == 0 else 0)
+        blocks = -(-size // LANES)
+        self._blocks = blocks + (blocks % _SAME_SETS == 0)
         self._kernel: BoundKernel | None = None
-        self._inputs = np.zeros(0)
 
     def __call__(self, **given: npt.NDArray[np.float64]) -> dict[str, npt.NDArray[np.float64]]:
         """Results by name, each (n,): rows of one new array."""
@@ -81,19 +84,22 @@ class CompiledStage:
         assert self._kernel is not None
         if tuple(given) != self._names:
             raise TypeError(f"arguments {[*given]}, expected {[*self._names]} as on the first call")
-        self._put([*given.values()], self._inputs)
-        out = np.empty((len(self._results), self._stride))
-        serial = self._size <= SERIAL_UP_TO
-        self._kernel(serial, self._size, self._constants, self._inputs, out)
-        rows = out if self._stride == self._size else out[:, : self._size]
-        return dict(zip(self._results, rows, strict=True))
+        self._entries(self._inputs)[:] = self._rows([*given.values()])
+        out = self._empty(len(self._results))
+        self._kernel(self._size <= SERIAL_UP_TO, self._constants, self._inputs, out)
+        return dict(zip(self._results, self._entries(out), strict=True))
 
-    def _put(self, arrays: list[Any], rows: npt.NDArray[np.float64]) -> None:
-        """Copy arrays (n,) to rows, which have room at their ends where the stride asks for it."""
-        if self._stride == self._size:
-            np.concatenate(arrays, out=rows.reshape(-1), casting="unsafe")
-        else:
-            np.stack(arrays, out=rows[:, : self._size], casting="unsafe")
+    def _rows(self, arrays: list[Any]) -> npt.NDArray[np.float64]:
+        """One array of these, faster than by ``np.stack``."""
+        return np.concatenate(arrays, dtype=np.float64).reshape(len(arrays), self._size)
+
+    def _empty(self, rows: int) -> Any:
+        """Rows of any content as the kernel takes them, (rows, blocks, LANES)."""
+        return aligned((rows, self._blocks, LANES), np.float64)
+
+    def _entries(self, rows: Any) -> Any:
+        """What such rows hold, (rows, n)."""
+        return rows.reshape(len(rows), -1)[:, : self._size]
 
     def _compile(self, names: tuple[str, ...]) -> None:
         record = _Record(self._size)
@@ -101,9 +107,10 @@ class CompiledStage:
         results = {name: record.lift(x) for name, x in self._stage(**given).items()}
         self._names, self._results = names, tuple(results)
         constants = record.constants or [np.zeros(self._size)]
-        self._constants = np.empty((len(constants), self._stride))
-        self._put(constants, self._constants)
-        self._inputs = np.empty((len(names), self._stride))
+        self._constants, self._inputs = self._empty(len(constants)), self._empty(len(names))
+        for rows in (self._constants, self._inputs):
+            rows[:] = 0.0
+        self._entries(self._constants)[:] = self._rows(constants)
         source = _source(record.lines(list(results.values())))
         self._kernel = BoundKernel(_kernel(source), templates=1)
 
@@ -178,7 +185,7 @@ class _Record:
             if array.dtype == np.bool_ or not np.isfinite(array):
                 raise TypeError(f"{value}: only finite numbers can be compiled")
             # Literals without a type would be rounded to f32.
-            return self.entry(f"ti.f64({float(array)!r})")
+            return self.entry(f"zeros + ti.f64({float(array)!r})")
         if array.shape != (self._size,):
             raise TypeError(f"constant of shape {array.shape}, expected ({self._size},)")
         row = self._rows.get(id(value))
@@ -226,11 +233,39 @@ def _source(body: list[str]) -> str:
     """A kernel that does these statements for every entry i."""
     head = (
         "@ti.kernel\n"
-        "def stage(serial: ti.template(), n: ti.i32, constants: Rows, given: Rows, out: Rows):\n"
-        "    ti.loop_config(serialize=serial)\n"
-        "    for i in range(n):\n"
+        "def stage(serial: ti.template(), constants: Rows, given: Rows, out: Rows):\n"
+        f"    ti.loop_config(serialize=serial, block_dim={_BLOCKS_AT_ONCE})\n"
+        "    for i in range(out.shape[1]):\n"
+        f"        zeros = ti.Vector([ti.f64(0.0)] * {LANES})\n"
     )
     return head + "".join(f"        {line}\n" for line in body)
+
+
+@ti.func
+@no_type_check
+def _larger(a, b):
+    return ti.select(a > b, a, b)
+
+
+@ti.func
+@no_type_check
+def _smaller(a, b):
+    return ti.select(a < b, a, b)
+
+
+@ti.func
+@no_type_check
+def _minus(a):
+    return a * ti.f64(-1.0)
+
+
+@ti.func
+@no_type_check
+def _each_exp(a):
+    out = a
+    for i in range(LANES):
+        out[i] = ti.exp(a[i])
+    return out
 
 
 @cache
@@ -241,7 +276,11 @@ def _kernel(source: str) -> Any:
     linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
     scope = {
         "ti": ti,
-        "Rows": ti.types.ndarray(dtype=ti.f64, ndim=2),
+        "Rows": ti.types.ndarray(dtype=ti.types.vector(LANES, ti.f64), ndim=2),
+        "larger": _larger,
+        "smaller": _smaller,
+        "minus": _minus,
+        "each_exp": _each_exp,
         "__name__": __name__,
     }
     exec(compile(source, name, "exec"), scope)
