@@ -79,17 +79,22 @@ class CompiledStage:
 
     def __call__(self, **given: npt.NDArray[np.float64]) -> dict[str, npt.NDArray[np.float64]]:
         """Results by name, each (n,): rows of one new array."""
+        rows = self.rows(**given)
+        return dict(zip(self._results, rows, strict=True))
+
+    def rows(self, **given: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Results in their order, (number of results, n); a new array."""
         if self._kernel is None:
             self._compile(tuple(given))
         assert self._kernel is not None
         if tuple(given) != self._names:
             raise TypeError(f"arguments {[*given]}, expected {[*self._names]} as on the first call")
-        self._entries(self._inputs)[:] = self._rows([*given.values()])
+        self._entries(self._inputs)[:] = self._stacked([*given.values()])
         out = self._empty(len(self._results))
         self._kernel(self._size <= SERIAL_UP_TO, self._constants, self._inputs, out)
-        return dict(zip(self._results, self._entries(out), strict=True))
+        return self._entries(out)
 
-    def _rows(self, arrays: list[Any]) -> npt.NDArray[np.float64]:
+    def _stacked(self, arrays: list[Any]) -> npt.NDArray[np.float64]:
         """One array of these, faster than by ``np.stack``."""
         return np.concatenate(arrays, dtype=np.float64).reshape(len(arrays), self._size)
 
@@ -97,9 +102,10 @@ class CompiledStage:
         """Rows of any content as the kernel takes them, (rows, blocks, LANES)."""
         return aligned((rows, self._blocks, LANES), np.float64)
 
-    def _entries(self, rows: Any) -> Any:
+    def _entries(self, rows: Any) -> npt.NDArray[np.float64]:
         """What such rows hold, (rows, n)."""
-        return rows.reshape(len(rows), -1)[:, : self._size]
+        held: npt.NDArray[np.float64] = rows.reshape(len(rows), -1)[:, : self._size]
+        return held
 
     def _compile(self, names: tuple[str, ...]) -> None:
         record = _Record(self._size)
@@ -110,7 +116,7 @@ class CompiledStage:
         self._constants, self._inputs = self._empty(len(constants)), self._empty(len(names))
         for rows in (self._constants, self._inputs):
             rows[:] = 0.0
-        self._entries(self._constants)[:] = self._rows(constants)
+        self._entries(self._constants)[:] = self._stacked(constants)
         source = _source(record.lines(list(results.values())))
         self._kernel = BoundKernel(_kernel(source), templates=1)
 

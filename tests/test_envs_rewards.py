@@ -136,10 +136,11 @@ def test_default_rewards_are_those_of_the_paper() -> None:
 )
 def test_sharing_keeps_the_sum(own: list[float], a: float) -> None:
     given = [np.array([r]) for r in own]
-    assert math.fsum(share(given, a)[:, 0]) == pytest.approx(math.fsum(own), abs=1e-9)
-    assert share(given, 1.0) == pytest.approx(np.array(given), abs=1e-12)
+    assert math.fsum(r[0] for r in share(given, a)) == pytest.approx(math.fsum(own), abs=1e-9)
+    assert np.array(share(given, 1.0)) == pytest.approx(np.array(given), abs=1e-12)
     # To the bit what several at once get.
-    assert np.array_equal(share([np.tile(r, 3) for r in given], a)[:, 1:2], share(given, a))
+    three = np.array(share([np.tile(r, 3) for r in given], a))
+    assert np.array_equal(three[:, 1:2], share(given, a))
 
 
 def test_agents_not_mentioned_keep_their_default() -> None:

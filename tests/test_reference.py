@@ -701,7 +701,7 @@ def check_setpoint(check: Check) -> Values:
 
 def check_collaboration(check: Check) -> Values:
     given = check["inputs"]
-    return {"R": share([np.array([r]) for r in given["r"]], given["a"])[:, 0].tolist()}
+    return {"R": [r[0] for r in share([np.array([r]) for r in given["r"]], given["a"])]}
 
 
 def check_trim_and_respond(check: Check) -> Values:

@@ -12,7 +12,8 @@ import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -30,9 +31,12 @@ from sdc_taichi.envs.forecasts import (
 from sdc_taichi.envs.timed import Layout, TimeRows, time_rows
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 from sdc_taichi.fleet import Fleet
-from sdc_taichi.plant.workload import TASKS_PER_STEP, age_histogram
+from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sizing import Sizing
 from sdc_taichi.types import F64, I64
+
+if TYPE_CHECKING:
+    from sdc_taichi.kernels.stage import CompiledStage
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,20 +254,14 @@ class Observer:
             for agent in agents
         }
         self._rows: dict[str, F32] = {}
-        sizes = [f.size for f in inside]
-        low = np.repeat([f.low for f in inside], sizes)
-        span = np.repeat([f.high - f.low for f in inside], sizes)
-        self._scale = (1.0 / span).astype(np.float32)[:, None]
-        self._shift = (-low / span).astype(np.float32)[:, None]
-        self._low = np.zeros((len(low), 1), dtype=np.float32)
-        self._high = self._low + 1.0
-
         per_hour = fleet.steps_per_hour
         limit_h = fleet.values("workload.queue_limit_h")
         limit_h = np.where(np.isnan(limit_h), UNLIMITED_QUEUE_H, limit_h)
         self._per_task = 1.0 / (limit_h * per_hour * TASKS_PER_STEP)
         self._edges_steps = np.asarray(AGE_EDGES_H) * per_hour
-        self._design: _Design | None = None
+        self._edge_entries: list[int] = []
+        self._sizing: Sizing | None = None
+        self._stage: CompiledStage | None = None
         self._seen: _Seen | None = None
 
     def reset(self, view: View, keys: Sequence[int] | I64 = ()) -> None:
@@ -281,7 +279,10 @@ class Observer:
             self._rows = {}
             if timed.rows is not None:
                 self._rows = {a: layout.of(timed.rows.values) for a, layout in layouts.items()}
-        self._design = _design(view.sizing, view.step_h)
+        if view.sizing is not self._sizing:
+            oldest = view.state.queue.shape[1] - 1
+            self._edge_entries = np.maximum(oldest - self._edges_steps, 0).astype(int).tolist()
+            self._stage, self._sizing = self._stage_of(view.sizing, view.step_h), view.sizing
         self._seen = None
 
     def observe(self, view: View) -> dict[str, F32]:
@@ -316,13 +317,13 @@ class Observer:
 
     def _look(self, view: View) -> _Seen:
         """What there is to observe; kept until the next view."""
-        seen, design, timed = self._seen, self._design, self._timed
+        seen, timed = self._seen, self._timed
         if seen is not None and seen.view is view:
             return seen
-        if design is None:
+        if self._stage is None:
             raise RuntimeStateError("the observer has not been reset; call reset() first")
         index, rows = view.drivers.start + view.state.step, timed.rows
-        inside = self._inside(view, design)
+        inside = self._inside(view)
         if rows is None:
             seen = _Seen(view, timed.look(index, view.state.step), None, inside)
         else:
@@ -330,36 +331,70 @@ class Observer:
         self._seen = seen
         return seen
 
-    def _inside(self, view: View, design: _Design) -> F32:
+    def _inside(self, view: View) -> F32:
         """Scaled queue, hall and battery, (n, B): one contiguous row each."""
-        state, last, at = view.state, view.last, self._row
-        out = np.empty((self._inside_width, len(state.stored_kwh)), dtype=np.float32)
-        waiting = state.queue[:, -1].copy()
-        out[at["queue"]] = waiting * self._per_task
-        out[at["age_histogram"]] = age_histogram(state.queue, self._edges_steps).T / counted(
-            waiting
+        assert self._stage is not None
+        state, last, alike = view.state, view.last, self._alike
+        setpoints = (
+            state.setpoint_c.reshape(-1, self._units).T if alike else [_setpoint_mean_c(view)]
         )
-        out[at["soc"]] = state.stored_kwh * design.per_battery_kwh
-        if self._alike:
-            out[at["setpoint"]] = state.setpoint_c.reshape(-1, self._units).T
-        else:
-            out[at["setpoint"]] = _setpoint_mean_c(view)
+        given = {f"setpoint_{i}": setpoint_c for i, setpoint_c in enumerate(setpoints)}
+        given |= {f"at_least_{i}": state.queue[:, k] for i, k in enumerate(self._edge_entries)}
+        given |= {"waiting": state.queue[:, -1], "stored_kwh": state.stored_kwh}
         if last is None:
             # A hall at rest at the setpoint.
-            for name in ("oldest_age", "mean_age", "it_energy", "hvac_energy", "dc_load"):
-                out[at[name]] = 0.0
-            out[at["room"]] = out[at["hottest_inlet"]] = _setpoint_mean_c(view)
+            at_c, none = _setpoint_mean_c(view), np.zeros(len(state.stored_kwh))
+            of_last = (none, none, at_c, at_c, none, none)
         else:
-            out[at["oldest_age"]] = last.oldest_age_h
-            out[at["mean_age"]] = last.mean_age_h
-            out[at["room"]] = last.return_c
-            out[at["hottest_inlet"]] = last.inlet_max_c
-            out[at["it_energy"]] = last.it_kwh * design.per_it_kwh
-            out[at["hvac_energy"]] = last.hvac_kwh * design.per_hvac_kwh
-            out[at["dc_load"]] = last.facility_kwh * design.per_facility_kwh
-        out *= self._scale
-        out += self._shift
-        return cut(out, self._low, self._high)
+            of_last = _of_last(last)
+        given |= zip(_OF_LAST, of_last, strict=True)
+        return self._stage.rows(**given).astype(np.float32)
+
+    def _stage_of(self, sizing: Sizing, step_h: float) -> CompiledStage:
+        """The stage from what ``_inside`` gives to its entries, in their order."""
+        from sdc_taichi.kernels.stage import CompiledStage
+
+        kwh = step_h / 1e3
+        per_it_kwh = _inverse(sizing.it_w * kwh)
+        per_hvac_kwh = _inverse((sizing.facility_w - sizing.it_w) * kwh)
+        per_facility_kwh = _inverse(sizing.facility_w * kwh)
+        per_battery_kwh = _inverse(sizing.battery_kwh)
+        edges, units = range(len(self._edge_entries)), range(self._units)
+
+        def entries(**x: F64) -> dict[str, F64]:
+            counts = x["waiting"] > NEGLIGIBLE_TASKS
+            per_task = np.where(counts, 1.0 / np.where(counts, x["waiting"], 1.0), 0.0)
+            at_least: list[Any] = [*(x[f"at_least_{i}"] for i in edges), 0.0]
+            found = {
+                "queue": [x["waiting"] * self._per_task],
+                "oldest_age": [x["oldest_age_h"]],
+                "mean_age": [x["mean_age_h"]],
+                "age_histogram": [(a - b) * per_task for a, b in pairwise(at_least)],
+                "room": [x["return_c"]],
+                "hottest_inlet": [x["inlet_max_c"]],
+                "setpoint": [x[f"setpoint_{i}"] for i in units],
+                "it_energy": [x["it_kwh"] * per_it_kwh],
+                "hvac_energy": [x["hvac_kwh"] * per_hvac_kwh],
+                "dc_load": [(x["it_kwh"] + x["hvac_kwh"]) * per_facility_kwh],
+                "soc": [x["stored_kwh"] * per_battery_kwh],
+            }
+            return {
+                f"{f.name}_{i}": np.clip((value - f.low) / (f.high - f.low), 0.0, 1.0)
+                for f in _inside(self._units)
+                for i, value in enumerate(found[f.name])
+            }
+
+        return CompiledStage(entries, len(self._per_task))
+
+
+_OF_LAST = ("oldest_age_h", "mean_age_h", "return_c", "inlet_max_c", "it_kwh", "hvac_kwh")
+_of_last = attrgetter(*_OF_LAST)
+"""What is observed of the last step."""
+
+
+def _inverse(values: F64) -> F64:
+    """1 over values, 0 where they are 0."""
+    return np.where(values > 0, 1.0 / np.where(values > 0, values, 1.0), 0.0)
 
 
 class _Seen(NamedTuple):
@@ -486,23 +521,6 @@ class _Timed:
         return out
 
 
-def counted(waiting: F64) -> F64:
-    """What shares of the queued tasks are taken of, (B,).
-
-    Infinity, of which every share is 0, where rounding alone has left some: nothing is read off
-    those.
-    """
-    out = waiting.copy()
-    out[waiting <= NEGLIGIBLE_TASKS] = np.inf
-    return out
-
-
-def cut(values: F32, low: F32, high: F32) -> F32:
-    """Values within bounds, in place; bounds are arrays, which NumPy cuts at faster."""
-    np.minimum(values, high, out=values)
-    return np.maximum(values, low, out=values)
-
-
 def _scaled(values: F32, feature: Feature) -> F32:
     if _signed(feature):
         return np.asarray(np.clip(values / feature.high, -1.0, 1.0))
@@ -514,29 +532,6 @@ def _places(features: Sequence[Feature]) -> tuple[dict[str, slice], int]:
     ends = np.cumsum([0, *(f.size for f in features)])
     starts = zip(features, ends, strict=False)
     return {f.name: slice(int(start), int(start) + f.size) for f, start in starts}, int(ends[-1])
-
-
-@dataclass(frozen=True, slots=True)
-class _Design:
-    """Inverse of the energies of a step at the design point and of the battery, each (B,)."""
-
-    per_it_kwh: F64
-    per_hvac_kwh: F64
-    per_facility_kwh: F64
-    per_battery_kwh: F64
-
-
-def _design(sizing: Sizing, step_h: float) -> _Design:
-    def inverse(kwh: F64) -> F64:
-        return np.where(kwh > 0, 1.0 / np.where(kwh > 0, kwh, 1.0), 0.0)
-
-    kwh_per_w = step_h / 1e3
-    return _Design(
-        per_it_kwh=inverse(sizing.it_w * kwh_per_w),
-        per_hvac_kwh=inverse((sizing.facility_w - sizing.it_w) * kwh_per_w),
-        per_facility_kwh=inverse(sizing.facility_w * kwh_per_w),
-        per_battery_kwh=inverse(sizing.battery_kwh),
-    )
 
 
 def _circle(steps: int) -> F32:

@@ -22,7 +22,7 @@ from gymnasium.spaces import Box
 
 from sdc_taichi.control.view import View
 from sdc_taichi.drivers import Table
-from sdc_taichi.envs.features import AGE_EDGES_H, AGENTS, NEGLIGIBLE_TASKS, Feature, counted, cut
+from sdc_taichi.envs.features import AGE_EDGES_H, AGENTS, NEGLIGIBLE_TASKS, Feature
 from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.envs.timed import Layout, TimeRows, time_rows
 from sdc_taichi.errors import DataError, RuntimeStateError
@@ -408,7 +408,7 @@ class _Episode:
         np.add(found[:, self._std], self._least_std, out=self._span[:, self._z_score])
         found -= self._low
         found /= self._span
-        return cut(found.astype(np.float32), *_TIMED_RANGES)
+        return _cut(found.astype(np.float32), *_TIMED_RANGES)
 
 
 # --- observer -----------------------------------------------------------------------------------
@@ -521,10 +521,25 @@ class ReleasedObserver:
         out[0] = 0.0 if last is None else last.oldest_age_h / 24.0
         out[1] = 0.0 if last is None else last.mean_age_h / 24.0
         out[2] = waiting / self._queue_limit
-        out[3:7] = tasks[:-1] / counted(waiting)
+        out[3:7] = tasks[:-1] / _counted(waiting)
         out[7] = tasks[-1] > NEGLIGIBLE_TASKS
         out[8] = state.stored_kwh / self._capacity_kwh
-        return cut(out, _LOW, _HIGH)
+        return _cut(out, _LOW, _HIGH)
+
+
+def _counted(waiting: F64) -> F64:
+    """What shares of the queued tasks are taken of, (B,).
+
+    Infinity, of which every share is 0, where rounding alone has left some: nothing is read off
+    those.
+    """
+    return np.where(waiting > NEGLIGIBLE_TASKS, waiting, np.inf)
+
+
+def _cut(values: F32, low: F32, high: F32) -> F32:
+    """Values within bounds, in place; bounds are arrays, which NumPy cuts at faster."""
+    np.minimum(values, high, out=values)
+    return np.maximum(values, low, out=values)
 
 
 # --- rewards ------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -60,12 +61,10 @@ class Context:
     (B,)."""
     bills: float
     """Length of the episode over that of a bill."""
-    step_of_day: int | I64
-    """Of this step, counted from 0 at midnight, of all or (B,)."""
     price_per_kwh: F64
-    """By step of the day."""
+    """In this step, (B,), as the next."""
     rush: F64
-    """Weight of queued tasks, by step of the day."""
+    """Weight of queued tasks."""
 
 
 def carbon(r: StepResult, c: Context) -> F64:
@@ -95,8 +94,7 @@ def it_energy(r: StepResult, c: Context) -> F64:
 
 def cost(r: StepResult, c: Context) -> F64:
     """Energy by the time-of-use tariff, over the price of the design energy at 0.1 per kWh."""
-    price = c.price_per_kwh[c.step_of_day]
-    return np.asarray(-r.grid_kwh * price / (PRICE_PER_KWH * c.design_kwh))
+    return -r.grid_kwh * c.price_per_kwh / (PRICE_PER_KWH * c.design_kwh)
 
 
 def demand_charge(r: StepResult, c: Context) -> F64:
@@ -107,7 +105,7 @@ def demand_charge(r: StepResult, c: Context) -> F64:
     """
     above_kw = np.maximum(r.grid_kwh / r.step_h - c.peak_kw, 0.0)
     charge = above_kw * c.tariff.demand_charge_per_kw * c.bills
-    return np.asarray(-charge / (PRICE_PER_KWH * c.design_kwh))
+    return -charge / (PRICE_PER_KWH * c.design_kwh)
 
 
 def fossil_share(r: StepResult, c: Context) -> F64:
@@ -118,7 +116,7 @@ def fossil_share(r: StepResult, c: Context) -> F64:
 
 def pue(r: StepResult, c: Context) -> F64:
     """HVAC power over IT power, PUE - 1; 0 without IT power."""
-    return np.asarray(np.where(r.it_w > 0, -r.hvac_w / np.where(r.it_w > 0, r.it_w, 1.0), 0.0))
+    return np.where(r.it_w > 0.0, -r.hvac_w / np.where(r.it_w > 0.0, r.it_w, 1.0), 0.0)
 
 
 def water(r: StepResult, c: Context) -> F64:
@@ -133,7 +131,7 @@ def hot_inlets(r: StepResult, c: Context) -> F64:
 
 def queue(r: StepResult, c: Context) -> F64:
     """Tasks queued in the last hour of the day over 10, weighed from 0 to 1 (paper, F.1, F.2)."""
-    return np.asarray(-c.rush[c.step_of_day] * r.queue_tasks / QUEUE_SCALE_TASKS)
+    return -c.rush * r.queue_tasks / QUEUE_SCALE_TASKS
 
 
 def dropped(r: StepResult, c: Context) -> F64:
@@ -227,25 +225,30 @@ class Rewards:
             self._function = spec if callable(spec) else _find(spec)
         # What decides the rewards, to tell environments apart.
         self.name = _name(self._function) if self._function else self._scales or "sustaindc"
-        self._wanted = {name for scales in (self._scales or {}).values() for name in scales}
+        scales = self._scales or {}
+        self._wanted = [name for name in TERMS if any(name in own for own in scales.values())]
+        self._stage: Any = None
+        self._reads: tuple[str, ...] = ()
+        """Quantities of a step that the stage reads."""
         # Highest power that is billed, before the last step and with it.
         self._peak_before_kw = self._peak_kw = np.zeros(0)
         self._design_kwh = np.zeros(0)
-        self._first: int | I64 = 0
+        self._step_h = 0.0
+        self._first: I64 = np.zeros(0, dtype=np.int64)
         """Step of the day of the first step."""
         self._price_per_kwh = self._rush = np.zeros(0)
 
     def reset(self, view: View) -> None:
         """Start an episode."""
         self._peak_before_kw = self._peak_kw = BILLED_SHARE * view.sizing.facility_w / 1e3
+        self._step_h = view.step_h
         self._design_kwh = view.sizing.facility_w * view.step_h / 1e3
         per_hour = view.fleet.steps_per_hour
         step = np.arange(24 * per_hour)
         prices = np.array(self._tariff.price_per_kwh)
         self._price_per_kwh = prices[step // per_hour % len(prices)]
         self._rush = _rush(step, view.step_h)
-        first = view.state.start % len(step)
-        self._first = int(first[0]) if np.all(first == first[0]) else first
+        self._first = view.state.start % len(step)
         if self._released is not None:
             self._released.reset(view)
 
@@ -265,18 +268,17 @@ class Rewards:
         """
         self._peak_before_kw = self._peak_kw
         self._peak_kw = np.maximum(self._peak_kw, result.grid_kwh / result.step_h)
+        if self._scales is not None:
+            found = self._weighed(result)
+            return found, found.pop("joint")
         if self._function is not None:
             found = self._function(result, view)
             if not isinstance(found, Mapping):
                 alike = _values(found, "all agents", view.size)
                 return dict.fromkeys(self._agents, alike), alike
             return _together(_by_agent(found, self._agents, view.size))
-        if self._released is not None:
-            own = list(self._released.rewards(result, view).values())
-        else:
-            own = self._weighed(result)
-        by_agent = dict(zip(AGENTS, share(own, self._own), strict=True))
-        return _together({agent: by_agent[agent] for agent in self._agents})
+        assert self._released is not None
+        return _together(self._shared([*self._released.rewards(result, view).values()]))
 
     def state(self) -> F64:
         """What an episode leaves behind for its rewards: its highest power, kW, (2, B)."""
@@ -291,32 +293,72 @@ class Rewards:
         context = self._context(result)
         return {name: term(result, context) for name, term in TERMS.items()}
 
-    def _weighed(self, result: StepResult) -> list[F64]:
-        """Weighed terms of each agent, (B,)."""
-        assert self._scales is not None
+    def _weighed(self, result: StepResult) -> dict[str, F64]:
+        """Rewards by learning agent, and of all of them by ``joint``, (B,)."""
+        if self._stage is None:
+            from sdc_taichi.kernels.stage import CompiledStage
+
+            reads = _Reads()
+            for name in self._wanted:
+                TERMS[name](reads, self._context(result))  # type: ignore[arg-type]
+            self._reads = tuple(reads.names)
+            self._stage = CompiledStage(self._of_terms, len(self._design_kwh))
         context = self._context(result)
+        found: dict[str, F64] = self._stage(
+            design_kwh=context.design_kwh,
+            peak_kw=context.peak_kw,
+            price_per_kwh=context.price_per_kwh,
+            rush=context.rush,
+            **{name: getattr(result, name) for name in self._reads},
+        )
+        return found
+
+    def _of_terms(
+        self, design_kwh: F64, peak_kw: F64, price_per_kwh: F64, rush: F64, **read: Any
+    ) -> dict[str, F64]:
+        """The stage: weighed terms of each agent, shared."""
+        assert self._scales is not None
+        context = Context(
+            design_kwh, self._tariff, peak_kw, self._bills, price_per_kwh=price_per_kwh, rush=rush
+        )
+        result: Any = SimpleNamespace(step_h=self._step_h, **read)
         found = {name: TERMS[name](result, context) for name in self._wanted}
-        return [
-            _sum(
-                [
-                    found[name] if scale == 1.0 else scale * found[name]
-                    for name, scale in self._scales[agent].items()
-                ]
-                or [np.zeros(len(self._design_kwh))]
-            )
+        none: Any = 0.0
+        own = [
+            _sum([scale * found[name] for name, scale in self._scales[agent].items()] or [none])
             for agent in AGENTS
         ]
+        by_agent, joint = _together(self._shared(own))
+        return by_agent | {"joint": joint}
+
+    def _shared(self, own: Sequence[F64]) -> dict[str, F64]:
+        """Rewards by learning agent from those of all agents."""
+        by_agent = dict(zip(AGENTS, share(own, self._own), strict=True))
+        return {agent: by_agent[agent] for agent in self._agents}
 
     def _context(self, result: StepResult) -> Context:
+        now = (self._first + result.step) % len(self._rush)
         return Context(
             design_kwh=self._design_kwh,
             tariff=self._tariff,
             peak_kw=self._peak_before_kw,
             bills=self._bills,
-            step_of_day=(self._first + result.step) % len(self._rush),
-            price_per_kwh=self._price_per_kwh,
-            rush=self._rush,
+            price_per_kwh=self._price_per_kwh[now],
+            rush=self._rush[now],
         )
+
+
+class _Reads:
+    """A step that notes which of its quantities are read."""
+
+    step_h = 1.0
+
+    def __init__(self) -> None:
+        self.names: dict[str, None] = {}
+
+    def __getattr__(self, name: str) -> F64:
+        self.names[name] = None
+        return np.ones(1)
 
 
 def _rush(step: I64, step_h: float) -> F64:
@@ -326,7 +368,7 @@ def _rush(step: I64, step_h: float) -> F64:
     return np.where(hour >= RUSH_START_H, weight, 0.0)
 
 
-def share(own: Sequence[F64], a: float) -> F64:
+def share(own: Sequence[F64], a: float) -> list[F64]:
     """Collaborative rewards: R_i = a r_i + (1 - a)/2 sum of the others' (paper, section 4.5).
 
     Args:
@@ -334,10 +376,10 @@ def share(own: Sequence[F64], a: float) -> F64:
         a: share of the own reward, 0..1.
 
     Returns:
-        R_LS, R_DC and R_BAT, (3, B).
+        R_LS, R_DC and R_BAT, (B,) each.
     """
-    each, rest = np.array(own), (1.0 - a) / (len(own) - 1)
-    return np.asarray(a * each + rest * (_sum(own) - each))
+    total, rest = _sum(own), (1.0 - a) / (len(own) - 1)
+    return [a * each + rest * (total - each) for each in own]
 
 
 def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
