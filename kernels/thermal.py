@@ -531,7 +531,7 @@ def hall_kernel(precision: str) -> Any:
         n_racks = ti.cast(dc_ints[DC.racks, n], ti.f64)
         sweep = control[CTL.sweep, n]
         crac_flow = ti.cast(0.0, ti.f64)
-        supply_c = ti.cast(0.0, ti.f64)
+        supply_c = unit_state[SUPPLY.supply_c, dc_ints[DC.first_unit, n]]
         passing = ti.cast(0.0, ti.f64)
         return_c = ti.cast(0.0, ti.f64)
         coil_load = ti.cast(0.0, ti.f64)
@@ -1138,8 +1138,13 @@ def hall_kernel(precision: str) -> Any:
                         terms[slice_at + SUM.airflow_m3s, b] = flow
                         terms[slice_at + SUM.inlet_c, b] = mean
                         terms[slice_at + SUM.outlet_c, b] = outlet
+                        carried = inlet_flow + heat * per_air
+                        if ti.static(not recirculates):
+                            # Their indices are those of the racks, whatever leaves the servers.
+                            inlet_flow = flow * mean
+                            carried = flow * outlet
                         terms[slice_at + SUM.inlet_m3k_s, b] = inlet_flow
-                        terms[slice_at + SUM.outlet_m3k_s, b] = inlet_flow + heat * per_air
+                        terms[slice_at + SUM.outlet_m3k_s, b] = carried
                         terms[slice_at + SUM.hot_k, b] = hot
                         terms[slice_at + SUM.cold_k, b] = cold
                         terms[slice_at + SUM.stored_w, b] = stored + parcel_w

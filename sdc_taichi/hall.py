@@ -113,10 +113,10 @@ class HallSums:
     """First server of the group with the hottest inlet, counted from 0 in its rack."""
     stored_w: F64
     """Heat that goes into servers and recirculated air."""
-    crac_flow_m3s: F64
-    """0 with inlet model ``approach``, as the next two."""
     supply_c: F64
     """Airflow-weighted mean over the units."""
+    crac_flow_m3s: F64
+    """0 with inlet model ``approach``, as the next."""
     return_c: F64
     coil_load_w: F64
     """Heat of air and fans that reaches the CRAC units (transient)."""
@@ -431,8 +431,7 @@ class Hall:
     def _begin(self, exchange: int) -> None:
         """The first sweep exchanges what the exhaust row holds, or starts as may be expected."""
         first = {"active": 1, "exchange": exchange, "side": exchange, "sweep": 0, "chunks": 0}
-        for row, name in zip(self._controls, self._thermal.CONTROL, strict=True):
-            row[:] = first[name]
+        self._controls[:] = [[first[name]] for name in self._thermal.CONTROL]
         self._moves[:] = 0.0
 
     def _sweep(self, out: F64, sweeps: int, **how: Any) -> None:

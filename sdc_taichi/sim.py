@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi import air_metrics, runtime
+from sdc_taichi import runtime
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.drivers import Drivers, load_drivers
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
@@ -336,7 +336,7 @@ class Simulator:
             air = hall.solve(met)
         after = stages.facility(
             **around,
-            **self._of_the_air(air, setpoint_c, supply_c, fan_speed, running),
+            **self._of_the_air(air, setpoint_c, fan_speed, running),
             ci_g_per_kwh=world.ci_g_per_kwh,
             battery_command=battery_command,
             stored_kwh=state.stored_kwh,
@@ -430,7 +430,7 @@ class Simulator:
         return coldest_c, in_use / self.fleet.unit_sums(design_m3s)
 
     def _of_the_air(
-        self, air: HallSums, setpoint_c: F64, supply_c: F64, fan_speed: F64, running: F64
+        self, air: HallSums, setpoint_c: F64, fan_speed: F64, running: F64
     ) -> dict[str, F64]:
         """What the facility reads of the halls, see ``Met``."""
         sums = self._unit_sums
@@ -440,13 +440,13 @@ class Simulator:
             "airflow_m3s": air.airflow_m3s,
             "hot_k": air.hot_k,
             "cold_k": air.cold_k,
+            "inlet_m3k_s": air.inlet_m3k_s,
+            "outlet_m3k_s": air.outlet_m3k_s,
+            "supply_c": air.supply_c,
         }
         flow_m3s = air.unit_flow_m3s
         if self._recirculates:
             out |= {
-                "inlet_m3k_s": air.inlet_m3k_s,
-                "outlet_m3k_s": air.outlet_m3k_s,
-                "supply_c": air.supply_c,
                 "crac_flow_m3s": air.crac_flow_m3s,
                 "return_c": air.return_c,
                 "cubed_m3s": sums(self.fleet.unit_design_m3s * air.unit_cubed_speed),
@@ -454,17 +454,7 @@ class Simulator:
             }
         else:
             # Such halls have one unit for all of a data center.
-            inlet_m3k_s, outlet_m3k_s = (
-                air_metrics.rise_m3k_s(air.rack_airflow_m3s, c, supply_c, self.fleet.rack_start)
-                for c in (air.rack_inlet_c, air.rack_outlet_c)
-            )
-            out |= {
-                "inlet_m3k_s": inlet_m3k_s,
-                "outlet_m3k_s": outlet_m3k_s,
-                "supply_c": supply_c,
-                "outlet_mean_c": air.outlet_mean_c,
-                "fan_speed": fan_speed,
-            }
+            out |= {"outlet_mean_c": air.outlet_mean_c, "fan_speed": fan_speed}
         if self._transient:
             out |= {"coil_load_w": air.coil_load_w, "coil_w": air.coil_w, "room_j": air.room_j}
         if not self._calm:
@@ -659,9 +649,9 @@ class Simulator:
             raise SdcError(
                 f"action {name}: shape {command.shape}, expected {' or '.join(map(str, valid))}"
             )
-        low, high = command.min(), command.max()
+        largest = np.maximum.reduce(np.abs(command), axis=None)
         # Not so of NaN either.
-        if not (-limit <= low and high <= limit and -np.inf < low and high < np.inf):
+        if not (largest <= limit and largest < np.inf):
             wrong = ~(np.abs(command) <= limit) | ~np.isfinite(command)
             value = command[wrong].flat[0] if command.ndim else command
             raise SdcError(
