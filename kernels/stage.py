@@ -89,7 +89,7 @@ class CompiledStage:
         assert self._kernel is not None
         if tuple(given) != self._names:
             raise TypeError(f"arguments {[*given]}, expected {[*self._names]} as on the first call")
-        self._entries(self._inputs)[:] = self._stacked([*given.values()])
+        self._given[:] = self._stacked([*given.values()])
         out = self._empty(len(self._results))
         self._kernel(self._size <= SERIAL_UP_TO, self._constants, self._inputs, out)
         return self._entries(out)
@@ -117,6 +117,7 @@ class CompiledStage:
         for rows in (self._constants, self._inputs):
             rows[:] = 0.0
         self._entries(self._constants)[:] = self._stacked(constants)
+        self._given = self._entries(self._inputs)
         source = _source(record.lines(list(results.values())))
         self._kernel = BoundKernel(_kernel(source), templates=1)
 
