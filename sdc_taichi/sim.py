@@ -161,11 +161,9 @@ class Simulator:
             raise RuntimeStateError("the simulator is closed; create a new one")
         if self._hall is None:
             hall = Hall(self.fleet, self.precision)
-            # Sizes are those of recorded runs to round-off, whatever the run's precision.
-            exact = hall if self.precision == "f64" else Hall(self.fleet, "f64")
             d = self.drivers
-            self._sizing = size(self.fleet, exact, d.design_outdoor_c, d.design_wet_bulb_c)
-            exact.forget()
+            self._sizing = size(self.fleet, hall, d.design_outdoor_c, d.design_wet_bulb_c)
+            hall.forget()
             self._stages = _Stages(
                 self.fleet, self._sizing, self._work_model, self._work, calm=self._calm
             )

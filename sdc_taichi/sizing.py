@@ -43,7 +43,7 @@ def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64
 
     Args:
         fleet: the data centers.
-        hall: their halls, in f64.
+        hall: their halls; sizes are as exact as its precision.
         design_outdoor_c: design dry bulb of each site's weather, (B,).
         design_wet_bulb_c: design wet bulb of each site's weather, (B,).
     """

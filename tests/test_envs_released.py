@@ -470,7 +470,7 @@ def test_load_bounds_of_recorded_runs(name: str, path: Path) -> None:
     config = rack_config(about["racks"], about["config"]["location"])
     with Simulator(config, drivers=drivers(inputs(0), start=[0]), precision="f64") as sim:
         sim.reset()
-        low, high = released.load_bounds_kw(sim.fleet, sim.sizing)
+        low, high = released.load_bounds_kw(sim.fleet, sim.sizing, "f64")
     assert low.tolist() == pytest.approx([about["sizing"]["power_lb_kw"]], rel=1e-9), name
     assert high.tolist() == pytest.approx([about["sizing"]["power_ub_kw"]], rel=1e-9), name
 
@@ -484,7 +484,8 @@ def test_rewards_of_a_run() -> None:
     actions = [replace(some_actions(rng, 1), load=LOAD[0]) for _ in range(40)]
     with Simulator(load_config("sustaindc"), drivers=drivers(series, start=[start])) as sim:
         _, rewards, results, _ = run(sim, actions)
-        low, high = (float(v[0]) for v in released.load_bounds_kw(sim.fleet, sim.sizing))
+        bounds = released.load_bounds_kw(sim.fleet, sim.sizing, sim.precision)
+        low, high = (float(v[0]) for v in bounds)
     queued_at_night = 0
     for k, result in enumerate(results):
         norm_ci = (ci[start + k] - ci.min()) / (ci.max() - ci.min())

@@ -394,7 +394,8 @@ def check_dc(check: Check) -> Values:
 
 
 def check_size(check: Check) -> Values:
-    with Simulator(config_of_check(check), drivers=recorded_drivers(20, 15, 300, 0.5)) as sim:
+    drivers = recorded_drivers(20, 15, 300, 0.5)
+    with Simulator(config_of_check(check), drivers=drivers, precision="f64") as sim:
         sized, fleet = sim.sizing.water_side, sim.fleet
         count, full_w = fleet.groups[0], fleet.groups[1]
         return {
@@ -406,7 +407,8 @@ def check_size(check: Check) -> Values:
 
 
 def check_range(check: Check) -> Values:
-    with Simulator(config_of_check(check), drivers=recorded_drivers(20, 15, 300, 0.5)) as sim:
+    drivers = recorded_drivers(20, 15, 300, 0.5)
+    with Simulator(config_of_check(check), drivers=drivers, precision="f64") as sim:
         ranges = released_ranges(sim.fleet, Hall(sim.fleet, "f64"))
         return {
             "max_battery_energy_Mwh": sim.sizing.battery_kwh[0] / 1e3,

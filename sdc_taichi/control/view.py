@@ -10,6 +10,7 @@ import numpy as np
 from sdc_taichi.drivers import Drivers
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.fleet import Fleet
+from sdc_taichi.hall import Precision
 from sdc_taichi.sim import Simulator
 from sdc_taichi.sizing import Sizing
 from sdc_taichi.types import F64, I64, Exogenous, State, StepResult
@@ -67,6 +68,8 @@ class View:
     sizing: Sizing
     limits: Limits
     step_h: float
+    precision: Precision
+    """Of the server kernels."""
 
     @property
     def now(self) -> Exogenous:
@@ -122,6 +125,8 @@ def viewer(sim: Simulator) -> Callable[[StepResult | None], View]:
     limits, sizing = limits_of(sim.fleet), sim.sizing
 
     def look(last: StepResult | None) -> View:
-        return View(last, sim.state, sim.drivers, sim.fleet, sizing, limits, step_h)
+        return View(
+            last, sim.state, sim.drivers, sim.fleet, sizing, limits, step_h, sim.precision
+        )
 
     return look

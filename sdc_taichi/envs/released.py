@@ -27,7 +27,7 @@ from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.envs.timed import Layout, TimeRows, time_rows
 from sdc_taichi.errors import DataError, RuntimeStateError
 from sdc_taichi.fleet import Fleet, build_fleet
-from sdc_taichi.hall import Hall
+from sdc_taichi.hall import Hall, Precision
 from sdc_taichi.plant.workload import TASKS_PER_STEP, age_histogram
 from sdc_taichi.sizing import Sizing, released_ranges
 from sdc_taichi.types import F64, I64, StepResult
@@ -595,7 +595,7 @@ def cooling_reward(facility_kw: F64, low_kw: F64, high_kw: F64) -> F64:
     return -(facility_kw - low_kw) / (high_kw - low_kw)
 
 
-def load_bounds_kw(fleet: Fleet, sizing: Sizing) -> tuple[F64, F64]:
+def load_bounds_kw(fleet: Fleet, sizing: Sizing, precision: Precision) -> tuple[F64, F64]:
     """Bounds of IT and HVAC power, (B,) each.
 
     From 0.9 times the lowest IT power of 15..22 C and 0..100 % load to the design power of the
@@ -605,7 +605,7 @@ def load_bounds_kw(fleet: Fleet, sizing: Sizing) -> tuple[F64, F64]:
     halls = [(c.hall, c.servers, c.hvac) for c in fleet.configs]
     distinct = dict(zip(halls, fleet.configs, strict=True))
     alike = build_fleet(distinct.values())
-    low_w, _ = released_ranges(alike, Hall(alike, "f64"))["it_w"]
+    low_w, _ = released_ranges(alike, Hall(alike, precision))["it_w"]
     position = {hall: i for i, hall in enumerate(distinct)}
     lowest_w = low_w[[position[hall] for hall in halls]]
     return LOWEST_POWER_FACTOR * lowest_w / 1e3, sizing.facility_w / 1e3
@@ -630,7 +630,7 @@ class ReleasedRewards:
             DataError: a carbon intensity that never changes, so has no range.
         """
         if self._fleet is not view.fleet:
-            self._bounds_kw = load_bounds_kw(view.fleet, view.sizing)
+            self._bounds_kw = load_bounds_kw(view.fleet, view.sizing, view.precision)
             self._fleet = view.fleet
         series, which = view.drivers.ci_g_per_kwh.distinct()
         low = np.array([values.min() for values in series])[which]
