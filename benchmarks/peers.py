@@ -43,10 +43,15 @@ class Arguments:
         self.racks = np.zeros((fleet.racks, 6), np.float32)
         self.listed: tuple[Any, ...] = (
             *(fleet.rack_start, fleet.rack_dc, fleet.group_start, fleet.server_start),
-            *(np.ascontiguousarray(a, np.float32) for a in (fleet.groups, fleet.dcs.T)),
             *(
                 np.ascontiguousarray(a, np.float32)
-                for a in (fleet.approach_k, met.unit_supply_c, met.utilisation)
+                for a in (
+                    np.concatenate(fleet.group_rows, axis=1),
+                    fleet.dcs.T,
+                    fleet.approach_k,
+                    met.unit_supply_c,
+                    met.utilisation,
+                )
             ),
             *(self.racks, self.sums),
             *(self.layers.inlet_c, self.layers.outlet_c, self.layers.power_w),

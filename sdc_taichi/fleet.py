@@ -120,8 +120,9 @@ class Fleet:
     approach_k: F64
     """Mean inlet over supply of each rack, (R,): as given, within the limits of the config; with
     recirculation what the hall has at its design point."""
-    groups: F64
-    """Rows GROUP_ROWS of the thermal kernel, (6, G)."""
+    group_rows: tuple[F64, ...]
+    """Rows GROUP_ROWS of the thermal kernel by data center, (6, its groups); equal halls share one
+    array."""
     dcs: F64
     """Rows DC_ROWS of the thermal kernel, (18, B)."""
     unit_design_m3s: F64
@@ -157,6 +158,11 @@ class Fleet:
         return len(self.rack_dc)
 
     @property
+    def groups(self) -> int:
+        """Number of server groups of all data centers."""
+        return len(self.server_start) - 1
+
+    @property
     def servers(self) -> int:
         """Number of servers of all data centers."""
         return int(self.server_start[-1])
@@ -189,6 +195,14 @@ class Fleet:
     def group_sums(self, values: npt.ArrayLike) -> F64:
         """Sum of group values, (G,), over each rack, (R,)."""
         return _sums(values, self.group_start)
+
+    def per_group_servers(self) -> F64:
+        """Servers of each group, (G,)."""
+        return np.diff(self.server_start).astype(np.float64)
+
+    def per_rack_servers(self) -> F64:
+        """Servers of each rack, (R,)."""
+        return np.diff(self.server_start[self.group_start]).astype(np.float64)
 
     def per_dc_servers(self) -> F64:
         """Servers of each data center, (B,)."""
@@ -248,12 +262,17 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     _shared(listed, "workload.age_horizon_h")
     # Data centers that share these sections share one hall, which is laid out once.
     cache: dict[Any, _HallArrays] = {}
+    # Copies share the sections themselves; comparing those takes a while where servers differ.
+    known: dict[Any, _HallArrays] = {}
     halls = []
     for config in listed:
-        key = (config.hall, config.servers, config.hvac)
-        if key not in cache:
-            cache[key] = _hall_arrays(config)
-        halls.append(cache[key])
+        sections = (config.hall, config.servers, config.hvac)
+        key = tuple(map(id, sections))
+        if key not in known:
+            if sections not in cache:
+                cache[sections] = _hall_arrays(config)
+            known[key] = cache[sections]
+        halls.append(known[key])
     racks = np.array([len(h.groups_per_rack) for h in halls])
     return Fleet(
         configs=listed,
@@ -264,7 +283,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         group_start=starts(np.concatenate([h.groups_per_rack for h in halls]), "server groups"),
         server_start=starts(np.concatenate([h.groups[0] for h in halls]), "servers"),
         approach_k=np.concatenate([h.approach_k for h in halls]),
-        groups=np.concatenate([h.groups for h in halls], axis=1),
+        group_rows=tuple(h.groups for h in halls),
         dcs=np.stack([h.dc for h in halls], axis=1),
         unit_start=starts(np.array([len(h.unit_design_m3s) for h in halls]), "CRAC units"),
         unit_design_m3s=np.concatenate([h.unit_design_m3s for h in halls]),

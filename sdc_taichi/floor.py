@@ -42,8 +42,8 @@ class Floor:
         self._policy = fleet.models["placement"]
         self._per_rack = self._policy == "uniform"
         self._servers = fleet.per_dc_servers()
-        self._rack_servers = fleet.group_sums(fleet.groups[0])
-        self._bin_servers = self._rack_servers if self._per_rack else fleet.groups[0]
+        self._rack_servers = fleet.per_rack_servers()
+        self._bin_servers = self._rack_servers if self._per_rack else fleet.per_group_servers()
         starts = fleet.rack_start if self._per_rack else fleet.group_start[fleet.rack_start]
         self._bins = layout(starts, fleet.names)
         classes = [c.protection.ashrae_class for c in fleet.configs]
@@ -172,7 +172,7 @@ class Floor:
             return np.zeros(len(self._servers))
         fleet = self._fleet
         if placed.group_load is not None:
-            busy = fleet.group_sums(fleet.groups[0] * placed.group_load)
+            busy = fleet.group_sums(fleet.per_group_servers() * placed.group_load)
         elif placed.rack_load is not None:
             busy = self._rack_servers * placed.rack_load
         else:
@@ -187,7 +187,7 @@ class Floor:
 
     def _weights(self, weights: F64 | None) -> F64:
         """Weights of the server groups, (G,), from one per rack or per group."""
-        groups, racks = self._fleet.groups.shape[1], self._fleet.racks
+        groups, racks = self._fleet.groups, self._fleet.racks
         if weights is None:
             return np.ones(groups)
         try:

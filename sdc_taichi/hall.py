@@ -211,24 +211,33 @@ class Hall:
             [fleet.group_start[rack], fleet.server_start[fleet.group_start[rack]]]
         ).reshape(2, -1)
         known: dict[Any, int] = {}
+        alike: dict[int, slice] = {}
         tables, table, total = [], np.zeros(len(most), np.int64), 0
-        for i, (a, n) in enumerate(zip(first_rack, filled, strict=True)):
-            if n == 0:
+        for dc, (end, count) in enumerate(zip(np.cumsum(self._blocks), self._blocks, strict=True)):
+            rows, blocks = fleet.group_rows[dc], slice(end - count, end)
+            same = alike.setdefault(id(rows), blocks)
+            if same != blocks:
+                table[blocks] = table[same]
                 continue
-            ends = fleet.group_start[a : a + n + 1]
-            values = fleet.groups[:, ends[0] : ends[-1]]
-            key = (values.tobytes(), (ends - ends[0]).tobytes())
-            if key not in known:
-                known[key] = total
-                zone = np.arange(most[i])
-                group = ends[:-1] + np.minimum(zone[:, None], np.diff(ends) - 1) - ends[0]
-                entry = np.zeros((most[i], len(values), lanes), self._dtype)
-                entry[:, :, :n] = values[:, group].swapaxes(0, 1)
-                entry[:, 1:, n:] = entry[:, 1:, n - 1 : n]
-                entry[:, 0, :n] *= zone[:, None] < np.diff(ends)
-                tables.append(entry)
-                total += int(most[i])
-            table[i] = known[key]
+            group_0 = fleet.group_start[fleet.rack_start[dc]]
+            for i in range(end - count, end):
+                a, n = first_rack[i], filled[i]
+                if n == 0:
+                    continue
+                ends = fleet.group_start[a : a + n + 1] - group_0
+                values = rows[:, ends[0] : ends[-1]]
+                key = (values.tobytes(), (ends - ends[0]).tobytes())
+                if key not in known:
+                    known[key] = total
+                    zone = np.arange(most[i])
+                    group = ends[:-1] + np.minimum(zone[:, None], np.diff(ends) - 1)
+                    entry = np.zeros((most[i], len(rows), lanes), self._dtype)
+                    entry[:, :, :n] = rows[:, group].swapaxes(0, 1)
+                    entry[:, 1:, n:] = entry[:, 1:, n - 1 : n]
+                    entry[:, 0, :n] *= zone[:, None] < np.diff(ends)
+                    tables.append(entry)
+                    total += int(most[i])
+                table[i] = known[key]
         self._tables = self._lanes(total, len(thermal.GROUP_ROWS))
         self._tables[:] = np.concatenate(tables)
         first_place = starts(most, "groups of blocks")
@@ -328,8 +337,7 @@ class Hall:
             self._rack[name][:] = self._is_rack
         self._of_a_step: set[str] = set()
         """Of these two, what the last step set to other values."""
-        servers = fleet.group_sums(fleet.groups[0])
-        rows = {"approach_k": fleet.approach_k, "per_server": 1.0 / servers}
+        rows = {"approach_k": fleet.approach_k, "per_server": 1.0 / fleet.per_rack_servers()}
         if air is not None:
             rows |= {
                 "norm": air.norm,
@@ -477,7 +485,7 @@ class Hall:
 
     def group_inlets(self) -> F64:
         """Inlet of every server group in the last step, (G,)."""
-        layers = [self._empty((self._fleet.groups.shape[1],), self._dtype) for _ in range(3)]
+        layers = [self._empty((self._fleet.groups,), self._dtype) for _ in range(3)]
         self._write(layers, each_once=1)
         return np.asarray(layers[0], dtype=np.float64)
 
@@ -504,7 +512,7 @@ class Hall:
         self.solve(met)
         for name, value in (("room_j", 0.0), ("room_j_per_k", 1.0), ("coil_limit_w", 0.0)):
             self._dc[name][:] = value
-        servers = np.zeros(self._fleet.groups.shape[1], self._dtype)
+        servers = np.zeros(self._fleet.groups, self._dtype)
         # A substep that lasts for ever brings servers to their steady temperatures; what it makes
         # of the air is not wanted.
         kept = [self._memory["mixed_c"], self._supply["fresh_ratio"], self._supply["supply_c"]]
@@ -554,15 +562,17 @@ class Hall:
         count = int(np.ceil(step_s / substep_s - 1e-9))
         out = self._new_sums()
         self._begin(exchange=1)
-        servers = np.empty(fleet.groups.shape[1], self._dtype)
+        before = np.ascontiguousarray(state.server_c, self._dtype)
+        servers = np.empty(fleet.groups, self._dtype)
         self._sweep(
             out,
             count,
             transient=True,
-            servers=(self._real(state.server_c), servers),
+            servers=(before, servers),
             substep_s=step_s / count,
             weight=1.0 / count,
         )
+        self._kernel.let_go(before)
         self._solved = True
         return self._results(out), self._state(servers)
 

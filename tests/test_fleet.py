@@ -56,7 +56,7 @@ def test_offsets_of_a_ragged_fleet() -> None:
     assert fleet.per_dc_servers().tolist() == [12, 1, 18]
     assert np.bincount(fleet.server_rack()).tolist() == [3, 3, 3, 3, 1, 5, 6, 7]
     assert fleet.approach_k.tolist() == [5.3, 5.0, 4.0, 4.5, 6.0, 1.5, 2.0, 5.0]
-    row = dict(zip(GROUP_ROWS, fleet.groups, strict=False))
+    row = dict(zip(GROUP_ROWS, np.concatenate(fleet.group_rows, axis=1), strict=False))
     assert row["count"].tolist() == np.diff(fleet.server_start).tolist()
     assert row["full_w"].tolist()[-3:] == [100, 200, 300]
     assert row["idle_w"].tolist()[-3:] == [10, 20, 30]
@@ -146,7 +146,7 @@ def test_sums_of_a_ragged_fleet() -> None:
     assert fleet.unit_sums([1.0, 2.0, 4.0]).tolist() == [1, 2, 4]
     assert fleet.rack_sums(np.arange(8)).tolist() == [6, 4, 18]
     assert fleet.rack_sums(np.arange(8) > 2).tolist() == [1, 1, 3]
-    assert fleet.group_sums(fleet.groups[0]).tolist() == [3, 3, 3, 3, 1, 5, 6, 7]
+    assert fleet.group_sums(fleet.per_group_servers()).tolist() == [3, 3, 3, 3, 1, 5, 6, 7]
 
 
 def test_approach_temperatures_are_those_that_the_hall_has(tmp_path: Path) -> None:
@@ -174,8 +174,9 @@ def test_rooms_hold_what_has_no_temperature_of_its_own() -> None:
 def test_equal_halls_are_laid_out_once_and_equal() -> None:
     fleet = build_fleet(make_configs(TINY, count=50))
     assert fleet.size == 50
-    groups = fleet.groups.reshape(len(fleet.groups), 50, -1)
-    assert np.all(groups == groups[:, :1])
+    assert len({id(rows) for rows in fleet.group_rows}) == 1
+    per_rack = fleet.per_rack_servers().reshape(50, -1)
+    assert np.all(per_rack == per_rack[:1])
 
 
 # --- copies and sampling ------------------------------------------------------------------------

@@ -118,7 +118,7 @@ def random_conditions(
         unit_supply_c=rng.uniform(16, 26, fleet.size)[fleet.unit_dc] + rng.uniform(0, 2, units),
         utilisation=rng.choice([0.0, 1.0, *rng.uniform(0, 1, 4)], fleet.size),
         rack_load=rng.uniform(0, 1, racks) if kind == 1 else None,
-        group_load=rng.uniform(0, 1, len(fleet.groups[0])) if kind == 2 else None,
+        group_load=rng.uniform(0, 1, fleet.groups) if kind == 2 else None,
         powered=rng.choice([0.0, 0.4, 1.0, 1.0, 1.0], racks),
         rack_airflow=rng.choice([0.05, 0.5, 1.0, 1.0, 1.0], racks),
         unit_low=low,
@@ -256,7 +256,7 @@ def test_full_load_at_the_highest_setpoint_agrees_with_the_twin_at_any_fan_speed
 def test_every_server_may_be_its_own(precision: Precision) -> None:
     config = load_config("corrected", ["hall.servers_per_rack=12", "hall.height_zones=12"])
     fleet = build_fleet(config)
-    assert len(fleet.groups[0]) == fleet.servers == 20 * 12
+    assert fleet.groups == fleet.servers == 20 * 12
     rng = np.random.default_rng(3)
     assert_agrees([config], random_conditions(rng, [config], kind=2), precision)
 

@@ -467,7 +467,8 @@ def test_power_range_covers_the_largest_rack(full_w: float) -> None:
     power = ["servers.groups=null", f"servers.power_w=[{full_w}, 1]"]
     fleet = build_fleet(load_config("tiny", [*power, "hall.servers_per_rack=40"]))
     scale = hall_layers.power_scale(fleet)
-    largest_kw = fleet.group_sums(fleet.groups[0] * fleet.groups[1]).max() / 1e3
+    count, full_w = np.concatenate(fleet.group_rows, axis=1)[:2]
+    largest_kw = fleet.group_sums(count * full_w).max() / 1e3
     assert largest_kw * 1.1 <= scale.high <= largest_kw * 1.1 * 2.5 * 1.0001
     exact = np.arange(0.0, scale.high, scale.quantum)
     assert np.array_equal(exact.astype(np.float16).astype(np.float64), exact)

@@ -397,7 +397,7 @@ def check_size(check: Check) -> Values:
     drivers = recorded_drivers(20, 15, 300, 0.5)
     with Simulator(config_of_check(check), drivers=drivers, precision="f64") as sim:
         sized, fleet = sim.sizing.water_side, sim.fleet
-        count, full_w = fleet.groups[0], fleet.groups[1]
+        count, full_w = fleet.group_rows[0][:2]
         return {
             "CT_REFERENCE_AIR_FLOW_RATE_m3s": sized.tower_air_m3s[0],
             "CT_FAN_REF_P_W": sized.tower_fan_w[0],

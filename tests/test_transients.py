@@ -62,7 +62,7 @@ def random_state(rng: np.random.Generator, fleet: Fleet, precision: Precision) -
     """A memory that no steady state leaves behind."""
     real = np.float64 if precision == "f64" else np.float32
     assert fleet.air is not None
-    groups = len(fleet.groups[0])
+    groups = fleet.groups
     return HallState(
         server_c=rng.uniform(22, 50, groups).astype(real),
         mixed_c=rng.uniform(20, 40, fleet.racks).astype(real),
@@ -247,7 +247,7 @@ def test_servers_follow_the_exact_exponential_in_any_number_of_substeps(
 
 def held_j(fleet: Fleet, state: HallState, room_j: F64) -> F64:
     """Heat in servers, recirculated air and room, from temperatures, (B,)."""
-    per_group = fleet.groups[0] * np.asarray(state.server_c, np.float64)
+    per_group = fleet.per_group_servers() * np.asarray(state.server_c, np.float64)
     servers = np.add.reduceat(per_group, fleet.group_start[fleet.rack_start[:-1]])
     parcels = np.add.reduceat(np.asarray(state.mixed_c, np.float64), fleet.rack_start[:-1])
     capacity = fleet.values("servers.heat_capacity_kj_per_k") * 1e3

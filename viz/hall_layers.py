@@ -48,7 +48,8 @@ def power_scale(fleet: Fleet) -> Scale:
     The upper end is rounded up to 1, 2 or 5 times a power of ten; the resolution is the power of
     two that half precision holds exactly over this range.
     """
-    largest_kw = float(fleet.group_sums(fleet.groups[0] * fleet.groups[1]).max()) * 1.1 / 1e3
+    nameplate_w = np.concatenate([count * full_w for count, full_w, *_ in fleet.group_rows])
+    largest_kw = float(fleet.group_sums(nameplate_w).max()) * 1.1 / 1e3
     decade = 10.0 ** np.floor(np.log10(largest_kw))
     high = float(decade * next(n for n in (1, 2, 5, 10) if n * decade >= largest_kw * (1 - 1e-9)))
     return Scale(0.0, high, float(2.0 ** np.ceil(np.log2(high / 2048))), "kW")

@@ -125,8 +125,6 @@ def viewer(sim: Simulator) -> Callable[[StepResult | None], View]:
     limits, sizing = limits_of(sim.fleet), sim.sizing
 
     def look(last: StepResult | None) -> View:
-        return View(
-            last, sim.state, sim.drivers, sim.fleet, sizing, limits, step_h, sim.precision
-        )
+        return View(last, sim.state, sim.drivers, sim.fleet, sizing, limits, step_h, sim.precision)
 
     return look
