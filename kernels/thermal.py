@@ -262,6 +262,10 @@ def hall_kernel(precision: str) -> Any:
 
     ``serial``: on the thread that calls; waking others takes longer than the step of a small hall.
 
+    ``step``: 1, which compilers cannot know. Loops that advance by it are compiled as they are;
+    others to up to eight copies of their body, which most here gain nothing from and which take
+    half of the time to machine code.
+
     ``write``: instead, compute all groups again as in the last sweep or substep, and store their
     values to their servers, or with ``each_once`` to themselves; ``..._blocks`` are the layers
     again as vectors.
@@ -271,7 +275,6 @@ def hall_kernel(precision: str) -> Any:
     mantissa, bias = (23, 127) if precision == "f32" else (52, 1023)
     exp_terms = EXP_TERMS[precision]
     n_terms, n_rows, n_values = len(TERMS), len(GROUP_ROWS), len(GROUP_OUT)
-    n_others = len(SUMS) - n_terms
     reals_2d = ti.types.ndarray(dtype=real, ndim=2)
     reals_1d = ti.types.ndarray(dtype=real, ndim=1)
     blocks_2d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=2)
@@ -370,14 +373,16 @@ def hall_kernel(precision: str) -> Any:
 
     @ti.func
     @no_type_check
-    def mixed_from(mix: ti.template(), at, rack_sources: ti.template(), first, count):
+    def mixed_from(mix: ti.template(), at, rack_sources: ti.template(), first, count, step):
         """Mixes before the racks of a block, or what they change by, from all racks of the hall."""
         sums = ti.Vector([ti.cast(0.0, real)] * (SOURCES * LANES))
-        for e in range(count):
+        e = 0
+        while e < count:
             x = rack_sources[first + e]
             sums += mix[at + e] * ti.Vector(
                 [x[i // LANES] for i in ti.static(range(SOURCES * LANES))]
             )
+            e += step
         out = ti.Vector([ti.cast(0.0, real)] * LANES)
         for i in range(LANES):
             for source in ti.static(range(SOURCES)):
@@ -390,6 +395,7 @@ def hall_kernel(precision: str) -> Any:
         again,
         n,
         chunk,
+        step,
         chunk_ints: ti.template(),
         dc_ints: ti.template(),
         control: ti.template(),
@@ -417,22 +423,26 @@ def hall_kernel(precision: str) -> Any:
             back = ti.cast(kept, real)
             if again == 2:
                 row = STATE.exhaust_c
-            for block in range(block_0, block_1):
+            block = block_0
+            while block < block_1:
                 moves = rack_store[STATE.exchanged_c, block] * racks[RACK.strength, block]
                 was = rack_store[STATE.exhaust_c, block]
                 change = rack_store[STATE.exhaust_odd_c, block] - was + moves * back
                 rack_store[STATE.change_k, block] = change
                 if again == 2:
                     rack_store[STATE.exhaust_c, block] = was + change
+                block += step
         least = ti.Vector([ti.cast(0.0, real)] * LANES)
         most = least
         first = (row * rack_store.shape[1] + block_0) * (LANES // SOURCES)
-        for block in range(block_0, block_1):
+        block = block_0
+        while block < block_1:
             at = dc_ints[DC.mix, n] + (block - block_0) * n_sources
-            mixed = mixed_from(mix, at, rack_sources, first, n_sources)
+            mixed = mixed_from(mix, at, rack_sources, first, n_sources, step)
             rack_store[STATE.exchanged_c, block] = mixed
             least = smaller(mixed, least)
             most = larger(mixed, most)
+            block += step
         if again == 0:
             least_k, most_k = real(0.0), real(0.0)
             for i in range(LANES):
@@ -444,32 +454,36 @@ def hall_kernel(precision: str) -> Any:
     @ti.func
     @no_type_check
     def add_up(
-        chunk, slice_at, chunk_ints: ti.template(), terms: ti.template(), sums: ti.template()
+        chunk, slice_at, step, chunk_ints: ti.template(), terms: ti.template(), sums: ti.template()
     ):
-        """Sums of the terms over a chunk; see ``close`` for the loops."""
+        """Sums of the terms over a chunk."""
         first_block = chunk_ints[CHUNK.first_block, chunk]
         n_blocks = chunk_ints[CHUNK.first_block, chunk + 1] - first_block
         r = 0
-        while r < sums.shape[0] - n_others:
+        while r < n_terms:
             lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
-            for b in range(n_blocks):
+            b = 0
+            while b < n_blocks:
                 term = terms[slice_at + r, b]
                 for i in range(LANES):
                     lanes[i] += ti.cast(term[i], ti.f64)
+                b += step
             total = ti.cast(0.0, ti.f64)
             for i in range(LANES):
                 total += lanes[i]
             sums[r, chunk] = total
-            r += 1
+            r += step
 
     @ti.func
     @no_type_check
-    def find_hottest(chunk, hottest, of_block, of_zone, sums: ti.template()):
+    def find_hottest(chunk, step, hottest, of_block, of_zone, sums: ti.template()):
         """The first of the racks with the hottest inlet."""
         most_c, block, lane, zone = real(-1e30), 0, 0, real(0.0)
-        for i in range(LANES):
+        i = 0
+        while i < LANES:
             if hottest[i] > most_c or (hottest[i] == most_c and of_block[i] < block):
                 most_c, block, lane, zone = hottest[i], of_block[i], i, of_zone[i]
+            i += step
         sums[SUM.inlet_max_c, chunk] = ti.cast(most_c, ti.f64)
         sums[SUM.hottest_block, chunk] = ti.cast(block, ti.f64)
         sums[SUM.hottest_lane, chunk] = ti.cast(lane, ti.f64)
@@ -484,6 +498,7 @@ def hall_kernel(precision: str) -> Any:
         late,
         slice_at,
         n_blocks,
+        step,
         hottest,
         of_block,
         of_zone,
@@ -510,14 +525,13 @@ def hall_kernel(precision: str) -> Any:
         ``late``: the terms that a sweep does not need are summed up at the end.
         """
         chunk_0 = dc_ints[DC.first_chunk, n]
-        # Loops whose ends are read anew from memory are compiled as they are, not to several copies
-        # for speed that is not needed here. `x = x + y`, since `x += y` would be atomic.
+        # `x = x + y`, since `x += y` would be atomic.
         chunk = chunk_0 + 1
         while chunk < dc_ints[DC.first_chunk, n + 1]:
             r = 0
-            while r < sums.shape[0] - n_others:
+            while r < n_terms:
                 sums[r, chunk_0] = sums[r, chunk_0] + sums[r, chunk]
-                r += 1
+                r += step
             if sums[SUM.inlet_max_c, chunk] > sums[SUM.inlet_max_c, chunk_0]:
                 sums[SUM.inlet_max_c, chunk_0] = sums[SUM.inlet_max_c, chunk]
                 sums[SUM.hottest_block, chunk_0] = sums[SUM.hottest_block, chunk]
@@ -527,7 +541,7 @@ def hall_kernel(precision: str) -> Any:
             most_k = ti.max(sums[SUM.most_k, chunk_0], sums[SUM.most_k, chunk])
             sums[SUM.least_k, chunk_0] = least_k
             sums[SUM.most_k, chunk_0] = most_k
-            chunk += 1
+            chunk += step
         n_racks = ti.cast(dc_ints[DC.racks, n], ti.f64)
         sweep = control[CTL.sweep, n]
         crac_flow = ti.cast(0.0, ti.f64)
@@ -551,7 +565,7 @@ def hall_kernel(precision: str) -> Any:
                 while chunk < dc_ints[DC.first_chunk, n + 1]:
                     other = chunk_ints[CHUNK.first_need, chunk] + at - unit_first
                     needs[need_at] = needs[need_at] + needs[other]
-                    chunk += 1
+                    chunk += step
                 need = needs[need_at]
                 low = ti.cast(units[UNIT.low, at], ti.f64)
                 high = ti.cast(units[UNIT.high, at], ti.f64)
@@ -577,7 +591,7 @@ def hall_kernel(precision: str) -> Any:
                         cubed += unit_state[SUPPLY.cubed_speed, at]
                 unit_state[SUPPLY.flow_m3s, at] = flow
                 unit_state[SUPPLY.cubed_speed, at] = cubed
-                at += 1
+                at += step
             supply_c = supply_flow / crac_flow
             doubles[EXACT.stirring_m3s, n] = crac_flow / n_racks
             control[CTL.sweep, n] = sweep + 1
@@ -653,8 +667,8 @@ def hall_kernel(precision: str) -> Any:
         if ends:
             if ti.static(recirculates and not transient):
                 if late:
-                    add_up(chunk_0, slice_at, chunk_ints, terms, sums)
-                    find_hottest(chunk_0, hottest, of_block, of_zone, sums)
+                    add_up(chunk_0, slice_at, step, chunk_ints, terms, sums)
+                    find_hottest(chunk_0, step, hottest, of_block, of_zone, sums)
                 leaves = sums[SUM.outlet_m3k_s, chunk_0] - sums[SUM.captured_m3k_s, chunk_0]
                 return_c = (leaves + passing) / crac_flow
             flow = sums[SUM.airflow_m3s, chunk_0]
@@ -770,6 +784,7 @@ def hall_kernel(precision: str) -> Any:
         loads_of,
         each_once,
         start_rows,
+        step,
         substep_s,
         weight,
         tolerance_k,
@@ -875,8 +890,10 @@ def hall_kernel(precision: str) -> Any:
                 need_0 = chunk_ints[CHUNK.first_need, chunk]
                 block_0 = chunk_ints[CHUNK.first_block, chunk]
                 n_blocks = chunk_ints[CHUNK.first_block, chunk + 1] - block_0
-                for j in range(n_units):
-                    needs[need_0 + j] = 0.0
+                unit = 0
+                while unit < n_units:
+                    needs[need_0 + unit] = 0.0
+                    unit += step
                 for b in range(n_blocks):
                     block = block_0 + b
                     n_groups = block_ints[BLOCK.groups, block]
@@ -898,14 +915,18 @@ def hall_kernel(precision: str) -> Any:
                     parcel_w = zeros
                     if ti.static(recirculates):
                         captured_share = racks[RACK.captured, block]
-                        for j in range(n_units):
+                        unit = 0
+                        while unit < n_units:
                             used = (
                                 SUPPLY.fresh_ratio_used if ti.static(write) else SUPPLY.fresh_ratio
                             )
-                            ratio = ti.cast(unit_state[used, unit_0 + j], real)
-                            part = shares[share_0 + j] * ratio
+                            ratio = ti.cast(unit_state[used, unit_0 + unit], real)
+                            part = shares[share_0 + unit] * ratio
                             cover += part
-                            fresh += part * ti.cast(unit_state[SUPPLY.supply_c, unit_0 + j], real)
+                            fresh += part * ti.cast(
+                                unit_state[SUPPLY.supply_c, unit_0 + unit], real
+                            )
+                            unit += step
                         if ti.static(write):
                             mixed = rack_store[STATE.mixed_c, block]
                         else:
@@ -924,21 +945,29 @@ def hall_kernel(precision: str) -> Any:
                                             rack_sources,
                                             first * (LANES // SOURCES),
                                             n_sources,
+                                            step,
                                         )
                                 if not at_once:
                                     from_0 = (1 + side) * rack_store.shape[1] // RUN_BLOCKS
-                                    for i in range(LANES):
-                                        at = block * LANES + i
+                                    lane = 0
+                                    while lane < LANES:
+                                        at = block * LANES + lane
                                         parts = ti.Vector([ti.cast(0.0, real)] * RUN_LANES)
-                                        for run in range(run_start[at], run_start[at + 1]):
+                                        run = run_start[at]
+                                        while run < run_start[at + 1]:
                                             x = from_0 + run_ints[RUN.first, run]
                                             w = run_ints[RUN.offset, run]
-                                            for e in range(run_ints[RUN.length, run]):
-                                                parts += weights[w + e] * run_sources[x + e]
+                                            end = w + run_ints[RUN.length, run]
+                                            while w < end:
+                                                parts += weights[w] * run_sources[x]
+                                                w += step
+                                                x += step
+                                            run += step
                                         t = real(0.0)
                                         for j in range(RUN_LANES):
                                             t += parts[j]
-                                        target[i] = t
+                                        target[lane] = t
+                                        lane += step
                                     target *= racks[RACK.norm, block]
                                 rack_store[STATE.exchanged_c, block] = target
                             elif begins:
@@ -1025,9 +1054,10 @@ def hall_kernel(precision: str) -> Any:
                         if exponent == real(3.0):
                             fan_1 = speed * speed * speed
                         elif exponent != real(1.0):
-                            powers = speed
-                            for i in range(block_ints[BLOCK.racks, block]):
-                                powers[i] = ti.pow(speed[i], exponent)
+                            powers, lane = speed, 0
+                            while lane < block_ints[BLOCK.racks, block]:
+                                powers[lane] = ti.pow(speed[lane], exponent)
+                                lane += step
                             fan_1 = powers
                         fan_1 *= breath * fan_w
                         to_air = cpu_1
@@ -1081,10 +1111,11 @@ def hall_kernel(precision: str) -> Any:
                             outlet = mean + (cpu + fan) * per_flow * per_air
                         else:
                             drawn = cpu + fan
-                            fit = zeros
-                            for i in range(block_ints[BLOCK.racks, block]):
-                                moved = ti.pow(ti.max(flow[i], real(1e-30)), constants[3])
-                                fit[i] = ti.pow(drawn[i], constants[1]) / moved
+                            fit, lane = zeros, 0
+                            while lane < block_ints[BLOCK.racks, block]:
+                                moved = ti.pow(ti.max(flow[lane], real(1e-30)), constants[3])
+                                fit[lane] = ti.pow(drawn[lane], constants[1]) / moved
+                                lane += step
                             outlet = mean + fit * (constants[0] / (constants[2] * air))
                             outlet += constants[4]
                     outlet = ti.select(flow > real(0.0), outlet, mean)
@@ -1127,12 +1158,16 @@ def hall_kernel(precision: str) -> Any:
                             terms[slice_at + SUM.captured_m3k_s, b] = (
                                 captured * mixed + parcel_w * per_air
                             )
-                            for j in range(n_units):
-                                need = shares[share_0 + j] * fresh_flow
+                            unit = 0
+                            while unit < n_units:
+                                need = shares[share_0 + unit] * fresh_flow
                                 needed = real(0.0)
                                 for i in range(LANES):
                                     needed += need[i]
-                                needs[need_0 + j] = needs[need_0 + j] + ti.cast(needed, ti.f64)
+                                needs[need_0 + unit] = needs[need_0 + unit] + ti.cast(
+                                    needed, ti.f64
+                                )
+                                unit += step
                         terms[slice_at + SUM.cpu_w, b] = cpu
                         terms[slice_at + SUM.fan_w, b] = fan
                         terms[slice_at + SUM.airflow_m3s, b] = flow
@@ -1184,8 +1219,8 @@ def hall_kernel(precision: str) -> Any:
                         sums[SUM.airflow_m3s, chunk] = flow_sum
                         sums[SUM.outlet_c, chunk] = outlet_sum
                     else:
-                        add_up(chunk, slice_at, chunk_ints, terms, sums)
-                        find_hottest(chunk, chunk_hottest, chunk_block, chunk_zone, sums)
+                        add_up(chunk, slice_at, step, chunk_ints, terms, sums)
+                        find_hottest(chunk, step, chunk_hottest, chunk_block, chunk_zone, sums)
                     least_k, most_k = real(1e30), real(-1e30)
                     for i in range(LANES):
                         least_k = ti.min(least_k, least[i])
@@ -1199,6 +1234,7 @@ def hall_kernel(precision: str) -> Any:
                                     again,
                                     n,
                                     chunk,
+                                    step,
                                     chunk_ints,
                                     dc_ints,
                                     control,
@@ -1223,6 +1259,7 @@ def hall_kernel(precision: str) -> Any:
                             late,
                             slice_at,
                             n_blocks,
+                            step,
                             chunk_hottest,
                             chunk_block,
                             chunk_zone,
@@ -1260,6 +1297,7 @@ def hall_kernel(precision: str) -> Any:
         loads_of: ti.i32,
         each_once: ti.i32,
         start_rows: ti.i32,
+        step: ti.i32,
         substep_s: ti.f64,
         weight: ti.f64,
         tolerance_k: ti.f64,
@@ -1327,6 +1365,7 @@ def hall_kernel(precision: str) -> Any:
                         loads_of,
                         each_once,
                         start_rows,
+                        step,
                         substep_s,
                         weight,
                         tolerance_k,

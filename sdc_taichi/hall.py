@@ -648,6 +648,7 @@ class Hall:
             self._loads_of,
             each_once,
             self._start_rows,
+            1,
             substep_s,
             weight,
             TOLERANCE_K[self._precision],
