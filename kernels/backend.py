@@ -1,6 +1,8 @@
 """The one place that imports Taichi, so that a maintained fork could take its place."""
 
 import ctypes
+import inspect
+import linecache
 import math
 import os
 import threading
@@ -11,9 +13,14 @@ from typing import Any
 import numpy as np
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
+# For each function that it decorates Taichi asks for the source of what imports it, which is Python
+# and has none. `inspect` searches all modules for it unless told, for half of the time to import.
+inspect.modulesbyfile.setdefault("<frozen importlib._bootstrap>", "importlib._bootstrap")
 
-import taichi as ti
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+import taichi as ti  # noqa: E402
+from taichi.lang import kernel_impl  # noqa: E402
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext  # noqa: E402
 
 __all__ = ["BoundKernel", "aligned", "ti"]
 
@@ -65,21 +72,35 @@ def _translation() -> Iterator[None]:
     """File and line alone for each node of the source, and whole numbers of 32 bits.
 
     Taichi writes an excerpt of the source for every node, in case of an error, which takes half of
-    the time of translating a kernel; this is done at every start. Literals have the type that
-    whoever started the runtime chose.
+    the time of translating a kernel; this is done at every start. Of what is left a fifth is that
+    `inspect` looks for the end of each function word by word. Literals have the type that whoever
+    started the runtime chose.
     """
 
     def position(context: Any, node: Any) -> str:
         return f'File "{context.file}", line {node.lineno + context.lineno_offset}:\n'
 
+    def source(function: Any) -> tuple[list[str], int]:
+        code = function.__code__
+        first = code.co_firstlineno
+        ends = [end for _, end, column, _ in code.co_positions() if end and column is not None]
+        if not ends:  # as with `python -X no_debug_ranges`
+            found: tuple[list[str], int] = read(function)
+            return found
+        lines = linecache.getlines(code.co_filename, function.__globals__)
+        return lines[first - 1 : max(ends)], first
+
     runtime = ti.lang.impl.get_runtime()
     excerpt, whole = ASTTransformerContext.get_pos_info, runtime.default_ip
+    read = kernel_impl.getsourcelines
     try:
         ASTTransformerContext.get_pos_info = position
+        kernel_impl.getsourcelines = source
         runtime.default_ip = ti.i32
         yield
     finally:
         ASTTransformerContext.get_pos_info = excerpt
+        kernel_impl.getsourcelines = read
         runtime.default_ip = whole
 
 
