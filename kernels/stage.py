@@ -9,6 +9,7 @@ centers.
 """
 
 import linecache
+from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import cache
 from hashlib import sha256
@@ -30,6 +31,9 @@ _BLOCKS_AT_ONCE = 64
 _SAME_SETS = 64
 """Rows that are multiples of 4 KiB apart compete for the same sets of the cache, and a stage reads
 and writes a hundred of them at a time: twice as slow. Such rows get a block more."""
+
+_LONGEST_TERM = 80
+"""Letters of a quantity that is written within another."""
 
 _NUMBERS = {
     np.add: "{} + {}",
@@ -203,7 +207,10 @@ class _Record:
         return read > 0.5 if array.dtype == np.bool_ else read
 
     def lines(self, results: list[Recorded]) -> list[str]:
-        """Statements that compute the results and store them, without what none of them needs."""
+        """Statements that compute the results and store them, without what none of them needs.
+
+        What is used once stands where it is used, since Taichi is slow at statements.
+        """
         known = list(self._operations)
         needed: set[int] = set()
         open_ends = [result.at for result in results]
@@ -212,11 +219,18 @@ class _Record:
             if at not in needed:
                 needed.add(at)
                 open_ends += known[at][1]
-        body = []
+        uses = Counter(x for at in needed for x in known[at][1])
+        body: list[str] = []
+        names: dict[int, str] = {}
         for at in sorted(needed):
             text, of = known[at]
-            body.append(f"v{at} = " + text.format(*(f"v{x}" for x in of)))
-        return body + [f"out[{row}, i] = v{result.at}" for row, result in enumerate(results)]
+            text = text.format(*(names[x] for x in of))
+            names[at] = f"v{at}"
+            if uses[at] == 1 and len(text) < _LONGEST_TERM:
+                names[at] = f"({text})"
+            else:
+                body.append(f"v{at} = {text}")
+        return body + [f"out[{row}, i] = {names[x.at]}" for row, x in enumerate(results)]
 
 
 def _power(base: Recorded, exponent: Any) -> Recorded:
