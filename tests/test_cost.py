@@ -122,5 +122,7 @@ def test_arithmetic_of_the_halls_is_on_vectors(tmp_path: Path) -> None:
     (code,) = (text for text in shown if "@hall_c" in text)
     on_vectors = len(re.findall(r" = f(?:mul|add|sub|div) .*<[0-9]+ x float>", code))
     one_by_one = len(re.findall(r" = f(?:mul|add|sub|div) (?:[a-z]+ )*float ", code))
-    assert on_vectors > 200
-    assert on_vectors > 2 * one_by_one
+    assert on_vectors > 150
+    assert on_vectors > 4 * one_by_one
+    # At every start machine code is made of it; copies of loop bodies would double it.
+    assert code.count("\n") < 5000
