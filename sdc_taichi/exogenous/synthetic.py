@@ -163,7 +163,7 @@ def _ar1(noise: FloatArray, phi: float) -> FloatArray:
     x = float(noise[0])
     out = [x]
     for kick in (noise[1:] * math.sqrt(1.0 - phi * phi)).tolist():
-        x = phi * x + float(kick)
+        x = phi * x + kick
         out.append(x)
     return np.array(out)
 
