@@ -42,9 +42,20 @@ RUN_INTS = ("first", "length", "offset")
 """Runs of weights in whole vectors of RUN_LANES: first vector of sources, how many, and first of
 weights."""
 CHUNK_INTS = ("first_block", "dc", "first_need")
-DC_INTS = ("first_chunk", "first_unit", "first_share", "racks", "mix", "start")
-"""``mix``: first of the weights of halls that keep every weight, -1 of others; ``start``: first
-row of the table of where the sweeps start."""
+DC_INTS = (
+    "first_chunk",
+    "first_unit",
+    "first_share",
+    "racks",
+    "mix",
+    "pattern",
+    "start",
+    "start_rows",
+)
+"""``mix``: first of the weights of halls that keep every weight, -1 of others. The last three are
+of where the sweeps start: first pattern of the racks, first entry and rows of the table."""
+PATTERNS = LANES - 1
+"""Patterns of a block of racks; an entry of the table tells how much of each, and ``kept``."""
 CONTROL = ("active", "exchange", "side", "sweep", "chunks")
 """Per data center: whether the next sweep computes it (1), it has ended (0) or come to no end (-1);
 whether the next sweep exchanges anew; which row of the exhaust its last exchange saw; sweeps since
@@ -59,13 +70,8 @@ RACK_ROWS = (
     "per_strength",
     "captured",
     "per_server",
-    "start_approach_k",
-    "start_rise_k",
-    "mixed_approach_k",
-    "mixed_rise_k",
 )
-"""``per_server``: 1 over the servers, 0 in places without a rack. The last four start the sweeps:
-of a rack and of the exhaust mix before it."""
+"""``per_server``: 1 over the servers, 0 in places without a rack."""
 GROUP_ROWS = ("count", "full_w", "idle_w", "inlet_offset_k", "load_deviation", "height")
 """In places without a rack or group all are those of another one, but ``count`` is 0."""
 DC_ROWS = (
@@ -97,19 +103,16 @@ DC_DOUBLES = (
     "it_airflow_m3s",
     "start_low_c",
     "start_per_k",
-    "start_scale",
-    "start_warming",
     "kept",
-    "start_c",
     "stirring_m3s",
     "shift_k",
     "moved_k",
     "shifted_k",
 )
 """Per data center in f64: heat held by the room and what the coil needs in transient runs; lowest
-supply air of the table of starts and its rows per K, where the sweeps start and what they keep of a
-common deviation; CRAC air per rack; common shift of the exhaust mixes since the last exchange, and
-by how much the outlets and the shift changed in the last sweep."""
+supply air of the table of starts and its rows per K; what sweeps keep of a common deviation; CRAC
+air per rack; common shift of the exhaust mixes since the last exchange, and by how much the outlets
+and the shift changed in the last sweep."""
 UNIT_ROWS = ("setpoint_c", "low", "high", "design_m3s", "running")
 UNIT_STATE = (
     "supply_c",
@@ -127,11 +130,11 @@ RACK_STATE = (
     "exhaust_odd_c",
     "captured_m3s",
     "exchanged_c",
-    "change_k",
+    "given_k",
 )
 """Exhaust mix before a rack, what it gives to the mixes times strength at the last exchange and
-since in turn, flow that the rack takes of the mix, the mix at the last exchange, and what the
-exhaust has changed by since."""
+since in turn, flow that the rack takes of the mix, and the mix at the last exchange. Of halls that
+keep every weight in steady air: the mix of the next sweep, and what is exchanged."""
 RACK_OUT = ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "inlet_max_c", "outlet_c")
 GROUP_OUT = ("inlet_c", "outlet_c", "power_w")
 TERMS = (
@@ -242,7 +245,7 @@ def hall_kernel(precision: str) -> Any:
 
     Halls that keep every weight exchange after each sweep, which tells exactly what the next would
     move. Their next sweep starts from where the mixes go when the share ``kept`` of what they
-    change by comes back from the racks, to the third pass. In larger halls, whose exchange costs
+    change by comes back from the racks for ever. In larger halls, whose exchange costs
     more than a sweep: the weights of a mix sum to 1, so it moves by no more than the exhausts have
     moved since the last exchange; where all of them moved alike, the mixes are shifted and nothing
     is exchanged.
@@ -285,7 +288,6 @@ def hall_kernel(precision: str) -> Any:
     sources_1d = ti.types.ndarray(dtype=ti.types.vector(SOURCES, real), ndim=1)
     runs_1d = ti.types.ndarray(dtype=ti.types.vector(RUN_LANES, real), ndim=1)
     mix_1d = ti.types.ndarray(dtype=ti.types.vector(SOURCES * LANES, real), ndim=1)
-    starts_2d = ti.types.ndarray(dtype=ti.types.vector(4, ti.f64), ndim=2)
     doubles_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
 
     @ti.func
@@ -344,32 +346,32 @@ def hall_kernel(precision: str) -> Any:
     @no_type_check
     def expect(
         n,
-        start_rows,
+        columns,
         dc_ints: ti.template(),
         doubles: ti.template(),
         unit_state: ti.template(),
         starts: ti.template(),
     ):
-        """Outlets to start from: the racks of the design point, moved as a mean rack would be.
+        """How much of each pattern to start from, and last ``kept``.
 
         By the supply air of the first unit, which tells where the others are near enough to start.
         """
         supply_c = unit_state[SUPPLY.supply_c, dc_ints[DC.first_unit, n]]
-        rows, columns = start_rows - 2, starts.shape[1] - 2
+        rows = dc_ints[DC.start_rows, n]
         y = (supply_c - doubles[EXACT.start_low_c, n]) * doubles[EXACT.start_per_k, n]
         y = ti.min(ti.max(y, 0.0), ti.cast(rows - 1, ti.f64))
         x = ti.min(ti.max(doubles[EXACT.utilisation, n], 0.0), 1.0) * ti.cast(columns - 1, ti.f64)
         row = ti.min(ti.cast(y, ti.i32), rows - 2)
         column = ti.min(ti.cast(x, ti.i32), columns - 2)
         of_rows, of_columns = cubic(y - row), cubic(x - column)
-        start = ti.Vector([ti.cast(0.0, ti.f64)] * 4)
-        for k in range(16):
-            w = of_rows[k // 4] * of_columns[k % 4]
-            start += w * starts[dc_ints[DC.start, n] + row + k // 4, column + k % 4]
-        doubles[EXACT.start_c, n] = supply_c
-        doubles[EXACT.start_scale, n] = start[0]
-        doubles[EXACT.start_warming, n] = start[1]
-        doubles[EXACT.kept, n] = start[2]
+        at = dc_ints[DC.start, n] + row * (columns + 2) + column
+        start = ti.Vector([ti.cast(0.0, real)] * LANES)
+        for i in ti.static(range(4)):
+            for j in ti.static(range(4)):
+                start += starts[at + j] * ti.cast(of_rows[i] * of_columns[j], real)
+            at += columns + 2
+        doubles[EXACT.kept, n] = ti.cast(start[PATTERNS], ti.f64)
+        return start
 
     @ti.func
     @no_type_check
@@ -396,6 +398,7 @@ def hall_kernel(precision: str) -> Any:
         n,
         chunk,
         step,
+        reference_c,
         chunk_ints: ti.template(),
         dc_ints: ti.template(),
         control: ti.template(),
@@ -406,42 +409,41 @@ def hall_kernel(precision: str) -> Any:
         rack_store: ti.template(),
         sums: ti.template(),
     ):
-        """Mixes of a data center of one chunk that keeps every weight, in three passes.
+        """Mixes of a data center of one chunk that keeps every weight, in two passes.
 
-        The first tells what the mixes change by if the racks answer no more. The others let the
-        share ``kept`` of that come back from the racks, now and then not, and the last gives the
-        exhausts that may be expected and their mixes.
+        The first tells what the mixes change by if the racks answer no more. The other lets the
+        share ``kept`` of that come back from the racks again and again, now and then not; what
+        comes back is exchanged once and taken as alike from then on.
         """
         block_0 = chunk_ints[CHUNK.first_block, chunk]
         block_1 = chunk_ints[CHUNK.first_block, chunk + 1]
         n_sources = (dc_ints[DC.racks, n] + (SOURCES - 1)) // SOURCES
-        row = STATE.change_k
-        if again > 0:
+        base = ti.Vector([ti.cast(0.0, real)] * LANES)
+        if again == 0:
+            base += reference_c
+        else:
             kept = ti.min(doubles[EXACT.kept, n], EXPECTED_KEPT)
             if control[CTL.sweep, n] % PLAIN_EVERY == 0:
                 kept = 0.0
-            back = ti.cast(kept, real)
-            if again == 2:
-                row = STATE.exhaust_c
+            back = ti.cast(kept / (1.0 - kept), real)
             block = block_0
             while block < block_1:
-                moves = rack_store[STATE.exchanged_c, block] * racks[RACK.strength, block]
-                was = rack_store[STATE.exhaust_c, block]
-                change = rack_store[STATE.exhaust_odd_c, block] - was + moves * back
-                rack_store[STATE.change_k, block] = change
-                if again == 2:
-                    rack_store[STATE.exhaust_c, block] = was + change
+                move = rack_store[STATE.exchanged_c, block] - rack_store[STATE.mixed_c, block]
+                rack_store[STATE.given_k, block] = move * racks[RACK.strength, block] * back
                 block += step
         least = ti.Vector([ti.cast(0.0, real)] * LANES)
         most = least
-        first = (row * rack_store.shape[1] + block_0) * (LANES // SOURCES)
+        first = (STATE.given_k * rack_store.shape[1] + block_0) * (LANES // SOURCES)
         block = block_0
         while block < block_1:
             at = dc_ints[DC.mix, n] + (block - block_0) * n_sources
-            mixed = mixed_from(mix, at, rack_sources, first, n_sources, step)
+            if again > 0:
+                base = rack_store[STATE.exchanged_c, block]
+            mixed = base + mixed_from(mix, at, rack_sources, first, n_sources, step)
             rack_store[STATE.exchanged_c, block] = mixed
-            least = smaller(mixed, least)
-            most = larger(mixed, most)
+            move = mixed - rack_store[STATE.mixed_c, block]
+            least = smaller(move, least)
+            most = larger(move, most)
             block += step
         if again == 0:
             least_k, most_k = real(0.0), real(0.0)
@@ -783,7 +785,7 @@ def hall_kernel(precision: str) -> Any:
         outlet_model,
         loads_of,
         each_once,
-        start_rows,
+        start_columns,
         step,
         substep_s,
         weight,
@@ -832,16 +834,18 @@ def hall_kernel(precision: str) -> Any:
         # Chunks that are tasks of their own wait for each other after every sweep.
         rounds = sweeps if end_chunk - first_chunk == n_parts else 1
         passes, late = 1, False
+        start = ti.Vector([ti.cast(0.0, real)] * LANES)
         if ti.static(recirculates and not transient and not write):
             late = n_parts == 1
             if dc_ints[DC.mix, n] >= 0:
-                passes = 3
+                passes = 2
             if control[CTL.sweep, n] == 0:
-                expect(n, start_rows, dc_ints, doubles, unit_state, starts)
+                start = expect(n, start_columns, dc_ints, doubles, unit_state, starts)
         zeros = ti.Vector([ti.cast(0.0, real)] * LANES)
         ones = zeros + real(1.0)
         unit_0 = dc_ints[DC.first_unit, n]
         n_units = dc_ints[DC.first_unit, n + 1] - unit_0
+        reference_c = ti.cast(unit_state[SUPPLY.supply_c, unit_0], real)
         utilisation = zeros + ti.cast(doubles[EXACT.utilisation, n], real)
         cpu_slope = dcs[VALUE.cpu_slope_per_k, n]
         cpu_offset = dcs[VALUE.cpu_offset, n]
@@ -971,17 +975,20 @@ def hall_kernel(precision: str) -> Any:
                                     target *= racks[RACK.norm, block]
                                 rack_store[STATE.exchanged_c, block] = target
                             elif begins:
-                                start_c = ti.cast(doubles[EXACT.start_c, n], real)
-                                scale = ti.cast(doubles[EXACT.start_scale, n], real)
-                                warming = ti.cast(doubles[EXACT.start_warming, n], real)
-                                approach = racks[RACK.start_approach_k, block]
-                                rise = racks[RACK.start_rise_k, block]
-                                gives = approach * scale + rise * warming + start_c
-                                rack_store[1 + side, block] = gives * racks[RACK.strength, block]
-                                approach = racks[RACK.mixed_approach_k, block]
-                                rise = racks[RACK.mixed_rise_k, block]
-                                target = approach * scale + rise * warming + start_c
-                                rack_store[STATE.exchanged_c, block] = target
+                                pattern = dc_ints[DC.pattern, n]
+                                pattern += (block - dc_block_0) * PATTERNS
+                                target = zeros + reference_c
+                                if passes > 1:
+                                    for k in ti.static(range(PATTERNS)):
+                                        target += starts[pattern + k] * start[k]
+                                else:
+                                    gives = target
+                                    for k in ti.static(range(2)):
+                                        target += starts[pattern + k] * start[k]
+                                        gives += starts[pattern + 2 + k] * start[k]
+                                    gives *= racks[RACK.strength, block]
+                                    rack_store[1 + side, block] = gives
+                                    rack_store[STATE.exchanged_c, block] = target
                             else:
                                 target = rack_store[STATE.exchanged_c, block]
                             target += shift
@@ -1144,17 +1151,23 @@ def hall_kernel(precision: str) -> Any:
                             # Of air that failing fans do not move, the mix is left.
                             seen = mixed + air_left * (outlet - mixed)
                             seen *= racks[RACK.strength, block]
-                            change = seen - rack_store[1 + side, block]
                             rack_store[2 - side, block] = seen
                             rack_store[STATE.captured_m3s, block] = captured
-                            rack_store[STATE.change_k, block] = change
-                            change *= racks[RACK.per_strength, block]
-                            least = smaller(
-                                ti.select(per_server > real(0.0), change, zeros + real(1e30)), least
-                            )
-                            most = larger(
-                                ti.select(per_server > real(0.0), change, zeros - real(1e30)), most
-                            )
+                            if passes > 1:
+                                rack_store[STATE.given_k, block] = (
+                                    seen - racks[RACK.strength, block] * reference_c
+                                )
+                            else:
+                                change = seen - rack_store[1 + side, block]
+                                change *= racks[RACK.per_strength, block]
+                                least = smaller(
+                                    ti.select(per_server > real(0.0), change, zeros + real(1e30)),
+                                    least,
+                                )
+                                most = larger(
+                                    ti.select(per_server > real(0.0), change, zeros - real(1e30)),
+                                    most,
+                                )
                             terms[slice_at + SUM.captured_m3k_s, b] = (
                                 captured * mixed + parcel_w * per_air
                             )
@@ -1235,6 +1248,7 @@ def hall_kernel(precision: str) -> Any:
                                     n,
                                     chunk,
                                     step,
+                                    reference_c,
                                     chunk_ints,
                                     dc_ints,
                                     control,
@@ -1296,7 +1310,7 @@ def hall_kernel(precision: str) -> Any:
         outlet_model: ti.i32,
         loads_of: ti.i32,
         each_once: ti.i32,
-        start_rows: ti.i32,
+        start_columns: ti.i32,
         step: ti.i32,
         substep_s: ti.f64,
         weight: ti.f64,
@@ -1319,7 +1333,7 @@ def hall_kernel(precision: str) -> Any:
         doubles: doubles_2d,
         units: reals_2d,
         unit_state: doubles_2d,
-        starts: starts_2d,
+        starts: blocks_1d,
         rack_sources: sources_1d,
         run_sources: runs_1d,
         rack_store: blocks_2d,
@@ -1364,7 +1378,7 @@ def hall_kernel(precision: str) -> Any:
                         outlet_model,
                         loads_of,
                         each_once,
-                        start_rows,
+                        start_columns,
                         step,
                         substep_s,
                         weight,

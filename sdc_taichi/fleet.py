@@ -19,9 +19,9 @@ from sdc_taichi.config import (
     with_values,
 )
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.hall_start import Start, find_start
 from sdc_taichi.layout import floor_plan, unit_shares
 from sdc_taichi.recirculation import (
-    RackServers,
     Recirculation,
     calibrate,
     design_point,
@@ -69,31 +69,12 @@ class HallAir:
     """First entry of each data center in ``unit_shares``, (B,)."""
     strength: F64
     """Exhaust airflow of each rack over the mean of its hall, 1 with a user's matrix, (R,)."""
-    rise_k: F64
-    """How much each rack warms its air at the design point, (R,)."""
-    mixed_approach_k: F64
-    """Approach temperatures in the exhaust mix before each rack, (R,)."""
-    mixed_rise_k: F64
-    """Rises in the exhaust mix before each rack, (R,)."""
     captured: F64
     """Recirculated share of each rack's intake where ``height`` is 1, (R,)."""
-    table: I32
-    """Entry of each data center in the next three, (B,)."""
-    supply_c: F64
-    """Supply air of the expectations, (H, n)."""
-    expected: F64
-    """Approach and rise of a mean rack over those at the design point, and what is left of a
-    deviation of the exhaust mix after it has passed the racks once; by hall, supply air and load
-    of LOADS, (H n len(LOADS), 3)."""
-
-
-LOADS = np.linspace(0.0, 1.0, 65)
-"""Loads of the expectations: airflow and power bend where their limits set in."""
-SETPOINTS = 9
-"""Supply temperatures of the expectations, from the lowest to the highest setpoint: with 5, racks
-loaded alike take 2.1 sweeps in f32 instead of 1.4."""
-EXPECTED_RACKS = 4
-"""Racks whose mean the expectations take for the hall."""
+    starts: tuple[Start, ...]
+    """Where sweeps start, one per distinct hall."""
+    start: I32
+    """Entry of each data center in ``starts``, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,11 +214,7 @@ class _Air:
     flows: Recirculation
     shares: F64
     captured: F64
-    rise_k: F64
-    mixed_approach_k: F64
-    mixed_rise_k: F64
-    supply_c: F64
-    expected: F64
+    start: Start
 
 
 def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet:
@@ -402,7 +379,12 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         # Units are sized for the racks they supply.
         need = shares.T @ ((1.0 - flows.share) * design.airflow_m3s)
         unit_design_m3s = design.crac_flow_m3s * need / need.sum()
-        air_parts = _air(config, racks, flows, shares)
+        air_parts = _Air(
+            flows=flows,
+            shares=shares,
+            captured=racks.per_rack(flows.captured) / racks.per_rack(racks.height),
+            start=find_start(config, racks, flows),
+        )
     else:
         design = design_point(config, racks)
         unit_design_m3s = np.array([design.crac_flow_m3s])
@@ -435,78 +417,13 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
     )
 
 
-def _air(config: DataCenterConfig, racks: RackServers, flows: Recirculation, shares: F64) -> _Air:
-    rise_k = flows.design.outlet_rise_k - flows.design.approach_k
-    supply_c, expected = _expectations(config, racks, flows)
-    return _Air(
-        flows=flows,
-        shares=shares,
-        captured=racks.per_rack(flows.captured) / racks.per_rack(racks.height),
-        rise_k=rise_k,
-        mixed_approach_k=flows.exchange.apply(flows.approach_k),
-        mixed_rise_k=flows.exchange.apply(rise_k),
-        supply_c=supply_c,
-        expected=expected,
-    )
-
-
-def _expectations(
-    config: DataCenterConfig, racks: RackServers, flows: Recirculation
-) -> tuple[F64, F64]:
-    """Where sweeps of the hall start: the mean of EXPECTED_RACKS of its racks, in steady state.
-
-    Returns:
-        Supply temperatures, (n,), and what ``HallAir.expected`` holds, (n len(LOADS), 3).
-    """
-    setpoint, design = config.hvac.setpoint, flows.design
-    chosen = np.zeros(config.hall.racks, dtype=np.bool_)
-    chosen[:: -(-config.hall.racks // EXPECTED_RACKS)] = True
-    group = racks.per_group(chosen.astype(np.float64)) > 0
-    count, full_w, idle_w = racks.count[group], racks.full_w[group], racks.idle_w[group]
-    approach_k = (racks.per_group(flows.approach_k) * design.height)[group]
-    approach = float(flows.approach_k[chosen].mean())
-    rise_k = float((design.outlet_rise_k - design.approach_k)[chosen].mean())
-
-    def outlet(scale: F64, supply_c: F64, load: F64) -> tuple[F64, F64]:
-        """Inlet over supply air in K, weighted by airflow, and heat over airflow."""
-        inlet_k = scale[..., None] * approach_k
-        power_w, ratio = config.server_power_w(
-            supply_c[..., None] + inlet_k, load[..., None], full_w, idle_w
-        )
-        flow = np.sum(count * ratio, axis=-1)
-        inlet = np.sum(count * ratio * inlet_k, axis=-1) / flow
-        return inlet, np.sum(count * power_w, axis=-1) / flow
-
-    one = np.ones((1, 1))
-    per_w = rise_k / outlet(one, one * design.supply_c, one)[1]
-    supply_c = np.linspace(setpoint.min_c, setpoint.max_c, SETPOINTS)
-    at, load = np.broadcast_arrays(supply_c[:, None], LOADS[None, :])
-
-    def mixed(scale: F64) -> F64:
-        inlet_k, heat = outlet(scale, at, load)
-        return np.asarray((inlet_k + heat * per_w) / (approach + rise_k))
-
-    # Newton steps, by the slope from a thousandth of a percent further on.
-    scale, beyond = np.ones(at.shape), 1e-5
-    for _ in range(8):
-        found = mixed(scale)
-        kept = np.clip((mixed(scale + beyond) - found) / beyond, -0.9, 0.9)
-        change = (found - scale) / (1.0 - kept)
-        scale = scale + change
-        if np.max(np.abs(change)) < 1e-9:
-            break
-    inlet_k, heat = outlet(scale, at, load)
-    parts = inlet_k / max(approach, 1e-9), heat * per_w / rise_k, kept
-    return supply_c, np.stack(parts, axis=-1).reshape(-1, 3)
-
-
 def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
-    """Exchanges end to end; copies of a hall share its weights and expectations."""
+    """Exchanges end to end; copies of a hall share its weights and where its sweeps start."""
     found = [h.air for h in halls if h.air is not None]
     distinct = list({id(air): air for air in found}.values())
     entries = {id(air): i for i, air in enumerate(distinct)}
-    table = np.array([entries[id(air)] for air in found], dtype=np.int32)
-    first_weight = starts([len(a.flows.exchange.weights) for a in distinct], "weights")[table]
+    entry = np.array([entries[id(air)] for air in found], dtype=np.int32)
+    first_weight = starts([len(a.flows.exchange.weights) for a in distinct], "weights")[entry]
     exchanges = [a.flows.exchange for a in found]
     first_rack = starts([len(e.norm) for e in exchanges], "racks")
     return HallAir(
@@ -521,15 +438,11 @@ def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
         weights=np.concatenate([a.flows.exchange.weights for a in distinct]),
         norm=np.concatenate([e.norm for e in exchanges]),
         strength=np.concatenate([e.strength for e in exchanges]),
-        mixed_approach_k=np.concatenate([a.mixed_approach_k for a in found]),
-        mixed_rise_k=np.concatenate([a.mixed_rise_k for a in found]),
         captured=np.concatenate([a.captured for a in found]),
         unit_shares=np.concatenate([a.shares.reshape(-1) for a in found]),
         share_start=starts([a.shares.size for a in found], "unit shares")[:-1],
-        rise_k=np.concatenate([a.rise_k for a in found]),
-        table=table,
-        supply_c=np.stack([a.supply_c for a in distinct]),
-        expected=np.concatenate([a.expected for a in distinct]),
+        starts=tuple(a.start for a in distinct),
+        start=entry,
     )
 
 

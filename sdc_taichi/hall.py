@@ -11,7 +11,8 @@ import numpy as np
 
 from sdc_taichi import runtime
 from sdc_taichi.errors import RuntimeStateError, SdcError
-from sdc_taichi.fleet import LOADS, Fleet, starts
+from sdc_taichi.fleet import Fleet, starts
+from sdc_taichi.hall_start import LOADS
 from sdc_taichi.recirculation import DENSE_RACKS
 from sdc_taichi.types import F64, Reals, ServerLayers
 
@@ -255,7 +256,7 @@ class Hall:
         if air is None:
             self._shares = self._lanes(1)
             self._mix = self._lanes(1, thermal.SOURCES).reshape(1, -1)
-            self._starts, self._start_rows = self._empty((1, 1, 4), np.float64), 1
+            self._starts = self._lanes(1)
             return
         shares, mixes, known, total = [], [], {}, 0
         for dc, (racks, units) in enumerate(
@@ -267,7 +268,7 @@ class Hall:
             shares.append(own.reshape(-1, lanes, int(units)).swapaxes(1, 2).reshape(-1, lanes))
             if racks > DENSE_RACKS:
                 continue
-            entry = int(air.table[dc])
+            entry = int(air.start[dc])
             if entry not in known:
                 at_once = thermal.SOURCES
                 whole = -(-int(racks) // at_once) * at_once
@@ -283,15 +284,34 @@ class Hall:
         self._mix = self._lanes(max(total, 1), thermal.SOURCES).reshape(-1, thermal.SOURCES * lanes)
         if mixes:
             self._mix[:] = np.concatenate(mixes)
-        # Cubics reach one row and column beyond.
-        expected = air.expected.reshape(len(air.supply_c), -1, len(LOADS), 3)
-        expected = np.pad(expected, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
-        self._start_rows = expected.shape[1]
-        self._starts = self._empty(
-            (len(expected) * self._start_rows, expected.shape[2], 4), np.float64
-        )
-        self._starts[..., :3] = expected.reshape(*self._starts.shape[:2], 3)
-        self._dc_ints[thermal.DC_INTS.index("start"), :-1] = air.table * self._start_rows
+        self._lay_out_starts(thermal)
+
+    def _lay_out_starts(self, thermal: Any) -> None:
+        """Patterns of each distinct hall by block, and the table of how much of each."""
+        air, lanes = self._fleet.air, thermal.LANES
+        assert air is not None
+        vectors, firsts = [], []
+        total = 0
+        first_dcs = np.unique(air.start, return_index=True)[1]
+        for start, blocks in zip(air.starts, self._blocks[first_dcs], strict=True):
+            patterns = np.zeros((thermal.PATTERNS, int(blocks) * lanes))
+            patterns[: len(start.patterns), : start.patterns.shape[1]] = start.patterns
+            shares = np.zeros((*start.values.shape[:2], lanes))
+            shares[..., : start.values.shape[2] - 1] = start.values[..., :-1]
+            shares[..., -1] = start.values[..., -1]
+            # Cubics reach one row and column beyond.
+            beyond = ((1, 1), (1, 1), (0, 0))
+            shares = np.pad(shares, beyond, mode="reflect", reflect_type="odd")
+            patterns = patterns.reshape(-1, int(blocks), lanes).swapaxes(0, 1).reshape(-1, lanes)
+            firsts.append((total, total + len(patterns), len(start.supply_c)))
+            vectors += [patterns, shares.reshape(-1, lanes)]
+            total += len(vectors[-2]) + len(vectors[-1])
+        starts([total], "vectors of starts")
+        self._starts = self._lanes(total)
+        self._starts[:] = np.concatenate(vectors)
+        rows = np.array(firsts)[air.start].T
+        for name, values in zip(("pattern", "start", "start_rows"), rows, strict=True):
+            self._dc_ints[thermal.DC_INTS.index(name), :-1] = values
 
     def _lay_out_runs(self, lanes: int) -> None:
         """Runs of weights in whole vectors, filled up with zeros, for halls of many racks."""
@@ -344,10 +364,6 @@ class Hall:
                 "strength": air.strength,
                 "per_strength": 1.0 / air.strength,
                 "captured": air.captured,
-                "start_approach_k": fleet.approach_k,
-                "start_rise_k": air.rise_k,
-                "mixed_approach_k": air.mixed_approach_k,
-                "mixed_rise_k": air.mixed_rise_k,
             }
         for name, values in rows.items():
             self._rack[name][self._rack_at] = values
@@ -356,10 +372,9 @@ class Hall:
         self._dc = dict(zip(thermal.DC_DOUBLES, self._doubles, strict=True))
         self._dc["it_airflow_m3s"][:] = fleet.it_airflow_m3s
         if air is not None:
-            low, high = air.supply_c[air.table, 0], air.supply_c[air.table, -1]
-            rows_apart = air.supply_c.shape[1] - 1
-            self._dc["start_low_c"][:] = low
-            self._dc["start_per_k"][:] = rows_apart / np.maximum(high - low, 1e-9)
+            ends = np.array([start.supply_c[:2] for start in air.starts])[air.start].T
+            self._dc["start_low_c"][:] = ends[0]
+            self._dc["start_per_k"][:] = 1.0 / (ends[1] - ends[0])
         self._moves = self._doubles[thermal.DC_DOUBLES.index("shift_k") :]
         self._controls = np.zeros((len(thermal.CONTROL), fleet.size), np.int32)
         self._control = dict(zip(thermal.CONTROL, self._controls, strict=True))
@@ -647,7 +662,7 @@ class Hall:
             self._outlet_model,
             self._loads_of,
             each_once,
-            self._start_rows,
+            len(LOADS),
             1,
             substep_s,
             weight,
