@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.recirculation import DENSE_RACKS, I32, RackServers, Recirculation
@@ -28,6 +29,8 @@ _FAR_K = 1e-3
 _LAST_STEP_K = 2e-3
 """The next would be shorter by a factor of fifty to a hundred."""
 _USUALLY_KEPT = 0.2
+_MOST_HEAT_K = 100.0
+"""Where fans hardly blow, the air is warmed without bounds, which would drown all other entries."""
 _MOST_PASSES = 10
 _MOST_EXACT_PASSES = 2
 
@@ -41,7 +44,7 @@ class Start:
     patterns: F64
     """Exhaust mix before each rack over supply air, (k, R). Of halls of more than DENSE_RACKS:
     approach and rise in the mix, then of the racks themselves, at the design point, (4, R)."""
-    values: F64
+    values: npt.NDArray[np.float32]
     """How much of each pattern, and last what is left of a deviation of the mixes after it has
     passed the racks once, (n, len(LOADS), k + 1); of large halls k is 2."""
 
@@ -93,7 +96,8 @@ def find_start(config: DataCenterConfig, racks: RackServers, flows: Recirculatio
         own = np.stack([flows.approach_k, design.outlet_rise_k - design.approach_k])
         patterns = np.concatenate([[flows.exchange.apply(row) for row in own], own])
     values = np.concatenate([parts, state.slope.mean(axis=0, keepdims=True)[:, :-1]])
-    return Start(supply_c, patterns, values.T.reshape(rows, len(LOADS), -1))
+    shaped = values.T.reshape(rows, len(LOADS), -1)
+    return Start(supply_c, patterns, shaped.astype(np.float32))
 
 
 @dataclass(slots=True)
@@ -147,7 +151,8 @@ class _Steady:
             )
             ratio = ratio * count
             flow = np.maximum(np.sum(ratio, axis=1), 1e-9)
-            self.heat_k[:, at] = np.sum(power_w * count, axis=1) / flow * self.k_per_w
+            heat_k = np.sum(power_w * count, axis=1) / flow * self.k_per_w
+            self.heat_k[:, at] = np.minimum(heat_k, _MOST_HEAT_K)
             self.inlet_k[:, at] = np.sum(inlet_k * ratio, axis=1) / flow
         return np.asarray(self.inlet_k + self.heat_k)
 

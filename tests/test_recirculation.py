@@ -252,6 +252,24 @@ def test_full_load_at_the_highest_setpoint_agrees_with_the_twin_at_any_fan_speed
     assert_agrees([load_config("corrected")], met, precision)
 
 
+@pytest.mark.parametrize(
+    "overrides",
+    [[], ["hall.servers_per_rack=12", "hall.height_zones=12"],
+     ["hall.rows=5", "hall.racks_per_row=16", "hall.supply_approach_k=5.15",
+      "hall.return_approach_k=-3.1", "servers.power_w=[150, 10]"]],
+    ids=["default", "each server its own", "80 racks"],
+)  # fmt: skip
+def test_most_sweeps_start_where_they_end(overrides: list[str]) -> None:
+    config = load_config("corrected", overrides)
+    fleet, rng = build_fleet([config] * 300), np.random.default_rng(0)
+    hall = Hall(fleet, "f32")
+    hall.solve(Conditions(rng.uniform(16.0, 23.0, 300), rng.uniform(0.0, 1.0, 300)))
+    assert hall._control["sweep"].mean() < 1.6
+    # Setpoints move by whole kelvins, where the table has its entries.
+    hall.solve(Conditions(rng.integers(16, 24, 300).astype(float), rng.integers(0, 65, 300) / 64))
+    assert hall._control["sweep"].max() == 1
+
+
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_every_server_may_be_its_own(precision: Precision) -> None:
     config = load_config("corrected", ["hall.servers_per_rack=12", "hall.height_zones=12"])
