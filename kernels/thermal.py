@@ -466,7 +466,7 @@ def hall_kernel(precision: str) -> Any:
             lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
             b = 0
             while b < n_blocks:
-                term = terms[slice_at + r, b]
+                term = terms[slice_at * CHUNK_BLOCKS + b * n_terms + r]
                 for i in range(LANES):
                     lanes[i] += ti.cast(term[i], ti.f64)
                 b += step
@@ -904,6 +904,7 @@ def hall_kernel(precision: str) -> Any:
                     table = block_ints[BLOCK.table, block]
                     place = block_ints[BLOCK.place, block]
                     share_0 = dc_ints[DC.first_share, n] + n_units * (block - dc_block_0)
+                    term_0 = slice_at * CHUNK_BLOCKS + b * n_terms
                     per_server = racks[RACK.per_server, block]
                     u = utilisation
                     if loads_of == OF_RACKS:
@@ -1144,7 +1145,7 @@ def hall_kernel(precision: str) -> Any:
                             layer_blocks,
                         )
                     else:
-                        terms[slice_at + SUM.captured_m3k_s, b] = zeros
+                        terms[term_0 + SUM.captured_m3k_s] = zeros
                         if ti.static(recirculates):
                             mean = ti.select(flow > real(0.0), inlet_flow * per_flow, mean)
                             captured = flow - cover * fresh_flow
@@ -1168,7 +1169,7 @@ def hall_kernel(precision: str) -> Any:
                                     ti.select(per_server > real(0.0), change, zeros - real(1e30)),
                                     most,
                                 )
-                            terms[slice_at + SUM.captured_m3k_s, b] = (
+                            terms[term_0 + SUM.captured_m3k_s] = (
                                 captured * mixed + parcel_w * per_air
                             )
                             unit = 0
@@ -1181,21 +1182,21 @@ def hall_kernel(precision: str) -> Any:
                                     needed, ti.f64
                                 )
                                 unit += step
-                        terms[slice_at + SUM.cpu_w, b] = cpu
-                        terms[slice_at + SUM.fan_w, b] = fan
-                        terms[slice_at + SUM.airflow_m3s, b] = flow
-                        terms[slice_at + SUM.inlet_c, b] = mean
-                        terms[slice_at + SUM.outlet_c, b] = outlet
+                        terms[term_0 + SUM.cpu_w] = cpu
+                        terms[term_0 + SUM.fan_w] = fan
+                        terms[term_0 + SUM.airflow_m3s] = flow
+                        terms[term_0 + SUM.inlet_c] = mean
+                        terms[term_0 + SUM.outlet_c] = outlet
                         carried = inlet_flow + heat * per_air
                         if ti.static(not recirculates):
                             # Their indices are those of the racks, whatever leaves the servers.
                             inlet_flow = flow * mean
                             carried = flow * outlet
-                        terms[slice_at + SUM.inlet_m3k_s, b] = inlet_flow
-                        terms[slice_at + SUM.outlet_m3k_s, b] = carried
-                        terms[slice_at + SUM.hot_k, b] = hot
-                        terms[slice_at + SUM.cold_k, b] = cold
-                        terms[slice_at + SUM.stored_w, b] = stored + parcel_w
+                        terms[term_0 + SUM.inlet_m3k_s] = inlet_flow
+                        terms[term_0 + SUM.outlet_m3k_s] = carried
+                        terms[term_0 + SUM.hot_k] = hot
+                        terms[term_0 + SUM.cold_k] = cold
+                        terms[term_0 + SUM.stored_w] = stored + parcel_w
                         for i in range(LANES):
                             flow_lanes[i] += ti.cast(flow[i], ti.f64)
                             outlet_lanes[i] += ti.cast(outlet[i], ti.f64)
@@ -1341,7 +1342,7 @@ def hall_kernel(precision: str) -> Any:
         servers_before: reals_1d,
         servers_after: reals_1d,
         constants: reals_1d,
-        terms: blocks_2d,
+        terms: blocks_1d,
         rack_out: blocks_2d,
         needs: doubles_1d,
         sums: doubles_2d,

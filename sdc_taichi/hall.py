@@ -160,7 +160,7 @@ class Hall:
         self._lay_out_air(thermal)
         self._lay_out_values(thermal)
         self._slices = max(1, min(8 * threads, len(self._tasks) - 1))
-        self._terms = self._lanes(self._slices * len(thermal.TERMS), thermal.CHUNK_BLOCKS)
+        self._terms = self._lanes(self._slices * len(thermal.TERMS) * thermal.CHUNK_BLOCKS)
         self._result_names = (*thermal.DC_OUT, *(f"rack_{name}" for name in thermal.RACK_OUT))
         self._solved: bool | None = None
         """Whether the last step was transient; None without one."""
