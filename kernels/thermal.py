@@ -278,6 +278,7 @@ def hall_kernel(precision: str) -> Any:
     mantissa, bias = (23, 127) if precision == "f32" else (52, 1023)
     exp_terms = EXP_TERMS[precision]
     n_terms, n_rows, n_values = len(TERMS), len(GROUP_ROWS), len(GROUP_OUT)
+    n_sums, n_exact, n_of_dc = len(SUMS), len(DC_DOUBLES), len(DC_ROWS)
     reals_2d = ti.types.ndarray(dtype=real, ndim=2)
     reals_1d = ti.types.ndarray(dtype=real, ndim=1)
     blocks_2d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=2)
@@ -358,9 +359,13 @@ def hall_kernel(precision: str) -> Any:
         """
         supply_c = unit_state[SUPPLY.supply_c, dc_ints[DC.first_unit, n]]
         rows = dc_ints[DC.start_rows, n]
-        y = (supply_c - doubles[EXACT.start_low_c, n]) * doubles[EXACT.start_per_k, n]
+        y = (supply_c - doubles[n * n_exact + EXACT.start_low_c]) * doubles[
+            n * n_exact + EXACT.start_per_k
+        ]
         y = ti.min(ti.max(y, 0.0), ti.cast(rows - 1, ti.f64))
-        x = ti.min(ti.max(doubles[EXACT.utilisation, n], 0.0), 1.0) * ti.cast(columns - 1, ti.f64)
+        x = ti.min(ti.max(doubles[n * n_exact + EXACT.utilisation], 0.0), 1.0) * ti.cast(
+            columns - 1, ti.f64
+        )
         row = ti.min(ti.cast(y, ti.i32), rows - 2)
         column = ti.min(ti.cast(x, ti.i32), columns - 2)
         of_rows, of_columns = cubic(y - row), cubic(x - column)
@@ -370,7 +375,7 @@ def hall_kernel(precision: str) -> Any:
             for j in ti.static(range(4)):
                 start += starts[at + j] * ti.cast(of_rows[i] * of_columns[j], real)
             at += columns + 2
-        doubles[EXACT.kept, n] = ti.cast(start[PATTERNS], ti.f64)
+        doubles[n * n_exact + EXACT.kept] = ti.cast(start[PATTERNS], ti.f64)
         return start
 
     @ti.func
@@ -422,7 +427,7 @@ def hall_kernel(precision: str) -> Any:
         if again == 0:
             base += reference_c
         else:
-            kept = ti.min(doubles[EXACT.kept, n], EXPECTED_KEPT)
+            kept = ti.min(doubles[n * n_exact + EXACT.kept], EXPECTED_KEPT)
             if control[CTL.sweep, n] % PLAIN_EVERY == 0:
                 kept = 0.0
             back = ti.cast(kept / (1.0 - kept), real)
@@ -450,8 +455,8 @@ def hall_kernel(precision: str) -> Any:
             for i in range(LANES):
                 least_k = ti.min(least_k, least[i])
                 most_k = ti.max(most_k, most[i])
-            sums[SUM.least_k, chunk] = ti.cast(least_k, ti.f64)
-            sums[SUM.most_k, chunk] = ti.cast(most_k, ti.f64)
+            sums[chunk * n_sums + SUM.least_k] = ti.cast(least_k, ti.f64)
+            sums[chunk * n_sums + SUM.most_k] = ti.cast(most_k, ti.f64)
 
     @ti.func
     @no_type_check
@@ -473,7 +478,7 @@ def hall_kernel(precision: str) -> Any:
             total = ti.cast(0.0, ti.f64)
             for i in range(LANES):
                 total += lanes[i]
-            sums[r, chunk] = total
+            sums[chunk * n_sums + r] = total
             r += step
 
     @ti.func
@@ -486,10 +491,10 @@ def hall_kernel(precision: str) -> Any:
             if hottest[i] > most_c or (hottest[i] == most_c and of_block[i] < block):
                 most_c, block, lane, zone = hottest[i], of_block[i], i, of_zone[i]
             i += step
-        sums[SUM.inlet_max_c, chunk] = ti.cast(most_c, ti.f64)
-        sums[SUM.hottest_block, chunk] = ti.cast(block, ti.f64)
-        sums[SUM.hottest_lane, chunk] = ti.cast(lane, ti.f64)
-        sums[SUM.hottest_zone, chunk] = ti.cast(zone, ti.f64)
+        sums[chunk * n_sums + SUM.inlet_max_c] = ti.cast(most_c, ti.f64)
+        sums[chunk * n_sums + SUM.hottest_block] = ti.cast(block, ti.f64)
+        sums[chunk * n_sums + SUM.hottest_lane] = ti.cast(lane, ti.f64)
+        sums[chunk * n_sums + SUM.hottest_zone] = ti.cast(zone, ti.f64)
 
     @ti.func
     @no_type_check
@@ -532,17 +537,21 @@ def hall_kernel(precision: str) -> Any:
         while chunk < dc_ints[DC.first_chunk, n + 1]:
             r = 0
             while r < n_terms:
-                sums[r, chunk_0] = sums[r, chunk_0] + sums[r, chunk]
+                sums[chunk_0 * n_sums + r] = sums[chunk_0 * n_sums + r] + sums[chunk * n_sums + r]
                 r += step
-            if sums[SUM.inlet_max_c, chunk] > sums[SUM.inlet_max_c, chunk_0]:
-                sums[SUM.inlet_max_c, chunk_0] = sums[SUM.inlet_max_c, chunk]
-                sums[SUM.hottest_block, chunk_0] = sums[SUM.hottest_block, chunk]
-                sums[SUM.hottest_lane, chunk_0] = sums[SUM.hottest_lane, chunk]
-                sums[SUM.hottest_zone, chunk_0] = sums[SUM.hottest_zone, chunk]
-            least_k = ti.min(sums[SUM.least_k, chunk_0], sums[SUM.least_k, chunk])
-            most_k = ti.max(sums[SUM.most_k, chunk_0], sums[SUM.most_k, chunk])
-            sums[SUM.least_k, chunk_0] = least_k
-            sums[SUM.most_k, chunk_0] = most_k
+            if sums[chunk * n_sums + SUM.inlet_max_c] > sums[chunk_0 * n_sums + SUM.inlet_max_c]:
+                sums[chunk_0 * n_sums + SUM.inlet_max_c] = sums[chunk * n_sums + SUM.inlet_max_c]
+                sums[chunk_0 * n_sums + SUM.hottest_block] = sums[
+                    chunk * n_sums + SUM.hottest_block
+                ]
+                sums[chunk_0 * n_sums + SUM.hottest_lane] = sums[chunk * n_sums + SUM.hottest_lane]
+                sums[chunk_0 * n_sums + SUM.hottest_zone] = sums[chunk * n_sums + SUM.hottest_zone]
+            least_k = ti.min(
+                sums[chunk_0 * n_sums + SUM.least_k], sums[chunk * n_sums + SUM.least_k]
+            )
+            most_k = ti.max(sums[chunk_0 * n_sums + SUM.most_k], sums[chunk * n_sums + SUM.most_k])
+            sums[chunk_0 * n_sums + SUM.least_k] = least_k
+            sums[chunk_0 * n_sums + SUM.most_k] = most_k
             chunk += step
         n_racks = ti.cast(dc_ints[DC.racks, n], ti.f64)
         sweep = control[CTL.sweep, n]
@@ -555,9 +564,15 @@ def hall_kernel(precision: str) -> Any:
         adds = False
         ends = True
         if ti.static(recirculates):
-            least_k, most_k = sums[SUM.least_k, chunk_0], sums[SUM.most_k, chunk_0]
+            least_k, most_k = (
+                sums[chunk_0 * n_sums + SUM.least_k],
+                sums[chunk_0 * n_sums + SUM.most_k],
+            )
             unit_first = dc_ints[DC.first_unit, n]
-            following = sums[SUM.airflow_m3s, chunk_0] / doubles[EXACT.it_airflow_m3s, n]
+            following = (
+                sums[chunk_0 * n_sums + SUM.airflow_m3s]
+                / doubles[n * n_exact + EXACT.it_airflow_m3s]
+            )
             uncovered = ti.cast(0.0, ti.f64)
             supply_flow = ti.cast(0.0, ti.f64)
             at = unit_first
@@ -573,7 +588,7 @@ def hall_kernel(precision: str) -> Any:
                 high = ti.cast(units[UNIT.high, at], ti.f64)
                 speed = ti.min(ti.max(following, low), high)
                 flow = ti.cast(units[UNIT.design_m3s, at], ti.f64) * speed
-                offered = ti.cast(dcs[VALUE.fresh_share, n], ti.f64) * flow
+                offered = ti.cast(dcs[n * n_of_dc + VALUE.fresh_share], ti.f64) * flow
                 crac_flow += flow
                 supply_flow += flow * unit_state[SUPPLY.supply_c, at]
                 used = unit_state[SUPPLY.fresh_ratio, at]
@@ -595,7 +610,7 @@ def hall_kernel(precision: str) -> Any:
                 unit_state[SUPPLY.cubed_speed, at] = cubed
                 at += step
             supply_c = supply_flow / crac_flow
-            doubles[EXACT.stirring_m3s, n] = crac_flow / n_racks
+            doubles[n * n_exact + EXACT.stirring_m3s] = crac_flow / n_racks
             control[CTL.sweep, n] = sweep + 1
             more = ti.cast(sweep + 1 < sweeps, ti.i32)
             # All mixes move by the middle of the outlets' changes, give or take half their spread.
@@ -605,7 +620,10 @@ def hall_kernel(precision: str) -> Any:
             if exchanged:
                 control[CTL.side, n] = 1 - control[CTL.side, n]
             if ti.static(transient):
-                leaves = sums[SUM.outlet_m3k_s, chunk_0] - sums[SUM.captured_m3k_s, chunk_0]
+                leaves = (
+                    sums[chunk_0 * n_sums + SUM.outlet_m3k_s]
+                    - sums[chunk_0 * n_sums + SUM.captured_m3k_s]
+                )
                 return_c = (leaves + passing) / crac_flow
                 control[CTL.exchange, n] = ti.cast(apart, ti.i32)
                 control[CTL.active, n] = more
@@ -618,28 +636,30 @@ def hall_kernel(precision: str) -> Any:
                     design_m3s = ti.cast(units[UNIT.design_m3s, unit], ti.f64)
                     is_on = ti.cast(units[UNIT.running, unit], ti.f64)
                     warmer_k = return_c - unit_state[SUPPLY.supply_c, unit]
-                    air = ti.cast(dcs[VALUE.air_j_per_m3_k, n], ti.f64)
+                    air = ti.cast(dcs[n * n_of_dc + VALUE.air_j_per_m3_k], ti.f64)
                     taken = air * design_m3s * speed * warmer_k
-                    fan_w = doubles[EXACT.crac_fan_w_per_m3s, n] * design_m3s
+                    fan_w = doubles[n * n_exact + EXACT.crac_fan_w_per_m3s] * design_m3s
                     drawn = is_on * speed * speed * speed * fan_w
                     coil_load += taken + drawn
                     running += is_on * (taken + drawn)
                     if is_on > 0.0:
                         coil_w = ti.cast(1.0, ti.f64)
-                wanted = ti.max(running + coil_w * doubles[EXACT.room_j, n] / substep_s, 0.0)
-                coil_w = ti.min(wanted, doubles[EXACT.coil_limit_w, n])
-                held_j = doubles[EXACT.room_j, n] + (coil_load - coil_w) * substep_s
-                doubles[EXACT.room_j, n] = held_j
-                warmed_k = held_j / doubles[EXACT.room_j_per_k, n]
+                wanted = ti.max(
+                    running + coil_w * doubles[n * n_exact + EXACT.room_j] / substep_s, 0.0
+                )
+                coil_w = ti.min(wanted, doubles[n * n_exact + EXACT.coil_limit_w])
+                held_j = doubles[n * n_exact + EXACT.room_j] + (coil_load - coil_w) * substep_s
+                doubles[n * n_exact + EXACT.room_j] = held_j
+                warmed_k = held_j / doubles[n * n_exact + EXACT.room_j_per_k]
                 for unit in range(unit_first, dc_ints[DC.first_unit, n + 1]):
                     setpoint_c = ti.cast(units[UNIT.setpoint_c, unit], ti.f64)
                     unit_state[SUPPLY.supply_c, unit] = setpoint_c + warmed_k
-                doubles[EXACT.shift_k, n] = ti.select(apart, 0.0, middle_k)
+                doubles[n * n_exact + EXACT.shift_k] = ti.select(apart, 0.0, middle_k)
             else:
-                shift_k = doubles[EXACT.shift_k, n]
+                shift_k = doubles[n * n_exact + EXACT.shift_k]
                 left_k = ti.max(most_k - shift_k, shift_k - least_k)
                 # The mixes cool or warm by less than what they lie above supply air.
-                above_k = ti.abs(sums[SUM.outlet_c, chunk_0] / n_racks - supply_c)
+                above_k = ti.abs(sums[chunk_0 * n_sums + SUM.outlet_c] / n_racks - supply_c)
                 left_k = ti.max(left_k, uncovered * above_k)
                 control[CTL.active, n] = 0
                 if not left_k <= tolerance_k:
@@ -650,42 +670,47 @@ def hall_kernel(precision: str) -> Any:
                     # Most of what is left is the same for all racks and shrinks by a factor, so a
                     # sweep can go all the way: as expected, or as the last sweep showed, now and
                     # then not.
-                    moved_k = middle_k - doubles[EXACT.moved_k, n]
-                    kept = ti.min(doubles[EXACT.kept, n], EXPECTED_KEPT)
-                    moved_far = ti.abs(doubles[EXACT.shifted_k, n]) > SEEN_FROM * tolerance_k
+                    moved_k = middle_k - doubles[n * n_exact + EXACT.moved_k]
+                    kept = ti.min(doubles[n * n_exact + EXACT.kept], EXPECTED_KEPT)
+                    moved_far = (
+                        ti.abs(doubles[n * n_exact + EXACT.shifted_k]) > SEEN_FROM * tolerance_k
+                    )
                     if sweep > 0 and not exchanged and moved_far:
-                        kept = ti.max(moved_k / doubles[EXACT.shifted_k, n], 0.0)
+                        kept = ti.max(moved_k / doubles[n * n_exact + EXACT.shifted_k], 0.0)
                         kept = ti.min(kept, SEEN_KEPT)
                     if sweep % PLAIN_EVERY == PLAIN_EVERY - 1:
                         kept = 0.0
                     beyond_k = kept / (1.0 - kept) * (middle_k - shift_k)
                     next_k = middle_k + beyond_k
-                    doubles[EXACT.shifted_k, n] = next_k - shift_k
-                    doubles[EXACT.moved_k, n] = middle_k
+                    doubles[n * n_exact + EXACT.shifted_k] = next_k - shift_k
+                    doubles[n * n_exact + EXACT.moved_k] = middle_k
                     if apart:
                         next_k = beyond_k
-                        doubles[EXACT.moved_k, n] = 0.0
-                    doubles[EXACT.shift_k, n] = next_k
+                        doubles[n * n_exact + EXACT.moved_k] = 0.0
+                    doubles[n * n_exact + EXACT.shift_k] = next_k
         if ends:
             if ti.static(recirculates and not transient):
                 if late:
                     add_up(chunk_0, slice_at, step, chunk_ints, terms, sums)
                     find_hottest(chunk_0, step, hottest, of_block, of_zone, sums)
-                leaves = sums[SUM.outlet_m3k_s, chunk_0] - sums[SUM.captured_m3k_s, chunk_0]
+                leaves = (
+                    sums[chunk_0 * n_sums + SUM.outlet_m3k_s]
+                    - sums[chunk_0 * n_sums + SUM.captured_m3k_s]
+                )
                 return_c = (leaves + passing) / crac_flow
-            flow = sums[SUM.airflow_m3s, chunk_0]
+            flow = sums[chunk_0 * n_sums + SUM.airflow_m3s]
             now = ti.Vector(
                 [
-                    sums[SUM.cpu_w, chunk_0],
-                    sums[SUM.fan_w, chunk_0],
+                    sums[chunk_0 * n_sums + SUM.cpu_w],
+                    sums[chunk_0 * n_sums + SUM.fan_w],
                     flow,
-                    sums[SUM.inlet_c, chunk_0] / n_racks,
-                    sums[SUM.outlet_c, chunk_0] / n_racks,
-                    sums[SUM.inlet_m3k_s, chunk_0] - flow * supply_c,
-                    sums[SUM.outlet_m3k_s, chunk_0] - flow * supply_c,
-                    sums[SUM.hot_k, chunk_0],
-                    sums[SUM.cold_k, chunk_0],
-                    sums[SUM.stored_w, chunk_0],
+                    sums[chunk_0 * n_sums + SUM.inlet_c] / n_racks,
+                    sums[chunk_0 * n_sums + SUM.outlet_c] / n_racks,
+                    sums[chunk_0 * n_sums + SUM.inlet_m3k_s] - flow * supply_c,
+                    sums[chunk_0 * n_sums + SUM.outlet_m3k_s] - flow * supply_c,
+                    sums[chunk_0 * n_sums + SUM.hot_k],
+                    sums[chunk_0 * n_sums + SUM.cold_k],
+                    sums[chunk_0 * n_sums + SUM.stored_w],
                     crac_flow,
                     supply_c,
                     return_c,
@@ -700,11 +725,11 @@ def hall_kernel(precision: str) -> Any:
                     if adds:
                         value += dc_out[r, n]
                 dc_out[r, n] = value
-            hottest_c = sums[SUM.inlet_max_c, chunk_0]
+            hottest_c = sums[chunk_0 * n_sums + SUM.inlet_max_c]
             if not adds or hottest_c > dc_out[TOTAL.inlet_max_c, n]:
-                block = ti.cast(sums[SUM.hottest_block, chunk_0], ti.i32)
-                zone = ti.cast(sums[SUM.hottest_zone, chunk_0], ti.i32)
-                lane = ti.cast(sums[SUM.hottest_lane, chunk_0], ti.i32)
+                block = ti.cast(sums[chunk_0 * n_sums + SUM.hottest_block], ti.i32)
+                zone = ti.cast(sums[chunk_0 * n_sums + SUM.hottest_zone], ti.i32)
+                lane = ti.cast(sums[chunk_0 * n_sums + SUM.hottest_lane], ti.i32)
                 rack = (block - chunk_ints[CHUNK.first_block, chunk_0]) * LANES + lane
                 count_at = block_ints[BLOCK.table, block] * (n_rows * LANES) + lane
                 server = ti.cast(0.0, real)
@@ -846,25 +871,25 @@ def hall_kernel(precision: str) -> Any:
         unit_0 = dc_ints[DC.first_unit, n]
         n_units = dc_ints[DC.first_unit, n + 1] - unit_0
         reference_c = ti.cast(unit_state[SUPPLY.supply_c, unit_0], real)
-        utilisation = zeros + ti.cast(doubles[EXACT.utilisation, n], real)
-        cpu_slope = dcs[VALUE.cpu_slope_per_k, n]
-        cpu_offset = dcs[VALUE.cpu_offset, n]
-        cpu_shift = dcs[VALUE.cpu_shift, n]
-        fan_slope = dcs[VALUE.fan_slope_per_k, n]
-        fan_offset = dcs[VALUE.fan_offset, n]
-        fan_shift = dcs[VALUE.fan_shift, n]
-        fan_low = zeros + dcs[VALUE.fan_low, n]
-        fan_high = zeros + dcs[VALUE.fan_high, n]
-        per_reference = real(1.0) / dcs[VALUE.fan_reference_ratio, n]
-        exponent = dcs[VALUE.fan_exponent, n]
-        fan_w = dcs[VALUE.fan_reference_w, n]
-        full_m3s = dcs[VALUE.fan_full_m3s, n]
-        air = dcs[VALUE.air_j_per_m3_k, n]
+        utilisation = zeros + ti.cast(doubles[n * n_exact + EXACT.utilisation], real)
+        cpu_slope = dcs[n * n_of_dc + VALUE.cpu_slope_per_k]
+        cpu_offset = dcs[n * n_of_dc + VALUE.cpu_offset]
+        cpu_shift = dcs[n * n_of_dc + VALUE.cpu_shift]
+        fan_slope = dcs[n * n_of_dc + VALUE.fan_slope_per_k]
+        fan_offset = dcs[n * n_of_dc + VALUE.fan_offset]
+        fan_shift = dcs[n * n_of_dc + VALUE.fan_shift]
+        fan_low = zeros + dcs[n * n_of_dc + VALUE.fan_low]
+        fan_high = zeros + dcs[n * n_of_dc + VALUE.fan_high]
+        per_reference = real(1.0) / dcs[n * n_of_dc + VALUE.fan_reference_ratio]
+        exponent = dcs[n * n_of_dc + VALUE.fan_exponent]
+        fan_w = dcs[n * n_of_dc + VALUE.fan_reference_w]
+        full_m3s = dcs[n * n_of_dc + VALUE.fan_full_m3s]
+        air = dcs[n * n_of_dc + VALUE.air_j_per_m3_k]
         per_air = real(1.0) / air
-        limit_c = zeros + dcs[VALUE.curve_limit_c, n]
-        server_j = dcs[VALUE.server_j_per_k, n]
-        taken_up = dcs[VALUE.effectiveness, n] * air
-        parcel_j = dcs[VALUE.parcel_j_per_k, n]
+        limit_c = zeros + dcs[n * n_of_dc + VALUE.curve_limit_c]
+        server_j = dcs[n * n_of_dc + VALUE.server_j_per_k]
+        taken_up = dcs[n * n_of_dc + VALUE.effectiveness] * air
+        parcel_j = dcs[n * n_of_dc + VALUE.parcel_j_per_k]
         step_s = ti.cast(substep_s, real)
         per_step_s = real(1.0) / step_s
         for _ in range(rounds):
@@ -873,12 +898,13 @@ def hall_kernel(precision: str) -> Any:
                     break
             # CRAC air of the room stirs the air before racks that stand still.
             still_per_s = ti.min(
-                real(STILL_PER_S), air * ti.cast(doubles[EXACT.stirring_m3s, n], real) / parcel_j
+                real(STILL_PER_S),
+                air * ti.cast(doubles[n * n_exact + EXACT.stirring_m3s], real) / parcel_j,
             )
             begins = control[CTL.sweep, n] == 0
             ends = control[CTL.sweep, n] == sweeps - 1
             # What the last sweep left is read anew after it.
-            shift = ti.cast(doubles[EXACT.shift_k, n], real)
+            shift = ti.cast(doubles[n * n_exact + EXACT.shift_k], real)
             side = control[CTL.side, n]
             anew = control[CTL.exchange, n] != 0
             if anew:
@@ -1230,8 +1256,8 @@ def hall_kernel(precision: str) -> Any:
                         for i in range(LANES):
                             flow_sum += flow_lanes[i]
                             outlet_sum += outlet_lanes[i]
-                        sums[SUM.airflow_m3s, chunk] = flow_sum
-                        sums[SUM.outlet_c, chunk] = outlet_sum
+                        sums[chunk * n_sums + SUM.airflow_m3s] = flow_sum
+                        sums[chunk * n_sums + SUM.outlet_c] = outlet_sum
                     else:
                         add_up(chunk, slice_at, step, chunk_ints, terms, sums)
                         find_hottest(chunk, step, chunk_hottest, chunk_block, chunk_zone, sums)
@@ -1239,8 +1265,8 @@ def hall_kernel(precision: str) -> Any:
                     for i in range(LANES):
                         least_k = ti.min(least_k, least[i])
                         most_k = ti.max(most_k, most[i])
-                    sums[SUM.least_k, chunk] = ti.cast(least_k, ti.f64)
-                    sums[SUM.most_k, chunk] = ti.cast(most_k, ti.f64)
+                    sums[chunk * n_sums + SUM.least_k] = ti.cast(least_k, ti.f64)
+                    sums[chunk * n_sums + SUM.most_k] = ti.cast(most_k, ti.f64)
                     for again in range(passes):
                         if ti.static(recirculates and not transient):
                             if passes > 1:
@@ -1330,8 +1356,8 @@ def hall_kernel(precision: str) -> Any:
         racks: blocks_2d,
         tables: blocks_2d,
         group_load: reals_1d,
-        dcs: reals_2d,
-        doubles: doubles_2d,
+        dcs: reals_1d,
+        doubles: doubles_1d,
         units: reals_2d,
         unit_state: doubles_2d,
         starts: blocks_1d,
@@ -1345,7 +1371,7 @@ def hall_kernel(precision: str) -> Any:
         terms: blocks_1d,
         rack_out: blocks_2d,
         needs: doubles_1d,
-        sums: doubles_2d,
+        sums: doubles_1d,
         dc_out: doubles_2d,
         counts: reals_1d,
         group_values: blocks_2d,
