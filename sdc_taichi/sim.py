@@ -526,13 +526,17 @@ class Simulator:
         """Events that cover step ``step`` of the present run."""
         return self._timeline.active(step)
 
-    def servers(self) -> ServerLayers:
+    def servers(self, into: ServerLayers | None = None) -> ServerLayers:
         """Inlet, outlet and power of every server in the last step, each (S,).
+
+        Args:
+            into: layers to overwrite and return; None allocates new ones.
 
         Raises:
             RuntimeStateError: before the first step.
+            SdcError: layers of another shape, type or order.
         """
-        return self._start().servers()
+        return self._start().servers(into)
 
     def state_dict(self, state: State | None = None) -> dict[str, Any]:
         """A state as plain arrays, for ``load_state_dict`` or ``numpy.savez``.

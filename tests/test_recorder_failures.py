@@ -113,7 +113,7 @@ def test_file_that_cannot_grow_ends_with_a_whole_block(tmp_path: Path) -> None:
     # The limit of a process on the size of its files, as a full disk or a quota would end them.
     code = """
 import resource
-resource.setrlimit(resource.RLIMIT_FSIZE, (900_000, 900_000))
+resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, 1_500_000))
 import sys
 sys.argv = ["sdc-taichi", "simulate", "tiny", "--days", "25", "--out", "run", "--quiet",
     "--record", "run/x.rrd"]

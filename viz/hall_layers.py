@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -101,12 +102,14 @@ def tiles(hall: HallConfig) -> Tiles:
 def pixels(racks: Reals, shape: Tiles, scale: Scale) -> npt.NDArray[np.float16]:
     """Images (T, height, width) of rack values (T, R); gaps have the lower end of the range."""
     rows, per_row, height, width, gap = shape
-    shots = len(racks)
-    image = np.full((shots, rows, height + gap, per_row, width + gap), scale.low, dtype=np.float16)
-    values = quantised(racks, scale).astype(np.float16)
-    image[:, :, :height, :, :width] = values.reshape(shots, rows, 1, per_row, 1)
-    flat = image.reshape(shots, rows * (height + gap), per_row * (width + gap))
-    return np.ascontiguousarray(flat[:, : shape.image[0], : shape.image[1]])
+    shots, count = racks.shape
+    # A value for the gaps follows those of the racks.
+    values = np.full((shots, count + 1), scale.low, dtype=np.float16)
+    values[:, :count] = quantised(racks, scale)
+    shown = np.full((rows, height + gap, per_row, width + gap), count)
+    shown[:, :height, :, :width] = np.arange(count).reshape(rows, 1, per_row, 1)
+    whole = shown.reshape(rows * (height + gap), per_row * (width + gap))
+    return values.take(whole[: shape.image[0], : shape.image[1]], axis=1)
 
 
 def legend(scale: Scale) -> tuple[Shots, list[float]]:
@@ -163,29 +166,36 @@ def outline_m(plan: Plan, height_m: float) -> list[list[tuple[float, float, floa
     return [[(x, y, z) for x, y in (*corners, corners[0])] for z in (0.0, height_m)]
 
 
-def zone_starts(fleet: Fleet, dc: int, zones: int) -> I64:
-    """First server of every zone of every rack of a data center, for ``zone_peaks``.
+class Zones(NamedTuple):
+    """What the zones of all racks of some data centers show."""
 
-    Racks need at least as many servers as zones.
-    """
-    racks = np.arange(*fleet.rack_start[dc : dc + 2])
-    first = fleet.server_start[fleet.group_start[racks]].astype(np.int64)
-    count = fleet.server_start[fleet.group_start[racks + 1]] - first
-    # Server j of n stands in zone j * zones // n.
-    before = (np.arange(zones) * count[:, None] + zones - 1) // zones
-    return np.asarray(first[:, None] + before).reshape(-1)
+    servers: I64
+    """The first server of each group in each zone, whose values all of the group have."""
+    starts: I64
+    """First of these in each zone, rack by rack from the floor up."""
 
 
-def zone_peaks(servers: Reals, starts: I64, end: int) -> Reals:
-    """Highest server value of each zone, (zones of all racks,).
+def zones_of(fleet: Fleet, dcs: Sequence[int], zones: Sequence[int]) -> Zones:
+    """Zones of data centers whose racks have so many zones each, and at least as many servers."""
+    servers: list[I64] = []
+    starts: list[I64] = []
+    for dc, heights in zip(dcs, zones, strict=True):
+        racks = np.arange(*fleet.rack_start[dc : dc + 2])
+        groups = fleet.server_start[slice(*fleet.group_start[fleet.rack_start[dc : dc + 2]])]
+        first = fleet.server_start[fleet.group_start[racks]].astype(np.int64)
+        count = fleet.server_start[fleet.group_start[racks + 1]] - first
+        # Server j of n stands in zone j * zones // n.
+        before = (np.arange(heights) * count[:, None] + heights - 1) // heights
+        zone_first = (first[:, None] + before).reshape(-1)
+        own = np.union1d(zone_first, groups)
+        starts.append(np.searchsorted(own, zone_first) + sum(map(len, servers)))
+        servers.append(own)
+    return Zones(np.concatenate(servers), np.concatenate(starts))
 
-    Args:
-        servers: per-server layer, (S,).
-        starts: of ``zone_starts``.
-        end: first server after the data center.
-    """
-    first = int(starts[0])
-    return np.asarray(np.maximum.reduceat(servers[first:end], starts - first))
+
+def zone_peaks(layer: Reals, zones: Zones) -> Reals:
+    """Highest value of each zone in a per-server layer (S,)."""
+    return np.asarray(np.maximum.reduceat(layer[zones.servers], zones.starts))
 
 
 def unit_boxes_m(places_m: F64, plan: Plan, height_m: float) -> F64:

@@ -16,6 +16,7 @@ center's own clock (see ``run.step_times``); the fleet has the clock of the firs
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections import Counter
@@ -38,6 +39,7 @@ from .blueprint import Tab, blueprint
 from .recording_events import Entry, Watch
 from .recording_reader import Block, Cadence, Reader
 from .recording_series import (
+    FIELDS,
     FLEET,
     PLOTS,
     QUEUE,
@@ -70,10 +72,9 @@ Real = TypeVar("Real", bound=np.floating[Any])
 Pictures: TypeAlias = dict[tuple[int, str], npt.NDArray[Real]]
 """By hall in focus and quantity."""
 
-BLOCK_STEPS, LARGE_BLOCK_STEPS = 384, 96
-"""Steps per block: every block costs some kB per entity on top of its values."""
-LARGE_RACKS = 2_000
-"""Racks in focus above which blocks are the shorter ones, for their memory."""
+BLOCK_STEPS, BLOCK_BYTES = 1_024, 16_000_000
+"""A block has as many steps as either allows: each costs some kB per entity on top of its values,
+and what it holds is in memory until it is written."""
 MAX_FOCUS, DEFAULT_FOCUS = 4, 2
 """Data centers in full that may be asked for, and those that are taken unasked."""
 EVERY_H = ((200, 0.0), (2_000, 1.0), (20_000, 3.0))
@@ -314,7 +315,7 @@ class _Episode:
         import rerun as rr
 
         for entity, line in FLEET.items():
-            self._lines(f"fleet/{entity}", every_step, line.value(block.total, block.most)[:, None])
+            self._lines(f"fleet/{entity}", every_step, line.value(block.fleet)[:, None])
         if block.hottest:
             kinds = ["text/markdown"] * len(block.hottest)
             tables = rr.TextDocument.columns(text=block.hottest, media_type=kinds)
@@ -405,9 +406,9 @@ class _Episode:
     def _cells(self, block: Block) -> Pictures[np.float32]:
         """Voxels, (H, racks zones), by hall and quantity."""
         return {
-            (index, what): layers.quantised(shots, self._scales[what])
-            for index, hall in enumerate(block.halls)
-            for what, shots in hall.items()
+            (index, what): layers.quantised(shots[:, cells], self._scales[what])
+            for index, cells in enumerate(self._reader.cells)
+            for what, shots in block.halls.items()
         }
 
     def _when(self, steps: I64) -> npt.NDArray[np.datetime64]:
@@ -458,15 +459,30 @@ def _cadence(fleet: Fleet, focus: Sequence[int], every: int | None) -> Cadence:
     per_server = fleet.servers <= SERVER_LAYERS_UP_TO
     most = ZONES if racks <= layers.SMALL_RACKS else LARGE_ZONES
     fewest = [_fewest_servers(fleet, dc) for dc in focus]
+    hall_every = every or max(map_every, round(HALL_H * fleet.steps_per_hour))
+    zones = tuple(min(most, servers) if per_server else 1 for servers in fewest)
     return Cadence(
         map_every=map_every,
-        hall_every=every or max(map_every, round(HALL_H * fleet.steps_per_hour)),
+        hall_every=hall_every,
         hall_every_in_events=every
         or max(map_every, round(HALL_IN_EVENTS_H * fleet.steps_per_hour)),
-        zones=tuple(min(most, servers) if per_server else 1 for servers in fewest),
+        zones=zones,
         per_server=per_server,
-        block_steps=BLOCK_STEPS if racks <= LARGE_RACKS else LARGE_BLOCK_STEPS,
+        block_steps=_block_steps(fleet, focus, map_every, hall_every, zones),
     )
+
+
+def _block_steps(
+    fleet: Fleet, focus: Sequence[int], map_every: int, hall_every: int, zones: Sequence[int]
+) -> int:
+    """Steps whose values and pictures fill a block."""
+    halls = [fleet.configs[dc].hall for dc in focus]
+    pixels = sum(math.prod(layers.tiles(hall).image) for hall in halls)
+    cells = sum(hall.racks * heights for hall, heights in zip(halls, zones, strict=True))
+    step_bytes = 8 * len(FIELDS) * (len(focus) + 2)
+    step_bytes += 2 * len(layers.COLOURMAPS) * pixels / map_every
+    step_bytes += 4 * len(layers.LIMITS_C) * cells / hall_every
+    return min(BLOCK_STEPS, max(1, int(BLOCK_BYTES / step_bytes)))
 
 
 def _fewest_servers(fleet: Fleet, dc: int) -> int:

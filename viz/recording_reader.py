@@ -13,19 +13,20 @@ import numpy as np
 from sdc_taichi.air_metrics import RECOMMENDED_C
 from sdc_taichi.errors import SdcError
 from sdc_taichi.events import ActiveEvent
-from sdc_taichi.fleet import Fleet
 from sdc_taichi.plant.workload import age_histogram
-from sdc_taichi.types import F64, I64, Reals, Status, StepResult
+from sdc_taichi.types import F64, I64, Reals, ServerLayers, Status, StepResult
 
 from . import hall_layers as layers
 from .recording_events import Entry, failure_entries, hottest_server, protection_entries
-from .recording_series import AGE_EDGES_H, FIELDS
+from .recording_series import AGE_EDGES_H, FIELDS, ROW, SUMMED
 
 if TYPE_CHECKING:
     from sdc_taichi.sim import Simulator
 
 HOTTEST = 5
 """Halls in the table of the hottest."""
+_ROWS_BYTES = 256_000
+"""What is read of so many steps is taken apart at once, while it is in the cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,15 +48,17 @@ class Cadence:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """T steps of n data centers in focus; R racks and U CRAC units of these, end to end."""
+    """T steps of n data centers in focus; R racks and U CRAC units of these, end to end.
+
+    Good until the reader is given another step.
+    """
 
     steps: I64
     """(T,)."""
     values: F64
     """Of ``FIELDS``, (T, FIELDS, n)."""
-    total: F64
-    """Over all data centers of the fleet, (T, FIELDS)."""
-    most: F64
+    fleet: dict[str, F64]
+    """Sums of ``SUMMED`` over all data centers of the fleet, and the highest ``inlet_max_c``."""
     ages: F64
     """Queued tasks by age, (T, n, bands)."""
     supply_c: F64
@@ -69,8 +72,8 @@ class Block:
     """Inlet and outlet in C, power in kW, (M, R)."""
     hall_steps: I64
     """(H,)."""
-    halls: list[dict[str, Reals]]
-    """Inlet and outlet of each hall, rack by rack from the floor up, (H, racks zones)."""
+    halls: dict[str, Reals]
+    """Inlet and outlet, rack by rack from the floor up, (H, zones of R)."""
     hottest: list[str]
     """Markdown table of the hottest halls for each of ``hall_steps``; empty for one hall."""
     entries: list[Entry]
@@ -93,18 +96,17 @@ class Reader:
         self._sim, self._fleet, self._names = sim, fleet, names
         self._focus, self._cadence = list(focus), cadence
         self._every_focus, _ = end_to_end([slice(dc, dc + 1) for dc in focus])
-        self._read = operator.attrgetter(*FIELDS)
+        self._read = operator.attrgetter(*FIELDS, "unit_supply_c", "unit_flow_m3s")
         self._edges = np.array(AGE_EDGES_H) * fleet.steps_per_hour
         self._racks = [slice(*fleet.rack_start[dc : dc + 2].tolist()) for dc in focus]
         self._units = [slice(*fleet.unit_start[dc : dc + 2].tolist()) for dc in focus]
         self._every_rack, self.racks = end_to_end(self._racks)
         self._every_unit, self.units = end_to_end(self._units)
-        self._zone_starts = [
-            layers.zone_starts(fleet, dc, zones)
-            for dc, zones in zip(focus, cadence.zones, strict=True)
-        ]
-        self._server_end = [int(fleet.server_start[fleet.group_start[r.stop]]) for r in self._racks]
-        self._status: Status = np.zeros(fleet.racks, dtype=np.int8)
+        self._zones = layers.zones_of(fleet, focus, cadence.zones)
+        cells = [(r.stop - r.start) * n for r, n in zip(self._racks, cadence.zones, strict=True)]
+        self.cells = [slice(end - n, end) for n, end in zip(cells, np.cumsum(cells), strict=True)]
+        self._servers: ServerLayers | None = None
+        self._status = bytes(fleet.racks)
         self._has_events = any(
             fleet.configs[dc].events.scheduled or fleet.configs[dc].events.sampled for dc in focus
         )
@@ -112,31 +114,21 @@ class Reader:
         self.reward_names: tuple[str, ...] | None = None
         """Known from the first step on."""
         self._last_step = -1
-        # Arrays that are written over block by block stay in the cache.
-        steps, n, fields = cadence.block_steps, len(focus), len(FIELDS)
-        shots = -(-steps // cadence.map_every)
-        self._values = np.empty((steps, fields, n))
-        self._row = np.empty(fields * fleet.size)
-        self._every_dc = self._row.reshape(fields, fleet.size)
-        self._total, self._most = np.empty((steps, fields)), np.empty((steps, fields))
-        self._queues: F64 = np.empty((0, n, 0))
-        self._supply_c = np.empty((steps, self.units[-1].stop))
-        self._flow_m3s = np.empty_like(self._supply_c)
-        self._rewards = np.empty((steps, 0, n))
-        self._maps = {
-            what: np.empty((shots, self.racks[-1].stop), dtype=np.float32)
-            for what in layers.COLOURMAPS
-        }
+        self._summed = [ROW[field] for field in SUMMED]
+        self._rows = np.empty((0, 0))
+        self._filled = 0
+        # Written over block by block, so that it stays in the cache.
+        shots = -(-cadence.block_steps // cadence.map_every)
+        self._maps = np.empty((shots, 4 * self.racks[-1].stop), dtype=np.float32)
         self._clear()
 
     def _clear(self) -> None:
         self._steps: list[int] = []
+        self._parts: list[list[F64]] = []
         self._map_steps: list[int] = []
         self._hall_steps: list[int] = []
-        self._halls: list[dict[str, list[Reals]]] = [
-            {what: [] for what in layers.LIMITS_C} for _ in self._focus
-        ]
-        self._hottest: list[str] = []
+        self._halls: dict[str, list[Reals]] = {what: [] for what in layers.LIMITS_C}
+        self._hottest: list[tuple[int, list[I64 | F64]]] = []
         self._entries: list[Entry] = []
 
     @property
@@ -152,20 +144,22 @@ class Reader:
                 rewards than it.
         """
         self._check(result)
-        k, step = len(self._steps), result.step
-        self._add_rewards(k, rewards)
-        self._last_step = step
+        queue = self._sim.state.queue[self._every_focus].reshape(-1)
+        names = tuple(rewards or ())
+        if self.reward_names is None:
+            self._lay_out(len(queue), names)
+        if names != self.reward_names:
+            raise SdcError(
+                f"recorder: rewards {', '.join(names) or 'none'}, expected "
+                f"{', '.join(self.reward_names or ()) or 'none'} as in the first step"
+            )
+        terms = rewards.values() if rewards else ()
+        np.concatenate((*self._read(result), queue, *terms), out=self._rows[self._filled])
+        self._filled += 1
+        if self._filled == len(self._rows):
+            self._take_apart()
+        step = self._last_step = result.step
         self._steps.append(step)
-        np.concatenate(self._read(result), out=self._row)
-        self._values[k] = self._every_dc[:, self._every_focus]
-        np.add.reduce(self._every_dc, axis=1, out=self._total[k])
-        np.maximum.reduce(self._every_dc, axis=1, out=self._most[k])
-        queue = self._sim.state.queue
-        if not len(self._queues):
-            self._queues = np.empty((len(self._values), len(self._focus), queue.shape[1]))
-        self._queues[k] = queue[self._every_focus]
-        self._supply_c[k] = result.unit_supply_c[self._every_unit]
-        self._flow_m3s[k] = result.unit_flow_m3s[self._every_unit]
         self._add_events(result)
         if step % self._cadence.map_every == 0:
             self._add_maps(result)
@@ -173,29 +167,59 @@ class Reader:
         if step % (cadence.hall_every_in_events if self._active else cadence.hall_every) == 0:
             self._add_halls(result)
 
+    def _lay_out(self, queued: int, reward_names: tuple[str, ...]) -> None:
+        """Make room for what is read of a step: fields, CRAC units, queues and reward terms."""
+        self.reward_names, size = reward_names, self._fleet.size
+        widths = [len(FIELDS) * size, *[self._fleet.units] * 2, queued, len(reward_names) * size]
+        self._ends = np.cumsum(widths)
+        width = int(self._ends[-1])
+        held = min(max(_ROWS_BYTES // (8 * width), 1), self._cadence.block_steps)
+        self._rows = np.empty((held, width))
+
+    def _take_apart(self) -> None:
+        """Bring what was read of several steps into the form of a block."""
+        k, self._filled = self._filled, 0
+        fields, supply_c, flow_m3s, queues, rewards = np.split(
+            self._rows[:k], self._ends[:-1], axis=1
+        )
+        focus, n, size = self._every_focus, len(self._focus), self._fleet.size
+        of_dcs = fields.reshape(k, len(FIELDS), size)
+        self._parts.append([
+            of_dcs[:, :, focus].copy(),
+            of_dcs[:, self._summed].sum(axis=2),
+            of_dcs[:, ROW["inlet_max_c"]].max(axis=1),
+            age_histogram(queues.reshape(k * n, -1), self._edges).reshape(k, n, -1),
+            supply_c[:, self._every_unit].copy(),
+            flow_m3s[:, self._every_unit].copy(),
+            rewards.reshape(k, -1, size)[:, :, focus].copy(),
+        ])  # fmt: skip
+
     def take(self) -> Block:
-        """The block under way; another begins. Its arrays are nobody else's."""
-        k, shots = len(self._steps), len(self._map_steps)
-        ages = age_histogram(self._queues[:k].reshape(-1, self._queues.shape[-1]), self._edges)
-        maps = {what: shown[:shots].copy() for what, shown in self._maps.items()}
-        maps["power"] *= np.float32(1e-3)
+        """The block under way; another begins."""
+        if self._filled:
+            self._take_apart()
+        values, total, hottest_c, ages, supply_c, flow_m3s, rewards = (
+            np.concatenate(parts) for parts in zip(*self._parts, strict=True)
+        )
+        shots = len(self._map_steps)
+        inlet_c, outlet_c, cpu_w, fan_w = np.split(self._maps[:shots], 4, axis=1)
         block = Block(
             steps=np.array(self._steps, dtype=np.int64),
-            values=self._values[:k].copy(),
-            total=self._total[:k].copy(),
-            most=self._most[:k].copy(),
-            ages=ages.reshape(k, len(self._focus), -1),
-            supply_c=self._supply_c[:k].copy(),
-            flow_m3s=self._flow_m3s[:k].copy(),
-            rewards=self._rewards[:k].copy() if self.reward_names else None,
+            values=values,
+            fleet=dict(zip(SUMMED, total.T, strict=True)) | {"inlet_max_c": hottest_c},
+            ages=ages,
+            supply_c=supply_c,
+            flow_m3s=flow_m3s,
+            rewards=rewards if self.reward_names else None,
             map_steps=np.array(self._map_steps, dtype=np.int64),
-            maps=dict(maps),
+            maps={
+                "inlet": inlet_c,
+                "outlet": outlet_c,
+                "power": (cpu_w + fan_w) * np.float32(1e-3),
+            },
             hall_steps=np.array(self._hall_steps, dtype=np.int64),
-            halls=[
-                {what: np.stack(shown) for what, shown in hall.items() if shown}
-                for hall in self._halls
-            ],
-            hottest=self._hottest,
+            halls={what: np.stack(shown) for what, shown in self._halls.items() if shown},
+            hottest=[self._hottest_halls(*found) for found in self._hottest],
             entries=self._entries,
         )
         self._clear()
@@ -219,35 +243,23 @@ class Reader:
                 "steps in order, and begin(sim) begins another"
             )
 
-    def _add_rewards(self, k: int, rewards: Mapping[str, F64] | None) -> None:
-        names = tuple(rewards or ())
-        if self.reward_names is None:
-            self.reward_names = names
-            self._rewards = np.empty((len(self._values), len(names), len(self._focus)))
-        if names != self.reward_names:
-            raise SdcError(
-                f"recorder: rewards {', '.join(names) or 'none'}, expected "
-                f"{', '.join(self.reward_names) or 'none'} as in the first step"
-            )
-        for row, values in enumerate((rewards or {}).values()):
-            self._rewards[k, row] = np.asarray(values, dtype=np.float64)[self._every_focus]
-
     def _add_events(self, result: StepResult) -> None:
         step, fleet = result.step, self._fleet
         if self._has_events:
             active = [e for e in self._sim.active_events(step) if e.dc in self._focus]
             self._entries += failure_entries(step, self._active, active, fleet)
             self._active = active
-        before, after = self._status, result.rack_status
-        if (before == after).all():
+        status, after = result.rack_status.tobytes(), result.rack_status
+        if status == self._status:
             return
-        self._status = after
+        before: Status = np.frombuffer(self._status, after.dtype)
+        self._status = status
         inlet_c: Reals | None = None
         for dc, racks in zip(self._focus, self._racks, strict=True):
             if np.array_equal(before[racks], after[racks]):
                 continue
             if inlet_c is None and self._cadence.per_server:
-                inlet_c = self._sim.servers().inlet_c
+                inlet_c = self._read_servers().inlet_c
 
             def hottest(
                 rack: int, first: int = racks.start, inlet_c: Reals | None = inlet_c
@@ -262,29 +274,50 @@ class Reader:
             )
 
     def _add_maps(self, result: StepResult) -> None:
-        racks, shot = self._every_rack, len(self._map_steps)
+        shown = result.rack_inlet_c, result.rack_outlet_c, result.rack_cpu_w, result.rack_fan_w
+        of_focus = [values[self._every_rack] for values in shown]
+        np.concatenate(of_focus, out=self._maps[len(self._map_steps)])
         self._map_steps.append(result.step)
-        self._maps["inlet"][shot] = result.rack_inlet_c[racks]
-        self._maps["outlet"][shot] = result.rack_outlet_c[racks]
-        power_w = self._maps["power"][shot]
-        np.add(result.rack_cpu_w[racks], result.rack_fan_w[racks], out=power_w, casting="same_kind")
+
+    def _read_servers(self) -> ServerLayers:
+        """Servers of the last step, in layers that are used again."""
+        self._servers = self._sim.servers(self._servers)
+        return self._servers
 
     def _add_halls(self, result: StepResult) -> None:
         self._hall_steps.append(result.step)
         if self._cadence.per_server:
-            servers = self._sim.servers()
-            given = {"inlet": servers.inlet_c, "outlet": servers.outlet_c}
-            for index, (starts, end) in enumerate(
-                zip(self._zone_starts, self._server_end, strict=True)
-            ):
-                for what, values in given.items():
-                    self._halls[index][what].append(layers.zone_peaks(values, starts, end))
+            servers = self._read_servers()
+            for what, values in (("inlet", servers.inlet_c), ("outlet", servers.outlet_c)):
+                self._halls[what].append(layers.zone_peaks(values, self._zones))
         else:
-            for index, racks in enumerate(self._racks):
-                self._halls[index]["inlet"].append(result.rack_inlet_max_c[racks])
-                self._halls[index]["outlet"].append(result.rack_outlet_c[racks])
+            self._halls["inlet"].append(result.rack_inlet_max_c[self._every_rack].copy())
+            self._halls["outlet"].append(result.rack_outlet_c[self._every_rack].copy())
         if self._fleet.size > 1:
-            self._hottest.append(_hottest_halls(result, self._fleet, self._names))
+            inlet_c = result.inlet_max_c
+            top = np.argsort(-inlet_c, kind="stable")[:HOTTEST]
+            where = result.hottest_rack, result.hottest_server
+            found = [top, inlet_c[top], *(values[top] for values in where)]
+            self._hottest.append((int(np.count_nonzero(inlet_c > RECOMMENDED_C[1])), found))
+
+    def _hottest_halls(self, above: int, found: list[I64 | F64]) -> str:
+        """Markdown table of the halls with the hottest inlets.
+
+        Args:
+            above: halls with inlets above what is recommended.
+            found: data centers, inlets, racks and servers, hottest first.
+        """
+        lines = [
+            f"{above} of {self._fleet.size} halls have inlets above {RECOMMENDED_C[1]:g} C",
+            "",
+            "| hall | hottest inlet [C] | row | rack | server from the floor |",
+            "|---|---:|---:|---:|---:|",
+        ]
+        for dc, inlet_c, rack, server in zip(*(x.tolist() for x in found), strict=True):
+            row = int(rack) // self._fleet.configs[dc].hall.racks_per_row
+            name = self._names[dc]
+            lines.append(f"| {name} | {inlet_c:.2f} | {row} | {int(rack)} | {int(server)} |")
+        return "\n".join(lines)
 
 
 def end_to_end(parts: Sequence[slice]) -> tuple[slice | I64, list[slice]]:
@@ -294,21 +327,3 @@ def end_to_end(parts: Sequence[slice]) -> tuple[slice | I64, list[slice]]:
     if all(a.stop == b.start for a, b in itertools.pairwise(parts)):
         return slice(parts[0].start, parts[-1].stop), own
     return np.concatenate([np.arange(part.start, part.stop) for part in parts]), own
-
-
-def _hottest_halls(result: StepResult, fleet: Fleet, names: Sequence[str]) -> str:
-    """Markdown table of the halls with the hottest inlets."""
-    hottest = result.inlet_max_c
-    lines = [
-        f"{int(np.count_nonzero(hottest > RECOMMENDED_C[1]))} of {fleet.size} halls have inlets "
-        f"above {RECOMMENDED_C[1]:g} C",
-        "",
-        "| hall | hottest inlet [C] | row | rack | server from the floor |",
-        "|---|---:|---:|---:|---:|",
-    ]
-    for dc in np.argsort(-hottest, kind="stable")[:HOTTEST]:
-        rack = int(result.hottest_rack[dc])
-        row = rack // fleet.configs[dc].hall.racks_per_row
-        server = int(result.hottest_server[dc])
-        lines.append(f"| {names[dc]} | {hottest[dc]:.2f} | {row} | {rack} | {server} |")
-    return "\n".join(lines)

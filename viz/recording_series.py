@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -167,13 +167,27 @@ FIELDS: tuple[str, ...] = tuple(
 ROW = {field: row for row, field in enumerate(FIELDS)}
 
 
+SUMMED = (
+    "it_w",
+    "hvac_w",
+    "carbon_g",
+    "water_l",
+    "queue_tasks",
+    "dropped_tasks",
+    "lost_tasks",
+    "throttled_racks",
+    "tripped_racks",
+)
+"""Fields that are summed over all data centers."""
+
+
 class FleetLine(NamedTuple):
     """A series over all data centers."""
 
     title: str
     colour: int
-    value: Callable[[F64, F64], F64]
-    """From sums and maxima over the data centers, (T, FIELDS), to the series, (T,)."""
+    value: Callable[[Mapping[str, F64]], F64]
+    """From the sums of ``SUMMED`` and the highest ``inlet_max_c`` to the series, all (T,)."""
 
 
 def _pue(it_w: F64, hvac_w: F64) -> F64:
@@ -182,19 +196,18 @@ def _pue(it_w: F64, hvac_w: F64) -> F64:
     return np.where(some, 1.0 + hvac_w / np.where(some, it_w, 1.0), np.nan)
 
 
-def _total(*fields: str, factor: float = 1.0) -> Callable[[F64, F64], F64]:
-    rows = [ROW[field] for field in fields]
-    return lambda total, _: total[:, rows].sum(axis=1) * factor
+def _total(*fields: str, factor: float = 1.0) -> Callable[[Mapping[str, F64]], F64]:
+    return lambda total: np.sum([total[field] for field in fields], axis=0) * factor
 
 
 FLEET: dict[str, FleetLine] = {
     "pue": FleetLine(
         "PUE of all [-]",
         BLUE,
-        lambda total, _: _pue(total[:, ROW["it_w"]], total[:, ROW["hvac_w"]]),
+        lambda total: _pue(total["it_w"], total["hvac_w"]),
     ),
     "hottest_inlet_c": FleetLine(
-        "hottest inlet of all [C]", ORANGE, lambda _, most: most[:, ROW["inlet_max_c"]]
+        "hottest inlet of all [C]", ORANGE, lambda total: total["inlet_max_c"]
     ),
     "it_kw": FleetLine("IT power of all [kW]", BLUE, _total("it_w", factor=1e-3)),
     "carbon_kg": FleetLine("carbon of all [kg/step]", RED, _total("carbon_g", factor=1e-3)),

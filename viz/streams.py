@@ -217,7 +217,7 @@ class Stream:
         self._keep_bytes = keep_bytes
         self._rec: rr.RecordingStream | None = None
         self._whole_bytes = 0
-        self._unconfirmed = False
+        self._writing: _Call | None = None
         self._behind_bytes = 0
         self.lost = False
         """Whether it has ended early."""
@@ -293,10 +293,9 @@ class Stream:
 
     def end_block(self) -> None:
         """Start writing out what was sent, without waiting for it."""
-        self._unconfirmed = True
         if self._rec is not None:
-            with contextlib.suppress(RuntimeError):  # the next block finds out
-                self._rec.flush(timeout_sec=0)
+            wait_s = 0.0 if self._file is None else CONFIRM_S
+            self._writing = _Call(lambda rec: rec.flush(timeout_sec=wait_s), self._rec)
 
     def close(self) -> None:
         """Write what is left, with the index of the file."""
@@ -315,9 +314,9 @@ class Stream:
 
     def _confirm(self, viewer_s: float = _SOON_S) -> None:
         """Find out whether what was sent has arrived."""
-        if not self._unconfirmed or self._rec is None:
+        writing, self._writing = self._writing, None
+        if writing is None or self._rec is None:
             return
-        self._unconfirmed = False
         if self._file is None:
             if self._flushed(viewer_s):
                 self._behind_bytes = 0
@@ -325,31 +324,15 @@ class Stream:
                 self._lose("the viewer has closed")
             return
         try:
-            self._written_out()
+            if not writing.ends(CONFIRM_S):
+                raise RuntimeError(f"nothing was written for {CONFIRM_S:g} s")
+            if writing.failed is not None:
+                raise writing.failed
             self._whole_bytes = self._file.stat().st_size
             self._behind_bytes = 0
         except (OSError, RuntimeError) as error:
             full = self._file.exists() and shutil.disk_usage(self._file.parent).free < 4096
             self._lose("the disk is full" if full else f"cannot be written ({error})")
-
-    def _written_out(self) -> None:
-        """Wait until the file holds what was sent.
-
-        A flush of Rerun's may never return, whatever its timeout, once writing has failed.
-        """
-        assert self._rec is not None
-        failed: list[RuntimeError] = []
-
-        def flush(rec: rr.RecordingStream) -> None:
-            try:
-                rec.flush(timeout_sec=CONFIRM_S)
-            except RuntimeError as error:
-                failed.append(error)
-
-        if not _ends(CONFIRM_S, flush, self._rec):
-            raise RuntimeError(f"nothing was written for {CONFIRM_S:g} s")
-        if failed:
-            raise failed[0]
 
     def _flushed(self, seconds: float) -> bool:
         """Whether what was sent to a viewer arrives in time."""
@@ -365,7 +348,7 @@ class Stream:
         rec, self._rec = self._rec, None
         if rec is not None:
             # Rerun waits for a viewer that hangs, and for a file that it cannot write, for ever.
-            if not _ends(WAIT_S, rec.disconnect):
+            if not _Call(rec.disconnect).ends(WAIT_S):
                 import rerun as rr
 
                 rr.unregister_shutdown()
@@ -394,12 +377,27 @@ _ABANDONED: list[rr.RecordingStream] = []
 """Recordings that Rerun would wait for when they are deleted."""
 
 
-def _ends(seconds: float, call: Callable[..., object], *arguments: object) -> bool:
-    """Whether a call that may never return does so in time."""
-    calling = threading.Thread(target=call, args=arguments, daemon=True)
-    calling.start()
-    calling.join(seconds)
-    return not calling.is_alive()
+class _Call(threading.Thread):
+    """A call beside the run that may never return.
+
+    A flush of Rerun's may not, whatever its timeout, once writing has failed.
+    """
+
+    def __init__(self, call: Callable[..., object], *arguments: object) -> None:
+        super().__init__(target=call, args=arguments, daemon=True)
+        self.failed: RuntimeError | None = None
+        self.start()
+
+    def run(self) -> None:
+        try:
+            super().run()
+        except RuntimeError as error:
+            self.failed = error
+
+    def ends(self, seconds: float) -> bool:
+        """Whether it ends in time."""
+        self.join(seconds)
+        return not self.is_alive()
 
 
 def _check_room(file: Path, keep_bytes: int) -> None:
