@@ -9,7 +9,9 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +33,7 @@ from sdc_taichi.control import View
 from sdc_taichi.plant.workload import age_histogram
 from sdc_taichi.run import Asked, describe, record
 from sdc_taichi.types import F64, ServerLayers
-from sdc_taichi.viz import hall_layers, recorder, recording_series
+from sdc_taichi.viz import hall_layers, recorder, recording_reader, recording_series
 from sdc_taichi.viz.recorder import Recorder
 from sdc_taichi.viz.recording_events import failure_entries, protection_entries
 
@@ -498,6 +500,11 @@ def small(count: int = 1) -> Simulator:
     return Simulator(make_configs(load_config("tiny"), count=count))
 
 
+def go_on(sim: Simulator, rec: Recorder, steps: int) -> None:
+    for _ in range(steps):
+        rec.add(sim.step())
+
+
 def test_episodes_get_files_of_their_own(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with small() as sim, Recorder(path, every=1) as rec:
@@ -532,6 +539,33 @@ def test_interrupted_recording_is_whole(tmp_path: Path, error: type[BaseExceptio
     assert [p.name for p in tmp_path.iterdir()] == ["cut.rrd"]
     assert verify(path).returncode == 0
     assert len(read(path)["/dc/ny/series/pue"]["step"]) == steps
+
+
+@pytest.mark.parametrize(
+    ("where", "what"), [(hall_layers, "zone_peaks"), (recording_reader, "age_histogram")]
+)
+def test_recording_that_is_interrupted_amid_a_step_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: ModuleType, what: str
+) -> None:
+    monkeypatch.setattr(recording_reader, "_ROWS_BYTES", 20_000)
+    path, rec = tmp_path / "x.rrd", Recorder(tmp_path / "x.rrd", every=1)
+    with small(2) as sim:
+        sim.reset()
+        rec.begin(sim)
+        for _ in range(3):
+            rec.add(sim.step())
+        with monkeypatch.context() as patch:
+            patch.setattr(where, what, Mock(side_effect=KeyboardInterrupt))
+            with pytest.raises(KeyboardInterrupt):
+                go_on(sim, rec, 100)
+        rec.close()
+    entities = read(path)
+    steps = entities["/dc/ny-0/series/pue"]["step"]
+    assert len(steps) >= 3
+    assert steps == list(range(len(steps)))
+    shots = entities["/dc/ny-0/hall/inlet"]["step"]
+    assert shots == entities["/fleet/hottest"]["step"] == list(range(len(shots)))
+    assert verify(path).returncode == 0
 
 
 def test_names_that_are_not_distinct_are_told_apart(tmp_path: Path) -> None:

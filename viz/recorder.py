@@ -479,7 +479,7 @@ def _block_steps(
     halls = [fleet.configs[dc].hall for dc in focus]
     pixels = sum(math.prod(layers.tiles(hall).image) for hall in halls)
     cells = sum(hall.racks * heights for hall, heights in zip(halls, zones, strict=True))
-    step_bytes = 8 * len(FIELDS) * (len(focus) + 2)
+    step_bytes: float = 8 * len(FIELDS) * (len(focus) + 2)
     step_bytes += 2 * len(layers.COLOURMAPS) * pixels / map_every
     step_bytes += 4 * len(layers.LIMITS_C) * cells / hall_every
     return min(BLOCK_STEPS, max(1, int(BLOCK_BYTES / step_bytes)))

@@ -6,9 +6,10 @@ import itertools
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.air_metrics import RECOMMENDED_C
 from sdc_taichi.errors import SdcError
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 
 HOTTEST = 5
 """Halls in the table of the hottest."""
-_ROWS_BYTES = 256_000
-"""What is read of so many steps is taken apart at once, while it is in the cache."""
+_ROWS_BYTES = 1_000_000
+"""Steps are read row by row, and rows of so much are taken apart at once, out of the cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +80,19 @@ class Block:
     entries: list[Entry]
 
 
+class _Shot(NamedTuple):
+    """The 3D halls in one step."""
+
+    step: int
+    inlet_c: Reals
+    """(Zones of R,)."""
+    outlet_c: Reals
+    above: int
+    """Halls of the fleet with inlets above what is recommended."""
+    hottest: list[npt.NDArray[Any]]
+    """Data centers, inlets, racks and servers, hottest first; empty for one hall."""
+
+
 class Reader:
     """Reads results into blocks.
 
@@ -116,7 +130,6 @@ class Reader:
         self._last_step = -1
         self._summed = [ROW[field] for field in SUMMED]
         self._rows = np.empty((0, 0))
-        self._filled = 0
         # Written over block by block, so that it stays in the cache.
         shots = -(-cadence.block_steps // cadence.map_every)
         self._maps = np.empty((shots, 4 * self.racks[-1].stop), dtype=np.float32)
@@ -126,9 +139,7 @@ class Reader:
         self._steps: list[int] = []
         self._parts: list[list[F64]] = []
         self._map_steps: list[int] = []
-        self._hall_steps: list[int] = []
-        self._halls: dict[str, list[Reals]] = {what: [] for what in layers.LIMITS_C}
-        self._hottest: list[tuple[int, list[I64 | F64]]] = []
+        self._shots: list[_Shot] = []
         self._entries: list[Entry] = []
 
     @property
@@ -153,12 +164,13 @@ class Reader:
                 f"recorder: rewards {', '.join(names) or 'none'}, expected "
                 f"{', '.join(self.reward_names or ()) or 'none'} as in the first step"
             )
-        terms = rewards.values() if rewards else ()
-        np.concatenate((*self._read(result), queue, *terms), out=self._rows[self._filled])
-        self._filled += 1
-        if self._filled == len(self._rows):
+        row = len(self._steps) % len(self._rows)
+        if row == 0 and self._steps:
             self._take_apart()
+        terms = rewards.values() if rewards else ()
+        np.concatenate((*self._read(result), queue, *terms), out=self._rows[row])
         step = self._last_step = result.step
+        # What is not listed yet does not count, should reading be interrupted.
         self._steps.append(step)
         self._add_events(result)
         if step % self._cadence.map_every == 0:
@@ -169,16 +181,17 @@ class Reader:
 
     def _lay_out(self, queued: int, reward_names: tuple[str, ...]) -> None:
         """Make room for what is read of a step: fields, CRAC units, queues and reward terms."""
-        self.reward_names, size = reward_names, self._fleet.size
+        size = self._fleet.size
         widths = [len(FIELDS) * size, *[self._fleet.units] * 2, queued, len(reward_names) * size]
         self._ends = np.cumsum(widths)
         width = int(self._ends[-1])
         held = min(max(_ROWS_BYTES // (8 * width), 1), self._cadence.block_steps)
         self._rows = np.empty((held, width))
+        self.reward_names = reward_names
 
     def _take_apart(self) -> None:
         """Bring what was read of several steps into the form of a block."""
-        k, self._filled = self._filled, 0
+        k = len(self._steps) - len(self._parts) * len(self._rows)
         fields, supply_c, flow_m3s, queues, rewards = np.split(
             self._rows[:k], self._ends[:-1], axis=1
         )
@@ -196,13 +209,14 @@ class Reader:
 
     def take(self) -> Block:
         """The block under way; another begins."""
-        if self._filled:
+        if len(self._steps) > len(self._parts) * len(self._rows):
             self._take_apart()
         values, total, hottest_c, ages, supply_c, flow_m3s, rewards = (
             np.concatenate(parts) for parts in zip(*self._parts, strict=True)
         )
-        shots = len(self._map_steps)
-        inlet_c, outlet_c, cpu_w, fan_w = np.split(self._maps[:shots], 4, axis=1)
+        inlet_c, outlet_c, cpu_w, fan_w = np.split(self._maps[: len(self._map_steps)], 4, axis=1)
+        shots = self._shots
+        halls = {"inlet": [s.inlet_c for s in shots], "outlet": [s.outlet_c for s in shots]}
         block = Block(
             steps=np.array(self._steps, dtype=np.int64),
             values=values,
@@ -217,9 +231,9 @@ class Reader:
                 "outlet": outlet_c,
                 "power": (cpu_w + fan_w) * np.float32(1e-3),
             },
-            hall_steps=np.array(self._hall_steps, dtype=np.int64),
-            halls={what: np.stack(shown) for what, shown in self._halls.items() if shown},
-            hottest=[self._hottest_halls(*found) for found in self._hottest],
+            hall_steps=np.array([s.step for s in shots], dtype=np.int64),
+            halls={what: np.stack(shown) for what, shown in halls.items() if shown},
+            hottest=[self._hottest_halls(s) for s in shots if s.hottest],
             entries=self._entries,
         )
         self._clear()
@@ -285,35 +299,31 @@ class Reader:
         return self._servers
 
     def _add_halls(self, result: StepResult) -> None:
-        self._hall_steps.append(result.step)
         if self._cadence.per_server:
             servers = self._read_servers()
-            for what, values in (("inlet", servers.inlet_c), ("outlet", servers.outlet_c)):
-                self._halls[what].append(layers.zone_peaks(values, self._zones))
+            inlet_c = layers.zone_peaks(servers.inlet_c, self._zones)
+            outlet_c = layers.zone_peaks(servers.outlet_c, self._zones)
         else:
-            self._halls["inlet"].append(result.rack_inlet_max_c[self._every_rack].copy())
-            self._halls["outlet"].append(result.rack_outlet_c[self._every_rack].copy())
+            inlet_c = result.rack_inlet_max_c[self._every_rack].copy()
+            outlet_c = result.rack_outlet_c[self._every_rack].copy()
+        hottest: list[npt.NDArray[Any]] = []
+        above = int(np.count_nonzero(result.inlet_max_c > RECOMMENDED_C[1]))
         if self._fleet.size > 1:
-            inlet_c = result.inlet_max_c
-            top = np.argsort(-inlet_c, kind="stable")[:HOTTEST]
-            where = result.hottest_rack, result.hottest_server
-            found = [top, inlet_c[top], *(values[top] for values in where)]
-            self._hottest.append((int(np.count_nonzero(inlet_c > RECOMMENDED_C[1])), found))
+            top = np.argsort(-result.inlet_max_c, kind="stable")[:HOTTEST]
+            shown = result.inlet_max_c, result.hottest_rack, result.hottest_server
+            hottest = [top, *(values[top] for values in shown)]
+        self._shots.append(_Shot(result.step, inlet_c, outlet_c, above, hottest))
 
-    def _hottest_halls(self, above: int, found: list[I64 | F64]) -> str:
-        """Markdown table of the halls with the hottest inlets.
-
-        Args:
-            above: halls with inlets above what is recommended.
-            found: data centers, inlets, racks and servers, hottest first.
-        """
+    def _hottest_halls(self, shot: _Shot) -> str:
+        """Markdown table of the halls with the hottest inlets."""
+        size, recommended_c = self._fleet.size, RECOMMENDED_C[1]
         lines = [
-            f"{above} of {self._fleet.size} halls have inlets above {RECOMMENDED_C[1]:g} C",
+            f"{shot.above} of {size} halls have inlets above {recommended_c:g} C",
             "",
             "| hall | hottest inlet [C] | row | rack | server from the floor |",
             "|---|---:|---:|---:|---:|",
         ]
-        for dc, inlet_c, rack, server in zip(*(x.tolist() for x in found), strict=True):
+        for dc, inlet_c, rack, server in zip(*(x.tolist() for x in shot.hottest), strict=True):
             row = int(rack) // self._fleet.configs[dc].hall.racks_per_row
             name = self._names[dc]
             lines.append(f"| {name} | {inlet_c:.2f} | {row} | {int(rack)} | {int(server)} |")
