@@ -31,7 +31,7 @@ MOST_SWEEPS = 2000
 that the servers draw."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Conditions:
     """What the halls meet during one step."""
 
@@ -89,7 +89,7 @@ class Coil:
     """CRAC fan power per airflow at full speed."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class HallSums:
     """Sums and means of one evaluation: (B,) per data center, (R,) per rack."""
 

@@ -1,4 +1,7 @@
-"""Arrays that flow through a step. Shapes: B data centers, R racks of all, one row each."""
+"""Arrays that flow through a step. Shapes: B data centers, R racks of all, one row each.
+
+Records that every step makes are not frozen, which would take three times as long to make.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +75,7 @@ class Actions:
     placement: F64 | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Exogenous:
     """What the world does during one step, each (B,)."""
 
@@ -130,7 +133,7 @@ class State:
     """Airflow of the servers over that at the design point, for each CRAC unit, (U,)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class StepResult:
     """Every quantity of one step, (B,) unless stated; powers are means over the step.
 
