@@ -26,6 +26,7 @@ OF_DATA_CENTERS, OF_RACKS, OF_GROUPS = range(3)
 
 LANES = 8
 """Racks that are computed at a time; the same for all, so that results never depend on it."""
+LANE_BITS, SQUARE = LANES.bit_length() - 1, LANES * LANES
 SOURCES = 4
 """Racks whose exhausts a vector of weights takes to all lanes of a block, in small halls."""
 RUN_LANES = 16
@@ -37,7 +38,7 @@ CHUNK_BLOCKS = 16
 BLOCK_INTS = ("racks", "groups", "table", "place")
 """Racks and groups per rack of each block, entry of its tables, and first place of its groups."""
 RACK_INTS = ("first_group", "first_server")
-"""Of each place; those without a rack have the groups of the last rack of their block."""
+"""Of each place; those without a rack, and a closing one, begin where the rack before them ends."""
 RUN_INTS = ("first", "length", "offset")
 """Runs of weights in whole vectors of RUN_LANES: first vector of sources, how many, and first of
 weights."""
@@ -283,6 +284,7 @@ def hall_kernel(precision: str) -> Any:
     reals_1d = ti.types.ndarray(dtype=real, ndim=1)
     blocks_2d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=2)
     blocks_1d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=1)
+    squares_2d = ti.types.ndarray(dtype=ti.types.vector(SQUARE, real), ndim=2)
     ints_2d = ti.types.ndarray(dtype=ti.i32, ndim=2)
     ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
     doubles_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
@@ -746,56 +748,102 @@ def hall_kernel(precision: str) -> Any:
     def spread(
         each_once,
         block,
-        n_groups,
         table,
         scratch,
         block_ints: ti.template(),
         counts: ti.template(),
         rack_ints: ti.template(),
+        group_values: ti.template(),
+        squares: ti.template(),
         values: ti.template(),
         layers: ti.template(),
         layer_blocks: ti.template(),
     ):
-        """Values of the groups of a block to their servers, whole vectors where a run has them."""
+        """Values of the groups of a block to their servers, whole vectors where a rack has them."""
         apart = values.shape[0] // n_values
         first_row = RACK_INT.first_server
         if each_once != 0:
             first_row = RACK_INT.first_group
-        for lane in range(block_ints[BLOCK.racks, block]):
-            end = rack_ints[first_row, block * LANES + lane]
+        rack_0 = block * LANES
+        rack_1 = rack_0 + block_ints[BLOCK.racks, block]
+        n_groups = rack_ints[RACK_INT.first_group, rack_1] - rack_ints[RACK_INT.first_group, rack_0]
+        singles = rack_ints[first_row, rack_1] - rack_ints[first_row, rack_0] == n_groups
+        if singles:
+            # Transpose the values of LANES groups at a time, all kinds by turns: halves of a square
+            # element by turns, as often as 2 is in LANES. See ``close`` for the loops.
+            at = scratch >> LANE_BITS
+            while at << LANE_BITS < scratch + block_ints[BLOCK.groups, block]:
+                turn = 0
+                while turn < LANE_BITS * squares.shape[0]:
+                    square = squares[turn % n_values, at]
+                    squares[turn % n_values, at] = ti.Vector(
+                        [square[i // 2 + i % 2 * (SQUARE // 2)] for i in range(SQUARE)]
+                    )
+                    turn += 1
+                at += 1
+        numbers = ti.Vector([i for i in range(LANES)])
+        for rack in range(rack_0, rack_1):
+            start, rack_end = rack_ints[first_row, rack], rack_ints[first_row, rack + 1]
+            lane = rack - rack_0
+            if singles:
+                row = scratch + lane
+                if start & (LANES - 1) == 0:
+                    b = start >> LANE_BITS
+                    while b < rack_ints[first_row, rack + 1] >> LANE_BITS:
+                        for kind in ti.static(range(n_values)):
+                            layer_blocks[kind][b] = group_values[kind, row]
+                        row += LANES
+                        b += 1
+                    start = b << LANE_BITS
+                while start < rack_end:
+                    at = row << LANE_BITS
+                    for s in range(start, ti.min(start + LANES, rack_end)):
+                        for kind in ti.static(range(n_values)):
+                            layers[kind][s] = values[at + kind * apart]
+                        at += 1
+                    row += LANES
+                    start += LANES
+                continue
+            # Between these are the vectors that the rack has to itself.
+            low, high = (start + (LANES - 1)) & -LANES, rack_end & -LANES
             count_at = table * (n_rows * LANES) + lane
-            at = scratch * LANES + lane
-            for _ in range(n_groups):
-                count = ti.cast(counts[count_at], ti.i32)
+            at = (scratch << LANE_BITS) + lane
+            inlets = ti.Vector([ti.cast(0.0, real)] * LANES)
+            outlets, powers = inlets, inlets
+            while start < rack_end:
+                end = start + ti.cast(counts[count_at], ti.i32)
                 inlet_c, outlet_c, power_w = values[at], values[at + apart], values[at + 2 * apart]
+                # The vector where a run begins has the ends of those before.
+                before = numbers < (start & (LANES - 1))
+                inlets = ti.select(before, inlets, ti.Vector([inlet_c] * LANES))
+                outlets = ti.select(before, outlets, ti.Vector([outlet_c] * LANES))
+                powers = ti.select(before, powers, ti.Vector([power_w] * LANES))
+                b, end_b = start >> LANE_BITS, end >> LANE_BITS
+                if b < end_b:
+                    if b << LANE_BITS >= low:
+                        layer_blocks[0][b] = inlets
+                        layer_blocks[1][b] = outlets
+                        layer_blocks[2][b] = powers
+                    inlets = ti.Vector([inlet_c] * LANES)
+                    outlets = ti.Vector([outlet_c] * LANES)
+                    powers = ti.Vector([power_w] * LANES)
+                    for next_b in range(b + 1, end_b):
+                        layer_blocks[0][next_b] = inlets
+                        layer_blocks[1][next_b] = outlets
+                        layer_blocks[2][next_b] = powers
+                s = start
+                if s >= low:
+                    s = ti.max(s, high)
+                while s < ti.min(end, rack_ints[first_row, rack + 1]):
+                    layers[0][s] = inlet_c
+                    layers[1][s] = outlet_c
+                    layers[2][s] = power_w
+                    s += 1
+                    if s == low:
+                        s = ti.max(s, high)
                 count_at += n_rows * LANES
                 at += LANES
                 start = end
-                if count == 1 or each_once != 0:
-                    if count > 0:
-                        layers[0][start] = inlet_c
-                        layers[1][start] = outlet_c
-                        layers[2][start] = power_w
-                        end = start + 1
-                    continue
-                end = start + count
-                first_block = (start + (LANES - 1)) // LANES
-                last_block = ti.max(end // LANES, first_block)
-                inlets = ti.Vector([inlet_c] * LANES)
-                outlets = ti.Vector([outlet_c] * LANES)
-                powers = ti.Vector([power_w] * LANES)
-                for b in range(first_block, last_block):
-                    layer_blocks[0][b] = inlets
-                    layer_blocks[1][b] = outlets
-                    layer_blocks[2][b] = powers
-                for s in range(start, ti.min(first_block * LANES, end)):
-                    layers[0][s] = inlet_c
-                    layers[1][s] = outlet_c
-                    layers[2][s] = power_w
-                for s in range(ti.max(last_block * LANES, start), end):
-                    layers[0][s] = inlet_c
-                    layers[1][s] = outlet_c
-                    layers[2][s] = power_w
 
     @ti.func
     @no_type_check
@@ -847,6 +895,7 @@ def hall_kernel(precision: str) -> Any:
         dc_out: ti.template(),
         counts: ti.template(),
         group_values: ti.template(),
+        squares: ti.template(),
         values: ti.template(),
         layers: ti.template(),
         layer_blocks: ti.template(),
@@ -1060,7 +1109,9 @@ def hall_kernel(precision: str) -> Any:
                                         ti.min(group, servers_before.shape[0] - 1)
                                     ]
                                 server_c[place + z] = before
-                    for z in range(n_groups):
+                    # See ``close`` for the loop.
+                    z = 0
+                    while z < block_ints[BLOCK.groups, block]:
                         count = tables[table + z, GROUP.count]
                         t = mixed
                         own = zeros
@@ -1137,6 +1188,7 @@ def hall_kernel(precision: str) -> Any:
                             here = ti.select(count > real(0.0), t, zeros - real(1e30))
                             zone = ti.select(here > hottest, zeros + ti.cast(z, real), zone)
                             hottest = larger(here, hottest)
+                        z += 1
                     mean = inlet * per_server
                     per_flow = real(1.0) / larger(flow, zeros + real(1e-30))
                     outlet = (inlet_flow + heat * per_air) * per_flow
@@ -1155,17 +1207,18 @@ def hall_kernel(precision: str) -> Any:
                     outlet = ti.select(flow > real(0.0), outlet, mean)
                     if ti.static(write):
                         if outlet_model != 0:
-                            for z in range(n_groups):
-                                group_values[PER_GROUP.outlet_c, slice_at + z] = outlet
+                            for i in range(n_groups):
+                                group_values[PER_GROUP.outlet_c, slice_at + i] = outlet
                         spread(
                             each_once,
                             block,
-                            n_groups,
                             table,
                             slice_at,
                             block_ints,
                             counts,
                             rack_ints,
+                            group_values,
+                            squares,
                             values,
                             layers,
                             layer_blocks,
@@ -1375,6 +1428,7 @@ def hall_kernel(precision: str) -> Any:
         dc_out: doubles_2d,
         counts: reals_1d,
         group_values: blocks_2d,
+        squares: squares_2d,
         values: reals_1d,
         inlet_c: reals_1d,
         outlet_c: reals_1d,
@@ -1442,6 +1496,7 @@ def hall_kernel(precision: str) -> Any:
                         dc_out,
                         counts,
                         group_values,
+                        squares,
                         values,
                         (inlet_c, outlet_c, power_w),
                         (inlet_blocks, outlet_blocks, power_blocks),

@@ -161,6 +161,11 @@ class Hall:
         self._lay_out_values(thermal)
         self._slices = max(1, min(8 * threads, len(self._tasks) - 1))
         self._terms = self._lanes(self._slices * len(thermal.TERMS) * thermal.CHUNK_BLOCKS)
+        squares = self._slices * -(-self._most_groups // thermal.LANES)
+        values = self._empty((len(thermal.GROUP_OUT), squares, thermal.SQUARE), self._dtype)
+        by_group = values.reshape(len(values), -1, thermal.LANES)
+        self._group_values = (self._tables.reshape(-1), by_group, values, values.reshape(-1))
+        """Counts of the groups, and three times the room for what those of a block come to."""
         self._result_names = (*thermal.DC_OUT, *(f"rack_{name}" for name in thermal.RACK_OUT))
         self._solved: bool | None = None
         """Whether the last step was transient; None without one."""
@@ -170,7 +175,7 @@ class Hall:
         fleet, lanes = self._fleet, thermal.LANES
         racks = np.diff(fleet.rack_start)
         self._blocks = -(-racks // lanes)
-        if racks.max() > DENSE_RACKS:
+        if fleet.air is not None and racks.max() > DENSE_RACKS:
             # Runs of weights need all halls to begin where their vectors do.
             self._blocks = -(-self._blocks // thermal.RUN_BLOCKS) * thermal.RUN_BLOCKS
         first_block = starts(self._blocks, "blocks of racks")
@@ -205,12 +210,10 @@ class Hall:
         np.maximum.at(most, block, groups)
         filled = np.bincount(block, minlength=len(most))
         first_rack = np.cumsum(filled) - filled
-        # Places without a rack take the values of the last rack of their block, and no servers.
-        lane = np.arange(lanes)
-        rack = first_rack[:, None] + np.minimum(lane, filled[:, None] - 1)
-        self._rack_ints = np.stack(
-            [fleet.group_start[rack], fleet.server_start[fleet.group_start[rack]]]
-        ).reshape(2, -1)
+        # Places without a rack, and the closing entry, begin where the rack before them ends.
+        rack = np.minimum(np.arange(lanes), filled[:, None]) + first_rack[:, None]
+        first_group = fleet.group_start[np.append(rack, fleet.racks)]
+        self._rack_ints = np.stack([first_group, fleet.server_start[first_group]])
         known: dict[Any, int] = {}
         alike: dict[int, slice] = {}
         tables, table, total = [], np.zeros(len(most), np.int64), 0
@@ -511,12 +514,8 @@ class Hall:
             raise RuntimeStateError("no step has been done yet; server layers exist after one")
         lanes = self._thermal.LANES
         whole = len(layers[0]) // lanes * lanes
-        blocks = [layer[:whole].reshape(-1, lanes) if whole else self._lanes(1) for layer in layers]
-        values = self._lanes(len(self._thermal.GROUP_OUT), self._slices * self._most_groups)
-        self._run(
-            None, transient=self._solved, write=(*layers, *blocks), values=values,
-            each_once=each_once,
-        )  # fmt: skip
+        blocks = [layer[:whole].reshape(-1, lanes) if whole else self._shares for layer in layers]
+        self._run(None, transient=self._solved, write=(*layers, *blocks), each_once=each_once)
         self._kernel.let_go(*layers, *blocks)
 
     def forget(self) -> None:
@@ -644,7 +643,6 @@ class Hall:
         weight: float = 1.0,
         servers: tuple[Any, Any] | None = None,
         write: tuple[Any, ...] | None = None,
-        values: Any = None,
         each_once: int = 0,
     ) -> None:
         runtime.ensure_started()
@@ -698,9 +696,7 @@ class Hall:
             self._needs,
             self._sums,
             self._unit_state if out is None else out,
-            self._tables.reshape(-1),
-            self._rack_store if values is None else values,
-            none if values is None else values.reshape(-1),
+            *self._group_values,
             *((none, none, none, no_lanes, no_lanes, no_lanes) if write is None else write),
         )
 

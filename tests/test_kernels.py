@@ -438,6 +438,61 @@ def test_layers_may_lie_anywhere_in_memory(precision: Precision) -> None:
             assert not layer[shift + fleet.servers :].any()
 
 
+LAYOUTS = {
+    "whole vectors": [[8, 16, 40]] * 8,
+    "odd counts": [[7, 9, 1, 23]] * 9,
+    "within a vector": [[1, 2], [2], [1, 1, 1], [3], [9], [2, 6], [5, 11]],
+    "one and many": [[1] * 8, [8], [1, 1, 6], [40, 1], [1] * 16, [3, 1, 20]],
+    "each its own": [[1] * 16] * 11,
+    "each its own, odd": [[1] * n for n in (11, 1, 8, 9, 16, 3, 24, 7, 2, 5)],
+}
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+@pytest.mark.parametrize("outlet_model", ["server", "rack"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("ahead", [0, 8, 13])
+def test_layers_of_any_layout_agree_with_the_twin(
+    precision: Precision, outlet_model: str, layout: str, ahead: int
+) -> None:
+    """Runs that begin, end and lie in vectors of servers in every way, in blocks full or not."""
+    rng = np.random.default_rng(12)
+    values = preset_values("corrected")
+    values["hall"] |= {"inlet_model": "approach", "supply_approach_k": 5.0, "rows": 1}
+    values["hall"]["return_approach_k"] = -3.0
+    values["servers"] |= {"outlet_model": outlet_model, "fan_full_airflow_m3s": 0.04}
+    values["servers"]["power_w"] = None
+    configs = []
+    for racks in ([[ahead]] if ahead else []), LAYOUTS[layout], [[1, 5]]:
+        if racks:
+            values["hall"]["racks_per_row"] = len(racks)
+            values["servers"]["groups"] = [
+                [
+                    {
+                        "count": count,
+                        "full_w": float(rng.uniform(80, 500)),
+                        "idle_w": float(rng.uniform(0, 40)),
+                        "load_weight": float(rng.uniform(0.8, 1.3)),
+                        "inlet_offset_k": float(rng.uniform(-0.5, 1.5)),
+                    }
+                    for count in counts
+                ]
+                for counts in racks
+            ]
+            configs.append(config_from_dict(values | {"name": f"dc{len(configs)}"}))
+    supply_c, load = np.linspace(18, 22, len(configs)), np.linspace(0.2, 0.8, len(configs))
+    fleet = build_fleet(configs)
+    hall = Hall(fleet, precision)
+    hall.solve(Conditions(supply_c[fleet.unit_dc], load))
+    layers = hall.servers()
+    first, counts = fleet.server_start[:-1], np.diff(fleet.server_start)
+    for name, expected in reference_twin.evaluate(configs, supply_c, load).servers.items():
+        found = getattr(layers, name)
+        assert_close(found, expected, TOLERANCE[precision], name)
+        assert np.array_equal(found, np.repeat(found[first], counts)), name
+    assert np.array_equal(hall.group_inlets(), layers.inlet_c[first])
+
+
 def test_a_bound_kernel_takes_new_arrays_and_refuses_other_types() -> None:
     hall = Hall(build_fleet(load_config("tiny")), "f32")
     bound, calls = hall._kernel, []
