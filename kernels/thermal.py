@@ -759,18 +759,19 @@ def hall_kernel(precision: str) -> Any:
         layers: ti.template(),
         layer_blocks: ti.template(),
     ):
-        """Values of the groups of a block to their servers, whole vectors where a rack has them."""
+        """Values of the groups of a block to their servers, nearly all in whole vectors."""
         apart = values.shape[0] // n_values
         first_row = RACK_INT.first_server
         if each_once != 0:
             first_row = RACK_INT.first_group
         rack_0 = block * LANES
-        rack_1 = rack_0 + block_ints[BLOCK.racks, block]
+        rack, rack_1 = rack_0, rack_0 + block_ints[BLOCK.racks, block]
+        start, end = rack_ints[first_row, rack_0], rack_ints[first_row, rack_1]
         n_groups = rack_ints[RACK_INT.first_group, rack_1] - rack_ints[RACK_INT.first_group, rack_0]
-        singles = rack_ints[first_row, rack_1] - rack_ints[first_row, rack_0] == n_groups
-        if singles:
-            # Transpose the values of LANES groups at a time, all kinds by turns: halves of a square
-            # element by turns, as often as 2 is in LANES. See ``close`` for the loops.
+        if end - start == n_groups:
+            # Each is a group of its own. Transpose the values of LANES groups at a time, all kinds
+            # by turns: halves of a square element by turns, as often as 2 is in LANES. See
+            # ``close`` for the loops.
             at = scratch >> LANE_BITS
             while at << LANE_BITS < scratch + block_ints[BLOCK.groups, block]:
                 turn = 0
@@ -781,12 +782,9 @@ def hall_kernel(precision: str) -> Any:
                     )
                     turn += 1
                 at += 1
-        numbers = ti.Vector([i for i in range(LANES)])
-        for rack in range(rack_0, rack_1):
-            start, rack_end = rack_ints[first_row, rack], rack_ints[first_row, rack + 1]
-            lane = rack - rack_0
-            if singles:
-                row = scratch + lane
+            while rack < rack_0 + block_ints[BLOCK.racks, block]:
+                row = scratch + rack - rack_0
+                end = rack_ints[first_row, rack + 1]
                 if start & (LANES - 1) == 0:
                     b = start >> LANE_BITS
                     while b < rack_ints[first_row, rack + 1] >> LANE_BITS:
@@ -795,55 +793,62 @@ def hall_kernel(precision: str) -> Any:
                         row += LANES
                         b += 1
                     start = b << LANE_BITS
-                while start < rack_end:
+                while start < end:
                     at = row << LANE_BITS
-                    for s in range(start, ti.min(start + LANES, rack_end)):
+                    s = start
+                    start = ti.min(start + LANES, end)
+                    while s < ti.min(start, rack_ints[first_row, rack + 1]):
                         for kind in ti.static(range(n_values)):
                             layers[kind][s] = values[at + kind * apart]
                         at += 1
+                        s += 1
                     row += LANES
-                    start += LANES
-                continue
-            # Between these are the vectors that the rack has to itself.
-            low, high = (start + (LANES - 1)) & -LANES, rack_end & -LANES
-            count_at = table * (n_rows * LANES) + lane
-            at = (scratch << LANE_BITS) + lane
+                rack += 1
+        else:
+            numbers = ti.Vector([i for i in range(LANES)])
+            # Between these are the vectors that the block has to itself.
+            low, high = (start + (LANES - 1)) & -LANES, end & -LANES
             inlets = ti.Vector([ti.cast(0.0, real)] * LANES)
             outlets, powers = inlets, inlets
-            while start < rack_end:
-                end = start + ti.cast(counts[count_at], ti.i32)
-                inlet_c, outlet_c, power_w = values[at], values[at + apart], values[at + 2 * apart]
-                # The vector where a run begins has the ends of those before.
-                before = numbers < (start & (LANES - 1))
-                inlets = ti.select(before, inlets, ti.Vector([inlet_c] * LANES))
-                outlets = ti.select(before, outlets, ti.Vector([outlet_c] * LANES))
-                powers = ti.select(before, powers, ti.Vector([power_w] * LANES))
-                b, end_b = start >> LANE_BITS, end >> LANE_BITS
-                if b < end_b:
-                    if b << LANE_BITS >= low:
-                        layer_blocks[0][b] = inlets
-                        layer_blocks[1][b] = outlets
-                        layer_blocks[2][b] = powers
-                    inlets = ti.Vector([inlet_c] * LANES)
-                    outlets = ti.Vector([outlet_c] * LANES)
-                    powers = ti.Vector([power_w] * LANES)
-                    for next_b in range(b + 1, end_b):
-                        layer_blocks[0][next_b] = inlets
-                        layer_blocks[1][next_b] = outlets
-                        layer_blocks[2][next_b] = powers
-                s = start
-                if s >= low:
-                    s = ti.max(s, high)
-                while s < ti.min(end, rack_ints[first_row, rack + 1]):
-                    layers[0][s] = inlet_c
-                    layers[1][s] = outlet_c
-                    layers[2][s] = power_w
-                    s += 1
-                    if s == low:
-                        s = ti.max(s, high)
-                count_at += n_rows * LANES
-                at += LANES
-                start = end
+            while rack < rack_0 + block_ints[BLOCK.racks, block]:
+                end = rack_ints[RACK_INT.first_server, rack + 1]
+                count_at = table * (n_rows * LANES) + rack - rack_0
+                at = (scratch << LANE_BITS) + rack - rack_0
+                while start < end:
+                    s, b = start, start >> LANE_BITS
+                    start += ti.cast(counts[count_at], ti.i32)
+                    inlet_c, outlet_c = values[at], values[at + apart]
+                    power_w = values[at + 2 * apart]
+                    # The vector where a run begins has the ends of those before.
+                    before = numbers < (s & (LANES - 1))
+                    inlets = ti.select(before, inlets, ti.Vector([inlet_c] * LANES))
+                    outlets = ti.select(before, outlets, ti.Vector([outlet_c] * LANES))
+                    powers = ti.select(before, powers, ti.Vector([power_w] * LANES))
+                    if b < start >> LANE_BITS:
+                        if b << LANE_BITS >= low:
+                            layer_blocks[0][b] = inlets
+                            layer_blocks[1][b] = outlets
+                            layer_blocks[2][b] = powers
+                        inlets = ti.Vector([inlet_c] * LANES)
+                        outlets = ti.Vector([outlet_c] * LANES)
+                        powers = ti.Vector([power_w] * LANES)
+                        for whole_b in range(b + 1, start >> LANE_BITS):
+                            layer_blocks[0][whole_b] = inlets
+                            layer_blocks[1][whole_b] = outlets
+                            layer_blocks[2][whole_b] = powers
+                    if s < low or start > high:
+                        if s >= low:
+                            s = ti.max(s, high)
+                        while s < ti.min(start, rack_ints[RACK_INT.first_server, rack + 1]):
+                            layers[0][s] = inlet_c
+                            layers[1][s] = outlet_c
+                            layers[2][s] = power_w
+                            s += 1
+                            if s == low:
+                                s = ti.max(s, high)
+                    count_at += n_rows * LANES
+                    at += LANES
+                rack += 1
 
     @ti.func
     @no_type_check
@@ -1109,9 +1114,8 @@ def hall_kernel(precision: str) -> Any:
                                         ti.min(group, servers_before.shape[0] - 1)
                                     ]
                                 server_c[place + z] = before
-                    # See ``close`` for the loop.
                     z = 0
-                    while z < block_ints[BLOCK.groups, block]:
+                    while z < n_groups:
                         count = tables[table + z, GROUP.count]
                         t = mixed
                         own = zeros
@@ -1174,6 +1178,8 @@ def hall_kernel(precision: str) -> Any:
                             group_values[PER_GROUP.inlet_c, slice_at + z] = t
                             group_values[PER_GROUP.outlet_c, slice_at + z] = t + rise
                             group_values[PER_GROUP.power_w, slice_at + z] = cpu_1 + fan_1
+                            # Read anew for no copies of the loop's body; see ``close``.
+                            n_groups = block_ints[BLOCK.groups, block]
                         counted = count * flow_1
                         cpu += count * cpu_1
                         fan += count * fan_1

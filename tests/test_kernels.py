@@ -462,7 +462,7 @@ def test_layers_of_any_layout_agree_with_the_twin(
     values["hall"]["return_approach_k"] = -3.0
     values["servers"] |= {"outlet_model": outlet_model, "fan_full_airflow_m3s": 0.04}
     values["servers"]["power_w"] = None
-    configs = []
+    configs: list[DataCenterConfig] = []
     for racks in ([[ahead]] if ahead else []), LAYOUTS[layout], [[1, 5]]:
         if racks:
             values["hall"]["racks_per_row"] = len(racks)
