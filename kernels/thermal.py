@@ -12,7 +12,7 @@ data center, so that a data center gives the same bits alone and in any batch.
 """
 
 from functools import cache
-from math import factorial, log
+from math import factorial
 from types import SimpleNamespace
 from typing import Any, no_type_check
 
@@ -136,25 +136,37 @@ RACK_STATE = (
 """Exhaust mix before a rack, what it gives to the mixes times strength at the last exchange and
 since in turn, flow that the rack takes of the mix, and the mix at the last exchange. Of halls that
 keep every weight in steady air: the mix of the next sweep, and what is exchanged."""
-RACK_OUT = ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "inlet_max_c", "outlet_c")
+RACK_OUT = ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "outlet_c", "inlet_max_c")
 GROUP_OUT = ("inlet_c", "outlet_c", "power_w")
 TERMS = (
-    "airflow_m3s",
-    "outlet_c",
-    "cpu_w",
-    "fan_w",
-    "inlet_c",
     "inlet_m3k_s",
     "outlet_m3k_s",
-    "captured_m3k_s",
     "hot_k",
     "cold_k",
     "stored_w",
+    "flow_m3s",
+    "leaves_m3k_s",
+    "given_c",
 )
-"""Of each rack, what adds up over a chunk."""
-SUMS = (*TERMS, "inlet_max_c", "hottest_block", "hottest_lane", "hottest_zone", "least_k", "most_k")
-"""Per chunk: sums, hottest group, and the range of what the exhaust changed by since the last
-exchange, or of what the mixes change by in the next one."""
+"""Lanes of a chunk while its blocks are computed: sums of what racks do not keep; of the present
+sweep airflow, what of the outlets no rack takes in again, and outlets."""
+BLOCK_TERMS = ("fresh_m3s", "mixed_c", "parcel_w")
+"""Of a block: what its servers would take in of supply air alone; in a substep the recirculated air
+that they take in and the heat that warms it."""
+SCRATCH = len(TERMS) + CHUNK_BLOCKS * len(BLOCK_TERMS)
+SUMS = (
+    *RACK_OUT[:-1],
+    *TERMS,
+    "inlet_max_c",
+    "hottest_block",
+    "hottest_lane",
+    "hottest_zone",
+    "least_k",
+    "most_k",
+)
+"""Per chunk: sums over its racks, of transient halls means over the substeps, and over them of the
+terms before ``flow_m3s``; hottest group, and the range of what the exhaust changed by since the
+last exchange, or of what the mixes change by in the next one."""
 DC_OUT = (
     "cpu_w",
     "fan_w",
@@ -197,14 +209,18 @@ STILL_PER_S = 1.0 / 128.0
 """Fastest rate at which CRAC air stirs the air before racks that stand still, as without fans in
 the room; a power of two, exact in both precisions."""
 
-EXP_TERMS = {"f32": 7, "f64": 14}
-"""Terms of the series of exp - 1 on half an octave of 2 to the last digit."""
+FIT_END = 5
+"""Of the constants, the first after those of the outlet fit."""
+SERIES_TO = 0.25
+SERIES_TERMS = {"f32": 6, "f64": 12}
+"""Terms of the series of (1 - exp(-x)) / x that give the last digit up to there; an even number."""
+MOST_DOUBLINGS = 60
+"""Of larger x; what lasts longer is at its end."""
 
 
-def exp_constants(precision: str) -> list[float]:
-    """1/ln 2, ln 2 and the series of exp - 1, for ``hall_kernel``."""
-    terms = range(EXP_TERMS[precision], 0, -1)
-    return [1.0 / log(2.0), log(2.0), *(1.0 / factorial(k) for k in terms)]
+def decay_constants(precision: str) -> list[float]:
+    """Series of (1 - exp(-x)) / x, highest power first, for ``hall_kernel``."""
+    return [(-1.0) ** k / factorial(k + 1) for k in reversed(range(SERIES_TERMS[precision]))]
 
 
 SLICE = 512
@@ -220,6 +236,7 @@ CHUNK, DC, CTL = map(_rows, (CHUNK_INTS, DC_INTS, CONTROL))
 RACK, GROUP, VALUE, EXACT = map(_rows, (RACK_ROWS, GROUP_ROWS, DC_ROWS, DC_DOUBLES))
 UNIT, SUPPLY, STATE = map(_rows, (UNIT_ROWS, UNIT_STATE, RACK_STATE))
 OUT, PER_GROUP, SUM, TOTAL = map(_rows, (RACK_OUT, GROUP_OUT, SUMS, DC_OUT))
+TERM, OF_BLOCK = map(_rows, (TERMS, BLOCK_TERMS))
 """Places of the rows by their names."""
 
 
@@ -253,7 +270,7 @@ def hall_kernel(precision: str) -> Any:
 
     Outlets: ``server`` is T + P/(rho*cp*V) per group, ``rack`` the same with the rack's sums, and
     ``released`` the rack fit T + 1.918*P^1.096/(0.526*rho*cp*V^0.824) - 14.01 of the released
-    SustainDC, whose constants come in as ``constants``, followed by ``exp_constants``.
+    SustainDC, whose constants come in as ``constants``, followed by ``decay_constants``.
 
     ``transient``: a sweep is a substep. Servers follow C dT/dt = P_cpu - eps K (T - T_in); the
     recirculated air before a rack follows its mix with the time constant of its share of the room
@@ -275,10 +292,10 @@ def hall_kernel(precision: str) -> Any:
     again as vectors.
     """
     real = _real(precision)
-    whole = ti.i32 if precision == "f32" else ti.i64
-    mantissa, bias = (23, 127) if precision == "f32" else (52, 1023)
-    exp_terms = EXP_TERMS[precision]
-    n_terms, n_rows, n_values = len(TERMS), len(GROUP_ROWS), len(GROUP_OUT)
+    series_terms = SERIES_TERMS[precision]
+    n_rows, n_values = len(GROUP_ROWS), len(GROUP_OUT)
+    n_terms, n_of_block = len(TERMS), len(BLOCK_TERMS)
+    of_racks, of_steps = len(RACK_OUT) - 1, SUM.flow_m3s
     n_sums, n_exact, n_of_dc = len(SUMS), len(DC_DOUBLES), len(DC_ROWS)
     reals_2d = ti.types.ndarray(dtype=real, ndim=2)
     reals_1d = ti.types.ndarray(dtype=real, ndim=1)
@@ -306,28 +323,42 @@ def hall_kernel(precision: str) -> Any:
 
     @ti.func
     @no_type_check
-    def gone_after(x, constants: ti.template()):
-        """1 - exp(-x) of a vector, 0 <= x, by its series; calls would go lane by lane.
+    def doublings(most):
+        """How often ``most`` is halved to be where the series holds."""
+        count = 0
+        while most > real(SERIES_TO) and count < MOST_DOUBLINGS:
+            most *= real(0.5)
+            count += 1
+        return count
 
-        To the last digit of small results, by which large differences are multiplied.
+    @ti.func
+    @no_type_check
+    def gone_per(y, times, step, constants: ti.template()):
+        """(1 - exp(-x)) / y of a vector, where y >= 0 doubled so many times is x.
+
+        By the series of its mean, and doubled again: calls would go lane by lane. To the last
+        digits of small x too, whose differences large capacities multiply.
         """
-        y = smaller(x, ti.Vector([ti.cast(80.0, real)] * LANES)) * real(-1.0)
-        octave = ti.floor(y * constants[5] + real(0.5))
-        rest = y - octave * constants[6]
-        # Two sums by turns, of even and of odd powers, since each waits for its last addition.
-        square = rest * rest
-        one = square * constants[7] + constants[9]
-        other = square * constants[8] + constants[10]
-        for i in ti.static(range(11, 6 + exp_terms, 2)):
-            one = one * square + constants[i]
-            other = other * square + constants[i + 1]
-        series = one * rest + other
-        if ti.static(exp_terms % 2 == 1):
-            series = (one * square + constants[6 + exp_terms]) + other * rest
-        power = square
-        for i in range(LANES):
-            power[i] = ti.bit_cast((ti.cast(octave[i], whole) + bias) << mantissa, real)
-        return (real(1.0) - power) - power * (rest * series)
+        # Terms in pairs, since each addition waits for the one before.
+        square = y * y
+        gone = y * constants[FIT_END] + constants[FIT_END + 1]
+        for i in ti.static(range(FIT_END + 2, FIT_END + series_terms, 2)):
+            gone = gone * square + (y * constants[i] + constants[i + 1])
+        time = 0
+        while time < times:
+            gone *= real(2.0) - y * gone
+            time += step
+        return gone
+
+    @ti.func
+    @no_type_check
+    def halved(times, step):
+        """0.5 to so many times."""
+        x, time = real(1.0), 0
+        while time < times:
+            x *= real(0.5)
+            time += step
+        return x
 
     @ti.func
     @no_type_check
@@ -462,41 +493,70 @@ def hall_kernel(precision: str) -> Any:
 
     @ti.func
     @no_type_check
-    def add_up(
-        chunk, slice_at, step, chunk_ints: ti.template(), terms: ti.template(), sums: ti.template()
-    ):
-        """Sums of the terms over a chunk."""
-        first_block = chunk_ints[CHUNK.first_block, chunk]
-        n_blocks = chunk_ints[CHUNK.first_block, chunk + 1] - first_block
-        r = 0
-        while r < n_terms:
-            lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
-            b = 0
-            while b < n_blocks:
-                term = terms[slice_at * CHUNK_BLOCKS + b * n_terms + r]
-                for i in range(LANES):
-                    lanes[i] += ti.cast(term[i], ti.f64)
-                b += step
-            total = ti.cast(0.0, ti.f64)
-            for i in range(LANES):
-                total += lanes[i]
-            sums[chunk * n_sums + r] = total
-            r += step
+    def gather(terms: ti.template(), row, value):
+        """To the lanes of a chunk; `+=` would be atomic."""
+        terms[row] = terms[row] + value
 
     @ti.func
     @no_type_check
-    def find_hottest(chunk, step, hottest, of_block, of_zone, sums: ti.template()):
-        """The first of the racks with the hottest inlet."""
+    def sum_of(lanes):
+        """In f64; neighbours first, since each addition waits for the one before."""
+        total = ti.cast(0.0, ti.f64)
+        for i in ti.static(range(0, LANES, 4)):
+            one = ti.cast(lanes[i], ti.f64) + ti.cast(lanes[i + 1], ti.f64)
+            other = ti.cast(lanes[i + 2], ti.f64) + ti.cast(lanes[i + 3], ti.f64)
+            total += one + other
+        return total
+
+    @ti.func
+    @no_type_check
+    def add_up(
+        chunk,
+        first_row,
+        end_row,
+        adds,
+        slice_at,
+        step,
+        chunk_ints: ti.template(),
+        terms: ti.template(),
+        rack_out: ti.template(),
+        sums: ti.template(),
+    ):
+        """Sums over the racks of a chunk, ``adds`` to those of substeps before."""
+        row = first_row
+        while row < end_row:
+            total = ti.cast(0.0, ti.f64)
+            if row < of_racks:
+                lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
+                block = chunk_ints[CHUNK.first_block, chunk]
+                while block < chunk_ints[CHUNK.first_block, chunk + 1]:
+                    value = rack_out[row, block]
+                    for i in range(LANES):
+                        lanes[i] += ti.cast(value[i], ti.f64)
+                    block += step
+                total = sum_of(lanes)
+            else:
+                total = sum_of(terms[slice_at + row - of_racks])
+                if adds and row < of_steps:
+                    total += sums[chunk * n_sums + row]
+            sums[chunk * n_sums + row] = total
+            row += step
+
+    @ti.func
+    @no_type_check
+    def find_hottest(chunk, adds, step, hottest, of_block, of_zone, sums: ti.template()):
+        """The first of the racks with the hottest inlet, ``adds`` to those of substeps before."""
         most_c, block, lane, zone = real(-1e30), 0, 0, real(0.0)
         i = 0
         while i < LANES:
             if hottest[i] > most_c or (hottest[i] == most_c and of_block[i] < block):
                 most_c, block, lane, zone = hottest[i], of_block[i], i, of_zone[i]
             i += step
-        sums[chunk * n_sums + SUM.inlet_max_c] = ti.cast(most_c, ti.f64)
-        sums[chunk * n_sums + SUM.hottest_block] = ti.cast(block, ti.f64)
-        sums[chunk * n_sums + SUM.hottest_lane] = ti.cast(lane, ti.f64)
-        sums[chunk * n_sums + SUM.hottest_zone] = ti.cast(zone, ti.f64)
+        if not adds or ti.cast(most_c, ti.f64) > sums[chunk * n_sums + SUM.inlet_max_c]:
+            sums[chunk * n_sums + SUM.inlet_max_c] = ti.cast(most_c, ti.f64)
+            sums[chunk * n_sums + SUM.hottest_block] = ti.cast(block, ti.f64)
+            sums[chunk * n_sums + SUM.hottest_lane] = ti.cast(lane, ti.f64)
+            sums[chunk * n_sums + SUM.hottest_zone] = ti.cast(zone, ti.f64)
 
     @ti.func
     @no_type_check
@@ -506,7 +566,6 @@ def hall_kernel(precision: str) -> Any:
         n,
         late,
         slice_at,
-        n_blocks,
         step,
         hottest,
         of_block,
@@ -526,19 +585,20 @@ def hall_kernel(precision: str) -> Any:
         counts: ti.template(),
         needs: ti.template(),
         terms: ti.template(),
+        rack_out: ti.template(),
         sums: ti.template(),
         dc_out: ti.template(),
     ):
         """CRAC units of a data center, what its next sweep is, and at its end what comes out.
 
-        ``late``: the terms that a sweep does not need are summed up at the end.
+        ``late``: what a sweep does not need is summed up at the end.
         """
         chunk_0 = dc_ints[DC.first_chunk, n]
         # `x = x + y`, since `x += y` would be atomic.
         chunk = chunk_0 + 1
         while chunk < dc_ints[DC.first_chunk, n + 1]:
-            r = 0
-            while r < n_terms:
+            r = of_steps
+            while r < SUM.inlet_max_c:
                 sums[chunk_0 * n_sums + r] = sums[chunk_0 * n_sums + r] + sums[chunk * n_sums + r]
                 r += step
             if sums[chunk * n_sums + SUM.inlet_max_c] > sums[chunk_0 * n_sums + SUM.inlet_max_c]:
@@ -556,6 +616,7 @@ def hall_kernel(precision: str) -> Any:
             sums[chunk_0 * n_sums + SUM.most_k] = most_k
             chunk += step
         n_racks = ti.cast(dc_ints[DC.racks, n], ti.f64)
+        flow_m3s = sums[chunk_0 * n_sums + SUM.flow_m3s]
         sweep = control[CTL.sweep, n]
         crac_flow = ti.cast(0.0, ti.f64)
         supply_c = unit_state[SUPPLY.supply_c, dc_ints[DC.first_unit, n]]
@@ -571,12 +632,15 @@ def hall_kernel(precision: str) -> Any:
                 sums[chunk_0 * n_sums + SUM.most_k],
             )
             unit_first = dc_ints[DC.first_unit, n]
-            following = (
-                sums[chunk_0 * n_sums + SUM.airflow_m3s]
-                / doubles[n * n_exact + EXACT.it_airflow_m3s]
-            )
+            following = flow_m3s / doubles[n * n_exact + EXACT.it_airflow_m3s]
             uncovered = ti.cast(0.0, ti.f64)
             supply_flow = ti.cast(0.0, ti.f64)
+            # Of units that run, as their fans alone draw power.
+            fans_m3s = ti.cast(0.0, ti.f64)
+            run_flow = ti.cast(0.0, ti.f64)
+            run_supply_flow = ti.cast(0.0, ti.f64)
+            fresh_share = ti.cast(dcs[n * n_of_dc + VALUE.fresh_share], ti.f64)
+            more = ti.cast(sweep + 1 < sweeps, ti.i32)
             at = unit_first
             while at < dc_ints[DC.first_unit, n + 1]:
                 need_at = chunk_ints[CHUNK.first_need, chunk_0] + at - unit_first
@@ -588,33 +652,41 @@ def hall_kernel(precision: str) -> Any:
                 need = needs[need_at]
                 low = ti.cast(units[UNIT.low, at], ti.f64)
                 high = ti.cast(units[UNIT.high, at], ti.f64)
-                speed = ti.min(ti.max(following, low), high)
-                flow = ti.cast(units[UNIT.design_m3s, at], ti.f64) * speed
-                offered = ti.cast(dcs[n * n_of_dc + VALUE.fresh_share], ti.f64) * flow
-                crac_flow += flow
-                supply_flow += flow * unit_state[SUPPLY.supply_c, at]
+                design_m3s = ti.cast(units[UNIT.design_m3s, at], ti.f64)
+                is_on = ti.cast(units[UNIT.running, at], ti.f64)
                 used = unit_state[SUPPLY.fresh_ratio, at]
-                passing += (flow - used * need) * unit_state[SUPPLY.supply_c, at]
-                unit_state[SUPPLY.fresh_ratio_used, at] = used
-                covers = ti.min(1.0, offered / ti.max(need, 1e-30))
+                gives_c = unit_state[SUPPLY.supply_c, at]
+                speed = ti.min(ti.max(following, low), high)
+                flow = design_m3s * speed
+                crac_flow += flow
+                supply_flow += flow * gives_c
+                passing += (flow - used * need) * gives_c
+                covers = ti.min(1.0, fresh_share * flow / ti.max(need, 1e-30))
                 uncovered = ti.max(uncovered, ti.abs(covers - used))
                 unit_state[SUPPLY.fresh_ratio, at] = covers
-                unit_state[SUPPLY.need_m3s, at] = need
-                unit_state[SUPPLY.following, at] = following
-                cubed = speed * speed * speed * ti.cast(units[UNIT.running, at], ti.f64)
+                cubed = speed * speed * speed * is_on
                 if ti.static(transient):
+                    fans_m3s += cubed * design_m3s
+                    run_flow += is_on * flow
+                    run_supply_flow += is_on * flow * gives_c
+                    if is_on > 0.0:
+                        coil_w = ti.cast(1.0, ti.f64)
                     flow *= weight
                     cubed *= weight
                     if sweep > 0:
                         flow += unit_state[SUPPLY.flow_m3s, at]
                         cubed += unit_state[SUPPLY.cubed_speed, at]
+                if more == 0:
+                    unit_state[SUPPLY.need_m3s, at] = need
+                    unit_state[SUPPLY.following, at] = following
+                if more == 0 or ti.static(not transient):
+                    unit_state[SUPPLY.fresh_ratio_used, at] = used
                 unit_state[SUPPLY.flow_m3s, at] = flow
                 unit_state[SUPPLY.cubed_speed, at] = cubed
                 at += step
             supply_c = supply_flow / crac_flow
             doubles[n * n_exact + EXACT.stirring_m3s] = crac_flow / n_racks
             control[CTL.sweep, n] = sweep + 1
-            more = ti.cast(sweep + 1 < sweeps, ti.i32)
             # All mixes move by the middle of the outlets' changes, give or take half their spread.
             middle_k = 0.5 * (least_k + most_k)
             apart = 0.5 * (most_k - least_k) > ALIKE * tolerance_k
@@ -622,30 +694,15 @@ def hall_kernel(precision: str) -> Any:
             if exchanged:
                 control[CTL.side, n] = 1 - control[CTL.side, n]
             if ti.static(transient):
-                leaves = (
-                    sums[chunk_0 * n_sums + SUM.outlet_m3k_s]
-                    - sums[chunk_0 * n_sums + SUM.captured_m3k_s]
-                )
-                return_c = (leaves + passing) / crac_flow
+                return_c = (sums[chunk_0 * n_sums + SUM.leaves_m3k_s] + passing) / crac_flow
                 control[CTL.exchange, n] = ti.cast(apart, ti.i32)
                 control[CTL.active, n] = more
                 adds = sweep > 0
-                running = ti.cast(0.0, ti.f64)
-                for unit in range(unit_first, dc_ints[DC.first_unit, n + 1]):
-                    low = ti.cast(units[UNIT.low, unit], ti.f64)
-                    high = ti.cast(units[UNIT.high, unit], ti.f64)
-                    speed = ti.min(ti.max(following, low), high)
-                    design_m3s = ti.cast(units[UNIT.design_m3s, unit], ti.f64)
-                    is_on = ti.cast(units[UNIT.running, unit], ti.f64)
-                    warmer_k = return_c - unit_state[SUPPLY.supply_c, unit]
-                    air = ti.cast(dcs[n * n_of_dc + VALUE.air_j_per_m3_k], ti.f64)
-                    taken = air * design_m3s * speed * warmer_k
-                    fan_w = doubles[n * n_exact + EXACT.crac_fan_w_per_m3s] * design_m3s
-                    drawn = is_on * speed * speed * speed * fan_w
-                    coil_load += taken + drawn
-                    running += is_on * (taken + drawn)
-                    if is_on > 0.0:
-                        coil_w = ti.cast(1.0, ti.f64)
+                ends = more == 0
+                air = ti.cast(dcs[n * n_of_dc + VALUE.air_j_per_m3_k], ti.f64)
+                fans_w = fans_m3s * doubles[n * n_exact + EXACT.crac_fan_w_per_m3s]
+                coil_load = air * (return_c * crac_flow - supply_flow) + fans_w
+                running = air * (return_c * run_flow - run_supply_flow) + fans_w
                 wanted = ti.max(
                     running + coil_w * doubles[n * n_exact + EXACT.room_j] / substep_s, 0.0
                 )
@@ -653,15 +710,17 @@ def hall_kernel(precision: str) -> Any:
                 held_j = doubles[n * n_exact + EXACT.room_j] + (coil_load - coil_w) * substep_s
                 doubles[n * n_exact + EXACT.room_j] = held_j
                 warmed_k = held_j / doubles[n * n_exact + EXACT.room_j_per_k]
-                for unit in range(unit_first, dc_ints[DC.first_unit, n + 1]):
-                    setpoint_c = ti.cast(units[UNIT.setpoint_c, unit], ti.f64)
-                    unit_state[SUPPLY.supply_c, unit] = setpoint_c + warmed_k
+                at = unit_first
+                while at < dc_ints[DC.first_unit, n + 1]:
+                    setpoint_c = ti.cast(units[UNIT.setpoint_c, at], ti.f64)
+                    unit_state[SUPPLY.supply_c, at] = setpoint_c + warmed_k
+                    at += step
                 doubles[n * n_exact + EXACT.shift_k] = ti.select(apart, 0.0, middle_k)
             else:
                 shift_k = doubles[n * n_exact + EXACT.shift_k]
                 left_k = ti.max(most_k - shift_k, shift_k - least_k)
                 # The mixes cool or warm by less than what they lie above supply air.
-                above_k = ti.abs(sums[chunk_0 * n_sums + SUM.outlet_c] / n_racks - supply_c)
+                above_k = ti.abs(sums[chunk_0 * n_sums + SUM.given_c] / n_racks - supply_c)
                 left_k = ti.max(left_k, uncovered * above_k)
                 control[CTL.active, n] = 0
                 if not left_k <= tolerance_k:
@@ -691,57 +750,74 @@ def hall_kernel(precision: str) -> Any:
                         doubles[n * n_exact + EXACT.moved_k] = 0.0
                     doubles[n * n_exact + EXACT.shift_k] = next_k
         if ends:
-            if ti.static(recirculates and not transient):
+            if ti.static(not transient):
+                if ti.static(recirculates):
+                    return_c = (sums[chunk_0 * n_sums + SUM.leaves_m3k_s] + passing) / crac_flow
                 if late:
-                    add_up(chunk_0, slice_at, step, chunk_ints, terms, sums)
-                    find_hottest(chunk_0, step, hottest, of_block, of_zone, sums)
-                leaves = (
-                    sums[chunk_0 * n_sums + SUM.outlet_m3k_s]
-                    - sums[chunk_0 * n_sums + SUM.captured_m3k_s]
-                )
-                return_c = (leaves + passing) / crac_flow
-            flow = sums[chunk_0 * n_sums + SUM.airflow_m3s]
-            now = ti.Vector(
-                [
-                    sums[chunk_0 * n_sums + SUM.cpu_w],
-                    sums[chunk_0 * n_sums + SUM.fan_w],
-                    flow,
-                    sums[chunk_0 * n_sums + SUM.inlet_c] / n_racks,
-                    sums[chunk_0 * n_sums + SUM.outlet_c] / n_racks,
-                    sums[chunk_0 * n_sums + SUM.inlet_m3k_s] - flow * supply_c,
-                    sums[chunk_0 * n_sums + SUM.outlet_m3k_s] - flow * supply_c,
-                    sums[chunk_0 * n_sums + SUM.hot_k],
-                    sums[chunk_0 * n_sums + SUM.cold_k],
-                    sums[chunk_0 * n_sums + SUM.stored_w],
-                    crac_flow,
-                    supply_c,
-                    return_c,
-                    coil_load,
-                    coil_w,
-                ]
-            )
-            for r in ti.static(range(TOTAL.inlet_max_c)):
+                    add_up(
+                        chunk_0,
+                        0,
+                        of_steps,
+                        False,
+                        slice_at,
+                        step,
+                        chunk_ints,
+                        terms,
+                        rack_out,
+                        sums,
+                    )
+                    find_hottest(chunk_0, False, step, hottest, of_block, of_zone, sums)
+            chunk = chunk_0 + 1
+            while chunk < dc_ints[DC.first_chunk, n + 1]:
+                r = 0
+                while r < of_steps:
+                    sums[chunk_0 * n_sums + r] = (
+                        sums[chunk_0 * n_sums + r] + sums[chunk * n_sums + r]
+                    )
+                    r += step
+                chunk += step
+        supplied = flow_m3s * supply_c * weight
+        closes = ends
+        if ti.static(transient):
+            closes = True
+        if closes:
+            now = ti.Vector([crac_flow, supply_c, return_c, coil_load, coil_w]) * weight
+            if adds:
+                supplied += dc_out[TOTAL.inlet_m3k_s, n]
+            dc_out[TOTAL.inlet_m3k_s, n] = supplied
+            for r in ti.static(range(TOTAL.inlet_max_c - TOTAL.crac_flow_m3s)):
                 value = now[r]
-                if ti.static(transient):
-                    value *= weight
-                    if adds:
-                        value += dc_out[r, n]
-                dc_out[r, n] = value
-            hottest_c = sums[chunk_0 * n_sums + SUM.inlet_max_c]
-            if not adds or hottest_c > dc_out[TOTAL.inlet_max_c, n]:
-                block = ti.cast(sums[chunk_0 * n_sums + SUM.hottest_block], ti.i32)
-                zone = ti.cast(sums[chunk_0 * n_sums + SUM.hottest_zone], ti.i32)
-                lane = ti.cast(sums[chunk_0 * n_sums + SUM.hottest_lane], ti.i32)
-                rack = (block - chunk_ints[CHUNK.first_block, chunk_0]) * LANES + lane
-                count_at = block_ints[BLOCK.table, block] * (n_rows * LANES) + lane
-                server = ti.cast(0.0, real)
-                z = 0
-                while z < zone:
-                    server += counts[count_at + z * (n_rows * LANES)]
-                    z += 1
-                dc_out[TOTAL.inlet_max_c, n] = hottest_c
-                dc_out[TOTAL.hottest_rack, n] = ti.cast(rack, ti.f64)
-                dc_out[TOTAL.hottest_server, n] = ti.cast(server, ti.f64)
+                if adds:
+                    value += dc_out[TOTAL.crac_flow_m3s + r, n]
+                dc_out[TOTAL.crac_flow_m3s + r, n] = value
+        if ends:
+            dc_out[TOTAL.cpu_w, n] = sums[chunk_0 * n_sums + SUM.cpu_w]
+            dc_out[TOTAL.fan_w, n] = sums[chunk_0 * n_sums + SUM.fan_w]
+            dc_out[TOTAL.airflow_m3s, n] = sums[chunk_0 * n_sums + SUM.airflow_m3s]
+            dc_out[TOTAL.inlet_mean_c, n] = sums[chunk_0 * n_sums + SUM.inlet_c] / n_racks
+            dc_out[TOTAL.outlet_mean_c, n] = sums[chunk_0 * n_sums + SUM.outlet_c] / n_racks
+            dc_out[TOTAL.inlet_m3k_s, n] = (
+                sums[chunk_0 * n_sums + SUM.inlet_m3k_s] * weight - supplied
+            )
+            dc_out[TOTAL.outlet_m3k_s, n] = (
+                sums[chunk_0 * n_sums + SUM.outlet_m3k_s] * weight - supplied
+            )
+            dc_out[TOTAL.hot_k, n] = sums[chunk_0 * n_sums + SUM.hot_k] * weight
+            dc_out[TOTAL.cold_k, n] = sums[chunk_0 * n_sums + SUM.cold_k] * weight
+            dc_out[TOTAL.stored_w, n] = sums[chunk_0 * n_sums + SUM.stored_w] * weight
+            block = ti.cast(sums[chunk_0 * n_sums + SUM.hottest_block], ti.i32)
+            zone = ti.cast(sums[chunk_0 * n_sums + SUM.hottest_zone], ti.i32)
+            lane = ti.cast(sums[chunk_0 * n_sums + SUM.hottest_lane], ti.i32)
+            rack = (block - chunk_ints[CHUNK.first_block, chunk_0]) * LANES + lane
+            count_at = block_ints[BLOCK.table, block] * (n_rows * LANES) + lane
+            server = ti.cast(0.0, real)
+            z = 0
+            while z < zone:
+                server += counts[count_at + z * (n_rows * LANES)]
+                z += 1
+            dc_out[TOTAL.inlet_max_c, n] = sums[chunk_0 * n_sums + SUM.inlet_max_c]
+            dc_out[TOTAL.hottest_rack, n] = ti.cast(rack, ti.f64)
+            dc_out[TOTAL.hottest_server, n] = ti.cast(server, ti.f64)
 
     @ti.func
     @no_type_check
@@ -912,10 +988,9 @@ def hall_kernel(precision: str) -> Any:
         dc_block_0 = chunk_ints[CHUNK.first_block, dc_chunk_0]
         # Chunks that are tasks of their own wait for each other after every sweep.
         rounds = sweeps if end_chunk - first_chunk == n_parts else 1
-        passes, late = 1, False
+        passes, late = 1, n_parts == 1
         start = ti.Vector([ti.cast(0.0, real)] * LANES)
         if ti.static(recirculates and not transient and not write):
-            late = n_parts == 1
             if dc_ints[DC.mix, n] >= 0:
                 passes = 2
             if control[CTL.sweep, n] == 0:
@@ -936,7 +1011,14 @@ def hall_kernel(precision: str) -> Any:
         fan_high = zeros + dcs[n * n_of_dc + VALUE.fan_high]
         per_reference = real(1.0) / dcs[n * n_of_dc + VALUE.fan_reference_ratio]
         exponent = dcs[n * n_of_dc + VALUE.fan_exponent]
-        fan_w = dcs[n * n_of_dc + VALUE.fan_reference_w]
+        # Branches on data, not one kernel per exponent: compiled apart, they would round apart, and
+        # a data center must not depend on its batch.
+        at_full = per_reference
+        if exponent == real(3.0):
+            at_full = per_reference * per_reference * per_reference
+        elif exponent != real(1.0):
+            at_full = ti.pow(per_reference, exponent)
+        fan_w = dcs[n * n_of_dc + VALUE.fan_reference_w] * at_full
         full_m3s = dcs[n * n_of_dc + VALUE.fan_full_m3s]
         air = dcs[n * n_of_dc + VALUE.air_j_per_m3_k]
         per_air = real(1.0) / air
@@ -946,6 +1028,13 @@ def hall_kernel(precision: str) -> Any:
         parcel_j = dcs[n * n_of_dc + VALUE.parcel_j_per_k]
         step_s = ti.cast(substep_s, real)
         per_step_s = real(1.0) / step_s
+        times, mix_times, k_per_w, mix_scale = 0, 0, step_s / server_j, real(1.0)
+        if ti.static(transient and not write):
+            times = doublings(dcs[n * n_of_dc + VALUE.fan_high] * full_m3s * taken_up * k_per_w)
+            k_per_w *= halved(times, step)
+        chunk_hottest = zeros - real(1e30)
+        chunk_zone = zeros
+        chunk_block = ti.Vector([0] * LANES)
         for _ in range(rounds):
             if ti.static(not write):
                 if control[CTL.active, n] <= 0:
@@ -966,55 +1055,40 @@ def hall_kernel(precision: str) -> Any:
             for chunk in range(first_chunk, end_chunk):
                 least = zeros + real(1e30)
                 most = zeros - real(1e30)
-                flow_lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
-                outlet_lanes = flow_lanes
-                chunk_hottest = zeros - real(1e30)
-                chunk_zone = zeros
-                chunk_block = ti.Vector([0] * LANES)
                 need_0 = chunk_ints[CHUNK.first_need, chunk]
                 block_0 = chunk_ints[CHUNK.first_block, chunk]
                 n_blocks = chunk_ints[CHUNK.first_block, chunk + 1] - block_0
-                unit = 0
-                while unit < n_units:
-                    needs[need_0 + unit] = 0.0
-                    unit += step
-                for b in range(n_blocks):
-                    block = block_0 + b
-                    n_groups = block_ints[BLOCK.groups, block]
-                    table = block_ints[BLOCK.table, block]
-                    place = block_ints[BLOCK.place, block]
-                    share_0 = dc_ints[DC.first_share, n] + n_units * (block - dc_block_0)
-                    term_0 = slice_at * CHUNK_BLOCKS + b * n_terms
-                    per_server = racks[RACK.per_server, block]
-                    u = utilisation
-                    if loads_of == OF_RACKS:
-                        u = racks[RACK.load, block]
-                    powered = racks[RACK.powered, block]
-                    air_left = racks[RACK.airflow, block]
-                    breath = air_left * powered
-                    uneven = u * (real(1.0) - u)
-                    cover = zeros
-                    mixed = zeros
-                    fresh = zeros
-                    captured_share = zeros
-                    parcel_w = zeros
-                    if ti.static(recirculates):
-                        captured_share = racks[RACK.captured, block]
-                        unit = 0
-                        while unit < n_units:
-                            used = (
-                                SUPPLY.fresh_ratio_used if ti.static(write) else SUPPLY.fresh_ratio
-                            )
-                            ratio = ti.cast(unit_state[used, unit_0 + unit], real)
-                            part = shares[share_0 + unit] * ratio
-                            cover += part
-                            fresh += part * ti.cast(
-                                unit_state[SUPPLY.supply_c, unit_0 + unit], real
-                            )
-                            unit += step
-                        if ti.static(write):
-                            mixed = rack_store[STATE.mixed_c, block]
-                        else:
+                if ti.static(not write):
+                    # Sums of data centers of one chunk go on over the substeps.
+                    goes_on = False
+                    if ti.static(transient):
+                        goes_on = late and not begins
+                    row = slice_at
+                    if goes_on:
+                        row += of_steps - of_racks
+                    else:
+                        chunk_hottest = zeros - real(1e30)
+                    while row < slice_at + n_terms:
+                        terms[row] = zeros
+                        row += step
+                if ti.static(recirculates and transient and not write):
+                    captured = zeros
+                    block = block_0
+                    while block < block_0 + n_blocks:
+                        captured = larger(rack_store[STATE.captured_m3s, block], captured)
+                        block += step
+                    most_m3s = captured[0]
+                    for i in range(1, LANES):
+                        most_m3s = ti.select(captured[i] > most_m3s, captured[i], most_m3s)
+                    mix_times = doublings(ti.max(most_m3s * (air / parcel_j), still_per_s) * step_s)
+                    mix_scale = halved(mix_times, step)
+                if ti.static(not write):
+                    # First the mixes before all racks, which do not wait for each other.
+                    b = 0
+                    while b < n_blocks:
+                        block = block_0 + b
+                        at_block = slice_at + n_terms + b * n_of_block
+                        if ti.static(recirculates):
                             target = zeros
                             if anew:
                                 at_once = False
@@ -1078,32 +1152,86 @@ def hall_kernel(precision: str) -> Any:
                                 # leaves at its own temperature.
                                 was = rack_store[STATE.mixed_c, block]
                                 rate = rack_store[STATE.captured_m3s, block] * (air / parcel_j)
-                                x = larger(rate, zeros + still_per_s) * step_s
-                                gone = gone_after(x, constants)
-                                now_c = was + (target - was) * gone
+                                x = larger(rate, zeros + still_per_s) * (step_s * mix_scale)
+                                gone = gone_per(x, mix_times, step, constants)
+                                change = (target - was) * (x * gone)
+                                per_server = racks[RACK.per_server, block]
                                 is_rack = ti.select(per_server > real(0.0), ones, zeros)
-                                parcel_w = is_rack * (now_c - was) * (parcel_j * per_step_s)
-                                mixed = target + (was - target) * gone / x
-                                rack_store[STATE.mixed_c, block] = now_c
+                                parcel_w = is_rack * change * (parcel_j * per_step_s)
+                                terms[at_block + OF_BLOCK.parcel_w] = parcel_w
+                                mixed = target + (was - target) * (gone * mix_scale)
+                                terms[at_block + OF_BLOCK.mixed_c] = mixed
+                                rack_store[STATE.mixed_c, block] = was + change
                             else:
-                                mixed = target
                                 rack_store[STATE.mixed_c, block] = target
+                        b += step
+                for b in range(n_blocks):
+                    block = block_0 + b
+                    at_block = slice_at + n_terms + b * n_of_block
+                    n_groups = block_ints[BLOCK.groups, block]
+                    table = block_ints[BLOCK.table, block]
+                    place = block_ints[BLOCK.place, block]
+                    share_0 = dc_ints[DC.first_share, n] + n_units * (block - dc_block_0)
+                    per_server = racks[RACK.per_server, block]
+                    u = utilisation
+                    if loads_of == OF_RACKS:
+                        u = racks[RACK.load, block]
+                    elif loads_of == OF_GROUPS:
+                        u = zeros
+                    powered = racks[RACK.powered, block]
+                    air_left = racks[RACK.airflow, block]
+                    breath = air_left * powered
+                    uneven = u * (real(1.0) - u)
+                    cpu_base, fan_base = u * cpu_shift + cpu_offset, u * fan_shift + fan_offset
+                    cover = zeros
+                    mixed = zeros
+                    fresh = zeros
+                    captured_share = zeros
+                    parcel_w = zeros
+                    if ti.static(recirculates):
+                        captured_share = racks[RACK.captured, block]
+                        unit = 0
+                        while unit < n_units:
+                            used = (
+                                SUPPLY.fresh_ratio_used if ti.static(write) else SUPPLY.fresh_ratio
+                            )
+                            ratio = ti.cast(unit_state[used, unit_0 + unit], real)
+                            part = shares[share_0 + unit] * ratio
+                            cover += part
+                            fresh += part * ti.cast(
+                                unit_state[SUPPLY.supply_c, unit_0 + unit], real
+                            )
+                            unit += step
+                        mixed = rack_store[STATE.mixed_c, block]
+                        if ti.static(transient and not write):
+                            mixed = terms[at_block + OF_BLOCK.mixed_c]
+                            parcel_w = terms[at_block + OF_BLOCK.parcel_w]
                         fresh = fresh - cover * mixed
                     else:
                         air_c = ti.cast(unit_state[SUPPLY.supply_c, unit_0], real)
                         mixed = racks[RACK.approach_k, block] + air_c
+                    # Inlet of a server that takes in no exhaust, and colder by height.
+                    least_c = mixed + fresh
+                    per_height_k = captured_share * fresh
+                    # What all groups of a rack have in common is multiplied with their sums.
+                    per_speed_m3s = breath * full_m3s
+                    per_speed_w = breath * fan_w
+                    # Of servers in a substep: decay per speed, warming per power.
+                    per_speed_x = breath * (full_m3s * taken_up * k_per_w)
+                    per_draw_k = powered * k_per_w
                     cpu = zeros
                     fan = zeros
                     flow = zeros
                     inlet = zeros
                     inlet_flow = zeros
                     fresh_flow = zeros
-                    heat = zeros
+                    high_flow = zeros
                     hot = zeros
                     cold = zeros
                     stored = zeros
                     hottest = zeros - real(1e30)
                     zone = zeros
+                    this_zone = zeros
                     if ti.static(transient and not write):
                         if begins:
                             for z in range(n_groups):
@@ -1117,84 +1245,86 @@ def hall_kernel(precision: str) -> Any:
                     z = 0
                     while z < n_groups:
                         count = tables[table + z, GROUP.count]
-                        t = mixed
-                        own = zeros
+                        t = least_c + tables[table + z, GROUP.inlet_offset_k]
                         if ti.static(recirculates):
-                            own = real(1.0) - captured_share * tables[table + z, GROUP.height]
-                            t = mixed + own * fresh
-                        else:
-                            t = mixed + tables[table + z, GROUP.inlet_offset_k]
-                        load = u + tables[table + z, GROUP.load_deviation] * uneven
+                            t = least_c - tables[table + z, GROUP.height] * per_height_k
+                        # Utilisation over that of the rack, where not given.
+                        apart = tables[table + z, GROUP.load_deviation] * uneven
                         if loads_of == OF_GROUPS:
                             for i in range(LANES):
                                 group = rack_ints[RACK_INT.first_group, block * LANES + i] + z
-                                load[i] = group_load[ti.min(group, group_load.shape[0] - 1)]
+                                apart[i] = group_load[ti.min(group, group_load.shape[0] - 1)]
                         on_curve = smaller(t, limit_c)
-                        ratio = on_curve * cpu_slope + (load * cpu_shift + cpu_offset)
+                        ratio = on_curve * cpu_slope + (apart * cpu_shift + cpu_base)
                         idle = tables[table + z, GROUP.idle_w]
-                        cpu_1 = powered * larger(idle, tables[table + z, GROUP.full_w] * ratio)
-                        y = on_curve * fan_slope + (load * fan_shift + fan_offset)
+                        draws = larger(idle, tables[table + z, GROUP.full_w] * ratio)
+                        y = on_curve * fan_slope + (apart * fan_shift + fan_base)
                         y = smaller(larger(y, fan_low), fan_high)
-                        flow_1 = y * breath * full_m3s
-                        speed = y * per_reference
-                        fan_1 = speed
-                        # A branch on data, not one kernel per exponent: compiled apart, they
-                        # would round apart, and a data center must not depend on its batch.
+                        turns = y
                         if exponent == real(3.0):
-                            fan_1 = speed * speed * speed
+                            turns = y * y * y
                         elif exponent != real(1.0):
-                            powers, lane = speed, 0
+                            powers, lane = y, 0
                             while lane < block_ints[BLOCK.racks, block]:
-                                powers[lane] = ti.pow(speed[lane], exponent)
+                                powers[lane] = ti.pow(y[lane], exponent)
                                 lane += step
-                            fan_1 = powers
-                        fan_1 *= breath * fan_w
-                        to_air = cpu_1
-                        if ti.static(transient):
-                            before = server_c[place + z]
-                            exchange = flow_1 * taken_up
-                            if ti.static(write):
-                                to_air = exchange * (before - t)
-                            else:
-                                steady = t + cpu_1 / larger(exchange, zeros + real(1e-30))
-                                gone = gone_after(exchange * (step_s / server_j), constants)
-                                after = before + (steady - before) * gone
-                                after = ti.select(exchange > real(0.0), after, before)
-                                warmed_w = (after - before) * (server_j * per_step_s)
-                                to_air = ti.select(exchange > real(0.0), cpu_1 - warmed_w, zeros)
-                                stored += count * warmed_w
-                                server_c[place + z] = after
-                                if ends:
-                                    for i in range(LANES):
-                                        if count[i] > real(0.0):
-                                            group = (
-                                                rack_ints[RACK_INT.first_group, block * LANES + i]
-                                                + z
-                                            )
-                                            servers_after[group] = after[i]
-                        warm = to_air + fan_1
+                            turns = powers
                         if ti.static(write):
-                            rise = warm / larger(flow_1 * air, zeros + real(1e-30))
+                            flow_1 = y * per_speed_m3s
+                            cpu_1, fan_1 = powered * draws, turns * per_speed_w
+                            to_air = cpu_1
+                            if ti.static(transient):
+                                to_air = flow_1 * taken_up * (server_c[place + z] - t)
+                            rise = (to_air + fan_1) / larger(flow_1 * air, zeros + real(1e-30))
                             group_values[PER_GROUP.inlet_c, slice_at + z] = t
                             group_values[PER_GROUP.outlet_c, slice_at + z] = t + rise
                             group_values[PER_GROUP.power_w, slice_at + z] = cpu_1 + fan_1
                             # Read anew for no copies of the loop's body; see ``close``.
                             n_groups = block_ints[BLOCK.groups, block]
-                        counted = count * flow_1
-                        cpu += count * cpu_1
-                        fan += count * fan_1
+                        elif ti.static(transient):
+                            # Without air a server keeps what it draws.
+                            before = server_c[place + z]
+                            x = y * per_speed_x
+                            change = draws * per_draw_k - (before - t) * x
+                            change *= gone_per(x, times, step, constants)
+                            after = before + change
+                            stored += count * change
+                            server_c[place + z] = after
+                            if ends:
+                                for i in range(LANES):
+                                    if count[i] > real(0.0):
+                                        group = (
+                                            rack_ints[RACK_INT.first_group, block * LANES + i] + z
+                                        )
+                                        servers_after[group] = after[i]
+                        counted = count * y
+                        cpu += count * draws
+                        fan += count * turns
                         flow += counted
                         inlet += count * t
-                        inlet_flow += counted * t
-                        heat += count * warm
+                        if ti.static(recirculates):
+                            high_flow += counted * tables[table + z, GROUP.height]
+                        else:
+                            inlet_flow += counted * t
                         if ti.static(not write):
-                            fresh_flow += counted * own
                             hot += count * larger(t - real(RECOMMENDED_HIGH_C), zeros)
                             cold += count * larger(real(RECOMMENDED_LOW_C) - t, zeros)
-                            here = ti.select(count > real(0.0), t, zeros - real(1e30))
-                            zone = ti.select(here > hottest, zeros + ti.cast(z, real), zone)
-                            hottest = larger(here, hottest)
+                            # Groups without servers are as another one of their rack.
+                            zone = ti.select(t > hottest, this_zone, zone)
+                            hottest = larger(t, hottest)
+                            this_zone += real(1.0)
                         z += 1
+                    cpu *= powered
+                    fan *= per_speed_w
+                    flow *= per_speed_m3s
+                    if ti.static(recirculates):
+                        fresh_flow = flow - captured_share * (high_flow * per_speed_m3s)
+                        inlet_flow = mixed * flow + fresh * fresh_flow
+                    else:
+                        inlet_flow *= per_speed_m3s
+                    hottest = ti.select(per_server > real(0.0), hottest, zeros - real(1e30))
+                    stored *= server_j * per_step_s
+                    heat = cpu + fan - stored
                     mean = inlet * per_server
                     per_flow = real(1.0) / larger(flow, zeros + real(1e-30))
                     outlet = (inlet_flow + heat * per_air) * per_flow
@@ -1230,7 +1360,11 @@ def hall_kernel(precision: str) -> Any:
                             layer_blocks,
                         )
                     else:
-                        terms[term_0 + SUM.captured_m3k_s] = zeros
+                        outlet_flow = inlet_flow + heat * per_air
+                        if ti.static(not recirculates):
+                            # Their indices are those of the racks, whatever leaves the servers.
+                            inlet_flow = flow * mean
+                            outlet_flow = flow * outlet
                         if ti.static(recirculates):
                             mean = ti.select(flow > real(0.0), inlet_flow * per_flow, mean)
                             captured = flow - cover * fresh_flow
@@ -1254,47 +1388,22 @@ def hall_kernel(precision: str) -> Any:
                                     ti.select(per_server > real(0.0), change, zeros - real(1e30)),
                                     most,
                                 )
-                            terms[term_0 + SUM.captured_m3k_s] = (
-                                captured * mixed + parcel_w * per_air
-                            )
-                            unit = 0
-                            while unit < n_units:
-                                need = shares[share_0 + unit] * fresh_flow
-                                needed = real(0.0)
-                                for i in range(LANES):
-                                    needed += need[i]
-                                needs[need_0 + unit] = needs[need_0 + unit] + ti.cast(
-                                    needed, ti.f64
-                                )
-                                unit += step
-                        terms[term_0 + SUM.cpu_w] = cpu
-                        terms[term_0 + SUM.fan_w] = fan
-                        terms[term_0 + SUM.airflow_m3s] = flow
-                        terms[term_0 + SUM.inlet_c] = mean
-                        terms[term_0 + SUM.outlet_c] = outlet
-                        carried = inlet_flow + heat * per_air
-                        if ti.static(not recirculates):
-                            # Their indices are those of the racks, whatever leaves the servers.
-                            inlet_flow = flow * mean
-                            carried = flow * outlet
-                        terms[term_0 + SUM.inlet_m3k_s] = inlet_flow
-                        terms[term_0 + SUM.outlet_m3k_s] = carried
-                        terms[term_0 + SUM.hot_k] = hot
-                        terms[term_0 + SUM.cold_k] = cold
-                        terms[term_0 + SUM.stored_w] = stored + parcel_w
-                        for i in range(LANES):
-                            flow_lanes[i] += ti.cast(flow[i], ti.f64)
-                            outlet_lanes[i] += ti.cast(outlet[i], ti.f64)
+                            leaves = outlet_flow - captured * mixed - parcel_w * per_air
+                            gather(terms, slice_at + TERM.leaves_m3k_s, leaves)
+                            terms[at_block + OF_BLOCK.fresh_m3s] = fresh_flow
+                        gather(terms, slice_at + TERM.inlet_m3k_s, inlet_flow)
+                        gather(terms, slice_at + TERM.outlet_m3k_s, outlet_flow)
+                        gather(terms, slice_at + TERM.hot_k, hot)
+                        gather(terms, slice_at + TERM.cold_k, cold)
+                        gather(terms, slice_at + TERM.flow_m3s, flow)
+                        if ti.static(transient):
+                            gather(terms, slice_at + TERM.stored_w, stored + parcel_w)
+                        else:
+                            gather(terms, slice_at + TERM.given_c, outlet)
                         chunk_block = ti.select(hottest > chunk_hottest, block, chunk_block)
                         chunk_zone = ti.select(hottest > chunk_hottest, zone, chunk_zone)
                         chunk_hottest = larger(hottest, chunk_hottest)
                         if ti.static(transient):
-                            share = ti.cast(weight, real)
-                            cpu *= share
-                            fan *= share
-                            flow *= share
-                            mean *= share
-                            outlet *= share
                             if not begins:
                                 cpu += rack_out[OUT.cpu_w, block]
                                 fan += rack_out[OUT.fan_w, block]
@@ -1302,6 +1411,13 @@ def hall_kernel(precision: str) -> Any:
                                 mean += rack_out[OUT.inlet_c, block]
                                 hottest = larger(hottest, rack_out[OUT.inlet_max_c, block])
                                 outlet += rack_out[OUT.outlet_c, block]
+                            if ends:
+                                share = ti.cast(weight, real)
+                                cpu *= share
+                                fan *= share
+                                flow *= share
+                                mean *= share
+                                outlet *= share
                         rack_out[OUT.cpu_w, block] = cpu
                         rack_out[OUT.fan_w, block] = fan
                         rack_out[OUT.airflow_m3s, block] = flow
@@ -1309,21 +1425,47 @@ def hall_kernel(precision: str) -> Any:
                         rack_out[OUT.inlet_max_c, block] = hottest
                         rack_out[OUT.outlet_c, block] = outlet
                 if ti.static(not write):
-                    if late:
-                        flow_sum = ti.cast(0.0, ti.f64)
-                        outlet_sum = ti.cast(0.0, ti.f64)
-                        for i in range(LANES):
-                            flow_sum += flow_lanes[i]
-                            outlet_sum += outlet_lanes[i]
-                        sums[chunk * n_sums + SUM.airflow_m3s] = flow_sum
-                        sums[chunk * n_sums + SUM.outlet_c] = outlet_sum
-                    else:
-                        add_up(chunk, slice_at, step, chunk_ints, terms, sums)
-                        find_hottest(chunk, step, chunk_hottest, chunk_block, chunk_zone, sums)
+                    if ti.static(recirculates):
+                        unit = 0
+                        while unit < n_units:
+                            need, b = zeros, 0
+                            while b < n_blocks:
+                                at = n_units * (block_0 + b - dc_block_0) + unit
+                                share = shares[dc_ints[DC.first_share, n] + at]
+                                at = slice_at + n_terms + b * n_of_block
+                                need += share * terms[at + OF_BLOCK.fresh_m3s]
+                                b += step
+                            needs[need_0 + unit] = sum_of(need)
+                            unit += step
+                    first_row, adds = 0, False
+                    if ti.static(transient):
+                        adds = not begins and not late
+                        if not ends:
+                            first_row = of_racks
+                            if late:
+                                first_row = of_steps
+                    elif late:
+                        first_row = of_steps
+                    add_up(
+                        chunk,
+                        first_row,
+                        SUM.given_c if ti.static(transient) else SUM.inlet_max_c,
+                        adds,
+                        slice_at,
+                        step,
+                        chunk_ints,
+                        terms,
+                        rack_out,
+                        sums,
+                    )
+                    if first_row < of_steps:
+                        find_hottest(
+                            chunk, adds, step, chunk_hottest, chunk_block, chunk_zone, sums
+                        )
                     least_k, most_k = real(1e30), real(-1e30)
                     for i in range(LANES):
-                        least_k = ti.min(least_k, least[i])
-                        most_k = ti.max(most_k, most[i])
+                        least_k = ti.select(least[i] < least_k, least[i], least_k)
+                        most_k = ti.select(most[i] > most_k, most[i], most_k)
                     sums[chunk * n_sums + SUM.least_k] = ti.cast(least_k, ti.f64)
                     sums[chunk * n_sums + SUM.most_k] = ti.cast(most_k, ti.f64)
                     for again in range(passes):
@@ -1358,7 +1500,6 @@ def hall_kernel(precision: str) -> Any:
                             n,
                             late,
                             slice_at,
-                            n_blocks,
                             step,
                             chunk_hottest,
                             chunk_block,
@@ -1378,6 +1519,7 @@ def hall_kernel(precision: str) -> Any:
                             counts,
                             needs,
                             terms,
+                            rack_out,
                             sums,
                             dc_out,
                         )
@@ -1450,7 +1592,7 @@ def hall_kernel(precision: str) -> Any:
             if k % SLICE == 0:
                 first = ti.cast(ti.cast(k // SLICE, ti.i64) * n_tasks // slices, ti.i32)
                 last = ti.cast((ti.cast(k // SLICE, ti.i64) + 1) * n_tasks // slices, ti.i32)
-                slice_at = k // SLICE * n_terms
+                slice_at = k // SLICE * SCRATCH
                 if ti.static(write):
                     slice_at = k // SLICE * (group_values.shape[1] // slices)
                 for task in range(first, last):

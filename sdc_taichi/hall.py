@@ -160,7 +160,7 @@ class Hall:
         self._lay_out_air(thermal)
         self._lay_out_values(thermal)
         self._slices = max(1, min(8 * threads, len(self._tasks) - 1))
-        self._terms = self._lanes(self._slices * len(thermal.TERMS) * thermal.CHUNK_BLOCKS)
+        self._terms = self._lanes(self._slices * thermal.SCRATCH)
         squares = self._slices * -(-self._most_groups // thermal.LANES)
         values = self._empty((len(thermal.GROUP_OUT), squares, thermal.SQUARE), self._dtype)
         by_group = values.reshape(len(values), -1, thermal.LANES)
@@ -396,7 +396,7 @@ class Hall:
         self._run_sources = self._rack_store.reshape(-1, thermal.RUN_LANES)
         self._memory = dict(zip(thermal.RACK_STATE, self._rack_state, strict=True))
         self._constants = self._real(
-            np.array([*_RELEASED_OUTLET_FIT, *thermal.exp_constants(self._precision)])
+            np.array([*_RELEASED_OUTLET_FIT, *thermal.decay_constants(self._precision)])
         )
         self._sums = np.zeros(len(thermal.SUMS) * (self._chunk_ints.shape[1] - 1))
 
