@@ -95,7 +95,8 @@ class CompiledStage:
             raise TypeError(f"arguments {[*given]}, expected {[*self._names]} as on the first call")
         self._given[:] = self._stacked([*given.values()])
         out = self._empty(len(self._results))
-        self._kernel(self._size <= SERIAL_UP_TO, self._constants, self._inputs, out)
+        serial = self._size <= SERIAL_UP_TO
+        self._kernel(serial, self._shared, self._constants, self._inputs, out)
         return self._entries(out)
 
     def _stacked(self, arrays: list[Any]) -> npt.NDArray[np.float64]:
@@ -116,6 +117,7 @@ class CompiledStage:
         given = {name: record.entry(f"given[{row}, i]") for row, name in enumerate(names)}
         results = {name: record.lift(x) for name, x in self._stage(**given).items()}
         self._names, self._results = names, tuple(results)
+        self._shared = np.array([*record.shared, 0.0])
         constants = record.constants or [np.zeros(self._size)]
         self._constants, self._inputs = self._empty(len(constants)), self._empty(len(names))
         for rows in (self._constants, self._inputs):
@@ -171,7 +173,10 @@ class _Record:
     def __init__(self, size: int) -> None:
         self._size = size
         self._operations: dict[tuple[str, tuple[int, ...]], int] = {}
-        self._rows: dict[int, int] = {}
+        self._known: dict[int, tuple[str, Any]] = {}
+        """Text that reads a constant, and the constant, by its identity."""
+        self.shared: list[float] = []
+        """Constants that are the same for all entries, which need not be read for each."""
         self.constants: list[Any] = []
 
     def entry(self, text: str, *, of: tuple[int, ...] = (), truth: bool = False) -> Recorded:
@@ -199,11 +204,15 @@ class _Record:
             return self.entry(f"zeros + ti.f64({float(array)!r})")
         if array.shape != (self._size,):
             raise TypeError(f"constant of shape {array.shape}, expected ({self._size},)")
-        row = self._rows.get(id(value))
-        if row is None:
-            row = self._rows[id(value)] = len(self.constants)
-            self.constants.append(value)
-        read = self.entry(f"constants[{row}, i]")
+        if id(value) not in self._known:
+            if np.all(array == array[0]):
+                text = f"zeros + shared[{len(self.shared)}]"
+                self.shared.append(float(array[0]))
+            else:
+                text = f"constants[{len(self.constants)}, i]"
+                self.constants.append(value)
+            self._known[id(value)] = text, value
+        read = self.entry(self._known[id(value)][0])
         return read > 0.5 if array.dtype == np.bool_ else read
 
     def lines(self, results: list[Recorded]) -> list[str]:
@@ -254,7 +263,7 @@ def _source(body: list[str]) -> str:
     """A kernel that does these statements for every entry i."""
     head = (
         "@ti.kernel\n"
-        "def stage(serial: ti.template(), constants: Rows, given: Rows, out: Rows):\n"
+        "def stage(serial: ti.template(), shared: Reals, constants: Rows, given: Rows, out: Rows):\n"
         f"    ti.loop_config(serialize=serial, block_dim={_BLOCKS_AT_ONCE})\n"
         "    for i in range(out.shape[1]):\n"
         f"        zeros = ti.Vector([ti.f64(0.0)] * {LANES})\n"
@@ -297,6 +306,7 @@ def _kernel(source: str) -> Any:
     linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
     scope = {
         "ti": ti,
+        "Reals": ti.types.ndarray(dtype=ti.f64, ndim=1),
         "Rows": ti.types.ndarray(dtype=ti.types.vector(LANES, ti.f64), ndim=2),
         "larger": _larger,
         "smaller": _smaller,

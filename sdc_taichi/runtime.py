@@ -46,14 +46,40 @@ def ensure_started() -> int:
 
     if ti.lang.impl.get_runtime().prog is None:
         options = {"cpu_max_num_threads": _thread_limit()} if _thread_limit() else {}
+        before = _thread_ids()
         # ti.init prints a banner, which would end up in a user's piped output.
         with contextlib.redirect_stdout(io.StringIO()):
             ti.init(arch=ti.cpu, offline_cache=True, log_level=ti.ERROR, **options)
+        _bind(_thread_ids() - before, ti.lang.impl.current_cfg().cpu_max_num_threads)
     # Starting makes another object of the runtime.
     program = ti.lang.impl.get_runtime().prog
     if _known[0] is not program:
         _known = (program, int(ti.lang.impl.current_cfg().cpu_max_num_threads))
     return _known[1]
+
+
+def _thread_ids() -> set[int]:
+    """Threads of this process; none where the system does not tell."""
+    try:
+        return set(map(int, os.listdir("/proc/self/task")))
+    except OSError:
+        return set()
+
+
+def _bind(started: set[int], threads: int) -> None:
+    """Bind Taichi's threads to one processor each.
+
+    Linux tends to wake all of them on the processor of the thread that waits for them, and moves
+    them apart some milliseconds later, when the step is done. Threads fewer than processors are
+    left alone: those of other processes would be bound to the same ones.
+    """
+    processors = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    if threads != len(processors):
+        return
+    # Those that compute are created one after the other, so no two of them meet.
+    for i, thread in enumerate(sorted(started)):
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(thread, {processors[i % threads]})
 
 
 def _thread_limit() -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import gc
 import multiprocessing
 import os
@@ -577,6 +578,30 @@ def resident_mb() -> float:
     if not statm.exists():
         pytest.skip("no /proc: resident memory cannot be read")
     return int(statm.read_text().split()[1]) * resource.getpagesize() / 1e6
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system binds no threads")
+def test_as_many_threads_as_processors_are_bound_to_one_each() -> None:
+    processors = sorted(os.sched_getaffinity(0))
+    code = (
+        "import os; from sdc_taichi import runtime; runtime.ensure_started();"
+        "print([sorted(os.sched_getaffinity(int(t))) for t in os.listdir('/proc/self/task')])"
+    )
+    for threads in (len(processors), len(processors) + 1):
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "SDC_TAICHI_THREADS": str(threads)},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=True,
+        )
+        allowed = ast.literal_eval(done.stdout)
+        assert processors in allowed
+        if threads == len(processors):
+            assert all([one] in allowed for one in processors)
+        else:
+            assert all(bound == processors for bound in allowed)
 
 
 def test_memory_does_not_grow_with_simulators_made_and_closed() -> None:

@@ -29,6 +29,7 @@ def compiled(function: Callable[..., Any], **given: F64) -> dict[str, F64]:
 
 WEIGHTS = np.linspace(0.5, 2.0, N)
 ODD = np.arange(N) % 2 == 1
+ALIKE = np.full(N, 1.0 / 3.0), np.full(N, 0.1)
 
 
 @pytest.mark.parametrize(
@@ -37,6 +38,7 @@ ODD = np.arange(N) % 2 == 1
         lambda x, y: x + 2.0 * y - 1.0,
         lambda x, y: x / (y + 3.0),
         lambda x, y: -x * WEIGHTS + y,
+        lambda x, y: np.where(ALIKE[1] > x, y * ALIKE[0], x),
         lambda x, y: np.maximum(x, y) * np.minimum(x, 0.25),
         lambda x, y: np.clip(x, -0.5, y),
         lambda x, y: np.where((x > y) & ~(y >= 0.5), x, np.where(x <= 0.0, y, 7.0)),
