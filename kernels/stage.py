@@ -263,7 +263,8 @@ def _source(body: list[str]) -> str:
     """A kernel that does these statements for every entry i."""
     head = (
         "@ti.kernel\n"
-        "def stage(serial: ti.template(), shared: Reals, constants: Rows, given: Rows, out: Rows):\n"
+        "def stage(serial: ti.template(), shared: Reals, constants: Rows, given: Rows,\n"
+        "          out: Rows):\n"
         f"    ti.loop_config(serialize=serial, block_dim={_BLOCKS_AT_ONCE})\n"
         "    for i in range(out.shape[1]):\n"
         f"        zeros = ti.Vector([ti.f64(0.0)] * {LANES})\n"
