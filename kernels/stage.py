@@ -24,7 +24,7 @@ from .backend import BoundKernel, aligned, ti
 Arrays = Mapping[str, Any]
 
 LANES = 8
-SERIAL_UP_TO = 1024
+SERIAL_UP_TO = 4096
 """Entries that one thread computes sooner than several are woken."""
 _BLOCKS_AT_ONCE = 64
 """Least that a thread takes on."""
