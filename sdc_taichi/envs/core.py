@@ -41,7 +41,7 @@ BATTERY_ORDERS = {"paper": (1.0, 0.0, -1.0), "sustaindc": (1.0, -1.0, 0.0)}
 """Commands of the battery's discrete actions."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Step:
     """What a step gives."""
 

@@ -267,10 +267,11 @@ class Rewards:
             SdcError: a user's function returned something of another shape, or not finite.
         """
         self._peak_before_kw = self._peak_kw
-        self._peak_kw = np.maximum(self._peak_kw, result.grid_kwh / result.step_h)
         if self._scales is not None:
             found = self._weighed(result)
+            self._peak_kw = found.pop("peak_kw")
             return found, found.pop("joint")
+        self._peak_kw = _peak_kw(self._peak_kw, result)
         if self._function is not None:
             found = self._function(result, view)
             if not isinstance(found, Mapping):
@@ -294,21 +295,22 @@ class Rewards:
         return {name: term(result, context) for name, term in TERMS.items()}
 
     def _weighed(self, result: StepResult) -> dict[str, F64]:
-        """Rewards by learning agent, and of all of them by ``joint``, (B,)."""
+        """Rewards by learning agent, of all of them by ``joint``, and ``peak_kw``, (B,)."""
         if self._stage is None:
             from sdc_taichi.kernels.stage import CompiledStage
 
             reads = _Reads()
             for name in self._wanted:
                 TERMS[name](reads, self._context(result))  # type: ignore[arg-type]
+            _peak_kw(self._peak_kw, reads)  # type: ignore[arg-type]
             self._reads = tuple(reads.names)
             self._stage = CompiledStage(self._of_terms, len(self._design_kwh))
-        context = self._context(result)
+        now = self._step_of_day(result)
         found: dict[str, F64] = self._stage(
-            design_kwh=context.design_kwh,
-            peak_kw=context.peak_kw,
-            price_per_kwh=context.price_per_kwh,
-            rush=context.rush,
+            design_kwh=self._design_kwh,
+            peak_kw=self._peak_before_kw,
+            price_per_kwh=self._price_per_kwh[now],
+            rush=self._rush[now],
             **{name: getattr(result, name) for name in self._reads},
         )
         return found
@@ -329,7 +331,7 @@ class Rewards:
             for agent in AGENTS
         ]
         by_agent, joint = _together(self._shared(own))
-        return by_agent | {"joint": joint}
+        return by_agent | {"joint": joint, "peak_kw": _peak_kw(peak_kw, result)}
 
     def _shared(self, own: Sequence[F64]) -> dict[str, F64]:
         """Rewards by learning agent from those of all agents."""
@@ -337,7 +339,7 @@ class Rewards:
         return {agent: by_agent[agent] for agent in self._agents}
 
     def _context(self, result: StepResult) -> Context:
-        now = (self._first + result.step) % len(self._rush)
+        now = self._step_of_day(result)
         return Context(
             design_kwh=self._design_kwh,
             tariff=self._tariff,
@@ -346,6 +348,15 @@ class Rewards:
             price_per_kwh=self._price_per_kwh[now],
             rush=self._rush[now],
         )
+
+    def _step_of_day(self, result: StepResult) -> I64:
+        """Counted from 0 at midnight, (B,)."""
+        return (self._first + result.step) % len(self._rush)
+
+
+def _peak_kw(before_kw: F64, result: StepResult) -> F64:
+    """Highest power of the episode, (B,)."""
+    return np.maximum(before_kw, result.grid_kwh / result.step_h)
 
 
 class _Reads:
