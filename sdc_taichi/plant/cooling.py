@@ -58,11 +58,10 @@ def accelerating_setpoint(
     it stands for; holding does count, without effect. Arguments as in ``symmetric_setpoint``.
     """
     goes_on = (command == last) & (command >= 0)
-    run = np.where(goes_on, run + 1, 1)
-    scale = np.where(goes_on, scale, 1.0)
-    scale = np.where(run > 3, scale + 1.0, scale)
-    moved = np.clip(setpoint_c + command * step_k * scale, low_c, high_c)
-    return moved, run, command, scale
+    run = run * goes_on + 1
+    scale = 1.0 + (scale - 1.0) * goes_on + (run > 3)
+    moved_c = np.minimum(np.maximum(setpoint_c + command * step_k * scale, low_c), high_c)
+    return moved_c, run, command, scale
 
 
 SETPOINTS: dict[str, SetpointModel] = {
