@@ -30,6 +30,8 @@ OPTIONS = {"cfg_optimization": False, "fast_math": False, "real_matrix_scalarize
 flow takes four fifths of the time and finds nothing that LLVM does not. Vectors stay vectors of the
 processor, which load and store as one and take one statement each; LLVM vectors know no casts, no
 negation and no functions but floor and sqrt: those go element by element."""
+SLICE = 512
+"""Iterations of a task: Taichi runs a parallel loop of at most so many on one thread."""
 ALIGNMENT = 512
 """Bytes; compiled code takes arrays of vectors to start at a multiple of the vector's length."""
 

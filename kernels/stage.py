@@ -19,15 +19,15 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from .backend import BoundKernel, aligned, ti
+from .backend import SLICE, BoundKernel, aligned, ti
 
 Arrays = Mapping[str, Any]
 
 LANES = 8
 SERIAL_UP_TO = 4096
 """Entries that one thread computes sooner than several are woken."""
-_BLOCKS_AT_ONCE = 64
-"""Least that a thread takes on."""
+_TASK_BLOCKS = 32
+"""Vectors that one task computes."""
 _SAME_SETS = 64
 """Rows that are multiples of 4 KiB apart compete for the same sets of the cache, and a stage reads
 and writes a hundred of them at a time: twice as slow. Such rows get a block more."""
@@ -265,11 +265,15 @@ def _source(body: list[str]) -> str:
         "@ti.kernel\n"
         "def stage(serial: ti.template(), shared: Reals, constants: Rows, given: Rows,\n"
         "          out: Rows):\n"
-        f"    ti.loop_config(serialize=serial, block_dim={_BLOCKS_AT_ONCE})\n"
-        "    for i in range(out.shape[1]):\n"
-        f"        zeros = ti.Vector([ti.f64(0.0)] * {LANES})\n"
+        f"    n_tasks = (out.shape[1] + {_TASK_BLOCKS - 1}) // {_TASK_BLOCKS}\n"
+        "    ti.loop_config(serialize=serial)\n"
+        f"    for at in range(n_tasks * {SLICE}):\n"
+        f"        if at % {SLICE} == 0:\n"
+        f"            first = at // {SLICE} * {_TASK_BLOCKS}\n"
+        f"            for i in range(first, ti.min(first + {_TASK_BLOCKS}, out.shape[1])):\n"
+        f"                zeros = ti.Vector([ti.f64(0.0)] * {LANES})\n"
     )
-    return head + "".join(f"        {line}\n" for line in body)
+    return head + "".join(f"                {line}\n" for line in body)
 
 
 @ti.func

@@ -16,7 +16,7 @@ from math import factorial
 from types import SimpleNamespace
 from typing import Any, no_type_check
 
-from .backend import ti
+from .backend import SLICE, ti
 
 HALL_TEMPLATES = 4
 """Template arguments of ``hall_kernel``, which come first."""
@@ -221,10 +221,6 @@ MOST_DOUBLINGS = 60
 def decay_constants(precision: str) -> list[float]:
     """Series of (1 - exp(-x)) / x, highest power first, for ``hall_kernel``."""
     return [(-1.0) ** k / factorial(k + 1) for k in reversed(range(SERIES_TERMS[precision]))]
-
-
-SLICE = 512
-"""Iterations of a slice of chunks: a parallel loop of at most so many runs on one thread."""
 
 
 def _rows(names: tuple[str, ...]) -> SimpleNamespace:

@@ -164,8 +164,9 @@ class Queue:
     def __init__(self, length: int, due_steps: F64) -> None:
         due_at = length - np.minimum(due_steps, length + 1.0).astype(np.int64)
         self._size, self._length = len(due_steps), length
-        self._due_row = np.where(due_at < 0, length, due_at).astype(np.float64)
+        self._due_row = np.where(due_at < 0, length, due_at).astype(np.int32)
         self._kernel: Any = None
+        self._room: Any = None
         self._rows: Any = None
         """Rows of the queue that the last step left, as the kernel takes them."""
         self._known: F64 | None = None
@@ -180,8 +181,7 @@ class Queue:
         """
         if queue is not self._known:
             never = np.zeros((1, self._size))
-            due_row = self._due_row.astype(np.int64)
-            due = np.concatenate([queue.T, never])[due_row, np.arange(self._size)]
+            due = np.concatenate([queue.T, never])[self._due_row, np.arange(self._size)]
             self._take(queue)
             self._start = queue[:, -1].copy(), due
         return self._start
@@ -198,10 +198,10 @@ class Queue:
 
         if self._kernel is None:
             runtime.ensure_started()
-            self._kernel = bound_queue_kernel()
+            self._kernel, self._room = bound_queue_kernel(), self._empty(3)
         if queue is not self._known:
             self._take(queue)
-        after, found = self._empty(), np.empty((4, self._size))
+        after, found = self._empty(self._length), np.empty((4, self._size))
         self._kernel(
             self._size <= SERIAL_UP_TO,
             _NEGLIGIBLE_TASKS,
@@ -210,6 +210,7 @@ class Queue:
             self._rows,
             taken,
             deferred,
+            self._room,
             after,
             found,
         )
@@ -218,15 +219,15 @@ class Queue:
         self._start = waiting, due
         return Queued(self._known, waiting, due, oldest_steps, mean_steps)
 
-    def _empty(self) -> Any:
-        """Rows of any content for the kernel, (L, blocks of data centers, LANES)."""
+    def _empty(self, rows: int) -> Any:
+        """Rows of any content for the kernel, (rows, blocks of data centers, LANES)."""
         from sdc_taichi.kernels.backend import aligned
         from sdc_taichi.kernels.queue import LANES
 
         blocks = -(-self._size // LANES)
         # Rows that are multiples of 4 KiB apart compete for the same sets of the cache.
         blocks += blocks % (4096 // (8 * LANES)) == 0
-        return aligned((self._length, blocks, LANES), np.float64)
+        return aligned((rows, blocks, LANES), np.float64)
 
     def _seen(self, rows: Any) -> F64:
         seen: F64 = rows.reshape(self._length, -1)[:, : self._size].T
@@ -234,14 +235,14 @@ class Queue:
 
     def _take(self, queue: F64) -> None:
         """Go on from a queue that was not left by the last step."""
-        self._rows = self._empty()
+        self._rows = self._empty(self._length)
         self._rows[:] = 0.0
         self._seen(self._rows)[:] = queue
         self._known = queue
 
     def forget(self) -> None:
         """Let go of the kernel and the arrays that it was last given."""
-        self._kernel = self._rows = self._known = None
+        self._kernel = self._room = self._rows = self._known = None
 
 
 def age_histogram(queue: F64, edges_steps: F64) -> F64:
