@@ -25,8 +25,7 @@ def store_s(servers: int, repeats: int) -> float:
     A parallel loop over all values stores them one by one, at half the speed of memory; a serial
     loop of fixed length within is vectorised, where the run's value comes from the same tree.
     """
-    from sdc_taichi.kernels.backend import ti
-    from sdc_taichi.kernels.thermal import SLICE
+    from sdc_taichi.kernels.backend import SLICE, ti
 
     slices = 64
 
