@@ -25,7 +25,12 @@ from sdc_taichi.types import ServerLayers
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 Step = Callable[[], object]
-COMPILED = ("-O3", "-march=native", "-ffast-math", "-fopenmp", "-shared", "-fPIC")
+# All of -ffast-math, which would also flush small numbers of the whole process to zero.
+REORDERED = (
+    *("-fassociative-math", "-freciprocal-math", "-ffinite-math-only"),
+    *("-fno-signed-zeros", "-fno-trapping-math", "-fno-math-errno"),
+)
+COMPILED = ("-O3", "-march=native", *REORDERED, "-fopenmp", "-shared", "-fPIC")
 
 
 class MissingError(Exception):
