@@ -223,7 +223,7 @@ def test_viewer_that_hangs_does_not_hold_the_run_up(monkeypatch: pytest.MonkeyPa
         process.send_signal(signal.SIGSTOP)
         begin = time.monotonic()
         with pytest.warns(RecordingWarning, match="the viewer hangs, "):
-            go_on(sim, rec, 3000)
+            go_on(sim, rec, 4 * BLOCK_STEPS)
         assert rec.lost
         rec.close()
         assert time.monotonic() - begin < 20.0
