@@ -169,6 +169,8 @@ class Hall:
         self._result_names = (*thermal.DC_OUT, *(f"rack_{name}" for name in thermal.RACK_OUT))
         self._solved: bool | None = None
         """Whether the last step was transient; None without one."""
+        self._of_groups: tuple[ServerLayers, tuple[Any, ...]] | None = None
+        """Layers of the groups, as such and as the kernel takes them, once they are asked for."""
 
     def _lay_out_racks(self, thermal: Any, slices: int) -> None:
         """Blocks of racks, each data center filled up to whole ones, and chunks of blocks."""
@@ -496,27 +498,43 @@ class Hall:
             layer if fits else self._empty((servers,), self._dtype)
             for layer, fits in zip(layers, fit, strict=True)
         ]
-        self._write(stored, each_once=0)
+        written = self._written(stored)
+        self._write(written, each_once=0)
+        self._kernel.let_go(*written)
         for layer, values, fits in zip(layers, stored, fit, strict=True):
             if not fits:
                 layer[:] = values
         return into
 
+    def groups(self) -> ServerLayers:
+        """As ``servers``, but of one server per group, (G,); the next call overwrites them.
+
+        Raises:
+            RuntimeStateError: before the first step.
+        """
+        if self._of_groups is None:
+            layers = [self._empty((self._fleet.groups,), self._dtype) for _ in range(3)]
+            self._of_groups = ServerLayers(*layers), self._written(layers)
+        found, written = self._of_groups
+        self._write(written, each_once=1)
+        return found
+
     def group_inlets(self) -> F64:
         """Inlet of every server group in the last step, (G,)."""
-        layers = [self._empty((self._fleet.groups,), self._dtype) for _ in range(3)]
-        self._write(layers, each_once=1)
-        return np.asarray(layers[0], dtype=np.float64)
+        return self.groups().inlet_c.astype(np.float64)
 
-    def _write(self, layers: list[Any], each_once: int) -> None:
+    def _written(self, layers: list[Any]) -> tuple[Any, ...]:
+        """Layers as the kernel takes them: whole, and as vectors of lanes."""
+        lanes = self._thermal.LANES
+        whole = len(layers[0]) // lanes * lanes
+        blocks = (layer[:whole].reshape(-1, lanes) if whole else self._shares for layer in layers)
+        return *layers, *blocks
+
+    def _write(self, written: tuple[Any, ...], each_once: int) -> None:
         """Values of the last step to servers, or to each group once."""
         if self._solved is None:
             raise RuntimeStateError("no step has been done yet; server layers exist after one")
-        lanes = self._thermal.LANES
-        whole = len(layers[0]) // lanes * lanes
-        blocks = [layer[:whole].reshape(-1, lanes) if whole else self._shares for layer in layers]
-        self._run(None, transient=self._solved, write=(*layers, *blocks), each_once=each_once)
-        self._kernel.let_go(*layers, *blocks)
+        self._run(None, transient=self._solved, write=written, each_once=each_once)
 
     def forget(self) -> None:
         """Drop the last step, so that ``servers`` cannot show layers of another state."""
@@ -646,7 +664,7 @@ class Hall:
         each_once: int = 0,
     ) -> None:
         runtime.ensure_started()
-        values_out = self._fleet.servers if write else self._group_places * self._thermal.LANES
+        values_out = len(write[0]) if write else self._group_places * self._thermal.LANES
         serial = values_out * (sweeps if transient else 1) <= _SERIAL_GROUPS
         none, no_lanes = self._no_groups, self._shares
         if transient and len(self._server_c) < self._group_places:

@@ -538,6 +538,16 @@ class Simulator:
         """
         return self._start().servers(into)
 
+    def server_groups(self) -> ServerLayers:
+        """As ``servers``, but of one server of each group, whose values all of it have, (G,).
+
+        The next call overwrites them.
+
+        Raises:
+            RuntimeStateError: before the first step.
+        """
+        return self._start().groups()
+
     def state_dict(self, state: State | None = None) -> dict[str, Any]:
         """A state as plain arrays, for ``load_state_dict`` or ``numpy.savez``.
 

@@ -169,33 +169,33 @@ def outline_m(plan: Plan, height_m: float) -> list[list[tuple[float, float, floa
 class Zones(NamedTuple):
     """What the zones of all racks of some data centers show."""
 
-    servers: I64
-    """The first server of each group in each zone, whose values all of the group have."""
+    groups: I64
+    """Server groups in each zone, all of whose servers have the same values."""
     starts: I64
     """First of these in each zone, rack by rack from the floor up."""
 
 
 def zones_of(fleet: Fleet, dcs: Sequence[int], zones: Sequence[int]) -> Zones:
     """Zones of data centers whose racks have so many zones each, and at least as many servers."""
-    servers: list[I64] = []
+    groups: list[I64] = []
     starts: list[I64] = []
     for dc, heights in zip(dcs, zones, strict=True):
         racks = np.arange(*fleet.rack_start[dc : dc + 2])
-        groups = fleet.server_start[slice(*fleet.group_start[fleet.rack_start[dc : dc + 2]])]
+        of_groups = fleet.server_start[slice(*fleet.group_start[fleet.rack_start[dc : dc + 2]])]
         first = fleet.server_start[fleet.group_start[racks]].astype(np.int64)
         count = fleet.server_start[fleet.group_start[racks + 1]] - first
         # Server j of n stands in zone j * zones // n.
         before = (np.arange(heights) * count[:, None] + heights - 1) // heights
         zone_first = (first[:, None] + before).reshape(-1)
-        own = np.union1d(zone_first, groups)
-        starts.append(np.searchsorted(own, zone_first) + sum(map(len, servers)))
-        servers.append(own)
-    return Zones(np.concatenate(servers), np.concatenate(starts))
+        own = np.union1d(zone_first, of_groups)
+        starts.append(np.searchsorted(own, zone_first) + sum(map(len, groups)))
+        groups.append(np.searchsorted(fleet.server_start, own, side="right") - 1)
+    return Zones(np.concatenate(groups), np.concatenate(starts))
 
 
 def zone_peaks(layer: Reals, zones: Zones) -> Reals:
-    """Highest value of each zone in a per-server layer (S,)."""
-    return np.asarray(np.maximum.reduceat(layer[zones.servers], zones.starts))
+    """Highest value of each zone in a layer of the groups (G,)."""
+    return np.asarray(np.maximum.reduceat(layer[zones.groups], zones.starts))
 
 
 def unit_boxes_m(places_m: F64, plan: Plan, height_m: float) -> F64:

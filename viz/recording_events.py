@@ -259,10 +259,10 @@ def hottest_server(inlet_c: Reals, fleet: Fleet, rack: int) -> tuple[int, float]
     """Hottest server of a rack of the fleet, counted from the floor, and its inlet.
 
     Args:
-        inlet_c: per-server layer, (S,).
+        inlet_c: layer of the server groups, (G,).
         fleet: the fleet.
         rack: counted over the whole fleet.
     """
-    first, last = fleet.server_start[fleet.group_start[rack : rack + 2]]
-    server = int(np.argmax(inlet_c[first:last]))
-    return server, float(inlet_c[first + server])
+    first, last = fleet.group_start[rack : rack + 2]
+    group = first + int(np.argmax(inlet_c[first:last]))
+    return int(fleet.server_start[group] - fleet.server_start[first]), float(inlet_c[group])

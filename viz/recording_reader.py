@@ -15,7 +15,7 @@ from sdc_taichi.air_metrics import RECOMMENDED_C
 from sdc_taichi.errors import SdcError
 from sdc_taichi.events import ActiveEvent
 from sdc_taichi.plant.workload import age_histogram
-from sdc_taichi.types import F64, I64, Reals, ServerLayers, Status, StepResult
+from sdc_taichi.types import F64, I64, Reals, Status, StepResult
 
 from . import hall_layers as layers
 from .recording_events import Entry, failure_entries, hottest_server, protection_entries
@@ -119,7 +119,6 @@ class Reader:
         self._zones = layers.zones_of(fleet, focus, cadence.zones)
         cells = [(r.stop - r.start) * n for r, n in zip(self._racks, cadence.zones, strict=True)]
         self.cells = [slice(end - n, end) for n, end in zip(cells, np.cumsum(cells), strict=True)]
-        self._servers: ServerLayers | None = None
         self._status = bytes(fleet.racks)
         self._has_events = any(
             fleet.configs[dc].events.scheduled or fleet.configs[dc].events.sampled for dc in focus
@@ -273,7 +272,7 @@ class Reader:
             if np.array_equal(before[racks], after[racks]):
                 continue
             if inlet_c is None and self._cadence.per_server:
-                inlet_c = self._read_servers().inlet_c
+                inlet_c = self._sim.server_groups().inlet_c
 
             def hottest(
                 rack: int, first: int = racks.start, inlet_c: Reals | None = inlet_c
@@ -293,16 +292,11 @@ class Reader:
         np.concatenate(of_focus, out=self._maps[len(self._map_steps)])
         self._map_steps.append(result.step)
 
-    def _read_servers(self) -> ServerLayers:
-        """Servers of the last step, in layers that are used again."""
-        self._servers = self._sim.servers(self._servers)
-        return self._servers
-
     def _add_halls(self, result: StepResult) -> None:
         if self._cadence.per_server:
-            servers = self._read_servers()
-            inlet_c = layers.zone_peaks(servers.inlet_c, self._zones)
-            outlet_c = layers.zone_peaks(servers.outlet_c, self._zones)
+            groups = self._sim.server_groups()
+            inlet_c = layers.zone_peaks(groups.inlet_c, self._zones)
+            outlet_c = layers.zone_peaks(groups.outlet_c, self._zones)
         else:
             inlet_c = result.rack_inlet_max_c[self._every_rack].copy()
             outlet_c = result.rack_outlet_c[self._every_rack].copy()
