@@ -8,7 +8,7 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 
@@ -50,6 +50,43 @@ def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     raw = np.empty(length + ALIGNMENT, np.uint8)
     start = -address_of(raw) % ALIGNMENT
     return raw[start : start + length].view(of).reshape(shape)
+
+
+F64_LANES = 8
+"""Numbers in f64 that a vector of the processor holds."""
+_SAME_SETS_BYTES = 4096
+
+
+def vector_rows(rows: int, length: int) -> Any:
+    """Rows of so many f64, of any content, that kernels take as vectors.
+
+    Their shape is (rows, vectors, F64_LANES).
+
+    Rows that are multiples of 4 KiB apart compete for the same sets of the cache, and a kernel that
+    goes through many of them at a time takes twice as long. Such rows get a vector more.
+    """
+    vectors = -(-length // F64_LANES)
+    vectors += vectors % (_SAME_SETS_BYTES // (8 * F64_LANES)) == 0
+    return aligned((rows, vectors, F64_LANES), np.float64)
+
+
+def held(rows: Any, length: int) -> Any:
+    """What such rows hold, (rows, length)."""
+    return rows.reshape(len(rows), -1)[:, :length]
+
+
+@ti.func
+@no_type_check
+def larger(a, b):
+    """As ``ti.max`` of vectors; one instruction, where that looks for NaN as well."""
+    return ti.select(a > b, a, b)
+
+
+@ti.func
+@no_type_check
+def smaller(a, b):
+    """As ``ti.min``, likewise."""
+    return ti.select(a < b, a, b)
 
 
 @contextmanager

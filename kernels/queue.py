@@ -3,10 +3,8 @@
 from functools import cache
 from typing import Any, no_type_check
 
-from .backend import SLICE, BoundKernel, ti
+from .backend import F64_LANES, SLICE, BoundKernel, ti
 
-LANES = 8
-"""Data centers that are computed at a time."""
 TASK_BLOCKS = 32
 """Vectors side by side in a row that one task takes on."""
 SERIAL_UP_TO = 512
@@ -27,12 +25,12 @@ def queue_kernel() -> Any:
     rows of many data centers side by side, as they lie in memory.
 
     Arguments: whether one thread does it; negligible work; number of data centers, B; row of the
-    queue that is due when the next step starts, (B,), L for none; the queues before, L rows of
-    vectors of LANES data centers; the work taken and deferred, (B,); room for three such rows. For
-    the results: the queues after, and four rows, (4, B): work that waits, what of it will be due,
-    the age of the oldest work and the mean age in steps.
+    queue that is due when the next step starts, (B,), L for none; the queues before, L
+    ``backend.vector_rows`` of data centers; the work taken and deferred, (B,); room for three such
+    rows. For the results: the queues after, and four rows, (4, B): work that waits, what of it will
+    be due, the age of the oldest work and the mean age in steps.
     """
-    blocks = ti.types.ndarray(dtype=ti.types.vector(LANES, ti.f64), ndim=2)
+    blocks = ti.types.ndarray(dtype=ti.types.vector(F64_LANES, ti.f64), ndim=2)
     rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
     reals = ti.types.ndarray(dtype=ti.f64, ndim=1)
     ints = ti.types.ndarray(dtype=ti.i32, ndim=1)
@@ -58,13 +56,13 @@ def queue_kernel() -> Any:
                 first = at // SLICE * TASK_BLOCKS
                 end = ti.min(first + TASK_BLOCKS, before.shape[1])
                 last = before.shape[0] - 1
-                zeros = ti.Vector([ti.f64(0.0)] * LANES)
+                zeros = ti.Vector([ti.f64(0.0)] * F64_LANES)
                 ones = zeros + ti.f64(1.0)
                 limit = zeros + negligible
                 for block in range(first, end):
                     out = zeros
-                    for i in range(LANES):
-                        out[i] = taken[ti.min(block * LANES + i, n - 1)]
+                    for i in range(F64_LANES):
+                        out[i] = taken[ti.min(block * F64_LANES + i, n - 1)]
                     room[0, block] = out
                     room[1, block] = zeros
                     room[2, block] = zeros
@@ -80,13 +78,13 @@ def queue_kernel() -> Any:
                         room[2, block] = room[2, block] + ti.select(waits, left, zeros)
                 for block in range(first, end):
                     new = zeros
-                    for i in range(LANES):
-                        new[i] = deferred[ti.min(block * LANES + i, n - 1)]
+                    for i in range(F64_LANES):
+                        new[i] = deferred[ti.min(block * F64_LANES + i, n - 1)]
                     total = after[last - 1, block] + new
                     after[last, block] = total
                     aged, waited = room[1, block], room[2, block]
-                    for i in range(LANES):
-                        b = block * LANES + i
+                    for i in range(F64_LANES):
+                        b = block * F64_LANES + i
                         if b < n:
                             found[0, b] = total[i]
                             found[1, b] = ti.f64(0.0)

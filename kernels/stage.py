@@ -2,7 +2,7 @@
 
 A stage is a plain function whose arrays all have one entry per data center. It is called once with
 quantities that write down what is done to them; from that record a kernel is made, which computes
-LANES entries at a time, as vectors of the processor, and keeps nothing in between. Whatever the
+F64_LANES entries at a time, as vectors of the processor, and keeps nothing in between. Whatever the
 stage reads apart from its arguments is taken as constant. NumPy needs a call and a temporary per
 operation, and some hundred of them cost more than the arithmetic unless there are thousands of data
 centers.
@@ -19,19 +19,14 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from .backend import SLICE, BoundKernel, aligned, ti
+from .backend import F64_LANES, SLICE, BoundKernel, held, larger, smaller, ti, vector_rows
 
 Arrays = Mapping[str, Any]
 
-LANES = 8
 SERIAL_UP_TO = 4096
 """Entries that one thread computes sooner than several are woken."""
 _TASK_BLOCKS = 32
 """Vectors that one task computes."""
-_SAME_SETS = 64
-"""Rows that are multiples of 4 KiB apart compete for the same sets of the cache, and a stage reads
-and writes a hundred of them at a time: twice as slow. Such rows get a block more."""
-
 _LONGEST_TERM = 80
 """Letters of a quantity that is written within another."""
 
@@ -77,8 +72,6 @@ class CompiledStage:
 
     def __init__(self, stage: Callable[..., Arrays], size: int) -> None:
         self._stage, self._size = stage, size
-        blocks = -(-size // LANES)
-        self._blocks = blocks + (blocks % _SAME_SETS == 0)
         self._kernel: BoundKernel | None = None
 
     def __call__(self, **given: npt.NDArray[np.float64]) -> dict[str, npt.NDArray[np.float64]]:
@@ -94,23 +87,15 @@ class CompiledStage:
         if tuple(given) != self._names:
             raise TypeError(f"arguments {[*given]}, expected {[*self._names]} as on the first call")
         self._given[:] = self._stacked([*given.values()])
-        out = self._empty(len(self._results))
+        out = vector_rows(len(self._results), self._size)
         serial = self._size <= SERIAL_UP_TO
         self._kernel(serial, self._shared, self._constants, self._inputs, out)
-        return self._entries(out)
+        entries: npt.NDArray[np.float64] = held(out, self._size)
+        return entries
 
     def _stacked(self, arrays: list[Any]) -> npt.NDArray[np.float64]:
         """One array of these, faster than by ``np.stack``."""
         return np.concatenate(arrays, dtype=np.float64).reshape(len(arrays), self._size)
-
-    def _empty(self, rows: int) -> Any:
-        """Rows of any content as the kernel takes them, (rows, blocks, LANES)."""
-        return aligned((rows, self._blocks, LANES), np.float64)
-
-    def _entries(self, rows: Any) -> npt.NDArray[np.float64]:
-        """What such rows hold, (rows, n)."""
-        held: npt.NDArray[np.float64] = rows.reshape(len(rows), -1)[:, : self._size]
-        return held
 
     def _compile(self, names: tuple[str, ...]) -> None:
         record = _Record(self._size)
@@ -119,11 +104,13 @@ class CompiledStage:
         self._names, self._results = names, tuple(results)
         self._shared = np.array([*record.shared, 0.0])
         constants = record.constants or [np.zeros(self._size)]
-        self._constants, self._inputs = self._empty(len(constants)), self._empty(len(names))
+        self._constants, self._inputs = (
+            vector_rows(len(x), self._size) for x in (constants, names)
+        )
         for rows in (self._constants, self._inputs):
             rows[:] = 0.0
-        self._entries(self._constants)[:] = self._stacked(constants)
-        self._given = self._entries(self._inputs)
+        held(self._constants, self._size)[:] = self._stacked(constants)
+        self._given = held(self._inputs, self._size)
         source = _source(record.lines(list(results.values())))
         self._kernel = BoundKernel(_kernel(source), templates=1)
 
@@ -271,21 +258,9 @@ def _source(body: list[str]) -> str:
         f"        if at % {SLICE} == 0:\n"
         f"            first = at // {SLICE} * {_TASK_BLOCKS}\n"
         f"            for i in range(first, ti.min(first + {_TASK_BLOCKS}, out.shape[1])):\n"
-        f"                zeros = ti.Vector([ti.f64(0.0)] * {LANES})\n"
+        f"                zeros = ti.Vector([ti.f64(0.0)] * {F64_LANES})\n"
     )
     return head + "".join(f"                {line}\n" for line in body)
-
-
-@ti.func
-@no_type_check
-def _larger(a, b):
-    return ti.select(a > b, a, b)
-
-
-@ti.func
-@no_type_check
-def _smaller(a, b):
-    return ti.select(a < b, a, b)
 
 
 @ti.func
@@ -298,7 +273,7 @@ def _minus(a):
 @no_type_check
 def _each_exp(a):
     out = a
-    for i in range(LANES):
+    for i in range(F64_LANES):
         out[i] = ti.exp(a[i])
     return out
 
@@ -312,9 +287,9 @@ def _kernel(source: str) -> Any:
     scope = {
         "ti": ti,
         "Reals": ti.types.ndarray(dtype=ti.f64, ndim=1),
-        "Rows": ti.types.ndarray(dtype=ti.types.vector(LANES, ti.f64), ndim=2),
-        "larger": _larger,
-        "smaller": _smaller,
+        "Rows": ti.types.ndarray(dtype=ti.types.vector(F64_LANES, ti.f64), ndim=2),
+        "larger": larger,
+        "smaller": smaller,
         "minus": _minus,
         "each_exp": _each_exp,
         "__name__": __name__,

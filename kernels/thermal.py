@@ -16,7 +16,7 @@ from math import factorial
 from types import SimpleNamespace
 from typing import Any, no_type_check
 
-from .backend import SLICE, ti
+from .backend import SLICE, larger, smaller, ti
 
 HALL_TEMPLATES = 4
 """Template arguments of ``hall_kernel``, which come first."""
@@ -305,17 +305,6 @@ def hall_kernel(precision: str) -> Any:
     runs_1d = ti.types.ndarray(dtype=ti.types.vector(RUN_LANES, real), ndim=1)
     mix_1d = ti.types.ndarray(dtype=ti.types.vector(SOURCES * LANES, real), ndim=1)
     doubles_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
-
-    @ti.func
-    @no_type_check
-    def larger(a, b):
-        """As ``ti.max`` of vectors; one instruction, where that looks for NaN as well."""
-        return ti.select(a > b, a, b)
-
-    @ti.func
-    @no_type_check
-    def smaller(a, b):
-        return ti.select(a < b, a, b)
 
     @ti.func
     @no_type_check

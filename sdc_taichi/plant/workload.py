@@ -194,14 +194,15 @@ class Queue:
             taken: work that leaves it, oldest first, (B,).
             deferred: work that enters it, (B,).
         """
+        from sdc_taichi.kernels.backend import held, vector_rows
         from sdc_taichi.kernels.queue import SERIAL_UP_TO, bound_queue_kernel
 
         if self._kernel is None:
             runtime.ensure_started()
-            self._kernel, self._room = bound_queue_kernel(), self._empty(3)
+            self._kernel, self._room = bound_queue_kernel(), vector_rows(3, self._size)
         if queue is not self._known:
             self._take(queue)
-        after, found = self._empty(self._length), np.empty((4, self._size))
+        after, found = vector_rows(self._length, self._size), np.empty((4, self._size))
         self._kernel(
             self._size <= SERIAL_UP_TO,
             _NEGLIGIBLE_TASKS,
@@ -215,29 +216,17 @@ class Queue:
             found,
         )
         waiting, due, oldest_steps, mean_steps = found
-        self._rows, self._known = after, self._seen(after)
+        self._rows, self._known = after, held(after, self._size).T
         self._start = waiting, due
         return Queued(self._known, waiting, due, oldest_steps, mean_steps)
 
-    def _empty(self, rows: int) -> Any:
-        """Rows of any content for the kernel, (rows, blocks of data centers, LANES)."""
-        from sdc_taichi.kernels.backend import aligned
-        from sdc_taichi.kernels.queue import LANES
-
-        blocks = -(-self._size // LANES)
-        # Rows that are multiples of 4 KiB apart compete for the same sets of the cache.
-        blocks += blocks % (4096 // (8 * LANES)) == 0
-        return aligned((rows, blocks, LANES), np.float64)
-
-    def _seen(self, rows: Any) -> F64:
-        seen: F64 = rows.reshape(self._length, -1)[:, : self._size].T
-        return seen
-
     def _take(self, queue: F64) -> None:
         """Go on from a queue that was not left by the last step."""
-        self._rows = self._empty(self._length)
+        from sdc_taichi.kernels.backend import held, vector_rows
+
+        self._rows = vector_rows(self._length, self._size)
         self._rows[:] = 0.0
-        self._seen(self._rows)[:] = queue
+        held(self._rows, self._size)[:] = queue.T
         self._known = queue
 
     def forget(self) -> None:
