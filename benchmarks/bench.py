@@ -314,7 +314,7 @@ def wall_s(call: Callable[[], object], repeats: int) -> float:
 
 
 def free_bytes() -> int:
-    """Memory that is free; without a way to know, none."""
+    """Memory that is free; where the system does not tell, a GiB is assumed."""
     try:
         found = re.search(r"MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text())
     except OSError:

@@ -2,7 +2,7 @@
 
 Both take the groups of a fleet, compute each once and store inlet, outlet and power of every
 server, with sums over racks and data centers. Where every server is a group of its own, their loop
-over servers is vectorised. Both are free to reorder floating-point sums, as the kernel is.
+over servers is vectorised. Both are free to reorder floating-point sums, which the kernel is not.
 """
 
 import ctypes

@@ -237,19 +237,20 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     _shared(listed, "simulation.substep_s")
     # One queue array serves the fleet; ages are read off its length.
     _shared(listed, "workload.age_horizon_h")
-    # Data centers that share these sections share one hall, which is laid out once.
+    # Data centers that share what a hall is made of share one hall, which is laid out once.
     cache: dict[Any, _HallArrays] = {}
     # Copies share the sections themselves; comparing those takes a while where servers differ.
     known: dict[Any, _HallArrays] = {}
     halls = []
     for config in listed:
-        sections = (config.hall, config.servers, config.hvac)
-        key = tuple(map(id, sections))
-        if key not in known:
-            if sections not in cache:
-                cache[sections] = _hall_arrays(config)
-            known[key] = cache[sections]
-        halls.append(known[key])
+        same = tuple(map(id, (config.hall, config.servers, config.hvac)))
+        if same not in known:
+            setpoint = config.hvac.setpoint
+            made_of = config.hall, config.servers, config.hvac.crac, setpoint.min_c, setpoint.max_c
+            if made_of not in cache:
+                cache[made_of] = _hall_arrays(config)
+            known[same] = cache[made_of]
+        halls.append(known[same])
     racks = np.array([len(h.groups_per_rack) for h in halls])
     return Fleet(
         configs=listed,

@@ -6,6 +6,7 @@ import contextlib
 import io
 import os
 import sys
+import threading
 
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 
@@ -29,7 +30,8 @@ def ensure_started() -> int:
     """Start the runtime when none exists and return its number of threads.
 
     A runtime that another library started is used as it is: a second start would destroy the
-    fields of the first. ``SDC_TAICHI_THREADS`` limits the threads of a runtime started here.
+    fields of the first. One started here has a thread for each processor that the process may
+    use, or ``SDC_TAICHI_THREADS``.
 
     Raises:
         RuntimeStateError: in a child forked after the start, where Taichi would hang.
@@ -45,12 +47,17 @@ def ensure_started() -> int:
     from sdc_taichi.kernels.backend import ti
 
     if ti.lang.impl.get_runtime().prog is None:
-        options = {"cpu_max_num_threads": _thread_limit()} if _thread_limit() else {}
         before = _thread_ids()
         # ti.init prints a banner, which would end up in a user's piped output.
         with contextlib.redirect_stdout(io.StringIO()):
-            ti.init(arch=ti.cpu, offline_cache=True, log_level=ti.ERROR, **options)
-        _bind(_thread_ids() - before, ti.lang.impl.current_cfg().cpu_max_num_threads)
+            ti.init(
+                arch=ti.cpu,
+                offline_cache=True,
+                log_level=ti.ERROR,
+                cpu_max_num_threads=_thread_limit() or len(_processors()),
+            )
+        others = {thread.native_id for thread in threading.enumerate()}
+        _bind(_thread_ids() - before - others, ti.lang.impl.current_cfg().cpu_max_num_threads)
     # Starting makes another object of the runtime.
     program = ti.lang.impl.get_runtime().prog
     if _known[0] is not program:
@@ -66,15 +73,22 @@ def _thread_ids() -> set[int]:
         return set()
 
 
+def _processors() -> list[int]:
+    """Those that this process may use, which Taichi would not ask."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
 def _bind(started: set[int], threads: int) -> None:
     """Bind Taichi's threads to one processor each.
 
     Linux tends to wake all of them on the processor of the thread that waits for them, and moves
-    them apart some milliseconds later, when the step is done. Threads fewer than processors are
-    left alone: those of other processes would be bound to the same ones.
+    them apart some milliseconds later, when the step is done. Where threads are fewer or more than
+    processors, they are left to the system, which also serves processes beside this one.
     """
-    processors = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    if threads != len(processors):
+    processors = _processors()
+    if threads != len(processors) or not hasattr(os, "sched_setaffinity"):
         return
     # Those that compute are created one after the other, so no two of them meet.
     for i, thread in enumerate(sorted(started)):

@@ -20,6 +20,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.config import apply_overrides, config_from_dict
 from sdc_taichi.hall import Conditions, Hall
+from sdc_taichi.hall_start import Start, find_start
 from sdc_taichi.kernels.thermal import DC_ROWS, GROUP_ROWS
 from sdc_taichi.plant.water_side import Design
 
@@ -99,6 +100,26 @@ def test_values_of_a_field() -> None:
     assert np.array_equal(fleet.values("workload.deadline_h"), [24, np.nan], equal_nan=True)
     assert np.array_equal(fleet.values("battery.capacity_kwh"), [np.nan, 5], equal_nan=True)
     assert fleet.values("hvac.tower.economiser").tolist() == [1, 1]
+
+
+def test_what_is_no_part_of_a_hall_makes_no_other_hall(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall = load_config("corrected")
+    laid_out = []
+
+    def find(config: DataCenterConfig, *parts: Any) -> Start:
+        laid_out.append(config.name)
+        return find_start(config, *parts)
+
+    monkeypatch.setattr("sdc_taichi.fleet.find_start", find)
+    build_fleet(
+        [
+            named(hall, "first"),
+            named(hall, "same", "hvac.setpoint.initial_c=18", "hvac.chiller.reference_cop=7"),
+            named(hall, "warmer", "hvac.setpoint.max_c=24"),
+            named(hall, "more air", "hvac.crac.supply_m3s_per_w=6e-5"),
+        ]
+    )
+    assert laid_out == ["first", "warmer", "more air"]
 
 
 @pytest.mark.parametrize(

@@ -604,6 +604,19 @@ def test_as_many_threads_as_processors_are_bound_to_one_each() -> None:
             assert all(bound == processors for bound in allowed)
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system binds no threads")
+def test_there_are_as_many_threads_as_processors_that_may_be_used() -> None:
+    code = (
+        "import os; os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1]);"
+        "from sdc_taichi import runtime; print(runtime.ensure_started())"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "SDC_TAICHI_THREADS"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, timeout=120, check=True
+    )
+    assert done.stdout.split() == [b"1"]
+
+
 def test_memory_does_not_grow_with_simulators_made_and_closed() -> None:
     configs = [load_config("tiny"), load_config("corrected")]
     drivers = short_drivers(steps=4)
