@@ -17,6 +17,7 @@ from types import SimpleNamespace
 from typing import Any, no_type_check
 
 from .backend import SLICE, larger, smaller, ti
+from .elementary import log_and_exp
 
 HALL_TEMPLATES = 4
 """Template arguments of ``hall_kernel``, which come first."""
@@ -266,7 +267,9 @@ def hall_kernel(precision: str) -> Any:
 
     Outlets: ``server`` is T + P/(rho*cp*V) per group, ``rack`` the same with the rack's sums, and
     ``released`` the rack fit T + 1.918*P^1.096/(0.526*rho*cp*V^0.824) - 14.01 of the released
-    SustainDC, whose constants come in as ``constants``, followed by ``decay_constants``.
+    SustainDC, whose constants come in as ``constants``, followed by ``decay_constants``. Its
+    exponents are given over 1: P^1.096 / V^0.824 is P/V exp(0.096 log P + 0.176 log V), whose
+    exponential is of small numbers and loses no digits.
 
     ``transient``: a sweep is a substep. Servers follow C dT/dt = P_cpu - eps K (T - T_in); the
     recirculated air before a rack follows its mix with the time constant of its share of the room
@@ -289,6 +292,7 @@ def hall_kernel(precision: str) -> Any:
     """
     real = _real(precision)
     series_terms = SERIES_TERMS[precision]
+    log_of, exp_of = log_and_exp(precision, LANES)
     n_rows, n_values = len(GROUP_ROWS), len(GROUP_OUT)
     n_terms, n_of_block = len(TERMS), len(BLOCK_TERMS)
     of_racks, of_steps = len(RACK_OUT) - 1, SUM.flow_m3s
@@ -1249,11 +1253,7 @@ def hall_kernel(precision: str) -> Any:
                         if exponent == real(3.0):
                             turns = y * y * y
                         elif exponent != real(1.0):
-                            powers, lane = y, 0
-                            while lane < block_ints[BLOCK.racks, block]:
-                                powers[lane] = ti.pow(y[lane], exponent)
-                                lane += step
-                            turns = powers
+                            turns = y * exp_of(log_of(y) * (exponent - real(1.0)))
                         if ti.static(write):
                             flow_1 = y * per_speed_m3s
                             cpu_1, fan_1 = powered * draws, turns * per_speed_w
@@ -1318,11 +1318,8 @@ def hall_kernel(precision: str) -> Any:
                             outlet = mean + (cpu + fan) * per_flow * per_air
                         else:
                             drawn = cpu + fan
-                            fit, lane = zeros, 0
-                            while lane < block_ints[BLOCK.racks, block]:
-                                moved = ti.pow(ti.max(flow[lane], real(1e-30)), constants[3])
-                                fit[lane] = ti.pow(drawn[lane], constants[1]) / moved
-                                lane += step
+                            rest = log_of(drawn) * constants[1] - log_of(flow) * constants[3]
+                            fit = drawn * per_flow * exp_of(rest)
                             outlet = mean + fit * (constants[0] / (constants[2] * air))
                             outlet += constants[4]
                     outlet = ti.select(flow > real(0.0), outlet, mean)

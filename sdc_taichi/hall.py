@@ -18,8 +18,9 @@ from sdc_taichi.types import F64, Reals, ServerLayers
 
 Precision = Literal["f32", "f64"]
 
-_RELEASED_OUTLET_FIT = (1.918, 1.096, 0.526, 0.824, -14.01)
-"""Rack outlet fit of the released SustainDC: factor, power exponent, divisor, flow exponent, K."""
+_RELEASED_OUTLET_FIT = (1.918, 1.096 - 1.0, 0.526, 0.824 - 1.0, -14.01)
+"""Rack outlet fit of the released SustainDC: factor, exponent of power over 1, divisor, exponent of
+flow over 1, K."""
 
 _SERIAL_GROUPS = 8192
 """So many groups, or of layers servers, and less are not worth waking a second thread."""
