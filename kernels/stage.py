@@ -20,6 +20,7 @@ import numpy.typing as npt
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from .backend import F64_LANES, SLICE, BoundKernel, held, larger, smaller, ti, vector_rows
+from .elementary import log_and_exp
 
 Arrays = Mapping[str, Any]
 
@@ -39,7 +40,7 @@ _NUMBERS = {
     np.minimum: "smaller({}, {})",
     np.negative: "minus({})",
     np.sqrt: "ti.sqrt({})",
-    np.exp: "each_exp({})",
+    np.exp: "exp_of({})",
     np.floor: "ti.floor({})",
     np.ceil: "minus(ti.floor(minus({})))",
 }
@@ -269,15 +270,6 @@ def _minus(a):
     return a * ti.f64(-1.0)
 
 
-@ti.func
-@no_type_check
-def _each_exp(a):
-    out = a
-    for i in range(F64_LANES):
-        out[i] = ti.exp(a[i])
-    return out
-
-
 @cache
 def _kernel(source: str) -> Any:
     """The Taichi kernel of this source, compiled once for all fleets whose stages are the same."""
@@ -291,7 +283,7 @@ def _kernel(source: str) -> Any:
         "larger": larger,
         "smaller": smaller,
         "minus": _minus,
-        "each_exp": _each_exp,
+        "exp_of": log_and_exp("f64", F64_LANES)[1],
         "__name__": __name__,
     }
     exec(compile(source, name, "exec"), scope)
