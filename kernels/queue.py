@@ -7,6 +7,8 @@ from .backend import F64_LANES, SLICE, BoundKernel, ti
 
 TASK_BLOCKS = 32
 """Vectors side by side in a row that one task takes on."""
+TASK_ROWS = 8
+"""Rows that a task goes through at a time; twice as many compete for the same sets of the cache."""
 SERIAL_UP_TO = 512
 """Data centers that one thread computes sooner than several are woken."""
 
@@ -21,8 +23,8 @@ def queue_kernel() -> Any:
     """Kernel that takes work out of the queue, puts new work in, and reads the ages.
 
     Row k of the queues is the work still queued that was put in by the end of step k, oldest first.
-    Work of no more than ``negligible`` is left by rounding, and has no age. A task goes through the
-    rows of many data centers side by side, as they lie in memory.
+    Work of no more than ``negligible`` is left by rounding, and has no age. A task goes through a
+    few rows of many data centers at a time, side by side as they lie in memory.
 
     Arguments: whether one thread does it; negligible work; number of data centers, B; row of the
     queue that is due when the next step starts, (B,), L for none; the queues before, L
@@ -66,16 +68,21 @@ def queue_kernel() -> Any:
                     room[0, block] = out
                     room[1, block] = zeros
                     room[2, block] = zeros
-                for k in range(last):
+                for rows_at in range((last + (TASK_ROWS - 1)) // TASK_ROWS):
+                    row = rows_at * TASK_ROWS
                     for block in range(first, end):
-                        left = before[k + 1, block] - room[0, block]
-                        left = ti.select(left > zeros, left, zeros)
-                        after[k, block] = left
-                        # Work of the newest step has age 0; older work counts once per step it has
-                        # waited.
-                        waits = left > limit
-                        room[1, block] = room[1, block] + ti.select(waits, ones, zeros)
-                        room[2, block] = room[2, block] + ti.select(waits, left, zeros)
+                        out, aged, waited = room[0, block], room[1, block], room[2, block]
+                        for k in range(row, ti.min(row + TASK_ROWS, last)):
+                            left = before[k + 1, block] - out
+                            left = ti.select(left > zeros, left, zeros)
+                            after[k, block] = left
+                            # Work of the newest step has age 0; older work counts once per step it
+                            # has waited.
+                            waits = left > limit
+                            aged += ti.select(waits, ones, zeros)
+                            waited += ti.select(waits, left, zeros)
+                        room[1, block] = aged
+                        room[2, block] = waited
                 for block in range(first, end):
                     new = zeros
                     for i in range(F64_LANES):
