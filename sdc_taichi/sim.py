@@ -40,7 +40,7 @@ from sdc_taichi.types import (
 )
 from sdc_taichi.whole_file import whole_file
 
-SNAPSHOT_VERSION = 2
+SNAPSHOT_VERSION = 3
 _NONE = np.zeros(0)
 _MEMORY = tuple(f.name for f in fields(HallState))
 _NO_MEMORY = dict.fromkeys(_MEMORY, _NONE)
@@ -213,7 +213,6 @@ class Simulator:
             setpoint_c=setpoint_c,
             cooling_run=np.zeros(fleet.units, dtype=np.int64),
             cooling_last=np.full(fleet.units, np.nan),
-            cooling_scale=np.ones(fleet.units),
             fan_speed=np.ones(fleet.units),
             queue=np.zeros((b, self._queue_length)),
             stored_kwh=v("battery.initial_soc") * self.sizing.battery_kwh,
@@ -280,12 +279,11 @@ class Simulator:
         utilisation = work["utilisation"]
         placed = floor.place(utilisation, capacity, powered, state.group_inlet_c, given.placement)
 
-        setpoint_c, run, last, scale = self._setpoint_model(
+        setpoint_c, run, last = self._setpoint_model(
             state.setpoint_c,
             cooling_command,
             state.cooling_run,
             state.cooling_last,
-            state.cooling_scale,
             **self._setpoint,
         )
         unit_up, running = None, self._all_units
@@ -354,7 +352,6 @@ class Simulator:
             setpoint_c=setpoint_c,
             cooling_run=run,
             cooling_last=last,
-            cooling_scale=scale,
             fan_speed=fan_speed,
             queue=queued.queue,
             # Not the rows themselves, which would keep all results of the step.

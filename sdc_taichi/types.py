@@ -105,8 +105,6 @@ class State:
     """Equal non-zero cooling commands in a row, (U,)."""
     cooling_last: F64
     """Last cooling command, (U,)."""
-    cooling_scale: F64
-    """Acceleration of the setpoint step, (U,)."""
     fan_speed: F64
     """Controlled speed of each CRAC fan over design speed, (U,)."""
     queue: F64

@@ -22,10 +22,10 @@ def follow(
 ) -> list[float]:
     """Setpoints of a row of commands."""
     setpoint, found = one(start_c), []
-    run, last, scale = np.zeros(1, dtype=np.int64), one(np.nan), np.ones(1)
+    run, last = np.zeros(1, dtype=np.int64), one(np.nan)
     for command in commands:
-        setpoint, run, last, scale = SETPOINTS[model](
-            setpoint, one(command), run, last, scale,
+        setpoint, run, last = SETPOINTS[model](
+            setpoint, one(command), run, last,
             step_k=one(1.0), low_c=one(low), high_c=one(high),
         )  # fmt: skip
         found.append(float(setpoint[0]))
@@ -78,7 +78,6 @@ def test_setpoints_move_in_steps_of_their_own_size() -> None:
         np.array([1.0, -2.0, 0.5]),
         np.zeros(3, dtype=np.int64),
         np.full(3, np.nan),
-        np.ones(3),
         step_k=np.array([1.0, 0.5, 3.0]),
         low_c=np.array([16.0, 19.5, 16.0]),
         high_c=np.array([23.0, 23.0, 21.0]),

@@ -685,14 +685,13 @@ def check_setpoint(check: Check) -> Values:
     v = preset_fleet_values(preset_of(check))
     move = cooling.SETPOINTS[load_config(preset_of(check)).hvac.setpoint.model]
     setpoint, found = np.array([float(given["start"])]), []
-    run, last, scale = np.zeros(1, dtype=np.int64), np.array([np.nan]), np.ones(1)
+    run, last = np.zeros(1, dtype=np.int64), np.array([np.nan])
     for action in given["actions"]:
-        setpoint, run, last, scale = move(
+        setpoint, run, last = move(
             setpoint,
             np.array([float(COOLING[action].value)]),
             run,
             last,
-            scale,
             step_k=v("hvac.setpoint.step_k"),
             low_c=v("hvac.setpoint.min_c"),
             high_c=v("hvac.setpoint.max_c"),

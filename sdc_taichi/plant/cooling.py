@@ -8,7 +8,7 @@ import numpy as np
 
 from sdc_taichi.types import F64, I64
 
-SetpointModel = Callable[..., tuple[F64, I64, F64, F64]]
+SetpointModel = Callable[..., tuple[F64, I64, F64]]
 
 
 def symmetric_setpoint(
@@ -16,12 +16,11 @@ def symmetric_setpoint(
     command: F64,
     run: I64,
     last: F64,
-    scale: F64,
     *,
     step_k: F64,
     low_c: F64,
     high_c: F64,
-) -> tuple[F64, I64, F64, F64]:
+) -> tuple[F64, I64, F64]:
     """Move the setpoint by ``command`` steps within its range.
 
     Args:
@@ -29,16 +28,15 @@ def symmetric_setpoint(
         command: steps to move, (B,).
         run: unused by this model, carried on, (B,).
         last: last command, (B,).
-        scale: unused by this model, carried on, (B,).
         step_k: size of a step, (B,).
         low_c: lowest setpoint, (B,).
         high_c: highest setpoint, (B,).
 
     Returns:
-        The new setpoint, run, last command and scale, each (B,).
+        The new setpoint, run and last command, each (B,).
     """
     moved_c = np.minimum(np.maximum(setpoint_c + command * step_k, low_c), high_c)
-    return moved_c, run, command, scale
+    return moved_c, run, command
 
 
 def accelerating_setpoint(
@@ -46,12 +44,11 @@ def accelerating_setpoint(
     command: F64,
     run: I64,
     last: F64,
-    scale: F64,
     *,
     step_k: F64,
     low_c: F64,
     high_c: F64,
-) -> tuple[F64, I64, F64, F64]:
+) -> tuple[F64, I64, F64]:
     """The released SustainDC rule: from the fourth equal command in a row each step grows by one.
 
     Lowering never accelerates there, because the code compares the action's index with the change
@@ -59,9 +56,9 @@ def accelerating_setpoint(
     """
     goes_on = (command == last) & (command >= 0)
     run = run * goes_on + 1
-    scale = 1.0 + (scale - 1.0) * goes_on + (run > 3)
-    moved_c = np.minimum(np.maximum(setpoint_c + command * step_k * scale, low_c), high_c)
-    return moved_c, run, command, scale
+    steps = command * np.maximum(run - 2, 1)
+    moved_c = np.minimum(np.maximum(setpoint_c + steps * step_k, low_c), high_c)
+    return moved_c, run, command
 
 
 SETPOINTS: dict[str, SetpointModel] = {
