@@ -26,7 +26,8 @@ def queue_kernel() -> Any:
     Work of no more than ``negligible`` is left by rounding, and has no age. A task goes through a
     few rows of many data centers at a time, side by side as they lie in memory.
 
-    Arguments: whether one thread does it; negligible work; number of data centers, B; row of the
+    Arguments: whether one thread does it; negligible work; number of data centers, B; 1, which
+    compilers cannot know, so that they make no copies of the loop that advances by it; row of the
     queue that is due when the next step starts, (B,), L for none; the queues before, L
     ``backend.vector_rows`` of data centers; the work taken and deferred, (B,); room for three such
     rows. For the results: the queues after, and four rows, (4, B): work that waits, what of it will
@@ -43,6 +44,7 @@ def queue_kernel() -> Any:
         serial: ti.template(),
         negligible: ti.f64,
         n: ti.i32,
+        step: ti.i32,
         due_row: ints,
         before: blocks,
         taken: reals,
@@ -72,7 +74,8 @@ def queue_kernel() -> Any:
                     row = rows_at * TASK_ROWS
                     for block in range(first, end):
                         out, aged, waited = room[0, block], room[1, block], room[2, block]
-                        for k in range(row, ti.min(row + TASK_ROWS, last)):
+                        k = row
+                        while k < ti.min(row + TASK_ROWS, last):
                             left = before[k + 1, block] - out
                             left = ti.select(left > zeros, left, zeros)
                             after[k, block] = left
@@ -81,6 +84,7 @@ def queue_kernel() -> Any:
                             waits = left > limit
                             aged += ti.select(waits, ones, zeros)
                             waited += ti.select(waits, left, zeros)
+                            k += step
                         room[1, block] = aged
                         room[2, block] = waited
                 for block in range(first, end):

@@ -207,6 +207,7 @@ class Queue:
             self._size <= SERIAL_UP_TO,
             _NEGLIGIBLE_TASKS,
             self._size,
+            1,
             self._due_row,
             self._rows,
             taken,
