@@ -6,6 +6,7 @@ import linecache
 import math
 import os
 import threading
+from collections import namedtuple
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, no_type_check
@@ -87,6 +88,71 @@ def larger(a, b):
 def smaller(a, b):
     """As ``ti.min``, likewise."""
     return ti.select(a < b, a, b)
+
+
+class Table:
+    """Arrays of named rows within a kernel: ``table[i].name``, to read and to assign.
+
+    Arrays of two dimensions have a row for each name; in those of one dimension the values of an
+    item stand next to each other.
+
+    Args:
+        parts: names of the rows of each array, and the array.
+        apart: places from an item to the next in arrays of one dimension; None for no gaps.
+    """
+
+    _data_oriented = True
+    """By this Taichi hands objects on as they are; those of :class:`Item` likewise."""
+
+    def __init__(self, *parts: tuple[tuple[str, ...], Any], apart: int | None = None) -> None:
+        self._places: dict[str, tuple[Any, int, int]] = {}
+        for names, array in parts:
+            length = 0 if len(array.shape) > 1 else apart or len(names)
+            self._places |= {name: (array, row, length) for row, name in enumerate(names)}
+
+    def __getitem__(self, i: Any) -> "Item":
+        return Item(self._places, local(i))
+
+
+class Item:
+    """The values of one item of a :class:`Table`; every use reads or writes the array anew."""
+
+    _data_oriented = True
+
+    def __init__(self, places: dict[str, tuple[Any, int, int]], i: Any) -> None:
+        self._places, self._i = places, i
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in self._places:
+            raise AttributeError(f"{name}; known are {', '.join(self._places)}")
+        array, row, length = self._places[name]
+        at = (self._i * length + row,) if length else (row, self._i)
+        return ti.lang.impl.subscript(None, array, *at)
+
+
+def local(value: Any) -> Any:
+    """A copy of a number within a kernel, whose arguments are otherwise read at every use."""
+    return ti.lang.impl.expr_init(value) if isinstance(value, ti.lang.expr.Expr) else value
+
+
+def shared(**values: Any) -> Any:
+    """What the functions of a kernel share, by name; to be called within ``ti.static``."""
+    values = {name: local(value) for name, value in values.items()}
+    return namedtuple("Shared", values)(**values)
+
+
+def reals(precision: str) -> Any:
+    """Type of the numbers of a kernel in ``f32`` or ``f64``."""
+    return {"f32": ti.f32, "f64": ti.f64}[precision]
+
+
+@ti.func
+@no_type_check
+def part_of(part, parts, items):
+    """First of the items of one of equal parts, and the end of the last."""
+    first = ti.cast(ti.cast(part, ti.i64) * items // parts, ti.i32)
+    end = ti.cast((ti.cast(part, ti.i64) + 1) * items // parts, ti.i32)
+    return first, end
 
 
 @contextmanager

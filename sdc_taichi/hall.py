@@ -146,14 +146,18 @@ class Hall:
 
     def __init__(self, fleet: Fleet, precision: Precision) -> None:
         threads = runtime.ensure_started()
-        from sdc_taichi.kernels import thermal
+        from sdc_taichi.kernels import decay, hall, layers, thermal
         from sdc_taichi.kernels.backend import BoundKernel, aligned
 
         self._thermal, self._empty = thermal, aligned
         self._precision: Precision = precision
         self._dtype = np.dtype(np.float32 if precision == "f32" else np.float64)
         self._fleet = fleet
-        self._kernel = BoundKernel(thermal.hall_kernel(precision), thermal.HALL_TEMPLATES)
+        self._kernel = BoundKernel(hall.hall_kernel(precision), hall.TEMPLATES)
+        self._layers_kernel = BoundKernel(layers.layers_kernel(precision), layers.TEMPLATES)
+        self._constants = self._real(
+            np.array([*_RELEASED_OUTLET_FIT, *decay.decay_constants(precision)])
+        )
         self._outlet_model = thermal.OUTLETS.index(fleet.models["outlet"])
         self._recirculates = fleet.air is not None
         self._lay_out_racks(thermal, 8 * threads)
@@ -164,9 +168,8 @@ class Hall:
         self._terms = self._lanes(self._slices * thermal.SCRATCH)
         squares = self._slices * -(-self._most_groups // thermal.LANES)
         values = self._empty((len(thermal.GROUP_OUT), squares, thermal.SQUARE), self._dtype)
-        by_group = values.reshape(len(values), -1, thermal.LANES)
-        self._group_values = (self._tables.reshape(-1), by_group, values, values.reshape(-1))
-        """Counts of the groups, and three times the room for what those of a block come to."""
+        self._group_values = values.reshape(len(values), -1, thermal.LANES), values
+        """Twice the room for what the groups of a block come to."""
         self._result_names = (*thermal.DC_OUT, *(f"rack_{name}" for name in thermal.RACK_OUT))
         self._solved: bool | None = None
         """Whether the last step was transient; None without one."""
@@ -245,8 +248,8 @@ class Hall:
                     tables.append(entry)
                     total += int(most[i])
                 table[i] = known[key]
-        self._tables = self._lanes(total, len(thermal.GROUP_ROWS))
-        self._tables[:] = np.concatenate(tables)
+        self._tables = self._lanes(total * len(thermal.GROUP_ROWS))
+        self._tables[:] = np.concatenate(tables).reshape(self._tables.shape)
         first_place = starts(most, "groups of blocks")
         self._block_ints = _table(filled, most, table, first_place[:-1])
         self._group_places, self._most_groups = int(first_place[-1]), int(most.max())
@@ -398,9 +401,6 @@ class Hall:
         self._sources = self._rack_store.reshape(-1, thermal.SOURCES)
         self._run_sources = self._rack_store.reshape(-1, thermal.RUN_LANES)
         self._memory = dict(zip(thermal.RACK_STATE, self._rack_state, strict=True))
-        self._constants = self._real(
-            np.array([*_RELEASED_OUTLET_FIT, *thermal.decay_constants(self._precision)])
-        )
         self._sums = np.zeros(len(thermal.SUMS) * (self._chunk_ints.shape[1] - 1))
 
     def _real(self, values: Reals) -> Any:
@@ -501,7 +501,7 @@ class Hall:
         ]
         written = self._written(stored)
         self._write(written, each_once=0)
-        self._kernel.let_go(*written)
+        self._layers_kernel.let_go(*written)
         for layer, values, fits in zip(layers, stored, fit, strict=True):
             if not fits:
                 layer[:] = values
@@ -535,7 +535,33 @@ class Hall:
         """Values of the last step to servers, or to each group once."""
         if self._solved is None:
             raise RuntimeStateError("no step has been done yet; server layers exist after one")
-        self._run(None, transient=self._solved, write=written, each_once=each_once)
+        runtime.ensure_started()
+        self._layers_kernel(
+            self._recirculates,
+            self._solved,
+            len(written[0]) <= _SERIAL_GROUPS,
+            self._slices,
+            self._outlet_model,
+            self._loads_of,
+            each_once,
+            1,
+            self._block_ints,
+            self._rack_ints,
+            self._chunk_ints,
+            self._dc_ints,
+            self._shares,
+            self._rack_blocks,
+            self._tables,
+            self._loads,
+            self._dcs,
+            self._doubles,
+            self._unit_state,
+            self._rack_store,
+            self._server_c,
+            self._constants,
+            *self._group_values,
+            *written,
+        )
 
     def forget(self) -> None:
         """Drop the last step, so that ``servers`` cannot show layers of another state."""
@@ -654,32 +680,26 @@ class Hall:
 
     def _run(
         self,
-        out: F64 | None,
+        out: F64,
         *,
         transient: bool = False,
         sweeps: int = 1,
         substep_s: float = 1.0,
         weight: float = 1.0,
         servers: tuple[Any, Any] | None = None,
-        write: tuple[Any, ...] | None = None,
-        each_once: int = 0,
     ) -> None:
         runtime.ensure_started()
-        values_out = len(write[0]) if write else self._group_places * self._thermal.LANES
-        serial = values_out * (sweeps if transient else 1) <= _SERIAL_GROUPS
-        none, no_lanes = self._no_groups, self._shares
+        places = self._group_places * self._thermal.LANES
         if transient and len(self._server_c) < self._group_places:
             self._server_c = self._lanes(self._group_places)
         self._kernel(
             self._recirculates,
             transient,
-            write is not None,
-            serial,
+            places * (sweeps if transient else 1) <= _SERIAL_GROUPS,
             self._slices,
             sweeps,
             self._outlet_model,
             self._loads_of,
-            each_once,
             len(LOADS),
             1,
             substep_s,
@@ -708,15 +728,13 @@ class Hall:
             self._run_sources,
             self._rack_store,
             self._server_c,
-            *((none, none) if servers is None else servers),
+            *((self._no_groups, self._no_groups) if servers is None else servers),
             self._constants,
             self._terms,
             self._rack_out,
             self._needs,
             self._sums,
-            self._unit_state if out is None else out,
-            *self._group_values,
-            *((none, none, none, no_lanes, no_lanes, no_lanes) if write is None else write),
+            out,
         )
 
     def _new_sums(self) -> F64:

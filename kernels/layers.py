@@ -1,0 +1,296 @@
+"""Values of the servers of a step that has been done, group by group."""
+
+from functools import cache
+from typing import Any, no_type_check
+
+from .backend import SLICE, Table, larger, part_of, reals, shared, ti
+from .elementary import log_and_exp
+from .servers import (
+    OUTLET_OF_SERVERS,
+    add_group,
+    air_before,
+    complete,
+    no_groups,
+    of_group,
+    rack_outlet,
+    racks_of,
+    servers_of,
+)
+from .thermal import (
+    BLOCK_INTS,
+    CHUNK_INTS,
+    DC_DOUBLES,
+    DC_INTS,
+    DC_ROWS,
+    GROUP_OUT,
+    GROUP_ROWS,
+    LANE_BITS,
+    LANES,
+    RACK_INT,
+    RACK_INTS,
+    RACK_ROWS,
+    RACK_STATE,
+    SQUARE,
+    SUPPLY,
+    UNIT_STATE,
+)
+
+TEMPLATES = 3
+"""Template arguments of the kernel, which come first."""
+
+N_VALUES = len(GROUP_OUT)
+
+
+@ti.func
+@no_type_check
+def compute_groups(hall: ti.template(), n, block_at, values_at, servers: ti.template()):
+    """Values of the groups of a block as in the last sweep or substep."""
+    block = hall.blocks[block_at]
+    air = air_before(hall, n, block_at, block.mixed_c, SUPPLY.fresh_ratio_used)
+    racks = racks_of(hall, servers, block_at)
+    sums = no_groups(hall)
+    z, n_groups, table, place = 0, block.groups, block.table, block.place
+    while z < n_groups:
+        group = hall.groups[table + z]
+        inlet_c, draws_w, speed, turns = of_group(hall, servers, racks, air, group, block_at, z)
+        add_group(hall, sums, group, group.count, inlet_c, draws_w, speed, turns)
+        flow_m3s = speed * racks.per_speed_m3s
+        cpu_w, fan_w = racks.powered * draws_w, turns * racks.per_speed_w
+        to_air_w = cpu_w
+        if ti.static(hall.transient):
+            warmer_k = hall.server_c[place + z] - inlet_c
+            to_air_w = flow_m3s * servers.taken_up_j_per_m3_k * warmer_k
+        per_k = larger(flow_m3s * servers.air_j_per_m3_k, hall.zeros + hall.real(1e-30))
+        values = hall.values[values_at + z]
+        values.inlet_c = inlet_c
+        values.outlet_c = inlet_c + (to_air_w + fan_w) / per_k
+        values.power_w = cpu_w + fan_w
+        z += hall.step
+    if ti.static(not hall.recirculates):
+        if hall.outlet_model != OUTLET_OF_SERVERS:
+            complete(hall, sums, racks, air)
+            per_flow = hall.real(1.0) / larger(sums.flow_m3s, hall.zeros + hall.real(1e-30))
+            outlet_c = rack_outlet(hall, servers, sums, per_flow)
+            outlet_c = ti.select(sums.flow_m3s > hall.real(0.0), outlet_c, sums.inlet_c)
+            z = 0
+            while z < n_groups:
+                hall.values[values_at + z].outlet_c = outlet_c
+                z += hall.step
+
+
+@ti.func
+@no_type_check
+def spread_each(hall: ti.template(), block_at, values_at, first_row):
+    """Values of the groups of a block to as many places of the layers.
+
+    Transpose the values of LANES groups at a time, all kinds by turns: halves of a square element
+    by turns, as often as 2 is in LANES.
+    """
+    block, place_0 = hall.blocks[block_at], block_at * LANES
+    at = values_at >> LANE_BITS
+    while at << LANE_BITS < values_at + block.groups:
+        turn = 0
+        while turn < LANE_BITS * N_VALUES:
+            square = hall.squares[turn % N_VALUES, at]
+            hall.squares[turn % N_VALUES, at] = ti.Vector(
+                [square[i // 2 + i % 2 * (SQUARE // 2)] for i in range(SQUARE)]
+            )
+            turn += hall.step
+        at += hall.step
+    lane = 0
+    while lane < block.racks:
+        row = values_at + lane
+        start = hall.rack_ints[first_row, place_0 + lane]
+        end = hall.rack_ints[first_row, place_0 + lane + 1]
+        if start & (LANES - 1) == 0:
+            while start + LANES <= end:
+                for kind in ti.static(range(N_VALUES)):
+                    hall.layer_blocks[kind][start >> LANE_BITS] = hall.group_values[kind, row]
+                row += LANES
+                start += LANES * hall.step
+        while start < end:
+            i = 0
+            while i < ti.min(LANES, end - start):
+                for kind in ti.static(range(N_VALUES)):
+                    hall.layers[kind][start + i] = hall.group_values[kind, row][i]
+                i += hall.step
+            start += LANES
+            row += LANES
+        lane += hall.step
+
+
+@ti.func
+@no_type_check
+def store(hall: ti.template(), b, inlet_c, outlet_c, power_w):
+    """A vector of servers to the layers."""
+    hall.layer_blocks[0][b] = inlet_c
+    hall.layer_blocks[1][b] = outlet_c
+    hall.layer_blocks[2][b] = power_w
+
+
+@ti.func
+@no_type_check
+def spread_runs(hall: ti.template(), block_at, values_at):
+    """Values of the groups of a block to runs of servers, nearly all in whole vectors."""
+    block, place_0 = hall.blocks[block_at], block_at * LANES
+    start = hall.places[place_0].first_server
+    end = hall.places[place_0 + block.racks].first_server
+    # Between these are the vectors that the block has to itself.
+    low, high = (start + (LANES - 1)) & -LANES, end & -LANES
+    numbers = ti.Vector([i for i in range(LANES)])
+    joined = ti.Struct(inlet_c=hall.zeros, outlet_c=hall.zeros, power_w=hall.zeros)
+    lane, table = 0, block.table
+    while lane < block.racks:
+        end = hall.places[place_0 + lane + 1].first_server
+        z = 0
+        while start < end:
+            s, b = start, start >> LANE_BITS
+            start += ti.cast(hall.groups[table + z].count[lane], ti.i32)
+            values = hall.values[values_at + z]
+            inlet_c, outlet_c = values.inlet_c[lane], values.outlet_c[lane]
+            power_w = values.power_w[lane]
+            inlets, outlets = ti.Vector([inlet_c] * LANES), ti.Vector([outlet_c] * LANES)
+            powers = ti.Vector([power_w] * LANES)
+            # The vector where a run begins has the ends of those before.
+            before = numbers < (s & (LANES - 1))
+            joined.inlet_c = ti.select(before, joined.inlet_c, inlets)
+            joined.outlet_c = ti.select(before, joined.outlet_c, outlets)
+            joined.power_w = ti.select(before, joined.power_w, powers)
+            if b < start >> LANE_BITS:
+                if b << LANE_BITS >= low:
+                    store(hall, b, joined.inlet_c, joined.outlet_c, joined.power_w)
+                joined.inlet_c = inlets
+                joined.outlet_c = outlets
+                joined.power_w = powers
+                for whole_b in range(b + 1, start >> LANE_BITS):
+                    store(hall, whole_b, inlets, outlets, powers)
+            if s < low or start > high:
+                if s >= low:
+                    s = ti.max(s, high)
+                while s < ti.min(start, end):
+                    hall.layers[0][s] = inlet_c
+                    hall.layers[1][s] = outlet_c
+                    hall.layers[2][s] = power_w
+                    s += hall.step
+                    if s == low:
+                        s = ti.max(s, high)
+            z += 1
+        lane += 1
+
+
+@ti.func
+@no_type_check
+def write_chunk(hall: ti.template(), chunk_at, values_at, each_once):
+    """Values of the servers of a chunk, or of each of its groups once."""
+    chunk = hall.chunks[chunk_at]
+    servers = servers_of(hall, chunk.dc)
+    first_row = RACK_INT.first_server
+    if each_once != 0:
+        first_row = RACK_INT.first_group
+    for block_at in range(chunk.first_block, hall.chunks[chunk_at + 1].first_block):
+        compute_groups(hall, chunk.dc, block_at, values_at, servers)
+        place_0 = block_at * LANES
+        place_1 = place_0 + hall.blocks[block_at].racks
+        n_groups = hall.places[place_1].first_group - hall.places[place_0].first_group
+        n_values = hall.rack_ints[first_row, place_1] - hall.rack_ints[first_row, place_0]
+        if n_values == n_groups:
+            spread_each(hall, block_at, values_at, first_row)
+        else:
+            spread_runs(hall, block_at, values_at)
+
+
+@cache
+def layers_kernel(precision: str) -> Any:
+    """Kernel that computes all groups as in the last sweep or substep and stores their values.
+
+    To all their servers, or with ``each_once`` to themselves; ``..._blocks`` are the layers again
+    as vectors. ``group_values`` and ``squares``, the same again, have room for the groups of a
+    block in each of the slices.
+    """
+    real = reals(precision)
+    log_of, exp_of = log_and_exp(precision, LANES)
+    reals_1d = ti.types.ndarray(dtype=real, ndim=1)
+    blocks_2d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=2)
+    blocks_1d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=1)
+    squares_2d = ti.types.ndarray(dtype=ti.types.vector(SQUARE, real), ndim=2)
+    ints_2d = ti.types.ndarray(dtype=ti.i32, ndim=2)
+    doubles_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
+    doubles_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
+
+    @ti.kernel
+    @no_type_check
+    def layers(
+        recirculates: ti.template(),
+        transient: ti.template(),
+        serial: ti.template(),
+        slices: ti.i32,
+        outlet_model: ti.i32,
+        loads_of: ti.i32,
+        each_once: ti.i32,
+        step: ti.i32,
+        block_ints: ints_2d,
+        rack_ints: ints_2d,
+        chunk_ints: ints_2d,
+        dc_ints: ints_2d,
+        shares: blocks_1d,
+        racks: blocks_2d,
+        groups: blocks_1d,
+        group_load: reals_1d,
+        dcs: reals_1d,
+        doubles: doubles_1d,
+        unit_state: doubles_2d,
+        rack_store: blocks_2d,
+        server_c: blocks_1d,
+        constants: reals_1d,
+        group_values: blocks_2d,
+        squares: squares_2d,
+        inlet_c: reals_1d,
+        outlet_c: reals_1d,
+        power_w: reals_1d,
+        inlet_blocks: blocks_1d,
+        outlet_blocks: blocks_1d,
+        power_blocks: blocks_1d,
+    ):
+        n_chunks = chunk_ints.shape[1] - 1
+        if ti.static(serial):
+            ti.loop_config(serialize=True)
+        for k in range(slices * SLICE):
+            if k % SLICE == 0:
+                hall = ti.static(
+                    shared(
+                        real=real,
+                        zeros=ti.Vector([ti.cast(0.0, real)] * LANES),
+                        log_of=log_of,
+                        exp_of=exp_of,
+                        recirculates=recirculates,
+                        transient=transient,
+                        outlet_model=outlet_model,
+                        loads_of=loads_of,
+                        step=step,
+                        dcs=Table((DC_INTS, dc_ints), (DC_ROWS, dcs), (DC_DOUBLES, doubles)),
+                        units=Table((UNIT_STATE, unit_state)),
+                        chunks=Table((CHUNK_INTS, chunk_ints)),
+                        blocks=Table(
+                            (BLOCK_INTS, block_ints), (RACK_ROWS, racks), (RACK_STATE, rack_store)
+                        ),
+                        places=Table((RACK_INTS, rack_ints)),
+                        groups=Table((GROUP_ROWS, groups)),
+                        values=Table((GROUP_OUT, group_values)),
+                        constants=constants,
+                        group_load=group_load,
+                        group_values=group_values,
+                        layer_blocks=(inlet_blocks, outlet_blocks, power_blocks),
+                        layers=(inlet_c, outlet_c, power_w),
+                        rack_ints=rack_ints,
+                        server_c=server_c,
+                        shares=shares,
+                        squares=squares,
+                        unit_state=unit_state,
+                    )
+                )
+                values_at = k // SLICE * (group_values.shape[1] // slices)
+                first, end = part_of(k // SLICE, slices, n_chunks)
+                for chunk_at in range(first, end):
+                    write_chunk(hall, chunk_at, values_at, each_once)
+
+    return layers
