@@ -138,9 +138,6 @@ class HallSums:
     rack_outlet_c: Reals
 
 
-_CONDITIONS = tuple(f.name for f in fields(Conditions))
-
-
 class Hall:
     """Kernel arguments of a fleet: plain arrays, given back with the object."""
 
@@ -158,6 +155,10 @@ class Hall:
         self._constants = self._real(
             np.array([*_RELEASED_OUTLET_FIT, *decay.decay_constants(precision)])
         )
+        sizes = {"unit": fleet.units, "utilisation": fleet.size, "group": fleet.groups}
+        self._shapes = {
+            f.name: (sizes.get(f.name.split("_")[0], fleet.racks),) for f in fields(Conditions)
+        }
         self._outlet_model = thermal.OUTLETS.index(fleet.models["outlet"])
         self._recirculates = fleet.air is not None
         self._lay_out_racks(thermal, 8 * threads)
@@ -478,25 +479,24 @@ class Hall:
 
         Raises:
             RuntimeStateError: before the first step.
-            SdcError: layers of another shape, type or order.
+            SdcError: layers of another shape, type or order, or that may not be written.
         """
-        servers = self._fleet.servers
+        shape = (self._fleet.servers,)
         if into is None:
-            into = ServerLayers(*(self._empty((servers,), self._dtype) for _ in range(3)))
+            into = ServerLayers(*(self._empty(shape, self._dtype) for _ in range(3)))
         layers = [into.inlet_c, into.outlet_c, into.power_w]
-        for layer in layers:
-            if (layer.shape, layer.dtype) != (
-                (servers,),
-                self._dtype,
-            ) or not layer.flags.c_contiguous:
+        for name, layer in zip(("inlet_c", "outlet_c", "power_w"), layers, strict=True):
+            has = layer.shape, layer.dtype, layer.flags.c_contiguous, layer.flags.writeable
+            if has != (shape, self._dtype, True, True):
                 raise SdcError(
-                    f"layer: {layer.dtype} {layer.shape}; valid is contiguous {self._dtype} "
-                    f"({servers},)"
+                    f"layer {name}: {layer.dtype} {layer.shape}"
+                    f"{'' if layer.flags.writeable else ', read-only'}; valid is a contiguous, "
+                    f"writeable {self._dtype} {shape}"
                 )
         lanes = self._thermal.LANES
         fit = [layer.ctypes.data % (lanes * layer.itemsize) == 0 for layer in layers]
         stored = [
-            layer if fits else self._empty((servers,), self._dtype)
+            layer if fits else self._empty(shape, self._dtype)
             for layer, fits in zip(layers, fit, strict=True)
         ]
         written = self._written(stored)
@@ -508,7 +508,9 @@ class Hall:
         return into
 
     def groups(self) -> ServerLayers:
-        """As ``servers``, but of one server per group, (G,); the next call overwrites them.
+        """As ``servers``, but of one server per group, (G,).
+
+        The next call of this or of ``group_inlets`` overwrites them.
 
         Raises:
             RuntimeStateError: before the first step.
@@ -582,6 +584,7 @@ class Hall:
         self._sweep(self._new_sums(), 1, transient=True, servers=(servers, servers), substep_s=1e9)
         for row, values in zip(kept, steady, strict=True):
             row[:] = values
+        self.forget()
         return self._state(servers)
 
     def advance(
@@ -652,10 +655,15 @@ class Hall:
         )
 
     def _set(self, met: Conditions) -> None:
-        for name in _CONDITIONS:
+        for name, shape in self._shapes.items():
             given = getattr(met, name)
-            if given is not None and not isfinite(np.add.reduce(given)):
+            if given is None:
+                continue
+            if np.shape(given) != shape:
+                raise SdcError(f"conditions: {name} has shape {np.shape(given)}; valid is {shape}")
+            if not isfinite(np.add.reduce(given)):
                 raise SdcError(f"conditions: {name} is not finite; valid are finite numbers")
+        self.forget()
         self._loads_of, self._loads = self._thermal.OF_DATA_CENTERS, self._no_groups
         self._dc["utilisation"][:] = met.utilisation
         if met.group_load is not None:

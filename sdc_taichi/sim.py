@@ -369,7 +369,7 @@ class Simulator:
             ci_g_per_kwh=world.ci_g_per_kwh,
             demand=world.demand,
             load_command=load_command,
-            cooling_command=self._per_dc(cooling_command),
+            cooling_command=self._per_dc(cooling_command).copy(),
             battery_command=battery_command,
             utilisation=utilisation,
             arrived_tasks=work["arrived"],
@@ -401,7 +401,7 @@ class Simulator:
             unit_supply_c=setpoint_c + self._per_unit(warmed_k),
             unit_flow_m3s=air.unit_flow_m3s if self._recirculates else after["crac_flow_m3s"],
             unit_running=running.copy(),
-            rack_status=status,
+            rack_status=status.copy(),
             rack_cpu_w=air.rack_cpu_w,
             rack_fan_w=air.rack_fan_w,
             rack_airflow_m3s=air.rack_airflow_m3s,
@@ -531,14 +531,14 @@ class Simulator:
 
         Raises:
             RuntimeStateError: before the first step.
-            SdcError: layers of another shape, type or order.
+            SdcError: layers of another shape, type or order, or that may not be written.
         """
         return self._start().servers(into)
 
     def server_groups(self) -> ServerLayers:
         """As ``servers``, but of one server of each group, whose values all of it have, (G,).
 
-        The next call overwrites them.
+        The next step or call overwrites them.
 
         Raises:
             RuntimeStateError: before the first step.

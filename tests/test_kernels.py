@@ -545,10 +545,21 @@ def test_layers_that_do_not_fit_are_refused() -> None:
         good[0][1:],
         np.zeros(fleet.servers),
         np.zeros(2 * fleet.servers, np.float32)[::2],
+        np.frombuffer(bytes(4 * fleet.servers), np.float32),
     ]
     for layer in wrong:
-        with pytest.raises(SdcError, match="layer: float"):
+        with pytest.raises(SdcError, match="layer power_w: float"):
             hall.servers(ServerLayers(good[0], good[1], layer))
+    assert not wrong[-1].any()
+
+
+def test_conditions_of_another_size_are_refused() -> None:
+    hall = Hall(build_fleet([load_config("tiny", [f"name={name}"]) for name in "ab"]), "f32")
+    one = np.array([20.0])
+    with pytest.raises(SdcError, match=r"unit_supply_c has shape \(1,\); valid is \(2,\)"):
+        hall.solve(Conditions(one, np.full(2, 0.5)))
+    with pytest.raises(SdcError, match=r"powered has shape \(1,\); valid is \(8,\)"):
+        hall.solve(Conditions(np.full(2, 20.0), np.full(2, 0.5), powered=one))
 
 
 def test_another_user_of_taichi_may_have_chosen_other_literals() -> None:

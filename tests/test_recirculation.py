@@ -14,7 +14,14 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import reference_twin
-from sdc_taichi import ConfigError, DataCenterConfig, SdcError, build_fleet, load_config
+from sdc_taichi import (
+    ConfigError,
+    DataCenterConfig,
+    RuntimeStateError,
+    SdcError,
+    build_fleet,
+    load_config,
+)
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.hall import MOST_SWEEPS, Conditions, Hall, HallSums, Precision
 from sdc_taichi.recirculation import DENSE_RACKS, calibrate, layout_exchange
@@ -308,6 +315,8 @@ def test_halls_of_any_size_give_up_after_as_many_sweeps(
     with pytest.raises(SdcError, match=r"or set simulation\.thermal") as error:
         hall.solve(still)
     assert f"no steady air temperatures in {MOST_SWEEPS} sweeps" in str(error.value)
+    with pytest.raises(RuntimeStateError, match="no step has been done"):
+        hall.servers()
     assert hall.solve(Conditions(np.array([20.0]), np.ones(1))).inlet_mean_c[0] < 26
 
 

@@ -183,6 +183,54 @@ def test_results_of_a_step_stay_as_they_were() -> None:
         assert all(np.array_equal(getattr(first, name), value) for name, value in before.items())
 
 
+RESULT_HALLS = {
+    "one unit": ("corrected", []),
+    "flat": ("corrected", ["hall.inlet_model=approach"]),
+    "units that accelerate": (
+        "corrected", ["hvac.crac.units=3", "hvac.setpoint.model=accelerating"]
+    ),
+    "transient": ("corrected", ["simulation.thermal=transient"]),
+    "events": (
+        "corrected",
+        ["workload.placement=coolest-first",
+         "events.scheduled=[{kind: rack_fan_failure, rack: 1, share: 0.5, start_h: 0, "
+         "duration_h: 9}]"],
+    ),
+    "released": ("sustaindc", []),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("hall", RESULT_HALLS)
+def test_results_share_nothing_with_actions_and_later_steps(hall: str) -> None:
+    preset, changes = RESULT_HALLS[hall]
+    configs = make_configs(load_config(preset, changes), count=2)
+    spoilt, kept = (Simulator(configs, drivers=short_drivers(2)) for _ in range(2))
+    with spoilt, kept:
+        spoilt.reset()
+        kept.reset()
+        for step, (given, same) in enumerate(
+            zip(random_actions(6, 2), random_actions(6, 2), strict=True)
+        ):
+            result, expected = spoilt.step(given), kept.step(same)
+            for f in fields(Actions):
+                if isinstance(values := getattr(given, f.name), np.ndarray):
+                    values[...] = -1
+            assert_same(result, expected, step)
+            for f in fields(StepResult):
+                if isinstance(values := getattr(result, f.name), np.ndarray):
+                    values[...] = -1
+
+
+def test_queues_of_a_state_are_read_only() -> None:
+    """Their sums are known beforehand, so half of an edit would be obeyed."""
+    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+        sim.reset()
+        for _ in range(2):
+            sim.step(Actions(LoadAction.DEFER))
+            with pytest.raises(ValueError, match="read-only"):
+                sim.state.queue[:] = 0.0
+
+
 def test_enums_and_numbers_are_the_same_commands() -> None:
     config, drivers = load_config("tiny"), short_drivers()
     for load in LoadAction:
@@ -468,16 +516,23 @@ def test_wrong_arguments_of_a_simulator() -> None:
         Simulator(load_config("tiny"), drivers=short_drivers(2))
 
 
-def test_server_layers_belong_to_the_last_step() -> None:
-    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
+@pytest.mark.parametrize("preset", ["tiny", "transient"])
+def test_server_layers_belong_to_the_last_step(preset: str) -> None:
+    config = load_config("tiny")
+    if preset == "transient":
+        config = load_config("corrected", ["simulation.thermal=transient"])
+    with Simulator(config, drivers=short_drivers()) as sim:
         sim.reset()
+        with pytest.raises(RuntimeStateError, match="no step has been done"):
+            sim.servers()
         result = sim.step()
         layers = sim.servers()
         assert layers.power_w.shape == (sim.fleet.servers,)
         assert float(layers.power_w.sum(dtype=np.float64)) == pytest.approx(
             result.it_w[0], rel=1e-6
         )
-        assert layers.inlet_c.max() == result.inlet_max_c[0]
+        if preset == "tiny":
+            assert layers.inlet_c.max() == result.inlet_max_c[0]
         snapshot = sim.state_dict()
         sim.load_state_dict(snapshot)
         with pytest.raises(RuntimeStateError, match="no step has been done"):

@@ -218,7 +218,9 @@ class Queue:
         )
         waiting, due, oldest_steps, mean_steps = found
         self._rows, self._known = after, held(after, self._size).T
-        self._start = waiting, due
+        # Copies, since callers may do what they like with results.
+        self._start = waiting.copy(), due.copy()
+        self._known.flags.writeable = False
         return Queued(self._known, waiting, due, oldest_steps, mean_steps)
 
     def _take(self, queue: F64) -> None:
@@ -228,6 +230,8 @@ class Queue:
         self._rows = vector_rows(self._length, self._size)
         self._rows[:] = 0.0
         held(self._rows, self._size)[:] = queue.T
+        # Whose sums are known from here on.
+        queue.flags.writeable = False
         self._known = queue
 
     def forget(self) -> None:
