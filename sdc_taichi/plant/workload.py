@@ -166,7 +166,11 @@ class Queue:
         self._size, self._length = len(due_steps), length
         self._due_row = np.where(due_at < 0, length, due_at).astype(np.int32)
         self._kernel: Any = None
+        self._backend: Any = None
         self._room: Any = None
+        # The same in every step: handing an array over takes longer than to copy a few entries.
+        self._taken, self._deferred = np.empty((2, self._size))
+        self._found = np.empty((4, self._size))
         self._rows: Any = None
         """Rows of the queue that the last step left, as the kernel takes them."""
         self._known: F64 | None = None
@@ -194,42 +198,47 @@ class Queue:
             taken: work that leaves it, oldest first, (B,).
             deferred: work that enters it, (B,).
         """
-        from sdc_taichi.kernels.backend import held, vector_rows
-        from sdc_taichi.kernels.queue import SERIAL_UP_TO, bound_queue_kernel
-
-        if self._kernel is None:
-            runtime.ensure_started()
-            self._kernel, self._room = bound_queue_kernel(), vector_rows(3, self._size)
         if queue is not self._known:
             self._take(queue)
-        after, found = vector_rows(self._length, self._size), np.empty((4, self._size))
+        self._taken[:], self._deferred[:] = taken, deferred
+        after = self._backend.vector_rows(self._length, self._size)
         self._kernel(
-            self._size <= SERIAL_UP_TO,
+            self._serial,
             _NEGLIGIBLE_TASKS,
             self._size,
             1,
             self._due_row,
             self._rows,
-            taken,
-            deferred,
+            self._taken,
+            self._deferred,
             self._room,
             after,
-            found,
+            self._found,
         )
-        waiting, due, oldest_steps, mean_steps = found
-        self._rows, self._known = after, held(after, self._size).T
-        # Copies, since callers may do what they like with results.
-        self._start = waiting.copy(), due.copy()
+        waiting, due, oldest_steps, mean_steps = self._found.copy()
+        self._rows, self._known = after, self._backend.held(after, self._size).T
+        # A copy, since callers may do what they like with results.
+        self._start = self._found[0].copy(), self._found[1].copy()
         self._known.flags.writeable = False
         return Queued(self._known, waiting, due, oldest_steps, mean_steps)
 
+    def _prepare(self) -> None:
+        """What needs Taichi."""
+        from sdc_taichi.kernels import backend
+        from sdc_taichi.kernels.queue import SERIAL_UP_TO, bound_queue_kernel
+
+        runtime.ensure_started()
+        self._backend, self._kernel = backend, bound_queue_kernel()
+        self._serial = self._size <= SERIAL_UP_TO
+        self._room = backend.vector_rows(3, self._size)
+
     def _take(self, queue: F64) -> None:
         """Go on from a queue that was not left by the last step."""
-        from sdc_taichi.kernels.backend import held, vector_rows
-
-        self._rows = vector_rows(self._length, self._size)
+        if self._kernel is None:
+            self._prepare()
+        self._rows = self._backend.vector_rows(self._length, self._size)
         self._rows[:] = 0.0
-        held(self._rows, self._size)[:] = queue.T
+        self._backend.held(self._rows, self._size)[:] = queue.T
         # Whose sums are known from here on.
         queue.flags.writeable = False
         self._known = queue
