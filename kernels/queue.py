@@ -26,32 +26,26 @@ def queue_kernel() -> Any:
     Work of no more than ``negligible`` is left by rounding, and has no age. A task goes through a
     few rows of many data centers at a time, side by side as they lie in memory.
 
-    Arguments: whether one thread does it; negligible work; number of data centers, B; 1, which
-    compilers cannot know, so that they make no copies of the loop that advances by it; row of the
-    queue that is due when the next step starts, (B,), L for none; the queues before, L
-    ``backend.vector_rows`` of data centers; the work taken and deferred, (B,); room for three such
-    rows. For the results: the queues after, and four rows, (4, B): work that waits, what of it will
-    be due, the age of the oldest work and the mean age in steps.
+    Arguments: whether one thread does it; 1, which the compiler cannot know and so makes no copies
+    of loops; negligible work; row of the queue that is due when the next step starts, L for none,
+    for each lane of each vector. All others are ``backend.vector_rows`` of data centers: the queues
+    before, L; the work taken and deferred. For the results: the queues after, L, and four: work
+    that waits, what of it will be due, the age of the oldest work and the mean age in steps.
     """
     blocks = ti.types.ndarray(dtype=ti.types.vector(F64_LANES, ti.f64), ndim=2)
-    rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
-    reals = ti.types.ndarray(dtype=ti.f64, ndim=1)
-    ints = ti.types.ndarray(dtype=ti.i32, ndim=1)
+    ints = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
     @ti.kernel
     @no_type_check
     def queue_after(
         serial: ti.template(),
-        negligible: ti.f64,
-        n: ti.i32,
         step: ti.i32,
+        negligible: ti.f64,
         due_row: ints,
         before: blocks,
-        taken: reals,
-        deferred: reals,
-        room: blocks,
+        moved: blocks,
         after: blocks,
-        found: rows,
+        found: blocks,
     ):
         n_tasks = (before.shape[1] + (TASK_BLOCKS - 1)) // TASK_BLOCKS
         ti.loop_config(serialize=serial)
@@ -63,19 +57,19 @@ def queue_kernel() -> Any:
                 zeros = ti.Vector([ti.f64(0.0)] * F64_LANES)
                 ones = zeros + ti.f64(1.0)
                 limit = zeros + negligible
-                for block in range(first, end):
-                    out = zeros
-                    for i in range(F64_LANES):
-                        out[i] = taken[ti.min(block * F64_LANES + i, n - 1)]
-                    room[0, block] = out
-                    room[1, block] = zeros
-                    room[2, block] = zeros
-                for rows_at in range((last + (TASK_ROWS - 1)) // TASK_ROWS):
-                    row = rows_at * TASK_ROWS
-                    for block in range(first, end):
-                        out, aged, waited = room[0, block], room[1, block], room[2, block]
+                block = first
+                while block < end:
+                    found[2, block] = zeros
+                    found[3, block] = zeros
+                    block += step
+                row = 0
+                while row < last:
+                    row_end = ti.min(row + TASK_ROWS, last)
+                    block = first
+                    while block < end:
+                        out, aged, waited = moved[0, block], found[2, block], found[3, block]
                         k = row
-                        while k < ti.min(row + TASK_ROWS, last):
+                        while k < row_end:
                             left = before[k + 1, block] - out
                             left = ti.select(left > zeros, left, zeros)
                             after[k, block] = left
@@ -85,26 +79,24 @@ def queue_kernel() -> Any:
                             aged += ti.select(waits, ones, zeros)
                             waited += ti.select(waits, left, zeros)
                             k += step
-                        room[1, block] = aged
-                        room[2, block] = waited
-                for block in range(first, end):
-                    new = zeros
-                    for i in range(F64_LANES):
-                        new[i] = deferred[ti.min(block * F64_LANES + i, n - 1)]
-                    total = after[last - 1, block] + new
+                        found[2, block] = aged
+                        found[3, block] = waited
+                        block += step
+                    row = row_end
+                block = first
+                while block < end:
+                    total = after[last - 1, block] + moved[1, block]
                     after[last, block] = total
-                    aged, waited = room[1, block], room[2, block]
+                    due = zeros
                     for i in range(F64_LANES):
-                        b = block * F64_LANES + i
-                        if b < n:
-                            found[0, b] = total[i]
-                            found[1, b] = ti.f64(0.0)
-                            if due_row[b] <= last:
-                                due = after[due_row[b], block]
-                                found[1, b] = due[i]
-                            found[2, b] = aged[i]
-                            found[3, b] = ti.f64(0.0)
-                            if total[i] > 0.0:
-                                found[3, b] = waited[i] / total[i]
+                        if due_row[block, i] <= last:
+                            due_of = after[due_row[block, i], block]
+                            due[i] = due_of[i]
+                    some = total > zeros
+                    mean = found[3, block] / ti.select(some, total, ones)
+                    found[0, block] = total
+                    found[1, block] = due
+                    found[3, block] = ti.select(some, mean, zeros)
+                    block += step
 
     return queue_after

@@ -166,11 +166,6 @@ class Queue:
         self._size, self._length = len(due_steps), length
         self._due_row = np.where(due_at < 0, length, due_at).astype(np.int32)
         self._kernel: Any = None
-        self._backend: Any = None
-        self._room: Any = None
-        # The same in every step: handing an array over takes longer than to copy a few entries.
-        self._taken, self._deferred = np.empty((2, self._size))
-        self._found = np.empty((4, self._size))
         self._rows: Any = None
         """Rows of the queue that the last step left, as the kernel takes them."""
         self._known: F64 | None = None
@@ -204,16 +199,13 @@ class Queue:
         after = self._backend.vector_rows(self._length, self._size)
         self._kernel(
             self._serial,
-            _NEGLIGIBLE_TASKS,
-            self._size,
             1,
-            self._due_row,
+            _NEGLIGIBLE_TASKS,
+            self._due_lanes,
             self._rows,
-            self._taken,
-            self._deferred,
-            self._room,
+            self._moved,
             after,
-            self._found,
+            self._results,
         )
         waiting, due, oldest_steps, mean_steps = self._found.copy()
         self._rows, self._known = after, self._backend.held(after, self._size).T
@@ -230,7 +222,13 @@ class Queue:
         runtime.ensure_started()
         self._backend, self._kernel = backend, bound_queue_kernel()
         self._serial = self._size <= SERIAL_UP_TO
-        self._room = backend.vector_rows(3, self._size)
+        # The same in every step: handing an array over takes longer than to copy a few entries.
+        self._moved, self._results = (backend.vector_rows(n, self._size) for n in (2, 4))
+        self._moved[:] = 0.0
+        self._taken, self._deferred = backend.held(self._moved, self._size)
+        self._found = backend.held(self._results, self._size)
+        self._due_lanes = np.full(self._moved.shape[1:], self._length, np.int32)
+        self._due_lanes.reshape(-1)[: self._size] = self._due_row
 
     def _take(self, queue: F64) -> None:
         """Go on from a queue that was not left by the last step."""
@@ -245,7 +243,7 @@ class Queue:
 
     def forget(self) -> None:
         """Let go of the kernel and the arrays that it was last given."""
-        self._kernel = self._room = self._rows = self._known = None
+        self._kernel = self._rows = self._known = None
 
 
 def age_histogram(queue: F64, edges_steps: F64) -> F64:
