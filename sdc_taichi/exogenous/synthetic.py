@@ -37,6 +37,8 @@ DEFAULT_SEED = 10
 
 # Streams of random numbers of one site; slow and fast residuals of fuel i are 100 + i and 200 + i.
 _STREAM_SLOW_FUEL, _STREAM_FAST_FUEL, _STREAM_TRACE = 100, 200, 300
+_WARM_UP = 240
+"""Hours."""
 
 _Table = dict[str, Any]
 
@@ -158,33 +160,35 @@ def _normals(seed: int, stream: int, name: str, n: int) -> FloatArray:
     return np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])[:n]
 
 
+def _filtered(kicks: FloatArray, phi: float) -> FloatArray:
+    """``x[t] = phi * x[t - 1] + kicks[t]`` along the first axis.
+
+    By doubling: the sum over 2 n kicks is that over n plus ``phi**n`` times that over the n before.
+    """
+    x, n, weight = kicks.copy(), 1, phi
+    while n < len(x) and weight > 1e-20:
+        x[n:] += weight * x[:-n]
+        n, weight = 2 * n, weight * weight
+    return x
+
+
 def _ar1(noise: FloatArray, phi: float) -> FloatArray:
-    """First-order autoregression of unit variance, started in its stationary state."""
-    x = float(noise[0])
-    out = [x]
-    for kick in (noise[1:] * math.sqrt(1.0 - phi * phi)).tolist():
-        x = phi * x + kick
-        out.append(x)
-    return np.array(out)
+    """First-order autoregression of unit variance along the first axis, in its stationary state."""
+    kicks = noise * math.sqrt(1.0 - phi * phi)
+    kicks[0] = noise[0]
+    return _filtered(kicks, phi)
 
 
 def _ar2(noise: FloatArray, memory_h: float, smooth_h: float) -> FloatArray:
     """Two first-order filters in a row: memory of ``memory_h``, smooth below ``smooth_h``.
 
-    Unit variance (Box, Jenkins and Reinsel 2008, eq. 3.2.28); the last 240 kicks warm it up.
+    Unit variance (Box, Jenkins and Reinsel 2008, eq. 3.2.28); the last kicks warm it up.
     """
     f, g = math.exp(-1.0 / memory_h), math.exp(-1.0 / max(smooth_h, 1e-3))
     a, b = f + g, -f * g
     variance = (1.0 - b) / ((1.0 + b) * ((1.0 - b) ** 2 - a * a))
-    kicks = (noise / math.sqrt(variance)).tolist()
-    x, before = 0.0, 0.0
-    for kick in kicks[-240:]:
-        x, before = a * x + b * before + kick, x
-    out = []
-    for kick in kicks:
-        x, before = a * x + b * before + kick, x
-        out.append(x)
-    return np.array(out)
+    kicks = np.concatenate([noise[-_WARM_UP:], noise]) / math.sqrt(variance)
+    return _filtered(_filtered(kicks, f), g)[_WARM_UP:]
 
 
 def _residual(p: _Table, slow: FloatArray, fast: FloatArray, basis: FloatArray) -> FloatArray:
@@ -197,10 +201,7 @@ def _residual(p: _Table, slow: FloatArray, fast: FloatArray, basis: FloatArray) 
         hourly = _ar1(fast, math.exp(-1.0 / p["tf"]))
         daily = p.get("Phi", 0.0)
         if daily > 0.0:
-            by_day = hourly.reshape(-1, 24)
-            for day in range(1, len(by_day)):
-                by_day[day] = daily * by_day[day - 1] + math.sqrt(1.0 - daily**2) * by_day[day]
-            hourly = by_day.ravel()
+            hourly = _ar1(hourly.reshape(-1, 24), daily).ravel()
         z = z + math.sqrt(1.0 - p["w"]) * hourly
     z = z - basis @ _project(basis, z)
     return np.asarray(z * (p["sd"] / z.std()), dtype=np.float64)
@@ -212,15 +213,19 @@ def _residual(p: _Table, slow: FloatArray, fast: FloatArray, basis: FloatArray) 
 @lru_cache(maxsize=32)
 def _climatology(annual: int, diurnal: int, products: tuple[int, ...]) -> FloatArray:
     """Columns: 1, annual and diurnal harmonics, first annual times given diurnal harmonics."""
-    hour = np.arange(HOURS)
-    year = 2.0 * np.pi * (hour + 0.5) / HOURS
-    day = 2.0 * np.pi * (hour % 24 + 0.5) / 24.0
+    year = 2.0 * np.pi * (np.arange(HOURS) + 0.5) / HOURS
+    day = 2.0 * np.pi * (np.arange(24) + 0.5) / 24.0
+
+    def diurnals(m: int) -> list[FloatArray]:
+        return [np.tile(f(m * day), HOURS // 24) for f in (np.cos, np.sin)]
+
     columns = [np.ones(HOURS)]
-    for angle, order in ((year, annual), (day, diurnal)):
-        for m in range(1, order + 1):
-            columns += [np.cos(m * angle), np.sin(m * angle)]
+    for m in range(1, annual + 1):
+        columns += [np.cos(m * year), np.sin(m * year)]
+    for m in range(1, diurnal + 1):
+        columns += diurnals(m)
     for m in products:
-        columns += [f(year) * g(m * day) for f in (np.cos, np.sin) for g in (np.cos, np.sin)]
+        columns += [first * each for first in (np.cos(year), np.sin(year)) for each in diurnals(m)]
     return np.stack(columns, axis=1)
 
 
