@@ -9,6 +9,7 @@ import threading
 from collections import namedtuple
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any, no_type_check
 
 import numpy as np
@@ -23,7 +24,7 @@ import taichi as ti  # noqa: E402
 from taichi.lang import kernel_impl  # noqa: E402
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext  # noqa: E402
 
-__all__ = ["BoundKernel", "aligned", "ti"]
+__all__ = ["BoundKernel", "aligned", "definitions", "ti"]
 
 
 OPTIONS = {"cfg_optimization": False, "fast_math": False, "real_matrix_scalarize": False}
@@ -178,8 +179,8 @@ def _translation() -> Iterator[None]:
 
     Taichi writes an excerpt of the source for every node, in case of an error, which takes half of
     the time of translating a kernel; this is done at every start. Of what is left a fifth is that
-    `inspect` looks for the end of each function word by word. Literals have the type that whoever
-    started the runtime chose.
+    `inspect` looks for the end of each function word by word, and a tenth that `textwrap` breaks
+    lines of more than 9,999 letters. Literals have the type that whoever started the runtime chose.
     """
 
     def position(context: Any, node: Any) -> str:
@@ -195,18 +196,38 @@ def _translation() -> Iterator[None]:
         lines = linecache.getlines(code.co_filename, function.__globals__)
         return lines[first - 1 : max(ends)], first
 
+    def unbroken(line: str, **_: Any) -> str:
+        return line.rstrip()
+
     runtime = ti.lang.impl.get_runtime()
     excerpt, whole = ASTTransformerContext.get_pos_info, runtime.default_ip
-    read = kernel_impl.getsourcelines
+    read, wrapped = kernel_impl.getsourcelines, kernel_impl.textwrap
     try:
         ASTTransformerContext.get_pos_info = position
         kernel_impl.getsourcelines = source
+        kernel_impl.textwrap = SimpleNamespace(fill=unbroken, dedent=wrapped.dedent)
         runtime.default_ip = ti.i32
         yield
     finally:
         ASTTransformerContext.get_pos_info = excerpt
         kernel_impl.getsourcelines = read
+        kernel_impl.textwrap = wrapped
         runtime.default_ip = whole
+
+
+@contextmanager
+def definitions() -> Iterator[None]:
+    """For functions that define kernels, as a decorator.
+
+    Of everything that it decorates Taichi asks `inspect` whether it stands in a class, for which
+    all modules are searched: 25 ms at every start.
+    """
+    asked = kernel_impl._inside_class
+    try:
+        kernel_impl._inside_class = lambda *_, **__: False
+        yield
+    finally:
+        kernel_impl._inside_class = asked
 
 
 class BoundKernel:

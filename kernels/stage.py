@@ -19,7 +19,17 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from .backend import F64_LANES, SLICE, BoundKernel, held, larger, smaller, ti, vector_rows
+from .backend import (
+    F64_LANES,
+    SLICE,
+    BoundKernel,
+    definitions,
+    held,
+    larger,
+    smaller,
+    ti,
+    vector_rows,
+)
 from .elementary import log_and_exp
 
 Arrays = Mapping[str, Any]
@@ -274,6 +284,7 @@ def _minus(a):
 
 
 @cache
+@definitions()
 def _kernel(source: str) -> Any:
     """The Taichi kernel of this source, compiled once for all fleets whose stages are the same."""
     # Taichi reads the source of a kernel by the name of its file.
