@@ -24,7 +24,7 @@ import taichi as ti  # noqa: E402
 from taichi.lang import kernel_impl  # noqa: E402
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext  # noqa: E402
 
-__all__ = ["BoundKernel", "aligned", "definitions", "ti"]
+__all__ = ["BoundKernel", "aligned", "ti"]
 
 
 OPTIONS = {"cfg_optimization": False, "fast_math": False, "real_matrix_scalarize": False}
@@ -213,21 +213,6 @@ def _translation() -> Iterator[None]:
         kernel_impl.getsourcelines = read
         kernel_impl.textwrap = wrapped
         runtime.default_ip = whole
-
-
-@contextmanager
-def definitions() -> Iterator[None]:
-    """For functions that define kernels, as a decorator.
-
-    Of everything that it decorates Taichi asks `inspect` whether it stands in a class, for which
-    all modules are searched: 25 ms at every start.
-    """
-    asked = kernel_impl._inside_class
-    try:
-        kernel_impl._inside_class = lambda *_, **__: False
-        yield
-    finally:
-        kernel_impl._inside_class = asked
 
 
 class BoundKernel:

@@ -3,7 +3,7 @@
 from functools import cache
 from typing import Any, no_type_check
 
-from .backend import F64_LANES, SLICE, BoundKernel, definitions, ti
+from .backend import F64_LANES, SLICE, BoundKernel, ti
 
 TASK_BLOCKS = 32
 """Vectors side by side in a row that one task takes on."""
@@ -19,7 +19,6 @@ def bound_queue_kernel() -> BoundKernel:
 
 
 @cache
-@definitions()
 def queue_kernel() -> Any:
     """Kernel that takes work out of the queue, puts new work in, and reads the ages.
 

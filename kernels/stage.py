@@ -23,7 +23,6 @@ from .backend import (
     F64_LANES,
     SLICE,
     BoundKernel,
-    definitions,
     held,
     larger,
     smaller,
@@ -284,7 +283,6 @@ def _minus(a):
 
 
 @cache
-@definitions()
 def _kernel(source: str) -> Any:
     """The Taichi kernel of this source, compiled once for all fleets whose stages are the same."""
     # Taichi reads the source of a kernel by the name of its file.
