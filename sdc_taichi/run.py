@@ -8,6 +8,7 @@ place and renamed when it is whole. Equal runs give equal bytes. See docs/cli.md
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import operator
 import os
@@ -172,13 +173,9 @@ def describe(sim: Simulator, asked: Asked) -> dict[str, Any]:
     """
     drivers = sim.drivers
     hashes = _file_hashes(sim.fleet.configs)
-    packages = ("sdc-taichi", "taichi", "numpy", "pyarrow")
     return {
         "format": FORMAT,
-        "versions": {
-            "python": platform.python_version(),
-            **{name: version(name) for name in packages},
-        },
+        "versions": dict(_versions()),
         "fingerprint": sim.fingerprint(),
         "controller": asked.controller,
         "seed": asked.seed,
@@ -201,6 +198,13 @@ def describe(sim: Simulator, asked: Asked) -> dict[str, Any]:
             )
         ],
     }
+
+
+@functools.cache
+def _versions() -> Mapping[str, str]:
+    """Of Python and of what results depend on; looking them up reads their packages' metadata."""
+    packages = ("sdc-taichi", "taichi", "numpy", "pyarrow")
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
 def report_json(report: dict[str, Any]) -> str:
