@@ -103,13 +103,15 @@ def pixels(racks: Reals, shape: Tiles, scale: Scale) -> npt.NDArray[np.float16]:
     """Images (T, height, width) of rack values (T, R); gaps have the lower end of the range."""
     rows, per_row, height, width, gap = shape
     shots, count = racks.shape
-    # A value for the gaps follows those of the racks.
+    # A value for the gaps follows those of the racks, and a line of gaps those of the rows.
     values = np.full((shots, count + 1), scale.low, dtype=np.float16)
     values[:, :count] = quantised(racks, scale)
-    shown = np.full((rows, height + gap, per_row, width + gap), count)
-    shown[:, :height, :, :width] = np.arange(count).reshape(rows, 1, per_row, 1)
-    whole = shown.reshape(rows * (height + gap), per_row * (width + gap))
-    return values.take(whole[: shape.image[0], : shape.image[1]], axis=1)
+    across = np.full((rows + 1, per_row, width + gap), count)
+    across[:rows, :, :width] = np.arange(count).reshape(rows, per_row, 1)
+    down = np.full((rows, height + gap), rows)
+    down[:, :height] = np.arange(rows).reshape(rows, 1)
+    lines = values.take(across.reshape(rows + 1, -1)[:, : shape.image[1]], axis=1)
+    return lines.take(down.reshape(-1)[: shape.image[0]], axis=1)
 
 
 def legend(scale: Scale) -> tuple[Shots, list[float]]:
