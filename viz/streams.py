@@ -26,6 +26,7 @@ from sdc_taichi.whole_file import writing
 if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
+    from rerun.chunk import Chunk
 
 DEFAULT_PORT = 9876
 """On which viewers listen."""
@@ -216,6 +217,8 @@ class Stream:
         self._file, self._address, self._port, self._name = file, address, port, name
         self._keep_bytes = keep_bytes
         self._rec: rr.RecordingStream | None = None
+        self._chunks: list[Chunk] = []
+        """Of the block under way; each that is sent by itself wakes Rerun's threads."""
         self._whole_bytes = 0
         self._writing: _Call | None = None
         self._behind_bytes = 0
@@ -282,9 +285,10 @@ class Stream:
         return not self.lost
 
     def columns(self, entity: str, times: Sequence[Any], columns: Iterable[Any]) -> None:
-        """Send a block of an entity."""
-        if self._rec is not None:
-            self._rec.send_columns(entity, times, columns, strict=True)
+        """A block of an entity, which ``end_block`` sends."""
+        from rerun.chunk import Chunk
+
+        self._chunks.append(Chunk.from_columns(entity, times, columns))
 
     def static(self, entity: str, what: Any) -> None:
         """Send something that holds at all times."""
@@ -292,8 +296,10 @@ class Stream:
             self._rec.log(entity, what, static=True, strict=True)
 
     def end_block(self) -> None:
-        """Start writing out what was sent, without waiting for it."""
+        """Send the block and start writing it out, without waiting for it."""
+        chunks, self._chunks = self._chunks, []
         if self._rec is not None:
+            self._rec.send_chunks(chunks)
             wait_s = 0.0 if self._file is None else CONFIRM_S
             self._writing = _Call(lambda rec: rec.flush(timeout_sec=wait_s), self._rec)
 
