@@ -116,7 +116,8 @@ class Reader:
         self._units = [slice(*fleet.unit_start[dc : dc + 2].tolist()) for dc in focus]
         self._every_rack, self.racks = end_to_end(self._racks)
         self._every_unit, self.units = end_to_end(self._units)
-        self._zones = layers.zones_of(fleet, focus, cadence.zones)
+        if cadence.per_server:
+            self._zones = layers.zones_of(fleet, focus, cadence.zones)
         cells = [(r.stop - r.start) * n for r, n in zip(self._racks, cadence.zones, strict=True)]
         self.cells = [slice(end - n, end) for n, end in zip(cells, np.cumsum(cells), strict=True)]
         self._status = bytes(fleet.racks)
