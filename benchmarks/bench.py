@@ -26,11 +26,12 @@ import env
 import fresh
 import numpy as np
 from peers import PEERS, Arguments, MissingError
-from roof import core_s, store_s
+from roof import core_s, plain_store
 from thermal import QUICK_SIZES, SIZES, fleet_of
 
 import sdc_taichi
 from sdc_taichi import runtime
+from sdc_taichi.fleet import Fleet
 from sdc_taichi.hall import Hall
 from sdc_taichi.types import ServerLayers
 
@@ -103,7 +104,7 @@ def start(part: str, *arguments: Any, **variables: str) -> subprocess.Popen[str]
 
 def kernel_and_peers(quick: bool) -> Iterator[Figure]:
     """Flat halls: share of the memory roof, reduction alone, and the peers."""
-    threads, repeats = runtime.ensure_started(), 3 if quick else 20
+    threads, rounds = runtime.ensure_started(), 3 if quick else 20
     fleets = {
         " x ".join(map(str, size)): fleet_of(*size, "approach")
         for size in (QUICK_SIZES if quick else SIZES)
@@ -114,40 +115,49 @@ def kernel_and_peers(quick: bool) -> Iterator[Figure]:
         sdc_taichi.make_configs(unlike, count=count)
     )
     for name, fleet in fleets.items():
-        alike = "own" not in name
-        roof = store_s(fleet.servers, repeats)
-        met = fresh.conditions(fleet)
-        hall = Hall(fleet, "f32")
-        sums = hall.solve(met)
-        layers = hall.servers()
-        reduction, whole = fresh.stepped(fleet)
-        sums_s, step_s = core_s(reduction, repeats), core_s(whole, repeats)
-        ns = 1e9 / fleet.servers
-        if alike:
-            yield Figure("kernel", f"{name}: memory roof", roof * ns, "ns/server")
-        yield Figure("kernel", f"{name}: step with layers", step_s * ns, "ns/server")
-        yield Figure(
-            "kernel", f"{name}: share of the roof", roof / step_s, at_least=0.75 if alike else None
-        )
-        yield Figure(
-            "kernel",
-            f"{name}: reduction over step",
-            sums_s / step_s,
-            at_most=0.4 if alike else None,
-        )
-        for peer, make in PEERS.items():
-            where = f"{name}: {peer}"
-            try:
-                given = Arguments(fleet, met)
-                step = make(given, threads)
-            except MissingError as error:
-                yield Figure("kernel", where, None, note=f"skipped: {error}")
-                continue
-            peer_s = core_s(step, repeats)
-            yield Figure("kernel", where, peer_s * ns, "ns/server")
-            yield Figure("kernel", f"{where}, ours over it", step_s / peer_s, at_most=1.3)
-            apart = difference(given, layers, np.stack([sums.cpu_w, sums.fan_w, sums.airflow_m3s]))
-            yield Figure("kernel", f"{where}, largest difference", apart, "relative", at_most=1e-5)
+        yield from beside_peers(name, fleet, threads, rounds)
+
+
+def beside_peers(name: str, fleet: Fleet, threads: int, rounds: int) -> Iterator[Figure]:
+    """One fleet: medians over the rounds, and medians of what one call takes over another."""
+    alike, met = fleet.groups < fleet.servers, fresh.conditions(fleet)
+    hall = Hall(fleet, "f32")
+    sums, layers = hall.solve(met), hall.servers()
+    reduction, whole = fresh.stepped(fleet)
+    calls = {"roof": plain_store(fleet.servers), "reduction": reduction, "step": whole}
+    peers = {}
+    for peer, make in PEERS.items():
+        given = Arguments(fleet, met)
+        try:
+            calls[peer] = make(given, threads)
+        except MissingError as error:
+            yield Figure("kernel", f"{name}: {peer}", None, note=f"skipped: {error}")
+        else:
+            peers[peer] = given
+    spent_s = core_s(calls, rounds)
+
+    def each(what: str, called: str) -> Figure:
+        ns = 1e9 * float(np.median(spent_s[what])) / fleet.servers
+        return Figure("kernel", f"{name}: {called}", ns, "ns/server")
+
+    def over(what: str, other: str) -> float:
+        return float(np.median(spent_s[what] / spent_s[other]))
+
+    if alike:
+        yield each("roof", "memory roof")
+    yield each("step", "step with layers")
+    for called, what, other, at_most, at_least in (
+        ("share of the roof", "roof", "step", None, 0.75),
+        ("reduction over step", "reduction", "step", 0.4, None),
+    ):
+        limits = (at_most, at_least) if alike else ()
+        yield Figure("kernel", f"{name}: {called}", over(what, other), "", *limits)
+    for peer, given in peers.items():
+        where = f"{name}: {peer}"
+        yield each(peer, peer)
+        yield Figure("kernel", f"{where}, ours over it", over("step", peer), at_most=1.3)
+        apart = difference(given, layers, np.stack([sums.cpu_w, sums.fan_w, sums.airflow_m3s]))
+        yield Figure("kernel", f"{where}, largest difference", apart, "relative", at_most=1e-5)
 
 
 def difference(given: Arguments, layers: ServerLayers, sums: Any) -> float:

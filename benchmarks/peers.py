@@ -82,7 +82,7 @@ def c_step(given: Arguments, threads: int) -> Step:
         loaded = ctypes.CDLL(str(library))
     loaded.omp_set_num_threads(threads)
     counts = (ctypes.c_int32(len(given.sums)), ctypes.c_int32(len(given.listed[3]) - 1))
-    pointers = [ctypes.c_void_p(a.ctypes.data) for a in given.listed]
+    pointers = [a.ctypes.data_as(ctypes.c_void_p) for a in given.listed]
     return lambda: loaded.hall_step(*counts, *pointers)
 
 

@@ -1,58 +1,59 @@
-"""The memory roof: how fast three layers can be stored at all."""
+"""The memory roof: how fast three layers can be stored at all, and how calls are compared."""
 
 import time
-from collections.abc import Callable
-from typing import no_type_check
+from collections.abc import Callable, Mapping
+from typing import Any, no_type_check
 
-RUN = 256
-"""Values that one pass of the inner loop stores: long against a vector."""
+import numpy as np
 
+from sdc_taichi import runtime
+from sdc_taichi.types import F64
 
-def core_s(call: Callable[[], object], repeats: int) -> float:
-    """Least core time of several runs, s."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        call()
-        times.append(time.process_time() - start)
-    return min(times)
+RUN = 32
+"""Vectors that one value is stored to, as to the servers of a group."""
 
 
-def store_s(servers: int, repeats: int) -> float:
-    """Core time of a plain store of three layers of ``servers`` values, s.
+def core_s(calls: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, F64]:
+    """Core time of each call in each round, s, (rounds,).
 
-    A parallel loop over all values stores them one by one, at half the speed of memory; a serial
-    loop of fixed length within is vectorised, where the run's value comes from the same tree.
+    The calls of a round follow each other, so that what memory and processors have to bear from
+    outside meets all of them: what a call takes over another is the median over the rounds.
     """
-    from sdc_taichi.kernels.backend import SLICE, ti
+    for call in calls.values():
+        call()
+    spent = {name: np.zeros(rounds) for name in calls}
+    for at in range(rounds):
+        for name, call in calls.items():
+            start = time.process_time()
+            call()
+            spent[name][at] = time.process_time() - start
+    return spent
 
-    slices = 64
+
+def plain_store(servers: int) -> Callable[[], object]:
+    """A store of three layers of ``servers`` values on all threads, in whole vectors."""
+    from sdc_taichi.kernels.backend import SLICE, BoundKernel, aligned, part_of, ti
+
+    lanes, slices = 8, 64
+    blocks_1d = ti.types.ndarray(dtype=ti.types.vector(lanes, ti.f32), ndim=1)
 
     @ti.kernel
     @no_type_check
-    def store(
-        a: ti.template(), b: ti.template(), c: ti.template(), of_run: ti.template(), runs: ti.i32
-    ):
+    def store(slices: ti.i32, values: blocks_1d, a: blocks_1d, b: blocks_1d, c: blocks_1d):
         for k in range(slices * SLICE):
             if k % SLICE == 0:
-                part = ti.cast(k // SLICE, ti.i64)
-                first = ti.cast(part * runs // slices, ti.i32)
-                last = ti.cast((part + 1) * runs // slices, ti.i32)
-                for run in range(first, last):
-                    x = of_run[run]
-                    at = run * RUN
-                    for i in range(RUN):
-                        a[at + i] = x
-                        b[at + i] = x
-                        c[at + i] = x
+                first, end = part_of(k // SLICE, slices, values.shape[0])
+                for run in range(first, end):
+                    x = values[run]
+                    for at in range(run * RUN, (run + 1) * RUN):
+                        a[at] = x
+                        b[at] = x
+                        c[at] = x
 
-    runs = -(-servers // RUN)
-    fields = [ti.field(ti.f32) for _ in range(4)]
-    builder = ti.FieldsBuilder()
-    for field, length in zip(fields, (runs * RUN, runs * RUN, runs * RUN, runs), strict=True):
-        builder.dense(ti.i, length).place(field)
-    tree = builder.finalize()
-    spent = core_s(lambda: (store(*fields, runs), ti.sync()), repeats)
-    tree.destroy()
-    return spent
+    runtime.ensure_started()
+    runs = -(-servers // (lanes * RUN))
+    arrays: list[Any] = [aligned((n, lanes), np.float32) for n in (runs, *[runs * RUN] * 3)]
+    for array in arrays:
+        array[:] = 0.0
+    bound = BoundKernel(store, templates=0)
+    return lambda: bound(slices, *arrays)

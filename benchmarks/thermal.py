@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from roof import core_s, store_s
+from roof import core_s, plain_store
 
 from sdc_taichi import build_fleet, load_config, make_configs
 from sdc_taichi.fleet import Fleet
@@ -67,20 +67,17 @@ def measure(n_dcs: int, racks: int, servers: int, repeats: int) -> dict[str, flo
     def advance(met: Conditions) -> object:
         return hall.advance(met, settled, coil, STEP_S, STEP_S / SUBSTEPS)
 
-    # In this order: server layers are those of the step before.
-    steps: dict[str, tuple[Hall, Callable[[], object]]] = {
-        "flat": (flat, lambda: flat.solve(alike)),
-        "steady": (hall, lambda: hall.solve(alike)),
-        "uneven steady": (hall, lambda: hall.solve(uneven)),
-        "transient": (hall, lambda: advance(alike)),
-        "uneven transient": (hall, lambda: advance(uneven)),
-    }
     in_all = n_dcs * racks * servers
-    spent_s = {"roof": store_s(in_all, repeats)}
-    for name, (one, step) in steps.items():
-        spent_s[name] = core_s(step, repeats)
-        spent_s[name] += core_s(lambda one=one: one.servers(layers), repeats)  # type: ignore[misc]
-    return {name: 1e9 * spent / in_all for name, spent in spent_s.items()}
+    steps: dict[str, Callable[[], object]] = {
+        "roof": plain_store(in_all),
+        "flat": lambda: (flat.solve(alike), flat.servers(layers)),
+        "steady": lambda: (hall.solve(alike), hall.servers(layers)),
+        "uneven steady": lambda: (hall.solve(uneven), hall.servers(layers)),
+        "transient": lambda: (advance(alike), hall.servers(layers)),
+        "uneven transient": lambda: (advance(uneven), hall.servers(layers)),
+    }
+    spent_s = core_s(steps, repeats)
+    return {name: float(1e9 * np.median(spent) / in_all) for name, spent in spent_s.items()}
 
 
 def row(ns: dict[str, float]) -> list[tuple[str, float]]:
