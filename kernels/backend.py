@@ -24,7 +24,7 @@ import taichi as ti  # noqa: E402
 from taichi.lang import kernel_impl  # noqa: E402
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext  # noqa: E402
 
-__all__ = ["BoundKernel", "aligned", "ti"]
+__all__ = ["BoundKernel", "aligned", "func", "kernel", "ti"]
 
 
 OPTIONS = {"cfg_optimization": False, "fast_math": False, "real_matrix_scalarize": False}
@@ -54,6 +54,26 @@ def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     return raw[start : start + length].view(of).reshape(shape)
 
 
+def _outside_classes(decorate: Any) -> Any:
+    """``ti.func`` or ``ti.kernel`` for functions that stand in no class.
+
+    Taichi asks `inspect` for the class around whatever it decorates, for which that goes through
+    the files of all modules: 30 ms at every start.
+    """
+
+    def define(function: Any) -> Any:
+        asked = kernel_impl._inside_class
+        kernel_impl._inside_class = lambda *_, **__: False
+        try:
+            return decorate(function)
+        finally:
+            kernel_impl._inside_class = asked
+
+    return define
+
+
+func, kernel = _outside_classes(ti.func), _outside_classes(ti.kernel)
+
 F64_LANES = 8
 """Numbers in f64 that a vector of the processor holds."""
 _SAME_SETS_BYTES = 4096
@@ -77,14 +97,14 @@ def held(rows: Any, length: int) -> Any:
     return rows.reshape(len(rows), -1)[:, :length]
 
 
-@ti.func
+@func
 @no_type_check
 def larger(a, b):
     """As ``ti.max`` of vectors; one instruction, where that looks for NaN as well."""
     return ti.select(a > b, a, b)
 
 
-@ti.func
+@func
 @no_type_check
 def smaller(a, b):
     """As ``ti.min``, likewise."""
@@ -147,7 +167,7 @@ def reals(precision: str) -> Any:
     return {"f32": ti.f32, "f64": ti.f64}[precision]
 
 
-@ti.func
+@func
 @no_type_check
 def part_of(part, parts, items):
     """First of the items of one of equal parts, and the end of the last."""

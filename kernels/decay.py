@@ -3,7 +3,7 @@
 from math import factorial
 from typing import no_type_check
 
-from .backend import ti
+from .backend import func, ti
 
 FIT_END = 5
 """Of the constants, the first after those of the outlet fit."""
@@ -19,7 +19,7 @@ def decay_constants(precision: str) -> list[float]:
     return [(-1.0) ** k / factorial(k + 1) for k in reversed(range(SERIES_TERMS[precision]))]
 
 
-@ti.func
+@func
 @no_type_check
 def doublings(hall: ti.template(), most):
     """How often ``most`` is halved to be where the series holds."""
@@ -30,7 +30,7 @@ def doublings(hall: ti.template(), most):
     return count
 
 
-@ti.func
+@func
 @no_type_check
 def halved(hall: ti.template(), times):
     """0.5 to so many times."""
@@ -41,7 +41,7 @@ def halved(hall: ti.template(), times):
     return x
 
 
-@ti.func
+@func
 @no_type_check
 def gone_per(hall: ti.template(), y, times):
     """(1 - exp(-x)) / y, where y >= 0 doubled so many times is x.

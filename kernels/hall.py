@@ -8,7 +8,7 @@ transient ones a sweep is a substep.
 from functools import cache
 from typing import Any, no_type_check
 
-from .backend import SLICE, Table, larger, part_of, reals, shared, smaller, ti
+from .backend import SLICE, Table, func, kernel, larger, part_of, reals, shared, smaller, ti
 from .decay import SERIES_TERMS
 from .elementary import log_and_exp
 from .mixes import (
@@ -75,7 +75,7 @@ RECOMMENDED_LOW_C = 18.0
 """Ends of the range that ASHRAE TC 9.9 (2021) recommends for inlets, beyond which degrees count."""
 
 
-@ti.func
+@func
 @no_type_check
 def compute_groups(
     hall: ti.template(),
@@ -108,7 +108,7 @@ def compute_groups(
     return stored_w
 
 
-@ti.func
+@func
 @no_type_check
 def compute_block(
     hall: ti.template(),
@@ -182,7 +182,7 @@ def compute_block(
     keep_racks(hall, block_at, now, found)
 
 
-@ti.func
+@func
 @no_type_check
 def no_inlets(hall: ti.template()):
     """What a rack keeps of the inlets of its groups, of which ``zones`` have been seen."""
@@ -195,7 +195,7 @@ def no_inlets(hall: ti.template()):
     )
 
 
-@ti.func
+@func
 @no_type_check
 def add_inlet(hall: ti.template(), inlets: ti.template(), count, inlet_c):
     """Inlet of a group; one without servers is as another one of its rack."""
@@ -206,7 +206,7 @@ def add_inlet(hall: ti.template(), inlets: ti.template(), count, inlet_c):
     inlets.zones += hall.real(1.0)
 
 
-@ti.func
+@func
 @no_type_check
 def keep_hottest(
     hall: ti.template(),
@@ -225,7 +225,7 @@ def keep_hottest(
     return inlet_c
 
 
-@ti.func
+@func
 @no_type_check
 def give(
     hall: ti.template(), block_at, now: ti.template(), mixed_c, outlet_c, moves: ti.template()
@@ -246,7 +246,7 @@ def give(
         moves.most_k = larger(ti.select(is_rack, change_k, hall.zeros - far_k), moves.most_k)
 
 
-@ti.func
+@func
 @no_type_check
 def keep_racks(hall: ti.template(), block_at, now: ti.template(), found: ti.template()):
     """What racks come to in a sweep, or on the mean of the substeps; the hottest inlet of all."""
@@ -274,7 +274,7 @@ def keep_racks(hall: ti.template(), block_at, now: ti.template(), found: ti.temp
     block.inlet_max_c = found.inlet_max_c
 
 
-@ti.func
+@func
 @no_type_check
 def compute_chunk(
     hall: ti.template(),
@@ -344,7 +344,7 @@ def compute_chunk(
     keep_range(hall, chunk_at, moves.least_k, moves.most_k)
 
 
-@ti.func
+@func
 @no_type_check
 def go_on(hall: ti.template(), n, now: ti.template()):
     """CRAC units at the servers' airflow, and whether and from where their data center goes on."""
@@ -376,7 +376,7 @@ def go_on(hall: ti.template(), n, now: ti.template()):
             shift_mixes(hall, n, sweep, exchanged_now, middle_k, apart)
 
 
-@ti.func
+@func
 @no_type_check
 def so_far(hall: ti.template(), now: ti.template(), before, value):
     """Mean over the substeps until now, or value of the last sweep."""
@@ -386,7 +386,7 @@ def so_far(hall: ti.template(), now: ti.template(), before, value):
     return out
 
 
-@ti.func
+@func
 @no_type_check
 def keep_air(hall: ti.template(), n, now: ti.template()):
     """What air the CRAC units give and take, and heat at their coils."""
@@ -400,7 +400,7 @@ def keep_air(hall: ti.template(), n, now: ti.template()):
     dc.coil_w = so_far(hall, now, dc.coil_w, now.coil_w)
 
 
-@ti.func
+@func
 @no_type_check
 def keep_results(hall: ti.template(), n):
     """What comes out of a data center that is at its end, after ``keep_air``."""
@@ -430,7 +430,7 @@ def keep_results(hall: ti.template(), n):
     dc.hottest_server = ti.cast(server, ti.f64)
 
 
-@ti.func
+@func
 @no_type_check
 def close(hall: ti.template(), n, terms_at, late, hottest: ti.template()):
     """End of a sweep of a data center, and at its own end what comes out.
@@ -462,7 +462,7 @@ def close(hall: ti.template(), n, terms_at, late, hottest: ti.template()):
         keep_results(hall, n)
 
 
-@ti.func
+@func
 @no_type_check
 def run(hall: ti.template(), terms_at, first_chunk, end_chunk):
     """All sweeps of a data center, or one of some of its chunks, which wait for the others."""
@@ -546,7 +546,7 @@ def hall_kernel(precision: str) -> Any:
     runs_1d = ti.types.ndarray(dtype=ti.types.vector(RUN_LANES, real), ndim=1)
     mix_1d = ti.types.ndarray(dtype=ti.types.vector(SOURCES * LANES, real), ndim=1)
 
-    @ti.kernel
+    @kernel
     @no_type_check
     def hall(
         recirculates: ti.template(),

@@ -3,7 +3,7 @@
 from functools import cache
 from typing import Any, no_type_check
 
-from .backend import SLICE, Table, larger, part_of, reals, shared, ti
+from .backend import SLICE, Table, func, kernel, larger, part_of, reals, shared, ti
 from .elementary import log_and_exp
 from .servers import (
     OUTLET_OF_SERVERS,
@@ -41,7 +41,7 @@ TEMPLATES = 3
 N_VALUES = len(GROUP_OUT)
 
 
-@ti.func
+@func
 @no_type_check
 def compute_groups(hall: ti.template(), n, block_at, values_at, servers: ti.template()):
     """Values of the groups of a block as in the last sweep or substep."""
@@ -78,7 +78,7 @@ def compute_groups(hall: ti.template(), n, block_at, values_at, servers: ti.temp
                 z += hall.step
 
 
-@ti.func
+@func
 @no_type_check
 def spread_each(hall: ti.template(), block_at, values_at, first_row):
     """Values of the groups of a block to as many places of the layers.
@@ -119,7 +119,7 @@ def spread_each(hall: ti.template(), block_at, values_at, first_row):
         lane += hall.step
 
 
-@ti.func
+@func
 @no_type_check
 def store(hall: ti.template(), b, inlet_c, outlet_c, power_w):
     """A vector of servers to the layers."""
@@ -128,7 +128,7 @@ def store(hall: ti.template(), b, inlet_c, outlet_c, power_w):
     hall.layer_blocks[2][b] = power_w
 
 
-@ti.func
+@func
 @no_type_check
 def spread_runs(hall: ti.template(), block_at, values_at):
     """Values of the groups of a block to runs of servers, nearly all in whole vectors."""
@@ -178,7 +178,7 @@ def spread_runs(hall: ti.template(), block_at, values_at):
         lane += 1
 
 
-@ti.func
+@func
 @no_type_check
 def write_chunk(hall: ti.template(), chunk_at, values_at, each_once):
     """Values of the servers of a chunk, or of each of its groups once."""
@@ -217,7 +217,7 @@ def layers_kernel(precision: str) -> Any:
     doubles_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
     doubles_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
 
-    @ti.kernel
+    @kernel
     @no_type_check
     def layers(
         recirculates: ti.template(),

@@ -9,7 +9,7 @@ exchange; where all of them moved alike, the mixes are shifted and nothing is ex
 
 from typing import no_type_check
 
-from .backend import larger, smaller, ti
+from .backend import func, larger, smaller, ti
 from .decay import doublings, gone_per, halved
 from .sums import keep_range
 from .thermal import (
@@ -39,7 +39,7 @@ STILL_PER_S = 1.0 / 128.0
 the room; a power of two, exact in both precisions."""
 
 
-@ti.func
+@func
 @no_type_check
 def cubic(x):
     """Weights of four points for the place x between the inner two (Catmull and Rom 1974).
@@ -56,7 +56,7 @@ def cubic(x):
     )
 
 
-@ti.func
+@func
 @no_type_check
 def expect(hall: ti.template(), n):
     """How much of each pattern to start from, and last ``kept``.
@@ -81,7 +81,7 @@ def expect(hall: ti.template(), n):
     return start
 
 
-@ti.func
+@func
 @no_type_check
 def start_mix(hall: ti.template(), n, block_at, now: ti.template(), start):
     """Mix before the racks of a block that a steady state is looked for from.
@@ -107,7 +107,7 @@ def start_mix(hall: ti.template(), n, block_at, now: ti.template(), start):
     return mix_c
 
 
-@ti.func
+@func
 @no_type_check
 def mixed_from(hall: ti.template(), at, first, count):
     """Mixes before the racks of a block, or what they change by, from all racks of the hall."""
@@ -126,7 +126,7 @@ def mixed_from(hall: ti.template(), at, first, count):
     return out
 
 
-@ti.func
+@func
 @no_type_check
 def mixed_from_runs(hall: ti.template(), block_at, side):
     """The same of halls that drop weights, by runs of neighbouring racks."""
@@ -155,7 +155,7 @@ def mixed_from_runs(hall: ti.template(), block_at, side):
     return mix_c
 
 
-@ti.func
+@func
 @no_type_check
 def exchanged(hall: ti.template(), n, block_at, side):
     """Mix before the racks of a block from what the racks gave in the sweep before."""
@@ -179,7 +179,7 @@ def exchanged(hall: ti.template(), n, block_at, side):
     return mix_c
 
 
-@ti.func
+@func
 @no_type_check
 def next_mix(hall: ti.template(), n, block_at, now: ti.template(), start):
     """Mix before the racks of a block in the present sweep."""
@@ -194,7 +194,7 @@ def next_mix(hall: ti.template(), n, block_at, now: ti.template(), start):
     return mix_c + now.shift_k
 
 
-@ti.func
+@func
 @no_type_check
 def exchange_at_once(hall: ti.template(), n, chunk_at, again, reference_c):
     """Mixes of a data center of one chunk that keeps every weight, in two passes.
@@ -239,7 +239,7 @@ def exchange_at_once(hall: ti.template(), n, chunk_at, again, reference_c):
         keep_range(hall, chunk_at, least_k, most_k)
 
 
-@ti.func
+@func
 @no_type_check
 def parcels_of(hall: ti.template(), n, chunk_at, servers: ti.template()):
     """How the recirculated air before the racks of a chunk follows its mix in a substep.
@@ -275,7 +275,7 @@ def parcels_of(hall: ti.template(), n, chunk_at, servers: ti.template()):
     )
 
 
-@ti.func
+@func
 @no_type_check
 def follow_mixes(
     hall: ti.template(), n, chunk_at, block_terms_0, now: ti.template(), servers: ti.template()
@@ -301,7 +301,7 @@ def follow_mixes(
         terms_at += N_BLOCK_TERMS
 
 
-@ti.func
+@func
 @no_type_check
 def judge_sweep(hall: ti.template(), n, supply_c, uncovered, more):
     """Whether a data center in steady air is at its end; CRAC units must cover what they did."""
@@ -319,7 +319,7 @@ def judge_sweep(hall: ti.template(), n, supply_c, uncovered, more):
     return ends
 
 
-@ti.func
+@func
 @no_type_check
 def shift_mixes(hall: ti.template(), n, sweep, exchanged_now, middle_k, apart):
     """Shift of all mixes of a data center that drops weights, in its next sweep.

@@ -3,7 +3,7 @@
 from functools import cache
 from typing import Any, no_type_check
 
-from .backend import F64_LANES, SLICE, BoundKernel, ti
+from .backend import F64_LANES, SLICE, BoundKernel, kernel, ti
 
 TASK_BLOCKS = 32
 """Vectors side by side in a row that one task takes on."""
@@ -35,7 +35,7 @@ def queue_kernel() -> Any:
     blocks = ti.types.ndarray(dtype=ti.types.vector(F64_LANES, ti.f64), ndim=2)
     ints = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
-    @ti.kernel
+    @kernel
     @no_type_check
     def queue_after(
         serial: ti.template(),

@@ -7,14 +7,14 @@ y = clip(slope*T + offset + shift*u); fan power reference*(y/reference ratio)^ex
 
 from typing import no_type_check
 
-from .backend import larger, smaller, ti
+from .backend import func, larger, smaller, ti
 from .decay import doublings, gone_per, halved
 from .thermal import LANES, OF_GROUPS, OF_RACKS, OUTLETS
 
 OUTLET_OF_SERVERS, OUTLET_OF_RACKS = OUTLETS.index("server"), OUTLETS.index("rack")
 
 
-@ti.func
+@func
 @no_type_check
 def servers_of(hall: ti.template(), n):
     """What the servers of a data center have in common."""
@@ -49,7 +49,7 @@ def servers_of(hall: ti.template(), n):
     )
 
 
-@ti.func
+@func
 @no_type_check
 def air_before(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.template()):
     """Air before the racks of a block.
@@ -89,7 +89,7 @@ def air_before(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.templa
     )
 
 
-@ti.func
+@func
 @no_type_check
 def racks_of(hall: ti.template(), servers: ti.template(), block_at):
     """Load of the racks of a block, and what all servers of a rack have in common."""
@@ -115,7 +115,7 @@ def racks_of(hall: ti.template(), servers: ti.template(), block_at):
     )
 
 
-@ti.func
+@func
 @no_type_check
 def of_group(
     hall: ti.template(),
@@ -149,7 +149,7 @@ def of_group(
     return inlet_c, draws_w, speed, turns
 
 
-@ti.func
+@func
 @no_type_check
 def no_groups(hall: ti.template()):
     """Sums that begin."""
@@ -163,7 +163,7 @@ def no_groups(hall: ti.template()):
     )
 
 
-@ti.func
+@func
 @no_type_check
 def add_group(
     hall: ti.template(), sums: ti.template(), group, count, inlet_c, draws_w, speed, turns
@@ -180,7 +180,7 @@ def add_group(
         sums.inlet_m3k_s += counted * inlet_c
 
 
-@ti.func
+@func
 @no_type_check
 def complete(hall: ti.template(), sums: ti.template(), racks: ti.template(), air: ti.template()):
     """Multiply the sums with what all groups have in common; return what they take in of fresh air.
@@ -200,7 +200,7 @@ def complete(hall: ti.template(), sums: ti.template(), racks: ti.template(), air
     return fresh_m3s
 
 
-@ti.func
+@func
 @no_type_check
 def rack_outlet(hall: ti.template(), servers: ti.template(), sums: ti.template(), per_flow):
     """What leaves a rack by the models that know racks alone; not with recirculation.
@@ -221,7 +221,7 @@ def rack_outlet(hall: ti.template(), servers: ti.template(), sums: ti.template()
     return outlet_c
 
 
-@ti.func
+@func
 @no_type_check
 def warming_of(hall: ti.template(), n, servers: ti.template()):
     """How the servers of a data center become warmer in a substep, C dT/dt = P - eps K (T - T_in).
@@ -243,7 +243,7 @@ def warming_of(hall: ti.template(), n, servers: ti.template()):
     )
 
 
-@ti.func
+@func
 @no_type_check
 def warm(
     hall: ti.template(), warming: ti.template(), racks: ti.template(), at, inlet_c, draws_w, speed
@@ -258,7 +258,7 @@ def warm(
     return change_k
 
 
-@ti.func
+@func
 @no_type_check
 def take_over(hall: ti.template(), block_at):
     """Temperatures of the servers of a block before the step."""
@@ -271,7 +271,7 @@ def take_over(hall: ti.template(), block_at):
         hall.server_c[block.place + z] = before_c
 
 
-@ti.func
+@func
 @no_type_check
 def hand_over(hall: ti.template(), block_at, z, count, after_c):
     """Temperatures of the servers of a group after the step."""

@@ -23,7 +23,9 @@ from .backend import (
     F64_LANES,
     SLICE,
     BoundKernel,
+    func,
     held,
+    kernel,
     larger,
     smaller,
     ti,
@@ -260,7 +262,7 @@ def _source(body: list[str]) -> str:
     two thirds of the machine code of a short one, and nothing gained.
     """
     head = (
-        "@ti.kernel\n"
+        "@kernel\n"
         "def stage(serial: ti.template(), step: ti.i32, shared: Reals, constants: Rows,\n"
         "          given: Rows, out: Rows):\n"
         f"    n_tasks = (out.shape[1] + {_TASK_BLOCKS - 1}) // {_TASK_BLOCKS}\n"
@@ -276,7 +278,7 @@ def _source(body: list[str]) -> str:
     return head + "".join(f"                {line}\n" for line in [*body, "i += step"])
 
 
-@ti.func
+@func
 @no_type_check
 def _minus(a):
     return a * ti.f64(-1.0)
@@ -290,6 +292,7 @@ def _kernel(source: str) -> Any:
     linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
     scope = {
         "ti": ti,
+        "kernel": kernel,
         "Reals": ti.types.ndarray(dtype=ti.f64, ndim=1),
         "Rows": ti.types.ndarray(dtype=ti.types.vector(F64_LANES, ti.f64), ndim=2),
         "larger": larger,
