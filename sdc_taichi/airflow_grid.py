@@ -11,9 +11,7 @@ import numpy.typing as npt
 from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.layout import Plan, floor_plan
-from sdc_taichi.types import F64
-
-I32 = npt.NDArray[np.int32]
+from sdc_taichi.types import F64, I32
 
 MOST_CELLS = 4_000_000
 """About 2 GB on two threads."""

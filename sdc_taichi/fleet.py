@@ -27,9 +27,7 @@ from sdc_taichi.recirculation import (
     design_point,
     rack_servers,
 )
-from sdc_taichi.types import F64
-
-I32 = npt.NDArray[np.int32]
+from sdc_taichi.types import F64, I32
 
 MOST_ENTRIES = int(np.iinfo(np.int32).max)
 STAGE_MODELS = {

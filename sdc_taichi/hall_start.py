@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.recirculation import DENSE_RACKS, I32, RackServers, Recirculation
-from sdc_taichi.types import F64
+from sdc_taichi.recirculation import DENSE_RACKS, RackServers, Recirculation
+from sdc_taichi.types import F64, I32
 
 LOADS = np.linspace(0.0, 1.0, 65)
 """Loads of the table: airflow and power bend where their limits set in."""

@@ -24,9 +24,7 @@ import numpy.typing as npt
 from sdc_taichi.config import DataCenterConfig, HallConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.layout import floor_plan, row_distance_m
-from sdc_taichi.types import F64
-
-I32 = npt.NDArray[np.int32]
+from sdc_taichi.types import F64, I32
 
 DENSE_RACKS = 64
 """Halls up to this size keep every weight; larger ones drop those below the cutoff."""

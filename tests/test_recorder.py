@@ -586,6 +586,9 @@ def test_results_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         sim.reset()
         rec.begin(sim)
         first = sim.step()
+        for values in (np.zeros(2), np.zeros((1, 1)), 0.0):
+            with pytest.raises(SdcError, match=r"reward a has shape .*; valid is one value per"):
+                rec.add(first, rewards={"a": values})  # type: ignore[dict-item]
         rec.add(first, rewards={"a": np.zeros(1)})
         with pytest.raises(SdcError, match="step 0 after step 0"):
             rec.add(first, rewards={"a": np.zeros(1)})

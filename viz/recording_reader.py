@@ -152,7 +152,7 @@ class Reader:
 
         Raises:
             SdcError: it is none of the simulator's, or does not follow the one before, or has other
-                rewards than it.
+                rewards than it, or rewards that are not one value per data center.
         """
         self._check(result)
         queue = self._sim.state.queue[self._every_focus].reshape(-1)
@@ -164,6 +164,12 @@ class Reader:
                 f"recorder: rewards {', '.join(names) or 'none'}, expected "
                 f"{', '.join(self.reward_names or ()) or 'none'} as in the first step"
             )
+        for name, values in (rewards or {}).items():
+            if np.shape(values) != (self._fleet.size,):
+                raise SdcError(
+                    f"recorder: reward {name} has shape {np.shape(values)}; valid is one value per "
+                    f"data center, ({self._fleet.size},)"
+                )
         row = len(self._steps) % len(self._rows)
         if row == 0 and self._steps:
             self._take_apart()

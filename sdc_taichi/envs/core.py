@@ -21,14 +21,13 @@ from sdc_taichi.config import DataCenterConfig, first_step_day, load_config
 from sdc_taichi.control import Idle, View, controlled, make_controller, viewer
 from sdc_taichi.control.rules import unrepeated
 from sdc_taichi.envs.features import AGENTS, Observer, heat_map, heat_map_space
-from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.released import ReleasedObserver
 from sdc_taichi.envs.rewards import Rewards
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
 from sdc_taichi.hall import Precision
 from sdc_taichi.sim import Simulator
-from sdc_taichi.types import F64, I64, Actions, State, StepResult
+from sdc_taichi.types import F32, F64, I64, Actions, State, StepResult
 
 Observation = F32 | dict[str, F32]
 """(B, n), or with the heat map a dict of ``features`` (B, n) and ``heat_map`` (B, rows, racks per

@@ -20,20 +20,13 @@ from gymnasium.spaces import Box
 
 from sdc_taichi.control.view import View
 from sdc_taichi.drivers import Drivers, Table
-from sdc_taichi.envs.forecasts import (
-    CI_LEADS_H,
-    F32,
-    PERFECT,
-    WEATHER_LEADS_H,
-    ForecastError,
-    Forecasts,
-)
+from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, ForecastError, Forecasts
 from sdc_taichi.envs.timed import Layout, TimeRows, time_rows
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 from sdc_taichi.fleet import Fleet
-from sdc_taichi.plant.workload import TASKS_PER_STEP
+from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP
 from sdc_taichi.sizing import Sizing
-from sdc_taichi.types import F64, I64
+from sdc_taichi.types import F32, F64, I64
 
 if TYPE_CHECKING:
     from sdc_taichi.kernels.stage import CompiledStage
@@ -57,8 +50,6 @@ AGE_EDGES_H = (0.0, 6.0, 12.0, 18.0, 24.0)
 """Lower edges of the age bins, those of the released code (``carbon_ls.py``); the last is open."""
 UNLIMITED_QUEUE_H = 10.0
 """Hours of full work that a queue without limit is measured by."""
-NEGLIGIBLE_TASKS = 1e-9
-"""Left in the queue by rounding; no ages are read off it."""
 
 _CLOCK = ("time_of_day", "time_of_year")
 _CI = ("ci", "ci_forecast")
@@ -243,7 +234,7 @@ class Observer:
         self.spaces = {agent: space(found) for agent, found in self.features.items()}
 
         inside = _inside(self._units)
-        self._row, self._inside_width = _places(inside)
+        self._inside_width = sum(feature.size for feature in inside)
         self._timed = _Timed(_timed(ci_leads_h, weather_leads_h), forecasts, fleet.steps_per_hour)
         at, _ = _places(self.state_features)
         self._layouts = {
@@ -542,8 +533,8 @@ def _circle(steps: int) -> F32:
 
 def _setpoint_mean_c(view: View) -> F64:
     """Mean setpoint of the CRAC units, (B,)."""
-    first = view.fleet.unit_start
-    return np.asarray(np.add.reduceat(view.state.setpoint_c, first[:-1]) / np.diff(first))
+    fleet = view.fleet
+    return np.asarray(fleet.unit_sums(view.state.setpoint_c) / np.diff(fleet.unit_start))
 
 
 def _hall_shape(fleet: Fleet) -> tuple[int, int]:

@@ -15,13 +15,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from sdc_taichi.drivers import Drivers, Table
 from sdc_taichi.errors import ConfigError, RuntimeStateError
-from sdc_taichi.types import F64, I64
-
-F32 = npt.NDArray[np.float32]
+from sdc_taichi.types import F32, F64, I64
 
 CI_LEADS_H = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0)
 WEATHER_LEADS_H = (3.0, 6.0, 12.0, 24.0)

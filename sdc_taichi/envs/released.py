@@ -22,15 +22,14 @@ from gymnasium.spaces import Box
 
 from sdc_taichi.control.view import View
 from sdc_taichi.drivers import Table
-from sdc_taichi.envs.features import AGE_EDGES_H, AGENTS, NEGLIGIBLE_TASKS, Feature
-from sdc_taichi.envs.forecasts import F32
+from sdc_taichi.envs.features import AGE_EDGES_H, AGENTS, Feature
 from sdc_taichi.envs.timed import Layout, TimeRows, time_rows
 from sdc_taichi.errors import DataError, RuntimeStateError
 from sdc_taichi.fleet import Fleet, build_fleet
 from sdc_taichi.hall import Hall, Precision
-from sdc_taichi.plant.workload import TASKS_PER_STEP, age_histogram
+from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP, age_histogram
 from sdc_taichi.sizing import Sizing, released_ranges
-from sdc_taichi.types import F64, I64, StepResult
+from sdc_taichi.types import F32, F64, I64, StepResult
 
 CI_STEPS = 8
 """Steps of carbon intensity ahead (``sustaindc_env.py``)."""

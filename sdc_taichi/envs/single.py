@@ -12,13 +12,12 @@ from gymnasium import spaces
 
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.core import Core, Observation, Source, Step, as_array
-from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.envs.parallel import core_of_one
 from sdc_taichi.envs.recording import Recording
 from sdc_taichi.envs.standards import OneDataCenter, first, floats, start_day, start_days
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.hall import Precision
-from sdc_taichi.types import F64
+from sdc_taichi.types import F32, F64
 
 
 class Learner(Protocol):

@@ -11,9 +11,8 @@ import numpy as np
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.core import Core, Observation
 from sdc_taichi.envs.features import hint
-from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.types import F64, I64
+from sdc_taichi.types import F32, F64, I64
 
 RESET_OPTIONS = ("start_day",)
 

@@ -14,9 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.drivers import Table
-from sdc_taichi.types import I64
-
-F32 = npt.NDArray[np.float32]
+from sdc_taichi.types import F32, I64
 
 TABLE_BYTES = 2**28
 """Most memory of one observer's tables; more series are read step by step."""

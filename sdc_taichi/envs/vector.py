@@ -12,14 +12,13 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.core import Core, Observation, Source
-from sdc_taichi.envs.forecasts import F32
 from sdc_taichi.envs.options import make_options
 from sdc_taichi.envs.recording import RecordedCore, Recording
 from sdc_taichi.envs.single import learner, one_agent, options_for
 from sdc_taichi.envs.standards import ManyDataCenters, start_day, start_days
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall import Precision
-from sdc_taichi.types import F64
+from sdc_taichi.types import F32, F64
 
 Flags = npt.NDArray[np.bool_]
 Seed = int | Sequence[int | None] | None

@@ -200,7 +200,7 @@ class Queue:
         self._kernel(
             self._serial,
             1,
-            _NEGLIGIBLE_TASKS,
+            NEGLIGIBLE_TASKS,
             self._due_lanes,
             self._rows,
             self._moved,
@@ -260,5 +260,5 @@ def age_histogram(queue: F64, edges_steps: F64) -> F64:
     return found.T
 
 
-_NEGLIGIBLE_TASKS = 1e-9
+NEGLIGIBLE_TASKS = 1e-9
 """Left by rounding where a step's work was taken out in parts; no age is read off it."""
