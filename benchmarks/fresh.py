@@ -65,9 +65,9 @@ def stepped(fleet: Fleet) -> tuple[Callable[[], object], Callable[[], object]]:
 def first_step(what: str) -> float:
     """Time of day at the end of the first step of one data center, or of its environment."""
     if what == "environment":
-        env = sdc_taichi.parallel_env("corrected")
-        env.reset(seed=0)
-        env.step(dict.fromkeys(env.possible_agents, 1))
+        one = sdc_taichi.parallel_env("corrected")
+        one.reset(seed=0)
+        one.step(dict.fromkeys(one.possible_agents, 1))
     else:
         sim = sdc_taichi.Simulator(sdc_taichi.load_config("corrected"))
         sim.reset()

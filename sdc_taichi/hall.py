@@ -23,7 +23,8 @@ _RELEASED_OUTLET_FIT = (1.918, 1.096 - 1.0, 0.526, 0.824 - 1.0, -14.01)
 flow over 1, K."""
 
 _SERIAL_GROUPS = 8192
-"""So many groups, or of layers servers, and less are not worth waking a second thread."""
+"""Up to so many places of groups, counted again in every substep, or servers of layers: waking a
+second thread takes longer."""
 
 TOLERANCE_K: dict[Precision, float] = {"f32": 1e-4, "f64": 1e-12}
 """How little another sweep would move the exhaust mix before any rack."""
@@ -146,7 +147,7 @@ class Hall:
         from sdc_taichi.kernels import decay, hall, layers, thermal
         from sdc_taichi.kernels.backend import BoundKernel, aligned
 
-        self._thermal, self._empty = thermal, aligned
+        self._thermal, self._aligned = thermal, aligned
         self._precision: Precision = precision
         self._dtype = np.dtype(np.float32 if precision == "f32" else np.float64)
         self._fleet = fleet
@@ -168,9 +169,9 @@ class Hall:
         self._slices = max(1, min(8 * threads, len(self._tasks) - 1))
         self._terms = self._lanes(self._slices * thermal.SCRATCH)
         squares = self._slices * -(-self._most_groups // thermal.LANES)
-        values = self._empty((len(thermal.GROUP_OUT), squares, thermal.SQUARE), self._dtype)
+        values = self._aligned((len(thermal.GROUP_OUT), squares, thermal.SQUARE), self._dtype)
         self._group_values = values.reshape(len(values), -1, thermal.LANES), values
-        """Twice the room for what the groups of a block come to."""
+        """The same room twice: as the kernel computes it, and in squares to be transposed."""
         self._result_names = (*thermal.DC_OUT, *(f"rack_{name}" for name in thermal.RACK_OUT))
         self._solved: bool | None = None
         """Whether the last step was transient; None without one."""
@@ -255,7 +256,7 @@ class Hall:
         self._block_ints = _table(filled, most, table, first_place[:-1])
         self._group_places, self._most_groups = int(first_place[-1]), int(most.max())
         self._server_c = self._lanes(1)
-        self._no_groups = np.zeros(1, self._dtype)
+        self._none = np.zeros(1, self._dtype)
 
     def _lay_out_air(self, thermal: Any) -> None:
         """Weights and unit shares at the places of the racks."""
@@ -347,7 +348,7 @@ class Hall:
         vectors = -(-(lane + length) // lanes)
         begin = starts(vectors[one], "vectors of weights")
         self._run_ints = _table(first // lanes, vectors, begin[same])
-        weights = self._empty((int(begin[-1]) * lanes,), self._dtype)
+        weights = self._aligned((int(begin[-1]) * lanes,), self._dtype)
         weights[:] = 0.0
         within = np.arange(int(length[one].sum()))
         within -= np.repeat(np.cumsum(length[one]) - length[one], length[one])
@@ -409,7 +410,7 @@ class Hall:
 
     def _lanes(self, *shape: int) -> Any:
         """Zeros that the kernel takes as vectors of lanes."""
-        out = self._empty((*shape, self._thermal.LANES), self._dtype)
+        out = self._aligned((*shape, self._thermal.LANES), self._dtype)
         out[:] = 0.0
         return out
 
@@ -483,7 +484,7 @@ class Hall:
         """
         shape = (self._fleet.servers,)
         if into is None:
-            into = ServerLayers(*(self._empty(shape, self._dtype) for _ in range(3)))
+            into = ServerLayers(*(self._aligned(shape, self._dtype) for _ in range(3)))
         layers = [into.inlet_c, into.outlet_c, into.power_w]
         for name, layer in zip(("inlet_c", "outlet_c", "power_w"), layers, strict=True):
             has = layer.shape, layer.dtype, layer.flags.c_contiguous, layer.flags.writeable
@@ -496,7 +497,7 @@ class Hall:
         lanes = self._thermal.LANES
         fit = [layer.ctypes.data % (lanes * layer.itemsize) == 0 for layer in layers]
         stored = [
-            layer if fits else self._empty(shape, self._dtype)
+            layer if fits else self._aligned(shape, self._dtype)
             for layer, fits in zip(layers, fit, strict=True)
         ]
         written = self._written(stored)
@@ -516,7 +517,7 @@ class Hall:
             RuntimeStateError: before the first step.
         """
         if self._of_groups is None:
-            layers = [self._empty((self._fleet.groups,), self._dtype) for _ in range(3)]
+            layers = [self._aligned((self._fleet.groups,), self._dtype) for _ in range(3)]
             self._of_groups = ServerLayers(*layers), self._written(layers)
         found, written = self._of_groups
         self._write(written, each_once=1)
@@ -664,7 +665,7 @@ class Hall:
             if not isfinite(np.add.reduce(given)):
                 raise SdcError(f"conditions: {name} is not finite; valid are finite numbers")
         self.forget()
-        self._loads_of, self._loads = self._thermal.OF_DATA_CENTERS, self._no_groups
+        self._loads_of, self._loads = self._thermal.OF_DATA_CENTERS, self._none
         self._dc["utilisation"][:] = met.utilisation
         if met.group_load is not None:
             self._loads_of = self._thermal.OF_GROUPS
@@ -736,7 +737,7 @@ class Hall:
             self._run_sources,
             self._rack_store,
             self._server_c,
-            *((self._no_groups, self._no_groups) if servers is None else servers),
+            *((self._none, self._none) if servers is None else servers),
             self._constants,
             self._terms,
             self._rack_out,

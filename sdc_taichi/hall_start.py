@@ -25,7 +25,7 @@ _BATCH, _LEAST_BATCH = 2**13, 32
 """Values that are computed at a time, so that they stay in the cache, and entries for which so many
 or more are computed."""
 _FAR_K = 1e-3
-"""Moves that tell a slope."""
+"""Moves that tell what racks keep of them."""
 _LAST_STEP_K = 2e-3
 """The next would be shorter by a factor of fifty to a hundred."""
 _USUALLY_KEPT = 0.2
@@ -45,8 +45,8 @@ class Start:
     """Exhaust mix before each rack over supply air, (k, R). Of halls of more than DENSE_RACKS:
     approach and rise in the mix, then of the racks themselves, at the design point, (4, R)."""
     values: npt.NDArray[np.float32]
-    """How much of each pattern, and last what is left of a deviation of the mixes after it has
-    passed the racks once, (n, len(LOADS), k + 1); of large halls k is 2."""
+    """How much of each pattern, and last ``kept``, which is left of a deviation of the mixes after
+    it has passed the racks once, (n, len(LOADS), k + 1); of large halls k is 2."""
 
 
 def find_start(config: DataCenterConfig, racks: RackServers, flows: Recirculation) -> Start:
@@ -84,7 +84,7 @@ def find_start(config: DataCenterConfig, racks: RackServers, flows: Recirculatio
     state.settle(merged, _MOST_PASSES)
     if groups.size > merged.size:
         state.settle(groups, _MOST_EXACT_PASSES)
-    if config.hall.racks <= DENSE_RACKS:
+    if hall.racks <= DENSE_RACKS:
         table = state.mix_k[:, :-1]
         # Eigenvectors come with the weakest first; of the small product of the table with itself
         # they take no threads.
@@ -95,7 +95,7 @@ def find_start(config: DataCenterConfig, racks: RackServers, flows: Recirculatio
         parts = (scales / np.maximum(scales[:, -1:], 1e-9))[:, :-1]
         own = np.stack([flows.approach_k, design.outlet_rise_k - design.approach_k])
         patterns = np.concatenate([[flows.exchange.apply(row) for row in own], own])
-    values = np.concatenate([parts, state.slope.mean(axis=0, keepdims=True)[:, :-1]])
+    values = np.concatenate([parts, state.kept.mean(axis=0, keepdims=True)[:, :-1]])
     shaped = values.T.reshape(rows, len(LOADS), -1)
     return Start(supply_c, patterns, shaped.astype(np.float32))
 
@@ -112,26 +112,26 @@ class _Steady:
     load: F64
     mix_k: F64
     """Over supply air, (R, n), as all that follow."""
-    slope: F64
-    """Of each rack's outlet with the mix before it."""
+    kept: F64
+    """Of a deviation of the mix before each rack, by its outlet."""
     inlet_k: F64 | None = None
     heat_k: F64 | None = None
     """What the racks' heat warms their air by."""
 
     def settle(self, groups: F64, passes: int) -> None:
-        """Newton steps, by slopes from the pass before."""
+        """Newton steps, by what the racks kept of the one before."""
         before: tuple[F64, F64] | None = None
         for _ in range(passes):
             outlet_k = self._outlet_k(groups)
             if before is not None:
                 moved_k = self.mix_k - before[0]
                 far = np.abs(moved_k) > _FAR_K
-                slope = np.divide(outlet_k - before[1], moved_k, out=self.slope.copy(), where=far)
-                self.slope = np.clip(slope, -0.9, 0.9)
+                kept = np.divide(outlet_k - before[1], moved_k, out=self.kept.copy(), where=far)
+                self.kept = np.clip(kept, -0.9, 0.9)
             before = self.mix_k, outlet_k
             step_k = back_k = self.weights @ outlet_k - self.mix_k
             for _ in range(4):
-                back_k = self.weights @ (self.slope * back_k)
+                back_k = self.weights @ (self.kept * back_k)
                 step_k = step_k + back_k
             self.mix_k = self.mix_k + step_k
             if np.max(np.abs(step_k)) < _LAST_STEP_K:

@@ -659,7 +659,7 @@ class Simulator:
                 f"action {name}: shape {command.shape}, expected {' or '.join(map(str, valid))}"
             )
         largest = np.maximum.reduce(np.abs(command), axis=None)
-        # Not so of NaN either.
+        # Comparisons with NaN are false, so that it ends here too.
         if not (largest <= limit and largest < np.inf):
             wrong = ~(np.abs(command) <= limit) | ~np.isfinite(command)
             value = command[wrong].flat[0] if command.ndim else command

@@ -314,10 +314,10 @@ class Core:
                 rng.bit_generator.state = state
         except (TypeError, ValueError, KeyError, OverflowError) as error:
             raise SdcError(f"state: a generator is not valid ({error})") from None
-        keys = as_array(values["keys"], "state: keys")
+        keys = checked_array(values["keys"], "state: keys")
         if keys.shape != (self.num_envs,) or keys.dtype != np.int64 or keys.min() < 0:
             raise SdcError(f"state: keys are {keys.dtype} {keys.shape}; valid is int64 from 0 on")
-        peaks_kw = as_array(values["rewards"], "state: rewards")
+        peaks_kw = checked_array(values["rewards"], "state: rewards")
         if peaks_kw.shape != (2, self.num_envs) or not _within(peaks_kw, np.inf):
             raise SdcError(
                 f"state: rewards are {peaks_kw.dtype} {peaks_kw.shape}; valid is finite numbers "
@@ -334,7 +334,7 @@ class Core:
             raise SdcError("state: actions are not valid; valid is what state_dict() gave")
         out: dict[str, F64] = {}
         for name, command in given.items():
-            values = as_array(command, f"state: actions of {name}")
+            values = checked_array(command, f"state: actions of {name}")
             shapes = [(), (self.num_envs,)]
             shapes += [(self.sim.fleet.units,)] if name == "cooling" else []
             highest = np.inf if name == "cooling" else 1.0
@@ -378,7 +378,7 @@ class Core:
         """Command of an agent, (B,), or (U,) for the units of all environments."""
         if agent not in actions:
             raise SdcError(f"actions: none for {agent}; valid: {list(self.agents)}")
-        given = as_array(actions[agent], f"action of {agent}")
+        given = checked_array(actions[agent], f"action of {agent}")
         if given.shape != self._shapes[agent]:
             raise SdcError(
                 f"action of {agent}: shape {given.shape}, expected {self._shapes[agent]}"
@@ -510,7 +510,7 @@ def _configs(source: Source) -> list[DataCenterConfig]:
     return listed
 
 
-def as_array(given: Any, name: str) -> npt.NDArray[Any]:
+def checked_array(given: Any, name: str) -> npt.NDArray[Any]:
     """Numbers of any kind as an array.
 
     Raises:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sdc_taichi.envs import rendering
-from sdc_taichi.envs.core import Core, Observation, Source, Step, as_array
+from sdc_taichi.envs.core import Core, Observation, Source, Step, checked_array
 from sdc_taichi.envs.parallel import core_of_one
 from sdc_taichi.envs.recording import Recording
 from sdc_taichi.envs.standards import OneDataCenter, first, floats, start_day, start_days
@@ -92,7 +92,7 @@ class Joint:
         Raises:
             SdcError: of another shape.
         """
-        given = as_array(given, "actions")
+        given = checked_array(given, "actions")
         shape = (self._core.num_envs, *(self.action_space.shape or ()))
         if given.shape != shape:
             raise SdcError(f"actions: shape {given.shape}, expected {shape}")
