@@ -351,7 +351,7 @@ def recording(quick: bool) -> Iterator[Figure]:
     """Simulators with a recorder and without."""
     from sdc_taichi.viz.recorder import Recorder
 
-    steps, repeats = (8, 1) if quick else (31 * 96, 3)
+    steps, repeats = (8, 1) if quick else (31 * 96, 7)
     for count in (1, 4, 64):
         sim = sdc_taichi.Simulator(
             sdc_taichi.make_configs(sdc_taichi.load_config("corrected"), count=count)

@@ -8,7 +8,7 @@ of a cell are numbered -x, -y, -z, +x, +y, +z, and lower faces lead to lower num
 from functools import cache
 from typing import Any, no_type_check
 
-from .backend import func, kernel, ti
+from .backend import SLICE, func, kernel, part_of, ti
 
 VECTORS = 9
 """Work vectors of one thread: solution, residual, shadow residual, direction, and products."""
@@ -179,12 +179,10 @@ def solve_kernel() -> Any:
         residual: reals_1d,
         iterations: ints_1d,
     ):
-        # A parallel loop of at most 512 iterations runs on one thread: each slice of tags gets 512.
-        for k in range(slices * 512):
-            if k % 512 == 0:
-                s = k // 512
+        for k in range(slices * SLICE):
+            if k % SLICE == 0:
+                s = k // SLICE
                 n = diagonal.shape[0]
-                tags = residual.shape[0]
                 for v in range(work.shape[1]):
                     work[s, v, n] = 0.0
                 for c in range(n):
@@ -194,7 +192,8 @@ def solve_kernel() -> Any:
                         if b < n:
                             pivot -= off[c, f] * off[b, f + 3] * work[s, _PIVOT, b]
                     work[s, _PIVOT, c] = 1.0 / pivot
-                for tag in range(tags * s // slices, tags * (s + 1) // slices):
+                first, end = part_of(s, slices, residual.shape[0])
+                for tag in range(first, end):
                     for c in range(n):
                         work[s, _X, c] = 0.0
                         work[s, _Z, c] = 0.0

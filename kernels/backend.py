@@ -54,6 +54,10 @@ def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     return raw[start : start + length].view(of).reshape(shape)
 
 
+_compiling = threading.RLock()
+"""Taichi's settings are those of the process."""
+
+
 def _outside_classes(decorate: Any) -> Any:
     """``ti.func`` or ``ti.kernel`` for functions that stand in no class.
 
@@ -62,12 +66,13 @@ def _outside_classes(decorate: Any) -> Any:
     """
 
     def define(function: Any) -> Any:
-        asked = kernel_impl._inside_class
-        kernel_impl._inside_class = lambda *_, **__: False
-        try:
-            return decorate(function)
-        finally:
-            kernel_impl._inside_class = asked
+        with _compiling:
+            asked = kernel_impl._inside_class
+            kernel_impl._inside_class = lambda *_, **__: False
+            try:
+                return decorate(function)
+            finally:
+                kernel_impl._inside_class = asked
 
     return define
 
@@ -119,7 +124,8 @@ class Table:
 
     Args:
         parts: names of the rows of each array, and the array.
-        apart: places from an item to the next in arrays of one dimension; None for no gaps.
+        apart: places from an item to the next in arrays of one dimension; None for no gaps, 1 where
+            an item is told by the place of its first row.
     """
 
     _data_oriented = True
@@ -187,10 +193,6 @@ def _options(config: Any) -> Iterator[Any]:
     finally:
         for name, value in before.items():
             setattr(config, name, value)
-
-
-_compiling = threading.Lock()
-"""Taichi's settings are those of the process."""
 
 
 @contextmanager

@@ -1,4 +1,7 @@
-"""Exponential decay of vectors, since calls would go lane by lane."""
+"""Exponential decay of vectors: (1 - exp(-x)) / x to the last digits of small x.
+
+A difference from ``elementary``'s exponential would lose them.
+"""
 
 from math import factorial
 from typing import no_type_check

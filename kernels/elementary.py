@@ -18,7 +18,8 @@ _EXP_TERMS = {"f32": 8, "f64": 14}
 """The first that is left out is less than a quarter of the last digit of the sum."""
 _LOG_2 = log(2.0)
 _LOG_2_HIGH, _LOG_2_LOW = 355.0 / 512.0, -2.121944400546905827679e-4
-"""Of the same sum; the first has few bits, so that its products with whole numbers are exact."""
+"""Log 2 as a sum of two (Cody and Waite 1980); the first has few bits, so that its products with
+whole numbers are exact."""
 
 
 @cache

@@ -35,7 +35,15 @@ from .servers import (
     warm,
     warming_of,
 )
-from .sums import OF_RACKS, OF_SWEEP, add_up, find_hottest, join_chunks, join_rows, keep_range
+from .sums import (
+    FIRST_OF_SWEEP,
+    N_RACK_SUMS,
+    add_up,
+    find_hottest,
+    join_chunks,
+    join_rows,
+    keep_range,
+)
 from .thermal import (
     BLOCK_INTS,
     BLOCK_TERMS,
@@ -53,6 +61,7 @@ from .thermal import (
     RACK_OUT,
     RACK_ROWS,
     RACK_STATE,
+    RECOMMENDED_C,
     RUN_INTS,
     RUN_LANES,
     SCRATCH,
@@ -69,10 +78,6 @@ from .units import add_needs, cool, run_units
 
 TEMPLATES = 3
 """Template arguments of the kernel, which come first."""
-
-RECOMMENDED_HIGH_C = 27.0
-RECOMMENDED_LOW_C = 18.0
-"""Ends of the range that ASHRAE TC 9.9 (2021) recommends for inlets, beyond which degrees count."""
 
 
 @func
@@ -94,13 +99,13 @@ def compute_groups(
     while z < n_groups:
         group = hall.groups[table + z]
         count = group.count
-        inlet_c, draws_w, speed, turns = of_group(hall, servers, racks, air, group, block_at, z)
+        inlet_c, draws_w, speed, fan_power = of_group(hall, servers, racks, air, group, block_at, z)
         if ti.static(hall.transient):
             change_k = warm(hall, warming, racks, place + z, inlet_c, draws_w, speed)
             stored_w += count * change_k
             if now.ends:
                 hand_over(hall, block_at, z, count, hall.server_c[place + z])
-        add_group(hall, sums, group, count, inlet_c, draws_w, speed, turns)
+        add_group(hall, sums, group, count, inlet_c, draws_w, speed, fan_power)
         add_inlet(hall, inlets, count, inlet_c)
         z += 1
     if ti.static(hall.transient):
@@ -199,8 +204,8 @@ def no_inlets(hall: ti.template()):
 @no_type_check
 def add_inlet(hall: ti.template(), inlets: ti.template(), count, inlet_c):
     """Inlet of a group; one without servers is as another one of its rack."""
-    inlets.hot_k += count * larger(inlet_c - hall.real(RECOMMENDED_HIGH_C), hall.zeros)
-    inlets.cold_k += count * larger(hall.real(RECOMMENDED_LOW_C) - inlet_c, hall.zeros)
+    inlets.hot_k += count * larger(inlet_c - hall.real(RECOMMENDED_C[1]), hall.zeros)
+    inlets.cold_k += count * larger(hall.real(RECOMMENDED_C[0]) - inlet_c, hall.zeros)
     inlets.zone = ti.select(inlet_c > inlets.max_c, inlets.zones, inlets.zone)
     inlets.max_c = larger(inlet_c, inlets.max_c)
     inlets.zones += hall.real(1.0)
@@ -236,7 +241,7 @@ def give(
     seen_c = mixed_c + block.airflow * (outlet_c - mixed_c)
     seen_c *= block.strength
     hall.rack_store[STATE.exhaust_odd_c - now.side, block_at] = seen_c
-    if now.whole:
+    if now.at_once:
         block.given_k = seen_c - block.strength * now.reference_c
     else:
         change_k = seen_c - hall.rack_store[STATE.exhaust_c + now.side, block_at]
@@ -297,11 +302,11 @@ def compute_chunk(
         goes_on = late and not now.begins
     row = terms_at
     if goes_on:
-        row += OF_SWEEP - OF_RACKS
+        row += FIRST_OF_SWEEP - N_RACK_SUMS
     else:
         hottest.inlet_c = hall.zeros - hall.real(1e30)
     while row < terms_at + N_TERMS:
-        hall.lanes[row] = hall.zeros
+        hall.scratch[row] = hall.zeros
         row += hall.step
     # First the mixes before all racks, which do not wait for each other.
     if ti.static(hall.transient):
@@ -332,29 +337,29 @@ def compute_chunk(
     if ti.static(hall.transient):
         adds = not now.begins and not late
         if not now.ends:
-            first_row = OF_RACKS
+            first_row = N_RACK_SUMS
             if late:
-                first_row = OF_SWEEP
+                first_row = FIRST_OF_SWEEP
     elif late:
-        first_row = OF_SWEEP
+        first_row = FIRST_OF_SWEEP
     end_row = SUM.given_c if ti.static(hall.transient) else SUM.inlet_max_c
     add_up(hall, chunk_at, terms_at, first_row, end_row, adds)
-    if first_row < OF_SWEEP:
+    if first_row < FIRST_OF_SWEEP:
         find_hottest(hall, chunk_at, hottest, adds)
     keep_range(hall, chunk_at, moves.least_k, moves.most_k)
 
 
 @func
 @no_type_check
-def go_on(hall: ti.template(), n, now: ti.template()):
+def go_on(hall: ti.template(), n, air: ti.template()):
     """CRAC units at the servers' airflow, and whether and from where their data center goes on."""
     dc = hall.dcs[n]
     total, sweep = hall.chunks[dc.first_chunk], dc.sweep
     more = ti.cast(sweep + 1 < hall.sweeps, ti.i32)
     units = run_units(hall, n, total.flow_m3s, more)
-    now.crac_flow_m3s = units.flow_m3s
-    now.supply_c = units.supply_m3k_s / units.flow_m3s
-    now.return_c = (total.leaves_m3k_s + units.passing_m3k_s) / units.flow_m3s
+    air.crac_flow_m3s = units.flow_m3s
+    air.supply_c = units.supply_m3k_s / units.flow_m3s
+    air.return_c = (total.leaves_m3k_s + units.passing_m3k_s) / units.flow_m3s
     dc.stirring_m3s = units.flow_m3s / ti.cast(dc.racks, ti.f64)
     dc.sweep = sweep + 1
     # All mixes move by the middle of the outlets' changes, give or take half their spread.
@@ -367,10 +372,10 @@ def go_on(hall: ti.template(), n, now: ti.template()):
         dc.exchange = ti.cast(apart, ti.i32)
         dc.active = more
         dc.shift_k = ti.select(apart, 0.0, middle_k)
-        now.adds, now.ends = sweep > 0, more == 0
-        now.coil_load_w, now.coil_w = cool(hall, n, units, now.return_c)
+        air.adds, air.ends = sweep > 0, more == 0
+        air.coil_load_w, air.coil_w = cool(hall, n, units, air.return_c)
     else:
-        now.ends = judge_sweep(hall, n, now.supply_c, units.uncovered, more)
+        air.ends = judge_sweep(hall, n, air.supply_c, units.uncovered, more)
         if dc.mix < 0:
             dc.exchange = ti.cast(apart, ti.i32)
             shift_mixes(hall, n, sweep, exchanged_now, middle_k, apart)
@@ -378,26 +383,26 @@ def go_on(hall: ti.template(), n, now: ti.template()):
 
 @func
 @no_type_check
-def so_far(hall: ti.template(), now: ti.template(), before, value):
+def so_far(hall: ti.template(), air: ti.template(), before, value):
     """Mean over the substeps until now, or value of the last sweep."""
     out = value * hall.weight
-    if now.adds:
+    if air.adds:
         out += before
     return out
 
 
 @func
 @no_type_check
-def keep_air(hall: ti.template(), n, now: ti.template()):
+def keep_air(hall: ti.template(), n, air: ti.template()):
     """What air the CRAC units give and take, and heat at their coils."""
     dc = hall.dcs[n]
-    supplied_m3k_s = hall.chunks[dc.first_chunk].flow_m3s * now.supply_c
-    dc.inlet_m3k_s = so_far(hall, now, dc.inlet_m3k_s, supplied_m3k_s)
-    dc.crac_flow_m3s = so_far(hall, now, dc.crac_flow_m3s, now.crac_flow_m3s)
-    dc.supply_c = so_far(hall, now, dc.supply_c, now.supply_c)
-    dc.return_c = so_far(hall, now, dc.return_c, now.return_c)
-    dc.coil_load_w = so_far(hall, now, dc.coil_load_w, now.coil_load_w)
-    dc.coil_w = so_far(hall, now, dc.coil_w, now.coil_w)
+    supplied_m3k_s = hall.chunks[dc.first_chunk].flow_m3s * air.supply_c
+    dc.inlet_m3k_s = so_far(hall, air, dc.inlet_m3k_s, supplied_m3k_s)
+    dc.crac_flow_m3s = so_far(hall, air, dc.crac_flow_m3s, air.crac_flow_m3s)
+    dc.supply_c = so_far(hall, air, dc.supply_c, air.supply_c)
+    dc.return_c = so_far(hall, air, dc.return_c, air.return_c)
+    dc.coil_load_w = so_far(hall, air, dc.coil_load_w, air.coil_load_w)
+    dc.coil_w = so_far(hall, air, dc.coil_w, air.coil_w)
 
 
 @func
@@ -439,7 +444,7 @@ def close(hall: ti.template(), n, terms_at, late, hottest: ti.template()):
     """
     join_chunks(hall, n)
     dc, none = hall.dcs[n], ti.cast(0.0, ti.f64)
-    now = ti.Struct(
+    air = ti.Struct(
         adds=False,
         ends=True,
         crac_flow_m3s=none,
@@ -449,16 +454,16 @@ def close(hall: ti.template(), n, terms_at, late, hottest: ti.template()):
         coil_w=none,
     )
     if ti.static(hall.recirculates):
-        go_on(hall, n, now)
+        go_on(hall, n, air)
     if ti.static(hall.transient):
-        keep_air(hall, n, now)
-    if now.ends:
+        keep_air(hall, n, air)
+    if air.ends:
         if ti.static(not hall.transient):
-            keep_air(hall, n, now)
+            keep_air(hall, n, air)
             if late:
-                add_up(hall, dc.first_chunk, terms_at, 0, OF_SWEEP, False)
+                add_up(hall, dc.first_chunk, terms_at, 0, FIRST_OF_SWEEP, False)
                 find_hottest(hall, dc.first_chunk, hottest, False)
-        join_rows(hall, n, 0, OF_SWEEP)
+        join_rows(hall, n, 0, FIRST_OF_SWEEP)
         keep_results(hall, n)
 
 
@@ -486,14 +491,15 @@ def run(hall: ti.template(), terms_at, first_chunk, end_chunk):
     for _ in range(rounds):
         if dc.active <= 0:
             break
-        # What the last sweep left is read anew after it.
+        # What the last sweep left is read anew after it: whether this is the first and the last,
+        # exchanges anew, and from which row of the exhaust; a shift of all mixes.
         now = ti.Struct(
             begins=dc.sweep == 0,
             ends=dc.sweep == hall.sweeps - 1,
             anew=dc.exchange != 0,
             side=dc.side,
             shift_k=ti.cast(dc.shift_k, hall.real),
-            whole=passes > 1,
+            at_once=passes > 1,
             reference_c=reference_c,
         )
         if now.anew:
@@ -528,6 +534,9 @@ def hall_kernel(precision: str) -> Any:
     ``step``: 1, which compilers cannot know. Loops that advance by it are compiled as they are;
     others to up to eight copies of their body, which most here gain nothing from and which take
     half of the time to machine code.
+
+    ``rack_sources`` and ``run_sources`` are ``rack_store`` again, in vectors of SOURCES and
+    RUN_LANES.
 
     ``constants``: of the released outlet fit, followed by ``decay_constants``.
     """
@@ -587,7 +596,7 @@ def hall_kernel(precision: str) -> Any:
         servers_before: reals_1d,
         servers_after: reals_1d,
         constants: reals_1d,
-        lanes: blocks_1d,
+        scratch: blocks_1d,
         rack_out: blocks_2d,
         needs: doubles_1d,
         sums: doubles_1d,
@@ -633,11 +642,11 @@ def hall_kernel(precision: str) -> Any:
                         places=Table((RACK_INTS, rack_ints)),
                         groups=Table((GROUP_ROWS, groups)),
                         runs=Table((RUN_INTS, run_ints)),
-                        terms=Table((TERMS, lanes), apart=1),
-                        block_terms=Table((BLOCK_TERMS, lanes), apart=1),
+                        terms=Table((TERMS, scratch), apart=1),
+                        block_terms=Table((BLOCK_TERMS, scratch), apart=1),
                         constants=constants,
                         group_load=group_load,
-                        lanes=lanes,
+                        scratch=scratch,
                         mix=mix,
                         needs=needs,
                         rack_out=rack_out,

@@ -43,8 +43,13 @@ N_VALUES = len(GROUP_OUT)
 
 @func
 @no_type_check
-def compute_groups(hall: ti.template(), n, block_at, values_at, servers: ti.template()):
-    """Values of the groups of a block as in the last sweep or substep."""
+def compute_values(hall: ti.template(), n, block_at, values_at, servers: ti.template()):
+    """Values of the groups of a block as in the last sweep, or at the end of the last substep.
+
+    A server gives T + P/(rho*cp*V); in transient halls T + eps (T_s - T) + P_fan/(rho*cp*V), with
+    its own temperature T_s and the supply air that follows the last substep. Sums are needed by
+    the outlets of racks alone.
+    """
     block = hall.blocks[block_at]
     air = air_before(hall, n, block_at, block.mixed_c, SUPPLY.fresh_ratio_used)
     racks = racks_of(hall, servers, block_at)
@@ -52,10 +57,10 @@ def compute_groups(hall: ti.template(), n, block_at, values_at, servers: ti.temp
     z, n_groups, table, place = 0, block.groups, block.table, block.place
     while z < n_groups:
         group = hall.groups[table + z]
-        inlet_c, draws_w, speed, turns = of_group(hall, servers, racks, air, group, block_at, z)
-        add_group(hall, sums, group, group.count, inlet_c, draws_w, speed, turns)
+        inlet_c, draws_w, speed, fan_power = of_group(hall, servers, racks, air, group, block_at, z)
+        add_group(hall, sums, group, group.count, inlet_c, draws_w, speed, fan_power)
         flow_m3s = speed * racks.per_speed_m3s
-        cpu_w, fan_w = racks.powered * draws_w, turns * racks.per_speed_w
+        cpu_w, fan_w = racks.powered * draws_w, fan_power * racks.per_speed_w
         to_air_w = cpu_w
         if ti.static(hall.transient):
             warmer_k = hall.server_c[place + z] - inlet_c
@@ -188,7 +193,7 @@ def write_chunk(hall: ti.template(), chunk_at, values_at, each_once):
     if each_once != 0:
         first_row = RACK_INT.first_group
     for block_at in range(chunk.first_block, hall.chunks[chunk_at + 1].first_block):
-        compute_groups(hall, chunk.dc, block_at, values_at, servers)
+        compute_values(hall, chunk.dc, block_at, values_at, servers)
         place_0 = block_at * LANES
         place_1 = place_0 + hall.blocks[block_at].racks
         n_groups = hall.places[place_1].first_group - hall.places[place_0].first_group
@@ -201,7 +206,7 @@ def write_chunk(hall: ti.template(), chunk_at, values_at, each_once):
 
 @cache
 def layers_kernel(precision: str) -> Any:
-    """Kernel that computes all groups as in the last sweep or substep and stores their values.
+    """Kernel that computes all groups of the last step again and stores their values.
 
     To all their servers, or with ``each_once`` to themselves; ``..._blocks`` are the layers again
     as vectors. ``group_values`` and ``squares``, the same again, have room for the groups of a

@@ -4,7 +4,8 @@ Halls that keep every weight exchange after each sweep, which tells exactly what
 move. Their next sweep starts from where the mixes go when the share ``kept`` of what they change by
 comes back from the racks for ever. In larger halls, whose exchange costs more than a sweep: the
 weights of a mix sum to 1, so it moves by no more than the exhausts have moved since the last
-exchange; where all of them moved alike, the mixes are shifted and nothing is exchanged.
+exchange; where all of them moved alike, the mixes are shifted and nothing is exchanged. Steps on by
+k/(1 - k) of a move, of which k is kept, are those of Aitken (1926).
 """
 
 from typing import no_type_check
@@ -33,7 +34,8 @@ where the airflow curves bend; a sweep that takes no such step never overshoots.
 SEEN_FROM = 32.0
 """Moves of fewer tolerances than this are too coarse in f32 to tell what a sweep keeps."""
 PLAIN_EVERY = 4
-"""Of so many sweeps one takes no step of that kind, so that wrong ones cannot go on for ever."""
+"""One sweep of so many goes by what was exchanged alone, so that a wrong share cannot go on for
+ever."""
 STILL_PER_S = 1.0 / 128.0
 """Fastest rate at which CRAC air stirs the air before racks that stand still, as without fans in
 the room; a power of two, exact in both precisions."""
@@ -61,7 +63,7 @@ def cubic(x):
 def expect(hall: ti.template(), n):
     """How much of each pattern to start from, and last ``kept``.
 
-    By the supply air of the first unit, which tells where the others are near enough to start.
+    By the supply air of the first unit; that of the others is near enough to start from.
     """
     dc = hall.dcs[n]
     rows, columns = dc.start_rows, hall.start_columns
@@ -93,7 +95,7 @@ def start_mix(hall: ti.template(), n, block_at, now: ti.template(), start):
     pattern = hall.dcs[n].pattern
     pattern += (block_at - hall.chunks[chunk_0].first_block) * PATTERNS
     mix_c = hall.zeros + now.reference_c
-    if now.whole:
+    if now.at_once:
         for k in ti.static(range(PATTERNS)):
             mix_c += hall.starts[pattern + k] * start[k]
     else:
@@ -282,7 +284,8 @@ def follow_mixes(
 ):
     """Means of the air before the racks of a chunk over a substep, and the heat that warms it.
 
-    Parcels of room air before the racks: air enters at the mix and leaves at their own temperature.
+    Parcels of room air before the racks: air enters at the mix and leaves at their own temperature,
+    C_parcel dT/dt = rho*cp*V_captured (T_mix - T).
     """
     parcels = parcels_of(hall, n, chunk_at, servers)
     block_at, terms_at = hall.chunks[chunk_at].first_block, block_terms_0

@@ -3,7 +3,7 @@
 from functools import cache
 from typing import Any, no_type_check
 
-from .backend import F64_LANES, SLICE, BoundKernel, kernel, ti
+from .backend import F64_LANES, SLICE, kernel, ti
 
 TASK_BLOCKS = 32
 """Vectors side by side in a row that one task takes on."""
@@ -11,11 +11,6 @@ TASK_ROWS = 8
 """Rows that a task goes through at a time; twice as many compete for the same sets of the cache."""
 SERIAL_UP_TO = 512
 """Data centers that one thread computes sooner than several are woken."""
-
-
-def bound_queue_kernel() -> BoundKernel:
-    """``queue_kernel`` for arrays of one fleet."""
-    return BoundKernel(queue_kernel(), templates=1)
 
 
 @cache

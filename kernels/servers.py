@@ -51,6 +51,16 @@ def servers_of(hall: ti.template(), n):
 
 @func
 @no_type_check
+def first_share_of(hall: ti.template(), n, block_at):
+    """Where the shares of the CRAC units in the supply air of a block of racks begin."""
+    dc = hall.dcs[n]
+    n_units = hall.dcs[n + 1].first_unit - dc.first_unit
+    block_0 = hall.chunks[dc.first_chunk].first_block
+    return dc.first_share + n_units * (block_at - block_0)
+
+
+@func
+@no_type_check
 def air_before(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.template()):
     """Air before the racks of a block.
 
@@ -61,12 +71,10 @@ def air_before(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.templa
     """
     block, dc = hall.blocks[block_at], hall.dcs[n]
     unit_0 = dc.first_unit
-    cover, fresh_k, captured = hall.zeros, hall.zeros, hall.zeros
+    cover, fresh_k, captured_share = hall.zeros, hall.zeros, hall.zeros
     if ti.static(hall.recirculates):
-        captured = block.captured
-        n_units = hall.dcs[n + 1].first_unit - unit_0
-        share_0 = n_units * (block_at - hall.chunks[dc.first_chunk].first_block)
-        share_0 += dc.first_share
+        captured_share = block.captured_share
+        n_units, share_0 = hall.dcs[n + 1].first_unit - unit_0, first_share_of(hall, n, block_at)
         unit = 0
         while unit < n_units:
             ratio = ti.cast(hall.unit_state[fresh_ratio, unit_0 + unit], hall.real)
@@ -80,12 +88,12 @@ def air_before(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.templa
     return ti.Struct(
         mixed_c=mixed_c,
         cover=cover,
-        captured=captured,
+        captured_share=captured_share,
         # Of supply air over the mix.
         fresh_k=fresh_k,
         # Inlet of a server that takes in no exhaust, and colder by height.
         least_c=mixed_c + fresh_k,
-        per_height_k=captured * fresh_k,
+        per_height_k=captured_share * fresh_k,
     )
 
 
@@ -126,7 +134,7 @@ def of_group(
     block_at,
     z,
 ):
-    """Inlet of group z of each rack, what a server draws, its speed and power of fans as ratios."""
+    """Inlet of group z of each rack; of a server CPU power, and fan speed and power as ratios."""
     inlet_c = air.least_c + group.inlet_offset_k
     if ti.static(hall.recirculates):
         inlet_c = air.least_c - group.height * air.per_height_k
@@ -141,12 +149,14 @@ def of_group(
     draws_w = larger(group.idle_w, group.full_w * ratio)
     speed = on_curve_c * servers.fan_slope + (apart * servers.fan_shift + racks.fan_base)
     speed = smaller(larger(speed, servers.fan_low), servers.fan_high)
-    turns = speed
+    fan_power = speed
     if servers.fan_exponent == hall.real(3.0):
-        turns = speed * speed * speed
+        fan_power = speed * speed * speed
     elif servers.fan_exponent != hall.real(1.0):
-        turns = speed * hall.exp_of(hall.log_of(speed) * (servers.fan_exponent - hall.real(1.0)))
-    return inlet_c, draws_w, speed, turns
+        # x^p as x exp((p - 1) log x), which is 0 where x is.
+        beyond_1 = servers.fan_exponent - hall.real(1.0)
+        fan_power = speed * hall.exp_of(hall.log_of(speed) * beyond_1)
+    return inlet_c, draws_w, speed, fan_power
 
 
 @func
@@ -166,12 +176,12 @@ def no_groups(hall: ti.template()):
 @func
 @no_type_check
 def add_group(
-    hall: ti.template(), sums: ti.template(), group, count, inlet_c, draws_w, speed, turns
+    hall: ti.template(), sums: ti.template(), group, count, inlet_c, draws_w, speed, fan_power
 ):
     """A group of so many servers to the sums of its rack."""
     counted = count * speed
     sums.cpu_w += count * draws_w
-    sums.fan_w += count * turns
+    sums.fan_w += count * fan_power
     sums.flow_m3s += counted
     sums.inlet_c += count * inlet_c
     if ti.static(hall.recirculates):
@@ -193,7 +203,7 @@ def complete(hall: ti.template(), sums: ti.template(), racks: ti.template(), air
     sums.inlet_c *= racks.per_server
     fresh_m3s = hall.zeros
     if ti.static(hall.recirculates):
-        fresh_m3s = sums.flow_m3s - air.captured * (sums.high_m3s * racks.per_speed_m3s)
+        fresh_m3s = sums.flow_m3s - air.captured_share * (sums.high_m3s * racks.per_speed_m3s)
         sums.inlet_m3k_s = air.mixed_c * sums.flow_m3s + air.fresh_k * fresh_m3s
     else:
         sums.inlet_m3k_s *= racks.per_speed_m3s
@@ -226,7 +236,8 @@ def rack_outlet(hall: ti.template(), servers: ti.template(), sums: ti.template()
 def warming_of(hall: ti.template(), n, servers: ti.template()):
     """How the servers of a data center become warmer in a substep, C dT/dt = P - eps K (T - T_in).
 
-    By the exact exponential.
+    C is the heat capacity of a server, K = rho*cp*V that of its air, eps how much of the difference
+    the air takes up. By the exact exponential.
     """
     dc, step_s = hall.dcs[n], ti.cast(hall.substep_s, hall.real)
     server_j_per_k = dc.server_j_per_k

@@ -6,9 +6,9 @@ from .backend import func, ti
 from .thermal import LANES, RACK_OUT, SUM, SUMS
 
 N_SUMS = len(SUMS)
-OF_RACKS = len(RACK_OUT) - 1
+N_RACK_SUMS = len(RACK_OUT) - 1
 """Sums of what racks keep come first, then those of the lanes that ``TERMS`` name."""
-OF_SWEEP = SUM.flow_m3s
+FIRST_OF_SWEEP = SUM.flow_m3s
 """From here on sums are of the present sweep or substep alone."""
 
 
@@ -31,7 +31,7 @@ def add_up(hall: ti.template(), chunk_at, terms_at, first_row, end_row, adds):
     row, at = first_row, chunk_at * N_SUMS
     while row < end_row:
         total = ti.cast(0.0, ti.f64)
-        if row < OF_RACKS:
+        if row < N_RACK_SUMS:
             lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
             block_at = hall.chunks[chunk_at].first_block
             while block_at < hall.chunks[chunk_at + 1].first_block:
@@ -41,8 +41,8 @@ def add_up(hall: ti.template(), chunk_at, terms_at, first_row, end_row, adds):
                 block_at += hall.step
             total = sum_of(lanes)
         else:
-            total = sum_of(hall.lanes[terms_at + row - OF_RACKS])
-            if adds and row < OF_SWEEP:
+            total = sum_of(hall.scratch[terms_at + row - N_RACK_SUMS])
+            if adds and row < FIRST_OF_SWEEP:
                 total += hall.sums[at + row]
         hall.sums[at + row] = total
         row += hall.step
@@ -98,7 +98,7 @@ def join_rows(hall: ti.template(), n, first_row, end_row):
 @no_type_check
 def join_chunks(hall: ti.template(), n):
     """What a sweep needs of all chunks of a data center, to its first."""
-    join_rows(hall, n, OF_SWEEP, SUM.inlet_max_c)
+    join_rows(hall, n, FIRST_OF_SWEEP, SUM.inlet_max_c)
     first = hall.dcs[n].first_chunk
     total, chunk_at = hall.chunks[first], first + 1
     while chunk_at < hall.dcs[n + 1].first_chunk:

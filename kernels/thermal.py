@@ -5,10 +5,10 @@
 
 Servers of a rack that are alike form a group, which is computed once. Halls may have any size: the
 racks of a data center are cut into blocks of LANES, filled up with places without a rack, and all
-arithmetic is on vectors of the lanes of a block. Blocks whose groups are equal share a table. Every
-literal in the kernels is exact in binary, so that f64 runs lose nothing to the default f32 literals
-of the runtime; in arithmetic with vectors literals must be of their type, since vectors are not
-cast.
+arithmetic is on vectors of the lanes of a block. Blocks whose groups are equal share a table.
+Literals in the kernels are exact in binary, or bounds out of reach, so that f64 runs lose nothing
+to the default f32 literals of the runtime; in arithmetic with vectors literals must be of their
+type, since vectors are not cast.
 
 Sums run serially over the blocks of a chunk, lane by lane, then over the lanes, and over the chunks
 of a data center, so that a data center gives the same bits alone and in any batch.
@@ -70,10 +70,13 @@ RACK_ROWS = (
     "airflow",
     "strength",
     "per_strength",
-    "captured",
+    "captured_share",
     "per_server",
 )
-"""``per_server``: 1 over the servers, 0 in places without a rack."""
+"""``norm``: 1 over the sum of the weights, each times the strength of its rack; ``airflow``,
+``powered``: what is left of fans and of the step; ``strength``: how much the exhaust of a rack
+counts; ``captured_share``: of exhaust in the intake at the design point; ``per_server``: 1 over the
+servers, 0 in places without a rack."""
 GROUP_ROWS = ("count", "full_w", "idle_w", "inlet_offset_k", "load_deviation", "height")
 """In places without a rack or group all are those of another one, but ``count`` is 0."""
 DC_ROWS = (
@@ -191,6 +194,11 @@ DC_OUT = (
     "hottest_server",
 )
 """The hottest inlet at the end: rack within its data center and server within its rack, from 0."""
+
+
+RECOMMENDED_C = (18.0, 27.0)
+"""Inlets that all classes are recommended (ASHRAE TC 9.9 Thermal Guidelines, 2021), beyond which
+degrees count."""
 
 
 def _rows(names: tuple[str, ...]) -> SimpleNamespace:

@@ -3,6 +3,7 @@
 from typing import no_type_check
 
 from .backend import func, ti
+from .servers import first_share_of
 from .sums import sum_of
 from .thermal import N_BLOCK_TERMS
 
@@ -14,12 +15,11 @@ def add_needs(hall: ti.template(), n, chunk_at, block_terms_0):
     dc, chunk = hall.dcs[n], hall.chunks[chunk_at]
     n_units = hall.dcs[n + 1].first_unit - dc.first_unit
     n_blocks = hall.chunks[chunk_at + 1].first_block - chunk.first_block
-    block_0 = chunk.first_block - hall.chunks[dc.first_chunk].first_block
     unit = 0
     while unit < n_units:
         need_m3s, b = hall.zeros, 0
         while b < n_blocks:
-            share = hall.shares[dc.first_share + n_units * (block_0 + b) + unit]
+            share = hall.shares[first_share_of(hall, n, chunk.first_block + b) + unit]
             need_m3s += share * hall.block_terms[block_terms_0 + b * N_BLOCK_TERMS].fresh_m3s
             b += hall.step
         hall.needs[chunk.first_need + unit] = sum_of(need_m3s)

@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.kernels import thermal
 from sdc_taichi.types import F64, Reals, as_array
 
 Values = F64 | float
 
-RECOMMENDED_C = (18.0, 27.0)
-"""Recommended inlet temperatures of all classes (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
+RECOMMENDED_C = thermal.RECOMMENDED_C
 ALLOWABLE_C = {"A1": (15.0, 32.0), "A2": (10.0, 35.0), "A3": (5.0, 40.0), "A4": (5.0, 45.0)}
 """Allowable inlet temperatures by class (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
 

@@ -167,13 +167,13 @@ class Hall:
         self._lay_out_air(thermal)
         self._lay_out_values(thermal)
         self._slices = max(1, min(8 * threads, len(self._tasks) - 1))
-        self._terms = self._lanes(self._slices * thermal.SCRATCH)
+        self._scratch = self._lanes(self._slices * thermal.SCRATCH)
         squares = self._slices * -(-self._most_groups // thermal.LANES)
         values = self._aligned((len(thermal.GROUP_OUT), squares, thermal.SQUARE), self._dtype)
         self._group_values = values.reshape(len(values), -1, thermal.LANES), values
         """The same room twice: as the kernel computes it, and in squares to be transposed."""
         self._result_names = (*thermal.DC_OUT, *(f"rack_{name}" for name in thermal.RACK_OUT))
-        self._solved: bool | None = None
+        self._was_transient: bool | None = None
         """Whether the last step was transient; None without one."""
         self._of_groups: tuple[ServerLayers, tuple[Any, ...]] | None = None
         """Layers of the groups, as such and as the kernel takes them, once they are asked for."""
@@ -374,7 +374,7 @@ class Hall:
                 "norm": air.norm,
                 "strength": air.strength,
                 "per_strength": 1.0 / air.strength,
-                "captured": air.captured,
+                "captured_share": air.captured,
             }
         for name, values in rows.items():
             self._rack[name][self._rack_at] = values
@@ -457,7 +457,7 @@ class Hall:
                 )
         else:
             self._run(out)
-        self._solved = False
+        self._was_transient = False
         return self._results(out)
 
     def _begin(self, exchange: int) -> None:
@@ -473,7 +473,7 @@ class Hall:
             self._run(out, sweeps=sweeps, **how)
 
     def servers(self, into: ServerLayers | None = None) -> ServerLayers:
-        """Per-server layers of the last ``solve`` or ``advance``, each (S,).
+        """Per-server layers of the last ``solve``, or the end of the last ``advance``, each (S,).
 
         Args:
             into: layers to overwrite and return; None allocates new ones.
@@ -536,12 +536,12 @@ class Hall:
 
     def _write(self, written: tuple[Any, ...], each_once: int) -> None:
         """Values of the last step to servers, or to each group once."""
-        if self._solved is None:
+        if self._was_transient is None:
             raise RuntimeStateError("no step has been done yet; server layers exist after one")
         runtime.ensure_started()
         self._layers_kernel(
             self._recirculates,
-            self._solved,
+            self._was_transient,
             len(written[0]) <= _SERIAL_GROUPS,
             self._slices,
             self._outlet_model,
@@ -568,7 +568,7 @@ class Hall:
 
     def forget(self) -> None:
         """Drop the last step, so that ``servers`` cannot show layers of another state."""
-        self._solved = None
+        self._was_transient = None
 
     def settle(self, met: Conditions) -> HallState:
         """State of transient halls that have been in the given conditions for ever."""
@@ -637,7 +637,7 @@ class Hall:
             weight=1.0 / count,
         )
         self._kernel.let_go(before)
-        self._solved = True
+        self._was_transient = True
         return self._results(out), self._state(servers)
 
     def _exhaust(self) -> Any:
@@ -739,7 +739,7 @@ class Hall:
             self._server_c,
             *((self._none, self._none) if servers is None else servers),
             self._constants,
-            self._terms,
+            self._scratch,
             self._rack_out,
             self._needs,
             self._sums,

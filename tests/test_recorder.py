@@ -596,6 +596,8 @@ def test_results_that_do_not_fit_are_refused(tmp_path: Path) -> None:
             rec.add(sim.step())
         with pytest.raises(SdcError, match="the simulator has done 2 steps"):
             rec.add(first)
+        with pytest.raises(SdcError, match="step 2 after step 0; an episode has all of its steps"):
+            rec.add(sim.step(), rewards={"a": np.zeros(1)})
         other.reset()
         with pytest.raises(SdcError, match="2 data centers and 8 racks, expected 1 and 4"):
             rec.add(other.step())

@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sdc_taichi import Actions, LoadAction, Simulator, drivers_from_arrays, load_config
-from sdc_taichi.plant.workload import MODELS, TASKS_PER_STEP, age_histogram
+from sdc_taichi.kernels.queue import SERIAL_UP_TO
+from sdc_taichi.plant.workload import MODELS, TASKS_PER_STEP, Queue, Queued, age_histogram
 from sdc_taichi.types import F64
 from work_steps import work_step
 
@@ -304,3 +305,22 @@ def test_due_work_runs_before_what_arrives() -> None:
     assert max(float(r.due_tasks[0]) for r in results) > 0
     assert all(r.overdue_tasks[0] == 0 for r in results)
     assert max(float(r.oldest_age_h[0]) for r in results) <= 2.0
+
+
+def test_many_queues_are_each_as_alone() -> None:
+    rng = np.random.default_rng(4)
+    size, length = 2 * SERIAL_UP_TO + 1, 9
+    due_steps = rng.choice([0.0, 3.0, 8.0, np.inf], size)
+    entered = np.sort(
+        rng.uniform(0.0, 50.0, (size, length)) * rng.integers(0, 2, (size, 1)), axis=1
+    )
+    taken, deferred = entered[:, -1] * rng.uniform(0.0, 1.0, size), rng.uniform(0.0, 9.0, size)
+    some = [0, 7, 8, SERIAL_UP_TO, size - 1]
+    all_of, few = Queue(length, due_steps), Queue(length, due_steps[some])
+    left = all_of.after(entered.copy(), taken, deferred)
+    own = few.after(entered[some], taken[some], deferred[some])
+    for f in fields(Queued):
+        assert np.array_equal(getattr(left, f.name)[some], getattr(own, f.name)), f.name
+    before = np.maximum(entered[:, 1:] - taken[:, None], 0.0)
+    assert np.array_equal(left.queue[:, :-1], before)
+    assert np.array_equal(left.waiting, before[:, -1] + deferred)

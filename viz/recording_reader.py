@@ -257,10 +257,10 @@ class Reader:
                 f"recorder: result of step {result.step}, but the simulator has done "
                 f"{self._sim.state.step} steps; add each step right after it"
             )
-        if result.step <= self._last_step:
+        if self._last_step >= 0 and result.step != self._last_step + 1:
             raise SdcError(
-                f"recorder: step {result.step} after step {self._last_step}; an episode has its "
-                "steps in order, and begin(sim) begins another"
+                f"recorder: step {result.step} after step {self._last_step}; an episode has all of "
+                "its steps in order, and begin(sim) begins another"
             )
 
     def _add_events(self, result: StepResult) -> None:

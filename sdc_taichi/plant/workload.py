@@ -135,6 +135,8 @@ def tasks(
 MODELS: dict[str, WorkModel] = {"fluid": fluid, "tasks": tasks}
 DUE_AFTER_STEPS = {"fluid": 0.0, "tasks": 1.0}
 """Steps between the deadline and when the models take work as due."""
+NEGLIGIBLE_TASKS = 1e-9
+"""Left by rounding where a step's work was taken out in parts; no age is read off it."""
 UNLIMITED_TASKS = 1e30
 """Limit of a queue without one; larger than any, and still a number."""
 
@@ -176,7 +178,8 @@ class Queue:
         """Work that waits when a step starts, and what of it is due, (B,).
 
         Args:
-            queue: work still queued by the step that put it in, oldest first, (B, L).
+            queue: work still queued by the step that put it in, oldest first, (B, L). It is made
+                read-only, since what is known of it would not follow a change.
         """
         if queue is not self._known:
             never = np.zeros((1, self._size))
@@ -189,7 +192,7 @@ class Queue:
         """The queues at the end of a step.
 
         Args:
-            queue: at its start, (B, L).
+            queue: at its start, (B, L); read-only from here on.
             taken: work that leaves it, oldest first, (B,).
             deferred: work that enters it, (B,).
         """
@@ -217,10 +220,10 @@ class Queue:
     def _prepare(self) -> None:
         """What needs Taichi."""
         from sdc_taichi.kernels import backend
-        from sdc_taichi.kernels.queue import SERIAL_UP_TO, bound_queue_kernel
+        from sdc_taichi.kernels.queue import SERIAL_UP_TO, queue_kernel
 
         runtime.ensure_started()
-        self._backend, self._kernel = backend, bound_queue_kernel()
+        self._backend, self._kernel = backend, backend.BoundKernel(queue_kernel(), templates=1)
         self._serial = self._size <= SERIAL_UP_TO
         # The same in every step: handing an array over takes longer than to copy a few entries.
         self._moved, self._results = (backend.vector_rows(n, self._size) for n in (2, 4))
@@ -237,7 +240,6 @@ class Queue:
         self._rows = self._backend.vector_rows(self._length, self._size)
         self._rows[:] = 0.0
         self._backend.held(self._rows, self._size)[:] = queue.T
-        # Whose sums are known from here on.
         queue.flags.writeable = False
         self._known = queue
 
@@ -258,7 +260,3 @@ def age_histogram(queue: F64, edges_steps: F64) -> F64:
     found: F64 = queue.T[np.maximum(last - edges, 0)]
     found[:-1] -= found[1:]
     return found.T
-
-
-NEGLIGIBLE_TASKS = 1e-9
-"""Left by rounding where a step's work was taken out in parts; no age is read off it."""
