@@ -84,7 +84,7 @@ def resident() -> int:
 
 def memory(data_centers: int, each_its_own: bool) -> dict[str, float]:
     """Bytes per server of a simulator that has stepped, with its layers; and at the most."""
-    import resource
+    from recording import most_mb
 
     transient = ["simulation.thermal=transient"]
     config = unlike(transient) if each_its_own else sdc_taichi.load_config("corrected")
@@ -98,7 +98,7 @@ def memory(data_centers: int, each_its_own: bool) -> dict[str, float]:
     before = resident()
     kept = run(data_centers)
     servers = kept[0].fleet.servers
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    most = 1e6 * most_mb()
     return {"held": (resident() - before) / servers, "most": (most - before) / servers}
 
 
