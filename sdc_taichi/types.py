@@ -110,7 +110,7 @@ class State:
     fan_speed: F64
     """Controlled speed of each CRAC fan over design speed, (U,)."""
     queue: F64
-    """Queued tasks by the step that put them in, oldest first and accumulated, (B, L)."""
+    """Queued tasks by the step that put them in, oldest first, accumulated, (B, L); read-only."""
     stored_kwh: F64
     """Energy in the battery, (B,)."""
     room_heat_kwh: F64
