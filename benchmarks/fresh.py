@@ -118,9 +118,6 @@ def cycles(count: int) -> float:
 
 def roof(servers: int, repeats: int) -> float:
     """Core time of the memory roof, s, with the threads of this process."""
-    from sdc_taichi import runtime
-
-    runtime.ensure_started()
     return float(np.median(core_s({"roof": plain_store(servers)}, repeats)["roof"]))
 
 

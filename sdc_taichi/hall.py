@@ -457,8 +457,7 @@ class Hall:
                 )
         else:
             self._run(out)
-        self._was_transient = False
-        return self._results(out)
+        return self._results(out, transient=False)
 
     def _begin(self, exchange: int) -> None:
         """The first sweep exchanges what the exhaust row holds, or starts as may be expected."""
@@ -637,8 +636,7 @@ class Hall:
             weight=1.0 / count,
         )
         self._kernel.let_go(before)
-        self._was_transient = True
-        return self._results(out), self._state(servers)
+        return self._results(out, transient=True), self._state(servers)
 
     def _exhaust(self) -> Any:
         """What the racks gave to the mixes in the last sweep, times strength, by place."""
@@ -749,7 +747,7 @@ class Hall:
     def _new_sums(self) -> F64:
         return np.empty((len(self._thermal.DC_OUT), self._fleet.size))
 
-    def _results(self, dcs: F64) -> HallSums:
+    def _results(self, dcs: F64, *, transient: bool) -> HallSums:
         racks = self._at_racks(self._rack_out)
         if not isfinite(np.add.reduce(dcs, axis=None)):
             finite = np.isfinite(dcs).all(axis=0)
@@ -757,6 +755,8 @@ class Hall:
                 f"{self._fleet.names[int(np.argmin(finite))]}: temperatures or power of the hall "
                 "are beyond any number; valid are smaller powers or larger airflows"
             )
+        # From here on there is a step whose layers can be shown.
+        self._was_transient = transient
         found = dict(zip(self._result_names, (*dcs, *racks), strict=True))
         return HallSums(
             unit_flow_m3s=self._supply["flow_m3s"].copy(),

@@ -553,6 +553,15 @@ def test_layers_that_do_not_fit_are_refused() -> None:
     assert not wrong[-1].any()
 
 
+def test_air_beyond_any_number_leaves_no_layers() -> None:
+    hall = Hall(build_fleet(load_config("tiny")), "f32")
+    hall.solve(Conditions(np.array([20.0]), np.array([0.5])))
+    with pytest.raises(SdcError, match="beyond any number"):
+        hall.solve(Conditions(np.array([3e38]), np.array([0.5])))
+    with pytest.raises(RuntimeStateError, match="no step has been done"):
+        hall.servers()
+
+
 def test_conditions_of_another_size_are_refused() -> None:
     hall = Hall(build_fleet([load_config("tiny", [f"name={name}"]) for name in "ab"]), "f32")
     one = np.array([20.0])
