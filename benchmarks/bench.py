@@ -276,8 +276,12 @@ def side_by_side(quick: bool) -> Iterator[Figure]:
         one, two = (child("roof", servers, 5, SDC_TAICHI_THREADS=t) for t in "12")
         found.append(2.0 * one / two)
     yield Figure("scaling", "memory roof, two threads over one", float(np.median(found)))
-    for what in ("kernel", "environments"):
-        of_what = f"{what} {' x '.join(map(str, size)) if what == 'kernel' else f'N = {size[0]}'}"
+    hall = " x ".join(map(str, size))
+    for what, shape, least in (
+        ("step with layers", hall, 1.7),
+        ("reduction", hall, 1.7),
+        ("environments", f"N = {size[0]}", None),
+    ):
         # The three of a round follow each other: what memory bears from outside meets all of them.
         per_s = np.array(
             [
@@ -286,9 +290,9 @@ def side_by_side(quick: bool) -> Iterator[Figure]:
             ]
         )
         threads, processes = np.median(per_s[:, 1:] / per_s[:, :1], axis=0).tolist()
-        target = 1.7 if what == "kernel" else None
-        yield Figure("scaling", f"{of_what}, two threads over one", threads, at_least=target)
-        yield Figure("scaling", f"{of_what}, two processes over one", processes, at_least=1.7)
+        where = f"{what} {shape}"
+        yield Figure("scaling", f"{where}, two threads over one", threads, at_least=least)
+        yield Figure("scaling", f"{where}, two processes over one", processes, at_least=1.7)
 
 
 def rates(what: str, size: list[int], seconds: float, processes: int, threads: int) -> float:

@@ -123,9 +123,7 @@ def roof(servers: int, repeats: int) -> float:
 
 def rate(what: str, size: list[int], seconds: float) -> float:
     """Steps of ``size`` per second from when a line comes in, which answers ``ready``."""
-    if what == "kernel":
-        step = stepped(fleet_of(size[0], size[1], size[2], "approach"))[1]
-    else:
+    if what == "environments":
         batch = sdc_taichi.vector_env(size[0], "corrected")
         batch.reset(seed=0)
         actions = {a: np.ones(size[0], np.int64) for a in batch.possible_agents}
@@ -133,11 +131,15 @@ def rate(what: str, size: list[int], seconds: float) -> float:
         def step() -> object:
             return batch.step(actions)
 
+        call: Callable[[], object] = step
+    else:
+        reduction, whole = stepped(fleet_of(size[0], size[1], size[2], "approach"))
+        call = reduction if what == "reduction" else whole
     for _ in range(3):
-        step()
+        call()
     print("ready", flush=True)
     sys.stdin.readline()
-    return env.rate(step, 1, seconds)
+    return env.rate(call, 1, seconds)
 
 
 PARTS: dict[str, Callable[..., Any]] = {
