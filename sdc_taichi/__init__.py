@@ -4,23 +4,26 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from sdc_taichi.config import DataCenterConfig, load_config, preset_names
-from sdc_taichi.drivers import Drivers, drivers_from_arrays, load_drivers
-from sdc_taichi.envs import registration
-from sdc_taichi.errors import ConfigError, DataError, RuntimeStateError, SdcError
-from sdc_taichi.fleet import Fleet, build_fleet, make_configs
-from sdc_taichi.sim import Simulator
-from sdc_taichi.types import (
-    Actions,
-    BatteryAction,
-    CoolAction,
-    Exogenous,
-    FanAction,
-    LoadAction,
-    ServerLayers,
-    State,
-    StepResult,
-)
+from sdc_taichi.kernels import collector
+
+with collector.paused():
+    from sdc_taichi.config import DataCenterConfig, load_config, preset_names
+    from sdc_taichi.drivers import Drivers, drivers_from_arrays, load_drivers
+    from sdc_taichi.envs import registration
+    from sdc_taichi.errors import ConfigError, DataError, RuntimeStateError, SdcError
+    from sdc_taichi.fleet import Fleet, build_fleet, make_configs
+    from sdc_taichi.sim import Simulator
+    from sdc_taichi.types import (
+        Actions,
+        BatteryAction,
+        CoolAction,
+        Exogenous,
+        FanAction,
+        LoadAction,
+        ServerLayers,
+        State,
+        StepResult,
+    )
 
 if TYPE_CHECKING:
     from sdc_taichi.envs.parallel import aec_env, parallel_env
@@ -78,7 +81,8 @@ _LAZY = {
 def __getattr__(name: str) -> Any:
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_LAZY[name]), name)
+    with collector.paused():
+        return getattr(import_module(_LAZY[name]), name)
 
 
 def __dir__() -> list[str]:
