@@ -1,15 +1,13 @@
-"""The one place that imports Taichi, so that a maintained fork could take its place."""
+"""The place that imports Taichi, with `translation.py`; a maintained fork could take its place."""
 
 import ctypes
 import inspect
-import linecache
 import math
 import os
 import threading
 from collections import namedtuple
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import SimpleNamespace
 from typing import Any, no_type_check
 
 import numpy as np
@@ -22,7 +20,9 @@ inspect.modulesbyfile.setdefault("<frozen importlib._bootstrap>", "importlib._bo
 
 import taichi as ti  # noqa: E402
 from taichi.lang import kernel_impl  # noqa: E402
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext  # noqa: E402
+
+from .collector import paused  # noqa: E402
+from .translation import translate  # noqa: E402
 
 __all__ = ["BoundKernel", "aligned", "func", "kernel", "ti"]
 
@@ -195,48 +195,6 @@ def _options(config: Any) -> Iterator[Any]:
             setattr(config, name, value)
 
 
-@contextmanager
-def _translation() -> Iterator[None]:
-    """File and line alone for each node of the source, and whole numbers of 32 bits.
-
-    Taichi writes an excerpt of the source for every node, in case of an error, which takes half of
-    the time of translating a kernel; this is done at every start. Of what is left a fifth is that
-    `inspect` looks for the end of each function word by word, and a tenth that `textwrap` breaks
-    lines of more than 9,999 letters. Literals have the type that whoever started the runtime chose.
-    """
-
-    def position(context: Any, node: Any) -> str:
-        return f'File "{context.file}", line {node.lineno + context.lineno_offset}:\n'
-
-    def source(function: Any) -> tuple[list[str], int]:
-        code = function.__code__
-        first = code.co_firstlineno
-        ends = [end for _, end, column, _ in code.co_positions() if end and column is not None]
-        if not ends:  # as with `python -X no_debug_ranges`
-            found: tuple[list[str], int] = read(function)
-            return found
-        lines = linecache.getlines(code.co_filename, function.__globals__)
-        return lines[first - 1 : max(ends)], first
-
-    def unbroken(line: str, **_: Any) -> str:
-        return line.rstrip()
-
-    runtime = ti.lang.impl.get_runtime()
-    excerpt, whole = ASTTransformerContext.get_pos_info, runtime.default_ip
-    read, wrapped = kernel_impl.getsourcelines, kernel_impl.textwrap
-    try:
-        ASTTransformerContext.get_pos_info = position
-        kernel_impl.getsourcelines = source
-        kernel_impl.textwrap = SimpleNamespace(fill=unbroken, dedent=wrapped.dedent)
-        runtime.default_ip = ti.i32
-        yield
-    finally:
-        ASTTransformerContext.get_pos_info = excerpt
-        kernel_impl.getsourcelines = read
-        kernel_impl.textwrap = wrapped
-        runtime.default_ip = whole
-
-
 class BoundKernel:
     """A kernel that is called again and again with mostly the same arrays.
 
@@ -258,7 +216,7 @@ class BoundKernel:
         key, given = args[: self._templates], args[self._templates :]
         launch = self._launches.get(key)
         if launch is None or launch.program is not ti.lang.impl.get_runtime().prog:
-            with _compiling:
+            with _compiling, paused():
                 launch = self._launches[key] = _Launch(self._kernel, args, self._templates)
         launch.run(given)
         self._last = launch
@@ -273,9 +231,7 @@ class _Launch:
 
     def __init__(self, kernel: Any, args: tuple[Any, ...], templates: int) -> None:
         primal = kernel._primal
-        with _translation():
-            key = primal.ensure_compiled(*args)
-        compiled = primal.compiled_kernels[key]
+        compiled = primal.compiled_kernels[translate(primal, args)]
         self.program = ti.lang.impl.get_runtime().prog
         with _options(self.program.config()) as config:
             self._compiled = self.program.compile_kernel(
