@@ -19,7 +19,7 @@ import zlib
 from collections.abc import Callable
 from functools import lru_cache
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -144,6 +144,22 @@ def _check_seed(seed: int) -> None:
         raise DataError(f"seed: {seed!r}, expected a whole number of 0 or more")
 
 
+class _Basis(NamedTuple):
+    """Columns, and their products with each other, which take longer than all else of a fit."""
+
+    columns: FloatArray
+    products: FloatArray
+
+    def project(self, z: FloatArray) -> FloatArray:
+        """Least-squares coefficients of z."""
+        return np.asarray(np.linalg.solve(self.products, self.columns.T @ z), dtype=np.float64)
+
+
+def _basis(columns: list[FloatArray]) -> _Basis:
+    stacked = np.stack(columns, axis=1)
+    return _Basis(stacked, stacked.T @ stacked)
+
+
 # Random numbers and residuals
 
 
@@ -191,7 +207,7 @@ def _ar2(noise: FloatArray, memory_h: float, smooth_h: float) -> FloatArray:
     return _filtered(_filtered(kicks, f), g)[_WARM_UP:]
 
 
-def _residual(p: _Table, slow: FloatArray, fast: FloatArray, basis: FloatArray) -> FloatArray:
+def _residual(p: _Table, slow: FloatArray, fast: FloatArray, basis: _Basis) -> FloatArray:
     """Slow part and fast part with a day-to-day memory, orthogonal to the climatology."""
     if "tm" in p:
         z = math.sqrt(p["w"]) * _ar2(slow, p["ts"], p["tm"])
@@ -203,7 +219,7 @@ def _residual(p: _Table, slow: FloatArray, fast: FloatArray, basis: FloatArray) 
         if daily > 0.0:
             hourly = _ar1(hourly.reshape(-1, 24), daily).ravel()
         z = z + math.sqrt(1.0 - p["w"]) * hourly
-    z = z - basis @ _project(basis, z)
+    z = z - basis.columns @ basis.project(z)
     return np.asarray(z * (p["sd"] / z.std()), dtype=np.float64)
 
 
@@ -211,7 +227,7 @@ def _residual(p: _Table, slow: FloatArray, fast: FloatArray, basis: FloatArray) 
 
 
 @lru_cache(maxsize=32)
-def _climatology(annual: int, diurnal: int, products: tuple[int, ...]) -> FloatArray:
+def _climatology(annual: int, diurnal: int, products: tuple[int, ...]) -> _Basis:
     """Columns: 1, annual and diurnal harmonics, first annual times given diurnal harmonics."""
     year = 2.0 * np.pi * (np.arange(HOURS) + 0.5) / HOURS
     day = 2.0 * np.pi * (np.arange(24) + 0.5) / 24.0
@@ -226,12 +242,7 @@ def _climatology(annual: int, diurnal: int, products: tuple[int, ...]) -> FloatA
         columns += diurnals(m)
     for m in products:
         columns += [first * each for first in (np.cos(year), np.sin(year)) for each in diurnals(m)]
-    return np.stack(columns, axis=1)
-
-
-def _project(basis: FloatArray, z: FloatArray) -> FloatArray:
-    """Least-squares coefficients of z on the basis."""
-    return np.asarray(np.linalg.solve(basis.T @ basis, basis.T @ z), dtype=np.float64)
+    return _basis(columns)
 
 
 def _pin(values: FloatArray, percentiles: list[float]) -> FloatArray:
@@ -250,7 +261,7 @@ def _series(p: _Table, slow: FloatArray, fast: FloatArray) -> FloatArray:
     basis = _climatology(annual, diurnal, tuple(products))
     c = np.array(p["c"])
     residual = _residual(p, slow, fast, basis)
-    z = basis @ c + residual - basis @ _project(basis, residual)
+    z = basis.columns @ c + residual - basis.columns @ basis.project(residual)
     root = p["link"] == "sqrt"
     values = np.maximum(z, 0.0) ** 2 if root else z
     if "q" not in p:
@@ -258,7 +269,7 @@ def _series(p: _Table, slow: FloatArray, fast: FloatArray) -> FloatArray:
     for _ in range(3):
         pinned = _pin(values, p["q"])
         z = np.sqrt(np.maximum(pinned, 0.0)) if root else pinned
-        z = z + basis @ (c - _project(basis, z))
+        z = z + basis.columns @ (c - basis.project(z))
         values = np.maximum(z, 0.0) ** 2 if root else z
     return _pin(values, p["q"])
 
@@ -358,6 +369,7 @@ def _workload(table: _Table, normals: Callable[[int], FloatArray]) -> FloatArray
     ):
         for m in range(1, order + 1):
             columns += [np.cos(m * angle), np.sin(m * angle)]
-    basis = np.stack(columns, axis=1)
+    basis = _basis(columns)
     slow, fast = normals(_STREAM_TRACE), normals(_STREAM_TRACE + 1)
-    return _pin(basis @ np.array(table["c"]) + _residual(table, slow, fast, basis), table["q"])
+    values = basis.columns @ np.array(table["c"]) + _residual(table, slow, fast, basis)
+    return _pin(values, table["q"])
