@@ -107,7 +107,7 @@ def compute_groups(
                 hand_over(hall, block_at, z, count, hall.server_c[place + z])
         add_group(hall, sums, group, count, inlet_c, draws_w, speed, fan_power)
         add_inlet(hall, inlets, count, inlet_c)
-        z += 1
+        z += hall.step
     if ti.static(hall.transient):
         stored_w *= warming.w_per_k
     return stored_w
@@ -429,7 +429,7 @@ def keep_results(hall: ti.template(), n):
     server, z = ti.cast(0.0, hall.real), 0
     while z < zone:
         server += hall.groups[hall.blocks[block_at].table + z].count[lane]
-        z += 1
+        z += hall.step
     dc.inlet_max_c = total.inlet_max_c
     dc.hottest_rack = ti.cast(rack, ti.f64)
     dc.hottest_server = ti.cast(server, ti.f64)
