@@ -7,8 +7,10 @@ import io
 import os
 import sys
 import threading
+from importlib import import_module
 
 from sdc_taichi.errors import ConfigError, RuntimeStateError
+from sdc_taichi.kernels import collector
 
 _forked = False
 _known: tuple[object, int] = (None, 0)
@@ -44,6 +46,9 @@ def ensure_started() -> int:
             "'spawn' method (multiprocessing.get_context('spawn')) or create simulators only in "
             "the children"
         )
+    if _known[0] is None:
+        with collector.paused():
+            import_module("sdc_taichi.kernels.backend")
     from sdc_taichi.kernels.backend import ti
 
     if ti.lang.impl.get_runtime().prog is None:

@@ -2,6 +2,8 @@
 
 import ast
 import gc
+import subprocess
+import sys
 from collections import Counter
 from typing import Any, no_type_check
 
@@ -135,3 +137,17 @@ def test_collections_pause_and_go_on() -> None:
     assert gc.get_freeze_count() == 0
     assert young < len(kept)
     assert not ended
+
+
+def test_a_start_is_not_searched_for_garbage() -> None:
+    code = """
+import gc, sdc_taichi
+env = sdc_taichi.parallel_env("corrected")
+env.reset(seed=0)
+env.step(dict.fromkeys(env.possible_agents, 1))
+print(sum(generation["collections"] for generation in gc.get_stats()), gc.isenabled())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    collections, enabled = done.stdout.split()
+    assert int(collections) < 60
+    assert enabled == "True"
