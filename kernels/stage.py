@@ -37,6 +37,8 @@ Arrays = Mapping[str, Any]
 
 SERIAL_UP_TO = 4096
 """Entries that one thread computes sooner than several are woken."""
+COPIED_UP_TO = 1024
+"""Entries whose results are copied sooner than the kernel is handed another table for them."""
 _TASK_BLOCKS = 32
 """Vectors that one task computes."""
 _LONGEST_TERM = 80
@@ -88,22 +90,34 @@ class CompiledStage:
 
     def __call__(self, **given: npt.NDArray[np.float64]) -> dict[str, npt.NDArray[np.float64]]:
         """Results by name, each (n,): rows of one new array."""
-        rows = self.rows(**given).copy()
+        if self._size <= COPIED_UP_TO:
+            rows = self.rows(**given).copy()
+        else:
+            self._take(given)
+            out = vector_rows(len(self._results), self._size)
+            self._run(out)
+            rows = held(out, self._size)
         return dict(zip(self._results, rows, strict=True))
 
     def rows(self, **given: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Results in their order, (number of results, n); the next call overwrites them."""
+        self._take(given)
+        self._run(self._outputs)
+        return self._found
+
+    def _take(self, given: Arrays) -> None:
+        """Arguments to their rows, which are the same in every call."""
         if self._kernel is None:
             self._compile(tuple(given))
-        assert self._kernel is not None
         if tuple(given) != self._names:
             raise TypeError(f"arguments {[*given]}, expected {[*self._names]} as on the first call")
         for row, values in zip(self._given, given.values(), strict=True):
             row[...] = values
-        # The same arrays in every call, which need not be handed over again.
+
+    def _run(self, out: Any) -> None:
+        assert self._kernel is not None
         serial = self._size <= SERIAL_UP_TO
-        self._kernel(serial, 1, self._shared, self._constants, self._inputs, self._outputs)
-        return self._found
+        self._kernel(serial, 1, self._shared, self._constants, self._inputs, out)
 
     def _compile(self, names: tuple[str, ...]) -> None:
         record = _Record(self._size)

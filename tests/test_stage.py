@@ -10,7 +10,7 @@ import pytest
 
 from sdc_taichi import Simulator, drivers_from_arrays, load_config, runtime
 from sdc_taichi.facility import Facility, Met
-from sdc_taichi.kernels.stage import SERIAL_UP_TO, CompiledStage, _kernel
+from sdc_taichi.kernels.stage import COPIED_UP_TO, SERIAL_UP_TO, CompiledStage, _kernel
 from sdc_taichi.plant import workload
 from sdc_taichi.types import F64
 
@@ -83,14 +83,18 @@ def test_an_entry_is_the_same_alone_and_among_many() -> None:
     assert np.array_equal(alone, together[::97])
 
 
-def test_results_are_new_arrays_and_inputs_stay() -> None:
-    stage = CompiledStage(lambda x: {"same": x, "twice": 2.0 * x}, 4)
-    x = np.arange(4.0)
+@pytest.mark.parametrize("size", [4, COPIED_UP_TO + 1])
+def test_results_are_new_arrays_and_inputs_stay(size: int) -> None:
+    stage = CompiledStage(lambda x: {"same": x, "twice": 2.0 * x}, size)
+    given = np.arange(float(size))
+    x = given.copy()
     first = stage(x=x)
     second = stage(x=x + 1.0)
-    assert np.array_equal(x, np.arange(4.0))
-    assert np.array_equal(first["twice"], [0, 2, 4, 6])
-    assert np.array_equal(second["same"], [1, 2, 3, 4])
+    rows = stage.rows(x=x + 2.0)
+    assert np.array_equal(x, given)
+    assert np.array_equal(first["twice"], 2.0 * given)
+    assert np.array_equal(second["same"], given + 1.0)
+    assert np.array_equal(rows, [given + 2.0, 2.0 * given + 4.0])
     assert not np.shares_memory(first["same"], x)
 
 
