@@ -19,16 +19,20 @@ def queue_kernel() -> Any:
 
     Row k of the queues is the work still queued that was put in by the end of step k, oldest first.
     Work of no more than ``negligible`` is left by rounding, and has no age. A task goes through a
-    few rows of many data centers at a time, side by side as they lie in memory.
+    few rows of many data centers at a time, side by side as they lie in memory. The oldest rows,
+    which mostly hold nothing, are not read.
 
     Arguments: whether one thread does it; 1, which the compiler cannot know and so makes no copies
     of loops; negligible work; row of the queue that is due when the next step starts, L for none,
-    for each lane of each vector. All others are ``backend.vector_rows`` of data centers: the queues
-    before, L; the work taken and deferred. For the results: the queues after, L, and four: work
-    that waits, what of it will be due, the age of the oldest work and the mean age in steps.
+    for each lane of each vector; how many of the first rows of each vector will be 0 after the
+    step, which is kept up to date for the next one. All others are ``backend.vector_rows`` of data
+    centers: the queues before, L; the work taken and deferred. For the results: the queues after,
+    L, and four: work that waits, what of it will be due, the age of the oldest work and the mean
+    age in steps.
     """
     blocks = ti.types.ndarray(dtype=ti.types.vector(F64_LANES, ti.f64), ndim=2)
     ints = ti.types.ndarray(dtype=ti.i32, ndim=2)
+    ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
     @kernel
     @no_type_check
@@ -37,6 +41,7 @@ def queue_kernel() -> Any:
         step: ti.i32,
         negligible: ti.f64,
         due_row: ints,
+        empty: ints_1d,
         before: blocks,
         moved: blocks,
         after: blocks,
@@ -54,6 +59,7 @@ def queue_kernel() -> Any:
                 limit = zeros + negligible
                 block = first
                 while block < end:
+                    found[0, block] = zeros
                     found[2, block] = zeros
                     found[3, block] = zeros
                     block += step
@@ -62,10 +68,15 @@ def queue_kernel() -> Any:
                     row_end = ti.min(row + TASK_ROWS, last)
                     block = first
                     while block < end:
-                        out, aged, waited = moved[0, block], found[2, block], found[3, block]
-                        k = row
+                        out, filled = moved[0, block], found[0, block]
+                        aged, waited = found[2, block], found[3, block]
+                        k, zero_end = row, ti.min(empty[block], row_end)
+                        while k < zero_end:
+                            after[k, block] = zeros
+                            k += step
                         while k < row_end:
                             left = before[k + 1, block] - out
+                            filled += ti.select(left > zeros, ones, zeros)
                             left = ti.select(left > zeros, left, zeros)
                             after[k, block] = left
                             # Work of the newest step has age 0; older work counts once per step it
@@ -74,12 +85,18 @@ def queue_kernel() -> Any:
                             aged += ti.select(waits, ones, zeros)
                             waited += ti.select(waits, left, zeros)
                             k += step
+                        found[0, block] = filled
                         found[2, block] = aged
                         found[3, block] = waited
                         block += step
                     row = row_end
                 block = first
                 while block < end:
+                    # A row of 0 in all lanes is the one before it a step later.
+                    filled, most = found[0, block], ti.f64(0.0)
+                    for i in range(F64_LANES):
+                        most = ti.max(most, filled[i])
+                    empty[block] = ti.max(last - 1 - ti.cast(most, ti.i32), 0)
                     total = after[last - 1, block] + moved[1, block]
                     after[last, block] = total
                     due = zeros

@@ -307,6 +307,28 @@ def test_due_work_runs_before_what_arrives() -> None:
     assert max(float(r.oldest_age_h[0]) for r in results) <= 2.0
 
 
+def test_rows_that_hold_nothing_are_told_from_those_that_do() -> None:
+    """Queues that fill up and are emptied again and again, and others in between."""
+    rng = np.random.default_rng(9)
+    size, length = 21, 12
+    queues = Queue(length, np.full(size, 5.0))
+
+    def some_queue() -> F64:
+        amounts = rng.uniform(0.0, 9.0, (size, length)) * (rng.random((size, length)) < 0.3)
+        return np.cumsum(amounts, axis=1)
+
+    queue = some_queue()
+    for step in range(120):
+        if step % 30 == 29:
+            queue = some_queue()
+        share = np.where(rng.random(size) < 0.4, 1.0, rng.choice([0.0, 0.5], size))
+        taken, deferred = share * queue[:, -1], rng.uniform(0.0, 9.0, size) * (step % 7 < 4)
+        before = np.maximum(queue[:, 1:] - taken[:, None], 0.0)
+        expected = np.column_stack([before, before[:, -1] + deferred])
+        queue = queues.after(queue, taken, deferred).queue
+        assert np.array_equal(queue, expected), step
+
+
 def test_many_queues_are_each_as_alone() -> None:
     rng = np.random.default_rng(4)
     size, length = 2 * SERIAL_UP_TO + 1, 9

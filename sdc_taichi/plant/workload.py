@@ -205,6 +205,7 @@ class Queue:
             1,
             NEGLIGIBLE_TASKS,
             self._due_lanes,
+            self._empty,
             self._rows,
             self._moved,
             after,
@@ -232,6 +233,7 @@ class Queue:
         self._found = backend.held(self._results, self._size)
         self._due_lanes = np.full(self._moved.shape[1:], self._length, np.int32)
         self._due_lanes.reshape(-1)[: self._size] = self._due_row
+        self._empty = np.zeros(self._moved.shape[1], np.int32)
 
     def _take(self, queue: F64) -> None:
         """Go on from a queue that was not left by the last step."""
@@ -240,6 +242,7 @@ class Queue:
         self._rows = self._backend.vector_rows(self._length, self._size)
         self._rows[:] = 0.0
         self._backend.held(self._rows, self._size)[:] = queue.T
+        self._empty[:] = 0
         queue.flags.writeable = False
         self._known = queue
 
