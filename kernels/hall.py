@@ -585,7 +585,7 @@ def hall_kernel(precision: str) -> Any:
         groups: blocks_1d,
         group_load: reals_1d,
         dcs: reals_1d,
-        doubles: doubles_1d,
+        doubles: doubles_2d,
         units: reals_2d,
         unit_state: doubles_2d,
         starts: blocks_1d,

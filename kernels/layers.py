@@ -220,7 +220,6 @@ def layers_kernel(precision: str) -> Any:
     squares_2d = ti.types.ndarray(dtype=ti.types.vector(SQUARE, real), ndim=2)
     ints_2d = ti.types.ndarray(dtype=ti.i32, ndim=2)
     doubles_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
-    doubles_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
 
     @kernel
     @no_type_check
@@ -242,7 +241,7 @@ def layers_kernel(precision: str) -> Any:
         groups: blocks_1d,
         group_load: reals_1d,
         dcs: reals_1d,
-        doubles: doubles_1d,
+        doubles: doubles_2d,
         unit_state: doubles_2d,
         rack_store: blocks_2d,
         server_c: blocks_1d,

@@ -379,15 +379,14 @@ class Hall:
         for name, values in rows.items():
             self._rack[name][self._rack_at] = values
         self._dcs = self._real(fleet.dcs.T).reshape(-1)
-        doubles = np.zeros((fleet.size, len(thermal.DC_DOUBLES)))
-        self._doubles = doubles.reshape(-1)
-        self._dc = dict(zip(thermal.DC_DOUBLES, doubles.T, strict=True))
+        self._doubles = np.zeros((len(thermal.DC_DOUBLES), fleet.size))
+        self._dc = dict(zip(thermal.DC_DOUBLES, self._doubles, strict=True))
         self._dc["it_airflow_m3s"][:] = fleet.it_airflow_m3s
         if air is not None:
             ends = np.array([start.supply_c[:2] for start in air.starts])[air.start].T
             self._dc["start_low_c"][:] = ends[0]
             self._dc["start_per_k"][:] = 1.0 / (ends[1] - ends[0])
-        self._moves = doubles[:, thermal.DC_DOUBLES.index("shift_k") :]
+        self._moves = self._doubles[thermal.DC_DOUBLES.index("shift_k") :]
         self._controls = np.zeros((len(thermal.CONTROL), fleet.size), np.int32)
         self._control = dict(zip(thermal.CONTROL, self._controls, strict=True))
         self._units = self._real(np.ones((len(thermal.UNIT_ROWS), fleet.units)))
