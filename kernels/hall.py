@@ -99,7 +99,7 @@ def compute_groups(
     while z < n_groups:
         group = hall.groups[table + z]
         count = group.count
-        inlet_c, draws_w, speed, fan_power = of_group(hall, servers, racks, air, group, block_at, z)
+        inlet_c, draws_w, speed, fan_power = of_group(hall, servers, racks, air, group, z)
         if ti.static(hall.transient):
             change_k = warm(hall, warming, racks, place + z, inlet_c, draws_w, speed)
             stored_w += count * change_k

@@ -7,12 +7,8 @@ from .backend import SLICE, Table, func, kernel, larger, part_of, reals, shared,
 from .elementary import log_and_exp
 from .servers import (
     OUTLET_OF_SERVERS,
-    add_group,
     air_before,
-    complete,
-    no_groups,
     of_group,
-    rack_outlet,
     racks_of,
     servers_of,
 )
@@ -28,9 +24,9 @@ from .thermal import (
     LANES,
     RACK_INT,
     RACK_INTS,
+    RACK_OUT,
     RACK_ROWS,
     RACK_STATE,
-    SQUARE,
     SUPPLY,
     UNIT_STATE,
 )
@@ -39,89 +35,6 @@ TEMPLATES = 3
 """Template arguments of the kernel, which come first."""
 
 N_VALUES = len(GROUP_OUT)
-
-
-@func
-@no_type_check
-def compute_values(hall: ti.template(), n, block_at, values_at, servers: ti.template()):
-    """Values of the groups of a block as in the last sweep, or at the end of the last substep.
-
-    A server gives T + P/(rho*cp*V); in transient halls T + eps (T_s - T) + P_fan/(rho*cp*V), with
-    its own temperature T_s and the supply air that follows the last substep. Sums are needed by
-    the outlets of racks alone.
-    """
-    block = hall.blocks[block_at]
-    air = air_before(hall, n, block_at, block.mixed_c, SUPPLY.fresh_ratio_used)
-    racks = racks_of(hall, servers, block_at)
-    sums = no_groups(hall)
-    z, n_groups, table, place = 0, block.groups, block.table, block.place
-    while z < n_groups:
-        group = hall.groups[table + z]
-        inlet_c, draws_w, speed, fan_power = of_group(hall, servers, racks, air, group, block_at, z)
-        add_group(hall, sums, group, group.count, inlet_c, draws_w, speed, fan_power)
-        flow_m3s = speed * racks.per_speed_m3s
-        cpu_w, fan_w = racks.powered * draws_w, fan_power * racks.per_speed_w
-        to_air_w = cpu_w
-        if ti.static(hall.transient):
-            warmer_k = hall.server_c[place + z] - inlet_c
-            to_air_w = flow_m3s * servers.taken_up_j_per_m3_k * warmer_k
-        per_k = larger(flow_m3s * servers.air_j_per_m3_k, hall.zeros + hall.real(1e-30))
-        values = hall.values[values_at + z]
-        values.inlet_c = inlet_c
-        values.outlet_c = inlet_c + (to_air_w + fan_w) / per_k
-        values.power_w = cpu_w + fan_w
-        z += hall.step
-    if ti.static(not hall.recirculates):
-        if hall.outlet_model != OUTLET_OF_SERVERS:
-            complete(hall, sums, racks, air)
-            per_flow = hall.real(1.0) / larger(sums.flow_m3s, hall.zeros + hall.real(1e-30))
-            outlet_c = rack_outlet(hall, servers, sums, per_flow)
-            outlet_c = ti.select(sums.flow_m3s > hall.real(0.0), outlet_c, sums.inlet_c)
-            z = 0
-            while z < n_groups:
-                hall.values[values_at + z].outlet_c = outlet_c
-                z += hall.step
-
-
-@func
-@no_type_check
-def spread_each(hall: ti.template(), block_at, values_at, first_row):
-    """Values of the groups of a block to as many places of the layers.
-
-    Transpose the values of LANES groups at a time, all kinds by turns: halves of a square element
-    by turns, as often as 2 is in LANES.
-    """
-    block, place_0 = hall.blocks[block_at], block_at * LANES
-    at = values_at >> LANE_BITS
-    while at << LANE_BITS < values_at + block.groups:
-        turn = 0
-        while turn < LANE_BITS * N_VALUES:
-            square = hall.squares[turn % N_VALUES, at]
-            hall.squares[turn % N_VALUES, at] = ti.Vector(
-                [square[i // 2 + i % 2 * (SQUARE // 2)] for i in range(SQUARE)]
-            )
-            turn += hall.step
-        at += hall.step
-    lane = 0
-    while lane < block.racks:
-        row = values_at + lane
-        start = hall.rack_ints[first_row, place_0 + lane]
-        end = hall.rack_ints[first_row, place_0 + lane + 1]
-        if start & (LANES - 1) == 0:
-            while start + LANES <= end:
-                for kind in ti.static(range(N_VALUES)):
-                    hall.layer_blocks[kind][start >> LANE_BITS] = hall.group_values[kind, row]
-                row += LANES
-                start += LANES * hall.step
-        while start < end:
-            i = 0
-            while i < ti.min(LANES, end - start):
-                for kind in ti.static(range(N_VALUES)):
-                    hall.layers[kind][start + i] = hall.group_values[kind, row][i]
-                i += hall.step
-            start += LANES
-            row += LANES
-        lane += hall.step
 
 
 @func
@@ -185,6 +98,113 @@ def spread_runs(hall: ti.template(), block_at, values_at):
 
 @func
 @no_type_check
+def to_all_lanes(
+    racks: ti.template(), air: ti.template(), lane, of_racks: ti.template(), of_air: ti.template()
+):
+    """What groups take of one rack of a block, and of the air before it."""
+    of_racks.uneven = ti.Vector([racks.uneven[lane]] * LANES)
+    of_racks.cpu_base = ti.Vector([racks.cpu_base[lane]] * LANES)
+    of_racks.fan_base = ti.Vector([racks.fan_base[lane]] * LANES)
+    of_racks.powered = ti.Vector([racks.powered[lane]] * LANES)
+    of_racks.per_speed_m3s = ti.Vector([racks.per_speed_m3s[lane]] * LANES)
+    of_racks.per_speed_w = ti.Vector([racks.per_speed_w[lane]] * LANES)
+    of_racks.first_group = ti.Vector([racks.first_group[lane] + i for i in range(LANES)])
+    of_air.least_c = ti.Vector([air.least_c[lane]] * LANES)
+    of_air.per_height_k = ti.Vector([air.per_height_k[lane]] * LANES)
+
+
+@func
+@no_type_check
+def compute_values(
+    hall: ti.template(),
+    servers: ti.template(),
+    racks: ti.template(),
+    air: ti.template(),
+    group,
+    z,
+    server_c,
+):
+    """Inlet, outlet and power of groups in the last sweep, or at the end of the last substep.
+
+    A server gives T + P/(rho*cp*V); in transient halls T + eps (T_s - T) + P_fan/(rho*cp*V), with
+    its own temperature T_s and the supply air that follows the last substep.
+    """
+    inlet_c, draws_w, speed, fan_power = of_group(hall, servers, racks, air, group, z)
+    flow_m3s = speed * racks.per_speed_m3s
+    cpu_w, fan_w = racks.powered * draws_w, fan_power * racks.per_speed_w
+    to_air_w = cpu_w
+    if ti.static(hall.transient):
+        to_air_w = flow_m3s * servers.taken_up_j_per_m3_k * (server_c - inlet_c)
+    per_k = larger(flow_m3s * servers.air_j_per_m3_k, hall.zeros + hall.real(1e-30))
+    return inlet_c, inlet_c + (to_air_w + fan_w) / per_k, cpu_w + fan_w
+
+
+@func
+@no_type_check
+def write_block(hall: ti.template(), n, block_at, values_at, servers: ti.template(), first_row):
+    """Values of the groups of a block to runs of servers; lanes are racks.
+
+    Where each group has one place in the layers, to these; lanes are groups of one rack.
+    """
+    block, place_0 = hall.blocks[block_at], block_at * LANES
+    place_1 = place_0 + block.racks
+    n_groups = hall.places[place_1].first_group - hall.places[place_0].first_group
+    n_values = hall.rack_ints[first_row, place_1] - hall.rack_ints[first_row, place_0]
+    in_runs = n_values > n_groups
+    racks = racks_of(hall, servers, block_at)
+    air = air_before(hall, n, block_at, block.mixed_c, SUPPLY.fresh_ratio_used)
+    parts, at, n_vectors, part = 1, block.table, block.groups, 0
+    if not in_runs:
+        parts, at, n_vectors = block.racks, block.along, (n_vectors + (LANES - 1)) >> LANE_BITS
+    while part < parts:
+        of_racks, of_air, rack_outlet_c, start, end = racks, air, block.outlet_c, 0, 0
+        if not in_runs:
+            to_all_lanes(racks, air, part, of_racks, of_air)
+            rack_outlet_c = ti.Vector([rack_outlet_c[part]] * LANES)
+            start = hall.rack_ints[first_row, place_0 + part]
+            end = hall.rack_ints[first_row, place_0 + part + 1]
+        fits = start & (LANES - 1) == 0
+        v, left = 0, 0
+        while v < n_vectors:
+            server_c, z = hall.zeros, v
+            if not in_runs:
+                z = v << LANE_BITS
+            if ti.static(hall.transient):
+                if in_runs:
+                    server_c = hall.server_c[block.place + z]
+                else:
+                    for i in range(LANES):
+                        place = block.place + ti.min(z + i, block.groups - 1)
+                        server_c[i] = hall.server_c[place][part]
+            inlet_c, outlet_c, power_w = compute_values(
+                hall, servers, of_racks, of_air, hall.groups[at + v], z, server_c
+            )
+            if ti.static(not hall.recirculates):
+                if hall.outlet_model != OUTLET_OF_SERVERS:
+                    outlet_c = rack_outlet_c
+            if not in_runs and fits and start + z + LANES <= end:
+                store(hall, (start + z) >> LANE_BITS, inlet_c, outlet_c, power_w)
+                left = z + LANES
+            else:
+                values = hall.values[values_at + v]
+                values.inlet_c = inlet_c
+                values.outlet_c = outlet_c
+                values.power_w = power_w
+            v += hall.step
+        while start + left < end:
+            row = values_at + (left >> LANE_BITS)
+            for kind in ti.static(range(N_VALUES)):
+                value = hall.group_values[kind, row][left & (LANES - 1)]
+                hall.layers[kind][start + left] = value
+            left += hall.step
+        at += n_vectors
+        part += hall.step
+    if in_runs:
+        spread_runs(hall, block_at, values_at)
+
+
+@func
+@no_type_check
 def write_chunk(hall: ti.template(), chunk_at, values_at, each_once):
     """Values of the servers of a chunk, or of each of its groups once."""
     chunk = hall.chunks[chunk_at]
@@ -193,15 +213,7 @@ def write_chunk(hall: ti.template(), chunk_at, values_at, each_once):
     if each_once != 0:
         first_row = RACK_INT.first_group
     for block_at in range(chunk.first_block, hall.chunks[chunk_at + 1].first_block):
-        compute_values(hall, chunk.dc, block_at, values_at, servers)
-        place_0 = block_at * LANES
-        place_1 = place_0 + hall.blocks[block_at].racks
-        n_groups = hall.places[place_1].first_group - hall.places[place_0].first_group
-        n_values = hall.rack_ints[first_row, place_1] - hall.rack_ints[first_row, place_0]
-        if n_values == n_groups:
-            spread_each(hall, block_at, values_at, first_row)
-        else:
-            spread_runs(hall, block_at, values_at)
+        write_block(hall, chunk.dc, block_at, values_at, servers, first_row)
 
 
 @cache
@@ -209,15 +221,13 @@ def layers_kernel(precision: str) -> Any:
     """Kernel that computes all groups of the last step again and stores their values.
 
     To all their servers, or with ``each_once`` to themselves; ``..._blocks`` are the layers again
-    as vectors. ``group_values`` and ``squares``, the same again, have room for the groups of a
-    block in each of the slices.
+    as vectors. ``group_values`` has room for the groups of a block in each of the slices.
     """
     real = reals(precision)
     log_of, exp_of = log_and_exp(precision, LANES)
     reals_1d = ti.types.ndarray(dtype=real, ndim=1)
     blocks_2d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=2)
     blocks_1d = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=1)
-    squares_2d = ti.types.ndarray(dtype=ti.types.vector(SQUARE, real), ndim=2)
     ints_2d = ti.types.ndarray(dtype=ti.i32, ndim=2)
     doubles_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
 
@@ -245,9 +255,8 @@ def layers_kernel(precision: str) -> Any:
         unit_state: doubles_2d,
         rack_store: blocks_2d,
         server_c: blocks_1d,
-        constants: reals_1d,
+        rack_out: blocks_2d,
         group_values: blocks_2d,
-        squares: squares_2d,
         inlet_c: reals_1d,
         outlet_c: reals_1d,
         power_w: reals_1d,
@@ -275,12 +284,14 @@ def layers_kernel(precision: str) -> Any:
                         units=Table((UNIT_STATE, unit_state)),
                         chunks=Table((CHUNK_INTS, chunk_ints)),
                         blocks=Table(
-                            (BLOCK_INTS, block_ints), (RACK_ROWS, racks), (RACK_STATE, rack_store)
+                            (BLOCK_INTS, block_ints),
+                            (RACK_ROWS, racks),
+                            (RACK_STATE, rack_store),
+                            (RACK_OUT, rack_out),
                         ),
                         places=Table((RACK_INTS, rack_ints)),
                         groups=Table((GROUP_ROWS, groups)),
                         values=Table((GROUP_OUT, group_values)),
-                        constants=constants,
                         group_load=group_load,
                         group_values=group_values,
                         layer_blocks=(inlet_blocks, outlet_blocks, power_blocks),
@@ -288,7 +299,6 @@ def layers_kernel(precision: str) -> Any:
                         rack_ints=rack_ints,
                         server_c=server_c,
                         shares=shares,
-                        squares=squares,
                         unit_state=unit_state,
                     )
                 )

@@ -106,6 +106,10 @@ def racks_of(hall: ti.template(), servers: ti.template(), block_at):
         u = block.load
     elif hall.loads_of == OF_GROUPS:
         u = hall.zeros
+    first_group = ti.Vector([0] * LANES)
+    if hall.loads_of == OF_GROUPS:
+        for i in range(LANES):
+            first_group[i] = hall.places[block_at * LANES + i].first_group
     powered = block.powered
     breath = block.airflow * powered
     return ti.Struct(
@@ -115,6 +119,8 @@ def racks_of(hall: ti.template(), servers: ti.template(), block_at):
         cpu_base=u * servers.cpu_shift + servers.cpu_offset,
         fan_base=u * servers.fan_shift + servers.fan_offset,
         per_server=block.per_server,
+        # Where loads are looked up, if they are given for each group.
+        first_group=first_group,
         # What all groups have in common is multiplied with their sums.
         powered=powered,
         breath=breath,
@@ -131,7 +137,6 @@ def of_group(
     racks: ti.template(),
     air: ti.template(),
     group,
-    block_at,
     z,
 ):
     """Inlet of group z of each rack; of a server CPU power, and fan speed and power as ratios."""
@@ -142,7 +147,7 @@ def of_group(
     apart = group.load_deviation * racks.uneven
     if hall.loads_of == OF_GROUPS:
         for i in range(LANES):
-            at = hall.places[block_at * LANES + i].first_group + z
+            at = racks.first_group[i] + z
             apart[i] = hall.group_load[ti.min(at, hall.group_load.shape[0] - 1)]
     on_curve_c = smaller(inlet_c, servers.curve_limit_c)
     ratio = on_curve_c * servers.cpu_slope + (apart * servers.cpu_shift + racks.cpu_base)

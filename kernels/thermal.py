@@ -27,7 +27,7 @@ OF_DATA_CENTERS, OF_RACKS, OF_GROUPS = range(3)
 
 LANES = 8
 """Racks that are computed at a time; the same for all, so that results never depend on it."""
-LANE_BITS, SQUARE = LANES.bit_length() - 1, LANES * LANES
+LANE_BITS = LANES.bit_length() - 1
 SOURCES = 4
 """Racks whose exhausts a vector of weights takes to all lanes of a block, in small halls."""
 RUN_LANES = 16
@@ -36,8 +36,9 @@ RUN_BLOCKS = RUN_LANES // LANES
 CHUNK_BLOCKS = 16
 """Most blocks of a chunk; fewer racks are not worth a thread of their own."""
 
-BLOCK_INTS = ("racks", "groups", "table", "place")
-"""Racks and groups per rack of each block, entry of its tables, and first place of its groups."""
+BLOCK_INTS = ("racks", "groups", "table", "place", "along")
+"""Racks and groups per rack of each block, entry of its table, first place of its groups, and entry
+of its table for layers, whose lanes are groups of one rack."""
 RACK_INTS = ("first_group", "first_server")
 """Of each place; those without a rack, and a closing one, begin where the rack before them ends."""
 RUN_INTS = ("first", "length", "offset")

@@ -168,10 +168,7 @@ class Hall:
         self._lay_out_values(thermal)
         self._slices = max(1, min(8 * threads, len(self._tasks) - 1))
         self._scratch = self._lanes(self._slices * thermal.SCRATCH)
-        squares = self._slices * -(-self._most_groups // thermal.LANES)
-        values = self._aligned((len(thermal.GROUP_OUT), squares, thermal.SQUARE), self._dtype)
-        self._group_values = values.reshape(len(values), -1, thermal.LANES), values
-        """The same room twice: as the kernel computes it, and in squares to be transposed."""
+        self._group_values = self._lanes(len(thermal.GROUP_OUT), self._slices * self._most_groups)
         self._result_names = (*thermal.DC_OUT, *(f"rack_{name}" for name in thermal.RACK_OUT))
         self._was_transient: bool | None = None
         """Whether the last step was transient; None without one."""
@@ -253,10 +250,29 @@ class Hall:
         self._tables = self._lanes(total * len(thermal.GROUP_ROWS))
         self._tables[:] = np.concatenate(tables).reshape(self._tables.shape)
         first_place = starts(most, "groups of blocks")
-        self._block_ints = _table(filled, most, table, first_place[:-1])
+        self._block_ints = _table(filled, most, table, first_place[:-1], np.full(len(most), -1))
         self._group_places, self._most_groups = int(first_place[-1]), int(most.max())
         self._server_c = self._lanes(1)
         self._none = np.zeros(1, self._dtype)
+
+    def _lay_out_along(self) -> None:
+        """Tables along the racks, behind the others, which layers alone are computed from."""
+        lanes = self._thermal.LANES
+        block = dict(zip(self._thermal.BLOCK_INTS, self._block_ints, strict=True))
+        tables = self._tables.reshape(-1, len(self._thermal.GROUP_ROWS), lanes)
+        at, one, of_block = np.unique(block["table"], return_index=True, return_inverse=True)
+        groups = block["groups"][one]
+        vectors = -(-groups // lanes)
+        first = len(tables) + starts(lanes * vectors, "groups along racks")
+        along = self._lanes(int(first[-1]) * tables.shape[1])
+        out = along.reshape(-1, *tables.shape[1:])
+        out[: len(tables)] = tables
+        for a, n, b, v in zip(at, groups, first, vectors, strict=False):
+            zone = np.minimum(np.arange(lanes * v), n - 1)
+            squares = tables[a : a + n][zone].reshape(v, lanes, -1, lanes)
+            out[b : b + lanes * v] = squares.transpose(3, 0, 2, 1).reshape(-1, *out.shape[1:])
+        self._tables = along
+        block["along"][:] = first[of_block]
 
     def _lay_out_air(self, thermal: Any) -> None:
         """Weights and unit shares at the places of the racks."""
@@ -537,6 +553,8 @@ class Hall:
         if self._was_transient is None:
             raise RuntimeStateError("no step has been done yet; server layers exist after one")
         runtime.ensure_started()
+        if self._block_ints[-1, 0] < 0:
+            self._lay_out_along()
         self._layers_kernel(
             self._recirculates,
             self._was_transient,
@@ -559,8 +577,8 @@ class Hall:
             self._unit_state,
             self._rack_store,
             self._server_c,
-            self._constants,
-            *self._group_values,
+            self._rack_out,
+            self._group_values,
             *written,
         )
 
