@@ -414,6 +414,9 @@ class Hall:
         self._fresh_m3s = fleet.dcs[fresh_share][fleet.unit_dc] * fleet.unit_design_m3s
         self._rack_store = self._lanes(len(thermal.RACK_STATE), blocks)
         self._rack_out = self._lanes(len(thermal.RACK_OUT), blocks)
+        of_servers = thermal.OUTLETS.index("server")
+        self._hands_out = self._places == fleet.racks and self._outlet_model == of_servers
+        """Whether the racks' results are given away as they are; other outlets are read again."""
         self._rack_state = self._rack_store.reshape(len(self._rack_store), -1)
         self._sources = self._rack_store.reshape(-1, thermal.SOURCES)
         self._run_sources = self._rack_store.reshape(-1, thermal.RUN_LANES)
@@ -766,10 +769,14 @@ class Hall:
         )
 
     def _new_sums(self) -> F64:
+        if self._hands_out:
+            self._rack_out = self._aligned(self._rack_out.shape, self._dtype)
         return np.empty((len(self._thermal.DC_OUT), self._fleet.size))
 
     def _results(self, dcs: F64, *, transient: bool) -> HallSums:
-        racks = self._at_racks(self._rack_out)
+        racks = self._rack_out.reshape(len(self._rack_out), -1)
+        if not self._hands_out:
+            racks = self._at_racks(racks)
         if not isfinite(np.add.reduce(dcs, axis=None)):
             finite = np.isfinite(dcs).all(axis=0)
             raise SdcError(

@@ -420,6 +420,28 @@ def test_server_layers_need_a_solve() -> None:
         hall.servers()
 
 
+@pytest.mark.parametrize("outlet_model", ["server", "rack"])
+@pytest.mark.parametrize("racks", [12, 16])
+def test_what_comes_out_belongs_to_the_caller(racks: int, outlet_model: str) -> None:
+    """Another step leaves it alone, and layers do not follow what is written to it."""
+    values = preset_values("corrected")
+    values["hall"] |= {"rows": 1, "racks_per_row": racks, "inlet_model": "approach"}
+    values["hall"] |= {"supply_approach_k": 5.0, "return_approach_k": -3.0}
+    values["servers"] |= {"outlet_model": outlet_model, "power_w": [150, 10]}
+    hall = Hall(build_fleet(config_from_dict(values)), "f32")
+    first = hall.solve(Conditions(np.array([20.0]), np.array([0.5])))
+    names = [f.name for f in fields(first) if f.name.startswith("rack_")]
+    before = {name: getattr(first, name).copy() for name in names}
+    second = hall.solve(Conditions(np.array([22.0]), np.array([0.9])))
+    layers = hall.servers()
+    for name in names:
+        assert np.array_equal(getattr(first, name), before[name]), name
+        assert not np.any(getattr(second, name) == before[name]), name
+        getattr(second, name)[:] = 0.0
+    for f in fields(layers):
+        assert np.array_equal(getattr(hall.servers(), f.name), getattr(layers, f.name)), f.name
+
+
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_layers_may_lie_anywhere_in_memory(precision: Precision) -> None:
     configs, supply_c, load = random_fleet(9)
