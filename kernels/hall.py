@@ -26,6 +26,7 @@ from .servers import (
     air_before,
     complete,
     hand_over,
+    inlet_of,
     no_groups,
     of_group,
     rack_outlet,
@@ -106,7 +107,7 @@ def compute_groups(
             if now.ends:
                 hand_over(hall, block_at, z, count, hall.server_c[place + z])
         add_group(hall, sums, group, count, inlet_c, draws_w, speed, fan_power)
-        add_inlet(hall, inlets, count, inlet_c)
+        add_inlet(hall, inlets, inlet_c)
         z += hall.step
     if ti.static(hall.transient):
         stored_w *= warming.w_per_k
@@ -168,9 +169,8 @@ def compute_block(
         outlet_m3k_s = flow_m3s * outlet_c
     terms.inlet_m3k_s = terms.inlet_m3k_s + sums.inlet_m3k_s
     terms.outlet_m3k_s = terms.outlet_m3k_s + outlet_m3k_s
-    terms.hot_k = terms.hot_k + inlets.hot_k
-    terms.cold_k = terms.cold_k + inlets.cold_k
     terms.flow_m3s = terms.flow_m3s + flow_m3s
+    add_degrees(hall, block_at, terms_at, racks, air, inlets)
     if ti.static(hall.transient):
         terms.stored_w = terms.stored_w + (stored_w + parcel_w)
     else:
@@ -192,8 +192,7 @@ def compute_block(
 def no_inlets(hall: ti.template()):
     """What a rack keeps of the inlets of its groups, of which ``zones`` have been seen."""
     return ti.Struct(
-        hot_k=hall.zeros,
-        cold_k=hall.zeros,
+        min_c=hall.zeros + hall.real(1e30),
         max_c=hall.zeros - hall.real(1e30),
         zone=hall.zeros,
         zones=hall.zeros,
@@ -202,10 +201,9 @@ def no_inlets(hall: ti.template()):
 
 @func
 @no_type_check
-def add_inlet(hall: ti.template(), inlets: ti.template(), count, inlet_c):
+def add_inlet(hall: ti.template(), inlets: ti.template(), inlet_c):
     """Inlet of a group; one without servers is as another one of its rack."""
-    inlets.hot_k += count * larger(inlet_c - hall.real(RECOMMENDED_C[1]), hall.zeros)
-    inlets.cold_k += count * larger(hall.real(RECOMMENDED_C[0]) - inlet_c, hall.zeros)
+    inlets.min_c = smaller(inlet_c, inlets.min_c)
     inlets.zone = ti.select(inlet_c > inlets.max_c, inlets.zones, inlets.zone)
     inlets.max_c = larger(inlet_c, inlets.max_c)
     inlets.zones += hall.real(1.0)
@@ -228,6 +226,37 @@ def keep_hottest(
     hottest.zone = ti.select(is_hotter, inlets.zone, hottest.zone)
     hottest.inlet_c = larger(inlet_c, hottest.inlet_c)
     return inlet_c
+
+
+@func
+@no_type_check
+def add_degrees(
+    hall: ti.template(),
+    block_at,
+    terms_at,
+    racks: ti.template(),
+    air: ti.template(),
+    inlets: ti.template(),
+):
+    """By what inlets of a block lie beyond the recommended range, which most never leave."""
+    low_c, high_c = hall.real(RECOMMENDED_C[0]), hall.real(RECOMMENDED_C[1])
+    beyond_k = larger(inlets.max_c - high_c, low_c - inlets.min_c)
+    beyond_k *= racks.per_server
+    # Written like this, the compiler asks all lanes at once.
+    is_any = 0
+    for i in ti.static(range(LANES)):
+        is_any |= ti.cast(beyond_k[i] > hall.real(0.0), ti.i32)
+    if is_any != 0:
+        block, terms = hall.blocks[block_at], hall.terms[terms_at]
+        hot_k, cold_k, z, table = hall.zeros, hall.zeros, 0, block.table
+        while z < block.groups:
+            group = hall.groups[table + z]
+            inlet_c = inlet_of(hall, air, group)
+            hot_k += group.count * larger(inlet_c - high_c, hall.zeros)
+            cold_k += group.count * larger(low_c - inlet_c, hall.zeros)
+            z += hall.step
+        terms.hot_k = terms.hot_k + hot_k
+        terms.cold_k = terms.cold_k + cold_k
 
 
 @func

@@ -131,6 +131,16 @@ def racks_of(hall: ti.template(), servers: ti.template(), block_at):
 
 @func
 @no_type_check
+def inlet_of(hall: ti.template(), air: ti.template(), group):
+    """Inlet of a group of each rack."""
+    inlet_c = air.least_c + group.inlet_offset_k
+    if ti.static(hall.recirculates):
+        inlet_c = air.least_c - group.height * air.per_height_k
+    return inlet_c
+
+
+@func
+@no_type_check
 def of_group(
     hall: ti.template(),
     servers: ti.template(),
@@ -140,9 +150,7 @@ def of_group(
     z,
 ):
     """Inlet of group z of each rack; of a server CPU power, and fan speed and power as ratios."""
-    inlet_c = air.least_c + group.inlet_offset_k
-    if ti.static(hall.recirculates):
-        inlet_c = air.least_c - group.height * air.per_height_k
+    inlet_c = inlet_of(hall, air, group)
     # Utilisation over that of the rack, where not given.
     apart = group.load_deviation * racks.uneven
     if hall.loads_of == OF_GROUPS:

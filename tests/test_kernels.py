@@ -420,6 +420,31 @@ def test_server_layers_need_a_solve() -> None:
         hall.servers()
 
 
+@pytest.mark.parametrize(
+    ("supply_c", "any_hot", "any_cold"),
+    [(20.0, False, False), (17.0, False, True), (22.0, True, False), (26.0, True, False)],
+)
+def test_degrees_beyond_the_recommended_range_are_those_of_the_servers(
+    supply_c: float, any_hot: bool, any_cold: bool
+) -> None:
+    """Also where a single rack of a block is the only one beyond."""
+    values = preset_values("corrected")
+    approach_k = [2.0] * 11
+    approach_k[5], approach_k[10] = 0.5, 6.0
+    values["hall"] |= {"rows": 1, "racks_per_row": 11, "inlet_model": "approach"}
+    values["hall"] |= {"supply_approach_k": approach_k, "return_approach_k": -3.0}
+    values["servers"] |= {"power_w": [150, 10]}
+    hall = Hall(build_fleet(config_from_dict(values)), "f64")
+    sums = hall.solve(Conditions(np.array([supply_c]), np.array([0.5])))
+    inlet_c = hall.servers().inlet_c
+    for found, beyond_k, is_any in (
+        (sums.hot_k, inlet_c - 27.0, any_hot),
+        (sums.cold_k, 18.0 - inlet_c, any_cold),
+    ):
+        assert (found[0] > 0.0) == is_any
+        np.testing.assert_allclose(found[0], np.maximum(beyond_k, 0.0).sum(), rtol=1e-12)
+
+
 @pytest.mark.parametrize("outlet_model", ["server", "rack"])
 @pytest.mark.parametrize("racks", [12, 16])
 def test_what_comes_out_belongs_to_the_caller(racks: int, outlet_model: str) -> None:
