@@ -271,6 +271,7 @@ class Hall:
             zone = np.minimum(np.arange(lanes * v), n - 1)
             squares = tables[a : a + n][zone].reshape(v, lanes, -1, lanes)
             out[b : b + lanes * v] = squares.transpose(3, 0, 2, 1).reshape(-1, *out.shape[1:])
+        self._kernel.let_go(self._tables)
         self._tables = along
         block["along"][:] = first[of_block]
 

@@ -583,6 +583,21 @@ def test_layers_that_were_handed_out_are_not_kept() -> None:
         assert left() is None
 
 
+def test_copies_of_a_hall_share_the_tables_of_layers() -> None:
+    """They come with the first layers, and what was there before is let go."""
+    sizes = []
+    for count in (1, 3):
+        hall = Hall(build_fleet([load_config("tiny")] * count), "f32")
+        hall.solve(Conditions(np.full(count, 20.0), np.full(count, 0.5)))
+        alone, before = len(hall._tables), weakref.ref(hall._tables.base)
+        hall.servers()
+        gc.collect()
+        assert before() is None
+        assert alone < len(hall._tables)
+        sizes.append(len(hall._tables))
+    assert sizes[0] == sizes[1]
+
+
 def test_layers_that_do_not_fit_are_refused() -> None:
     fleet = build_fleet(load_config("tiny"))
     hall = Hall(fleet, "f32")
