@@ -568,6 +568,17 @@ def test_recording_that_is_interrupted_amid_a_step_is_whole(
     assert verify(path).returncode == 0
 
 
+def test_zones_are_found_once_per_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    peaks = Mock(side_effect=hall_layers.zone_peaks)
+    monkeypatch.setattr(hall_layers, "zone_peaks", peaks)
+    with small(2) as sim, Recorder(tmp_path / "x.rrd", every=1) as rec:
+        sim.reset()
+        rec.begin(sim)
+        go_on(sim, rec, 20)
+    assert len(read(tmp_path / "x.rrd")["/dc/ny-0/hall/inlet"]["step"]) == 20
+    assert peaks.call_count == 1
+
+
 def test_names_that_are_not_distinct_are_told_apart(tmp_path: Path) -> None:
     twins = make_configs(load_config("tiny")) * 3
     with Simulator(twins) as sim, Recorder(tmp_path / "x.rrd", focus=["ny#0", "ny#2"]) as rec:

@@ -172,7 +172,8 @@ class Zones(NamedTuple):
     """What the zones of all racks of some data centers show."""
 
     groups: I64
-    """Server groups in each zone, all of whose servers have the same values."""
+    """Server groups in each zone, all of whose servers have the same values; counted over the
+    groups of these data centers."""
     starts: I64
     """First of these in each zone, rack by rack from the floor up."""
 
@@ -181,9 +182,11 @@ def zones_of(fleet: Fleet, dcs: Sequence[int], zones: Sequence[int]) -> Zones:
     """Zones of data centers whose racks have so many zones each, and at least as many servers."""
     groups: list[I64] = []
     starts: list[I64] = []
+    earlier = 0
     for dc, heights in zip(dcs, zones, strict=True):
         racks = np.arange(*fleet.rack_start[dc : dc + 2])
-        of_groups = fleet.server_start[slice(*fleet.group_start[fleet.rack_start[dc : dc + 2]])]
+        first_group, end_group = fleet.group_start[fleet.rack_start[dc : dc + 2]].tolist()
+        of_groups = fleet.server_start[first_group:end_group]
         first = fleet.server_start[fleet.group_start[racks]].astype(np.int64)
         count = fleet.server_start[fleet.group_start[racks + 1]] - first
         # Server j of n stands in zone j * zones // n.
@@ -191,13 +194,14 @@ def zones_of(fleet: Fleet, dcs: Sequence[int], zones: Sequence[int]) -> Zones:
         zone_first = (first[:, None] + before).reshape(-1)
         own = np.union1d(zone_first, of_groups)
         starts.append(np.searchsorted(own, zone_first) + sum(map(len, groups)))
-        groups.append(np.searchsorted(fleet.server_start, own, side="right") - 1)
+        groups.append(np.searchsorted(of_groups, own, side="right") - 1 + earlier)
+        earlier += len(of_groups)
     return Zones(np.concatenate(groups), np.concatenate(starts))
 
 
-def zone_peaks(layer: Reals, zones: Zones) -> Reals:
-    """Highest value of each zone in a layer of the groups (G,)."""
-    return np.asarray(np.maximum.reduceat(layer[zones.groups], zones.starts))
+def zone_peaks(layers: Shots, zones: Zones) -> Shots:
+    """Highest value of each zone, (..., zones), in layers of the groups, (..., G)."""
+    return np.asarray(np.maximum.reduceat(layers[..., zones.groups], zones.starts, axis=-1))
 
 
 def unit_boxes_m(places_m: F64, plan: Plan, height_m: float) -> F64:

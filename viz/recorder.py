@@ -468,17 +468,24 @@ def _cadence(fleet: Fleet, focus: Sequence[int], every: int | None) -> Cadence:
         or max(map_every, round(HALL_IN_EVENTS_H * fleet.steps_per_hour)),
         zones=zones,
         per_server=per_server,
-        block_steps=_block_steps(fleet, focus, map_every, hall_every, zones),
+        block_steps=_block_steps(fleet, focus, map_every, hall_every, zones, per_server),
     )
 
 
 def _block_steps(
-    fleet: Fleet, focus: Sequence[int], map_every: int, hall_every: int, zones: Sequence[int]
+    fleet: Fleet,
+    focus: Sequence[int],
+    map_every: int,
+    hall_every: int,
+    zones: Sequence[int],
+    per_server: bool,
 ) -> int:
     """Steps whose values and pictures fill a block."""
     halls = [fleet.configs[dc].hall for dc in focus]
     pixels = sum(math.prod(layers.tiles(hall).image) for hall in halls)
     cells = sum(hall.racks * heights for hall, heights in zip(halls, zones, strict=True))
+    if per_server:
+        cells += int(np.diff(fleet.group_start[fleet.rack_start])[focus].sum())
     step_bytes: float = 8 * len(FIELDS) * (len(focus) + 2)
     step_bytes += 2 * len(layers.COLOURMAPS) * pixels / map_every
     step_bytes += 4 * len(layers.LIMITS_C) * cells / hall_every

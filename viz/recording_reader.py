@@ -6,10 +6,9 @@ import itertools
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from sdc_taichi.air_metrics import RECOMMENDED_C
 from sdc_taichi.errors import SdcError
@@ -80,19 +79,6 @@ class Block:
     entries: list[Entry]
 
 
-class _Shot(NamedTuple):
-    """The 3D halls in one step."""
-
-    step: int
-    inlet_c: Reals
-    """(Zones of R,)."""
-    outlet_c: Reals
-    above: int
-    """Halls of the fleet with inlets above what is recommended."""
-    hottest: list[npt.NDArray[Any]]
-    """Data centers, inlets, racks and servers, hottest first; empty for one hall."""
-
-
 class Reader:
     """Reads results into blocks.
 
@@ -108,6 +94,7 @@ class Reader:
     ) -> None:
         fleet = sim.fleet
         self._sim, self._fleet, self._names = sim, fleet, names
+        self._shape = fleet.size, fleet.racks
         self._focus, self._cadence = list(focus), cadence
         self._every_focus, _ = end_to_end([slice(dc, dc + 1) for dc in focus])
         self._read = operator.attrgetter(*FIELDS, "unit_supply_c", "unit_flow_m3s")
@@ -116,8 +103,11 @@ class Reader:
         self._units = [slice(*fleet.unit_start[dc : dc + 2].tolist()) for dc in focus]
         self._every_rack, self.racks = end_to_end(self._racks)
         self._every_unit, self.units = end_to_end(self._units)
+        shown = self._racks
         if cadence.per_server:
+            shown = [slice(*fleet.group_start[[r.start, r.stop]].tolist()) for r in self._racks]
             self._zones = layers.zones_of(fleet, focus, cadence.zones)
+        self._every_shown, ends = end_to_end(shown)
         cells = [(r.stop - r.start) * n for r, n in zip(self._racks, cadence.zones, strict=True)]
         self.cells = [slice(end - n, end) for n, end in zip(cells, np.cumsum(cells), strict=True)]
         self._status = bytes(fleet.racks)
@@ -131,15 +121,17 @@ class Reader:
         self._summed = [ROW[field] for field in SUMMED]
         self._rows = np.empty((0, 0))
         # Written over block by block, so that it stays in the cache.
-        shots = -(-cadence.block_steps // cadence.map_every)
-        self._maps = np.empty((shots, 4 * self.racks[-1].stop), dtype=np.float32)
+        each = (cadence.map_every, cadence.hall_every, cadence.hall_every_in_events)
+        maps, *halls = (-(-cadence.block_steps // steps) for steps in each)
+        self._maps = np.empty((maps, 4 * self.racks[-1].stop), dtype=np.float32)
+        self._halls = np.empty((2, sum(halls), ends[-1].stop), dtype=np.float32)
         self._clear()
 
     def _clear(self) -> None:
         self._steps: list[int] = []
         self._parts: list[list[F64]] = []
         self._map_steps: list[int] = []
-        self._shots: list[_Shot] = []
+        self._hall_steps: list[int] = []
         self._entries: list[Entry] = []
 
     @property
@@ -156,32 +148,24 @@ class Reader:
         """
         self._check(result)
         queue = self._sim.state.queue[self._every_focus].reshape(-1)
-        names = tuple(rewards or ())
+        terms = rewards or {}
         if self.reward_names is None:
-            self._lay_out(len(queue), names)
-        if names != self.reward_names:
-            raise SdcError(
-                f"recorder: rewards {', '.join(names) or 'none'}, expected "
-                f"{', '.join(self.reward_names or ()) or 'none'} as in the first step"
-            )
-        for name, values in (rewards or {}).items():
-            if np.shape(values) != (self._fleet.size,):
-                raise SdcError(
-                    f"recorder: reward {name} has shape {np.shape(values)}; valid is one value per "
-                    f"data center, ({self._fleet.size},)"
-                )
+            self._lay_out(len(queue), tuple(terms))
+        if terms or self.reward_names:
+            self._check_rewards(terms)
         row = len(self._steps) % len(self._rows)
         if row == 0 and self._steps:
             self._take_apart()
-        terms = rewards.values() if rewards else ()
-        np.concatenate((*self._read(result), queue, *terms), out=self._rows[row])
+        np.concatenate((*self._read(result), queue, *terms.values()), out=self._rows[row])
         step = self._last_step = result.step
         # What is not listed yet does not count, should reading be interrupted.
         self._steps.append(step)
-        self._add_events(result)
-        if step % self._cadence.map_every == 0:
-            self._add_maps(result)
+        status = result.rack_status.tobytes()
+        if self._has_events or status != self._status:
+            self._add_events(result, status)
         cadence = self._cadence
+        if step % cadence.map_every == 0:
+            self._add_maps(result)
         if step % (cadence.hall_every_in_events if self._active else cadence.hall_every) == 0:
             self._add_halls(result)
 
@@ -203,26 +187,45 @@ class Reader:
         )
         focus, n, size = self._every_focus, len(self._focus), self._fleet.size
         of_dcs = fields.reshape(k, len(FIELDS), size)
+        inlet_max_c = of_dcs[:, ROW["inlet_max_c"]]
         self._parts.append([
             of_dcs[:, :, focus].copy(),
             of_dcs[:, self._summed].sum(axis=2),
-            of_dcs[:, ROW["inlet_max_c"]].max(axis=1),
+            inlet_max_c.max(axis=1),
             age_histogram(queues.reshape(k * n, -1), self._edges).reshape(k, n, -1),
             supply_c[:, self._every_unit].copy(),
             flow_m3s[:, self._every_unit].copy(),
             rewards.reshape(k, -1, size)[:, :, focus].copy(),
+            *self._hottest(of_dcs),
         ])  # fmt: skip
+
+    def _hottest(self, of_dcs: F64) -> tuple[F64, F64]:
+        """Hot halls and the hottest inlets where the 3D halls are shown, of the rows read.
+
+        Returns:
+            Number of halls above what is recommended, (shots,), and hall, inlet, rack and server
+            of the hottest ones, (shots, 4, halls).
+        """
+        first = self._steps[-1] + 1 - len(of_dcs)
+        shown = of_dcs[[step - first for step in self._hall_steps if step >= first]]
+        inlet_c = shown[:, ROW["inlet_max_c"]]
+        top = np.argsort(-inlet_c, axis=1, kind="stable")[:, :HOTTEST]
+        rows = [ROW[field] for field in ("inlet_max_c", "hottest_rack", "hottest_server")]
+        values = np.take_along_axis(shown[:, rows], top[:, None], axis=2)
+        above = np.count_nonzero(inlet_c > RECOMMENDED_C[1], axis=1)
+        return above, np.concatenate([top[:, None], values], axis=1)
 
     def take(self) -> Block:
         """The block under way; another begins."""
         if len(self._steps) > len(self._parts) * len(self._rows):
             self._take_apart()
-        values, total, hottest_c, ages, supply_c, flow_m3s, rewards = (
+        values, total, hottest_c, ages, supply_c, flow_m3s, rewards, above, hottest = (
             np.concatenate(parts) for parts in zip(*self._parts, strict=True)
         )
         inlet_c, outlet_c, cpu_w, fan_w = np.split(self._maps[: len(self._map_steps)], 4, axis=1)
-        shots = self._shots
-        halls = {"inlet": [s.inlet_c for s in shots], "outlet": [s.outlet_c for s in shots]}
+        halls = self._halls[:, : len(self._hall_steps)]
+        if self._cadence.per_server:
+            halls = layers.zone_peaks(halls, self._zones)
         block = Block(
             steps=np.array(self._steps, dtype=np.int64),
             values=values,
@@ -237,41 +240,55 @@ class Reader:
                 "outlet": outlet_c,
                 "power": (cpu_w + fan_w) * np.float32(1e-3),
             },
-            hall_steps=np.array([s.step for s in shots], dtype=np.int64),
-            halls={what: np.stack(shown) for what, shown in halls.items() if shown},
-            hottest=[self._hottest_halls(s) for s in shots if s.hottest],
+            hall_steps=np.array(self._hall_steps, dtype=np.int64),
+            halls=dict(zip(("inlet", "outlet"), halls, strict=True)) if halls.size else {},
+            hottest=list(map(self._table, above.tolist(), hottest)) if self._fleet.size > 1 else [],
             entries=self._entries,
         )
         self._clear()
         return block
 
     def _check(self, result: StepResult) -> None:
-        dcs, racks = len(result.it_w), len(result.rack_inlet_c)
-        if dcs != self._fleet.size or racks != self._fleet.racks:
+        shape = len(result.it_w), len(result.rack_inlet_c)
+        if shape != self._shape:
             raise SdcError(
-                f"recorder: result of {dcs} data centers and {racks} racks, expected "
-                f"{self._fleet.size} and {self._fleet.racks}"
+                f"recorder: result of {shape[0]} data centers and {shape[1]} racks, expected "
+                f"{self._shape[0]} and {self._shape[1]}"
             )
-        if result.step != self._sim.state.step - 1:
+        step, done = result.step, self._sim.state.step
+        if step != done - 1:
             raise SdcError(
-                f"recorder: result of step {result.step}, but the simulator has done "
-                f"{self._sim.state.step} steps; add each step right after it"
+                f"recorder: result of step {step}, but the simulator has done {done} steps; add "
+                "each step right after it"
             )
-        if self._last_step >= 0 and result.step != self._last_step + 1:
+        if step != self._last_step + 1 and self._last_step >= 0:
             raise SdcError(
-                f"recorder: step {result.step} after step {self._last_step}; an episode has all of "
-                "its steps in order, and begin(sim) begins another"
+                f"recorder: step {step} after step {self._last_step}; an episode has all of its "
+                "steps in order, and begin(sim) begins another"
             )
 
-    def _add_events(self, result: StepResult) -> None:
+    def _check_rewards(self, terms: Mapping[str, F64]) -> None:
+        if tuple(terms) != self.reward_names:
+            raise SdcError(
+                f"recorder: rewards {', '.join(terms) or 'none'}, expected "
+                f"{', '.join(self.reward_names or ()) or 'none'} as in the first step"
+            )
+        for name, values in terms.items():
+            if np.shape(values) != (self._fleet.size,):
+                raise SdcError(
+                    f"recorder: reward {name} has shape {np.shape(values)}; valid is one value per "
+                    f"data center, ({self._fleet.size},)"
+                )
+
+    def _add_events(self, result: StepResult, status: bytes) -> None:
         step, fleet = result.step, self._fleet
         if self._has_events:
             active = [e for e in self._sim.active_events(step) if e.dc in self._focus]
             self._entries += failure_entries(step, self._active, active, fleet)
             self._active = active
-        status, after = result.rack_status.tobytes(), result.rack_status
         if status == self._status:
             return
+        after = result.rack_status
         before: Status = np.frombuffer(self._status, after.dtype)
         self._status = status
         inlet_c: Reals | None = None
@@ -302,31 +319,26 @@ class Reader:
     def _add_halls(self, result: StepResult) -> None:
         if self._cadence.per_server:
             groups = self._sim.server_groups()
-            inlet_c = layers.zone_peaks(groups.inlet_c, self._zones)
-            outlet_c = layers.zone_peaks(groups.outlet_c, self._zones)
+            inlet_c, outlet_c = groups.inlet_c, groups.outlet_c
         else:
-            inlet_c = result.rack_inlet_max_c[self._every_rack].copy()
-            outlet_c = result.rack_outlet_c[self._every_rack].copy()
-        hottest: list[npt.NDArray[Any]] = []
-        above = int(np.count_nonzero(result.inlet_max_c > RECOMMENDED_C[1]))
-        if self._fleet.size > 1:
-            top = np.argsort(-result.inlet_max_c, kind="stable")[:HOTTEST]
-            shown = result.inlet_max_c, result.hottest_rack, result.hottest_server
-            hottest = [top, *(values[top] for values in shown)]
-        self._shots.append(_Shot(result.step, inlet_c, outlet_c, above, hottest))
+            inlet_c, outlet_c = result.rack_inlet_max_c, result.rack_outlet_c
+        shot = len(self._hall_steps)
+        self._halls[0, shot] = inlet_c[self._every_shown]
+        self._halls[1, shot] = outlet_c[self._every_shown]
+        self._hall_steps.append(result.step)
 
-    def _hottest_halls(self, shot: _Shot) -> str:
-        """Markdown table of the halls with the hottest inlets."""
+    def _table(self, above: int, hottest: F64) -> str:
+        """Markdown table of the halls with the hottest inlets in a step."""
         size, recommended_c = self._fleet.size, RECOMMENDED_C[1]
         lines = [
-            f"{shot.above} of {size} halls have inlets above {recommended_c:g} C",
+            f"{above} of {size} halls have inlets above {recommended_c:g} C",
             "",
             "| hall | hottest inlet [C] | row | rack | server from the floor |",
             "|---|---:|---:|---:|---:|",
         ]
-        for dc, inlet_c, rack, server in zip(*(x.tolist() for x in shot.hottest), strict=True):
-            row = int(rack) // self._fleet.configs[dc].hall.racks_per_row
-            name = self._names[dc]
+        for dc, inlet_c, rack, server in hottest.T.tolist():
+            row = int(rack) // self._fleet.configs[int(dc)].hall.racks_per_row
+            name = self._names[int(dc)]
             lines.append(f"| {name} | {inlet_c:.2f} | {row} | {int(rack)} | {int(server)} |")
         return "\n".join(lines)
 
