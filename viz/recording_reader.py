@@ -25,8 +25,10 @@ if TYPE_CHECKING:
 
 HOTTEST = 5
 """Halls in the table of the hottest."""
-_ROWS_BYTES = 1_000_000
-"""Steps are read row by row, and rows of so much are taken apart at once, out of the cache."""
+HOTTEST_FIELDS = ("inlet_max_c", "hottest_rack", "hottest_server")
+_ROWS_BYTES = 4_000_000
+"""Steps are read row by row; rows of so much are taken apart at once, before they leave the cache
+that processors share."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +120,6 @@ class Reader:
         self.reward_names: tuple[str, ...] | None = None
         """Known from the first step on."""
         self._last_step = -1
-        self._summed = [ROW[field] for field in SUMMED]
         self._rows = np.empty((0, 0))
         # Written over block by block, so that it stays in the cache.
         each = (cadence.map_every, cadence.hall_every, cadence.hall_every_in_events)
@@ -173,8 +174,9 @@ class Reader:
         """Make room for what is read of a step: fields, CRAC units, queues and reward terms."""
         size = self._fleet.size
         widths = [len(FIELDS) * size, *[self._fleet.units] * 2, queued, len(reward_names) * size]
-        self._ends = np.cumsum(widths)
-        width = int(self._ends[-1])
+        ends = np.cumsum(widths).tolist()
+        self._kinds = [slice(end - n, end) for n, end in zip(widths, ends, strict=True)]
+        width = ends[-1]
         held = min(max(_ROWS_BYTES // (8 * width), 1), self._cadence.block_steps)
         self._rows = np.empty((held, width))
         self.reward_names = reward_names
@@ -182,16 +184,13 @@ class Reader:
     def _take_apart(self) -> None:
         """Bring what was read of several steps into the form of a block."""
         k = len(self._steps) - len(self._parts) * len(self._rows)
-        fields, supply_c, flow_m3s, queues, rewards = np.split(
-            self._rows[:k], self._ends[:-1], axis=1
-        )
+        fields, supply_c, flow_m3s, queues, rewards = (self._rows[:k, part] for part in self._kinds)
         focus, n, size = self._every_focus, len(self._focus), self._fleet.size
         of_dcs = fields.reshape(k, len(FIELDS), size)
-        inlet_max_c = of_dcs[:, ROW["inlet_max_c"]]
         self._parts.append([
             of_dcs[:, :, focus].copy(),
-            of_dcs[:, self._summed].sum(axis=2),
-            inlet_max_c.max(axis=1),
+            of_dcs[:, : len(SUMMED)].sum(axis=2),
+            of_dcs[:, ROW["inlet_max_c"]].max(axis=1),
             age_histogram(queues.reshape(k * n, -1), self._edges).reshape(k, n, -1),
             supply_c[:, self._every_unit].copy(),
             flow_m3s[:, self._every_unit].copy(),
@@ -207,13 +206,11 @@ class Reader:
             of the hottest ones, (shots, 4, halls).
         """
         first = self._steps[-1] + 1 - len(of_dcs)
-        shown = of_dcs[[step - first for step in self._hall_steps if step >= first]]
-        inlet_c = shown[:, ROW["inlet_max_c"]]
-        top = np.argsort(-inlet_c, axis=1, kind="stable")[:, :HOTTEST]
-        rows = [ROW[field] for field in ("inlet_max_c", "hottest_rack", "hottest_server")]
-        values = np.take_along_axis(shown[:, rows], top[:, None], axis=2)
-        above = np.count_nonzero(inlet_c > RECOMMENDED_C[1], axis=1)
-        return above, np.concatenate([top[:, None], values], axis=1)
+        at = np.array([step - first for step in self._hall_steps if step >= first], dtype=np.intp)
+        shown = of_dcs[at[:, None], [ROW[field] for field in HOTTEST_FIELDS]]
+        top = np.argsort(-shown[:, 0], axis=1, kind="stable")[:, None, :HOTTEST]
+        above = np.count_nonzero(shown[:, 0] > RECOMMENDED_C[1], axis=1)
+        return above, np.concatenate([top, np.take_along_axis(shown, top, axis=2)], axis=1)
 
     def take(self) -> Block:
         """The block under way; another begins."""

@@ -151,22 +151,6 @@ WATCHED = (
 )
 """Fields that the log of events needs besides those plotted."""
 
-FIELDS: tuple[str, ...] = tuple(
-    dict.fromkeys(
-        [
-            *(line.field for plot in PLOTS.values() for line in plot.lines if line.field != "pue"),
-            *(command for command, _ in STATES.values()),
-            *WATCHED,
-            "throttled_racks",
-            "tripped_racks",
-            "queue_tasks",
-        ]
-    )
-)
-"""What is read of every step; PUE follows from the powers."""
-ROW = {field: row for row, field in enumerate(FIELDS)}
-
-
 SUMMED = (
     "it_w",
     "hvac_w",
@@ -179,6 +163,19 @@ SUMMED = (
     "tripped_racks",
 )
 """Fields that are summed over all data centers."""
+
+FIELDS: tuple[str, ...] = tuple(
+    dict.fromkeys(
+        [
+            *SUMMED,
+            *(line.field for plot in PLOTS.values() for line in plot.lines if line.field != "pue"),
+            *(command for command, _ in STATES.values()),
+            *WATCHED,
+        ]
+    )
+)
+"""What is read of every step, ``SUMMED`` first; PUE follows from the powers."""
+ROW = {field: row for row, field in enumerate(FIELDS)}
 
 
 class FleetLine(NamedTuple):
