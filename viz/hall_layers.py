@@ -201,7 +201,10 @@ def zones_of(fleet: Fleet, dcs: Sequence[int], zones: Sequence[int]) -> Zones:
 
 def zone_peaks(layers: Shots, zones: Zones) -> Shots:
     """Highest value of each zone, (..., zones), in layers of the groups, (..., G)."""
-    return np.asarray(np.maximum.reduceat(layers[..., zones.groups], zones.starts, axis=-1))
+    of_groups = layers[..., zones.groups]
+    if len(zones.starts) == len(zones.groups):
+        return of_groups
+    return np.asarray(np.maximum.reduceat(of_groups, zones.starts, axis=-1))
 
 
 def unit_boxes_m(places_m: F64, plan: Plan, height_m: float) -> F64:
