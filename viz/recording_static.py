@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ Entities = Iterator[tuple[str, Any]]
 def fleet_entities(scales: dict[str, layers.Scale]) -> Entities:
     """Colour bars, and the lines of the fleet."""
     for what, scale in scales.items():
-        yield from _legend(what, scale)
+        yield from _legend(what, scale).items()
     for entity, line in FLEET.items():
         yield f"fleet/{entity}", _lines([line.title], [line.colour])
 
@@ -146,13 +147,20 @@ def _unit_lines(units: int, what: str) -> tuple[list[str], list[int]]:
 
 
 def _lines(names: Sequence[str], colours: Sequence[int]) -> Any:
+    return _series_lines(tuple(names), tuple(colours))
+
+
+@cache
+def _series_lines(names: tuple[str, ...], colours: tuple[int, ...]) -> Any:
+    """Lines of a plot, which nearly all data centers have alike."""
     import rerun as rr
 
     # An array, because a list of three or four numbers is read as one colour.
     return rr.SeriesLines(names=list(names), colors=np.array(colours, np.uint32))
 
 
-def _legend(what: str, scale: layers.Scale) -> Entities:
+@cache
+def _legend(what: str, scale: layers.Scale) -> dict[str, Any]:
     """The viewer has no colour bar: a gradient with labelled points."""
     import rerun as rr
 
@@ -164,7 +172,6 @@ def _legend(what: str, scale: layers.Scale) -> Entities:
         colormap=layers.COLOURMAPS[what],
         depth_range=(scale.low, scale.high),
     )
-    yield f"legend/{what}/bar", bar
     x = (np.array(marks) - scale.low) / (scale.high - scale.low) * width
     points = rr.Points2D(
         np.stack([x, np.full_like(x, height + 2.0)], axis=1),
@@ -173,4 +180,4 @@ def _legend(what: str, scale: layers.Scale) -> Entities:
         labels=[f"{mark:g} {scale.unit}" for mark in marks],
         show_labels=True,
     )
-    yield f"legend/{what}/ticks", points
+    return {f"legend/{what}/bar": bar, f"legend/{what}/ticks": points}
