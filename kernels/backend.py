@@ -219,11 +219,11 @@ class BoundKernel:
             with _compiling, paused():
                 launch = self._launches[key] = _Launch(self._kernel, args, self._templates)
         launch.run(given)
-        self._last = launch
 
     def let_go(self, *arrays: Any) -> None:
-        """Forget arrays of the last call, which otherwise live until others take their places."""
-        self._last.let_go({id(array) for array in arrays})
+        """Forget arrays of past calls, which otherwise live until others take their places."""
+        for launch in self._launches.values():
+            launch.let_go({id(array) for array in arrays})
 
 
 class _Launch:

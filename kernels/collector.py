@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def paused() -> Iterator[None]:
-    """Collect nothing meanwhile, and take what was made for old.
+    """Collect nothing meanwhile; all that is alive at the end counts as old.
 
     What imports and the translation of kernels make is kept. The collector would go through all of
     it several times while it is young, for a twentieth of a start.

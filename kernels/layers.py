@@ -144,7 +144,8 @@ def compute_values(
 def write_block(hall: ti.template(), n, block_at, values_at, servers: ti.template(), first_row):
     """Values of the groups of a block to runs of servers; lanes are racks.
 
-    Where each group has one place in the layers, to these; lanes are groups of one rack.
+    Where each group has one place in the layers, lanes are groups of one rack, which are stored as
+    they lie.
     """
     block, place_0 = hall.blocks[block_at], block_at * LANES
     place_1 = place_0 + block.racks

@@ -19,8 +19,8 @@ def queue_kernel() -> Any:
 
     Row k of the queues is the work still queued that was put in by the end of step k, oldest first.
     Work of no more than ``negligible`` is left by rounding, and has no age. A task goes through a
-    few rows of many data centers at a time, side by side as they lie in memory. The oldest rows,
-    which mostly hold nothing, are not read.
+    few rows of many data centers at a time, side by side as they lie in memory. Of the oldest rows
+    those that are known to hold nothing are not read.
 
     Arguments: whether one thread does it; 1, which the compiler cannot know and so makes no copies
     of loops; negligible work; row of the queue that is due when the next step starts, L for none,

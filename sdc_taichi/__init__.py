@@ -82,7 +82,8 @@ def __getattr__(name: str) -> Any:
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     with collector.paused():
-        return getattr(import_module(_LAZY[name]), name)
+        globals()[name] = found = getattr(import_module(_LAZY[name]), name)
+    return found
 
 
 def __dir__() -> list[str]:

@@ -250,7 +250,8 @@ class Hall:
         self._tables = self._lanes(total * len(thermal.GROUP_ROWS))
         self._tables[:] = np.concatenate(tables).reshape(self._tables.shape)
         first_place = starts(most, "groups of blocks")
-        self._block_ints = _table(filled, most, table, first_place[:-1], np.full(len(most), -1))
+        self._block_ints = _table(filled, most, table, first_place[:-1], [])
+        self._laid_along = False
         self._group_places, self._most_groups = int(first_place[-1]), int(most.max())
         self._server_c = self._lanes(1)
         self._none = np.zeros(1, self._dtype)
@@ -267,13 +268,14 @@ class Hall:
         along = self._lanes(int(first[-1]) * tables.shape[1])
         out = along.reshape(-1, *tables.shape[1:])
         out[: len(tables)] = tables
-        for a, n, b, v in zip(at, groups, first, vectors, strict=False):
+        for a, n, b, v in zip(at, groups, first[:-1], vectors, strict=True):
             zone = np.minimum(np.arange(lanes * v), n - 1)
             squares = tables[a : a + n][zone].reshape(v, lanes, -1, lanes)
             out[b : b + lanes * v] = squares.transpose(3, 0, 2, 1).reshape(-1, *out.shape[1:])
         self._kernel.let_go(self._tables)
         self._tables = along
         block["along"][:] = first[of_block]
+        self._laid_along = True
 
     def _lay_out_air(self, thermal: Any) -> None:
         """Weights and unit shares at the places of the racks."""
@@ -557,7 +559,7 @@ class Hall:
         if self._was_transient is None:
             raise RuntimeStateError("no step has been done yet; server layers exist after one")
         runtime.ensure_started()
-        if self._block_ints[-1, 0] < 0:
+        if not self._laid_along:
             self._lay_out_along()
         self._layers_kernel(
             self._recirculates,
@@ -585,6 +587,9 @@ class Hall:
             self._group_values,
             *written,
         )
+        if self._hands_out:
+            # Whoever has the results of the step has these, and no other needs them.
+            self._layers_kernel.let_go(self._rack_out)
 
     def forget(self) -> None:
         """Drop the last step, so that ``servers`` cannot show layers of another state."""

@@ -592,8 +592,8 @@ class Simulator:
             if field.name != "cooling_last" and not valid:
                 raise SdcError(f"snapshot: {field.name} has values that are negative or not finite")
             loaded[field.name] = int(given) if given.ndim == 0 else given.copy()
-        if np.any(np.diff(loaded["queue"], axis=1) < 0.0):
-            raise SdcError("snapshot: queue falls from older to newer work; valid rises, as a sum")
+        if np.any(np.diff(loaded["queue"], axis=1) < -workload.NEGLIGIBLE_TASKS):
+            raise SdcError("snapshot: queue falls from older to newer work; valid never falls")
         self._start().forget()
         self._state = State(**loaded)
         self._timeline = self._timeline.reseeded(self._state.seed)

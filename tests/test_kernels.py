@@ -598,6 +598,19 @@ def test_copies_of_a_hall_share_the_tables_of_layers() -> None:
     assert sizes[0] == sizes[1]
 
 
+def test_tables_that_those_with_layers_replace_are_let_go_by_every_kind_of_step() -> None:
+    """Transient halls begin with a steady step, which holds its arrays as well."""
+    config = load_config("corrected", ["simulation.thermal=transient"])
+    with Simulator(config) as sim:
+        sim.reset()
+        sim.step()
+        assert sim._hall is not None
+        before = weakref.ref(sim._hall._tables.base)
+        sim.servers()
+        gc.collect()
+        assert before() is None
+
+
 def test_layers_that_do_not_fit_are_refused() -> None:
     fleet = build_fleet(load_config("tiny"))
     hall = Hall(fleet, "f32")

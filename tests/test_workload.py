@@ -346,3 +346,37 @@ def test_many_queues_are_each_as_alone() -> None:
     before = np.maximum(entered[:, 1:] - taken[:, None], 0.0)
     assert np.array_equal(left.queue[:, :-1], before)
     assert np.array_equal(left.waiting, before[:, -1] + deferred)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_queue_that_rounding_overfills_takes_nothing(model: str) -> None:
+    limit = np.array([0.3])
+    work = MODELS[model](
+        np.array([0.5]),
+        np.array([-1.0]),
+        np.nextafter(limit, 1.0),
+        np.zeros(1),
+        flexible_share=np.array([0.5]),
+        max_utilisation=np.ones(1),
+        queue_limit=limit,
+    )
+    assert work.deferred == 0.0
+
+
+def test_a_step_that_is_interrupted_can_be_done_again() -> None:
+    queues = Queue(6, np.full(1, np.inf))
+    queue = np.array([[0.0, 0.0, 1.0, 2.0, 3.0, 4.0]])
+    nothing, everything = np.zeros(1), np.full(1, 4.0)
+    queue = queues.after(queue, nothing, nothing).queue
+    run = queues._kernel
+
+    def interrupted(*given: Any) -> None:
+        run(*given)
+        raise KeyboardInterrupt
+
+    queues._kernel = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        queues.after(queue, everything, nothing)
+    queues._kernel = run
+    after = queues.after(queue, nothing, nothing).queue
+    assert np.array_equal(after, [[1.0, 2.0, 3.0, 4.0, 4.0, 4.0]])

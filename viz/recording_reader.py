@@ -161,9 +161,7 @@ class Reader:
         step = self._last_step = result.step
         # What is not listed yet does not count, should reading be interrupted.
         self._steps.append(step)
-        status = result.rack_status.tobytes()
-        if self._has_events or status != self._status:
-            self._add_events(result, status)
+        self._add_events(result)
         cadence = self._cadence
         if step % cadence.map_every == 0:
             self._add_maps(result)
@@ -277,8 +275,8 @@ class Reader:
                     f"data center, ({self._fleet.size},)"
                 )
 
-    def _add_events(self, result: StepResult, status: bytes) -> None:
-        step, fleet = result.step, self._fleet
+    def _add_events(self, result: StepResult) -> None:
+        step, fleet, status = result.step, self._fleet, result.rack_status.tobytes()
         if self._has_events:
             active = [e for e in self._sim.active_events(step) if e.dc in self._focus]
             self._entries += failure_entries(step, self._active, active, fleet)

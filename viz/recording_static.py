@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -150,7 +150,7 @@ def _lines(names: Sequence[str], colours: Sequence[int]) -> Any:
     return _series_lines(tuple(names), tuple(colours))
 
 
-@cache
+@lru_cache(maxsize=128)
 def _series_lines(names: tuple[str, ...], colours: tuple[int, ...]) -> Any:
     """Lines of a plot, which nearly all data centers have alike."""
     import rerun as rr
@@ -159,7 +159,7 @@ def _series_lines(names: tuple[str, ...], colours: tuple[int, ...]) -> Any:
     return rr.SeriesLines(names=list(names), colors=np.array(colours, np.uint32))
 
 
-@cache
+@lru_cache(maxsize=32)
 def _legend(what: str, scale: layers.Scale) -> dict[str, Any]:
     """The viewer has no colour bar: a gradient with labelled points."""
     import rerun as rr

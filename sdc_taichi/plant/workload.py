@@ -73,7 +73,8 @@ def fluid(
     forced = np.minimum(due, capacity)
     now = np.minimum(wanted, capacity - forced)
     held_back = arrived - now
-    room = queue_limit - (waiting - forced)
+    # Rounding may leave more in a full queue than it may hold.
+    room = np.maximum(queue_limit - (waiting - forced), 0.0)
     deferred = np.minimum(held_back, room)
     drained = np.minimum(waiting - forced, np.maximum(command, 0.0) * (capacity - now - forced))
     executed = now + forced + drained
@@ -113,7 +114,7 @@ def tasks(
     arrived = fixed + flexible
     forced = np.minimum(due, np.maximum(cap - arrived, 0.0))
     held_back = np.floor(np.maximum(-command, 0.0) * flexible)
-    deferred = np.minimum(held_back, queue_limit - (waiting - forced))
+    deferred = np.minimum(held_back, np.maximum(queue_limit - (waiting - forced), 0.0))
     free = np.maximum(cap - arrived - forced, 0.0)
     drainable = np.minimum(np.minimum(waiting - forced, flexible), free)
     drained = np.floor(np.maximum(command, 0.0) * drainable)
@@ -199,6 +200,8 @@ class Queue:
         if queue is not self._known:
             self._take(queue)
         self._taken[:], self._deferred[:] = taken, deferred
+        # Nothing is known of a step that is interrupted from here on.
+        self._known = None
         after = self._backend.vector_rows(self._length, self._size)
         self._kernel(
             self._serial,
@@ -239,6 +242,7 @@ class Queue:
         """Go on from a queue that was not left by the last step."""
         if self._kernel is None:
             self._prepare()
+        self._known = None
         self._rows = self._backend.vector_rows(self._length, self._size)
         self._rows[:] = 0.0
         self._backend.held(self._rows, self._size)[:] = queue.T
