@@ -149,5 +149,5 @@ print(sum(generation["collections"] for generation in gc.get_stats()), gc.isenab
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     collections, enabled = done.stdout.split()
-    assert int(collections) < 60
+    assert int(collections) < 120
     assert enabled == "True"
