@@ -73,9 +73,7 @@ def fluid(
     forced = np.minimum(due, capacity)
     now = np.minimum(wanted, capacity - forced)
     held_back = arrived - now
-    # Rounding may leave more in a full queue than it may hold.
-    room = np.maximum(queue_limit - (waiting - forced), 0.0)
-    deferred = np.minimum(held_back, room)
+    deferred = np.minimum(held_back, _room(queue_limit, waiting - forced))
     drained = np.minimum(waiting - forced, np.maximum(command, 0.0) * (capacity - now - forced))
     executed = now + forced + drained
     return Work(
@@ -114,7 +112,7 @@ def tasks(
     arrived = fixed + flexible
     forced = np.minimum(due, np.maximum(cap - arrived, 0.0))
     held_back = np.floor(np.maximum(-command, 0.0) * flexible)
-    deferred = np.minimum(held_back, np.maximum(queue_limit - (waiting - forced), 0.0))
+    deferred = np.minimum(held_back, _room(queue_limit, waiting - forced))
     free = np.maximum(cap - arrived - forced, 0.0)
     drainable = np.minimum(np.minimum(waiting - forced, flexible), free)
     drained = np.floor(np.maximum(command, 0.0) * drainable)
@@ -131,6 +129,11 @@ def tasks(
         held_back - deferred,
         forced + drained,
     )
+
+
+def _room(queue_limit: F64, waiting: F64) -> F64:
+    # Rounding may leave more in a full queue than it may hold.
+    return np.maximum(queue_limit - waiting, 0.0)
 
 
 MODELS: dict[str, WorkModel] = {"fluid": fluid, "tasks": tasks}
