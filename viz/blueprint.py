@@ -9,7 +9,6 @@ from .hall_layers import Scale
 from .recording_series import FLEET, PLOTS, QUEUE, REWARDS
 
 if TYPE_CHECKING:
-    import rerun as rr
     import rerun.blueprint as rrb
 
 PLAYBACK_S_PER_S = 14_400.0
@@ -38,8 +37,11 @@ def blueprint(tabs: Sequence[Tab], *, hottest: bool, rewards: bool) -> rrb.Bluep
     """
     import rerun.blueprint as rrb
 
-    plot = _Plots()
-    overall = [plot(f"fleet/{entity}", line.title, legend=False) for entity, line in FLEET.items()]
+    whole_run = _whole_run()
+    overall = [
+        _plot(f"fleet/{entity}", line.title, whole_run, legend=False)
+        for entity, line in FLEET.items()
+    ]
     texts = [rrb.TextDocumentView(origin="summary", name="summary")]
     if hottest:
         texts.append(rrb.TextDocumentView(origin="fleet/hottest", name="hottest halls"))
@@ -50,7 +52,7 @@ def blueprint(tabs: Sequence[Tab], *, hottest: bool, rewards: bool) -> rrb.Bluep
         name="fleet",
     )
     return rrb.Blueprint(
-        rrb.Tabs(*(_data_center(tab, plot, rewards=rewards) for tab in tabs), fleet),
+        rrb.Tabs(*(_data_center(tab, whole_run, rewards=rewards) for tab in tabs), fleet),
         rrb.TimePanel(
             timeline="sim_time",
             playback_speed=PLAYBACK_S_PER_S,
@@ -63,19 +65,20 @@ def blueprint(tabs: Sequence[Tab], *, hottest: bool, rewards: bool) -> rrb.Bluep
     )
 
 
-def _data_center(tab: Tab, plot: _Plots, *, rewards: bool) -> Any:
+def _data_center(tab: Tab, whole_run: Any, *, rewards: bool) -> Any:
     import rerun.blueprint as rrb
 
     def plots(*entities: str) -> list[Any]:
-        titles = {name: given.title for name, given in PLOTS.items()}
+        titles = {name: plot.title for name, plot in PLOTS.items()}
         titles |= {QUEUE: "queue by age [tasks]", REWARDS: "reward terms [-]"}
-        limits = {name: given.limits for name, given in PLOTS.items()}
+        limits = {name: plot.limits for name, plot in PLOTS.items()}
         # The title of a plot with one line is its name.
-        alone = {name for name, given in PLOTS.items() if len(given.lines) == 1}
+        alone = {name for name, plot in PLOTS.items() if len(plot.lines) == 1}
         return [
-            plot(
+            _plot(
                 f"{tab.path}/series/{e}",
                 titles[e],
+                whole_run,
                 limits=limits.get(e),
                 legend=e not in alone,
             )
@@ -83,7 +86,7 @@ def _data_center(tab: Tab, plot: _Plots, *, rewards: bool) -> Any:
         ]
 
     actions = rrb.StateTimelineView(
-        origin=f"{tab.path}/actions", name="actions", time_view=plot.whole_run
+        origin=f"{tab.path}/actions", name="actions", time_view=whole_run
     )
     overview = rrb.Grid(
         *plots("temperature_c", "power_kw", "carbon_intensity", QUEUE, "battery"),
@@ -93,8 +96,8 @@ def _data_center(tab: Tab, plot: _Plots, *, rewards: bool) -> Any:
     )
     cooling = rrb.Grid(
         *plots("hvac_kw", "pue"),
-        plot(f"{tab.path}/crac/temperature_c", "CRAC supply and return air [C]"),
-        plot(f"{tab.path}/crac/airflow_m3s", "CRAC airflow [m3/s]"),
+        _plot(f"{tab.path}/crac/temperature_c", "CRAC supply and return air [C]", whole_run),
+        _plot(f"{tab.path}/crac/airflow_m3s", "CRAC airflow [m3/s]", whole_run),
         *plots("weather_c", "water_l"),
         grid_columns=2,
         name="cooling",
@@ -165,55 +168,30 @@ def _hall(tab: Tab) -> Any:
     )
 
 
-class _Plots:
-    """Plots over time, which have their properties in common."""
+def _plot(
+    origin: str,
+    name: str,
+    whole_run: Any,
+    *,
+    limits: tuple[float, float] | None = None,
+    legend: bool = True,
+) -> Any:
+    import rerun.blueprint as rrb
 
-    def __init__(self) -> None:
-        import rerun as rr
-        import rerun.blueprint as rrb
-
-        ends = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite()
-        whole_run = rrb.TimeRange(start=ends[0], end=ends[1])
-        # On a timestamp timeline plots open on one minute around the cursor.
-        self.whole_run = rrb.TimeAxis(link="Independent", view_range=whole_run)
-        self._axis = _Once(self.whole_run)
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=name,
+        axis_x=whole_run,
+        axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
         # A legend covers what is behind it; the night that a run begins with is the least loss.
-        self._legend = {
-            visible: _Once(rrb.PlotLegend("LeftTop", visible=visible)) for visible in (False, True)
-        }
-        self._contents = rrb.archetypes.ViewContents("$origin/**")
-
-    def __call__(
-        self,
-        origin: str,
-        name: str,
-        *,
-        limits: tuple[float, float] | None = None,
-        legend: bool = True,
-    ) -> rrb.View:
-        import rerun.blueprint as rrb
-
-        properties: dict[str, rr.AsComponents] = {
-            "TimeAxis": self._axis,
-            "PlotLegend": self._legend[legend],
-        }
-        if limits is not None:
-            properties["ScalarAxis"] = _Once(rrb.ScalarAxis(range=limits))
-        # As TimeSeriesView would, with properties that are not converted for each plot.
-        return rrb.View(
-            class_identifier="TimeSeries",
-            origin=origin,
-            contents=self._contents,
-            name=name,
-            properties=properties,
-        )
+        plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
+    )
 
 
-class _Once:
-    """Properties of views, converted for Rerun once."""
+def _whole_run() -> Any:
+    """On a timestamp timeline plots open on one minute around the cursor: pin the whole run."""
+    import rerun as rr
+    import rerun.blueprint as rrb
 
-    def __init__(self, given: rr.AsComponents) -> None:
-        self._batches = given.as_component_batches()
-
-    def as_component_batches(self) -> list[rr.DescribedComponentBatch]:
-        return self._batches
+    ends = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite()
+    return rrb.TimeAxis(link="Independent", view_range=rrb.TimeRange(start=ends[0], end=ends[1]))
