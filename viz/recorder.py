@@ -53,6 +53,7 @@ from .recording_static import MAX_UNIT_LINES, data_center_entities, fleet_entiti
 from .recording_summary import summary
 from .streams import (
     Stream,
+    Times,
     blobs,
     check_address,
     check_path,
@@ -64,8 +65,6 @@ from .streams import (
 )
 
 if TYPE_CHECKING:
-    import rerun as rr
-
     from sdc_taichi.sim import Simulator
 
 Real = TypeVar("Real", bound=np.floating[Any])
@@ -309,9 +308,7 @@ class _Episode:
             self._send_pictures(index, path, images, map_steps[index], cells, hall_steps[index])
         self._stream.end_block()
 
-    def _send_fleet(
-        self, block: Block, every_step: list[rr.TimeColumn], hall_steps: list[rr.TimeColumn]
-    ) -> None:
+    def _send_fleet(self, block: Block, every_step: list[Times], hall_steps: list[Times]) -> None:
         import rerun as rr
 
         for entity, line in FLEET.items():
@@ -322,7 +319,7 @@ class _Episode:
             self._stream.columns("fleet/hottest", hall_steps, tables)
 
     def _send_lines(
-        self, block: Block, index: int, path: str, times: list[rr.TimeColumn], values: F64
+        self, block: Block, index: int, path: str, times: list[Times], values: F64
     ) -> None:
         for entity, (rows, factors) in self._plots.items():
             self._lines(f"{path}/series/{entity}", times, values[:, rows] * factors)
@@ -337,7 +334,7 @@ class _Episode:
         self._lines(f"{path}/crac/temperature_c", times, air_c)
         self._lines(f"{path}/crac/airflow_m3s", times, flow_m3s)
 
-    def _lines(self, entity: str, times: list[rr.TimeColumn], values: F64) -> None:
+    def _lines(self, entity: str, times: list[Times], values: F64) -> None:
         import rerun as rr
 
         self._stream.columns(entity, times, [column(rr.Scalars.descriptor_scalars(), values)])
@@ -377,9 +374,9 @@ class _Episode:
         index: int,
         path: str,
         images: Pictures[np.float16],
-        map_steps: list[rr.TimeColumn],
+        map_steps: list[Times],
         cells: Pictures[np.float32],
-        hall_steps: list[rr.TimeColumn],
+        hall_steps: list[Times],
     ) -> None:
         import rerun as rr
 
@@ -415,13 +412,11 @@ class _Episode:
         """Clock of each data center in focus, (T, n)."""
         return step_times(self._start, steps, self._fleet.steps_per_hour)
 
-    def _clock(self, steps: I64) -> list[list[rr.TimeColumn]]:
+    def _clock(self, steps: I64) -> list[list[Times]]:
         """Both timelines for each data center in focus."""
-        import rerun as rr
-
-        step = rr.TimeColumn("step", sequence=steps)
+        step = Times("step", steps)
         own = self._when(steps).astype("datetime64[ns]").T
-        return [[step, rr.TimeColumn("sim_time", timestamp=times)] for times in own]
+        return [[step, Times("sim_time", times)] for times in own]
 
     def _path(self, dc: int) -> str:
         import rerun as rr
