@@ -357,34 +357,64 @@ def starting(quick: bool) -> Iterator[Figure]:
 
 
 def recording(quick: bool) -> Iterator[Figure]:
-    """Simulators with a recorder and without."""
+    """A month of simulators and environments with a recorder and without."""
+    steps, repeats = (8, 1) if quick else (31 * 96, 7)
+    runs = [(f"simulator, {count} data centers", simulated, count) for count in (1, 4, 64)]
+    runs += [("PettingZoo, N = 1", played, 1), ("vector_env, N = 64", played, 64)]
+    for name, make, count in runs:
+        spent: list[list[float]] = [[], []]
+        with tempfile.TemporaryDirectory() as folder:
+            kinds = [make(count, steps, file) for file in (None, Path(folder, "run.rrd"))]
+            for _ in range(repeats):
+                for run, times in zip(kinds, spent, strict=True):
+                    begin = time.perf_counter()
+                    run()
+                    times.append(time.perf_counter() - begin)
+        ratio = min(spent[1]) / min(spent[0])
+        yield Figure("recording", f"{name}, {steps} steps", ratio, at_most=1.3)
+
+
+def simulated(count: int, steps: int, file: Path | None) -> Callable[[], None]:
+    """Run of a simulator, recorded if there is a file."""
     from sdc_taichi.viz.recorder import Recorder
 
-    steps, repeats = (8, 1) if quick else (31 * 96, 7)
-    for count in (1, 4, 64):
-        sim = sdc_taichi.Simulator(
-            sdc_taichi.make_configs(sdc_taichi.load_config("corrected"), count=count)
-        )
-        spent: dict[bool, list[float]] = {False: [], True: []}
-        with tempfile.TemporaryDirectory() as folder:
-            for _ in range(repeats):
-                for recorded in spent:
-                    sim.reset()
-                    begin = time.perf_counter()
-                    if recorded:
-                        with Recorder(Path(folder, "run.rrd")) as recorder:
-                            recorder.begin(sim)
-                            for _ in range(steps):
-                                recorder.add(sim.step())
-                    else:
-                        for _ in range(steps):
-                            sim.step()
-                    spent[recorded].append(time.perf_counter() - begin)
-        sim.close()
-        ratio = min(spent[True]) / min(spent[False])
-        yield Figure(
-            "recording", f"corrected, {count} data centers, {steps} steps", ratio, at_most=1.3
-        )
+    sim = sdc_taichi.Simulator(
+        sdc_taichi.make_configs(sdc_taichi.load_config("corrected"), count=count)
+    )
+
+    def run() -> None:
+        sim.reset()
+        if file is None:
+            for _ in range(steps):
+                sim.step()
+            return
+        with Recorder(file) as recorder:
+            recorder.begin(sim)
+            for _ in range(steps):
+                recorder.add(sim.step())
+
+    return run
+
+
+def played(count: int, steps: int, file: Path | None) -> Callable[[], None]:
+    """Episode of that many environments, recorded if there is a file."""
+    recorder = None
+    if file is not None:
+        recorder = sdc_taichi.EpisodeRecorder(file, episode_trigger=lambda _: True)
+    env: Any
+    if count == 1:
+        env = sdc_taichi.parallel_env("corrected", days=31, recorder=recorder)
+        actions: dict[str, Any] = dict.fromkeys(env.possible_agents, 1)
+    else:
+        env = sdc_taichi.vector_env(count, "corrected", days=31, recorder=recorder)
+        actions = dict.fromkeys(env.possible_agents, np.ones(count, np.int64))
+
+    def run() -> None:
+        env.reset(seed=0)
+        for _ in range(steps):
+            env.step(actions)
+
+    return run
 
 
 def machine() -> dict[str, Any]:

@@ -246,7 +246,7 @@ class Core:
         After ``next_episode`` they are those of the step that ended the episode before.
         """
         last = self.view.last
-        return dict(self._final_terms) if last is None else self._rewards.terms(last, self.view)
+        return dict(self._final_terms) if last is None else self._rewards.terms(last)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that decides how the episode goes on, for ``load_state_dict``; picklable."""

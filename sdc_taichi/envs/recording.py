@@ -127,12 +127,7 @@ class RecordedCore(Core):
 
     def _rewards_by_name(self, done: Step) -> dict[str, F64]:
         """Rewards by learning agent, and the terms that they are made of, unscaled, by name."""
-        scales = self._rewards.name
-        if not isinstance(scales, dict):
-            return done.rewards
-        used = {term for by_term in scales.values() for term in by_term}
-        terms = self.terms()
-        return {**done.rewards, **{name: terms[name] for name in terms if name in used}}
+        return {**done.rewards, **self._rewards.terms(done.result, self._rewards.weighed)}
 
     def __getstate__(self) -> dict[str, Any]:
         if self._episodes is not None and self._episodes.recording:

@@ -11,7 +11,7 @@ Nothing is scaled by data of the run.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -226,7 +226,8 @@ class Rewards:
         # What decides the rewards, to tell environments apart.
         self.name = _name(self._function) if self._function else self._scales or "sustaindc"
         scales = self._scales or {}
-        self._wanted = [name for name in TERMS if any(name in own for own in scales.values())]
+        self.weighed = [name for name in TERMS if any(name in own for own in scales.values())]
+        """Terms that the rewards are made of; none for those of a function."""
         self._stage: Any = None
         self._reads: tuple[str, ...] = ()
         """Quantities of a step that the stage reads."""
@@ -289,10 +290,10 @@ class Rewards:
         """Go on from ``state``, of the shape that it has."""
         self._peak_before_kw, self._peak_kw = state.copy()
 
-    def terms(self, result: StepResult, view: View) -> dict[str, F64]:
-        """All terms of the last step by name, (B,) each, whatever the rewards are made of."""
+    def terms(self, result: StepResult, names: Iterable[str] = TERMS) -> dict[str, F64]:
+        """Terms of the last step by name, (B,) each, whatever the rewards are made of."""
         context = self._context(result)
-        return {name: term(result, context) for name, term in TERMS.items()}
+        return {name: TERMS[name](result, context) for name in names}
 
     def _weighed(self, result: StepResult) -> dict[str, F64]:
         """Rewards by learning agent, of all of them by ``joint``, and ``peak_kw``, (B,)."""
@@ -300,7 +301,7 @@ class Rewards:
             from sdc_taichi.kernels.stage import CompiledStage
 
             reads = _Reads()
-            for name in self._wanted:
+            for name in self.weighed:
                 TERMS[name](reads, self._context(result))  # type: ignore[arg-type]
             _peak_kw(self._peak_kw, reads)  # type: ignore[arg-type]
             self._reads = tuple(reads.names)
@@ -324,7 +325,7 @@ class Rewards:
             design_kwh, self._tariff, peak_kw, self._bills, price_per_kwh=price_per_kwh, rush=rush
         )
         result: Any = SimpleNamespace(step_h=self._step_h, **read)
-        found = {name: TERMS[name](result, context) for name in self._wanted}
+        found = {name: TERMS[name](result, context) for name in self.weighed}
         none: Any = 0.0
         own = [
             _sum([scale * found[name] for name, scale in self._scales[agent].items()] or [none])
