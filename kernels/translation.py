@@ -1,4 +1,4 @@
-"""Translation of a kernel's source by Taichi, which is done at every start, in a third of the time.
+"""Translation of the source of kernels by Taichi, which every start does, in a quarter of the time.
 
 Taichi keeps compiled kernels, but knows them by what their source is translated to.
 """

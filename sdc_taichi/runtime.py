@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import os
 import sys
 import threading
 from importlib import import_module
+from pathlib import Path
 
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 from sdc_taichi.kernels import collector
@@ -33,7 +35,7 @@ def ensure_started() -> int:
 
     A runtime that another library started is used as it is: a second start would destroy the
     fields of the first. One started here has a thread for each processor that the process may
-    use, or ``SDC_TAICHI_THREADS``.
+    use, no more than the quotas of its control groups grant, or ``SDC_TAICHI_THREADS``.
 
     Raises:
         RuntimeStateError: in a child forked after the start, where Taichi would hang.
@@ -59,7 +61,7 @@ def ensure_started() -> int:
                 arch=ti.cpu,
                 offline_cache=True,
                 log_level=ti.ERROR,
-                cpu_max_num_threads=_thread_limit() or len(_processors()),
+                cpu_max_num_threads=_thread_limit() or int(min(len(_processors()), granted())),
             )
         others = {thread.native_id for thread in threading.enumerate()}
         _bind(_thread_ids() - before - others, ti.lang.impl.current_cfg().cpu_max_num_threads)
@@ -83,6 +85,44 @@ def _processors() -> list[int]:
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
+
+
+def granted(
+    groups: Path = Path("/proc/self/cgroup"), mounted: Path = Path("/sys/fs/cgroup")
+) -> float:
+    """Processors whose time the process is granted, as in containers; inf without a quota.
+
+    Args:
+        groups: control groups of the process, one per line (cgroups(7) of Linux).
+        mounted: where their settings are. In a container these may begin below the groups' paths.
+
+    Returns:
+        The least quota of the groups and those above, rounded up.
+    """
+    found = [math.inf]
+    for line in _text(groups).splitlines():
+        number, controllers, path = line.split(":", 2)
+        group = Path(path.lstrip("/"))
+        for folder in (group, *group.parents):
+            if number == "0":
+                quota, _, period_us = _text(mounted / folder / "cpu.max").partition(" ")
+            elif "cpu" in controllers.split(","):
+                quota = _text(mounted / "cpu" / folder / "cpu.cfs_quota_us")
+                period_us = _text(mounted / "cpu" / folder / "cpu.cfs_period_us")
+            else:
+                continue
+            # "max" or -1 without a quota.
+            if quota.strip().isdigit() and period_us.strip().isdigit():
+                found.append(math.ceil(int(quota) / int(period_us)))
+    return min(found)
+
+
+def _text(file: Path) -> str:
+    """What a file of the system says; nothing where there is none."""
+    try:
+        return file.read_text()
+    except OSError:
+        return ""
 
 
 def _bind(started: set[int], threads: int) -> None:

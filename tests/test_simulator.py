@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import gc
+import math
 import multiprocessing
 import os
 import resource
@@ -34,6 +35,7 @@ from sdc_taichi import (
     load_config,
     load_drivers,
     make_configs,
+    runtime,
 )
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.drivers import Table
@@ -665,6 +667,46 @@ def test_there_are_as_many_threads_as_processors_that_may_be_used() -> None:
     code = (
         "import os; os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1]);"
         "from sdc_taichi import runtime; print(runtime.ensure_started())"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "SDC_TAICHI_THREADS"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, timeout=120, check=True
+    )
+    assert done.stdout.split() == [b"1"]
+
+
+@pytest.mark.parametrize(
+    ("groups", "settings", "processors"),
+    [
+        ("0::/", {"cpu.max": "max 100000"}, math.inf),
+        ("0::/", {"cpu.max": "150000 100000"}, 2),
+        ("0::/docker/1f2e", {"cpu.max": "50000 100000"}, 1),
+        ("0::/jobs/7", {"jobs/7/cpu.max": "800000 100000", "jobs/cpu.max": "300000 100000"}, 3),
+        (
+            "3:cpuset:/\n2:cpu,cpuacct:/docker/1f2e",
+            {"cpu/cpu.cfs_quota_us": "400000", "cpu/cpu.cfs_period_us": "100000"},
+            4,
+        ),
+        ("1:cpu:/", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, math.inf),
+        (None, {}, math.inf),
+    ],
+)
+def test_quotas_of_control_groups_are_read(
+    groups: str | None, settings: dict[str, str], processors: float, tmp_path: Path
+) -> None:
+    told, mounted = tmp_path / "groups", tmp_path / "mounted"
+    if groups is not None:
+        told.write_text(f"{groups}\n")
+    for name, text in settings.items():
+        (mounted / name).parent.mkdir(parents=True, exist_ok=True)
+        (mounted / name).write_text(f"{text}\n")
+    assert runtime.granted(told, mounted) == processors
+
+
+def test_there_are_no_more_threads_than_quotas_grant() -> None:
+    code = (
+        "from sdc_taichi import runtime; runtime.granted = lambda: 1;"
+        "print(runtime.ensure_started())"
     )
     environment = {k: v for k, v in os.environ.items() if k != "SDC_TAICHI_THREADS"}
     done = subprocess.run(
