@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import runpy
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -642,6 +643,51 @@ def test_bad_arguments(
     with small(3) as sim, pytest.raises(SdcError, match=message):
         Recorder(target if address else tmp_path / str(target), **arguments).begin(sim)
     assert not list(tmp_path.iterdir())
+
+
+THREADS_OF_RECORDINGS = """
+import os, sys
+from pathlib import Path
+from sdc_taichi import Simulator, load_config
+from sdc_taichi.viz.recorder import Recorder
+
+def recording(name):
+    sim = Simulator(load_config("tiny"))
+    sim.reset()
+    rec = Recorder(Path(sys.argv[1], f"{name}.rrd"))
+    rec.begin(sim)
+    rec.add(sim.step())
+    rec.flush()
+    return rec
+
+def threads():
+    return len(os.listdir("/proc/self/task"))
+
+recording(0).close()
+print(threads())
+for i in range(1, 4):
+    recording(i).close()
+print(threads())
+first, second = recording(4), recording(5)
+between = threads()
+first.close()
+second.close()
+print(threads(), between)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="no /proc that tells of threads")
+def test_recordings_that_have_ended_leave_no_threads(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", THREADS_OF_RECORDINGS, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    after_one, after_four, after_two_at_once, while_two = map(int, done.stdout.split())
+    assert max(after_four, after_two_at_once) <= after_one < while_two
+    assert len(list(tmp_path.iterdir())) == 6
 
 
 @pytest.mark.repo

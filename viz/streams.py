@@ -12,6 +12,7 @@ import shutil
 import socket
 import threading
 import warnings
+import weakref
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -268,6 +269,7 @@ class Stream:
         rr = import_rerun()
         sinks: list[Any] = []
         self._rec = rr.RecordingStream("sdc_taichi")
+        _UNDER_WAY.add(self._rec)
         try:
             if self._file is not None:
                 sinks.append(rr.FileSink(self._file))
@@ -278,7 +280,9 @@ class Stream:
                 sinks.append(rr.GrpcServerSink(HOST, self._port))
             self._rec.set_sinks(*sinks)
             self._rec.send_recording_name(self._name)
-            self._rec.send_blueprint(blueprint)
+            layout: Any = _Layout(blueprint)
+            self._rec.send_blueprint(layout)
+            layout.end()
         except (OSError, RuntimeError) as error:
             self._lose(f"cannot be opened ({error})")
 
@@ -331,6 +335,7 @@ class Stream:
             return
         self._rec.disconnect()
         self._rec = None
+        _delete_ended()
         if self._file is not None and not _is_indexed(self._file):
             self._cut()
             self._warn("its index could not be written")
@@ -397,8 +402,40 @@ class Stream:
         )
 
 
+class _Layout:
+    """A layout that knows what Rerun logs it to, which would otherwise never end."""
+
+    def __init__(self, blueprint: rrb.Blueprint) -> None:
+        self._blueprint = blueprint
+        self._log: rr.RecordingStream | None = None
+
+    def to_blueprint(self) -> Any:
+        """What Rerun sends."""
+        return self
+
+    def _log_to_stream(self, stream: rr.RecordingStream) -> None:
+        self._log = stream
+        self._blueprint._log_to_stream(stream)
+
+    def end(self) -> None:
+        """Let go of what has been sent."""
+        if self._log is not None:
+            self._log.disconnect()
+            self._log = None
+
+
+_UNDER_WAY: weakref.WeakSet[rr.RecordingStream] = weakref.WeakSet()
 _ABANDONED: list[rr.RecordingStream] = []
 """Recordings that Rerun would wait for when they are deleted."""
+
+
+def _delete_ended() -> None:
+    """Delete recordings that have ended, each of which Rerun keeps with two threads."""
+    import rerun as rr
+
+    # Rerun writes out all others first, and waits for ever for one that hangs.
+    if not (_UNDER_WAY or _ABANDONED):
+        _Call(lambda: rr.init("sdc_taichi", init_logging=False)).ends(WAIT_S)
 
 
 class _Call(threading.Thread):
