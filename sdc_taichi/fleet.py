@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -160,8 +160,7 @@ class Fleet:
 
     def values(self, path: str) -> F64:
         """A numeric config field of every data center, (B,); None becomes nan."""
-        found = [reduce(getattr, path.split("."), c) for c in self.configs]
-        return np.array([np.nan if v is None else v for v in found], dtype=np.float64)
+        return np.array([*map(attrgetter(path), self.configs)], dtype=np.float64)
 
     def unit_sums(self, values: npt.ArrayLike) -> F64:
         """Sum of unit values, (U,), over each data center, (B,)."""
@@ -349,7 +348,7 @@ def _draw(rule: Mapping[str, Any], rng: np.random.Generator) -> Any:
 
 
 def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
-    found = [reduce(getattr, path.split("."), c) for c in configs]
+    found = [*map(attrgetter(path), configs)]
     for config, value in zip(configs, found, strict=True):
         if value != found[0]:
             raise ConfigError(

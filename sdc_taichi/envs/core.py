@@ -433,10 +433,12 @@ class Core:
             listed = [_checked(seed) + i for i in range(self.num_envs)]
         if len(listed) != self.num_envs:
             raise ConfigError(f"seed: {len(listed)} for {self.num_envs} environments")
-        fresh = self._rngs or [np.random.default_rng() for _ in listed]
+        before: list[np.random.Generator | None] = [*self._rngs] or [None] * len(listed)
         return [
-            rng if given is None else np.random.Generator(np.random.PCG64(_checked(given)))
-            for given, rng in zip(listed, fresh, strict=True)
+            (rng or np.random.default_rng())
+            if given is None
+            else np.random.Generator(np.random.PCG64(_checked(given)))
+            for given, rng in zip(listed, before, strict=True)
         ]
 
     def _drawn_days(self, drawn: I64) -> I64:
