@@ -777,10 +777,12 @@ class DataCenterConfig(_Section):
             pairs = pairs * racks if len(pairs) == 1 else pairs
             counts = self.hall.servers_per_rack
             counts = (counts,) * racks if isinstance(counts, int) else counts
-            per_rack = tuple(
-                (ServerGroup(count=n, full_w=full, idle_w=idle),)
-                for n, (full, idle) in zip(counts, pairs, strict=True)
-            )
+            kinds = list(zip(counts, pairs, strict=True))
+            groups = {
+                kind: (ServerGroup(count=kind[0], full_w=kind[1][0], idle_w=kind[1][1]),)
+                for kind in set(kinds)
+            }
+            per_rack = tuple(map(groups.__getitem__, kinds))
         if self.hall.capacity_mw is None:
             return per_rack
         nameplate_w = sum(g.count * g.full_w for rack in per_rack for g in rack)

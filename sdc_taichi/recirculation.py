@@ -127,9 +127,12 @@ class Exchange:
     def _slices(self) -> Iterator[tuple[Any, Any, F64]]:
         """Entries (row, column, weight), one position within the runs at a time."""
         rack = np.repeat(np.arange(len(self.norm)), np.diff(self.run_start))
-        for i in range(int(self.length.max())):
-            live = self.length > i
-            yield rack[live], self.first[live] + i, self.weights[self.offset[live] + i]
+        # Longest first, so that the runs that go on are the first ones.
+        order = np.argsort(-self.length, kind="stable")
+        rack, first, offset = rack[order], self.first[order], self.offset[order]
+        going_on = len(order) - np.cumsum(np.bincount(self.length))
+        for i, runs in enumerate(going_on[:-1].tolist()):
+            yield rack[:runs], first[:runs] + i, self.weights[offset[:runs] + i]
 
 
 @dataclass(frozen=True, slots=True)
