@@ -19,12 +19,12 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 inspect.modulesbyfile.setdefault("<frozen importlib._bootstrap>", "importlib._bootstrap")
 
 import taichi as ti  # noqa: E402
-from taichi.lang import kernel_impl  # noqa: E402
+from taichi.lang import kernel_impl, misc  # noqa: E402
 
 from .collector import paused  # noqa: E402
-from .translation import translate  # noqa: E402
+from .translation import replaced, translate  # noqa: E402
 
-__all__ = ["BoundKernel", "aligned", "func", "kernel", "ti"]
+__all__ = ["BoundKernel", "aligned", "func", "kernel", "start", "ti"]
 
 
 OPTIONS = {"cfg_optimization": False, "fast_math": False, "real_matrix_scalarize": False}
@@ -36,6 +36,15 @@ SLICE = 512
 """Iterations of a task: Taichi runs a parallel loop of at most so many on one thread."""
 ALIGNMENT = 512
 """Bytes; compiled code takes arrays of vectors to start at a multiple of the vector's length."""
+
+
+def start(threads: int) -> None:
+    """Start the runtime, without the banner that would be in the midst of a user's output."""
+    misc.print = print
+    with replaced((misc, "print", lambda *_: None)):
+        ti.init(arch=ti.cpu, offline_cache=True, log_level=ti.ERROR, cpu_max_num_threads=threads)
+    # Taichi sets up memory at the first launch, which may only be in this thread.
+    ti.sync()
 
 
 def address_of(array: Any) -> int:

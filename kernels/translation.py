@@ -19,7 +19,7 @@ MOST_I32 = 2**31 - 1
 
 
 @contextmanager
-def _replaced(*places: tuple[Any, str, Any]) -> Iterator[None]:
+def replaced(*places: tuple[Any, str, Any]) -> Iterator[None]:
     """Attributes of objects meanwhile: object, name and value of each."""
     before = [getattr(owner, name) for owner, name, _ in places]
     try:
@@ -36,7 +36,7 @@ def translate(kernel: Any, args: tuple[Any, ...]) -> Any:
 
     Whole numbers have 32 bits, whatever whoever started the runtime chose.
     """
-    with _replaced((impl.get_runtime(), "default_ip", primitive_types.i32)):
+    with replaced((impl.get_runtime(), "default_ip", primitive_types.i32)):
         try:
             with _in_short():
                 return kernel.ensure_compiled(*args)
@@ -119,7 +119,7 @@ def _in_short() -> Iterator[None]:
         parsed[context.func.func].append((tree, context))
         return found
 
-    with _replaced(
+    with replaced(
         (Builder, "__call__", _build),
         (ASTTransformerContext, "get_pos_info", lambda *_: ""),
         (core, "DebugInfo", lambda *_: nowhere),

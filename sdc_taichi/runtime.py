@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import os
 import sys
@@ -15,6 +14,7 @@ from sdc_taichi.errors import ConfigError, RuntimeStateError
 from sdc_taichi.kernels import collector
 
 _forked = False
+_starting = threading.Lock()
 _known: tuple[object, int] = (None, 0)
 """Runtime of the last call and its threads, which take a while to ask for."""
 
@@ -53,23 +53,24 @@ def ensure_started() -> int:
             import_module("sdc_taichi.kernels.backend")
     from sdc_taichi.kernels.backend import ti
 
-    if ti.lang.impl.get_runtime().prog is None:
-        before = _thread_ids()
-        # ti.init prints a banner, which would end up in a user's piped output.
-        with contextlib.redirect_stdout(io.StringIO()):
-            ti.init(
-                arch=ti.cpu,
-                offline_cache=True,
-                log_level=ti.ERROR,
-                cpu_max_num_threads=_thread_limit() or int(min(len(_processors()), granted())),
-            )
-        others = {thread.native_id for thread in threading.enumerate()}
-        _bind(_thread_ids() - before - others, ti.lang.impl.current_cfg().cpu_max_num_threads)
-    # Starting makes another object of the runtime.
-    program = ti.lang.impl.get_runtime().prog
-    if _known[0] is not program:
-        _known = (program, int(ti.lang.impl.current_cfg().cpu_max_num_threads))
+    if _known[0] is None or _known[0] is not ti.lang.impl.get_runtime().prog:
+        with _starting:
+            if ti.lang.impl.get_runtime().prog is None:
+                _start()
+            # Starting makes another object of the runtime.
+            program = ti.lang.impl.get_runtime().prog
+            _known = (program, int(ti.lang.impl.current_cfg().cpu_max_num_threads))
     return _known[1]
+
+
+def _start() -> None:
+    from sdc_taichi.kernels import backend
+
+    before = _thread_ids()
+    backend.start(_thread_limit() or int(min(len(_processors()), granted())))
+    others = {thread.native_id for thread in threading.enumerate()}
+    threads = backend.ti.lang.impl.current_cfg().cpu_max_num_threads
+    _bind(_thread_ids() - before - others, threads)
 
 
 def _thread_ids() -> set[int]:

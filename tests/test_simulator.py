@@ -703,6 +703,32 @@ def test_quotas_of_control_groups_are_read(
     assert runtime.granted(told, mounted) == processors
 
 
+def test_several_threads_may_start_first() -> None:
+    code = """
+import threading
+from sdc_taichi import Simulator, load_config
+
+def run():
+    with Simulator(load_config("tiny")) as sim:
+        sim.reset()
+        print(sim.step().grid_kwh[0])
+
+threads = [threading.Thread(target=run) for _ in range(4)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print("end")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
+    )
+    *found, end = done.stdout.split()
+    assert len(found) == 4
+    assert len(set(found)) == 1
+    assert end == "end"
+
+
 def test_there_are_no_more_threads_than_quotas_grant() -> None:
     code = (
         "from sdc_taichi import runtime; runtime.granted = lambda: 1;"
