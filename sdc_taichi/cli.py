@@ -21,6 +21,7 @@ from sdc_taichi.config import (
     DataCenterConfig,
     first_step_day,
     load_config,
+    load_yaml,
     preset_names,
 )
 from sdc_taichi.data_commands import data_app
@@ -369,7 +370,7 @@ def _read_sample(path: Path) -> dict[str, Any]:
     import yaml
 
     try:
-        rules = yaml.safe_load(path.read_text("utf-8"))
+        rules = load_yaml(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ConfigError(f"{path}: cannot be read: {reason}") from None

@@ -82,6 +82,8 @@ def fails(arguments: list[str], parts: list[str]) -> None:
         ("", ["the top level is a NoneType", "valid is a mapping"]),
         ("- 1", ["the top level is a list", "valid is a mapping"]),
         ("hall: [1", ["not valid YAML", "line 1"]),
+        ("hall: {rows: 1}\nhall: {rows: 2}\n", ["'hall' is given twice", "line 2"]),
+        ("? [a]\n: 1\n? [a]\n: 2\n", ["not valid YAML"]),
         ("a: 1\n---\nb: 2\n", ["not valid YAML", "single document"]),
         ("!!python/object:os.system {}", ["not valid YAML", "python/object"]),
         ("extends: corected", ["extends: 'corected'", "corrected, large, paper"]),
