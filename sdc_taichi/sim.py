@@ -133,6 +133,14 @@ class Simulator:
         self._work_model = workload.MODELS[models["workload"]]
         self._setpoint_model = cooling.SETPOINTS[models["setpoint"]]
 
+    def __getstate__(self) -> dict[str, Any]:
+        if self._hall is not None:
+            raise RuntimeStateError(
+                "a simulator or environment that has been in use cannot be copied or pickled; "
+                "valid before reset(), or state_dict() into load_state_dict() of another made alike"
+            )
+        return self.__dict__
+
     @property
     def size(self) -> int:
         """Number of data centers, B."""

@@ -247,7 +247,7 @@ class StepResult:
     hvac_kwh: F64
     grid_kwh: F64
     unserved_kwh: F64
-    """What facility and battery lacked in an outage."""
+    """What facility and battery lacked in an outage while they had power, see ``powered``."""
     carbon_g: F64
     grid_up: F64
     """1 with grid, 0 in an outage."""

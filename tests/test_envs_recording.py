@@ -25,7 +25,8 @@ from rerun.chunk import RrdReader
 
 import sdc_taichi
 from rrd import read, scalars
-from sdc_taichi import EpisodeRecorder, RecordEpisodes, SdcError, load_config
+from sdc_taichi import EpisodeRecorder, RecordEpisodes, SdcError, StepResult, load_config
+from sdc_taichi.control import View
 from sdc_taichi.envs.forecasts import ForecastError
 from sdc_taichi.envs.recording import cubes
 from sdc_taichi.viz import recorder as recorder_module
@@ -347,7 +348,7 @@ def test_copies(copied: Callable[[Any], Any], tmp_path: Path) -> None:
     env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
     other = copied(env)
     env.reset(seed=0)
-    with pytest.raises(SdcError, match=r"is being recorded cannot be copied .*before reset"):
+    with pytest.raises(SdcError, match=r"cannot be copied .*before reset.*state_dict"):
         copied(env)
     env.close()
     play(other, 3)
@@ -443,9 +444,31 @@ def test_wrapping_twice_or_something_else(tmp_path: Path) -> None:
         RecordEpisodes(env, path)
     env.close()
     singles = SyncVectorEnv([partial(gymnasium.make, "sdc_taichi/Load-v0", config="tiny")])
-    with pytest.raises(SdcError, match="SyncVectorEnv cannot be recorded"):
-        RecordEpisodes(singles, path)
-    singles.close()
+    agents: Any = sdc_taichi.vector_env(2, "tiny")
+    for other in (singles, agents):
+        with pytest.raises(SdcError, match=f"{type(other).__name__} cannot be recorded here"):
+            RecordEpisodes(other, path)
+        other.close()
+
+
+def test_error_of_a_reward_function_costs_no_step_after_it(tmp_path: Path) -> None:
+    calls = iter(range(1000))
+
+    def reward(result: StepResult, view: View) -> Any:
+        if next(calls) == 6:
+            raise ValueError("of the user's")
+        return -result.grid_kwh
+
+    path = tmp_path / "run.rrd"
+    env = sdc_taichi.parallel_env("tiny", days=1, rewards=reward, recorder=path)
+    play(env, 6)
+    with pytest.raises(ValueError, match="of the user's"):
+        go_on(env, 1)
+    with pytest.warns(RecordingWarning, match="step 7 after step 5.*goes on without a recording"):
+        go_on(env, 1)
+    go_on(env, 88)
+    assert not env.agents
+    assert steps_of(tmp_path / "run-episode-0.rrd") == list(range(6))
 
 
 def test_without_a_viewer_the_episode_goes_on() -> None:

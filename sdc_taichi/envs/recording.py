@@ -129,14 +129,6 @@ class RecordedCore(Core):
         """Rewards by learning agent, and the terms that they are made of, unscaled, by name."""
         return {**done.rewards, **self._rewards.terms(done.result, self._rewards.weighed)}
 
-    def __getstate__(self) -> dict[str, Any]:
-        if self._episodes is not None and self._episodes.recording:
-            raise RuntimeStateError(
-                "an environment whose episode is being recorded cannot be copied or pickled; "
-                "valid before reset()"
-            )
-        return self.__dict__
-
 
 class RecordEpisodes(VectorWrapper[Any, Any, Any]):
     """Records chosen environments of what ``gymnasium.make_vec`` gives for the ids of sdc_taichi.
@@ -164,13 +156,14 @@ class RecordEpisodes(VectorWrapper[Any, Any, Any]):
         envs: Sequence[int] | None = None,
         every: int | None = None,
     ) -> None:
-        super().__init__(env)
-        core = getattr(env.unwrapped, "core", None)
-        if not isinstance(core, RecordedCore):
+        core = getattr(getattr(env, "unwrapped", None), "core", None)
+        if not (isinstance(env, VectorEnv) and isinstance(core, RecordedCore)):
             raise ConfigError(
-                f"env: {type(env.unwrapped).__name__} cannot be recorded; valid is a batch of "
-                "gymnasium.make_vec('sdc_taichi/...') that is one environment of its own"
+                f"env: {type(getattr(env, 'unwrapped', env)).__name__} cannot be recorded here; "
+                "valid is a batch of gymnasium.make_vec('sdc_taichi/...') that is one environment "
+                "of its own; others take recorder=... when they are made"
             )
+        super().__init__(env)
         core.record(EpisodeRecorder(target, episode_trigger, envs, every))
 
 
@@ -224,9 +217,18 @@ class _Episodes:
         atexit.register(self._closing)
 
     def add(self, result: StepResult, rewards: Mapping[str, F64]) -> None:
-        """A step of the present episode, which is recorded."""
+        """A step of the present episode, which is recorded.
+
+        The episode goes on without its recording, after a ``RecordingWarning``, where a step before
+        ended in an error of a reward function.
+        """
         assert self._recorder is not None
-        self._recorder.add(result, rewards=rewards)
+        try:
+            self._recorder.add(result, rewards=rewards)
+        except SdcError as error:
+            told = f"{error}; episode {self._episode} goes on without a recording"
+            warnings.warn(told, RecordingWarning, stacklevel=2)
+            self.end()
 
     def end(self) -> None:
         """The present episode is over."""
