@@ -44,7 +44,7 @@ def start(threads: int) -> None:
     with replaced((misc, "print", lambda *_: None)):
         ti.init(arch=ti.cpu, offline_cache=True, log_level=ti.ERROR, cpu_max_num_threads=threads)
     # Taichi sets up memory at the first launch, which may only be in this thread.
-    ti.sync()
+    ti.lang.impl.get_runtime().materialize()
 
 
 def address_of(array: Any) -> int:

@@ -101,10 +101,11 @@ def granted(
         The least quota of the groups and those above, rounded up.
     """
     found = [math.inf]
-    for line in _text(groups).splitlines():
-        number, controllers, path = line.split(":", 2)
+    for line in _text(groups).split("\n"):
+        number, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
         group = Path(path.lstrip("/"))
-        for folder in (group, *group.parents):
+        for folder in (group, *group.parents) if path else ():
             if number == "0":
                 quota, _, period_us = _text(mounted / folder / "cpu.max").partition(" ")
             elif "cpu" in controllers.split(","):
@@ -113,16 +114,16 @@ def granted(
             else:
                 continue
             # "max" or -1 without a quota.
-            if quota.strip().isdigit() and period_us.strip().isdigit():
-                found.append(math.ceil(int(quota) / int(period_us)))
+            if quota.strip().isdecimal() and period_us.strip().isdecimal() and int(period_us):
+                found.append(max(1, math.ceil(int(quota) / int(period_us))))
     return min(found)
 
 
 def _text(file: Path) -> str:
     """What a file of the system says; nothing where there is none."""
     try:
-        return file.read_text()
-    except OSError:
+        return file.read_text("utf-8", errors="replace")
+    except (OSError, ValueError):  # the latter of names that no file may have
         return ""
 
 

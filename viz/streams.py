@@ -7,12 +7,13 @@ it is lost; a file then ends with the last whole block.
 from __future__ import annotations
 
 import contextlib
+import gc
+import itertools
 import os
 import shutil
 import socket
 import threading
 import warnings
-import weakref
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -269,7 +270,6 @@ class Stream:
         rr = import_rerun()
         sinks: list[Any] = []
         self._rec = rr.RecordingStream("sdc_taichi")
-        _UNDER_WAY.add(self._rec)
         try:
             if self._file is not None:
                 sinks.append(rr.FileSink(self._file))
@@ -350,7 +350,7 @@ class Stream:
             elif self._address is not None and not listens(self._address):
                 self._lose("the viewer has closed")
             return
-        # Not while Python computes, since this lets go of what was sent, with Python's lock.
+        # Not while Python computes: this lets go of texts that were sent, with Python's lock.
         writing = _Call(lambda rec: rec.flush(timeout_sec=CONFIRM_S), self._rec)
         try:
             if not writing.ends(CONFIRM_S):
@@ -424,18 +424,27 @@ class _Layout:
             self._log = None
 
 
-_UNDER_WAY: weakref.WeakSet[rr.RecordingStream] = weakref.WeakSet()
 _ABANDONED: list[rr.RecordingStream] = []
 """Recordings that Rerun would wait for when they are deleted."""
 
+DELETE_EVERY = 8
+"""Recordings that have ended are deleted together; until then Rerun keeps four threads of each."""
+_ended = itertools.count(1)
+
 
 def _delete_ended() -> None:
-    """Delete recordings that have ended, each of which Rerun keeps with two threads."""
+    """Delete recordings that have ended, while there are no others, whoever made them.
+
+    Rerun would write these out first, wait for ever for one that hangs, and log to no other than
+    the global one any more.
+    """
     import rerun as rr
 
-    # Rerun writes out all others first, and waits for ever for one that hangs.
-    if not (_UNDER_WAY or _ABANDONED):
-        _Call(lambda: rr.init("sdc_taichi", init_logging=False)).ends(WAIT_S)
+    if next(_ended) % DELETE_EVERY:
+        return
+    others = (issubclass(type(thing), rr.RecordingStream) for thing in gc.get_objects())
+    if rr.get_global_data_recording() is None and not any(others):
+        rr.init("sdc_taichi", init_logging=False)
 
 
 class _Call(threading.Thread):
@@ -447,7 +456,10 @@ class _Call(threading.Thread):
     def __init__(self, call: Callable[..., object], *arguments: object) -> None:
         super().__init__(target=call, args=arguments, daemon=True)
         self.failed: RuntimeError | None = None
-        self.start()
+        try:
+            self.start()
+        except RuntimeError as error:  # as many threads as the system grants
+            self.failed = error
 
     def run(self) -> None:
         try:
@@ -457,7 +469,8 @@ class _Call(threading.Thread):
 
     def ends(self, seconds: float) -> bool:
         """Whether it ends in time."""
-        self.join(seconds)
+        if self.failed is None:
+            self.join(seconds)
         return not self.is_alive()
 
 

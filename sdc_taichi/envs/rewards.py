@@ -227,7 +227,7 @@ class Rewards:
         self.name = _name(self._function) if self._function else self._scales or "sustaindc"
         scales = self._scales or {}
         self.weighed = [name for name in TERMS if any(name in own for own in scales.values())]
-        """Terms that the rewards are made of; none for those of a function."""
+        """Terms that the rewards are made of; none for a function's and the released ones."""
         self._stage: Any = None
         self._reads: tuple[str, ...] = ()
         """Quantities of a step that the stage reads."""
