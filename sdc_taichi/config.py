@@ -642,6 +642,10 @@ class DataCenterConfig(_Section):
             kinds |= {e.kind for e in self.events.sampled}
             wants = [
                 (crac.units > 1, f"hvac.crac.units {crac.units}"),
+                (
+                    self.hall.recirculation.matrix_file is not None,
+                    "hall.recirculation.matrix_file",
+                ),
                 (self.simulation.thermal == "transient", "simulation.thermal transient"),
                 ("crac_down" in kinds, "event crac_down"),
                 ("rack_fan_failure" in kinds, "event rack_fan_failure"),

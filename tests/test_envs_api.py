@@ -367,6 +367,8 @@ def test_saved_by_another_environment() -> None:
         other.load_state_dict(before)
     with pytest.raises(SdcError, match=r"missing \['options', 'actions'"):
         env.load_state_dict({"simulator": before["simulator"]})
+    with pytest.raises(SdcError, match=r"state: unknown \['more'\]"):
+        env.load_state_dict({**before, "more": 1})
     with pytest.raises(SdcError, match="another fleet"):
         sdc_taichi.parallel_env(**{**tiny(), "config": "corrected"}).load_state_dict(before)
     one_unit = sdc_taichi.parallel_env("corrected", days=1)
@@ -817,7 +819,7 @@ ACTED: list[tuple[str, Any, str]] = [
     ("discrete", dict.fromkeys(AGENTS, 3), "agent_ls: 3"),
     ("discrete", dict.fromkeys(AGENTS, -1), "valid is 0, 1 or 2"),
     ("discrete", dict.fromkeys(AGENTS, 1.0), "1.0"),
-    ("discrete", dict.fromkeys(AGENTS, None), "valid is 0, 1 or 2"),
+    ("discrete", dict.fromkeys(AGENTS, None), "None (object); valid is 0, 1 or 2"),
     ("discrete", dict.fromkeys(AGENTS, "up"), "up"),
     ("discrete", {key: [1] for key in AGENTS}, "agent_ls: shape (1, 1), expected (1,)"),
     ("continuous", {key: [1.5] for key in AGENTS}, "agent_ls: 1.5; valid is within -1..1"),

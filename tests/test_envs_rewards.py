@@ -247,7 +247,7 @@ def test_wrong_rewards_are_named(rewards: Any, message: str) -> None:
         ({**dict.fromkeys(AGENTS, 0.0), "agent_dc": "x"}, "returned 'x' for agent_dc"),
         ({**dict.fromkeys(AGENTS, 0.0), "agent_x": 0.0}, "unknown agent 'agent_x'"),
         ({"agent_ls": np.zeros(2), "agent_dc": 0.0, "agent_bat": 0.0}, r"\(2,\) for agent_ls"),
-        (np.array([np.nan]), "of finite numbers"),
+        (np.array([np.nan]), "with nan .* of finite numbers"),
         ({"agent_ls": np.zeros(1)}, "returned none for agent_dc"),
     ],
 )

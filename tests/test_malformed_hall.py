@@ -113,6 +113,11 @@ def matrix_error(path: Path, *overrides: str) -> str:
     return text
 
 
+def test_matrix_file_without_recirculation() -> None:
+    with pytest.raises(ConfigError, match=r"matrix_file needs hall\.inlet_model recirculation"):
+        load_config("tiny", ["hall.recirculation.matrix_file=r.npz"])
+
+
 def test_matrix_file_that_is_missing_or_broken(tmp_path: Path) -> None:
     assert "No such file" in matrix_error(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("no archive")

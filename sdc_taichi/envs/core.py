@@ -293,6 +293,9 @@ class Core:
         missing = [name for name in parts if name not in values]
         if missing:
             raise SdcError(f"state: missing {missing}; valid is what state_dict() gave")
+        extra = sorted(map(str, values.keys() - set(parts)))
+        if extra:
+            raise SdcError(f"state: unknown {extra}; valid is what state_dict() gave")
         for name, kind in (("options", Mapping), ("simulator", Mapping), ("generators", list)):
             if not isinstance(values[name], kind):
                 raise SdcError(f"state: {name} is a {type(values[name]).__name__}")
@@ -385,13 +388,15 @@ class Core:
             )
         if self.options.actions == "continuous":
             return self._decode_numbers(agent, given)
-        if given.dtype.kind in "iu":
+        whole = given.dtype.kind in "iu"
+        if whole:
             chosen = given.reshape(-1).astype(np.int64)
             # Read without sign, what is below 0 is beyond 2 too.
             if np.maximum.reduce(chosen.view(np.uint64)) <= 2:
                 return self._commands[agent].take(chosen)
             given = given[(given < 0) | (given > 2)]
-        raise SdcError(f"action of {agent}: {given.flat[0]}; valid is 0, 1 or 2")
+        kind = "" if whole else f" ({given.dtype})"
+        raise SdcError(f"action of {agent}: {given.flat[0]}{kind}; valid is 0, 1 or 2")
 
     def _decode_numbers(self, agent: str, given: npt.NDArray[Any]) -> F64:
         if given.dtype.kind not in "iuf":

@@ -455,9 +455,11 @@ def _values(given: Any, whose: str, size: int) -> F64:
         raise SdcError(
             f"rewards function: returned {given!r} for {whose}; valid is ({size},) of numbers"
         ) from None
-    if values.shape not in ((), (size,)) or not np.all(np.isfinite(values)):
+    finite = np.isfinite(values)
+    if values.shape not in ((), (size,)) or not finite.all():
+        odd = "" if finite.all() else f" with {values[~finite].flat[0]}"
         raise SdcError(
-            f"rewards function: returned {values.dtype} {values.shape} for {whose}; valid is "
+            f"rewards function: returned {values.dtype} {values.shape}{odd} for {whose}; valid is "
             f"({size},) of finite numbers"
         )
     return np.broadcast_to(values, (size,))
