@@ -482,6 +482,7 @@ def plot(figures: list[Figure], path: Path) -> None:
     """Cost per server against size, with the memory roof at all threads."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
     points = [
         (float(f.name.split()[0]), f.value)
@@ -498,6 +499,9 @@ def plot(figures: list[Figure], path: Path) -> None:
     )
     axes.set_xlabel("servers")
     axes.set_ylabel("wall time per server and step [ns]")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
     axes.set_title("Halls of 4,000 servers, inlet model approach")
     axes.grid(which="major", alpha=0.3)
     axes.legend()
