@@ -367,15 +367,13 @@ def _data_centers(
 
 
 def _read_sample(path: Path) -> dict[str, Any]:
-    import yaml
-
     try:
         rules = load_yaml(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ConfigError(f"{path}: cannot be read: {reason}") from None
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid YAML ({error})") from None
     wrong = [name for name in rules if not isinstance(name, str)] if isinstance(rules, dict) else []
     if not isinstance(rules, dict) or wrong:
         found = f"key {wrong[0]!r}" if wrong else f"the top level is a {type(rules).__name__}"

@@ -985,16 +985,19 @@ def load_yaml(text: str) -> Any:
     """What a YAML text says.
 
     Raises:
-        yaml.YAMLError: not valid, or a key given twice.
+        ValueError: not valid, or a key given twice; says on one line what is wrong.
     """
-    return yaml.load(text, _Loader)
+    try:
+        return yaml.load(text, _Loader)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise ValueError(" ".join(str(error).split())) from None
 
 
 def _parse_yaml(text: str, label: str) -> dict[str, Any]:
     try:
         values = load_yaml(text)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise ConfigError(f"{label}: not valid YAML ({' '.join(str(error).split())})") from None
+    except ValueError as error:
+        raise ConfigError(f"{label}: not valid YAML ({error})") from None
     return _require_mapping(values, label)
 
 
@@ -1019,9 +1022,8 @@ def _apply_override(values: dict[str, Any], override: str) -> None:
         raise ConfigError(f"override {override!r}: valid is section.key=value")
     try:
         value = load_yaml(text)
-    except yaml.YAMLError as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"override {override!r}: {text!r} is no YAML value ({reason})") from None
+    except ValueError as error:
+        raise ConfigError(f"override {override!r}: {text!r} is no YAML value ({error})") from None
     _assign(values, path, value, override)
 
 

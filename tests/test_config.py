@@ -162,6 +162,7 @@ def test_the_last_override_wins_and_the_original_stays() -> None:
         ("name.first=x", "name is a value, not a section"),
         ("hall.supply_approach_k.4=1", "index '4' is not in 0..3"),
         ("site.seed=[1", "is no YAML value"),
+        ("site.start=2001-13-45", "is no YAML value (month must be in 1..12)"),
         ("hvac={setpoint: {initial_c: 20, initial_c: 21}}", "'initial_c' is given twice"),
         ("hvac.chiller.model=carno", "'carnot'"),
         ("simulation.steps_per_hour=7", "7 does not divide 60 minutes; valid are 1, 2, 3, 4"),

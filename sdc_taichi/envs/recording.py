@@ -205,8 +205,7 @@ class _Episodes:
         except SdcError as error:
             if self._episode == 0:
                 raise
-            told = f"{error}; episode {self._episode} goes on without a recording"
-            warnings.warn(told, RecordingWarning, stacklevel=2)
+            self._go_without(error)
             return
         self._recorder = recorder
         # Whole files also where nothing closes the environment. What runs at exit does so last in,
@@ -226,8 +225,7 @@ class _Episodes:
         try:
             self._recorder.add(result, rewards=rewards)
         except SdcError as error:
-            told = f"{error}; episode {self._episode} goes on without a recording"
-            warnings.warn(told, RecordingWarning, stacklevel=2)
+            self._go_without(error)
             self.end()
 
     def end(self) -> None:
@@ -237,6 +235,10 @@ class _Episodes:
             self._closing()
         _places.pop(self._place, None)
         self._closing = self._recorder = self._place = None
+
+    def _go_without(self, error: SdcError) -> None:
+        told = f"{error}; episode {self._episode} goes on without a recording"
+        warnings.warn(told, RecordingWarning, stacklevel=3)
 
     def _claim(self, recorder: Recorder) -> None:
         """Make sure that no other environment of this process writes to the same place."""
