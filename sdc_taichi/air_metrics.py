@@ -23,6 +23,9 @@ _USUAL_CLASS = "A2"
 _NO_RISE = 1e-9
 """Rises (K, m3 K/s) up to this are none: a ratio to what rounding left would mean nothing."""
 
+_ROUND_OFF_SHARE = 1e-6
+"""Indices up to this are 0: sums of f32 temperatures hold no smaller share of the exhaust heat."""
+
 
 def allowable_c(ashrae_class: str | None) -> tuple[float, float]:
     """Allowable inlet temperatures of a class of ``ALLOWABLE_C``; None is A2."""
@@ -79,9 +82,11 @@ def shi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:
         outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets.
 
     Returns:
-        SHI, and 0 where the outlets have no rise, as without load or airflow.
+        SHI, and 0 where the outlets have no rise, as without load or airflow, or where rounding
+        alone has left something of either sign.
     """
-    return _ratio(inlet_rise_m3k_s, outlet_rise_m3k_s)
+    share = _ratio(inlet_rise_m3k_s, outlet_rise_m3k_s)
+    return as_array(np.where(np.maximum(share, -share) > _ROUND_OFF_SHARE, share, 0.0))
 
 
 def rhi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:

@@ -150,3 +150,10 @@ def test_shi_is_a_share_and_grows_with_recirculation(
 
     assert index(0.0) == 0.0
     assert 0.0 <= index(1.0) <= index(2.0) + 1e-12 < 1.0
+
+
+@pytest.mark.parametrize("share", [-2.5e-16, -1e-7, 1e-7])
+def test_shi_of_what_rounding_leaves_is_zero_of_no_sign(share: float) -> None:
+    found = air_metrics.shi(np.array([share * 40.0]), np.array([40.0]))
+    assert found == 0.0
+    assert not np.signbit(found).any()
