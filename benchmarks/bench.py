@@ -31,9 +31,9 @@ from roof import core_s, plain_store
 from thermal import QUICK_SIZES, SIZES, fleet_of
 
 import sdc_taichi
-from sdc_taichi import runtime
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.hall import Hall
+from sdc_taichi.kernels.compiler import runtime
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import Hall
 from sdc_taichi.types import ServerLayers
 
 HERE = Path(__file__).parent

@@ -19,8 +19,8 @@ from thermal import fleet_of
 
 import sdc_taichi
 from sdc_taichi.config import with_values
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.hall import Conditions, Hall
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import Conditions, Hall
 
 MEMORY = Path("/proc/self/statm")
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import sdc_taichi
 from sdc_taichi.control import make_controller
-from sdc_taichi.run import Asked, describe, record
+from sdc_taichi.run.loop import Asked, describe, record
 from sdc_taichi.viz.recorder import Recorder
 
 MONTH_STEPS = 31 * 96

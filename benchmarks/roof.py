@@ -6,7 +6,7 @@ from typing import Any, no_type_check
 
 import numpy as np
 
-from sdc_taichi import runtime
+from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.types import F64
 
 RUN = 32
@@ -32,7 +32,7 @@ def core_s(calls: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, 
 
 def plain_store(servers: int) -> Callable[[], object]:
     """A store of three layers of ``servers`` values on all threads, in whole vectors."""
-    from sdc_taichi.kernels.backend import SLICE, BoundKernel, aligned, part_of, ti
+    from sdc_taichi.kernels.compiler.backend import SLICE, BoundKernel, aligned, part_of, ti
 
     lanes, slices = 8, 64
     blocks_1d = ti.types.ndarray(dtype=ti.types.vector(lanes, ti.f32), ndim=1)

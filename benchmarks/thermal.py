@@ -18,8 +18,8 @@ import numpy as np
 from roof import core_s, plain_store
 
 from sdc_taichi import build_fleet, load_config, make_configs
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.hall import Coil, Conditions, Hall
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall
 
 SIZES = ((4096, 20, 200), (256, 1000, 40), (1, 100_000, 40))
 QUICK_SIZES = ((16, 20, 200), (2, 100, 40), (1, 400, 40))
@@ -99,7 +99,7 @@ def main() -> None:
     )
     parser.add_argument("--quick", action="store_true", help="small sizes, for correctness only")
     quick = parser.parse_args().quick
-    from sdc_taichi import runtime
+    from sdc_taichi.kernels.compiler import runtime
 
     threads = runtime.ensure_started()
     print(f"{threads} threads, f32, {SUBSTEPS} substeps; core time in ns per server")

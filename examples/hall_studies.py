@@ -30,9 +30,9 @@ from sdc_taichi import (
 )
 from sdc_taichi.config import cpu_coefficients
 from sdc_taichi.control import Controller, View, make_controller
-from sdc_taichi.layout import floor_plan
-from sdc_taichi.metrics import Metric, per_dc
-from sdc_taichi.run import run
+from sdc_taichi.hall.floor_plan import floor_plan
+from sdc_taichi.run.loop import run
+from sdc_taichi.run.metrics import Metric, per_dc
 from sdc_taichi.types import F64
 from sdc_taichi.viz import floor_plan as plans
 from sdc_taichi.viz import hall_figures

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from sdc_taichi import Simulator, load_config
 from sdc_taichi.control import make_controller
 from sdc_taichi.exogenous.synthetic import synthetic_sites, synthetic_traces
-from sdc_taichi.run import Asked, record
+from sdc_taichi.run.loop import Asked, record
 from sdc_taichi.viz import dashboards, data_figures, fleet_figures
 from sdc_taichi.viz.animation import write_animation
 from sdc_taichi.viz.figures import DPI, webp

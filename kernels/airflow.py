@@ -8,7 +8,7 @@ of a cell are numbered -x, -y, -z, +x, +y, +z, and lower faces lead to lower num
 from functools import cache
 from typing import Any, no_type_check
 
-from .backend import SLICE, func, kernel, part_of, ti
+from .compiler.backend import SLICE, func, kernel, part_of, ti
 
 VECTORS = 9
 """Work vectors of one thread: solution, residual, shadow residual, direction, and products."""

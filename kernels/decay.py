@@ -6,7 +6,7 @@ A difference from ``elementary``'s exponential would lose them.
 from math import factorial
 from typing import no_type_check
 
-from .backend import func, ti
+from .compiler.backend import func, ti
 
 FIT_END = 5
 """Of the constants, the first after those of the outlet fit."""

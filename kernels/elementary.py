@@ -9,7 +9,7 @@ from functools import cache
 from math import factorial, log
 from typing import Any, no_type_check
 
-from .backend import func, larger, smaller, ti
+from .compiler.backend import func, larger, smaller, ti
 
 _FORMATS = {"f32": (23, 127), "f64": (52, 1023)}
 """Bits of the fraction, and bias of the exponent (IEEE 754)."""

@@ -8,7 +8,18 @@ transient ones a sweep is a substep.
 from functools import cache
 from typing import Any, no_type_check
 
-from .backend import SLICE, Table, func, kernel, larger, part_of, reals, shared, smaller, ti
+from .compiler.backend import (
+    SLICE,
+    Table,
+    func,
+    kernel,
+    larger,
+    part_of,
+    reals,
+    shared,
+    smaller,
+    ti,
+)
 from .decay import SERIES_TERMS
 from .elementary import log_and_exp
 from .mixes import (

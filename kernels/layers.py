@@ -3,7 +3,7 @@
 from functools import cache
 from typing import Any, no_type_check
 
-from .backend import SLICE, Table, func, kernel, larger, part_of, reals, shared, ti
+from .compiler.backend import SLICE, Table, func, kernel, larger, part_of, reals, shared, ti
 from .elementary import log_and_exp
 from .servers import (
     OUTLET_OF_SERVERS,

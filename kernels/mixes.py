@@ -10,7 +10,7 @@ k/(1 - k) of a move, of which k is kept, are those of Aitken (1926).
 
 from typing import no_type_check
 
-from .backend import func, larger, smaller, ti
+from .compiler.backend import func, larger, smaller, ti
 from .decay import doublings, gone_per, halved
 from .sums import keep_range
 from .thermal import (

@@ -3,7 +3,7 @@
 from functools import cache
 from typing import Any, no_type_check
 
-from .backend import F64_LANES, SLICE, kernel, ti
+from .compiler.backend import F64_LANES, SLICE, kernel, ti
 
 TASK_BLOCKS = 32
 """Vectors side by side in a row that one task takes on."""

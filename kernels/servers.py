@@ -7,7 +7,7 @@ y = clip(slope*T + offset + shift*u); fan power reference*(y/reference ratio)^ex
 
 from typing import no_type_check
 
-from .backend import func, larger, smaller, ti
+from .compiler.backend import func, larger, smaller, ti
 from .decay import doublings, gone_per, halved
 from .thermal import LANES, OF_GROUPS, OF_RACKS, OUTLETS
 

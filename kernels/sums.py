@@ -2,7 +2,7 @@
 
 from typing import no_type_check
 
-from .backend import func, ti
+from .compiler.backend import func, ti
 from .thermal import LANES, RACK_OUT, SUM, SUMS
 
 N_SUMS = len(SUMS)

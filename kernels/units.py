@@ -2,7 +2,7 @@
 
 from typing import no_type_check
 
-from .backend import func, ti
+from .compiler.backend import func, ti
 from .servers import first_share_of
 from .sums import sum_of
 from .thermal import N_BLOCK_TERMS

@@ -4,15 +4,15 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from sdc_taichi.kernels import collector
+from sdc_taichi.kernels.compiler import collector
 
 with collector.paused():
     from sdc_taichi.config import DataCenterConfig, load_config, preset_names
-    from sdc_taichi.drivers import Drivers, drivers_from_arrays, load_drivers
     from sdc_taichi.envs import registration
     from sdc_taichi.errors import ConfigError, DataError, RuntimeStateError, SdcError
-    from sdc_taichi.fleet import Fleet, build_fleet, make_configs
-    from sdc_taichi.sim import Simulator
+    from sdc_taichi.sim.drivers import Drivers, drivers_from_arrays, load_drivers
+    from sdc_taichi.sim.fleet import Fleet, build_fleet, make_configs
+    from sdc_taichi.sim.simulator import Simulator
     from sdc_taichi.types import (
         Actions,
         BatteryAction,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.view_commands import viewer_program
+from sdc_taichi.cli.view import viewer_program
 
 VIEWER_ENVIRONMENT = {"RERUN_ANALYTICS": "0", "RUST_LOG": "error"}
 

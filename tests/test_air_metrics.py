@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sdc_taichi import air_metrics
+from sdc_taichi.hall import air_metrics
 
 CHECKS = Path(__file__).parent / "reference" / "physics_checks.json"
 

@@ -10,12 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sdc_taichi import DataCenterConfig, airflow, load_config, runtime
-from sdc_taichi.airflow import LayoutSolution, solve
-from sdc_taichi.airflow_grid import MOST_CELLS, Grid, build_grid
+from sdc_taichi import DataCenterConfig, load_config
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.layout import floor_plan
-from sdc_taichi.recirculation import design_point
+from sdc_taichi.hall.floor_plan import floor_plan
+from sdc_taichi.hall.recirculation import design_point
+from sdc_taichi.kernels.compiler import runtime
+from sdc_taichi.layout_solver import solve as airflow
+from sdc_taichi.layout_solver.grid import MOST_CELLS, Grid, build_grid
+from sdc_taichi.layout_solver.solve import LayoutSolution, solve
 from sdc_taichi.types import F64
 
 AIR_J_PER_M3_K = 1.225 * 1006.0

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from sdc_taichi import build_fleet, make_configs
-from sdc_taichi.hall import Hall
+from sdc_taichi.sim.hall_solver import Hall
 
 pytestmark = pytest.mark.repo
 

@@ -30,11 +30,11 @@ from sdc_taichi import (
     load_config,
     preset_names,
 )
-from sdc_taichi.cli import app
+from sdc_taichi.cli.app import app
 from sdc_taichi.control import View, make_controller
-from sdc_taichi.run import Asked, record, run, step_times
+from sdc_taichi.run.loop import Asked, record, run, step_times
 
-PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli import main; main()")
+PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli.app import main; main()")
 HEAVY = {"taichi", "pandas", "pyarrow", "psychrolib", "matplotlib", "rerun"}
 FILES = {"steps.parquet", "metrics.json"}
 
@@ -458,7 +458,7 @@ def test_progress_is_for_terminals(tmp_path: Path) -> None:
 def test_help_and_version_load_nothing_heavy(arguments: list[str]) -> None:
     code = (
         f"import sys; sys.argv = ['sdc-taichi', *{arguments!r}]\n"
-        "from sdc_taichi.cli import main\n"
+        "from sdc_taichi.cli.app import main\n"
         "try: main()\n"
         "except SystemExit as e: print(e.code, *sys.modules, file=sys.stderr)\n"
     )

@@ -34,7 +34,7 @@ from sdc_taichi.control import (
     viewer,
 )
 from sdc_taichi.control.rules import quarter_command, slots_in_step, unrepeated
-from sdc_taichi.run import run
+from sdc_taichi.run.loop import run
 
 CHECKS = json.loads((Path(__file__).parent / "reference" / "physics_checks.json").read_text())
 TRIM = next(c for c in CHECKS["checks"] if c["id"] == "G36-TR")

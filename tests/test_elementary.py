@@ -5,7 +5,7 @@ from typing import Any, no_type_check
 import numpy as np
 import pytest
 
-from sdc_taichi import runtime
+from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.types import F64
 
 LANES = 8
@@ -14,7 +14,7 @@ LANES = 8
 def of_vectors(precision: str, which: int, x: F64) -> Any:
     """Logarithms (0) or exponentials (1) of (n, LANES), as kernels compute them."""
     runtime.ensure_started()
-    from sdc_taichi.kernels.backend import BoundKernel, aligned, ti
+    from sdc_taichi.kernels.compiler.backend import BoundKernel, aligned, ti
     from sdc_taichi.kernels.elementary import log_and_exp
 
     real = {"f32": ti.f32, "f64": ti.f64}[precision]

@@ -25,7 +25,6 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.control import View, viewer
-from sdc_taichi.drivers import Table
 from sdc_taichi.envs import timed
 from sdc_taichi.envs.features import (
     AGENTS,
@@ -45,6 +44,7 @@ from sdc_taichi.envs.forecasts import (
     Forecasts,
     lead_steps,
 )
+from sdc_taichi.sim.drivers import Table
 
 SITES = ("ny", "ca", "az")
 STARTS = ("01-01", "07-01", "12-31")

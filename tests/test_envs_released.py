@@ -29,11 +29,11 @@ from sdc_taichi import (
     load_config,
 )
 from sdc_taichi.control.view import View, viewer
-from sdc_taichi.drivers import Table
 from sdc_taichi.envs import released
 from sdc_taichi.envs.released import FEATURES, ReleasedObserver, ReleasedRewards
 from sdc_taichi.errors import DataError, RuntimeStateError
-from sdc_taichi.hall import Precision
+from sdc_taichi.sim.drivers import Table
+from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64, I64, StepResult
 from test_reference import BATTERY, COOLING, FOLDERS, LOAD, TRAJECTORIES, rack_config
 

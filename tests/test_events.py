@@ -17,7 +17,7 @@ from sdc_taichi.config import (
     load_config,
 )
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.events import HOURS_PER_BLOCK, ActiveEvent, Timeline, schedule
+from sdc_taichi.sim.events import HOURS_PER_BLOCK, ActiveEvent, Timeline, schedule
 
 BASE = load_config("corrected")
 HOURLY = "{kind: grid_outage, per_year: 8760, duration_h: [1, 2]}"

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import exogenous_builders as build
-from sdc_taichi.data_commands import data_app
+from sdc_taichi.cli.data import data_app
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import (
     load_site,

@@ -18,8 +18,8 @@ from sdc_taichi import SdcError, Simulator, StepResult, load_config, make_config
 from sdc_taichi.config import EventKind
 from sdc_taichi.control import make_controller, viewer
 from sdc_taichi.exogenous.synthetic import synthetic_site, synthetic_sites, synthetic_traces
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.metrics import Metric
+from sdc_taichi.run.metrics import Metric
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.viz import animation, dashboards, data_figures, figures, fleet_figures
 
 DAYS = 3

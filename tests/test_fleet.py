@@ -19,10 +19,10 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.config import apply_overrides, config_from_dict
-from sdc_taichi.hall import Conditions, Hall
-from sdc_taichi.hall_start import Start, find_start
+from sdc_taichi.hall.initial_guess import Start, find_start
 from sdc_taichi.kernels.thermal import DC_ROWS, GROUP_ROWS
 from sdc_taichi.plant.water_side import Design
+from sdc_taichi.sim.hall_solver import Conditions, Hall
 
 TINY = load_config("tiny")
 
@@ -110,7 +110,7 @@ def test_what_is_no_part_of_a_hall_makes_no_other_hall(monkeypatch: pytest.Monke
         laid_out.append(config.name)
         return find_start(config, *parts)
 
-    monkeypatch.setattr("sdc_taichi.fleet.find_start", find)
+    monkeypatch.setattr("sdc_taichi.sim.fleet.find_start", find)
     build_fleet(
         [
             named(hall, "first"),

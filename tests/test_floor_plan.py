@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from sdc_taichi import SdcError, load_config
-from sdc_taichi.hall_description import DesignHall, at_design
+from sdc_taichi.sim.design_hall import DesignHall, at_design
 from sdc_taichi.viz import floor_plan
 
 WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[400, 40]"]

@@ -12,9 +12,9 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from sdc_taichi import load_config
+from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.errors import ConfigError, SdcError
-from sdc_taichi.hall_commands import hall_app
-from sdc_taichi.recirculation import calibrate, design_point
+from sdc_taichi.hall.recirculation import calibrate, design_point
 
 
 def call(*arguments: object) -> Result:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from sdc_taichi import DataCenterConfig, SdcError, load_config
-from sdc_taichi.hall_description import (
+from sdc_taichi.hall.recirculation import calibrate
+from sdc_taichi.sim.design_hall import (
     EXACT_RADIUS_RACKS,
     LISTED_ROWS,
     DesignHall,
@@ -20,7 +21,6 @@ from sdc_taichi.hall_description import (
     report,
     show,
 )
-from sdc_taichi.recirculation import calibrate
 
 WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[400, 40]"]
 

@@ -20,8 +20,8 @@ from sdc_taichi import (
     load_config,
 )
 from sdc_taichi.config import apply_overrides
-from sdc_taichi.hall import Precision
-from sdc_taichi.plant.protection import NORMAL, THROTTLED, TRIPPED
+from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
+from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64
 from test_transients import assert_same, part_of, run
 

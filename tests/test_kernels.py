@@ -20,7 +20,7 @@ import reference_twin
 from sdc_taichi import DataCenterConfig, RuntimeStateError, Simulator, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.errors import SdcError
-from sdc_taichi.hall import _SERIAL_GROUPS, Coil, Conditions, Hall, HallSums, Precision
+from sdc_taichi.sim.hall_solver import _SERIAL_GROUPS, Coil, Conditions, Hall, HallSums, Precision
 from sdc_taichi.types import F64, ServerLayers
 
 OUTLETS = ("server", "rack", "released")
@@ -373,7 +373,7 @@ def digest_of_large_halls() -> str:
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
     code = (
-        "import test_kernels as t; from sdc_taichi import runtime;"
+        "import test_kernels as t; from sdc_taichi.kernels.compiler import runtime;"
         "print(runtime.ensure_started(), t.digest_of_large_halls())"
     )
     found = {}

@@ -20,7 +20,7 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.exogenous import site_names
-from sdc_taichi.hall import Precision
+from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64
 
 MONTHS = tuple(f"{month:02d}-01" for month in range(1, 13))

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sdc_taichi import DataCenterConfig, load_config
-from sdc_taichi.cli import app
+from sdc_taichi.cli.app import app
 
 HALL, HVAC, SERVERS = (
     "data_center_configuration",

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sdc_taichi.errors import SdcError
-from sdc_taichi.placement import MIN_HEADROOM_K, POLICIES, PlacementError, layout, place
+from sdc_taichi.hall.placement import MIN_HEADROOM_K, POLICIES, PlacementError, layout, place
 from sdc_taichi.types import F64, I64
 
 LIMIT_C = 27.0

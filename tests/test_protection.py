@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sdc_taichi.plant.protection import NORMAL, THROTTLED, TRIPPED, capacity, protect
+from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED, capacity, protect
 from sdc_taichi.types import Status
 
 LIMITS = {"limit_c": 32.0, "trip_c": 37.0, "restart_c": 27.0}

@@ -23,8 +23,8 @@ from sdc_taichi import (
     load_config,
 )
 from sdc_taichi.config import config_from_dict
-from sdc_taichi.hall import MOST_SWEEPS, Conditions, Hall, HallSums, Precision
-from sdc_taichi.recirculation import DENSE_RACKS, calibrate, layout_exchange
+from sdc_taichi.hall.recirculation import DENSE_RACKS, calibrate, layout_exchange
+from sdc_taichi.sim.hall_solver import MOST_SWEEPS, Conditions, Hall, HallSums, Precision
 from sdc_taichi.types import F64, ServerLayers
 
 SEEDS = st.integers(0, 2**32 - 1)

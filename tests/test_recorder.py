@@ -32,7 +32,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.control import View
 from sdc_taichi.plant.workload import age_histogram
-from sdc_taichi.run import Asked, describe, record
+from sdc_taichi.run.loop import Asked, describe, record
 from sdc_taichi.types import F64, ServerLayers
 from sdc_taichi.viz import hall_layers, recorder, recording_reader, recording_series
 from sdc_taichi.viz.recorder import Recorder
@@ -483,7 +483,7 @@ def test_power_range_covers_the_largest_rack(full_w: float) -> None:
 def test_voxels_stand_where_the_racks_do() -> None:
     hall = load_config("large").hall
     grid = hall_layers.voxels(hall, 5)
-    from sdc_taichi.layout import floor_plan
+    from sdc_taichi.hall.floor_plan import floor_plan
 
     plan, measures = floor_plan(hall), hall.layout
     offset = np.array([measures.end_margin_m, 0.0])

@@ -21,13 +21,13 @@ from typer.testing import CliRunner, Result
 
 from rrd import VIEWER_ENVIRONMENT, read, verify
 from sdc_taichi import SdcError, Simulator, load_config, make_configs
-from sdc_taichi.cli import app
-from sdc_taichi.view_commands import viewer_program
+from sdc_taichi.cli.app import app
+from sdc_taichi.cli.view import viewer_program
 from sdc_taichi.viz import streams
 from sdc_taichi.viz.recorder import BLOCK_STEPS, Recorder
 from sdc_taichi.viz.streams import RecordingWarning, listens, served_at
 
-PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli import main; main()")
+PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli.app import main; main()")
 POSIX = pytest.mark.skipif(os.name != "posix", reason="signals and limits of POSIX")
 
 
@@ -117,7 +117,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, 1_500_000))
 import sys
 sys.argv = ["sdc-taichi", "simulate", "tiny", "--days", "25", "--out", "run", "--quiet",
     "--record", "run/x.rrd"]
-from sdc_taichi.cli import main
+from sdc_taichi.cli.app import main
 main()
 """
     done = subprocess.run(

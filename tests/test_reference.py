@@ -34,16 +34,16 @@ from sdc_taichi import (
     preset_names,
 )
 from sdc_taichi.control.rules import trim_and_respond
-from sdc_taichi.drivers import Table
 from sdc_taichi.envs.rewards import share
 from sdc_taichi.exogenous.psychrometrics import humidity_ratio, stull_wet_bulb_c, wet_bulb_c
-from sdc_taichi.hall import Conditions, Hall, HallSums, Precision
-from sdc_taichi.layout import floor_plan
+from sdc_taichi.hall.floor_plan import floor_plan
+from sdc_taichi.hall.recirculation import calibrate, layout_exchange
 from sdc_taichi.plant import chiller, cooling, tower, water, workload
 from sdc_taichi.plant.battery import BATTERIES
 from sdc_taichi.plant.carbon import emitted_g
-from sdc_taichi.recirculation import calibrate, layout_exchange
-from sdc_taichi.sizing import released_ranges
+from sdc_taichi.sim.drivers import Table
+from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums, Precision
+from sdc_taichi.sim.sizing import released_ranges
 from sdc_taichi.types import F64
 from work_steps import work_step
 

@@ -19,9 +19,9 @@ from typer.testing import CliRunner, Result
 
 from report_reader import Page, pictures, read_page
 from sdc_taichi import DataCenterConfig, SdcError, Simulator, load_config, make_configs
-from sdc_taichi.cli import app
+from sdc_taichi.cli.app import app
 from sdc_taichi.control import make_controller
-from sdc_taichi.run import Asked, record
+from sdc_taichi.run.loop import Asked, record
 from sdc_taichi.viz import dashboards, fleet_figures, recorded, report
 from sdc_taichi.viz.recorded import read_run, read_steps
 

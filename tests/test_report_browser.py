@@ -14,7 +14,7 @@ import pytest
 from report_reader import Page, pictures, read_page
 from sdc_taichi import Simulator, load_config, make_configs
 from sdc_taichi.control import make_controller
-from sdc_taichi.run import Asked, record
+from sdc_taichi.run.loop import Asked, record
 from sdc_taichi.viz import figures
 from sdc_taichi.viz.recorded import read_run
 from sdc_taichi.viz.report import write_report

@@ -38,8 +38,8 @@ from sdc_taichi import (
     runtime,
 )
 from sdc_taichi.config import apply_overrides
-from sdc_taichi.drivers import Table
-from sdc_taichi.hall import Precision
+from sdc_taichi.sim.drivers import Table
+from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64
 
 PRECISIONS: tuple[Precision, ...] = ("f32", "f64")
@@ -642,7 +642,7 @@ def resident_mb() -> float:
 def test_as_many_threads_as_processors_are_bound_to_one_each() -> None:
     processors = sorted(os.sched_getaffinity(0))
     code = (
-        "import os; from sdc_taichi import runtime; runtime.ensure_started();"
+        "import os; from sdc_taichi.kernels.compiler import runtime; runtime.ensure_started();"
         "print([sorted(os.sched_getaffinity(int(t))) for t in os.listdir('/proc/self/task')])"
     )
     for threads in (len(processors), len(processors) + 1):
@@ -672,7 +672,7 @@ def test_as_many_threads_as_processors_are_bound_to_one_each() -> None:
 def test_there_are_no_more_threads_than_processors_may_be_used(limit: str) -> None:
     if "affinity" in limit and not hasattr(os, "sched_setaffinity"):
         pytest.skip("the system binds no processes")
-    code = f"from sdc_taichi import runtime; {limit}; print(runtime.ensure_started())"
+    code = f"from sdc_taichi.kernels.compiler import runtime; {limit}; print(runtime.ensure_started())"
     environment = {k: v for k, v in os.environ.items() if k != "SDC_TAICHI_THREADS"}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, timeout=120, check=True

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sdc_taichi import Simulator, drivers_from_arrays, load_config, runtime
-from sdc_taichi.facility import Facility, Met
-from sdc_taichi.kernels.stage import COPIED_UP_TO, SERIAL_UP_TO, CompiledStage, _kernel
+from sdc_taichi import Simulator, drivers_from_arrays, load_config
+from sdc_taichi.kernels.compiler import runtime
+from sdc_taichi.kernels.compiler.stage import COPIED_UP_TO, SERIAL_UP_TO, CompiledStage, _kernel
 from sdc_taichi.plant import workload
+from sdc_taichi.sim.facility import Facility, Met
 from sdc_taichi.types import F64
 
 N = 37

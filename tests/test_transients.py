@@ -24,8 +24,8 @@ from sdc_taichi import (
     load_config,
 )
 from sdc_taichi.config import apply_overrides
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.hall import Coil, Conditions, Hall, HallState, HallSums, Precision
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums, Precision
 from sdc_taichi.types import F64
 from test_recirculation import (
     AS_FOUND,

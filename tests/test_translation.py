@@ -14,9 +14,9 @@ from taichi.lang import expr, impl, kernel_impl
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext, Builder
 from taichi.lang.exception import TaichiCompilationError
 
-from sdc_taichi.kernels import collector
-from sdc_taichi.kernels.backend import BoundKernel, func, kernel, ti
-from sdc_taichi.runtime import ensure_started
+from sdc_taichi.kernels.compiler import collector
+from sdc_taichi.kernels.compiler.backend import BoundKernel, func, kernel, ti
+from sdc_taichi.kernels.compiler.runtime import ensure_started
 
 ARRAY = ti.types.ndarray(dtype=ti.f64, ndim=1)
 

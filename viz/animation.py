@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
-from sdc_taichi.fleet import Fleet
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, StepResult
 from sdc_taichi.whole_file import whole_file
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import SdcError
-from sdc_taichi.metrics import HOT_INLET_C
+from sdc_taichi.run.metrics import HOT_INLET_C
 from sdc_taichi.types import F64
 
 from .figures import (

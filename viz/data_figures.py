@@ -18,7 +18,7 @@ import numpy as np
 from sdc_taichi.errors import SdcError
 from sdc_taichi.exogenous.registry import load_site, load_trace
 from sdc_taichi.exogenous.series import Series
-from sdc_taichi.run import FIRST_YEAR
+from sdc_taichi.run.loop import FIRST_YEAR
 
 from .figures import BLUE, RED, clean, finish, format_time, new_figure, plain, set_title
 from .fleet_figures import line_style

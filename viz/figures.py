@@ -21,9 +21,9 @@ import numpy.typing as npt
 
 from sdc_taichi.config import first_step_day
 from sdc_taichi.errors import SdcError
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.layout import Plan
-from sdc_taichi.run import FIRST_YEAR, step_times
+from sdc_taichi.hall.floor_plan import Plan
+from sdc_taichi.run.loop import FIRST_YEAR, step_times
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, Reals, StepResult
 
 if TYPE_CHECKING:

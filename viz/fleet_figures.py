@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
-from sdc_taichi.metrics import Metric
+from sdc_taichi.run.metrics import Metric
 from sdc_taichi.types import F64
 
 from .figures import (

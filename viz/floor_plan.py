@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.hall_description import DesignHall, at_design
+from sdc_taichi.sim.design_hall import DesignHall, at_design
 from sdc_taichi.types import F64
 
 from .figures import (

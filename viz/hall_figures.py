@@ -9,8 +9,8 @@ import numpy as np
 
 from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import SdcError
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.layout import Plan, floor_plan, unit_places_m
+from sdc_taichi.hall.floor_plan import Plan, floor_plan, unit_places_m
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, StepResult
 
 from .figures import BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY, new_figure, on_page, rack_boxes

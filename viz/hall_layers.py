@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import HallConfig
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.layout import Plan, floor_plan
+from sdc_taichi.hall.floor_plan import Plan, floor_plan
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, Reals
 
 Shots = npt.NDArray[np.float32]

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig, config_from_dict
 from sdc_taichi.errors import SdcError
-from sdc_taichi.run import FORMAT, METADATA_KEY
+from sdc_taichi.run.loop import FORMAT, METADATA_KEY
 from sdc_taichi.types import F64
 
 if TYPE_CHECKING:

@@ -29,9 +29,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.layout import floor_plan
-from sdc_taichi.run import Asked, describe, step_times
+from sdc_taichi.hall.floor_plan import floor_plan
+from sdc_taichi.run.loop import Asked, describe, step_times
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, StepResult
 
 from . import hall_layers as layers
@@ -65,7 +65,7 @@ from .streams import (
 )
 
 if TYPE_CHECKING:
-    from sdc_taichi.sim import Simulator
+    from sdc_taichi.sim.simulator import Simulator
 
 Real = TypeVar("Real", bound=np.floating[Any])
 Pictures: TypeAlias = dict[tuple[int, str], npt.NDArray[Real]]

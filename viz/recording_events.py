@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.air_metrics import RECOMMENDED_C, allowable_c
-from sdc_taichi.events import ActiveEvent
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.plant.protection import NORMAL, THROTTLED, TRIPPED
+from sdc_taichi.hall.air_metrics import RECOMMENDED_C, allowable_c
+from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
+from sdc_taichi.sim.events import ActiveEvent
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, Reals, Status
 
 from .recording_series import ROW

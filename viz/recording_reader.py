@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sdc_taichi.air_metrics import RECOMMENDED_C
 from sdc_taichi.errors import SdcError
-from sdc_taichi.events import ActiveEvent
+from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.plant.workload import age_histogram
+from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.types import F64, I64, Reals, Status, StepResult
 
 from . import hall_layers as layers
@@ -21,7 +21,7 @@ from .recording_events import Entry, failure_entries, hottest_server, protection
 from .recording_series import AGE_EDGES_H, FIELDS, ROW, SUMMED
 
 if TYPE_CHECKING:
-    from sdc_taichi.sim import Simulator
+    from sdc_taichi.sim.simulator import Simulator
 
 HOTTEST = 5
 """Halls in the table of the hottest."""

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.layout import floor_plan, unit_places_m
+from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
+from sdc_taichi.sim.fleet import Fleet
 
 from . import hall_layers as layers
 from .recording_series import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sdc_taichi.fleet import Fleet
+from sdc_taichi.sim.fleet import Fleet
 
 from .hall_layers import Scale
 from .recording_reader import Cadence

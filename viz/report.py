@@ -19,8 +19,8 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig, first_step_day
 from sdc_taichi.errors import SdcError
-from sdc_taichi.metrics import HOT_INLET_C
-from sdc_taichi.run import REPORT_FILE, step_times
+from sdc_taichi.run.loop import REPORT_FILE, step_times
+from sdc_taichi.run.metrics import HOT_INLET_C
 from sdc_taichi.whole_file import whole_file
 
 from . import dashboards, data_figures, figures, fleet_figures

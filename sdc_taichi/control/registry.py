@@ -21,7 +21,7 @@ from sdc_taichi.control.rules import (
 )
 from sdc_taichi.control.view import limits_of
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.fleet import Fleet
+from sdc_taichi.sim.fleet import Fleet
 
 CONTROLLED = ("load", "cooling", "battery")
 """What a controller may give commands for, as specs name it."""

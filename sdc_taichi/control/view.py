@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.drivers import Drivers
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.hall import Precision
-from sdc_taichi.sim import Simulator
-from sdc_taichi.sizing import Sizing
+from sdc_taichi.sim.drivers import Drivers
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.types import F64, I64, Exogenous, State, StepResult
 
 

@@ -25,8 +25,8 @@ from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.released import ReleasedObserver
 from sdc_taichi.envs.rewards import Rewards
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
-from sdc_taichi.hall import Precision
-from sdc_taichi.sim import Simulator
+from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F32, F64, I64, Actions, State, StepResult
 
 Observation = F32 | dict[str, F32]

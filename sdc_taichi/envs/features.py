@@ -19,17 +19,17 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from sdc_taichi.control.view import View
-from sdc_taichi.drivers import Drivers, Table
 from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, ForecastError, Forecasts
 from sdc_taichi.envs.timed import Layout, TimeRows, time_rows
 from sdc_taichi.errors import ConfigError, RuntimeStateError
-from sdc_taichi.fleet import Fleet
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP
-from sdc_taichi.sizing import Sizing
+from sdc_taichi.sim.drivers import Drivers, Table
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.types import F32, F64, I64
 
 if TYPE_CHECKING:
-    from sdc_taichi.kernels.stage import CompiledStage
+    from sdc_taichi.kernels.compiler.stage import CompiledStage
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,7 +343,7 @@ class Observer:
 
     def _stage_of(self, sizing: Sizing, step_h: float) -> CompiledStage:
         """The stage from what ``_inside`` gives to its entries, in their order."""
-        from sdc_taichi.kernels.stage import CompiledStage
+        from sdc_taichi.kernels.compiler.stage import CompiledStage
 
         kwh = step_h / 1e3
         per_it_kwh = _inverse(sizing.it_w * kwh)

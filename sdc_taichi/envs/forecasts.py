@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from sdc_taichi.drivers import Drivers, Table
 from sdc_taichi.errors import ConfigError, RuntimeStateError
+from sdc_taichi.sim.drivers import Drivers, Table
 from sdc_taichi.types import F32, F64, I64
 
 CI_LEADS_H = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0)

@@ -15,7 +15,7 @@ from sdc_taichi.envs.options import make_options
 from sdc_taichi.envs.recording import RecordedCore, Recording
 from sdc_taichi.envs.standards import OneDataCenter, first, floats, start_day, start_days
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.hall import Precision
+from sdc_taichi.sim.hall_solver import Precision
 
 
 class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type: ignore[misc]

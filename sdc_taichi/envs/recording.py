@@ -23,8 +23,8 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from sdc_taichi.envs.core import Core, Source, Step
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
-from sdc_taichi.hall import Precision
-from sdc_taichi.sim import Simulator
+from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
 from sdc_taichi.viz.streams import RecordingWarning, check_path, is_address
 

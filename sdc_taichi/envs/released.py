@@ -21,14 +21,14 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from sdc_taichi.control.view import View
-from sdc_taichi.drivers import Table
 from sdc_taichi.envs.features import AGE_EDGES_H, AGENTS, Feature
 from sdc_taichi.envs.timed import Layout, TimeRows, time_rows
 from sdc_taichi.errors import DataError, RuntimeStateError
-from sdc_taichi.fleet import Fleet, build_fleet
-from sdc_taichi.hall import Hall, Precision
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP, age_histogram
-from sdc_taichi.sizing import Sizing, released_ranges
+from sdc_taichi.sim.drivers import Table
+from sdc_taichi.sim.fleet import Fleet, build_fleet
+from sdc_taichi.sim.hall_solver import Hall, Precision
+from sdc_taichi.sim.sizing import Sizing, released_ranges
 from sdc_taichi.types import F32, F64, I64, StepResult
 
 CI_STEPS = 8

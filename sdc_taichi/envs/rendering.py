@@ -14,7 +14,7 @@ import numpy.typing as npt
 from sdc_taichi.config import HallConfig
 from sdc_taichi.envs.core import Core
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.layout import floor_plan, row_distance_m
+from sdc_taichi.hall.floor_plan import floor_plan, row_distance_m
 
 Image = npt.NDArray[np.uint8]
 

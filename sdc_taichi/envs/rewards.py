@@ -298,7 +298,7 @@ class Rewards:
     def _weighed(self, result: StepResult) -> dict[str, F64]:
         """Rewards by learning agent, of all of them by ``joint``, and ``peak_kw``, (B,)."""
         if self._stage is None:
-            from sdc_taichi.kernels.stage import CompiledStage
+            from sdc_taichi.kernels.compiler.stage import CompiledStage
 
             reads = _Reads()
             for name in self.weighed:

@@ -16,7 +16,7 @@ from sdc_taichi.envs.parallel import core_of_one
 from sdc_taichi.envs.recording import Recording
 from sdc_taichi.envs.standards import OneDataCenter, first, floats, start_day, start_days
 from sdc_taichi.errors import ConfigError, SdcError
-from sdc_taichi.hall import Precision
+from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F32, F64
 
 

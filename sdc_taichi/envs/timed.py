@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.drivers import Table
+from sdc_taichi.sim.drivers import Table
 from sdc_taichi.types import F32, I64
 
 TABLE_BYTES = 2**28

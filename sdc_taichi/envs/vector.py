@@ -17,7 +17,7 @@ from sdc_taichi.envs.recording import RecordedCore, Recording
 from sdc_taichi.envs.single import learner, one_agent, options_for
 from sdc_taichi.envs.standards import ManyDataCenters, start_day, start_days
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.hall import Precision
+from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F32, F64
 
 Flags = npt.NDArray[np.bool_]

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sdc_taichi import runtime
+from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.types import F64
 
 TASKS_PER_STEP = 100.0
@@ -226,7 +226,7 @@ class Queue:
 
     def _prepare(self) -> None:
         """What needs Taichi."""
-        from sdc_taichi.kernels import backend
+        from sdc_taichi.kernels.compiler import backend
         from sdc_taichi.kernels.queue import SERIAL_UP_TO, queue_kernel
 
         runtime.ensure_started()

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
+from ..elementary import log_and_exp
 from .backend import (
     F64_LANES,
     SLICE,
@@ -31,7 +32,6 @@ from .backend import (
     ti,
     vector_rows,
 )
-from .elementary import log_and_exp
 
 Arrays = Mapping[str, Any]
 

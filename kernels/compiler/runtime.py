@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 
 from sdc_taichi.errors import ConfigError, RuntimeStateError
-from sdc_taichi.kernels import collector
+from sdc_taichi.kernels.compiler import collector
 
 _forked = False
 _starting = threading.Lock()
@@ -50,8 +50,8 @@ def ensure_started() -> int:
         )
     if _known[0] is None:
         with collector.paused():
-            import_module("sdc_taichi.kernels.backend")
-    from sdc_taichi.kernels.backend import ti
+            import_module("sdc_taichi.kernels.compiler.backend")
+    from sdc_taichi.kernels.compiler.backend import ti
 
     if _known[0] is None or _known[0] is not ti.lang.impl.get_runtime().prog:
         with _starting:
@@ -64,7 +64,7 @@ def ensure_started() -> int:
 
 
 def _start() -> None:
-    from sdc_taichi.kernels import backend
+    from sdc_taichi.kernels.compiler import backend
 
     before = _thread_ids()
     backend.start(_thread_limit() or int(min(len(_processors()), granted())))

@@ -11,15 +11,15 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from sdc_taichi.airflow_grid import DEFAULT_CELL_M
-from sdc_taichi.command_options import Overrides, Source, read_config
+from sdc_taichi.cli.arguments import Overrides, Source, read_config
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M
 from sdc_taichi.types import F64
 from sdc_taichi.whole_file import check_new_file, whole_file
 
 if TYPE_CHECKING:
-    from sdc_taichi.airflow import LayoutSolution
+    from sdc_taichi.layout_solver.solve import LayoutSolution
 
 hall_app = typer.Typer(help="Describe a hall, solve its air.", no_args_is_help=True)
 
@@ -36,7 +36,7 @@ def show_hall(
     as_json: Annotated[bool, typer.Option("--json", help="Print the description as JSON.")] = False,
 ) -> None:
     """Describe a hall: its measures, CRAC units, and racks at the design point."""
-    from sdc_taichi.hall_description import show
+    from sdc_taichi.sim.design_hall import show
 
     config, _ = read_config(source, overrides)
     typer.echo(show(config, out, force=force, as_json=as_json))
@@ -78,8 +78,8 @@ def solve_hall(
 
 
 def _solve(config: DataCenterConfig, cell_m: float) -> LayoutSolution:
-    from sdc_taichi.airflow import solve
-    from sdc_taichi.recirculation import design_point
+    from sdc_taichi.hall.recirculation import design_point
+    from sdc_taichi.layout_solver.solve import solve
 
     outlets = config.servers.outlet_model
     if outlets != "server":

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.fleet import Fleet
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, StepResult
 
 HOT_INLET_C = 27.0

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.layout import Plan, floor_plan
+from sdc_taichi.hall.floor_plan import Plan, floor_plan
 from sdc_taichi.types import F64, I32
 
 MOST_CELLS = 4_000_000

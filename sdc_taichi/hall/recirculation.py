@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig, HallConfig
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.layout import floor_plan, row_distance_m
+from sdc_taichi.hall.floor_plan import floor_plan, row_distance_m
 from sdc_taichi.types import F64, I32
 
 DENSE_RACKS = 64

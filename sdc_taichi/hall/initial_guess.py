@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.recirculation import DENSE_RACKS, RackServers, Recirculation
+from sdc_taichi.hall.recirculation import DENSE_RACKS, RackServers, Recirculation
 from sdc_taichi.types import F64, I32
 
 LOADS = np.linspace(0.0, 1.0, 65)

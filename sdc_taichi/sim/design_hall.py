@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from sdc_taichi import air_metrics
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.fleet import Fleet, build_fleet
-from sdc_taichi.hall import Conditions, Hall, HallSums
-from sdc_taichi.layout import Plan, floor_plan, unit_places_m
-from sdc_taichi.recirculation import Exchange
+from sdc_taichi.hall import air_metrics
+from sdc_taichi.hall.floor_plan import Plan, floor_plan, unit_places_m
+from sdc_taichi.hall.recirculation import Exchange
+from sdc_taichi.sim.fleet import Fleet, build_fleet
+from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
 from sdc_taichi.types import F64
 from sdc_taichi.whole_file import check_new_file, whole_file
 

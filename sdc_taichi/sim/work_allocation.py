@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.air_metrics import allowable_c
 from sdc_taichi.errors import SdcError
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.placement import layout, place
-from sdc_taichi.plant import protection
-from sdc_taichi.plant.protection import TRIPPED
+from sdc_taichi.hall import protection
+from sdc_taichi.hall.air_metrics import allowable_c
+from sdc_taichi.hall.placement import layout, place
+from sdc_taichi.hall.protection import TRIPPED
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, Reals, Status
 
 

@@ -19,9 +19,9 @@ from sdc_taichi.config import (
     with_values,
 )
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.hall_start import Start, find_start
-from sdc_taichi.layout import floor_plan, unit_shares
-from sdc_taichi.recirculation import (
+from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
+from sdc_taichi.hall.initial_guess import Start, find_start
+from sdc_taichi.hall.recirculation import (
     Recirculation,
     calibrate,
     design_point,

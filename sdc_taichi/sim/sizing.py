@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.fleet import Fleet
-from sdc_taichi.hall import Conditions, Hall, HallSums
 from sdc_taichi.plant import chiller, tower
 from sdc_taichi.plant.air import hydraulic_pump_w
 from sdc_taichi.plant.water_side import Design
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
 from sdc_taichi.types import F64
 
 WATER_DENSITY_KG_M3 = 1000.0

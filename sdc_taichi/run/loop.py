@@ -23,13 +23,13 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from sdc_taichi import metrics
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import Controller, viewer
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.events import ActiveEvent
 from sdc_taichi.exogenous.files import sha256
-from sdc_taichi.sim import Simulator
+from sdc_taichi.run import metrics
+from sdc_taichi.sim.events import ActiveEvent
+from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, I64, StepResult
 from sdc_taichi.whole_file import part_of, whole_file, writing
 

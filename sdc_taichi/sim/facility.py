@@ -10,8 +10,7 @@ from typing import cast
 
 import numpy as np
 
-from sdc_taichi import air_metrics
-from sdc_taichi.fleet import Fleet
+from sdc_taichi.hall import air_metrics
 from sdc_taichi.plant import cooling, water_side
 from sdc_taichi.plant.air import crac_fan_w
 from sdc_taichi.plant.battery import BATTERIES, Battery
@@ -19,7 +18,8 @@ from sdc_taichi.plant.carbon import emitted_g
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER
-from sdc_taichi.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k
 from sdc_taichi.types import F64
 
 _UNREAD = cast(F64, None)

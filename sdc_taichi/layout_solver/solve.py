@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 import sdc_taichi
-from sdc_taichi import air_metrics, runtime
-from sdc_taichi.airflow_grid import DEFAULT_CELL_M, LEAST_LEAK, Grid, build_grid
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, SdcError
-from sdc_taichi.recirculation import MOST_MATRIX_RACKS
+from sdc_taichi.hall import air_metrics
+from sdc_taichi.hall.recirculation import MOST_MATRIX_RACKS
+from sdc_taichi.kernels.compiler import runtime
+from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M, LEAST_LEAK, Grid, build_grid
 from sdc_taichi.types import F64
 
 MIXING_M = 0.3

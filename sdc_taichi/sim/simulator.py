@@ -14,18 +14,18 @@ from zipfile import BadZipFile
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi import runtime
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.drivers import Drivers, load_drivers
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
-from sdc_taichi.events import ActiveEvent, Disturbance, schedule
-from sdc_taichi.facility import Facility, Met
-from sdc_taichi.fleet import Fleet, build_fleet
-from sdc_taichi.floor import Floor
-from sdc_taichi.hall import Coil, Conditions, Hall, HallState, HallSums, Precision
+from sdc_taichi.hall.protection import THROTTLED, TRIPPED
+from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.plant import cooling, workload
-from sdc_taichi.plant.protection import THROTTLED, TRIPPED
-from sdc_taichi.sizing import Sizing, size
+from sdc_taichi.sim.drivers import Drivers, load_drivers
+from sdc_taichi.sim.events import ActiveEvent, Disturbance, schedule
+from sdc_taichi.sim.facility import Facility, Met
+from sdc_taichi.sim.fleet import Fleet, build_fleet
+from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums, Precision
+from sdc_taichi.sim.sizing import Sizing, size
+from sdc_taichi.sim.work_allocation import Floor
 from sdc_taichi.types import (
     F64,
     I64,
@@ -715,7 +715,7 @@ class _Stages:
         *,
         calm: bool,
     ) -> None:
-        from sdc_taichi.kernels.stage import CompiledStage
+        from sdc_taichi.kernels.compiler.stage import CompiledStage
 
         models = Facility(fleet, sized, 1.0 / fleet.steps_per_hour, calm=calm)
         self.run_battery = models.run_battery

@@ -16,7 +16,11 @@ import typer
 import typer.core
 
 import sdc_taichi
-from sdc_taichi.command_options import Overrides, Source, read_config
+from sdc_taichi.cli.arguments import Overrides, Source, read_config
+from sdc_taichi.cli.data import data_app
+from sdc_taichi.cli.hall import hall_app
+from sdc_taichi.cli.report import report_command
+from sdc_taichi.cli.view import view_command
 from sdc_taichi.config import (
     DataCenterConfig,
     first_step_day,
@@ -24,17 +28,13 @@ from sdc_taichi.config import (
     load_yaml,
     preset_names,
 )
-from sdc_taichi.data_commands import data_app
 from sdc_taichi.errors import ConfigError, SdcError
-from sdc_taichi.hall_commands import hall_app
-from sdc_taichi.report_commands import report_command
-from sdc_taichi.view_commands import view_command
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sdc_taichi.run import Asked
-    from sdc_taichi.sim import Simulator
+    from sdc_taichi.run.loop import Asked
+    from sdc_taichi.sim.simulator import Simulator
     from sdc_taichi.types import StepResult
     from sdc_taichi.viz.recorder import Recorder
 
@@ -224,9 +224,9 @@ def simulate(
     inputs are synthetic years.
     """
     from sdc_taichi.control import make_controller
-    from sdc_taichi.fleet import build_fleet
-    from sdc_taichi.run import Asked, prepare_folder, record, report_json
-    from sdc_taichi.sim import Simulator
+    from sdc_taichi.run.loop import Asked, prepare_folder, record, report_json
+    from sdc_taichi.sim.fleet import build_fleet
+    from sdc_taichi.sim.simulator import Simulator
 
     base, label = read_config(source, overrides)
     configs = _data_centers(base, site, start, dcs, sample, seed)
@@ -284,8 +284,8 @@ def show_config(source: Source = None, overrides: Overrides = None) -> None:
 @config_app.command("check")
 def check_config(source: Source = None, overrides: Overrides = None) -> None:
     """Check a configuration and the inputs it names, without simulating."""
-    from sdc_taichi.drivers import load_drivers
-    from sdc_taichi.fleet import build_fleet
+    from sdc_taichi.sim.drivers import load_drivers
+    from sdc_taichi.sim.fleet import build_fleet
 
     config, label = read_config(source, overrides)
     fleet = build_fleet(config)
@@ -348,7 +348,7 @@ def _data_centers(
     sample: Path | None,
     seed: int,
 ) -> list[DataCenterConfig]:
-    from sdc_taichi.fleet import make_configs
+    from sdc_taichi.sim.fleet import make_configs
 
     if start is not None:
         try:
@@ -479,7 +479,7 @@ def _recording(recorder: Recorder | None, sim: Simulator, asked: Asked) -> Itera
     if recorder is None:
         yield
         return
-    from sdc_taichi.run import describe
+    from sdc_taichi.run.loop import describe
     from sdc_taichi.viz.streams import RecordingWarning
 
     with warnings.catch_warnings(), recorder:

@@ -9,11 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sdc_taichi import runtime
 from sdc_taichi.errors import RuntimeStateError, SdcError
-from sdc_taichi.fleet import Fleet, starts
-from sdc_taichi.hall_start import LOADS
-from sdc_taichi.recirculation import DENSE_RACKS
+from sdc_taichi.hall.initial_guess import LOADS
+from sdc_taichi.hall.recirculation import DENSE_RACKS
+from sdc_taichi.kernels.compiler import runtime
+from sdc_taichi.sim.fleet import Fleet, starts
 from sdc_taichi.types import F64, Reals, ServerLayers
 
 Precision = Literal["f32", "f64"]
@@ -145,7 +145,7 @@ class Hall:
     def __init__(self, fleet: Fleet, precision: Precision) -> None:
         threads = runtime.ensure_started()
         from sdc_taichi.kernels import decay, hall, layers, thermal
-        from sdc_taichi.kernels.backend import BoundKernel, aligned
+        from sdc_taichi.kernels.compiler.backend import BoundKernel, aligned
 
         self._thermal, self._aligned = thermal, aligned
         self._precision: Precision = precision

@@ -1,0 +1,49 @@
+"""The configuration of a data center: its schema, and how files and overrides become one.
+
+What may be given, in which bounds, and the errors about it live here.
+Nothing here computes a hall or a plant, and no other module validates a configuration.
+"""
+
+from sdc_taichi.config.schema import (
+    MONTH_DAYS,
+    DataCenterConfig,
+    EventKind,
+    EventsConfig,
+    HallConfig,
+    LayoutConfig,
+    SampledEvent,
+    ScheduledEvent,
+    airflow_limits,
+    apply_overrides,
+    config_from_dict,
+    cpu_coefficients,
+    explain,
+    fan_coefficients,
+    first_step_day,
+    load_config,
+    load_yaml,
+    preset_names,
+    with_values,
+)
+
+__all__ = [
+    "MONTH_DAYS",
+    "DataCenterConfig",
+    "EventKind",
+    "EventsConfig",
+    "HallConfig",
+    "LayoutConfig",
+    "SampledEvent",
+    "ScheduledEvent",
+    "airflow_limits",
+    "apply_overrides",
+    "config_from_dict",
+    "cpu_coefficients",
+    "explain",
+    "fan_coefficients",
+    "first_step_day",
+    "load_config",
+    "load_yaml",
+    "preset_names",
+    "with_values",
+]
