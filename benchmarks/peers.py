@@ -47,7 +47,7 @@ class Arguments:
         self.sums = np.zeros((fleet.size, 3))
         self.racks = np.zeros((fleet.racks, 6), np.float32)
         self.listed: tuple[Any, ...] = (
-            *(fleet.rack_start, fleet.rack_dc, fleet.group_start, fleet.server_start),
+            *(fleet.rack_offsets, fleet.rack_dc, fleet.group_offsets, fleet.server_offsets),
             *(
                 np.ascontiguousarray(a, np.float32)
                 for a in (
@@ -110,10 +110,10 @@ def numba_step(given: Arguments, threads: int) -> Step:
 
     @numba.njit(parallel=True, fastmath=True)  # type: ignore[untyped-decorator]
     def step(
-        rack_start: Any,
+        rack_offsets: Any,
         rack_dc: Any,
-        group_start: Any,
-        server_start: Any,
+        group_offsets: Any,
+        server_offsets: Any,
         groups: Any,
         dcs: Any,
         approach_k: Any,
@@ -136,7 +136,7 @@ def numba_step(given: Arguments, threads: int) -> Step:
             cpu, fan, flow, inlet, outlet = zero, zero, zero, zero, zero
             hottest = np.float32(-1e30)
             if each_its_own:
-                for g in range(group_start[r], group_start[r + 1]):
+                for g in range(group_offsets[r], group_offsets[r + 1]):
                     t = air_c + groups[3, g]
                     load = u + groups[4, g] * spread
                     cpu_w, fan_w, m3s, out_c = operate(dc, t, load, groups[1, g], groups[2, g])
@@ -150,14 +150,14 @@ def numba_step(given: Arguments, threads: int) -> Step:
                     outlet += m3s * out_c
                     hottest = max(hottest, t)
             else:
-                for g in range(group_start[r], group_start[r + 1]):
+                for g in range(group_offsets[r], group_offsets[r + 1]):
                     t = air_c + groups[3, g]
                     load = u + groups[4, g] * spread
                     cpu_w, fan_w, m3s, out_c = operate(dc, t, load, groups[1, g], groups[2, g])
                     drawn_w = cpu_w + fan_w
-                    inlet_c[server_start[g] : server_start[g + 1]] = t
-                    outlet_c[server_start[g] : server_start[g + 1]] = out_c
-                    power_w[server_start[g] : server_start[g + 1]] = drawn_w
+                    inlet_c[server_offsets[g] : server_offsets[g + 1]] = t
+                    outlet_c[server_offsets[g] : server_offsets[g + 1]] = out_c
+                    power_w[server_offsets[g] : server_offsets[g + 1]] = drawn_w
                     count = groups[0, g]
                     cpu += count * cpu_w
                     fan += count * fan_w
@@ -165,7 +165,7 @@ def numba_step(given: Arguments, threads: int) -> Step:
                     inlet += count * t
                     outlet += count * m3s * out_c
                     hottest = max(hottest, t)
-            servers = server_start[group_start[r + 1]] - server_start[group_start[r]]
+            servers = server_offsets[group_offsets[r + 1]] - server_offsets[group_offsets[r]]
             racks[r, 0] = cpu
             racks[r, 1] = fan
             racks[r, 2] = flow
@@ -175,7 +175,7 @@ def numba_step(given: Arguments, threads: int) -> Step:
         for d in prange(len(sums)):
             for what in range(3):
                 total = 0.0
-                for r in range(rack_start[d], rack_start[d + 1]):
+                for r in range(rack_offsets[d], rack_offsets[d + 1]):
                     total += racks[r, what]
                 sums[d, what] = total
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import sdc_taichi
 from sdc_taichi.control import make_controller
-from sdc_taichi.run.loop import Asked, describe, record
+from sdc_taichi.run.loop import RunRequest, describe, record
 from sdc_taichi.viz.recorder import Recorder
 
 MONTH_STEPS = 31 * 96
@@ -52,7 +52,7 @@ def simulator(name: str) -> sdc_taichi.Simulator:
 
 def run_s(sim: sdc_taichi.Simulator, steps: int, folder: Path, recorded: bool) -> float:
     """Wall time of a run with its files, s."""
-    asked = Asked("idle", steps)
+    asked = RunRequest("idle", steps)
     controller = make_controller("idle", sim.fleet)
     begin = time.perf_counter()
     if recorded:

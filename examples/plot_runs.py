@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from sdc_taichi import Simulator, load_config
 from sdc_taichi.control import make_controller
 from sdc_taichi.exogenous.synthetic import synthetic_sites, synthetic_traces
-from sdc_taichi.run.loop import Asked, record
+from sdc_taichi.run.loop import RunRequest, record
 from sdc_taichi.viz import dashboards, data_figures, fleet_figures
 from sdc_taichi.viz.animation import write_animation
 from sdc_taichi.viz.figures import DPI, webp
@@ -53,7 +53,7 @@ def recorded_run(out: Path, controller: str, days: int, values: list[str]) -> di
     with Simulator(load_config("corrected", ["site.location=NY", *values])) as sim:
         steps = days * 24 * sim.fleet.steps_per_hour
         driver = make_controller(controller, sim.fleet)
-        written = record(sim, driver, Asked(controller, steps), out)
+        written = record(sim, driver, RunRequest(controller, steps), out)
     if written is None:
         raise RuntimeError("the run has no steps")
     return written

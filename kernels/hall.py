@@ -106,7 +106,7 @@ def compute_groups(
     inlets: ti.template(),
 ):
     """Groups of a block, to the sums of their racks; return the heat that servers store."""
-    block, stored_w = hall.blocks[block_at], hall.zeros
+    block, thermal_storage_w = hall.blocks[block_at], hall.zeros
     z, n_groups, table, place = 0, block.groups, block.table, block.place
     while z < n_groups:
         group = hall.groups[table + z]
@@ -114,15 +114,15 @@ def compute_groups(
         inlet_c, draws_w, speed, fan_power = of_group(hall, servers, racks, air, group, z)
         if ti.static(hall.transient):
             change_k = warm(hall, warming, racks, place + z, inlet_c, draws_w, speed)
-            stored_w += count * change_k
+            thermal_storage_w += count * change_k
             if now.ends:
                 hand_over(hall, block_at, z, count, hall.server_c[place + z])
         add_group(hall, sums, group, count, inlet_c, draws_w, speed, fan_power)
         add_inlet(hall, inlets, inlet_c)
         z += hall.step
     if ti.static(hall.transient):
-        stored_w *= warming.w_per_k
-    return stored_w
+        thermal_storage_w *= warming.w_per_k
+    return thermal_storage_w
 
 
 @func
@@ -152,12 +152,14 @@ def compute_block(
     air = air_before(hall, n, block_at, mixed_c, SUPPLY.fresh_ratio)
     racks = racks_of(hall, servers, block_at)
     sums, inlets = no_groups(hall), no_inlets(hall)
-    stored_w = compute_groups(hall, block_at, now, servers, warming, racks, air, sums, inlets)
+    thermal_storage_w = compute_groups(
+        hall, block_at, now, servers, warming, racks, air, sums, inlets
+    )
     fresh_m3s = complete(hall, sums, racks, air)
     flow_m3s, mean_c = sums.flow_m3s, sums.inlet_c
 
     # The exact mean: heat stored plus heat removed is heat generated.
-    heat_w = sums.cpu_w + sums.fan_w - stored_w
+    heat_w = sums.cpu_w + sums.fan_w - thermal_storage_w
     outlet_m3k_s = sums.inlet_m3k_s + heat_w * servers.per_air
     per_flow = hall.real(1.0) / larger(flow_m3s, hall.zeros + hall.real(1e-30))
     outlet_c = outlet_m3k_s * per_flow
@@ -183,7 +185,7 @@ def compute_block(
     terms.flow_m3s = terms.flow_m3s + flow_m3s
     add_degrees(hall, block_at, terms_at, racks, air, inlets)
     if ti.static(hall.transient):
-        terms.stored_w = terms.stored_w + (stored_w + parcel_w)
+        terms.thermal_storage_w = terms.thermal_storage_w + (thermal_storage_w + parcel_w)
     else:
         terms.given_c = terms.given_c + outlet_c
 
@@ -259,15 +261,15 @@ def add_degrees(
         is_any |= ti.cast(beyond_k[i] > hall.real(0.0), ti.i32)
     if is_any != 0:
         block, terms = hall.blocks[block_at], hall.terms[terms_at]
-        hot_k, cold_k, z, table = hall.zeros, hall.zeros, 0, block.table
+        over_27_sum_k, under_18_sum_k, z, table = hall.zeros, hall.zeros, 0, block.table
         while z < block.groups:
             group = hall.groups[table + z]
             inlet_c = inlet_of(hall, air, group)
-            hot_k += group.count * larger(inlet_c - high_c, hall.zeros)
-            cold_k += group.count * larger(low_c - inlet_c, hall.zeros)
+            over_27_sum_k += group.count * larger(inlet_c - high_c, hall.zeros)
+            under_18_sum_k += group.count * larger(low_c - inlet_c, hall.zeros)
             z += hall.step
-        terms.hot_k = terms.hot_k + hot_k
-        terms.cold_k = terms.cold_k + cold_k
+        terms.over_27_sum_k = terms.over_27_sum_k + over_27_sum_k
+        terms.under_18_sum_k = terms.under_18_sum_k + under_18_sum_k
 
 
 @func
@@ -459,9 +461,9 @@ def keep_results(hall: ti.template(), n):
     dc.outlet_mean_c = total.outlet_c / n_racks
     dc.inlet_m3k_s = total.inlet_m3k_s * hall.weight - supplied_m3k_s
     dc.outlet_m3k_s = total.outlet_m3k_s * hall.weight - supplied_m3k_s
-    dc.hot_k = total.hot_k * hall.weight
-    dc.cold_k = total.cold_k * hall.weight
-    dc.stored_w = total.stored_w * hall.weight
+    dc.over_27_sum_k = total.over_27_sum_k * hall.weight
+    dc.under_18_sum_k = total.under_18_sum_k * hall.weight
+    dc.thermal_storage_w = total.thermal_storage_w * hall.weight
     block_at = ti.cast(total.hottest_block, ti.i32)
     zone = ti.cast(total.hottest_zone, ti.i32)
     lane = ti.cast(total.hottest_lane, ti.i32)

@@ -184,7 +184,7 @@ class StepResult:
     """Rack with the hottest inlet, counted from 0 in its data center."""
     hottest_server: F64
     """Server with the hottest inlet, counted from the floor of its rack."""
-    hot_k: F64
+    over_27_mean_k: F64
     """Mean over the servers of what their inlets exceed 27 C by; times hours, degree-hours."""
     shi: F64
     """Supply heat index, 0 when all inlets get supply air; see ``air_metrics``."""
@@ -220,7 +220,7 @@ class StepResult:
     """Heat that the tower gives to the outside."""
     room_heat_kwh: F64
     """As in ``State``, at the end of the step."""
-    stored_w: F64
+    thermal_storage_w: F64
     """Heat that went into servers and recirculated air (transient)."""
     chiller_w: F64
     tower_fan_w: F64

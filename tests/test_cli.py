@@ -32,7 +32,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.cli.app import app
 from sdc_taichi.control import View, make_controller
-from sdc_taichi.run.loop import Asked, record, run, step_times
+from sdc_taichi.run.loop import RunRequest, record, run, step_times
 
 PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli.app import main; main()")
 HEAVY = {"taichi", "pandas", "pyarrow", "psychrolib", "matplotlib", "rerun"}
@@ -116,7 +116,7 @@ def test_metrics_are_those_of_the_recorded_steps(two_sites: Path) -> None:
             "hottest_rack": 1,
             "hottest_row": 0,
             "hottest_server": 2,
-            "over_27_degree_h": total["hot_k"] * h,
+            "over_27_degree_h": total["over_27_mean_k"] * h,
             "shi": rows["shi"].mean(),
             "rhi": 1 - rows["shi"].mean(),
             "rti_pct": rows["rti_pct"].mean(),
@@ -514,7 +514,7 @@ def wait_for(ready: Callable[[], bool], process: subprocess.Popen[str]) -> None:
 def test_stopped_before_the_first_step_writes_nothing(tmp_path: Path) -> None:
     with Simulator(load_config("tiny")) as sim:
         controller = make_controller("idle", sim.fleet)
-        report = record(sim, controller, Asked("idle", 5), tmp_path / "run", stop=lambda: True)
+        report = record(sim, controller, RunRequest("idle", 5), tmp_path / "run", stop=lambda: True)
     assert report is None
     assert names_in(tmp_path / "run") == set()
 
@@ -532,7 +532,7 @@ def test_each_data_center_lists_the_events_that_it_met(tmp_path: Path) -> None:
     ]
     with Simulator(halls) as sim:
         controller = make_controller("idle", sim.fleet)
-        report = record(sim, controller, Asked("idle", 8), tmp_path / "run")
+        report = record(sim, controller, RunRequest("idle", 8), tmp_path / "run")
     assert report is not None
     assert [dc["events"] for dc in report["data_centers"]] == [
         [
@@ -557,7 +557,7 @@ def test_failing_run_leaves_the_former_one_whole(tmp_path: Path) -> None:
     simulate(out)
     before = {p.name: p.read_bytes() for p in out.iterdir()}
     with Simulator(load_config("tiny")) as sim, pytest.raises(RuntimeError, match="broken"):
-        record(sim, Broken(), Asked("broken", 20), out)
+        record(sim, Broken(), RunRequest("broken", 20), out)
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before
 
 

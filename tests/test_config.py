@@ -363,7 +363,7 @@ def test_every_value_of_the_sustaindc_format_arrives(tmp_path: Path) -> None:
     assert hvac.crac.supply_m3s_per_w == 0.00006
     assert hvac.crac.reference_m3s_per_w == 0.00009
     assert hvac.crac.released_fan_w == 140
-    assert (hvac.tower.printed_fan_w, hvac.tower.printed_airflow_m3s) == (900, 2.5)
+    assert (hvac.tower.paper_fan_w, hvac.tower.paper_airflow_m3s) == (900, 2.5)
     assert hvac.pumps.released_chilled_w == pytest.approx(200000 * 0.002 / 0.8)
     assert hvac.pumps.released_condenser_w == pytest.approx(100000 * 0.003 / 0.6)
 

@@ -157,7 +157,7 @@ def by_hand(view: View, dc: int, work: list[list[float]]) -> dict[str, list[floa
     kwh_per_w = 1.0 / per_hour / 1000.0
     hvac_w = float(sizing.facility_w[dc] - sizing.it_w[dc])
     battery_kwh = float(sizing.battery_kwh[dc])
-    units = view.state.setpoint_c[view.fleet.unit_start[dc] : view.fleet.unit_start[dc + 1]]
+    units = view.state.setpoint_c[view.fleet.unit_offsets[dc] : view.fleet.unit_offsets[dc + 1]]
     return {
         "time_of_day": [math.sin(2 * math.pi * hour / 24), math.cos(2 * math.pi * hour / 24)],
         "time_of_year": [math.sin(2 * math.pi * hour / 8760), math.cos(2 * math.pi * hour / 8760)],
@@ -703,7 +703,7 @@ def test_heat_map_shows_each_rack_in_its_place(episode: tuple[Observer, Seen]) -
             assert image[dc].shape == (rows, per_row, 3) == heat_map_space(view.fleet).shape
             for row in range(rows):
                 for place in range(per_row):
-                    rack = int(view.fleet.rack_start[dc]) + row * per_row + place
+                    rack = int(view.fleet.rack_offsets[dc]) + row * per_row + place
                     if view.last is None:
                         raw = [18.0, 18.0, 0.0]
                     else:

@@ -54,7 +54,7 @@ def test_terms_are_what_their_names_say() -> None:
         "fossil_share": -result.grid_kwh * (result.ci_g_per_kwh / FOSSIL_G_PER_KWH) / design_kwh,
         "pue": 1.0 - result.pue,
         "water": -result.water_l / (WATER_L_PER_KWH * design_kwh),
-        "hot_inlets": -result.hot_k,
+        "hot_inlets": -result.over_27_mean_k,
         "dropped": -result.dropped_tasks,
         "sla": -(result.overdue_tasks + result.dropped_tasks + result.lost_tasks) / 100,
     }

@@ -43,8 +43,8 @@ def timeline(
 ) -> Timeline:
     return schedule(
         configs,
-        rack_start=np.cumsum([0, *(racks or (3,) * len(configs))]),
-        unit_start=np.cumsum([0, *(units or (2,) * len(configs))]),
+        rack_offsets=np.cumsum([0, *(racks or (3,) * len(configs))]),
+        unit_offsets=np.cumsum([0, *(units or (2,) * len(configs))]),
         steps_per_hour=steps_per_hour,
         seed=seed,
     )

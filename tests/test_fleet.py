@@ -19,7 +19,7 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.config import apply_overrides, config_from_dict
-from sdc_taichi.hall.initial_guess import Start, find_start
+from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.kernels.thermal import DC_ROWS, GROUP_ROWS
 from sdc_taichi.plant.water_side import Design
 from sdc_taichi.sim.hall_solver import Conditions, Hall
@@ -50,23 +50,23 @@ def test_offsets_of_a_ragged_fleet() -> None:
     fleet = build_fleet(ragged())
     assert fleet.names == ("tiny", "one", "plain")
     assert (fleet.size, fleet.racks, fleet.servers) == (3, 8, 12 + 1 + 18)
-    assert fleet.rack_start.tolist() == [0, 4, 5, 8]
+    assert fleet.rack_offsets.tolist() == [0, 4, 5, 8]
     assert fleet.rack_dc.tolist() == [0, 0, 0, 0, 1, 2, 2, 2]
-    assert fleet.group_start.tolist() == [0, 1, 3, 4, 7, 8, 9, 10, 11]
-    assert np.diff(fleet.server_start).tolist() == [3, 2, 1, 3, 1, 1, 1, 1, 5, 6, 7]
+    assert fleet.group_offsets.tolist() == [0, 1, 3, 4, 7, 8, 9, 10, 11]
+    assert np.diff(fleet.server_offsets).tolist() == [3, 2, 1, 3, 1, 1, 1, 1, 5, 6, 7]
     assert fleet.per_dc_servers().tolist() == [12, 1, 18]
     assert np.bincount(fleet.server_rack()).tolist() == [3, 3, 3, 3, 1, 5, 6, 7]
     assert fleet.approach_k.tolist() == [5.3, 5.0, 4.0, 4.5, 6.0, 1.5, 2.0, 5.0]
     row = dict(zip(GROUP_ROWS, np.concatenate(fleet.group_rows, axis=1), strict=False))
-    assert row["count"].tolist() == np.diff(fleet.server_start).tolist()
+    assert row["count"].tolist() == np.diff(fleet.server_offsets).tolist()
     assert row["full_w"].tolist()[-3:] == [100, 200, 300]
     assert row["idle_w"].tolist()[-3:] == [10, 20, 30]
     assert row["inlet_offset_k"].tolist() == [0, -0.2, 0.4, 0, -0.3, 0, 0.3, 0, 0, 0, 0]
     mean = (2 * 1.2 + 0.6) / 3
     np.testing.assert_allclose(row["load_deviation"][1:3], [1.2 / mean - 1, 0.6 / mean - 1])
-    weighted = np.add.reduceat(row["count"] * row["load_deviation"], fleet.group_start[:-1])
+    weighted = np.add.reduceat(row["count"] * row["load_deviation"], fleet.group_offsets[:-1])
     np.testing.assert_allclose(weighted, 0.0, atol=1e-15)
-    for offsets in (fleet.rack_start, fleet.group_start, fleet.server_start, fleet.rack_dc):
+    for offsets in (fleet.rack_offsets, fleet.group_offsets, fleet.server_offsets, fleet.rack_dc):
         assert offsets.dtype == np.int32
 
 
@@ -106,11 +106,11 @@ def test_what_is_no_part_of_a_hall_makes_no_other_hall(monkeypatch: pytest.Monke
     hall = load_config("corrected")
     laid_out = []
 
-    def find(config: DataCenterConfig, *parts: Any) -> Start:
+    def find(config: DataCenterConfig, *parts: Any) -> SteadyStateTable:
         laid_out.append(config.name)
-        return find_start(config, *parts)
+        return initial_guess(config, *parts)
 
-    monkeypatch.setattr("sdc_taichi.sim.fleet.find_start", find)
+    monkeypatch.setattr("sdc_taichi.sim.fleet.initial_guess", find)
     build_fleet(
         [
             named(hall, "first"),

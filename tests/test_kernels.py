@@ -167,7 +167,7 @@ def test_server_layers_are_the_values_of_their_group(precision: Precision, seed:
     configs, supply_c, load = random_fleet(seed)
     fleet = build_fleet(configs)
     sums, servers = solve_servers(configs, supply_c, load, precision)
-    first, counts = fleet.server_start[:-1], np.diff(fleet.server_start)
+    first, counts = fleet.server_offsets[:-1], np.diff(fleet.server_offsets)
     for values in servers.values():
         assert values.shape == (fleet.servers,)
         assert values.dtype == np.dtype(np.float32 if precision == "f32" else np.float64)
@@ -179,7 +179,9 @@ def test_server_layers_are_the_values_of_their_group(precision: Precision, seed:
         (sums.rack_inlet_c * np.bincount(rack_of), servers["inlet_c"]),
     ):
         assert_close(total, np.bincount(rack_of, layer, fleet.racks), rel, "sum per rack")
-    hottest = np.maximum.reduceat(servers["inlet_c"], fleet.server_start[fleet.group_start[:-1]])
+    hottest = np.maximum.reduceat(
+        servers["inlet_c"], fleet.server_offsets[fleet.group_offsets[:-1]]
+    )
     assert np.array_equal(sums.rack_inlet_max_c, hottest)
 
 
@@ -192,7 +194,7 @@ def test_data_centers_are_the_sums_and_means_of_their_racks(
     configs, supply_c, load = random_fleet(seed)
     fleet = build_fleet(configs)
     sums = solve(configs, supply_c, load, precision)
-    racks = np.diff(fleet.rack_start)
+    racks = np.diff(fleet.rack_offsets)
 
     def total(name: str) -> F64:
         rack_values = getattr(sums, f"rack_{name}").astype(np.float64)
@@ -202,7 +204,7 @@ def test_data_centers_are_the_sums_and_means_of_their_racks(
         assert_close(getattr(sums, name), total(name), 1e-14, name)
     assert_close(sums.inlet_mean_c, total("inlet_c") / racks, 1e-14, "inlet")
     assert_close(sums.outlet_mean_c, total("outlet_c") / racks, 1e-14, "outlet")
-    hottest = np.maximum.reduceat(sums.rack_inlet_max_c, fleet.rack_start[:-1])
+    hottest = np.maximum.reduceat(sums.rack_inlet_max_c, fleet.rack_offsets[:-1])
     assert np.array_equal(sums.inlet_max_c, hottest.astype(np.float64))
 
 
@@ -246,7 +248,7 @@ def part_of(sums: HallSums, configs: list[DataCenterConfig], index: int) -> Hall
     """The sums of one data center of a fleet."""
     fleet = build_fleet(configs)
     whole = np.arange(fleet.size + 1)
-    start: dict[str, Any] = {"rack": fleet.rack_start, "unit": fleet.unit_start}
+    start: dict[str, Any] = {"rack": fleet.rack_offsets, "unit": fleet.unit_offsets}
     found = {}
     for f in fields(sums):
         kind = f.name.split("_")[0]
@@ -276,7 +278,7 @@ def test_servers_of_a_batch_equal_themselves_alone(precision: Precision) -> None
     fleet = build_fleet(configs)
     assert fleet.size > 3
     _, servers = solve_servers(configs, supply_c, load, precision)
-    start = fleet.server_start[fleet.group_start[fleet.rack_start]]
+    start = fleet.server_offsets[fleet.group_offsets[fleet.rack_offsets]]
     for i, config in enumerate(configs):
         _, own = solve_servers([config], supply_c[i : i + 1], load[i : i + 1], precision)
         for name, values in servers.items():
@@ -438,8 +440,8 @@ def test_degrees_beyond_the_recommended_range_are_those_of_the_servers(
     sums = hall.solve(Conditions(np.array([supply_c]), np.array([0.5])))
     inlet_c = hall.servers().inlet_c
     for found, beyond_k, is_any in (
-        (sums.hot_k, inlet_c - 27.0, any_hot),
-        (sums.cold_k, 18.0 - inlet_c, any_cold),
+        (sums.over_27_sum_k, inlet_c - 27.0, any_hot),
+        (sums.under_18_sum_k, 18.0 - inlet_c, any_cold),
     ):
         assert (found[0] > 0.0) == is_any
         np.testing.assert_allclose(found[0], np.maximum(beyond_k, 0.0).sum(), rtol=1e-12)
@@ -532,7 +534,7 @@ def test_layers_of_any_layout_agree_with_the_twin(
     hall = Hall(fleet, precision)
     hall.solve(Conditions(supply_c[fleet.unit_dc], load))
     layers = hall.servers()
-    first, counts = fleet.server_start[:-1], np.diff(fleet.server_start)
+    first, counts = fleet.server_offsets[:-1], np.diff(fleet.server_offsets)
     for name, expected in reference_twin.evaluate(configs, supply_c, load).servers.items():
         found = getattr(layers, name)
         assert_close(found, expected, TOLERANCE[precision], name)

@@ -72,9 +72,9 @@ def flow_balance(sim: Simulator, twins: list[reference_twin.HallTwin], result: S
     no rack takes back and supply air that passes them by, against supply air.
     """
     fleet, layers, out = sim.fleet, sim.servers(), np.empty(sim.size)
-    first = fleet.server_start[fleet.group_start[fleet.rack_start]]
+    first = fleet.server_offsets[fleet.group_offsets[fleet.rack_offsets]]
     for i, twin in enumerate(twins):
-        servers, racks = slice(first[i], first[i + 1]), slice(*fleet.rack_start[i : i + 2])
+        servers, racks = slice(first[i], first[i + 1]), slice(*fleet.rack_offsets[i : i + 2])
         inlet_c, outlet_c, power_w = (
             np.asarray(getattr(layers, name)[servers], dtype=np.float64)
             for name in ("inlet_c", "outlet_c", "power_w")
@@ -116,7 +116,7 @@ def record(
             "queue_tasks": state.queue[:, -1],
         }
         fleet = sim.fleet
-        first = fleet.rack_start[:-1]
+        first = fleet.rack_offsets[:-1]
         v = fleet.values
         air = (v("hall.air_density_kg_m3") * v("hall.air_heat_capacity_j_per_kg_k"))[fleet.rack_dc]
         for t in range(steps):
@@ -256,7 +256,7 @@ LEDGERS: dict[str, Ledger] = {
     "heat": lambda r: [
         r.kwh("it_w"),
         r.kwh("crac_fan_w"),
-        -r.kwh("stored_w"),
+        -r.kwh("thermal_storage_w"),
         -r.kwh("heat_removed_w"),
         r.before("room_heat_kwh"),
         -r["room_heat_kwh"],
@@ -267,7 +267,7 @@ LEDGERS: dict[str, Ledger] = {
         -r["unmet_w"],
         r["recovered_w"],
     ],
-    "coils": lambda r: [r["cooling_load_w"], -r["it_w"], -r["crac_fan_w"], r["stored_w"]],
+    "coils": lambda r: [r["cooling_load_w"], -r["it_w"], -r["crac_fan_w"], r["thermal_storage_w"]],
     "server air": lambda r: [r["it_w"], -r["racks_air_w"]],
     "room air": lambda r: [
         r["it_w"],
@@ -383,14 +383,14 @@ def test_ledger_closes_on_every_step_of_the_transient_year(
 @pytest.mark.slow
 def test_sums_of_the_transient_year_close(transient_year: tuple[Precision, Run]) -> None:
     precision, run = transient_year
-    assert np.all(run["stored_w"].min(axis=0) < -1e4)
-    assert np.all(run["stored_w"].max(axis=0) > 1e4)
+    assert np.all(run["thermal_storage_w"].min(axis=0) < -1e4)
+    assert np.all(run["thermal_storage_w"].max(axis=0) > 1e4)
     generated = run.kwh("it_w").sum(axis=0) + run.kwh("crac_fan_w").sum(axis=0)
     removed = run.kwh("heat_removed_w").sum(axis=0)
-    kept = run["room_heat_kwh"][-1] + run.kwh("stored_w").sum(axis=0)
+    kept = run["room_heat_kwh"][-1] + run.kwh("thermal_storage_w").sum(axis=0)
     assert np.max(np.abs(generated - removed - kept) / generated) <= TOLERANCE[precision]
     # What servers and air have gained in a month is little against what has passed them.
-    assert np.all(np.abs(run.kwh("stored_w").sum(axis=0)) < 1e-3 * generated)
+    assert np.all(np.abs(run.kwh("thermal_storage_w").sum(axis=0)) < 1e-3 * generated)
 
 
 @pytest.mark.parametrize("name", LEDGERS)
@@ -404,7 +404,7 @@ def test_ledger_closes_when_the_plant_is_too_small(
 @pytest.mark.parametrize("name", LEDGERS)
 def test_ledger_closes_through_failures(name: str, trouble: tuple[Precision, Run]) -> None:
     precision, run = trouble
-    if name in TRANSIENT_LEDGERS or not np.any(run["stored_w"]):
+    if name in TRANSIENT_LEDGERS or not np.any(run["thermal_storage_w"]):
         # Rounding in halls without power is rounding of what they do with it.
         assert_closes(name, run, TOLERANCE[precision], floor=1e-3)
 

@@ -156,13 +156,13 @@ def parts(configs: list[DataCenterConfig], met: Conditions) -> list[Part]:
     """Every data center of a fleet, for the twin."""
     fleet, out = build_fleet(configs), []
     for i, config in enumerate(configs):
-        racks = slice(*fleet.rack_start[i : i + 2])
-        groups = slice(fleet.group_start[racks.start], fleet.group_start[racks.stop])
-        servers = slice(fleet.server_start[groups.start], fleet.server_start[groups.stop])
-        units = slice(*fleet.unit_start[i : i + 2])
+        racks = slice(*fleet.rack_offsets[i : i + 2])
+        groups = slice(fleet.group_offsets[racks.start], fleet.group_offsets[racks.stop])
+        servers = slice(fleet.server_offsets[groups.start], fleet.server_offsets[groups.stop])
+        units = slice(*fleet.unit_offsets[i : i + 2])
         twin = reference_twin.calibrated(config)
         if met.group_load is not None:
-            counts = np.diff(fleet.server_start)[groups]
+            counts = np.diff(fleet.server_offsets)[groups]
             load = np.repeat(met.group_load[groups], counts)
         elif met.rack_load is not None:
             load = twin.load(met.rack_load[racks])
@@ -210,7 +210,7 @@ def assert_agrees(configs: list[DataCenterConfig], met: Conditions, precision: P
         for field, expected in twin.dcs.items():
             where = part.units if field.startswith("unit_") else slice(i, i + 1)
             # Sums over what exceeds a limit inherit the absolute error of each inlet.
-            scale = float(len(part.load)) if field in ("hot_k", "cold_k") else 0.0
+            scale = float(len(part.load)) if field in ("over_27_sum_k", "under_18_sum_k") else 0.0
             assert_close(getattr(sums, field)[where], expected, rel, (name, field), scale)
         for field, expected in twin.racks.items():
             found = getattr(sums, f"rack_{field}")[part.racks]
@@ -221,7 +221,7 @@ def assert_agrees(configs: list[DataCenterConfig], met: Conditions, precision: P
         hottest = layers.inlet_c[part.servers].max()
         fleet = build_fleet(configs)
         rack = part.racks.start + int(sums.hottest_rack[i])
-        server = fleet.server_start[fleet.group_start[rack]] + int(sums.hottest_server[i])
+        server = fleet.server_offsets[fleet.group_offsets[rack]] + int(sums.hottest_server[i])
         assert layers.inlet_c[server] == hottest == sums.inlet_max_c[i]
 
 
@@ -923,8 +923,8 @@ def test_servers_agree_with_their_racks_and_get_warmer_upwards(seed: int) -> Non
 def own_part(values: HallSums, configs: list[DataCenterConfig], index: int) -> dict[str, Any]:
     """What a fleet computed for one of its data centers."""
     fleet = build_fleet(configs)
-    racks = slice(*fleet.rack_start[index : index + 2])
-    units = slice(*fleet.unit_start[index : index + 2])
+    racks = slice(*fleet.rack_offsets[index : index + 2])
+    units = slice(*fleet.unit_offsets[index : index + 2])
     out = {}
     for f in fields(values):
         where = slice(index, index + 1)
@@ -938,15 +938,15 @@ def own_part(values: HallSums, configs: list[DataCenterConfig], index: int) -> d
 
 def own_conditions(met: Conditions, configs: list[DataCenterConfig], index: int) -> Conditions:
     fleet = build_fleet(configs)
-    racks = slice(*fleet.rack_start[index : index + 2])
+    racks = slice(*fleet.rack_offsets[index : index + 2])
     where = {
         "utilisation": slice(index, index + 1),
         "rack_load": racks,
         "powered": racks,
         "rack_airflow": racks,
-        "group_load": slice(fleet.group_start[racks.start], fleet.group_start[racks.stop]),
+        "group_load": slice(fleet.group_offsets[racks.start], fleet.group_offsets[racks.stop]),
     }
-    units = slice(*fleet.unit_start[index : index + 2])
+    units = slice(*fleet.unit_offsets[index : index + 2])
     own: dict[str, Any] = {
         f.name: None if (v := getattr(met, f.name)) is None else v[where.get(f.name, units)]
         for f in fields(met)

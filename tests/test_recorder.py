@@ -32,7 +32,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.control import View
 from sdc_taichi.plant.workload import age_histogram
-from sdc_taichi.run.loop import Asked, describe, record
+from sdc_taichi.run.loop import RunRequest, describe, record
 from sdc_taichi.types import F64, ServerLayers
 from sdc_taichi.viz import hall_layers, recorder, recording_reader, recording_series
 from sdc_taichi.viz.recorder import Recorder
@@ -120,7 +120,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     queues: list[F64] = []
     rewards: list[F64] = []
     with Simulator(configs()) as sim:
-        asked = Asked("wild", STEPS)
+        asked = RunRequest("wild", STEPS)
         with (
             pytest.MonkeyPatch.context() as patch,
             Recorder(path, focus=["ny-0", ODD_NAME, "ny-2"], every=2) as rec,
@@ -186,7 +186,7 @@ def test_queue_by_age_adds_up(run: Run) -> None:
 
 
 def test_units_rewards_and_fleet_are_recorded(run: Run) -> None:
-    first = run.sim.fleet.unit_start[1]
+    first = run.sim.fleet.unit_offsets[1]
     air = scalars(run.recorded[f"/dc/{FOCUS[1]}/crac/temperature_c"])
     np.testing.assert_array_equal(air[:, 0], [r.unit_supply_c[first] for r in run.results])
     np.testing.assert_array_equal(air[:, 1], [r.unit_supply_c[first + 1] for r in run.results])
@@ -245,7 +245,7 @@ def test_actions_are_states_that_change(run: Run, dc: int) -> None:
 @pytest.mark.parametrize("dc", FOCUS)
 def test_heat_maps_are_the_racks_to_their_resolution(run: Run, dc: int) -> None:
     fleet = run.sim.fleet
-    hall, racks = fleet.configs[dc].hall, slice(*fleet.rack_start[dc : dc + 2])
+    hall, racks = fleet.configs[dc].hall, slice(*fleet.rack_offsets[dc : dc + 2])
     tiles = hall_layers.tiles(hall)
     scales = {what: hall_layers.temperature_scale(what) for what in hall_layers.LIMITS_C}
     scales["power"] = hall_layers.power_scale(fleet)
@@ -282,8 +282,8 @@ def test_hall_shows_the_hottest_server_of_every_height(run: Run, dc: int) -> Non
         for step, cells in zip(entity["step"], voxels(entity), strict=True):
             values = getattr(run.servers[step], layer)
             expected = []
-            for rack in range(*fleet.rack_start[dc : dc + 2]):
-                first, last = fleet.server_start[fleet.group_start[rack : rack + 2]]
+            for rack in range(*fleet.rack_offsets[dc : dc + 2]):
+                first, last = fleet.server_offsets[fleet.group_offsets[rack : rack + 2]]
                 height = np.arange(12) * ZONES // 12
                 expected += [values[first:last][height == zone].max() for zone in range(ZONES)]
             clipped = np.clip(expected, scale.low, scale.high)
@@ -339,10 +339,12 @@ def test_log_names_racks_that_protect_themselves(run: Run) -> None:
         log = {(step, text[12:]) for step, text in zip(entity["step"], texts(entity), strict=True)}
         before = np.zeros(4, dtype=np.int8)
         for step, result in enumerate(run.results):
-            after = result.rack_status[slice(*fleet.rack_start[dc : dc + 2])]
+            after = result.rack_status[slice(*fleet.rack_offsets[dc : dc + 2])]
             for rack in np.flatnonzero(after != before):
-                first, last = fleet.server_start[
-                    fleet.group_start[fleet.rack_start[dc] + rack : fleet.rack_start[dc] + rack + 2]
+                first, last = fleet.server_offsets[
+                    fleet.group_offsets[
+                        fleet.rack_offsets[dc] + rack : fleet.rack_offsets[dc] + rack + 2
+                    ]
                 ]
                 inlets = run.servers[step].inlet_c[first:last]
                 verb = ("back to normal", "throttled", "tripped")[after[rack]]
@@ -369,7 +371,7 @@ def test_recording_explains_itself(run: Run) -> None:
     from rerun.chunk import RrdReader
 
     (((text,),)) = run.recorded["/summary"]["TextDocument:text"]
-    about = describe(run.sim, Asked("wild", STEPS))
+    about = describe(run.sim, RunRequest("wild", STEPS))
     for expected in (
         ODD_NAME, "site CA", "**synthetic**", "synthetic year, seed 10", "carnot", "wild",
         about["fingerprint"], f"taichi {about['versions']['taichi']}", "inlet 10 to 45 C",

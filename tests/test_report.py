@@ -21,7 +21,7 @@ from report_reader import Page, pictures, read_page
 from sdc_taichi import DataCenterConfig, SdcError, Simulator, load_config, make_configs
 from sdc_taichi.cli.app import app
 from sdc_taichi.control import make_controller
-from sdc_taichi.run.loop import Asked, record
+from sdc_taichi.run.loop import RunRequest, record
 from sdc_taichi.viz import dashboards, fleet_figures, recorded, report
 from sdc_taichi.viz.recorded import read_run, read_steps
 
@@ -50,7 +50,7 @@ def simulate(
 
     with Simulator(configs) as sim:
         driver = make_controller(controller, sim.fleet)
-        written = record(sim, driver, Asked(controller, steps), out, stop=stop)
+        written = record(sim, driver, RunRequest(controller, steps), out, stop=stop)
     assert written is not None
     return written
 

@@ -14,7 +14,7 @@ import pytest
 from report_reader import Page, pictures, read_page
 from sdc_taichi import Simulator, load_config, make_configs
 from sdc_taichi.control import make_controller
-from sdc_taichi.run.loop import Asked, record
+from sdc_taichi.run.loop import RunRequest, record
 from sdc_taichi.viz import figures
 from sdc_taichi.viz.recorded import read_run
 from sdc_taichi.viz.report import write_report
@@ -47,7 +47,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     configs = make_configs(load_config("tiny"), count=2, sites=["NY", "CA"])
     configs[0] = configs[0].model_copy(update={"name": f"<b>&amp;{long}"})
     with Simulator(configs) as sim:
-        record(sim, make_controller("greedy-ci", sim.fleet), Asked("greedy-ci", 60), out)
+        record(sim, make_controller("greedy-ci", sim.fleet), RunRequest("greedy-ci", 60), out)
     return write_report(read_run(out))
 
 

@@ -672,7 +672,9 @@ def test_as_many_threads_as_processors_are_bound_to_one_each() -> None:
 def test_there_are_no_more_threads_than_processors_may_be_used(limit: str) -> None:
     if "affinity" in limit and not hasattr(os, "sched_setaffinity"):
         pytest.skip("the system binds no processes")
-    code = f"from sdc_taichi.kernels.compiler import runtime; {limit}; print(runtime.ensure_started())"
+    code = (
+        f"from sdc_taichi.kernels.compiler import runtime; {limit}; print(runtime.ensure_started())"
+    )
     environment = {k: v for k, v in os.environ.items() if k != "SDC_TAICHI_THREADS"}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, timeout=120, check=True

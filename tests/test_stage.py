@@ -12,7 +12,7 @@ from sdc_taichi import Simulator, drivers_from_arrays, load_config
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.kernels.compiler.stage import COPIED_UP_TO, SERIAL_UP_TO, CompiledStage, _kernel
 from sdc_taichi.plant import workload
-from sdc_taichi.sim.facility import Facility, Met
+from sdc_taichi.sim.facility import Facility, FacilityInputs
 from sdc_taichi.types import F64
 
 N = 37
@@ -155,8 +155,8 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
         "cpu_w": 0.9 * it_w,
         "it_fan_w": 0.1 * it_w,
         "airflow_m3s": sized.it_airflow_m3s * some(0.3, 1.1),
-        "hot_k": some(0.0, 100.0),
-        "cold_k": some(0.0, 100.0),
+        "over_27_sum_k": some(0.0, 100.0),
+        "under_18_sum_k": some(0.0, 100.0),
         "inlet_m3k_s": inlet_m3k_s,
         "outlet_m3k_s": inlet_m3k_s + it_w / 1210.0,
         "supply_c": supply_c,
@@ -215,7 +215,7 @@ def test_facility_as_in_numpy(overrides: list[str] | str, calm: bool) -> None:
     for run, x in ((facility.step, inputs), (facility.removable_w, limits)):
 
         def stage(run: Any = run, **x: F64) -> Any:
-            return run(Met(**x))
+            return run(FacilityInputs(**x))
 
         expected, found = stage(**x), CompiledStage(stage, n)(**x)
         assert list(found) == list(expected)

@@ -75,7 +75,7 @@ def random_state(rng: np.random.Generator, fleet: Fleet, precision: Precision) -
 
 def twin_memory(fleet: Fleet, part: Part, state: HallState, room_j: float) -> reference_twin.Memory:
     assert fleet.air is not None
-    counts = np.diff(fleet.server_start)[part.groups]
+    counts = np.diff(fleet.server_offsets)[part.groups]
     return reference_twin.Memory(
         server_c=np.repeat(np.asarray(state.server_c, np.float64)[part.groups], counts),
         mixed_c=np.asarray(state.mixed_c, np.float64)[part.racks],
@@ -125,7 +125,7 @@ def test_transient_halls_agree_with_the_twin(
             where: Any = slice(i, i + 1)
             if name.startswith(("rack_", "unit_")):
                 where = part.racks if name.startswith("rack_") else part.units
-            scale = through if name in ("stored_w", "coil_load_w", "coil_w") else 0.0
+            scale = through if name in ("thermal_storage_w", "coil_load_w", "coil_w") else 0.0
             np.testing.assert_allclose(
                 getattr(sums, name)[where], expected, rtol=rel, atol=rel * scale + 1e-9,
                 err_msg=f"{configs[i].name} {name}",
@@ -185,7 +185,7 @@ def test_substeps_converge_to_the_differential_equations(low: float) -> None:
     settled = hall.settle(before)
     part = parts([config], after)[0]
     capacity = config.servers.heat_capacity_kj_per_k * 1e3
-    counts = np.diff(fleet.server_start)
+    counts = np.diff(fleet.server_offsets)
     state = np.concatenate([np.repeat(settled.server_c, counts), settled.mixed_c])
     change, _ = rates(parts([config], before)[0], state, supply_c, capacity)
     assert np.max(np.abs(change)) < 1e-9, "the hall was not settled"
@@ -234,10 +234,10 @@ def test_servers_follow_the_exact_exponential_in_any_number_of_substeps(
     on = np.ones(20)
     cpu, _, flow = twin.servers(np.full(4000, 20.0), twin.load(0.8 * on), on, on)
     per_k = config.servers.heat_exchange_effectiveness * twin.air_j_per_m3_k * flow
-    start = np.repeat(np.asarray(settled.server_c, np.float64), np.diff(fleet.server_start))
+    start = np.repeat(np.asarray(settled.server_c, np.float64), np.diff(fleet.server_offsets))
     final = 20.0 + cpu / per_k
     expected = final + (start - final) * np.exp(-900.0 * per_k / 9750.0)
-    found = np.repeat(ends[0], np.diff(fleet.server_start))
+    found = np.repeat(ends[0], np.diff(fleet.server_offsets))
     np.testing.assert_allclose(found, expected, rtol=rel)
     assert np.all((expected > start + 1) & (expected < final - 1))
 
@@ -248,8 +248,8 @@ def test_servers_follow_the_exact_exponential_in_any_number_of_substeps(
 def held_j(fleet: Fleet, state: HallState, room_j: F64) -> F64:
     """Heat in servers, recirculated air and room, from temperatures, (B,)."""
     per_group = fleet.per_group_servers() * np.asarray(state.server_c, np.float64)
-    servers = np.add.reduceat(per_group, fleet.group_start[fleet.rack_start[:-1]])
-    parcels = np.add.reduceat(np.asarray(state.mixed_c, np.float64), fleet.rack_start[:-1])
+    servers = np.add.reduceat(per_group, fleet.group_offsets[fleet.rack_offsets[:-1]])
+    parcels = np.add.reduceat(np.asarray(state.mixed_c, np.float64), fleet.rack_offsets[:-1])
     capacity = fleet.values("servers.heat_capacity_kj_per_k") * 1e3
     twins = [reference_twin.calibrated(c) for c in fleet.configs]
     per_parcel = np.array([t.parcel_j_per_k for t in twins])
@@ -274,7 +274,7 @@ def test_heat_that_comes_in_stays_or_leaves(precision: Precision, seed: int) -> 
         running = np.ones(fleet.units) if met.unit_running is None else met.unit_running
         fans = coil.fan_w_per_m3s[fleet.unit_dc] * fleet.unit_design_m3s * sums.unit_cubed_speed
         assert np.all(fans[running == 0] == 0)
-        generated = sums.cpu_w + sums.fan_w + np.add.reduceat(fans, fleet.unit_start[:-1])
+        generated = sums.cpu_w + sums.fan_w + np.add.reduceat(fans, fleet.unit_offsets[:-1])
         kept = held_j(fleet, state, room_j) - before
         # Against all heat that moves, for some halls are idle.
         moved = np.abs(generated) + np.abs(sums.coil_w) + np.abs(kept) / 900.0
@@ -371,7 +371,7 @@ def test_constant_conditions_end_in_the_quasi_steady_state(precision: Precision,
     for f in fields(HallSums):
         if f.name in ("hottest_rack", "hottest_server", "coil_w", "coil_load_w", "room_j"):
             continue
-        scale = through if f.name == "stored_w" else 1.0
+        scale = through if f.name == "thermal_storage_w" else 1.0
         np.testing.assert_allclose(
             getattr(sums, f.name), getattr(expected, f.name), rtol=rel, atol=30 * rel * scale,
             err_msg=f.name,
@@ -397,7 +397,7 @@ def test_settled_halls_stay_settled(precision: Precision, seed: int) -> None:
     atol = {"f64": 1e-4, "f32": 1e-2}[precision]
     np.testing.assert_allclose(after.server_c, state.server_c, rtol=0, atol=atol)
     np.testing.assert_allclose(after.mixed_c, state.mixed_c, rtol=0, atol=atol)
-    assert np.all(np.abs(sums.stored_w) <= 1e-4 * (sums.cpu_w + sums.fan_w) + 1e-6)
+    assert np.all(np.abs(sums.thermal_storage_w) <= 1e-4 * (sums.cpu_w + sums.fan_w) + 1e-6)
 
 
 def test_a_failed_unit_is_felt_over_steps_and_forgotten_again() -> None:

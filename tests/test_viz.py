@@ -99,7 +99,7 @@ def test_hall_map_shows_the_racks(run: tuple[Simulator, list[StepResult]], dc: i
     axes: Any
     mesh: Any
     for axes, bar, what in zip(maps, bars, ("inlet", "outlet"), strict=True):
-        values = getattr(result, f"rack_{what}_c")[slice(*sim.fleet.rack_start[dc : dc + 2])]
+        values = getattr(result, f"rack_{what}_c")[slice(*sim.fleet.rack_offsets[dc : dc + 2])]
         mesh = axes.collections[0]
         np.testing.assert_array_equal(np.ravel(mesh.get_array()), values.astype(np.float64))
         low, high = mesh.get_clim()

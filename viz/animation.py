@@ -133,7 +133,7 @@ def _temperatures(
     results: Iterable[StepResult], fleet: Fleet, dc: int, what: str
 ) -> tuple[F64, list[datetime]]:
     """Temperatures of the hall's racks in every step, (n, R), and the steps' beginnings."""
-    racks = slice(*fleet.rack_start[dc : dc + 2])
+    racks = slice(*fleet.rack_offsets[dc : dc + 2])
     rows, times = [], []
     for result in results:
         values = result.rack_inlet_c if what == "inlet" else result.rack_outlet_c

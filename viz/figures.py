@@ -318,7 +318,7 @@ def _draw_hall(axes: Axes, what: str, result: StepResult, fleet: Fleet, dc: int)
 
     hall = fleet.configs[dc].hall
     every: Reals = result.rack_inlet_c if what == "inlet" else result.rack_outlet_c
-    grid = np.asarray(every[slice(*fleet.rack_start[dc : dc + 2])], dtype=np.float64)
+    grid = np.asarray(every[slice(*fleet.rack_offsets[dc : dc + 2])], dtype=np.float64)
     grid = grid.reshape(hall.rows, hall.racks_per_row)
     low, high = colour_range(grid)
     image = rack_grid(axes, grid, "inferno", (low, high))

@@ -81,7 +81,7 @@ def failure_maps(
     """
     hall = fleet.configs[dc].hall
     plan = floor_plan(hall)
-    racks, units = slice(*fleet.rack_start[dc : dc + 2]), slice(*fleet.unit_start[dc : dc + 2])
+    racks, units = slice(*fleet.rack_offsets[dc : dc + 2]), slice(*fleet.unit_offsets[dc : dc + 2])
     shown = [_at(results, hour) for hour in hours]
     values = [np.asarray(r.rack_inlet_c[racks], dtype=np.float64) for r in shown]
     limits = float(np.min(values)), float(np.max(values))
@@ -134,14 +134,14 @@ def failure_curves(runs: Mapping[str, Sequence[StepResult]], fleet: Fleet, dc: i
             ("supply_c", BLUE, "supply air"),
         ):
             top.plot(hours, [getattr(r, name)[dc] for r in results], color=colour, label=label)
-        units = slice(*fleet.unit_start[dc : dc + 2])
+        units = slice(*fleet.unit_offsets[dc : dc + 2])
         down = np.array([not np.all(r.unit_running[units]) for r in results])
         for axes in (top, bottom):
             axes.fill_between(
                 hours, 0, 1, where=down, transform=axes.get_xaxis_transform(), color=GREY,
                 alpha=0.15, linewidth=0, step="pre", label="down" if axes is top else None,
             )  # fmt: skip
-        racks = fleet.rack_start[dc + 1] - fleet.rack_start[dc]
+        racks = fleet.rack_offsets[dc + 1] - fleet.rack_offsets[dc]
         for name, colour, label in (
             ("throttled_racks", ORANGE, "racks throttled"),
             ("tripped_racks", RED, "racks tripped"),

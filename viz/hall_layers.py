@@ -184,11 +184,11 @@ def zones_of(fleet: Fleet, dcs: Sequence[int], zones: Sequence[int]) -> Zones:
     starts: list[I64] = []
     earlier = 0
     for dc, heights in zip(dcs, zones, strict=True):
-        racks = np.arange(*fleet.rack_start[dc : dc + 2])
-        first_group, end_group = fleet.group_start[fleet.rack_start[dc : dc + 2]].tolist()
-        of_groups = fleet.server_start[first_group:end_group]
-        first = fleet.server_start[fleet.group_start[racks]].astype(np.int64)
-        count = fleet.server_start[fleet.group_start[racks + 1]] - first
+        racks = np.arange(*fleet.rack_offsets[dc : dc + 2])
+        first_group, end_group = fleet.group_offsets[fleet.rack_offsets[dc : dc + 2]].tolist()
+        of_groups = fleet.server_offsets[first_group:end_group]
+        first = fleet.server_offsets[fleet.group_offsets[racks]].astype(np.int64)
+        count = fleet.server_offsets[fleet.group_offsets[racks + 1]] - first
         # Server j of n stands in zone j * zones // n.
         before = (np.arange(heights) * count[:, None] + heights - 1) // heights
         zone_first = (first[:, None] + before).reshape(-1)

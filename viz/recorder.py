@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.floor_plan import floor_plan
-from sdc_taichi.run.loop import Asked, describe, step_times
+from sdc_taichi.run.loop import RunRequest, describe, step_times
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, StepResult
 
@@ -175,7 +175,7 @@ class Recorder:
         """
         self.close()
         self._episodes += 1
-        described = describe(sim, Asked("", 0)) if about is None else about
+        described = describe(sim, RunRequest("", 0)) if about is None else about
         if about is None:
             described = {k: v for k, v in described.items() if k not in ("controller", "seed")}
         fleet = sim.fleet
@@ -449,7 +449,7 @@ class _Episode:
 
 def _cadence(fleet: Fleet, focus: Sequence[int], every: int | None) -> Cadence:
     """Defaults by the size of the halls in focus."""
-    racks = int(np.diff(fleet.rack_start)[focus].sum())
+    racks = int(np.diff(fleet.rack_offsets)[focus].sum())
     map_every = every or max(1, round(_every_h(racks) * fleet.steps_per_hour))
     per_server = fleet.servers <= SERVER_LAYERS_UP_TO
     most = ZONES if racks <= layers.SMALL_RACKS else LARGE_ZONES
@@ -480,7 +480,7 @@ def _block_steps(
     pixels = sum(math.prod(layers.tiles(hall).image) for hall in halls)
     cells = sum(hall.racks * heights for hall, heights in zip(halls, zones, strict=True))
     if per_server:
-        cells += int(np.diff(fleet.group_start[fleet.rack_start])[focus].sum())
+        cells += int(np.diff(fleet.group_offsets[fleet.rack_offsets])[focus].sum())
     step_bytes: float = 8 * len(FIELDS) * (len(focus) + 2)
     step_bytes += 2 * len(layers.COLOURMAPS) * pixels / map_every
     step_bytes += 4 * len(layers.LIMITS_C) * cells / hall_every
@@ -489,8 +489,8 @@ def _block_steps(
 
 def _fewest_servers(fleet: Fleet, dc: int) -> int:
     """Servers of the smallest rack of a data center."""
-    first, last = fleet.rack_start[dc : dc + 2]
-    return int(np.diff(fleet.server_start[fleet.group_start[first : last + 1]]).min())
+    first, last = fleet.rack_offsets[dc : dc + 2]
+    return int(np.diff(fleet.server_offsets[fleet.group_offsets[first : last + 1]]).min())
 
 
 def _range(units: F64) -> F64:

@@ -263,6 +263,6 @@ def hottest_server(inlet_c: Reals, fleet: Fleet, rack: int) -> tuple[int, float]
         fleet: the fleet.
         rack: counted over the whole fleet.
     """
-    first, last = fleet.group_start[rack : rack + 2]
+    first, last = fleet.group_offsets[rack : rack + 2]
     group = first + int(np.argmax(inlet_c[first:last]))
-    return int(fleet.server_start[group] - fleet.server_start[first]), float(inlet_c[group])
+    return int(fleet.server_offsets[group] - fleet.server_offsets[first]), float(inlet_c[group])

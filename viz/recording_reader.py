@@ -101,13 +101,13 @@ class Reader:
         self._every_focus, _ = end_to_end([slice(dc, dc + 1) for dc in focus])
         self._read = operator.attrgetter(*FIELDS, "unit_supply_c", "unit_flow_m3s")
         self._edges = np.array(AGE_EDGES_H) * fleet.steps_per_hour
-        self._racks = [slice(*fleet.rack_start[dc : dc + 2].tolist()) for dc in focus]
-        self._units = [slice(*fleet.unit_start[dc : dc + 2].tolist()) for dc in focus]
+        self._racks = [slice(*fleet.rack_offsets[dc : dc + 2].tolist()) for dc in focus]
+        self._units = [slice(*fleet.unit_offsets[dc : dc + 2].tolist()) for dc in focus]
         self._every_rack, self.racks = end_to_end(self._racks)
         self._every_unit, self.units = end_to_end(self._units)
         shown = self._racks
         if cadence.per_server:
-            shown = [slice(*fleet.group_start[[r.start, r.stop]].tolist()) for r in self._racks]
+            shown = [slice(*fleet.group_offsets[[r.start, r.stop]].tolist()) for r in self._racks]
             self._zones = layers.zones_of(fleet, focus, cadence.zones)
         self._every_shown, ends = end_to_end(shown)
         cells = [(r.stop - r.start) * n for r, n in zip(self._racks, cadence.zones, strict=True)]

@@ -72,7 +72,7 @@ def data_center_entities(
     if rewards:
         shades = [PALETTE[i % len(PALETTE)] for i in range(len(rewards))]
         yield f"{path}/series/{REWARDS}", _lines([f"{name} [-]" for name in rewards], shades)
-    units = int(fleet.unit_start[dc + 1] - fleet.unit_start[dc])
+    units = int(fleet.unit_offsets[dc + 1] - fleet.unit_offsets[dc])
     supplies, shades = _unit_lines(units, "supply [C]")
     yield f"{path}/crac/temperature_c", _lines([*supplies, "return, all units [C]"], [*shades, RED])
     yield f"{path}/crac/airflow_m3s", _lines(*_unit_lines(units, "airflow [m3/s]"))

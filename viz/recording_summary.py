@@ -102,9 +102,9 @@ def _facts(about: Mapping[str, Any]) -> dict[str, str]:
 
 def _data_center(fleet: Fleet, dc: int, name: str, described: Mapping[str, Any]) -> list[str]:
     config = fleet.configs[dc]
-    first, last = fleet.rack_start[dc : dc + 2]
-    servers = int(fleet.server_start[fleet.group_start[last]]) - int(
-        fleet.server_start[fleet.group_start[first]]
+    first, last = fleet.rack_offsets[dc : dc + 2]
+    servers = int(fleet.server_offsets[fleet.group_offsets[last]]) - int(
+        fleet.server_offsets[fleet.group_offsets[first]]
     )
     provenance: Mapping[str, str] = described.get("provenance", {})
     hashes: Mapping[str, str] = described.get("sha256", {})

@@ -33,7 +33,7 @@ from sdc_taichi.errors import ConfigError, SdcError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sdc_taichi.run.loop import Asked
+    from sdc_taichi.run.loop import RunRequest
     from sdc_taichi.sim.simulator import Simulator
     from sdc_taichi.types import StepResult
     from sdc_taichi.viz.recorder import Recorder
@@ -224,7 +224,7 @@ def simulate(
     inputs are synthetic years.
     """
     from sdc_taichi.control import make_controller
-    from sdc_taichi.run.loop import Asked, prepare_folder, record, report_json
+    from sdc_taichi.run.loop import RunRequest, prepare_folder, record, report_json
     from sdc_taichi.sim.fleet import build_fleet
     from sdc_taichi.sim.simulator import Simulator
 
@@ -232,7 +232,7 @@ def simulate(
     configs = _data_centers(base, site, start, dcs, sample, seed)
     configs = _with_files(configs, _site_names(site), weather, carbon, workload)
     fleet = build_fleet(configs)
-    asked = Asked(controller, _whole_steps(days, fleet.steps_per_hour), seed)
+    asked = RunRequest(controller, _whole_steps(days, fleet.steps_per_hour), seed)
     driver = make_controller(controller, fleet)
     recorder = _recorder(recording, focus, every, serve, serve_port)
     folder = out if out is not None else _default_folder(label, configs)
@@ -474,7 +474,7 @@ def _recorder(
 
 
 @contextlib.contextmanager
-def _recording(recorder: Recorder | None, sim: Simulator, asked: Asked) -> Iterator[None]:
+def _recording(recorder: Recorder | None, sim: Simulator, asked: RunRequest) -> Iterator[None]:
     """Record while the context lasts, if there is a recorder."""
     if recorder is None:
         yield

@@ -338,9 +338,9 @@ class TowerConfig(_Section):
     approach_min_k: Positive = 4.0
     water_range_k: Positive = 5.56
     fan_w_per_w_rejected: NonNegative = 0.02
-    printed_fan_w: NonNegative = 1000.0
+    paper_fan_w: NonNegative = 1000.0
     """CT_FAN_REF_P of the SustainDC format, for the tower of the paper."""
-    printed_airflow_m3s: Positive = 2.8315
+    paper_airflow_m3s: Positive = 2.8315
     """CT_REFRENCE_AIR_FLOW_RATE of the SustainDC format, for the tower of the paper."""
     economiser: bool = True
     economiser_approach_k: NonNegative = 5.0
@@ -1229,8 +1229,8 @@ def from_sustaindc(values: dict[str, Any], label: str) -> dict[str, Any]:
                 "released_fan_w": hvac["CRAC_FAN_REF_P"],
             },
             "tower": {
-                "printed_fan_w": hvac["CT_FAN_REF_P"],
-                "printed_airflow_m3s": hvac["CT_REFRENCE_AIR_FLOW_RATE"],
+                "paper_fan_w": hvac["CT_FAN_REF_P"],
+                "paper_airflow_m3s": hvac["CT_REFRENCE_AIR_FLOW_RATE"],
             },
             "pumps": {"released_chilled_w": pump_w("CW"), "released_condenser_w": pump_w("CT")},
         },

@@ -101,7 +101,7 @@ class TrimAndRespond:
             requests = np.zeros(view.size)
         else:
             hot = np.asarray(view.last.rack_inlet_max_c > REQUEST_INLET_C, dtype=np.float64)
-            requests = np.add.reduceat(hot, view.fleet.rack_start[:-1])
+            requests = np.add.reduceat(hot, view.fleet.rack_offsets[:-1])
         target_c = view.setpoint_c
         for _ in range(slots_in_step(view.state.step, view.step_h)):
             target_c = trim_and_respond(

@@ -28,7 +28,7 @@ class Limits:
 
 
 def _first_of_units(per_unit: F64, fleet: Fleet) -> F64:
-    return per_unit[fleet.unit_start[:-1]]
+    return per_unit[fleet.unit_offsets[:-1]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,10 +89,10 @@ class Core:
         fleet = self.sim.fleet
         self.num_envs = size
         self._units = int(fleet.units // size)
-        if np.any(np.diff(fleet.unit_start) != self._units):
+        if np.any(np.diff(fleet.unit_offsets) != self._units):
             raise ConfigError(
                 "environments of one batch have the same number of CRAC units; hvac.crac.units "
-                f"is {np.diff(fleet.unit_start).tolist()[:8]}"
+                f"is {np.diff(fleet.unit_offsets).tolist()[:8]}"
             )
         self._others = make_controller(options.others, fleet)
         _check_others(options)

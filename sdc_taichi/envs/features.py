@@ -225,7 +225,7 @@ class Observer:
             weather_leads_h=weather_leads_h,
             error=forecast_error,
         )
-        per_dc = np.diff(fleet.unit_start)
+        per_dc = np.diff(fleet.unit_offsets)
         self._alike = bool(np.all(per_dc == per_dc[0]))
         self._units = int(per_dc[0]) if self._alike else 1
         self.state_features = catalogue(ci_leads_h, weather_leads_h, self._units)
@@ -534,7 +534,7 @@ def _circle(steps: int) -> F32:
 def _setpoint_mean_c(view: View) -> F64:
     """Mean setpoint of the CRAC units, (B,)."""
     fleet = view.fleet
-    return np.asarray(fleet.unit_sums(view.state.setpoint_c) / np.diff(fleet.unit_start))
+    return np.asarray(fleet.unit_sums(view.state.setpoint_c) / np.diff(fleet.unit_offsets))
 
 
 def _hall_shape(fleet: Fleet) -> tuple[int, int]:

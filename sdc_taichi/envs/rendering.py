@@ -66,10 +66,10 @@ def frame(core: Core, env: int) -> Image:
     fleet = view.fleet
     hall = fleet.configs[env].hall
     if view.last is None:
-        units = slice(*fleet.unit_start[env : env + 2])
+        units = slice(*fleet.unit_offsets[env : env + 2])
         inlet_c = np.full(hall.racks, view.state.setpoint_c[units].mean())
     else:
-        racks = slice(*fleet.rack_start[env : env + 2])
+        racks = slice(*fleet.rack_offsets[env : env + 2])
         inlet_c = np.asarray(view.last.rack_inlet_c[racks], dtype=np.float64)
     return hall_image(hall, inlet_c)
 

@@ -126,7 +126,7 @@ def water(r: StepResult, c: Context) -> F64:
 
 def hot_inlets(r: StepResult, c: Context) -> F64:
     """What inlets exceed the recommended 27 C by, mean over servers, K (ASHRAE TC 9.9)."""
-    return -r.hot_k
+    return -r.over_27_mean_k
 
 
 def queue(r: StepResult, c: Context) -> F64:

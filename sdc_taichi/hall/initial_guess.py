@@ -36,7 +36,7 @@ _MOST_EXACT_PASSES = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class SteadyStateTable:
     """Steady states of a hall as shares of patterns over its racks."""
 
     supply_c: F64
@@ -49,7 +49,9 @@ class Start:
     it has passed the racks once, (n, len(LOADS), k + 1); of large halls k is 2."""
 
 
-def find_start(config: DataCenterConfig, racks: RackServers, flows: Recirculation) -> Start:
+def initial_guess(
+    config: DataCenterConfig, racks: RackServers, flows: Recirculation
+) -> SteadyStateTable:
     """Steady states of a hall whose CRAC units cover what it needs, its racks loaded alike.
 
     Halls of up to DENSE_RACKS are taken as they are, larger ones as the mean of SAMPLED_RACKS.
@@ -97,7 +99,7 @@ def find_start(config: DataCenterConfig, racks: RackServers, flows: Recirculatio
         patterns = np.concatenate([[flows.exchange.apply(row) for row in own], own])
     values = np.concatenate([parts, state.kept.mean(axis=0, keepdims=True)[:, :-1]])
     shaped = values.T.reshape(rows, len(LOADS), -1)
-    return Start(supply_c, patterns, shaped.astype(np.float32))
+    return SteadyStateTable(supply_c, patterns, shaped.astype(np.float32))
 
 
 @dataclass(slots=True)

@@ -46,7 +46,7 @@ _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class RunRequest:
     """What a run was asked to do."""
 
     controller: str
@@ -98,7 +98,7 @@ def run(
 def record(
     sim: Simulator,
     controller: Controller,
-    asked: Asked,
+    asked: RunRequest,
     out: Path,
     *,
     force: bool = False,
@@ -164,7 +164,7 @@ def record(
     return report
 
 
-def describe(sim: Simulator, asked: Asked) -> dict[str, Any]:
+def describe(sim: Simulator, asked: RunRequest) -> dict[str, Any]:
     """What a run is, before any step: versions, seed, inputs and data centers.
 
     Args:

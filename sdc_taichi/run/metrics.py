@@ -53,7 +53,7 @@ _SUMMED = (
     "unmet_w",
     "lost_tasks",
     "unserved_kwh",
-    "hot_k",
+    "over_27_mean_k",
     "throttled_racks",
     "tripped_racks",
     "shi",
@@ -141,7 +141,7 @@ def per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
                 "hottest_inlet_c": float(totals.hottest_inlet_c[dc]),
                 **_place(totals, dc, fleet),
                 **_means(totals, {name: float(totals.sums[name][dc]) for name in _MEAN}),
-                "over_27_degree_h": sums["hot_k"] * totals.step_h,
+                "over_27_degree_h": sums["over_27_mean_k"] * totals.step_h,
                 "rci_hi_min_pct": float(totals.rci_hi_min_pct[dc]),
                 "hottest_step": int(totals.hottest_step[dc]),
             }
@@ -169,7 +169,9 @@ def overall(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
         "hottest_dc": fleet.names[hottest],
         **_place(totals, hottest, fleet),
         **_means(totals, {name: sums[name] / fleet.size for name in _MEAN}),
-        "over_27_degree_h": float(totals.sums["hot_k"] @ servers) / servers.sum() * totals.step_h,
+        "over_27_degree_h": float(totals.sums["over_27_mean_k"] @ servers)
+        / servers.sum()
+        * totals.step_h,
         "rci_hi_min_pct": float(totals.rci_hi_min_pct.min()),
         "hottest_step": int(totals.hottest_step[hottest]),
     }

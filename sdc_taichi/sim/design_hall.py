@@ -89,8 +89,8 @@ def at_design(config: DataCenterConfig) -> DesignHall:
     approach_k[np.abs(approach_k) < _NO_APPROACH_K] = 0.0
     # Racks that are alike differ in the last bits; the first of them is named.
     group = int(np.argmax(np.round(hall.group_inlets(), _TIE_DIGITS)))
-    rack = int(np.searchsorted(fleet.group_start, group, side="right")) - 1
-    first_server = fleet.server_start[fleet.group_start[rack]]
+    rack = int(np.searchsorted(fleet.group_offsets, group, side="right")) - 1
+    first_server = fleet.server_offsets[fleet.group_offsets[rack]]
     return DesignHall(
         config=config,
         plan=plan,
@@ -105,7 +105,7 @@ def at_design(config: DataCenterConfig) -> DesignHall:
         unit_m3s=fleet.unit_design_m3s,
         unit_places_m=unit_places_m(plan, fleet.units),
         hottest_rack=rack,
-        hottest_server=int(fleet.server_start[group] - first_server),
+        hottest_server=int(fleet.server_offsets[group] - first_server),
         air=_air_flows(fleet, sums, approach_k, supply_c),
     )
 

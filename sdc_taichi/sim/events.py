@@ -95,15 +95,15 @@ class Timeline:
         scheduled: _Events,
         rules: tuple[_Rule, ...],
         *,
-        rack_start: I64,
-        unit_start: I64,
+        rack_offsets: I64,
+        unit_offsets: I64,
         steps_per_hour: int,
         seed: I64 | int,
     ) -> None:
         self._scheduled, self._rules = scheduled, rules
-        size = len(rack_start) - 1
+        size = len(rack_offsets) - 1
         self._seed = np.broadcast_to(np.asarray(seed, dtype=np.int64), (size,))
-        self._rack_start, self._unit_start = rack_start, unit_start
+        self._rack_start, self._unit_start = rack_offsets, unit_offsets
         self._steps_per_hour = steps_per_hour
         longest_h = max((rule.event.duration_h[1] for rule in rules), default=0.0)
         self._blocks_back = int(np.ceil(longest_h / HOURS_PER_BLOCK))
@@ -112,9 +112,9 @@ class Timeline:
         self._near = scheduled
         self._normal = _read_only(
             Disturbance(
-                unit_up=np.ones(unit_start[-1], dtype=np.bool_),
+                unit_up=np.ones(unit_offsets[-1], dtype=np.bool_),
                 chiller_share=np.ones(size),
-                rack_airflow=np.ones(rack_start[-1]),
+                rack_airflow=np.ones(rack_offsets[-1]),
                 outdoor_offset_k=np.zeros(size),
                 grid_up=np.ones(size, dtype=np.bool_),
             )
@@ -132,8 +132,8 @@ class Timeline:
         return Timeline(
             self._scheduled,
             self._rules,
-            rack_start=self._rack_start,
-            unit_start=self._unit_start,
+            rack_offsets=self._rack_start,
+            unit_offsets=self._unit_start,
             steps_per_hour=self._steps_per_hour,
             seed=seed,
         )
@@ -227,8 +227,8 @@ class Timeline:
 def schedule(
     configs: Sequence[DataCenterConfig],
     *,
-    rack_start: npt.NDArray[np.integer],
-    unit_start: npt.NDArray[np.integer],
+    rack_offsets: npt.NDArray[np.integer],
+    unit_offsets: npt.NDArray[np.integer],
     steps_per_hour: int,
     seed: I64 | int,
 ) -> Timeline:
@@ -241,12 +241,12 @@ def schedule(
 
     Args:
         configs: data centers, B of them, with names that differ.
-        rack_start: first rack of each data center and their total, (B + 1,).
-        unit_start: first CRAC unit of each data center and their total, (B + 1,).
+        rack_offsets: first rack of each data center and their total, (B + 1,).
+        unit_offsets: first CRAC unit of each data center and their total, (B + 1,).
         steps_per_hour: steps per hour.
         seed: decides the sampled events, at least 0, (B,) or one for all.
     """
-    racks, units = np.diff(rack_start), np.diff(unit_start)
+    racks, units = np.diff(rack_offsets), np.diff(unit_offsets)
     listed, rules = [_EMPTY], []
     for dc, config in enumerate(configs):
         for event in config.events.scheduled:
@@ -268,8 +268,8 @@ def schedule(
     return Timeline(
         _joined(listed),
         tuple(rules),
-        rack_start=np.asarray(rack_start, dtype=np.int64),
-        unit_start=np.asarray(unit_start, dtype=np.int64),
+        rack_offsets=np.asarray(rack_offsets, dtype=np.int64),
+        unit_offsets=np.asarray(unit_offsets, dtype=np.int64),
         steps_per_hour=steps_per_hour,
         seed=seed,
     )

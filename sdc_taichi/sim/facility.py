@@ -22,7 +22,7 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k
 from sdc_taichi.types import F64
 
-_UNREAD = cast(F64, None)
+NOT_USED = cast(F64, None)
 _BATTERY = (
     "charge_efficiency",
     "discharge_factor",
@@ -36,7 +36,7 @@ _BATTERY = (
 
 
 @dataclass(frozen=True, slots=True)
-class Met:
+class FacilityInputs:
     """What a step starts from, each (B,); what the models of a fleet do not read may be left out.
 
     Sums over CRAC units and racks are airflows times what is named.
@@ -47,48 +47,48 @@ class Met:
     outdoor_c: F64
     wet_bulb_c: F64
 
-    cpu_w: F64 = _UNREAD
-    it_fan_w: F64 = _UNREAD
-    airflow_m3s: F64 = _UNREAD
-    hot_k: F64 = _UNREAD
+    cpu_w: F64 = NOT_USED
+    it_fan_w: F64 = NOT_USED
+    airflow_m3s: F64 = NOT_USED
+    over_27_sum_k: F64 = NOT_USED
     """Sum over the servers, as the next."""
-    cold_k: F64 = _UNREAD
-    inlet_m3k_s: F64 = _UNREAD
+    under_18_sum_k: F64 = NOT_USED
+    inlet_m3k_s: F64 = NOT_USED
     """Of racks, over supply, as the next."""
-    outlet_m3k_s: F64 = _UNREAD
-    supply_c: F64 = _UNREAD
-    outlet_mean_c: F64 = _UNREAD
-    fan_speed: F64 = _UNREAD
-    crac_flow_m3s: F64 = _UNREAD
+    outlet_m3k_s: F64 = NOT_USED
+    supply_c: F64 = NOT_USED
+    outlet_mean_c: F64 = NOT_USED
+    fan_speed: F64 = NOT_USED
+    crac_flow_m3s: F64 = NOT_USED
     """This and the next three of halls that recirculate."""
-    return_c: F64 = _UNREAD
-    cubed_m3s: F64 = _UNREAD
+    return_c: F64 = NOT_USED
+    cubed_m3s: F64 = NOT_USED
     """Design airflow times the cube of the fan speed."""
-    mixed_m3k_s: F64 = _UNREAD
+    mixed_m3k_s: F64 = NOT_USED
     """Airflow times setpoint."""
-    coil_load_w: F64 = _UNREAD
+    coil_load_w: F64 = NOT_USED
     """This and the next two of transient halls, see ``HallSums``."""
-    coil_w: F64 = _UNREAD
-    room_j: F64 = _UNREAD
+    coil_w: F64 = NOT_USED
+    room_j: F64 = NOT_USED
 
-    ci_g_per_kwh: F64 = _UNREAD
-    battery_command: F64 = _UNREAD
-    stored_kwh: F64 = _UNREAD
-    room_heat_kwh: F64 = _UNREAD
+    ci_g_per_kwh: F64 = NOT_USED
+    battery_command: F64 = NOT_USED
+    stored_kwh: F64 = NOT_USED
+    room_heat_kwh: F64 = NOT_USED
 
-    powered: F64 = _UNREAD
+    powered: F64 = NOT_USED
     """Share of the step with power; this and what follows where events may happen."""
-    grid_up: F64 = _UNREAD
+    grid_up: F64 = NOT_USED
     """1 with grid, 0 in an outage."""
-    chiller_share: F64 = _UNREAD
+    chiller_share: F64 = NOT_USED
     """Capacity left to the chiller."""
-    coils: F64 = _UNREAD
+    coils: F64 = NOT_USED
     """Share of the coils in use."""
-    all_running: F64 = _UNREAD
+    all_running: F64 = NOT_USED
     """1 if no CRAC unit is down."""
-    idle_m3s: F64 = _UNREAD
+    idle_m3s: F64 = NOT_USED
     """Airflow of units that are down."""
-    idle_m3k_s: F64 = _UNREAD
+    idle_m3k_s: F64 = NOT_USED
     """The same times setpoint."""
 
 
@@ -160,11 +160,11 @@ class Facility:
         self._return_approach_k = mean_return_approach_k(fleet)
         self._fan_w_per_m3s = sized.crac_fan_w / sized.crac_flow_m3s
 
-    def removable_w(self, met: Met) -> dict[str, F64]:
+    def removable_w(self, met: FacilityInputs) -> dict[str, F64]:
         """Heat that the plant can take with the coils in use."""
         return {"removed_w": self._operate(self._coils_w(met), met).removed_w}
 
-    def step(self, met: Met) -> dict[str, F64]:
+    def step(self, met: FacilityInputs) -> dict[str, F64]:
         """Everything that follows from the air of the halls.
 
         Returns:
@@ -207,15 +207,15 @@ class Facility:
         return {
             "supply_c": room.supply_c,
             "warmed_k": room.warmed_k,
-            "hot_k": met.hot_k / self._servers,
+            "over_27_mean_k": met.over_27_sum_k / self._servers,
             "shi": air_metrics.shi(met.inlet_m3k_s, met.outlet_m3k_s),
             "rti_pct": air_metrics.rti(
                 room.return_c,
                 room.supply_c,
                 air_metrics.it_rise_k(met.inlet_m3k_s, met.outlet_m3k_s, met.airflow_m3s),
             ),
-            "rci_hi_pct": air_metrics.rci_hi(met.hot_k, self._servers, allowable_c=high_c),
-            "rci_lo_pct": air_metrics.rci_lo(met.cold_k, self._servers, allowable_c=low_c),
+            "rci_hi_pct": air_metrics.rci_hi(met.over_27_sum_k, self._servers, allowable_c=high_c),
+            "rci_lo_pct": air_metrics.rci_lo(met.under_18_sum_k, self._servers, allowable_c=low_c),
             "it_w": it_w,
             "crac_flow_m3s": room.flow_m3s,
             "return_c": room.return_c,
@@ -262,12 +262,12 @@ class Facility:
             **self._battery,
         )
 
-    def _coils_w(self, met: Met) -> F64:
+    def _coils_w(self, met: FacilityInputs) -> F64:
         """Capacity of the coils in use."""
         cooling_w = self._sized.water_side.cooling_w
         return cooling_w if self._calm else cooling_w * met.coils * met.powered
 
-    def _operate(self, request_w: F64, met: Met) -> water_side.WaterSide:
+    def _operate(self, request_w: F64, met: FacilityInputs) -> water_side.WaterSide:
         """The plant, which stands still while there is no power."""
         design = self._sized.water_side
         if not self._calm:
@@ -286,7 +286,7 @@ class Facility:
         )
         return found if self._calm else found.scaled(met.powered)
 
-    def _room_air(self, met: Met, it_w: F64) -> _Room:
+    def _room_air(self, met: FacilityInputs, it_w: F64) -> _Room:
         """Airflow, supply and return air, fans and heat of the CRAC units."""
         if self._recirculates:
             fan_w = self._fan_w_per_m3s * met.cubed_m3s
@@ -316,7 +316,7 @@ class Facility:
         warmed_k = met.supply_c - met.plant_setpoint_c
         return _Room(flow, fan_w, met.supply_c, warmed_k, return_c, load_w)
 
-    def _remove_heat(self, met: Met, room: _Room) -> _Heat:
+    def _remove_heat(self, met: FacilityInputs, room: _Room) -> _Heat:
         """What the plant takes of the heat that comes back and of the heat held by the room."""
         step_h = self._step_h
         if self._transient:

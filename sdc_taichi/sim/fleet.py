@@ -20,7 +20,7 @@ from sdc_taichi.config import (
 )
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
-from sdc_taichi.hall.initial_guess import Start, find_start
+from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.hall.recirculation import (
     Recirculation,
     calibrate,
@@ -69,7 +69,7 @@ class HallAir:
     """Exhaust airflow of each rack over the mean of its hall, 1 with a user's matrix, (R,)."""
     captured: F64
     """Recirculated share of each rack's intake where ``height`` is 1, (R,)."""
-    starts: tuple[Start, ...]
+    starts: tuple[SteadyStateTable, ...]
     """Where sweeps start, one per distinct hall."""
     start: I32
     """Entry of each data center in ``starts``, (B,)."""
@@ -86,15 +86,15 @@ class Fleet:
     configs: tuple[DataCenterConfig, ...]
     models: Mapping[str, str]
     steps_per_hour: int
-    rack_start: I32
+    rack_offsets: I32
     """First rack of each data center, (B + 1,)."""
     rack_dc: I32
     """Data center of each rack, (R,)."""
-    unit_start: I32
+    unit_offsets: I32
     """First CRAC unit of each data center, (B + 1,)."""
-    group_start: I32
+    group_offsets: I32
     """First group of each rack, (R + 1,)."""
-    server_start: I32
+    server_offsets: I32
     """First server of each group, (G + 1,)."""
     approach_k: F64
     """Mean inlet over supply of each rack, (R,): as given, within the limits of the config; with
@@ -114,12 +114,12 @@ class Fleet:
     @property
     def units(self) -> int:
         """Number of CRAC units of all data centers."""
-        return int(self.unit_start[-1])
+        return int(self.unit_offsets[-1])
 
     @property
     def unit_dc(self) -> I32:
         """Data center of each CRAC unit, (U,)."""
-        return np.repeat(np.arange(self.size, dtype=np.int32), np.diff(self.unit_start))
+        return np.repeat(np.arange(self.size, dtype=np.int32), np.diff(self.unit_offsets))
 
     @property
     def size(self) -> int:
@@ -139,12 +139,12 @@ class Fleet:
     @property
     def groups(self) -> int:
         """Number of server groups of all data centers."""
-        return len(self.server_start) - 1
+        return len(self.server_offsets) - 1
 
     @property
     def servers(self) -> int:
         """Number of servers of all data centers."""
-        return int(self.server_start[-1])
+        return int(self.server_offsets[-1])
 
     def require_distinct_names(self) -> None:
         """Make sure that names tell the data centers apart.
@@ -164,32 +164,32 @@ class Fleet:
 
     def unit_sums(self, values: npt.ArrayLike) -> F64:
         """Sum of unit values, (U,), over each data center, (B,)."""
-        return _sums(values, self.unit_start)
+        return _sums(values, self.unit_offsets)
 
     def rack_sums(self, values: npt.ArrayLike) -> F64:
         """Sum of rack values, (R,), over each data center, (B,)."""
-        return _sums(values, self.rack_start)
+        return _sums(values, self.rack_offsets)
 
     def group_sums(self, values: npt.ArrayLike) -> F64:
         """Sum of group values, (G,), over each rack, (R,)."""
-        return _sums(values, self.group_start)
+        return _sums(values, self.group_offsets)
 
     def per_group_servers(self) -> F64:
         """Servers of each group, (G,)."""
-        return np.diff(self.server_start).astype(np.float64)
+        return np.diff(self.server_offsets).astype(np.float64)
 
     def per_rack_servers(self) -> F64:
         """Servers of each rack, (R,)."""
-        return np.diff(self.server_start[self.group_start]).astype(np.float64)
+        return np.diff(self.server_offsets[self.group_offsets]).astype(np.float64)
 
     def per_dc_servers(self) -> F64:
         """Servers of each data center, (B,)."""
-        counts = np.diff(self.server_start[self.group_start[self.rack_start]])
+        counts = np.diff(self.server_offsets[self.group_offsets[self.rack_offsets]])
         return counts.astype(np.float64)
 
     def server_rack(self) -> I32:
         """Rack of each server, (S,)."""
-        per_rack = np.diff(self.server_start[self.group_start])
+        per_rack = np.diff(self.server_offsets[self.group_offsets])
         return np.repeat(np.arange(self.racks, dtype=np.int32), per_rack)
 
 
@@ -211,7 +211,7 @@ class _Air:
     flows: Recirculation
     shares: F64
     captured: F64
-    start: Start
+    start: SteadyStateTable
 
 
 def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet:
@@ -253,14 +253,18 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         configs=listed,
         models=models,
         steps_per_hour=steps_per_hour,
-        rack_start=starts(racks, "racks"),
+        rack_offsets=offsets_from_counts(racks, "racks"),
         rack_dc=np.repeat(np.arange(len(listed), dtype=np.int32), racks),
-        group_start=starts(np.concatenate([h.groups_per_rack for h in halls]), "server groups"),
-        server_start=starts(np.concatenate([h.groups[0] for h in halls]), "servers"),
+        group_offsets=offsets_from_counts(
+            np.concatenate([h.groups_per_rack for h in halls]), "server groups"
+        ),
+        server_offsets=offsets_from_counts(np.concatenate([h.groups[0] for h in halls]), "servers"),
         approach_k=np.concatenate([h.approach_k for h in halls]),
         group_rows=tuple(h.groups for h in halls),
         dcs=np.stack([h.dc for h in halls], axis=1),
-        unit_start=starts(np.array([len(h.unit_design_m3s) for h in halls]), "CRAC units"),
+        unit_offsets=offsets_from_counts(
+            np.array([len(h.unit_design_m3s) for h in halls]), "CRAC units"
+        ),
         unit_design_m3s=np.concatenate([h.unit_design_m3s for h in halls]),
         it_airflow_m3s=np.array([h.it_airflow_m3s for h in halls]),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
@@ -381,7 +385,7 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
             flows=flows,
             shares=shares,
             captured=racks.per_rack(flows.captured) / racks.per_rack(racks.height),
-            start=find_start(config, racks, flows),
+            start=initial_guess(config, racks, flows),
         )
     else:
         design = design_point(config, racks)
@@ -421,11 +425,15 @@ def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
     distinct = list({id(air): air for air in found}.values())
     entries = {id(air): i for i, air in enumerate(distinct)}
     entry = np.array([entries[id(air)] for air in found], dtype=np.int32)
-    first_weight = starts([len(a.flows.exchange.weights) for a in distinct], "weights")[entry]
+    first_weight = offsets_from_counts(
+        [len(a.flows.exchange.weights) for a in distinct], "weights"
+    )[entry]
     exchanges = [a.flows.exchange for a in found]
-    first_rack = starts([len(e.norm) for e in exchanges], "racks")
+    first_rack = offsets_from_counts([len(e.norm) for e in exchanges], "racks")
     return HallAir(
-        run_start=starts(np.concatenate([np.diff(e.run_start) for e in exchanges]), "runs"),
+        run_start=offsets_from_counts(
+            np.concatenate([np.diff(e.run_start) for e in exchanges]), "runs"
+        ),
         run_first=np.concatenate(
             [e.first + rack for e, rack in zip(exchanges, first_rack, strict=False)]
         ),
@@ -438,7 +446,7 @@ def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
         strength=np.concatenate([e.strength for e in exchanges]),
         captured=np.concatenate([a.captured for a in found]),
         unit_shares=np.concatenate([a.shares.reshape(-1) for a in found]),
-        share_start=starts([a.shares.size for a in found], "unit shares")[:-1],
+        share_start=offsets_from_counts([a.shares.size for a in found], "unit shares")[:-1],
         starts=tuple(a.start for a in distinct),
         start=entry,
     )
@@ -448,7 +456,7 @@ def _sums(values: npt.ArrayLike, start: I32) -> F64:
     return np.asarray(np.add.reduceat(np.asarray(values, dtype=np.float64), start[:-1]))
 
 
-def starts(counts: npt.ArrayLike, what: str) -> I32:
+def offsets_from_counts(counts: npt.ArrayLike, what: str) -> I32:
     """Where each of so many entries begins, and where the last ends, (n + 1,).
 
     Raises:

@@ -13,7 +13,7 @@ from sdc_taichi.errors import RuntimeStateError, SdcError
 from sdc_taichi.hall.initial_guess import LOADS
 from sdc_taichi.hall.recirculation import DENSE_RACKS
 from sdc_taichi.kernels.compiler import runtime
-from sdc_taichi.sim.fleet import Fleet, starts
+from sdc_taichi.sim.fleet import Fleet, offsets_from_counts
 from sdc_taichi.types import F64, Reals, ServerLayers
 
 Precision = Literal["f32", "f64"]
@@ -106,15 +106,15 @@ class HallSums:
     """Airflow times inlet temperature over supply."""
     outlet_m3k_s: F64
     """Airflow times outlet temperature over supply."""
-    hot_k: F64
+    over_27_sum_k: F64
     """Sum over the servers of what their inlets exceed 27 C by."""
-    cold_k: F64
+    under_18_sum_k: F64
     """Sum over the servers of what their inlets fall short of 18 C by."""
     hottest_rack: F64
     """Rack with the hottest inlet, counted from 0 in its data center."""
     hottest_server: F64
     """First server of the group with the hottest inlet, counted from 0 in its rack."""
-    stored_w: F64
+    thermal_storage_w: F64
     """Heat that goes into servers and recirculated air."""
     supply_c: F64
     """Airflow-weighted mean over the units."""
@@ -178,13 +178,13 @@ class Hall:
     def _lay_out_racks(self, thermal: Any, slices: int) -> None:
         """Blocks of racks, each data center filled up to whole ones, and chunks of blocks."""
         fleet, lanes = self._fleet, thermal.LANES
-        racks = np.diff(fleet.rack_start)
+        racks = np.diff(fleet.rack_offsets)
         self._blocks = -(-racks // lanes)
         if fleet.air is not None and racks.max() > DENSE_RACKS:
             # Runs of weights need all halls to begin where their vectors do.
             self._blocks = -(-self._blocks // thermal.RUN_BLOCKS) * thermal.RUN_BLOCKS
-        first_block = starts(self._blocks, "blocks of racks")
-        within = np.arange(fleet.racks) - np.repeat(fleet.rack_start[:-1], racks)
+        first_block = offsets_from_counts(self._blocks, "blocks of racks")
+        within = np.arange(fleet.racks) - np.repeat(fleet.rack_offsets[:-1], racks)
         self._rack_at = lanes * np.repeat(first_block[:-1], racks) + within
         self._places = int(lanes * first_block[-1])
         self._same_size = int(racks[0]) if np.all(racks == racks[0]) else None
@@ -196,29 +196,29 @@ class Hall:
         chunk_starts_task = ~np.repeat(whole, per_dc)
         chunk_starts_task[np.cumsum(per_dc) - per_dc] = True
         self._tasks = np.append(np.flatnonzero(chunk_starts_task), per_dc.sum()).astype(np.int32)
-        units = np.diff(fleet.unit_start)
-        first_need = starts(units[chunk_dc], "needs of chunks")
+        units = np.diff(fleet.unit_offsets)
+        first_need = offsets_from_counts(units[chunk_dc], "needs of chunks")
         self._chunk_ints = _table(np.concatenate([*chunks, first_block[-1:]]), chunk_dc, first_need)
         self._needs = np.zeros(max(int(first_need[-1]), 1))
-        first_share = starts(self._blocks * units, "unit shares of blocks")
-        first_chunk = starts(per_dc, "chunks")
+        first_share = offsets_from_counts(self._blocks * units, "unit shares of blocks")
+        first_chunk = offsets_from_counts(per_dc, "chunks")
         self._dc_ints = np.zeros((len(thermal.DC_INTS), fleet.size + 1), np.int32)
-        for row, values in enumerate((first_chunk, fleet.unit_start, first_share, racks)):
+        for row, values in enumerate((first_chunk, fleet.unit_offsets, first_share, racks)):
             self._dc_ints[row, : len(values)] = values
 
     def _lay_out_groups(self, thermal: Any) -> None:
         """Places of the groups, lane by lane, and the tables that equal blocks share."""
         fleet, lanes = self._fleet, thermal.LANES
         block = self._rack_at // lanes
-        groups = np.diff(fleet.group_start)
+        groups = np.diff(fleet.group_offsets)
         most = np.zeros(int(self._blocks.sum()), np.int64)
         np.maximum.at(most, block, groups)
         filled = np.bincount(block, minlength=len(most))
         first_rack = np.cumsum(filled) - filled
         # Places without a rack, and the closing entry, begin where the rack before them ends.
         rack = np.minimum(np.arange(lanes), filled[:, None]) + first_rack[:, None]
-        first_group = fleet.group_start[np.append(rack, fleet.racks)]
-        self._rack_ints = np.stack([first_group, fleet.server_start[first_group]])
+        first_group = fleet.group_offsets[np.append(rack, fleet.racks)]
+        self._rack_ints = np.stack([first_group, fleet.server_offsets[first_group]])
         known: dict[Any, int] = {}
         alike: dict[int, slice] = {}
         tables, table, total = [], np.zeros(len(most), np.int64), 0
@@ -228,12 +228,12 @@ class Hall:
             if same != blocks:
                 table[blocks] = table[same]
                 continue
-            group_0 = fleet.group_start[fleet.rack_start[dc]]
+            group_0 = fleet.group_offsets[fleet.rack_offsets[dc]]
             for i in range(end - count, end):
                 a, n = first_rack[i], filled[i]
                 if n == 0:
                     continue
-                ends = fleet.group_start[a : a + n + 1] - group_0
+                ends = fleet.group_offsets[a : a + n + 1] - group_0
                 values = rows[:, ends[0] : ends[-1]]
                 key = (values.tobytes(), (ends - ends[0]).tobytes())
                 if key not in known:
@@ -249,7 +249,7 @@ class Hall:
                 table[i] = known[key]
         self._tables = self._lanes(total * len(thermal.GROUP_ROWS))
         self._tables[:] = np.concatenate(tables).reshape(self._tables.shape)
-        first_place = starts(most, "groups of blocks")
+        first_place = offsets_from_counts(most, "groups of blocks")
         self._block_ints = _table(filled, most, table, first_place[:-1], [])
         self._laid_along = False
         self._group_places, self._most_groups = int(first_place[-1]), int(most.max())
@@ -264,7 +264,7 @@ class Hall:
         at, one, of_block = np.unique(block["table"], return_index=True, return_inverse=True)
         groups = block["groups"][one]
         vectors = -(-groups // lanes)
-        first = len(tables) + starts(lanes * vectors, "groups along racks")
+        first = len(tables) + offsets_from_counts(lanes * vectors, "groups along racks")
         along = self._lanes(int(first[-1]) * tables.shape[1])
         out = along.reshape(-1, *tables.shape[1:])
         out[: len(tables)] = tables
@@ -290,7 +290,7 @@ class Hall:
             return
         shares, mixes, known, total = [], [], {}, 0
         for dc, (racks, units) in enumerate(
-            zip(np.diff(fleet.rack_start), np.diff(fleet.unit_start), strict=True)
+            zip(np.diff(fleet.rack_offsets), np.diff(fleet.unit_offsets), strict=True)
         ):
             own = np.zeros((int(self._blocks[dc]) * lanes, int(units)))
             at = air.share_start[dc]
@@ -336,7 +336,7 @@ class Hall:
             firsts.append((total, total + len(patterns), len(start.supply_c)))
             vectors += [patterns, shares.reshape(-1, lanes)]
             total += len(vectors[-2]) + len(vectors[-1])
-        starts([total], "vectors of starts")
+        offsets_from_counts([total], "vectors of starts")
         self._starts = self._lanes(total)
         self._starts[:] = np.concatenate(vectors)
         rows = np.array(firsts)[air.start].T
@@ -347,17 +347,17 @@ class Hall:
         """Runs of weights in whole vectors, filled up with zeros, for halls of many racks."""
         fleet, air = self._fleet, self._fleet.air
         run_counts = np.zeros(self._places, np.int64)
-        large = np.diff(fleet.rack_start)[fleet.rack_dc] > DENSE_RACKS
+        large = np.diff(fleet.rack_offsets)[fleet.rack_dc] > DENSE_RACKS
         if air is None or not large.any():
-            self._run_start = starts(run_counts, "runs of weights")
+            self._run_start = offsets_from_counts(run_counts, "runs of weights")
             self._run_ints = np.zeros((3, 1), np.int32)
             self._weights = self._lanes(lanes).reshape(-1, lanes)[:1]
             return
         counts = np.diff(air.run_start)
         run_counts[self._rack_at[large]] = counts[large]
-        self._run_start = starts(run_counts, "runs of weights")
+        self._run_start = offsets_from_counts(run_counts, "runs of weights")
         of_large = np.repeat(large, counts)
-        moved = self._rack_at[fleet.rack_start[:-1]] - fleet.rack_start[:-1]
+        moved = self._rack_at[fleet.rack_offsets[:-1]] - fleet.rack_offsets[:-1]
         first = (air.run_first + np.repeat(moved[fleet.rack_dc], counts))[of_large]
         length, offset = air.run_length[of_large], air.run_offset[of_large].astype(np.int64)
         # Runs that share weights share their vectors where they begin at the same lane.
@@ -365,7 +365,7 @@ class Hall:
         key = (offset * (int(length.max()) + 1) + length) * lanes + lane
         _, one, same = np.unique(key, return_index=True, return_inverse=True)
         vectors = -(-(lane + length) // lanes)
-        begin = starts(vectors[one], "vectors of weights")
+        begin = offsets_from_counts(vectors[one], "vectors of weights")
         self._run_ints = _table(first // lanes, vectors, begin[same])
         weights = self._aligned((int(begin[-1]) * lanes,), self._dtype)
         weights[:] = 0.0
@@ -637,7 +637,7 @@ class Hall:
         covers = self._fresh_m3s * speed / np.maximum(state.need_m3s, 1e-30)
         self._supply["fresh_ratio"][:] = np.minimum(1.0, covers)
         flow_m3s = fleet.unit_sums(fleet.unit_design_m3s * speed)
-        self._dc["stirring_m3s"][:] = flow_m3s / np.diff(fleet.rack_start)
+        self._dc["stirring_m3s"][:] = flow_m3s / np.diff(fleet.rack_offsets)
         self._unit["setpoint_c"][:] = coil.setpoint_c
         for name, values in (
             ("room_j", coil.room_j),
@@ -804,7 +804,7 @@ def _dense(fleet: Fleet, dc: int) -> F64:
     """Mix before every rack of a data center from what all its racks give, (R, R)."""
     air = fleet.air
     assert air is not None
-    first, end = fleet.rack_start[dc : dc + 2]
+    first, end = fleet.rack_offsets[dc : dc + 2]
     out = np.zeros((end - first, end - first))
     for rack in range(first, end):
         for run in range(air.run_start[rack], air.run_start[rack + 1]):

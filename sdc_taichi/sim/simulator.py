@@ -21,11 +21,11 @@ from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.plant import cooling, workload
 from sdc_taichi.sim.drivers import Drivers, load_drivers
 from sdc_taichi.sim.events import ActiveEvent, Disturbance, schedule
-from sdc_taichi.sim.facility import Facility, Met
+from sdc_taichi.sim.facility import Facility, FacilityInputs
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums, Precision
 from sdc_taichi.sim.sizing import Sizing, size
-from sdc_taichi.sim.work_allocation import Floor
+from sdc_taichi.sim.work_allocation import WorkAllocation
 from sdc_taichi.types import (
     F64,
     I64,
@@ -79,8 +79,8 @@ class Simulator:
         self.step_h = 1.0 / self.fleet.steps_per_hour
         self._timeline = schedule(
             self.fleet.configs,
-            rack_start=self.fleet.rack_start,
-            unit_start=self.fleet.unit_start,
+            rack_offsets=self.fleet.rack_offsets,
+            unit_offsets=self.fleet.unit_offsets,
             steps_per_hour=self.fleet.steps_per_hour,
             seed=0,
         )
@@ -118,7 +118,7 @@ class Simulator:
         }
         self._fan_step = v("hvac.crac.fan_step")[self._unit_dc]
         self._coasting = v("hvac.crac.coasting_flow_ratio")[self._unit_dc]
-        self._floor = Floor(self.fleet)
+        self._floor = WorkAllocation(self.fleet)
         self._single = self.fleet.units == self.size
         self._all = np.ones(self.size)
         self._all_units = np.ones(self.fleet.units)
@@ -208,7 +208,7 @@ class Simulator:
         v, b, fleet = self.fleet.values, self.size, self.fleet
         setpoint_c = v("hvac.setpoint.initial_c")[self._unit_dc]
         inlet_c = v("hvac.setpoint.initial_c")[fleet.rack_dc] + fleet.approach_k
-        groups = np.diff(fleet.group_start)
+        groups = np.diff(fleet.group_offsets)
         memory = _NO_MEMORY
         if self._transient:
             demand = self.drivers.at(0).demand
@@ -402,7 +402,7 @@ class Simulator:
             cpu_w=air.cpu_w,
             it_fan_w=air.fan_w,
             it_airflow_m3s=air.airflow_m3s,
-            stored_w=air.stored_w,
+            thermal_storage_w=air.thermal_storage_w,
             grid_up=event.grid_up.astype(np.float64),
             powered=self._all.copy() if powered is None else powered,
             unit_setpoint_c=setpoint_c.copy(),
@@ -423,7 +423,7 @@ class Simulator:
         """Setpoint that the plant's water serves, and share of the coils in use, each (B,)."""
         if self._calm and self._single:
             return setpoint_c, self._all
-        first = self.fleet.unit_start[:-1]
+        first = self.fleet.unit_offsets[:-1]
         coldest_c = np.minimum.reduceat(np.where(running > 0, setpoint_c, np.inf), first)
         none = np.isinf(coldest_c)
         if np.any(none):
@@ -435,14 +435,14 @@ class Simulator:
     def _of_the_air(
         self, air: HallSums, setpoint_c: F64, fan_speed: F64, running: F64
     ) -> dict[str, F64]:
-        """What the facility reads of the halls, see ``Met``."""
+        """What the facility reads of the halls, see ``FacilityInputs``."""
         sums = self._unit_sums
         out = {
             "cpu_w": air.cpu_w,
             "it_fan_w": air.fan_w,
             "airflow_m3s": air.airflow_m3s,
-            "hot_k": air.hot_k,
-            "cold_k": air.cold_k,
+            "over_27_sum_k": air.over_27_sum_k,
+            "under_18_sum_k": air.under_18_sum_k,
             "inlet_m3k_s": air.inlet_m3k_s,
             "outlet_m3k_s": air.outlet_m3k_s,
             "supply_c": air.supply_c,
@@ -463,7 +463,7 @@ class Simulator:
         if not self._calm:
             idle_m3s = (1.0 - running) * flow_m3s
             out |= {
-                "all_running": np.minimum.reduceat(running, self.fleet.unit_start[:-1]),
+                "all_running": np.minimum.reduceat(running, self.fleet.unit_offsets[:-1]),
                 "idle_m3s": sums(idle_m3s),
                 "idle_m3k_s": sums(idle_m3s * setpoint_c),
             }
@@ -517,7 +517,7 @@ class Simulator:
         """Mean over the CRAC units, (B,)."""
         if self._single:
             return per_unit
-        return self.fleet.unit_sums(per_unit) / np.diff(self.fleet.unit_start)
+        return self.fleet.unit_sums(per_unit) / np.diff(self.fleet.unit_offsets)
 
     def _per_unit(self, per_dc: F64) -> F64:
         """For each CRAC unit the value of its data center, (U,)."""
@@ -720,8 +720,10 @@ class _Stages:
         models = Facility(fleet, sized, 1.0 / fleet.steps_per_hour, calm=calm)
         self.run_battery = models.run_battery
         self.work = CompiledStage(lambda **x: _fields(decide(**x, **limits)), fleet.size)
-        self.facility = CompiledStage(lambda **x: models.step(Met(**x)), fleet.size)
-        self.removable = CompiledStage(lambda **x: models.removable_w(Met(**x)), fleet.size)
+        self.facility = CompiledStage(lambda **x: models.step(FacilityInputs(**x)), fleet.size)
+        self.removable = CompiledStage(
+            lambda **x: models.removable_w(FacilityInputs(**x)), fleet.size
+        )
 
 
 def _fields(record: Any) -> dict[str, Any]:

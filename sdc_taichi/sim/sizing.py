@@ -252,8 +252,8 @@ def _tower(
             water_kg_s, wet_bulb_c=wet_bulb_c, range_k=range_k, approach_k=approach_k
         )
     elif model == "paper":
-        sized["tower_fan_w"] = v("hvac.tower.printed_fan_w")
-        sized["tower_air_m3s"] = v("hvac.tower.printed_airflow_m3s")
+        sized["tower_fan_w"] = v("hvac.tower.paper_fan_w")
+        sized["tower_air_m3s"] = v("hvac.tower.paper_airflow_m3s")
     return sized
 
 

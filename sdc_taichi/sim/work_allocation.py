@@ -27,7 +27,7 @@ class Placed:
     """The same of each server group, (G,); None spreads the load of a rack by load weights."""
 
 
-class Floor:
+class WorkAllocation:
     """The racks of a fleet as places for work.
 
     Bins of work are racks with policy ``uniform``, which keeps the load weights within a rack, and
@@ -44,7 +44,7 @@ class Floor:
         self._servers = fleet.per_dc_servers()
         self._rack_servers = fleet.per_rack_servers()
         self._bin_servers = self._rack_servers if self._per_rack else fleet.per_group_servers()
-        starts = fleet.rack_start if self._per_rack else fleet.group_start[fleet.rack_start]
+        starts = fleet.rack_offsets if self._per_rack else fleet.group_offsets[fleet.rack_offsets]
         self._bins = layout(starts, fleet.names)
         classes = [c.protection.ashrae_class for c in fleet.configs]
         limit_c = np.array([np.inf if c is None else allowable_c(c)[1] for c in classes])
@@ -183,7 +183,7 @@ class Floor:
 
     def _spread(self, per_rack: F64) -> F64:
         """Rack values for each server group, (G,)."""
-        return np.repeat(per_rack, np.diff(self._fleet.group_start))
+        return np.repeat(per_rack, np.diff(self._fleet.group_offsets))
 
     def _weights(self, weights: F64 | None) -> F64:
         """Weights of the server groups, (G,), from one per rack or per group."""
