@@ -302,6 +302,8 @@ SCRIPT = """
 import os, signal, sys
 import sdc_taichi
 
+# A shell that starts the tests in the background has switched SIGINT off.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 plain = sdc_taichi.parallel_env("tiny", days=1)
 plain.reset(seed=0)
 assert "rerun" not in sys.modules, "imported without a recording"

@@ -27,7 +27,6 @@ from sdc_taichi import (
     LoadAction,
     Simulator,
     StepResult,
-    air_metrics,
     build_fleet,
     drivers_from_arrays,
     load_config,
@@ -36,6 +35,7 @@ from sdc_taichi import (
 from sdc_taichi.control.rules import trim_and_respond
 from sdc_taichi.envs.rewards import share
 from sdc_taichi.exogenous.psychrometrics import humidity_ratio, stull_wet_bulb_c, wet_bulb_c
+from sdc_taichi.hall import air_metrics
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.hall.recirculation import calibrate, layout_exchange
 from sdc_taichi.plant import chiller, cooling, tower, water, workload

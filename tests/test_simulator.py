@@ -35,9 +35,9 @@ from sdc_taichi import (
     load_config,
     load_drivers,
     make_configs,
-    runtime,
 )
 from sdc_taichi.config import apply_overrides
+from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim.drivers import Table
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64
