@@ -1,1 +1,5 @@
-"""Presets, one YAML file each; ``sdc_taichi.load_config`` reads them by name."""
+"""Presets: one YAML file for each, complete or starting from another.
+
+They are read by ``sdc_taichi.load_config``, which ``sdc_taichi.preset_names`` lists.
+No code lives here.
+"""

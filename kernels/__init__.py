@@ -1,1 +1,5 @@
-"""Taichi kernels of sdc-taichi; they import nothing of the package and start no runtime."""
+"""Taichi kernels on the CPU: the air of the halls, layers of servers, queues, airflow on a grid.
+
+A kernel takes NumPy arrays and fills NumPy arrays; README.md says where to look first.
+Kernels know no configuration and no fleet; what reaches into Taichi itself is in ``compiler``.
+"""

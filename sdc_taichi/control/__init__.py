@@ -1,4 +1,8 @@
-"""Controllers that are not learned, and what a controller sees."""
+"""Controllers that are not learned, and what a controller sees.
+
+A controller turns a view of the data centers into actions, and knows them by nothing else.
+Learning algorithms and physics never live here.
+"""
 
 from sdc_taichi.control.registry import CONTROLLED, controlled, controller_names, make_controller
 from sdc_taichi.control.rules import (

@@ -1,4 +1,8 @@
-"""Weather, grid carbon intensity and workload: embedded synthetic years and files of the user."""
+"""Weather, grid carbon intensity and workload: embedded synthetic years and files of the user.
+
+Everything that comes from outside the data center is read, checked and brought to steps here.
+What the data center does with it never is.
+"""
 
 from sdc_taichi.exogenous.carbon import read_carbon
 from sdc_taichi.exogenous.psychrometrics import stull_wet_bulb_c, wet_bulb_c
