@@ -28,7 +28,6 @@ from sdc_taichi import (
     drivers_from_arrays,
     load_config,
 )
-from sdc_taichi.config import cpu_coefficients
 from sdc_taichi.control import Controller, View, make_controller
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.run.loop import run
@@ -88,7 +87,7 @@ def move_load() -> MovedLoad:
     )
     racks, source, target = config.hall.racks, 12, 67
     rack_kw = 1e-3 * sum(g.count * g.full_w for g in config.rack_groups()[0])
-    step = MOVED_KW / (rack_kw * cpu_coefficients(config.servers)[2])
+    step = MOVED_KW / (rack_kw * config.servers.curves.cpu_shift)
     load = np.full((2, racks), 0.5)
     load[:, source] += np.array([0.5, -0.5]) * step
     load[:, target] += np.array([-0.5, 0.5]) * step

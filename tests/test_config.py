@@ -24,8 +24,6 @@ from sdc_taichi import (
 from sdc_taichi.config import (
     apply_overrides,
     config_from_dict,
-    cpu_coefficients,
-    fan_coefficients,
     first_step_day,
 )
 
@@ -191,27 +189,6 @@ def test_wrong_overrides_name_the_place(override: str, message: str) -> None:
 
 
 # --- servers ------------------------------------------------------------------------------------
-
-
-def test_curve_coefficients_by_hand() -> None:
-    servers = load_config("corrected").servers
-    assert cpu_coefficients(servers) == pytest.approx((1 / 600, -1 / 60, 0.99))
-    assert fan_coefficients(servers) == pytest.approx((0.215 / 12, 0.225 - 0.215 * 28 / 12, 0.215))
-    released = load_config("sustaindc").servers
-    assert cpu_coefficients(released) == pytest.approx((1 / 600 + 0.05, -1 / 60, 0.99))
-    slope, offset, shift = fan_coefficients(servers)
-    assert fan_coefficients(released) == pytest.approx((10 * slope, 5 * offset, 5 * shift))
-
-
-def test_airflow_curve_is_the_one_that_runs() -> None:
-    config = load_config("tiny", ["hvac.setpoint.initial_c=20"])
-    drivers = drivers_from_arrays([20.0], [15.0], [300.0], [0.6])
-    with Simulator(config, drivers=drivers, precision="f64") as sim:
-        sim.reset()
-        result = sim.step()
-    inlet = result.rack_inlet_c[[0, 2]].astype(np.float64)
-    ratio = config.airflow_ratio(inlet, np.array([0.6]))
-    np.testing.assert_allclose(result.rack_airflow_m3s[[0, 2]], 3 * 0.0212 * ratio, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -428,8 +405,7 @@ def test_the_config_of_sustaindc_itself(real_data: Path) -> None:
         update={"servers_per_rack": config.hall.servers_per_rack}
     )
     assert config.rack_groups() == preset.rack_groups()
-    assert cpu_coefficients(config.servers) == cpu_coefficients(preset.servers)
-    assert fan_coefficients(config.servers) == fan_coefficients(preset.servers)
+    assert config.servers.curves == preset.servers.curves
     assert config.hvac == preset.hvac
 
 

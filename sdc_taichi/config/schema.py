@@ -30,6 +30,7 @@ from pydantic import (
 
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C
+from sdc_taichi.plant.servers import ServerCurves, linear_curve
 
 
 def _no_bool(value: Any) -> Any:
@@ -243,6 +244,38 @@ class ServerConfig(_Section):
     def power_pairs(self) -> tuple[Pair, ...]:
         """(full, idle) power, one pair for all racks or one per rack."""
         return self.power_w or ((150.0, 10.0),)
+
+    @property
+    def curves(self) -> ServerCurves:
+        """Coefficients of power and airflow against inlet temperature and load.
+
+        Fan model ``released`` scales slope by 10, offset by 5 and load shift by 5 (shift per 20 %
+        of load), as the released SustainDC code does.
+        """
+        cpu_slope, cpu_offset, cpu_shift = linear_curve(
+            self.inlet_range_c, self.cpu_power_ratio_lb, self.cpu_power_ratio_ub
+        )
+        fan_slope, fan_offset, fan_shift = linear_curve(
+            self.inlet_range_c, self.fan_airflow_ratio_lb, self.fan_airflow_ratio_ub
+        )
+        if self.fan_model == "released":
+            fan_slope, fan_offset, fan_shift = 10 * fan_slope, 5 * fan_offset, 5 * fan_shift
+        fan_low, fan_high = self.fan_airflow_ratio_limits or (0.0, np.inf)
+        return ServerCurves(
+            cpu_slope_per_k=cpu_slope + self.cpu_slope_offset_per_k,
+            cpu_offset=cpu_offset,
+            cpu_shift=cpu_shift,
+            fan_slope_per_k=fan_slope,
+            fan_offset=fan_offset,
+            fan_shift=fan_shift,
+            # Fans never blow backwards.
+            fan_low=max(fan_low, 0.0),
+            fan_high=fan_high,
+            fan_reference_ratio=self.fan_reference_ratio,
+            fan_exponent=self.fan_power_exponent,
+            fan_reference_w=self.fan_reference_w,
+            curve_limit_c=np.inf if self.curve_limit_c is None else self.curve_limit_c,
+        )
 
     @field_validator("power_w", mode="before")
     @classmethod
@@ -733,7 +766,7 @@ class DataCenterConfig(_Section):
                 else np.zeros(racks)
             )
         )
-        ratio = self.airflow_ratio(coldest_c, np.zeros(racks))
+        ratio = self.servers.curves.airflow_ratio(coldest_c, np.zeros(racks))
         worst = int(np.argmin(ratio))
         if ratio[worst] <= 0:
             raise ValueError(
@@ -742,33 +775,6 @@ class DataCenterConfig(_Section):
                 "fan_airflow_ratio_lb or set fan_airflow_ratio_limits)"
             )
         return self
-
-    def airflow_ratio(self, inlet_c: np.ndarray, utilisation: np.ndarray) -> np.ndarray:
-        """Server airflow over full airflow, the curve that the kernels use (dimensionless)."""
-        slope, offset, shift = fan_coefficients(self.servers)
-        highest = np.inf if self.servers.curve_limit_c is None else self.servers.curve_limit_c
-        ratio = slope * np.minimum(inlet_c, highest) + offset + shift * utilisation
-        return np.asarray(np.clip(ratio, *airflow_limits(self.servers)))
-
-    def server_power_w(
-        self, inlet_c: np.ndarray, utilisation: np.ndarray, full_w: np.ndarray, idle_w: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Power of servers with their fans, W, and airflow ratio, as the kernels compute them.
-
-        Args:
-            inlet_c: inlet temperatures, any shape, as all that follow.
-            utilisation: 0..1.
-            full_w: CPU power at full load and a power ratio of 1.
-            idle_w: least CPU power.
-        """
-        servers = self.servers
-        slope, offset, shift = cpu_coefficients(servers)
-        highest = np.inf if servers.curve_limit_c is None else servers.curve_limit_c
-        on_curve = slope * np.minimum(inlet_c, highest) + offset + shift * utilisation
-        ratio = self.airflow_ratio(inlet_c, utilisation)
-        speed = ratio / servers.fan_reference_ratio
-        fan_w = servers.fan_reference_w * speed**servers.fan_power_exponent
-        return np.maximum(idle_w, full_w * on_curve) + fan_w, ratio
 
     def rack_groups(self) -> tuple[tuple[ServerGroup, ...], ...]:
         """Server groups of every rack, with capacity_mw applied to the counts."""
@@ -806,36 +812,6 @@ class DataCenterConfig(_Section):
     def to_yaml(self) -> str:
         """YAML text that ``load_config`` reads back equal."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-
-
-def cpu_coefficients(servers: ServerConfig) -> tuple[float, float, float]:
-    """Slope (1/K), offset and load shift of CPU power over nameplate (Sun et al. 2021)."""
-    low, high = servers.inlet_range_c
-    slope = (servers.cpu_power_ratio_ub[0] - servers.cpu_power_ratio_lb[0]) / (high - low)
-    offset = servers.cpu_power_ratio_ub[0] - slope * high
-    shift = servers.cpu_power_ratio_lb[1] - servers.cpu_power_ratio_lb[0]
-    return slope + servers.cpu_slope_offset_per_k, offset, shift
-
-
-def airflow_limits(servers: ServerConfig) -> tuple[float, float]:
-    """Lowest and highest airflow ratio; fans never blow backwards."""
-    low, high = servers.fan_airflow_ratio_limits or (0.0, np.inf)
-    return max(low, 0.0), high
-
-
-def fan_coefficients(servers: ServerConfig) -> tuple[float, float, float]:
-    """Slope (1/K), offset and load shift of the airflow ratio.
-
-    ``released`` scales slope by 10, offset by 5 and shift by 5 (shift per 20 % of load),
-    as the released SustainDC code does.
-    """
-    low, high = servers.inlet_range_c
-    slope = (servers.fan_airflow_ratio_ub[0] - servers.fan_airflow_ratio_lb[0]) / (high - low)
-    offset = servers.fan_airflow_ratio_ub[0] - slope * high
-    shift = servers.fan_airflow_ratio_lb[1] - servers.fan_airflow_ratio_lb[0]
-    if servers.fan_model == "released":
-        return 10 * slope, 5 * offset, 5 * shift
-    return slope, offset, shift
 
 
 MONTH_DAYS = (31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31)

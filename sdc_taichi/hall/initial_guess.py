@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.hall.recirculation import DENSE_RACKS, RackServers, Recirculation
+from sdc_taichi.plant.servers import ServerCurves
 from sdc_taichi.types import F64, I32
 
 LOADS = np.linspace(0.0, 1.0, 65)
@@ -74,7 +75,7 @@ def initial_guess(
     air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
     shape = len(mix_k), rows * len(LOADS) + 1
     state = _Steady(
-        config,
+        config.servers.curves,
         weights,
         1.0 / (design.fan_full_airflow_m3s * air),
         # The design point comes last.
@@ -106,7 +107,7 @@ def initial_guess(
 class _Steady:
     """Exhaust mixes of the racks that settle, for each supply temperature and load."""
 
-    config: DataCenterConfig
+    curves: ServerCurves
     weights: F64
     k_per_w: float
     """Over the airflow ratio of the servers."""
@@ -148,9 +149,9 @@ class _Steady:
             inlet_k = self.mix_k[:, None, at] * captured
             load = self.load[at]
             load = load + deviation * (load * (1.0 - load))
-            power_w, ratio = self.config.server_power_w(
-                self.supply_c[at] + inlet_k, load, full_w, idle_w
-            )
+            inlet_c = self.supply_c[at] + inlet_k
+            ratio = self.curves.airflow_ratio(inlet_c, load)
+            power_w = self.curves.cpu_w(inlet_c, load, full_w, idle_w) + self.curves.fan_w(ratio)
             ratio = ratio * count
             flow = np.maximum(np.sum(ratio, axis=1), 1e-9)
             heat_k = np.sum(power_w * count, axis=1) / flow * self.k_per_w

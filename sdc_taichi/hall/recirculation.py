@@ -217,6 +217,7 @@ def design_point(
     groups = rack_servers(config) if groups is None else groups
     approach_k = config.hall.rack_approach_k() if approach_k is None else approach_k
     hall, supply_c = config.hall, config.hvac.setpoint.max_c
+    curves = config.servers.curves
     approach = groups.per_group(approach_k)
     one = np.ones(len(groups.count))
 
@@ -227,13 +228,14 @@ def design_point(
     if hall.inlet_model == "recirculation":
         # Airflow depends on the inlet, which depends on the mean that airflow weights.
         for _ in range(100):
-            moved = groups.count * config.airflow_ratio(inlets_c(height), one)
+            moved = groups.count * curves.airflow_ratio(inlets_c(height), one)
             mean = groups.per_rack(moved * groups.height) / groups.per_rack(moved)
             before, height = height, groups.height / groups.per_group(mean)
             if np.max(np.abs(height - before)) < 1e-15:
                 break
     inlet_c = inlets_c(height)
-    power_w, ratio = config.server_power_w(inlet_c, one, groups.full_w, groups.idle_w)
+    ratio = curves.airflow_ratio(inlet_c, one)
+    power_w = curves.cpu_w(inlet_c, one, groups.full_w, groups.idle_w) + curves.fan_w(ratio)
     it_w = groups.per_rack(groups.count * power_w)
     moved = groups.per_rack(groups.count * ratio)
     air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k

@@ -13,9 +13,6 @@ import numpy.typing as npt
 
 from sdc_taichi.config import (
     DataCenterConfig,
-    airflow_limits,
-    cpu_coefficients,
-    fan_coefficients,
     with_values,
 )
 from sdc_taichi.errors import ConfigError
@@ -391,16 +388,22 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         design = design_point(config, racks)
         unit_design_m3s = np.array([design.crac_flow_m3s])
     air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
+    curves = servers.curves
     dc = (
-        *cpu_coefficients(servers),
-        *fan_coefficients(servers),
-        *airflow_limits(servers),
-        servers.fan_reference_ratio,
-        servers.fan_power_exponent,
-        servers.fan_reference_w,
+        curves.cpu_slope_per_k,
+        curves.cpu_offset,
+        curves.cpu_shift,
+        curves.fan_slope_per_k,
+        curves.fan_offset,
+        curves.fan_shift,
+        curves.fan_low,
+        curves.fan_high,
+        curves.fan_reference_ratio,
+        curves.fan_exponent,
+        curves.fan_reference_w,
         design.fan_full_airflow_m3s,
         air,
-        np.inf if servers.curve_limit_c is None else servers.curve_limit_c,
+        curves.curve_limit_c,
         fresh_share,
         servers.heat_capacity_kj_per_k * 1e3,
         servers.heat_exchange_effectiveness,

@@ -1,0 +1,65 @@
+"""Curves of the servers, by hand and against the compiled ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sdc_taichi import Simulator, drivers_from_arrays, load_config
+from sdc_taichi.plant.servers import linear_curve
+
+
+def test_curve_coefficients_by_hand() -> None:
+    curves = load_config("corrected").servers.curves
+    cpu = curves.cpu_slope_per_k, curves.cpu_offset, curves.cpu_shift
+    fan = curves.fan_slope_per_k, curves.fan_offset, curves.fan_shift
+    assert cpu == pytest.approx((1 / 600, -1 / 60, 0.99))
+    assert fan == pytest.approx((0.215 / 12, 0.225 - 0.215 * 28 / 12, 0.215))
+    released = load_config("sustaindc").servers.curves
+    assert released.cpu_slope_per_k == pytest.approx(1 / 600 + 0.05)
+    released_fan = released.fan_slope_per_k, released.fan_offset, released.fan_shift
+    assert released_fan == pytest.approx((10 * fan[0], 5 * fan[1], 5 * fan[2]))
+
+
+def test_line_goes_through_the_given_points() -> None:
+    slope, offset, shift = linear_curve((16.0, 28.0), (0.01, 1.0), (0.03, 1.02))
+    assert slope * 16.0 + offset == pytest.approx(0.01)
+    assert slope * 28.0 + offset == pytest.approx(0.03)
+    assert slope * 16.0 + offset + shift == pytest.approx(1.0)
+
+
+def test_fans_never_blow_backwards_and_curves_end_at_the_limit() -> None:
+    curves = load_config("corrected", ["servers.fan_airflow_ratio_limits=null"]).servers.curves
+    idle = np.zeros(1)
+    assert curves.airflow_ratio(np.array([-40.0]), idle) == 0.0
+    at_limit, beyond = np.array([45.0]), np.array([60.0])
+    assert curves.airflow_ratio(beyond, idle) == curves.airflow_ratio(at_limit, idle)
+    watts = np.array([150.0]), np.array([10.0])
+    assert curves.cpu_w(beyond, idle, *watts) == curves.cpu_w(at_limit, idle, *watts)
+    assert curves.fan_w(np.array([0.5])) == pytest.approx(10.0 * 0.5**3)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        [],
+        ["servers.fan_model=released", "servers.fan_power_exponent=1"],
+        ["servers.fan_power_exponent=2.2", "servers.fan_reference_ratio=0.6"],
+        ["servers.curve_limit_c=23", "servers.fan_airflow_ratio_limits=[0.1, 0.3]"],
+    ],
+    ids=["cubic", "released", "other exponent", "limits"],
+)
+def test_kernel_computes_the_same_curves(changes: list[str]) -> None:
+    config = load_config("tiny", ["hvac.setpoint.initial_c=20", *changes])
+    curves, load = config.servers.curves, np.array([0.6])
+    racks, full_w, idle_w = [0, 2], np.array([150.0, 170.0]), np.array([10.0, 20.0])
+    drivers = drivers_from_arrays([20.0], [15.0], [300.0], load)
+    with Simulator(config, drivers=drivers, precision="f64") as sim:
+        sim.reset()
+        result = sim.step()
+    inlet_c = result.rack_inlet_c[racks].astype(np.float64)
+    ratio = curves.airflow_ratio(inlet_c, load)
+    cpu_w = curves.cpu_w(inlet_c, load, full_w, idle_w)
+    np.testing.assert_allclose(result.rack_airflow_m3s[racks], 3 * 0.0212 * ratio, rtol=1e-12)
+    np.testing.assert_allclose(result.rack_cpu_w[racks], 3 * cpu_w, rtol=1e-12)
+    np.testing.assert_allclose(result.rack_fan_w[racks], 3 * curves.fan_w(ratio), rtol=1e-12)
