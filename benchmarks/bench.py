@@ -157,7 +157,8 @@ def beside_peers(name: str, fleet: Fleet, threads: int, rounds: int) -> Iterator
         where = f"{name}: {peer}"
         yield each(peer, peer)
         yield Figure("kernel", f"{where}, ours over it", over("step", peer), at_most=1.3)
-        apart = difference(given, layers, np.stack([sums.cpu_w, sums.fan_w, sums.airflow_m3s]))
+        summed = np.stack([sums.cpu_w, sums.it_fan_w, sums.it_airflow_m3s])
+        apart = difference(given, layers, summed)
         yield Figure("kernel", f"{where}, largest difference", apart, "relative", at_most=1e-5)
 
 

@@ -415,7 +415,7 @@ def go_on(hall: ti.template(), n, air: ti.template()):
         dc.active = more
         dc.shift_k = ti.select(apart, 0.0, middle_k)
         air.adds, air.ends = sweep > 0, more == 0
-        air.coil_load_w, air.coil_w = cool(hall, n, units, air.return_c)
+        air.cooling_load_w, air.coil_w = cool(hall, n, units, air.return_c)
     else:
         air.ends = judge_sweep(hall, n, air.supply_c, units.uncovered, more)
         if dc.mix < 0:
@@ -443,7 +443,7 @@ def keep_air(hall: ti.template(), n, air: ti.template()):
     dc.crac_flow_m3s = so_far(hall, air, dc.crac_flow_m3s, air.crac_flow_m3s)
     dc.supply_c = so_far(hall, air, dc.supply_c, air.supply_c)
     dc.return_c = so_far(hall, air, dc.return_c, air.return_c)
-    dc.coil_load_w = so_far(hall, air, dc.coil_load_w, air.coil_load_w)
+    dc.cooling_load_w = so_far(hall, air, dc.cooling_load_w, air.cooling_load_w)
     dc.coil_w = so_far(hall, air, dc.coil_w, air.coil_w)
 
 
@@ -455,8 +455,8 @@ def keep_results(hall: ti.template(), n):
     total, n_racks = hall.chunks[first], ti.cast(dc.racks, ti.f64)
     supplied_m3k_s = dc.inlet_m3k_s
     dc.cpu_w = total.cpu_w
-    dc.fan_w = total.fan_w
-    dc.airflow_m3s = total.airflow_m3s
+    dc.it_fan_w = total.fan_w
+    dc.it_airflow_m3s = total.airflow_m3s
     dc.inlet_mean_c = total.inlet_c / n_racks
     dc.outlet_mean_c = total.outlet_c / n_racks
     dc.inlet_m3k_s = total.inlet_m3k_s * hall.weight - supplied_m3k_s
@@ -492,7 +492,7 @@ def close(hall: ti.template(), n, terms_at, late, hottest: ti.template()):
         crac_flow_m3s=none,
         supply_c=hall.units[dc.first_unit].supply_c,
         return_c=none,
-        coil_load_w=none,
+        cooling_load_w=none,
         coil_w=none,
     )
     if ti.static(hall.recirculates):

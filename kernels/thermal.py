@@ -106,7 +106,7 @@ DC_DOUBLES = (
     "room_j_per_k",
     "coil_limit_w",
     "crac_fan_w_per_m3s",
-    "it_airflow_m3s",
+    "design_it_airflow_m3s",
     "start_low_c",
     "start_per_k",
     "kept",
@@ -176,8 +176,8 @@ terms before ``flow_m3s``; hottest group, and the range of what the exhaust chan
 last exchange, or of what the mixes change by in the next one."""
 DC_OUT = (
     "cpu_w",
-    "fan_w",
-    "airflow_m3s",
+    "it_fan_w",
+    "it_airflow_m3s",
     "inlet_mean_c",
     "outlet_mean_c",
     "inlet_m3k_s",
@@ -188,7 +188,7 @@ DC_OUT = (
     "crac_flow_m3s",
     "supply_c",
     "return_c",
-    "coil_load_w",
+    "cooling_load_w",
     "coil_w",
     "inlet_max_c",
     "hottest_rack",

@@ -53,7 +53,7 @@ def run_units(hall: ti.template(), n, flow_m3s, more):
         run_m3k_s=none,
         any_runs=none,
     )
-    following = flow_m3s / dc.it_airflow_m3s
+    following = flow_m3s / dc.design_it_airflow_m3s
     fresh_share = ti.cast(dc.fresh_share, ti.f64)
     at = dc.first_unit
     while at < hall.dcs[n + 1].first_unit:

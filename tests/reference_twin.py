@@ -129,8 +129,8 @@ def _data_center(racks: list[dict[str, float]]) -> dict[str, float]:
 
     return {
         "cpu_w": float(np.sum(of("cpu_w"))),
-        "fan_w": float(np.sum(of("fan_w"))),
-        "airflow_m3s": float(np.sum(of("airflow_m3s"))),
+        "it_fan_w": float(np.sum(of("fan_w"))),
+        "it_airflow_m3s": float(np.sum(of("airflow_m3s"))),
         "inlet_mean_c": float(np.mean(of("inlet_c"))),
         "inlet_max_c": float(np.max(of("inlet_max_c"))),
         "outlet_mean_c": float(np.mean(of("outlet_c"))),
@@ -593,7 +593,8 @@ def advance(
         coil_w = min(max(wanted, 0.0), limit_w)
         parts.append(
             {
-                "cpu_w": cpu.sum(), "fan_w": fan.sum(), "airflow_m3s": flow.sum(),
+                "cpu_w": cpu.sum(), "it_fan_w": fan.sum(),
+                "it_airflow_m3s": flow.sum(),
                 "inlet_mean_c": rack_inlet.mean(), "outlet_mean_c": outlet_c.mean(),
                 "inlet_m3k_s": flow @ (inlet_c - warmth),
                 "over_27_sum_k": np.maximum(inlet_c - 27, 0).sum(),
@@ -601,7 +602,8 @@ def advance(
                 "outlet_m3k_s": carried.sum() - rack_flow.sum() * warmth,
                 "thermal_storage_w": capacity * np.sum(warmer - now.server_c) / h + parcel_w,
                 "crac_flow_m3s": moved.unit.sum(),
-                "supply_c": warmth, "return_c": return_c, "coil_load_w": load_w, "coil_w": coil_w,
+                "supply_c": warmth, "return_c": return_c,
+                "cooling_load_w": load_w, "coil_w": coil_w,
                 "unit_flow_m3s": moved.unit, "unit_cubed_speed": running * moved.speed**3,
                 "rack_cpu_w": hall.per_rack(cpu), "rack_fan_w": hall.per_rack(fan),
                 "rack_airflow_m3s": rack_flow, "rack_inlet_c": rack_inlet,

@@ -106,7 +106,7 @@ def test_peers_compute_what_the_kernel_computes(
     peers.PEERS[peer](given, 2)()
     for name in ("inlet_c", "outlet_c", "power_w"):
         np.testing.assert_allclose(getattr(given.layers, name), getattr(layers, name), rtol=2e-6)
-    for column, name in enumerate(("cpu_w", "fan_w", "airflow_m3s")):
+    for column, name in enumerate(("cpu_w", "it_fan_w", "it_airflow_m3s")):
         np.testing.assert_allclose(given.sums[:, column], getattr(sums, name), rtol=2e-6)
     for column, name in enumerate(
         ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "inlet_max_c", "outlet_c")

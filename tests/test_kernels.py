@@ -200,8 +200,12 @@ def test_data_centers_are_the_sums_and_means_of_their_racks(
         rack_values = getattr(sums, f"rack_{name}").astype(np.float64)
         return np.asarray(np.bincount(fleet.rack_dc, rack_values, fleet.size), dtype=np.float64)
 
-    for name in ("cpu_w", "fan_w", "airflow_m3s"):
-        assert_close(getattr(sums, name), total(name), 1e-14, name)
+    for name, of_rack in (
+        ("cpu_w", "cpu_w"),
+        ("it_fan_w", "fan_w"),
+        ("it_airflow_m3s", "airflow_m3s"),
+    ):
+        assert_close(getattr(sums, name), total(of_rack), 1e-14, name)
     assert_close(sums.inlet_mean_c, total("inlet_c") / racks, 1e-14, "inlet")
     assert_close(sums.outlet_mean_c, total("outlet_c") / racks, 1e-14, "outlet")
     hottest = np.maximum.reduceat(sums.rack_inlet_max_c, fleet.rack_offsets[:-1])

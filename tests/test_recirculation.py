@@ -295,7 +295,7 @@ def test_fans_without_limits_of_their_airflow(precision: Precision) -> None:
     assert_agrees([config], Conditions(np.array([18.0]), np.array([0.05])), precision)
     # The curve is below 0 here, and fans do not blow backwards; heat goes to the room all the same.
     sums = Hall(build_fleet(config), precision).solve(Conditions(np.array([4.0]), np.zeros(1)))
-    assert sums.airflow_m3s[0] == sums.fan_w[0] == 0.0
+    assert sums.it_airflow_m3s[0] == sums.it_fan_w[0] == 0.0
     carried = 1.225 * 1006.0 * sums.crac_flow_m3s[0] * (sums.return_c[0] - 4.0)
     assert carried == pytest.approx(sums.cpu_w[0], rel=TOLERANCE[precision])
 
@@ -728,7 +728,7 @@ def test_all_power_leaves_with_the_air(precision: Precision, seed: int) -> None:
     sums, layers = hall.solve(met), hall.servers()
     for i, part in enumerate(parts(configs, met)):
         heat_w, power_w, left_over = leaving(part, sums, layers)
-        it_w = sums.cpu_w[i] + sums.fan_w[i]
+        it_w = sums.cpu_w[i] + sums.it_fan_w[i]
         assert power_w == pytest.approx(it_w, rel=TOLERANCE[precision])
         # In f32 what the last sweep leaves counts ten times where units give a third of the need.
         rel = {"f64": 1e-12, "f32": 1e-4}[precision]

@@ -441,10 +441,10 @@ def check_rack(check: Check) -> Values:
     )
     return {
         "P_cpu": sums.cpu_w[0],
-        "P_fan": sums.fan_w[0],
-        "V_total": sums.airflow_m3s[0],
+        "P_fan": sums.it_fan_w[0],
+        "V_total": sums.it_airflow_m3s[0],
         "cpu_ratio": sums.cpu_w[0] / (servers * full_w),
-        "fan_v_ratio": sums.airflow_m3s[0] / (servers * full_m3s),
+        "fan_v_ratio": sums.it_airflow_m3s[0] / (servers * full_m3s),
     }
 
 
@@ -766,7 +766,7 @@ def solve_even(config: DataCenterConfig, crac_flow_ratio: float) -> tuple[HallSu
 
 def rti_of(sums: HallSums) -> float:
     """Return temperature index as a ratio."""
-    it_rise_k = air_metrics.it_rise_k(sums.inlet_m3k_s, sums.outlet_m3k_s, sums.airflow_m3s)
+    it_rise_k = air_metrics.it_rise_k(sums.inlet_m3k_s, sums.outlet_m3k_s, sums.it_airflow_m3s)
     return float(air_metrics.rti(sums.return_c, sums.supply_c, it_rise_k)[0]) / 100.0
 
 
@@ -777,7 +777,7 @@ def check_recirculation_of_a_row(check: Check) -> Values:
     config = even_hall({"layout": "1x5", "a": given["a"], "d": given["d"], "V_crac_per_W": per_w})
     flows = calibrate(config)
     sums, _ = solve_even(config, 1.0)
-    it_rise_k = (sums.cpu_w + sums.fan_w) / (RHO_CP * sums.airflow_m3s)
+    it_rise_k = (sums.cpu_w + sums.it_fan_w) / (RHO_CP * sums.it_airflow_m3s)
     assert it_rise_k == pytest.approx(given["dT_IT"], rel=1e-12)
     return {
         "r": float(np.mean(flows.share)),

@@ -125,7 +125,7 @@ def test_transient_halls_agree_with_the_twin(
             where: Any = slice(i, i + 1)
             if name.startswith(("rack_", "unit_")):
                 where = part.racks if name.startswith("rack_") else part.units
-            scale = through if name in ("thermal_storage_w", "coil_load_w", "coil_w") else 0.0
+            scale = through if name in ("thermal_storage_w", "cooling_load_w", "coil_w") else 0.0
             np.testing.assert_allclose(
                 getattr(sums, name)[where], expected, rtol=rel, atol=rel * scale + 1e-9,
                 err_msg=f"{configs[i].name} {name}",
@@ -274,7 +274,7 @@ def test_heat_that_comes_in_stays_or_leaves(precision: Precision, seed: int) -> 
         running = np.ones(fleet.units) if met.unit_running is None else met.unit_running
         fans = coil.fan_w_per_m3s[fleet.unit_dc] * fleet.unit_design_m3s * sums.unit_cubed_speed
         assert np.all(fans[running == 0] == 0)
-        generated = sums.cpu_w + sums.fan_w + np.add.reduceat(fans, fleet.unit_offsets[:-1])
+        generated = sums.cpu_w + sums.it_fan_w + np.add.reduceat(fans, fleet.unit_offsets[:-1])
         kept = held_j(fleet, state, room_j) - before
         # Against all heat that moves, for some halls are idle.
         moved = np.abs(generated) + np.abs(sums.coil_w) + np.abs(kept) / 900.0
@@ -339,7 +339,7 @@ def test_an_uncooled_hall_warms_by_its_power_over_its_heat_capacity(precision: P
         means.append((sums.inlet_mean_c[0], sums.outlet_mean_c[0], sums.supply_c[0]))
     parcels = reference_twin.calibrated(config).parcel_j_per_k * fleet.racks
     capacity = servers * (9750.0 + 2000.0) + parcels
-    expected = 900.0 * (sums.cpu_w + sums.fan_w) / capacity
+    expected = 900.0 * (sums.cpu_w + sums.it_fan_w) / capacity
     rel = {"f64": 1e-6, "f32": 1e-3}[precision]
     np.testing.assert_allclose(np.diff(means, axis=0)[-1], np.full(3, expected[0]), rtol=rel)
 
@@ -367,9 +367,9 @@ def test_constant_conditions_end_in_the_quasi_steady_state(precision: Precision,
     for _ in range(80):
         sums, state = hall.advance(met, state, coil, 900.0, 100.0)
     rel = {"f64": 1e-7, "f32": 1e-4}[precision]
-    through = float(expected.cpu_w[0] + expected.fan_w[0]) + 1.0
+    through = float(expected.cpu_w[0] + expected.it_fan_w[0]) + 1.0
     for f in fields(HallSums):
-        if f.name in ("hottest_rack", "hottest_server", "coil_w", "coil_load_w", "room_j"):
+        if f.name in ("hottest_rack", "hottest_server", "coil_w", "cooling_load_w", "room_j"):
             continue
         scale = through if f.name == "thermal_storage_w" else 1.0
         np.testing.assert_allclose(
@@ -397,7 +397,7 @@ def test_settled_halls_stay_settled(precision: Precision, seed: int) -> None:
     atol = {"f64": 1e-4, "f32": 1e-2}[precision]
     np.testing.assert_allclose(after.server_c, state.server_c, rtol=0, atol=atol)
     np.testing.assert_allclose(after.mixed_c, state.mixed_c, rtol=0, atol=atol)
-    assert np.all(np.abs(sums.thermal_storage_w) <= 1e-4 * (sums.cpu_w + sums.fan_w) + 1e-6)
+    assert np.all(np.abs(sums.thermal_storage_w) <= 1e-4 * (sums.cpu_w + sums.it_fan_w) + 1e-6)
 
 
 def test_a_failed_unit_is_felt_over_steps_and_forgotten_again() -> None:

@@ -125,7 +125,7 @@ def _air_flows(fleet: Fleet, sums: HallSums, approach_k: F64, supply_c: float) -
     flow_m3s = float(sums.crac_flow_m3s[0])
     return_c = float(sums.return_c[0])
     inlet_rise, outlet_rise = sums.inlet_m3k_s, sums.outlet_m3k_s
-    rise_k = air_metrics.it_rise_k(inlet_rise, outlet_rise, sums.airflow_m3s)
+    rise_k = air_metrics.it_rise_k(inlet_rise, outlet_rise, sums.it_airflow_m3s)
     return AirFlows(
         exhaust_share=share,
         bypass_share=max(1.0 - float(np.sum((1.0 - share) * airflow_m3s)) / flow_m3s, 0.0),

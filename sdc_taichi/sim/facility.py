@@ -49,7 +49,7 @@ class FacilityInputs:
 
     cpu_w: F64 = NOT_USED
     it_fan_w: F64 = NOT_USED
-    airflow_m3s: F64 = NOT_USED
+    it_airflow_m3s: F64 = NOT_USED
     over_27_sum_k: F64 = NOT_USED
     """Sum over the servers, as the next."""
     under_18_sum_k: F64 = NOT_USED
@@ -66,7 +66,7 @@ class FacilityInputs:
     """Design airflow times the cube of the fan speed."""
     mixed_m3k_s: F64 = NOT_USED
     """Airflow times setpoint."""
-    coil_load_w: F64 = NOT_USED
+    cooling_load_w: F64 = NOT_USED
     """This and the next two of transient halls, see ``HallSums``."""
     coil_w: F64 = NOT_USED
     room_j: F64 = NOT_USED
@@ -212,7 +212,7 @@ class Facility:
             "rti_pct": air_metrics.rti(
                 room.return_c,
                 room.supply_c,
-                air_metrics.it_rise_k(met.inlet_m3k_s, met.outlet_m3k_s, met.airflow_m3s),
+                air_metrics.it_rise_k(met.inlet_m3k_s, met.outlet_m3k_s, met.it_airflow_m3s),
             ),
             "rci_hi_pct": air_metrics.rci_hi(met.over_27_sum_k, self._servers, allowable_c=high_c),
             "rci_lo_pct": air_metrics.rci_lo(met.under_18_sum_k, self._servers, allowable_c=low_c),
@@ -300,7 +300,7 @@ class Facility:
                 return_c=met.return_c,
                 load_w=it_w + fan_w,
             )
-        flow, speed = self._flow(it_w, met.airflow_m3s, speed=met.fan_speed, **self._flow_limits)
+        flow, speed = self._flow(it_w, met.it_airflow_m3s, speed=met.fan_speed, **self._flow_limits)
         fan_w = crac_fan_w(speed, design_flow_m3s=1.0, design_w=self._sized.crac_fan_w)
         fan_w = fan_w if self._calm else met.powered * fan_w
         return_c, load_w = self._load(
@@ -320,7 +320,7 @@ class Facility:
         """What the plant takes of the heat that comes back and of the heat held by the room."""
         step_h = self._step_h
         if self._transient:
-            load_w, device = met.coil_load_w, self._operate(met.coil_w, met)
+            load_w, device = met.cooling_load_w, self._operate(met.coil_w, met)
             # The room has kept its heat within the step; here is what the plant fell short of.
             held_kwh = met.room_j / 3.6e6 + (met.coil_w - device.removed_w) * step_h / 1e3
             unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, device.removed_w)

@@ -96,8 +96,8 @@ class HallSums:
     """Sums and means of one evaluation: (B,) per data center, (R,) per rack."""
 
     cpu_w: F64
-    fan_w: F64
-    airflow_m3s: F64
+    it_fan_w: F64
+    it_airflow_m3s: F64
     inlet_mean_c: F64
     """Plain mean over the racks of ``rack_inlet_c``, as ``outlet_mean_c`` of ``rack_outlet_c``."""
     inlet_max_c: F64
@@ -121,7 +121,7 @@ class HallSums:
     crac_flow_m3s: F64
     """0 with inlet model ``approach``, as the next."""
     return_c: F64
-    coil_load_w: F64
+    cooling_load_w: F64
     """Heat of air and fans that reaches the CRAC units (transient)."""
     coil_w: F64
     """Heat that the coils take out (transient)."""
@@ -400,7 +400,7 @@ class Hall:
         self._dcs = self._real(fleet.dcs.T).reshape(-1)
         self._doubles = np.zeros((len(thermal.DC_DOUBLES), fleet.size))
         self._dc = dict(zip(thermal.DC_DOUBLES, self._doubles, strict=True))
-        self._dc["it_airflow_m3s"][:] = fleet.it_airflow_m3s
+        self._dc["design_it_airflow_m3s"][:] = fleet.it_airflow_m3s
         if air is not None:
             ends = np.array([start.supply_c[:2] for start in air.starts])[air.start].T
             self._dc["start_low_c"][:] = ends[0]

@@ -400,8 +400,8 @@ class Simulator:
             tripped_racks=floor.racks_in(status, TRIPPED),
             outlet_mean_c=air.outlet_mean_c,
             cpu_w=air.cpu_w,
-            it_fan_w=air.fan_w,
-            it_airflow_m3s=air.airflow_m3s,
+            it_fan_w=air.it_fan_w,
+            it_airflow_m3s=air.it_airflow_m3s,
             thermal_storage_w=air.thermal_storage_w,
             grid_up=event.grid_up.astype(np.float64),
             powered=self._all.copy() if powered is None else powered,
@@ -439,8 +439,8 @@ class Simulator:
         sums = self._unit_sums
         out = {
             "cpu_w": air.cpu_w,
-            "it_fan_w": air.fan_w,
-            "airflow_m3s": air.airflow_m3s,
+            "it_fan_w": air.it_fan_w,
+            "it_airflow_m3s": air.it_airflow_m3s,
             "over_27_sum_k": air.over_27_sum_k,
             "under_18_sum_k": air.under_18_sum_k,
             "inlet_m3k_s": air.inlet_m3k_s,
@@ -459,7 +459,11 @@ class Simulator:
             # Such halls have one unit for all of a data center.
             out |= {"outlet_mean_c": air.outlet_mean_c, "fan_speed": fan_speed}
         if self._transient:
-            out |= {"coil_load_w": air.coil_load_w, "coil_w": air.coil_w, "room_j": air.room_j}
+            out |= {
+                "cooling_load_w": air.cooling_load_w,
+                "coil_w": air.coil_w,
+                "room_j": air.room_j,
+            }
         if not self._calm:
             idle_m3s = (1.0 - running) * flow_m3s
             out |= {

@@ -62,7 +62,7 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     """Full load, highest setpoint and design wet bulb, with the margin of the config on top."""
     v = fleet.values
     full = _solve(fleet, hall, v("hvac.setpoint.max_c"), np.ones(fleet.size))
-    it_w = full.cpu_w + full.fan_w
+    it_w = full.cpu_w + full.it_fan_w
     crac_flow = fleet.unit_sums(fleet.unit_design_m3s)
     crac_fan_w = v("hvac.crac.fan_w_per_m3s") * crac_flow
     cooling_w = (it_w + crac_fan_w) * v("hvac.sizing.margin")
@@ -106,7 +106,7 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     hours = v("battery.hours_of_design_load")
     return Sizing(
         it_w=it_w,
-        it_airflow_m3s=full.airflow_m3s,
+        it_airflow_m3s=full.it_airflow_m3s,
         crac_flow_m3s=crac_flow,
         crac_fan_w=crac_fan_w,
         design_outdoor_c=outdoor_c,
@@ -134,7 +134,7 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
     outdoor_c = np.where(np.isnan(given), listed, given)
     low_c, air = v("hvac.setpoint.min_c"), air_j_per_m3_k(fleet)
     full = _solve(fleet, hall, v("hvac.setpoint.max_c"), ones)
-    it_w = full.cpu_w + full.fan_w
+    it_w = full.cpu_w + full.it_fan_w
     crac_flow = v("hvac.crac.supply_m3s_per_w") * it_w
     rise_k = np.maximum(full.outlet_mean_c + mean_return_approach_k(fleet) - low_c, 0.0)
     rated_w = air * crac_flow * rise_k
@@ -150,7 +150,7 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
     facility_w = 1.1 * (highest_w + rated_w + machine.power_w)
     return Sizing(
         it_w=it_w,
-        it_airflow_m3s=full.airflow_m3s,
+        it_airflow_m3s=full.it_airflow_m3s,
         crac_flow_m3s=crac_flow,
         crac_fan_w=v("hvac.crac.released_fan_w")
         * (v("hvac.crac.supply_m3s_per_w") / v("hvac.crac.reference_m3s_per_w")) ** 3,
@@ -188,7 +188,7 @@ def released_ranges(fleet: Fleet, hall: Hall) -> dict[str, tuple[F64, F64]]:
                 np.full(fleet.size, float(supply_c)),
                 np.full(fleet.size, percent / 100),
             )
-            it_w.append(sums.cpu_w + sums.fan_w)
+            it_w.append(sums.cpu_w + sums.it_fan_w)
             outlet_c.append(sums.outlet_mean_c)
     return {
         "it_w": (np.min(it_w, axis=0), np.max(it_w, axis=0)),
