@@ -24,7 +24,6 @@ from sdc_taichi import (
 from sdc_taichi.config import (
     apply_overrides,
     config_from_dict,
-    first_step_day,
 )
 
 PRESETS = ("corrected", "large", "paper", "sustaindc", "tiny")
@@ -239,25 +238,6 @@ def test_capacity_without_scaling_keeps_the_racks() -> None:
     config = load_config("corrected", ["hall.servers_per_rack=[" + ", ".join(["3"] * 19) + ", 8]"])
     counts = [rack[0].count for rack in config.rack_groups()]
     assert counts == [3] * 19 + [8]
-
-
-# --- dates --------------------------------------------------------------------------------------
-
-
-def test_first_step_day_counts_a_year_of_365_days() -> None:
-    days = [
-        first_step_day(f"{month:02d}-{day:02d}")
-        for month, length in enumerate((31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31), 1)
-        for day in range(1, length + 1)
-    ]
-    assert days == list(range(365))
-    assert first_step_day("7-1") == first_step_day(" 07-01 ") == 181
-
-
-@pytest.mark.parametrize("text", ["02-29", "00-01", "13-01", "04-31", "07/01", "", "07", 701, None])
-def test_days_that_are_none(text: object) -> None:
-    with pytest.raises(ValueError, match=r"valid is MM-DD"):
-        first_step_day(text)
 
 
 # --- the SustainDC format -----------------------------------------------------------------------

@@ -11,7 +11,7 @@ import exogenous_builders as build
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import read_carbon, read_epw, read_workload, statistics, wet_bulb_c
 from sdc_taichi.exogenous.files import read_metadata, write_parquet
-from sdc_taichi.exogenous.statistics import DAYS_PER_MONTH
+from sdc_taichi.year_clock import MONTH_OF_DAY
 
 
 def write(path: Path, lines: list[str] | tuple[str, ...], newline: str = "\n") -> Path:
@@ -145,7 +145,7 @@ def test_a_file_from_july_to_june_begins_with_january(start: int, tmp_path: Path
     hours = np.repeat(stamps, 24) + np.tile(np.arange(24), stamps.size)
     lines = ["timestamp,cpu_load", *(f"{t}:00,{int(str(t)[5:7]) / 100}" for t in hours)]
     months = np.rint(read_workload(write(tmp_path / "w.csv", lines)).values * 100).astype(int)
-    january_to_december = np.repeat(np.arange(1, 13), np.array(DAYS_PER_MONTH) * 24)
+    january_to_december = np.repeat(MONTH_OF_DAY, 24)
     np.testing.assert_array_equal(months, january_to_december)
 
 

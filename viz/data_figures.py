@@ -18,7 +18,7 @@ import numpy as np
 from sdc_taichi.errors import SdcError
 from sdc_taichi.exogenous.registry import load_site, load_trace
 from sdc_taichi.exogenous.series import Series
-from sdc_taichi.run.loop import FIRST_YEAR
+from sdc_taichi.year_clock import FIRST_YEAR, MINUTES_PER_YEAR
 
 from .figures import BLUE, RED, clean, finish, format_time, new_figure, plain, set_title
 from .fleet_figures import line_style
@@ -75,7 +75,7 @@ def as_pandas(series: Series) -> pd.Series:
     """Values of the first year by time."""
     import pandas as pd
 
-    count = min(series.values.size, round(365 * 1440 / series.minutes))
+    count = min(series.values.size, round(MINUTES_PER_YEAR / series.minutes))
     begin = pd.Timestamp(year=FIRST_YEAR, month=1, day=1)
     times = pd.date_range(begin, periods=count, freq=pd.Timedelta(minutes=series.minutes))
     return pd.Series(series.values[:count], index=times)

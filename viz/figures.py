@@ -19,12 +19,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.config import first_step_day
 from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.floor_plan import Plan
-from sdc_taichi.run.loop import FIRST_YEAR, step_times
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, Reals, StepResult
+from sdc_taichi.year_clock import FIRST_YEAR, day_of_year, step_times
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -302,7 +301,7 @@ def _check_result(result: StepResult, fleet: Fleet, dc: int) -> None:
 
 def step_time(result: StepResult, fleet: Fleet, dc: int) -> np.datetime64:
     """Start of a step on the clock of a data center, as in steps.parquet."""
-    day = first_step_day(fleet.configs[dc].site.start)
+    day = day_of_year(fleet.configs[dc].site.start)
     start = np.array([day * 24 * fleet.steps_per_hour])
     found = step_times(start, np.array([result.step]), fleet.steps_per_hour)
     return np.datetime64(found[0, 0], "s")

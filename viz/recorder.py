@@ -11,7 +11,8 @@ Entities of a recording, NAME being a data center in focus:
     legend/..., summary                static
 
 Timelines are ``step``, from 0 at reset, and ``sim_time``, the start of the step on the data
-center's own clock (see ``run.step_times``); the fleet has the clock of the first one in focus.
+center's own clock (see ``year_clock.step_times``); the fleet has the clock of the first one in
+focus.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.floor_plan import floor_plan
-from sdc_taichi.run.loop import RunRequest, describe, step_times
+from sdc_taichi.run.loop import RunRequest, describe
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, StepResult
+from sdc_taichi.year_clock import step_times
 
 from . import hall_layers as layers
 from .blueprint import Tab, blueprint

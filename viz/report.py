@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sdc_taichi.config import DataCenterConfig, first_step_day
+from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import SdcError
-from sdc_taichi.run.loop import REPORT_FILE, step_times
+from sdc_taichi.run.loop import REPORT_FILE
 from sdc_taichi.run.metrics import HOT_INLET_C
 from sdc_taichi.whole_file import whole_file
+from sdc_taichi.year_clock import HOURS_PER_YEAR, day_of_year, step_times
 
 from . import dashboards, data_figures, figures, fleet_figures
 from .fleet_figures import MAP_ROWS, MOST_RUNS, RADAR, number
@@ -52,7 +53,6 @@ PICTURE_DPI = 110
 LONG_WORD = 24
 """Words of a table from this length on, such as names and hashes, may be broken on paper."""
 YEAR_FROM_H = 48.0
-HOURS_PER_YEAR = 8760
 
 METRICS = (
     (
@@ -884,7 +884,7 @@ def _local(run: RecordedRun, dc: int, step: int) -> datetime:
     """Start of a step on the clock of a data center."""
     about = run.about["data_centers"][dc]
     per_hour = round(1 / run.about["step_h"])
-    start = np.array([first_step_day(about["start"]) * 24 * per_hour])
+    start = np.array([day_of_year(about["start"]) * 24 * per_hour])
     moment: datetime = step_times(start, np.array([step]), per_hour)[0, 0].astype(datetime)
     return moment
 

@@ -23,12 +23,12 @@ from sdc_taichi.cli.report import report_command
 from sdc_taichi.cli.view import view_command
 from sdc_taichi.config import (
     DataCenterConfig,
-    first_step_day,
     load_config,
     load_yaml,
     preset_names,
 )
 from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.year_clock import day_of_year
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -352,7 +352,7 @@ def _data_centers(
 
     if start is not None:
         try:
-            first_step_day(start)
+            day_of_year(start)
         except ValueError as error:
             raise ConfigError(f"--start: {error}") from None
         moved = base.site.model_copy(update={"start": start.strip()})

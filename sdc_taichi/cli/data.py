@@ -23,7 +23,7 @@ from sdc_taichi.exogenous.registry import (
     user_data_dir,
 )
 from sdc_taichi.exogenous.series import Series, resample
-from sdc_taichi.exogenous.statistics import DAYS_PER_MONTH, statistics
+from sdc_taichi.exogenous.statistics import statistics
 from sdc_taichi.exogenous.synthetic import (
     DEFAULT_SEED,
     synthetic_site,
@@ -31,6 +31,7 @@ from sdc_taichi.exogenous.synthetic import (
     synthetic_trace,
     synthetic_traces,
 )
+from sdc_taichi.year_clock import DAYS_PER_YEAR, FIRST_DAY_OF_MONTH, HOURS_PER_YEAR
 
 data_app = typer.Typer(help="Sites and workload traces.", no_args_is_help=True)
 
@@ -142,16 +143,20 @@ def write_picture(series: tuple[Series, ...], title: str, out: Path) -> None:
     figure = Figure(figsize=(10.0, 1.0 + 1.9 * len(series)), layout="constrained")
     figure.suptitle(f"{title} (synthetic)" if any(s.synthetic for s in series) else title)
     axes = figure.subplots(len(series), 2, squeeze=False, width_ratios=(3, 1))
-    month_ends = [sum(DAYS_PER_MONTH[:m]) for m in range(13)]
     for (year, day), s in zip(axes, series, strict=True):
-        hourly = resample(s, 1)[:8760].reshape(365, 24)
-        days = range(365)
+        hourly = resample(s, 1)[:HOURS_PER_YEAR].reshape(DAYS_PER_YEAR, 24)
+        days = range(DAYS_PER_YEAR)
         year.fill_between(days, hourly.min(axis=1), hourly.max(axis=1), alpha=0.3, lw=0)
         year.plot(days, hourly.mean(axis=1), lw=1)
-        year.set(xlim=(0, 364), xticks=month_ends[:-1], ylabel=f"{s.name}\n{s.unit}")
+        year.set(
+            xlim=(0, DAYS_PER_YEAR - 1),
+            xticks=FIRST_DAY_OF_MONTH[:-1],
+            ylabel=f"{s.name}\n{s.unit}",
+        )
         year.set_xticklabels("JFMAMJJASOND", ha="left")
         for month, label in ((0, "Jan"), (3, "Apr"), (6, "Jul"), (9, "Oct")):
-            mean = hourly[month_ends[month] : month_ends[month + 1]].mean(axis=0)
+            first, end = FIRST_DAY_OF_MONTH[month : month + 2]
+            mean = hourly[first:end].mean(axis=0)
             day.plot([h + 0.5 for h in range(24)], mean, label=label)
         day.set(xlim=(0, 24), xticks=(0, 6, 12, 18, 24))
     axes[0, 0].set_title("Daily mean and range")

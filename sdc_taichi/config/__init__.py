@@ -5,7 +5,6 @@ Nothing here computes a hall or a plant, and no other module validates a configu
 """
 
 from sdc_taichi.config.schema import (
-    MONTH_DAYS,
     DataCenterConfig,
     EventKind,
     EventsConfig,
@@ -16,7 +15,6 @@ from sdc_taichi.config.schema import (
     apply_overrides,
     config_from_dict,
     explain,
-    first_step_day,
     load_config,
     load_yaml,
     preset_names,
@@ -24,7 +22,6 @@ from sdc_taichi.config.schema import (
 )
 
 __all__ = [
-    "MONTH_DAYS",
     "DataCenterConfig",
     "EventKind",
     "EventsConfig",
@@ -35,7 +32,6 @@ __all__ = [
     "apply_overrides",
     "config_from_dict",
     "explain",
-    "first_step_day",
     "load_config",
     "load_yaml",
     "preset_names",

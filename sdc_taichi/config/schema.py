@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import json
 import os
-import re
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -31,6 +30,7 @@ from pydantic import (
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C
 from sdc_taichi.plant.servers import ServerCurves, linear_curve
+from sdc_taichi.year_clock import day_of_year
 
 
 def _no_bool(value: Any) -> Any:
@@ -534,7 +534,7 @@ class SiteConfig(_Section):
     @field_validator("start", mode="before")
     @classmethod
     def _month_day(cls, value: Any) -> Any:
-        first_step_day(value)
+        day_of_year(value)
         return value
 
 
@@ -812,26 +812,6 @@ class DataCenterConfig(_Section):
     def to_yaml(self) -> str:
         """YAML text that ``load_config`` reads back equal."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-
-
-MONTH_DAYS = (31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31)
-"""Of the 365-day year."""
-
-
-def first_step_day(start: object) -> int:
-    """Day of the 365-day year (0-based) of a ``MM-DD`` text.
-
-    Raises:
-        ValueError: the text is no day of a 365-day year.
-    """
-    match = re.fullmatch(r"(\d{1,2})-(\d{1,2})", str(start).strip())
-    if match:
-        month, day = int(match[1]), int(match[2])
-        if 1 <= month <= 12 and 1 <= day <= MONTH_DAYS[month - 1]:
-            return sum(MONTH_DAYS[: month - 1]) + day - 1
-    raise ValueError(
-        f"start {start!r} is no day of a 365-day year; valid is MM-DD, for example 07-01"
-    )
 
 
 def preset_names() -> list[str]:

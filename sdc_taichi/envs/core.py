@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sdc_taichi.config import DataCenterConfig, first_step_day, load_config
+from sdc_taichi.config import DataCenterConfig, load_config
 from sdc_taichi.control import Idle, View, controlled, make_controller, viewer
 from sdc_taichi.control.rules import unrepeated
 from sdc_taichi.envs.features import AGENTS, Observer, heat_map, heat_map_space
@@ -28,6 +28,7 @@ from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F32, F64, I64, Actions, State, StepResult
+from sdc_taichi.year_clock import DAYS_PER_YEAR, day_of_year
 
 Observation = F32 | dict[str, F32]
 """(B, n), or with the heat map a dict of ``features`` (B, n) and ``heat_map`` (B, rows, racks per
@@ -450,7 +451,7 @@ class Core:
         """First day of each episode as the options say, (B,)."""
         if self.options.start == "fixed":
             starts = [c.site.start for c in self.sim.fleet.configs]
-            return np.array([first_step_day(s) for s in starts], dtype=np.int64)
+            return np.array([day_of_year(s) for s in starts], dtype=np.int64)
         return np.asarray(self._start_days[drawn % len(self._start_days)], dtype=np.int64)
 
     def _chosen_days(self, given: Any) -> I64:
@@ -537,11 +538,11 @@ def _checked(seed: Any) -> int:
 
 def _day(given: Any) -> int:
     if isinstance(given, int | np.integer) and not isinstance(given, bool):
-        if 0 <= given < 365:
+        if 0 <= given < DAYS_PER_YEAR:
             return int(given)
     elif isinstance(given, str):
         try:
-            return first_step_day(given)
+            return day_of_year(given)
         except ValueError:
             pass
     raise ConfigError(f"start_day {given!r}: valid is MM-DD or a day of the year, 0..364")

@@ -27,6 +27,7 @@ from sdc_taichi.sim.drivers import Drivers, Table
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.types import F32, F64, I64
+from sdc_taichi.year_clock import HOURS_PER_YEAR
 
 if TYPE_CHECKING:
     from sdc_taichi.kernels.compiler.stage import CompiledStage
@@ -454,7 +455,7 @@ class _Timed:
         self._at, self.width = _places(features)
         self._forecasts = forecasts
         self._day = _circle(24 * steps_per_hour)
-        self._year = _circle(365 * 24 * steps_per_hour)
+        self._year = _circle(HOURS_PER_YEAR * steps_per_hour)
         self._demand: Table | None = None
         self.rows: TimeRows | None = None
 

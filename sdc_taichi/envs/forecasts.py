@@ -19,10 +19,11 @@ import numpy as np
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 from sdc_taichi.sim.drivers import Drivers, Table
 from sdc_taichi.types import F32, F64, I64
+from sdc_taichi.year_clock import HOURS_PER_YEAR
 
 CI_LEADS_H = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0)
 WEATHER_LEADS_H = (3.0, 6.0, 12.0, 24.0)
-LONGEST_LEAD_H = 8760.0
+LONGEST_LEAD_H = float(HOURS_PER_YEAR)
 _DRAWN_STEPS = 128
 _ALL = slice(None)
 

@@ -16,10 +16,11 @@ from pydantic import (
     model_validator,
 )
 
-from sdc_taichi.config import MONTH_DAYS, explain
+from sdc_taichi.config import explain
 from sdc_taichi.envs.features import AGENTS
 from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, ForecastError
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.year_clock import DAYS_PER_YEAR, MONTH_OF_DAY
 
 Agent = Literal["agent_ls", "agent_dc", "agent_bat"]
 
@@ -163,10 +164,10 @@ class EnvOptions(BaseModel):
         All year round, episodes may run past 31 December, where the inputs repeat.
         """
         if len(self.months) == 12:
-            return list(range(365))
-        month_of = [m for m, days in enumerate(MONTH_DAYS, 1) for _ in range(days)]
-        inside = [month in self.months for month in month_of]
-        return [d for d in range(366 - self.days) if all(inside[d : d + self.days])]
+            return list(range(DAYS_PER_YEAR))
+        inside = [month in self.months for month in MONTH_OF_DAY]
+        last = DAYS_PER_YEAR - self.days
+        return [d for d in range(last + 1) if all(inside[d : d + self.days])]
 
 
 def make_options(**given: Any) -> EnvOptions:

@@ -12,6 +12,7 @@ from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import files
 from sdc_taichi.exogenous.series import FloatArray, Series
 from sdc_taichi.exogenous.synthetic import FUELS, emission_factors
+from sdc_taichi.year_clock import DAYS_PER_YEAR, MINUTES_PER_DAY
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -288,7 +289,7 @@ def _apply_stamp(
     if (before > 0.0) == (after > 0.0):
         word = "end" if before > 0.0 else "start"
         return intensity, int(before > 0.0), f"stamps mark the {word} of the interval (solar noon)"
-    per_day = round(1440.0 / minutes)
+    per_day = round(MINUTES_PER_DAY / minutes)
     cut = min(day * per_day, len(intensity) - 1)
     date = (local + np.timedelta64(day, "D")).astype("datetime64[D]")
     if before > 0.0:  # end, then start: one interval is never reported
@@ -319,7 +320,7 @@ def _solar_lateness(
     year_angle = (
         2.0
         * np.pi
-        / 365.0
+        / DAYS_PER_YEAR
         * (
             (times[0].astype("datetime64[D]") - times[0].astype("datetime64[Y]")).astype(np.int64)
             + np.arange(total.size)

@@ -6,7 +6,6 @@ Parquet file count from 1 without headers).
 
 from __future__ import annotations
 
-import calendar
 import hashlib
 import json
 import math
@@ -19,8 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sdc_taichi.errors import DataError, SdcError
-from sdc_taichi.exogenous.series import MINUTES_PER_YEAR, FloatArray, Series
+from sdc_taichi.exogenous.series import FloatArray, Series
 from sdc_taichi.whole_file import whole_file
+from sdc_taichi.year_clock import (
+    MINUTES_PER_DAY,
+    MINUTES_PER_YEAR,
+    is_leap_day,
+    minutes_into_year,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -221,7 +226,7 @@ def rows_per_year(path: Path, minutes: float) -> int:
     Raises:
         DataError: the resolution is not positive or does not divide a day.
     """
-    per_day = 1440.0 / minutes if minutes > 0.0 else 0.5
+    per_day = MINUTES_PER_DAY / minutes if minutes > 0.0 else 0.5
     if abs(per_day - round(per_day)) > 1e-9:
         raise DataError(
             f"{path}: resolution {minutes:g} min, expected a positive one that divides a day"
@@ -259,17 +264,10 @@ def without_leap_days(
     """
     seconds = np.timedelta64(round(minutes * 60), "s")
     times = start.astype("datetime64[s]") + seconds * np.arange(len(values))
-    leap = (_month(times) == 2) & (_day(times) == 29)
+    leap = is_leap_day(times)
     kept = times[~leap]
     notes = [f"29 February removed ({int(leap.sum())} rows)"] if leap.any() else []
-    if not kept.size:
-        return values[~leap], 0.0, notes
-    since = kept[0] - kept[0].astype("datetime64[Y]").astype("datetime64[s]")
-    minutes_since = float(since / np.timedelta64(1, "m"))
-    year = int(kept[0].astype("datetime64[Y]").astype(np.int64)) + 1970
-    if calendar.isleap(year) and int(_month(kept[:1])[0]) > 2:
-        minutes_since -= 1440.0
-    return values[~leap], minutes_since, notes
+    return values[~leap], minutes_into_year(kept[0]) if kept.size else 0.0, notes
 
 
 def whole_years(
@@ -309,15 +307,6 @@ def whole_years(
     if first:
         notes.append(f"{first} rows before 1 January 00:00 moved to the end")
     return values, notes
-
-
-def _month(times: NDArray[np.datetime64]) -> NDArray[np.int64]:
-    return np.asarray(times.astype("datetime64[M]").astype(np.int64) % 12 + 1)
-
-
-def _day(times: NDArray[np.datetime64]) -> NDArray[np.int64]:
-    since = times.astype("datetime64[D]") - times.astype("datetime64[M]").astype("datetime64[D]")
-    return np.asarray(since.astype(np.int64) + 1)
 
 
 def grid_of_stamps(

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sdc_taichi.errors import DataError
+from sdc_taichi.year_clock import MINUTES_PER_DAY
 
 FloatArray = NDArray[np.float64]
-
-MINUTES_PER_YEAR = 365 * 24 * 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,7 @@ class Series:
     @property
     def days(self) -> float:
         """Length of the series in days."""
-        return self.values.size * self.minutes / 1440.0
+        return self.values.size * self.minutes / MINUTES_PER_DAY
 
 
 @dataclass(frozen=True, eq=False)

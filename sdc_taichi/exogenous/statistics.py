@@ -6,8 +6,7 @@ import numpy as np
 
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous.series import FloatArray, Series, resample
-
-DAYS_PER_MONTH = (31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31)
+from sdc_taichi.year_clock import DAYS_PER_YEAR, HOURS_PER_YEAR, MONTH_OF_DAY
 
 
 def statistics(series: Series) -> dict[str, float]:
@@ -26,11 +25,11 @@ def statistics(series: Series) -> dict[str, float]:
         DataError: the series is not a whole number of 365-day years.
     """
     hourly = resample(series, 1)
-    if hourly.size % 8760:
+    if hourly.size % HOURS_PER_YEAR:
         raise DataError(f"{series.name}: {series.days:g} days, expected whole years of 365 days")
     by_day = hourly.reshape(-1, 24)
-    months = np.tile(np.repeat(np.arange(12), DAYS_PER_MONTH), len(by_day) // 365)
-    monthly = [by_day[months == month].mean() for month in range(12)]
+    months = np.tile(MONTH_OF_DAY, len(by_day) // DAYS_PER_YEAR)
+    monthly = [by_day[months == month].mean() for month in range(1, 13)]
     p1, p50, p99 = np.percentile(hourly, [1, 50, 99])
     return {
         "mean": float(hourly.mean()),

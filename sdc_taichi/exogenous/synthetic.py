@@ -29,8 +29,8 @@ from sdc_taichi.exogenous.psychrometrics import (
     wet_bulb_c,
 )
 from sdc_taichi.exogenous.series import FloatArray, Series, SiteData
+from sdc_taichi.year_clock import DAYS_PER_YEAR, HOURS_PER_YEAR
 
-HOURS = 8760
 TRACE_HOURS = 53 * 168  # whole weeks, as the fitted traces; cut to the year at the end
 FUELS = ("WND", "SUN", "WAT", "OIL", "NG", "COL", "NUC", "OTH")
 DEFAULT_SEED = 10
@@ -87,7 +87,7 @@ def synthetic_site(name: str, seed: int = DEFAULT_SEED) -> SiteData:
     table = coefficients()["weather"][name]
 
     def normals(stream: int) -> FloatArray:
-        return _normals(seed, stream, name, HOURS)
+        return _normals(seed, stream, name, HOURS_PER_YEAR)
 
     outdoor, humidity, pressure = (np.round(x, 4) for x in _weather(table, normals))
     mix = _fuel_mix(coefficients()["grid"][name], normals)
@@ -134,7 +134,7 @@ def synthetic_trace(name: str, seed: int = DEFAULT_SEED) -> Series:
         raise DataError(f"trace {name!r}: expected one of {', '.join(synthetic_traces())}")
     _check_seed(seed)
     table = coefficients()["workload"][name]
-    values = _workload(table, lambda i: _normals(seed, i, name, TRACE_HOURS))[:HOURS]
+    values = _workload(table, lambda i: _normals(seed, i, name, TRACE_HOURS))[:HOURS_PER_YEAR]
     source = f"synthetic year, seed {seed}, fitted to {table['fitted_to']}"
     return Series(np.round(values, 6), 60.0, "utilisation", "1", source, synthetic=True)
 
@@ -229,13 +229,13 @@ def _residual(p: _Table, slow: FloatArray, fast: FloatArray, basis: _Basis) -> F
 @lru_cache(maxsize=32)
 def _climatology(annual: int, diurnal: int, products: tuple[int, ...]) -> _Basis:
     """Columns: 1, annual and diurnal harmonics, first annual times given diurnal harmonics."""
-    year = 2.0 * np.pi * (np.arange(HOURS) + 0.5) / HOURS
+    year = 2.0 * np.pi * (np.arange(HOURS_PER_YEAR) + 0.5) / HOURS_PER_YEAR
     day = 2.0 * np.pi * (np.arange(24) + 0.5) / 24.0
 
     def diurnals(m: int) -> list[FloatArray]:
-        return [np.tile(f(m * day), HOURS // 24) for f in (np.cos, np.sin)]
+        return [np.tile(f(m * day), DAYS_PER_YEAR) for f in (np.cos, np.sin)]
 
-    columns = [np.ones(HOURS)]
+    columns = [np.ones(HOURS_PER_YEAR)]
     for m in range(1, annual + 1):
         columns += [np.cos(m * year), np.sin(m * year)]
     for m in range(1, diurnal + 1):
@@ -301,8 +301,8 @@ def _solar_envelope(latitude_deg: float, lateness_h: float, saturation: float) -
 
     Sine of the solar elevation (declination by Cooper 1969), saturating as trackers do.
     """
-    hour = np.arange(HOURS)
-    declination = np.radians(23.45) * np.sin(2.0 * np.pi * (284 + hour // 24 + 1) / 365.0)
+    hour = np.arange(HOURS_PER_YEAR)
+    declination = np.radians(23.45) * np.sin(2.0 * np.pi * (284 + hour // 24 + 1) / DAYS_PER_YEAR)
     angle = np.radians(15.0) * (hour % 24 + 0.5 - 12.0 - lateness_h)
     latitude = math.radians(latitude_deg)
     sine = np.maximum(
@@ -341,7 +341,7 @@ def _fuel_mix(table: _Table, normals: Callable[[int], FloatArray]) -> dict[str, 
         )
         for part, stream in (("slow", _STREAM_SLOW_FUEL), ("fast", _STREAM_FAST_FUEL))
     )
-    mix = {fuel: np.full(HOURS, float(table["flat"].get(fuel, 0.0))) for fuel in FUELS}
+    mix = {fuel: np.full(HOURS_PER_YEAR, float(table["flat"].get(fuel, 0.0))) for fuel in FUELS}
     for i, name in enumerate(names):
         p = table["drv"][name]
         if name == "SUN":  # percentiles are those of daylight hours, after the envelope
@@ -363,7 +363,7 @@ def _workload(table: _Table, normals: Callable[[int], FloatArray]) -> FloatArray
     day = 2.0 * np.pi * (hour % 24 + 0.5) / 24.0
     columns = [np.ones(TRACE_HOURS)]
     for angle, order in (
-        (2.0 * np.pi * hour / HOURS, table["annual"]),
+        (2.0 * np.pi * hour / HOURS_PER_YEAR, table["annual"]),
         (day, table["D"]),
         (2.0 * np.pi * hour / 168.0, table["W"]),
     ):

@@ -12,6 +12,7 @@ from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import files
 from sdc_taichi.exogenous.psychrometrics import wet_bulb_c
 from sdc_taichi.exogenous.series import FloatArray, Series, Weather
+from sdc_taichi.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH, HOURS_PER_YEAR
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,9 +28,8 @@ _HUMIDITY = ("relative humidity (column 9)", 8, (0.0, 110.0), 999.0)
 _PRESSURE = ("station pressure (column 10)", 9, PRESSURE_LIMITS_PA, 999_999.0)
 # Dew point above dry bulb by more than the rounding of both would put the wet bulb above it too.
 _DEW_POINT_SLACK_K = 0.2
-_MONTH_DAYS = np.array([31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])
-_MONTH_START = np.concatenate([[0], np.cumsum(_MONTH_DAYS)[:-1]])
-_YEAR_H = 8760
+_DAYS_PER_MONTH = np.array(DAYS_PER_MONTH)
+_FIRST_DAY_OF_MONTH = np.array(FIRST_DAY_OF_MONTH)
 
 
 def read_epw(path: str | Path) -> Weather:
@@ -180,12 +180,12 @@ def _hours(path: Path, frame: pd.DataFrame) -> tuple[NDArray[np.int64], pd.DataF
         dates[name] = values.astype(np.int64)
     month, day, hour = dates["month"], dates["day"], dates["hour"]
     leap = (month == 2) & (day == 29)
-    long = day > _MONTH_DAYS[month - 1] + leap
+    long = day > _DAYS_PER_MONTH[month - 1] + leap
     if long.any():
         row = int(np.argmax(long))
         valid = f"a day of month {month[row]}"
         raise files.fault(path, int(rows[row]), "day (column 3)", int(day[row]), valid)
-    of_year = (_MONTH_START[month - 1] + day - 1) * 24 + hour - 1
+    of_year = (_FIRST_DAY_OF_MONTH[month - 1] + day - 1) * 24 + hour - 1
     kept = frame[~leap]
     if kept.empty:
         raise DataError(f"{path}: row {HEADER_LINES + 1}: only 29 February, expected 365 days")
@@ -211,12 +211,12 @@ def _positions(
             f"{path}: row {int(rows[starts[at]])}, column hour: {int(counts[at])} rows in the "
             f"hour, expected {per_hour} (DATA PERIODS)"
         )
-    steps = np.diff(hours[starts]) % _YEAR_H
+    steps = np.diff(hours[starts]) % HOURS_PER_YEAR
     bad = steps - 1 > files.MAX_GAP_H
     if bad.any():
         at = int(np.argmax(bad)) + 1
         month, day, hour = (frame[i].iloc[starts[at]].strip() for i in (1, 2, 3))
-        back = steps[at - 1] > _YEAR_H // 2
+        back = steps[at - 1] > HOURS_PER_YEAR // 2
         valid = (
             "an hour after the row above"
             if back

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 import yaml
 
 from sdc_taichi.config import DataCenterConfig
@@ -30,18 +29,15 @@ from sdc_taichi.exogenous.files import sha256
 from sdc_taichi.run import metrics
 from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.types import F64, I64, StepResult
+from sdc_taichi.types import F64, StepResult
 from sdc_taichi.whole_file import part_of, whole_file, writing
+from sdc_taichi.year_clock import step_times
 
 FORMAT = "sdc-run/1"
 METADATA_KEY = b"sdc_taichi"
 REPORT_FILE = "report.html"
 """Made of the files of a run by ``sdc-taichi report``."""
-FIRST_YEAR = 2001
-"""Calendar year of the first simulated year in time stamps; it has no other meaning."""
 _ROWS_PER_GROUP = 1 << 16
-_MINUTES_PER_YEAR = 365 * 24 * 60
-_MARCH_MIN = 59 * 24 * 60
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
@@ -218,28 +214,6 @@ def configs_yaml(configs: Sequence[DataCenterConfig]) -> str:
     return yaml.dump_all(
         dumped, Dumper=_DUMPER, sort_keys=False, allow_unicode=True, explicit_start=len(configs) > 1
     )
-
-
-def step_times(start: I64, steps: I64, steps_per_hour: int) -> npt.NDArray[np.datetime64]:
-    """Local standard time at which each step begins.
-
-    Years have 365 days and are written as 2001, 2002 and so on; the 29 February of a calendar leap
-    year is left out.
-
-    Args:
-        start: first step of each data center since the start of its year, (B,).
-        steps: steps since reset, (n,).
-        steps_per_hour: the time step.
-
-    Returns:
-        Milliseconds since 1970, (n, B).
-    """
-    minutes = (start + steps[:, None]) * (60 // steps_per_hour)
-    years, within = FIRST_YEAR + minutes // _MINUTES_PER_YEAR, minutes % _MINUTES_PER_YEAR
-    leap = (years % 4 == 0) & ((years % 100 != 0) | (years % 400 == 0))
-    within = within + 1440 * (leap & (within >= _MARCH_MIN))
-    begun = (years - 1970).astype("datetime64[Y]").astype("datetime64[ms]")
-    return np.asarray(begun + within.astype("timedelta64[m]"))
 
 
 class StepsWriter:

@@ -13,12 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.config import DataCenterConfig, first_step_day
+from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous.registry import load_site, load_trace, site_from_files
 from sdc_taichi.exogenous.series import Series, SiteData, resample
 from sdc_taichi.exogenous.workload import read_workload
 from sdc_taichi.types import F64, I64, Exogenous
+from sdc_taichi.year_clock import day_of_year
 
 DESIGN_QUANTILE = 0.996
 """Share of the year that a design temperature covers, the 0.4 % of ASHRAE design conditions."""
@@ -138,7 +139,7 @@ def load_drivers(configs: Sequence[DataCenterConfig]) -> Drivers:
             )
             traces[trace_key] = (trace, resample(trace, steps_per_hour))
         chosen.append((sites[site_key], traces[trace_key]))
-    days = np.array([first_step_day(c.site.start) for c in configs], dtype=np.int64)
+    days = np.array([day_of_year(c.site.start) for c in configs], dtype=np.int64)
     outdoor_c = _table([site.outdoor_c for site, _ in chosen])
     return Drivers(
         outdoor_c=outdoor_c,

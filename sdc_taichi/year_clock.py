@@ -1,0 +1,101 @@
+"""The clock of a simulation: years of 365 days in local standard time.
+
+Every year begins on 1 January at 00:00 and has no 29 February and no daylight saving time, so
+that hour h of the year is the same hour of the same day in every year. Days and steps of the year
+are counted from 0.
+"""
+
+from __future__ import annotations
+
+import re
+from itertools import accumulate
+
+import numpy as np
+import numpy.typing as npt
+
+DAYS_PER_MONTH = (31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31)
+"""Days of each month, January first."""
+FIRST_DAY_OF_MONTH = (0, *accumulate(DAYS_PER_MONTH))
+"""Day of the year on which each month begins, January first; the last entry is the whole year."""
+MONTH_OF_DAY = tuple(month for month, days in enumerate(DAYS_PER_MONTH, 1) for _ in range(days))
+"""Month, 1..12, of each day of the year."""
+DAYS_PER_YEAR = FIRST_DAY_OF_MONTH[-1]
+"""Days of a year: 365."""
+HOURS_PER_YEAR = 24 * DAYS_PER_YEAR
+"""Hours of a year: 8760."""
+MINUTES_PER_DAY = 24 * 60
+"""Minutes of a day: 1440."""
+MINUTES_PER_YEAR = MINUTES_PER_DAY * DAYS_PER_YEAR
+"""Minutes of a year: 525,600."""
+FIRST_YEAR = 2001
+"""Calendar year of the first simulated year in time stamps; it has no other meaning."""
+
+
+def day_of_year(month_day: object) -> int:
+    """Day of the year, 0..364, of a text such as ``07-01``.
+
+    Args:
+        month_day: month and day, ``MM-DD``.
+
+    Raises:
+        ValueError: the text is no day of a 365-day year.
+    """
+    match = re.fullmatch(r"(\d{1,2})-(\d{1,2})", str(month_day).strip())
+    if match:
+        month, day = int(match[1]), int(match[2])
+        if 1 <= month <= 12 and 1 <= day <= DAYS_PER_MONTH[month - 1]:
+            return FIRST_DAY_OF_MONTH[month - 1] + day - 1
+    raise ValueError(
+        f"start {month_day!r} is no day of a 365-day year; valid is MM-DD, for example 07-01"
+    )
+
+
+def step_times(
+    start: npt.NDArray[np.int64], steps: npt.NDArray[np.int64], steps_per_hour: int
+) -> npt.NDArray[np.datetime64]:
+    """Local standard time at which each step begins.
+
+    Years are written as 2001, 2002 and so on; the 29 February of a calendar leap year is left out.
+
+    Args:
+        start: first step of each data center, counted from the beginning of its year, (B,).
+        steps: steps since reset, (n,).
+        steps_per_hour: number of steps in an hour.
+
+    Returns:
+        Milliseconds since 1970, (n, B).
+    """
+    minutes = (start + steps[:, None]) * (60 // steps_per_hour)
+    years, within = FIRST_YEAR + minutes // MINUTES_PER_YEAR, minutes % MINUTES_PER_YEAR
+    from_march = within >= MINUTES_PER_DAY * FIRST_DAY_OF_MONTH[2]
+    within = within + MINUTES_PER_DAY * (_is_leap_year(years) & from_march)
+    new_year = (years - 1970).astype("datetime64[Y]").astype("datetime64[ms]")
+    return np.asarray(new_year + within.astype("timedelta64[m]"))
+
+
+def is_leap_day(times: npt.NDArray[np.datetime64]) -> npt.NDArray[np.bool_]:
+    """Which of the calendar's times, of any shape, fall on 29 February."""
+    months = times.astype("datetime64[M]")
+    month = months.astype(np.int64) % 12
+    day = (times.astype("datetime64[D]") - months.astype("datetime64[D]")).astype(np.int64)
+    return np.asarray((month == 1) & (day == 28))
+
+
+def minutes_into_year(time: np.datetime64) -> float:
+    """Minutes of the 365-day year that have passed at a time of the calendar.
+
+    Args:
+        time: any but one of 29 February.
+    """
+    year = time.astype("datetime64[Y]")
+    minutes = float((time - year.astype(time.dtype)) / np.timedelta64(1, "m"))
+    leap_year = bool(_is_leap_year(year.astype(np.int64) + 1970))
+    if leap_year and minutes >= MINUTES_PER_DAY * FIRST_DAY_OF_MONTH[2]:
+        minutes -= MINUTES_PER_DAY
+    return minutes
+
+
+def _is_leap_year(years: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Which years of the Gregorian calendar have a 29 February."""
+    years = np.asarray(years, dtype=np.int64)
+    return np.asarray((years % 4 == 0) & ((years % 100 != 0) | (years % 400 == 0)))
