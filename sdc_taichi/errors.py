@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class SdcError(ValueError):
     """Base of all errors caused by input; the command line prints them without a traceback."""
@@ -17,3 +20,37 @@ class DataError(SdcError):
 
 class RuntimeStateError(SdcError):
     """The simulator was used in a state that cannot work (closed, forked, not reset)."""
+
+
+def similar_names(name: object, valid: Iterable[str], most: int = 1) -> list[str]:
+    """Valid names that a misspelt ``name`` may have meant, the most similar first.
+
+    Args:
+        name: what was given; compared without regard to case.
+        valid: the names to choose from.
+        most: at most this many are returned.
+    """
+    by_folded = {x.casefold(): x for x in valid}
+    near = difflib.get_close_matches(str(name).strip().casefold(), by_folded, most, cutoff=0.5)
+    return [by_folded[x] for x in near]
+
+
+def suggestion(name: object, valid: Iterable[str], text: str = "; did you mean {!r}?") -> str:
+    """End of a message about an unknown name: what was probably meant.
+
+    Args:
+        name: what was given.
+        valid: the names to choose from.
+        text: format of the suggestion, with one placeholder for the name.
+
+    Returns:
+        The text; empty if no valid name is similar.
+    """
+    near = similar_names(name, valid)
+    return text.format(near[0]) if near else ""
+
+
+def suggestion_or_valid(name: object, valid: Iterable[str]) -> str:
+    """End of a message about an unknown name: what was probably meant, or else all valid names."""
+    names = list(valid)
+    return suggestion(name, names) or f"; valid: {', '.join(names)}"

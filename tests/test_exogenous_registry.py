@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 import exogenous_builders as build
 from sdc_taichi.cli.data import data_app
-from sdc_taichi.errors import DataError
+from sdc_taichi.errors import DataError, SdcError
 from sdc_taichi.exogenous import (
     load_site,
     load_trace,
@@ -249,7 +249,7 @@ def test_show_draws_a_picture(tmp_path: Path, user_folder: Path) -> None:
     assert "matplotlib.pyplot" not in sys.modules
     with pytest.raises(DataError, match=r"va\.xyz: suffix"):
         run("show", "VA", "--out", str(tmp_path / "va.xyz"))
-    with pytest.raises(DataError, match="cannot be written"):
+    with pytest.raises(SdcError, match="cannot be written"):
         run("show", "VA", "--out", str(tmp_path / "absent" / "va.png"))
 
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from sdc_taichi import SdcError, load_config
-from sdc_taichi.sim.design_hall import DesignHall, at_design
+from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
 from sdc_taichi.viz import floor_plan
 
 WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[400, 40]"]
@@ -30,7 +30,7 @@ def drawn(request: pytest.FixtureRequest) -> tuple[DesignHall, Any, Any]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     source, overrides = HALLS[request.param]
-    found = at_design(load_config(source, overrides))
+    found = solve_design_hall(load_config(source, overrides))
     figure = floor_plan.draw(found)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
@@ -137,7 +137,7 @@ def test_units_stand_outside_their_wall(drawn: tuple[DesignHall, Any, Any]) -> N
 def test_a_config_draws_as_its_description_does() -> None:
     config = load_config("tiny")
     figure = floor_plan.draw(config)
-    np.testing.assert_array_equal(racks_of(figure).get_array(), at_design(config).inlet_c)
+    np.testing.assert_array_equal(racks_of(figure).get_array(), solve_design_hall(config).inlet_c)
 
 
 def test_missing_matplotlib_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:

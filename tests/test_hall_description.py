@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from sdc_taichi import DataCenterConfig, SdcError, load_config
+from sdc_taichi.cli.hall import hall_app
+from sdc_taichi.cli.hall_text import LISTED_ROWS, describe_hall
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.sim.design_hall import (
     EXACT_RADIUS_RACKS,
-    LISTED_ROWS,
     DesignHall,
-    at_design,
-    describe,
-    report,
-    show,
+    design_hall_values,
+    solve_design_hall,
 )
 
 WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[400, 40]"]
@@ -27,7 +27,7 @@ WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.p
 
 @pytest.fixture(scope="module")
 def corrected() -> DesignHall:
-    return at_design(load_config("corrected"))
+    return solve_design_hall(load_config("corrected"))
 
 
 def heat_closes(found: DesignHall) -> None:
@@ -46,7 +46,7 @@ def test_the_papers_hall_comes_out(corrected: DesignHall) -> None:
     np.testing.assert_allclose(corrected.air.exhaust_share, calibrate(config).share, rtol=1e-9)
     heat_closes(corrected)
     # Racks alike: shares, bypass and RTI have a closed form.
-    alike = at_design(load_config("corrected", WIDE)).air
+    alike = solve_design_hall(load_config("corrected", WIDE)).air
     assert alike is not None
     np.testing.assert_allclose(alike.exhaust_share, 0.29548, atol=1e-5)
     assert alike.bypass_share == pytest.approx(0.17786, abs=1e-5)
@@ -56,7 +56,7 @@ def test_the_papers_hall_comes_out(corrected: DesignHall) -> None:
 
 def test_spectral_radius_is_that_of_the_matrix(corrected: DesignHall) -> None:
     assert corrected.air is not None
-    low, high = corrected.air.radius
+    low, high = corrected.air.spectral_radius_bounds
     exact = float(np.abs(np.linalg.eigvals(calibrate(corrected.config).matrix())).max())
     assert low <= exact + 1e-12
     assert exact <= high + 1e-12
@@ -66,7 +66,7 @@ def test_spectral_radius_is_that_of_the_matrix(corrected: DesignHall) -> None:
 
 
 def test_containment_warms_less_and_still_closes(corrected: DesignHall) -> None:
-    closed = at_design(
+    closed = solve_design_hall(
         load_config("corrected", ["hall.layout.containment=0.8", "hvac.crac.units=3"])
     )
     assert corrected.air is not None
@@ -79,33 +79,37 @@ def test_containment_warms_less_and_still_closes(corrected: DesignHall) -> None:
 
 @pytest.mark.parametrize("overrides", [["hall.layout.containment=1"], ["hall.supply_approach_k=0"]])
 def test_no_recirculation_is_zero_of_no_sign(overrides: list[str]) -> None:
-    found = at_design(load_config("corrected", [*overrides, "hvac.crac.units=3"]))
+    found = solve_design_hall(load_config("corrected", [*overrides, "hvac.crac.units=3"]))
     assert found.air is not None
-    for values in (found.approach_k, found.air.exhaust_share, np.array(found.air.radius)):
+    for values in (
+        found.approach_k,
+        found.air.exhaust_share,
+        np.array(found.air.spectral_radius_bounds),
+    ):
         np.testing.assert_array_equal(values, 0.0)
         assert not np.signbit(values).any()
-    text = describe(found)
+    text = describe_hall(found)
     assert "over supply 0.00 K" in text
     assert not re.search(r"-0\.?0*(?![0-9.])", text)
 
 
 def test_approach_model_has_inlets_and_no_flows() -> None:
-    found = at_design(load_config("tiny"))
+    found = solve_design_hall(load_config("tiny"))
     assert found.air is None
     np.testing.assert_allclose(
-        report(found)["approach_k"], found.config.hall.rack_approach_k(), atol=0.2
+        design_hall_values(found)["approach_k"], found.config.hall.rack_approach_k(), atol=0.2
     )
     # Server 2 of rack 1 sits 0.4 K above its rack.
     assert (found.hottest_rack, found.hottest_server) == (1, 2)
     assert found.inlet_max_c.max() == pytest.approx(28.4)
-    text = describe(found)
+    text = describe_hall(found)
     assert "return air" not in text
     assert "spectral" not in text
     assert "inlet model approach" in text
 
 
 def test_rows_and_places(corrected: DesignHall) -> None:
-    lines = describe(corrected).splitlines()
+    lines = describe_hall(corrected).splitlines()
     rows = [line.split() for line in lines[-4:]]
     for i, cells in enumerate(rows):
         mine = slice(5 * i, 5 * i + 5)
@@ -134,7 +138,7 @@ def test_large_halls_list_their_hottest_rows() -> None:
             "hvac.crac.units=20",
         ],
     )
-    text = describe(at_design(config))
+    text = describe_hall(solve_design_hall(config))
     table = text[text.index("row  faces") :].splitlines()
     assert [int(line.split()[0]) for line in table[2:-1]] == hot.tolist()
     assert table[-1] == f"({LISTED_ROWS} hottest of {rows} rows)"
@@ -144,15 +148,21 @@ def test_large_halls_list_their_hottest_rows() -> None:
 def test_radius_of_a_hall_too_large_to_iterate_is_bounded_by_its_rows() -> None:
     config = load_config("large", ["hall.rows=101"])
     assert config.hall.racks > EXACT_RADIUS_RACKS
-    found = at_design(config)
+    found = solve_design_hall(config)
     assert found.air is not None
     share = found.air.exhaust_share
-    assert found.air.radius == (share.min(), share.max())
+    assert found.air.spectral_radius_bounds == (share.min(), share.max())
+
+
+def show(*arguments: object) -> str:
+    done = CliRunner().invoke(hall_app, ["show", *map(str, arguments)])
+    if done.exception is not None:
+        raise done.exception
+    return done.stdout
 
 
 def test_json_has_an_entry_per_rack_and_unit(corrected: DesignHall) -> None:
-    config = load_config("corrected", ["hvac.crac.units=4"])
-    values = json.loads(show(config, as_json=True))
+    values = json.loads(show("corrected", "hvac.crac.units=4", "--json"))
     assert {len(values[k]) for k in ("approach_k", "inlet_c", "rack_it_w", "exhaust_share")} == {20}
     assert [u["x_m"] for u in values["crac_units"]] == [0.0, 6.6, 0.0, 6.6]
     assert sum(u["airflow_m3s"] for u in values["crac_units"]) == pytest.approx(
@@ -163,20 +173,19 @@ def test_json_has_an_entry_per_rack_and_unit(corrected: DesignHall) -> None:
 
 
 def test_picture_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    config = load_config("tiny")
     out = tmp_path / "new" / "plan.png"
-    assert show(config, out).splitlines()[-1] == f"Floor plan: {out}"
+    assert show("tiny", "--out", out).splitlines()[-1] == f"Floor plan: {out}"
     assert out.read_bytes().startswith(b"\x89PNG")
     with pytest.raises(SdcError, match="exists; choose another name or replace it with --force"):
-        show(config, out)
-    show(config, out, force=True)
+        show("tiny", "--out", out)
+    show("tiny", "--out", out, "--force")
     with pytest.raises(SdcError, match=r"valid is a name that ends in \.png"):
-        show(config, tmp_path / "plan.jpg")
+        show("tiny", "--out", tmp_path / "plan.jpg")
     (tmp_path / "folder.png").mkdir()
     with pytest.raises(SdcError, match="is a folder"):
-        show(config, tmp_path / "folder.png")
+        show("tiny", "--out", tmp_path / "folder.png")
     with pytest.raises(SdcError, match="cannot be written"):
-        show(config, out / "below.png")
+        show("tiny", "--out", out / "below.png")
     assert [p.name for p in out.parent.iterdir()] == ["plan.png"]
 
 
@@ -190,11 +199,11 @@ def test_description_names_what_the_room_has(units: int) -> None:
             "hall.layout.containment=0.25",
         ],
     )
-    found = at_design(config)
-    text = describe(found)
+    found = solve_design_hall(config)
+    text = describe_hall(found)
     assert "25 %; returns in the end walls" in text
     assert f"CRAC units    {units}, " in text
     assert ("unit 0" in text) == (units == 1)
-    bare = describe(replace(found, air=None))
+    bare = describe_hall(replace(found, air=None))
     assert "bypass" in text
     assert "bypass" not in bare

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import SdcError
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, StepResult
-from sdc_taichi.whole_file import whole_file
 
 from .figures import colour_range, short, step_time
 
@@ -88,7 +88,7 @@ def write_animation(
     # Pillow asks a picture of several frames for one after the other, so one is in memory.
     picture.n_frames, picture.seek = len(times), draw_frame
     draw_frame(0)
-    with whole_file(target) as file:
+    with atomic_write(target) as file:
         picture.save(
             file,
             "WEBP",

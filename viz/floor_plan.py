@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.sim.design_hall import DesignHall, at_design
+from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
 from sdc_taichi.types import F64
 
 from .figures import (
@@ -48,13 +48,13 @@ def draw(hall: DataCenterConfig | DesignHall) -> Figure:
     The longer side of the room runs to the right. Labels that would not fit are left out.
 
     Args:
-        hall: a data center, or what ``hall_description.at_design`` found of it.
+        hall: a data center, or what ``solve_design_hall`` found of it.
 
     Raises:
         SdcError: matplotlib is missing, or the hall cannot be solved.
     """
     figure = new_figure(1.0, 1.0)
-    found = at_design(hall) if isinstance(hall, DataCenterConfig) else hall
+    found = solve_design_hall(hall) if isinstance(hall, DataCenterConfig) else hall
     _Drawing(found, figure).draw()
     return figure
 

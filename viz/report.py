@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import SdcError
 from sdc_taichi.run.loop import REPORT_FILE
 from sdc_taichi.run.metrics import HOT_INLET_C
-from sdc_taichi.whole_file import whole_file
 from sdc_taichi.year_clock import HOURS_PER_YEAR, day_of_year, step_times
 
 from . import dashboards, data_figures, figures, fleet_figures
@@ -219,7 +219,7 @@ def write_report(
     """
     target = run.folder / REPORT_FILE if out is None else out
     # Opened first, so that a place that cannot be written is known before the work.
-    with whole_file(target) as file:
+    with atomic_write(target) as file:
         file.write(report_html(run, others).encode("utf-8", "replace"))
     return target
 

@@ -22,8 +22,8 @@ from urllib.parse import urlsplit
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.atomic_file import naming_errors
 from sdc_taichi.errors import SdcError
-from sdc_taichi.whole_file import writing
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -476,7 +476,7 @@ class _Call(threading.Thread):
 
 def _check_room(file: Path, keep_bytes: int) -> None:
     """Make sure that the file can be opened and begun; Rerun waits for ever on a full disk."""
-    with writing(file):
+    with naming_errors(file):
         new = not file.exists()
         with file.open("ab"):
             pass

@@ -1,9 +1,9 @@
-"""Arguments that several commands share."""
+"""Arguments and options that several commands share, and how they are checked."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -18,16 +18,59 @@ Source = Annotated[
         show_default=False,
     ),
 ]
+"""Argument of a command that reads a configuration."""
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="A.B=C", help="Override a field of the config; repeatable."),
 ]
+"""Option of a command that reads a configuration."""
+Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")]
+
+
+def out_option(help: str, metavar: str | None = None) -> Any:
+    """Option ``--out`` of a command that writes a file or a folder."""
+    return typer.Option("--out", metavar=metavar, help=help)
+
+
+def force_option(help: str = "Replace an existing file.") -> Any:
+    """Option ``--force`` of a command that replaces nothing without it."""
+    return typer.Option("--force", help=help)
+
+
+def json_option(help: str) -> Any:
+    """Option ``--json`` of a command that prints JSON in place of text."""
+    return typer.Option("--json", help=help)
+
+
+def check_out_file(out: Path | None, suffix: str, *, force: bool) -> None:
+    """Check the file of ``--out`` before any work; None is no file.
+
+    Args:
+        out: the file.
+        suffix: the only valid suffix, such as ``.png``.
+        force: whether an existing file may be replaced.
+
+    Raises:
+        ConfigError: another suffix, a folder, or an existing file without ``force``.
+    """
+    if out is None:
+        return
+    if out.suffix.lower() != suffix:
+        raise ConfigError(f"--out {out}: valid is a name that ends in {suffix}")
+    if out.is_dir():
+        raise ConfigError(f"--out {out}: is a folder; valid is a file")
+    if out.exists() and not force:
+        raise ConfigError(f"--out {out}: exists; choose another name or replace it with --force")
 
 
 def read_config(
     source: list[str] | None, overrides: list[str] | None
 ) -> tuple[DataCenterConfig, str]:
-    """The config and the name of its preset or file, from arguments in any order."""
+    """The config that ``Source`` and ``Overrides`` give, and the name of its preset or file.
+
+    Raises:
+        ConfigError: two presets or files, or a config that is not valid.
+    """
     given = source or []
     files = [text for text in given if "=" not in text or Path(text).is_file()]
     if len(files) > 1:

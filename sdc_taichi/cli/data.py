@@ -10,6 +10,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from sdc_taichi.atomic_file import atomic_write
+from sdc_taichi.cli.arguments import out_option
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import importing
 from sdc_taichi.exogenous.registry import (
@@ -88,7 +90,7 @@ def show(
     name: Annotated[str, typer.Argument(help="Site or workload trace.")],
     seed: Seed = DEFAULT_SEED,
     out: Annotated[
-        Path | None, typer.Option(help="Write a picture (PNG, SVG or PDF) to this file.")
+        Path | None, out_option("Write a picture (PNG, SVG or PDF) to this file.")
     ] = None,
 ) -> None:
     """Show the statistics of a site or a workload trace, and a picture of it."""
@@ -128,7 +130,7 @@ def write_picture(series: tuple[Series, ...], title: str, out: Path) -> None:
         out: file with a suffix that matplotlib can write.
 
     Raises:
-        DataError: matplotlib is missing, or the file cannot be written.
+        SdcError: matplotlib is missing, or the file cannot be written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -138,7 +140,8 @@ def write_picture(series: tuple[Series, ...], title: str, out: Path) -> None:
             'a picture needs matplotlib: pip install "sdc-taichi[plot]" (or leave out --out)'
         ) from None
     kinds = FigureCanvasAgg.get_supported_filetypes()
-    if out.suffix.lstrip(".").lower() not in kinds:
+    kind = out.suffix.lstrip(".").lower()
+    if kind not in kinds:
         raise DataError(f"{out}: suffix {out.suffix!r}, expected one of .{', .'.join(kinds)}")
     figure = Figure(figsize=(10.0, 1.0 + 1.9 * len(series)), layout="constrained")
     figure.suptitle(f"{title} (synthetic)" if any(s.synthetic for s in series) else title)
@@ -162,10 +165,8 @@ def write_picture(series: tuple[Series, ...], title: str, out: Path) -> None:
     axes[0, 0].set_title("Daily mean and range")
     axes[0, 1].set_title("Mean day")
     axes[0, 1].legend(fontsize="small")
-    try:
-        figure.savefig(out, dpi=120)
-    except OSError as error:
-        raise DataError(f"{out}: cannot be written: {error.strerror}") from None
+    with atomic_write(out) as file:
+        figure.savefig(file, dpi=120, format=kind)
 
 
 @data_app.command("import")

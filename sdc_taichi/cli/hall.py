@@ -11,15 +11,24 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from sdc_taichi.cli.arguments import Overrides, Source, read_config
+from sdc_taichi.atomic_file import atomic_write
+from sdc_taichi.cli.arguments import (
+    Overrides,
+    Source,
+    check_out_file,
+    force_option,
+    json_option,
+    out_option,
+    read_config,
+)
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M
 from sdc_taichi.types import F64
-from sdc_taichi.whole_file import check_new_file, whole_file
 
 if TYPE_CHECKING:
     from sdc_taichi.layout_solver.solve import LayoutSolution
+    from sdc_taichi.sim.design_hall import DesignHall
 
 hall_app = typer.Typer(help="Describe a hall, solve its air.", no_args_is_help=True)
 
@@ -27,19 +36,26 @@ hall_app = typer.Typer(help="Describe a hall, solve its air.", no_args_is_help=T
 @hall_app.command("show")
 def show_hall(
     source: Source = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.png", help="Draw the floor plan."),
-    ] = None,
+    out: Annotated[Path | None, out_option("Draw the floor plan.", "FILE.png")] = None,
     overrides: Overrides = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the description as JSON.")] = False,
+    force: Annotated[bool, force_option()] = False,
+    as_json: Annotated[bool, json_option("Print the description as JSON.")] = False,
 ) -> None:
     """Describe a hall: its measures, CRAC units, and racks at the design point."""
-    from sdc_taichi.sim.design_hall import show
+    from sdc_taichi.cli.hall_text import describe_hall
+    from sdc_taichi.sim.design_hall import design_hall_values, solve_design_hall
 
     config, _ = read_config(source, overrides)
-    typer.echo(show(config, out, force=force, as_json=as_json))
+    check_out_file(out, ".png", force=force)
+    hall = solve_design_hall(config)
+    if out is not None:
+        _write_floor_plan(out, hall)
+    if as_json:
+        typer.echo(json.dumps(design_hall_values(hall), indent=2))
+        return
+    typer.echo(describe_hall(hall))
+    if out is not None:
+        typer.echo(f"Floor plan: {out}")
 
 
 @hall_app.command("solve")
@@ -50,29 +66,26 @@ def solve_hall(
     ] = DEFAULT_CELL_M,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE.npz", help="Write R and its provenance, for recirculation.matrix_file."
-        ),
+        out_option("Write R and its provenance, for recirculation.matrix_file.", "FILE.npz"),
     ] = None,
     overrides: Overrides = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    force: Annotated[bool, force_option()] = False,
+    as_json: Annotated[bool, json_option("Print the report as JSON.")] = False,
 ) -> None:
     """Solve air and temperatures at the design point, and write the recirculation matrix R.
 
     Potential flow on a grid: racks, floor tiles, returns and containment of hall.layout, full load
     at the highest setpoint. docs/layout-solver.md says what potential flow cannot tell.
     """
-    if out is not None:
-        check_new_file(out, ".npz", force=force)
+    check_out_file(out, ".npz", force=force)
     config, _ = read_config(source, overrides)
     solution = _solve(config, cell)
     if out is not None:
-        _write_npz(out, solution)
+        _write_matrix(out, solution)
     if as_json:
-        typer.echo(json.dumps(report(config, solution), indent=2))
+        typer.echo(json.dumps(layout_solution_values(config, solution), indent=2))
         return
-    _print_report(config, solution)
+    _print_layout_solution(config, solution)
     if out is not None:
         typer.echo(f"Matrix: {out} (for hall.recirculation.matrix_file)")
 
@@ -98,8 +111,11 @@ def _solve(config: DataCenterConfig, cell_m: float) -> LayoutSolution:
     )
 
 
-def report(config: DataCenterConfig, solution: LayoutSolution) -> dict[str, Any]:
-    """What the solve found, in plain values; entries per rack in the order of the racks."""
+def layout_solution_values(config: DataCenterConfig, solution: LayoutSolution) -> dict[str, Any]:
+    """A solved hall as plain values for JSON.
+
+    Units are in the keys; lists per rack are in the order of the racks, row by row.
+    """
     inner, outer = _row_means(config, solution.approach_k)
     return {
         "cells": solution.cells,
@@ -126,14 +142,14 @@ def report(config: DataCenterConfig, solution: LayoutSolution) -> dict[str, Any]
 
 
 def _row_means(config: DataCenterConfig, values: F64) -> tuple[float | None, float]:
-    """Means over the inner and over the two outer rows; no inner rows below three."""
+    """Means over the inner and over the two outer rows; None without inner rows."""
     rows = values.reshape(config.hall.rows, -1)
     outer = np.concatenate([rows[:1], rows[1:][-1:]])
     inner = rows[1:-1]
     return (float(inner.mean()) if inner.size else None), float(outer.mean())
 
 
-def _print_report(config: DataCenterConfig, solution: LayoutSolution) -> None:
+def _print_layout_solution(config: DataCenterConfig, solution: LayoutSolution) -> None:
     console = Console()
     grid = " x ".join(str(n) for n in solution.provenance["grid"])
     hall = config.hall
@@ -166,8 +182,15 @@ def _print_report(config: DataCenterConfig, solution: LayoutSolution) -> None:
     typer.echo("\n".join(lines))
 
 
-def _write_npz(out: Path, solution: LayoutSolution) -> None:
-    """Write the file so that a reader sees the old one or the whole new one."""
+def _write_floor_plan(out: Path, hall: DesignHall) -> None:
+    from sdc_taichi.viz.floor_plan import draw
+
+    figure = draw(hall)
+    with atomic_write(out, parents=True) as file:
+        figure.savefig(file, format="png")
+
+
+def _write_matrix(out: Path, solution: LayoutSolution) -> None:
     text = json.dumps(solution.provenance, sort_keys=True)
-    with whole_file(out, parents=True) as file:
+    with atomic_write(out, parents=True) as file:
         np.savez(file, R=solution.R, provenance=np.array(text))

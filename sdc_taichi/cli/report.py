@@ -1,4 +1,4 @@
-"""``sdc-taichi report``: one HTML file about a recorded run."""
+"""``sdc-taichi report``: one HTML file about the folder of a run."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from sdc_taichi.cli.arguments import check_out_file, force_option, out_option
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.whole_file import check_new_file
 
 
 def report_command(
@@ -22,11 +22,9 @@ def report_command(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.html", help="Output file. [default: DIR/report.html]"),
+        out_option("Output file. [default: DIR/report.html]", "FILE.html"),
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace an existing file of --out.")
-    ] = False,
+    force: Annotated[bool, force_option("Replace an existing file of --out.")] = False,
 ) -> None:
     """Write a report of a recorded run: one HTML file with summary, tables and pictures.
 
@@ -38,8 +36,7 @@ def report_command(
 
     if force and out is None:
         raise ConfigError("--force: valid with --out; DIR/report.html is replaced without it")
-    if out is not None:
-        check_new_file(out, ".html", force=force)
+    check_out_file(out, ".html", force=force)
     for index, folder in enumerate(folders):
         if folder.resolve() in [other.resolve() for other in folders[:index]]:
             raise ConfigError(f"{folder}: is given twice; valid is each run once")

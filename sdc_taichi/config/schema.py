@@ -6,7 +6,6 @@ Units are part of every field name. An unknown key is an error that suggests the
 
 from __future__ import annotations
 
-import difflib
 import json
 import os
 from collections.abc import Mapping
@@ -27,7 +26,7 @@ from pydantic import (
     model_validator,
 )
 
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, suggestion, suggestion_or_valid
 from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C
 from sdc_taichi.plant.servers import ServerCurves, linear_curve
 from sdc_taichi.year_clock import day_of_year
@@ -874,10 +873,9 @@ def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
     try:
         text = path.read_text("utf-8")
     except FileNotFoundError:
-        near = difflib.get_close_matches(str(source), preset_names(), n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        meant = suggestion(source, preset_names())
         raise ConfigError(
-            f"{source}: no such file or preset{hint} (presets: {', '.join(preset_names())})"
+            f"{source}: no such file or preset{meant} (presets: {', '.join(preset_names())})"
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{source}: cannot be read ({error})") from None
@@ -1018,9 +1016,7 @@ def explain(error: ValidationError, label: str, model: type[BaseModel] | None = 
         where = ".".join(names)
         if item["type"] == "extra_forbidden":
             valid = _fields_at(names[:-1], model or DataCenterConfig)
-            near = difflib.get_close_matches(names[-1], valid, n=1, cutoff=0.5)
-            hint = f"; did you mean {near[0]!r}?" if near else f"; valid: {', '.join(valid)}"
-            text = f"{where}: unknown key{hint}"
+            text = f"{where}: unknown key{suggestion_or_valid(names[-1], valid)}"
         elif item["type"] == "missing":
             text = f"{where}: missing"
         else:
@@ -1207,9 +1203,7 @@ def _sustaindc_problems(values: dict[str, Any]) -> list[str]:
             continue
         for key in found:
             if key not in keys:
-                near = difflib.get_close_matches(key, keys, n=1, cutoff=0.5)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
-                problems.append(f"{section}.{key}: unknown key{hint}")
+                problems.append(f"{section}.{key}: unknown key{suggestion(key, keys)}")
         problems.extend(f"{section}.{key}: missing" for key in keys if key not in found)
     if problems and not all(isinstance(values.get(s), dict) for s in _SUSTAINDC_KEYS):
         return problems

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ from sdc_taichi.control.rules import (
     TrimAndRespond,
 )
 from sdc_taichi.control.view import limits_of
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, suggestion
 from sdc_taichi.sim.fleet import Fleet
 
 CONTROLLED = ("load", "cooling", "battery")
@@ -44,6 +43,7 @@ _ENTRIES: dict[str, _Entry] = {
     "greedy-ci": _Entry(GreedyCarbon, ("load", "battery")),
 }
 _CONSTANT = "constant:C"
+_SUGGESTION = " (did you mean {!r}?)"
 
 
 def controller_names() -> tuple[str, ...]:
@@ -71,7 +71,7 @@ def make_controller(spec: str, fleet: Fleet) -> Controller:
         if not sign or agent not in CONTROLLED:
             raise ConfigError(
                 f"controller {spec!r}: {part.strip()!r}: valid is agent=name with one of the "
-                f"agents {', '.join(CONTROLLED)}{_nearest(agent, CONTROLLED)}"
+                f"agents {', '.join(CONTROLLED)}{suggestion(agent, CONTROLLED, _SUGGESTION)}"
             )
         if agent in chosen:
             raise ConfigError(f"controller {spec!r}: {agent} is given twice")
@@ -96,9 +96,8 @@ def _make(name: str, fleet: Fleet, agents: tuple[str, ...]) -> Controller:
         entry = _ENTRIES[name]
     else:
         valid = controller_names()
-        raise ConfigError(
-            f"controller {name!r}: unknown; valid: {', '.join(valid)}{_nearest(name, valid)}"
-        )
+        meant = suggestion(name, valid, _SUGGESTION)
+        raise ConfigError(f"controller {name!r}: unknown; valid: {', '.join(valid)}{meant}")
     if not set(agents) & set(entry.agents):
         (agent,) = agents
         able = [n for n, e in _ENTRIES.items() if agent in e.agents]
@@ -124,8 +123,3 @@ def _constant(text: str, fleet: Fleet) -> Controller:
             f"(hvac.setpoint of {fleet.names[at]}), such as constant:20"
         )
     return FixedSetpoint(setpoint_c)
-
-
-def _nearest(name: str, valid: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name.casefold(), list(valid), n=1, cutoff=0.4)
-    return f" (did you mean {near[0]!r}?)" if near else ""

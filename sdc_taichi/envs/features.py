@@ -8,7 +8,6 @@ and the forecasts.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,7 +20,7 @@ from gymnasium.spaces import Box
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, ForecastError, Forecasts
 from sdc_taichi.envs.timed import Layout, TimeRows, time_rows
-from sdc_taichi.errors import ConfigError, RuntimeStateError
+from sdc_taichi.errors import ConfigError, RuntimeStateError, suggestion_or_valid
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP
 from sdc_taichi.sim.drivers import Drivers, Table
 from sdc_taichi.sim.fleet import Fleet
@@ -170,7 +169,9 @@ def select(
     given = dict(chosen or {})
     for agent in given:
         if agent not in AGENTS:
-            raise ConfigError(f"features: unknown agent {agent!r}; {hint(agent, AGENTS)}")
+            raise ConfigError(
+                f"features: unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}"
+            )
     by_name = {feature.name: feature for feature in known}
     out: dict[str, tuple[Feature, ...]] = {}
     for agent in AGENTS:
@@ -180,7 +181,7 @@ def select(
         for name in names:
             if name not in by_name:
                 raise ConfigError(
-                    f"features of {agent}: unknown {name!r}; {hint(name, list(by_name))}"
+                    f"features of {agent}: unknown {name!r}{suggestion_or_valid(name, by_name)}"
                 )
         twice = next((name for name in names if list(names).count(name) > 1), None)
         if twice is not None:
@@ -552,12 +553,6 @@ def _hall_shape(fleet: Fleet) -> tuple[int, int]:
 
 def _signed(feature: Feature) -> bool:
     return feature.low == -feature.high
-
-
-def hint(name: Any, valid: Sequence[str]) -> str:
-    """What was meant by an unknown name, or else all that is valid."""
-    near = difflib.get_close_matches(str(name), valid, n=1, cutoff=0.5)
-    return f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(valid)}"
 
 
 def table_markdown() -> str:

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.control.view import View
-from sdc_taichi.envs.features import AGENTS, hint
+from sdc_taichi.envs.features import AGENTS
 from sdc_taichi.envs.options import Tariff
 from sdc_taichi.envs.released import ReleasedRewards
-from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64, I64, StepResult
 
@@ -397,13 +397,15 @@ def share(own: Sequence[F64], a: float) -> list[F64]:
 def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
     for agent, scales in given.items():
         if agent not in AGENTS:
-            raise ConfigError(f"rewards: unknown agent {agent!r}; {hint(agent, AGENTS)}")
+            raise ConfigError(
+                f"rewards: unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}"
+            )
         if not isinstance(scales, Mapping):
             raise ConfigError(f"rewards of {agent}: {scales!r}; valid is a dict of term to scale")
         for name, scale in scales.items():
             if name not in TERMS:
                 raise ConfigError(
-                    f"rewards of {agent}: unknown term {name!r}; {hint(name, list(TERMS))}"
+                    f"rewards of {agent}: unknown term {name!r}{suggestion_or_valid(name, TERMS)}"
                 )
             number = isinstance(scale, int | float | np.number) and not isinstance(scale, bool)
             if not number or not np.isfinite(scale):
@@ -441,7 +443,9 @@ def _by_agent(given: Mapping[Any, Any], agents: Sequence[str], size: int) -> dic
     """What a user's function gives to each learning agent; what it gives to others is left out."""
     for agent in given:
         if agent not in AGENTS:
-            raise SdcError(f"rewards function: unknown agent {agent!r}; {hint(agent, AGENTS)}")
+            raise SdcError(
+                f"rewards function: unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}"
+            )
     for agent in agents:
         if agent not in given:
             raise SdcError(f"rewards function: returned none for {agent}")

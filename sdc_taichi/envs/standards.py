@@ -10,8 +10,7 @@ import numpy as np
 
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.core import Core, Observation
-from sdc_taichi.envs.features import hint
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.types import F32, F64, I64
 
 RESET_OPTIONS = ("start_day",)
@@ -93,10 +92,10 @@ def start_day(options: Mapping[str, Any] | None, *, strict: bool = True) -> Any:
     given = dict(options or {})
     for name in given:
         if name not in RESET_OPTIONS:
-            meant = hint(name, RESET_OPTIONS)
+            meant = suggestion_or_valid(name, RESET_OPTIONS)
             if strict:
-                raise ConfigError(f"reset options: unknown {name!r}; {meant}")
-            warnings.warn(f"reset options: {name!r} is without effect; {meant}", stacklevel=3)
+                raise ConfigError(f"reset options: unknown {name!r}{meant}")
+            warnings.warn(f"reset options: {name!r} is without effect{meant}", stacklevel=3)
     return given.get("start_day")
 
 

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import DataError, SdcError
 from sdc_taichi.exogenous.series import FloatArray, Series
-from sdc_taichi.whole_file import whole_file
 from sdc_taichi.year_clock import (
     MINUTES_PER_DAY,
     MINUTES_PER_YEAR,
@@ -374,7 +374,7 @@ def write_parquet(
         {METADATA_KEY: json.dumps({"format": FORMAT, **metadata}).encode()}
     )
     try:
-        with whole_file(path, parents=True) as file:
+        with atomic_write(path, parents=True) as file:
             pq.write_table(table, file)
     except SdcError as error:
         raise DataError(str(error)) from None

@@ -7,14 +7,13 @@ name never hides an embedded one.
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sdc_taichi.errors import DataError
+from sdc_taichi.errors import DataError, similar_names
 from sdc_taichi.exogenous import files
 from sdc_taichi.exogenous.carbon import Pairing, Stamp, read_carbon
 from sdc_taichi.exogenous.series import Series, SiteData, make_site, site_weather
@@ -75,8 +74,8 @@ def find_name(kind: str, name: str, valid: tuple[str, ...]) -> str:
     by_folded = {x.casefold(): x for x in valid}
     found = by_folded.get(name.strip().casefold())
     if found is None:
-        near = difflib.get_close_matches(name.strip().casefold(), by_folded, n=3, cutoff=0.5)
-        nearest = f"; nearest: {', '.join(by_folded[x] for x in near)}" if near else ""
+        near = similar_names(name, valid, most=3)
+        nearest = f"; nearest: {', '.join(near)}" if near else ""
         raise DataError(f"{kind} {name!r}: expected one of {', '.join(valid)}{nearest}")
     return found
 

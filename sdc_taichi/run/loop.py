@@ -7,11 +7,9 @@ place and renamed when it is whole. Equal runs give equal bytes. See docs/cli.md
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import json
 import operator
-import os
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -22,6 +20,7 @@ from typing import Any, Self
 import numpy as np
 import yaml
 
+from sdc_taichi.atomic_file import AtomicFile, atomic_write, delete_leftovers, naming_errors
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import Controller, viewer
 from sdc_taichi.errors import ConfigError
@@ -30,7 +29,6 @@ from sdc_taichi.run import metrics
 from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
-from sdc_taichi.whole_file import part_of, whole_file, writing
 from sdc_taichi.year_clock import step_times
 
 FORMAT = "sdc-run/1"
@@ -141,7 +139,7 @@ def record(
     if former:
         # What a former run left, and what was made of it.
         for name in (other_name, REPORT_FILE):
-            with writing(out / name):
+            with naming_errors(out / name):
                 (out / name).unlink(missing_ok=True)
     events = _events_by_dc(met, sim.size)
     report = {
@@ -232,7 +230,6 @@ class StepsWriter:
     """
 
     def __init__(self, path: Path, sim: Simulator, metadata: Mapping[str, Any]) -> None:
-        self._path, self._part = path, part_of(path)
         self._fleet, self._start = sim.fleet, sim.drivers.start
         self._metadata = {METADATA_KEY: json.dumps(metadata, allow_nan=False).encode()}
         self._steps_per_group = max(1, _ROWS_PER_GROUP // sim.size)
@@ -241,10 +238,9 @@ class StepsWriter:
         self._filled = 0
         self._first = 0
         self._writer: Any = None
-        with writing(path):
-            for leftover in path.parent.glob(f".{path.name}.*.part"):
-                leftover.unlink()
-            self._file = self._part.open("wb")
+        with naming_errors(path):
+            delete_leftovers(path)
+        self._output = AtomicFile(path)
 
     def add(self, result: StepResult) -> None:
         """Add one step; steps follow each other.
@@ -271,22 +267,15 @@ class StepsWriter:
             SdcError: the file cannot be written.
         """
         self._flush()
-        with writing(self._path):
+        with naming_errors(self._output.path):
             self._writer.close()
-            self._file.flush()
-            os.fsync(self._file.fileno())
-            self._file.close()
-            self._part.replace(self._path)
+        self._output.commit()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # After a commit there is nothing left to close or delete.
-        with contextlib.suppress(OSError):
-            self._file.close()
-        with contextlib.suppress(OSError):
-            self._part.unlink(missing_ok=True)
+        self._output.discard()
 
     def _flush(self) -> None:
         import pyarrow as pa
@@ -307,10 +296,10 @@ class StepsWriter:
         for name, values in zip(self._names, self._values, strict=True):
             columns[name] = values[:n].reshape(-1)
         table = pa.table(columns).replace_schema_metadata(self._metadata)
-        with writing(self._path):
+        with naming_errors(self._output.path):
             if self._writer is None:
                 self._writer = pq.ParquetWriter(
-                    self._file, table.schema, compression="zstd", use_dictionary=["dc"]
+                    self._output.file, table.schema, compression="zstd", use_dictionary=["dc"]
                 )
             self._writer.write_table(table)
         self._filled = 0
@@ -326,7 +315,7 @@ def prepare_folder(out: Path, *, force: bool = False) -> bool:
         SdcError: it holds other files than those of a run and ``force`` is not set, or it cannot
             be created or read.
     """
-    with writing(out):
+    with naming_errors(out):
         if out.exists() and not out.is_dir():
             raise ConfigError(f"{out}: is a file; valid is a folder to write the run to")
         out.mkdir(parents=True, exist_ok=True)
@@ -347,7 +336,7 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         SdcError: it cannot be written.
     """
-    with whole_file(path) as file:
+    with atomic_write(path) as file:
         file.write(text.encode())
 
 

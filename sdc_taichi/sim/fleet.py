@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -15,7 +14,7 @@ from sdc_taichi.config import (
     DataCenterConfig,
     with_values,
 )
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, suggestion
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.hall.recirculation import (
@@ -321,11 +320,8 @@ def _check_rule(base: DataCenterConfig, path: str, rule: Any) -> None:
         raise ConfigError(f"{where}: valid is {{uniform: [low, high]}} or {{choice: [a, b, ...]}}")
     ((kind, values),) = rule.items()
     if kind not in ("uniform", "choice"):
-        near = difflib.get_close_matches(str(kind), ("uniform", "choice"), n=1)
-        raise ConfigError(
-            f"{where}: unknown kind {kind!r}; valid: uniform, choice"
-            + (f" (did you mean {near[0]!r}?)" if near else "")
-        )
+        meant = suggestion(kind, ("uniform", "choice"), " (did you mean {!r}?)")
+        raise ConfigError(f"{where}: unknown kind {kind!r}; valid: uniform, choice{meant}")
     if not isinstance(values, list | tuple) or not values:
         raise ConfigError(f"{where}: {kind} needs a list, got {values!r}")
     if kind == "uniform":

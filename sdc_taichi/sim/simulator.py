@@ -14,6 +14,7 @@ from zipfile import BadZipFile
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
 from sdc_taichi.hall.protection import THROTTLED, TRIPPED
@@ -38,7 +39,6 @@ from sdc_taichi.types import (
     State,
     StepResult,
 )
-from sdc_taichi.whole_file import whole_file
 
 SNAPSHOT_VERSION = 3
 _NONE = np.zeros(0)
@@ -618,7 +618,7 @@ class Simulator:
             SdcError: the file cannot be written.
         """
         values = self.state_dict()
-        with whole_file(Path(path)) as file:
+        with atomic_write(Path(path)) as file:
             np.savez(file, **values)
 
     def load(self, path: str | os.PathLike[str]) -> None:
