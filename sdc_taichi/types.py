@@ -16,6 +16,8 @@ import numpy.typing as npt
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
+Values = F64 | float
+"""An array, or one number for all of its entries."""
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 Status = npt.NDArray[np.int8]

@@ -21,7 +21,7 @@ from sdc_taichi import (
 from sdc_taichi.config import apply_overrides, config_from_dict
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.kernels.thermal import DC_ROWS, GROUP_ROWS
-from sdc_taichi.plant.water_side import Design
+from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.sim.hall_solver import Conditions, Hall
 
 TINY = load_config("tiny")
@@ -310,7 +310,7 @@ def test_a_fleet_has_at_least_one(count: int) -> None:
         make_configs(TINY, count=count)
 
 
-def _design(*overrides: str) -> Design:
+def _design(*overrides: str) -> WaterSideDesign:
     drivers = drivers_from_arrays([20.0], [15.0], [300.0], [0.5])
     with Simulator(load_config("corrected", list(overrides)), drivers=drivers) as sim:
         return sim.sizing.water_side

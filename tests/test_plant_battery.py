@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sdc_taichi.plant.battery import BATTERIES, Battery
+from sdc_taichi.plant.battery import BATTERIES, BatteryResult
 
 REFERENCE = Path(__file__).parent / "reference"
 ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
 CHECKS = [c for c in ALL if c["group"] == "battery"]
 TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
-FIELDS = Battery.__slots__
+FIELDS = BatteryResult.__slots__
 COMMAND_OF_CODE = {0: 1.0, 1: -1.0, 2: 0.0}
 
 PROPERTY = settings(max_examples=80, deadline=None, derandomize=True)
@@ -33,7 +33,7 @@ def _no_floating_point_warnings() -> Any:
         yield
 
 
-def run(name: str, stored_kwh: Any, command: Any, **changes: Any) -> Battery:
+def run(name: str, stored_kwh: Any, command: Any, **changes: Any) -> BatteryResult:
     arguments: dict[str, Any] = {"capacity_kwh": 2000.0, "load_kw": 1500.0, "dt_h": 0.25}
     return BATTERIES[name](
         np.asarray(stored_kwh, float), np.asarray(command, float), **{**arguments, **changes}
@@ -135,7 +135,7 @@ def test_ledger_bounds_and_batch(
         assert values.shape == (5,)
         assert values.dtype == np.float64
         assert np.isfinite(values).all()
-        assert (values >= (-5.01e-6 if field == "loss_kwh" else 0.0)).all()
+        assert (values >= (-5.01e-6 if field == "battery_loss_kwh" else 0.0)).all()
         for i in range(5):
             single = run(
                 name, stored[i : i + 1], command[i : i + 1], load_kw=load_kw[i : i + 1], **changes
@@ -147,12 +147,12 @@ def test_ledger_bounds_and_batch(
     assert (result.stored_kwh <= capacity_kwh).all()
     assert (result.stored_kwh >= 0.0).all()
     np.testing.assert_allclose(
-        result.loss_kwh,
+        result.battery_loss_kwh,
         (1.0 - efficiency) * result.charge_kwh + (factor - 1.0) * result.discharge_kwh,
         atol=5.01e-6 if name == "released" else 1e-12 * capacity_kwh,
     )
     np.testing.assert_allclose(
-        result.charge_kwh - result.discharge_kwh - result.loss_kwh,
+        result.charge_kwh - result.discharge_kwh - result.battery_loss_kwh,
         result.stored_kwh - stored,
         atol=1e-12 * capacity_kwh,
     )
@@ -183,7 +183,7 @@ def test_idle_keeps_the_store(name: str) -> None:
     stored = np.array([0.0, 123.456789012345, 2000.0])
     result = run(name, stored, 0.0)
     np.testing.assert_array_equal(result.stored_kwh, stored)
-    for field in ("charge_kwh", "discharge_kwh", "loss_kwh"):
+    for field in ("charge_kwh", "discharge_kwh", "battery_loss_kwh"):
         np.testing.assert_array_equal(getattr(result, field), 0.0)
     np.testing.assert_array_equal(result.grid_kwh, 375.0)
 

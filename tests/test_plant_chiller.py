@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sdc_taichi.plant import chiller
-from sdc_taichi.plant.chiller import CHILLERS, Chiller
+from sdc_taichi.plant.chiller import CHILLERS, ChillerResult
 
 REFERENCE = Path(__file__).parent / "reference"
 ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
 CHECKS = [c for c in ALL if c["group"] == "chiller"]
 DC_CHECKS = [c for c in ALL if c["group"] == "dc" and "P_comp" in c["expected"]]
 TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
-FIELDS = Chiller.__slots__
+FIELDS = ChillerResult.__slots__
 CURVES = ("carnot", "eir_york", "electric_water_cooled", "electric_air_cooled", "released")
 
 PROPERTY = settings(max_examples=60, deadline=None, derandomize=True)
@@ -33,7 +33,7 @@ def _no_floating_point_warnings() -> Any:
         yield
 
 
-def run(name: str, load_w: Any, **changes: Any) -> Chiller:
+def run(name: str, load_w: Any, **changes: Any) -> ChillerResult:
     arguments: dict[str, Any] = {
         "reference_w": 1e6,
         "chilled_water_c": 6.67,
@@ -64,10 +64,10 @@ def evaluated(check: dict[str, Any]) -> dict[str, float]:
         evaporator_c, part_load_sum = inputs["T_evap_lvg"], sum(chiller.YORK_PART_LOAD)
     elif "T_cond_in" in inputs:
         name, cop, condenser_c = "electric_water_cooled", 4.75, inputs["T_cond_in"]
-        evaporator_c, part_load_sum = inputs["T_evap_out"], sum(chiller.FULL_LOAD_RATIO)
+        evaporator_c, part_load_sum = inputs["T_evap_out"], sum(chiller.ELECTRIC_PART_LOAD)
     else:
         name, cop, condenser_c = "electric_air_cooled", 3.0, None
-        evaporator_c, part_load_sum = inputs["T_evap_out"], sum(chiller.FULL_LOAD_RATIO)
+        evaporator_c, part_load_sum = inputs["T_evap_out"], sum(chiller.ELECTRIC_PART_LOAD)
     place = {
         "reference_w": inputs["Q_nom_W"],
         "chilled_water_c": evaporator_c,

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 
 from sdc_taichi.errors import SdcError
 from sdc_taichi.plant import tower
-from sdc_taichi.plant.tower import TOWERS, Tower
+from sdc_taichi.plant.tower import TOWERS, TowerResult
 
 REFERENCE = Path(__file__).parent / "reference"
 ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
 CHECKS = [c for c in ALL if c["group"] == "tower"]
 DC_CHECKS = [c for c in ALL if c["group"] == "dc" and "P_ct" in c["expected"]]
 TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
-FIELDS = Tower.__slots__
+FIELDS = TowerResult.__slots__
 
 PROPERTY = settings(max_examples=60, deadline=None, derandomize=True)
 wet_bulbs = st.floats(-34.4, 26.7)
@@ -41,7 +41,7 @@ def _no_floating_point_warnings() -> Any:
         yield
 
 
-def run(name: str, heat_w: Any, **changes: Any) -> Tower:
+def run(name: str, heat_w: Any, **changes: Any) -> TowerResult:
     arguments: dict[str, Any] = {
         "wet_bulb_c": 20.0,
         "outdoor_c": 25.0,

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sdc_taichi.plant.water import WATER, Water
+from sdc_taichi.plant.water import WATER, WaterUse
 
 REFERENCE = Path(__file__).parent / "reference"
 ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
 CHECKS = [c for c in ALL if c["group"] == "water"]
 DC_CHECKS = [c for c in ALL if c["group"] == "dc" and "water_L_15min" in c["expected"]]
 TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
-FIELDS = Water.__slots__
+FIELDS = WaterUse.__slots__
 
 PROPERTY = settings(max_examples=80, deadline=None, derandomize=True)
 five: dict[str, Any] = {"min_size": 5, "max_size": 5}
@@ -29,7 +29,7 @@ def _no_floating_point_warnings() -> Any:
         yield
 
 
-def run(name: str, **changes: Any) -> Water:
+def run(name: str, **changes: Any) -> WaterUse:
     arguments: dict[str, Any] = {
         "rejected_w": 1e6,
         "range_k": 5.56,
@@ -61,8 +61,8 @@ def evaluated(check: dict[str, Any]) -> dict[str, float]:
             "evap_L": float(result.evaporation_l),
             "blowdown_L": float(result.blowdown_l),
             "drift_L": float(result.drift_l),
-            "makeup_L": float(result.makeup_l),
-            "L_per_kWh_heat": float(result.makeup_l) / (rejected_w * inputs["dt_s"] / 3.6e6),
+            "makeup_L": float(result.water_l),
+            "L_per_kWh_heat": float(result.water_l) / (rejected_w * inputs["dt_s"] / 3.6e6),
         }
     place = {
         "wet_bulb_c": inputs["Twb"],
@@ -70,8 +70,8 @@ def evaluated(check: dict[str, Any]) -> dict[str, float]:
         "supply_setpoint_c": inputs["setpoint"],
     }
     return {
-        "code_L_15min": float(run("released", **place).makeup_l),
-        "paper_eq_L_15min": float(run("paper", **place).makeup_l),
+        "code_L_15min": float(run("released", **place).water_l),
+        "paper_eq_L_15min": float(run("paper", **place).water_l),
     }
 
 
@@ -88,7 +88,7 @@ def test_water_of_the_released_code(check: dict[str, Any]) -> None:
         return_c=check["expected"]["T_ret"],
         supply_setpoint_c=check["inputs"]["setpoint_C"],
     )
-    assert float(result.makeup_l) == pytest.approx(check["expected"]["water_L_15min"], rel=1e-9)
+    assert float(result.water_l) == pytest.approx(check["expected"]["water_L_15min"], rel=1e-9)
 
 
 @pytest.mark.parametrize("path", TRAJECTORIES, ids=lambda p: p.stem)
@@ -102,7 +102,7 @@ def test_water_along_a_recorded_run(path: Path) -> None:
         return_c=column["return_c"],
         supply_setpoint_c=column["setpoint_c"],
     )
-    np.testing.assert_allclose(result.makeup_l, column["water_l"], rtol=1e-6)
+    np.testing.assert_allclose(result.water_l, column["water_l"], rtol=1e-6)
 
 
 @given(
@@ -125,7 +125,7 @@ def test_balance_and_batch(
     }
     result = run(name, **changes)
     np.testing.assert_allclose(
-        result.makeup_l,
+        result.water_l,
         result.evaporation_l + result.drift_l + result.blowdown_l,
         rtol=1e-12,
         atol=1e-12,
@@ -156,7 +156,7 @@ def test_solids_are_conserved(heat_w: float, cycles: float, range_k: float) -> N
     # What enters with the make-up leaves, concentrated, with drift and blowdown.
     leaving = cycles * (result.drift_l + result.blowdown_l)
     if result.blowdown_l > 0.0:
-        np.testing.assert_allclose(leaving, result.makeup_l, rtol=1e-9)
+        np.testing.assert_allclose(leaving, result.water_l, rtol=1e-9)
     np.testing.assert_allclose(result.evaporation_l * 2.45e6, heat_w * 900.0, rtol=1e-12)
 
 
@@ -169,12 +169,12 @@ def test_drift_beyond_the_blowdown_needs_no_blowdown() -> None:
     result = run("mass_balance", drift_share=np.array([0.0, 1e-2]))
     assert result.blowdown_l[0] == pytest.approx(result.evaporation_l[0] / 4.0)
     assert result.blowdown_l[1] == 0.0
-    assert result.makeup_l[1] == result.evaporation_l[1] + result.drift_l[1]
+    assert result.water_l[1] == result.evaporation_l[1] + result.drift_l[1]
 
 
 def test_idle_tower_only_drifts() -> None:
     result = run("mass_balance", rejected_w=np.array([0.0, -1e5]), water_kg_s=50.0)
-    np.testing.assert_allclose(result.makeup_l, 50.0 * 2e-5 * 900.0)
+    np.testing.assert_allclose(result.water_l, 50.0 * 2e-5 * 900.0)
     np.testing.assert_array_equal(result.evaporation_l, 0.0)
 
 
@@ -195,14 +195,14 @@ def test_fits_split_off_one_percent_of_drift() -> None:
 
 
 def test_released_litres_have_four_decimals() -> None:
-    makeup = run("released", wet_bulb_c=np.linspace(-40.0, 25.0, 50)).makeup_l
+    makeup = run("released", wet_bulb_c=np.linspace(-40.0, 25.0, 50)).water_l
     np.testing.assert_array_equal(makeup, np.round(makeup, 4))
     assert makeup[0] == round((0.044 * -40.0 + 0.3528 * 12.0 + 0.101) * 1.01 * 250.0, 4)
 
 
 def test_fits_never_turn_into_a_source() -> None:
     place = {"wet_bulb_c": -30.0, "return_c": 18.0}
-    assert float(run("released", **place).makeup_l) == 0.0
+    assert float(run("released", **place).water_l) == 0.0
     assert float(run("paper", **place).evaporation_l) == 0.0
     # As printed, the drift stays on the unclipped use.
-    assert float(run("paper", **place).makeup_l) == pytest.approx((0.1 - 1.32) * 0.01 * 250.0)
+    assert float(run("paper", **place).water_l) == pytest.approx((0.1 - 1.32) * 0.01 * 250.0)

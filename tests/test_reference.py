@@ -463,8 +463,8 @@ def check_released_chiller(check: Check) -> Values:
 
 
 def _curve_chiller(
-    model: Callable[..., chiller.Chiller], check: Check, reference_cop: float
-) -> tuple[chiller.Chiller, dict[str, Any]]:
+    model: Callable[..., chiller.ChillerResult], check: Check, reference_cop: float
+) -> tuple[chiller.ChillerResult, dict[str, Any]]:
     """A chiller's step, and the curve values it used on the way."""
     given = check["inputs"]
     used: dict[str, Any] = {}
@@ -547,7 +547,7 @@ def check_fan_cube(check: Check) -> Values:
     return {"P": tower.fan_power_w(ratio, design_fan_w=given["P_ref"])}
 
 
-def _water_l(model: str, **given: Any) -> water.Water:
+def _water_l(model: str, **given: Any) -> water.WaterUse:
     needed = {
         "rejected_w": 0.0,
         "range_k": 0.0,
@@ -570,8 +570,8 @@ def check_air_side_water(check: Check) -> Values:
         "supply_setpoint_c": given["setpoint"],
     }
     return {
-        "code_L_15min": _water_l("released", **weather).makeup_l,
-        "paper_eq_L_15min": _water_l("paper", **weather).makeup_l,
+        "code_L_15min": _water_l("released", **weather).water_l,
+        "paper_eq_L_15min": _water_l("paper", **weather).water_l,
     }
 
 
@@ -592,8 +592,8 @@ def check_water_balance(check: Check) -> Values:
         "evap_L": lost.evaporation_l,
         "blowdown_L": lost.blowdown_l,
         "drift_L": lost.drift_l,
-        "makeup_L": lost.makeup_l,
-        "L_per_kWh_heat": lost.makeup_l / (rejected_w * given["dt_s"] / 3.6e6),
+        "makeup_L": lost.water_l,
+        "L_per_kWh_heat": lost.water_l / (rejected_w * given["dt_s"] / 3.6e6),
     }
 
 

@@ -121,13 +121,13 @@ def expected_step(
     total = math.fsum(amount for _, amount in ages)
     return {
         "utilisation": executed / 100.0,
-        "arrived": arrived,
-        "executed": executed,
-        "deferred": deferred,
-        "drained": drained,
-        "due": due,
-        "overdue": due - forced,
-        "dropped": dropped,
+        "arrived_tasks": arrived,
+        "executed_tasks": executed,
+        "deferred_tasks": deferred,
+        "drained_tasks": drained,
+        "due_tasks": due,
+        "overdue_tasks": due - forced,
+        "dropped_tasks": dropped,
         "oldest_age_steps": max((age for age, _ in ages), default=0),
         "mean_age_steps": math.fsum(a * n for a, n in ages) / total if total else 0.0,
     }
@@ -185,17 +185,19 @@ def test_fluid_work_is_conserved_and_within_its_limits(
         before = queue[0, -1]
         work = one_step("fluid", queue, demand, command, limits)
         queue = work.queue
-        a, e, d = (float(x[0]) for x in (work.arrived, work.executed, work.dropped))
+        a, e, d = (
+            float(x[0]) for x in (work.arrived_tasks, work.executed_tasks, work.dropped_tasks)
+        )
         assert a == pytest.approx(e + queue[0, -1] - before + d, abs=1e-10)
-        assert min(e, d, queue[0, -1], float(work.deferred[0])) >= 0.0
+        assert min(e, d, queue[0, -1], float(work.deferred_tasks[0])) >= 0.0
         assert e <= capacity * (1 + 1e-12)
         assert queue[0, -1] <= limits.queue_limit * (1 + 1e-12)
         assert np.all(np.diff(queue[0]) >= 0.0)
         if d > 1e-9:
             assert queue[0, -1] == pytest.approx(limits.queue_limit), "dropped before it was full"
-        if work.overdue[0] > 1e-9:
+        if work.overdue_tasks[0] > 1e-9:
             assert e == pytest.approx(capacity), "overdue with capacity to spare"
-        elif work.due[0] == 0 and command == 0 and a <= capacity:
+        elif work.due_tasks[0] == 0 and command == 0 and a <= capacity:
             assert e == a, "neutral runs what arrives"
         if command == 1:
             assert e == pytest.approx(min(a + before, capacity), abs=1e-9), "drain runs all it can"
@@ -217,10 +219,10 @@ def test_whole_tasks_stay_whole_and_are_conserved(
             if name not in ("utilisation", "mean_age_steps"):
                 assert np.array_equal(values, np.rint(values)), name
         # Tasks that find the queue full count as dropped and run all the same.
-        assert work.arrived[0] == work.executed[0] + queue[0, -1] - before
-        assert abs(work.arrived[0] - 100.0 * demand) < 1.0 + 1e-9
+        assert work.arrived_tasks[0] == work.executed_tasks[0] + queue[0, -1] - before
+        assert abs(work.arrived_tasks[0] - 100.0 * demand) < 1.0 + 1e-9
         cap = math.floor(limits.max_utilisation * 100.0)
-        assert work.executed[0] <= max(cap, work.arrived[0])
+        assert work.executed_tasks[0] <= max(cap, work.arrived_tasks[0])
         assert queue[0, -1] <= limits.queue_limit
 
 
@@ -234,7 +236,7 @@ def test_no_work_outlives_its_deadline_where_capacity_allows(
         work = one_step("fluid", queue, 0.5 * demand, -abs(command), limits)
         queue = work.queue
         # At most half the capacity arrives, and no more than that can be due in one step.
-        assert work.overdue[0] <= 1e-9
+        assert work.overdue_tasks[0] <= 1e-9
         assert work.oldest_age_steps[0] < deadline
 
 
@@ -245,10 +247,10 @@ def test_full_queue_drops(model: str) -> None:
     for _ in range(6):
         work = one_step(model, queue, 0.8, -1.0, limits)
         queue = work.queue
-        dropped.append(float(work.dropped[0]))
+        dropped.append(float(work.dropped_tasks[0]))
     assert dropped == [0, 0, 0, 40, 40, 40]
     assert queue[0, -1] == 120
-    assert work.executed[0] == (80 if model == "tasks" else 40)
+    assert work.executed_tasks[0] == (80 if model == "tasks" else 40)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -360,7 +362,7 @@ def test_a_queue_that_rounding_overfills_takes_nothing(model: str) -> None:
         max_utilisation=np.ones(1),
         queue_limit=limit,
     )
-    assert work.deferred == 0.0
+    assert work.deferred_tasks == 0.0
 
 
 def test_a_step_that_is_interrupted_can_be_done_again() -> None:

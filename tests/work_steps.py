@@ -14,7 +14,7 @@ def work_step(
     """Fields of ``Work``, ages in steps, and the queue at the end of a step."""
     queues = workload.Queue(queue.shape[1], deadline_steps + workload.DUE_AFTER_STEPS[model])
     work = workload.MODELS[model](demand, command, *queues.at_start(queue), **limits)
-    after = queues.after(queue, work.taken, work.deferred)
+    after = queues.after(queue, work.dequeued_tasks, work.deferred_tasks)
     own = {name: getattr(work, name) for name in work.__slots__}
     return SimpleNamespace(
         **own,

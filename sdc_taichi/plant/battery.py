@@ -12,8 +12,8 @@ Every model has the same signature, so a caller can look it up in `BATTERIES` an
     discharge_factor       energy taken from the store per energy delivered
     charge_limit_c_rate    largest rate into the store, in capacities per hour
     discharge_limit_c_rate largest rate out of the store, in capacities per hour
-    upper_u_h, upper_v     upper limit of the stored energy at charge power P: u*P + v*capacity
-    lower_u_h, lower_v     lower limit of the stored energy at discharge power P
+    upper_u_h, upper_v     highest stored energy at charge power P, u*P + v*capacity; u in h
+    lower_u_h, lower_v     lowest stored energy at discharge power P, u*P + v*capacity; u in h
 
 Arguments are float64 arrays of shape (B,), or anything that broadcasts to it; a model reads only
 what its equations need. Energy at the bus: charge_kwh is drawn, discharge_kwh delivered, and
@@ -32,29 +32,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Values = Array | float
+from sdc_taichi.types import F64, Values
 
 
 @dataclass(frozen=True, slots=True)
-class Battery:
-    """One step of a battery, in kWh; all fields have shape (B,).
+class BatteryResult:
+    """One step of the batteries of B data centers."""
 
-    Attributes:
-        stored_kwh: Energy in the store at the end of the step.
-        charge_kwh: Energy drawn from the bus.
-        discharge_kwh: Energy delivered to the load.
-        loss_kwh: charge_kwh - discharge_kwh - change of stored_kwh.
-        grid_kwh: Energy bought, load + charge_kwh - discharge_kwh, at least 0.
-    """
-
-    stored_kwh: Array
-    charge_kwh: Array
-    discharge_kwh: Array
-    loss_kwh: Array
-    grid_kwh: Array
+    stored_kwh: F64
+    """Energy in the battery at the end of the step, in kWh, (B,)."""
+    charge_kwh: F64
+    """Energy drawn from the bus into the battery, in kWh, (B,)."""
+    discharge_kwh: F64
+    """Energy that the battery delivers to the load, in kWh, (B,)."""
+    battery_loss_kwh: F64
+    """Energy lost, charge minus discharge minus the rise of the stored energy, in kWh, (B,)."""
+    grid_kwh: F64
+    """Energy bought, load plus charge minus discharge, in kWh, (B,), at least 0."""
 
 
 def clc(
@@ -72,7 +67,7 @@ def clc(
     upper_v: Values = 1.0,
     lower_u_h: Values = 0.01,
     lower_v: Values = 0.0,
-) -> Battery:
+) -> BatteryResult:
     """C/L/C: constant efficiencies, linear limits of the stored energy, constant rate limits.
 
     P_c <= min(alpha_c*C/eta_c, (v*C - b)/(eta_c*dt - u)),
@@ -85,14 +80,14 @@ def clc(
         capacity_kwh: Capacity C, kWh.
         load_kw: Facility load, kW.
         dt_h: Length of the step, h.
-        charge_efficiency: eta_c.
-        discharge_factor: eta_d, 1 or more.
-        charge_limit_c_rate: alpha_c, 1/h.
-        discharge_limit_c_rate: alpha_d, 1/h.
-        upper_u_h: u, h, at most 0.
-        upper_v: v.
-        lower_u_h: u', h, at least 0.
-        lower_v: v'.
+        charge_efficiency: Energy stored per energy drawn eta_c, 0..1.
+        discharge_factor: Energy taken from the store per energy delivered eta_d, 1 or more.
+        charge_limit_c_rate: Largest rate into the store alpha_c, 1/h.
+        discharge_limit_c_rate: Largest rate out of the store alpha_d, 1/h.
+        upper_u_h: Rise u of the highest stored energy with the charge power, h, at most 0.
+        upper_v: Highest stored energy v without charge power, over capacity.
+        lower_u_h: Rise u' of the lowest stored energy with the discharge power, h, at least 0.
+        lower_v: Lowest stored energy v' without discharge power, over capacity.
 
     Returns:
         The battery's step.
@@ -133,7 +128,7 @@ def released(
     upper_v: Values = 1.0,
     lower_u_h: Values = 0.01,
     lower_v: Values = 0.0,
-) -> Battery:
+) -> BatteryResult:
     """The battery of the released SustainDC code, as identified from its recorded runs.
 
     The limits use a step length T that depends on the state of charge s instead of dt: charging
@@ -148,17 +143,17 @@ def released(
         capacity_kwh: Capacity C, kWh.
         load_kw: Facility load, kW.
         dt_h: Length of the step, h; the code was only used with 0.25.
-        charge_efficiency: Not used, 1.
-        discharge_factor: Not used, 1.
-        charge_limit_c_rate: Not used, 0.1.
-        discharge_limit_c_rate: Not used, 1.
-        upper_u_h: Not used, -0.04.
-        upper_v: Not used, 1.
-        lower_u_h: Not used, 0.01.
-        lower_v: Not used, 0.
+        charge_efficiency: Not used; the model has 1.
+        discharge_factor: Not used; the model has 1.
+        charge_limit_c_rate: Not used; the model has 0.1 per hour.
+        discharge_limit_c_rate: Not used; the model has 1 per hour.
+        upper_u_h: Not used; the model has -0.04 h.
+        upper_v: Not used; the model has 1.
+        lower_u_h: Not used; the model has 0.01 h.
+        lower_v: Not used; the model has 0.
 
     Returns:
-        The battery's step. Its loss_kwh is what the rounding takes or gives, 5e-6 kWh at most.
+        The battery's step. Its loss is what the rounding takes or gives, 5e-6 kWh at most.
     """
     exists = np.greater(capacity_kwh, 0.0)
     soc = np.where(exists, stored_kwh / np.where(exists, capacity_kwh, 1.0), 0.0)
@@ -198,7 +193,7 @@ def paper(
     upper_v: Values = 1.0,
     lower_u_h: Values = 0.01,
     lower_v: Values = 0.0,
-) -> Battery:
+) -> BatteryResult:
     """Appendix A.3.4: the rates are limited by the energy that fits and by a largest power.
 
     r_charge = min((C - E)/(eta_c*dt), P_max), r_discharge = min(E/(eta_d*dt), P_max, load). The
@@ -212,7 +207,7 @@ def paper(
         capacity_kwh: Capacity C, kWh.
         load_kw: Facility load, kW.
         dt_h: Length of the step, h.
-        charge_efficiency: eta_c.
+        charge_efficiency: Energy stored per energy drawn eta_c, 0..1.
         discharge_factor: eta_d, energy taken from the store per energy delivered.
         charge_limit_c_rate: P_max over capacity when charging, 1/h.
         discharge_limit_c_rate: P_max over capacity when discharging, 1/h.
@@ -242,11 +237,12 @@ def paper(
     )
 
 
-BATTERIES: dict[str, Callable[..., Battery]] = {
+BATTERIES: dict[str, Callable[..., BatteryResult]] = {
     "clc": clc,
     "released": released,
     "paper": paper,
 }
+"""Battery models by the names that ``battery.model`` takes."""
 
 
 def _step(
@@ -260,8 +256,8 @@ def _step(
     discharge_limit_kw: Values,
     charge_efficiency: Values,
     discharge_factor: Values,
-) -> Battery:
-    """Apply the share `command` of the limits."""
+) -> BatteryResult:
+    """Charge or discharge at a share of the limit powers; a discharge never exceeds the load."""
     charge_kwh = np.maximum(command, 0.0) * charge_limit_kw * dt_h
     discharge_kwh = np.maximum(-command, 0.0) * np.minimum(discharge_limit_kw, load_kw) * dt_h
     after_kwh = stored_kwh + charge_efficiency * charge_kwh - discharge_factor * discharge_kwh
@@ -282,8 +278,9 @@ def _battery(
     charge_kwh: Values,
     discharge_kwh: Values,
     load_kwh: Values,
-) -> Battery:
-    return Battery(
+) -> BatteryResult:
+    """Result of a step, with loss and grid energy from the energies before and after it."""
+    return BatteryResult(
         *np.broadcast_arrays(
             after_kwh,
             charge_kwh,

@@ -27,12 +27,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Values = Array | float
+from sdc_taichi.types import F64, Values
 
 KELVIN = 273.15
+"""0 C in kelvin."""
 
 # York YT 1055 kW / 5.96 COP, inlet vanes: biquadratics in (1, Te, Te^2, Tc, Tc^2, Te*Tc), C.
 YORK_CAPACITY = (
@@ -50,46 +49,52 @@ CHILLED_WATER_BOUNDS_C: dict[str, tuple[float, float]] = {
     "carnot": (4.0, 20.0),
     "eir_york": (4.44, 8.89),
 }
+"""Leaving chilled water within which each model is evaluated, in C."""
 CONDENSER_BOUNDS_C: dict[str, tuple[float, float]] = {"eir_york": (12.78, 35.0)}
+"""Entering condenser water within which each model is evaluated, in C."""
 
-# Reference point of the York data set; `carnot` is calibrated to it.
 YORK_CHILLED_WATER_C = 6.67
+"""Leaving chilled water at the reference point of the York data set, in C."""
 YORK_CONDENSER_C = 29.44
+"""Entering condenser water at the reference point of the York data set, in C."""
 
-# The York data set admits condenser water down to 12.78 C against chilled water at 6.67 C: below
-# that difference a centrifugal compressor has no head to work against, and the flow through the
-# expansion device, not the lift, limits it. Without a floor a constant Carnot effectiveness
-# diverges as the two temperatures meet.
 MIN_LIFT_K = CONDENSER_BOUNDS_C["eir_york"][0] - YORK_CHILLED_WATER_C
+"""Smallest lift of ``carnot``, in K.
 
-# The capacity parabola of Chiller:Electric turns over near -15 K, where colder condenser water
-# would start to cost capacity.
+The York data set admits condenser water down to 12.78 C against chilled water at 6.67 C: below that
+difference a centrifugal compressor has no head to work against, and the flow through the expansion
+device, not the lift, limits it. Without a floor a constant Carnot effectiveness diverges as the two
+temperatures meet.
+"""
+
 MIN_DELTA_K = -15.0
+"""Smallest temperature difference of Chiller:Electric, in K: its capacity parabola turns over near
+it, and colder condenser water would start to cost capacity."""
 
-FULL_LOAD_RATIO = (0.03303, 0.6852, 0.2818)
+ELECTRIC_PART_LOAD = (0.03303, 0.6852, 0.2818)
+"""Power over full-load power of Chiller:Electric, a quadratic in the part-load ratio."""
 
 
 @dataclass(frozen=True, slots=True)
-class Chiller:
-    """One step of a chiller; all fields have shape (B,).
+class ChillerResult:
+    """One step of the chillers of B data centers."""
 
-    Attributes:
-        power_w: Electric power, W.
-        evaporator_w: Heat taken from the chilled water, W; load_w = evaporator_w + unmet_w.
-        available_w: Capacity under the present temperatures, W.
-        unmet_w: Load beyond the available capacity, W.
-        plr: evaporator_w / available_w, 0..1 (mean over on and off when the machine cycles).
-        cop: evaporator_w / power_w; 0 when the machine is off.
-        rejected_w: Heat handed to the cooling tower by this model, W.
-    """
-
-    power_w: Array
-    evaporator_w: Array
-    available_w: Array
-    unmet_w: Array
-    plr: Array
-    cop: Array
-    rejected_w: Array
+    power_w: F64
+    """Electric power, in W, (B,)."""
+    evaporator_w: F64
+    """Heat taken from the chilled water, in W, (B,); the load is evaporator_w + unmet_w."""
+    available_w: F64
+    """Cooling capacity under the present temperatures, in W, (B,)."""
+    unmet_w: F64
+    """Load beyond the available capacity, in W, (B,)."""
+    plr: F64
+    """Part-load ratio evaporator_w / available_w, 0..1, (B,); the mean over on and off when the
+    machine cycles."""
+    cop: F64
+    """Coefficient of performance evaporator_w / power_w, in W/W, (B,); 0 when the machine is
+    off."""
+    rejected_w: F64
+    """Heat that the model hands to the cooling tower, in W, (B,)."""
 
 
 def carnot(
@@ -102,7 +107,7 @@ def carnot(
     reference_cop: Values,
     min_plr: Values = 0.1,
     min_lift_k: Values = MIN_LIFT_K,
-) -> Chiller:
+) -> ChillerResult:
     """Constant Carnot effectiveness with the part-load curve of the York machine.
 
     COP = eta * Te / max(Tc - Te, min_lift_k) in kelvin, with eta such that the COP is
@@ -144,7 +149,7 @@ def eir_york(
     outdoor_c: Values,
     reference_cop: Values,
     min_plr: Values = 0.1,
-) -> Chiller:
+) -> ChillerResult:
     """York YT centrifugal chiller by its Chiller:Electric:EIR curves.
 
     Q_avail = Q_ref*CapFT, P = Q_avail/COP_ref*EIRFT*EIRFPLR*min(1, PLR/min_plr)
@@ -183,7 +188,7 @@ def electric_water_cooled(
     outdoor_c: Values,
     reference_cop: Values,
     min_plr: Values = 0.15,
-) -> Chiller:
+) -> ChillerResult:
     """Water-cooled Chiller:Electric (EnergyPlus Engineering Reference, after BLAST).
 
     Coefficients of the EnergyPlus unit test ChillerElectric; its nominal COP is 4.75.
@@ -221,7 +226,7 @@ def electric_air_cooled(
     outdoor_c: Values,
     reference_cop: Values,
     min_plr: Values = 0.05,
-) -> Chiller:
+) -> ChillerResult:
     """Air-cooled Chiller:Electric: the condenser sees the outdoor dry bulb.
 
     Coefficients of the EnergyPlus test file AirCooledElectricChiller.idf.
@@ -259,7 +264,7 @@ def constant_cop(
     outdoor_c: Values,
     reference_cop: Values,
     min_plr: Values = 0.0,
-) -> Chiller:
+) -> ChillerResult:
     """Constant COP up to the capacity (EnergyPlus Engineering Reference, Chiller:ConstantCOP).
 
     Args:
@@ -289,7 +294,7 @@ def released(
     outdoor_c: Values,
     reference_cop: Values,
     min_plr: Values = 0.05,
-) -> Chiller:
+) -> ChillerResult:
     """The chiller of the released SustainDC code: Chiller:Electric with three departures.
 
     The difference from design is (T_amb - 35)/2.778 - (6.67 - 35), so the chilled water never
@@ -330,7 +335,7 @@ def paper(
     outdoor_c: Values,
     reference_cop: Values,
     min_plr: Values = 0.0,
-) -> Chiller:
+) -> ChillerResult:
     """Appendix A.2.2 as printed: P_chiller = P_cool*(1 + 1/COP), counted as electricity.
 
     The term is the heat a condenser rejects; the paper adds it to the HVAC power and hands the
@@ -353,7 +358,7 @@ def paper(
     return _chiller(load, load, np.maximum(reference_w, load), power_w, rejected_w=power_w)
 
 
-CHILLERS: dict[str, Callable[..., Chiller]] = {
+CHILLERS: dict[str, Callable[..., ChillerResult]] = {
     "carnot": carnot,
     "eir_york": eir_york,
     "electric_water_cooled": electric_water_cooled,
@@ -362,6 +367,7 @@ CHILLERS: dict[str, Callable[..., Chiller]] = {
     "released": released,
     "paper": paper,
 }
+"""Chiller models by the names that ``hvac.chiller.model`` takes."""
 
 
 def _electric(
@@ -373,14 +379,14 @@ def _electric(
     power_ratio: tuple[float, float, float],
     reference_cop: Values,
     min_plr: Values,
-) -> Chiller:
+) -> ChillerResult:
     """Chiller:Electric: capacity from the temperature difference, full-load power from capacity."""
     capacity = np.maximum(_quadratic(capacity_ratio, delta_k), 0.0)
     return _from_curves(
         load_w,
         reference_w * capacity,
         eir=_quadratic(power_ratio, capacity) / reference_cop,
-        part_load=FULL_LOAD_RATIO,
+        part_load=ELECTRIC_PART_LOAD,
         min_plr=min_plr,
     )
 
@@ -392,8 +398,12 @@ def _from_curves(
     eir: Values,
     part_load: tuple[float, ...],
     min_plr: Values,
-) -> Chiller:
-    """Power from full-load input per output (`eir`), a part-load curve, and cycling."""
+) -> ChillerResult:
+    """Power from the energy input ratio at full load, a part-load curve, and cycling.
+
+    P = Q_avail*EIR*f(max(PLR, min_plr))*min(1, PLR/min_plr) (EnergyPlus Engineering Reference,
+    Chiller:Electric:EIR).
+    """
     load = np.maximum(load_w, 0.0)
     evaporator_w = np.minimum(load, available_w)
     plr = _quotient(evaporator_w, available_w)
@@ -409,11 +419,12 @@ def _chiller(
     power_w: Values,
     *,
     rejected_w: Values,
-) -> Chiller:
+) -> ChillerResult:
+    """Result of a step, with unmet load, part-load ratio and COP from the heat and the power."""
     load, evaporator, available, power, rejected = np.broadcast_arrays(
         load_w, evaporator_w, available_w, power_w, rejected_w
     )
-    return Chiller(
+    return ChillerResult(
         power_w=power,
         evaporator_w=evaporator,
         available_w=available,
@@ -424,10 +435,10 @@ def _chiller(
     )
 
 
-def _quotient(numerator: Values, denominator: Values) -> Array:
+def _quotient(numerator: Values, denominator: Values) -> F64:
     """Numerator / denominator, 0 where the denominator is 0."""
     positive = np.greater(denominator, 0.0)
-    result: Array = np.where(positive, numerator / np.where(positive, denominator, 1.0), 0.0)
+    result: F64 = np.where(positive, numerator / np.where(positive, denominator, 1.0), 0.0)
     return result
 
 

@@ -1,4 +1,9 @@
-"""CRAC setpoint, airflow, return temperature and the cooling load of the hall."""
+"""Air side of the plant: CRAC setpoint, airflow, return temperature and cooling load of the hall.
+
+Setpoint, airflow and cooling load each have several models with one signature, so that a caller can
+look a model up by name in ``SETPOINTS``, ``CRAC_FLOWS`` and ``COOLING_LOADS`` and pass all
+arguments; a model reads only what its equations need.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,8 @@ import numpy as np
 from sdc_taichi.types import F64, I64
 
 SetpointModel = Callable[..., tuple[F64, I64, F64]]
+FlowModel = Callable[..., tuple[F64, F64]]
+LoadModel = Callable[..., tuple[F64, F64]]
 
 
 def symmetric_setpoint(
@@ -24,16 +31,16 @@ def symmetric_setpoint(
     """Move the setpoint by ``command`` steps within its range.
 
     Args:
-        setpoint_c: present setpoint, (B,).
-        command: steps to move, (B,).
-        run: unused by this model, carried on, (B,).
-        last: last command, (B,).
-        step_k: size of a step, (B,).
-        low_c: lowest setpoint, (B,).
-        high_c: highest setpoint, (B,).
+        setpoint_c: Present setpoint, C, (B,).
+        command: Steps to move, (B,).
+        run: Equal commands in a row so far, (B,); not used.
+        last: Last command, (B,); not used.
+        step_k: Size of a step, K, (B,).
+        low_c: Lowest setpoint, C, (B,).
+        high_c: Highest setpoint, C, (B,).
 
     Returns:
-        The new setpoint, run and last command, each (B,).
+        The new setpoint, C, the run unchanged, and the command, each (B,).
     """
     moved_c = np.minimum(np.maximum(setpoint_c + command * step_k, low_c), high_c)
     return moved_c, run, command
@@ -49,13 +56,25 @@ def accelerating_setpoint(
     low_c: F64,
     high_c: F64,
 ) -> tuple[F64, I64, F64]:
-    """The released SustainDC rule: from the fourth equal command in a row each step grows by one.
+    """The rule of the released SustainDC: steps grow by one from the fourth equal command on.
 
     Lowering never accelerates there, because the code compares the action's index with the change
-    it stands for; holding does count, without effect. Arguments as in ``symmetric_setpoint``.
+    it stands for; holding does count, without effect.
+
+    Args:
+        setpoint_c: Present setpoint, C, (B,).
+        command: Steps to move, (B,).
+        run: Equal commands in a row so far, (B,).
+        last: Last command, (B,).
+        step_k: Size of a step, K, (B,).
+        low_c: Lowest setpoint, C, (B,).
+        high_c: Highest setpoint, C, (B,).
+
+    Returns:
+        The new setpoint, C, equal commands in a row, and the command, each (B,).
     """
-    goes_on = (command == last) & (command >= 0)
-    run = run * goes_on + 1
+    continues = (command == last) & (command >= 0)
+    run = run * continues + 1
     steps = command * np.maximum(run - 2, 1)
     moved_c = np.minimum(np.maximum(setpoint_c + steps * step_k, low_c), high_c)
     return moved_c, run, command
@@ -65,6 +84,7 @@ SETPOINTS: dict[str, SetpointModel] = {
     "symmetric": symmetric_setpoint,
     "accelerating": accelerating_setpoint,
 }
+"""Setpoint models by the names that ``hvac.setpoint.model`` takes."""
 
 
 def constant_flow(
@@ -73,12 +93,12 @@ def constant_flow(
     """CRAC airflow of fixed-speed fans.
 
     Args:
-        it_w: IT power, (B,).
-        airflow_m3s: airflow through the servers, (B,).
-        design_flow_m3s: CRAC airflow at design, (B,).
+        it_w: IT power, W, (B,); not used.
+        airflow_m3s: Airflow through the servers, m3/s, (B,); not used.
+        design_flow_m3s: CRAC airflow at design, m3/s, (B,).
 
     Returns:
-        Airflow m3/s and fan speed over design speed, each (B,).
+        CRAC airflow, m3/s, and fan speed over design speed, each (B,).
     """
     return design_flow_m3s, np.ones_like(design_flow_m3s)
 
@@ -92,10 +112,17 @@ def following_flow(
     min_ratio: F64,
     **_: F64,
 ) -> tuple[F64, F64]:
-    """CRAC airflow of fans that keep pace with the servers' airflow; see ``constant_flow``.
+    """CRAC airflow of fans that keep pace with the servers' airflow.
 
-    The ratio to design flow follows the ratio of the servers' airflow to theirs, not below
-    ``min_ratio``.
+    Args:
+        it_w: IT power, W, (B,); not used.
+        airflow_m3s: Airflow through the servers, m3/s, (B,).
+        design_flow_m3s: CRAC airflow at design, m3/s, (B,).
+        design_it_airflow_m3s: Airflow through the servers at design, m3/s, (B,).
+        min_ratio: Lowest fan speed over design speed, (B,).
+
+    Returns:
+        CRAC airflow, m3/s, and fan speed over design speed, each (B,).
     """
     speed = np.clip(airflow_m3s / design_it_airflow_m3s, min_ratio, 1.0)
     return design_flow_m3s * speed, speed
@@ -104,9 +131,15 @@ def following_flow(
 def per_watt_flow(
     it_w: F64, airflow_m3s: F64, *, supply_m3s_per_w: F64, **_: F64
 ) -> tuple[F64, F64]:
-    """Airflow in proportion to IT power, fan speed fixed, as in the released SustainDC.
+    """CRAC airflow in proportion to IT power at fixed fan speed, as in the released SustainDC.
 
-    See ``constant_flow``.
+    Args:
+        it_w: IT power, W, (B,).
+        airflow_m3s: Airflow through the servers, m3/s, (B,); not used.
+        supply_m3s_per_w: CRAC airflow per IT power, m3/(s W), (B,).
+
+    Returns:
+        CRAC airflow, m3/s, and fan speed over design speed, each (B,).
     """
     return supply_m3s_per_w * it_w, np.ones_like(supply_m3s_per_w)
 
@@ -114,22 +147,30 @@ def per_watt_flow(
 def controlled_flow(
     it_w: F64, airflow_m3s: F64, *, design_flow_m3s: F64, speed: F64, **_: F64
 ) -> tuple[F64, F64]:
-    """CRAC airflow of fans that an agent controls, at ``speed`` over design speed.
+    """CRAC airflow of fans whose speed an agent controls.
 
-    See ``constant_flow``.
+    Args:
+        it_w: IT power, W, (B,); not used.
+        airflow_m3s: Airflow through the servers, m3/s, (B,); not used.
+        design_flow_m3s: CRAC airflow at design, m3/s, (B,).
+        speed: Fan speed over design speed, (B,).
+
+    Returns:
+        CRAC airflow, m3/s, and fan speed over design speed, each (B,).
     """
     return design_flow_m3s * speed, speed
 
 
-FLOWS: dict[str, Callable[..., tuple[F64, F64]]] = {
+CRAC_FLOWS: dict[str, FlowModel] = {
     "constant": constant_flow,
     "follow_servers": following_flow,
     "per_watt": per_watt_flow,
     "controlled": controlled_flow,
 }
+"""Airflow models by the names that ``hvac.crac.flow_model`` takes."""
 
 
-def balanced_load(
+def heat_balance_load(
     it_w: F64, crac_fan_w: F64, crac_flow_m3s: F64, supply_c: F64, setpoint_c: F64, outlet_c: F64,
     *, air_j_per_m3_k: F64, return_approach_k: F64,
 ) -> tuple[F64, F64]:  # fmt: skip
@@ -137,8 +178,18 @@ def balanced_load(
 
     Servers and CRAC fans heat the air: T_ret = T_sup + P_it/(rho cp V_crac), Q = P_it + P_fan.
 
+    Args:
+        it_w: IT power, W, (B,).
+        crac_fan_w: Power of the CRAC fans, W, (B,).
+        crac_flow_m3s: CRAC airflow, m3/s, (B,).
+        supply_c: Supply air, C, (B,).
+        setpoint_c: CRAC setpoint, C, (B,); not used.
+        outlet_c: Mean outlet of the racks, C, (B,); not used.
+        air_j_per_m3_k: Heat capacity of air per volume, J/(m3 K), (B,).
+        return_approach_k: Return air over the mean outlet, K, (B,); not used.
+
     Returns:
-        Return temperature C, that of the supply without airflow, and cooling load W, each (B,).
+        Return temperature, C, that of the supply without airflow, and cooling load, W, each (B,).
     """
     flows = crac_flow_m3s > 0
     rise_k = np.where(flows, it_w, 0.0) / np.where(flows, air_j_per_m3_k * crac_flow_m3s, 1.0)
@@ -149,55 +200,94 @@ def released_load(
     it_w: F64, crac_fan_w: F64, crac_flow_m3s: F64, supply_c: F64, setpoint_c: F64, outlet_c: F64,
     *, air_j_per_m3_k: F64, return_approach_k: F64,
 ) -> tuple[F64, F64]:  # fmt: skip
-    """Mean rack outlet plus mean return approach; Q = rho cp V max(0, T_ret - T_set).
+    """Return air and cooling load of the released SustainDC.
 
-    With V in proportion to IT power this is the released SustainDC; heat removed differs from heat
-    generated. Returns as ``balanced_load``.
+    Mean rack outlet plus mean return approach; Q = rho cp V max(0, T_ret - T_set). Heat removed
+    differs from heat generated.
+
+    Args:
+        it_w: IT power, W, (B,); not used.
+        crac_fan_w: Power of the CRAC fans, W, (B,); not used.
+        crac_flow_m3s: CRAC airflow, m3/s, (B,).
+        supply_c: Supply air, C, (B,); not used.
+        setpoint_c: CRAC setpoint, C, (B,).
+        outlet_c: Mean outlet of the racks, C, (B,).
+        air_j_per_m3_k: Heat capacity of air per volume, J/(m3 K), (B,).
+        return_approach_k: Return air over the mean outlet, K, (B,).
+
+    Returns:
+        Return temperature, C, and cooling load, W, each (B,).
     """
     return_c = outlet_c + return_approach_k
     return return_c, air_j_per_m3_k * crac_flow_m3s * np.maximum(return_c - setpoint_c, 0.0)
 
 
-def printed_load(
+def paper_load(
     it_w: F64, crac_fan_w: F64, crac_flow_m3s: F64, supply_c: F64, setpoint_c: F64, outlet_c: F64,
     *, air_j_per_m3_k: F64, return_approach_k: F64,
 ) -> tuple[F64, F64]:  # fmt: skip
-    """As ``released_load`` without the lower bound (paper, A.2.2)."""
+    """Return air and cooling load of the SustainDC paper, A.2.2, without a lower bound.
+
+    Mean rack outlet plus mean return approach; Q = rho cp V (T_ret - T_set), negative where the
+    return air is colder than the setpoint.
+
+    Args:
+        it_w: IT power, W, (B,); not used.
+        crac_fan_w: Power of the CRAC fans, W, (B,); not used.
+        crac_flow_m3s: CRAC airflow, m3/s, (B,).
+        supply_c: Supply air, C, (B,); not used.
+        setpoint_c: CRAC setpoint, C, (B,).
+        outlet_c: Mean outlet of the racks, C, (B,).
+        air_j_per_m3_k: Heat capacity of air per volume, J/(m3 K), (B,).
+        return_approach_k: Return air over the mean outlet, K, (B,).
+
+    Returns:
+        Return temperature, C, and cooling load, W, each (B,).
+    """
     return_c = outlet_c + return_approach_k
     return return_c, air_j_per_m3_k * crac_flow_m3s * (return_c - setpoint_c)
 
 
-LOADS: dict[str, Callable[..., tuple[F64, F64]]] = {
-    "heat_balance": balanced_load,
+COOLING_LOADS: dict[str, LoadModel] = {
+    "heat_balance": heat_balance_load,
     "released": released_load,
-    "paper": printed_load,
+    "paper": paper_load,
 }
+"""Cooling load models by the names that ``hvac.cooling_load_model`` takes."""
 
 
 STORES_UNMET_HEAT = frozenset({"heat_balance"})
 """Load models whose heat is conserved; the others remove whatever load they compute."""
 
 
-def hold_heat(
-    load_w: F64, removed_w: F64, room_heat_kwh: F64, step_h: float
+def balance_room_heat(
+    load_w: F64, heat_removed_w: F64, room_heat_kwh: F64, step_h: float
 ) -> tuple[F64, F64, F64]:
     """Account for cooling load that was not removed, or removed later.
 
-    generated = removed + change of stored heat, to round-off.
+    Heat generated is heat removed plus the rise of the room heat, to round-off.
 
     Args:
-        load_w: heat that entered the air of the room, (B,).
-        removed_w: heat that the plant took out, at most load plus what was stored, (B,).
-        room_heat_kwh: heat stored at the start of the step, (B,).
-        step_h: length of the step.
+        load_w: Heat that entered the air of the room, W, (B,).
+        heat_removed_w: Heat that the plant took out, W, (B,), at most the load plus the room heat.
+        room_heat_kwh: Heat that the room held at the start of the step, kWh, (B,).
+        step_h: Length of the step, h.
 
     Returns:
-        Unmet W, recovered W and the new stored heat kWh, each (B,).
+        Unmet load, W, recovered heat, W, and the new room heat, kWh, each (B,).
     """
-    stored = np.maximum(room_heat_kwh + (load_w - removed_w) * step_h / 1e3, 0.0)
-    return *unmet_and_recovered(load_w, removed_w), stored
+    after_kwh = np.maximum(room_heat_kwh + (load_w - heat_removed_w) * step_h / 1e3, 0.0)
+    return *unmet_and_recovered(load_w, heat_removed_w), after_kwh
 
 
-def unmet_and_recovered(load_w: F64, removed_w: F64) -> tuple[F64, F64]:
-    """Load beyond what is removed, and what is removed beyond the load, each (B,)."""
-    return np.maximum(load_w - removed_w, 0.0), np.maximum(removed_w - load_w, 0.0)
+def unmet_and_recovered(load_w: F64, heat_removed_w: F64) -> tuple[F64, F64]:
+    """Load beyond the heat removed, and heat removed beyond the load.
+
+    Args:
+        load_w: Cooling load, W, (B,).
+        heat_removed_w: Heat that the plant took out, W, (B,).
+
+    Returns:
+        Unmet load and recovered heat, W, each (B,) and at least 0.
+    """
+    return np.maximum(load_w - heat_removed_w, 0.0), np.maximum(heat_removed_w - load_w, 0.0)

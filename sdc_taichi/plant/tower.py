@@ -30,18 +30,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sdc_taichi.errors import SdcError
-from sdc_taichi.types import as_array
-
-Array = NDArray[np.float64]
-Values = Array | float
+from sdc_taichi.types import F64, Values, as_array
 
 WATER_J_PER_KG_K = 4184.0
+"""Heat capacity of water, in J/(kg K)."""
 AIR_J_PER_M3_K = 1.225 * 1006.0
+"""Heat capacity of air per volume, in J/(m3 K)."""
 
-# [power of L/G, power of the range, power of the wet bulb]
 YORKCALC = np.array(
     [
         [
@@ -61,38 +58,42 @@ YORKCALC = np.array(
         ],
     ]
 )
+"""Coefficients of the approach, in K, by the powers of the liquid to gas ratio, of the range in K
+and of the wet bulb in C."""
 WET_BULB_BOUNDS_C = (-34.4, 26.7)
+"""Wet bulb within which YorkCalc is evaluated, in C."""
 RANGE_BOUNDS_K = (1.1, 22.2)
+"""Range within which YorkCalc is evaluated, in K."""
 APPROACH_BOUNDS_K = (1.1, 40.0)
+"""Approach that YorkCalc gives, in K."""
 MAX_LIQUID_GAS_RATIO = 8.0
+"""Largest liquid to gas ratio at which YorkCalc is evaluated."""
 
-# Share of the full-speed cooling that is left when the fan stands still.
 FREE_CONVECTION_SHARE = 0.125
+"""Share of the full-speed cooling that is left when the fan stands still."""
 
-# 275 W of fan per 0.15 kg/s of water, the default of the Modelica model.
 FAN_W_PER_KG_S = 275.0 / 0.15
+"""Fan power at full speed per design water flow, in W/(kg/s): 275 W per 0.15 kg/s, the default of
+the Modelica model."""
 
 
 @dataclass(frozen=True, slots=True)
-class Tower:
-    """One step of a cooling tower; all fields have shape (B,).
+class TowerResult:
+    """One step of the cooling towers of B data centers."""
 
-    Attributes:
-        fan_w: Fan power, W.
-        air_ratio: Airflow over its design (reference) value; 0 when the fan is off.
-        leaving_c: Water leaving the tower, C.
-        range_k: Entering minus leaving water, K.
-        approach_k: Leaving water minus wet bulb, K.
-    """
-
-    fan_w: Array
-    air_ratio: Array
-    leaving_c: Array
-    range_k: Array
-    approach_k: Array
+    fan_w: F64
+    """Fan power, in W, (B,)."""
+    air_ratio: F64
+    """Airflow over its design (reference) value, (B,); 0 when the fan is off."""
+    leaving_c: F64
+    """Temperature of the water that leaves the tower, in C, (B,)."""
+    range_k: F64
+    """Range: entering minus leaving water temperature, in K, (B,)."""
+    approach_k: F64
+    """Approach: leaving water temperature minus wet bulb, in K, (B,)."""
 
 
-def yorkcalc_approach_k(wet_bulb_c: Values, range_k: Values, liquid_gas_ratio: Values) -> Array:
+def yorkcalc_approach_k(wet_bulb_c: Values, range_k: Values, liquid_gas_ratio: Values) -> F64:
     """Approach of a York tower: leaving water minus wet bulb.
 
     Args:
@@ -106,7 +107,7 @@ def yorkcalc_approach_k(wet_bulb_c: Values, range_k: Values, liquid_gas_ratio: V
     return _approach_at(liquid_gas_ratio, *_approach_parabola(wet_bulb_c, range_k))
 
 
-def yorkcalc_liquid_gas_ratio(wet_bulb_c: Values, range_k: Values, approach_k: Values) -> Array:
+def yorkcalc_liquid_gas_ratio(wet_bulb_c: Values, range_k: Values, approach_k: Values) -> F64:
     """Largest liquid to gas ratio (least air) that reaches an approach, the inverse of YorkCalc.
 
     For a given wet bulb and range the approach is a + b*x + c*x^2 in the ratio x, and b > 0
@@ -125,12 +126,14 @@ def yorkcalc_liquid_gas_ratio(wet_bulb_c: Values, range_k: Values, approach_k: V
     return _ratio_at(approach_k, *_approach_parabola(wet_bulb_c, range_k))
 
 
-def _approach_at(liquid_gas_ratio: Values, a: Values, b: Values, c: Values) -> Array:
+def _approach_at(liquid_gas_ratio: Values, a: Values, b: Values, c: Values) -> F64:
+    """Approach a + b*x + c*x^2 at the liquid to gas ratio x, in K."""
     x = np.minimum(liquid_gas_ratio, MAX_LIQUID_GAS_RATIO)
     return as_array(np.clip(a + x * (b + x * c), *APPROACH_BOUNDS_K))
 
 
-def _ratio_at(approach_k: Values, a: Values, b: Values, c: Values) -> Array:
+def _ratio_at(approach_k: Values, a: Values, b: Values, c: Values) -> F64:
+    """Liquid to gas ratio x at which a + b*x + c*x^2 is the approach, 0..8."""
     above_intercept = np.clip(approach_k, *APPROACH_BOUNDS_K) - a
     discriminant = b**2 + 4.0 * c * above_intercept
     # A negative discriminant has two meanings. The parabola opens downwards and stays below the
@@ -144,7 +147,7 @@ def _ratio_at(approach_k: Values, a: Values, b: Values, c: Values) -> Array:
 
 def yorkcalc_reference_water_kg_s(
     water_kg_s: Values, *, wet_bulb_c: Values, range_k: Values, approach_k: Values
-) -> Array:
+) -> F64:
     """Water flow at which the flow ratio is 1, so that full air meets the design approach.
 
     Args:
@@ -172,17 +175,32 @@ def yorkcalc_reference_water_kg_s(
 
 
 def design_water_kg_s(heat_w: Values, *, range_k: Values) -> Values:
-    """Condenser water flow that carries `heat_w` with a range of `range_k`, kg/s."""
+    """Condenser water flow that carries a heat with a given range, kg/s.
+
+    Args:
+        heat_w: Heat to reject, W, (B,).
+        range_k: Entering minus leaving water, K, (B,).
+    """
     return heat_w / (WATER_J_PER_KG_K * range_k)
 
 
 def sized_fan_w(water_kg_s: Values, *, fan_w_per_kg_s: Values = FAN_W_PER_KG_S) -> Values:
-    """Fan power at full speed from the design water flow (Modelica Buildings, YorkCalc), W."""
+    """Fan power at full speed from the design water flow (Modelica Buildings, YorkCalc), W.
+
+    Args:
+        water_kg_s: Condenser water flow at design, kg/s, (B,).
+        fan_w_per_kg_s: Fan power per water flow, W/(kg/s).
+    """
     return fan_w_per_kg_s * water_kg_s
 
 
 def fan_power_w(air_ratio: Values, *, design_fan_w: Values) -> Values:
-    """Fan power by the affinity law, W: design power times the cube of the flow ratio."""
+    """Fan power by the affinity law, W: design power times the cube of the flow ratio.
+
+    Args:
+        air_ratio: Airflow over airflow at full speed, (B,).
+        design_fan_w: Fan power at full speed, W, (B,).
+    """
     return design_fan_w * air_ratio**3
 
 
@@ -198,7 +216,7 @@ def yorkcalc(
     reference_air_m3s: Values,
     design_fan_w: Values,
     air_j_per_m3_k: Values = AIR_J_PER_M3_K,
-) -> Tower:
+) -> TowerResult:
     """York tower with a variable-speed fan that holds the condenser water at its setpoint.
 
     All heat is rejected: the range is heat_w/(c*m). The fan runs at the lowest speed that reaches
@@ -260,7 +278,7 @@ def released(
     reference_air_m3s: Values,
     design_fan_w: Values,
     air_j_per_m3_k: Values = AIR_J_PER_M3_K,
-) -> Tower:
+) -> TowerResult:
     """The tower of the released SustainDC code: a cubic fan on the airflow that carries the heat.
 
     V = Q/(cp*rho*max(50 - (T_amb - T_set), 1)), P = P_ref*min(V/V_ref, 1)^3, and no power at all
@@ -305,7 +323,7 @@ def paper(
     reference_air_m3s: Values,
     design_fan_w: Values,
     air_j_per_m3_k: Values = AIR_J_PER_M3_K,
-) -> Tower:
+) -> TowerResult:
     """Appendix A.2.2 as printed: P_CT = P_ref*(V/V_ref)^-3, so less airflow costs more power.
 
     The paper leaves f_ct_delta to Breen et al. 2010; the temperature difference is that of the
@@ -339,11 +357,12 @@ def paper(
     )
 
 
-TOWERS: dict[str, Callable[..., Tower]] = {
+TOWERS: dict[str, Callable[..., TowerResult]] = {
     "yorkcalc": yorkcalc,
     "released": released,
     "paper": paper,
 }
+"""Tower models by the names that ``hvac.tower.model`` takes."""
 
 
 def _approach_parabola(wet_bulb_c: Values, range_k: Values) -> tuple[Values, Values, Values]:
@@ -355,7 +374,8 @@ def _approach_parabola(wet_bulb_c: Values, range_k: Values) -> tuple[Values, Val
     return a, b, c
 
 
-def _range_k(heat_w: Values, water_kg_s: Values) -> Array:
+def _range_k(heat_w: Values, water_kg_s: Values) -> F64:
+    """Range of the tower water, Q/(c*m), in K; 0 without flow."""
     flowing = np.greater(water_kg_s, 0.0)
     carried = np.maximum(heat_w, 0.0) / (WATER_J_PER_KG_K * np.where(flowing, water_kg_s, 1.0))
     return as_array(np.where(flowing, carried, 0.0))
@@ -366,14 +386,16 @@ def _air_m3s(
     outdoor_c: Values,
     supply_setpoint_c: Values,
     air_j_per_m3_k: Values,
-) -> Array:
+) -> F64:
+    """Airflow that carries the heat, in m3/s, at max(50 - (T_amb - T_set), 1) K."""
     delta_k = np.maximum(50.0 - (outdoor_c - supply_setpoint_c), 1.0)
     return as_array(np.maximum(heat_w, 0.0) / (air_j_per_m3_k * delta_k))
 
 
 def _tower(
-    power_w: Values, air_ratio: Values, *, leaving_c: Values, range_k: Values, wet_bulb_c: Values
-) -> Tower:
-    return Tower(
-        *np.broadcast_arrays(power_w, air_ratio, leaving_c, range_k, leaving_c - wet_bulb_c)
+    fan_w: Values, air_ratio: Values, *, leaving_c: Values, range_k: Values, wet_bulb_c: Values
+) -> TowerResult:
+    """Result of a step, all fields of one shape."""
+    return TowerResult(
+        *np.broadcast_arrays(fan_w, air_ratio, leaving_c, range_k, leaving_c - wet_bulb_c)
     )

@@ -22,33 +22,30 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Values = Array | float
+from sdc_taichi.types import F64, Values
 
 EVAPORATION_HEAT_J_PER_KG = 2.45e6
-# EnergyPlus, "loss factor" evaporation: at most 0.2 % of the water flow per kelvin of range.
+"""Heat of evaporation of water near 20 C, in J/kg."""
 MAX_EVAPORATION_PER_K = 0.002
-# Drift rate of the paper and its code: a share of the water used, not of the water circulated.
+"""Most water that evaporates, as a share of the water flow per kelvin of range (EnergyPlus, "loss
+factor" evaporation)."""
 PAPER_DRIFT_RATE = 0.01
+"""Drift of the paper and its code, as a share of the water used, not of the water circulated."""
 
 
 @dataclass(frozen=True, slots=True)
-class Water:
-    """Water lost by the tower in one step, in litres; all fields have shape (B,).
+class WaterUse:
+    """Water that the cooling towers of B data centers use in one step."""
 
-    Attributes:
-        evaporation_l: Evaporated.
-        drift_l: Carried out as droplets.
-        blowdown_l: Drained to hold the concentration of solids.
-        makeup_l: Fed in, the sum of the three.
-    """
-
-    evaporation_l: Array
-    drift_l: Array
-    blowdown_l: Array
-    makeup_l: Array
+    evaporation_l: F64
+    """Water that evaporates, in litres, (B,)."""
+    drift_l: F64
+    """Water that the air carries out as droplets, in litres, (B,)."""
+    blowdown_l: F64
+    """Water drained to hold the concentration of solids, in litres, (B,)."""
+    water_l: F64
+    """Make-up water, evaporation plus drift plus blowdown, in litres, (B,)."""
 
 
 def mass_balance(
@@ -62,7 +59,7 @@ def mass_balance(
     cycles_of_concentration: Values,
     drift_share: Values,
     dt_s: Values,
-) -> Water:
+) -> WaterUse:
     """Evaporation, drift and blowdown (EnergyPlus Engineering Reference, tower make-up water).
 
     All heat is taken to leave as vapour, an upper bound (in frost a part leaves as warm air), and
@@ -81,7 +78,7 @@ def mass_balance(
         dt_s: Length of the step, s.
 
     Returns:
-        Litres in the step.
+        The water used in the step.
     """
     latent_kg_s = np.maximum(rejected_w, 0.0) / EVAPORATION_HEAT_J_PER_KG
     evaporation_l = np.minimum(latent_kg_s, MAX_EVAPORATION_PER_K * range_k * water_kg_s) * dt_s
@@ -101,7 +98,7 @@ def released(
     cycles_of_concentration: Values,
     drift_share: Values,
     dt_s: Values,
-) -> Water:
+) -> WaterUse:
     """The fit of the released SustainDC code, from the air temperatures of the room.
 
     max(0, 0.044*T_wb + 0.3528*(T_ret - T_set) + 0.101) m3/h, 1 % drift on top, litres rounded to
@@ -120,13 +117,13 @@ def released(
         dt_s: Length of the step, s.
 
     Returns:
-        Litres in the step.
+        The water used in the step.
     """
     use_m3h = 0.044 * wet_bulb_c + 0.3528 * (return_c - supply_setpoint_c) + 0.101
     use_l = np.maximum(use_m3h, 0.0) * _litres_per_m3h(dt_s)
-    makeup_l = np.round(use_l * (1.0 + PAPER_DRIFT_RATE), 4)
+    water_l = np.round(use_l * (1.0 + PAPER_DRIFT_RATE), 4)
     drift_l = use_l * PAPER_DRIFT_RATE
-    return _water(makeup_l - drift_l, drift_l, 0.0, makeup_l)
+    return _water(water_l - drift_l, drift_l, 0.0, water_l)
 
 
 def paper(
@@ -140,7 +137,7 @@ def paper(
     cycles_of_concentration: Values,
     drift_share: Values,
     dt_s: Values,
-) -> Water:
+) -> WaterUse:
     """Appendix A.2.6 as printed: w = 0.044*T_wb + 0.35*range + 0.1 m3/h, max(0, w) + 0.01*w.
 
     The drift term is printed on the unclipped w, so the use is slightly negative where w is.
@@ -157,7 +154,7 @@ def paper(
         dt_s: Length of the step, s.
 
     Returns:
-        Litres in the step.
+        The water used in the step.
     """
     use_m3h = 0.044 * wet_bulb_c + (0.35 * (return_c - supply_setpoint_c) + 0.1)
     evaporation_l = np.maximum(use_m3h, 0.0) * _litres_per_m3h(dt_s)
@@ -165,16 +162,19 @@ def paper(
     return _water(evaporation_l, drift_l, 0.0, evaporation_l + drift_l)
 
 
-WATER: dict[str, Callable[..., Water]] = {
+WATER: dict[str, Callable[..., WaterUse]] = {
     "mass_balance": mass_balance,
     "released": released,
     "paper": paper,
 }
+"""Water models by the names that ``hvac.water.model`` takes."""
 
 
 def _litres_per_m3h(dt_s: Values) -> Values:
+    """Litres that a flow of 1 m3/h gives in a step."""
     return 1000.0 * dt_s / 3600.0
 
 
-def _water(evaporation_l: Values, drift_l: Values, blowdown_l: Values, makeup_l: Values) -> Water:
-    return Water(*np.broadcast_arrays(evaporation_l, drift_l, blowdown_l, makeup_l))
+def _water(evaporation_l: Values, drift_l: Values, blowdown_l: Values, water_l: Values) -> WaterUse:
+    """Result of a step, all fields of one shape."""
+    return WaterUse(*np.broadcast_arrays(evaporation_l, drift_l, blowdown_l, water_l))

@@ -1,4 +1,4 @@
-"""Chilled water, economiser, chiller, tower and pumps as one plant."""
+"""Water side of the plant: chilled water, economiser, chiller, tower and pumps together."""
 
 from __future__ import annotations
 
@@ -7,76 +7,129 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from sdc_taichi.plant.air import economiser_share, pump_w
-from sdc_taichi.plant.chiller import Chiller
-from sdc_taichi.plant.tower import Tower
-from sdc_taichi.types import F64
+from sdc_taichi.plant.chiller import ChillerResult
+from sdc_taichi.plant.fans_pumps import pump_w
+from sdc_taichi.plant.tower import TowerResult
+from sdc_taichi.types import F64, Values, as_array
 
 
 @dataclass(frozen=True, slots=True)
-class Design:
-    """Sized devices of the plant, each (B,)."""
+class WaterSideDesign:
+    """Sized devices of the plants of B data centers."""
 
     cooling_w: F64
-    """Capacity of coils, exchanger and chilled-water pumps."""
+    """Cooling capacity of coils, heat exchanger and chilled-water pumps, in W, (B,)."""
     chiller_w: F64
-    """Cooling capacity of the chiller at its reference point."""
+    """Cooling capacity of the chiller at its reference point, in W, (B,)."""
     reference_cop: F64
+    """Coefficient of performance of the chiller at its reference point, in W/W, (B,)."""
     rejected_w: F64
+    """Heat that the tower rejects at design, in W, (B,)."""
     tower_water_kg_s: F64
+    """Condenser water flow at design, in kg/s, (B,)."""
     tower_reference_kg_s: F64
-    """Water flow at which the tower's water flow ratio is 1."""
+    """Water flow at which the water flow ratio of the tower is 1, in kg/s, (B,)."""
     tower_air_m3s: F64
+    """Airflow of the tower at full fan speed, in m3/s, (B,)."""
     tower_fan_w: F64
+    """Power of the tower fan at full speed, in W, (B,)."""
     air_j_per_m3_k: F64
+    """Heat capacity of air per volume, in J/(m3 K), (B,)."""
     chilled_pump_w: F64
+    """Power of the chilled-water pumps at design flow, in W, (B,)."""
     condenser_pump_w: F64
+    """Power of the condenser-water pumps at design flow, in W, (B,)."""
     pump_min_ratio: F64
-    """Lowest flow of the pumps over design flow; 1 is constant flow."""
+    """Lowest flow of the pumps over design flow, (B,); 1 is constant flow."""
     coil_approach_k: F64
+    """Coil approach: supply air temperature less that of the chilled water, in K, (B,)."""
     chilled_water_range_k: F64
+    """Return less supply temperature of the chilled water, in K, (B,)."""
     approach_min_k: F64
+    """Lowest approach of the tower, leaving water over wet bulb, in K, (B,)."""
     exchanger_approach_k: F64
+    """Approach of the economiser, precooled water over tower water, in K, (B,)."""
     min_condenser_c: F64
+    """Coldest condenser water that the chiller takes, in C, (B,)."""
     economiser: F64
-    """1 with economiser, 0 without."""
+    """1 with a waterside economiser, 0 without, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
-class WaterSide:
-    """One step of the plant, each (B,)."""
+class WaterSideResult:
+    """One step of the plants of B data centers."""
 
-    removed_w: F64
+    heat_removed_w: F64
+    """Heat taken from the chilled water, in W, (B,)."""
     economiser_w: F64
+    """Heat that the economiser takes off the chilled water, in W, (B,)."""
     chiller_load_w: F64
+    """Heat that the chiller takes off the chilled water, in W, (B,)."""
     chiller_w: F64
+    """Electric power of the chiller, in W, (B,)."""
     rejected_w: F64
+    """Heat that the tower gives to the outside, in W, (B,)."""
     chilled_water_c: F64
+    """Temperature of the chilled water supply, in C, (B,)."""
     condenser_water_c: F64
+    """Temperature of the water that leaves the tower, in C, (B,)."""
     tower_range_k: F64
+    """Entering less leaving water temperature of the tower, in K, (B,)."""
     tower_water_kg_s: F64
+    """Condenser water flow, in kg/s, (B,)."""
     tower_fan_w: F64
+    """Power of the tower fan, in W, (B,)."""
     chilled_pump_w: F64
+    """Power of the chilled-water pumps, in W, (B,)."""
     condenser_pump_w: F64
+    """Power of the condenser-water pumps, in W, (B,)."""
 
-    def scaled(self, share: F64) -> WaterSide:
-        """Means over a step of which the plant ran a share, (B,); temperatures are those then."""
+    def scaled(self, share: F64) -> WaterSideResult:
+        """Means over a step during a share of which, (B,), the plant ran.
+
+        Powers and flows are multiplied with the share; temperatures stay those while it ran.
+        """
         flows = [f.name for f in fields(self) if f.name.endswith(("_w", "_kg_s"))]
         return replace(self, **{name: getattr(self, name) * share for name in flows})
 
 
+def economiser_share(
+    return_water_c: Values, *, chilled_water_c: Values, tower_water_c: Values
+) -> F64:
+    """Share of the cooling load that an integrated waterside economiser takes off the chiller.
+
+    A heat exchanger in series ahead of the chiller precools the return water to the temperature
+    tower water can give it; the chiller does the rest.
+
+    Args:
+        return_water_c: Chilled water coming back from the room, C, (B,).
+        chilled_water_c: Chilled water supply, C, (B,).
+        tower_water_c: Lowest temperature the exchanger can reach, wet bulb plus the approach of
+            tower and exchanger, C, (B,).
+
+    Returns:
+        Share 0..1, (B,), and 0 where the water does not come back warmer than it left.
+    """
+    span_k = as_array(return_water_c - chilled_water_c)
+    loaded = span_k > 0.0
+    precooled_k = return_water_c - tower_water_c
+    return as_array(
+        np.where(loaded, np.clip(precooled_k / np.where(loaded, span_k, 1.0), 0.0, 1.0), 0.0)
+    )
+
+
 def operate(
-    request_w: F64,
+    requested_w: F64,
     *,
     setpoint_c: F64,
     outdoor_c: F64,
     wet_bulb_c: F64,
-    design: Design,
-    chiller: Callable[..., Chiller],
-    tower: Callable[..., Tower],
+    design: WaterSideDesign,
+    chiller: Callable[..., ChillerResult],
+    tower: Callable[..., TowerResult],
     limited: bool,
-) -> WaterSide:
-    """Remove up to ``request_w`` from the chilled water and reject it outside.
+) -> WaterSideResult:
+    """Remove up to ``requested_w`` from the chilled water and reject it outside.
 
     Chilled water follows the air, T_chw = setpoint - coil approach. The integrated economiser
     precools the return water with tower water as cold as the weather allows; the chiller does the
@@ -84,28 +137,24 @@ def operate(
     the tower setpoint, then chiller and economiser at the water that the tower gives.
 
     Args:
-        request_w: heat to remove, (B,).
-        setpoint_c: CRAC supply setpoint, (B,).
-        outdoor_c: dry bulb, (B,).
-        wet_bulb_c: wet bulb, (B,).
-        design: sized devices.
-        chiller: model of ``plant.chiller``.
-        tower: model of ``plant.tower``.
-        limited: whether the plant's capacity limits the heat removed.
+        requested_w: Heat to remove, W, (B,).
+        setpoint_c: CRAC supply setpoint, C, (B,).
+        outdoor_c: Outdoor dry bulb, C, (B,).
+        wet_bulb_c: Outdoor wet bulb, C, (B,).
+        design: Sized devices.
+        chiller: Model of ``plant.chiller``.
+        tower: Model of ``plant.tower``.
+        limited: Whether the plant's capacity limits the heat removed.
+
+    Returns:
+        The plant's step.
     """
-    wanted_w = np.minimum(request_w, design.cooling_w) if limited else request_w
+    load_w = np.minimum(requested_w, design.cooling_w) if limited else requested_w
     chilled_c = setpoint_c - design.coil_approach_k
-    return_c = chilled_c + design.chilled_water_range_k
 
-    def precooled_share(tower_water_c: F64) -> F64:
-        exchanger_c = tower_water_c + design.exchanger_approach_k
-        return design.economiser * economiser_share(
-            return_c, chilled_water_c=chilled_c, tower_water_c=exchanger_c
-        )
-
-    def run_chiller(share: F64, tower_water_c: F64) -> Chiller:
+    def run_chiller(economiser: F64, tower_water_c: F64) -> ChillerResult:
         return chiller(
-            wanted_w * (1.0 - share),
+            load_w * (1.0 - economiser),
             reference_w=design.chiller_w,
             chilled_water_c=chilled_c,
             condenser_c=np.maximum(tower_water_c, design.min_condenser_c),
@@ -114,13 +163,11 @@ def operate(
         )
 
     coldest_c = wet_bulb_c + design.approach_min_k
-    share = precooled_share(coldest_c)
-    useful_c = np.where(share > 0, chilled_c - design.exchanger_approach_k, design.min_condenser_c)
-    tower_setpoint_c = np.maximum(coldest_c, useful_c)
-    expected = run_chiller(share, tower_setpoint_c)
-    heat_w = wanted_w * share + expected.rejected_w
-    flow = np.maximum(heat_w / design.rejected_w, design.pump_min_ratio)
-    tower_water_kg_s = design.tower_water_kg_s * flow
+    share = _economiser_share_at(coldest_c, chilled_c, design)
+    tower_setpoint_c = _tower_setpoint_c(coldest_c, share, chilled_c, design)
+    heat_w = load_w * share + run_chiller(share, tower_setpoint_c).rejected_w
+    flow_ratio = np.maximum(heat_w / design.rejected_w, design.pump_min_ratio)
+    tower_water_kg_s = design.tower_water_kg_s * flow_ratio
     cooled = tower(
         heat_w,
         wet_bulb_c=wet_bulb_c,
@@ -133,14 +180,15 @@ def operate(
         design_fan_w=design.tower_fan_w,
         air_j_per_m3_k=design.air_j_per_m3_k,
     )
-    share = precooled_share(cooled.leaving_c)
+    share = _economiser_share_at(cooled.leaving_c, chilled_c, design)
     machine = run_chiller(share, cooled.leaving_c)
-    economiser_w = wanted_w * share
-    removed_w = wanted_w - machine.unmet_w if limited else wanted_w
-    return WaterSide(
-        removed_w=removed_w,
+    economiser_w = load_w * share
+    heat_removed_w = load_w - machine.unmet_w if limited else load_w
+    chilled_pump_w, condenser_pump_w = _pumps_w(heat_removed_w, heat_w, design)
+    return WaterSideResult(
+        heat_removed_w=heat_removed_w,
         economiser_w=economiser_w,
-        chiller_load_w=removed_w - economiser_w,
+        chiller_load_w=heat_removed_w - economiser_w,
         chiller_w=machine.power_w,
         rejected_w=economiser_w + machine.rejected_w,
         chilled_water_c=chilled_c,
@@ -148,16 +196,44 @@ def operate(
         tower_range_k=cooled.range_k,
         tower_water_kg_s=tower_water_kg_s,
         tower_fan_w=cooled.fan_w,
-        chilled_pump_w=pump_w(
-            removed_w,
-            design_flow=design.cooling_w,
-            design_w=design.chilled_pump_w,
-            min_flow_ratio=design.pump_min_ratio,
-        ),
-        condenser_pump_w=pump_w(
-            heat_w,
-            design_flow=design.rejected_w,
-            design_w=design.condenser_pump_w,
-            min_flow_ratio=design.pump_min_ratio,
-        ),
+        chilled_pump_w=chilled_pump_w,
+        condenser_pump_w=condenser_pump_w,
     )
+
+
+def _economiser_share_at(tower_water_c: F64, chilled_water_c: F64, design: WaterSideDesign) -> F64:
+    """Share of the cooling load that the economiser takes with tower water, both in C, (B,)."""
+    return design.economiser * economiser_share(
+        chilled_water_c + design.chilled_water_range_k,
+        chilled_water_c=chilled_water_c,
+        tower_water_c=tower_water_c + design.exchanger_approach_k,
+    )
+
+
+def _tower_setpoint_c(
+    coldest_c: F64, share: F64, chilled_water_c: F64, design: WaterSideDesign
+) -> F64:
+    """Water temperature that the tower is controlled to, in C, (B,).
+
+    As cold as the economiser or else the chiller can use, and not below what the weather gives.
+    """
+    economiser_c = chilled_water_c - design.exchanger_approach_k
+    useful_c = np.where(share > 0, economiser_c, design.min_condenser_c)
+    return np.maximum(coldest_c, useful_c)
+
+
+def _pumps_w(heat_removed_w: F64, rejected_w: F64, design: WaterSideDesign) -> tuple[F64, F64]:
+    """Power of chilled- and condenser-water pumps, in W, whose flows follow the heat, (B,)."""
+    chilled_pump_w = pump_w(
+        heat_removed_w,
+        design_flow=design.cooling_w,
+        design_w=design.chilled_pump_w,
+        min_flow_ratio=design.pump_min_ratio,
+    )
+    condenser_pump_w = pump_w(
+        rejected_w,
+        design_flow=design.rejected_w,
+        design_w=design.condenser_pump_w,
+        min_flow_ratio=design.pump_min_ratio,
+    )
+    return chilled_pump_w, condenser_pump_w

@@ -24,18 +24,26 @@ TASKS_PER_STEP = 100.0
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """Outcome of one step, each (B,), in tasks unless stated."""
+    """What happens to the work of B data centers in one step."""
 
     utilisation: F64
-    arrived: F64
-    executed: F64
-    deferred: F64
-    drained: F64
-    due: F64
-    overdue: F64
-    dropped: F64
-    taken: F64
-    """Work that left the queue."""
+    """Work that starts, as a share of capacity, 0..1, (B,)."""
+    arrived_tasks: F64
+    """Work that arrives, in tasks, (B,)."""
+    executed_tasks: F64
+    """Work that starts, in tasks, (B,)."""
+    deferred_tasks: F64
+    """Work that enters the queue, in tasks, (B,)."""
+    drained_tasks: F64
+    """Work that leaves the queue on command, in tasks, (B,)."""
+    due_tasks: F64
+    """Queued work whose deadline has come, in tasks, (B,)."""
+    overdue_tasks: F64
+    """Due work that does not fit into the step, in tasks, (B,)."""
+    dropped_tasks: F64
+    """Work that finds the queue full, in tasks, (B,)."""
+    dequeued_tasks: F64
+    """Work that leaves the queue, drained or due, in tasks, (B,)."""
 
 
 WorkModel = Callable[..., Work]
@@ -58,13 +66,17 @@ def fluid(
     runs first, as far as capacity allows; what does not fit into the queue is dropped.
 
     Args:
-        demand: arriving work as a share of capacity, (B,).
-        command: -1 defer all flexible work .. 0 .. 1 drain all that fits, (B,).
-        waiting: work in the queue, (B,).
-        due: part of it whose deadline has come, (B,).
-        flexible_share: share of the demand that may wait, (B,).
-        max_utilisation: capacity limit, (B,).
-        queue_limit: longest queue in tasks, (B,).
+        demand: Arriving work as a share of capacity, 0..1, (B,).
+        command: -1 defers all flexible work, 0 neither defers nor drains, 1 drains all that fits,
+            (B,).
+        waiting: Work in the queue, tasks, (B,).
+        due: Part of the waiting work whose deadline has come, tasks, (B,).
+        flexible_share: Share of the demand that may wait, 0..1, (B,).
+        max_utilisation: Highest utilisation, 0..1, (B,).
+        queue_limit: Longest queue, tasks, (B,).
+
+    Returns:
+        What happens to the work.
     """
     arrived = demand * TASKS_PER_STEP
     capacity = max_utilisation * TASKS_PER_STEP
@@ -77,15 +89,15 @@ def fluid(
     drained = np.minimum(waiting - forced, np.maximum(command, 0.0) * (capacity - now - forced))
     executed = now + forced + drained
     return Work(
-        executed / TASKS_PER_STEP,
-        arrived,
-        executed,
-        deferred,
-        drained,
-        due,
-        due - forced,
-        held_back - deferred,
-        forced + drained,
+        utilisation=executed / TASKS_PER_STEP,
+        arrived_tasks=arrived,
+        executed_tasks=executed,
+        deferred_tasks=deferred,
+        drained_tasks=drained,
+        due_tasks=due,
+        overdue_tasks=due - forced,
+        dropped_tasks=held_back - deferred,
+        dequeued_tasks=forced + drained,
     )
 
 
@@ -99,12 +111,24 @@ def tasks(
     max_utilisation: F64,
     queue_limit: F64,
 ) -> Work:
-    """Whole tasks as the released SustainDC counts them; arguments as in ``fluid``.
+    """Whole tasks as the released SustainDC counts them.
 
     Fixed work is rounded up and flexible work down, so a step may execute one task more than
     arrived. Tasks older than the deadline run first up to the utilisation cap; a drain takes no
     more than the step's flexible tasks and stops at the cap. Work above the cap that nobody
     deferred still runs, as in the released code.
+
+    Args:
+        demand: Arriving work as a share of capacity, 0..1, (B,).
+        command: -1 defers all flexible work, 0 neither defers nor drains, 1 drains what fits, (B,).
+        waiting: Work in the queue, tasks, (B,).
+        due: Part of the waiting work whose deadline has come, tasks, (B,).
+        flexible_share: Share of the demand that may wait, 0..1, (B,).
+        max_utilisation: Utilisation above which no queued work runs, 0..1, (B,).
+        queue_limit: Longest queue, tasks, (B,).
+
+    Returns:
+        What happens to the work.
     """
     fixed = np.ceil(demand * (1.0 - flexible_share) * TASKS_PER_STEP)
     flexible = np.floor(demand * flexible_share * TASKS_PER_STEP)
@@ -119,24 +143,26 @@ def tasks(
     # As released: tasks that find the queue full count as dropped and run all the same.
     executed = arrived - deferred + forced + drained
     return Work(
-        executed / TASKS_PER_STEP,
-        arrived,
-        executed,
-        deferred,
-        drained,
-        due,
-        due - forced,
-        held_back - deferred,
-        forced + drained,
+        utilisation=executed / TASKS_PER_STEP,
+        arrived_tasks=arrived,
+        executed_tasks=executed,
+        deferred_tasks=deferred,
+        drained_tasks=drained,
+        due_tasks=due,
+        overdue_tasks=due - forced,
+        dropped_tasks=held_back - deferred,
+        dequeued_tasks=forced + drained,
     )
 
 
 def _room(queue_limit: F64, waiting: F64) -> F64:
+    """Work that still fits into a queue, in tasks, (B,)."""
     # Rounding may leave more in a full queue than it may hold.
     return np.maximum(queue_limit - waiting, 0.0)
 
 
 MODELS: dict[str, WorkModel] = {"fluid": fluid, "tasks": tasks}
+"""Models of work by the names that ``workload.model`` takes."""
 DUE_AFTER_STEPS = {"fluid": 0.0, "tasks": 1.0}
 """Steps between the deadline and when the models take work as due."""
 NEGLIGIBLE_TASKS = 1e-9

@@ -12,10 +12,10 @@ import numpy as np
 
 from sdc_taichi.hall import air_metrics
 from sdc_taichi.plant import cooling, water_side
-from sdc_taichi.plant.air import crac_fan_w
-from sdc_taichi.plant.battery import BATTERIES, Battery
+from sdc_taichi.plant.battery import BATTERIES, BatteryResult
 from sdc_taichi.plant.carbon import emitted_g
 from sdc_taichi.plant.chiller import CHILLERS
+from sdc_taichi.plant.fans_pumps import crac_fan_w
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER
 from sdc_taichi.sim.fleet import Fleet
@@ -112,7 +112,7 @@ class _Heat:
 
     load_w: F64
     """Heat that comes back to the CRAC units."""
-    device: water_side.WaterSide
+    device: water_side.WaterSideResult
     unmet_w: F64
     recovered_w: F64
     held_kwh: F64
@@ -139,8 +139,8 @@ class Facility:
         self._recirculates = models["inlet"] == "recirculation"
         self._transient = models["thermal"] == "transient"
         self._stores_heat = models["cooling_load"] in cooling.STORES_UNMET_HEAT
-        self._flow = cooling.FLOWS[models["crac_flow"]]
-        self._load = cooling.LOADS[models["cooling_load"]]
+        self._flow = cooling.CRAC_FLOWS[models["crac_flow"]]
+        self._load = cooling.COOLING_LOADS[models["cooling_load"]]
         self._chiller = CHILLERS[models["chiller"]]
         self._tower = TOWERS[models["tower"]]
         self._water_model = WATER[models["water"]]
@@ -162,7 +162,7 @@ class Facility:
 
     def removable_w(self, met: FacilityInputs) -> dict[str, F64]:
         """Heat that the plant can take with the coils in use."""
-        return {"removed_w": self._operate(self._coils_w(met), met).removed_w}
+        return {"removed_w": self._operate(self._coils_w(met), met).heat_removed_w}
 
     def step(self, met: FacilityInputs) -> dict[str, F64]:
         """Everything that follows from the air of the halls.
@@ -226,7 +226,7 @@ class Facility:
             "chiller_load_w": device.chiller_load_w,
             "unmet_w": heat.unmet_w,
             "recovered_w": heat.recovered_w,
-            "heat_removed_w": device.removed_w,
+            "heat_removed_w": device.heat_removed_w,
             "rejected_w": device.rejected_w,
             "room_heat_kwh": heat.held_kwh,
             "chiller_w": device.chiller_w,
@@ -238,12 +238,12 @@ class Facility:
             "evaporation_l": water.evaporation_l,
             "drift_l": water.drift_l,
             "blowdown_l": water.blowdown_l,
-            "water_l": water.makeup_l,
+            "water_l": water.water_l,
             "stored_kwh": battery.stored_kwh,
             "soc": battery.stored_kwh / np.where(sized.battery_kwh > 0, sized.battery_kwh, 1.0),
             "charge_kwh": battery.charge_kwh,
             "discharge_kwh": battery.discharge_kwh,
-            "battery_loss_kwh": battery.loss_kwh,
+            "battery_loss_kwh": battery.battery_loss_kwh,
             "it_kwh": it_w * step_h / 1e3,
             "hvac_kwh": hvac_w * step_h / 1e3,
             "grid_kwh": grid_kwh,
@@ -251,7 +251,7 @@ class Facility:
             "carbon_g": emitted_g(grid_kwh, met.ci_g_per_kwh),
         }
 
-    def run_battery(self, stored_kwh: F64, command: F64, *, load_kw: F64) -> Battery:
+    def run_battery(self, stored_kwh: F64, command: F64, *, load_kw: F64) -> BatteryResult:
         """One step of the batteries."""
         return self._battery_model(
             stored_kwh,
@@ -267,7 +267,7 @@ class Facility:
         cooling_w = self._sized.water_side.cooling_w
         return cooling_w if self._calm else cooling_w * met.coils * met.powered
 
-    def _operate(self, request_w: F64, met: FacilityInputs) -> water_side.WaterSide:
+    def _operate(self, request_w: F64, met: FacilityInputs) -> water_side.WaterSideResult:
         """The plant, which stands still while there is no power."""
         design = self._sized.water_side
         if not self._calm:
@@ -322,8 +322,8 @@ class Facility:
         if self._transient:
             load_w, device = met.cooling_load_w, self._operate(met.coil_w, met)
             # The room has kept its heat within the step; here is what the plant fell short of.
-            held_kwh = met.room_j / 3.6e6 + (met.coil_w - device.removed_w) * step_h / 1e3
-            unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, device.removed_w)
+            held_kwh = met.room_j / 3.6e6 + (met.coil_w - device.heat_removed_w) * step_h / 1e3
+            unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, device.heat_removed_w)
         else:
             load_w = room.load_w
             wanted_w = load_w + met.room_heat_kwh * 1e3 / step_h
@@ -334,8 +334,8 @@ class Facility:
                 reached_w = np.clip(wanted_w - past_w, 0.0, self._coils_w(met))
                 wanted_w = np.where(met.all_running > 0, wanted_w, reached_w)
             device = self._operate(wanted_w, met)
-            unmet_w, recovered_w, held_kwh = cooling.hold_heat(
-                load_w, device.removed_w, met.room_heat_kwh, step_h
+            unmet_w, recovered_w, held_kwh = cooling.balance_room_heat(
+                load_w, device.heat_removed_w, met.room_heat_kwh, step_h
             )
         if not self._stores_heat:
             unmet_w = recovered_w = 0.0 * load_w

@@ -283,7 +283,7 @@ class Simulator:
             due=due,
             max_utilisation=np.minimum(self._max_utilisation, highest),
         )
-        queued = self._queue.after(state.queue, work["taken"], work["deferred"])
+        queued = self._queue.after(state.queue, work["dequeued_tasks"], work["deferred_tasks"])
         utilisation = work["utilisation"]
         placed = floor.place(utilisation, capacity, powered, state.group_inlet_c, given.placement)
 
@@ -380,13 +380,13 @@ class Simulator:
             cooling_command=self._per_dc(cooling_command).copy(),
             battery_command=battery_command,
             utilisation=utilisation,
-            arrived_tasks=work["arrived"],
-            executed_tasks=work["executed"] - lost_tasks,
-            deferred_tasks=work["deferred"],
-            drained_tasks=work["drained"],
-            due_tasks=work["due"],
-            overdue_tasks=work["overdue"],
-            dropped_tasks=work["dropped"],
+            arrived_tasks=work["arrived_tasks"],
+            executed_tasks=work["executed_tasks"] - lost_tasks,
+            deferred_tasks=work["deferred_tasks"],
+            drained_tasks=work["drained_tasks"],
+            due_tasks=work["due_tasks"],
+            overdue_tasks=work["overdue_tasks"],
+            dropped_tasks=work["dropped_tasks"],
             lost_tasks=lost_tasks,
             queue_tasks=queued.waiting,
             oldest_age_h=queued.oldest_steps * step_h,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdc_taichi.plant import chiller, tower
-from sdc_taichi.plant.air import hydraulic_pump_w
-from sdc_taichi.plant.water_side import Design
+from sdc_taichi.plant.fans_pumps import hydraulic_pump_w
+from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
 from sdc_taichi.types import F64
@@ -35,7 +35,7 @@ class Sizing:
     battery_kwh: F64
     room_kwh_per_k: F64
     """Heat that warms the room, and its servers if quasi-steady, by 1 K."""
-    water_side: Design
+    water_side: WaterSideDesign
 
 
 def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64) -> Sizing:
@@ -72,7 +72,7 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     # The coldest chilled water asks most of the chiller.
     chilled_c = v("hvac.setpoint.min_c") - v("hvac.chiller.coil_approach_k")
 
-    def run_chiller(load_w: F64, reference_w: F64) -> chiller.Chiller:
+    def run_chiller(load_w: F64, reference_w: F64) -> chiller.ChillerResult:
         return chiller.CHILLERS[fleet.models["chiller"]](
             load_w,
             reference_w=reference_w,
@@ -86,7 +86,7 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     chiller_w = cooling_w / per_reference
     machine = run_chiller(cooling_w, chiller_w)
     rejected_w = machine.rejected_w
-    design = Design(
+    design = WaterSideDesign(
         cooling_w=cooling_w,
         chiller_w=chiller_w,
         reference_cop=v("hvac.chiller.reference_cop"),
@@ -159,7 +159,7 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
         facility_w=facility_w,
         battery_kwh=_battery_kwh(fleet, facility_w / 1e3),
         room_kwh_per_k=_room_kwh_per_k(fleet),
-        water_side=Design(
+        water_side=WaterSideDesign(
             cooling_w=rated_w,
             chiller_w=rated_w,
             reference_cop=v("hvac.chiller.reference_cop"),

@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sdc_taichi.plant.cooling import FLOWS, LOADS, SETPOINTS, STORES_UNMET_HEAT, hold_heat
+from sdc_taichi.plant.cooling import (
+    COOLING_LOADS,
+    CRAC_FLOWS,
+    SETPOINTS,
+    STORES_UNMET_HEAT,
+    balance_room_heat,
+)
 from sdc_taichi.types import F64
 
 AIR = np.array([1.225 * 1006.0])
@@ -93,19 +99,19 @@ def test_airflow_of_the_crac_units() -> None:
         "min_ratio": np.full(3, 0.6),
         "supply_m3s_per_w": np.full(3, 5e-5),
     }
-    flow, speed = FLOWS["constant"](it_w, server_flow, **given_all)
+    flow, speed = CRAC_FLOWS["constant"](it_w, server_flow, **given_all)
     assert flow.tolist() == [20, 20, 20]
     assert speed.tolist() == [1, 1, 1]
-    flow, speed = FLOWS["follow_servers"](it_w, server_flow, **given_all)
+    flow, speed = CRAC_FLOWS["follow_servers"](it_w, server_flow, **given_all)
     np.testing.assert_allclose(speed, [0.6, 0.8, 1.0])
     np.testing.assert_allclose(flow, [12, 16, 20])
-    flow, speed = FLOWS["per_watt"](it_w, server_flow, **given_all)
+    flow, speed = CRAC_FLOWS["per_watt"](it_w, server_flow, **given_all)
     np.testing.assert_allclose(flow, [0, 10, 20])
     assert speed.tolist() == [1, 1, 1]
 
 
 def load_of(model: str, outlet_c: float, setpoint_c: float = 18.0) -> tuple[float, float]:
-    return_c, load_w = LOADS[model](
+    return_c, load_w = COOLING_LOADS[model](
         one(3e5), one(1.2e4), one(20.0), one(18.5), one(setpoint_c), one(outlet_c),
         air_j_per_m3_k=AIR, return_approach_k=one(-3.0),
     )  # fmt: skip
@@ -129,7 +135,7 @@ def test_loads_by_return_approach(outlet_c: float, rise_k: float) -> None:
 
 def test_only_the_balanced_load_holds_heat() -> None:
     assert {"heat_balance"} == STORES_UNMET_HEAT
-    assert set(LOADS) >= STORES_UNMET_HEAT
+    assert set(COOLING_LOADS) >= STORES_UNMET_HEAT
 
 
 @given(
@@ -143,7 +149,7 @@ def test_heat_that_is_not_removed_is_held(
 ) -> None:
     removed_w = min(load_w + held_kwh * 1e3 / step_h, capacity_w)
     unmet, recovered, stored = (
-        float(x[0]) for x in hold_heat(one(load_w), one(removed_w), one(held_kwh), step_h)
+        float(x[0]) for x in balance_room_heat(one(load_w), one(removed_w), one(held_kwh), step_h)
     )
     scale = max(load_w * step_h / 1e3, held_kwh, 1e-9)
     assert stored - held_kwh == pytest.approx(
