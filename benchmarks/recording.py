@@ -20,7 +20,8 @@ from typing import Any
 
 import sdc_taichi
 from sdc_taichi.control import make_controller
-from sdc_taichi.run.loop import RunRequest, describe, record
+from sdc_taichi.run.description import RunRequest, describe_run
+from sdc_taichi.run.folder_writer import simulate_to_folder
 from sdc_taichi.viz.recorder import Recorder
 
 MONTH_STEPS = 31 * 96
@@ -57,10 +58,10 @@ def run_s(sim: sdc_taichi.Simulator, steps: int, folder: Path, recorded: bool) -
     begin = time.perf_counter()
     if recorded:
         with Recorder(folder / "run.rrd") as recorder:
-            recorder.begin(sim, describe(sim, asked))
-            record(sim, controller, asked, folder, on_step=recorder.add)
+            recorder.begin(sim, describe_run(sim, asked))
+            simulate_to_folder(sim, controller, asked, folder, on_step=recorder.add)
     else:
-        record(sim, controller, asked, folder)
+        simulate_to_folder(sim, controller, asked, folder)
     return time.perf_counter() - begin
 
 

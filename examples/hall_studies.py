@@ -30,8 +30,8 @@ from sdc_taichi import (
 )
 from sdc_taichi.control import Controller, View, make_controller
 from sdc_taichi.hall.floor_plan import floor_plan
-from sdc_taichi.run.loop import run
-from sdc_taichi.run.metrics import Metric, per_dc
+from sdc_taichi.run.loop import simulate
+from sdc_taichi.run.metrics import Metric, metrics_per_dc
 from sdc_taichi.types import F64
 from sdc_taichi.viz import floor_plan as plans
 from sdc_taichi.viz import hall_figures
@@ -213,11 +213,11 @@ def run_mode(
         clock.append(time.perf_counter())
 
     with Simulator(fleet) as sim:
-        totals = run(sim, driver, steps, on_step=keep)
+        totals = simulate(sim, driver, steps, on_step=keep)
     inlet, it_w, hvac_w = (np.array(x) for x in zip(*results, strict=True))
     return ModeRun(
         names=names,
-        metrics=per_dc(totals, fleet),
+        metrics=metrics_per_dc(totals, fleet),
         inlet_max_c=inlet,
         it_w=it_w,
         hvac_w=hvac_w,

@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Any
 from sdc_taichi import Simulator, load_config
 from sdc_taichi.control import make_controller
 from sdc_taichi.exogenous.synthetic import synthetic_sites, synthetic_traces
-from sdc_taichi.run.loop import RunRequest, record
+from sdc_taichi.run.description import RunRequest
+from sdc_taichi.run.folder_reader import read_run, read_steps
+from sdc_taichi.run.folder_writer import simulate_to_folder
 from sdc_taichi.viz import dashboards, data_figures, fleet_figures
 from sdc_taichi.viz.animation import write_animation
 from sdc_taichi.viz.figures import DPI, webp
-from sdc_taichi.viz.recorded import read_run, read_steps
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,12 +49,12 @@ def save(figure: Figure, path: Path, dpi: int = DPI) -> None:
     path.write_bytes(webp(figure, dpi)[2])
 
 
-def recorded_run(out: Path, controller: str, days: int, values: list[str]) -> dict[str, Any]:
-    """Record a run of one data center; the content of metrics.json."""
+def simulate_run(out: Path, controller: str, days: int, values: list[str]) -> dict[str, Any]:
+    """Write the run folder of one data center; the content of metrics.json."""
     with Simulator(load_config("corrected", ["site.location=NY", *values])) as sim:
         steps = days * 24 * sim.fleet.steps_per_hour
         driver = make_controller(controller, sim.fleet)
-        written = record(sim, driver, RunRequest(controller, steps), out)
+        written = simulate_to_folder(sim, driver, RunRequest(controller, steps), out)
     if written is None:
         raise RuntimeError("the run has no steps")
     return written
@@ -61,7 +62,7 @@ def recorded_run(out: Path, controller: str, days: int, values: list[str]) -> di
 
 def plot_year(folder: Path, scratch: Path) -> None:
     """Dashboards of a year."""
-    recorded_run(scratch, CONTROLLERS["g36, load and battery greedy"], 365, [])
+    simulate_run(scratch, CONTROLLERS["g36, load and battery greedy"], 365, [])
     (steps,) = read_steps(read_run(scratch), [0])
     save(dashboards.year(steps, "New York"), folder / "year.webp", dpi=75)
     save(dashboards.day(steps, "07-15", "New York"), folder / "day.webp")
@@ -74,7 +75,7 @@ def plot_year(folder: Path, scratch: Path) -> None:
 def plot_controllers(folder: Path, scratch: Path) -> None:
     """July under several controllers."""
     totals = {
-        label: recorded_run(scratch / str(index), name, 31, ["site.start=07-01"])["total"]
+        label: simulate_run(scratch / str(index), name, 31, ["site.start=07-01"])["total"]
         for index, (label, name) in enumerate(CONTROLLERS.items())
     }
     save(fleet_figures.radar(totals), folder / "radar.webp")

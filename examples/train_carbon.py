@@ -30,7 +30,7 @@ from train_skrl import ALGORITHMS, BatchEnv, learner, prepare, trainer
 import sdc_taichi
 from sdc_taichi import DataCenterConfig, Simulator, StepResult, build_fleet, load_config
 from sdc_taichi.control import View, make_controller
-from sdc_taichi.run.loop import run
+from sdc_taichi.run.loop import simulate
 from sdc_taichi.types import F64
 
 SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
@@ -122,7 +122,7 @@ def run_rules(name: str, configs: Sequence[DataCenterConfig]) -> Sums:
                 total += getattr(result, key)
 
     with Simulator(fleet) as sim:
-        run(sim, make_controller(name, fleet), STEPS, on_step=score)
+        simulate(sim, make_controller(name, fleet), STEPS, on_step=score)
     return sums
 
 

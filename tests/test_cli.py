@@ -32,7 +32,9 @@ from sdc_taichi import (
 )
 from sdc_taichi.cli.app import app
 from sdc_taichi.control import View, make_controller
-from sdc_taichi.run.loop import RunRequest, record, run
+from sdc_taichi.run import loop
+from sdc_taichi.run.description import RunRequest
+from sdc_taichi.run.folder_writer import simulate_to_folder
 
 PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli.app import main; main()")
 HEAVY = {"taichi", "pandas", "pyarrow", "psychrolib", "matplotlib", "rerun"}
@@ -153,7 +155,7 @@ def test_hottest_rack_is_found_in_its_data_center() -> None:
         load_config("tiny", [f"hall.supply_approach_k.{i}=9", f"name=hot-{i}"]) for i in range(4)
     ]
     with Simulator(hot) as sim:
-        totals = run(sim, make_controller("idle", sim.fleet), 5)
+        totals = loop.simulate(sim, make_controller("idle", sim.fleet), 5)
     assert totals.hottest_rack.tolist() == [0, 1, 2, 3]
 
 
@@ -505,7 +507,9 @@ def wait_for(ready: Callable[[], bool], process: subprocess.Popen[str]) -> None:
 def test_stopped_before_the_first_step_writes_nothing(tmp_path: Path) -> None:
     with Simulator(load_config("tiny")) as sim:
         controller = make_controller("idle", sim.fleet)
-        report = record(sim, controller, RunRequest("idle", 5), tmp_path / "run", stop=lambda: True)
+        report = simulate_to_folder(
+            sim, controller, RunRequest("idle", 5), tmp_path / "run", stop=lambda: True
+        )
     assert report is None
     assert names_in(tmp_path / "run") == set()
 
@@ -523,7 +527,7 @@ def test_each_data_center_lists_the_events_that_it_met(tmp_path: Path) -> None:
     ]
     with Simulator(halls) as sim:
         controller = make_controller("idle", sim.fleet)
-        report = record(sim, controller, RunRequest("idle", 8), tmp_path / "run")
+        report = simulate_to_folder(sim, controller, RunRequest("idle", 8), tmp_path / "run")
     assert report is not None
     assert [dc["events"] for dc in report["data_centers"]] == [
         [
@@ -548,7 +552,7 @@ def test_failing_run_leaves_the_former_one_whole(tmp_path: Path) -> None:
     simulate(out)
     before = {p.name: p.read_bytes() for p in out.iterdir()}
     with Simulator(load_config("tiny")) as sim, pytest.raises(RuntimeError, match="broken"):
-        record(sim, Broken(), RunRequest("broken", 20), out)
+        simulate_to_folder(sim, Broken(), RunRequest("broken", 20), out)
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before
 
 

@@ -34,7 +34,7 @@ from sdc_taichi.control import (
     viewer,
 )
 from sdc_taichi.control.rules import quarter_command, slots_in_step, unrepeated
-from sdc_taichi.run.loop import run
+from sdc_taichi.run.loop import simulate
 
 CHECKS = json.loads((Path(__file__).parent / "reference" / "physics_checks.json").read_text())
 TRIM = next(c for c in CHECKS["checks"] if c["id"] == "G36-TR")
@@ -55,7 +55,7 @@ def sim() -> Iterator[Simulator]:
 
 def results(sim: Simulator, controller: Controller, steps: int, seed: int = 0) -> list[StepResult]:
     kept: list[StepResult] = []
-    run(sim, controller, steps, seed, on_step=kept.append)
+    simulate(sim, controller, steps, seed, on_step=kept.append)
     return kept
 
 
@@ -295,7 +295,7 @@ def test_forecast_shorter_than_a_step_is_an_error(sim: Simulator) -> None:
 @pytest.mark.parametrize("name", controller_names())
 def test_every_name_runs(name: str, sim: Simulator) -> None:
     controller = make_controller(name.replace(":C", ":20"), sim.fleet)
-    assert run(sim, controller, 8, 1).steps == 8
+    assert simulate(sim, controller, 8, 1).steps == 8
 
 
 def test_each_agent_may_have_its_own(sim: Simulator) -> None:

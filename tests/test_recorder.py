@@ -32,7 +32,8 @@ from sdc_taichi import (
 )
 from sdc_taichi.control import View
 from sdc_taichi.plant.workload import age_histogram
-from sdc_taichi.run.loop import RunRequest, describe, record
+from sdc_taichi.run.description import RunRequest, describe_run
+from sdc_taichi.run.folder_writer import simulate_to_folder
 from sdc_taichi.types import F64, ServerLayers
 from sdc_taichi.viz import hall_layers, recorder, recording_reader, recording_series
 from sdc_taichi.viz.recorder import Recorder
@@ -126,7 +127,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             Recorder(path, focus=["ny-0", ODD_NAME, "ny-2"], every=2) as rec,
         ):
             patch.setattr(recorder, "BLOCK_STEPS", 96)
-            rec.begin(sim, describe(sim, asked))
+            rec.begin(sim, describe_run(sim, asked))
 
             def each(result: StepResult) -> None:
                 results.append(result)
@@ -135,7 +136,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
                 rewards.append(-result.carbon_g / 7.0)
                 rec.add(result, rewards={"carbon": rewards[-1], "water": -result.water_l})
 
-            record(sim, Wild(), asked, out / "files", on_step=each)
+            simulate_to_folder(sim, Wild(), asked, out / "files", on_step=each)
         steps = pd.read_parquet(out / "files" / "steps.parquet")
         yield Run(sim, results, servers, queues, rewards, steps, path, read(path))
 
@@ -371,7 +372,7 @@ def test_recording_explains_itself(run: Run) -> None:
     from rerun.chunk import RrdReader
 
     (((text,),)) = run.recorded["/summary"]["TextDocument:text"]
-    about = describe(run.sim, RunRequest("wild", STEPS))
+    about = describe_run(run.sim, RunRequest("wild", STEPS))
     for expected in (
         ODD_NAME, "site CA", "**synthetic**", "synthetic year, seed 10", "carnot", "wild",
         about["fingerprint"], f"taichi {about['versions']['taichi']}", "inlet 10 to 45 C",

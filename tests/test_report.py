@@ -21,9 +21,11 @@ from report_reader import Page, pictures, read_page
 from sdc_taichi import DataCenterConfig, SdcError, Simulator, load_config, make_configs
 from sdc_taichi.cli.app import app
 from sdc_taichi.control import make_controller
-from sdc_taichi.run.loop import RunRequest, record
-from sdc_taichi.viz import dashboards, fleet_figures, recorded, report
-from sdc_taichi.viz.recorded import read_run, read_steps
+from sdc_taichi.run import folder_reader
+from sdc_taichi.run.description import RunRequest
+from sdc_taichi.run.folder_reader import read_run, read_steps
+from sdc_taichi.run.folder_writer import simulate_to_folder
+from sdc_taichi.viz import dashboards, fleet_figures, report
 
 NASTY = '<script>alert("1")</script> & $x_{$\n</style>東'
 STEPS = 2 * 96
@@ -50,7 +52,7 @@ def simulate(
 
     with Simulator(configs) as sim:
         driver = make_controller(controller, sim.fleet)
-        written = record(sim, driver, RunRequest(controller, steps), out, stop=stop)
+        written = simulate_to_folder(sim, driver, RunRequest(controller, steps), out, stop=stop)
     assert written is not None
     return written
 
@@ -211,12 +213,12 @@ def test_words_stay_whole_but_for_long_ones(folder: Path) -> None:
     run = read_run(folder / "greedy")
     cells = re.findall(r'<t[hd][^>]*?(?: class="([^"]+)")?>([^<]*)</t', report._summary(run))
     classes = {text: kind for kind, text in cells}
-    assert classes[run.about["fingerprint"]] == "long"
+    assert classes[run.metrics["fingerprint"]] == "long"
     assert classes["fingerprint of configs, inputs and precision"] == ""
 
 
-def many_events(run: recorded.RecordedRun) -> recorded.RecordedRun:
-    about = json.loads(json.dumps(run.about))
+def many_events(run: folder_reader.RunFolder) -> folder_reader.RunFolder:
+    about = json.loads(json.dumps(run.metrics))
     first, second = about["data_centers"]
     first["events"] = [
         {"kind": "crac_down", "target": 1, "start_step": 4 * i, "end_step": 4 * i + 2}
@@ -224,7 +226,7 @@ def many_events(run: recorded.RecordedRun) -> recorded.RecordedRun:
     ]
     second["events"] += [{"kind": "grid_outage", "start_step": i, "end_step": i + 4}
                          for i in range(20)]  # fmt: skip
-    return recorded.RecordedRun(run.folder, about)
+    return folder_reader.RunFolder(run.path, about)
 
 
 def test_many_events_are_told_by_kind(folder: Path) -> None:
@@ -240,7 +242,7 @@ def test_many_events_are_told_by_kind(folder: Path) -> None:
 
 def test_times_of_long_runs_have_a_year(folder: Path) -> None:
     run = read_run(folder / "greedy")
-    long = recorded.RecordedRun(run.folder, run.about | {"steps_done": 400 * 96})
+    long = folder_reader.RunFolder(run.path, run.metrics | {"steps_done": 400 * 96})
     moment = report._local(long, 0, 366 * 96)
     assert report._clock(long, moment) == "1 March (year 2) 00:00"
     assert report._clock(run, moment) == "1 March 00:00"
@@ -316,8 +318,8 @@ def test_one_step_has_tables_alone(tmp_path: Path) -> None:
 def test_files_are_named_with_their_hashes(folder: Path) -> None:
     run = read_run(folder / "idle")
     digest = "ab" * 32
-    run.about["synthetic"] = False
-    for dc in run.about["data_centers"]:
+    run.metrics["synthetic"] = False
+    for dc in run.metrics["data_centers"]:
         dc["provenance"]["weather"] = "LGA.epw"
         dc["sha256"] = {"weather": digest, "recirculation": digest}
     page = read_page(report._provenance(run))
@@ -341,7 +343,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_large_fleet_shows_extremes(fleet: Path) -> None:
     run = read_run(fleet)
     page = read_page(report._metrics(run))
-    by_pue = sorted(run.about["data_centers"], key=lambda dc: dc["metrics"]["pue"])
+    by_pue = sorted(run.metrics["data_centers"], key=lambda dc: dc["metrics"]["pue"])
     worst, best = by_pue[-1], by_pue[0]
     (row,) = page.rows("PUE")
     number = fleet_figures.number
@@ -350,7 +352,7 @@ def test_large_fleet_shows_extremes(fleet: Path) -> None:
         f"{number(best['metrics']['pue'])} {best['name']}",
         number(float(mean)),
         f"{number(worst['metrics']['pue'])} {worst['name']}",
-        number(run.about["total"]["pue"]),
+        number(run.metrics["total"]["pue"]),
     ]
     first, third = page.rows("1"), page.rows("3")
     assert first[0][2] == f"{worst['name']}:\u00a0{number(worst['metrics']['pue'])}"
@@ -375,7 +377,7 @@ def test_large_fleet_has_few_pictures(fleet: Path, monkeypatch: pytest.MonkeyPat
     sections = re.findall(r"Data center ([a-z0-9-]+)</h2>", html)
     assert sections == [run.names[index] for index in drawn]
     assert 2 <= len(sections) <= report.SHOWN_DCS
-    worst = max(run.about["data_centers"], key=lambda dc: dc["metrics"]["pue"])
+    worst = max(run.metrics["data_centers"], key=lambda dc: dc["metrics"]["pue"])
     assert worst["name"] in sections
     assert re.search(r"Shown because it has the [^.]*highest PUE[^.]* of 60\.", page.text)
     assert "The 40 hottest of 60 are shown." in page.text
@@ -390,7 +392,7 @@ def test_equal_data_centers_are_not_told_apart(tmp_path: Path) -> None:
 
 def test_fleet_sums_and_maxima(fleet: Path) -> None:
     run = read_run(fleet)
-    found = recorded.read_fleet(run)
+    found = folder_reader.read_fleet_steps(run)
     steps = pd.read_parquet(fleet / "steps.parquet")
     by_step = steps.groupby("step")
     for name in ("it_w", "hvac_w", "carbon_g"):
@@ -418,13 +420,13 @@ def test_rows_are_read_across_row_groups(fleet: Path, tmp_path: Path) -> None:
 
 def test_long_runs_are_shown_in_intervals(tmp_path: Path) -> None:
     simulate(tmp_path / "run", two_halls(), 900)
-    found = recorded.read_fleet(read_run(tmp_path / "run"))
+    found = folder_reader.read_fleet_steps(read_run(tmp_path / "run"))
     inlets = pd.read_parquet(tmp_path / "run" / "steps.parquet")["inlet_max_c"].to_numpy()
     # 900 steps of a quarter of an hour in at most 400 intervals: an hour each.
     expected = np.reshape(inlets, (225, 4, 2)).max(axis=1)
     np.testing.assert_array_equal(found.inlet_max_c, expected)
-    assert found.edges[1] - found.edges[0] == np.timedelta64(1, "h")
-    assert found.edges[-1] == np.datetime64("2001-03-09T09:00"), "the end of the run"
+    assert found.edge_times[1] - found.edge_times[0] == np.timedelta64(1, "h")
+    assert found.edge_times[-1] == np.datetime64("2001-03-09T09:00"), "the end of the run"
 
 
 # Bad input
@@ -670,7 +672,7 @@ def test_missing_matplotlib_is_explained(
 
 def test_configs_are_read_from_the_steps(folder: Path) -> None:
     run = read_run(folder / "idle")
-    first, second = recorded.read_configs(run, [0, 1])
+    first, second = folder_reader.read_configs(run, [0, 1])
     assert [first, second] == two_halls()
     with pytest.raises(SdcError):
-        recorded.read_configs(recorded.RecordedRun(folder / "none", run.about), [0])
+        folder_reader.read_configs(folder_reader.RunFolder(folder / "none", run.metrics), [0])

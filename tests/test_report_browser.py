@@ -14,9 +14,10 @@ import pytest
 from report_reader import Page, pictures, read_page
 from sdc_taichi import Simulator, load_config, make_configs
 from sdc_taichi.control import make_controller
-from sdc_taichi.run.loop import RunRequest, record
+from sdc_taichi.run.description import RunRequest
+from sdc_taichi.run.folder_reader import read_run
+from sdc_taichi.run.folder_writer import simulate_to_folder
 from sdc_taichi.viz import figures
-from sdc_taichi.viz.recorded import read_run
 from sdc_taichi.viz.report import write_report
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -47,7 +48,9 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     configs = make_configs(load_config("tiny"), count=2, sites=["NY", "CA"])
     configs[0] = configs[0].model_copy(update={"name": f"<b>&amp;{long}"})
     with Simulator(configs) as sim:
-        record(sim, make_controller("greedy-ci", sim.fleet), RunRequest("greedy-ci", 60), out)
+        simulate_to_folder(
+            sim, make_controller("greedy-ci", sim.fleet), RunRequest("greedy-ci", 60), out
+        )
     return write_report(read_run(out))
 
 
@@ -106,7 +109,7 @@ def test_browser_prints_pages(browser: str, report: Path, tmp_path: Path) -> Non
             assert re.search(rf"^\s*{heading}\s*$", text, re.MULTILINE), heading
         for words in ("input", "carbon", "weather", "data centers"):
             assert re.search(rf"\b{words}\b", text.partition("Provenance")[2]), words
-        total = read_run(report.parent).about["total"]["facility_kwh"]
+        total = read_run(report.parent).metrics["total"]["facility_kwh"]
         row = re.search(r"facility energy, IT and HVAC\s.*", text)
         assert row is not None
         assert row[0].rstrip().endswith(f"{total:.4g}"), "the last column is on the page"

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import SdcError
-from sdc_taichi.run.metrics import HOT_INLET_C
+from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.types import F64
 
 from .figures import (
@@ -323,7 +323,7 @@ def _draw_day_temperatures(
         ("setpoint_c", "black", "setpoint", 1.2),
     ):
         draw_steps(axes, steps, steps[name], color=colour, linewidth=width, label=label)
-    axes.axhline(HOT_INLET_C, color=RED, linewidth=0.8, linestyle=":")
+    axes.axhline(RECOMMENDED_C[1], color=RED, linewidth=0.8, linestyle=":")
     flags = [
         ((steps["throttled_racks"] > 0).to_numpy(), ORANGE, "", "racks throttled"),
         ((steps["tripped_racks"] > 0).to_numpy(), RED, "", "racks tripped"),

@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.floor_plan import floor_plan
-from sdc_taichi.run.loop import RunRequest, describe
+from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, StepResult
 from sdc_taichi.year_clock import step_times
@@ -169,7 +169,7 @@ class Recorder:
 
         Args:
             sim: its steps are those that ``add`` is given.
-            about: what ``run.describe`` says of the run; None is what the simulator knows.
+            about: what ``describe_run`` says of the run; None is what the simulator knows.
 
         Raises:
             SdcError: a name in focus that there is not, a file that cannot be written, or too
@@ -177,7 +177,7 @@ class Recorder:
         """
         self.close()
         self._episodes += 1
-        described = describe(sim, RunRequest("", 0)) if about is None else about
+        described = describe_run(sim, RunRequest("", 0)) if about is None else about
         if about is None:
             described = {k: v for k, v in described.items() if k not in ("controller", "seed")}
         fleet = sim.fleet

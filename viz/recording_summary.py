@@ -21,7 +21,7 @@ def summary(
     """Markdown of what was run, on which inputs, and how to read the recording.
 
     Args:
-        about: of ``run.describe``, or a part of it.
+        about: of ``describe_run``, or a part of it.
         fleet: the fleet.
         focus: data centers in focus and the names they have here.
         scales: of the heat maps.

@@ -20,20 +20,19 @@ import numpy as np
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import SdcError
-from sdc_taichi.run.loop import REPORT_FILE
-from sdc_taichi.run.metrics import HOT_INLET_C
+from sdc_taichi.hall.air_metrics import RECOMMENDED_C
+from sdc_taichi.run.folder_reader import (
+    RunFolder,
+    is_number,
+    read_configs,
+    read_fleet_steps,
+    read_steps,
+)
+from sdc_taichi.run.folder_writer import METRICS_FILE, REPORT_FILE
 from sdc_taichi.year_clock import HOURS_PER_YEAR, day_of_year, step_times
 
 from . import dashboards, data_figures, figures, fleet_figures
 from .fleet_figures import MAP_ROWS, MOST_RUNS, RADAR, number
-from .recorded import (
-    METRICS_FILE,
-    RecordedRun,
-    is_number,
-    read_configs,
-    read_fleet,
-    read_steps,
-)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -200,9 +199,7 @@ class _Shown:
     config: DataCenterConfig
 
 
-def write_report(
-    run: RecordedRun, others: Sequence[RecordedRun] = (), out: Path | None = None
-) -> Path:
+def write_report(run: RunFolder, others: Sequence[RunFolder] = (), out: Path | None = None) -> Path:
     """Write the report of a recorded run.
 
     Args:
@@ -217,14 +214,14 @@ def write_report(
         SdcError: matplotlib is missing, steps.parquet is damaged, the runs cannot be compared, or
             the file cannot be written.
     """
-    target = run.folder / REPORT_FILE if out is None else out
+    target = run.path / REPORT_FILE if out is None else out
     # Opened first, so that a place that cannot be written is known before the work.
     with atomic_write(target) as file:
         file.write(report_html(run, others).encode("utf-8", "replace"))
     return target
 
 
-def report_html(run: RecordedRun, others: Sequence[RecordedRun] = ()) -> str:
+def report_html(run: RunFolder, others: Sequence[RunFolder] = ()) -> str:
     """The report as text.
 
     Raises:
@@ -240,23 +237,23 @@ def report_html(run: RecordedRun, others: Sequence[RecordedRun] = ()) -> str:
         sections["Comparison"] = _comparison([run, *others])
     sections["Events"] = _events(run)
     shown = _shown(run)
-    if len(run.names) > 1 and run.about["steps_done"] > 1:
+    if len(run.names) > 1 and run.metrics["steps_done"] > 1:
         sections["All data centers"] = _fleet(run)
     for dc in shown:
         sections[f"Data center {run.names[dc.index]}"] = _data_center(run, dc)
-    if run.about["steps_done"] > 1:
+    if run.metrics["steps_done"] > 1:
         sections["Inputs"] = _inputs(run, shown)
     sections["Provenance"] = _provenance(run)
     return _page(run, sections)
 
 
-def _check_metrics(run: RecordedRun) -> None:
-    path, dcs = run.folder / METRICS_FILE, run.about["data_centers"]
+def _check_metrics(run: RunFolder) -> None:
+    path, dcs = run.path / METRICS_FILE, run.metrics["data_centers"]
     # Racks of a hall and servers of a rack are far fewer.
     places = dict.fromkeys(("hottest_row", "hottest_rack", "hottest_server"), 10**9)
-    places["hottest_step"] = run.about["steps_done"] - 1
+    places["hottest_step"] = run.metrics["steps_done"] - 1
     ratios = {"pue", "pue_with_ups", "partial_pue", "cue_kg_per_kwh", "wue_l_per_kwh"}
-    given = [("total", run.about["total"])]
+    given = [("total", run.metrics["total"])]
     given += [(f"data_centers[{i}].metrics", dc["metrics"]) for i, dc in enumerate(dcs)]
     for where, metrics in given:
         for key in (key for _, group in METRICS for key, *_ in group):
@@ -271,7 +268,7 @@ def _check_metrics(run: RecordedRun) -> None:
                 raise SdcError(
                     f"{path}: {where}.{key} is {value!r}; valid is a whole number, 0..{most}"
                 )
-    hottest = run.about["total"].get("hottest_dc")
+    hottest = run.metrics["total"].get("hottest_dc")
     if hottest not in run.names:
         raise SdcError(f"{path}: total.hottest_dc {hottest!r}: no such data center")
 
@@ -286,10 +283,10 @@ def picture(figure: Figure, alt: str, caption: str) -> str:
     )
 
 
-def _page(run: RecordedRun, sections: Mapping[str, str]) -> str:
+def _page(run: RunFolder, sections: Mapping[str, str]) -> str:
     count = len(run.names)
     names = ", ".join(run.names) if count <= COLUMN_DCS else f"{count:,} data centers"
-    title = f"Run of {names} under {run.about['controller']}"
+    title = f"Run of {names} under {run.metrics['controller']}"
     ids = {name: f"s{index}" for index, name in enumerate(sections)}
     links = "".join(f'<li><a href="#{ids[name]}">{escape(name)}</a></li>\n' for name in sections)
     own = {f"Data center {name}" for name in run.names}
@@ -309,8 +306,8 @@ def _page(run: RecordedRun, sections: Mapping[str, str]) -> str:
     )
 
 
-def _summary(run: RecordedRun) -> str:
-    about, total = run.about, run.about["total"]
+def _summary(run: RunFolder) -> str:
+    about, total = run.metrics, run.metrics["total"]
     done, asked = about["steps_done"], about["steps_asked"]
     out = []
     if done < asked:
@@ -351,7 +348,7 @@ def _summary(run: RecordedRun) -> str:
         ("steps", f"{done:,} of {60 * about['step_h']:g} min, {_count(run.hours / 24, 'day')}"),
         ("seed", f"{about['seed']}"),
         ("precision of the kernels", about["precision"]),
-        ("folder", run.folder.resolve().name),
+        ("folder", run.path.resolve().name),
         ("versions", versions),
         ("fingerprint of configs, inputs and precision", about["fingerprint"]),
     ]
@@ -359,24 +356,24 @@ def _summary(run: RecordedRun) -> str:
     return "".join(out) + table
 
 
-def _hottest_fact(run: RecordedRun) -> str:
-    total = run.about["total"]
+def _hottest_fact(run: RunFolder) -> str:
+    total = run.metrics["total"]
     where = total["hottest_dc"]
     dc = run.names.index(where)
     moment = _clock(run, _local(run, dc, total["hottest_step"]))
-    hours = run.about["data_centers"][dc]["metrics"]["inlet_above_27_h"]
+    hours = run.metrics["data_centers"][dc]["metrics"]["inlet_above_27_h"]
     (config,) = read_configs(run, [dc])
     row, rack = divmod(total["hottest_rack"], config.hall.racks_per_row)
     return (
         f"The hottest inlet was {_value(total, 'hottest_inlet_c')} °C in {where}, row {row}, rack "
         f"{rack}, server {total['hottest_server']} from the floor, on {moment}. An inlet "
-        f"there was above {HOT_INLET_C:g} °C for {number(hours)} h, "
+        f"there was above {RECOMMENDED_C[1]:g} °C for {number(hours)} h, "
         f"{100 * hours / run.hours:.3g} % of the time."
     )
 
 
-def _work_facts(run: RecordedRun) -> list[str]:
-    total = run.about["total"]
+def _work_facts(run: RunFolder) -> list[str]:
+    total = run.metrics["total"]
     arrived = total["arrived_tasks"]
     dropped, lost = total["dropped_tasks"], total["lost_tasks"]
     late = 100 * dropped / arrived if arrived else 0.0
@@ -406,8 +403,8 @@ def _work_facts(run: RecordedRun) -> list[str]:
     return facts
 
 
-def _metrics(run: RecordedRun) -> str:
-    dcs, total = run.about["data_centers"], run.about["total"]
+def _metrics(run: RunFolder) -> str:
+    dcs, total = run.metrics["data_centers"], run.metrics["total"]
     few = len(dcs) <= COLUMN_DCS
     several = len(dcs) > 1
     heads = [_Cell("metric"), _Cell("unit")]
@@ -469,22 +466,22 @@ def _ranks(pairs: Sequence[tuple[float, str]], count: int) -> list[str]:
     return texts + ["–"] * (count - len(texts))
 
 
-def _comparison(runs: Sequence[RecordedRun]) -> str:
+def _comparison(runs: Sequence[RunFolder]) -> str:
     first, labels = runs[0], _run_labels(runs)
     for run in runs[1:]:
         if abs(run.hours - first.hours) > 1e-9:
             raise SdcError(
-                f"{run.folder}: {run.hours:g} h, {first.folder}: {first.hours:g} h; runs to "
+                f"{run.path}: {run.hours:g} h, {first.path}: {first.hours:g} h; runs to "
                 "compare must be of equal length"
             )
     if len(runs) > MOST_RUNS:
         raise SdcError(f"{len(runs)} runs to compare; valid are up to {MOST_RUNS}")
-    totals = [run.about["total"] for run in runs]
+    totals = [run.metrics["total"] for run in runs]
     out = []
     other = [
         label
         for label, run in zip(labels, runs, strict=True)
-        if run.about["fingerprint"] != first.about["fingerprint"]
+        if run.metrics["fingerprint"] != first.metrics["fingerprint"]
     ]
     if other:
         out.append(
@@ -530,18 +527,18 @@ def _comparison_table(labels: Sequence[str], totals: Sequence[Mapping[str, Any]]
     return _table(caption, heads, rows)
 
 
-def _run_labels(runs: Sequence[RecordedRun]) -> list[str]:
+def _run_labels(runs: Sequence[RunFolder]) -> list[str]:
     """Controllers, with the folder where they are not enough to tell the runs apart."""
-    names = [run.about["controller"] for run in runs]
+    names = [run.metrics["controller"] for run in runs]
     if len(set(names)) < len(names):
-        names = [f"{n} ({run.folder.resolve().name})" for n, run in zip(names, runs, strict=True)]
+        names = [f"{n} ({run.path.resolve().name})" for n, run in zip(names, runs, strict=True)]
     if len(set(names)) < len(names):
         names = [f"{name} #{index + 1}" for index, name in enumerate(names)]
     return names
 
 
-def _events(run: RecordedRun) -> str:
-    met = [(i, event) for i, dc in enumerate(run.about["data_centers"]) for event in dc["events"]]
+def _events(run: RunFolder) -> str:
+    met = [(i, event) for i, dc in enumerate(run.metrics["data_centers"]) for event in dc["events"]]
     if not met:
         return "<p>None: the run met no failure, outage or heat wave.</p>\n"
     caption = f"{_count(len(met), 'event')} that the run met"
@@ -562,9 +559,7 @@ def _events(run: RecordedRun) -> str:
     )
 
 
-def _event_kinds(
-    run: RecordedRun, met: Sequence[tuple[int, Mapping[str, Any]]], caption: str
-) -> str:
+def _event_kinds(run: RunFolder, met: Sequence[tuple[int, Mapping[str, Any]]], caption: str) -> str:
     """A row for each kind of event."""
     groups: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
     for index, event in met:
@@ -584,12 +579,12 @@ def _kind(event: Mapping[str, Any]) -> str:
     return str(event["kind"]).replace("_", " ")
 
 
-def _event_hours(run: RecordedRun, event: Mapping[str, Any]) -> float:
-    return float((event["end_step"] - event["start_step"]) * run.about["step_h"])
+def _event_hours(run: RunFolder, event: Mapping[str, Any]) -> float:
+    return float((event["end_step"] - event["start_step"]) * run.metrics["step_h"])
 
 
-def _fleet(run: RecordedRun) -> str:
-    fleet = read_fleet(run)
+def _fleet(run: RunFolder) -> str:
+    fleet = read_fleet_steps(run)
     count = len(run.names)
     powers_kw = (fleet.series["it_w"] + fleet.series["hvac_w"]).to_numpy() / 1e3
     power, unit = figures.scaled(powers_kw, "kW", "MW")
@@ -607,16 +602,16 @@ def _fleet(run: RecordedRun) -> str:
         hottest = ", ".join(run.names[dc] for dc in order)
         cut = f" The {MAP_ROWS} hottest of {count:,} are shown." if count > MAP_ROWS else ""
         out += picture(
-            fleet_figures.fleet_map(fleet.edges, fleet.inlet_max_c, run.names),
+            fleet_figures.fleet_map(fleet.edge_times, fleet.inlet_max_c, run.names),
             f"Hottest inlet of each data center over time, hottest data centers first: {hottest}.",
             f"Which halls ran hot, and when: the hottest inlet of each.{cut}",
         )
     return out
 
 
-def _shown(run: RecordedRun) -> list[_Shown]:
+def _shown(run: RunFolder) -> list[_Shown]:
     """The data centers with pictures: all of a few, else the extremes."""
-    dcs = run.about["data_centers"]
+    dcs = run.metrics["data_centers"]
     if len(dcs) <= SHOWN_DCS:
         why = dict.fromkeys(range(len(dcs)), "")
     else:
@@ -641,7 +636,7 @@ def _shown(run: RecordedRun) -> list[_Shown]:
     ]
 
 
-def _data_center(run: RecordedRun, dc: _Shown) -> str:
+def _data_center(run: RunFolder, dc: _Shown) -> str:
     steps, hall = dc.steps, dc.config.hall
     out = []
     if dc.why:
@@ -665,7 +660,7 @@ def _data_center(run: RecordedRun, dc: _Shown) -> str:
     return "".join(out) + _pictures(run, dc, hot) + _yaml(dc)
 
 
-def _pictures(run: RecordedRun, dc: _Shown, hot: str) -> str:
+def _pictures(run: RunFolder, dc: _Shown, hot: str) -> str:
     """Pictures of one data center, whose hottest inlet is told in words."""
     name, steps, hall = run.names[dc.index], dc.steps, dc.config.hall
     out = []
@@ -701,7 +696,7 @@ def _pictures(run: RecordedRun, dc: _Shown, hot: str) -> str:
         )
     date = dashboards.hottest_day(steps)
     if int((steps["time"].dt.strftime("%Y-%m-%d") == date).sum()) > 1:
-        events = run.about["data_centers"][dc.index]["events"]
+        events = run.metrics["data_centers"][dc.index]["events"]
         out.append(
             picture(
                 dashboards.day(steps, date, name, events),
@@ -732,9 +727,9 @@ def _pictures(run: RecordedRun, dc: _Shown, hot: str) -> str:
     return "".join(out)
 
 
-def _inputs(run: RecordedRun, shown: Sequence[_Shown]) -> str:
+def _inputs(run: RunFolder, shown: Sequence[_Shown]) -> str:
     names = [run.names[dc.index] for dc in shown]
-    origin = "as the run read them" + (", SYNTHETIC in part" if run.about["synthetic"] else "")
+    origin = "as the run read them" + (", SYNTHETIC in part" if run.metrics["synthetic"] else "")
     out = []
     for column, quantity, what in (
         ("outdoor_c", data_figures.TEMPERATURE, "Outdoor temperature"),
@@ -778,9 +773,9 @@ def _alike(names: Sequence[str], every: Sequence[pd.Series]) -> dict[str, pd.Ser
     return {", ".join(own): series for own, series in users}
 
 
-def _provenance(run: RecordedRun) -> str:
+def _provenance(run: RunFolder) -> str:
     users: dict[tuple[str, str, str], list[str]] = {}
-    for dc in run.about["data_centers"]:
+    for dc in run.metrics["data_centers"]:
         sources, hashes = dc["provenance"], dc["sha256"]
         for kind in (*sources, *(kind for kind in hashes if kind not in sources)):
             key = (
@@ -880,16 +875,16 @@ def _cut(texts: Sequence[str]) -> list[str]:
     return [*texts[:MOST_ROWS], f"and {len(texts) - MOST_ROWS} more, see {METRICS_FILE}"]
 
 
-def _local(run: RecordedRun, dc: int, step: int) -> datetime:
+def _local(run: RunFolder, dc: int, step: int) -> datetime:
     """Start of a step on the clock of a data center."""
-    about = run.about["data_centers"][dc]
-    per_hour = round(1 / run.about["step_h"])
+    about = run.metrics["data_centers"][dc]
+    per_hour = round(1 / run.metrics["step_h"])
     start = np.array([day_of_year(about["start"]) * 24 * per_hour])
     moment: datetime = step_times(start, np.array([step]), per_hour)[0, 0].astype(datetime)
     return moment
 
 
-def _clock(run: RecordedRun, moment: datetime) -> str:
+def _clock(run: RunFolder, moment: datetime) -> str:
     day = figures.day_of_run(moment, over_a_year=run.hours > HOURS_PER_YEAR)
     return f"{day} {moment:%H:%M}"
 
@@ -898,7 +893,7 @@ def _count(value: float, noun: str) -> str:
     return f"{number(value)} {noun}" + ("" if value == 1 else "s")
 
 
-def _span(run: RecordedRun) -> str:
-    begin, last = _local(run, 0, 0), _local(run, 0, run.about["steps_done"])
+def _span(run: RunFolder) -> str:
+    begin, last = _local(run, 0, 0), _local(run, 0, run.metrics["steps_done"])
     span = f"{_clock(run, begin)} to {_clock(run, last)}, local standard time"
     return f"{_count(len(run.names), 'data center')}, {_count(run.hours / 24, 'day')} from {span}"

@@ -33,7 +33,7 @@ from sdc_taichi.year_clock import day_of_year
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sdc_taichi.run.loop import RunRequest
+    from sdc_taichi.run.description import RunRequest
     from sdc_taichi.sim.simulator import Simulator
     from sdc_taichi.types import StepResult
     from sdc_taichi.viz.recorder import Recorder
@@ -224,7 +224,8 @@ def simulate(
     inputs are synthetic years.
     """
     from sdc_taichi.control import make_controller
-    from sdc_taichi.run.loop import RunRequest, prepare_folder, record, report_json
+    from sdc_taichi.run.description import RunRequest
+    from sdc_taichi.run.folder_writer import metrics_json, prepare_folder, simulate_to_folder
     from sdc_taichi.sim.fleet import build_fleet
     from sdc_taichi.sim.simulator import Simulator
 
@@ -248,16 +249,16 @@ def simulate(
                         recorder.add(result)
                     advance(result)
 
-                report = record(
+                content = simulate_to_folder(
                     sim, driver, asked, folder, force=force, on_step=each, stop=interrupted
                 )
-            if report is None:
+            if content is None:
                 print("interrupted before the first step; nothing written", file=sys.stderr)
                 raise typer.Exit(EXIT_INTERRUPTED)
             if as_json:
-                print(report_json(report))
+                print(metrics_json(content))
             elif not quiet:
-                _print_summary(report, label, folder, sim.fleet.steps_per_hour)
+                _print_summary(content, label, folder, sim.fleet.steps_per_hour)
                 if recorder is not None and recorder.file is not None and not recorder.lost:
                     print(
                         f"Recording: {recorder.file} (open with: sdc-taichi view {recorder.file})"
@@ -265,9 +266,9 @@ def simulate(
             if recorder is not None and recorder.served is not None and not recorder.lost:
                 recorder.flush()
                 _wait(interrupted, recorder.served)
-    if report["steps_done"] < asked.steps:
+    if content["steps_done"] < asked.steps:
         print(
-            f"interrupted after {report['steps_done']} of {asked.steps} steps; {folder} holds the "
+            f"interrupted after {content['steps_done']} of {asked.steps} steps; {folder} holds the "
             "steps done",
             file=sys.stderr,
         )
@@ -479,13 +480,13 @@ def _recording(recorder: Recorder | None, sim: Simulator, asked: RunRequest) -> 
     if recorder is None:
         yield
         return
-    from sdc_taichi.run.loop import describe
+    from sdc_taichi.run.description import describe_run
     from sdc_taichi.viz.streams import RecordingWarning
 
     with warnings.catch_warnings(), recorder:
         warnings.simplefilter("always", RecordingWarning)
         warnings.showwarning = _show_warning
-        recorder.begin(sim, describe(sim, asked))
+        recorder.begin(sim, describe_run(sim, asked))
         if recorder.served is not None:
             command = f"sdc-taichi view {recorder.served}"
             print(f"serving the run; watch it with: {command} [--web]", file=sys.stderr)

@@ -31,7 +31,7 @@ def report_command(
     It reads steps.parquet and metrics.json of the first folder. Further folders, of runs of equal
     length, are compared with it in a table and a radar. The file needs no network.
     """
-    from sdc_taichi.viz.recorded import read_run
+    from sdc_taichi.run.folder_reader import read_run
     from sdc_taichi.viz.report import write_report
 
     if force and out is None:
@@ -42,7 +42,7 @@ def report_command(
             raise ConfigError(f"{folder}: is given twice; valid is each run once")
     runs = [read_run(folder) for folder in folders]
     for run in runs:
-        done, asked = run.about["steps_done"], run.about["steps_asked"]
+        done, asked = run.metrics["steps_done"], run.metrics["steps_asked"]
         if done < asked:
-            typer.echo(f"note: {run.folder}: interrupted after {done} of {asked} steps", err=True)
+            typer.echo(f"note: {run.path}: interrupted after {done} of {asked} steps", err=True)
     typer.echo(f"Report: {write_report(runs[0], runs[1:], out)}")

@@ -1,5 +1,5 @@
-"""Runs: a simulator under a controller for many steps, their totals, and the folder of a run.
+"""Runs: a simulator under a controller for many steps, their metrics, and the run folder.
 
-Files of a run are defined here, and read back by ``sdc_taichi.viz``.
-No physics, no controller and no picture lives here.
+The files of a run folder are defined here, written by ``folder_writer`` and read by
+``folder_reader``. No physics, no controller and no picture lives here.
 """

@@ -1,8 +1,8 @@
-"""What an episode used: energy, carbon, water, work and temperatures of each data center.
+"""Metrics of a run: energy, carbon, water, work and temperatures of each data center.
 
-``begin`` and ``add`` sum the steps as they come, so a year of a large fleet needs no more memory
-than a day; ``per_dc`` and ``overall`` turn the sums into figures. Sums run step by step in f64, so
-a data center has the same figures whatever the batch it is in.
+``add_step`` sums the steps as they come, so a year of a large fleet needs no more memory than a
+day; ``metrics_per_dc`` and ``metrics_of_fleet`` turn the sums into metrics. Sums run step by step
+in f64, so a data center has the same metrics whatever the batch it is in.
 
 Definitions (PUE, CUE and WUE after The Green Grid, white papers 49, 32 and 35):
 
@@ -16,7 +16,7 @@ Definitions (PUE, CUE and WUE after The Green Grid, white papers 49, 32 and 35):
     battery_throughput_kwh  energy delivered, as warranties count it
     over_27_degree_h  what inlets exceed 27 C by, summed over time, mean over the servers
     shi, rhi, rti_pct, rci_hi_pct, rci_lo_pct  means over the steps (see ``air_metrics``)
-    rci_hi_min_pct  the same of the worst step
+    rci_hi_min_pct   rci_hi_pct of the worst step
 
 A ratio without IT energy is None.
 """
@@ -27,15 +27,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, StepResult
 
-HOT_INLET_C = 27.0
-"""Highest recommended inlet temperature (ASHRAE TC 9.9)."""
-
 Metric = float | int | str | None
+"""A metric: a number, the name of a data center, or None where a ratio is not defined."""
 
-_SUMMED = (
+_SUMMED_FIELDS = (
     "it_kwh",
     "hvac_kwh",
     "grid_kwh",
@@ -61,42 +60,50 @@ _SUMMED = (
     "rci_hi_pct",
     "rci_lo_pct",
 )
-_MEAN = ("shi", "rti_pct", "rci_hi_pct", "rci_lo_pct")
-"""Reported as means over the steps."""
+"""Fields of ``StepResult`` that are summed over the steps."""
+_MEAN_FIELDS = ("shi", "rti_pct", "rci_hi_pct", "rci_lo_pct")
+"""Those of the summed fields whose metric is the mean over the steps."""
 
 
 @dataclass(slots=True)
 class Totals:
-    """Sums and extremes of the steps so far."""
+    """Sums and extremes over the steps of a run, of B data centers."""
 
     steps: int
+    """Number of steps."""
     step_h: float
+    """Length of a step, in h."""
     sums: dict[str, F64]
-    """Sum over the steps of the field of ``StepResult``, (B,) each."""
+    """Sum over the steps of each summed field of ``StepResult``, in its unit, (B,) each."""
     hot_steps: I64
-    """Steps with an inlet above ``HOT_INLET_C``, (B,)."""
+    """Number of steps with an inlet above the recommended 27 C, (B,)."""
     queue_max_tasks: F64
+    """Longest queue, in tasks, (B,)."""
     overdue_max_tasks: F64
+    """Most overdue work in a step, in tasks, (B,)."""
     hottest_inlet_c: F64
+    """Hottest server inlet of all steps, in C, (B,)."""
     hottest_rack: I64
     """Rack of the hottest inlet, counted from 0 in its data center, (B,)."""
     hottest_server: I64
     """Server of the hottest inlet, counted from the floor of its rack, (B,)."""
     hottest_step: I64
+    """Step of the hottest inlet, counted from 0 at reset, (B,)."""
     rci_hi_min_pct: F64
+    """Lowest rack cooling index at the high end, in %, (B,)."""
 
 
-def begin(size: int, step_h: float) -> Totals:
+def empty_totals(size: int, step_h: float) -> Totals:
     """Totals of no steps.
 
     Args:
         size: number of data centers, B.
-        step_h: length of a step.
+        step_h: length of a step, in h.
     """
     return Totals(
         steps=0,
         step_h=step_h,
-        sums={name: np.zeros(size) for name in _SUMMED},
+        sums={name: np.zeros(size) for name in _SUMMED_FIELDS},
         hot_steps=np.zeros(size, dtype=np.int64),
         queue_max_tasks=np.zeros(size),
         overdue_max_tasks=np.zeros(size),
@@ -108,12 +115,12 @@ def begin(size: int, step_h: float) -> Totals:
     )
 
 
-def add(totals: Totals, result: StepResult) -> None:
+def add_step(totals: Totals, result: StepResult) -> None:
     """Add one step to the totals, in place."""
     totals.steps += 1
     for name, total in totals.sums.items():
         total += getattr(result, name)
-    totals.hot_steps += result.inlet_max_c > HOT_INLET_C
+    totals.hot_steps += result.inlet_max_c > RECOMMENDED_C[1]
     np.maximum(totals.queue_max_tasks, result.queue_tasks, out=totals.queue_max_tasks)
     np.maximum(totals.overdue_max_tasks, result.overdue_tasks, out=totals.overdue_max_tasks)
     hotter = np.flatnonzero(result.inlet_max_c > totals.hottest_inlet_c)
@@ -124,23 +131,25 @@ def add(totals: Totals, result: StepResult) -> None:
     np.minimum(totals.rci_hi_min_pct, result.rci_hi_pct, out=totals.rci_hi_min_pct)
 
 
-def per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
-    """Figures of every data center, in the order of the fleet; at least one step."""
+def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
+    """Metrics of every data center, in the order of the fleet, from totals of at least one step."""
     efficiency = fleet.values("hvac.ups_efficiency")
     out = []
     for dc in range(fleet.size):
         sums = {name: float(values[dc]) for name, values in totals.sums.items()}
-        figures = _figures(sums, sums["it_kwh"] / float(efficiency[dc]), totals.step_h)
+        behind_ups_kwh = sums["it_kwh"] / float(efficiency[dc])
         out.append(
-            figures
+            _energy_and_work(sums, behind_ups_kwh, totals.step_h)
             | {
                 "queue_mean_tasks": sums["queue_tasks"] / totals.steps,
                 "queue_max_tasks": float(totals.queue_max_tasks[dc]),
                 "overdue_max_tasks": float(totals.overdue_max_tasks[dc]),
                 "inlet_above_27_h": int(totals.hot_steps[dc]) * totals.step_h,
                 "hottest_inlet_c": float(totals.hottest_inlet_c[dc]),
-                **_place(totals, dc, fleet),
-                **_means(totals, {name: float(totals.sums[name][dc]) for name in _MEAN}),
+                **_hottest_place(totals, dc, fleet),
+                **_mean_metrics(
+                    totals, {name: float(totals.sums[name][dc]) for name in _MEAN_FIELDS}
+                ),
                 "over_27_degree_h": sums["over_27_mean_k"] * totals.step_h,
                 "rci_hi_min_pct": float(totals.rci_hi_min_pct[dc]),
                 "hottest_step": int(totals.hottest_step[dc]),
@@ -149,26 +158,26 @@ def per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
     return out
 
 
-def overall(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
-    """Figures of the whole fleet; at least one step.
+def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
+    """Metrics of the whole fleet, from totals of at least one step.
 
-    Energies, carbon, water, tasks and hours are sums over the data centers, ratios are those of the
-    sums. ``queue_mean_tasks`` is the mean, ``queue_max_tasks`` and ``overdue_max_tasks`` the
+    Energies, carbon, water, tasks and hours are sums over the data centers, ratios are those of
+    the sums. ``queue_mean_tasks`` is the mean, ``queue_max_tasks`` and ``overdue_max_tasks`` the
     highest over the data centers, because a task is 1 % of the capacity of its own data center.
     """
     sums = {name: float(values.sum()) for name, values in totals.sums.items()}
     behind_ups_kwh = float((totals.sums["it_kwh"] / fleet.values("hvac.ups_efficiency")).sum())
     hottest = int(np.argmax(totals.hottest_inlet_c))
     servers = fleet.per_dc_servers()
-    return _figures(sums, behind_ups_kwh, totals.step_h) | {
+    return _energy_and_work(sums, behind_ups_kwh, totals.step_h) | {
         "queue_mean_tasks": sums["queue_tasks"] / totals.steps / fleet.size,
         "queue_max_tasks": float(totals.queue_max_tasks.max()),
         "overdue_max_tasks": float(totals.overdue_max_tasks.max()),
         "inlet_above_27_h": int(totals.hot_steps.sum()) * totals.step_h,
         "hottest_inlet_c": float(totals.hottest_inlet_c[hottest]),
         "hottest_dc": fleet.names[hottest],
-        **_place(totals, hottest, fleet),
-        **_means(totals, {name: sums[name] / fleet.size for name in _MEAN}),
+        **_hottest_place(totals, hottest, fleet),
+        **_mean_metrics(totals, {name: sums[name] / fleet.size for name in _MEAN_FIELDS}),
         "over_27_degree_h": float(totals.sums["over_27_mean_k"] @ servers)
         / servers.sum()
         * totals.step_h,
@@ -177,8 +186,8 @@ def overall(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
     }
 
 
-def _place(totals: Totals, dc: int, fleet: Fleet) -> dict[str, Metric]:
-    """Where the hottest inlet was."""
+def _hottest_place(totals: Totals, dc: int, fleet: Fleet) -> dict[str, Metric]:
+    """Rack, row and server of the hottest inlet of a data center."""
     rack = int(totals.hottest_rack[dc])
     return {
         "hottest_rack": rack,
@@ -187,12 +196,22 @@ def _place(totals: Totals, dc: int, fleet: Fleet) -> dict[str, Metric]:
     }
 
 
-def _means(totals: Totals, sums: dict[str, float]) -> dict[str, Metric]:
+def _mean_metrics(totals: Totals, sums: dict[str, float]) -> dict[str, Metric]:
+    """Means over the steps of the summed air metrics, and the RHI that follows from the SHI."""
     means = {name: value / totals.steps for name, value in sums.items()}
     return {**means, "rhi": 1.0 - means["shi"]}
 
 
-def _figures(sums: dict[str, float], behind_ups_kwh: float, step_h: float) -> dict[str, Metric]:
+def _energy_and_work(
+    sums: dict[str, float], behind_ups_kwh: float, step_h: float
+) -> dict[str, Metric]:
+    """Metrics of energy, carbon, water and work.
+
+    Args:
+        sums: sum over the steps of each summed field of ``StepResult``, by name.
+        behind_ups_kwh: IT energy with the losses of the UPS.
+        step_h: length of a step, in h.
+    """
     it_kwh, hvac_kwh = sums["it_kwh"], sums["hvac_kwh"]
     compression_kwh = (sums["chiller_w"] + sums["tower_fan_w"]) * step_h / 1e3
     cfp_kg = sums["carbon_g"] / 1e3

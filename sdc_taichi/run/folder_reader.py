@@ -1,4 +1,4 @@
-"""Read the folder of a recorded run: its metrics.json and steps.parquet (see docs/cli.md).
+"""Read a run folder: its metrics.json and steps.parquet (see docs/cli.md).
 
 Rows of steps.parquet follow each other step by step, and within a step in the order of the data
 centers, so a column is an array (steps, data centers). It is read a row group at a time: a year of
@@ -18,17 +18,18 @@ import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig, config_from_dict
 from sdc_taichi.errors import SdcError
-from sdc_taichi.run.loop import FORMAT, METADATA_KEY
+from sdc_taichi.run.description import FORMAT
+from sdc_taichi.run.folder_writer import METRICS_FILE
+from sdc_taichi.run.steps_file import METADATA_KEY, STEPS_FILE
 from sdc_taichi.types import F64
 
 if TYPE_CHECKING:
     import pandas as pd
 
-METRICS_FILE, STEPS_FILE = "metrics.json", "steps.parquet"
-MAP_INTERVALS = 400
-"""Most intervals of ``FleetSteps.inlet_max_c``."""
+MAX_INTERVALS = 400
+"""Largest number of intervals in ``FleetSteps.inlet_max_c``."""
 
-_ABOUT: Mapping[str, type | tuple[type, ...]] = {
+_METRICS_TYPES: Mapping[str, type | tuple[type, ...]] = {
     "versions": dict,
     "fingerprint": str,
     "controller": str,
@@ -42,7 +43,7 @@ _ABOUT: Mapping[str, type | tuple[type, ...]] = {
     "data_centers": list,
     "total": dict,
 }
-_DATA_CENTER: Mapping[str, type | tuple[type, ...]] = {
+_DATA_CENTER_TYPES: Mapping[str, type | tuple[type, ...]] = {
     "name": str,
     "location": str,
     "start": str,
@@ -52,73 +53,81 @@ _DATA_CENTER: Mapping[str, type | tuple[type, ...]] = {
     "metrics": dict,
     "events": list,
 }
-_EVENT: Mapping[str, type | tuple[type, ...]] = {"kind": str, "start_step": int, "end_step": int}
-_MOST_CHARACTERS = 80
-"""Of a value in an error."""
-_HOURS = (0.25, 0.5, 1, 2, 3, 6, 12, 24, 48, 96, 168, 336, 720, 2160, 8760)
+_EVENT_TYPES: Mapping[str, type | tuple[type, ...]] = {
+    "kind": str,
+    "start_step": int,
+    "end_step": int,
+}
+_MAX_VALUE_LENGTH = 80
+"""Characters of a value that an error message shows."""
+_INTERVALS_H = (0.25, 0.5, 1, 2, 3, 6, 12, 24, 48, 96, 168, 336, 720, 2160, 8760)
 
 
 @dataclass(frozen=True, slots=True)
-class RecordedRun:
-    """A run as its folder holds it."""
+class RunFolder:
+    """A run folder whose metrics.json has been read and checked."""
 
-    folder: Path
-    about: dict[str, Any]
+    path: Path
+    """The folder."""
+    metrics: dict[str, Any]
     """Content of metrics.json."""
 
     @property
     def names(self) -> list[str]:
-        """Of the data centers, in order."""
-        return [dc["name"] for dc in self.about["data_centers"]]
+        """Names of the data centers, in order."""
+        return [dc["name"] for dc in self.metrics["data_centers"]]
 
     @property
     def steps_path(self) -> Path:
-        """The file of its steps."""
-        return self.folder / STEPS_FILE
+        """Path of steps.parquet."""
+        return self.path / STEPS_FILE
 
     @property
     def hours(self) -> float:
-        """Length of what was done."""
-        return float(self.about["steps_done"] * self.about["step_h"])
+        """Length of the steps done, in h."""
+        return float(self.metrics["steps_done"] * self.metrics["step_h"])
 
 
 @dataclass(frozen=True, slots=True)
 class FleetSteps:
-    """A run of all data centers together."""
+    """All data centers of a run together."""
 
     series: pd.DataFrame
-    """By step, as ``fleet_figures.fleet_overview`` reads them."""
-    edges: npt.NDArray[np.datetime64]
+    """One row per step: ``time`` on the clock of the first data center, sums over the data centers
+    of ``it_w``, ``hvac_w`` (W) and ``carbon_g`` (g), and of their hottest inlets the 10 %, 50 % and
+    90 % quantile and the maximum, ``inlet_low_c``, ``inlet_mid_c``, ``inlet_high_c`` and
+    ``inlet_max_c`` (C)."""
+    edge_times: npt.NDArray[np.datetime64]
     """Beginnings of m intervals, equal but for the last, and the end of the run, (m + 1,)."""
     inlet_max_c: F64
-    """Hottest inlet of each interval and data center, (m, B)."""
+    """Hottest inlet of each interval and data center, in C, (m, B)."""
 
 
-def read_run(folder: str | Path) -> RecordedRun:
+def read_run(folder: str | Path) -> RunFolder:
     """Read metrics.json and check it and steps.parquet against each other.
 
     Raises:
         SdcError: there is no such folder, no run in it or one of another format, or a file is
             damaged or of another run.
     """
-    place = Path(folder)
-    if not place.is_dir():
-        found = "is a file" if place.exists() else "no such folder"
-        raise SdcError(f"{place}: {found}; valid is a folder that simulate wrote a run to")
-    run = RecordedRun(place, _read_metrics(place / METRICS_FILE))
+    path = Path(folder)
+    if not path.is_dir():
+        found = "is a file" if path.exists() else "no such folder"
+        raise SdcError(f"{path}: {found}; valid is a folder that simulate wrote a run to")
+    run = RunFolder(path, _read_metrics(path / METRICS_FILE))
     _check_steps_file(run)
     return run
 
 
 def read_steps(
-    run: RecordedRun, dcs: Sequence[int], columns: Sequence[str] | None = None
+    run: RunFolder, dcs: Sequence[int], columns: Sequence[str] | None = None
 ) -> list[pd.DataFrame]:
-    """Rows of some data centers, one table each, with ``step``, ``time`` and the columns asked for.
+    """Steps of some data centers, a DataFrame each, with ``step``, ``time`` and other columns.
 
     Args:
         run: the run.
         dcs: indices of the data centers.
-        columns: names; None is all of them.
+        columns: names of the other columns; None is all of them.
 
     Raises:
         SdcError: steps.parquet is damaged, lacks a column, or its rows are out of order.
@@ -128,7 +137,7 @@ def read_steps(
     if columns is None:
         columns = _column_names(run)
     parts: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("step", "time", *columns)}
-    for group in _groups(run, columns):
+    for group in _row_groups(run, columns):
         for name, values in parts.items():
             values.append(group[name][:, list(dcs)])
     whole = {name: np.concatenate(values) for name, values in parts.items()}
@@ -138,35 +147,38 @@ def read_steps(
     ]
 
 
-def read_fleet(run: RecordedRun) -> FleetSteps:
-    """Sums over the data centers by step, and their hottest inlets.
+def read_fleet_steps(run: RunFolder) -> FleetSteps:
+    """Read the sums over the data centers by step, and their hottest inlets.
 
     Raises:
-        SdcError: as ``read_steps``.
+        SdcError: steps.parquet is damaged, lacks a column, or its rows are out of order.
     """
     import pandas as pd
 
     summed = ("it_w", "hvac_w", "carbon_g")
-    steps, size = run.about["steps_done"], len(run.names)
-    step_h = float(run.about["step_h"])
+    steps, size = run.metrics["steps_done"], len(run.names)
+    step_h = float(run.metrics["step_h"])
     interval = next(
-        (round(h / step_h) for h in _HOURS if h >= step_h and run.hours <= h * MAP_INTERVALS),
-        -(-steps // MAP_INTERVALS),
+        (round(h / step_h) for h in _INTERVALS_H if h >= step_h and run.hours <= h * MAX_INTERVALS),
+        -(-steps // MAX_INTERVALS),
     )
     parts: dict[str, list[npt.NDArray[Any]]] = {}
     hottest = np.full((-(-steps // interval), size), -np.inf)
     done = 0
-    for group in _groups(run, (*summed, "inlet_max_c")):
+    for group in _row_groups(run, (*summed, "inlet_max_c")):
         inlets = group["inlet_max_c"]
         low, mid, high = np.quantile(inlets, (0.1, 0.5, 0.9), axis=1)
-        found = {"time": group["time"][:, 0], **{name: group[name].sum(axis=1) for name in summed}}
-        found |= {"inlet_low_c": low, "inlet_mid_c": mid, "inlet_high_c": high}
-        for name, values in (found | {"inlet_max_c": inlets.max(axis=1)}).items():
+        columns = {"time": group["time"][:, 0]}
+        columns |= {name: group[name].sum(axis=1) for name in summed}
+        columns |= {"inlet_low_c": low, "inlet_mid_c": mid, "inlet_high_c": high}
+        columns["inlet_max_c"] = inlets.max(axis=1)
+        for name, values in columns.items():
             parts.setdefault(name, []).append(values)
-        which = np.arange(done, done + len(inlets)) // interval
-        edges = np.flatnonzero(np.diff(which, prepend=-1))
-        rows = which[edges]
-        hottest[rows] = np.maximum(hottest[rows], np.maximum.reduceat(inlets, edges, axis=0))
+        interval_of_step = np.arange(done, done + len(inlets)) // interval
+        first_steps = np.flatnonzero(np.diff(interval_of_step, prepend=-1))
+        rows = interval_of_step[first_steps]
+        highest = np.maximum.reduceat(inlets, first_steps, axis=0)
+        hottest[rows] = np.maximum(hottest[rows], highest)
         done += len(inlets)
     series = pd.DataFrame({name: np.concatenate(values) for name, values in parts.items()})
     times = series["time"].to_numpy()
@@ -174,8 +186,8 @@ def read_fleet(run: RecordedRun) -> FleetSteps:
     return FleetSteps(series, np.append(times[::interval], end), hottest)
 
 
-def read_configs(run: RecordedRun, dcs: Sequence[int]) -> list[DataCenterConfig]:
-    """Configs of some data centers, as steps.parquet holds them.
+def read_configs(run: RunFolder, dcs: Sequence[int]) -> list[DataCenterConfig]:
+    """Read the configs of some data centers, which steps.parquet holds.
 
     Raises:
         SdcError: they are missing or not valid.
@@ -200,8 +212,9 @@ def read_configs(run: RecordedRun, dcs: Sequence[int]) -> list[DataCenterConfig]
 
 
 def _read_metrics(path: Path) -> dict[str, Any]:
+    """Content of metrics.json, checked field by field."""
     try:
-        about = json.loads(path.read_text("utf-8"))
+        content = json.loads(path.read_text("utf-8"))
     except FileNotFoundError:
         raise SdcError(
             f"{path}: no such file; valid is a folder that simulate wrote a whole run to"
@@ -209,29 +222,29 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         reason = getattr(error, "strerror", None) or _one_line(error)
         raise SdcError(f"{path}: cannot be read: {reason}") from None
-    if not isinstance(about, dict) or about.get("format") != FORMAT:
-        found = about.get("format") if isinstance(about, dict) else type(about).__name__
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        found = content.get("format") if isinstance(content, dict) else type(content).__name__
         raise SdcError(f"{path}: format {found!r}; valid is {FORMAT!r}, simulate the run again")
-    _check_fields(path, "", about, _ABOUT)
-    done, asked, step_h = about["steps_done"], about["steps_asked"], about["step_h"]
+    _check_fields(path, "", content, _METRICS_TYPES)
+    done, asked, step_h = content["steps_done"], content["steps_asked"], content["step_h"]
     if not 1 <= done <= asked:
         raise SdcError(f"{path}: steps_done {done} of steps_asked {asked}; valid is 1..{asked}")
-    for index, dc in enumerate(about["data_centers"]):
+    for index, dc in enumerate(content["data_centers"]):
         where = f"data_centers[{index}]"
         if not isinstance(dc, dict):
             raise SdcError(f"{path}: {where} is {dc!r}; valid is an object")
-        _check_fields(path, f"{where}.", dc, _DATA_CENTER)
+        _check_fields(path, f"{where}.", dc, _DATA_CENTER_TYPES)
         for number, event in enumerate(dc["events"]):
             place = f"{where}.events[{number}]"
             if not isinstance(event, dict):
                 raise SdcError(f"{path}: {place} is {event!r}; valid is an object")
-            _check_fields(path, f"{place}.", event, _EVENT)
+            _check_fields(path, f"{place}.", event, _EVENT_TYPES)
             _check_event(f"{path}: {place}", event, done)
-    if not about["data_centers"]:
+    if not content["data_centers"]:
         raise SdcError(f"{path}: data_centers is empty; valid is one or more")
     if not 0 < step_h <= 1:
         raise SdcError(f"{path}: step_h {step_h!r}; valid is above 0 up to 1")
-    return dict(about)
+    return dict(content)
 
 
 def is_number(value: object) -> bool:
@@ -240,6 +253,7 @@ def is_number(value: object) -> bool:
 
 
 def _check_event(place: str, event: Mapping[str, Any], done: int) -> None:
+    """Check the steps and amounts of an event against the steps done."""
     start, end = event["start_step"], event["end_step"]
     if not 0 <= start < min(done, end) or end >= 1 << 63:
         raise SdcError(
@@ -257,6 +271,7 @@ def _check_fields(
     given: Mapping[str, Any],
     expected: Mapping[str, type | tuple[type, ...]],
 ) -> None:
+    """Check that the fields of a JSON object are there and of their types."""
     for name, kind in expected.items():
         value = given.get(name)
         # A bool is an int in Python, and no number here.
@@ -266,17 +281,18 @@ def _check_fields(
             raise SdcError(f"{path}: {where}{name} {found}; valid is of type {names}")
 
 
-def _check_steps_file(run: RecordedRun) -> None:
+def _check_steps_file(run: RunFolder) -> None:
+    """Check that steps.parquet is of the run that metrics.json describes, and has all its rows."""
     path = run.steps_path
-    stored, given = _described(_stored_metadata(path)), _described(run.about)
+    stored, given = _flat_description(_stored_metadata(path)), _flat_description(run.metrics)
     for name in {**stored, **given}:
         if stored.get(name) != given.get(name):
             raise SdcError(
-                f"{path}: {name} {_cut(stored.get(name))} is not that of {METRICS_FILE}, "
-                f"{_cut(given.get(name))}; simulate the run again"
+                f"{path}: {name} {_shortened(stored.get(name))} is not that of {METRICS_FILE}, "
+                f"{_shortened(given.get(name))}; simulate the run again"
             )
-    rows = _open(path).metadata.num_rows
-    expected = run.about["steps_done"] * len(run.names)
+    rows = _open_parquet(path).metadata.num_rows
+    expected = run.metrics["steps_done"] * len(run.names)
     if rows != expected:
         raise SdcError(
             f"{path}: {rows} rows, expected {expected} as steps_done and data_centers of "
@@ -284,22 +300,28 @@ def _check_steps_file(run: RecordedRun) -> None:
         )
 
 
-def _described(about: Mapping[str, Any]) -> dict[str, Any]:
-    """What a run is, field by field, which steps.parquet and metrics.json tell alike."""
+def _flat_description(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields that steps.parquet and metrics.json both hold, by their paths."""
     others = ("data_centers", "steps_done", "total", "configs_yaml")
-    out = {name: value for name, value in about.items() if name not in others}
-    for index, dc in enumerate(about.get("data_centers", ())):
+    out = {name: value for name, value in content.items() if name not in others}
+    for index, dc in enumerate(content.get("data_centers", ())):
         own = {name: value for name, value in dc.items() if name not in ("metrics", "events")}
         out |= {f"data_centers[{index}].{name}": value for name, value in own.items()}
     return out
 
 
-def _cut(value: object) -> str:
+def _shortened(value: object) -> str:
+    """A value as an error message shows it."""
     text = repr(value)
-    return text if len(text) <= _MOST_CHARACTERS else text[:_MOST_CHARACTERS] + "…"
+    return text if len(text) <= _MAX_VALUE_LENGTH else text[:_MAX_VALUE_LENGTH] + "…"
 
 
-def _open(path: Path) -> Any:
+def _open_parquet(path: Path) -> Any:
+    """The Parquet file, of which the metadata have been read.
+
+    Raises:
+        SdcError: there is no such file, or it is damaged.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -314,7 +336,8 @@ def _open(path: Path) -> Any:
 
 
 def _stored_metadata(path: Path) -> dict[str, Any]:
-    metadata = _open(path).schema_arrow.metadata or {}
+    """Description of the run that the metadata of steps.parquet hold."""
+    metadata = _open_parquet(path).schema_arrow.metadata or {}
     try:
         stored = json.loads(metadata[METADATA_KEY])
     except (KeyError, ValueError):
@@ -324,17 +347,18 @@ def _stored_metadata(path: Path) -> dict[str, Any]:
     return stored
 
 
-def _column_names(run: RecordedRun) -> list[str]:
-    names = _open(run.steps_path).schema_arrow.names
+def _column_names(run: RunFolder) -> list[str]:
+    """Columns of steps.parquet that hold quantities."""
+    names = _open_parquet(run.steps_path).schema_arrow.names
     return [name for name in names if name not in ("dc", "step", "time")]
 
 
-def _groups(run: RecordedRun, columns: Sequence[str]) -> Iterator[dict[str, npt.NDArray[Any]]]:
+def _row_groups(run: RunFolder, columns: Sequence[str]) -> Iterator[dict[str, npt.NDArray[Any]]]:
     """Row groups as arrays (steps, data centers), ``step`` and ``time`` among them."""
     import pyarrow as pa
 
     path, size = run.steps_path, len(run.names)
-    file = _open(path)
+    file = _open_parquet(path)
     wanted = ("dc", "step", "time", *columns)
     known = set(file.schema_arrow.names)
     missing = [name for name in wanted if name not in known]
@@ -361,6 +385,7 @@ def _groups(run: RecordedRun, columns: Sequence[str]) -> Iterator[dict[str, npt.
 
 
 def _as_array(path: Path, name: str, table: Any) -> npt.NDArray[Any]:
+    """Values of a column of an Arrow table, whose type is checked."""
     column = table.column(name)
     kind = {"step": "int64", "time": "timestamp[ms]"}.get(name, "double")
     if str(column.type) != kind or column.null_count:
@@ -372,4 +397,5 @@ def _as_array(path: Path, name: str, table: Any) -> npt.NDArray[Any]:
 
 
 def _one_line(error: Exception) -> str:
+    """Message of an error without line breaks."""
     return " ".join(str(error).split())

@@ -1,0 +1,97 @@
+"""What a run is, before its first step: versions, seed, inputs and data centers."""
+
+from __future__ import annotations
+
+import functools
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.exogenous.files import sha256
+from sdc_taichi.sim.simulator import Simulator
+
+FORMAT = "sdc-run/1"
+"""Version of the format of metrics.json, which its field ``format`` names."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """What a run is asked to do."""
+
+    controller: str
+    """Name of the controller, as metrics.json and reports show it."""
+    steps: int
+    """Number of steps to simulate."""
+    seed: int = 0
+    """Seed of the simulator's events and of the controller."""
+
+
+def describe_run(sim: Simulator, request: RunRequest) -> dict[str, Any]:
+    """The part of metrics.json that is known before the first step.
+
+    Args:
+        sim: the simulator.
+        request: what it is asked to do.
+    """
+    drivers = sim.drivers
+    hashes = _file_hashes(sim.fleet.configs)
+    return {
+        "format": FORMAT,
+        "versions": dict(_versions()),
+        "fingerprint": sim.fingerprint(),
+        "controller": request.controller,
+        "seed": request.seed,
+        "precision": sim.precision,
+        "step_h": sim.step_h,
+        "steps_asked": request.steps,
+        "synthetic": any(drivers.synthetic),
+        "notes": list(drivers.notes),
+        "data_centers": [
+            {
+                "name": config.name,
+                "location": config.site.location,
+                "start": config.site.start,
+                "synthetic": synthetic,
+                "provenance": sources,
+                "sha256": {kind: hashes[path] for kind, path in _input_files(config).items()},
+            }
+            for config, synthetic, sources in zip(
+                sim.fleet.configs, drivers.synthetic, drivers.sources, strict=True
+            )
+        ],
+    }
+
+
+@functools.cache
+def _versions() -> Mapping[str, str]:
+    """Versions of Python and of the packages that results depend on, by name.
+
+    They are kept, because looking them up reads the packages' metadata from disk.
+    """
+    packages = ("sdc-taichi", "taichi", "numpy", "pyarrow")
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def _input_files(config: DataCenterConfig) -> dict[str, str]:
+    """Paths of the files that a config names, by the input that they give."""
+    site = config.site
+    named = {
+        "weather": site.weather_file,
+        "carbon": site.carbon_file,
+        "workload": site.workload_file,
+        "recirculation": config.hall.recirculation.matrix_file,
+    }
+    return {kind: path for kind, path in named.items() if path is not None}
+
+
+def _file_hashes(configs: Sequence[DataCenterConfig]) -> dict[str, str]:
+    """SHA-256 of every file that the configs name, by path.
+
+    Drivers made from arrays need no such file, so one that is gone has the hash "missing".
+    """
+    paths = {path for config in configs for path in _input_files(config).values()}
+    return {p: sha256(Path(p)) if Path(p).is_file() else "missing" for p in sorted(paths)}

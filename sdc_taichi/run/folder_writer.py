@@ -1,0 +1,192 @@
+"""Simulate and write a run folder.
+
+A run folder holds ``steps.parquet``, ``metrics.json`` and ``config.yaml`` (one data center) or
+``configs.yaml`` (several, one YAML document each). Every file is written beside its place and
+renamed when it is whole. Equal runs give equal bytes. See docs/cli.md for the columns.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sdc_taichi.atomic_file import atomic_write, naming_errors
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.control import Controller
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.run.description import RunRequest, describe_run
+from sdc_taichi.run.loop import simulate
+from sdc_taichi.run.metrics import Totals, metrics_of_fleet, metrics_per_dc
+from sdc_taichi.run.steps_file import STEPS_FILE, StepsWriter
+from sdc_taichi.sim.events import ActiveEvent
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.types import StepResult
+
+METRICS_FILE = "metrics.json"
+"""Written last, so that its presence marks the folder of a whole run."""
+REPORT_FILE = "report.html"
+"""Written by ``sdc-taichi report`` from the other files of a run folder."""
+_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+
+def simulate_to_folder(
+    sim: Simulator,
+    controller: Controller,
+    request: RunRequest,
+    out: Path,
+    *,
+    force: bool = False,
+    on_step: Callable[[StepResult], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> dict[str, Any] | None:
+    """Simulate as ``simulate`` does, and write the files of the run to a folder.
+
+    Args:
+        sim: the simulator; its data centers have distinct names.
+        controller: gives the actions of every step.
+        request: steps, seed and the controller's name.
+        out: folder, created if need be; files of a former run there are replaced.
+        force: also write into a folder with other files.
+        on_step: called with the result of every step.
+        stop: asked before every step; true ends the run with files of the steps done.
+
+    Returns:
+        The content of metrics.json; None, and no files, if it was stopped before the first step.
+
+    Raises:
+        SdcError: the folder is not free, a file cannot be written, or the controller gave actions
+            that are not valid.
+    """
+    sim.fleet.require_distinct_names()
+    has_former_run = prepare_folder(out, force=force)
+    description = describe_run(sim, request)
+    configs = configs_yaml(sim.fleet.configs)
+    names = ["config.yaml", "configs.yaml"]
+    config_name, other_name = names if sim.size == 1 else names[::-1]
+    metadata = {**description, "configs_yaml": configs}
+    # A dict, because it keeps the order in which events began.
+    events: dict[ActiveEvent, None] = {}
+    with StepsWriter(out / STEPS_FILE, sim, metadata) as writer:
+
+        def write_step(result: StepResult) -> None:
+            writer.add(result)
+            events.update(dict.fromkeys(sim.active_events(result.step)))
+            if on_step is not None:
+                on_step(result)
+
+        totals = simulate(
+            sim, controller, request.steps, request.seed, on_step=write_step, stop=stop
+        )
+        if totals.steps == 0:
+            return None
+        writer.commit()
+    write_text(out / config_name, configs)
+    if has_former_run:
+        for name in (other_name, REPORT_FILE):
+            with naming_errors(out / name):
+                (out / name).unlink(missing_ok=True)
+    content = _metrics_content(description, totals, sim.fleet, events)
+    write_text(out / METRICS_FILE, metrics_json(content) + "\n")
+    return content
+
+
+def metrics_json(content: dict[str, Any]) -> str:
+    """JSON text of the content of metrics.json."""
+    return json.dumps(content, indent=2, allow_nan=False)
+
+
+def configs_yaml(configs: Sequence[DataCenterConfig]) -> str:
+    """YAML text of configs, one document per data center."""
+    dumped = (c.model_dump(mode="json") for c in configs)
+    return yaml.dump_all(
+        dumped, Dumper=_DUMPER, sort_keys=False, allow_unicode=True, explicit_start=len(configs) > 1
+    )
+
+
+def prepare_folder(out: Path, *, force: bool = False) -> bool:
+    """Create the folder of a run, or check that its files may be replaced.
+
+    Args:
+        out: the folder.
+        force: accept a folder that holds other files.
+
+    Returns:
+        Whether it holds a former run.
+
+    Raises:
+        SdcError: it holds other files than those of a run and ``force`` is not set, or it cannot
+            be created or read.
+    """
+    with naming_errors(out):
+        if out.exists() and not out.is_dir():
+            raise ConfigError(f"{out}: is a file; valid is a folder to write the run to")
+        out.mkdir(parents=True, exist_ok=True)
+        others = sorted(p.name for p in out.iterdir() if not _is_left_by_broken_run(p))
+    has_former_run = _is_run_folder(out)
+    if others and not force and not has_former_run:
+        some = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
+        raise ConfigError(
+            f"{out}: holds files that are not of a run ({some}); choose an empty folder with --out "
+            "or write into it with --force"
+        )
+    return has_former_run
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file so that a reader sees the old one or the whole new one.
+
+    Raises:
+        SdcError: it cannot be written.
+    """
+    with atomic_write(path) as file:
+        file.write(text.encode())
+
+
+def _metrics_content(
+    description: dict[str, Any], totals: Totals, fleet: Fleet, events: Iterable[ActiveEvent]
+) -> dict[str, Any]:
+    """Content of metrics.json: description, steps done, metrics and events."""
+    return {
+        **description,
+        "steps_done": totals.steps,
+        "data_centers": [
+            {**dc, "metrics": metrics, "events": own_events}
+            for dc, metrics, own_events in zip(
+                description["data_centers"],
+                metrics_per_dc(totals, fleet),
+                _events_by_dc(events, fleet.size),
+                strict=True,
+            )
+        ],
+        "total": metrics_of_fleet(totals, fleet),
+    }
+
+
+def _events_by_dc(events: Iterable[ActiveEvent], size: int) -> list[list[dict[str, Any]]]:
+    """Events of each of ``size`` data centers as metrics.json lists them, in the order given."""
+    by_dc: list[list[dict[str, Any]]] = [[] for _ in range(size)]
+    for event in events:
+        fields = asdict(event)
+        dc = fields.pop("dc")
+        by_dc[dc].append({name: value for name, value in fields.items() if value is not None})
+    return by_dc
+
+
+def _is_left_by_broken_run(path: Path) -> bool:
+    """Whether a file is one that a run may leave when it ends before metrics.json is written."""
+    return path.name in (STEPS_FILE, REPORT_FILE) or path.suffix in (".part", ".rrd")
+
+
+def _is_run_folder(out: Path) -> bool:
+    """Whether a folder holds the metrics.json of a run."""
+    try:
+        content = json.loads((out / METRICS_FILE).read_text("utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and str(content.get("format", "")).startswith("sdc-run/")

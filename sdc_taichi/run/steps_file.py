@@ -1,0 +1,114 @@
+"""Write the steps of a run as a Parquet file, steps.parquet of a run folder."""
+
+from __future__ import annotations
+
+import json
+import operator
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from sdc_taichi.atomic_file import AtomicFile, delete_leftovers, naming_errors
+from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.types import F64, StepResult
+from sdc_taichi.year_clock import step_times
+
+STEPS_FILE = "steps.parquet"
+"""Name of the file in a run folder."""
+METADATA_KEY = b"sdc_taichi"
+"""Key of the file's metadata under which the run is described, as JSON."""
+_ROWS_PER_GROUP = 1 << 16
+
+
+class StepsWriter:
+    """Writes one row per data center and step to a Parquet file, a row group at a time.
+
+    Memory does not grow with the number of steps. The file appears under its name on ``commit``;
+    without it, nothing is left behind.
+
+    Args:
+        path: the file.
+        sim: the simulator whose steps are added.
+        metadata: stored as JSON under ``METADATA_KEY`` in the file's metadata.
+
+    Raises:
+        SdcError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path, sim: Simulator, metadata: Mapping[str, Any]) -> None:
+        self._fleet, self._start = sim.fleet, sim.drivers.start
+        self._metadata = {METADATA_KEY: json.dumps(metadata, allow_nan=False).encode()}
+        self._steps_per_group = max(1, _ROWS_PER_GROUP // sim.size)
+        self._names: tuple[str, ...] = ()
+        self._values: F64 = np.empty((0, 0, 0))  # of the row group under way, (columns, steps, B)
+        self._filled = 0
+        self._first_step = 0
+        self._writer: Any = None
+        with naming_errors(path):
+            delete_leftovers(path)
+        self._output = AtomicFile(path)
+
+    def add(self, result: StepResult) -> None:
+        """Add one step, the one after the step added before.
+
+        Raises:
+            SdcError: the file cannot be written.
+        """
+        if not self._names:
+            self._names = tuple(result.per_dc())
+            self._columns = operator.attrgetter(*self._names)
+            shape = (len(self._names), self._steps_per_group, self._fleet.size)
+            self._values = np.empty(shape)
+        if self._filled == 0:
+            self._first_step = result.step
+        self._values[:, self._filled] = self._columns(result)
+        self._filled += 1
+        if self._filled == self._steps_per_group:
+            self._write_row_group()
+
+    def commit(self) -> None:
+        """Finish the file and give it its name.
+
+        Raises:
+            SdcError: the file cannot be written.
+        """
+        self._write_row_group()
+        with naming_errors(self._output.path):
+            self._writer.close()
+        self._output.commit()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._output.discard()
+
+    def _write_row_group(self) -> None:
+        """Write the steps added since the last row group, if there are any."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        if self._filled == 0:
+            return
+        count, size = self._filled, self._fleet.size
+        steps = np.arange(self._first_step, self._first_step + count)
+        times = step_times(self._start, steps, self._fleet.steps_per_hour)
+        names = pa.array(self._fleet.names)
+        dc = pa.array(np.tile(np.arange(size, dtype=np.int32), count))
+        columns: dict[str, Any] = {
+            "dc": pa.DictionaryArray.from_arrays(dc, names),
+            "step": np.repeat(steps, size),
+            "time": times.reshape(-1),
+        }
+        for name, values in zip(self._names, self._values, strict=True):
+            columns[name] = values[:count].reshape(-1)
+        group = pa.table(columns).replace_schema_metadata(self._metadata)
+        with naming_errors(self._output.path):
+            if self._writer is None:
+                self._writer = pq.ParquetWriter(
+                    self._output.file, group.schema, compression="zstd", use_dictionary=["dc"]
+                )
+            self._writer.write_table(group)
+        self._filled = 0
