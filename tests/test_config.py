@@ -24,7 +24,9 @@ from sdc_taichi import (
 from sdc_taichi.config import (
     apply_overrides,
     config_from_dict,
+    with_values,
 )
+from sdc_taichi.config.schema import BatteryConfig
 
 PRESETS = ("corrected", "large", "paper", "sustaindc", "tiny")
 
@@ -145,6 +147,43 @@ def test_the_last_override_wins_and_the_original_stays() -> None:
     changed = apply_overrides(config, ["site.seed=1", "site.seed=2"])
     assert changed.site.seed == 2
     assert config.to_yaml() == before
+
+
+def test_plain_values_at_dotted_paths() -> None:
+    config = load_config("tiny")
+    changed = with_values(
+        config,
+        {
+            "hvac.setpoint.initial_c": 20,
+            "hall.supply_approach_k.2": 9.0,
+            "hvac.total_of": ("chiller", "crac_fan"),
+            "battery": {"capacity_kwh": 5.0},
+            "name": "a.b=c",
+        },
+    )
+    assert changed.hvac.setpoint.initial_c == 20
+    assert changed.hvac.setpoint.max_c == config.hvac.setpoint.max_c
+    assert changed.hall.supply_approach_k == (5.3, 5.0, 9.0, 4.5)
+    assert changed.hvac.total_of == ("chiller", "crac_fan")
+    assert changed.battery == BatteryConfig(capacity_kwh=5.0)
+    assert changed.name == "a.b=c"
+    assert with_values(config, {}) == config == load_config("tiny")
+
+
+@pytest.mark.parametrize(
+    ("assigned", "message"),
+    [
+        ({"hvac.setpoint.maxc": 22}, "tiny: hvac.setpoint.maxc: unknown key; did you mean 'max_c'"),
+        ({"hvac.setpoint.max_c": "x"}, r"tiny: hvac.setpoint.max_c: .*\(got 'x'\)"),
+        ({"hvac..max_c": 3}, "'hvac..max_c=3': valid is section.key=value"),
+        ({"name.first": 3}, "name is a value, not a section"),
+        ({3: 4}, "{3: 4}: valid is a mapping of dotted paths to values"),
+        (["site.seed=1"], "valid is a mapping of dotted paths to values"),
+    ],
+)
+def test_values_that_are_not_valid_are_named(assigned: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        with_values(load_config("tiny"), assigned)
 
 
 @pytest.mark.parametrize(

@@ -4,22 +4,23 @@ What may be given, in which bounds, and the errors about it live here.
 Nothing here computes a hall or a plant, and no other module validates a configuration.
 """
 
-from sdc_taichi.config.schema import (
-    DataCenterConfig,
+from sdc_taichi.config.event_schema import (
     EventKind,
     EventsConfig,
-    HallConfig,
-    LayoutConfig,
     SampledEvent,
     ScheduledEvent,
+)
+from sdc_taichi.config.hall_schema import HallConfig, LayoutConfig
+from sdc_taichi.config.loading import (
     apply_overrides,
     config_from_dict,
-    explain,
     load_config,
     load_yaml,
     preset_names,
     with_values,
 )
+from sdc_taichi.config.messages import explain
+from sdc_taichi.config.schema import DataCenterConfig
 
 __all__ = [
     "DataCenterConfig",

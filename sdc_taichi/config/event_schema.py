@@ -1,0 +1,121 @@
+"""Sections ``events`` and ``protection``: what goes wrong in a run, and how servers meet it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from sdc_taichi.config.fields import (
+    Finite,
+    Index,
+    NonNegative,
+    Pair,
+    Positive,
+    Section,
+    Share,
+)
+
+EventKind = Literal["crac_down", "chiller_derate", "rack_fan_failure", "heat_wave", "grid_outage"]
+
+_REQUIRED: dict[EventKind, tuple[str, ...]] = {
+    "crac_down": (),
+    "chiller_derate": ("share",),
+    "rack_fan_failure": ("rack", "share"),
+    "heat_wave": ("offset_k",),
+    "grid_outage": (),
+}
+_OPTIONAL: dict[EventKind, tuple[str, ...]] = {"crac_down": ("unit",)}
+
+
+class ProtectionConfig(Section):
+    """What servers do when their inlets leave the allowable range of their ASHRAE class.
+
+    Above the limit a rack throttles; ``trip_margin_k`` above it, it switches off and loses the
+    work of the step, until its inlet is at most ``restart_c``.
+    """
+
+    ashrae_class: Literal["A1", "A2", "A3", "A4"] | None = None
+    """ASHRAE TC 9.9 (2021) class of the servers, whose allowable range has the limit; None is no
+    protection."""
+    throttle_share: Share = 0.5
+    """Utilisation that a throttled rack may reach, 0..1."""
+    trip_margin_k: NonNegative = 5.0
+    """Inlet above the limit at which a rack switches off, in K."""
+    restart_c: Finite = 27.0
+    """Warmest inlet at which a rack that has switched off starts again, in C."""
+
+
+class ScheduledEvent(Section):
+    """Something that goes wrong at a known time."""
+
+    kind: EventKind
+    """What goes wrong."""
+    start_h: NonNegative
+    """Start of the event after reset, in h."""
+    duration_h: Positive
+    """Duration of the event, in h."""
+    unit: Index | None = None
+    """CRAC unit that is down, counted from 0; None is all of them."""
+    rack: Index | None = None
+    """Rack whose fans fail, counted from 0, row by row."""
+    share: Share | None = None
+    """What is left of the chiller's capacity, or of the rack's airflow, 0..1."""
+    offset_k: Finite | None = None
+    """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
+
+    @model_validator(mode="after")
+    def _has_what_its_kind_needs(self) -> Self:
+        _check_fields_of_kind(self)
+        return self
+
+
+class SampledEvent(Section):
+    """Something that goes wrong at random times: a Poisson process with uniform durations.
+
+    CRAC units and racks are drawn evenly.
+    """
+
+    kind: EventKind
+    """What goes wrong."""
+    per_year: Annotated[Finite, Field(gt=0, le=8760)]
+    """Mean number of events in a year, at most one an hour."""
+    duration_h: Pair
+    """Shortest and longest duration of an event, in h."""
+    share: Share | None = None
+    """What is left of the chiller's capacity, or of the rack's airflow, 0..1."""
+    offset_k: Finite | None = None
+    """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
+
+    @model_validator(mode="after")
+    def _has_what_its_kind_needs(self) -> Self:
+        low, high = self.duration_h
+        if not 0 < low <= high:
+            raise ValueError(
+                f"duration_h ({low:g}, {high:g}) must be (low, high) with 0 < low <= high"
+            )
+        _check_fields_of_kind(self)
+        return self
+
+
+class EventsConfig(Section):
+    """Failures and weather that a run meets."""
+
+    scheduled: tuple[ScheduledEvent, ...] = ()
+    """Events at known times."""
+    sampled: tuple[SampledEvent, ...] = ()
+    """Events at random times."""
+
+
+def _check_fields_of_kind(event: ScheduledEvent | SampledEvent) -> None:
+    required, optional = _REQUIRED[event.kind], _OPTIONAL.get(event.kind, ())
+    for name in ("unit", "rack", "share", "offset_k"):
+        if name not in type(event).model_fields:
+            continue
+        given = getattr(event, name) is not None
+        if given and name not in required and name not in optional:
+            raise ValueError(f"{name} has no meaning for {event.kind}")
+        if not given and name in required:
+            raise ValueError(f"{event.kind} needs {name}")
+    if event.kind == "rack_fan_failure" and event.share == 0.0:
+        raise ValueError("share 0 leaves a rack without air; valid is above 0")

@@ -1,0 +1,309 @@
+"""Sections ``hall`` and ``servers``: racks, their layout, recirculation, and what servers draw."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from sdc_taichi.config.fields import (
+    Count,
+    FileName,
+    Finite,
+    NonNegative,
+    Pair,
+    Positive,
+    PositiveShare,
+    Section,
+    Share,
+    check_one_per_rack,
+    check_ordered,
+)
+from sdc_taichi.plant.servers import ServerCurves, linear_curve
+
+MOST_RACKS = 10_000_000
+"""Largest number of racks of a hall."""
+
+
+class LayoutConfig(Section):
+    """Measures of the hall: rows side by side, fronts facing fronts across the cold aisles.
+
+    Row 0 lies along the first wall and faces away from it, row 1 faces row 0, and so on.
+    """
+
+    rack_pitch_m: Positive = 0.6
+    """Distance between the centres of neighbouring racks of a row, in m."""
+    rack_depth_m: Positive = 1.2
+    """Depth of a rack, from front to back, in m."""
+    rack_height_m: Positive = 2.1
+    """Height of a rack, in m."""
+    cold_aisle_m: Positive = 1.2
+    """Width of a cold aisle, between the fronts of two rows, in m."""
+    hot_aisle_m: Positive = 1.2
+    """Width of a hot aisle, between the backs of two rows, in m."""
+    end_margin_m: NonNegative = 1.8
+    """Distance between the ends of the rows and the walls, in m."""
+    side_margin_m: Positive = 1.2
+    """Distance between the outer rows and the walls, in m."""
+    ceiling_m: Positive = 3.6
+    """Height of the hall, in m."""
+    containment: Share = 0.0
+    """Share of the paths from hot to cold aisles that containment closes, 0..1."""
+    returns: Literal["ceiling", "end_wall"] = "ceiling"
+    """Where warm air leaves the hall: grilles above the hot aisles, or the wall at the row ends."""
+
+    @model_validator(mode="after")
+    def _racks_fit(self) -> Self:
+        if self.ceiling_m <= self.rack_height_m:
+            raise ValueError(
+                f"ceiling_m {self.ceiling_m:g} must be above rack_height_m {self.rack_height_m:g}"
+            )
+        return self
+
+
+class RecirculationConfig(Section):
+    """How exhaust air reaches the inlets of the racks."""
+
+    decay_m: Positive = 3.0
+    """Length over which the exhaust of another rack loses weight by a factor of e, in m."""
+    cutoff: Annotated[Finite, Field(ge=0, le=0.01)] = 1e-4
+    """Share of what a rack amid the hall collects below which the weight of a source is left out,
+    in halls of more than 64 racks; 0 keeps all sources."""
+    matrix_file: FileName | None = None
+    """File (.npz, .csv) with the matrix R or D of a CFD study, in place of the weights that follow
+    from the layout; None is the layout."""
+    matrix_kind: Literal["R", "D"] | None = None
+    """Which matrix a .csv file holds; None where the .npz file names it."""
+    calibrate: bool = True
+    """Whether the magnitude of recirculation follows from ``supply_approach_k`` and the matrix file
+    gives weights alone; False takes both from the file, and the approach temperatures follow."""
+
+    @model_validator(mode="after")
+    def _magnitude_is_known(self) -> Self:
+        if not self.calibrate and self.matrix_file is None:
+            raise ValueError(
+                "calibrate false needs a matrix_file; the layout alone gives weights, no magnitude"
+            )
+        if self.matrix_kind is not None and self.matrix_file is None:
+            raise ValueError(
+                f"matrix_kind {self.matrix_kind} needs a matrix_file; valid without one is null"
+            )
+        return self
+
+
+class HallConfig(Section):
+    """Rows of racks, their approach temperatures, and how many servers they hold."""
+
+    rows: Count
+    """Number of rows of racks."""
+    racks_per_row: Count
+    """Number of racks of each row."""
+    servers_per_rack: Count | tuple[Count, ...] = 200
+    """Number of servers of a rack: one for all racks, or one per rack."""
+    capacity_mw: Positive | None = None
+    """IT nameplate power that the number of servers is scaled to, in MW; None keeps
+    ``servers_per_rack``."""
+    inlet_model: Literal["approach", "recirculation"] = "approach"
+    """Source of rack inlets: given approach temperatures, or the exhaust air of the racks."""
+    supply_approach_k: NonNegative | tuple[NonNegative, ...]
+    """Rack inlet above the CRAC supply at the design point, in K: one for all racks, or one per
+    rack."""
+    supply_approach_limits_k: Pair | None = None
+    """Lowest and highest supply approach, which bound ``supply_approach_k``, in K; None is no
+    bounds."""
+    return_approach_k: Finite | tuple[Finite, ...]
+    """CRAC return air above the rack outlet, in K, negative where supply air bypasses the racks:
+    one for all racks, or one per rack."""
+    layout: LayoutConfig = LayoutConfig()
+    """Measures of the hall."""
+    recirculation: RecirculationConfig = RecirculationConfig()
+    """How exhaust air reaches rack inlets, for inlet model ``recirculation``."""
+    height_zones: Count = 5
+    """Number of zones over the height of a rack that each share an inlet temperature, for inlet
+    model ``recirculation``."""
+    height_gradient: Annotated[Finite, Field(ge=0, lt=1)] = 0.4
+    """Relative rise of the recirculated share of the intake from the middle of a rack to its top,
+    and its fall to the floor, 0..1."""
+    room_heat_capacity_kj_per_k_per_server: Positive = 2.0
+    """Heat capacity of room, coils and all else that follows the supply air, in kJ/K per server."""
+    air_density_kg_m3: Positive = 1.225
+    """Density of the air, in kg/m3."""
+    air_heat_capacity_j_per_kg_k: Positive = 1006.0
+    """Specific heat capacity of the air, in J/(kg K)."""
+
+    @property
+    def racks(self) -> int:
+        """Number of racks, rows x racks per row."""
+        return self.rows * self.racks_per_row
+
+    def rack_approach_k(self) -> np.ndarray:
+        """Supply approach temperature of every rack within its limits, in K, (R,)."""
+        given = np.broadcast_to(np.asarray(self.supply_approach_k, np.float64), (self.racks,))
+        limits = self.supply_approach_limits_k
+        return given.copy() if limits is None else np.asarray(np.clip(given, *limits))
+
+    @model_validator(mode="after")
+    def _not_too_many_racks(self) -> Self:
+        if self.racks > MOST_RACKS:
+            raise ValueError(
+                f"rows x racks_per_row is {self.racks:,}; valid is at most {MOST_RACKS:,} racks"
+            )
+        return self
+
+    @field_validator("supply_approach_limits_k")
+    @classmethod
+    def _ordered(cls, value: Pair | None) -> Pair | None:
+        return check_ordered(value)
+
+    @model_validator(mode="after")
+    def _containment_acts_once(self) -> Self:
+        if self.layout.containment > 0 and self.recirculation.matrix_file is not None:
+            raise ValueError(
+                f"layout.containment {self.layout.containment:g} with recirculation.matrix_file: "
+                "a matrix holds what containment does; valid is containment 0"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _one_entry_per_rack(self) -> Self:
+        for name in ("servers_per_rack", "supply_approach_k", "return_approach_k"):
+            check_one_per_rack(name, getattr(self, name), self.racks)
+        return self
+
+
+class ServerGroup(Section):
+    """Servers of a rack that are alike: computed once, expanded to servers on request."""
+
+    count: Count
+    """Number of servers."""
+    full_w: Positive
+    """CPU power of one server at full load and a power ratio of 1, in W."""
+    idle_w: NonNegative
+    """Least CPU power of one server, in W."""
+    load_weight: NonNegative = 1.0
+    """Load of a server relative to the mean of its rack, by count, at little load; at most twice
+    that mean."""
+    inlet_offset_k: Finite = 0.0
+    """Inlet of a server above the inlet of its rack, by its height in the rack, in K."""
+
+    @model_validator(mode="after")
+    def _idle_below_full(self) -> Self:
+        if self.idle_w > self.full_w:
+            raise ValueError(f"idle_w {self.idle_w:g} must not exceed full_w {self.full_w:g}")
+        return self
+
+
+class ServerConfig(Section):
+    """Power and airflow of the servers (ITE:AirCooled form of EnergyPlus, curves of Sun 2021)."""
+
+    power_w: Annotated[tuple[Pair, ...], Field(min_length=1)] | None = None
+    """(full, idle) CPU power of one server, in W: one pair for all racks, or one per rack. Without
+    it and without groups a server draws 150 W at full load and 10 W idle."""
+    groups: tuple[tuple[ServerGroup, ...], ...] | None = None
+    """Server groups, in place of ``power_w`` and ``servers_per_rack``: one entry for all racks, or
+    one per rack."""
+    cpu_power_ratio_lb: Pair = (0.01, 1.00)
+    """CPU power over full power at the coldest inlet of ``inlet_range_c``: at no load, and at full
+    load."""
+    cpu_power_ratio_ub: Pair = (0.03, 1.02)
+    """CPU power over full power at the warmest inlet of ``inlet_range_c``: at no load, and at full
+    load."""
+    cpu_slope_offset_per_k: Finite = 0.0
+    """Addition to the slope of CPU power over full power against the inlet, in 1/K."""
+    inlet_range_c: Pair = (16.0, 28.0)
+    """Coldest and warmest inlet, between which the curves are given, in C."""
+    curve_limit_c: Finite | None = 45.0
+    """Inlet above which power and airflow no longer rise (upper limit of ASHRAE class A4), in C;
+    without a limit, None, a room that cannot be cooled draws ever more power."""
+    fan_airflow_ratio_lb: Pair = (0.01, 0.225)
+    """Server airflow over full airflow at the coldest inlet of ``inlet_range_c``: at no load, and
+    at full load."""
+    fan_airflow_ratio_ub: Pair = (0.225, 1.0)
+    """Server airflow over full airflow at the warmest inlet of ``inlet_range_c``: at no load, and
+    at full load."""
+    fan_model: Literal["linear", "released"] = "linear"
+    """Airflow ratio against inlet temperature and load: as the ratios above give it, or scaled as
+    in the released SustainDC."""
+    fan_airflow_ratio_limits: Pair | None = None
+    """Lowest and highest airflow ratio; None bounds the ratio at 0 alone, since fans never blow
+    backwards."""
+    fan_power_exponent: Annotated[Finite, Field(ge=1, le=3)] = 3.0
+    """Exponent of fan power over the airflow ratio, 1..3."""
+    fan_full_airflow_m3s: Positive | None = 0.051
+    """Airflow through one server at airflow ratio 1, in m3/s; None takes the airflow on which the
+    supply and return approach temperatures close at the design point."""
+    fan_reference_ratio: Positive = 1.0
+    """Airflow ratio at which the fans of a server draw ``fan_reference_w``."""
+    fan_reference_w: NonNegative = 10.0
+    """Fan power of one server at the reference airflow ratio, in W."""
+    outlet_model: Literal["server", "rack", "released"] = "server"
+    """Outlet temperature from a heat balance per server, from one per rack, or from the fit of the
+    released SustainDC."""
+    heat_capacity_kj_per_k: Positive = 9.75
+    """Heat capacity of one server, in kJ/K."""
+    heat_exchange_effectiveness: PositiveShare = 0.95
+    """Effectiveness of the heat exchange between the mass of a server and the air that passes it,
+    0..1."""
+
+    @property
+    def power_pairs(self) -> tuple[Pair, ...]:
+        """(full, idle) CPU power of one server, in W: one pair for all racks, or one per rack."""
+        return self.power_w or ((150.0, 10.0),)
+
+    @property
+    def curves(self) -> ServerCurves:
+        """Coefficients of power and airflow against inlet temperature and load.
+
+        Fan model ``released`` scales slope by 10, offset by 5 and load shift by 5 (shift per 20 %
+        of load), as the released SustainDC code does.
+        """
+        cpu_slope, cpu_offset, cpu_shift = linear_curve(
+            self.inlet_range_c, self.cpu_power_ratio_lb, self.cpu_power_ratio_ub
+        )
+        fan_slope, fan_offset, fan_shift = linear_curve(
+            self.inlet_range_c, self.fan_airflow_ratio_lb, self.fan_airflow_ratio_ub
+        )
+        if self.fan_model == "released":
+            fan_slope, fan_offset, fan_shift = 10 * fan_slope, 5 * fan_offset, 5 * fan_shift
+        fan_low, fan_high = self.fan_airflow_ratio_limits or (0.0, np.inf)
+        return ServerCurves(
+            cpu_slope_per_k=cpu_slope + self.cpu_slope_offset_per_k,
+            cpu_offset=cpu_offset,
+            cpu_shift=cpu_shift,
+            fan_slope_per_k=fan_slope,
+            fan_offset=fan_offset,
+            fan_shift=fan_shift,
+            # Fans never blow backwards.
+            fan_low=max(fan_low, 0.0),
+            fan_high=fan_high,
+            fan_reference_ratio=self.fan_reference_ratio,
+            fan_exponent=self.fan_power_exponent,
+            fan_reference_w=self.fan_reference_w,
+            curve_limit_c=np.inf if self.curve_limit_c is None else self.curve_limit_c,
+        )
+
+    @field_validator("power_w", mode="before")
+    @classmethod
+    def _one_pair_is_a_list_of_one(cls, value: Any) -> Any:
+        flat = isinstance(value, list | tuple) and not any(
+            isinstance(x, list | tuple) for x in value
+        )
+        return [value] if flat and value else value
+
+    @field_validator("inlet_range_c", "fan_airflow_ratio_limits")
+    @classmethod
+    def _ordered(cls, value: Pair | None) -> Pair | None:
+        return check_ordered(value)
+
+    @model_validator(mode="after")
+    def _idle_below_full(self) -> Self:
+        if self.power_w is not None and self.groups is not None:
+            raise ValueError("power_w and groups are both given; valid is one, null for the other")
+        for rack, (full_w, idle_w) in enumerate(self.power_pairs):
+            if not full_w > 0 or not 0 <= idle_w <= full_w:
+                raise ValueError(
+                    f"power_w entry {rack} is ({full_w:g}, {idle_w:g}); "
+                    "valid is (full, idle) with full > 0 and 0 <= idle <= full"
+                )
+        return self

@@ -1,0 +1,230 @@
+"""Section ``hvac``: cooling from the CRAC units to the tower, its water, and its sizing."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from sdc_taichi.config.fields import (
+    Finite,
+    NonNegative,
+    Positive,
+    PositiveShare,
+    Section,
+    Share,
+    Whole,
+)
+from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C
+
+Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
+
+
+class SetpointConfig(Section):
+    """CRAC supply setpoint: range, first value and how actions move it."""
+
+    model: Literal["symmetric", "accelerating"] = "symmetric"
+    """How a command moves the setpoint: by one step, or by a step that grows with equal commands
+    in a row, as in the released SustainDC."""
+    min_c: Finite = 16.0
+    """Lowest setpoint, in C."""
+    max_c: Finite = 23.0
+    """Highest setpoint, in C."""
+    initial_c: Finite = 18.0
+    """Setpoint after a reset, in C."""
+    step_k: Positive = 1.0
+    """Change of the setpoint by one action, in K."""
+
+    @model_validator(mode="after")
+    def _inside(self) -> Self:
+        if not self.min_c <= self.initial_c <= self.max_c:
+            raise ValueError(
+                f"initial_c {self.initial_c:g} must lie within min_c {self.min_c:g} "
+                f"and max_c {self.max_c:g}"
+            )
+        return self
+
+
+class CracConfig(Section):
+    """CRAC units: airflow per IT watt at design, fan power, who supplies whom."""
+
+    units: Annotated[Whole, Field(ge=1, le=64)] = 1
+    """Number of CRAC units, along both end walls in turn and evenly spread over the rows."""
+    unit_shares: tuple[tuple[Share, ...], ...] | None = None
+    """Share of each unit in the supply air of each rack, 0..1: one row of shares per rack, each row
+    summing to 1; None is by distance."""
+    supply_length_m: Positive = 6.0
+    """Length over which a unit loses weight in the supply of a rack by a factor of e, in m."""
+    supply_m3s_per_w: Positive = 5.663e-5
+    """Design airflow of all units per IT power at the design point, in m3/s per W."""
+    reference_m3s_per_w: Positive = 9.438e-5
+    """Airflow per IT power at which a fan draws ``released_fan_w``, in m3/s per W."""
+    flow_model: Literal["constant", "follow_servers", "per_watt", "controlled"] = "follow_servers"
+    """What the airflow of the units follows: nothing, the airflow of the servers, IT power, or the
+    actions of an agent."""
+    min_flow_ratio: PositiveShare = 0.6
+    """Lowest airflow of a running unit over its design airflow, 0..1."""
+    fan_step: PositiveShare = 0.05
+    """Change of fan speed over design speed by one action, for flow model ``controlled``, 0..1."""
+    coasting_flow_ratio: PositiveShare = 0.1
+    """Airflow through a unit that is down over its design airflow, 0..1."""
+    fan_w_per_m3s: NonNegative = 1000.0
+    """Design fan power per design airflow (specific fan power), in W per m3/s."""
+    released_fan_w: NonNegative = 150.0
+    """CRAC_FAN_REF_P of the SustainDC format: power of one unscaled fan, in W."""
+
+
+class ChillerConfig(Section):
+    """Chiller model and its reference point."""
+
+    model: Literal[
+        "carnot",
+        "eir_york",
+        "electric_water_cooled",
+        "electric_air_cooled",
+        "constant_cop",
+        "released",
+        "paper",
+    ] = "carnot"
+    """How power and capacity of the chiller follow from load and temperatures."""
+    reference_cop: Positive = 5.96
+    """COP at the reference point, in W of heat per W of power."""
+    coil_approach_k: Positive = 8.0
+    """Supply air setpoint above the chilled water that the coils take, in K."""
+    chilled_water_range_k: Positive = 6.0
+    """Chilled water that returns above chilled water that is supplied, in K."""
+    min_condenser_c: Finite = 12.78
+    """Lowest temperature of the condenser water that enters the chiller, in C."""
+
+
+class TowerConfig(Section):
+    """Cooling tower, condenser water and waterside economiser."""
+
+    model: Literal["yorkcalc", "released", "paper"] = "yorkcalc"
+    """How fan power and water temperature of the tower follow from the heat to reject."""
+    approach_min_k: Positive = 4.0
+    """Least approach: coldest water that the tower gives, above wet bulb, in K."""
+    water_range_k: Positive = 5.56
+    """Water that enters the tower above water that leaves it, at the design point, in K."""
+    fan_w_per_w_rejected: NonNegative = 0.02
+    """Design fan power per heat rejected at the design point, in W per W."""
+    paper_fan_w: NonNegative = 1000.0
+    """CT_FAN_REF_P of the SustainDC format: fan power of the paper's tower at its reference
+    airflow, in W."""
+    paper_airflow_m3s: Positive = 2.8315
+    """CT_REFRENCE_AIR_FLOW_RATE of the SustainDC format: reference airflow of the paper's tower, in
+    m3/s."""
+    economiser: bool = True
+    """Whether a waterside economiser cools the return water before the chiller."""
+    economiser_approach_k: NonNegative = 5.0
+    """Approach of tower and heat exchanger together: coldest water that the exchanger gives, above
+    wet bulb, in K."""
+
+    @model_validator(mode="after")
+    def _exchanger_adds(self) -> Self:
+        if self.economiser_approach_k < self.approach_min_k:
+            raise ValueError(
+                f"economiser_approach_k {self.economiser_approach_k:g} must not be below "
+                f"approach_min_k {self.approach_min_k:g}, which it contains"
+            )
+        return self
+
+
+class PumpConfig(Section):
+    """Chilled- and condenser-water pumps."""
+
+    model: Literal["sized", "released"] = "sized"
+    """Whether pumps are sized for their flow, or draw the unscaled power of the released
+    SustainDC."""
+    pressure_drop_pa: Positive = 300_000.0
+    """Pressure drop of each water loop at design flow, in Pa."""
+    efficiency: PositiveShare = 0.75
+    """Hydraulic power over electric power of a pump, 0..1."""
+    min_flow_ratio: PositiveShare = 0.6
+    """Lowest flow of a running pump over its design flow, 0..1."""
+    released_chilled_w: NonNegative = 0.0
+    """Power of the chilled-water pump of pump model ``released``, in W."""
+    released_condenser_w: NonNegative = 0.0
+    """Power of the condenser-water pump of pump model ``released``, in W."""
+
+
+class WaterConfig(Section):
+    """Make-up water of the cooling tower."""
+
+    model: Literal["mass_balance", "released", "paper"] = "mass_balance"
+    """How evaporation, drift and blowdown of the tower are computed."""
+    cycles_of_concentration: Annotated[Finite, Field(gt=1)] = 5.0
+    """Concentration of solids in the tower water over that in the make-up water."""
+    drift_share: Share = 2e-5
+    """Drift over the water flow of the tower, 0..1."""
+
+
+class SizingConfig(Section):
+    """How devices are sized for load and site."""
+
+    model: Literal["design_day", "released"] = "design_day"
+    """Rules of sizing: full load on the design day of the site, or the rules of the released
+    SustainDC."""
+    margin: Annotated[Finite, Field(ge=1)] = 1.15
+    """Sized cooling power over the cooling load at the design point."""
+    design_wet_bulb_c: Finite | None = None
+    """Design wet bulb of the site, in C; None takes the 99.6 % quantile of its weather."""
+    design_outdoor_c: Finite | None = None
+    """Design dry bulb of the site, in C; None takes the 99.6 % quantile of its weather, or with
+    sizing model ``released`` 30 in NY, 20 in WA and else 50."""
+
+
+class HvacConfig(Section):
+    """Cooling from the CRAC units to the tower."""
+
+    setpoint: SetpointConfig = SetpointConfig()
+    """Supply setpoint of the CRAC units."""
+    crac: CracConfig = CracConfig()
+    """CRAC units and their fans."""
+    cooling_load_model: Literal["heat_balance", "released", "paper"] = "heat_balance"
+    """How return air and cooling load follow from the hall: a heat balance, or the formulas of the
+    released SustainDC or of its paper."""
+    chiller: ChillerConfig = ChillerConfig()
+    """Chiller and chilled water."""
+    tower: TowerConfig = TowerConfig()
+    """Cooling tower, condenser water and economiser."""
+    pumps: PumpConfig = PumpConfig()
+    """Pumps of chilled water and condenser water."""
+    water: WaterConfig = WaterConfig()
+    """Make-up water of the tower."""
+    sizing: SizingConfig = SizingConfig()
+    """How devices are sized."""
+    total_of: tuple[Device, ...] = (
+        "chiller",
+        "tower_fan",
+        "chilled_pump",
+        "condenser_pump",
+        "crac_fan",
+    )
+    """Devices whose power counts in the HVAC total."""
+    ups_efficiency: PositiveShare = 0.96
+    """Efficiency of the UPS, 0..1, for the PUE with UPS losses alone; the grid balance is IT + HVAC
+    + battery."""
+
+    @field_validator("total_of")
+    @classmethod
+    def _each_device_once(cls, value: tuple[Device, ...]) -> tuple[Device, ...]:
+        if not value or len(set(value)) < len(value):
+            raise ValueError(f"{list(value)} must name at least one device and each one once")
+        return value
+
+    @model_validator(mode="after")
+    def _chilled_water_within_the_model(self) -> Self:
+        if self.chiller.model != "carnot":
+            return self
+        low, high = CHILLED_WATER_BOUNDS_C["carnot"]
+        for name in ("min_c", "max_c"):
+            setpoint = getattr(self.setpoint, name)
+            water = setpoint - self.chiller.coil_approach_k
+            if not low <= water <= high:
+                raise ValueError(
+                    f"setpoint.{name} {setpoint:g} less chiller.coil_approach_k "
+                    f"{self.chiller.coil_approach_k:g} makes chilled water of {water:g} C; "
+                    f"model carnot is valid within {low:g}..{high:g} C"
+                )
+        return self

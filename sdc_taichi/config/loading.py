@@ -1,0 +1,258 @@
+"""Configurations from presets, files, overrides and plain values."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from sdc_taichi.config import sustaindc
+from sdc_taichi.config.messages import explain
+from sdc_taichi.config.schema import DataCenterConfig
+from sdc_taichi.errors import ConfigError, suggestion
+
+DEFAULT_PRESET = "corrected"
+"""Preset that is read where none is named."""
+
+
+def preset_names() -> list[str]:
+    """Names of the presets that come with the package."""
+    folder = resources.files("sdc_taichi.configs")
+    return sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+
+
+def load_config(
+    source: str | os.PathLike[str] | None = None, overrides: Sequence[str] = ()
+) -> DataCenterConfig:
+    """Read a preset, a YAML file or a SustainDC ``dc_config.json``.
+
+    Args:
+        source: a preset name (see ``preset_names``), a path to YAML with the schema of
+            ``DataCenterConfig``, which may name a preset to start from under ``extends``, or a path
+            to the SustainDC JSON format, which starts from preset ``sustaindc``. None is
+            ``corrected``.
+        overrides: ``a.b=c`` assignments applied last; ``c`` is read as YAML.
+
+    Raises:
+        ConfigError: naming the file, the key, the value and what would be valid.
+    """
+    if isinstance(overrides, str):
+        raise ConfigError(f"overrides {overrides!r}: valid is a list of section.key=value")
+    label, values = _read_source(DEFAULT_PRESET if source is None else source)
+    for override in overrides:
+        _apply_override(values, override)
+    return config_from_dict(values, label)
+
+
+def config_from_dict(values: dict[str, Any], label: str = "config") -> DataCenterConfig:
+    """A config of plain values, section by section.
+
+    Args:
+        values: what a YAML file with the schema of ``DataCenterConfig`` would say.
+        label: where the values come from, at the start of every message.
+
+    Raises:
+        ConfigError: naming the key, the value and what would be valid.
+    """
+    try:
+        return DataCenterConfig.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(explain(error, label, DataCenterConfig)) from None
+
+
+def apply_overrides(config: DataCenterConfig, overrides: Sequence[str]) -> DataCenterConfig:
+    """A copy of a config with assignments as the command line takes them.
+
+    Args:
+        config: the config to copy.
+        overrides: ``a.b=c`` assignments, applied in turn; ``c`` is read as YAML.
+
+    Raises:
+        ConfigError: naming the assignment, or the key, the value and what would be valid.
+    """
+    values = config.model_dump(mode="json")
+    for override in overrides:
+        _apply_override(values, override)
+    return config_from_dict(values, config.name)
+
+
+def with_values(config: DataCenterConfig, assigned: Mapping[str, Any]) -> DataCenterConfig:
+    """A copy of a config with other values at some paths, validated anew.
+
+    ``with_values(config, {"hvac.setpoint.initial_c": 20, "hall.supply_approach_k.2": 5.5})``
+
+    Args:
+        config: the config to copy.
+        assigned: dotted path of a field, or of a list entry by its index, to its new value; values
+            are plain, as in a YAML file. A section is replaced as a whole: fields that its value
+            does not give take their defaults.
+
+    Raises:
+        ConfigError: naming the path, or the key, the value and what would be valid.
+    """
+    if not isinstance(assigned, Mapping) or not all(isinstance(path, str) for path in assigned):
+        raise ConfigError(
+            f"values {assigned!r}: valid is a mapping of dotted paths to values, such as "
+            "{'hvac.setpoint.initial_c': 20}"
+        )
+    values = config.model_dump(mode="json")
+    for path, value in assigned.items():
+        _assign(values, path, value, f"{path}={value!r}")
+    return config_from_dict(values, config.name)
+
+
+def load_yaml(text: str) -> Any:
+    """The plain values that a YAML text holds.
+
+    Raises:
+        ValueError: not valid, or a key given twice; says on one line what is wrong.
+    """
+    try:
+        return yaml.load(text, _Loader)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise ValueError(" ".join(str(error).split())) from None
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a mapping that gives a key twice, of which YAML would drop the first."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key in [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]:
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    problem=f"{key.value!r} is given twice", problem_mark=key.start_mark
+                )
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
+    """Label and values of a preset or a file, with what it extends."""
+    if isinstance(source, str) and source in preset_names():
+        return _read_preset(source)
+    path = Path(source)
+    try:
+        text = path.read_text("utf-8")
+    except FileNotFoundError:
+        meant = suggestion(source, preset_names())
+        raise ConfigError(
+            f"{source}: no such file or preset{meant} (presets: {', '.join(preset_names())})"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{source}: cannot be read ({error})") from None
+    label = str(path)
+    if path.suffix.lower() != ".json":
+        return label, _with_base(label, _parse_yaml(text, label))
+    values = _parse_json(text, label)
+    if sustaindc.SECTIONS[0] in values:
+        _, base = _read_preset("sustaindc")
+        return label, _merged(base, sustaindc.read(values, label))
+    return label, _with_base(label, values)
+
+
+def _read_preset(name: str) -> tuple[str, dict[str, Any]]:
+    text = resources.files("sdc_taichi.configs").joinpath(f"{name}.yaml").read_text("utf-8")
+    label = f"preset {name}"
+    return label, _with_base(label, _parse_yaml(text, label))
+
+
+def _with_base(label: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Values on top of the preset that they extend, if they name one."""
+    base = values.pop("extends", None)
+    if base is None:
+        return values
+    if base not in preset_names():
+        raise ConfigError(
+            f"{label}: extends: {base!r} is no preset; valid: {', '.join(preset_names())}"
+        )
+    _, merged = _read_preset(str(base))
+    merged = _merged(merged, values)
+    given = values.get("servers")
+    if isinstance(given, dict):
+        _replace_other_servers(merged["servers"], given)
+    return merged
+
+
+def _replace_other_servers(servers: dict[str, Any], given: Mapping[str, Any]) -> None:
+    """Let groups take the place of inherited power pairs, and the other way round."""
+    for new, old in (("groups", "power_w"), ("power_w", "groups")):
+        if given.get(new) is not None and old not in given:
+            servers[old] = None
+
+
+def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in over.items():
+        old = out.get(key)
+        if isinstance(old, dict) and isinstance(value, dict):
+            value = _merged(old, value)
+        out[key] = value
+    return out
+
+
+def _parse_yaml(text: str, label: str) -> dict[str, Any]:
+    try:
+        values = load_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"{label}: not valid YAML ({error})") from None
+    return _require_mapping(values, label)
+
+
+def _parse_json(text: str, label: str) -> dict[str, Any]:
+    try:
+        values = json.loads(text)
+    except (RecursionError, ValueError) as error:
+        raise ConfigError(f"{label}: not valid JSON ({error})") from None
+    return _require_mapping(values, label)
+
+
+def _require_mapping(values: Any, label: str) -> dict[str, Any]:
+    if not isinstance(values, dict):
+        kind = type(values).__name__
+        raise ConfigError(f"{label}: the top level is a {kind}; valid is a mapping of sections")
+    return values
+
+
+def _apply_override(values: dict[str, Any], override: str) -> None:
+    path, sign, text = override.partition("=")
+    if not sign:
+        raise ConfigError(f"override {override!r}: valid is section.key=value")
+    try:
+        value = load_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"override {override!r}: {text!r} is no YAML value ({error})") from None
+    _assign(values, path, value, override)
+
+
+def _assign(values: dict[str, Any], path: str, value: Any, override: str) -> None:
+    """Put a value at a dotted path; messages quote ``override``."""
+    *sections, last = path.strip().split(".")
+    if not all([*sections, last]):
+        raise ConfigError(f"override {override!r}: valid is section.key=value")
+    node: Any = values
+    for key in sections:
+        if isinstance(node, list):
+            node = node[_list_index(node, key, override)]
+        else:
+            node = node.setdefault(key, {})
+        if not isinstance(node, dict | list):
+            raise ConfigError(f"override {override!r}: {key} is a value, not a section")
+    if isinstance(node, list):
+        node[_list_index(node, last, override)] = value
+    else:
+        node[last] = value
+        if sections == ["servers"]:
+            _replace_other_servers(node, {last: value})
+
+
+def _list_index(node: list[Any], key: str, override: str) -> int:
+    if not key.isdigit() or int(key) >= len(node):
+        raise ConfigError(f"override {override!r}: index {key!r} is not in 0..{len(node) - 1}")
+    return int(key)

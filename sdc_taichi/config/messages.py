@@ -1,0 +1,64 @@
+"""One line on what is wrong with values that a schema refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from sdc_taichi.errors import suggestion_or_valid
+
+MOST_PROBLEMS = 3
+"""Number of problems that a message lists; of further ones it gives the number."""
+
+
+def explain(error: ValidationError, label: str, model: type[BaseModel]) -> str:
+    """One line on what is wrong, with key, value and what is valid.
+
+    Args:
+        error: what pydantic found.
+        label: where the values come from, at the start of the line.
+        model: the schema that was validated against.
+    """
+    problems: dict[str, str] = {}
+    for item in error.errors(include_url=False):
+        keys = [str(part) for part in item["loc"] if not _is_union_branch(part)]
+        where = ".".join(keys)
+        if item["type"] == "extra_forbidden":
+            valid = _keys_of(model, keys[:-1])
+            text = f"{where}: unknown key{suggestion_or_valid(keys[-1], valid)}"
+        elif item["type"] == "missing":
+            text = f"{where}: missing"
+        else:
+            message = item["msg"].removeprefix("Value error, ")
+            text = f"{where}: {message}" if where else message
+            value = item["input"]
+            if value is None or isinstance(value, str | int | float | bool):
+                text += f" (got {value!r})"
+        # Each branch of a union has a problem of its own; the first says enough.
+        problems.setdefault(where, text)
+    left_out = len(problems) - MOST_PROBLEMS
+    more = f" (and {left_out} more)" if left_out > 0 else ""
+    return f"{label}: {'; '.join([*problems.values()][:MOST_PROBLEMS])}{more}"
+
+
+def _is_union_branch(part: str | int) -> bool:
+    """Whether a part of pydantic's location is the tried type of a union and no key of the user."""
+    return isinstance(part, str) and (part in {"int", "float"} or "[" in part)
+
+
+def _keys_of(model: type[BaseModel], path: Sequence[str]) -> list[str]:
+    """Valid keys of the section at ``path`` in ``model``; entries of lists are skipped."""
+    section = model
+    for key in path:
+        if not key.isdigit():
+            section = _section_in(section.model_fields[key].annotation) or section
+    return list(section.model_fields)
+
+
+def _section_in(annotation: Any) -> type[BaseModel] | None:
+    """The schema in a field's type, which may list sections or be optional."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(_section_in, get_args(annotation))), None)
