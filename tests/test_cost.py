@@ -16,7 +16,7 @@ import pytest
 from call_counts import calls_of
 from sdc_taichi import Actions, Simulator, drivers_from_arrays, load_config
 from sdc_taichi.envs.core import Core
-from sdc_taichi.envs.options import make_options
+from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.kernels.compiler.backend import BoundKernel
 
 
@@ -71,7 +71,7 @@ def test_python_calls_do_not_grow_with_the_number_of_data_centers() -> None:
 
 
 def test_python_calls_do_not_grow_with_the_number_of_environments() -> None:
-    steps = [stepper(Core("corrected", make_options(), num_envs=n)) for n in (2, 96)]
+    steps = [stepper(Core([load_config("corrected")], EnvOptions(), num_envs=n)) for n in (2, 96)]
     few, many = (calls_of(step, "call") for step in steps)
     assert few == many < 350
 

@@ -24,12 +24,13 @@ from pettingzoo.test.state_test import state_test
 import sdc_taichi
 from call_counts import calls_of
 from sdc_taichi import ConfigError, RuntimeStateError, SdcError, load_config
-from sdc_taichi.envs import rendering, rewards
-from sdc_taichi.envs.features import AGENTS
+from sdc_taichi.envs import rendering
+from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.forecasts import ForecastError
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.parallel import SdcParallelEnv
 from sdc_taichi.envs.registration import IDS
+from sdc_taichi.envs.reward_terms import TERMS, terms_markdown
 from sdc_taichi.envs.single import SdcEnv
 from sdc_taichi.envs.vector import SdcVectorEnv
 
@@ -558,7 +559,7 @@ def test_what_the_standards_do_not_know_is_reached_through_unwrapped() -> None:
     wrapped.step(np.array([1, 1, 1]))
     env: Any = wrapped.unwrapped
     assert env.state_space.contains(env.state())
-    assert env.reward_terms().keys() == rewards.TERMS.keys()
+    assert env.reward_terms().keys() == TERMS.keys()
     assert env.load_state_dict(env.state_dict()).shape == env.observation_space.shape
     for name in ("state", "reward_terms", "state_dict"):
         assert not hasattr(wrapped, name)
@@ -652,7 +653,7 @@ def test_infos_are_quantities_of_the_step() -> None:
     assert infos.keys() == view.last.per_dc().keys()
     assert np.array_equal(infos["carbon_g"], view.last.carbon_g)
     assert np.all(infos["it_kwh"] > 0)
-    assert env.reward_terms().keys() == rewards.TERMS.keys()
+    assert env.reward_terms().keys() == TERMS.keys()
     single = SdcEnv(**tiny())
     assert single.reset(seed=0)[1].keys() == {"start_day"}
     *_, info = single.step(np.array([1, 1, 1]))
@@ -1003,6 +1004,6 @@ def test_docs_have_every_option_and_term() -> None:
         default = EnvOptions.model_fields[name].default
         if isinstance(default, str | int | float | bool | None):
             assert shown == f"`{default}`", name
-    assert rewards.table_markdown() in text
+    assert terms_markdown() in text
     for name in IDS:
         assert f"`{name}`" in text

@@ -25,17 +25,13 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.control import View, viewer
-from sdc_taichi.envs import timed
+from sdc_taichi.envs import time_rows
+from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.features import (
-    AGENTS,
     DEFAULT_FEATURES,
-    HEAT_MAP_FEATURES,
     Feature,
-    Observer,
-    catalogue,
-    heat_map,
-    heat_map_space,
-    table_markdown,
+    all_features,
+    features_markdown,
 )
 from sdc_taichi.envs.forecasts import (
     CI_LEADS_H,
@@ -44,6 +40,8 @@ from sdc_taichi.envs.forecasts import (
     Forecasts,
     lead_steps,
 )
+from sdc_taichi.envs.heat_map import HEAT_MAP_CHANNELS, heat_map, heat_map_space
+from sdc_taichi.envs.observer import Observer
 from sdc_taichi.sim.drivers import Table
 
 SITES = ("ny", "ca", "az")
@@ -418,7 +416,7 @@ def walk_forecast(error: ForecastError, seeds: int, step: int = 0) -> tuple[Any,
     )
     made = Forecasts(4, error=error)
     made.reset(drivers, keys(seeds, 5))
-    ci, outdoor, wet_bulb = made.look(drivers.start + step, step)
+    ci, outdoor, wet_bulb = made.forecast(drivers.start + step, step)
     return ci.T, outdoor.T, wet_bulb.T
 
 
@@ -483,14 +481,14 @@ def test_forecast_of_a_step_does_not_depend_on_the_steps_looked_at() -> None:
     )
     each, only = Forecasts(4, error=ForecastError(0.1, 2.0)), None
     each.reset(drivers, keys(2))
-    found = [each.look(drivers.start + step, step) for step in range(501)]
+    found = [each.forecast(drivers.start + step, step) for step in range(501)]
     for step in (1, 127, 128, 300, 500):
         only = Forecasts(4, error=ForecastError(0.1, 2.0))
         only.reset(drivers, keys(2))
-        for a, b in zip(found[step], only.look(drivers.start + step, step), strict=True):
+        for a, b in zip(found[step], only.forecast(drivers.start + step, step), strict=True):
             np.testing.assert_array_equal(a, b)
     with pytest.raises(RuntimeStateError, match="reset starts again"):
-        each.look(drivers.start, 0)
+        each.forecast(drivers.start, 0)
 
 
 def test_ci_forecasts_are_never_negative() -> None:
@@ -533,7 +531,7 @@ def test_series_that_end_repeat_from_their_own_start() -> None:
 
 def test_tables_and_reading_step_by_step_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     _, fast = watch(fleet_of("tiny"), 30)
-    monkeypatch.setattr(timed, "TABLE_BYTES", 0)
+    monkeypatch.setattr(time_rows, "MAX_ROW_BYTES", 0)
     _, slow = watch(fleet_of("tiny"), 30)
     for (_, _, a, _), (_, _, b, _) in zip(fast, slow, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -548,15 +546,15 @@ def test_data_centers_of_a_site_share_rows() -> None:
         def read(index: np.ndarray, dc: np.ndarray) -> np.ndarray:
             return np.stack([index, dc], axis=1)
 
-        rows = timed.time_rows(tables, read, period=96, row_bytes=8)
+        rows = time_rows.time_rows(tables, read, period=96, row_bytes=8)
         assert rows is not None
         assert rows.values.shape == (3 * 35040, 2)
         found = rows.at(np.full(9, 35040 + 7))
         assert found[:, 0].tolist() == [7] * 9
         assert [SITES[dc] for dc in found[:, 1]] == list(SITES) * 3
         # Series that end within a day, or more of them than there is room for.
-        assert timed.time_rows(tables, read, period=97, row_bytes=8) is None
-        assert timed.time_rows(tables, read, period=96, row_bytes=2**28) is None
+        assert time_rows.time_rows(tables, read, period=97, row_bytes=8) is None
+        assert time_rows.time_rows(tables, read, period=96, row_bytes=2**28) is None
 
 
 @pytest.mark.parametrize("columns", [[0, 1, 2, 3, 4], [4, 0, 3, 1], [3], [1, 2], [2, 3, 0, 4]])
@@ -566,10 +564,10 @@ def test_entries_are_put_where_they_belong(columns: list[int]) -> None:
     others = np.array([[100.0, 101.0], [200.0, 201.0]], dtype=np.float32)
     entries = np.array([3, 1])
     everything = np.concatenate([rows[entries], others.T], axis=1)
-    layout = timed.Layout(columns, 3)
-    found = layout.filled(layout.of(rows), entries, others)
+    order = time_rows.EntryOrder(columns, 3)
+    found = order.assemble(order.arrange(rows), entries, others)
     np.testing.assert_array_equal(found, everything[:, columns])
-    own = layout.filled(layout.of(rows[entries]), None, others)
+    own = order.assemble(order.arrange(rows[entries]), None, others)
     np.testing.assert_array_equal(own, found)
 
 
@@ -582,7 +580,7 @@ def test_features_of_an_agent_are_those_named_in_their_order() -> None:
     observer, seen = watch(fleet_of("tiny"), 3, ci_leads_h=[0.5, 3], **options)
     assert [f.name for f in observer.features["agent_bat"]] == names
     assert [f.name for f in observer.features["agent_ls"]] == list(DEFAULT_FEATURES["agent_ls"])
-    assert len(observer.state_features) == len(catalogue())
+    assert len(observer.state_features) == len(all_features())
     _, observed, state, _ = seen[-1]
     found = parts(state, observer.state_features)
     np.testing.assert_array_equal(
@@ -713,7 +711,7 @@ def test_heat_map_shows_each_rack_in_its_place(episode: tuple[Observer, Seen]) -
                             float(view.last.rack_outlet_c[rack]),
                             float(view.last.rack_power_w[rack]) / design_w,
                         ]
-                    want = [scaled(f, x) for f, x in zip(HEAT_MAP_FEATURES, raw, strict=True)]
+                    want = [scaled(f, x) for f, x in zip(HEAT_MAP_CHANNELS, raw, strict=True)]
                     np.testing.assert_allclose(image[dc, row, place], want, atol=2e-6)
 
 
@@ -734,15 +732,15 @@ def test_heat_map_needs_halls_of_one_shape() -> None:
 @pytest.mark.repo
 def test_the_page_has_the_table_as_generated() -> None:
     page = (Path(__file__).parent.parent / "docs" / "observations.md").read_text("utf-8")
-    assert f"\n\n{table_markdown()}\n" in page
-    for feature in HEAT_MAP_FEATURES:
+    assert f"\n\n{features_markdown()}\n" in page
+    for feature in HEAT_MAP_CHANNELS:
         assert f"`{feature.name}` {feature.low:g}..{feature.high:g}" in page
 
 
 def test_the_table_names_who_observes_what() -> None:
-    lines = table_markdown().splitlines()[2:]
-    assert len(lines) == len(catalogue())
-    for line, feature in zip(lines, catalogue(), strict=True):
+    lines = features_markdown().splitlines()[2:]
+    assert len(lines) == len(all_features())
+    for line, feature in zip(lines, all_features(), strict=True):
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         assert cells[:2] == [f"`{feature.name}`", str(feature.size)]
         assert [bool(cell) for cell in cells[-3:]] == [

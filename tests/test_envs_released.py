@@ -29,8 +29,10 @@ from sdc_taichi import (
     load_config,
 )
 from sdc_taichi.control.view import View, viewer
-from sdc_taichi.envs import released
-from sdc_taichi.envs.released import FEATURES, ReleasedObserver, ReleasedRewards
+from sdc_taichi.envs import released_rewards, released_rows
+from sdc_taichi.envs.released_features import FEATURES
+from sdc_taichi.envs.released_observer import ReleasedObserver
+from sdc_taichi.envs.released_rewards import ReleasedRewards
 from sdc_taichi.errors import DataError, RuntimeStateError
 from sdc_taichi.sim.drivers import Table
 from sdc_taichi.sim.hall_solver import Precision
@@ -292,7 +294,7 @@ def test_extremes_of_what_follows(series: F64, window: int) -> None:
     expected = [
         [series[i : i + window].min(), series[i : i + window].max()] for i in range(len(series))
     ]
-    assert np.array_equal(released._extremes(series, window), np.array(expected))
+    assert np.array_equal(released_rows.extremes_ahead(series, window), np.array(expected))
 
 
 def test_queue_entries_by_hand() -> None:
@@ -360,7 +362,7 @@ def test_tables_are_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = ReleasedObserver()
     expected.reset(other)
     with monkeypatch.context() as patch:
-        patch.setattr(released, "_ci_rows", None)
+        patch.setattr(released_rows, "_ci_rows", None)
         observer.reset(later)
         with pytest.raises(TypeError):
             observer.reset(other)
@@ -425,7 +427,7 @@ def test_series_that_several_share() -> None:
 
 def test_footprint_reward_by_hand() -> None:
     """Paper, F.2: -0.5 x (300 - 100) / (500 - 100) and its zeros."""
-    found = released.footprint_reward(
+    found = released_rewards.footprint_reward(
         np.array([0.5, 0.0, 1.0, 1.0]),
         np.array([300.0, 300.0, 100.0, 500.0]),
         np.full(4, 100.0),
@@ -451,14 +453,14 @@ def test_footprint_reward_by_hand() -> None:
 def test_load_penalty_by_hand(
     quarter_hour: int, dropped: float, queue: float, expected: float
 ) -> None:
-    found = released.load_penalty(
+    found = released_rewards.load_penalty(
         np.array([dropped]), np.array([queue]), np.array([quarter_hour / 96])
     )
     assert found.tolist() == pytest.approx([expected], rel=1e-6)
 
 
 def test_cooling_reward_by_hand() -> None:
-    found = released.cooling_reward(
+    found = released_rewards.cooling_reward(
         np.array([1200.0, 200.0, 2200.0]), np.full(3, 200.0), np.full(3, 2200.0)
     )
     assert found.tolist() == pytest.approx([-0.5, 0.0, -1.0])
@@ -470,7 +472,7 @@ def test_load_bounds_of_recorded_runs(name: str, path: Path) -> None:
     config = rack_config(about["racks"], about["config"]["location"])
     with Simulator(config, drivers=drivers(inputs(0), start=[0]), precision="f64") as sim:
         sim.reset()
-        low, high = released.load_bounds_kw(sim.fleet, sim.sizing, "f64")
+        low, high = released_rewards.power_bounds_kw(sim.fleet, sim.sizing, "f64")
     assert low.tolist() == pytest.approx([about["sizing"]["power_lb_kw"]], rel=1e-9), name
     assert high.tolist() == pytest.approx([about["sizing"]["power_ub_kw"]], rel=1e-9), name
 
@@ -484,7 +486,7 @@ def test_rewards_of_a_run() -> None:
     actions = [replace(some_actions(rng, 1), load=LOAD[0]) for _ in range(40)]
     with Simulator(load_config("sustaindc"), drivers=drivers(series, start=[start])) as sim:
         _, rewards, results, _ = run(sim, actions)
-        bounds = released.load_bounds_kw(sim.fleet, sim.sizing, sim.precision)
+        bounds = released_rewards.power_bounds_kw(sim.fleet, sim.sizing, sim.precision)
         low, high = (float(v[0]) for v in bounds)
     queued_at_night = 0
     for k, result in enumerate(results):

@@ -12,17 +12,16 @@ from hypothesis import strategies as st
 
 from sdc_taichi import ConfigError, SdcError, StepResult, load_config
 from sdc_taichi.control import View
+from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.core import Core
-from sdc_taichi.envs.features import AGENTS
 from sdc_taichi.envs.options import make_options
-from sdc_taichi.envs.rewards import (
+from sdc_taichi.envs.reward_terms import (
     CI_G_PER_KWH,
     FOSSIL_G_PER_KWH,
     TERMS,
     WATER_L_PER_KWH,
-    register_reward,
-    share,
 )
+from sdc_taichi.envs.rewards import collaborative_rewards, register_reward
 from sdc_taichi.envs.single import SdcEnv
 from sdc_taichi.types import F64
 
@@ -31,7 +30,7 @@ DEFER = dict.fromkeys(AGENTS, np.array([0]))
 
 def core(overrides: list[str] | None = None, num_envs: int = 1, **options: Any) -> Core:
     config = load_config("tiny", overrides or [])
-    return Core(config, make_options(**{"days": 1, "start": "fixed", **options}), num_envs)
+    return Core([config], make_options(**{"days": 1, "start": "fixed", **options}), num_envs)
 
 
 def act(size: int, command: int) -> dict[str, Any]:
@@ -43,7 +42,7 @@ def test_terms_are_what_their_names_say() -> None:
     env.reset(0)
     result = [env.step(act(2, 2)).result for _ in range(5)][-1]
     design_kwh = env.sim.sizing.facility_w / 4e3
-    found = env.terms()
+    found = env.reward_terms()
     assert set(found) == set(TERMS)
     expected = {
         "carbon": -result.carbon_g / (CI_G_PER_KWH * design_kwh),
@@ -72,7 +71,7 @@ def test_queued_tasks_cost_in_the_last_hour_of_the_day() -> None:
     for step in range(96):
         queued = env.step(act(1, 0)).result.queue_tasks[0]
         weight = max(0.0, (step / 4 - 23.0) / 0.75)
-        assert env.terms()["queue"][0] == pytest.approx(-weight * queued / 10.0, abs=1e-12)
+        assert env.reward_terms()["queue"][0] == pytest.approx(-weight * queued / 10.0, abs=1e-12)
     assert queued > 0
 
 
@@ -81,7 +80,7 @@ def test_an_hourly_step_has_its_whole_penalty_at_23() -> None:
     env.reset(0)
     for step in range(24):
         queued = env.step(act(1, 0)).result.queue_tasks[0]
-        assert env.terms()["queue"][0] == pytest.approx(-queued / 10 if step == 23 else 0.0)
+        assert env.reward_terms()["queue"][0] == pytest.approx(-queued / 10 if step == 23 else 0.0)
 
 
 def test_cost_follows_the_hour_and_the_peak_of_the_episode() -> None:
@@ -104,7 +103,7 @@ def test_cost_follows_the_hour_and_the_peak_of_the_episode() -> None:
             design_kwh = env.sim.sizing.facility_w[0] / 4e3
             paid = kwh * prices[step // 4]
             assert done.rewards["agent_ls"][0] == pytest.approx(-paid / (0.1 * design_kwh))
-            assert env.terms()["cost"][0] == done.rewards["agent_ls"][0]
+            assert env.reward_terms()["cost"][0] == done.rewards["agent_ls"][0]
             # A day's part of a bill of 30 days.
             charge = 3.0 * above_kw / 30.0
             assert done.rewards["agent_bat"][0] == pytest.approx(-charge / (0.1 * design_kwh))
@@ -119,7 +118,7 @@ def test_default_rewards_are_those_of_the_paper() -> None:
     env.reset(0)
     for _ in range(94):
         done = env.step(act(1, 0))
-        terms = env.terms()
+        terms = env.reward_terms()
         own = {
             "agent_ls": terms["carbon"] + terms["queue"] + 10.0 * terms["dropped"],
             "agent_dc": terms["facility_energy"],
@@ -136,18 +135,20 @@ def test_default_rewards_are_those_of_the_paper() -> None:
 )
 def test_sharing_keeps_the_sum(own: list[float], a: float) -> None:
     given = [np.array([r]) for r in own]
-    assert math.fsum(r[0] for r in share(given, a)) == pytest.approx(math.fsum(own), abs=1e-9)
-    assert np.array(share(given, 1.0)) == pytest.approx(np.array(given), abs=1e-12)
+    assert math.fsum(r[0] for r in collaborative_rewards(given, a)) == pytest.approx(
+        math.fsum(own), abs=1e-9
+    )
+    assert np.array(collaborative_rewards(given, 1.0)) == pytest.approx(np.array(given), abs=1e-12)
     # To the bit what several at once get.
-    three = np.array(share([np.tile(r, 3) for r in given], a))
-    assert np.array_equal(three[:, 1:2], share(given, a))
+    three = np.array(collaborative_rewards([np.tile(r, 3) for r in given], a))
+    assert np.array_equal(three[:, 1:2], collaborative_rewards(given, a))
 
 
 def test_agents_not_mentioned_keep_their_default() -> None:
     env = core(rewards={"agent_dc": {"pue": 2.0, "water": 0.5}}, collaboration=1.0)
     env.reset(0)
     done = env.step(act(1, 1))
-    terms = env.terms()
+    terms = env.reward_terms()
     np.testing.assert_allclose(
         done.rewards["agent_dc"], 2 * terms["pue"] + 0.5 * terms["water"], rtol=1e-12
     )
@@ -206,7 +207,7 @@ def test_the_first_step_of_an_episode_pays_no_more_than_others() -> None:
     found = []
     for _ in range(96):
         env.step(act(1, 1))
-        found.append(env.terms())
+        found.append(env.reward_terms())
     cost = np.array([terms["cost"][0] for terms in found])
     assert cost[0] > 2 * np.median(cost)
     # However it goes, a week pays no more than what lies between half and full design power.

@@ -33,7 +33,7 @@ from sdc_taichi import (
     preset_names,
 )
 from sdc_taichi.control.rules import trim_and_respond
-from sdc_taichi.envs.rewards import share
+from sdc_taichi.envs.rewards import collaborative_rewards
 from sdc_taichi.exogenous.psychrometrics import humidity_ratio, stull_wet_bulb_c, wet_bulb_c
 from sdc_taichi.hall import air_metrics
 from sdc_taichi.hall.floor_plan import floor_plan
@@ -702,7 +702,9 @@ def check_setpoint(check: Check) -> Values:
 
 def check_collaboration(check: Check) -> Values:
     given = check["inputs"]
-    return {"R": [r[0] for r in share([np.array([r]) for r in given["r"]], given["a"])]}
+    return {
+        "R": [r[0] for r in collaborative_rewards([np.array([r]) for r in given["r"]], given["a"])]
+    }
 
 
 def check_trim_and_respond(check: Check) -> Values:

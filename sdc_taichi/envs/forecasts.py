@@ -22,24 +22,30 @@ from sdc_taichi.types import F32, F64, I64
 from sdc_taichi.year_clock import HOURS_PER_YEAR
 
 CI_LEADS_H = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0)
+"""Leads of the carbon-intensity forecast unless told otherwise, in h."""
 WEATHER_LEADS_H = (3.0, 6.0, 12.0, 24.0)
+"""Leads of the weather forecasts unless told otherwise, in h."""
 LONGEST_LEAD_H = float(HOURS_PER_YEAR)
+"""Longest valid lead, in h."""
 _DRAWN_STEPS = 128
+"""Steps of the random walks that are drawn at once."""
 _ALL = slice(None)
 
 
 @dataclass(frozen=True, slots=True)
 class ForecastError:
-    """Standard deviations of the error at a lead of 24 h; zero is perfect foresight.
+    """How forecasts err: standard deviations at a lead of 24 h. Zero is perfect foresight.
 
     Raises:
         ConfigError: a value that is negative or not finite.
     """
 
     ci_share: float = 0.0
-    """Of the carbon intensity, as a share of its true value; forecasts are cut at zero."""
+    """Standard deviation of the carbon intensity at 24 h, as a share of its true value; forecasts
+    are cut at zero."""
     temperature_k: float = 0.0
-    """Of dry and wet bulb, which err alike, so that the wet bulb stays below."""
+    """Standard deviation of dry bulb and wet bulb at 24 h, in K. Both err alike, so that the wet
+    bulb stays below the dry bulb."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -54,10 +60,16 @@ class ForecastError:
 
 
 PERFECT = ForecastError()
+"""Perfect foresight."""
 
 
 def lead_steps(name: str, leads_h: Sequence[float], steps_per_hour: int) -> I64:
     """Leads in steps, (n,).
+
+    Args:
+        name: name of the option, for errors.
+        leads_h: leads in h.
+        steps_per_hour: number of steps in an hour.
 
     Raises:
         ConfigError: leads that do not rise, or that are no positive multiples of the step.
@@ -84,12 +96,12 @@ def lead_steps(name: str, leads_h: Sequence[float], steps_per_hour: int) -> I64:
 
 
 class Forecasts:
-    """Carbon intensity, dry bulb and wet bulb of a fleet, the present first, then the leads.
+    """Carbon intensity, dry bulb and wet bulb of a fleet at present and at each lead.
 
     Args:
-        steps_per_hour: of the simulation.
-        ci_leads_h: leads of the carbon intensity, rising multiples of the step.
-        weather_leads_h: leads of both temperatures, likewise.
+        steps_per_hour: number of steps in an hour.
+        ci_leads_h: leads of the carbon intensity in h, rising multiples of the step.
+        weather_leads_h: leads of both temperatures in h, rising multiples of the step.
         error: how forecasts err.
 
     Raises:
@@ -112,17 +124,17 @@ class Forecasts:
         self._error = error
         self._step_h = 1.0 / steps_per_hour
         self._tables: tuple[Table, ...] = ()
-        self._walks: _Walks | None = None
+        self._walks: _RandomWalks | None = None
 
     def reset(self, drivers: Drivers, keys: Sequence[int] | I64 = ()) -> bool:
         """Start an episode.
 
         Args:
             drivers: inputs of the fleet.
-            keys: one per data center, seeds of the errors; not looked at without errors.
+            keys: seeds of the errors, one per data center; unused without errors.
 
         Returns:
-            Whether the series are others than in the episode before.
+            Whether the series differ from those of the episode before.
 
         Raises:
             ConfigError: another number of keys than of data centers.
@@ -135,13 +147,13 @@ class Forecasts:
         new = not all(map(operator.is_, tables, self._tables)) or not self._tables
         if new:
             self._tables = tables
-            self._ci = _Series(tables[0], self._ci_leads)
-            self._outdoor = _Series(tables[1], self._weather_leads)
-            self._wet_bulb = _Series(tables[2], self._weather_leads)
+            self._ci = _ExtendedSeries(tables[0], self._ci_leads)
+            self._outdoor = _ExtendedSeries(tables[1], self._weather_leads)
+            self._wet_bulb = _ExtendedSeries(tables[2], self._weather_leads)
         self._walks = None
         if not self.perfect:
             ahead = int(max(self._ci_leads[-1], self._weather_leads[-1]))
-            self._walks = _Walks(keys, self._step_h, ahead)
+            self._walks = _RandomWalks(keys, self._step_h, ahead)
         return new
 
     @property
@@ -150,22 +162,33 @@ class Forecasts:
         return self._error == PERFECT
 
     def truth(self, index: I64, dc: I64 | slice = _ALL) -> tuple[F32, F32, F32]:
-        """Carbon intensity (1 + k, n) in g/kWh, dry and wet bulb (1 + l, n) in C, without error.
+        """The true carbon intensity, dry bulb and wet bulb at present and at each lead.
 
         Args:
             index: steps since the start of the year, (n,).
-            dc: data center of each index.
+            dc: data center of each index, (n,); one index for each by default.
+
+        Returns:
+            Carbon intensity in g/kWh, (1 + CI leads, n), dry bulb and wet bulb in C, (1 + weather
+            leads, n) each.
+
+        Raises:
+            RuntimeStateError: before ``reset``.
         """
         if not self._tables:
             raise RuntimeStateError("the forecasts have not been reset; call reset() first")
         return self._ci.at(index, dc), self._outdoor.at(index, dc), self._wet_bulb.at(index, dc)
 
-    def look(self, index: I64, step: int) -> tuple[F32, F32, F32]:
-        """As ``truth`` for all data centers, with the errors of forecasts issued now.
+    def forecast(self, index: I64, step: int) -> tuple[F32, F32, F32]:
+        """Carbon intensity, dry bulb and wet bulb of all data centers as forecast at present.
 
         Args:
             index: steps since the start of the year, (B,).
             step: steps since reset.
+
+        Returns:
+            Carbon intensity in g/kWh, (1 + CI leads, B), dry bulb and wet bulb in C, (1 + weather
+            leads, B) each; the present, which comes first, has no error.
 
         Raises:
             RuntimeStateError: before ``reset``, or, with errors, a step before one seen already.
@@ -173,12 +196,14 @@ class Forecasts:
         ci, outdoor, wet_bulb = self.truth(index)
         if self._walks is None:
             return ci, outdoor, wet_bulb
-        self._walks.reach(step)
+        self._walks.extend(step)
         if self._error.ci_share > 0:
-            ci *= 1.0 + float(self._error.ci_share) * self._walks.moved(0, step, self._ci_leads)
+            ci *= 1.0 + float(self._error.ci_share) * self._walks.increments(
+                0, step, self._ci_leads
+            )
             np.maximum(ci, 0.0, out=ci)
         if self._error.temperature_k > 0:
-            error = float(self._error.temperature_k) * self._walks.moved(
+            error = float(self._error.temperature_k) * self._walks.increments(
                 1, step, self._weather_leads
             )
             outdoor += error
@@ -186,56 +211,67 @@ class Forecasts:
         return ci, outdoor, wet_bulb
 
 
-class _Series:
-    """A table in f32 with each series continued past its end, so that no lead wraps."""
+class _ExtendedSeries:
+    """A series of each data center in f32, repeated past its end by the longest lead.
+
+    Args:
+        table: the series.
+        leads: 0 for the present, then the leads in steps, (1 + k,).
+    """
 
     def __init__(self, table: Table, leads: I64) -> None:
         series, which = table.distinct()
         ahead = int(leads[-1])
         parts = [np.resize(one.astype(np.float32), len(one) + ahead) for one in series]
-        starts = np.cumsum([0, *(len(part) for part in parts[:-1])])
+        offsets = np.cumsum([0, *(len(part) for part in parts[:-1])])
         self._values = np.concatenate(parts)
-        self._offset = starts[which]
-        self._length = table.length
+        self._offsets = offsets[which]
+        self._lengths = table.length
         self._leads = leads[:, None]
 
     def at(self, index: I64, dc: I64 | slice) -> F32:
-        """Entry ``index`` of data center ``dc`` and those at its leads, (1 + k, n)."""
-        first = self._offset[dc] + index % self._length[dc]
+        """Values of data centers ``dc`` at steps ``index`` and at each lead, (1 + k, n)."""
+        first = self._offsets[dc] + index % self._lengths[dc]
         return np.asarray(self._values.take(first + self._leads))
 
 
-class _Walks:
+class _RandomWalks:
     """Two random walks per environment, of unit variance per 24 h, from reset on.
 
     Args:
-        keys: one seed per environment.
-        step_h: time step.
-        ahead: longest lead in steps.
+        keys: seed of each environment, (B,).
+        step_h: time step, in h.
+        ahead: longest lead, in steps.
     """
 
     def __init__(self, keys: Sequence[int] | I64, step_h: float, ahead: int) -> None:
-        self._streams = [np.random.Generator(np.random.PCG64(int(key))) for key in keys]
+        self._generators = [np.random.Generator(np.random.PCG64(int(key))) for key in keys]
         self._scale = np.sqrt(step_h / 24.0)
         self._ahead = ahead
         self._first = 0
         self._walk: F64 = np.zeros((2, 1, len(keys)))
 
-    def reach(self, step: int) -> None:
-        """Draw as far as the longest lead of ``step`` needs, and forget what lies before it."""
+    def extend(self, step: int) -> None:
+        """Draw as far as the longest lead of ``step`` needs, and drop what lies before it.
+
+        Raises:
+            RuntimeStateError: ``step`` lies before one that was asked for already.
+        """
         if step < self._first:
             raise RuntimeStateError(
                 f"forecasts of step {step} after those of a later one; reset starts again"
             )
         while self._first + self._walk.shape[1] <= step + self._ahead:
             keep = min(step - self._first, self._walk.shape[1] - 1)
-            drawn = np.stack([s.standard_normal((2, _DRAWN_STEPS)) for s in self._streams], axis=2)
+            drawn = np.stack(
+                [rng.standard_normal((2, _DRAWN_STEPS)) for rng in self._generators], axis=2
+            )
             more = self._walk[:, -1:] + np.cumsum(drawn * self._scale, axis=1)
             self._walk = np.concatenate([self._walk[:, keep:], more], axis=1)
             self._first += keep
 
-    def moved(self, which: int, step: int, leads: I64) -> F32:
-        """What walk ``which`` does between ``step`` and each lead, (n, B)."""
+    def increments(self, which: int, step: int, leads: I64) -> F32:
+        """Increments of walk ``which`` between ``step`` and each lead, (1 + k, B)."""
         now = step - self._first
         walk = self._walk[which]
         return np.asarray(walk[now + leads] - walk[now], dtype=np.float32)

@@ -17,41 +17,23 @@ from pydantic import (
 )
 
 from sdc_taichi.config import explain
-from sdc_taichi.envs.features import AGENTS
+from sdc_taichi.envs.agents import AGENTS, Agent
 from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, ForecastError
+from sdc_taichi.envs.rewards import REWARD_SETS
+from sdc_taichi.envs.tariff import Tariff
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.year_clock import DAYS_PER_YEAR, MONTH_OF_DAY
 
-Agent = Literal["agent_ls", "agent_dc", "agent_bat"]
 
-
-def _plain(value: Any) -> Any:
+def _plain_int(value: Any) -> Any:
+    """NumPy's whole numbers as Python's."""
     return int(value) if isinstance(value, np.integer) else value
 
 
-Whole = Annotated[int, Field(strict=True), BeforeValidator(_plain)]
+Whole = Annotated[int, Field(strict=True), BeforeValidator(_plain_int)]
+"""A whole number of Python or NumPy, no float and no bool."""
 Month = Annotated[Whole, Field(ge=1, le=12)]
-Price = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-
-class Tariff(BaseModel):
-    """Price of electricity, for the reward terms ``cost`` and ``demand_charge``."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    price_per_kwh: tuple[Price, ...] = (
-        *(0.08,) * 7, *(0.12,) * 9, *(0.20,) * 5, *(0.12,) * 3,
-    )  # fmt: skip
-    """One price, or one for each local hour of the day from midnight on."""
-    demand_charge_per_kw: Price = 12.0
-    """Price of the highest mean power of a step, per bill of 30 days."""
-
-    @field_validator("price_per_kwh")
-    @classmethod
-    def _hours(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        if len(value) not in (1, 24):
-            raise ValueError(f"{len(value)} prices; valid is 1, or 24 from midnight on")
-        return value
+"""A month, 1..12."""
 
 
 class EnvOptions(BaseModel):
@@ -60,39 +42,47 @@ class EnvOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
     agents: tuple[Agent, ...] = AGENTS  # type: ignore[assignment]
-    """Who learns; ``others`` plays the rest."""
+    """Agents that learn; ``others`` plays the rest."""
     others: str = "idle"
-    """Controller of what nobody learns, as on the command line: a name or ``agent=name`` parts."""
+    """Controller of the agents that do not learn, as on the command line: a name, or
+    ``load=name,cooling=name,battery=name`` in part."""
     actions: Literal["discrete", "continuous"] = "discrete"
+    """Whether an agent chooses one of three commands or a number."""
     action_order: Literal["paper", "sustaindc"] | None = None
     """Order of the battery's discrete actions: charge, hold, discharge as in the paper, or charge,
     discharge, hold as in the released code; None is that of the preset."""
     setpoint_change_k: Annotated[float, Field(gt=0, le=20)] = 2.0
-    """Largest change of a continuous setpoint action in one step."""
+    """Largest change of the setpoint by a continuous action in one step, in K."""
     days: Annotated[Whole, Field(ge=1, le=365)] = 7
-    """Length of an episode."""
+    """Length of an episode, in days."""
     start: Literal["sampled", "fixed"] = "sampled"
-    """Episodes start at midnight of a day of ``months`` or on ``site.start``."""
+    """Whether episodes start at midnight of a day drawn from ``months``, or on ``site.start``."""
     months: tuple[Month, ...] = tuple(range(1, 13))
-    """Months that sampled episodes lie in from start to end."""
+    """Months, 1..12, that sampled episodes lie in from start to end."""
     observations: Literal["default", "sustaindc"] = "default"
+    """Whether agents observe named features or the vectors of the released code."""
     features: Mapping[str, tuple[str, ...]] | None = None
-    """Names of the features of agents, in place of the default."""
+    """Names of the features that agents observe, by agent; agents left out have the default."""
     ci_leads_h: tuple[float, ...] = CI_LEADS_H
+    """Leads of the carbon-intensity forecast, in h."""
     weather_leads_h: tuple[float, ...] = WEATHER_LEADS_H
+    """Leads of the weather forecasts, in h."""
     forecast_error: ForecastError = PERFECT
+    """How forecasts err."""
     heat_map: bool = False
-    """Adds an image of the hall to every observation, which becomes a dict."""
+    """Whether every observation becomes a dict of features and an image of the hall."""
     rewards: Any = "default"
-    """A named set, agent to term to scale, or a function or its import path ``module:name``."""
+    """Rewards: ``default``, ``sustaindc``, agent to term to scale, or a function, the name that
+    ``register_reward`` gave it, or its import path ``module:name``."""
     collaboration: Annotated[float, Field(ge=0, le=1)] = 0.8
-    """Share a of an agent's own reward in what it gets; the others' share the rest evenly (paper,
-    section 4.5). 1 is no collaboration."""
+    """Share a of an agent's own reward in what it gets, 0..1; those of the other two agents share
+    the rest evenly (paper, section 4.5). 1 is no collaboration."""
     tariff: Tariff = Tariff()
+    """Prices for the reward terms ``cost`` and ``demand_charge``."""
 
     @field_validator("agents", "months")
     @classmethod
-    def _some_once(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
+    def _at_least_one_each_once(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
         if not value or len(set(value)) < len(value):
             raise ValueError(f"{list(value)}; valid is one or more, each once")
         return value
@@ -103,8 +93,8 @@ class EnvOptions(BaseModel):
         return tuple(sorted(value, key=AGENTS.index))
 
     @model_validator(mode="after")
-    def _fits(self) -> Self:
-        for names, without_effect, why in self._idle_options():
+    def _options_fit_each_other(self) -> Self:
+        for names, without_effect, why in self._without_effect():
             given = [name for name in names if name in self.model_fields_set]
             if given and without_effect:
                 raise ValueError(f"{', '.join(given)}: without effect {why}")
@@ -121,11 +111,11 @@ class EnvOptions(BaseModel):
             )
         return self
 
-    def _idle_options(self) -> list[tuple[tuple[str, ...], bool, str]]:
+    def _without_effect(self) -> list[tuple[tuple[str, ...], bool, str]]:
         """Names of options, whether they change nothing here, and why."""
         continuous = self.actions == "continuous"
-        named = isinstance(self.rewards, Mapping) or (
-            isinstance(self.rewards, str) and self.rewards in ("default", "sustaindc")
+        shared = isinstance(self.rewards, Mapping) or (
+            isinstance(self.rewards, str) and self.rewards in REWARD_SETS
         )
         return [
             (
@@ -153,7 +143,7 @@ class EnvOptions(BaseModel):
             ),
             (
                 ("collaboration",),
-                not named,
+                not shared,
                 "on a function's rewards; valid with rewards default, sustaindc or a dict",
             ),
         ]

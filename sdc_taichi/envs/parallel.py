@@ -10,15 +10,16 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from sdc_taichi.envs import rendering
-from sdc_taichi.envs.core import Observation, Source
-from sdc_taichi.envs.options import make_options
-from sdc_taichi.envs.recording import RecordedCore, Recording
-from sdc_taichi.envs.standards import OneDataCenter, first, floats, start_day, start_days
+from sdc_taichi.envs.arguments import ConfigSource, Overrides, single_core
+from sdc_taichi.envs.base import SingleEnv, as_floats, first_of_batch, start_day_option, start_days
+from sdc_taichi.envs.core import Observation
+from sdc_taichi.envs.options import EnvOptions
+from sdc_taichi.envs.recording import Recording
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.hall_solver import Precision
 
 
-class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
+class SdcParallelEnv(SingleEnv, ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
     """A PettingZoo environment: the learning agents of one data center act at the same time.
 
     Episodes end by truncation: their length is a choice, the data center goes on. Infos are the
@@ -27,10 +28,13 @@ class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type
 
     Args:
         config: a preset, a file or a config.
-        precision: of the server kernels, ``f32`` or ``f64``.
+        overrides: values put into the config: a dict of section.key to value, or a list of
+            ``section.key=value``.
+        options: options; None is the default ones.
+        precision: precision of the server kernels, ``f32`` or ``f64``.
         render_mode: None or ``rgb_array``.
         recorder: records episodes: a file ending in .rrd, or what ``EpisodeRecorder`` says.
-        options: fields of ``EnvOptions``.
+        keywords: fields of ``EnvOptions``, in place of those in ``options``.
 
     Raises:
         SdcError: a config or option that is not valid.
@@ -45,15 +49,17 @@ class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type
 
     def __init__(
         self,
-        config: Source = "corrected",
+        config: ConfigSource = "corrected",
         *,
+        overrides: Overrides = (),
+        options: EnvOptions | None = None,
         precision: Precision = "f32",
         render_mode: str | None = None,
         recorder: Recording = None,
-        **options: Any,
+        **keywords: Any,
     ) -> None:
         rendering.check_render_mode(render_mode)
-        self.core = core_of_one(config, precision, options, recorder)
+        self.core = single_core(config, overrides, options, keywords, precision, recorder)
         self.render_mode = render_mode
         self.possible_agents: list[str] = list(self.core.agents)
         self.agents: list[str] = []
@@ -73,10 +79,10 @@ class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type
         Raises:
             ConfigError: a seed or day that is not valid.
         """
-        observations = self.core.reset(seed, start_day(options, strict=False))
+        observations = self.core.reset(seed, start_day_option(options, strict=False))
         self.agents = list(self.possible_agents)
         info = {"start_day": int(start_days(self.core)[0])}
-        return _first(observations), {agent: dict(info) for agent in self.agents}
+        return _first_of_each(observations), {agent: dict(info) for agent in self.agents}
 
     def step(
         self, actions: Mapping[str, Any]
@@ -98,15 +104,15 @@ class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type
         """
         if isinstance(actions, Mapping):
             actions = {agent: [action] for agent, action in actions.items()}
-        done = self.core.step(actions)
-        agents, info = self.agents, floats(done.result.per_dc())
-        if done.ended:
+        transition = self.core.step(actions)
+        agents, info = self.agents, as_floats(transition.result.per_dc())
+        if transition.ended:
             self.agents = []
         return (
-            _first(done.observations),
-            floats(done.rewards),
+            _first_of_each(transition.observations),
+            as_floats(transition.rewards),
             dict.fromkeys(agents, False),
-            dict.fromkeys(agents, done.ended),
+            dict.fromkeys(agents, transition.ended),
             {agent: dict(info) for agent in agents},
         )
 
@@ -116,7 +122,7 @@ class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type
         Raises:
             ConfigError: an agent that does not learn here.
         """
-        return self._of(agent, self.observation_spaces)
+        return self._space_of(agent, self.observation_spaces)
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """The space of an agent's actions.
@@ -124,12 +130,12 @@ class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type
         Raises:
             ConfigError: an agent that does not learn here.
         """
-        return self._of(agent, self.action_spaces)
+        return self._space_of(agent, self.action_spaces)
 
-    def _of(self, agent: str, found: Mapping[str, spaces.Space[Any]]) -> spaces.Space[Any]:
-        if agent not in found:
-            raise ConfigError(f"agent {agent!r}: does not learn here; valid: {list(found)}")
-        return found[agent]
+    def _space_of(self, agent: str, by_agent: Mapping[str, spaces.Space[Any]]) -> spaces.Space[Any]:
+        if agent not in by_agent:
+            raise ConfigError(f"agent {agent!r}: does not learn here; valid: {list(by_agent)}")
+        return by_agent[agent]
 
     def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
         """Go on from the ``state_dict`` of an environment made alike.
@@ -141,39 +147,51 @@ class SdcParallelEnv(OneDataCenter, ParallelEnv[str, Observation, Any]):  # type
             SdcError: made by another environment, or incomplete.
         """
         observations = self.core.load_state_dict(values)
-        self.agents = [] if self.core.over else list(self.possible_agents)
-        return _first(observations)
+        self.agents = [] if self.core.episode_over else list(self.possible_agents)
+        return _first_of_each(observations)
 
 
 parallel_env = SdcParallelEnv
 
 
-def aec_env(config: Source = "corrected", **options: Any) -> AECEnv[str, Observation, Any]:
+def aec_env(
+    config: ConfigSource = "corrected",
+    *,
+    overrides: Overrides = (),
+    options: EnvOptions | None = None,
+    precision: Precision = "f32",
+    render_mode: str | None = None,
+    recorder: Recording = None,
+    **keywords: Any,
+) -> AECEnv[str, Observation, Any]:
     """A PettingZoo environment whose agents act in turn, by PettingZoo's own conversion.
 
     Args:
         config: a preset, a file or a config.
-        options: as ``parallel_env`` takes them.
+        overrides: values put into the config: a dict of section.key to value, or a list of
+            ``section.key=value``.
+        options: options; None is the default ones.
+        precision: precision of the server kernels, ``f32`` or ``f64``.
+        render_mode: None or ``rgb_array``.
+        recorder: records episodes: a file ending in .rrd, or what ``EpisodeRecorder`` says.
+        keywords: fields of ``EnvOptions``, in place of those in ``options``.
 
     Raises:
         SdcError: a config or option that is not valid.
     """
-    return parallel_to_aec(parallel_env(config, **options))
+    return parallel_to_aec(
+        parallel_env(
+            config,
+            overrides=overrides,
+            options=options,
+            precision=precision,
+            render_mode=render_mode,
+            recorder=recorder,
+            **keywords,
+        )
+    )
 
 
-def core_of_one(
-    config: Source, precision: Precision, options: Mapping[str, Any], recorder: Recording
-) -> RecordedCore:
-    """The core of a single environment.
-
-    Raises:
-        SdcError: several configs, or an option or recorder that is not valid.
-    """
-    core = RecordedCore(config, make_options(**options), precision=precision, recorder=recorder)
-    if core.num_envs != 1:
-        raise ConfigError(f"config: {core.num_envs} data centers; valid is one, or vector_env")
-    return core
-
-
-def _first(observations: Mapping[str, Observation]) -> dict[str, Observation]:
-    return {agent: first(found) for agent, found in observations.items()}
+def _first_of_each(observations: Mapping[str, Observation]) -> dict[str, Observation]:
+    """Observations of a batch of one by agent, (n,) each."""
+    return {agent: first_of_batch(found) for agent, found in observations.items()}

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from gymnasium.vector import VectorEnv, VectorWrapper
 
-from sdc_taichi.envs.core import Core, Source, Step
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.envs.core import Core, Transition
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
 from sdc_taichi.sim.hall_solver import Precision
@@ -69,7 +70,7 @@ class RecordedCore(Core):
     """Data centers whose episodes can be recorded; without a recorder nothing else than ``Core``.
 
     Args:
-        config: as ``Core`` takes it, and so are the next three.
+        configs: configs of data centers; environment i takes config i modulo their number.
         options: what agents do, see and get.
         num_envs: number of environments; None is one per config.
         precision: of the server kernels.
@@ -83,13 +84,13 @@ class RecordedCore(Core):
 
     def __init__(
         self,
-        config: Source,
+        configs: Sequence[DataCenterConfig],
         options: EnvOptions,
         num_envs: int | None = None,
         precision: Precision = "f32",
         recorder: Recording = None,
     ) -> None:
-        super().__init__(config, options, num_envs, precision)
+        super().__init__(configs, options, num_envs, precision)
         if recorder is not None:
             self.record(recorder)
 
@@ -110,7 +111,7 @@ class RecordedCore(Core):
         if self._episodes is not None:
             self._episodes.begin(self.sim)
 
-    def step(self, actions: Mapping[str, Any]) -> Step:
+    def step(self, actions: Mapping[str, Any]) -> Transition:
         """As ``Core.step``, and record the step."""
         done = super().step(actions)
         if self._episodes is not None and self._episodes.recording:
@@ -125,9 +126,9 @@ class RecordedCore(Core):
             self._episodes.end()
         super().close()
 
-    def _rewards_by_name(self, done: Step) -> dict[str, F64]:
+    def _rewards_by_name(self, done: Transition) -> dict[str, F64]:
         """Rewards by learning agent, and the terms that they are made of, unscaled, by name."""
-        return {**done.rewards, **self._rewards.terms(done.result, self._rewards.weighed)}
+        return {**done.rewards, **self._rewards.terms(done.result, self._rewards.used_terms)}
 
 
 class RecordEpisodes(VectorWrapper[Any, Any, Any]):

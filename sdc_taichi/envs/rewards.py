@@ -1,189 +1,63 @@
-"""Rewards: named terms of a step, weighed by scales and shared between agents.
+"""Rewards of agents: named terms weighed by scales, or a function of the user's, shared by agents.
 
-Every term is 0 or less. Energies, carbon, cost, fossil share and water are shares of what the data
-center would use, emit or pay in a step at its design point, about -1 at full load, so that sites
-and halls of any size give rewards of one size; ``sla`` is a share of the work of a full step. The
-others have units: ``pue`` is a ratio, ``hot_inlets`` in K, ``queue`` and ``dropped`` in tasks, and
-``demand_charge`` is in the money of ``cost``, due in the few steps that raise the highest power.
-Nothing is scaled by data of the run.
+A user's own reward is a function of the result of a step and the view after it. It is given as the
+option ``rewards``: itself, the name that ``register_reward`` gave it, or its import path.
 """
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from sdc_taichi.control.view import View
-from sdc_taichi.envs.features import AGENTS
-from sdc_taichi.envs.options import Tariff
-from sdc_taichi.envs.released import ReleasedRewards
+from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.envs.released_rewards import ReleasedRewards
+from sdc_taichi.envs.reward_terms import TERMS, TermContext
+from sdc_taichi.envs.tariff import Tariff
 from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
-from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64, I64, StepResult
 
-Reward = Callable[[StepResult, View], Any]
-"""Rewards of a step, (B,), the same for all agents or by learning agent in a dict; gets the step
-and the view after it."""
+RewardFunction = Callable[[StepResult, View], Any]
+"""A user's own reward. It gets the result of a step and the view after it, and returns rewards,
+(B,), which all agents get alike, or a dict of them by learning agent."""
 
-CI_G_PER_KWH = 500.0
-"""Carbon intensity at which the design energy gives a carbon term of -1, a grid run on gas."""
-FOSSIL_G_PER_KWH = 800.0
-"""Intensity of a grid without renewables, for their estimated share (mixed coal and gas; IPCC AR5
-WG III annex III gives medians of 820 and 490)."""
-WATER_L_PER_KWH = 1.8
-"""Average use of data centers per kWh of IT (Shehabi et al. 2016, LBNL-1005775)."""
-RUSH_START_H = 23.0
-"""Hour of the day from which queued tasks cost, more and more (paper, F.1)."""
-QUEUE_SCALE_TASKS = 10.0
-"""Queued tasks that cost 1 at the end of the day (paper, F.2)."""
-PRICE_PER_KWH = 0.1
-"""Price at which the design energy gives a cost of -1."""
-BILLED_SHARE = 0.5
-"""Share of the design power that is billed whatever the episode draws."""
-BILL_DAYS = 30.0
-"""Days between two bills."""
-
-
-@dataclass(frozen=True, slots=True)
-class Context:
-    """What terms refer to."""
-
-    design_kwh: F64
-    """Energy of a step at the design point, (B,)."""
-    tariff: Tariff
-    peak_kw: F64
-    """Highest power of the episode before this step, at least ``BILLED_SHARE`` of the design power,
-    (B,)."""
-    bills: float
-    """Length of the episode over that of a bill."""
-    price_per_kwh: F64
-    """In this step, (B,), as the next."""
-    rush: F64
-    """Weight of queued tasks."""
-
-
-def carbon(r: StepResult, c: Context) -> F64:
-    """Carbon of the step: CFP = (E_it + E_hvac + E_bat) CI (paper, A.3.4)."""
-    return -r.carbon_g / (c.design_kwh * CI_G_PER_KWH)
-
-
-def facility_energy(r: StepResult, c: Context) -> F64:
-    """IT and HVAC energy (paper, 4.5: r_DC)."""
-    return -r.facility_kwh / c.design_kwh
-
-
-def total_energy(r: StepResult, c: Context) -> F64:
-    """Energy drawn from the grid, the battery included."""
-    return -r.grid_kwh / c.design_kwh
-
-
-def hvac_energy(r: StepResult, c: Context) -> F64:
-    """HVAC energy."""
-    return -r.hvac_kwh / c.design_kwh
-
-
-def it_energy(r: StepResult, c: Context) -> F64:
-    """IT energy."""
-    return -r.it_kwh / c.design_kwh
-
-
-def cost(r: StepResult, c: Context) -> F64:
-    """Energy by the time-of-use tariff, over the price of the design energy at 0.1 per kWh."""
-    return -r.grid_kwh * c.price_per_kwh / (PRICE_PER_KWH * c.design_kwh)
-
-
-def demand_charge(r: StepResult, c: Context) -> F64:
-    """What the step adds to the highest power above half the design power, in units of `cost`.
-
-    The charge of a bill times the length of the episode over 30 days. Half the design power is
-    billed in any case, so it is no part of the reward.
-    """
-    above_kw = np.maximum(r.grid_kwh / r.step_h - c.peak_kw, 0.0)
-    charge = above_kw * c.tariff.demand_charge_per_kw * c.bills
-    return -charge / (PRICE_PER_KWH * c.design_kwh)
-
-
-def fossil_share(r: StepResult, c: Context) -> F64:
-    """Energy from the grid less its renewable share, estimated as 1 - CI/(800 g/kWh)."""
-    share = np.minimum(r.ci_g_per_kwh / FOSSIL_G_PER_KWH, 1.0)
-    return -share * r.grid_kwh / c.design_kwh
-
-
-def pue(r: StepResult, c: Context) -> F64:
-    """HVAC power over IT power, PUE - 1; 0 without IT power."""
-    return np.where(r.it_w > 0.0, -r.hvac_w / np.where(r.it_w > 0.0, r.it_w, 1.0), 0.0)
-
-
-def water(r: StepResult, c: Context) -> F64:
-    """Make-up water, over the design energy times 1.8 L/kWh."""
-    return -r.water_l / (WATER_L_PER_KWH * c.design_kwh)
-
-
-def hot_inlets(r: StepResult, c: Context) -> F64:
-    """What inlets exceed the recommended 27 C by, mean over servers, K (ASHRAE TC 9.9)."""
-    return -r.over_27_mean_k
-
-
-def queue(r: StepResult, c: Context) -> F64:
-    """Tasks queued in the last hour of the day over 10, weighed from 0 to 1 (paper, F.1, F.2)."""
-    return -c.rush * r.queue_tasks / QUEUE_SCALE_TASKS
-
-
-def dropped(r: StepResult, c: Context) -> F64:
-    """Tasks dropped because the queue was full."""
-    return -r.dropped_tasks
-
-
-def sla(r: StepResult, c: Context) -> F64:
-    """Work past its deadline, dropped or lost, as a share of a full step."""
-    return -(r.overdue_tasks + r.dropped_tasks + r.lost_tasks) / TASKS_PER_STEP
-
-
-Term = Callable[[StepResult, Context], F64]
-TERMS: dict[str, Term] = {
-    term.__name__: term
-    for term in (
-        carbon,
-        total_energy,
-        facility_energy,
-        it_energy,
-        hvac_energy,
-        cost,
-        demand_charge,
-        fossil_share,
-        pue,
-        water,
-        hot_inlets,
-        queue,
-        dropped,
-        sla,
-    )
-}
-
+REWARD_SETS = ("default", "sustaindc")
+"""Rewards that the option ``rewards`` takes by name, besides registered functions."""
 DEFAULT_SCALES: dict[str, dict[str, float]] = {
     "agent_ls": {"carbon": 1.0, "queue": 1.0, "dropped": 10.0},
     "agent_dc": {"facility_energy": 1.0},
     "agent_bat": {"carbon": 1.0},
 }
-"""r_LS, r_DC and r_BAT of the paper (4.5, F.2), with CFP and energies in this module's units."""
+"""Scales of the terms of each agent by default: r_LS, r_DC and r_BAT of the paper (4.5, F.2), with
+carbon and energies over those of the design point."""
 
-_registered: dict[str, Reward] = {}
+BILLED_SHARE = 0.5
+"""Share of the design power that is billed whatever the episode draws."""
+BILL_DAYS = 30.0
+"""Days between two bills."""
+END_OF_DAY_START_H = 23.0
+"""Hour of the day from which queued tasks cost, more and more (paper, F.1)."""
+
+_registered: dict[str, RewardFunction] = {}
 
 
-def register_reward(name: str, reward: Reward) -> None:
+def register_reward(name: str, reward: RewardFunction) -> None:
     """Make a function available as ``rewards=name``.
+
+    Args:
+        name: an identifier that no other reward has.
+        reward: the function; see ``RewardFunction``.
 
     Raises:
         ConfigError: a name that another function has, or no function.
     """
     if not callable(reward):
         raise ConfigError(f"reward {name!r}: is a {type(reward).__name__}; valid is a function")
-    taken = name in ("default", "sustaindc") or _registered.get(name, reward) is not reward
+    taken = name in REWARD_SETS or _registered.get(name, reward) is not reward
     if not isinstance(name, str) or not name.isidentifier() or taken:
         raise ConfigError(f"reward {name!r}: valid is a name that is not taken")
     _registered[name] = reward
@@ -193,11 +67,16 @@ class Rewards:
     """Rewards of the agents that learn.
 
     Args:
-        spec: ``EnvOptions.rewards``.
-        collaboration: share of an agent's own reward in what it gets.
+        rewards: the option ``rewards``: a name, agent to term to scale, or a function or its path.
+        collaboration: share of an agent's own reward in what it gets, 0..1.
         tariff: prices for the terms ``cost`` and ``demand_charge``.
-        agents: who learns.
-        days: length of the episodes.
+        agents: agents that learn.
+        days: length of the episodes in days.
+
+    Attributes:
+        identity: plain values that tell rewards apart: scales, or the name of a function.
+        used_terms: names of the terms that the rewards are made of; empty for functions and for
+            those of the released code.
 
     Raises:
         ConfigError: an unknown name, agent or term, or a path without a function.
@@ -205,51 +84,57 @@ class Rewards:
 
     def __init__(
         self,
-        spec: Any,
+        rewards: Any,
         collaboration: float,
         tariff: Tariff,
         *,
         agents: Sequence[str],
         days: float,
     ) -> None:
-        self._own, self._tariff, self._agents = collaboration, tariff, tuple(agents)
+        self._collaboration, self._tariff, self._agents = collaboration, tariff, tuple(agents)
         self._bills = days / BILL_DAYS
-        self._released = ReleasedRewards() if spec == "sustaindc" else None
+        self._released = ReleasedRewards() if rewards == "sustaindc" else None
         self._scales: dict[str, dict[str, float]] | None = None
-        self._function: Reward | None = None
-        if spec == "default":
+        self._function: RewardFunction | None = None
+        if rewards == "default":
             self._scales = DEFAULT_SCALES
-        elif isinstance(spec, Mapping):
-            self._scales = _checked_scales(spec)
+        elif isinstance(rewards, Mapping):
+            self._scales = _checked_scales(rewards)
         elif self._released is None:
-            self._function = spec if callable(spec) else _find(spec)
-        # What decides the rewards, to tell environments apart.
-        self.name = _name(self._function) if self._function else self._scales or "sustaindc"
+            self._function = rewards if callable(rewards) else _function_named(rewards)
+        self.identity: Any = (
+            _import_path(self._function) if self._function else self._scales or "sustaindc"
+        )
         scales = self._scales or {}
-        self.weighed = [name for name in TERMS if any(name in own for own in scales.values())]
-        """Terms that the rewards are made of; none for a function's and the released ones."""
+        self.used_terms = [name for name in TERMS if any(name in own for own in scales.values())]
         self._stage: Any = None
-        self._reads: tuple[str, ...] = ()
-        """Quantities of a step that the stage reads."""
-        # Highest power that is billed, before the last step and with it.
+        self._quantities_read: tuple[str, ...] = ()
+        # Highest power that is billed, before the last step and with it, (B,) each.
         self._peak_before_kw = self._peak_kw = np.zeros(0)
         self._design_kwh = np.zeros(0)
         self._step_h = 0.0
-        self._first: I64 = np.zeros(0, dtype=np.int64)
-        """Step of the day of the first step."""
-        self._price_per_kwh = self._rush = np.zeros(0)
+        self._first_step_of_day: I64 = np.zeros(0, dtype=np.int64)
+        # By step of the day.
+        self._price_per_kwh = self._end_of_day_weight = np.zeros(0)
 
     def reset(self, view: View) -> None:
-        """Start an episode."""
+        """Start an episode.
+
+        Args:
+            view: the view before the first step.
+
+        Raises:
+            DataError: a carbon intensity that never changes, with rewards of the released code.
+        """
         self._peak_before_kw = self._peak_kw = BILLED_SHARE * view.sizing.facility_w / 1e3
         self._step_h = view.step_h
         self._design_kwh = view.sizing.facility_w * view.step_h / 1e3
         per_hour = view.fleet.steps_per_hour
-        step = np.arange(24 * per_hour)
+        step_of_day = np.arange(24 * per_hour)
         prices = np.array(self._tariff.price_per_kwh)
-        self._price_per_kwh = prices[step // per_hour % len(prices)]
-        self._rush = _rush(step, view.step_h)
-        self._first = view.state.start % len(step)
+        self._price_per_kwh = prices[step_of_day // per_hour % len(prices)]
+        self._end_of_day_weight = _end_of_day_weight(step_of_day, view.step_h)
+        self._first_step_of_day = view.state.start % len(step_of_day)
         if self._released is not None:
             self._released.reset(view)
 
@@ -261,127 +146,116 @@ class Rewards:
             view: the view after it.
 
         Returns:
-            By learning agent, (B,) each, and of all of them as one learner, (B,): the sum, or what
-            a user's function gives for all agents alike.
+            Rewards by learning agent, (B,) each, and of all learning agents as one, (B,): their
+            sum, or what a user's function gives for all agents alike.
 
         Raises:
             SdcError: a user's function returned something of another shape, or not finite.
         """
         self._peak_before_kw = self._peak_kw
         if self._scales is not None:
-            found = self._weighed(result)
-            self._peak_kw = found.pop("peak_kw")
-            return found, found.pop("joint")
+            by_agent = self._weighed_terms(result)
+            self._peak_kw = by_agent.pop("peak_kw")
+            return by_agent, by_agent.pop("joint")
         self._peak_kw = _peak_kw(self._peak_kw, result)
         if self._function is not None:
-            found = self._function(result, view)
-            if not isinstance(found, Mapping):
-                alike = _values(found, "all agents", view.size)
-                return dict.fromkeys(self._agents, alike), alike
-            return _together(_by_agent(found, self._agents, view.size))
+            returned = self._function(result, view)
+            if not isinstance(returned, Mapping):
+                for_all = _checked_values(returned, "all agents", view.size)
+                return dict.fromkeys(self._agents, for_all), for_all
+            return _with_sum(_checked_by_agent(returned, self._agents, view.size))
         assert self._released is not None
-        return _together(self._shared([*self._released.rewards(result, view).values()]))
-
-    def state(self) -> F64:
-        """What an episode leaves behind for its rewards: its highest power, kW, (2, B)."""
-        return np.stack([self._peak_before_kw, self._peak_kw])
-
-    def load(self, state: F64) -> None:
-        """Go on from ``state``, of the shape that it has."""
-        self._peak_before_kw, self._peak_kw = state.copy()
+        return _with_sum(self._shared([*self._released.rewards(result, view).values()]))
 
     def terms(self, result: StepResult, names: Iterable[str] = TERMS) -> dict[str, F64]:
-        """Terms of the last step by name, (B,) each, whatever the rewards are made of."""
+        """Terms of the last step by name, unscaled, (B,) each, whatever the rewards are made of."""
         context = self._context(result)
         return {name: TERMS[name](result, context) for name in names}
 
-    def _weighed(self, result: StepResult) -> dict[str, F64]:
-        """Rewards by learning agent, of all of them by ``joint``, and ``peak_kw``, (B,)."""
-        if self._stage is None:
-            from sdc_taichi.kernels.compiler.stage import CompiledStage
+    def peaks_kw(self) -> F64:
+        """Highest billed power of the episode before the last step and with it, in kW, (2, B)."""
+        return np.stack([self._peak_before_kw, self._peak_kw])
 
-            reads = _Reads()
-            for name in self.weighed:
-                TERMS[name](reads, self._context(result))  # type: ignore[arg-type]
-            _peak_kw(self._peak_kw, reads)  # type: ignore[arg-type]
-            self._reads = tuple(reads.names)
-            self._stage = CompiledStage(self._of_terms, len(self._design_kwh))
+    def load_peaks_kw(self, peaks_kw: F64) -> None:
+        """Go on from what ``peaks_kw`` gave, (2, B)."""
+        self._peak_before_kw, self._peak_kw = peaks_kw.copy()
+
+    def _weighed_terms(self, result: StepResult) -> dict[str, F64]:
+        """Rewards by learning agent, of all of them as ``joint``, and ``peak_kw``, (B,) each."""
+        if self._stage is None:
+            self._compile(result)
         now = self._step_of_day(result)
         found: dict[str, F64] = self._stage(
             design_kwh=self._design_kwh,
             peak_kw=self._peak_before_kw,
             price_per_kwh=self._price_per_kwh[now],
-            rush=self._rush[now],
-            **{name: getattr(result, name) for name in self._reads},
+            end_of_day_weight=self._end_of_day_weight[now],
+            **{name: getattr(result, name) for name in self._quantities_read},
         )
         return found
 
-    def _of_terms(
-        self, design_kwh: F64, peak_kw: F64, price_per_kwh: F64, rush: F64, **read: Any
+    def _compile(self, result: StepResult) -> None:
+        """Find out which quantities of a step the terms read, and compile the terms."""
+        from sdc_taichi.kernels.compiler.stage import CompiledStage
+
+        reads = _NotedReads()
+        for name in self.used_terms:
+            TERMS[name](reads, self._context(result))  # type: ignore[arg-type]
+        _peak_kw(self._peak_kw, reads)  # type: ignore[arg-type]
+        self._quantities_read = tuple(reads.names)
+        self._stage = CompiledStage(self._stage_function, len(self._design_kwh))
+
+    def _stage_function(
+        self,
+        design_kwh: F64,
+        peak_kw: F64,
+        price_per_kwh: F64,
+        end_of_day_weight: F64,
+        **quantities: Any,
     ) -> dict[str, F64]:
-        """The stage: weighed terms of each agent, shared."""
+        """Weighed terms of each agent, shared, from quantities of a step, (B,) each."""
         assert self._scales is not None
-        context = Context(
-            design_kwh, self._tariff, peak_kw, self._bills, price_per_kwh=price_per_kwh, rush=rush
+        context = TermContext(
+            design_kwh=design_kwh,
+            tariff=self._tariff,
+            peak_kw=peak_kw,
+            bills=self._bills,
+            price_per_kwh=price_per_kwh,
+            end_of_day_weight=end_of_day_weight,
         )
-        result: Any = SimpleNamespace(step_h=self._step_h, **read)
-        found = {name: TERMS[name](result, context) for name in self.weighed}
+        result: Any = SimpleNamespace(step_h=self._step_h, **quantities)
+        terms = {name: TERMS[name](result, context) for name in self.used_terms}
         none: Any = 0.0
         own = [
-            _sum([scale * found[name] for name, scale in self._scales[agent].items()] or [none])
+            _sum([scale * terms[name] for name, scale in self._scales[agent].items()] or [none])
             for agent in AGENTS
         ]
-        by_agent, joint = _together(self._shared(own))
+        by_agent, joint = _with_sum(self._shared(own))
         return by_agent | {"joint": joint, "peak_kw": _peak_kw(peak_kw, result)}
 
     def _shared(self, own: Sequence[F64]) -> dict[str, F64]:
-        """Rewards by learning agent from those of all agents."""
-        by_agent = dict(zip(AGENTS, share(own, self._own), strict=True))
+        """Collaborative rewards by learning agent, from those of all agents in order."""
+        by_agent = dict(zip(AGENTS, collaborative_rewards(own, self._collaboration), strict=True))
         return {agent: by_agent[agent] for agent in self._agents}
 
-    def _context(self, result: StepResult) -> Context:
+    def _context(self, result: StepResult) -> TermContext:
         now = self._step_of_day(result)
-        return Context(
+        return TermContext(
             design_kwh=self._design_kwh,
             tariff=self._tariff,
             peak_kw=self._peak_before_kw,
             bills=self._bills,
             price_per_kwh=self._price_per_kwh[now],
-            rush=self._rush[now],
+            end_of_day_weight=self._end_of_day_weight[now],
         )
 
     def _step_of_day(self, result: StepResult) -> I64:
-        """Counted from 0 at midnight, (B,)."""
-        return (self._first + result.step) % len(self._rush)
+        """Step of the day, counted from 0 at midnight, (B,)."""
+        return (self._first_step_of_day + result.step) % len(self._end_of_day_weight)
 
 
-def _peak_kw(before_kw: F64, result: StepResult) -> F64:
-    """Highest power of the episode, (B,)."""
-    return np.maximum(before_kw, result.grid_kwh / result.step_h)
-
-
-class _Reads:
-    """A step that notes which of its quantities are read."""
-
-    step_h = 1.0
-
-    def __init__(self) -> None:
-        self.names: dict[str, None] = {}
-
-    def __getattr__(self, name: str) -> F64:
-        self.names[name] = None
-        return np.ones(1)
-
-
-def _rush(step: I64, step_h: float) -> F64:
-    """Weight of queued tasks by step of the day; 1 at the last."""
-    hour, span_h = step * step_h, 24.0 - step_h - RUSH_START_H
-    weight = (hour - RUSH_START_H) / span_h if span_h > 0 else np.ones(len(hour))
-    return np.where(hour >= RUSH_START_H, weight, 0.0)
-
-
-def share(own: Sequence[F64], a: float) -> list[F64]:
-    """Collaborative rewards: R_i = a r_i + (1 - a)/2 sum of the others' (paper, section 4.5).
+def collaborative_rewards(own: Sequence[F64], a: float) -> list[F64]:
+    """Rewards that agents share: R_i = a r_i + (1 - a)/2 sum of the others' (paper, section 4.5).
 
     Args:
         own: r_LS, r_DC and r_BAT, (B,) each.
@@ -394,7 +268,33 @@ def share(own: Sequence[F64], a: float) -> list[F64]:
     return [a * each + rest * (total - each) for each in own]
 
 
+class _NotedReads:
+    """Stands in for the result of a step, and notes which of its quantities are read."""
+
+    step_h = 1.0
+
+    def __init__(self) -> None:
+        self.names: dict[str, None] = {}
+
+    def __getattr__(self, name: str) -> F64:
+        self.names[name] = None
+        return np.ones(1)
+
+
+def _peak_kw(before_kw: F64, result: StepResult) -> F64:
+    """Highest power of the episode with this step, in kW, (B,)."""
+    return np.maximum(before_kw, result.grid_kwh / result.step_h)
+
+
+def _end_of_day_weight(step_of_day: I64, step_h: float) -> F64:
+    """Weight of queued tasks by step of the day; 1 at the last."""
+    hour, span_h = step_of_day * step_h, 24.0 - step_h - END_OF_DAY_START_H
+    weight = (hour - END_OF_DAY_START_H) / span_h if span_h > 0 else np.ones(len(hour))
+    return np.where(hour >= END_OF_DAY_START_H, weight, 0.0)
+
+
 def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+    """Scales of all agents; those that are not given have their defaults."""
     for agent, scales in given.items():
         if agent not in AGENTS:
             raise ConfigError(
@@ -413,51 +313,54 @@ def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[
     return {agent: dict(given.get(agent, DEFAULT_SCALES[agent])) for agent in AGENTS}
 
 
-def _find(spec: Any) -> Reward:
-    """A registered function, or one by import path."""
-    module, _, name = spec.partition(":") if isinstance(spec, str) else ("", "", "")
-    if isinstance(spec, str) and spec in _registered:
-        return _registered[spec]
+def _function_named(given: Any) -> RewardFunction:
+    """A registered function, or one by its import path ``module:name``."""
+    module, _, name = given.partition(":") if isinstance(given, str) else ("", "", "")
+    if isinstance(given, str) and given in _registered:
+        return _registered[given]
     if not module or not name or module.startswith("."):
-        valid = ["default", "sustaindc", *_registered]
+        valid = [*REWARD_SETS, *_registered]
         raise ConfigError(
-            f"rewards {spec!r}: unknown; valid: {', '.join(valid)}, a dict of agent to term to "
+            f"rewards {given!r}: unknown; valid: {', '.join(valid)}, a dict of agent to term to "
             "scale, a function, or its import path module:name"
         )
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"rewards {spec!r}: cannot be imported ({error})") from None
+        raise ConfigError(f"rewards {given!r}: cannot be imported ({error})") from None
     if not callable(found):
-        raise ConfigError(f"rewards {spec!r}: is a {type(found).__name__}; valid is a function")
+        raise ConfigError(f"rewards {given!r}: is a {type(found).__name__}; valid is a function")
     return found  # type: ignore[no-any-return]
 
 
-def _name(function: Reward) -> str:
-    """Where a function comes from."""
-    kind = function if hasattr(function, "__qualname__") else type(function)
-    return f"{kind.__module__}:{kind.__qualname__}"
+def _import_path(function: RewardFunction) -> str:
+    """Module and name of a function, or of the class of another callable."""
+    named = function if hasattr(function, "__qualname__") else type(function)
+    return f"{named.__module__}:{named.__qualname__}"
 
 
-def _by_agent(given: Mapping[Any, Any], agents: Sequence[str], size: int) -> dict[str, F64]:
-    """What a user's function gives to each learning agent; what it gives to others is left out."""
-    for agent in given:
+def _checked_by_agent(
+    returned: Mapping[Any, Any], agents: Sequence[str], size: int
+) -> dict[str, F64]:
+    """What a user's function returned for each learning agent; the rest is left out."""
+    for agent in returned:
         if agent not in AGENTS:
             raise SdcError(
                 f"rewards function: unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}"
             )
     for agent in agents:
-        if agent not in given:
+        if agent not in returned:
             raise SdcError(f"rewards function: returned none for {agent}")
-    return {agent: _values(given[agent], agent, size) for agent in agents}
+    return {agent: _checked_values(returned[agent], agent, size) for agent in agents}
 
 
-def _values(given: Any, whose: str, size: int) -> F64:
+def _checked_values(returned: Any, whose: str, size: int) -> F64:
+    """What a user's function returned for one agent or all, (B,)."""
     try:
-        values = np.asarray(given, dtype=np.float64)
+        values = np.asarray(returned, dtype=np.float64)
     except (TypeError, ValueError):
         raise SdcError(
-            f"rewards function: returned {given!r} for {whose}; valid is ({size},) of numbers"
+            f"rewards function: returned {returned!r} for {whose}; valid is ({size},) of numbers"
         ) from None
     finite = np.isfinite(values)
     if values.shape not in ((), (size,)) or not finite.all():
@@ -469,19 +372,14 @@ def _values(given: Any, whose: str, size: int) -> F64:
     return np.broadcast_to(values, (size,))
 
 
-def _together(by_agent: dict[str, F64]) -> tuple[dict[str, F64], F64]:
+def _with_sum(by_agent: dict[str, F64]) -> tuple[dict[str, F64], F64]:
+    """Rewards by agent, and their sum, (B,)."""
     return by_agent, _sum(list(by_agent.values()))
 
 
 def _sum(values: Sequence[F64]) -> F64:
-    """In order, whatever the size of the batch; ``np.sum`` adds up single entries in another."""
+    """Sum in order, whatever the size of the batch; ``np.sum`` has another order for size 1."""
     first, *others = values
     for other in others:
         first = first + other
     return first
-
-
-def table_markdown() -> str:
-    """The terms as a table for the docs."""
-    rows = [f"| `{n}` | {(t.__doc__ or '').split(chr(10))[0]} |" for n, t in TERMS.items()]
-    return "\n".join(["| term | negative of |", "|---|---|", *rows])

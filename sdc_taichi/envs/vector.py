@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,20 +11,21 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 
 from sdc_taichi.envs import rendering
-from sdc_taichi.envs.core import Core, Observation, Source
-from sdc_taichi.envs.options import make_options
+from sdc_taichi.envs.arguments import ConfigSource, Overrides, configs_and_options
+from sdc_taichi.envs.base import BatchEnv, start_day_option, start_days
+from sdc_taichi.envs.core import Core, Observation
+from sdc_taichi.envs.episode_start import Seed
+from sdc_taichi.envs.learners import learning_agent, make_learner
+from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.recording import RecordedCore, Recording
-from sdc_taichi.envs.single import learner, one_agent, options_for
-from sdc_taichi.envs.standards import ManyDataCenters, start_day, start_days
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F32, F64
 
 Flags = npt.NDArray[np.bool_]
-Seed = int | Sequence[int | None] | None
 
 
-class SdcVectorEnv(ManyDataCenters, VectorEnv[Any, Any, npt.NDArray[Any]]):
+class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
     """Data centers with one learner each that step together, as ``gymnasium.make_vec`` gives them.
 
     Gives what Gymnasium's ``SyncVectorEnv`` gives for single environments. All episodes have the
@@ -33,15 +34,18 @@ class SdcVectorEnv(ManyDataCenters, VectorEnv[Any, Any, npt.NDArray[Any]]):
     Args:
         num_envs: number of environments.
         config: a preset, a file, or configs; environment i takes config i modulo their number.
-        agent: who learns while ``others`` plays the rest; None is all ``agents`` as one.
-        precision: of the server kernels, ``f32`` or ``f64``.
+        overrides: values put into every config: a dict of section.key to value, or a list of
+            ``section.key=value``.
+        options: options; None is the default ones.
+        agent: agent that learns while ``others`` plays the rest; None is all ``agents`` as one.
+        precision: precision of the server kernels, ``f32`` or ``f64``.
         render_mode: None or ``rgb_array``.
         registered_agent: set by the ids of one agent.
         autoreset_mode: when the next episodes start, as the enum or its value: in the step that
             ends the last ones, in the step after it, or only by ``reset``.
         recorder: records episodes of the first environment into a file ending in .rrd, or what
             ``EpisodeRecorder`` says.
-        options: fields of ``EnvOptions``.
+        keywords: fields of ``EnvOptions``, in place of those in ``options``.
 
     Raises:
         SdcError: a config, number or option that is not valid.
@@ -50,21 +54,25 @@ class SdcVectorEnv(ManyDataCenters, VectorEnv[Any, Any, npt.NDArray[Any]]):
     def __init__(
         self,
         num_envs: int = 1,
-        config: Source = "corrected",
+        config: ConfigSource = "corrected",
         *,
+        overrides: Overrides = (),
+        options: EnvOptions | None = None,
         agent: str | None = None,
         precision: Precision = "f32",
         render_mode: str | None = None,
         registered_agent: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         recorder: Recording = None,
-        **options: Any,
+        **keywords: Any,
     ) -> None:
         rendering.check_render_mode(render_mode)
         self._mode = _autoreset_mode(autoreset_mode)
-        agent = one_agent(agent, registered_agent)
-        chosen = make_options(**options_for(agent, options))
-        self.core = RecordedCore(config, chosen, num_envs, precision, recorder)
+        agent = learning_agent(agent, registered_agent)
+        configs, chosen = configs_and_options(
+            config, overrides, options, keywords, only_agent=agent
+        )
+        self.core = RecordedCore(configs, chosen, num_envs, precision, recorder)
         self.num_envs = num_envs = self.core.num_envs
         self.render_mode = render_mode
         self.metadata = {
@@ -72,14 +80,14 @@ class SdcVectorEnv(ManyDataCenters, VectorEnv[Any, Any, npt.NDArray[Any]]):
             "render_fps": 8,
             "autoreset_mode": self._mode,
         }
-        self._learner = learner(self.core, agent)
+        self._learner = make_learner(self.core, agent)
         self.single_observation_space = self._learner.observation_space
         self.single_action_space = self._learner.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.state_space = self.core.state_space
-        self._all = np.ones(num_envs, dtype=np.bool_)
-        self._all.flags.writeable = False
+        self._everyone = np.ones(num_envs, dtype=np.bool_)
+        self._everyone.flags.writeable = False
 
     def reset(
         self, *, seed: Seed = None, options: dict[str, Any] | None = None
@@ -101,9 +109,9 @@ class SdcVectorEnv(ManyDataCenters, VectorEnv[Any, Any, npt.NDArray[Any]]):
                 "reset_mask: episodes of a batch start and end together; valid selects all "
                 f"{self.num_envs} environments"
             )
-        observations = self.core.reset(seed, start_day(given))
+        observations = self.core.reset(seed, start_day_option(given))
         super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
-        return self._learner.observation(observations), self._infos(self._started())
+        return self._learner.observation(observations), self._infos(self._start_info())
 
     def step(self, actions: Any) -> tuple[Observation, F64, Flags, Flags, dict[str, Any]]:
         """Advance all environments.
@@ -117,27 +125,27 @@ class SdcVectorEnv(ManyDataCenters, VectorEnv[Any, Any, npt.NDArray[Any]]):
                 starts the next ones.
         """
         none = np.zeros(self.num_envs, dtype=np.bool_)
-        if self._mode is AutoresetMode.NEXT_STEP and self.core.over:
+        if self._mode is AutoresetMode.NEXT_STEP and self.core.episode_over:
             observation, infos = self.reset()
             return observation, np.zeros(self.num_envs), none, none.copy(), infos
-        done = self.core.step(self._learner.actions(actions))
-        observation = self._learner.observation(done.observations)
-        infos = self._infos(done.result.per_dc())
-        if done.ended and self._mode is AutoresetMode.SAME_STEP:
-            final = {"final_obs": self._each(observation), "final_info": infos}
+        transition = self.core.step(self._learner.actions(actions))
+        observation = self._learner.observation(transition.observations)
+        infos = self._infos(transition.result.per_dc())
+        if transition.ended and self._mode is AutoresetMode.SAME_STEP:
+            final = {"final_obs": self._one_by_one(observation), "final_info": infos}
             observation = self._learner.observation(self.core.next_episode())
-            infos = self._infos({**final, **self._started()})
-        ended = np.full(self.num_envs, done.ended)
-        return observation, self._learner.reward(done), none, ended, infos
+            infos = self._infos({**final, **self._start_info()})
+        ended = np.full(self.num_envs, transition.ended)
+        return observation, self._learner.reward(transition), none, ended, infos
 
-    def _started(self) -> dict[str, Any]:
+    def _start_info(self) -> dict[str, Any]:
         return {"start_day": start_days(self.core)}
 
-    def _infos(self, found: Mapping[str, Any]) -> dict[str, Any]:
-        """Infos with Gymnasium's masks of who has them, which is everyone."""
-        return {**found, **{f"_{name}": self._all for name in found}}
+    def _infos(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Infos with Gymnasium's masks of the environments that have them, which is all."""
+        return {**values, **{f"_{name}": self._everyone for name in values}}
 
-    def _each(self, observation: Observation) -> npt.NDArray[np.object_]:
+    def _one_by_one(self, observation: Observation) -> npt.NDArray[np.object_]:
         """Observations one by one, as Gymnasium hands out ``final_obs``."""
         out = np.empty(self.num_envs, dtype=object)
         for i, one in enumerate(iterate(self.observation_space, observation)):
@@ -160,15 +168,15 @@ class SdcVectorEnv(ManyDataCenters, VectorEnv[Any, Any, npt.NDArray[Any]]):
         self.core.close()
 
 
-class MultiAgentVectorEnv(ManyDataCenters):
+class MultiAgentVectorEnv(BatchEnv):
     """Data centers with several learning agents each that step together; see ``vector_env``.
 
     Attributes:
         num_envs: number of environments, B.
         possible_agents: the learning agents; ``agents`` is the same, as episodes follow each other.
-        observation_spaces: of one environment, by agent.
-        action_spaces: of one environment, by agent.
-        state_space: of one environment.
+        observation_spaces: spaces of the observations of one environment, by agent.
+        action_spaces: spaces of the actions of one environment, by agent.
+        state_space: space of the shared state of one environment.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  as Gymnasium has it
@@ -205,7 +213,7 @@ class MultiAgentVectorEnv(ManyDataCenters):
         Raises:
             ConfigError: a seed, option or day that is not valid.
         """
-        observations = self.core.reset(seed, start_day(options))
+        observations = self.core.reset(seed, start_day_option(options))
         return observations, {"start_day": start_days(self.core)}
 
     def step(
@@ -229,17 +237,17 @@ class MultiAgentVectorEnv(ManyDataCenters):
             SdcError: actions that are missing, too many, or outside their space.
             RuntimeStateError: before ``reset``.
         """
-        done = self.core.step(actions)
-        observations = done.observations
-        infos: dict[str, Any] = done.result.per_dc()
-        if done.ended:
+        transition = self.core.step(actions)
+        observations = transition.observations
+        infos: dict[str, Any] = transition.result.per_dc()
+        if transition.ended:
             infos["final_obs"], infos["final_state"] = observations, self.core.state()
             observations = self.core.next_episode()
             infos["start_day"] = start_days(self.core)
-        ended = np.ones if done.ended else np.zeros
+        ended = np.ones if transition.ended else np.zeros
         return (
             observations,
-            {agent: reward.astype(np.float32) for agent, reward in done.rewards.items()},
+            {agent: reward.astype(np.float32) for agent, reward in transition.rewards.items()},
             {agent: np.zeros(self.num_envs, dtype=np.bool_) for agent in self.agents},
             {agent: ended(self.num_envs, dtype=np.bool_) for agent in self.agents},
             infos,
@@ -263,12 +271,14 @@ class MultiAgentVectorEnv(ManyDataCenters):
 
 def vector_env(
     num_envs: int | None = None,
-    config: Source = "corrected",
+    config: ConfigSource = "corrected",
     *,
+    overrides: Overrides = (),
+    options: EnvOptions | None = None,
     precision: Precision = "f32",
     render_mode: str | None = None,
     recorder: Recording = None,
-    **options: Any,
+    **keywords: Any,
 ) -> MultiAgentVectorEnv:
     """A batch of data centers with several learning agents each.
 
@@ -278,16 +288,20 @@ def vector_env(
     Args:
         num_envs: number of environments; None is one per config.
         config: a preset, a file, or configs; environment i takes config i modulo their number.
-        precision: of the server kernels, ``f32`` or ``f64``.
+        overrides: values put into every config: a dict of section.key to value, or a list of
+            ``section.key=value``.
+        options: options; None is the default ones.
+        precision: precision of the server kernels, ``f32`` or ``f64``.
         render_mode: None or ``rgb_array``.
         recorder: records episodes of the first environment into a file ending in .rrd, or what
             ``EpisodeRecorder`` says.
-        options: fields of ``EnvOptions``.
+        keywords: fields of ``EnvOptions``, in place of those in ``options``.
 
     Raises:
         SdcError: a config, number or option that is not valid.
     """
-    core = RecordedCore(config, make_options(**options), num_envs, precision, recorder)
+    configs, chosen = configs_and_options(config, overrides, options, keywords)
+    core = RecordedCore(configs, chosen, num_envs, precision, recorder)
     return MultiAgentVectorEnv(core, render_mode)
 
 

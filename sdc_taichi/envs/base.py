@@ -1,4 +1,4 @@
-"""What the environments of all standards share: reset options, infos, and what goes beyond them."""
+"""What the environments of all standards share: reset options, infos, and methods beyond them."""
 
 from __future__ import annotations
 
@@ -14,29 +14,32 @@ from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.types import F32, F64, I64
 
 RESET_OPTIONS = ("start_day",)
+"""Names that ``reset(options=...)`` takes."""
 
 
-class _Extended:
-    """What environments offer beyond their standards."""
+class _Env:
+    """What all environments offer beyond their standards."""
 
     core: Core
+    """The data centers."""
     render_mode: str | None
+    """None or ``rgb_array``."""
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that decides how the episodes go on; picklable."""
         return self.core.state_dict()
 
 
-class OneDataCenter(_Extended):
-    """Of an environment with a batch of one."""
+class SingleEnv(_Env):
+    """What environments with one data center offer beyond their standards."""
 
     def state(self) -> F32:
-        """Shared state for centralised critics, of ``state_space``."""
+        """Shared state for centralised critics, (m,), of ``state_space``."""
         return np.asarray(self.core.state()[0])
 
     def reward_terms(self) -> dict[str, float]:
         """All reward terms of the last step by name, unscaled; empty before the first."""
-        return floats(self.core.terms())
+        return as_floats(self.core.reward_terms())
 
     def render(self) -> rendering.Image:
         """The hall after the last step, (height, width, 3).
@@ -52,8 +55,8 @@ class OneDataCenter(_Extended):
         self.core.close()
 
 
-class ManyDataCenters(_Extended):
-    """Of a batch."""
+class BatchEnv(_Env):
+    """What batches of environments offer beyond their standards."""
 
     def state(self) -> F32:
         """Shared state for centralised critics, (B, m)."""
@@ -62,12 +65,12 @@ class ManyDataCenters(_Extended):
     def reward_terms(self) -> dict[str, F64]:
         """All reward terms of the last step by name, (B,) each, unscaled; empty before the first.
 
-        Where a step that ends episodes starts the next ones, they are those of that step still.
+        A step that ends episodes and starts the next ones counts as the last step too.
         """
-        return self.core.terms()
+        return self.core.reward_terms()
 
     def render(self) -> tuple[rendering.Image, ...]:
-        """The hall of each environment after the last step.
+        """The hall of each environment after the last step, (height, width, 3) each.
 
         Raises:
             ConfigError: made without ``render_mode``.
@@ -76,11 +79,11 @@ class ManyDataCenters(_Extended):
         return tuple(rendering.frame(self.core, i) for i in range(self.core.num_envs))
 
 
-def start_day(options: Mapping[str, Any] | None, *, strict: bool = True) -> Any:
-    """What ``options`` of ``reset`` say about the first day, None if nothing.
+def start_day_option(options: Mapping[str, Any] | None, *, strict: bool = True) -> Any:
+    """The first day that the ``options`` of ``reset`` ask for, None if they do not.
 
     Args:
-        options: by name.
+        options: values by name.
         strict: whether an unknown name is an error; else it is a warning, which PettingZoo's own
             API test needs, as it passes an option of a name that no environment knows.
 
@@ -105,13 +108,13 @@ def start_days(core: Core) -> I64:
     return np.asarray(view.state.start // (24 * view.fleet.steps_per_hour), dtype=np.int64)
 
 
-def floats(quantities: Mapping[str, F64]) -> dict[str, float]:
-    """Quantities of a batch of one."""
+def as_floats(quantities: Mapping[str, F64]) -> dict[str, float]:
+    """Quantities, (1,) each, of a batch of one as numbers."""
     return {name: values.item() for name, values in quantities.items()}
 
 
-def first(observation: Observation) -> Observation:
-    """The observation of a batch of one."""
+def first_of_batch(observation: Observation) -> Observation:
+    """The first observation of a batch, (n,) of (B, n)."""
     if isinstance(observation, dict):
         return {name: values[0] for name, values in observation.items()}
     return np.asarray(observation[0])

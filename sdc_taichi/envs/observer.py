@@ -1,0 +1,367 @@
+"""Observations by named features, computed from what a controller may see."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sdc_taichi.control.view import View
+from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.envs.features import (
+    AGE_EDGES_H,
+    UNLIMITED_QUEUE_H,
+    Feature,
+    all_features,
+    feature_slices,
+    features_by_agent,
+    features_space,
+    measured_features,
+    scale,
+    time_features,
+)
+from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, ForecastError, Forecasts
+from sdc_taichi.envs.time_rows import EntryOrder, TimeRows, time_rows
+from sdc_taichi.errors import RuntimeStateError
+from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP
+from sdc_taichi.sim.drivers import Drivers, Table
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.sizing import Sizing
+from sdc_taichi.types import F32, F64, I64
+from sdc_taichi.year_clock import HOURS_PER_YEAR
+
+if TYPE_CHECKING:
+    from sdc_taichi.kernels.compiler.stage import CompiledStage
+
+
+class Observer:
+    """Observations of each agent, and the shared state, of a fleet.
+
+    Args:
+        fleet: the data centers.
+        agents: agents whose observations are wanted.
+        features: names of the features of each agent; None is ``DEFAULT_FEATURES``.
+        ci_leads_h: leads of the carbon-intensity forecast in h, rising multiples of the step.
+        weather_leads_h: leads of the weather forecasts in h, rising multiples of the step.
+        forecast_error: how forecasts err.
+
+    Attributes:
+        features: features of each agent, in the order of its observation.
+        spaces: space of each agent's observation.
+        state_features: all features, in the order of the shared state.
+        state_space: space of the shared state.
+
+    Raises:
+        ConfigError: an unknown agent or feature, or leads that are not valid.
+    """
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        *,
+        agents: Sequence[str] = AGENTS,
+        features: Mapping[str, Sequence[str]] | None = None,
+        ci_leads_h: Sequence[float] = CI_LEADS_H,
+        weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
+        forecast_error: ForecastError = PERFECT,
+    ) -> None:
+        forecasts = Forecasts(
+            fleet.steps_per_hour,
+            ci_leads_h=ci_leads_h,
+            weather_leads_h=weather_leads_h,
+            error=forecast_error,
+        )
+        units_of_each = np.diff(fleet.unit_offsets)
+        self._equal_units = bool(np.all(units_of_each == units_of_each[0]))
+        self._units = int(units_of_each[0]) if self._equal_units else 1
+        self.state_features = all_features(ci_leads_h, weather_leads_h, self._units)
+        self.state_space = features_space(self.state_features)
+        self.features = features_by_agent(features, self.state_features)
+        self.spaces = {agent: features_space(found) for agent, found in self.features.items()}
+
+        self._measured = measured_features(self._units)
+        self._measured_width = sum(feature.size for feature in self._measured)
+        self._time = _TimeEntries(
+            time_features(ci_leads_h, weather_leads_h), forecasts, fleet.steps_per_hour
+        )
+        slices = feature_slices(self.state_features)
+        entry_numbers = range(self._time.width + self._measured_width)
+        self._orders = {
+            agent: EntryOrder(
+                [i for f in self.features[agent] for i in entry_numbers[slices[f.name]]],
+                self._time.width,
+            )
+            for agent in agents
+        }
+        self._arranged_rows: dict[str, F32] = {}
+        per_hour = fleet.steps_per_hour
+        limit_h = fleet.values("workload.queue_limit_h")
+        limit_h = np.where(np.isnan(limit_h), UNLIMITED_QUEUE_H, limit_h)
+        self._per_task = 1.0 / (limit_h * per_hour * TASKS_PER_STEP)
+        self._age_edges_steps = np.asarray(AGE_EDGES_H) * per_hour
+        self._age_columns: list[int] = []
+        self._sizing: Sizing | None = None
+        self._stage: CompiledStage | None = None
+        self._entries: _Entries | None = None
+
+    def reset(self, view: View, keys: Sequence[int] | I64 = ()) -> None:
+        """Start an episode.
+
+        Args:
+            view: the view before the first step.
+            keys: seeds of the errors of forecasts that err, one for each data center.
+
+        Raises:
+            ConfigError: another number of keys than of data centers.
+        """
+        orders, time = self._orders, self._time
+        if time.reset(view.drivers, keys, sum(order.width for order in orders.values())):
+            self._arranged_rows = {}
+            if time.rows is not None:
+                self._arranged_rows = {
+                    agent: order.arrange(time.rows.values) for agent, order in orders.items()
+                }
+        if view.sizing is not self._sizing:
+            oldest = view.state.queue.shape[1] - 1
+            # Column k of the queue counts the tasks that are at least (oldest - k) steps old.
+            self._age_columns = np.maximum(oldest - self._age_edges_steps, 0).astype(int).tolist()
+            self._stage, self._sizing = self._measuring_stage(view.sizing, view.step_h), view.sizing
+        self._entries = None
+
+    def observe(self, view: View) -> dict[str, F32]:
+        """Observation of each agent before the step to come, (B, n) each.
+
+        Raises:
+            RuntimeStateError: before ``reset``.
+        """
+        entries = self._entries_of(view)
+        return {
+            agent: order.assemble(
+                order.arrange(entries.time)
+                if entries.row_numbers is None
+                else self._arranged_rows[agent],
+                entries.row_numbers,
+                entries.measured,
+            )
+            for agent, order in self._orders.items()
+        }
+
+    def state(self, view: View) -> F32:
+        """Shared state: all features side by side, (B, m).
+
+        Raises:
+            RuntimeStateError: before ``reset``.
+        """
+        entries, first = self._entries_of(view), self._time.width
+        rows = entries.time
+        if entries.row_numbers is not None:
+            rows = rows.take(entries.row_numbers, axis=0)
+        out = np.empty((len(rows), first + self._measured_width), dtype=np.float32)
+        out[:, :first] = rows
+        out[:, first:] = entries.measured.T
+        return out
+
+    def _entries_of(self, view: View) -> _Entries:
+        """Entries of all features in a view, computed once for each view."""
+        entries, time = self._entries, self._time
+        if entries is not None and entries.view is view:
+            return entries
+        if self._stage is None:
+            raise RuntimeStateError("the observer has not been reset; call reset() first")
+        index, rows = view.drivers.start + view.state.step, time.rows
+        measured = self._measure(view)
+        if rows is None:
+            entries = _Entries(view, time.compute(index, view.state.step), None, measured)
+        else:
+            entries = _Entries(view, rows.values, rows.row_numbers(index), measured)
+        self._entries = entries
+        return entries
+
+    def _measure(self, view: View) -> F32:
+        """Scaled entries of queue, hall and battery, (m, B), one contiguous row each."""
+        assert self._stage is not None
+        state, last = view.state, view.last
+        setpoints = (
+            state.setpoint_c.reshape(-1, self._units).T
+            if self._equal_units
+            else [mean_setpoint_c(view)]
+        )
+        given = {f"setpoint_{i}": setpoint_c for i, setpoint_c in enumerate(setpoints)}
+        given |= {f"at_least_{i}": state.queue[:, k] for i, k in enumerate(self._age_columns)}
+        given |= {"waiting": state.queue[:, -1], "stored_kwh": state.stored_kwh}
+        if last is None:
+            # A hall at rest at the setpoint.
+            at_c, none = mean_setpoint_c(view), np.zeros(len(state.stored_kwh))
+            of_last_step = (none, none, at_c, at_c, none, none)
+        else:
+            of_last_step = _read_last_step(last)
+        given |= zip(_LAST_STEP_QUANTITIES, of_last_step, strict=True)
+        return self._stage.rows(**given).astype(np.float32)
+
+    def _measuring_stage(self, sizing: Sizing, step_h: float) -> CompiledStage:
+        """The compiled stage from the quantities in ``_measure`` to scaled entries in order."""
+        from sdc_taichi.kernels.compiler.stage import CompiledStage
+
+        kwh = step_h / 1e3
+        per_it_kwh = _inverse(sizing.it_w * kwh)
+        per_hvac_kwh = _inverse((sizing.facility_w - sizing.it_w) * kwh)
+        per_facility_kwh = _inverse(sizing.facility_w * kwh)
+        per_battery_kwh = _inverse(sizing.battery_kwh)
+        edges, units = range(len(self._age_columns)), range(self._units)
+
+        def entries(**x: F64) -> dict[str, F64]:
+            counts = x["waiting"] > NEGLIGIBLE_TASKS
+            per_task = np.where(counts, 1.0 / np.where(counts, x["waiting"], 1.0), 0.0)
+            at_least: list[Any] = [*(x[f"at_least_{i}"] for i in edges), 0.0]
+            values = {
+                "queue": [x["waiting"] * self._per_task],
+                "oldest_age": [x["oldest_age_h"]],
+                "mean_age": [x["mean_age_h"]],
+                "age_histogram": [(a - b) * per_task for a, b in pairwise(at_least)],
+                "room": [x["return_c"]],
+                "hottest_inlet": [x["inlet_max_c"]],
+                "setpoint": [x[f"setpoint_{i}"] for i in units],
+                "it_energy": [x["it_kwh"] * per_it_kwh],
+                "hvac_energy": [x["hvac_kwh"] * per_hvac_kwh],
+                "dc_load": [(x["it_kwh"] + x["hvac_kwh"]) * per_facility_kwh],
+                "soc": [x["stored_kwh"] * per_battery_kwh],
+            }
+            return {
+                f"{f.name}_{i}": np.clip((value - f.low) / (f.high - f.low), 0.0, 1.0)
+                for f in self._measured
+                for i, value in enumerate(values[f.name])
+            }
+
+        return CompiledStage(entries, len(self._per_task))
+
+
+_LAST_STEP_QUANTITIES = (
+    "oldest_age_h",
+    "mean_age_h",
+    "return_c",
+    "inlet_max_c",
+    "it_kwh",
+    "hvac_kwh",
+)
+"""Fields of ``StepResult`` that are observed."""
+_read_last_step = attrgetter(*_LAST_STEP_QUANTITIES)
+
+
+class _Entries(NamedTuple):
+    """Scaled entries of all features in one view."""
+
+    view: View
+    """The view that was observed."""
+    time: F32
+    """Time entries: rows that data centers share, (rows, n), or one row for each, (B, n)."""
+    row_numbers: I64 | None
+    """Row of ``time`` that each data center reads, (B,); None if it has one for each."""
+    measured: F32
+    """Measured entries, (m, B)."""
+
+
+class _TimeEntries:
+    """Scaled features that depend on time alone, as rows of all steps if these are few enough.
+
+    Args:
+        features: what ``time_features`` gives.
+        forecasts: carbon intensity and weather at the leads of ``features``.
+        steps_per_hour: number of steps in an hour.
+
+    Attributes:
+        width: number of entries.
+        rows: rows of all steps, once per site; None if they are computed step by step.
+    """
+
+    def __init__(
+        self, features: Sequence[Feature], forecasts: Forecasts, steps_per_hour: int
+    ) -> None:
+        self._features = {f.name: f for f in features}
+        self._slices = feature_slices(features)
+        self.width = sum(f.size for f in features)
+        self._forecasts = forecasts
+        self._time_of_day = _sine_and_cosine(24 * steps_per_hour)
+        self._time_of_year = _sine_and_cosine(HOURS_PER_YEAR * steps_per_hour)
+        self._demand: Table | None = None
+        self.rows: TimeRows | None = None
+
+    def reset(self, drivers: Drivers, keys: Sequence[int] | I64, arranged_width: int) -> bool:
+        """Start an episode.
+
+        Args:
+            drivers: inputs of the fleet.
+            keys: seeds of the errors of forecasts, one for each data center.
+            arranged_width: entries that the observer keeps for each row besides those of ``rows``.
+
+        Returns:
+            Whether ``rows`` are others than before.
+        """
+        demand = drivers.demand
+        changed = self._forecasts.reset(drivers, keys) or demand is not self._demand
+        self._demand = demand
+        if changed and self._forecasts.perfect:
+            self.rows = time_rows(
+                (drivers.ci_g_per_kwh, drivers.outdoor_c, drivers.wet_bulb_c, demand),
+                lambda index, dc: self._scaled(
+                    index,
+                    demand.values[demand.offset[dc] + index],
+                    self._forecasts.truth(index, dc),
+                ),
+                period=len(self._time_of_year),
+                row_bytes=4 * (self.width + arranged_width),
+            )
+        return changed
+
+    def compute(self, index: I64, step: int) -> F32:
+        """Entries of all data centers, (B, n), at steps of the year, (B,), ``step`` after reset."""
+        assert self._demand is not None
+        return self._scaled(index, self._demand.at(index), self._forecasts.forecast(index, step))
+
+    def _scaled(self, index: I64, demand: F64, forecasts: tuple[F32, F32, F32]) -> F32:
+        """Scaled entries, (n, width).
+
+        Args:
+            index: steps of the year, (n,).
+            demand: arriving work as a share of capacity, (n,).
+            forecasts: carbon intensity, dry bulb and wet bulb, (1 + leads, n) each, the present
+                first.
+        """
+        ci, outdoor, wet_bulb = forecasts
+        out = np.empty((len(index), self.width), dtype=np.float32)
+        day, year = self._time_of_day, self._time_of_year
+        out[:, self._slices["time_of_day"]] = day.take(index % len(day), axis=0)
+        out[:, self._slices["time_of_year"]] = year.take(index % len(year), axis=0)
+        values = {
+            "ci": ci[:1],
+            "ci_forecast": ci[1:],
+            "ci_change": ci[1:] - ci[:1],
+            "outdoor": outdoor[:1],
+            "outdoor_forecast": outdoor[1:],
+            "wet_bulb": wet_bulb[:1],
+            "wet_bulb_forecast": wet_bulb[1:],
+            "workload": demand[None].astype(np.float32),
+        }
+        for name, of_feature in values.items():
+            if name in self._features:
+                out[:, self._slices[name]] = scale(of_feature, self._features[name]).T
+        return out
+
+
+def mean_setpoint_c(view: View) -> F64:
+    """Mean setpoint over the CRAC units of each data center, in C, (B,)."""
+    fleet = view.fleet
+    return np.asarray(fleet.unit_sums(view.state.setpoint_c) / np.diff(fleet.unit_offsets))
+
+
+def _inverse(values: F64) -> F64:
+    """1 over values, and 0 where they are 0, of the same shape."""
+    return np.where(values > 0, 1.0 / np.where(values > 0, values, 1.0), 0.0)
+
+
+def _sine_and_cosine(period: int) -> F32:
+    """Sine and cosine of each step of a period, (period, 2)."""
+    angle = 2.0 * np.pi * np.arange(period) / period
+    return np.stack([np.sin(angle), np.cos(angle)], axis=1).astype(np.float32)

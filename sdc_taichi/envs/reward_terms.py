@@ -1,0 +1,165 @@
+"""Reward terms: what a step costs, by name.
+
+Every term is 0 or less. Energies, carbon, cost, fossil share and water are shares of what the data
+center would use, emit or pay in a step at its design point, about -1 at full load, so that sites
+and halls of any size give rewards of one size; ``sla`` is a share of the work of a full step. The
+others have units: ``pue`` is a ratio, ``hot_inlets`` in K, ``queue`` and ``dropped`` in tasks, and
+``demand_charge`` is in the money of ``cost``, due in the few steps that raise the highest power.
+Nothing is scaled by data of the run.
+
+Add a term here: a function with the decorator ``reward_term``, whose name is the name of the term
+and whose docstring's first line is its row in docs/environments.md (``terms_markdown`` prints the
+table). Terms are compiled together, so they use arithmetic and NumPy functions that
+``kernels.compiler.stage`` knows, and ``np.where`` instead of branches on values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sdc_taichi.envs.tariff import Tariff
+from sdc_taichi.plant.workload import TASKS_PER_STEP
+from sdc_taichi.types import F64, StepResult
+
+CI_G_PER_KWH = 500.0
+"""Carbon intensity at which the design energy gives a carbon term of -1, a grid run on gas."""
+FOSSIL_G_PER_KWH = 800.0
+"""Carbon intensity of a grid without renewables, by which their share is estimated (mixed coal and
+gas; IPCC AR5 WG III annex III gives medians of 820 and 490 g/kWh)."""
+WATER_L_PER_KWH = 1.8
+"""Average water use of data centers per kWh of IT (Shehabi et al. 2016, LBNL-1005775)."""
+QUEUE_SCALE_TASKS = 10.0
+"""Queued tasks that cost 1 at the end of the day (paper, F.2)."""
+PRICE_PER_KWH = 0.1
+"""Price per kWh at which the design energy gives a cost of -1."""
+
+
+@dataclass(frozen=True, slots=True)
+class TermContext:
+    """What a term may refer to beside the result of the step."""
+
+    design_kwh: F64
+    """Energy of a step at the design point, in kWh, (B,)."""
+    tariff: Tariff
+    """Prices of electricity."""
+    peak_kw: F64
+    """Highest power of the episode before this step, at least half the design power, in kW,
+    (B,)."""
+    bills: float
+    """Length of the episode over the 30 days of a bill."""
+    price_per_kwh: F64
+    """Price of a kWh in this step, (B,)."""
+    end_of_day_weight: F64
+    """Weight of queued tasks, 0 before 23:00 and rising to 1 in the last step of the day, (B,)."""
+
+
+Term = Callable[[StepResult, TermContext], F64]
+"""A reward term: (B,) from the result of a step and what it refers to."""
+TERMS: dict[str, Term] = {}
+"""All terms by name."""
+
+
+def reward_term(function: Term) -> Term:
+    """Add a function to ``TERMS`` under its own name."""
+    TERMS[function.__name__] = function
+    return function
+
+
+@reward_term
+def carbon(r: StepResult, c: TermContext) -> F64:
+    """Carbon of the step: CFP = (E_it + E_hvac + E_bat) CI (paper, A.3.4)."""
+    return -r.carbon_g / (c.design_kwh * CI_G_PER_KWH)
+
+
+@reward_term
+def total_energy(r: StepResult, c: TermContext) -> F64:
+    """Energy drawn from the grid, the battery included."""
+    return -r.grid_kwh / c.design_kwh
+
+
+@reward_term
+def facility_energy(r: StepResult, c: TermContext) -> F64:
+    """IT and HVAC energy (paper, 4.5: r_DC)."""
+    return -r.facility_kwh / c.design_kwh
+
+
+@reward_term
+def it_energy(r: StepResult, c: TermContext) -> F64:
+    """IT energy."""
+    return -r.it_kwh / c.design_kwh
+
+
+@reward_term
+def hvac_energy(r: StepResult, c: TermContext) -> F64:
+    """HVAC energy."""
+    return -r.hvac_kwh / c.design_kwh
+
+
+@reward_term
+def cost(r: StepResult, c: TermContext) -> F64:
+    """Energy by the time-of-use tariff, over the price of the design energy at 0.1 per kWh."""
+    return -r.grid_kwh * c.price_per_kwh / (PRICE_PER_KWH * c.design_kwh)
+
+
+@reward_term
+def demand_charge(r: StepResult, c: TermContext) -> F64:
+    """What the step adds to the highest power above half the design power, in units of `cost`.
+
+    The charge of a bill times the length of the episode over 30 days. Half the design power is
+    billed in any case, so it is no part of the reward.
+    """
+    above_kw = np.maximum(r.grid_kwh / r.step_h - c.peak_kw, 0.0)
+    charge = above_kw * c.tariff.demand_charge_per_kw * c.bills
+    return -charge / (PRICE_PER_KWH * c.design_kwh)
+
+
+@reward_term
+def fossil_share(r: StepResult, c: TermContext) -> F64:
+    """Energy from the grid less its renewable share, estimated as 1 - CI/(800 g/kWh)."""
+    share = np.minimum(r.ci_g_per_kwh / FOSSIL_G_PER_KWH, 1.0)
+    return -share * r.grid_kwh / c.design_kwh
+
+
+@reward_term
+def pue(r: StepResult, c: TermContext) -> F64:
+    """HVAC power over IT power, PUE - 1; 0 without IT power."""
+    return np.where(r.it_w > 0.0, -r.hvac_w / np.where(r.it_w > 0.0, r.it_w, 1.0), 0.0)
+
+
+@reward_term
+def water(r: StepResult, c: TermContext) -> F64:
+    """Make-up water, over the design energy times 1.8 L/kWh."""
+    return -r.water_l / (WATER_L_PER_KWH * c.design_kwh)
+
+
+@reward_term
+def hot_inlets(r: StepResult, c: TermContext) -> F64:
+    """What inlets exceed the recommended 27 C by, mean over servers, K (ASHRAE TC 9.9)."""
+    return -r.over_27_mean_k
+
+
+@reward_term
+def queue(r: StepResult, c: TermContext) -> F64:
+    """Tasks queued in the last hour of the day over 10, weighed from 0 to 1 (paper, F.1, F.2)."""
+    return -c.end_of_day_weight * r.queue_tasks / QUEUE_SCALE_TASKS
+
+
+@reward_term
+def dropped(r: StepResult, c: TermContext) -> F64:
+    """Tasks dropped because the queue was full."""
+    return -r.dropped_tasks
+
+
+@reward_term
+def sla(r: StepResult, c: TermContext) -> F64:
+    """Work past its deadline, dropped or lost, as a share of a full step."""
+    return -(r.overdue_tasks + r.dropped_tasks + r.lost_tasks) / TASKS_PER_STEP
+
+
+def terms_markdown() -> str:
+    """The table of terms in docs/environments.md."""
+    rows = [f"| `{n}` | {(t.__doc__ or '').split(chr(10))[0]} |" for n, t in TERMS.items()]
+    return "\n".join(["| term | negative of |", "|---|---|", *rows])

@@ -1,0 +1,122 @@
+"""Observation entries that depend on time alone, gathered from rows computed once.
+
+An observation has entries of two kinds. Time entries (clock, weather, carbon intensity, arriving
+work) depend on the step of the year and the site alone: one row for every step and distinct site,
+read by all data centers of that site. Measured entries (queue, hall, battery) are computed in every
+step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.sim.drivers import Table
+from sdc_taichi.types import F32, I64
+
+MAX_ROW_BYTES = 2**28
+"""Most memory that the rows of one observer take, in bytes; series that need more are read step by
+step."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimeRows:
+    """Rows of several series end to end, and which of them each data center reads."""
+
+    values: npt.NDArray[Any]
+    """Rows of all distinct series end to end, (rows, columns)."""
+    offsets: I64
+    """First row that each data center reads, (B,)."""
+    lengths: I64
+    """Number of rows after which the series of each data center repeats, (B,)."""
+
+    def row_numbers(self, index: I64) -> I64:
+        """Row of ``values`` that each data center reads at step ``index`` of its series, (B,)."""
+        return self.offsets + index % self.lengths
+
+    def at(self, index: I64) -> npt.NDArray[Any]:
+        """Rows of all data centers at step ``index`` of their series, (B, columns)."""
+        return self.values.take(self.row_numbers(index), axis=0)
+
+
+def time_rows(
+    series: Sequence[Table],
+    read: Callable[[I64, I64], npt.NDArray[Any]],
+    *,
+    period: int,
+    row_bytes: int,
+) -> TimeRows | None:
+    """Compute the rows of all steps, once for data centers that read the same series.
+
+    Args:
+        series: the series that the rows depend on, each for all data centers.
+        read: computes rows, (n, columns), from steps of the year, (n,), and data centers, (n,).
+        period: steps after which the clock repeats, as far as the rows depend on it.
+        row_bytes: memory of a row and of whatever else is kept per row, in bytes.
+
+    Returns:
+        None where there can be no such rows: the series of a data center differ in length, end
+        within a period, or need more memory than ``MAX_ROW_BYTES``.
+    """
+    length = series[0].length
+    alike = all(np.array_equal(one.length, length) for one in series)
+    if not alike or np.any(length % period):
+        return None
+    places = np.stack([*(one.offset for one in series), length], axis=1)
+    _, first, which = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    lengths = length[first]
+    if int(lengths.sum()) * row_bytes > MAX_ROW_BYTES:
+        return None
+    parts = [read(np.arange(n), np.full(n, dc)) for dc, n in zip(first, lengths, strict=True)]
+    offsets = np.cumsum(lengths) - lengths
+    return TimeRows(np.concatenate(parts), offsets[which.reshape(-1)], length)
+
+
+class EntryOrder:
+    """The order of an observation's entries, taken from time entries and measured entries.
+
+    Args:
+        columns: where each entry of the observation comes from: below ``time_width`` the column of
+            a time row, from there on ``time_width`` plus the row of the measured entries.
+        time_width: number of time entries that a row has.
+
+    Attributes:
+        width: number of entries of the observation.
+    """
+
+    def __init__(self, columns: Sequence[int], time_width: int) -> None:
+        given = np.array(columns)
+        self.width = len(given)
+        # Places of measured entries take any time entry and are written over afterwards.
+        self._time_columns = np.where(given < time_width, given, 0)
+        breaks = np.diff(given, prepend=-2) != 1
+        run_starts = np.flatnonzero(breaks | (given == time_width)).tolist()
+        # Measured entries that are neighbours in the observation and in their source are copied
+        # together.
+        self._measured_runs = [
+            (slice(here, end), slice(source, source + end - here))
+            for here, end in zip(run_starts, [*run_starts[1:], self.width], strict=True)
+            if (source := int(given[here]) - time_width) >= 0
+        ]
+
+    def arrange(self, time_rows: F32) -> F32:
+        """Time rows, (n, time_width), in the order of this observation, (n, width)."""
+        return time_rows.take(self._time_columns, axis=1)
+
+    def assemble(self, arranged: F32, row_numbers: I64 | None, measured: F32) -> F32:
+        """Observations of all data centers, (B, width).
+
+        Args:
+            arranged: rows that ``arrange`` gave, (n, width).
+            row_numbers: row of each data center, (B,); None if ``arranged`` has a row for each,
+                which is then written to.
+            measured: measured entries of all data centers, (m, B).
+        """
+        out = arranged if row_numbers is None else arranged.take(row_numbers, axis=0)
+        for here, source in self._measured_runs:
+            out[:, here] = measured[source].T
+        return out
