@@ -14,7 +14,8 @@ from typer.testing import CliRunner, Result
 from sdc_taichi import load_config
 from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.errors import ConfigError, SdcError
-from sdc_taichi.hall.recirculation import calibrate, design_point
+from sdc_taichi.hall.design_point import design_point
+from sdc_taichi.hall.recirculation import calibrate
 
 
 def call(*arguments: object) -> Result:
@@ -81,7 +82,7 @@ def test_the_matrix_serves_as_matrix_file(tmp_path: Path) -> None:
     )
     R = np.load(out)["R"]
     np.testing.assert_allclose(
-        calibrate(config).exchange.dense(), R / R.sum(axis=1, keepdims=True), rtol=1e-12
+        calibrate(config).mix_weights.dense(), R / R.sum(axis=1, keepdims=True), rtol=1e-12
     )
 
 

@@ -43,7 +43,9 @@ def test_the_papers_hall_comes_out(corrected: DesignHall) -> None:
     np.testing.assert_allclose(corrected.approach_k, config.hall.rack_approach_k(), atol=1e-9)
     assert corrected.air is not None
     assert corrected.air.return_c - corrected.outlet_c.mean() == pytest.approx(-3.1, abs=1e-9)
-    np.testing.assert_allclose(corrected.air.exhaust_share, calibrate(config).share, rtol=1e-9)
+    np.testing.assert_allclose(
+        corrected.air.exhaust_share, calibrate(config).exhaust_share, rtol=1e-9
+    )
     heat_closes(corrected)
     # Racks alike: shares, bypass and RTI have a closed form.
     alike = solve_design_hall(load_config("corrected", WIDE)).air

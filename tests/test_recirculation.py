@@ -23,7 +23,8 @@ from sdc_taichi import (
     load_config,
 )
 from sdc_taichi.config import config_from_dict
-from sdc_taichi.hall.recirculation import DENSE_RACKS, calibrate, layout_exchange
+from sdc_taichi.hall.mix_weights import DENSE_RACKS, layout_weights
+from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.sim.hall_solver import MOST_SWEEPS, Conditions, Hall, HallSums, Precision
 from sdc_taichi.types import F64, ServerLayers
 
@@ -363,7 +364,7 @@ def test_weights_are_those_of_the_paths(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(shape[0] * shape[1])
     hall = config_from_dict(random_values(rng, "dc", shape)).hall
     flow = rng.uniform(0.5, 2.0, hall.racks)
-    exchange = layout_exchange(hall, flow)
+    exchange = layout_weights(hall, flow)
     dense, expected = exchange.dense(), reference_twin.layout_weights(hall, flow)
     assert_close(dense, expected, 1e-12, "weights", scale=1.0)
     assert_close(dense.sum(axis=1), np.ones(hall.racks), 1e-12, "rows sum to 1")
@@ -382,7 +383,7 @@ def test_rows_of_deep_racks_are_within_reach(shape: tuple[int, int], cutoff: flo
     values["hall"]["recirculation"] = {"decay_m": 3.0, "cutoff": cutoff}
     hall = config_from_dict(values).hall
     expected = reference_twin.layout_weights(hall, np.ones(hall.racks))
-    assert_close(layout_exchange(hall).dense(), expected, 1e-12, "weights", scale=1.0)
+    assert_close(layout_weights(hall).dense(), expected, 1e-12, "weights", scale=1.0)
     assert np.all(expected > 0) == (cutoff == 0)
 
 
@@ -395,7 +396,7 @@ def test_paths_of_many_decay_lengths_leave_weights(shape: tuple[int, int]) -> No
         k: v if k in ("containment", "returns") else 1e3 * v for k, v in layout.items()
     }
     config = config_from_dict(values)
-    dense = layout_exchange(config.hall).dense()
+    dense = layout_weights(config.hall).dense()
     assert_close(dense.sum(axis=1), np.ones(config.hall.racks), 1e-12, "rows sum to 1")
 
 
@@ -410,12 +411,12 @@ def test_a_cutoff_that_leaves_no_source_is_refused() -> None:
         values["hvac"]["crac"]["unit_shares"] = None
         hall = config_from_dict(values).hall
         with pytest.raises(ConfigError, match="without any source: their largest") as error:
-            layout_exchange(hall)
+            layout_weights(hall)
         assert f"hall.recirculation.cutoff {cutoff:g} with decay_m 50" in str(error.value)
         largest = float(str(error.value).split("weight is ")[1].split(";")[0])
         if shape == (10, 100):
             smaller = hall.recirculation.model_copy(update={"cutoff": 0.5 * largest})
-            exchange = layout_exchange(hall.model_copy(update={"recirculation": smaller}))
+            exchange = layout_weights(hall.model_copy(update={"recirculation": smaller}))
             assert np.all(np.isfinite(exchange.norm))
 
 
@@ -427,7 +428,7 @@ def test_more_weights_than_fit_are_refused() -> None:
     }  # fmt: skip
     values["hvac"]["crac"]["unit_shares"] = None
     with pytest.raises(ConfigError, match=r"keeps 6.39e.09 weights for 800,000 racks; valid is at"):
-        layout_exchange(config_from_dict(values).hall)
+        layout_weights(config_from_dict(values).hall)
 
 
 @pytest.mark.parametrize("shape", MERGED + LONG)
@@ -436,10 +437,10 @@ def test_large_halls_drop_small_weights_alone(shape: tuple[int, int], cutoff: fl
     assert shape[0] * shape[1] > DENSE_RACKS
     values = random_values(np.random.default_rng(4), "dc", shape)
     values["hall"]["recirculation"] = {"decay_m": 1.5, "cutoff": 0.0}
-    every = layout_exchange(config_from_dict(values).hall).dense()
+    every = layout_weights(config_from_dict(values).hall).dense()
     assert np.all(every > 0)
     values["hall"]["recirculation"]["cutoff"] = cutoff
-    cut = layout_exchange(config_from_dict(values).hall).dense()
+    cut = layout_weights(config_from_dict(values).hall).dense()
     kept = cut > 0
     assert 0 < np.mean(~kept) < 1
     # Racks at the rim collect down to a quarter of what those amid the hall do.
@@ -457,7 +458,7 @@ def test_recirculation_takes_less_than_there_is(seed: int) -> None:
     matrix = flows.matrix()
     assert np.all(matrix >= 0)
     assert np.all(matrix.sum(axis=1) <= 1.0)
-    assert np.all((flows.captured >= 0) & (flows.captured < 1))
+    assert np.all((flows.group_exhaust_share >= 0) & (flows.group_exhaust_share < 1))
     assert np.max(np.abs(np.linalg.eigvals(matrix))) < 1.0
     airflow = flows.design.airflow_m3s
     assert np.all(airflow - matrix.T @ airflow >= 0), "a rack gives more air than it exhausts"

@@ -37,7 +37,8 @@ from sdc_taichi.envs.rewards import collaborative_rewards
 from sdc_taichi.exogenous.psychrometrics import humidity_ratio, stull_wet_bulb_c, wet_bulb_c
 from sdc_taichi.hall import air_metrics
 from sdc_taichi.hall.floor_plan import floor_plan
-from sdc_taichi.hall.recirculation import calibrate, layout_exchange
+from sdc_taichi.hall.mix_weights import layout_weights
+from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.plant import chiller, cooling, tower, water, workload
 from sdc_taichi.plant.battery import BATTERIES
 from sdc_taichi.plant.carbon import emitted_g
@@ -782,7 +783,7 @@ def check_recirculation_of_a_row(check: Check) -> Values:
     it_rise_k = (sums.cpu_w + sums.it_fan_w) / (RHO_CP * sums.it_airflow_m3s)
     assert it_rise_k == pytest.approx(given["dT_IT"], rel=1e-12)
     return {
-        "r": float(np.mean(flows.share)),
+        "r": float(np.mean(flows.exhaust_share)),
         "b": 1.0 - flows.fresh_share,
         "RTI_local": rti_of(sums),
     }
@@ -793,12 +794,12 @@ def check_recirculation_of_a_hall(check: Check) -> Values:
     config = even_hall(given)
     places = floor_plan(config.hall).centre_m
     np.testing.assert_allclose(places - places[0], given["rack_centres"], atol=1e-12)
-    flows, weights = calibrate(config), layout_exchange(config.hall).dense()
+    flows, weights = calibrate(config), layout_weights(config.hall).dense()
     sums, supply_c = solve_even(config, 1.0)
     airflow = np.asarray(sums.rack_airflow_m3s)
-    left = airflow - flows.exchange.apply_transposed(flows.share * airflow)
+    left = airflow - flows.mix_weights.apply_transposed(flows.exhaust_share * airflow)
     return {
-        "r": flows.share,
+        "r": flows.exhaust_share,
         "W_row0": weights[0],
         "mean_approach": sums.inlet_mean_c[0] - supply_c,
         "T_ret_minus_T_sup": sums.return_c[0] - supply_c,

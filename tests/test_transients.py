@@ -66,7 +66,7 @@ def random_state(rng: np.random.Generator, fleet: Fleet, precision: Precision) -
     return HallState(
         server_c=rng.uniform(22, 50, groups).astype(real),
         mixed_c=rng.uniform(20, 40, fleet.racks).astype(real),
-        exhaust_c=(fleet.air.strength * rng.uniform(25, 45, fleet.racks)).astype(real),
+        exhaust_c=(fleet.air.mix_weights.strength * rng.uniform(25, 45, fleet.racks)).astype(real),
         captured_m3s=rng.uniform(0, 1, fleet.racks).astype(real),
         need_m3s=fleet.unit_design_m3s * rng.uniform(0.2, 1.2, fleet.units),
         following=rng.uniform(0.2, 1.1, fleet.size)[fleet.unit_dc],
@@ -79,7 +79,9 @@ def twin_memory(fleet: Fleet, part: Part, state: HallState, room_j: float) -> re
     return reference_twin.Memory(
         server_c=np.repeat(np.asarray(state.server_c, np.float64)[part.groups], counts),
         mixed_c=np.asarray(state.mixed_c, np.float64)[part.racks],
-        given_c=(np.asarray(state.exhaust_c, np.float64) / fleet.air.strength)[part.racks],
+        given_c=(np.asarray(state.exhaust_c, np.float64) / fleet.air.mix_weights.strength)[
+            part.racks
+        ],
         captured_m3s=np.asarray(state.captured_m3s, np.float64)[part.racks],
         need_m3s=state.need_m3s[part.units],
         following=state.following[part.units],

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
-from sdc_taichi.hall.floor_plan import Plan
+from sdc_taichi.hall.floor_plan import FloorPlan
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, Reals, StepResult
 from sdc_taichi.year_clock import FIRST_YEAR, day_of_year, step_times
@@ -273,17 +273,17 @@ def colour_range(values: F64) -> tuple[float, float]:
     return float(middle - half), float(middle + half)
 
 
-def is_turned(plan: Plan) -> bool:
+def is_turned(plan: FloorPlan) -> bool:
     """Whether y runs to the right on the page, where the longer side of the room lies."""
     return plan.width_m > plan.length_m
 
 
-def on_page(plan: Plan, xy: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def on_page(plan: FloorPlan, xy: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Coordinates on the page of those in the room, (..., 2)."""
     return xy[..., ::-1] if is_turned(plan) else xy
 
 
-def rack_boxes(plan: Plan, pitch_m: float, depth_m: float) -> F64:
+def rack_boxes(plan: FloorPlan, pitch_m: float, depth_m: float) -> F64:
     """Corners of the racks on the page, (R, 4, 2)."""
     half = np.array([pitch_m / 2, depth_m / 2])
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])

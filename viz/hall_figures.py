@@ -9,7 +9,7 @@ import numpy as np
 
 from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import SdcError
-from sdc_taichi.hall.floor_plan import Plan, floor_plan, unit_places_m
+from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan, unit_places_m
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, StepResult
 
@@ -183,7 +183,12 @@ def modes(series: Mapping[str, tuple[F64, F64]], title: str) -> Figure:
 
 
 def _draw_racks(
-    axes: Axes, hall: HallConfig, plan: Plan, values: F64, cmap: str, limits: tuple[float, float]
+    axes: Axes,
+    hall: HallConfig,
+    plan: FloorPlan,
+    values: F64,
+    cmap: str,
+    limits: tuple[float, float],
 ) -> PolyCollection:
     """Racks to scale with their fronts, and the walls."""
     from matplotlib.collections import LineCollection, PolyCollection

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import HallConfig
-from sdc_taichi.hall.floor_plan import Plan, floor_plan
+from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, Reals
 
@@ -162,7 +162,7 @@ def voxels(hall: HallConfig, zones: int) -> Voxels:
     )
 
 
-def outline_m(plan: Plan, height_m: float) -> list[list[tuple[float, float, float]]]:
+def outline_m(plan: FloorPlan, height_m: float) -> list[list[tuple[float, float, float]]]:
     """Lines around the floor and the ceiling of a hall."""
     corners = [(0.0, 0.0), (plan.length_m, 0.0), (plan.length_m, plan.width_m), (0.0, plan.width_m)]
     return [[(x, y, z) for x, y in (*corners, corners[0])] for z in (0.0, height_m)]
@@ -207,7 +207,7 @@ def zone_peaks(layers: Shots, zones: Zones) -> Shots:
     return np.asarray(np.maximum.reduceat(of_groups, zones.starts, axis=-1))
 
 
-def unit_boxes_m(places_m: F64, plan: Plan, height_m: float) -> F64:
+def unit_boxes_m(places_m: F64, plan: FloorPlan, height_m: float) -> F64:
     """Centres of boxes for CRAC units whose places are on the end walls, outside of the room."""
     outside = np.where(places_m[:, 0] > plan.length_m / 2, 0.5, -0.5)
     return np.stack(

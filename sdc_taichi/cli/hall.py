@@ -91,7 +91,7 @@ def solve_hall(
 
 
 def _solve(config: DataCenterConfig, cell_m: float) -> LayoutSolution:
-    from sdc_taichi.hall.recirculation import design_point
+    from sdc_taichi.hall.design_point import design_point
     from sdc_taichi.layout_solver.solve import solve
 
     outlets = config.servers.outlet_model

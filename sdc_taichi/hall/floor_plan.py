@@ -17,7 +17,7 @@ from sdc_taichi.types import F64
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class FloorPlan:
     """Floor plan of a hall of R racks, row by row."""
 
     centre_m: F64
@@ -38,7 +38,7 @@ class Plan:
     """Volume of the room less that of the racks."""
 
 
-def floor_plan(hall: HallConfig) -> Plan:
+def floor_plan(hall: HallConfig) -> FloorPlan:
     """Places of the racks."""
     measures = hall.layout
     row = np.arange(hall.rows)
@@ -53,7 +53,7 @@ def floor_plan(hall: HallConfig) -> Plan:
     length_m = row_length_m + 2 * measures.end_margin_m
     width_m = float(row_y[-1]) + measures.rack_depth_m / 2 + measures.side_margin_m
     rack_m3 = measures.rack_pitch_m * measures.rack_depth_m * measures.rack_height_m
-    return Plan(
+    return FloorPlan(
         centre_m=centre,
         front_m=centre + half,
         back_m=centre - half,
@@ -72,7 +72,7 @@ def row_distance_m(measures: LayoutConfig, row: npt.NDArray[np.int64]) -> F64:
     return np.asarray(row // 2 * (cold + hot) + row % 2 * cold, dtype=np.float64)
 
 
-def unit_places_m(plan: Plan, units: int) -> F64:
+def unit_places_m(plan: FloorPlan, units: int) -> F64:
     """Places of the CRAC units, along both end walls in turn, (units, 2)."""
     index = np.arange(units)
     walls = index % 2
@@ -81,7 +81,7 @@ def unit_places_m(plan: Plan, units: int) -> F64:
     return np.stack([walls * plan.length_m, y], axis=1)
 
 
-def unit_shares(plan: Plan, units: int, length_m: float) -> F64:
+def unit_shares(plan: FloorPlan, units: int, length_m: float) -> F64:
     """Share of each unit in the supply of each rack, (R, units); rows sum to 1.
 
     A share falls with the distance from unit to inlet face as exp(-distance/length).

@@ -1,39 +1,59 @@
-"""Where the sweeps of quasi-steady halls start: a table of their steady states."""
+"""First guess of the exhaust mixes before the racks, from a table of a hall's steady states.
+
+In steady air the mixes follow from the outlets, and the outlets from the mixes: the kernel sweeps
+over the racks until they agree. A guess near the answer saves most of the sweeps. Where racks are
+loaded alike the answer depends on supply temperature and load alone, so it is computed once per
+hall for a grid of both and stored as shares of a few patterns over the racks. The kernel reads the
+table with cubics.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.hall.recirculation import DENSE_RACKS, RackServers, Recirculation
+from sdc_taichi.hall.mix_weights import DENSE_RACKS
+from sdc_taichi.hall.rack_servers import RackServers
+from sdc_taichi.hall.recirculation import Recirculation
 from sdc_taichi.plant.servers import ServerCurves
-from sdc_taichi.types import F64, I32
+from sdc_taichi.types import F32, F64, I32
 
-LOADS = np.linspace(0.0, 1.0, 65)
-"""Loads of the table: airflow and power bend where their limits set in."""
+TABLE_LOADS = np.linspace(0.0, 1.0, 65)
+"""Loads of the table, so close because airflow and power bend where their limits set in."""
 SUPPLY_STEP_K = 0.5
-"""Supply temperatures of the table lie so far apart: setpoints move in whole or half kelvins."""
+"""Distance of the supply temperatures of the table, in K; setpoints move in whole or half kelvins.
+A wide range of setpoints has wider steps."""
 MOST_SUPPLIES = 65
+"""Most supply temperatures of the table of a wide range of setpoints."""
 PATTERNS = 7
-"""Most patterns of a hall; six are all that 1e-4 K tell apart in a hall of 20 racks."""
+"""Most patterns of a hall; six tell all mixes of a hall of 20 racks to 1e-4 K."""
 SAMPLED_RACKS = 4
-"""Racks whose mean tells how a hall that drops weights behaves."""
+"""Racks whose mean stands for all racks of a hall that drops weights."""
 
-_BATCH, _LEAST_BATCH = 2**13, 32
-"""Values that are computed at a time, so that they stay in the cache, and entries for which so many
-or more are computed."""
-_FAR_K = 1e-3
-"""Moves that tell what racks keep of them."""
+_BATCH_VALUES, _LEAST_BATCH = 2**13, 32
+"""Values that are computed at a time, so that they stay in the cache, and least table entries that
+are computed at a time."""
+_SECANT_K = 1e-3
+"""Smallest move of a mix, in K, from which a feedback gain is read."""
 _LAST_STEP_K = 2e-3
-"""The next would be shorter by a factor of fifty to a hundred."""
-_USUALLY_KEPT = 0.2
+"""Largest Newton step that ends the search, in K; another would be shorter by a factor of fifty to
+a hundred."""
+_USUAL_GAIN = 0.2
+"""Feedback gain of a usual hall, from which the search starts."""
+_MOST_GAIN = 0.9
+"""Largest feedback gain, of either sign, that the search goes by."""
 _MOST_HEAT_K = 100.0
-"""Where fans hardly blow, the air is warmed without bounds, which would drown all other entries."""
+"""Most that heat warms air by, in K. Where fans hardly blow it knows no bounds, and would drown all
+other entries in the patterns."""
 _MOST_PASSES = 10
+"""Most Newton steps with merged server groups."""
 _MOST_EXACT_PASSES = 2
+"""Most Newton steps with all server groups, from the result with merged ones."""
+_NEUMANN_TERMS = 4
+"""Terms of the Neumann series that solves for a Newton step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,112 +61,227 @@ class SteadyStateTable:
     """Steady states of a hall as shares of patterns over its racks."""
 
     supply_c: F64
-    """Supply air of the table, evenly spaced, (n,)."""
+    """Supply temperatures of the table, evenly spaced, in C, (n,)."""
     patterns: F64
-    """Exhaust mix before each rack over supply air, (k, R). Of halls of more than DENSE_RACKS:
-    approach and rise in the mix, then of the racks themselves, at the design point, (4, R)."""
-    values: npt.NDArray[np.float32]
-    """How much of each pattern, and last ``kept``, which is left of a deviation of the mixes after
-    it has passed the racks once, (n, len(LOADS), k + 1); of large halls k is 2."""
+    """Patterns over the racks, (k, R). In halls of up to DENSE_RACKS they are patterns of the
+    exhaust mix over supply air. In larger halls they are, at the design point and in K, the mix of
+    approach temperatures, the mix of temperature rises, the approach temperatures and the rises of
+    the racks themselves, (4, R)."""
+    pattern_shares: F32
+    """How much of each pattern a steady state holds, (n, len(TABLE_LOADS), k). In larger halls k is
+    2: one share for approach temperatures, one for rises, of mixes and racks alike."""
+    feedback_gain: F32
+    """Change of a rack's outlet with a change of the mix before it, in K/K, mean over the racks,
+    (n, len(TABLE_LOADS))."""
 
 
 def initial_guess(
-    config: DataCenterConfig, racks: RackServers, flows: Recirculation
+    config: DataCenterConfig, servers: RackServers, recirculation: Recirculation
 ) -> SteadyStateTable:
-    """Steady states of a hall whose CRAC units cover what it needs, its racks loaded alike.
+    """Table of the steady states of a hall whose CRAC units cover what its racks need.
 
-    Halls of up to DENSE_RACKS are taken as they are, larger ones as the mean of SAMPLED_RACKS.
+    All racks have the same load. Halls of up to DENSE_RACKS are computed as they are, larger ones
+    as the mean of SAMPLED_RACKS racks.
+
+    Args:
+        config: The data center.
+        servers: Its ``rack_servers``.
+        recirculation: Its calibrated recirculation.
     """
-    setpoint, design, hall = config.hvac.setpoint, flows.design, config.hall
+    supply_c = _table_supplies_c(config)
+    dense = config.hall.racks <= DENSE_RACKS
+    part = (_whole_hall if dense else _sampled_racks)(servers, recirculation)
+    states = _steady_states(config, part, recirculation, supply_c)
+    if dense:
+        patterns, shares = _strongest_patterns(states.mix_k[:, :-1])
+    else:
+        patterns, shares = _design_patterns(states, recirculation)
+    gain = states.feedback_gain.mean(axis=0)[:-1]
+    grid = len(supply_c), len(TABLE_LOADS)
+    return SteadyStateTable(
+        supply_c=supply_c,
+        patterns=patterns,
+        pattern_shares=shares.T.reshape(*grid, -1).astype(np.float32),
+        feedback_gain=gain.reshape(grid).astype(np.float32),
+    )
+
+
+def _table_supplies_c(config: DataCenterConfig) -> F64:
+    """Supply temperatures of the table, which cover the range of setpoints, in C, (n,)."""
+    setpoint = config.hvac.setpoint
     span_k = setpoint.max_c - setpoint.min_c
     step_k = max(SUPPLY_STEP_K, span_k / (MOST_SUPPLIES - 1))
-    rows = 1 + max(1, int(np.ceil(span_k / step_k - 1e-9)))
-    supply_c = np.asarray(setpoint.min_c + step_k * np.arange(rows), dtype=np.float64)
-    start = racks.start
-    columns = np.stack([racks.count, racks.full_w, racks.idle_w, racks.deviation, flows.captured])
-    if hall.racks <= DENSE_RACKS:
-        weights, mix_k = flows.exchange.dense(), flows.exchange.apply(design.outlet_rise_k)
-    else:
-        chosen = np.arange(0, hall.racks, -(-hall.racks // SAMPLED_RACKS))
-        kept = np.concatenate([np.arange(*start[r : r + 2]) for r in chosen])
-        start, columns = np.array([0, len(kept)], dtype=np.int32), columns[:, kept]
-        weights, mix_k = np.ones((1, 1)), design.outlet_rise_k[chosen].mean(keepdims=True)
-    groups, merged = _by_rack(start, columns), _by_rack(*_merged(start, columns))
-    air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
-    shape = len(mix_k), rows * len(LOADS) + 1
-    state = _Steady(
-        config.servers.curves,
-        weights,
-        1.0 / (design.fan_full_airflow_m3s * air),
-        # The design point comes last.
-        np.append(np.repeat(supply_c, len(LOADS)), design.supply_c),
-        np.append(np.tile(LOADS, rows), 1.0),
-        np.broadcast_to(mix_k[:, None], shape),
-        np.full(shape, _USUALLY_KEPT),
+    count = 1 + max(1, int(np.ceil(span_k / step_k - 1e-9)))
+    return np.asarray(setpoint.min_c + step_k * np.arange(count), dtype=np.float64)
+
+
+class _HallPart(NamedTuple):
+    """Racks whose steady states are computed: all of a hall, or a sample of it as one rack."""
+
+    group_offsets: I32
+    """First server group of each rack, (R + 1,)."""
+    columns: F64
+    """Rows count, full power, idle power, load deviation and exhaust share of the server groups,
+    (5, G)."""
+    weights: F64
+    """Weights of the exhaust mix, (R, R)."""
+    design_mix_k: F64
+    """Exhaust mix before each rack over supply air at the design point, in K, (R,)."""
+
+
+def _whole_hall(servers: RackServers, recirculation: Recirculation) -> _HallPart:
+    """All racks of a hall."""
+    weights = recirculation.mix_weights
+    return _HallPart(
+        group_offsets=servers.group_offsets,
+        columns=_columns(servers, recirculation),
+        weights=weights.dense(),
+        design_mix_k=weights.apply(recirculation.design.outlet_rise_k),
     )
-    state.settle(merged, _MOST_PASSES)
+
+
+def _sampled_racks(servers: RackServers, recirculation: Recirculation) -> _HallPart:
+    """A sample of the racks of a hall as one rack that breathes its own exhaust."""
+    offsets, outlet_rise_k = servers.group_offsets, recirculation.design.outlet_rise_k
+    racks = len(outlet_rise_k)
+    sample = np.arange(0, racks, -(-racks // SAMPLED_RACKS))
+    groups = np.concatenate([np.arange(*offsets[rack : rack + 2]) for rack in sample])
+    return _HallPart(
+        group_offsets=np.array([0, len(groups)], dtype=np.int32),
+        columns=_columns(servers, recirculation)[:, groups],
+        weights=np.ones((1, 1)),
+        design_mix_k=outlet_rise_k[sample].mean(keepdims=True),
+    )
+
+
+def _columns(servers: RackServers, recirculation: Recirculation) -> F64:
+    """What the steady states read of the server groups, see ``_HallPart``, (5, G)."""
+    return np.stack(
+        [
+            servers.count,
+            servers.full_w,
+            servers.idle_w,
+            servers.load_deviation,
+            recirculation.group_exhaust_share,
+        ]
+    )
+
+
+def _steady_states(
+    config: DataCenterConfig, part: _HallPart, recirculation: Recirculation, supply_c: F64
+) -> _SteadyStates:
+    """Steady states of the whole table and, as the last entry, of the design point."""
+    design, hall = recirculation.design, config.hall
+    air_j_per_m3_k = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
+    shape = len(part.design_mix_k), len(supply_c) * len(TABLE_LOADS) + 1
+    states = _SteadyStates(
+        curves=config.servers.curves,
+        weights=part.weights,
+        k_per_w=1.0 / (design.fan_full_airflow_m3s * air_j_per_m3_k),
+        supply_c=np.append(np.repeat(supply_c, len(TABLE_LOADS)), design.supply_c),
+        load=np.append(np.tile(TABLE_LOADS, len(supply_c)), 1.0),
+        mix_k=np.broadcast_to(part.design_mix_k[:, None], shape),
+        feedback_gain=np.full(shape, _USUAL_GAIN),
+    )
+    groups = _by_rack(part.group_offsets, part.columns)
+    merged = _by_rack(*_merge_neighbours(part.group_offsets, part.columns))
+    states.solve(merged, _MOST_PASSES)
     if groups.size > merged.size:
-        state.settle(groups, _MOST_EXACT_PASSES)
-    if hall.racks <= DENSE_RACKS:
-        table = state.mix_k[:, :-1]
-        # Eigenvectors come with the weakest first; of the small product of the table with itself
-        # they take no threads.
-        patterns = np.linalg.eigh(table @ table.T)[1].T[: -PATTERNS - 1 : -1]
-        parts = patterns @ table
-    else:
-        scales = np.concatenate([state.inlet_k, state.heat_k])
-        parts = (scales / np.maximum(scales[:, -1:], 1e-9))[:, :-1]
-        own = np.stack([flows.approach_k, design.outlet_rise_k - design.approach_k])
-        patterns = np.concatenate([[flows.exchange.apply(row) for row in own], own])
-    values = np.concatenate([parts, state.kept.mean(axis=0, keepdims=True)[:, :-1]])
-    shaped = values.T.reshape(rows, len(LOADS), -1)
-    return SteadyStateTable(supply_c, patterns, shaped.astype(np.float32))
+        states.solve(groups, _MOST_EXACT_PASSES)
+    return states
+
+
+def _strongest_patterns(mix_k: F64) -> tuple[F64, F64]:
+    """Principal components of the mixes, (R, m), and how much of each they hold.
+
+    Returns:
+        Patterns, (k, R), strongest first, and shares, (k, m).
+    """
+    # Eigenvectors come weakest first; those of the small product of the table with itself take no
+    # threads.
+    patterns = np.linalg.eigh(mix_k @ mix_k.T)[1].T[: -PATTERNS - 1 : -1]
+    return patterns, patterns @ mix_k
+
+
+def _design_patterns(states: _SteadyStates, recirculation: Recirculation) -> tuple[F64, F64]:
+    """Patterns of the design point, (4, R), and shares of approach and rise over it, (2, m)."""
+    scales = np.concatenate([states.inlet_k, states.heat_k])
+    shares = (scales / np.maximum(scales[:, -1:], 1e-9))[:, :-1]
+    approach_k = recirculation.approach_k
+    own = np.stack([approach_k, recirculation.design.outlet_rise_k - approach_k])
+    mixes = [recirculation.mix_weights.apply(row) for row in own]
+    return np.concatenate([mixes, own]), shares
 
 
 @dataclass(slots=True)
-class _Steady:
-    """Exhaust mixes of the racks that settle, for each supply temperature and load."""
+class _SteadyStates:
+    """Search for the steady exhaust mixes of R racks at m pairs of supply temperature and load."""
 
     curves: ServerCurves
+    """Curves of the servers."""
     weights: F64
+    """Weights of the exhaust mix, (R, R)."""
     k_per_w: float
-    """Over the airflow ratio of the servers."""
+    """Temperature rise of the air of one server per power at an airflow ratio of 1, in K/W."""
     supply_c: F64
+    """Supply temperature of each pair, in C, (m,)."""
     load: F64
+    """Load of each pair, 0..1, (m,)."""
     mix_k: F64
-    """Over supply air, (R, n), as all that follow."""
-    kept: F64
-    """Of a deviation of the mix before each rack, by its outlet."""
+    """Exhaust mix before each rack over supply air, in K, (R, m)."""
+    feedback_gain: F64
+    """Change of each rack's outlet with a change of the mix before it, in K/K, (R, m)."""
     inlet_k: F64 | None = None
+    """Airflow-weighted mean inlet of each rack over supply air, in K, (R, m)."""
     heat_k: F64 | None = None
-    """What the racks' heat warms their air by."""
+    """Temperature rise of the air through each rack, in K, (R, m)."""
 
-    def settle(self, groups: F64, passes: int) -> None:
-        """Newton steps, by what the racks kept of the one before."""
+    def solve(self, groups: F64, passes: int) -> None:
+        """Take Newton steps towards mixes that their own outlets make.
+
+        With outlets T(m) of the mixes m, the residual is w T(m) - m and a step s solves
+        (1 - w G) s = residual by its Neumann series; the diagonal G holds the feedback gains, as
+        secants over the step before.
+
+        Args:
+            groups: Server groups by rack, see ``_by_rack``, (5, R, most groups of a rack).
+            passes: Most steps.
+        """
         before: tuple[F64, F64] | None = None
         for _ in range(passes):
             outlet_k = self._outlet_k(groups)
             if before is not None:
-                moved_k = self.mix_k - before[0]
-                far = np.abs(moved_k) > _FAR_K
-                kept = np.divide(outlet_k - before[1], moved_k, out=self.kept.copy(), where=far)
-                self.kept = np.clip(kept, -0.9, 0.9)
+                self._update_gain(outlet_k - before[1], self.mix_k - before[0])
             before = self.mix_k, outlet_k
-            step_k = back_k = self.weights @ outlet_k - self.mix_k
-            for _ in range(4):
-                back_k = self.weights @ (self.kept * back_k)
-                step_k = step_k + back_k
+            step_k = term_k = self.weights @ outlet_k - self.mix_k
+            for _ in range(_NEUMANN_TERMS):
+                term_k = self.weights @ (self.feedback_gain * term_k)
+                step_k = step_k + term_k
             self.mix_k = self.mix_k + step_k
             if np.max(np.abs(step_k)) < _LAST_STEP_K:
                 break
 
+    def _update_gain(self, outlet_change_k: F64, mix_change_k: F64) -> None:
+        """Feedback gains from changes, (R, m), where mixes have moved far enough."""
+        gain = np.divide(
+            outlet_change_k,
+            mix_change_k,
+            out=self.feedback_gain.copy(),
+            where=np.abs(mix_change_k) > _SECANT_K,
+        )
+        self.feedback_gain = np.clip(gain, -_MOST_GAIN, _MOST_GAIN)
+
     def _outlet_k(self, groups: F64) -> F64:
-        count, full_w, idle_w, deviation, captured = (v[..., None] for v in groups)
+        """Outlets of the racks over supply air with the present mixes, in K, (R, m).
+
+        Keeps ``inlet_k`` and ``heat_k``, of which outlets are the sum.
+        """
+        count, full_w, idle_w, deviation, exhaust_share = (row[..., None] for row in groups)
         self.inlet_k, self.heat_k = np.empty_like(self.mix_k), np.empty_like(self.mix_k)
-        each = max(_LEAST_BATCH, _BATCH // count.size)
-        for a in range(0, len(self.load), each):
-            at = slice(a, a + each)
-            inlet_k = self.mix_k[:, None, at] * captured
+        batch = max(_LEAST_BATCH, _BATCH_VALUES // count.size)
+        for first in range(0, len(self.load), batch):
+            at = slice(first, first + batch)
+            inlet_k = self.mix_k[:, None, at] * exhaust_share
             load = self.load[at]
             load = load + deviation * (load * (1.0 - load))
             inlet_c = self.supply_c[at] + inlet_k
@@ -160,21 +295,22 @@ class _Steady:
         return np.asarray(self.inlet_k + self.heat_k)
 
 
-def _by_rack(start: I32, columns: F64) -> F64:
-    """Columns of groups, (5, G), as (5, R, most groups of a rack); the rest are none."""
-    sizes = np.diff(start)
+def _by_rack(group_offsets: I32, columns: F64) -> F64:
+    """Columns of server groups, (5, G), as (5, R, most groups of a rack), filled up with none."""
+    sizes = np.diff(group_offsets)
     place = np.arange(int(sizes.max()))
-    out = columns[:, start[:-1, None] + np.minimum(place, sizes[:, None] - 1)]
+    out = columns[:, group_offsets[:-1, None] + np.minimum(place, sizes[:, None] - 1)]
     out[0] *= place < sizes[:, None]
     return np.asarray(out)
 
 
-def _merged(start: I32, columns: F64) -> tuple[I32, F64]:
+def _merge_neighbours(group_offsets: I32, columns: F64) -> tuple[I32, F64]:
     """One mean group for neighbours in a rack that take in the same share of exhaust air."""
     first = np.diff(columns[-1], prepend=np.nan) != 0.0
-    first[start[:-1]] = True
+    first[group_offsets[:-1]] = True
     begin = np.flatnonzero(first)
     count = columns[0]
     servers = np.add.reduceat(count, begin)
     means = np.add.reduceat(count * columns[1:], begin, axis=1) / servers
-    return np.searchsorted(begin, start).astype(np.int32), np.concatenate([[servers], means])
+    merged = np.searchsorted(begin, group_offsets).astype(np.int32)
+    return merged, np.concatenate([[servers], means])

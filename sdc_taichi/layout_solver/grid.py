@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.hall.floor_plan import Plan, floor_plan
+from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan
 from sdc_taichi.types import F64, I32
 
 MOST_CELLS = 4_000_000
@@ -157,7 +157,7 @@ def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: fl
     )  # fmt: skip
 
 
-def _strips_m(plan: Plan, hall: HallConfig) -> F64:
+def _strips_m(plan: FloorPlan, hall: HallConfig) -> F64:
     """Depths of aisles and rows in turn, across the hall."""
     row_y = plan.centre_m[:: hall.racks_per_row, 1]
     half = hall.layout.rack_depth_m / 2

@@ -17,7 +17,7 @@ import sdc_taichi
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.hall import air_metrics
-from sdc_taichi.hall.recirculation import MOST_MATRIX_RACKS
+from sdc_taichi.hall.matrix_file import MOST_MATRIX_RACKS
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M, LEAST_LEAK, Grid, build_grid
 from sdc_taichi.types import F64

@@ -9,8 +9,8 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.hall import air_metrics
-from sdc_taichi.hall.floor_plan import Plan, floor_plan, unit_places_m
-from sdc_taichi.hall.recirculation import Exchange
+from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan, unit_places_m
+from sdc_taichi.hall.mix_weights import MixWeights
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
 from sdc_taichi.types import F64
@@ -50,7 +50,7 @@ class DesignHall:
 
     config: DataCenterConfig
     """The data center that the hall belongs to."""
-    plan: Plan
+    plan: FloorPlan
     """Places of racks, aisles and walls."""
     servers: int
     """Number of servers in the hall."""
@@ -122,13 +122,11 @@ def _air_flows(fleet: Fleet, sums: HallSums, approach_k: F64, supply_c: float) -
     air = fleet.air
     if air is None:
         return None
-    exchange = Exchange(
-        air.run_start, air.run_first, air.run_length, air.run_offset, air.weights, air.strength,
-        air.norm,
-    )  # fmt: skip
     airflow_m3s = np.asarray(sums.rack_airflow_m3s, dtype=np.float64)
     # A rack's inlet lies between supply air and the mix before it, by the share it takes of each.
-    mix_over_supply_k = exchange.apply(np.asarray(sums.rack_outlet_c - supply_c, dtype=np.float64))
+    mix_over_supply_k = air.mix_weights.apply(
+        np.asarray(sums.rack_outlet_c - supply_c, dtype=np.float64)
+    )
     share = np.maximum(approach_k / mix_over_supply_k, 0.0)
     flow_m3s = float(sums.crac_flow_m3s[0])
     return_c = float(sums.return_c[0])
@@ -140,11 +138,11 @@ def _air_flows(fleet: Fleet, sums: HallSums, approach_k: F64, supply_c: float) -
         return_c=return_c,
         shi=float(air_metrics.shi(inlet_rise, outlet_rise)[0]),
         rti_pct=float(air_metrics.rti(return_c, supply_c, rise_k)[0]),
-        spectral_radius_bounds=_spectral_radius_bounds(exchange, share),
+        spectral_radius_bounds=_spectral_radius_bounds(air.mix_weights, share),
     )
 
 
-def _spectral_radius_bounds(exchange: Exchange, share: F64) -> tuple[float, float]:
+def _spectral_radius_bounds(weights: MixWeights, share: F64) -> tuple[float, float]:
     """Bounds of the spectral radius of R = diag(share) w, which is not negative.
 
     For any positive x it lies between the least and the largest (R x)_j / x_j (Collatz 1942,
@@ -154,7 +152,7 @@ def _spectral_radius_bounds(exchange: Exchange, share: F64) -> tuple[float, floa
     if len(share) > EXACT_RADIUS_RACKS or low <= 0.0:
         return low, high
     for _ in range(_MOST_ITERATIONS):
-        after = share * exchange.apply(x)
+        after = share * weights.apply(x)
         ratio = after / x
         low, high = float(ratio.min()), float(ratio.max())
         x = after / after.max()

@@ -15,14 +15,12 @@ from sdc_taichi.config import (
     with_values,
 )
 from sdc_taichi.errors import ConfigError, suggestion
+from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
-from sdc_taichi.hall.recirculation import (
-    Recirculation,
-    calibrate,
-    design_point,
-    rack_servers,
-)
+from sdc_taichi.hall.mix_weights import MixWeights
+from sdc_taichi.hall.rack_servers import rack_servers
+from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.types import F64, I32
 
 MOST_ENTRIES = int(np.iinfo(np.int32).max)
@@ -47,28 +45,21 @@ STAGE_MODELS = {
 
 @dataclass(frozen=True, slots=True)
 class HallAir:
-    """Recirculation and CRAC supply of all racks."""
+    """Recirculation and CRAC supply of the R racks of B data centers."""
 
-    run_start: I32
-    """First run of weights of each rack, (R + 1,); see ``recirculation.Exchange``."""
-    run_first: I32
-    run_length: I32
-    run_offset: I32
-    weights: F64
-    norm: F64
-    """(R,)."""
+    mix_weights: MixWeights
+    """Weights of the exhaust mix before each rack, over all racks of the fleet; copies of a hall
+    share their weights."""
+    exhaust_share: F64
+    """Share of each rack's intake that is exhaust air where the height factor is 1, (R,)."""
     unit_shares: F64
-    """Share of each unit in each rack's supply, rack by rack."""
-    share_start: I32
-    """First entry of each data center in ``unit_shares``, (B,)."""
-    strength: F64
-    """Exhaust airflow of each rack over the mean of its hall, 1 with a user's matrix, (R,)."""
-    captured: F64
-    """Recirculated share of each rack's intake where ``height`` is 1, (R,)."""
-    starts: tuple[SteadyStateTable, ...]
-    """Where sweeps start, one per distinct hall."""
-    start: I32
-    """Entry of each data center in ``starts``, (B,)."""
+    """Share of each CRAC unit of its data center in the supply of each rack, rack by rack."""
+    unit_share_offsets: I32
+    """First entry of each data center in ``unit_shares``, and the number of entries, (B + 1,)."""
+    steady_states: tuple[SteadyStateTable, ...]
+    """Tables of steady states, from which sweeps take their first guess, one per distinct hall."""
+    steady_state_of_dc: I32
+    """Entry of each data center in ``steady_states``, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,23 +182,36 @@ class Fleet:
 
 @dataclass(frozen=True, slots=True)
 class _HallArrays:
+    """Arrays of one hall of R racks, G server groups and U CRAC units."""
+
     groups_per_rack: I32
+    """Server groups of each rack, (R,)."""
     groups: F64
+    """Rows GROUP_ROWS of the thermal kernel, (6, G)."""
     approach_k: F64
+    """Mean inlet over supply of each rack at the design point, in K, (R,)."""
     dc: F64
+    """Rows DC_ROWS of the thermal kernel, (18,)."""
     unit_design_m3s: F64
+    """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
     it_airflow_m3s: float
+    """Airflow through all servers at the design point, in m3/s."""
     air: _Air | None
+    """How air moves in the hall; None with inlet model ``approach``."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Air:
-    """Recirculation of one hall, for ``HallAir``."""
+    """Recirculation and CRAC supply of one hall of R racks and U CRAC units."""
 
-    flows: Recirculation
-    shares: F64
-    captured: F64
-    start: SteadyStateTable
+    mix_weights: MixWeights
+    """Weights of the exhaust mix before each rack."""
+    exhaust_share: F64
+    """Share of each rack's intake that is exhaust air where the height factor is 1, (R,)."""
+    unit_shares: F64
+    """Share of each CRAC unit in the supply of each rack, (R, U)."""
+    steady_states: SteadyStateTable
+    """Steady states, from which sweeps take their first guess."""
 
 
 def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet:
@@ -356,35 +360,35 @@ def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
 
 
 def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
-    hall, servers, crac = config.hall, config.servers, config.hvac.crac
-    racks = rack_servers(config)
-    if racks.count.sum() > MOST_ENTRIES:
+    hall, crac, curves = config.hall, config.hvac.crac, config.servers.curves
+    servers = rack_servers(config)
+    if servers.count.sum() > MOST_ENTRIES:
         raise ConfigError(
-            f"{config.name}: {racks.count.sum():.4g} servers; valid is at most {MOST_ENTRIES:,}"
+            f"{config.name}: {servers.count.sum():.4g} servers; valid is at most {MOST_ENTRIES:,}"
         )
-    air_parts, approach_k, fresh_share = None, hall.rack_approach_k(), 1.0
+    air, approach_k, fresh_share = None, hall.rack_approach_k(), 1.0
     if hall.inlet_model == "recirculation":
-        flows = calibrate(config, racks)
-        design, approach_k, fresh_share = flows.design, flows.approach_k, flows.fresh_share
+        found = calibrate(config, servers)
+        design, approach_k, fresh_share = found.design, found.approach_k, found.fresh_share
         shares = (
             unit_shares(floor_plan(hall), crac.units, crac.supply_length_m)
             if crac.unit_shares is None
             else np.array(crac.unit_shares)
         )
         # Units are sized for the racks they supply.
-        need = shares.T @ ((1.0 - flows.share) * design.airflow_m3s)
+        need = shares.T @ ((1.0 - found.exhaust_share) * design.airflow_m3s)
         unit_design_m3s = design.crac_flow_m3s * need / need.sum()
-        air_parts = _Air(
-            flows=flows,
-            shares=shares,
-            captured=racks.per_rack(flows.captured) / racks.per_rack(racks.height),
-            start=initial_guess(config, racks, flows),
+        of_groups = servers.per_rack(found.group_exhaust_share)
+        air = _Air(
+            mix_weights=found.mix_weights,
+            exhaust_share=of_groups / servers.per_rack(servers.height_factor),
+            unit_shares=shares,
+            steady_states=initial_guess(config, servers, found),
         )
     else:
-        design = design_point(config, racks)
+        design = design_point(config, servers)
         unit_design_m3s = np.array([design.crac_flow_m3s])
-    air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
-    curves = servers.curves
+    air_j_per_m3_k = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
     dc = (
         curves.cpu_slope_per_k,
         curves.cpu_offset,
@@ -398,56 +402,74 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         curves.fan_exponent,
         curves.fan_reference_w,
         design.fan_full_airflow_m3s,
-        air,
+        air_j_per_m3_k,
         curves.curve_limit_c,
         fresh_share,
-        servers.heat_capacity_kj_per_k * 1e3,
-        servers.heat_exchange_effectiveness,
-        air * floor_plan(hall).air_m3 / hall.racks,
+        config.servers.heat_capacity_kj_per_k * 1e3,
+        config.servers.heat_exchange_effectiveness,
+        air_j_per_m3_k * floor_plan(hall).air_m3 / hall.racks,
     )
     return _HallArrays(
-        groups_per_rack=np.diff(racks.start),
+        groups_per_rack=np.diff(servers.group_offsets),
         groups=np.stack(
-            [racks.count, racks.full_w, racks.idle_w, racks.offset_k, racks.deviation, racks.height]
+            [
+                servers.count,
+                servers.full_w,
+                servers.idle_w,
+                servers.inlet_offset_k,
+                servers.load_deviation,
+                servers.height_factor,
+            ]
         ),
         approach_k=approach_k,
         dc=np.array(dc),
         unit_design_m3s=unit_design_m3s,
         it_airflow_m3s=float(design.airflow_m3s.sum()),
-        air=air_parts,
+        air=air,
     )
 
 
 def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
-    """Exchanges end to end; copies of a hall share its weights and where its sweeps start."""
+    """Recirculation of all halls end to end; copies of a hall share weights and steady states."""
     found = [h.air for h in halls if h.air is not None]
     distinct = list({id(air): air for air in found}.values())
-    entries = {id(air): i for i, air in enumerate(distinct)}
-    entry = np.array([entries[id(air)] for air in found], dtype=np.int32)
-    first_weight = offsets_from_counts(
-        [len(a.flows.exchange.weights) for a in distinct], "weights"
-    )[entry]
-    exchanges = [a.flows.exchange for a in found]
-    first_rack = offsets_from_counts([len(e.norm) for e in exchanges], "racks")
+    entry_of = {id(air): i for i, air in enumerate(distinct)}
+    entry = np.array([entry_of[id(air)] for air in found], dtype=np.int32)
     return HallAir(
-        run_start=offsets_from_counts(
-            np.concatenate([np.diff(e.run_start) for e in exchanges]), "runs"
+        mix_weights=_joined([air.mix_weights for air in distinct], entry),
+        exhaust_share=np.concatenate([air.exhaust_share for air in found]),
+        unit_shares=np.concatenate([air.unit_shares.reshape(-1) for air in found]),
+        unit_share_offsets=offsets_from_counts(
+            [air.unit_shares.size for air in found], "unit shares"
         ),
-        run_first=np.concatenate(
-            [e.first + rack for e, rack in zip(exchanges, first_rack, strict=False)]
+        steady_states=tuple(air.steady_states for air in distinct),
+        steady_state_of_dc=entry,
+    )
+
+
+def _joined(distinct: Sequence[MixWeights], entry: I32) -> MixWeights:
+    """Weights of many halls as those of one.
+
+    Args:
+        distinct: Weights of the halls that differ.
+        entry: Which of them each data center has, (B,).
+    """
+    halls = [distinct[i] for i in entry]
+    first_rack = offsets_from_counts([len(w.norm) for w in halls], "racks")
+    first_weight = offsets_from_counts([len(w.weights) for w in distinct], "weights")[entry]
+    run_counts = np.concatenate([np.diff(w.run_offsets) for w in halls])
+    return MixWeights(
+        run_offsets=offsets_from_counts(run_counts, "runs"),
+        run_first_rack=np.concatenate(
+            [w.run_first_rack + rack for w, rack in zip(halls, first_rack, strict=False)]
         ),
-        run_length=np.concatenate([e.length for e in exchanges]),
-        run_offset=np.concatenate(
-            [e.offset + weight for e, weight in zip(exchanges, first_weight, strict=True)]
+        run_length=np.concatenate([w.run_length for w in halls]),
+        run_first_weight=np.concatenate(
+            [w.run_first_weight + weight for w, weight in zip(halls, first_weight, strict=True)]
         ),
-        weights=np.concatenate([a.flows.exchange.weights for a in distinct]),
-        norm=np.concatenate([e.norm for e in exchanges]),
-        strength=np.concatenate([e.strength for e in exchanges]),
-        captured=np.concatenate([a.captured for a in found]),
-        unit_shares=np.concatenate([a.shares.reshape(-1) for a in found]),
-        share_start=offsets_from_counts([a.shares.size for a in found], "unit shares")[:-1],
-        starts=tuple(a.start for a in distinct),
-        start=entry,
+        weights=np.concatenate([w.weights for w in distinct]),
+        strength=np.concatenate([w.strength for w in halls]),
+        norm=np.concatenate([w.norm for w in halls]),
     )
 
 

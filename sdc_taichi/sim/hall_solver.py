@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from sdc_taichi.errors import RuntimeStateError, SdcError
-from sdc_taichi.hall.initial_guess import LOADS
-from sdc_taichi.hall.recirculation import DENSE_RACKS
+from sdc_taichi.hall.initial_guess import TABLE_LOADS
+from sdc_taichi.hall.mix_weights import DENSE_RACKS
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim.fleet import Fleet, offsets_from_counts
 from sdc_taichi.types import F64, Reals, ServerLayers
@@ -293,12 +293,12 @@ class Hall:
             zip(np.diff(fleet.rack_offsets), np.diff(fleet.unit_offsets), strict=True)
         ):
             own = np.zeros((int(self._blocks[dc]) * lanes, int(units)))
-            at = air.share_start[dc]
+            at = air.unit_share_offsets[dc]
             own[:racks] = air.unit_shares[at : at + racks * units].reshape(racks, units)
             shares.append(own.reshape(-1, lanes, int(units)).swapaxes(1, 2).reshape(-1, lanes))
             if racks > DENSE_RACKS:
                 continue
-            entry = int(air.start[dc])
+            entry = int(air.steady_state_of_dc[dc])
             if entry not in known:
                 at_once = thermal.SOURCES
                 whole = -(-int(racks) // at_once) * at_once
@@ -322,13 +322,13 @@ class Hall:
         assert air is not None
         vectors, firsts = [], []
         total = 0
-        first_dcs = np.unique(air.start, return_index=True)[1]
-        for start, blocks in zip(air.starts, self._blocks[first_dcs], strict=True):
+        first_dcs = np.unique(air.steady_state_of_dc, return_index=True)[1]
+        for start, blocks in zip(air.steady_states, self._blocks[first_dcs], strict=True):
             patterns = np.zeros((thermal.PATTERNS, int(blocks) * lanes))
             patterns[: len(start.patterns), : start.patterns.shape[1]] = start.patterns
-            shares = np.zeros((*start.values.shape[:2], lanes))
-            shares[..., : start.values.shape[2] - 1] = start.values[..., :-1]
-            shares[..., -1] = start.values[..., -1]
+            shares = np.zeros((*start.feedback_gain.shape, lanes))
+            shares[..., : start.pattern_shares.shape[2]] = start.pattern_shares
+            shares[..., -1] = start.feedback_gain
             # Cubics reach one row and column beyond.
             beyond = ((1, 1), (1, 1), (0, 0))
             shares = np.pad(shares, beyond, mode="reflect", reflect_type="odd")
@@ -339,7 +339,7 @@ class Hall:
         offsets_from_counts([total], "vectors of starts")
         self._starts = self._lanes(total)
         self._starts[:] = np.concatenate(vectors)
-        rows = np.array(firsts)[air.start].T
+        rows = np.array(firsts)[air.steady_state_of_dc].T
         for name, values in zip(("pattern", "start", "start_rows"), rows, strict=True):
             self._dc_ints[thermal.DC_INTS.index(name), :-1] = values
 
@@ -353,13 +353,16 @@ class Hall:
             self._run_ints = np.zeros((3, 1), np.int32)
             self._weights = self._lanes(lanes).reshape(-1, lanes)[:1]
             return
-        counts = np.diff(air.run_start)
+        counts = np.diff(air.mix_weights.run_offsets)
         run_counts[self._rack_at[large]] = counts[large]
         self._run_start = offsets_from_counts(run_counts, "runs of weights")
         of_large = np.repeat(large, counts)
         moved = self._rack_at[fleet.rack_offsets[:-1]] - fleet.rack_offsets[:-1]
-        first = (air.run_first + np.repeat(moved[fleet.rack_dc], counts))[of_large]
-        length, offset = air.run_length[of_large], air.run_offset[of_large].astype(np.int64)
+        first = (air.mix_weights.run_first_rack + np.repeat(moved[fleet.rack_dc], counts))[of_large]
+        length, offset = (
+            air.mix_weights.run_length[of_large],
+            air.mix_weights.run_first_weight[of_large].astype(np.int64),
+        )
         # Runs that share weights share their vectors where they begin at the same lane.
         lane = first % lanes
         key = (offset * (int(length.max()) + 1) + length) * lanes + lane
@@ -372,7 +375,7 @@ class Hall:
         within = np.arange(int(length[one].sum()))
         within -= np.repeat(np.cumsum(length[one]) - length[one], length[one])
         to = np.repeat(begin[:-1].astype(np.int64) * lanes + lane[one], length[one]) + within
-        weights[to] = air.weights[np.repeat(offset[one], length[one]) + within]
+        weights[to] = air.mix_weights.weights[np.repeat(offset[one], length[one]) + within]
         self._weights = weights.reshape(-1, lanes)
 
     def _lay_out_values(self, thermal: Any) -> None:
@@ -390,10 +393,10 @@ class Hall:
         rows = {"approach_k": fleet.approach_k, "per_server": 1.0 / fleet.per_rack_servers()}
         if air is not None:
             rows |= {
-                "norm": air.norm,
-                "strength": air.strength,
-                "per_strength": 1.0 / air.strength,
-                "captured_share": air.captured,
+                "norm": air.mix_weights.norm,
+                "strength": air.mix_weights.strength,
+                "per_strength": 1.0 / air.mix_weights.strength,
+                "captured_share": air.exhaust_share,
             }
         for name, values in rows.items():
             self._rack[name][self._rack_at] = values
@@ -402,7 +405,9 @@ class Hall:
         self._dc = dict(zip(thermal.DC_DOUBLES, self._doubles, strict=True))
         self._dc["design_it_airflow_m3s"][:] = fleet.it_airflow_m3s
         if air is not None:
-            ends = np.array([start.supply_c[:2] for start in air.starts])[air.start].T
+            ends = np.array([start.supply_c[:2] for start in air.steady_states])[
+                air.steady_state_of_dc
+            ].T
             self._dc["start_low_c"][:] = ends[0]
             self._dc["start_per_k"][:] = 1.0 / (ends[1] - ends[0])
         self._moves = self._doubles[thermal.DC_DOUBLES.index("shift_k") :]
@@ -737,7 +742,7 @@ class Hall:
             sweeps,
             self._outlet_model,
             self._loads_of,
-            len(LOADS),
+            len(TABLE_LOADS),
             1,
             substep_s,
             weight,
@@ -807,12 +812,16 @@ def _dense(fleet: Fleet, dc: int) -> F64:
     first, end = fleet.rack_offsets[dc : dc + 2]
     out = np.zeros((end - first, end - first))
     for rack in range(first, end):
-        for run in range(air.run_start[rack], air.run_start[rack + 1]):
-            at, count, weight = air.run_first[run], air.run_length[run], air.run_offset[run]
-            out[rack - first, at - first : at - first + count] += air.weights[
+        for run in range(air.mix_weights.run_offsets[rack], air.mix_weights.run_offsets[rack + 1]):
+            at, count, weight = (
+                air.mix_weights.run_first_rack[run],
+                air.mix_weights.run_length[run],
+                air.mix_weights.run_first_weight[run],
+            )
+            out[rack - first, at - first : at - first + count] += air.mix_weights.weights[
                 weight : weight + count
             ]
-    return out * air.norm[first:end, None]
+    return out * air.mix_weights.norm[first:end, None]
 
 
 def _table(*rows: Any) -> Any:

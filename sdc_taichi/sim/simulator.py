@@ -694,7 +694,8 @@ class Simulator:
         digest.update(self.drivers.digest())
         # A matrix that a config names may change under its name.
         if (air := self.fleet.air) is not None:
-            for part in (air.weights, air.norm, air.strength, air.captured, self.fleet.dcs):
+            mix = air.mix_weights
+            for part in (mix.weights, mix.norm, mix.strength, air.exhaust_share, self.fleet.dcs):
                 digest.update(part.tobytes())
         return digest.hexdigest()
 
