@@ -32,7 +32,11 @@ def core_s(calls: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, 
 
 def plain_store(servers: int) -> Callable[[], object]:
     """A store of three layers of ``servers`` values on all threads, in whole vectors."""
-    from sdc_taichi.kernels.compiler.backend import SLICE, BoundKernel, aligned, part_of, ti
+    import taichi as ti
+
+    from sdc_taichi.kernels.compiler.arrays import aligned
+    from sdc_taichi.kernels.compiler.functions import SLICE, part_of
+    from sdc_taichi.kernels.compiler.launch import BoundKernel
 
     lanes, slices = 8, 64
     blocks_1d = ti.types.ndarray(dtype=ti.types.vector(lanes, ti.f32), ndim=1)

@@ -8,7 +8,9 @@ of a cell are numbered -x, -y, -z, +x, +y, +z, and lower faces lead to lower num
 from functools import cache
 from typing import Any, no_type_check
 
-from .compiler.backend import SLICE, func, kernel, part_of, ti
+import taichi as ti
+
+from .compiler.functions import SLICE, part_of
 
 VECTORS = 9
 """Work vectors of one thread: solution, residual, shadow residual, direction, and products."""
@@ -30,7 +32,7 @@ def transport_kernel() -> Any:
     reals_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
     ints_2d = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
-    @kernel
+    @ti.kernel
     @no_type_check
     def transport(
         beyond: ints_2d,
@@ -95,7 +97,7 @@ def solve_kernel() -> Any:
     ints_2d = ti.types.ndarray(dtype=ti.i32, ndim=2)
     ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
-    @func
+    @ti.func
     @no_type_check
     def dot(work: reals_3d, s, a, b, n):
         total = ti.cast(0.0, ti.f64)
@@ -103,7 +105,7 @@ def solve_kernel() -> Any:
             total += work[s, a, c] * work[s, b, c]
         return total
 
-    @func
+    @ti.func
     @no_type_check
     def multiply(
         coupled: ti.template(),
@@ -134,7 +136,7 @@ def solve_kernel() -> Any:
                 for i in range(back_start[j], back_start[j + 1]):
                     work[s, out, back_cell[i]] -= back_m3s[i] * mean
 
-    @func
+    @ti.func
     @no_type_check
     def precondition(beyond: ints_2d, off: reals_2d, diagonal: reals_1d, work: reals_3d, s, a, out):
         cells = diagonal.shape[0]
@@ -150,7 +152,7 @@ def solve_kernel() -> Any:
                 total += off[c, f] * work[s, out, beyond[c, f]]
             work[s, out, c] += total * work[s, _PIVOT, c]
 
-    @kernel
+    @ti.kernel
     @no_type_check
     def solve(
         coupled: ti.template(),

@@ -6,7 +6,7 @@ A difference from ``elementary``'s exponential would lose them.
 from math import factorial
 from typing import no_type_check
 
-from .compiler.backend import func, ti
+import taichi as ti
 
 FIT_END = 5
 """Of the constants, the first after those of the outlet fit."""
@@ -22,7 +22,7 @@ def decay_constants(precision: str) -> list[float]:
     return [(-1.0) ** k / factorial(k + 1) for k in reversed(range(SERIES_TERMS[precision]))]
 
 
-@func
+@ti.func
 @no_type_check
 def doublings(hall: ti.template(), most):
     """How often ``most`` is halved to be where the series holds."""
@@ -33,7 +33,7 @@ def doublings(hall: ti.template(), most):
     return count
 
 
-@func
+@ti.func
 @no_type_check
 def halved(hall: ti.template(), times):
     """0.5 to so many times."""
@@ -44,7 +44,7 @@ def halved(hall: ti.template(), times):
     return x
 
 
-@func
+@ti.func
 @no_type_check
 def gone_per(hall: ti.template(), y, times):
     """(1 - exp(-x)) / y, where y >= 0 doubled so many times is x.

@@ -9,7 +9,9 @@ from functools import cache
 from math import factorial, log
 from typing import Any, no_type_check
 
-from .compiler.backend import func, larger, smaller, ti
+import taichi as ti
+
+from .compiler.functions import larger, smaller
 
 _FORMATS = {"f32": (23, 127), "f64": (52, 1023)}
 """Bits of the fraction, and bias of the exponent (IEEE 754)."""
@@ -35,7 +37,7 @@ def log_and_exp(precision: str, lanes: int) -> tuple[Any, Any]:
     exp_series = [1.0 / factorial(n) for n in reversed(range(_EXP_TERMS[precision]))]
     three_quarters = (2 * bias - 1) << (fraction_bits - 1)
 
-    @func
+    @ti.func
     @no_type_check
     def with_bits(bits):
         out = ti.Vector([ti.cast(0.0, real)] * lanes)
@@ -43,7 +45,7 @@ def log_and_exp(precision: str, lanes: int) -> tuple[Any, Any]:
             out[i] = ti.bit_cast(bits[i], real)
         return out
 
-    @func
+    @ti.func
     @no_type_check
     def log_of(x):
         """Of 2^e m with m in [3/4, 3/2); log m = 2 atanh((m - 1) / (m + 1))."""
@@ -63,7 +65,7 @@ def log_and_exp(precision: str, lanes: int) -> tuple[Any, Any]:
             series = series * square + real(log_series[n])
         return z * series + exponent * real(_LOG_2)
 
-    @func
+    @ti.func
     @no_type_check
     def exp_of(x):
         """Of k log 2 + r with r at most half of log 2."""

@@ -8,18 +8,10 @@ transient ones a sweep is a substep.
 from functools import cache
 from typing import Any, no_type_check
 
-from .compiler.backend import (
-    SLICE,
-    Table,
-    func,
-    kernel,
-    larger,
-    part_of,
-    reals,
-    shared,
-    smaller,
-    ti,
-)
+import taichi as ti
+
+from .compiler.functions import SLICE, larger, part_of, reals, smaller
+from .compiler.named_rows import NamedRows, shared
 from .decay import SERIES_TERMS
 from .elementary import log_and_exp
 from .mixes import (
@@ -92,7 +84,7 @@ TEMPLATES = 3
 """Template arguments of the kernel, which come first."""
 
 
-@func
+@ti.func
 @no_type_check
 def compute_groups(
     hall: ti.template(),
@@ -125,7 +117,7 @@ def compute_groups(
     return thermal_storage_w
 
 
-@func
+@ti.func
 @no_type_check
 def compute_block(
     hall: ti.template(),
@@ -200,7 +192,7 @@ def compute_block(
     keep_racks(hall, block_at, now, found)
 
 
-@func
+@ti.func
 @no_type_check
 def no_inlets(hall: ti.template()):
     """What a rack keeps of the inlets of its groups, of which ``zones`` have been seen."""
@@ -212,7 +204,7 @@ def no_inlets(hall: ti.template()):
     )
 
 
-@func
+@ti.func
 @no_type_check
 def add_inlet(hall: ti.template(), inlets: ti.template(), inlet_c):
     """Inlet of a group; one without servers is as another one of its rack."""
@@ -222,7 +214,7 @@ def add_inlet(hall: ti.template(), inlets: ti.template(), inlet_c):
     inlets.zones += hall.real(1.0)
 
 
-@func
+@ti.func
 @no_type_check
 def keep_hottest(
     hall: ti.template(),
@@ -241,7 +233,7 @@ def keep_hottest(
     return inlet_c
 
 
-@func
+@ti.func
 @no_type_check
 def add_degrees(
     hall: ti.template(),
@@ -272,7 +264,7 @@ def add_degrees(
         terms.under_18_sum_k = terms.under_18_sum_k + under_18_sum_k
 
 
-@func
+@ti.func
 @no_type_check
 def give(
     hall: ti.template(), block_at, now: ti.template(), mixed_c, outlet_c, moves: ti.template()
@@ -293,7 +285,7 @@ def give(
         moves.most_k = larger(ti.select(is_rack, change_k, hall.zeros - far_k), moves.most_k)
 
 
-@func
+@ti.func
 @no_type_check
 def keep_racks(hall: ti.template(), block_at, now: ti.template(), found: ti.template()):
     """What racks come to in a sweep, or on the mean of the substeps; the hottest inlet of all."""
@@ -321,7 +313,7 @@ def keep_racks(hall: ti.template(), block_at, now: ti.template(), found: ti.temp
     block.inlet_max_c = found.inlet_max_c
 
 
-@func
+@ti.func
 @no_type_check
 def compute_chunk(
     hall: ti.template(),
@@ -391,7 +383,7 @@ def compute_chunk(
     keep_range(hall, chunk_at, moves.least_k, moves.most_k)
 
 
-@func
+@ti.func
 @no_type_check
 def go_on(hall: ti.template(), n, air: ti.template()):
     """CRAC units at the servers' airflow, and whether and from where their data center goes on."""
@@ -423,7 +415,7 @@ def go_on(hall: ti.template(), n, air: ti.template()):
             shift_mixes(hall, n, sweep, exchanged_now, middle_k, apart)
 
 
-@func
+@ti.func
 @no_type_check
 def so_far(hall: ti.template(), air: ti.template(), before, value):
     """Mean over the substeps until now, or value of the last sweep."""
@@ -433,7 +425,7 @@ def so_far(hall: ti.template(), air: ti.template(), before, value):
     return out
 
 
-@func
+@ti.func
 @no_type_check
 def keep_air(hall: ti.template(), n, air: ti.template()):
     """What air the CRAC units give and take, and heat at their coils."""
@@ -447,7 +439,7 @@ def keep_air(hall: ti.template(), n, air: ti.template()):
     dc.coil_w = so_far(hall, air, dc.coil_w, air.coil_w)
 
 
-@func
+@ti.func
 @no_type_check
 def keep_results(hall: ti.template(), n):
     """What comes out of a data center that is at its end, after ``keep_air``."""
@@ -477,7 +469,7 @@ def keep_results(hall: ti.template(), n):
     dc.hottest_server = ti.cast(server, ti.f64)
 
 
-@func
+@ti.func
 @no_type_check
 def close(hall: ti.template(), n, terms_at, late, hottest: ti.template()):
     """End of a sweep of a data center, and at its own end what comes out.
@@ -509,7 +501,7 @@ def close(hall: ti.template(), n, terms_at, late, hottest: ti.template()):
         keep_results(hall, n)
 
 
-@func
+@ti.func
 @no_type_check
 def run(hall: ti.template(), terms_at, first_chunk, end_chunk):
     """All sweeps of a data center, or one of some of its chunks, which wait for the others."""
@@ -597,7 +589,7 @@ def hall_kernel(precision: str) -> Any:
     runs_1d = ti.types.ndarray(dtype=ti.types.vector(RUN_LANES, real), ndim=1)
     mix_1d = ti.types.ndarray(dtype=ti.types.vector(SOURCES * LANES, real), ndim=1)
 
-    @kernel
+    @ti.kernel
     @no_type_check
     def hall(
         recirculates: ti.template(),
@@ -666,26 +658,26 @@ def hall_kernel(precision: str) -> Any:
                         substep_s=substep_s,
                         weight=weight,
                         tolerance_k=tolerance_k,
-                        dcs=Table(
+                        dcs=NamedRows(
                             (DC_INTS, dc_ints),
                             (CONTROL, control),
                             (DC_ROWS, dcs),
                             (DC_DOUBLES, doubles),
                             (DC_OUT, dc_out),
                         ),
-                        units=Table((UNIT_ROWS, units), (UNIT_STATE, unit_state)),
-                        chunks=Table((CHUNK_INTS, chunk_ints), (SUMS, sums)),
-                        blocks=Table(
+                        units=NamedRows((UNIT_ROWS, units), (UNIT_STATE, unit_state)),
+                        chunks=NamedRows((CHUNK_INTS, chunk_ints), (SUMS, sums)),
+                        blocks=NamedRows(
                             (BLOCK_INTS, block_ints),
                             (RACK_ROWS, racks),
                             (RACK_STATE, rack_store),
                             (RACK_OUT, rack_out),
                         ),
-                        places=Table((RACK_INTS, rack_ints)),
-                        groups=Table((GROUP_ROWS, groups)),
-                        runs=Table((RUN_INTS, run_ints)),
-                        terms=Table((TERMS, scratch), apart=1),
-                        block_terms=Table((BLOCK_TERMS, scratch), apart=1),
+                        places=NamedRows((RACK_INTS, rack_ints)),
+                        groups=NamedRows((GROUP_ROWS, groups)),
+                        runs=NamedRows((RUN_INTS, run_ints)),
+                        terms=NamedRows((TERMS, scratch), apart=1),
+                        block_terms=NamedRows((BLOCK_TERMS, scratch), apart=1),
                         constants=constants,
                         group_load=group_load,
                         scratch=scratch,

@@ -3,7 +3,10 @@
 from functools import cache
 from typing import Any, no_type_check
 
-from .compiler.backend import SLICE, Table, func, kernel, larger, part_of, reals, shared, ti
+import taichi as ti
+
+from .compiler.functions import SLICE, larger, part_of, reals
+from .compiler.named_rows import NamedRows, shared
 from .elementary import log_and_exp
 from .servers import (
     OUTLET_OF_SERVERS,
@@ -37,7 +40,7 @@ TEMPLATES = 3
 N_VALUES = len(GROUP_OUT)
 
 
-@func
+@ti.func
 @no_type_check
 def store(hall: ti.template(), b, inlet_c, outlet_c, power_w):
     """A vector of servers to the layers."""
@@ -46,7 +49,7 @@ def store(hall: ti.template(), b, inlet_c, outlet_c, power_w):
     hall.layer_blocks[2][b] = power_w
 
 
-@func
+@ti.func
 @no_type_check
 def spread_runs(hall: ti.template(), block_at, values_at):
     """Values of the groups of a block to runs of servers, nearly all in whole vectors."""
@@ -96,7 +99,7 @@ def spread_runs(hall: ti.template(), block_at, values_at):
         lane += 1
 
 
-@func
+@ti.func
 @no_type_check
 def to_all_lanes(
     racks: ti.template(), air: ti.template(), lane, of_racks: ti.template(), of_air: ti.template()
@@ -113,7 +116,7 @@ def to_all_lanes(
     of_air.per_height_k = ti.Vector([air.per_height_k[lane]] * LANES)
 
 
-@func
+@ti.func
 @no_type_check
 def compute_values(
     hall: ti.template(),
@@ -139,7 +142,7 @@ def compute_values(
     return inlet_c, inlet_c + (to_air_w + fan_w) / per_k, cpu_w + fan_w
 
 
-@func
+@ti.func
 @no_type_check
 def write_block(hall: ti.template(), n, block_at, values_at, servers: ti.template(), first_row):
     """Values of the groups of a block to runs of servers; lanes are racks.
@@ -204,7 +207,7 @@ def write_block(hall: ti.template(), n, block_at, values_at, servers: ti.templat
         spread_runs(hall, block_at, values_at)
 
 
-@func
+@ti.func
 @no_type_check
 def write_chunk(hall: ti.template(), chunk_at, values_at, each_once):
     """Values of the servers of a chunk, or of each of its groups once."""
@@ -232,7 +235,7 @@ def layers_kernel(precision: str) -> Any:
     ints_2d = ti.types.ndarray(dtype=ti.i32, ndim=2)
     doubles_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
 
-    @kernel
+    @ti.kernel
     @no_type_check
     def layers(
         recirculates: ti.template(),
@@ -281,18 +284,18 @@ def layers_kernel(precision: str) -> Any:
                         outlet_model=outlet_model,
                         loads_of=loads_of,
                         step=step,
-                        dcs=Table((DC_INTS, dc_ints), (DC_ROWS, dcs), (DC_DOUBLES, doubles)),
-                        units=Table((UNIT_STATE, unit_state)),
-                        chunks=Table((CHUNK_INTS, chunk_ints)),
-                        blocks=Table(
+                        dcs=NamedRows((DC_INTS, dc_ints), (DC_ROWS, dcs), (DC_DOUBLES, doubles)),
+                        units=NamedRows((UNIT_STATE, unit_state)),
+                        chunks=NamedRows((CHUNK_INTS, chunk_ints)),
+                        blocks=NamedRows(
                             (BLOCK_INTS, block_ints),
                             (RACK_ROWS, racks),
                             (RACK_STATE, rack_store),
                             (RACK_OUT, rack_out),
                         ),
-                        places=Table((RACK_INTS, rack_ints)),
-                        groups=Table((GROUP_ROWS, groups)),
-                        values=Table((GROUP_OUT, group_values)),
+                        places=NamedRows((RACK_INTS, rack_ints)),
+                        groups=NamedRows((GROUP_ROWS, groups)),
+                        values=NamedRows((GROUP_OUT, group_values)),
                         group_load=group_load,
                         group_values=group_values,
                         layer_blocks=(inlet_blocks, outlet_blocks, power_blocks),

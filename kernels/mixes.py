@@ -10,7 +10,9 @@ k/(1 - k) of a move, of which k is kept, are those of Aitken (1926).
 
 from typing import no_type_check
 
-from .compiler.backend import func, larger, smaller, ti
+import taichi as ti
+
+from .compiler.functions import larger, smaller
 from .decay import doublings, gone_per, halved
 from .sums import keep_range
 from .thermal import (
@@ -41,7 +43,7 @@ STILL_PER_S = 1.0 / 128.0
 the room; a power of two, exact in both precisions."""
 
 
-@func
+@ti.func
 @no_type_check
 def cubic(x):
     """Weights of four points for the place x between the inner two (Catmull and Rom 1974).
@@ -58,7 +60,7 @@ def cubic(x):
     )
 
 
-@func
+@ti.func
 @no_type_check
 def expect(hall: ti.template(), n):
     """How much of each pattern to start from, and last ``kept``.
@@ -83,7 +85,7 @@ def expect(hall: ti.template(), n):
     return start
 
 
-@func
+@ti.func
 @no_type_check
 def start_mix(hall: ti.template(), n, block_at, now: ti.template(), start):
     """Mix before the racks of a block that a steady state is looked for from.
@@ -109,7 +111,7 @@ def start_mix(hall: ti.template(), n, block_at, now: ti.template(), start):
     return mix_c
 
 
-@func
+@ti.func
 @no_type_check
 def mixed_from(hall: ti.template(), at, first, count):
     """Mixes before the racks of a block, or what they change by, from all racks of the hall."""
@@ -128,7 +130,7 @@ def mixed_from(hall: ti.template(), at, first, count):
     return out
 
 
-@func
+@ti.func
 @no_type_check
 def mixed_from_runs(hall: ti.template(), block_at, side):
     """The same of halls that drop weights, by runs of neighbouring racks."""
@@ -157,7 +159,7 @@ def mixed_from_runs(hall: ti.template(), block_at, side):
     return mix_c
 
 
-@func
+@ti.func
 @no_type_check
 def exchanged(hall: ti.template(), n, block_at, side):
     """Mix before the racks of a block from what the racks gave in the sweep before."""
@@ -181,7 +183,7 @@ def exchanged(hall: ti.template(), n, block_at, side):
     return mix_c
 
 
-@func
+@ti.func
 @no_type_check
 def next_mix(hall: ti.template(), n, block_at, now: ti.template(), start):
     """Mix before the racks of a block in the present sweep."""
@@ -196,7 +198,7 @@ def next_mix(hall: ti.template(), n, block_at, now: ti.template(), start):
     return mix_c + now.shift_k
 
 
-@func
+@ti.func
 @no_type_check
 def exchange_at_once(hall: ti.template(), n, chunk_at, again, reference_c):
     """Mixes of a data center of one chunk that keeps every weight, in two passes.
@@ -241,7 +243,7 @@ def exchange_at_once(hall: ti.template(), n, chunk_at, again, reference_c):
         keep_range(hall, chunk_at, least_k, most_k)
 
 
-@func
+@ti.func
 @no_type_check
 def parcels_of(hall: ti.template(), n, chunk_at, servers: ti.template()):
     """How the recirculated air before the racks of a chunk follows its mix in a substep.
@@ -277,7 +279,7 @@ def parcels_of(hall: ti.template(), n, chunk_at, servers: ti.template()):
     )
 
 
-@func
+@ti.func
 @no_type_check
 def follow_mixes(
     hall: ti.template(), n, chunk_at, block_terms_0, now: ti.template(), servers: ti.template()
@@ -304,7 +306,7 @@ def follow_mixes(
         terms_at += N_BLOCK_TERMS
 
 
-@func
+@ti.func
 @no_type_check
 def judge_sweep(hall: ti.template(), n, supply_c, uncovered, more):
     """Whether a data center in steady air is at its end; CRAC units must cover what they did."""
@@ -322,7 +324,7 @@ def judge_sweep(hall: ti.template(), n, supply_c, uncovered, more):
     return ends
 
 
-@func
+@ti.func
 @no_type_check
 def shift_mixes(hall: ti.template(), n, sweep, exchanged_now, middle_k, apart):
     """Shift of all mixes of a data center that drops weights, in its next sweep.

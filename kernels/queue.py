@@ -3,7 +3,10 @@
 from functools import cache
 from typing import Any, no_type_check
 
-from .compiler.backend import F64_LANES, SLICE, kernel, ti
+import taichi as ti
+
+from .compiler.arrays import F64_LANES
+from .compiler.functions import SLICE
 
 TASK_BLOCKS = 32
 """Vectors side by side in a row that one task takes on."""
@@ -34,7 +37,7 @@ def queue_kernel() -> Any:
     ints = ti.types.ndarray(dtype=ti.i32, ndim=2)
     ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
-    @kernel
+    @ti.kernel
     @no_type_check
     def queue_after(
         serial: ti.template(),

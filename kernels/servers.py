@@ -7,14 +7,16 @@ y = clip(slope*T + offset + shift*u); fan power reference*(y/reference ratio)^ex
 
 from typing import no_type_check
 
-from .compiler.backend import func, larger, smaller, ti
+import taichi as ti
+
+from .compiler.functions import larger, smaller
 from .decay import doublings, gone_per, halved
 from .thermal import LANES, OF_GROUPS, OF_RACKS, OUTLETS
 
 OUTLET_OF_SERVERS, OUTLET_OF_RACKS = OUTLETS.index("server"), OUTLETS.index("rack")
 
 
-@func
+@ti.func
 @no_type_check
 def servers_of(hall: ti.template(), n):
     """What the servers of a data center have in common."""
@@ -49,7 +51,7 @@ def servers_of(hall: ti.template(), n):
     )
 
 
-@func
+@ti.func
 @no_type_check
 def first_share_of(hall: ti.template(), n, block_at):
     """Where the shares of the CRAC units in the supply air of a block of racks begin."""
@@ -59,7 +61,7 @@ def first_share_of(hall: ti.template(), n, block_at):
     return dc.first_share + n_units * (block_at - block_0)
 
 
-@func
+@ti.func
 @no_type_check
 def air_before(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.template()):
     """Air before the racks of a block.
@@ -97,7 +99,7 @@ def air_before(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.templa
     )
 
 
-@func
+@ti.func
 @no_type_check
 def racks_of(hall: ti.template(), servers: ti.template(), block_at):
     """Load of the racks of a block, and what all servers of a rack have in common."""
@@ -129,7 +131,7 @@ def racks_of(hall: ti.template(), servers: ti.template(), block_at):
     )
 
 
-@func
+@ti.func
 @no_type_check
 def inlet_of(hall: ti.template(), air: ti.template(), group):
     """Inlet of a group of each rack."""
@@ -139,7 +141,7 @@ def inlet_of(hall: ti.template(), air: ti.template(), group):
     return inlet_c
 
 
-@func
+@ti.func
 @no_type_check
 def of_group(
     hall: ti.template(),
@@ -172,7 +174,7 @@ def of_group(
     return inlet_c, draws_w, speed, fan_power
 
 
-@func
+@ti.func
 @no_type_check
 def no_groups(hall: ti.template()):
     """Sums that begin."""
@@ -186,7 +188,7 @@ def no_groups(hall: ti.template()):
     )
 
 
-@func
+@ti.func
 @no_type_check
 def add_group(
     hall: ti.template(), sums: ti.template(), group, count, inlet_c, draws_w, speed, fan_power
@@ -203,7 +205,7 @@ def add_group(
         sums.inlet_m3k_s += counted * inlet_c
 
 
-@func
+@ti.func
 @no_type_check
 def complete(hall: ti.template(), sums: ti.template(), racks: ti.template(), air: ti.template()):
     """Multiply the sums with what all groups have in common; return what they take in of fresh air.
@@ -223,7 +225,7 @@ def complete(hall: ti.template(), sums: ti.template(), racks: ti.template(), air
     return fresh_m3s
 
 
-@func
+@ti.func
 @no_type_check
 def rack_outlet(hall: ti.template(), servers: ti.template(), sums: ti.template(), per_flow):
     """What leaves a rack by the models that know racks alone; not with recirculation.
@@ -244,7 +246,7 @@ def rack_outlet(hall: ti.template(), servers: ti.template(), sums: ti.template()
     return outlet_c
 
 
-@func
+@ti.func
 @no_type_check
 def warming_of(hall: ti.template(), n, servers: ti.template()):
     """How the servers of a data center become warmer in a substep, C dT/dt = P - eps K (T - T_in).
@@ -267,7 +269,7 @@ def warming_of(hall: ti.template(), n, servers: ti.template()):
     )
 
 
-@func
+@ti.func
 @no_type_check
 def warm(
     hall: ti.template(), warming: ti.template(), racks: ti.template(), at, inlet_c, draws_w, speed
@@ -282,7 +284,7 @@ def warm(
     return change_k
 
 
-@func
+@ti.func
 @no_type_check
 def take_over(hall: ti.template(), block_at):
     """Temperatures of the servers of a block before the step."""
@@ -295,7 +297,7 @@ def take_over(hall: ti.template(), block_at):
         hall.server_c[block.place + z] = before_c
 
 
-@func
+@ti.func
 @no_type_check
 def hand_over(hall: ti.template(), block_at, z, count, after_c):
     """Temperatures of the servers of a group after the step."""

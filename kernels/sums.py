@@ -2,7 +2,8 @@
 
 from typing import no_type_check
 
-from .compiler.backend import func, ti
+import taichi as ti
+
 from .thermal import LANES, RACK_OUT, SUM, SUMS
 
 N_SUMS = len(SUMS)
@@ -12,7 +13,7 @@ FIRST_OF_SWEEP = SUM.flow_m3s
 """From here on sums are of the present sweep or substep alone."""
 
 
-@func
+@ti.func
 @no_type_check
 def sum_of(lanes):
     """In f64; neighbours first, since each addition waits for the one before."""
@@ -24,7 +25,7 @@ def sum_of(lanes):
     return total
 
 
-@func
+@ti.func
 @no_type_check
 def add_up(hall: ti.template(), chunk_at, terms_at, first_row, end_row, adds):
     """Sums over the racks of a chunk, ``adds`` to those of substeps before."""
@@ -48,7 +49,7 @@ def add_up(hall: ti.template(), chunk_at, terms_at, first_row, end_row, adds):
         row += hall.step
 
 
-@func
+@ti.func
 @no_type_check
 def find_hottest(hall: ti.template(), chunk_at, hottest: ti.template(), adds):
     """The first of the racks with the hottest inlet, ``adds`` to those of substeps before."""
@@ -67,7 +68,7 @@ def find_hottest(hall: ti.template(), chunk_at, hottest: ti.template(), adds):
         chunk.hottest_zone = ti.cast(zone, ti.f64)
 
 
-@func
+@ti.func
 @no_type_check
 def keep_range(hall: ti.template(), chunk_at, least_k, most_k):
     """Least and most over the lanes of a chunk."""
@@ -79,7 +80,7 @@ def keep_range(hall: ti.template(), chunk_at, least_k, most_k):
     chunk.most_k = ti.cast(most, ti.f64)
 
 
-@func
+@ti.func
 @no_type_check
 def join_rows(hall: ti.template(), n, first_row, end_row):
     """Rows of the sums of all chunks of a data center to those of its first."""
@@ -94,7 +95,7 @@ def join_rows(hall: ti.template(), n, first_row, end_row):
         chunk_at += hall.step
 
 
-@func
+@ti.func
 @no_type_check
 def join_chunks(hall: ti.template(), n):
     """What a sweep needs of all chunks of a data center, to its first."""

@@ -2,13 +2,14 @@
 
 from typing import no_type_check
 
-from .compiler.backend import func, ti
+import taichi as ti
+
 from .servers import first_share_of
 from .sums import sum_of
 from .thermal import N_BLOCK_TERMS
 
 
-@func
+@ti.func
 @no_type_check
 def add_needs(hall: ti.template(), n, chunk_at, block_terms_0):
     """Supply air that the racks of a chunk ask of each CRAC unit."""
@@ -26,7 +27,7 @@ def add_needs(hall: ti.template(), n, chunk_at, block_terms_0):
         unit += hall.step
 
 
-@func
+@ti.func
 @no_type_check
 def need_of(hall: ti.template(), n, unit):
     """What all chunks of a data center ask of one of its units."""
@@ -37,7 +38,7 @@ def need_of(hall: ti.template(), n, unit):
     return need_m3s
 
 
-@func
+@ti.func
 @no_type_check
 def run_units(hall: ti.template(), n, flow_m3s, more):
     """What the CRAC units give at the servers' airflow, and how much of the need it covers."""
@@ -94,7 +95,7 @@ def run_units(hall: ti.template(), n, flow_m3s, more):
     return units
 
 
-@func
+@ti.func
 @no_type_check
 def cool(hall: ti.template(), n, units: ti.template(), return_c):
     """Heat at the coils in a substep, what they take out, and the supply air of the next one.

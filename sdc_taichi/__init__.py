@@ -4,26 +4,23 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from sdc_taichi.kernels.compiler import collector
-
-with collector.paused():
-    from sdc_taichi.config import DataCenterConfig, load_config, preset_names
-    from sdc_taichi.envs import registration
-    from sdc_taichi.errors import ConfigError, DataError, RuntimeStateError, SdcError
-    from sdc_taichi.sim.drivers import Drivers, drivers_from_arrays, load_drivers
-    from sdc_taichi.sim.fleet import Fleet, build_fleet, make_configs
-    from sdc_taichi.sim.simulator import Simulator
-    from sdc_taichi.types import (
-        Actions,
-        BatteryAction,
-        CoolAction,
-        Exogenous,
-        FanAction,
-        LoadAction,
-        ServerLayers,
-        State,
-        StepResult,
-    )
+from sdc_taichi.config import DataCenterConfig, load_config, preset_names
+from sdc_taichi.envs import registration
+from sdc_taichi.errors import ConfigError, DataError, RuntimeStateError, SdcError
+from sdc_taichi.sim.drivers import Drivers, drivers_from_arrays, load_drivers
+from sdc_taichi.sim.fleet import Fleet, build_fleet, make_configs
+from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.types import (
+    Actions,
+    BatteryAction,
+    CoolAction,
+    Exogenous,
+    FanAction,
+    LoadAction,
+    ServerLayers,
+    State,
+    StepResult,
+)
 
 if TYPE_CHECKING:
     from sdc_taichi.envs.parallel import aec_env, parallel_env
@@ -81,8 +78,7 @@ _LAZY = {
 def __getattr__(name: str) -> Any:
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    with collector.paused():
-        globals()[name] = found = getattr(import_module(_LAZY[name]), name)
+    globals()[name] = found = getattr(import_module(_LAZY[name]), name)
     return found
 
 

@@ -17,7 +17,7 @@ from call_counts import calls_of
 from sdc_taichi import Actions, Simulator, drivers_from_arrays, load_config
 from sdc_taichi.envs.core import Core
 from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.kernels.compiler.backend import BoundKernel
+from sdc_taichi.kernels.compiler.launch import BoundKernel
 
 
 def simulator(size: int, *overrides: str) -> Simulator:

@@ -14,7 +14,10 @@ LANES = 8
 def of_vectors(precision: str, which: int, x: F64) -> Any:
     """Logarithms (0) or exponentials (1) of (n, LANES), as kernels compute them."""
     runtime.ensure_started()
-    from sdc_taichi.kernels.compiler.backend import BoundKernel, aligned, ti
+    import taichi as ti
+
+    from sdc_taichi.kernels.compiler.arrays import aligned
+    from sdc_taichi.kernels.compiler.launch import BoundKernel
     from sdc_taichi.kernels.elementary import log_and_exp
 
     real = {"f32": ti.f32, "f64": ti.f64}[precision]

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import ast
 import gc
-import math
-import multiprocessing
-import os
 import resource
-import signal
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +30,6 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.config import apply_overrides
-from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim.drivers import Table
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64
@@ -549,195 +541,11 @@ def test_server_layers_belong_to_the_last_step(preset: str) -> None:
 # --- processes and memory -----------------------------------------------------------------------
 
 
-def child_step(queue: Any) -> None:
-    """Run a step in another process and tell how it ended."""
-    try:
-        with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
-            sim.reset()
-            queue.put(("done", float(sim.step().it_w[0])))
-    except RuntimeStateError as error:
-        queue.put(("refused", str(error)))
-
-
-def run_child(method: Literal["fork", "spawn"]) -> tuple[str, Any]:
-    context: Any = multiprocessing.get_context(method)
-    queue = context.Queue()
-    process = context.Process(target=child_step, args=(queue,))
-    process.start()
-    try:
-        answer: tuple[str, Any] = queue.get(timeout=60)
-        process.join(60)
-        assert process.exitcode == 0
-    finally:
-        if process.is_alive():
-            process.kill()
-    return answer
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
-def test_a_forked_worker_is_refused_and_a_spawned_one_works() -> None:
-    with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
-        sim.reset()
-        here = float(sim.step().it_w[0])
-    kind, text = run_child("fork")
-    assert kind == "refused"
-    assert "forked after Taichi started" in text
-    assert "spawn" in text
-    assert run_child("spawn") == ("done", here)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
-@pytest.mark.parametrize("use", ["step", "servers", "reset", "new", "close"])
-def test_a_simulator_in_a_forked_child_never_hangs(use: str) -> None:
-    sim = Simulator(load_config("tiny"), drivers=short_drivers())
-    sim.reset()
-    sim.step()
-    pid = os.fork()
-    if pid == 0:
-        signal.alarm(30)
-        code = 1
-        try:
-            if use == "new":
-                Simulator(load_config("tiny"), drivers=short_drivers()).reset()
-            else:
-                getattr(sim, use)()
-            code = 0
-        except RuntimeStateError:
-            code = 2
-        finally:
-            os._exit(code)
-    _, status = os.waitpid(pid, 0)
-    # A reset touches no kernel once the devices are sized; the step after it does.
-    harmless = use in ("close", "reset")
-    assert os.waitstatus_to_exitcode(status) == (0 if harmless else 2)
-    assert sim.step().step == 1, "the parent goes on"
-    sim.close()
-
-
-def test_creating_a_simulator_starts_no_runtime() -> None:
-    code = (
-        "import sys, time; t = time.perf_counter(); import sdc_taichi as s;"
-        "sim = s.Simulator(s.load_config('tiny'),"
-        " drivers=s.drivers_from_arrays([20.], [15.], [300.], [.5]));"
-        "assert 'taichi' not in sys.modules; sim.reset(); assert 'taichi' in sys.modules;"
-        "import taichi; assert not sys.stdout.tell() if sys.stdout.seekable() else True"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == "", "Taichi's banner reached standard output"
-
-
 def resident_mb() -> float:
     statm = Path("/proc/self/statm")
     if not statm.exists():
         pytest.skip("no /proc: resident memory cannot be read")
     return int(statm.read_text().split()[1]) * resource.getpagesize() / 1e6
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system binds no threads")
-def test_as_many_threads_as_processors_are_bound_to_one_each() -> None:
-    processors = sorted(os.sched_getaffinity(0))
-    code = (
-        "import os; from sdc_taichi.kernels.compiler import runtime; runtime.ensure_started();"
-        "print([sorted(os.sched_getaffinity(int(t))) for t in os.listdir('/proc/self/task')])"
-    )
-    for threads in (len(processors), len(processors) + 1):
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            env={**os.environ, "SDC_TAICHI_THREADS": str(threads)},
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=True,
-        )
-        allowed = ast.literal_eval(done.stdout)
-        assert processors in allowed
-        if threads == len(processors):
-            assert all([one] in allowed for one in processors)
-        else:
-            assert all(bound == processors for bound in allowed)
-
-
-@pytest.mark.parametrize(
-    "limit",
-    [
-        "import os; os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])",
-        "runtime.granted = lambda: 1",
-    ],
-)
-def test_there_are_no_more_threads_than_processors_may_be_used(limit: str) -> None:
-    if "affinity" in limit and not hasattr(os, "sched_setaffinity"):
-        pytest.skip("the system binds no processes")
-    code = (
-        f"from sdc_taichi.kernels.compiler import runtime; {limit}; print(runtime.ensure_started())"
-    )
-    environment = {k: v for k, v in os.environ.items() if k != "SDC_TAICHI_THREADS"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, timeout=120, check=True
-    )
-    assert done.stdout.split() == [b"1"]
-
-
-@pytest.mark.parametrize(
-    ("groups", "settings", "processors"),
-    [
-        ("0::/", {"cpu.max": "max 100000"}, math.inf),
-        ("0::/", {"cpu.max": "150000 100000"}, 2),
-        ("0::/docker/1f2e", {"cpu.max": "50000 100000"}, 1),
-        ("0::/jobs/7", {"jobs/7/cpu.max": "800000 100000", "jobs/cpu.max": "300000 100000"}, 3),
-        (
-            "3:cpuset:/\n2:cpu,cpuacct:/docker/1f2e",
-            {"cpu/cpu.cfs_quota_us": "400000", "cpu/cpu.cfs_period_us": "100000"},
-            4,
-        ),
-        ("0::/", {"cpu.max": "1000 100000"}, 1),
-        ("0::/", {"cpu.max": "100000 0"}, math.inf),
-        ("0::/", {"cpu.max": "much"}, math.inf),
-        ("0::/a\0b\nnone\n\n0", {}, math.inf),
-        ("1:cpu:/", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, math.inf),
-        (None, {}, math.inf),
-    ],
-)
-def test_quotas_of_control_groups_are_read(
-    groups: str | None, settings: dict[str, str], processors: float, tmp_path: Path
-) -> None:
-    told, mounted = tmp_path / "groups", tmp_path / "mounted"
-    if groups is not None:
-        told.write_text(f"{groups}\n")
-    for name, text in settings.items():
-        (mounted / name).parent.mkdir(parents=True, exist_ok=True)
-        (mounted / name).write_text(f"{text}\n")
-    assert runtime.granted(told, mounted) == processors
-
-
-def test_several_threads_may_start_first() -> None:
-    code = """
-import threading
-from sdc_taichi import Simulator, load_config
-
-def run():
-    with Simulator(load_config("tiny")) as sim:
-        sim.reset()
-        found.append(sim.step().grid_kwh[0])
-
-found = []
-threads = [threading.Thread(target=run) for _ in range(4)]
-for thread in threads:
-    thread.start()
-for thread in threads:
-    thread.join()
-print(*found)
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
-    )
-    found = done.stdout.split()
-    assert len(found) == 4
-    assert len(set(found)) == 1
 
 
 def test_memory_does_not_grow_with_simulators_made_and_closed() -> None:

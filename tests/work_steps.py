@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 from sdc_taichi.plant import workload
+from sdc_taichi.sim.queue import Queue
 from sdc_taichi.types import F64
 
 
@@ -12,13 +13,13 @@ def work_step(
     model: str, demand: F64, command: F64, queue: F64, *, deadline_steps: F64, **limits: F64
 ) -> SimpleNamespace:
     """Fields of ``Work``, ages in steps, and the queue at the end of a step."""
-    queues = workload.Queue(queue.shape[1], deadline_steps + workload.DUE_AFTER_STEPS[model])
-    work = workload.MODELS[model](demand, command, *queues.at_start(queue), **limits)
-    after = queues.after(queue, work.dequeued_tasks, work.deferred_tasks)
+    queues = Queue(queue.shape[1], deadline_steps + workload.DUE_AFTER_STEPS[model])
+    work = workload.MODELS[model](demand, command, *queues.begin_step(queue), **limits)
+    after = queues.end_step(queue, work.dequeued_tasks, work.deferred_tasks)
     own = {name: getattr(work, name) for name in work.__slots__}
     return SimpleNamespace(
         **own,
-        oldest_age_steps=after.oldest_steps,
-        mean_age_steps=after.mean_steps,
+        oldest_age_steps=after.oldest_age_steps,
+        mean_age_steps=after.mean_age_steps,
         queue=after.queue,
     )

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import math
+import io
 import os
 import sys
 import threading
-from importlib import import_module
-from pathlib import Path
+from collections.abc import Iterator
 
 from sdc_taichi.errors import ConfigError, RuntimeStateError
-from sdc_taichi.kernels.compiler import collector
+from sdc_taichi.kernels.compiler import processors
 
 _forked = False
 _starting = threading.Lock()
@@ -23,11 +22,23 @@ def _mark_child() -> None:
     """Remember in a forked child that its parent had a runtime, whoever started it."""
     global _forked
     taichi = sys.modules.get("taichi")
-    _forked = taichi is not None and taichi.lang.impl.get_runtime().prog is not None
+    _forked = taichi is not None and taichi.cfg is not None
 
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_mark_child)
+
+
+def uses_plain_taichi() -> bool:
+    """Whether kernels are to be called through Taichi's public interface alone.
+
+    Raises:
+        ConfigError: ``SDC_TAICHI_PLAIN`` is neither 0 nor 1.
+    """
+    text = os.environ.get("SDC_TAICHI_PLAIN", "").strip()
+    if text not in ("", "0", "1"):
+        raise ConfigError(f"SDC_TAICHI_PLAIN={text!r}: valid are 0 and 1")
+    return text == "1"
 
 
 def ensure_started() -> int:
@@ -38,7 +49,9 @@ def ensure_started() -> int:
     use, no more than the quotas of its control groups grant, or ``SDC_TAICHI_THREADS``.
 
     Raises:
-        RuntimeStateError: in a child forked after the start, where Taichi would hang.
+        RuntimeStateError: in a child forked after the start, where Taichi would hang; or the
+            runtime was started with whole numbers of another length than 32 bits, and
+            ``SDC_TAICHI_PLAIN`` is 1.
         ConfigError: ``SDC_TAICHI_THREADS`` is no positive integer.
     """
     global _known
@@ -48,102 +61,49 @@ def ensure_started() -> int:
             "'spawn' method (multiprocessing.get_context('spawn')) or create simulators only in "
             "the children"
         )
-    if _known[0] is None:
-        with collector.paused():
-            import_module("sdc_taichi.kernels.compiler.backend")
-    from sdc_taichi.kernels.compiler.backend import ti
+    import taichi as ti
 
-    if _known[0] is None or _known[0] is not ti.lang.impl.get_runtime().prog:
+    # As `ti.cfg` tells it, but in a fifteenth of the time: steps ask several times.
+    runtime = ti.lang.impl.get_runtime
+    if _known[0] is None or _known[0] is not runtime().prog:
         with _starting:
-            if ti.lang.impl.get_runtime().prog is None:
-                _start()
-            # Starting makes another object of the runtime.
-            program = ti.lang.impl.get_runtime().prog
-            _known = (program, int(ti.lang.impl.current_cfg().cpu_max_num_threads))
+            if ti.cfg is None:
+                _start_taichi()
+            elif uses_plain_taichi() and ti.cfg.default_ip != ti.i32:
+                raise RuntimeStateError(
+                    f"Taichi was started with default_ip={ti.cfg.default_ip.to_string()}; valid "
+                    "with SDC_TAICHI_PLAIN=1 is i32"
+                )
+            _known = (runtime().prog, int(ti.cfg.cpu_max_num_threads))
     return _known[1]
 
 
-def _start() -> None:
-    from sdc_taichi.kernels.compiler import backend
+def _start_taichi() -> None:
+    import taichi as ti
 
-    before = _thread_ids()
-    backend.start(_thread_limit() or int(min(len(_processors()), granted())))
-    others = {thread.native_id for thread in threading.enumerate()}
-    threads = backend.ti.lang.impl.current_cfg().cpu_max_num_threads
-    _bind(_thread_ids() - before - others, threads)
-
-
-def _thread_ids() -> set[int]:
-    """Threads of this process; none where the system does not tell."""
-    try:
-        return set(map(int, os.listdir("/proc/self/task")))
-    except OSError:
-        return set()
+    threads = _thread_limit() or int(min(len(processors.allowed()), processors.quota()))
+    before = processors.thread_ids()
+    with _without_banner():
+        ti.init(arch=ti.cpu, offline_cache=True, log_level=ti.ERROR, cpu_max_num_threads=threads)
+    # Taichi sets up memory at the first launch or here, which has to be in the thread that starts.
+    ti.sync()
+    if not uses_plain_taichi():
+        others = {thread.native_id for thread in threading.enumerate()}
+        processors.bind(processors.thread_ids() - before - others, ti.cfg.cpu_max_num_threads)
 
 
-def _processors() -> list[int]:
-    """Those that this process may use, which Taichi would not ask."""
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
-
-
-def granted(
-    groups: Path = Path("/proc/self/cgroup"), mounted: Path = Path("/sys/fs/cgroup")
-) -> float:
-    """Processors whose time the process is granted, as in containers; inf without a quota.
-
-    Args:
-        groups: control groups of the process, one per line (cgroups(7) of Linux).
-        mounted: where their settings are. In a container these may begin below the groups' paths.
-
-    Returns:
-        The least quota of the groups and those above, rounded up.
-    """
-    found = [math.inf]
-    for line in _text(groups).split("\n"):
-        number, _, rest = line.partition(":")
-        controllers, _, path = rest.partition(":")
-        group = Path(path.lstrip("/"))
-        for folder in (group, *group.parents) if path else ():
-            if number == "0":
-                quota, _, period_us = _text(mounted / folder / "cpu.max").partition(" ")
-            elif "cpu" in controllers.split(","):
-                quota = _text(mounted / "cpu" / folder / "cpu.cfs_quota_us")
-                period_us = _text(mounted / "cpu" / folder / "cpu.cfs_period_us")
-            else:
-                continue
-            # "max" or -1 without a quota.
-            if quota.strip().isdecimal() and period_us.strip().isdecimal() and int(period_us):
-                found.append(max(1, math.ceil(int(quota) / int(period_us))))
-    return min(found)
-
-
-def _text(file: Path) -> str:
-    """What a file of the system says; nothing where there is none."""
-    try:
-        return file.read_text("utf-8", errors="replace")
-    except (OSError, ValueError):  # the latter of names that no file may have
-        return ""
-
-
-def _bind(started: set[int], threads: int) -> None:
-    """Bind Taichi's threads to one processor each.
-
-    Linux tends to wake all of them on the processor of the thread that waits for them, and moves
-    them apart some milliseconds later, when the step is done. Where threads are fewer or more than
-    processors, they are left to the system, which also serves processes beside this one.
-    """
-    processors = _processors()
-    if threads != len(processors) or not hasattr(os, "sched_setaffinity"):
-        return
-    # Those that compute are created one after the other, so no two of them meet.
-    for i, thread in enumerate(sorted(started)):
-        with contextlib.suppress(OSError):
-            os.sched_setaffinity(thread, {processors[i % threads]})
+@contextlib.contextmanager
+def _without_banner() -> Iterator[None]:
+    """Drop what Taichi prints at its start; pass on what other threads print meanwhile."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        yield
+    for line in printed.getvalue().splitlines(keepends=True):
+        if not line.startswith("[Taichi]"):
+            sys.stdout.write(line)
 
 
 def _thread_limit() -> int:
+    """Number of threads that the environment asks for; 0 where it asks for none."""
     text = os.environ.get("SDC_TAICHI_THREADS", "").strip()
     if not text:
         return 0

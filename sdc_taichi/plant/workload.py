@@ -4,18 +4,16 @@ The queue is one array per data center: entry k is the work still queued that wa
 of step k, oldest step first. It never decreases along k, so length, due part and age histogram are
 read off it or are differences of two entries.
 Work is counted in tasks: 1 task is 1 % of the data center's capacity for one step. A model decides
-what happens to work from what waits and what is due; ``Queue`` does it.
+what happens to work from what waits and what is due; ``sim.queue`` keeps the queues.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.types import F64
 
 TASKS_PER_STEP = 100.0
@@ -169,119 +167,6 @@ NEGLIGIBLE_TASKS = 1e-9
 """Left by rounding where a step's work was taken out in parts; no age is read off it."""
 UNLIMITED_TASKS = 1e30
 """Limit of a queue without one; larger than any, and still a number."""
-
-
-@dataclass(frozen=True, slots=True)
-class Queued:
-    """Work in the queues of a fleet between two steps, (B,) unless stated."""
-
-    queue: F64
-    """Work still queued by the step that put it in, oldest first and accumulated, (B, L)."""
-    waiting: F64
-    due: F64
-    """Part of it whose deadline has come when the next step starts."""
-    oldest_steps: F64
-    """Age of the oldest work."""
-    mean_steps: F64
-
-
-class Queue:
-    """What every step does to the queues of a fleet.
-
-    Args:
-        length: steps that a queue tells apart, L.
-        due_steps: age at which work is due, inf for never, (B,).
-    """
-
-    def __init__(self, length: int, due_steps: F64) -> None:
-        due_at = length - np.minimum(due_steps, length + 1.0).astype(np.int64)
-        self._size, self._length = len(due_steps), length
-        self._due_row = np.where(due_at < 0, length, due_at).astype(np.int32)
-        self._kernel: Any = None
-        self._rows: Any = None
-        """Rows of the queue that the last step left, as the kernel takes them."""
-        self._known: F64 | None = None
-        """That queue as others see it."""
-        self._start = (np.zeros(0), np.zeros(0))
-
-    def at_start(self, queue: F64) -> tuple[F64, F64]:
-        """Work that waits when a step starts, and what of it is due, (B,).
-
-        Args:
-            queue: work still queued by the step that put it in, oldest first, (B, L). It is made
-                read-only, since what is known of it would not follow a change.
-        """
-        if queue is not self._known:
-            never = np.zeros((1, self._size))
-            due = np.concatenate([queue.T, never])[self._due_row, np.arange(self._size)]
-            self._take(queue)
-            self._start = queue[:, -1].copy(), due
-        return self._start
-
-    def after(self, queue: F64, taken: F64, deferred: F64) -> Queued:
-        """The queues at the end of a step.
-
-        Args:
-            queue: at its start, (B, L); read-only from here on.
-            taken: work that leaves it, oldest first, (B,).
-            deferred: work that enters it, (B,).
-        """
-        if queue is not self._known:
-            self._take(queue)
-        self._taken[:], self._deferred[:] = taken, deferred
-        # Nothing is known of a step that is interrupted from here on.
-        self._known = None
-        after = self._backend.vector_rows(self._length, self._size)
-        self._kernel(
-            self._serial,
-            1,
-            NEGLIGIBLE_TASKS,
-            self._due_lanes,
-            self._empty,
-            self._rows,
-            self._moved,
-            after,
-            self._results,
-        )
-        waiting, due, oldest_steps, mean_steps = self._found.copy()
-        self._rows, self._known = after, self._backend.held(after, self._size).T
-        # A copy, since callers may do what they like with results.
-        self._start = self._found[0].copy(), self._found[1].copy()
-        self._known.flags.writeable = False
-        return Queued(self._known, waiting, due, oldest_steps, mean_steps)
-
-    def _prepare(self) -> None:
-        """What needs Taichi."""
-        from sdc_taichi.kernels.compiler import backend
-        from sdc_taichi.kernels.queue import SERIAL_UP_TO, queue_kernel
-
-        runtime.ensure_started()
-        self._backend, self._kernel = backend, backend.BoundKernel(queue_kernel(), templates=1)
-        self._serial = self._size <= SERIAL_UP_TO
-        # The same in every step: handing an array over takes longer than to copy a few entries.
-        self._moved, self._results = (backend.vector_rows(n, self._size) for n in (2, 4))
-        self._moved[:] = 0.0
-        self._taken, self._deferred = backend.held(self._moved, self._size)
-        self._found = backend.held(self._results, self._size)
-        self._due_lanes = np.full(self._moved.shape[1:], self._length, np.int32)
-        self._due_lanes.reshape(-1)[: self._size] = self._due_row
-        self._empty = np.zeros(self._moved.shape[1], np.int32)
-
-    def _take(self, queue: F64) -> None:
-        """Go on from a queue that was not left by the last step."""
-        if self._kernel is None:
-            self._prepare()
-        self._known = None
-        self._rows = self._backend.vector_rows(self._length, self._size)
-        self._rows[:] = 0.0
-        self._backend.held(self._rows, self._size)[:] = queue.T
-        self._empty[:] = 0
-        queue.flags.writeable = False
-        self._known = queue
-
-    def forget(self) -> None:
-        """Let go of the kernel and the arrays that it was last given."""
-        self._kernel = self._rows = self._known = None
 
 
 def age_histogram(queue: F64, edges_steps: F64) -> F64:

@@ -145,7 +145,8 @@ class Hall:
     def __init__(self, fleet: Fleet, precision: Precision) -> None:
         threads = runtime.ensure_started()
         from sdc_taichi.kernels import decay, hall, layers, thermal
-        from sdc_taichi.kernels.compiler.backend import BoundKernel, aligned
+        from sdc_taichi.kernels.compiler.arrays import aligned
+        from sdc_taichi.kernels.compiler.launch import BoundKernel
 
         self._thermal, self._aligned = thermal, aligned
         self._precision: Precision = precision
@@ -272,7 +273,7 @@ class Hall:
             zone = np.minimum(np.arange(lanes * v), n - 1)
             squares = tables[a : a + n][zone].reshape(v, lanes, -1, lanes)
             out[b : b + lanes * v] = squares.transpose(3, 0, 2, 1).reshape(-1, *out.shape[1:])
-        self._kernel.let_go(self._tables)
+        self._kernel.release(self._tables)
         self._tables = along
         block["along"][:] = first[of_block]
         self._laid_along = True
@@ -527,7 +528,7 @@ class Hall:
         ]
         written = self._written(stored)
         self._write(written, each_once=0)
-        self._layers_kernel.let_go(*written)
+        self._layers_kernel.release(*written)
         for layer, values, fits in zip(layers, stored, fit, strict=True):
             if not fits:
                 layer[:] = values
@@ -594,7 +595,7 @@ class Hall:
         )
         if self._hands_out:
             # Whoever has the results of the step has these, and no other needs them.
-            self._layers_kernel.let_go(self._rack_out)
+            self._layers_kernel.release(self._rack_out)
 
     def forget(self) -> None:
         """Drop the last step, so that ``servers`` cannot show layers of another state."""
@@ -666,7 +667,7 @@ class Hall:
             substep_s=step_s / count,
             weight=1.0 / count,
         )
-        self._kernel.let_go(before)
+        self._kernel.release(before)
         return self._results(out, transient=True), self._state(servers)
 
     def _exhaust(self) -> Any:

@@ -25,6 +25,7 @@ from sdc_taichi.sim.events import ActiveEvent, Disturbance, schedule
 from sdc_taichi.sim.facility import Facility, FacilityInputs
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums, Precision
+from sdc_taichi.sim.queue import Queue
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.sim.work_allocation import WorkAllocation
 from sdc_taichi.types import (
@@ -109,7 +110,7 @@ class Simulator:
         self._queue_length = int(horizon) + 2
         deadline_steps = np.where(np.isnan(deadline_h), np.inf, np.rint(deadline_h * per_hour))
         due_steps = deadline_steps + workload.DUE_AFTER_STEPS[models["workload"]]
-        self._queue = workload.Queue(self._queue_length, due_steps)
+        self._queue = Queue(self._queue_length, due_steps)
         self._unit_dc = self.fleet.unit_dc
         self._setpoint = {
             "step_k": v("hvac.setpoint.step_k")[self._unit_dc],
@@ -275,7 +276,7 @@ class Simulator:
         powered = None if calm else self._powered(state, event)
         floor, status = self._floor, state.rack_status
         capacity, highest = floor.capacity(status, powered, given.placement)
-        waiting, due = self._queue.at_start(state.queue)
+        waiting, due = self._queue.begin_step(state.queue)
         work = stages.work(
             demand=world.demand,
             command=load_command,
@@ -283,7 +284,7 @@ class Simulator:
             due=due,
             max_utilisation=np.minimum(self._max_utilisation, highest),
         )
-        queued = self._queue.after(state.queue, work["dequeued_tasks"], work["deferred_tasks"])
+        queued = self._queue.end_step(state.queue, work["dequeued_tasks"], work["deferred_tasks"])
         utilisation = work["utilisation"]
         placed = floor.place(utilisation, capacity, powered, state.group_inlet_c, given.placement)
 
@@ -388,9 +389,9 @@ class Simulator:
             overdue_tasks=work["overdue_tasks"],
             dropped_tasks=work["dropped_tasks"],
             lost_tasks=lost_tasks,
-            queue_tasks=queued.waiting,
-            oldest_age_h=queued.oldest_steps * step_h,
-            mean_age_h=queued.mean_steps * step_h,
+            queue_tasks=queued.waiting_tasks,
+            oldest_age_h=queued.oldest_age_steps * step_h,
+            mean_age_h=queued.mean_age_steps * step_h,
             setpoint_c=self._per_dc(setpoint_c).copy(),
             inlet_mean_c=air.inlet_mean_c,
             inlet_max_c=air.inlet_max_c,
@@ -639,7 +640,7 @@ class Simulator:
     def close(self) -> None:
         """Let go of the kernel arrays; the simulator is unusable afterwards."""
         self._hall = self._stages = None
-        self._queue.forget()
+        self._queue.release()
         self._closed = True
 
     def __enter__(self) -> Self:
