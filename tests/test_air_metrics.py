@@ -27,12 +27,12 @@ def test_indices_of_a_hall_of_two_racks() -> None:
     assert float(rise_k) == pytest.approx(34.0 / 3.0)
     # The CRAC units supply 4 m3/s, so 34 m3 K/s of heat warm it by 8.5 K.
     assert float(air_metrics.rti(26.5, 18.0, rise_k)) == pytest.approx(75.0)
-    over_k = air_metrics.over_temperature_k(inlet_c)
+    over_k = air_metrics.over_27_sum_k(inlet_c)
     assert float(over_k) == 3.0
     for name, found in (("A1", 70.0), ("A2", 81.25), ("A3", 88.4615384615), ("A4", 91.6666666667)):
         high_c = air_metrics.ALLOWABLE_C[name][1]
         assert float(air_metrics.rci_hi(over_k, 2, allowable_c=high_c)) == pytest.approx(found)
-    under_k = air_metrics.under_temperature_k(np.array([16.0, 17.5, 30.0]))
+    under_k = air_metrics.under_18_sum_k(np.array([16.0, 17.5, 30.0]))
     assert float(air_metrics.rci_lo(under_k, 3, allowable_c=15.0)) == pytest.approx(
         100.0 * (1.0 - 2.5 / 9.0)
     )
@@ -50,8 +50,8 @@ def test_rci_is_perfect_inside_zero_at_the_limit_and_negative_beyond() -> None:
     ):
         inlets = np.full(4, inlet_c)
         over, under = (
-            air_metrics.over_temperature_k(inlets),
-            air_metrics.under_temperature_k(inlets),
+            air_metrics.over_27_sum_k(inlets),
+            air_metrics.under_18_sum_k(inlets),
         )
         assert float(air_metrics.rci_hi(over, 4, allowable_c=high_c)) == pytest.approx(at_high)
         assert float(air_metrics.rci_lo(under, 4, allowable_c=low_c)) == pytest.approx(at_low)
@@ -111,7 +111,7 @@ def test_sums_over_axes_and_offsets_agree() -> None:
     # From sums alone, as a simulator carries them.
     from_sums = (flow_m3s * air_c).sum(axis=1) - supply_c * flow_m3s.sum(axis=1)
     np.testing.assert_allclose(from_sums, dense, rtol=1e-11)
-    for sums in (air_metrics.over_temperature_k, air_metrics.under_temperature_k):
+    for sums in (air_metrics.over_27_sum_k, air_metrics.under_18_sum_k):
         np.testing.assert_allclose(sums(air_c), [sums(row) for row in air_c], rtol=1e-13)
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sdc_taichi.errors import SdcError
-from sdc_taichi.hall.placement import MIN_HEADROOM_K, POLICIES, PlacementError, layout, place
+from sdc_taichi.hall.placement import MIN_HEADROOM_K, POLICIES, PlacementError, make_bins, place
 from sdc_taichi.types import F64, I64
 
 LIMIT_C = 27.0
@@ -28,7 +28,7 @@ class Case:
         return place(
             policy,
             self.utilisation if utilisation is None else utilisation,
-            bins=layout(self.start),
+            bins=make_bins(self.start),
             count=self.count,
             capacity=self.capacity,
             inlet_c=self.inlet_c,
@@ -267,7 +267,7 @@ def test_weights_that_cannot_be_used_are_named(weights: object, message: str) ->
         place(
             "weights",
             np.array([0.5, 0.5]),
-            bins=layout(np.array([0, 2, 4]), ["bergen", "oslo"]),
+            bins=make_bins(np.array([0, 2, 4]), ["bergen", "oslo"]),
             count=np.ones(4),
             capacity=np.ones(4),
             inlet_c=np.full(4, 20.0),
@@ -290,7 +290,7 @@ def test_policies_and_limits_that_cannot_be_used_are_named(
         place(
             policy,
             np.array([0.5, 0.5]),
-            bins=layout(np.array([0, 2, 4])),
+            bins=make_bins(np.array([0, 2, 4])),
             count=np.ones(4),
             capacity=np.ones(4),
             inlet_c=np.full(4, 20.0),

@@ -10,13 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.kernels import thermal
-from sdc_taichi.types import F64, Reals, as_array
-
-Values = F64 | float
+from sdc_taichi.types import F64, Reals, Values, as_array
 
 RECOMMENDED_C = thermal.RECOMMENDED_C
+"""Lowest and highest recommended inlet, in C (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
 ALLOWABLE_C = {"A1": (15.0, 32.0), "A2": (10.0, 35.0), "A3": (5.0, 40.0), "A4": (5.0, 45.0)}
-"""Allowable inlet temperatures by class (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
+"""Lowest and highest allowable inlet, in C, by class (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
 
 _USUAL_CLASS = "A2"
 
@@ -28,7 +27,7 @@ _ROUND_OFF_SHARE = 1e-6
 
 
 def allowable_c(ashrae_class: str | None) -> tuple[float, float]:
-    """Allowable inlet temperatures of a class of ``ALLOWABLE_C``; None is A2."""
+    """Lowest and highest allowable inlet of a class of ``ALLOWABLE_C``, in C; None is A2."""
     return ALLOWABLE_C[ashrae_class or _USUAL_CLASS]
 
 
@@ -36,37 +35,46 @@ def rise_m3k_s(
     airflow_m3s: Reals,
     temperature_c: Reals,
     supply_c: Values,
-    start: npt.NDArray[np.integer] | None = None,
+    rack_offsets: npt.NDArray[np.integer] | None = None,
 ) -> F64:
     """Flow-weighted temperature above the supply air, sum V*(T - T_sup); times rho*cp it is heat.
 
     With sums alone it is sum(V*T) - T_sup*sum(V).
 
     Args:
-        airflow_m3s: airflow of each rack, (..., N) or (R,) with ``start``.
-        temperature_c: inlet or outlet temperature, same shape.
-        supply_c: supply air, one for all, (..., 1) or per rack; with ``start`` also (B,).
-        start: first rack of each data center and their total, (B + 1,), each with a rack or more.
+        airflow_m3s: Airflow of each rack, m3/s, (..., N), or (R,) with ``rack_offsets``.
+        temperature_c: Inlet or outlet temperature of each rack, C, same shape.
+        supply_c: Supply air, C, one for all, (..., 1) or per rack; with ``rack_offsets`` also (B,).
+        rack_offsets: First rack of each data center, and the number of racks, (B + 1,); each data
+            center has a rack or more.
 
     Returns:
         Sum over the racks, m3 K/s, (...) or (B,).
     """
     supply = np.asarray(supply_c, dtype=np.float64)
-    if start is not None and supply.shape == (len(start) - 1,):
-        supply = np.repeat(supply, np.diff(start))
+    if rack_offsets is not None and supply.shape == (len(rack_offsets) - 1,):
+        supply = np.repeat(supply, np.diff(rack_offsets))
     rise = airflow_m3s * (temperature_c - supply)
-    if start is None:
+    if rack_offsets is None:
         return np.asarray(rise.sum(axis=-1))
-    return np.asarray(np.add.reduceat(rise, start[:-1]))
+    return np.asarray(np.add.reduceat(rise, rack_offsets[:-1]))
 
 
-def over_temperature_k(inlet_c: F64) -> F64:
-    """Sum over racks of what inlets, (..., N), exceed ``RECOMMENDED_C`` by, K, (...)."""
+def over_27_sum_k(inlet_c: F64) -> F64:
+    """Sum over the racks of what their inlets exceed 27 C by, in K, (...).
+
+    Args:
+        inlet_c: Inlet temperature of each rack, C, (..., N).
+    """
     return np.asarray(np.maximum(inlet_c - RECOMMENDED_C[1], 0.0).sum(axis=-1))
 
 
-def under_temperature_k(inlet_c: F64) -> F64:
-    """Sum over racks of what inlets, (..., N), are below ``RECOMMENDED_C`` by, K, (...)."""
+def under_18_sum_k(inlet_c: F64) -> F64:
+    """Sum over the racks of what their inlets lie below 18 C by, in K, (...).
+
+    Args:
+        inlet_c: Inlet temperature of each rack, C, (..., N).
+    """
     return np.asarray(np.maximum(RECOMMENDED_C[0] - inlet_c, 0.0).sum(axis=-1))
 
 
@@ -78,19 +86,24 @@ def shi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:
     large-scale data centers", AIAA 2002-3091): 0 without recirculation.
 
     Args:
-        inlet_rise_m3k_s: ``rise_m3k_s`` of the inlets.
-        outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets.
+        inlet_rise_m3k_s: ``rise_m3k_s`` of the inlets, m3 K/s.
+        outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets, m3 K/s.
 
     Returns:
-        SHI, and 0 where the outlets have no rise, as without load or airflow, or where rounding
-        alone has left something of either sign.
+        SHI, dimensionless, and 0 where the outlets have no rise, as without load or airflow, or
+        where rounding alone has left something of either sign.
     """
     share = _ratio(inlet_rise_m3k_s, outlet_rise_m3k_s)
     return as_array(np.where(np.maximum(share, -share) > _ROUND_OFF_SHARE, share, 0.0))
 
 
 def rhi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:
-    """Return heat index, 1 - SHI (Sharma, Bash and Patel 2002); arguments as in ``shi``."""
+    """Return heat index, 1 - SHI, dimensionless (Sharma, Bash and Patel 2002).
+
+    Args:
+        inlet_rise_m3k_s: ``rise_m3k_s`` of the inlets, m3 K/s.
+        outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets, m3 K/s.
+    """
     return as_array(1.0 - shi(inlet_rise_m3k_s, outlet_rise_m3k_s))
 
 
@@ -98,12 +111,12 @@ def it_rise_k(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values, airflow_m3s: 
     """Flow-weighted temperature rise through the equipment, sum V*(T_out - T_in) / sum V, K.
 
     Args:
-        inlet_rise_m3k_s: ``rise_m3k_s`` of the inlets.
-        outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets.
-        airflow_m3s: sum of the airflow of the racks.
+        inlet_rise_m3k_s: ``rise_m3k_s`` of the inlets, m3 K/s.
+        outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets, m3 K/s.
+        airflow_m3s: Sum of the airflow of the racks, m3/s.
 
     Returns:
-        Rise, and 0 where there is no airflow.
+        Rise, K, and 0 where there is no airflow.
     """
     return _ratio(np.subtract(outlet_rise_m3k_s, inlet_rise_m3k_s), airflow_m3s)
 
@@ -115,12 +128,12 @@ def rti(return_c: Values, supply_c: Values, it_rise_k: Values) -> F64:
     Transactions 114(2). Above 100 % air recirculates on balance, below it bypasses the equipment.
 
     Args:
-        return_c: return air of the CRAC units.
-        supply_c: supply air.
-        it_rise_k: ``it_rise_k`` of the equipment.
+        return_c: Return air of the CRAC units, C.
+        supply_c: Supply air of the CRAC units, C.
+        it_rise_k: ``it_rise_k`` of the equipment, K.
 
     Returns:
-        RTI, and 0 where the equipment does not warm its air: all that is supplied bypasses it.
+        RTI, %, and 0 where the equipment does not warm its air: all that is supplied bypasses it.
     """
     return 100.0 * _ratio(np.subtract(return_c, supply_c), it_rise_k)
 
@@ -133,9 +146,9 @@ def rci_hi(over_k: Values, racks: Values, *, allowable_c: Values) -> F64:
     is over-temperatures that average to the allowable limit, and worse is negative.
 
     Args:
-        over_k: ``over_temperature_k``.
-        racks: number of inlets in that sum, at least 1.
-        allowable_c: upper end of the allowable range, above the recommended one.
+        over_k: Sum over the inlets of what they exceed 27 C by, K.
+        racks: Number of inlets in the sum, at least 1.
+        allowable_c: Upper end of the allowable range, C, above 27.
     """
     return as_array(100.0 * (1.0 - over_k / (racks * (allowable_c - RECOMMENDED_C[1]))))
 
@@ -143,17 +156,18 @@ def rci_hi(over_k: Values, racks: Values, *, allowable_c: Values) -> F64:
 def rci_lo(under_k: Values, racks: Values, *, allowable_c: Values) -> F64:
     """Rack cooling index at the low end, 100*(1 - under/(n*(T_recommended - T_allowable))), %.
 
-    Args:
-        under_k: ``under_temperature_k``.
-        racks: number of inlets in that sum, at least 1.
-        allowable_c: lower end of the allowable range, below the recommended one.
+    Herrlin 2005, "Rack cooling effectiveness in data centers and telecom central offices: the Rack
+    Cooling Index (RCI)", ASHRAE Transactions 111(2). 100 is no inlet below the recommended range.
 
-    Returns:
-        RCI (Herrlin 2005, as ``rci_hi``).
+    Args:
+        under_k: Sum over the inlets of what they lie below 18 C by, K.
+        racks: Number of inlets in the sum, at least 1.
+        allowable_c: Lower end of the allowable range, C, below 18.
     """
     return as_array(100.0 * (1.0 - under_k / (racks * (RECOMMENDED_C[0] - allowable_c))))
 
 
 def _ratio(part: Values, whole: Values) -> F64:
+    """Part over whole, 0 where the whole is no more than round-off."""
     some = np.greater(whole, _NO_RISE)
     return as_array(np.where(some, part / np.where(some, whole, 1.0), 0.0))

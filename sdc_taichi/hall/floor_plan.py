@@ -21,25 +21,25 @@ class FloorPlan:
     """Floor plan of a hall of R racks, row by row."""
 
     centre_m: F64
-    """Rack centres, (R, 2)."""
+    """Centres of the racks, x and y in m, (R, 2)."""
     front_m: F64
-    """Middle of the inlet faces, (R, 2)."""
+    """Middles of the inlet faces, x and y in m, (R, 2)."""
     back_m: F64
-    """Middle of the exhaust faces, (R, 2)."""
+    """Middles of the exhaust faces, x and y in m, (R, 2)."""
     facing: npt.NDArray[np.int64]
     """1 where the inlet faces larger y, -1 where it faces smaller y, (R,)."""
     row_ends_m: tuple[float, float]
-    """x of both ends of the rows."""
+    """x of both ends of the rows, in m."""
     length_m: float
-    """Of the room along x."""
+    """Length of the room along x, in m."""
     width_m: float
-    """Of the room along y."""
+    """Width of the room along y, in m."""
     air_m3: float
-    """Volume of the room less that of the racks."""
+    """Volume of the room less that of the racks, in m3."""
 
 
 def floor_plan(hall: HallConfig) -> FloorPlan:
-    """Places of the racks."""
+    """Floor plan of a hall, with racks placed row by row by the measures of its layout."""
     measures = hall.layout
     row = np.arange(hall.rows)
     facing = np.where(row % 2 == 0, 1, -1)
@@ -66,14 +66,24 @@ def floor_plan(hall: HallConfig) -> FloorPlan:
 
 
 def row_distance_m(measures: LayoutConfig, row: npt.NDArray[np.int64]) -> F64:
-    """Distance of each row's middle from that of row 0, for any row number, below 0 too."""
+    """Distance of the middle of each row from that of row 0, in m.
+
+    Args:
+        measures: Depths of racks and aisles.
+        row: Row numbers, any shape; numbers below 0 give negative distances.
+    """
     cold = measures.rack_depth_m + measures.cold_aisle_m
     hot = measures.rack_depth_m + measures.hot_aisle_m
     return np.asarray(row // 2 * (cold + hot) + row % 2 * cold, dtype=np.float64)
 
 
 def unit_places_m(plan: FloorPlan, units: int) -> F64:
-    """Places of the CRAC units, along both end walls in turn, (units, 2)."""
+    """Places of the CRAC units along both end walls in turn, x and y in m, (U, 2).
+
+    Args:
+        plan: Floor plan of the hall.
+        units: Number of CRAC units, U.
+    """
     index = np.arange(units)
     walls = index % 2
     on_wall = np.array([(units + 1) // 2, units // 2])[walls]
@@ -82,9 +92,14 @@ def unit_places_m(plan: FloorPlan, units: int) -> F64:
 
 
 def unit_shares(plan: FloorPlan, units: int, length_m: float) -> F64:
-    """Share of each unit in the supply of each rack, (R, units); rows sum to 1.
+    """Share of each CRAC unit in the supply of each rack, (R, U); rows sum to 1.
 
     A share falls with the distance from unit to inlet face as exp(-distance/length).
+
+    Args:
+        plan: Floor plan of the hall.
+        units: Number of CRAC units, U.
+        length_m: Distance over which a share falls to 1/e, m.
     """
     places = unit_places_m(plan, units)
     distance = np.hypot(*np.moveaxis(plan.front_m[:, None] - places[None], -1, 0))

@@ -1,8 +1,8 @@
 """Where in the hall a data center's work runs: its utilisation spread over racks or server groups.
 
-Bins are racks or groups of alike servers, those of all data centers end to end. What is placed is
-conserved: the loads, weighted by the servers of each bin, sum to the utilisation, as far as the
-usable servers suffice.
+Bins are the places for work, racks or groups of alike servers, those of all data centers end to
+end. What is placed is conserved: the loads, weighted by the servers of each bin, sum to the
+utilisation, as far as the usable servers suffice.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.types import F64, I64
 
 POLICIES = ("uniform", "fill", "coolest-first", "inlet-aware", "weights")
+"""Policies by the names that ``workload.placement`` takes."""
 MIN_HEADROOM_K = 0.1
-"""Headroom that a bin at or above its limit counts as having under ``inlet-aware``."""
+"""Headroom, in K, that a bin at or above its limit counts as having under ``inlet-aware``."""
 _LEAST_WEIGHT = 1e-100
-"""Of the largest of a data center; any smaller positive weight counts as this."""
+"""Smallest weight over the largest of a data center; smaller positive weights count as this."""
 
 Mask = npt.NDArray[np.bool_]
 
@@ -31,66 +32,69 @@ class PlacementError(SdcError):
 
 @dataclass(frozen=True, slots=True)
 class Bins:
-    """Bins of B data centers, n in all; see ``layout``."""
+    """Places for work in B data centers, n in all: racks, or groups of alike servers."""
 
-    start: I64
-    """First bin of each data center and their total, (B + 1,)."""
+    offsets: I64
+    """First bin of each data center, and the number of bins, (B + 1,)."""
     dc: I64
     """Data center of each bin, (n,)."""
     names: tuple[str, ...]
-    rows: tuple[I64, ...]
-    """Bins of the data centers of similar size, one row each; index n fills the shorter rows up."""
+    """Name of each data center, for errors, (B,)."""
+    by_size: tuple[I64, ...]
+    """Bins of the data centers of similar size, one row a data center; index n fills shorter rows
+    up."""
 
     def sums(self, values: npt.NDArray[np.float64 | np.int64]) -> F64:
-        """Sum of each data center, (B,)."""
-        return np.asarray(np.add.reduceat(values, self.start[:-1]), dtype=np.float64)
+        """Sum of bin values, (n,), over each data center, (B,)."""
+        return np.asarray(np.add.reduceat(values, self.offsets[:-1]), dtype=np.float64)
 
-    def up_to(self, values: F64) -> F64:
-        """Running sum within each data center, the bin itself included, (n,)."""
+    def running_sums(self, values: F64) -> F64:
+        """Sum of bin values over a bin and those before it in its data center, (n,)."""
         out, padded = np.empty(len(values) + 1), np.append(values, 0.0)
-        for rows in self.rows:
+        for rows in self.by_size:
             out[rows] = np.cumsum(padded[rows], axis=1)
         return out[:-1]
 
-    def after(self, values: F64) -> F64:
-        """Sum over the later bins of the same data center, (n,)."""
+    def later_sums(self, values: F64) -> F64:
+        """Sum of bin values over those after a bin in its data center, (n,)."""
         out, padded = np.empty(len(values) + 1), np.append(values, 0.0)
-        for rows in self.rows:
+        for rows in self.by_size:
             # Summed from the end: a difference from the total would lose small values.
             later = np.cumsum(padded[rows][:, :0:-1], axis=1)[:, ::-1]
             out[rows] = np.append(later, np.zeros((len(rows), 1)), axis=1)
         return out[:-1]
 
     def order(self, key: F64) -> I64:
-        """Bins by rising key within each data center, ties by index, (n,)."""
+        """Bins of each data center by rising key, ties by index, (n,)."""
         out, padded = np.empty(len(key) + 1, dtype=np.int64), np.append(key, np.inf)
-        for rows in self.rows:
+        for rows in self.by_size:
             by_key = np.argsort(padded[rows], axis=1, kind="stable")
             out[rows] = np.take_along_axis(rows, by_key, axis=1)
         return out[:-1]
 
 
-def layout(start: npt.NDArray[np.integer], names: Sequence[str] = ()) -> Bins:
-    """Lay bins out for ``place``; done once per fleet.
+def make_bins(bin_offsets: npt.NDArray[np.integer], names: Sequence[str] = ()) -> Bins:
+    """Arrange the bins of a fleet for ``place``; done once per fleet.
 
     Args:
-        start: first bin of each data center and their total, (B + 1,), each with a bin or more.
-        names: of the data centers, for errors; none are their numbers.
+        bin_offsets: First bin of each data center, and the number of bins, (B + 1,); each data
+            center has a bin or more.
+        names: Names of the data centers, for errors; none names them by their numbers.
     """
-    starts = np.asarray(start, dtype=np.int64)
-    sizes = np.diff(starts)
+    offsets = np.asarray(bin_offsets, dtype=np.int64)
+    sizes = np.diff(offsets)
     # One class per power of two: rows are at most half empty, and the classes few.
     size_class = np.ceil(np.log2(sizes)).astype(np.int64)
-    rows = []
+    by_size = []
     for chosen in (np.flatnonzero(size_class == c) for c in np.unique(size_class)):
         column = np.arange(sizes[chosen].max())
         inside = column < sizes[chosen, None]
-        rows.append(np.where(inside, starts[chosen, None] + column, starts[-1]))
+        by_size.append(np.where(inside, offsets[chosen, None] + column, offsets[-1]))
     return Bins(
-        start=starts,
+        offsets=offsets,
         dc=np.repeat(np.arange(len(sizes)), sizes),
         names=tuple(names) or tuple(f"data center {i}" for i in range(len(sizes))),
-        rows=tuple(rows),
+        by_size=tuple(by_size),
     )
 
 
@@ -110,24 +114,27 @@ def place(
     - ``uniform``: the same load everywhere; where that exceeds a bin's capacity, the bins that have
       room share the rest evenly.
     - ``fill``: bins in order of their index, each up to its capacity.
-    - ``coolest-first``: bins in order of their inlet temperature, ties by index, likewise.
+    - ``coolest-first``: bins in order of their inlet temperature, ties by index, each up to its
+      capacity.
     - ``inlet-aware``: loads in proportion to the headroom max(limit - inlet, ``MIN_HEADROOM_K``),
       up to capacity.
     - ``weights``: loads in proportion to ``weights``, up to capacity; weight 0 gets none, even when
       the others are full.
 
-    In proportion and up to capacity is load = min(capacity, level*weight), the level exact: bins in
-    the order in which they fill up are taken as full as long as the work suffices.
+    Loads in proportion and up to capacity are min(capacity, level*weight), with one exact level for
+    a data center: bins are full in the order in which a rising level fills them, as long as the
+    work suffices.
 
     Args:
-        policy: one of ``POLICIES``.
-        utilisation: work as a share of all servers, at least 0, (B,).
-        bins: see ``layout``.
-        count: servers of each bin, above 0, (n,).
-        capacity: utilisation each bin may reach, 0..1, (n,).
-        inlet_c: last known inlet temperature of each bin, (n,).
-        limit_c: inlet temperature that ``inlet-aware`` keeps away from, finite, () or (B,).
-        weights: at least 0, one or more per data center positive, (n,); for ``weights`` alone.
+        policy: One of ``POLICIES``.
+        utilisation: Work as a share of all servers, at least 0, (B,).
+        bins: Bins of the fleet, see ``make_bins``.
+        count: Servers of each bin, above 0, (n,).
+        capacity: Utilisation each bin may reach, 0..1, (n,).
+        inlet_c: Last known inlet temperature of each bin, C, (n,).
+        limit_c: Inlet temperature that ``inlet-aware`` keeps away from, C, finite, () or (B,).
+        weights: Relative loads, at least 0 and above 0 for a bin or more of each data center, (n,);
+            for ``weights`` alone.
 
     Returns:
         Load of each bin, 0..capacity, (n,), and the utilisation really placed, (B,):
@@ -151,14 +158,15 @@ def place(
     placed, work, full = _placeable(utilisation, bins, count, usable)
     if policy in ("fill", "coolest-first"):
         order = np.arange(len(count)) if policy == "fill" else bins.order(inlet_c)
-        load = _one_after_the_other(order, work, bins, count, usable)
+        load = _fill_in_order(order, work, bins, count, usable)
     else:
         load = _in_proportion(weight, work, bins, count, usable)
     return np.where(full[bins.dc], usable, load), placed
 
 
 def _uniform(utilisation: F64, bins: Bins, count: F64, capacity: F64) -> tuple[F64, F64]:
-    unhindered = utilisation <= np.minimum.reduceat(capacity, bins.start[:-1])
+    """Load of each bin, (n,), and utilisation placed, (B,), alike as far as capacities allow."""
+    unhindered = utilisation <= np.minimum.reduceat(capacity, bins.offsets[:-1])
     if np.all(unhindered):
         return utilisation[bins.dc], utilisation.copy()
     placed, work, full = _placeable(utilisation, bins, count, capacity)
@@ -170,31 +178,31 @@ def _uniform(utilisation: F64, bins: Bins, count: F64, capacity: F64) -> tuple[F
 
 
 def _placeable(utilisation: F64, bins: Bins, count: F64, capacity: F64) -> tuple[F64, F64, Mask]:
-    """Utilisation that fits, the same in servers, and where it takes all there is, each (B,)."""
+    """Utilisation that fits, servers that it keeps busy, and whether it fills all, each (B,)."""
     servers = bins.sums(count)
     highest = bins.sums(count * capacity) / servers
     placed = np.minimum(utilisation, highest)
     return placed, placed * servers, utilisation >= highest
 
 
-def _one_after_the_other(order: I64, work: F64, bins: Bins, count: F64, capacity: F64) -> F64:
-    """Fill bins in the given order, (n,)."""
+def _fill_in_order(order: I64, work: F64, bins: Bins, count: F64, capacity: F64) -> F64:
+    """Load of bins that are filled in the given order, (n,)."""
     room = count * capacity
-    in_order = bins.up_to(room[order]) <= work[bins.dc]
+    in_order = bins.running_sums(room[order]) <= work[bins.dc]
     full = np.empty(len(room), dtype=np.bool_)
     full[order] = in_order
     load = np.where(full, capacity, 0.0)
     # The running sum only tells which bins are full; what is left for the next one is exact.
     rest = work - bins.sums(np.where(full, room, 0.0))
-    position = bins.start[:-1] + np.add.reduceat(in_order.astype(np.int64), bins.start[:-1])
-    some = position < bins.start[1:]
+    position = bins.offsets[:-1] + np.add.reduceat(in_order.astype(np.int64), bins.offsets[:-1])
+    some = position < bins.offsets[1:]
     following = order[position[some]]
     load[following] = np.clip(rest[some] / count[following], 0.0, capacity[following])
     return load
 
 
 def _in_proportion(weight: F64, work: F64, bins: Bins, count: F64, capacity: F64) -> F64:
-    """min(capacity, level*weight) with the level that places all work, (n,).
+    """Load min(capacity, level*weight) with the level that places all work, (n,).
 
     Where the weight is 0, so is the capacity.
     """
@@ -202,7 +210,7 @@ def _in_proportion(weight: F64, work: F64, bins: Bins, count: F64, capacity: F64
     level_full = capacity / np.where(weight > 0.0, weight, 1.0)
     order = bins.order(level_full)
     # Work done when the level just fills a bin: all before it are full, those after it are not.
-    at_level = bins.up_to(room[order]) + level_full[order] * bins.after(weighted[order])
+    at_level = bins.running_sums(room[order]) + level_full[order] * bins.later_sums(weighted[order])
     full = np.empty(len(room), dtype=np.bool_)
     full[order] = at_level <= work[bins.dc]
     rest = work - bins.sums(np.where(full, room, 0.0))
@@ -213,7 +221,8 @@ def _in_proportion(weight: F64, work: F64, bins: Bins, count: F64, capacity: F64
 
 
 def _checked_limit(limit_c: npt.ArrayLike, bins: Bins) -> F64:
-    limit = np.broadcast_to(np.asarray(limit_c, dtype=np.float64), (len(bins.start) - 1,))
+    """Limit of each data center, in C, (B,)."""
+    limit = np.broadcast_to(np.asarray(limit_c, dtype=np.float64), (len(bins.offsets) - 1,))
     wrong = np.flatnonzero(~np.isfinite(limit))
     if len(wrong):
         raise PlacementError(
@@ -239,10 +248,10 @@ def _checked_weights(weights: npt.ArrayLike | None, bins: Bins) -> F64:
     if len(wrong):
         dc = bins.dc[wrong[0]]
         raise PlacementError(
-            f"{bins.names[dc]}: placement weight {wrong[0] - bins.start[dc]} is "
+            f"{bins.names[dc]}: placement weight {wrong[0] - bins.offsets[dc]} is "
             f"{given[wrong[0]]}; valid is a finite number of at least 0"
         )
-    largest = np.maximum.reduceat(given, bins.start[:-1])
+    largest = np.maximum.reduceat(given, bins.offsets[:-1])
     without = np.flatnonzero(largest == 0.0)
     if len(without):
         raise PlacementError(

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sdc_taichi.types import F64, Status
-
-Values = F64 | float
+from sdc_taichi.types import F64, Status, Values
 
 NORMAL, THROTTLED, TRIPPED = 0, 1, 2
-"""Status of a rack."""
+"""Status of a rack: works as asked, works less because an inlet is too hot, or is off."""
 
 
 def protect(
@@ -24,10 +22,10 @@ def protect(
 
     Args:
         status: NORMAL, THROTTLED or TRIPPED, (R,).
-        inlet_max_c: hottest inlet temperature of each rack, (R,).
-        limit_c: highest inlet without throttling, inf for no protection, () or (R,).
-        trip_c: highest inlet without tripping, at least the limit, () or (R,).
-        restart_c: highest inlet at which a tripped rack starts again, () or (R,).
+        inlet_max_c: Hottest inlet temperature of each rack, C, (R,).
+        limit_c: Highest inlet without throttling, C, inf for no protection, () or (R,).
+        trip_c: Highest inlet without tripping, C, at least the limit, () or (R,).
+        restart_c: Highest inlet at which a tripped rack restarts, C, () or (R,).
 
     Returns:
         New status, (R,).
@@ -40,10 +38,12 @@ def protect(
 
 
 def capacity(status: Status, throttle_share: Values) -> F64:
-    """Utilisation each rack may reach: 1, ``throttle_share`` throttled, and 0 tripped, (R,).
+    """Utilisation that each rack may reach, 0..1, (R,).
+
+    A rack in order may reach 1, a throttled one ``throttle_share``, a tripped one 0.
 
     Args:
         status: NORMAL, THROTTLED or TRIPPED, (R,).
-        throttle_share: 0..1, () or (R,).
+        throttle_share: Utilisation that a throttled rack may reach, 0..1, () or (R,).
     """
     return np.where(status == TRIPPED, 0.0, np.where(status == THROTTLED, throttle_share, 1.0))

@@ -123,10 +123,10 @@ def solve(
         rhi=float(air_metrics.rhi(inlet, outlet)),
         rti_pct=float(air_metrics.rti(return_c, supply_c, mean_rise_k)),
         rci_hi_pct=float(
-            air_metrics.rci_hi(air_metrics.over_temperature_k(inlet_c), racks, allowable_c=high_c)
+            air_metrics.rci_hi(air_metrics.over_27_sum_k(inlet_c), racks, allowable_c=high_c)
         ),
         rci_lo_pct=float(
-            air_metrics.rci_lo(air_metrics.under_temperature_k(inlet_c), racks, allowable_c=low_c)
+            air_metrics.rci_lo(air_metrics.under_18_sum_k(inlet_c), racks, allowable_c=low_c)
         ),
         mass_residual=mass_residual,
         share_residual=float(np.abs(R.sum(axis=1) + supply_share - 1.0).max()),

@@ -9,7 +9,7 @@ import numpy as np
 from sdc_taichi.errors import SdcError
 from sdc_taichi.hall import protection
 from sdc_taichi.hall.air_metrics import allowable_c
-from sdc_taichi.hall.placement import layout, place
+from sdc_taichi.hall.placement import make_bins, place
 from sdc_taichi.hall.protection import TRIPPED
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, Reals, Status
@@ -45,7 +45,7 @@ class WorkAllocation:
         self._rack_servers = fleet.per_rack_servers()
         self._bin_servers = self._rack_servers if self._per_rack else fleet.per_group_servers()
         starts = fleet.rack_offsets if self._per_rack else fleet.group_offsets[fleet.rack_offsets]
-        self._bins = layout(starts, fleet.names)
+        self._bins = make_bins(starts, fleet.names)
         classes = [c.protection.ashrae_class for c in fleet.configs]
         limit_c = np.array([np.inf if c is None else allowable_c(c)[1] for c in classes])
         trip_c = limit_c + fleet.values("protection.trip_margin_k")
