@@ -4,7 +4,7 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from sdc_taichi.config import DataCenterConfig, load_config, preset_names
+from sdc_taichi.config import DataCenterConfig, load_config, preset_names, with_values
 from sdc_taichi.envs import registration
 from sdc_taichi.errors import ConfigError, DataError, RuntimeStateError, SdcError
 from sdc_taichi.sim.drivers import Drivers, drivers_from_arrays, load_drivers
@@ -23,10 +23,17 @@ from sdc_taichi.types import (
 )
 
 if TYPE_CHECKING:
+    from sdc_taichi.control import View, make_controller
+    from sdc_taichi.envs.forecasts import ForecastError
+    from sdc_taichi.envs.options import EnvOptions
     from sdc_taichi.envs.parallel import aec_env, parallel_env
     from sdc_taichi.envs.recording import EpisodeRecorder, RecordEpisodes
     from sdc_taichi.envs.rewards import register_reward
     from sdc_taichi.envs.vector import vector_env
+    from sdc_taichi.run.description import RunRequest
+    from sdc_taichi.run.folder_writer import simulate_to_folder
+    from sdc_taichi.run.loop import simulate
+    from sdc_taichi.viz.recorder import Recorder
 
 __version__ = version("sdc-taichi")
 
@@ -40,37 +47,54 @@ __all__ = [
     "DataCenterConfig",
     "DataError",
     "Drivers",
+    "EnvOptions",
     "EpisodeRecorder",
     "Exogenous",
     "FanAction",
     "Fleet",
+    "ForecastError",
     "LoadAction",
     "RecordEpisodes",
+    "Recorder",
+    "RunRequest",
     "RuntimeStateError",
     "SdcError",
     "ServerLayers",
     "Simulator",
     "State",
     "StepResult",
+    "View",
     "aec_env",
     "build_fleet",
     "drivers_from_arrays",
     "load_config",
     "load_drivers",
     "make_configs",
+    "make_controller",
     "parallel_env",
     "preset_names",
     "register_reward",
+    "simulate",
+    "simulate_to_folder",
     "vector_env",
+    "with_values",
 ]
 
-# Imported on first use, as they bring PettingZoo and the environments with them.
+# Imported on first use, as they bring PettingZoo, the environments or the viewer with them.
 _LAZY = {
+    "EnvOptions": "sdc_taichi.envs.options",
     "EpisodeRecorder": "sdc_taichi.envs.recording",
+    "ForecastError": "sdc_taichi.envs.forecasts",
     "RecordEpisodes": "sdc_taichi.envs.recording",
+    "Recorder": "sdc_taichi.viz.recorder",
+    "RunRequest": "sdc_taichi.run.description",
+    "View": "sdc_taichi.control",
     "aec_env": "sdc_taichi.envs.parallel",
+    "make_controller": "sdc_taichi.control",
     "parallel_env": "sdc_taichi.envs.parallel",
     "register_reward": "sdc_taichi.envs.rewards",
+    "simulate": "sdc_taichi.run.loop",
+    "simulate_to_folder": "sdc_taichi.run.folder_writer",
     "vector_env": "sdc_taichi.envs.vector",
 }
 

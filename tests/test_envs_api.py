@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import pickle
 import re
 import subprocess
@@ -678,75 +679,6 @@ def test_start_day() -> None:
 # --- bad input ---
 
 
-MADE: list[tuple[dict[str, Any], str]] = [
-    ({"dayss": 3}, "dayss"),
-    ({"agents": ["agent_x"]}, "agent_x"),
-    ({"agents": []}, "agents"),
-    ({"others": "g37", "agents": ["agent_ls"]}, "'g37': unknown"),
-    ({"actions": "both"}, "actions"),
-    ({"days": 0}, "days"),
-    ({"render_mode": "human"}, "render_mode 'human': valid is None or rgb_array"),
-    ({"precision": "f16"}, "precision 'f16'"),
-    ({"config": "tinny"}, "tinny"),
-    ({"config": []}, "empty list"),
-    ({"config": None}, "config None: valid is a preset"),
-    ({"config": 3}, "config 3: valid is a preset"),
-    ({"config": ["tiny"]}, "config 'tiny': valid is"),
-    ({"days": True}, "days"),
-    ({"days": "7"}, "days"),
-    ({"months": [1.0]}, "months"),
-    ({"others": "idle"}, "others: without effect as all agents learn"),
-    ({"others": 3, "agents": ["agent_ls"]}, "others"),
-    ({"others": "load=greedy-ci", "agents": ["agent_ls"]}, "without effect on load"),
-    ({"others": "load=idle,cooling=g36", "agents": ["agent_ls"]}, "without effect on load"),
-    ({"others": "g36", "agents": ["agent_dc"]}, "without effect on cooling"),
-    ({"others": "constant:20", "agents": ["agent_dc"]}, "valid is for load, battery"),
-    ({"action_order": "paper", "actions": "continuous"}, "action_order: without effect"),
-    ({"action_order": "paper", "agents": ["agent_ls"]}, "as agent_bat does not learn"),
-    ({"setpoint_change_k": 1.0}, "setpoint_change_k: without effect"),
-    (
-        {"setpoint_change_k": 1.0, "actions": "continuous", "agents": ["agent_ls"]},
-        "as agent_dc does not learn",
-    ),
-    ({"collaboration": 0.5, "rewards": "no:such"}, "collaboration: without effect"),
-    ({"collaboration": 0.5, "rewards": len}, "collaboration: without effect"),
-    (
-        {"features": {"agent_ls": ["ci"]}, "agents": ["agent_bat"]},
-        "without effect for agent_ls, which does not learn",
-    ),
-    ({"observations": "sustaindc", "ci_leads_h": [1.0]}, "ci_leads_h: without effect"),
-    ({"start": "fixed", "months": [1]}, "months: without effect"),
-]
-
-
-def test_options_that_do_have_an_effect() -> None:
-    for options in (
-        {"others": "load=greedy-ci", "agents": ["agent_bat"]},
-        {"others": "greedy-ci", "agents": ["agent_bat"]},
-        {"others": "random", "agents": ["agent_bat"]},
-        {"others": "idle", "agents": ["agent_bat"]},
-        {"action_order": "sustaindc", "agents": ["agent_bat"]},
-        {"setpoint_change_k": 1.0, "actions": "continuous", "agents": ["agent_dc"]},
-        {"collaboration": 0.5, "rewards": "sustaindc"},
-        {"features": {"agent_bat": ["ci"]}, "agents": ["agent_bat"]},
-        {"days": np.int64(1), "months": [np.int64(2)]},
-    ):
-        sdc_taichi.parallel_env(**{**tiny(), **options})
-
-
-@pytest.mark.parametrize(("options", "message"), MADE)
-def test_made_of_bad_options(options: dict[str, Any], message: str) -> None:
-    for make in (
-        sdc_taichi.parallel_env,
-        sdc_taichi.aec_env,
-        SdcEnv,
-        lambda **given: sdc_taichi.vector_env(2, **given),
-        lambda **given: gymnasium.make_vec("sdc_taichi/Joint-v0", num_envs=2, **given),
-    ):
-        with pytest.raises(ConfigError, match=re.escape(message)):
-            make(**tiny(**options))
-
-
 def test_made_of_bad_numbers() -> None:
     for number in (0, -1, 2.5, True):
         with pytest.raises(ConfigError, match=f"num_envs {number}: valid is a whole number"):
@@ -997,6 +929,9 @@ def test_large_halls_are_drawn_smaller() -> None:
 @pytest.mark.repo
 def test_docs_have_every_option_and_term() -> None:
     text = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
+    arguments = text.partition("## Arguments")[2].partition("\n## ")[0]
+    for name in inspect.signature(sdc_taichi.parallel_env).parameters:
+        assert name == "keywords" or f"| `{name}` |" in arguments, name
     table = text.partition("## Options")[2].partition("\n## ")[0]
     listed = re.findall(r"^\| `(\w+)` \| (.*?) \|", table, re.MULTILINE)
     assert [name for name, _ in listed] == list(EnvOptions.model_fields)
@@ -1004,6 +939,6 @@ def test_docs_have_every_option_and_term() -> None:
         default = EnvOptions.model_fields[name].default
         if isinstance(default, str | int | float | bool | None):
             assert shown == f"`{default}`", name
-    assert terms_markdown() in text
+    assert terms_markdown() in text, f"docs/environments.md: the table is\n{terms_markdown()}"
     for name in IDS:
         assert f"`{name}`" in text

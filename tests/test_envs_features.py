@@ -732,7 +732,8 @@ def test_heat_map_needs_halls_of_one_shape() -> None:
 @pytest.mark.repo
 def test_the_page_has_the_table_as_generated() -> None:
     page = (Path(__file__).parent.parent / "docs" / "observations.md").read_text("utf-8")
-    assert f"\n\n{features_markdown()}\n" in page
+    made = features_markdown()
+    assert f"\n\n{made}\n" in page, f"docs/observations.md: the table is\n{made}"
     for feature in HEAT_MAP_CHANNELS:
         assert f"`{feature.name}` {feature.low:g}..{feature.high:g}" in page
 
