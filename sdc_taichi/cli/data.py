@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -24,7 +25,7 @@ from sdc_taichi.exogenous.registry import (
     trace_names,
     user_data_dir,
 )
-from sdc_taichi.exogenous.series import Series, resample
+from sdc_taichi.exogenous.series import Series
 from sdc_taichi.exogenous.statistics import statistics
 from sdc_taichi.exogenous.synthetic import (
     DEFAULT_SEED,
@@ -33,7 +34,6 @@ from sdc_taichi.exogenous.synthetic import (
     synthetic_trace,
     synthetic_traces,
 )
-from sdc_taichi.year_clock import DAYS_PER_YEAR, FIRST_DAY_OF_MONTH, HOURS_PER_YEAR
 
 data_app = typer.Typer(help="Sites and workload traces.", no_args_is_help=True)
 
@@ -86,7 +86,7 @@ def _fitted_to(series: Series) -> str:
 
 
 @data_app.command("show")
-def show(
+def show_data(
     name: Annotated[str, typer.Argument(help="Site or workload trace.")],
     seed: Seed = DEFAULT_SEED,
     out: Annotated[
@@ -117,56 +117,26 @@ def show(
     for note in dict.fromkeys(note for s in series for note in s.notes):
         console.print(f"Note: {note}", soft_wrap=True)
     if out is not None:
-        write_picture(series, title, out)
+        _write_picture(series, title, out)
         console.print(f"Picture: {out}", soft_wrap=True)
 
 
-def write_picture(series: tuple[Series, ...], title: str, out: Path) -> None:
-    """Draw daily mean and range over the year, and the mean day of four months, per series.
-
-    Args:
-        series: whole years; the first year is drawn.
-        title: of the figure.
-        out: file with a suffix that matplotlib can write.
-
-    Raises:
-        SdcError: matplotlib is missing, or the file cannot be written.
-    """
+def _write_picture(series: tuple[Series, ...], title: str, out: Path) -> None:
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
     except ImportError:
         raise DataError(
             'a picture needs matplotlib: pip install "sdc-taichi[plot]" (or leave out --out)'
         ) from None
-    kinds = FigureCanvasAgg.get_supported_filetypes()
-    kind = out.suffix.lstrip(".").lower()
-    if kind not in kinds:
-        raise DataError(f"{out}: suffix {out.suffix!r}, expected one of .{', .'.join(kinds)}")
-    figure = Figure(figsize=(10.0, 1.0 + 1.9 * len(series)), layout="constrained")
-    figure.suptitle(f"{title} (synthetic)" if any(s.synthetic for s in series) else title)
-    axes = figure.subplots(len(series), 2, squeeze=False, width_ratios=(3, 1))
-    for (year, day), s in zip(axes, series, strict=True):
-        hourly = resample(s, 1)[:HOURS_PER_YEAR].reshape(DAYS_PER_YEAR, 24)
-        days = range(DAYS_PER_YEAR)
-        year.fill_between(days, hourly.min(axis=1), hourly.max(axis=1), alpha=0.3, lw=0)
-        year.plot(days, hourly.mean(axis=1), lw=1)
-        year.set(
-            xlim=(0, DAYS_PER_YEAR - 1),
-            xticks=FIRST_DAY_OF_MONTH[:-1],
-            ylabel=f"{s.name}\n{s.unit}",
-        )
-        year.set_xticklabels("JFMAMJJASOND", ha="left")
-        for month, label in ((0, "Jan"), (3, "Apr"), (6, "Jul"), (9, "Oct")):
-            first, end = FIRST_DAY_OF_MONTH[month : month + 2]
-            mean = hourly[first:end].mean(axis=0)
-            day.plot([h + 0.5 for h in range(24)], mean, label=label)
-        day.set(xlim=(0, 24), xticks=(0, 6, 12, 18, 24))
-    axes[0, 0].set_title("Daily mean and range")
-    axes[0, 1].set_title("Mean day")
-    axes[0, 1].legend(fontsize="small")
+    from sdc_taichi.viz.year_figure import draw_year
+
+    known = FigureCanvasAgg.get_supported_filetypes()
+    suffix = out.suffix.lstrip(".").lower()
+    if suffix not in known:
+        raise DataError(f"{out}: suffix {out.suffix!r}, expected one of .{', .'.join(known)}")
+    figure = draw_year(series, title)
     with atomic_write(out) as file:
-        figure.savefig(file, dpi=120, format=kind)
+        figure.savefig(file, dpi=120, format=suffix)
 
 
 @data_app.command("import")
@@ -189,62 +159,49 @@ def import_data(
     console = Console()
     if base is not None:
         base = find_name("base", base, synthetic_sites())
-    jobs: list[tuple[str, Path, str]]
-    left_out: list[tuple[Path, str]] = []
-    if path.is_dir():
-        if site is not None:
-            raise DataError(f"--site {site}: names one file, but {path} is a folder")
-        jobs, left_out = importing.plan_folder(path)
-    else:
-        kind = importing.file_kind(path)
-        name = site or (importing.default_name(path) if kind == "workload" else None)
-        if name is None:
-            raise DataError(f"{path}: a {kind} file, expected --site NAME to import it under")
-        jobs = [(kind, path, name)]
+    jobs, left_out = _plan_import(path, site)
     done: list[importing.Imported] = []
     failed: list[DataError] = []
     for kind, file, name in jobs:
         try:
             if kind == "weather":
-                done.append(importing.import_weather(file, name, base))
+                item = importing.import_weather(file, name, base)
             elif kind == "carbon":
-                done.append(
-                    importing.import_carbon(
-                        file,
-                        name,
-                        base,
-                        utc_offset_h=utc_offset,
-                        stamp=stamp.value,
-                    )
+                item = importing.import_carbon(
+                    file, name, base, utc_offset_h=utc_offset, stamp=stamp.value
                 )
             else:
-                done.append(importing.import_workload(file, name))
+                item = importing.import_workload(file, name)
         except DataError as error:
             failed.append(error)
             continue
-        _report(console, done[-1])
+        done.append(item)
+        _print_imported(console, item)
     for file, reason in left_out:
         console.print(f"left out {file}: {reason}", soft_wrap=True)
-    for name in dict.fromkeys(x.name for x in done if x.kind != "workload"):
-        missing = {"weather", "carbon"} - set(imported_sites().get(name, {}))
-        if missing and base is None:
-            part = missing.pop()
-            console.print(
-                f"site {name} lacks {part}: import a {part} file with --site {name}, or import "
-                "again with --base SITE to take it from an embedded site",
-                soft_wrap=True,
-            )
-        elif missing:
-            console.print(
-                f"site {name}: {missing.pop()} of the embedded {base} (synthetic)", soft_wrap=True
-            )
+    _print_missing_parts(console, done, base)
     if failed and len(jobs) == 1:
         raise failed[0]
     if failed:
         raise DataError(f"{len(failed)} of {len(jobs)} files not imported; first: {failed[0]}")
 
 
-def _report(console: Console, item: importing.Imported) -> None:
+def _plan_import(
+    path: Path, site: str | None
+) -> tuple[list[tuple[str, Path, str]], list[tuple[Path, str]]]:
+    """Kind, file and name of each import, and the files that are left out, with the reasons."""
+    if path.is_dir():
+        if site is not None:
+            raise DataError(f"--site {site}: names one file, but {path} is a folder")
+        return importing.plan_folder(path)
+    kind = importing.file_kind(path)
+    name = site or (importing.default_name(path) if kind == "workload" else None)
+    if name is None:
+        raise DataError(f"{path}: a {kind} file, expected --site NAME to import it under")
+    return [(kind, path, name)], []
+
+
+def _print_imported(console: Console, item: importing.Imported) -> None:
     console.print(
         f"{item.kind} {item.name}: {item.source.name} -> {item.target}",
         soft_wrap=True,
@@ -252,3 +209,21 @@ def _report(console: Console, item: importing.Imported) -> None:
     )
     for note in item.notes:
         console.print(f"  {note}", soft_wrap=True, markup=False)
+
+
+def _print_missing_parts(
+    console: Console, done: Sequence[importing.Imported], base: str | None
+) -> None:
+    """Say of each imported site that lacks weather or carbon where that comes from."""
+    for name in dict.fromkeys(item.name for item in done if item.kind != "workload"):
+        missing = {"weather", "carbon"} - set(imported_sites().get(name, {}))
+        if not missing:
+            continue
+        part = missing.pop()
+        text = (
+            f"site {name} lacks {part}: import a {part} file with --site {name}, or import "
+            "again with --base SITE to take it from an embedded site"
+            if base is None
+            else f"site {name}: {part} of the embedded {base} (synthetic)"
+        )
+        console.print(text, soft_wrap=True)

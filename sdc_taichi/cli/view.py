@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 import typer
 
+from sdc_taichi.cli.arguments import Debug
 from sdc_taichi.errors import SdcError
 
 WEB_PORT = 9090
@@ -37,7 +38,7 @@ def view_command(
             help=f"Of the page with --web; 0 is any free one. [default: {WEB_PORT}, or any]",
         ),
     ] = None,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")] = False,
+    debug: Debug = False,
 ) -> None:
     """Show a recording in Rerun's viewer, or serve it on 127.0.0.1 to a browser.
 

@@ -1,0 +1,177 @@
+"""What goes on beside a simulation: Ctrl-C, the progress bar, and the Rerun recording."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, TextIO
+
+from sdc_taichi.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sdc_taichi.run.description import RunRequest
+    from sdc_taichi.sim.simulator import Simulator
+    from sdc_taichi.types import StepResult
+    from sdc_taichi.viz.recorder import Recorder
+
+
+def print_notes(notes: Iterable[str]) -> None:
+    """Print what was found out about the inputs of a run, on stderr."""
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[Callable[[], bool]]:
+    """Catch Ctrl-C and SIGTERM; a second one ends the program at once.
+
+    Yields:
+        A function that says whether the run is to end.
+    """
+    signals: list[int] = []
+
+    def handle(number: int, _frame: object) -> None:
+        if signals:
+            raise KeyboardInterrupt
+        signals.append(number)
+
+    before = {s: signal.signal(s, handle) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(signals)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def make_recorder(
+    target: str | None, focus: str | None, every: int | None, serve: bool, port: int | None
+) -> Recorder | None:
+    """The recorder that the options ask for; None if they ask for no recording.
+
+    Args:
+        target: file or address of ``--record``.
+        focus: names of ``--focus``.
+        every: steps of ``--every``.
+        serve: whether ``--serve`` is given.
+        port: port of ``--serve-port``.
+
+    Raises:
+        SdcError: options of a recording without one, or a recording that cannot be made.
+    """
+    from sdc_taichi.viz.streams import DEFAULT_PORT, is_address
+
+    if serve or port is not None:
+        port = DEFAULT_PORT if port is None else port
+    elif target is None:
+        for name, value in (("--focus", focus), ("--every", every)):
+            if value is not None:
+                raise ConfigError(
+                    f"{name}: given without a recording; valid with --record, --serve"
+                )
+        return None
+    from sdc_taichi.viz.recorder import Recorder
+
+    if target is not None and target.endswith(".rrd") and not is_address(target):
+        with contextlib.suppress(OSError):  # the recorder says what is wrong with it
+            Path(target).parent.mkdir(parents=True, exist_ok=True)
+    names = None if focus is None else [name.strip() for name in focus.split(",")]
+    return Recorder(target, focus=names, every=every, serve_port=port)
+
+
+@contextlib.contextmanager
+def recording(
+    recorder: Recorder | None, sim: Simulator, request: RunRequest
+) -> Iterator[Callable[[StepResult], None]]:
+    """Keep a recording open while a run lasts, if there is a recorder.
+
+    Args:
+        recorder: what records; None records nothing.
+        sim: the simulator, before its first step.
+        request: what it is to do.
+
+    Yields:
+        A function to call with the result of every step.
+    """
+    if recorder is None:
+        yield lambda _: None
+        return
+    from sdc_taichi.run.description import describe_run
+    from sdc_taichi.viz.streams import RecordingWarning
+
+    with warnings.catch_warnings(), recorder:
+        warnings.simplefilter("always", RecordingWarning)
+        warnings.showwarning = _show_warning
+        recorder.begin(sim, describe_run(sim, request))
+        if recorder.served is not None:
+            command = f"sdc-taichi view {recorder.served}"
+            print(f"serving the run; watch it with: {command} [--web]", file=sys.stderr)
+        yield recorder.add
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    print(f"warning: {message}", file=sys.stderr)
+
+
+def print_recording(recorder: Recorder | None) -> None:
+    """Print where the recording of a run is, if it is a file."""
+    if recorder is not None and recorder.file is not None and not recorder.lost:
+        print(f"Recording: {recorder.file} (open with: sdc-taichi view {recorder.file})")
+
+
+def serve_until_interrupted(recorder: Recorder | None, interrupted: Callable[[], bool]) -> None:
+    """Keep a run that is done on show until Ctrl-C, if it is served to viewers."""
+    if recorder is None or recorder.served is None or recorder.lost:
+        return
+    recorder.flush()
+    if not interrupted():
+        text = f"the run is done and still served at {recorder.served}; Ctrl-C ends it"
+        print(text, file=sys.stderr)
+    while not interrupted():
+        time.sleep(0.1)
+
+
+@contextlib.contextmanager
+def progress_bar(steps: int, *, shown: bool) -> Iterator[Callable[[StepResult], None]]:
+    """Show a progress bar on stderr, if that is a terminal.
+
+    Args:
+        steps: number of steps of the run.
+        shown: whether to show it at all.
+
+    Yields:
+        A function to call with the result of every step.
+    """
+    if not shown or not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    every = max(1, steps // 1000)
+    columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=steps)
+
+        def advance(result: StepResult) -> None:
+            if result.step % every == 0:
+                progress.update(task, completed=result.step + 1)
+
+        yield advance

@@ -1,0 +1,146 @@
+"""The summary of a run: a few figures per data center, in the terminal."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+TABLE_DCS = 12
+"""Number of data centers up to which each has a column of its own."""
+EVENT_LINES = 8
+"""Number of events up to which each is listed."""
+
+_ROWS = (
+    ("IT energy (kWh)", "it_kwh"),
+    ("HVAC energy (kWh)", "hvac_kwh"),
+    ("facility energy (kWh)", "facility_kwh"),
+    ("grid energy (kWh)", "grid_kwh"),
+    ("PUE", "pue"),
+    ("PUE with UPS losses", "pue_with_ups"),
+    ("WUE (L/kWh)", "wue_l_per_kwh"),
+    ("CUE (kg/kWh)", "cue_kg_per_kwh"),
+    ("CFP (kg CO2e)", "cfp_kg"),
+    ("water (L)", "water_l"),
+    ("mean queue (tasks)", "queue_mean_tasks"),
+    ("longest queue (tasks)", "queue_max_tasks"),
+    ("dropped (tasks)", "dropped_tasks"),
+    ("overdue (task hours)", "overdue_task_h"),
+    ("hottest inlet (C)", "hottest_inlet_c"),
+    ("inlet above 27 C (h)", "inlet_above_27_h"),
+    ("inlet over 27 C (degree hours per server)", "over_27_degree_h"),
+    ("SHI", "shi"),
+    ("RTI (%)", "rti_pct"),
+    ("RCI hi (%)", "rci_hi_pct"),
+    ("RCI lo (%)", "rci_lo_pct"),
+    ("lost (tasks)", "lost_tasks"),
+    ("unserved energy (kWh)", "unserved_kwh"),
+    ("battery throughput (kWh)", "battery_throughput_kwh"),
+)
+
+
+def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_hour: int) -> None:
+    """Print the summary of a run.
+
+    Args:
+        metrics: content of metrics.json.
+        label: name of the preset or file that the run was simulated with.
+        folder: the run folder.
+        steps_per_hour: number of steps in an hour.
+    """
+    from rich.console import Console
+
+    # A pipe or a file has no width to fit into.
+    console = Console(
+        markup=False, highlight=False, width=None if sys.stdout.isatty() else 200, soft_wrap=True
+    )
+    dcs, steps = metrics["data_centers"], metrics["steps_done"]
+    days = steps / steps_per_hour / 24
+    count = "1 data center" if len(dcs) == 1 else f"{len(dcs)} data centers"
+    console.print(
+        f"{label}: {count}, {days:g} days from {dcs[0]['start']} ({steps} steps of "
+        f"{60 // steps_per_hour} min), controller {metrics['controller']}"
+    )
+    table = _per_dc_table(metrics)
+    if len(dcs) > TABLE_DCS or console.measure(table).maximum > console.width:
+        table = _aggregate_table(metrics)
+    console.print(table)
+    console.print(_hottest_line(metrics))
+    for line in _event_lines(metrics):
+        console.print(line)
+    if metrics["synthetic"]:
+        console.print("These figures rest on SYNTHETIC inputs, not on measurements:")
+    sources = dict.fromkeys(
+        f"{kind}: {source}" for dc in dcs for kind, source in dc["provenance"].items()
+    )
+    for line in sorted(sources)[:TABLE_DCS]:
+        console.print(f"  {line}")
+    if len(sources) > TABLE_DCS:
+        console.print(f"  and {len(sources) - TABLE_DCS} more, see metrics.json")
+    config_file = "config.yaml" if len(dcs) == 1 else "configs.yaml"
+    console.print(f"Files in {folder}: steps.parquet, metrics.json, {config_file}")
+
+
+def _hottest_line(metrics: dict[str, Any]) -> str:
+    total = metrics["total"]
+    where = f"{total['hottest_dc']}, " if len(metrics["data_centers"]) > 1 else ""
+    return (
+        f"Hottest inlet: {total['hottest_inlet_c']:.1f} C at {where}row {total['hottest_row']}, "
+        f"rack {total['hottest_rack']}, server {total['hottest_server']} from the floor, step "
+        f"{total['hottest_step']}"
+    )
+
+
+def _event_lines(metrics: dict[str, Any]) -> list[str]:
+    lines = []
+    for dc in metrics["data_centers"]:
+        for event in dc["events"]:
+            target = f" {event['target']}" if "target" in event else ""
+            amount = f", {event['share']:.0%} left" if "share" in event else ""
+            amount += f", {event['offset_k']:+g} K" if "offset_k" in event else ""
+            lines.append(
+                f"Event: {dc['name']}: {event['kind']}{target}{amount}, steps "
+                f"{event['start_step']}..{event['end_step'] - 1}"
+            )
+    if len(lines) > EVENT_LINES:
+        lines[EVENT_LINES:] = [f"and {len(lines) - EVENT_LINES} more events, see metrics.json"]
+    return lines
+
+
+def _per_dc_table(metrics: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    dcs = metrics["data_centers"]
+    several = len(dcs) > 1
+    table = Table("")
+    for dc in dcs:
+        table.add_column(dc["name"], justify="right", no_wrap=True)
+    if several:
+        table.add_column("all", justify="right", no_wrap=True)
+    for title, name in _ROWS:
+        values = [dc["metrics"][name] for dc in dcs] + ([metrics["total"][name]] if several else [])
+        table.add_row(title, *map(_figure, values))
+    return table
+
+
+def _aggregate_table(metrics: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    table = Table("")
+    for column in ("lowest", "mean", "highest", "all"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for title, name in _ROWS:
+        values = [dc["metrics"][name] for dc in metrics["data_centers"]]
+        known = [v for v in values if v is not None]
+        spread = [min(known), sum(known) / len(known), max(known)] if known else [None] * 3
+        table.add_row(title, *map(_figure, [*spread, metrics["total"][name]]))
+    return table
+
+
+def _figure(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
