@@ -29,6 +29,11 @@ def as_array(values: F64 | float) -> F64:
     return np.asarray(values) if isinstance(values, float) else values
 
 
+def fields_of(values: Any) -> dict[str, Any]:
+    """Fields of a dataclass by name."""
+    return {f.name: getattr(values, f.name) for f in fields(values)}
+
+
 class LoadAction(Enum):
     """What to do with delay-tolerant work; the value is the command in -1..1."""
 

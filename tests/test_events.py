@@ -86,7 +86,7 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         units=(3, 2),
         steps_per_hour=1,
     )
-    assert not line.quiet
+    assert not line.event_free
     normal = [[True] * 5, [1.0, 1.0], [1.0] * 6, [0.0, 0.0], [True, True]]
     expected = {
         1: (0, [True, True, True, True, False]),
@@ -152,14 +152,14 @@ def test_an_event_covers_every_step_it_has_a_part_in(
 
 def test_without_events_nothing_is_made() -> None:
     line = timeline(data_center("a"), data_center("b"))
-    assert line.quiet
+    assert line.event_free
     assert line.at(0) is line.at(10**9)
     assert line.active(3) == []
     assert line.reseeded(3) is line
     for array in arrays(line, 0):
         assert not array.flags.writeable
     later = timeline(data_center(scheduled=(scheduled("grid_outage", 50.0, 1.0),)))
-    assert not later.quiet
+    assert not later.event_free
     assert later.at(0) is later.at(1)
     assert later.at(200) is not later.at(0)
     assert later.at(10**9) is later.at(0)

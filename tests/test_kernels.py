@@ -610,8 +610,7 @@ def test_tables_that_those_with_layers_replace_are_let_go_by_every_kind_of_step(
     with Simulator(config) as sim:
         sim.reset()
         sim.step()
-        assert sim._hall is not None
-        before = weakref.ref(sim._hall._tables.base)
+        before = weakref.ref(sim._started().hall._tables.base)
         sim.servers()
         gc.collect()
         assert before() is None

@@ -164,8 +164,8 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
         "fan_speed": some(0.3, 1.0),
         "crac_flow_m3s": flow_m3s,
         "return_c": supply_c + some(0.0, 20.0),
-        "cubed_m3s": flow_m3s * some(0.1, 1.0),
-        "mixed_m3k_s": flow_m3s * setpoint_c,
+        "cubed_flow_m3s": flow_m3s * some(0.1, 1.0),
+        "setpoint_m3k_s": flow_m3s * setpoint_c,
         "cooling_load_w": it_w * some(0.8, 1.2),
         "coil_w": it_w * some(0.8, 1.2),
         "room_j": some(-1e6, 1e8),
@@ -176,14 +176,14 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
         "powered": rng.choice([0.0, 0.4, 1.0], n),
         "grid_up": rng.choice([0.0, 1.0], n),
         "chiller_share": rng.choice([0.0, 0.5, 1.0], n),
-        "coils": some(0.3, 1.0),
-        "all_running": running,
-        "idle_m3s": (1.0 - running) * flow_m3s,
-        "idle_m3k_s": (1.0 - running) * flow_m3s * setpoint_c,
+        "coil_share": some(0.3, 1.0),
+        "no_unit_down": running,
+        "idle_flow_m3s": (1.0 - running) * flow_m3s,
+        "idle_setpoint_m3k_s": (1.0 - running) * flow_m3s * setpoint_c,
     }
 
 
-@pytest.mark.parametrize("calm", [True, False])
+@pytest.mark.parametrize("event_free", [True, False])
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -201,18 +201,19 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
     ],
     ids=str,
 )
-def test_facility_as_in_numpy(overrides: list[str] | str, calm: bool) -> None:
+def test_facility_as_in_numpy(overrides: list[str] | str, event_free: bool) -> None:
     preset, given = (overrides, []) if isinstance(overrides, str) else ("corrected", overrides)
     rng, n = np.random.default_rng(7), 200
     year = [20.0, 30.0], [15.0, 20.0], [300.0, 200.0], [0.5, 0.6]
     drivers = drivers_from_arrays(*([column] * n for column in year))
     with Simulator([load_config(preset, given)] * n, drivers=drivers) as sim:
-        facility = Facility(sim.fleet, sim.sizing, sim.step_h, calm=calm)
+        facility = Facility(sim.fleet, sim.sizing, event_free=event_free)
         inputs = random_inputs(sim, rng, n)
-    limits = {name: inputs[name] for name in ("plant_setpoint_c", "outdoor_c", "wet_bulb_c")}
-    if not calm:
-        limits |= {name: inputs[name] for name in ("powered", "coils", "chiller_share")}
-    for run, x in ((facility.step, inputs), (facility.removable_w, limits)):
+    for run, names in (
+        (facility.step, facility.inputs),
+        (facility.removable_w, facility.plant_inputs),
+    ):
+        x = {name: inputs[name] for name in names}
 
         def stage(run: Any = run, **x: F64) -> Any:
             return run(FacilityInputs(**x))

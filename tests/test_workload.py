@@ -121,7 +121,7 @@ def expected_step(
     return {
         "utilisation": executed / 100.0,
         "arrived_tasks": arrived,
-        "executed_tasks": executed,
+        "started_tasks": executed,
         "deferred_tasks": deferred,
         "drained_tasks": drained,
         "due_tasks": due,
@@ -185,7 +185,7 @@ def test_fluid_work_is_conserved_and_within_its_limits(
         work = one_step("fluid", queue, demand, command, limits)
         queue = work.queue
         a, e, d = (
-            float(x[0]) for x in (work.arrived_tasks, work.executed_tasks, work.dropped_tasks)
+            float(x[0]) for x in (work.arrived_tasks, work.started_tasks, work.dropped_tasks)
         )
         assert a == pytest.approx(e + queue[0, -1] - before + d, abs=1e-10)
         assert min(e, d, queue[0, -1], float(work.deferred_tasks[0])) >= 0.0
@@ -218,10 +218,10 @@ def test_whole_tasks_stay_whole_and_are_conserved(
             if name not in ("utilisation", "mean_age_steps"):
                 assert np.array_equal(values, np.rint(values)), name
         # Tasks that find the queue full count as dropped and run all the same.
-        assert work.arrived_tasks[0] == work.executed_tasks[0] + queue[0, -1] - before
+        assert work.arrived_tasks[0] == work.started_tasks[0] + queue[0, -1] - before
         assert abs(work.arrived_tasks[0] - 100.0 * demand) < 1.0 + 1e-9
         cap = math.floor(limits.max_utilisation * 100.0)
-        assert work.executed_tasks[0] <= max(cap, work.arrived_tasks[0])
+        assert work.started_tasks[0] <= max(cap, work.arrived_tasks[0])
         assert queue[0, -1] <= limits.queue_limit
 
 
@@ -249,7 +249,7 @@ def test_full_queue_drops(model: str) -> None:
         dropped.append(float(work.dropped_tasks[0]))
     assert dropped == [0, 0, 0, 40, 40, 40]
     assert queue[0, -1] == 120
-    assert work.executed_tasks[0] == (80 if model == "tasks" else 40)
+    assert work.started_tasks[0] == (80 if model == "tasks" else 40)
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -28,7 +28,7 @@ class Work:
     """Work that starts, as a share of capacity, 0..1, (B,)."""
     arrived_tasks: F64
     """Work that arrives, in tasks, (B,)."""
-    executed_tasks: F64
+    started_tasks: F64
     """Work that starts, in tasks, (B,)."""
     deferred_tasks: F64
     """Work that enters the queue, in tasks, (B,)."""
@@ -85,11 +85,11 @@ def fluid(
     held_back = arrived - now
     deferred = np.minimum(held_back, _room(queue_limit, waiting - forced))
     drained = np.minimum(waiting - forced, np.maximum(command, 0.0) * (capacity - now - forced))
-    executed = now + forced + drained
+    started = now + forced + drained
     return Work(
-        utilisation=executed / TASKS_PER_STEP,
+        utilisation=started / TASKS_PER_STEP,
         arrived_tasks=arrived,
-        executed_tasks=executed,
+        started_tasks=started,
         deferred_tasks=deferred,
         drained_tasks=drained,
         due_tasks=due,
@@ -139,11 +139,11 @@ def tasks(
     drainable = np.minimum(np.minimum(waiting - forced, flexible), free)
     drained = np.floor(np.maximum(command, 0.0) * drainable)
     # As released: tasks that find the queue full count as dropped and run all the same.
-    executed = arrived - deferred + forced + drained
+    started = arrived - deferred + forced + drained
     return Work(
-        utilisation=executed / TASKS_PER_STEP,
+        utilisation=started / TASKS_PER_STEP,
         arrived_tasks=arrived,
-        executed_tasks=executed,
+        started_tasks=started,
         deferred_tasks=deferred,
         drained_tasks=drained,
         due_tasks=due,

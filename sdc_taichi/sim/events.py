@@ -31,16 +31,18 @@ Mask = npt.NDArray[np.bool_]
 class Disturbance:
     """What events do to one step; arrays are read-only. U CRAC units, R racks, B data centers."""
 
+    active: bool
+    """Whether any event covers the step; without one, all is as if there were no events."""
     unit_up: Mask
-    """Whether each CRAC unit runs, (U,)."""
+    """Whether each CRAC unit is in order, (U,)."""
     chiller_share: F64
-    """What is left of the chiller's capacity, (B,)."""
+    """What is left of the chiller's capacity, 0..1, (B,)."""
     rack_airflow: F64
-    """What is left of each rack's airflow, (R,)."""
+    """What is left of each rack's airflow, 0..1, (R,)."""
     outdoor_offset_k: F64
-    """Added to the dry bulb and to the wet bulb alike, so that order is kept, (B,)."""
+    """Offset of dry bulb and wet bulb alike, so that their order is kept, in K, (B,)."""
     grid_up: Mask
-    """Whether the grid supplies, (B,)."""
+    """Whether the grid supplies the data center, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,27 +50,37 @@ class ActiveEvent:
     """One event that covers a step."""
 
     kind: EventKind
+    """What happens, as in ``events`` of the config."""
     dc: int
+    """Data center that meets the event, counted from 0."""
     target: int | None
     """CRAC unit or rack, counted within its data center; None is all of them, or none to name."""
     share: float | None
+    """What the event leaves of capacity or airflow, 0..1; None for kinds without a share."""
     offset_k: float | None
+    """What the event adds to the outdoor temperatures, in K; None for kinds without an offset."""
     start_step: int
+    """First step since reset that the event covers."""
     end_step: int
-    """First step after it."""
+    """First step since reset after the event."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Events:
-    """Events, one entry each; those of a data center keep their order in any fleet."""
+    """E events, one entry each; those of a data center keep their order in any fleet."""
 
     kind: I64
+    """Place of the kind in ``_KINDS``, (E,)."""
     dc: I64
+    """Data center, counted from 0, (E,)."""
     target: I64
+    """CRAC unit or rack within the data center, -1 for all of them or none to name, (E,)."""
     value: F64
-    """Share or offset; nan for kinds without."""
-    start: I64
-    end: I64
+    """Share left, 0..1, or temperature offset, in K; nan for kinds without either, (E,)."""
+    first_step: I64
+    """First step since reset that the event covers, (E,)."""
+    end_step: I64
+    """First step since reset after the event, (E,)."""
 
     def chosen(self, mask: Mask) -> _Events:
         return _Events(*(getattr(self, f.name)[mask] for f in fields(self)))
@@ -76,11 +88,16 @@ class _Events:
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
+    """Events of one data center that are sampled from one distribution."""
+
     dc: int
+    """Data center, counted from 0."""
     key: tuple[int, int]
-    """Tells the stream: CRC-32 of the data center's name, and the index of the rule."""
+    """Key of the random stream: CRC-32 of the data center's name, and the index of the rule."""
     targets: int
+    """CRAC units or racks to draw from; 0 for kinds without a target."""
     event: SampledEvent
+    """Rate, duration and effect, as in the config."""
 
 
 class Timeline:
@@ -103,7 +120,7 @@ class Timeline:
         self._scheduled, self._rules = scheduled, rules
         size = len(rack_offsets) - 1
         self._seed = np.broadcast_to(np.asarray(seed, dtype=np.int64), (size,))
-        self._rack_start, self._unit_start = rack_offsets, unit_offsets
+        self._rack_offsets, self._unit_offsets = rack_offsets, unit_offsets
         self._steps_per_hour = steps_per_hour
         longest_h = max((rule.event.duration_h[1] for rule in rules), default=0.0)
         self._blocks_back = int(np.ceil(longest_h / HOURS_PER_BLOCK))
@@ -112,6 +129,7 @@ class Timeline:
         self._near = scheduled
         self._normal = _read_only(
             Disturbance(
+                active=False,
                 unit_up=np.ones(unit_offsets[-1], dtype=np.bool_),
                 chiller_share=np.ones(size),
                 rack_airflow=np.ones(rack_offsets[-1]),
@@ -121,7 +139,7 @@ class Timeline:
         )
 
     @property
-    def quiet(self) -> bool:
+    def event_free(self) -> bool:
         """Whether no event can ever happen."""
         return not self._rules and not len(self._scheduled.kind)
 
@@ -132,8 +150,8 @@ class Timeline:
         return Timeline(
             self._scheduled,
             self._rules,
-            rack_offsets=self._rack_start,
-            unit_offsets=self._unit_start,
+            rack_offsets=self._rack_offsets,
+            unit_offsets=self._unit_offsets,
             steps_per_hour=self._steps_per_hour,
             seed=seed,
         )
@@ -150,24 +168,33 @@ class Timeline:
         is_kind = {kind: found.kind == code for code, kind in enumerate(_KINDS)}
         down = found.chosen(is_kind["crac_down"])
         one = down.target != _WHOLE
-        unit_up[self._unit_start[down.dc[one]] + down.target[one]] = False
+        unit_up[self._unit_offsets[down.dc[one]] + down.target[one]] = False
         without = np.zeros(len(grid_up), dtype=np.bool_)
         without[down.dc[~one]] = True
-        unit_up &= ~np.repeat(without, np.diff(self._unit_start))
+        unit_up &= ~np.repeat(without, np.diff(self._unit_offsets))
         derated = found.chosen(is_kind["chiller_derate"])
         np.multiply.at(chiller, derated.dc, derated.value)
         failed = found.chosen(is_kind["rack_fan_failure"])
-        np.multiply.at(airflow, self._rack_start[failed.dc] + failed.target, failed.value)
+        np.multiply.at(airflow, self._rack_offsets[failed.dc] + failed.target, failed.value)
         wave = found.chosen(is_kind["heat_wave"])
         np.add.at(offset_k, wave.dc, wave.value)
         grid_up[found.dc[is_kind["grid_outage"]]] = False
-        return _read_only(Disturbance(unit_up, chiller, airflow, offset_k, grid_up))
+        return _read_only(
+            Disturbance(
+                active=True,
+                unit_up=unit_up,
+                chiller_share=chiller,
+                rack_airflow=airflow,
+                outdoor_offset_k=offset_k,
+                grid_up=grid_up,
+            )
+        )
 
     def active(self, step: int) -> list[ActiveEvent]:
         """Events that cover step ``step``, by data center and start."""
         found = self._at(step)
         out = []
-        for i in np.lexsort((found.start, found.dc)):
+        for i in np.lexsort((found.first_step, found.dc)):
             kind, value = _KINDS[found.kind[i]], float(found.value[i])
             target = int(found.target[i])
             out.append(
@@ -177,21 +204,21 @@ class Timeline:
                     target=None if target == _WHOLE else target,
                     share=value if kind in ("chiller_derate", "rack_fan_failure") else None,
                     offset_k=value if kind == "heat_wave" else None,
-                    start_step=int(found.start[i]),
-                    end_step=int(found.end[i]),
+                    start_step=int(found.first_step[i]),
+                    end_step=int(found.end_step[i]),
                 )
             )
         return out
 
     def _at(self, step: int) -> _Events:
-        if self.quiet:
+        if self.event_free:
             return self._scheduled
         steps = _HOURS_PER_WINDOW * self._steps_per_hour
         window = step // steps
         if window != self._window:
             self._near = self._within(window * steps, (window + 1) * steps)
             self._window = window
-        return self._near.chosen((self._near.start <= step) & (step < self._near.end))
+        return self._near.chosen((self._near.first_step <= step) & (step < self._near.end_step))
 
     def _within(self, low: int, high: int) -> _Events:
         """Events that cover any of the steps low..high-1, which lie in one block."""
@@ -205,7 +232,7 @@ class Timeline:
             }
             listed += self._blocks.values()
         together = _joined(listed)
-        return together.chosen((together.start < high) & (low < together.end))
+        return together.chosen((together.first_step < high) & (low < together.end_step))
 
     def _sampled(self, block: int) -> _Events:
         return _joined([self._drawn(rule, block) for rule in self._rules])
@@ -294,8 +321,8 @@ def _events(
         dc=np.full(n, dc),
         target=target,
         value=np.full(n, np.nan if value is None else value),
-        start=start.astype(np.int64),
-        end=np.maximum(end, start + 1.0).astype(np.int64),
+        first_step=start.astype(np.int64),
+        end_step=np.maximum(end, start + 1.0).astype(np.int64),
     )
 
 
@@ -305,7 +332,8 @@ def _joined(listed: Sequence[_Events]) -> _Events:
 
 def _read_only(disturbance: Disturbance) -> Disturbance:
     for field in fields(disturbance):
-        getattr(disturbance, field.name).flags.writeable = False
+        if isinstance(values := getattr(disturbance, field.name), np.ndarray):
+            values.flags.writeable = False
     return disturbance
 
 

@@ -1,14 +1,16 @@
 """From the air of the halls to the grid: CRAC units, plant, water, battery, carbon and indices.
 
-One stage for all data centers, which runs as one compiled pass. Arrays are (B,).
+One pass over B data centers, plain NumPy, which a step runs compiled. Quantities have the names of
+``StepResult`` on the way.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import cast
+from dataclasses import dataclass, fields, replace
+from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.hall import air_metrics
 from sdc_taichi.plant import cooling, water_side
@@ -17,10 +19,11 @@ from sdc_taichi.plant.carbon import emitted_g
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.fans_pumps import crac_fan_w
 from sdc_taichi.plant.tower import TOWERS
-from sdc_taichi.plant.water import WATER
+from sdc_taichi.plant.water import WATER, WaterUse
+from sdc_taichi.plant.water_side import WaterSideResult
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, StepResult, fields_of
 
 NOT_USED = cast(F64, None)
 _BATTERY = (
@@ -33,90 +36,136 @@ _BATTERY = (
     "lower_u_h",
     "lower_v",
 )
+_PLANT_INPUTS = ("plant_setpoint_c", "outdoor_c", "wet_bulb_c")
+_PLANT_EVENT_INPUTS = ("powered", "chiller_share", "coil_share")
+_STEP_INPUTS = (
+    "cpu_w",
+    "it_fan_w",
+    "it_airflow_m3s",
+    "over_27_sum_k",
+    "under_18_sum_k",
+    "inlet_m3k_s",
+    "outlet_m3k_s",
+    "supply_c",
+    "ci_g_per_kwh",
+    "battery_command",
+    "stored_kwh",
+    "room_heat_kwh",
+)
+_RECIRCULATION_INPUTS = ("crac_flow_m3s", "return_c", "cubed_flow_m3s", "setpoint_m3k_s")
+_APPROACH_INPUTS = ("outlet_mean_c", "fan_speed")
+_TRANSIENT_INPUTS = ("cooling_load_w", "coil_w", "room_j")
+_EVENT_INPUTS = ("grid_up", "no_unit_down", "idle_flow_m3s", "idle_setpoint_m3k_s")
+_RESULTS = {f.name for f in fields(StepResult)} | {"supply_warming_k"}
 
 
 @dataclass(frozen=True, slots=True)
 class FacilityInputs:
-    """What a step starts from, each (B,); what the models of a fleet do not read may be left out.
+    """What a step of B data centers starts from, without what the models of a fleet do not read.
 
-    Sums over CRAC units and racks are airflows times what is named.
+    Sums go over the CRAC units, racks or servers of a data center.
     """
 
     plant_setpoint_c: F64
-    """Lowest setpoint of the units that run, which the chilled water follows."""
+    """Supply air setpoint that the chilled water follows, in C, (B,)."""
     outdoor_c: F64
+    """Dry-bulb temperature outside, in C, (B,)."""
     wet_bulb_c: F64
+    """Wet-bulb temperature outside, in C, (B,)."""
 
     cpu_w: F64 = NOT_USED
+    """Power of the processors, in W, (B,)."""
     it_fan_w: F64 = NOT_USED
+    """Power of the server fans, in W, (B,)."""
     it_airflow_m3s: F64 = NOT_USED
+    """Airflow through the servers, in m3/s, (B,)."""
     over_27_sum_k: F64 = NOT_USED
-    """Sum over the servers, as the next."""
+    """Sum over the servers of what their inlets exceed 27 C by, in K, (B,)."""
     under_18_sum_k: F64 = NOT_USED
+    """Sum over the servers of what their inlets fall short of 18 C by, in K, (B,)."""
     inlet_m3k_s: F64 = NOT_USED
-    """Of racks, over supply, as the next."""
+    """Sum over the racks of airflow times inlet temperature over supply, in m3 K/s, (B,)."""
     outlet_m3k_s: F64 = NOT_USED
+    """Sum over the racks of airflow times outlet temperature over supply, in m3 K/s, (B,)."""
     supply_c: F64 = NOT_USED
+    """Supply air temperature, mean over the CRAC airflow, in C, (B,)."""
     outlet_mean_c: F64 = NOT_USED
+    """Outlet temperature, plain mean over the racks, in C, (B,); for inlet model ``approach``."""
     fan_speed: F64 = NOT_USED
+    """Controlled speed of the CRAC fan over design speed, (B,); for inlet model ``approach``."""
     crac_flow_m3s: F64 = NOT_USED
-    """This and the next three of halls that recirculate."""
+    """Airflow of the CRAC units, in m3/s, (B,); for halls that recirculate."""
     return_c: F64 = NOT_USED
-    cubed_m3s: F64 = NOT_USED
-    """Design airflow times the cube of the fan speed."""
-    mixed_m3k_s: F64 = NOT_USED
-    """Airflow times setpoint."""
+    """Temperature of the air that returns to the CRAC units, in C, (B,); for halls that
+    recirculate."""
+    cubed_flow_m3s: F64 = NOT_USED
+    """Sum over the CRAC units of design airflow times the mean cube of the fan speed over design
+    speed, in m3/s, (B,); for halls that recirculate."""
+    setpoint_m3k_s: F64 = NOT_USED
+    """Sum over the CRAC units of airflow times setpoint, in m3 C/s, (B,); for halls that
+    recirculate."""
     cooling_load_w: F64 = NOT_USED
-    """This and the next two of transient halls, see ``HallSums``."""
+    """Heat of air and fans that reaches the CRAC units, in W, (B,); for transient halls."""
     coil_w: F64 = NOT_USED
+    """Heat that the coils take out, in W, (B,); for transient halls."""
     room_j: F64 = NOT_USED
+    """Heat held by the room at the end of the step over that at the setpoint, in J, (B,); for
+    transient halls."""
 
     ci_g_per_kwh: F64 = NOT_USED
+    """Carbon intensity of the grid, in g CO2 per kWh, (B,)."""
     battery_command: F64 = NOT_USED
+    """Share of the battery's power limit, discharged (below 0) or charged, -1..1, (B,)."""
     stored_kwh: F64 = NOT_USED
+    """Energy in the battery at the start of the step, in kWh, (B,)."""
     room_heat_kwh: F64 = NOT_USED
+    """Heat held by the room at the start of the step, in kWh, (B,)."""
 
     powered: F64 = NOT_USED
-    """Share of the step with power; this and what follows where events may happen."""
+    """Share of the step with power, 0..1, (B,); for fleets with events."""
     grid_up: F64 = NOT_USED
-    """1 with grid, 0 in an outage."""
+    """1 with grid, 0 in an outage, (B,); for fleets with events."""
     chiller_share: F64 = NOT_USED
-    """Capacity left to the chiller."""
-    coils: F64 = NOT_USED
-    """Share of the coils in use."""
-    all_running: F64 = NOT_USED
-    """1 if no CRAC unit is down."""
-    idle_m3s: F64 = NOT_USED
-    """Airflow of units that are down."""
-    idle_m3k_s: F64 = NOT_USED
-    """The same times setpoint."""
+    """What is left of the chiller's capacity, 0..1, (B,); for fleets with events."""
+    coil_share: F64 = NOT_USED
+    """Design airflow of the CRAC units that run over that of all, (B,); for fleets with events."""
+    no_unit_down: F64 = NOT_USED
+    """1 if all CRAC units run, 0 if one is down, (B,); for fleets with events."""
+    idle_flow_m3s: F64 = NOT_USED
+    """Airflow of the CRAC units that are down, in m3/s, (B,); for fleets with events."""
+    idle_setpoint_m3k_s: F64 = NOT_USED
+    """Sum over the CRAC units that are down of airflow times setpoint, in m3 C/s, (B,); for fleets
+    with events."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Room:
-    """Air of the CRAC units, each (B,)."""
+class _CracAir:
+    """Air of the CRAC units of B data centers in one step."""
 
-    flow_m3s: F64
-    fan_w: F64
+    crac_flow_m3s: F64
+    """Airflow of the CRAC units, in m3/s, (B,)."""
+    crac_fan_w: F64
+    """Power of the CRAC fans, in W, (B,)."""
     supply_c: F64
-    warmed_k: F64
-    """Supply air over the setpoints."""
+    """Supply air temperature, mean over the CRAC airflow, in C, (B,)."""
+    supply_warming_k: F64
+    """Supply air temperature over the setpoint, in K, (B,)."""
     return_c: F64
-    load_w: F64
-    """Heat of servers and CRAC fans, if nothing stores it."""
+    """Temperature of the air that returns to the CRAC units, in C, (B,)."""
+    cooling_load_w: F64
+    """Heat that the CRAC units take from the room, in W, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Heat:
-    """Heat that the plant takes, each (B,)."""
+class _HeatBalance:
+    """Heat that the plants of B data centers leave in the room or fetch from it in one step."""
 
-    load_w: F64
-    """Heat that comes back to the CRAC units."""
-    device: water_side.WaterSideResult
     unmet_w: F64
+    """Cooling load that is not removed, in W, (B,)."""
     recovered_w: F64
-    held_kwh: F64
-    """Heat that the room holds at the end of the step."""
+    """Heat held earlier that is removed, in W, (B,)."""
+    room_heat_kwh: F64
+    """Heat held by the room at the end of the step, in kWh, (B,)."""
 
 
 class Facility:
@@ -124,18 +173,18 @@ class Facility:
 
     Args:
         fleet: B data centers.
-        sized: their devices.
-        step_h: length of a step.
-        calm: whether no event can ever happen: all is in order and has power.
+        sizing: Their sized devices.
+        event_free: Whether no event can ever happen: all is in order and has power.
     """
 
-    def __init__(self, fleet: Fleet, sized: Sizing, step_h: float, *, calm: bool) -> None:
+    def __init__(self, fleet: Fleet, sizing: Sizing, *, event_free: bool) -> None:
         v, models = fleet.values, fleet.models
-        self._sized, self._step_h, self._calm = sized, step_h, calm
+        self._sizing, self._event_free = sizing, event_free
+        self._step_h = 1.0 / fleet.steps_per_hour
         self._servers = fleet.per_dc_servers()
         classes = [air_metrics.allowable_c(c.protection.ashrae_class) for c in fleet.configs]
         self._allowable_c = np.array(classes).T.copy()
-        self._counted = fleet.configs[0].hvac.total_of
+        self._hvac_devices = fleet.configs[0].hvac.total_of
         self._recirculates = models["inlet"] == "recirculation"
         self._transient = models["thermal"] == "transient"
         self._stores_heat = models["cooling_load"] in cooling.STORES_UNMET_HEAT
@@ -151,158 +200,91 @@ class Facility:
             "drift_share": v("hvac.water.drift_share"),
         }
         self._flow_limits = {
-            "design_flow_m3s": sized.crac_flow_m3s,
-            "design_it_airflow_m3s": sized.it_airflow_m3s,
+            "design_flow_m3s": sizing.crac_flow_m3s,
+            "design_it_airflow_m3s": sizing.it_airflow_m3s,
             "min_ratio": v("hvac.crac.min_flow_ratio"),
             "supply_m3s_per_w": v("hvac.crac.supply_m3s_per_w"),
         }
         self._air_j_per_m3_k = air_j_per_m3_k(fleet)
         self._return_approach_k = mean_return_approach_k(fleet)
-        self._fan_w_per_m3s = sized.crac_fan_w / sized.crac_flow_m3s
+        self._fan_w_per_m3s = sizing.crac_fan_w / sizing.crac_flow_m3s
+        self.plant_inputs = _PLANT_INPUTS + (() if event_free else _PLANT_EVENT_INPUTS)
+        """Names of the inputs that ``removable_w`` reads."""
+        self.inputs = (
+            *self.plant_inputs,
+            *_STEP_INPUTS,
+            *(_RECIRCULATION_INPUTS if self._recirculates else _APPROACH_INPUTS),
+            *(_TRANSIENT_INPUTS if self._transient else ()),
+            *(() if event_free else _EVENT_INPUTS),
+        )
+        """Names of the inputs that ``step`` reads."""
 
     def removable_w(self, met: FacilityInputs) -> dict[str, F64]:
-        """Heat that the plant can take with the coils in use."""
-        return {"removed_w": self._operate(self._coils_w(met), met).heat_removed_w}
+        """Heat that the plant can take with the coils in use, W, as ``heat_removed_w``, (B,)."""
+        return {"heat_removed_w": self._operate(self._coil_capacity_w(met), met).heat_removed_w}
 
     def step(self, met: FacilityInputs) -> dict[str, F64]:
         """Everything that follows from the air of the halls.
 
+        Args:
+            met: What the step starts from.
+
         Returns:
-            Quantities of ``StepResult`` by their names there, and ``warmed_k``, what the supply air
-            is warmer than the setpoints.
+            Quantities of ``StepResult`` by their names there, and ``supply_warming_k``, supply air
+            over the setpoint, K, each (B,).
         """
-        sized, step_h = self._sized, self._step_h
         it_w = met.cpu_w + met.it_fan_w
-        room = self._room_air(met, it_w)
-        heat = self._remove_heat(met, room)
-        device = heat.device
-        water = self._water_model(
-            rejected_w=device.rejected_w,
-            range_k=device.tower_range_k,
-            water_kg_s=device.tower_water_kg_s,
-            wet_bulb_c=met.wet_bulb_c,
-            return_c=room.return_c,
-            supply_setpoint_c=met.plant_setpoint_c,
-            dt_s=step_h * 3600.0,
-            **self._water,
-        )
-        devices = {
-            "chiller": device.chiller_w,
-            "tower_fan": device.tower_fan_w,
-            "chilled_pump": device.chilled_pump_w,
-            "condenser_pump": device.condenser_pump_w,
-            "crac_fan": room.fan_w,
-        }
-        first, *rest = (devices[name] for name in self._counted)
-        hvac_w = sum(rest, first)
-        battery = self.run_battery(
-            met.stored_kwh,
-            met.battery_command
-            if self._calm
-            else np.where(met.grid_up > 0, met.battery_command, -1.0),
-            load_kw=(it_w + hvac_w) / 1e3,
-        )
-        grid_kwh = battery.grid_kwh if self._calm else battery.grid_kwh * met.grid_up
-        low_c, high_c = self._allowable_c
-        return {
-            "supply_c": room.supply_c,
-            "warmed_k": room.warmed_k,
-            "over_27_mean_k": met.over_27_sum_k / self._servers,
-            "shi": air_metrics.shi(met.inlet_m3k_s, met.outlet_m3k_s),
-            "rti_pct": air_metrics.rti(
-                room.return_c,
-                room.supply_c,
-                air_metrics.it_rise_k(met.inlet_m3k_s, met.outlet_m3k_s, met.it_airflow_m3s),
-            ),
-            "rci_hi_pct": air_metrics.rci_hi(met.over_27_sum_k, self._servers, allowable_c=high_c),
-            "rci_lo_pct": air_metrics.rci_lo(met.under_18_sum_k, self._servers, allowable_c=low_c),
+        air = self._crac_air(met, it_w)
+        plant = self._operate(self._requested_w(met, air), met)
+        heat = self._balance_heat(met, air, plant)
+        water = self._use_water(met, air, plant)
+        hvac_w = self._hvac_w(air, plant)
+        found: dict[str, Any] = {
             "it_w": it_w,
-            "crac_flow_m3s": room.flow_m3s,
-            "return_c": room.return_c,
-            "cooling_load_w": heat.load_w,
-            "chilled_water_c": device.chilled_water_c,
-            "condenser_water_c": device.condenser_water_c,
-            "economiser_w": device.economiser_w,
-            "chiller_load_w": device.chiller_load_w,
-            "unmet_w": heat.unmet_w,
-            "recovered_w": heat.recovered_w,
-            "heat_removed_w": device.heat_removed_w,
-            "rejected_w": device.rejected_w,
-            "room_heat_kwh": heat.held_kwh,
-            "chiller_w": device.chiller_w,
-            "tower_fan_w": device.tower_fan_w,
-            "chilled_pump_w": device.chilled_pump_w,
-            "condenser_pump_w": device.condenser_pump_w,
-            "crac_fan_w": room.fan_w,
             "hvac_w": hvac_w,
-            "evaporation_l": water.evaporation_l,
-            "drift_l": water.drift_l,
-            "blowdown_l": water.blowdown_l,
-            "water_l": water.water_l,
-            "stored_kwh": battery.stored_kwh,
-            "soc": battery.stored_kwh / np.where(sized.battery_kwh > 0, sized.battery_kwh, 1.0),
-            "charge_kwh": battery.charge_kwh,
-            "discharge_kwh": battery.discharge_kwh,
-            "battery_loss_kwh": battery.battery_loss_kwh,
-            "it_kwh": it_w * step_h / 1e3,
-            "hvac_kwh": hvac_w * step_h / 1e3,
-            "grid_kwh": grid_kwh,
-            "unserved_kwh": battery.grid_kwh - grid_kwh,
-            "carbon_g": emitted_g(grid_kwh, met.ci_g_per_kwh),
+            **fields_of(air),
+            **fields_of(plant),
+            **fields_of(heat),
+            **fields_of(water),
+            **self._energy(met, it_w, hvac_w),
+            **self._air_indices(met, air),
         }
+        return {name: values for name, values in found.items() if name in _RESULTS}
 
-    def run_battery(self, stored_kwh: F64, command: F64, *, load_kw: F64) -> BatteryResult:
-        """One step of the batteries."""
-        return self._battery_model(
-            stored_kwh,
-            command,
-            capacity_kwh=self._sized.battery_kwh,
-            load_kw=load_kw,
-            dt_h=self._step_h,
-            **self._battery,
-        )
+    def powered_share(self, grid_up: npt.NDArray[np.bool_], stored_kwh: F64) -> F64:
+        """Share of a step with power, 0..1, (B,).
 
-    def _coils_w(self, met: FacilityInputs) -> F64:
-        """Capacity of the coils in use."""
-        cooling_w = self._sized.water_side.cooling_w
-        return cooling_w if self._calm else cooling_w * met.coils * met.powered
+        In an outage power lasts as long as the battery would carry the facility at its design
+        power, which is more than it draws.
 
-    def _operate(self, request_w: F64, met: FacilityInputs) -> water_side.WaterSideResult:
-        """The plant, which stands still while there is no power."""
-        design = self._sized.water_side
-        if not self._calm:
-            on = np.where(met.powered > 0, met.powered, 1.0)
-            request_w = np.where(met.powered > 0, request_w / on, 0.0)
-            design = replace(design, chiller_w=design.chiller_w * met.chiller_share)
-        found = water_side.operate(
-            request_w,
-            setpoint_c=met.plant_setpoint_c,
-            outdoor_c=met.outdoor_c,
-            wet_bulb_c=met.wet_bulb_c,
-            design=design,
-            chiller=self._chiller,
-            tower=self._tower,
-            limited=self._stores_heat,
-        )
-        return found if self._calm else found.scaled(met.powered)
+        Args:
+            grid_up: Whether the grid supplies, (B,).
+            stored_kwh: Energy in the batteries at the start of the step, kWh, (B,).
+        """
+        all_step = np.ones(len(stored_kwh))
+        if np.all(grid_up):
+            return all_step
+        design_kw = self._sizing.facility_w / 1e3
+        carried_kwh = self._run_battery(stored_kwh, -all_step, load_kw=design_kw).discharge_kwh
+        lasts = np.minimum(carried_kwh / (design_kw * self._step_h), 1.0)
+        return np.where(grid_up, all_step, lasts)
 
-    def _room_air(self, met: FacilityInputs, it_w: F64) -> _Room:
+    def _crac_air(self, met: FacilityInputs, it_w: F64) -> _CracAir:
         """Airflow, supply and return air, fans and heat of the CRAC units."""
         if self._recirculates:
-            fan_w = self._fan_w_per_m3s * met.cubed_m3s
-            fan_w = fan_w if self._calm else fan_w * met.powered
-            return _Room(
-                flow_m3s=met.crac_flow_m3s,
-                fan_w=fan_w,
+            fan_w = self._while_powered(self._fan_w_per_m3s * met.cubed_flow_m3s, met)
+            return _CracAir(
+                crac_flow_m3s=met.crac_flow_m3s,
+                crac_fan_w=fan_w,
                 supply_c=met.supply_c,
                 # Units differ by their setpoints alone; the room warms the air of all alike.
-                warmed_k=met.supply_c - met.mixed_m3k_s / met.crac_flow_m3s,
+                supply_warming_k=met.supply_c - met.setpoint_m3k_s / met.crac_flow_m3s,
                 return_c=met.return_c,
-                load_w=it_w + fan_w,
+                cooling_load_w=met.cooling_load_w if self._transient else it_w + fan_w,
             )
         flow, speed = self._flow(it_w, met.it_airflow_m3s, speed=met.fan_speed, **self._flow_limits)
-        fan_w = crac_fan_w(speed, design_flow_m3s=1.0, design_w=self._sized.crac_fan_w)
-        fan_w = fan_w if self._calm else met.powered * fan_w
+        full_w = crac_fan_w(speed, design_flow_m3s=1.0, design_w=self._sizing.crac_fan_w)
+        fan_w = self._while_powered(full_w, met)
         return_c, load_w = self._load(
             it_w,
             fan_w,
@@ -313,30 +295,133 @@ class Facility:
             air_j_per_m3_k=self._air_j_per_m3_k,
             return_approach_k=self._return_approach_k,
         )
-        warmed_k = met.supply_c - met.plant_setpoint_c
-        return _Room(flow, fan_w, met.supply_c, warmed_k, return_c, load_w)
+        return _CracAir(
+            crac_flow_m3s=flow,
+            crac_fan_w=fan_w,
+            supply_c=met.supply_c,
+            supply_warming_k=met.supply_c - met.plant_setpoint_c,
+            return_c=return_c,
+            cooling_load_w=load_w,
+        )
 
-    def _remove_heat(self, met: FacilityInputs, room: _Room) -> _Heat:
-        """What the plant takes of the heat that comes back and of the heat held by the room."""
-        step_h = self._step_h
+    def _requested_w(self, met: FacilityInputs, air: _CracAir) -> F64:
+        """Heat that the CRAC units ask the plant to take: load, and heat held by the room."""
         if self._transient:
-            load_w, device = met.cooling_load_w, self._operate(met.coil_w, met)
+            return met.coil_w
+        wanted_w = air.cooling_load_w + met.room_heat_kwh * 1e3 / self._step_h
+        if self._event_free:
+            return wanted_w
+        # Heat of the air that passes units that are down stays in the room.
+        idle_rise_m3k_s = (
+            air.return_c - air.supply_warming_k
+        ) * met.idle_flow_m3s - met.idle_setpoint_m3k_s
+        passing_w = self._air_j_per_m3_k * idle_rise_m3k_s
+        reached_w = np.clip(wanted_w - passing_w, 0.0, self._coil_capacity_w(met))
+        return np.where(met.no_unit_down > 0, wanted_w, reached_w)
+
+    def _operate(self, requested_w: F64, met: FacilityInputs) -> WaterSideResult:
+        """The plant, which stands still while there is no power."""
+        design = self._sizing.water_side
+        if not self._event_free:
+            on = np.where(met.powered > 0, met.powered, 1.0)
+            requested_w = np.where(met.powered > 0, requested_w / on, 0.0)
+            design = replace(design, chiller_w=design.chiller_w * met.chiller_share)
+        found = water_side.operate(
+            requested_w,
+            setpoint_c=met.plant_setpoint_c,
+            outdoor_c=met.outdoor_c,
+            wet_bulb_c=met.wet_bulb_c,
+            design=design,
+            chiller=self._chiller,
+            tower=self._tower,
+            limited=self._stores_heat,
+        )
+        return found if self._event_free else found.scaled(met.powered)
+
+    def _balance_heat(
+        self, met: FacilityInputs, air: _CracAir, plant: WaterSideResult
+    ) -> _HeatBalance:
+        """Heat that was not removed stays in the room; spare capacity fetches it later."""
+        load_w, removed_w = air.cooling_load_w, plant.heat_removed_w
+        if self._transient:
             # The room has kept its heat within the step; here is what the plant fell short of.
-            held_kwh = met.room_j / 3.6e6 + (met.coil_w - device.heat_removed_w) * step_h / 1e3
-            unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, device.heat_removed_w)
+            short_kwh = (met.coil_w - removed_w) * self._step_h / 1e3
+            room_heat_kwh = met.room_j / 3.6e6 + short_kwh
+            unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, removed_w)
         else:
-            load_w = room.load_w
-            wanted_w = load_w + met.room_heat_kwh * 1e3 / step_h
-            if not self._calm:
-                # Heat of the air that passes units that are down stays in the room.
-                idle_c = (room.return_c - room.warmed_k) * met.idle_m3s - met.idle_m3k_s
-                past_w = self._air_j_per_m3_k * idle_c
-                reached_w = np.clip(wanted_w - past_w, 0.0, self._coils_w(met))
-                wanted_w = np.where(met.all_running > 0, wanted_w, reached_w)
-            device = self._operate(wanted_w, met)
-            unmet_w, recovered_w, held_kwh = cooling.balance_room_heat(
-                load_w, device.heat_removed_w, met.room_heat_kwh, step_h
+            unmet_w, recovered_w, room_heat_kwh = cooling.balance_room_heat(
+                load_w, removed_w, met.room_heat_kwh, self._step_h
             )
         if not self._stores_heat:
             unmet_w = recovered_w = 0.0 * load_w
-        return _Heat(load_w, device, unmet_w, recovered_w, held_kwh)
+        return _HeatBalance(unmet_w, recovered_w, room_heat_kwh)
+
+    def _use_water(self, met: FacilityInputs, air: _CracAir, plant: WaterSideResult) -> WaterUse:
+        """Water that the tower evaporates, loses and gets."""
+        return self._water_model(
+            rejected_w=plant.rejected_w,
+            range_k=plant.tower_range_k,
+            water_kg_s=plant.tower_water_kg_s,
+            wet_bulb_c=met.wet_bulb_c,
+            return_c=air.return_c,
+            supply_setpoint_c=met.plant_setpoint_c,
+            dt_s=self._step_h * 3600.0,
+            **self._water,
+        )
+
+    def _hvac_w(self, air: _CracAir, plant: WaterSideResult) -> F64:
+        """Power of the devices that ``hvac.total_of`` names."""
+        power_w = fields_of(plant) | fields_of(air)
+        first, *rest = (power_w[f"{device}_w"] for device in self._hvac_devices)
+        return cast(F64, sum(rest, first))
+
+    def _energy(self, met: FacilityInputs, it_w: F64, hvac_w: F64) -> dict[str, F64]:
+        """Battery, grid and emissions; without grid the battery gives what it can."""
+        command = met.battery_command
+        if not self._event_free:
+            command = np.where(met.grid_up > 0, command, -1.0)
+        battery = self._run_battery(met.stored_kwh, command, load_kw=(it_w + hvac_w) / 1e3)
+        needed_kwh = battery.grid_kwh
+        grid_kwh = needed_kwh if self._event_free else needed_kwh * met.grid_up
+        battery_kwh = self._sizing.battery_kwh
+        return {
+            **fields_of(battery),
+            "soc": battery.stored_kwh / np.where(battery_kwh > 0, battery_kwh, 1.0),
+            "it_kwh": it_w * self._step_h / 1e3,
+            "hvac_kwh": hvac_w * self._step_h / 1e3,
+            "grid_kwh": grid_kwh,
+            "unserved_kwh": needed_kwh - grid_kwh,
+            "carbon_g": emitted_g(grid_kwh, met.ci_g_per_kwh),
+        }
+
+    def _air_indices(self, met: FacilityInputs, air: _CracAir) -> dict[str, F64]:
+        """Indices of how well the air of the hall is managed."""
+        servers, (low_c, high_c) = self._servers, self._allowable_c
+        it_rise_k = air_metrics.it_rise_k(met.inlet_m3k_s, met.outlet_m3k_s, met.it_airflow_m3s)
+        return {
+            "over_27_mean_k": met.over_27_sum_k / servers,
+            "shi": air_metrics.shi(met.inlet_m3k_s, met.outlet_m3k_s),
+            "rti_pct": air_metrics.rti(air.return_c, air.supply_c, it_rise_k),
+            "rci_hi_pct": air_metrics.rci_hi(met.over_27_sum_k, servers, allowable_c=high_c),
+            "rci_lo_pct": air_metrics.rci_lo(met.under_18_sum_k, servers, allowable_c=low_c),
+        }
+
+    def _run_battery(self, stored_kwh: F64, command: F64, *, load_kw: F64) -> BatteryResult:
+        """One step of the batteries."""
+        return self._battery_model(
+            stored_kwh,
+            command,
+            capacity_kwh=self._sizing.battery_kwh,
+            load_kw=load_kw,
+            dt_h=self._step_h,
+            **self._battery,
+        )
+
+    def _coil_capacity_w(self, met: FacilityInputs) -> F64:
+        """Heat that the coils in use can take, mean over the step."""
+        cooling_w = self._sizing.water_side.cooling_w
+        return cooling_w if self._event_free else cooling_w * met.coil_share * met.powered
+
+    def _while_powered(self, power_w: F64, met: FacilityInputs) -> F64:
+        """Mean over the step of a power that is drawn while there is power."""
+        return power_w if self._event_free else power_w * met.powered

@@ -91,7 +91,7 @@ class Coil:
     """CRAC fan power per airflow at full speed."""
 
 
-@dataclass(slots=True)
+@dataclass
 class HallSums:
     """Sums and means of one evaluation: (B,) per data center, (R,) per rack."""
 

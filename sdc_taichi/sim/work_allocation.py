@@ -1,4 +1,4 @@
-"""Which racks may work, and where the work of a data center goes."""
+"""Which racks may work, where the work of a data center goes, and what its racks make of it."""
 
 from __future__ import annotations
 
@@ -6,25 +6,59 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.errors import SdcError
 from sdc_taichi.hall import protection
 from sdc_taichi.hall.air_metrics import allowable_c
 from sdc_taichi.hall.placement import make_bins, place
-from sdc_taichi.hall.protection import TRIPPED
+from sdc_taichi.hall.protection import THROTTLED, TRIPPED
+from sdc_taichi.plant.workload import TASKS_PER_STEP
+from sdc_taichi.sim.actions import Commands
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import F64, Reals, Status
+from sdc_taichi.sim.surroundings import Surroundings
+from sdc_taichi.sim.workload import WorkResult
+from sdc_taichi.types import F64, Reals, State, Status
 
 
-@dataclass(frozen=True, slots=True)
-class Placed:
-    """Work in its place."""
+@dataclass
+class Capacity:
+    """How much work fits into one step: B data centers."""
+
+    utilisation: F64 | float
+    """Highest work of each data center as a share of all its servers, 0..1, (B,) or for all."""
+    bins: F64 | None
+    """Highest utilisation of each rack or server group, 0..1; None loads all of them freely."""
+
+
+@dataclass
+class Placement:
+    """Work of one step in its place: B data centers, R racks, G server groups."""
 
     utilisation: F64
-    """What was placed, as a share of all servers, (B,)."""
+    """Work that starts, as a share of all servers, 0..1, (B,)."""
+    placed_utilisation: F64
+    """Work that found a place, as a share of all servers, (B,)."""
     rack_load: F64 | None
-    """Utilisation of each rack while it is on, (R,); None loads all racks alike."""
+    """Utilisation of each rack while it is on, 0..1, (R,); None loads all racks alike."""
     group_load: F64 | None
-    """The same of each server group, (G,); None spreads the load of a rack by load weights."""
+    """Utilisation of each server group while it is on, 0..1, (G,); None spreads the load of a rack
+    over its servers by their load weights."""
+    rack_powered: F64 | None
+    """Share of the step that each rack is on, 0..1, (R,); None is all of it."""
+
+
+@dataclass
+class RackOutcome:
+    """What racks make of their work and inlets in one step: B data centers, R racks."""
+
+    rack_status: Status
+    """Status at the end of the step: 0 normal, 1 throttled, 2 tripped, (R,)."""
+    throttled_racks: F64
+    """Racks that are throttled at the end of the step, (B,)."""
+    tripped_racks: F64
+    """Racks that are off at the end of the step, having tripped, (B,)."""
+    lost_tasks: F64
+    """Work that had been started and found no server or went down with its rack, (B,)."""
+    executed_tasks: F64
+    """Work that was done, (B,)."""
 
 
 class WorkAllocation:
@@ -63,142 +97,126 @@ class WorkAllocation:
         """Whether placement needs the inlets of the last step."""
         return self._policy in ("coolest-first", "inlet-aware")
 
-    def capacity(
-        self, status: Status, powered: F64 | None, weights: F64 | None
-    ) -> tuple[F64 | None, F64 | float]:
-        """How much work fits.
+    def capacity(self, state: State, commands: Commands, surroundings: Surroundings) -> Capacity:
+        """How much work fits into a step.
 
         Args:
-            status: of each rack, see ``plant.protection``, (R,).
-            powered: share of the step with power, (B,); None is all of it.
-            weights: of the action, per rack or server group.
-
-        Returns:
-            Utilisation each bin may reach, None if all of it, and each data center, (B,).
-
-        Raises:
-            SdcError: weights that are no numbers or of the wrong shape.
+            state: State at the start of the step, with the status of each rack.
+            commands: Weights of the server groups; those of weight 0 take no work.
+            surroundings: How long each data center has power.
         """
-        chosen = self._policy == "weights" and weights is not None
-        if not chosen and self._all_on(status, powered):
-            return None, 1.0
-        per_rack = protection.capacity(status, self._throttle_share)
-        if powered is not None:
-            per_rack = per_rack * powered[self._fleet.rack_dc]
+        weights = commands.group_weights
+        if weights is None and self._fully_on(state.rack_status, surroundings):
+            return Capacity(utilisation=1.0, bins=None)
+        per_rack = protection.capacity(state.rack_status, self._throttle_share)
+        per_rack = per_rack * surroundings.powered[self._fleet.rack_dc]
         bins = per_rack if self._per_rack else self._spread(per_rack)
-        usable = np.where(self._weights(weights) > 0, bins, 0.0) if chosen else bins
-        return bins, self._bins.sums(self._bin_servers * usable) / self._servers
+        usable = bins if weights is None else np.where(weights > 0, bins, 0.0)
+        fits = self._bins.sums(self._bin_servers * usable)
+        return Capacity(utilisation=fits / self._servers, bins=bins)
 
     def place(
         self,
-        utilisation: F64,
-        capacity: F64 | None,
-        powered: F64 | None,
-        group_inlet_c: F64,
-        weights: F64 | None,
-    ) -> Placed:
+        state: State,
+        commands: Commands,
+        surroundings: Surroundings,
+        work: WorkResult,
+        capacity: Capacity,
+    ) -> Placement:
         """Put work in its place by the policy of the fleet.
 
         Args:
-            utilisation: work as a share of all servers, (B,).
-            capacity: of each bin, see ``capacity``.
-            powered: share of the step with power, (B,).
-            group_inlet_c: inlets of the last step, (G,), if the policy watches them.
-            weights: of the action, per rack or server group.
+            state: State at the start of the step, with the inlets if the policy watches them.
+            commands: Weights of the server groups.
+            surroundings: How long each data center has power.
+            work: Work that starts.
+            capacity: How much of it fits.
 
         Raises:
-            SdcError: weights without policy ``weights``, or weights that are not valid.
+            PlacementError: Weights that are negative, not finite, or all 0.
         """
-        if weights is not None and self._policy != "weights":
-            raise SdcError(
-                f"action placement: given, but workload.placement is {self._policy}; valid is None"
-            )
-        if self._per_rack and capacity is None:
-            return Placed(utilisation, None, None)
-        load, placed = place(
+        rack_powered = self._rack_powered(state.rack_status, surroundings)
+        # Whole tasks may round to more than there are servers.
+        utilisation = np.minimum(work.utilisation, 1.0)
+        if self._per_rack and capacity.bins is None:
+            return Placement(utilisation, work.utilisation, None, None, rack_powered)
+        all_bins = np.ones(len(self._bin_servers))
+        weights = all_bins if commands.group_weights is None else commands.group_weights
+        load, placed_utilisation = place(
             self._policy,
-            utilisation,
+            work.utilisation,
             bins=self._bins,
             count=self._bin_servers,
-            capacity=np.ones(len(self._bin_servers)) if capacity is None else capacity,
-            inlet_c=group_inlet_c,
+            capacity=all_bins if capacity.bins is None else capacity.bins,
+            inlet_c=state.group_inlet_c,
             limit_c=self._allowable_high_c,
-            weights=self._weights(weights) if self._policy == "weights" else None,
+            weights=weights if self._policy == "weights" else None,
         )
-        if powered is not None:
-            on = powered[self._bins.dc]
+        if not surroundings.fully_powered:
+            on = surroundings.powered[self._bins.dc]
             load = load / np.where(on > 0, on, 1.0)
-        return Placed(placed, *((load, None) if self._per_rack else (None, load)))
+        rack_load, group_load = (load, None) if self._per_rack else (None, load)
+        return Placement(utilisation, placed_utilisation, rack_load, group_load, rack_powered)
 
-    def powered(self, status: Status, powered: F64 | None) -> F64 | None:
-        """Share of the step that each rack is on, (R,); None if all are on throughout."""
-        if self._all_on(status, powered):
-            return None
-        on = np.ones(self._fleet.racks) if powered is None else powered[self._fleet.rack_dc]
-        return np.where(status == TRIPPED, 0.0, on)
+    def protect(
+        self, state: State, work: WorkResult, placement: Placement, rack_inlet_max_c: Reals
+    ) -> RackOutcome:
+        """Racks throttle, trip and restart by their hottest inlets.
 
-    def _all_on(self, status: Status, powered: F64 | None) -> bool:
+        Args:
+            state: State at the start of the step, with the status of each rack.
+            work: Work that starts.
+            placement: Where it runs.
+            rack_inlet_max_c: Hottest inlet of each rack, C, (R,).
+        """
+        before, status = state.rack_status, state.rack_status.copy()
+        if self._protected:
+            inlet_max_c = rack_inlet_max_c.astype(np.float64)
+            status = protection.protect(before, inlet_max_c, **self._limits)
+        unplaced = np.maximum(work.utilisation - placement.placed_utilisation, 0.0)
+        lost_tasks = TASKS_PER_STEP * (unplaced + self._tripped_work(before, status, placement))
+        return RackOutcome(
+            rack_status=status,
+            throttled_racks=self._racks_in(status, THROTTLED),
+            tripped_racks=self._racks_in(status, TRIPPED),
+            lost_tasks=lost_tasks,
+            executed_tasks=work.started_tasks - lost_tasks,
+        )
+
+    def _fully_on(self, status: Status, surroundings: Surroundings) -> bool:
         """Whether all racks are in order and on throughout the step."""
-        lit = powered is None or bool((powered == 1.0).all())
-        return lit and not (self._protected and status.any())
+        return surroundings.fully_powered and not (self._protected and status.any())
 
-    def protect(self, status: Status, inlet_max_c: Reals) -> Status:
-        """Status of each rack after a step with the given hottest inlets, (R,)."""
-        if not self._protected:
-            return status
-        return protection.protect(status, inlet_max_c.astype(np.float64), **self._limits)
+    def _rack_powered(self, status: Status, surroundings: Surroundings) -> F64 | None:
+        """Share of the step that each rack is on, (R,); None if all are on throughout."""
+        if self._fully_on(status, surroundings):
+            return None
+        return np.where(status == TRIPPED, 0.0, surroundings.powered[self._fleet.rack_dc])
 
-    def racks_in(self, status: Status, which: int) -> F64:
-        """Racks of each data center that have a status of ``plant.protection``, (B,)."""
+    def _racks_in(self, status: Status, which: int) -> F64:
+        """Racks of each data center that have a status of ``hall.protection``, (B,)."""
         if not (self._protected and status.any()):
             return np.zeros(len(self._servers))
         return self._fleet.rack_sums(status == which)
 
-    def tripped_work(
-        self, before: Status, after: Status, placed: Placed, rack_powered: F64 | None
-    ) -> F64:
-        """Work of the racks that tripped in a step, as a share of all servers, (B,).
-
-        Args:
-            before: status at the start of the step, (R,).
-            after: status at its end, (R,).
-            placed: the work of the step.
-            rack_powered: share of the step that each rack was on, None if all were.
-        """
-        if after is before:
-            return np.zeros(len(self._servers))
+    def _tripped_work(self, before: Status, after: Status, placement: Placement) -> F64:
+        """Work of the racks that trip in a step, as a share of all servers, (B,)."""
+        fleet = self._fleet
+        if not self._protected:
+            return np.zeros(fleet.size)
         tripped = (after == TRIPPED) & (before != TRIPPED)
         if not tripped.any():
-            return np.zeros(len(self._servers))
-        fleet = self._fleet
-        if placed.group_load is not None:
-            busy = fleet.group_sums(fleet.per_group_servers() * placed.group_load)
-        elif placed.rack_load is not None:
-            busy = self._rack_servers * placed.rack_load
+            return np.zeros(fleet.size)
+        if placement.group_load is not None:
+            busy = fleet.group_sums(fleet.per_group_servers() * placement.group_load)
+        elif placement.rack_load is not None:
+            busy = self._rack_servers * placement.rack_load
         else:
-            busy = self._rack_servers * placed.utilisation[fleet.rack_dc]
-        if rack_powered is not None:
-            busy = busy * rack_powered
+            busy = self._rack_servers * placement.placed_utilisation[fleet.rack_dc]
+        if placement.rack_powered is not None:
+            busy = busy * placement.rack_powered
         return fleet.rack_sums(busy * tripped) / self._servers
 
     def _spread(self, per_rack: F64) -> F64:
         """Rack values for each server group, (G,)."""
         return np.repeat(per_rack, np.diff(self._fleet.group_offsets))
-
-    def _weights(self, weights: F64 | None) -> F64:
-        """Weights of the server groups, (G,), from one per rack or per group."""
-        groups, racks = self._fleet.groups, self._fleet.racks
-        if weights is None:
-            return np.ones(groups)
-        try:
-            given = np.asarray(weights, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise SdcError(f"action placement: {weights!r} are no numbers") from None
-        if given.shape == (groups,):
-            return given
-        if given.shape != (racks,):
-            raise SdcError(
-                f"action placement: shape {given.shape}, expected ({racks},), one per rack, or "
-                f"({groups},), one per server group"
-            )
-        return self._spread(given)

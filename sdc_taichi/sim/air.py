@@ -1,0 +1,176 @@
+"""Air of the halls during a step: quasi-steady, or with temperatures that take time to change.
+
+Both models solve a step from where the work is and how the CRAC units run. What they remember from
+step to step are fields of ``State``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from sdc_taichi.sim.crac_units import Supply
+from sdc_taichi.sim.facility_stage import FacilityStage
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums
+from sdc_taichi.sim.sizing import Sizing
+from sdc_taichi.sim.surroundings import Surroundings
+from sdc_taichi.sim.unit_index import UnitIndex
+from sdc_taichi.sim.work_allocation import Placement
+from sdc_taichi.types import F64, State, fields_of
+
+J_PER_KWH = 3.6e6
+_HALL_FIELDS = tuple(f.name for f in fields(HallState))
+_EMPTY = np.zeros(0)
+
+
+class SteadyAir:
+    """Halls whose temperatures follow load and supply air at once.
+
+    Args:
+        fleet: B data centers.
+        hall: Their halls.
+        sizing: Their sized devices.
+        units: Their CRAC units.
+        keep_inlets: Whether placement needs the inlets of the last step.
+    """
+
+    def __init__(
+        self, fleet: Fleet, hall: Hall, sizing: Sizing, units: UnitIndex, *, keep_inlets: bool
+    ) -> None:
+        self._hall, self._units = hall, units
+        self._room_kwh_per_k = sizing.room_kwh_per_k
+        self._inlets = _GroupInlets(fleet, hall, keep=keep_inlets)
+
+    def initial(self, supply: Supply, demand: F64) -> dict[str, Any]:
+        """Temperatures before the first step, by their names in ``State``.
+
+        Args:
+            supply: How the CRAC units run.
+            demand: Work that runs, as a share of capacity, 0..1, (B,).
+        """
+        return {**dict.fromkeys(_HALL_FIELDS, _EMPTY), "group_inlet_c": self._inlets.initial()}
+
+    def solve(
+        self, state: State, placement: Placement, supply: Supply, surroundings: Surroundings
+    ) -> tuple[HallSums, dict[str, Any]]:
+        """Air, temperatures and power of a step.
+
+        Args:
+            state: State at the start of the step, with the heat held by the room.
+            placement: Where the work is.
+            supply: How the CRAC units run.
+            surroundings: What is out of order.
+
+        Returns:
+            Sums and means over the step, and temperatures at its end by their names in ``State``.
+
+        Raises:
+            SdcError: No steady state, or temperatures or power beyond any number.
+        """
+        warmed_k = self._units.of_each(state.room_heat_kwh / self._room_kwh_per_k)
+        unit_supply_c = supply.unit_setpoint_c + warmed_k
+        air = self._hall.solve(_conditions(unit_supply_c, placement, supply, surroundings))
+        thermal = {**dict.fromkeys(_HALL_FIELDS, _EMPTY), "group_inlet_c": self._inlets.last()}
+        return air, thermal
+
+
+class TransientAir:
+    """Halls whose servers and recirculated air take time to warm and to cool.
+
+    Args:
+        fleet: B data centers.
+        hall: Their halls.
+        sizing: Their sized devices.
+        facility: What limits the heat that the coils can take.
+        keep_inlets: Whether placement needs the inlets of the last step.
+    """
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        hall: Hall,
+        sizing: Sizing,
+        facility: FacilityStage,
+        *,
+        keep_inlets: bool,
+    ) -> None:
+        self._hall, self._facility = hall, facility
+        self._step_s = 1.0 / fleet.steps_per_hour * 3600.0
+        self._substep_s = fleet.configs[0].simulation.substep_s
+        self._room_j_per_k = sizing.room_kwh_per_k * J_PER_KWH
+        self._fan_w_per_m3s = sizing.crac_fan_w / sizing.crac_flow_m3s
+        self._inlets = _GroupInlets(fleet, hall, keep=keep_inlets)
+
+    def initial(self, supply: Supply, demand: F64) -> dict[str, Any]:
+        """Steady temperatures under the given load; arguments as in ``SteadyAir.initial``."""
+        steady = self._hall.settle(
+            Conditions(
+                unit_supply_c=supply.unit_setpoint_c,
+                utilisation=demand,
+                unit_low=supply.unit_low,
+                unit_high=supply.unit_high,
+            )
+        )
+        return {**fields_of(steady), "group_inlet_c": self._inlets.initial()}
+
+    def solve(
+        self, state: State, placement: Placement, supply: Supply, surroundings: Surroundings
+    ) -> tuple[HallSums, dict[str, Any]]:
+        """Air, temperatures and power of a step; arguments and results as in ``SteadyAir.solve``.
+
+        Raises:
+            SdcError: Temperatures or power beyond any number.
+        """
+        coil = Coil(
+            setpoint_c=supply.unit_setpoint_c,
+            room_j=state.room_heat_kwh * J_PER_KWH,
+            room_j_per_k=self._room_j_per_k,
+            limit_w=self._facility.removable_w(supply, surroundings),
+            fan_w_per_m3s=self._fan_w_per_m3s * surroundings.powered,
+        )
+        air, after = self._hall.advance(
+            # The supply air of each substep follows from the coil.
+            _conditions(supply.unit_setpoint_c, placement, supply, surroundings),
+            HallState(**{name: getattr(state, name) for name in _HALL_FIELDS}),
+            coil,
+            self._step_s,
+            self._substep_s,
+        )
+        return air, {**fields_of(after), "group_inlet_c": self._inlets.last()}
+
+
+class _GroupInlets:
+    """Inlets of the server groups in the last step, as far as placement needs them."""
+
+    def __init__(self, fleet: Fleet, hall: Hall, *, keep: bool) -> None:
+        self._hall, self._keep = hall, keep
+        setpoint_c = fleet.values("hvac.setpoint.initial_c")[fleet.rack_dc]
+        self._initial_c = np.repeat(setpoint_c + fleet.approach_k, np.diff(fleet.group_offsets))
+
+    def initial(self) -> F64:
+        """Inlets at the initial setpoints, in C, (G,); empty if nothing needs them."""
+        return self._initial_c.copy() if self._keep else _EMPTY
+
+    def last(self) -> F64:
+        """Inlets of the last step, in C, (G,); empty if nothing needs them."""
+        return self._hall.group_inlets() if self._keep else _EMPTY
+
+
+def _conditions(
+    unit_supply_c: F64, placement: Placement, supply: Supply, surroundings: Surroundings
+) -> Conditions:
+    """What the halls meet during a step."""
+    return Conditions(
+        unit_supply_c=unit_supply_c,
+        utilisation=placement.utilisation,
+        rack_load=placement.rack_load,
+        group_load=placement.group_load,
+        powered=placement.rack_powered,
+        rack_airflow=surroundings.rack_airflow,
+        unit_low=supply.unit_low,
+        unit_high=supply.unit_high,
+        unit_running=None if surroundings.all_running else surroundings.unit_running,
+    )

@@ -1,0 +1,150 @@
+"""CRAC units: their setpoints and fan speeds in a step, and what they ask of the plant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sdc_taichi.plant import cooling
+from sdc_taichi.sim.actions import Commands
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.surroundings import Surroundings
+from sdc_taichi.sim.unit_index import UnitIndex
+from sdc_taichi.types import F64, I64, State
+
+
+@dataclass
+class Supply:
+    """How the CRAC units run during one step: B data centers, U units."""
+
+    unit_setpoint_c: F64
+    """Supply air setpoint of each unit, in C, (U,)."""
+    setpoint_c: F64
+    """Supply air setpoint, mean over the units, in C, (B,)."""
+    cooling_run: I64
+    """Equal cooling commands in a row that each unit has had, (U,)."""
+    cooling_last: F64
+    """Cooling command of each unit, in steps, (U,)."""
+    fan_speed: F64
+    """Controlled speed of each fan over design speed, (U,)."""
+    unit_low: F64
+    """Lowest speed of each fan over design speed in this step, (U,)."""
+    unit_high: F64
+    """Highest speed of each fan over design speed in this step, (U,)."""
+    plant_setpoint_c: F64
+    """Supply air setpoint that the chilled water follows, in C, (B,)."""
+    coil_share: F64
+    """Design airflow of the units that run over that of all units, (B,)."""
+
+
+class CracUnits:
+    """The CRAC units of a fleet.
+
+    Args:
+        fleet: B data centers with U CRAC units.
+        units: The units by data center.
+    """
+
+    def __init__(self, fleet: Fleet, units: UnitIndex) -> None:
+        self._units = units
+
+        def of_each(path: str) -> F64:
+            return fleet.values(path)[units.dc]
+
+        self._setpoint_model = cooling.SETPOINTS[fleet.models["setpoint"]]
+        self._setpoint_limits = {
+            "step_k": of_each("hvac.setpoint.step_k"),
+            "low_c": of_each("hvac.setpoint.min_c"),
+            "high_c": of_each("hvac.setpoint.max_c"),
+        }
+        self._initial_c = of_each("hvac.setpoint.initial_c")
+        self._fan_step = of_each("hvac.crac.fan_step")
+        self._coasting = of_each("hvac.crac.coasting_flow_ratio")
+        self._min_speed = of_each("hvac.crac.min_flow_ratio")
+        self._design_m3s = fleet.unit_design_m3s
+        self._ones, full_speed = np.ones(fleet.size), np.ones(fleet.units)
+        flow_model = fleet.models["crac_flow"]
+        self._controlled = flow_model == "controlled"
+        follows = flow_model == "follow_servers"
+        self._free_range = (self._min_speed if follows else full_speed, full_speed)
+
+    def initial_supply(self) -> Supply:
+        """Initial setpoints of units that all run at full speed, before any command."""
+        n_units = len(self._initial_c)
+        setpoint_c = self._initial_c.copy()
+        low, high = self._free_range
+        return Supply(
+            unit_setpoint_c=setpoint_c,
+            setpoint_c=self._units.mean(setpoint_c),
+            cooling_run=np.zeros(n_units, dtype=np.int64),
+            cooling_last=np.full(n_units, np.nan),
+            fan_speed=np.ones(n_units),
+            unit_low=low,
+            unit_high=high,
+            plant_setpoint_c=self._units.lowest(setpoint_c),
+            coil_share=self._ones,
+        )
+
+    def supply(self, state: State, commands: Commands, surroundings: Surroundings) -> Supply:
+        """Setpoints and fan speeds of a step.
+
+        Args:
+            state: State at the start of the step.
+            commands: What to do with setpoints and fans.
+            surroundings: Which units run.
+        """
+        unit_setpoint_c, cooling_run, cooling_last = self._setpoint_model(
+            state.setpoint_c,
+            commands.unit_cooling_command,
+            state.cooling_run,
+            state.cooling_last,
+            **self._setpoint_limits,
+        )
+        fan_speed = self._moved_fans(state.fan_speed, commands.unit_fan_command)
+        unit_low, unit_high = self._speed_range(fan_speed, surroundings)
+        plant_setpoint_c, coil_share = self._served_by_plant(unit_setpoint_c, surroundings)
+        return Supply(
+            unit_setpoint_c=unit_setpoint_c,
+            setpoint_c=self._units.mean(unit_setpoint_c),
+            cooling_run=cooling_run,
+            cooling_last=cooling_last,
+            fan_speed=fan_speed,
+            unit_low=unit_low,
+            unit_high=unit_high,
+            plant_setpoint_c=plant_setpoint_c,
+            coil_share=coil_share,
+        )
+
+    def _moved_fans(self, fan_speed: F64, command: F64 | None) -> F64:
+        """Speed of each fan after its command, (U,)."""
+        if command is None:
+            return fan_speed
+        return np.clip(fan_speed + command * self._fan_step, self._min_speed, 1.0)
+
+    def _speed_range(self, fan_speed: F64, surroundings: Surroundings) -> tuple[F64, F64]:
+        """Speeds between which each fan follows the airflow of the servers, each (U,).
+
+        Fans of units that are down coast at one speed.
+        """
+        low, high = self._free_range
+        if self._controlled:
+            low = high = fan_speed
+        if surroundings.all_running:
+            return low, high
+        runs = surroundings.unit_running > 0
+        return np.where(runs, low, self._coasting), np.where(runs, high, self._coasting)
+
+    def _served_by_plant(self, unit_setpoint_c: F64, surroundings: Surroundings) -> tuple[F64, F64]:
+        """Setpoint that the chilled water follows, and share of the coils in use, each (B,).
+
+        The coldest unit that runs decides; without any, the coldest of all.
+        """
+        lowest_c = self._units.lowest(unit_setpoint_c)
+        if surroundings.all_running:
+            return lowest_c, self._ones
+        running = surroundings.unit_running
+        coldest_c = self._units.lowest(np.where(running > 0, unit_setpoint_c, np.inf))
+        coldest_c = np.where(np.isinf(coldest_c), lowest_c, coldest_c)
+        in_use_m3s = self._units.sum(running * self._design_m3s)
+        return coldest_c, in_use_m3s / self._units.sum(self._design_m3s)

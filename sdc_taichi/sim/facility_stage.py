@@ -1,0 +1,93 @@
+"""The facility as a stage of a step: its inputs from the stages before it, compiled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sdc_taichi.sim.actions import Commands
+from sdc_taichi.sim.crac_units import Supply
+from sdc_taichi.sim.facility import Facility, FacilityInputs
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import HallSums
+from sdc_taichi.sim.surroundings import Surroundings
+from sdc_taichi.sim.unit_index import UnitIndex
+from sdc_taichi.types import F64, State
+
+
+class FacilityStage:
+    """Runs the models of a facility as compiled passes over the data centers.
+
+    Args:
+        fleet: B data centers.
+        units: Their CRAC units.
+        facility: Their models and sized devices.
+        event_free: Whether no event can ever happen.
+    """
+
+    def __init__(
+        self, fleet: Fleet, units: UnitIndex, facility: Facility, *, event_free: bool
+    ) -> None:
+        from sdc_taichi.kernels.compiler.stage import CompiledStage
+
+        self._units, self._facility, self._event_free = units, facility, event_free
+        self._recirculates = fleet.models["inlet"] == "recirculation"
+        self._unit_design_m3s = fleet.unit_design_m3s
+        self._step = CompiledStage(lambda **x: facility.step(FacilityInputs(**x)), fleet.size)
+        self._removable = CompiledStage(
+            lambda **x: facility.removable_w(FacilityInputs(**x)), fleet.size
+        )
+
+    def removable_w(self, supply: Supply, surroundings: Surroundings) -> F64:
+        """Heat that the plant can take during a step, W, (B,)."""
+        known = {**vars(surroundings), **vars(supply)}
+        inputs = {name: known[name] for name in self._facility.plant_inputs}
+        return self._removable(**inputs)["heat_removed_w"]
+
+    def step(
+        self,
+        state: State,
+        commands: Commands,
+        surroundings: Surroundings,
+        supply: Supply,
+        air: HallSums,
+    ) -> dict[str, Any]:
+        """Everything that follows from the air of the halls, by the names of ``StepResult``.
+
+        Args:
+            state: State at the start of the step, with battery and heat held by the room.
+            commands: What the battery is to do.
+            surroundings: Weather, carbon intensity, grid and what is out of order.
+            supply: How the CRAC units run.
+            air: Air, temperatures and power of the halls.
+        """
+        known = {
+            **vars(surroundings),
+            **vars(supply),
+            **vars(air),
+            **self._unit_sums(surroundings, supply, air),
+            "battery_command": commands.battery_command,
+            "stored_kwh": state.stored_kwh,
+            "room_heat_kwh": state.room_heat_kwh,
+        }
+        found = self._step(**{name: known[name] for name in self._facility.inputs})
+        warming_k = self._units.of_each(found.pop("supply_warming_k"))
+        found["unit_supply_c"] = supply.unit_setpoint_c + warming_k
+        found["unit_flow_m3s"] = air.unit_flow_m3s if self._recirculates else found["crac_flow_m3s"]
+        return found
+
+    def _unit_sums(
+        self, surroundings: Surroundings, supply: Supply, air: HallSums
+    ) -> dict[str, F64]:
+        """Sums over the CRAC units that the facility reads, see ``FacilityInputs``."""
+        units, flow_m3s, sums = self._units, air.unit_flow_m3s, {}
+        if self._recirculates:
+            cubed_m3s = self._unit_design_m3s * air.unit_cubed_speed
+            sums["cubed_flow_m3s"] = units.sum(cubed_m3s)
+            sums["setpoint_m3k_s"] = units.sum(flow_m3s * supply.unit_setpoint_c)
+        if not self._event_free:
+            running = surroundings.unit_running
+            idle_m3s = (1.0 - running) * flow_m3s
+            sums["no_unit_down"] = units.lowest(running)
+            sums["idle_flow_m3s"] = units.sum(idle_m3s)
+            sums["idle_setpoint_m3k_s"] = units.sum(idle_m3s * supply.unit_setpoint_c)
+        return sums

@@ -1,0 +1,93 @@
+"""What a step meets: weather, carbon intensity and demand, and what events do to the fleet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sdc_taichi.sim.events import Disturbance
+from sdc_taichi.sim.facility import Facility
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.unit_index import UnitIndex
+from sdc_taichi.types import F64, Exogenous
+
+
+@dataclass
+class Surroundings:
+    """What one step meets: B data centers, U CRAC units, R racks."""
+
+    outdoor_c: F64
+    """Dry-bulb temperature outside, in C, (B,)."""
+    wet_bulb_c: F64
+    """Wet-bulb temperature outside, in C, (B,)."""
+    ci_g_per_kwh: F64
+    """Carbon intensity of the grid, in g CO2 per kWh, (B,)."""
+    demand: F64
+    """Work that arrives as a share of capacity, 0..1, (B,)."""
+    grid_up: F64
+    """1 with grid, 0 in an outage, (B,)."""
+    powered: F64
+    """Share of the step that the data center has power, 0..1, (B,)."""
+    fully_powered: bool
+    """Whether all data centers have power throughout the step."""
+    chiller_share: F64
+    """What is left of the chiller's capacity, 0..1, (B,)."""
+    unit_running: F64
+    """1 for CRAC units that run, 0 for those that are down or without power, (U,)."""
+    all_running: bool
+    """Whether all CRAC units run."""
+    rack_airflow: F64 | None
+    """What is left of each rack's airflow, 0..1, (R,); None is all of it."""
+
+
+class SurroundingsModel:
+    """Puts together what a step meets.
+
+    Args:
+        fleet: B data centers.
+        units: Their CRAC units.
+        facility: Their batteries, which carry them through outages.
+    """
+
+    def __init__(self, fleet: Fleet, units: UnitIndex, facility: Facility) -> None:
+        self._units, self._facility = units, facility
+        self._ones, self._unit_ones = np.ones(fleet.size), np.ones(fleet.units)
+
+    def at(self, exogenous: Exogenous, event: Disturbance, stored_kwh: F64) -> Surroundings:
+        """Surroundings of one step.
+
+        Args:
+            exogenous: Weather, carbon intensity and demand of the step.
+            event: What events do to the step.
+            stored_kwh: Energy in the batteries at the start of the step, kWh, (B,).
+        """
+        if not event.active:
+            return Surroundings(
+                outdoor_c=exogenous.outdoor_c,
+                wet_bulb_c=exogenous.wet_bulb_c,
+                ci_g_per_kwh=exogenous.ci_g_per_kwh,
+                demand=exogenous.demand,
+                grid_up=self._ones.copy(),
+                powered=self._ones.copy(),
+                fully_powered=True,
+                chiller_share=self._ones,
+                unit_running=self._unit_ones.copy(),
+                all_running=True,
+                rack_airflow=None,
+            )
+        powered = self._facility.powered_share(event.grid_up, stored_kwh)
+        running = event.unit_up & (self._units.of_each(powered) > 0)
+        return Surroundings(
+            outdoor_c=exogenous.outdoor_c + event.outdoor_offset_k,
+            wet_bulb_c=exogenous.wet_bulb_c + event.outdoor_offset_k,
+            ci_g_per_kwh=exogenous.ci_g_per_kwh,
+            demand=exogenous.demand,
+            grid_up=event.grid_up.astype(np.float64),
+            powered=powered,
+            fully_powered=bool(np.all(powered == 1.0)),
+            chiller_share=event.chiller_share,
+            unit_running=running.astype(np.float64),
+            all_running=bool(np.all(running)),
+            rack_airflow=event.rack_airflow,
+        )
