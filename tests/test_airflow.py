@@ -110,7 +110,7 @@ def test_given_flows_balance(returns: str) -> None:
     flow = np.linspace(1.0, 2.0, 6)
     grid = build_grid(config.hall, flow, 7.0, 0.6)
     for runs in (grid.fronts, grid.backs):
-        np.testing.assert_allclose(np.add.reduceat(runs.m3s, runs.start[:-1]), flow)
+        np.testing.assert_allclose(np.add.reduceat(runs.m3s, runs.face_offsets[:-1]), flow)
     assert grid.supply_m3s.sum() == pytest.approx(7.0)
     assert grid.return_m3s.sum() == pytest.approx(7.0)
     assert abs(grid.boundary_m3s.sum()) < 1e-12
@@ -215,13 +215,13 @@ def test_kernels_solve_what_a_dense_solver_solves() -> None:
 
     entering = np.zeros((n, 3))
     for rack in range(2):
-        run = slice(grid.backs.start[rack], grid.backs.start[rack + 1])
+        run = slice(grid.backs.face_offsets[rack], grid.backs.face_offsets[rack + 1])
         np.add.at(entering[:, rack], grid.backs.cell[run], grid.backs.m3s[run])
     np.add.at(entering[:, 2], grid.supply_cell, grid.supply_m3s)
     tags = np.linalg.solve(transport, entering)
     intake = np.zeros((2, n))
     for rack in range(2):
-        run = slice(grid.fronts.start[rack], grid.fronts.start[rack + 1])
+        run = slice(grid.fronts.face_offsets[rack], grid.fronts.face_offsets[rack + 1])
         np.add.at(intake[rack], grid.fronts.cell[run], grid.fronts.m3s[run] / flow[rack])
     np.testing.assert_allclose(found.R, (intake @ tags)[:, :2], rtol=1e-9)
     np.testing.assert_allclose(found.supply_share, (intake @ tags)[:, 2], rtol=1e-9)

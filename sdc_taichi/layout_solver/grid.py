@@ -14,9 +14,11 @@ from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan
 from sdc_taichi.types import F64, I32
 
 MOST_CELLS = 4_000_000
-"""About 2 GB on two threads."""
+"""Most cells of a grid, solids included: about 2 GB on two threads."""
 CELL_RANGE_M = (0.05, 2.0)
+"""Least and largest length of a cell, in m."""
 DEFAULT_CELL_M = 0.3
+"""Length of a cell unless another is asked for, in m."""
 LEAST_LEAK = 1e-3
 """Share of its free area that containment always leaves open: gaps, and a flow that must balance
 even where racks draw more than their closed aisle is given."""
@@ -25,44 +27,56 @@ _EDGE = (0.25, 0.5)
 """Cells at the edges of racks, in cells: potential flow is singular there."""
 _CELL_HEIGHT = 0.5
 """Height of a cell over its length: halls are flat, and aisles are stratified."""
-_AROUND = ((-1, 0, 0), (0, -1, 0), (0, 0, -1), (1, 0, 0), (0, 1, 0), (0, 0, 1))
 _WEST, _FRONT, _FLOOR, _EAST, _BACK, _CEILING = range(6)
 
 
 @dataclass(frozen=True, slots=True)
-class Runs:
-    """Faces of racks: the cells before them and the flow through each, rack by rack."""
+class RackFaces:
+    """Cell faces at one side of R racks, rack by rack."""
 
-    start: I32
-    """(R + 1,)."""
+    face_offsets: I32
+    """First face of each rack, and the number of faces, (R + 1,)."""
     cell: I32
+    """Cell of air before each face, (faces,)."""
     m3s: F64
+    """Airflow through each face, in m3/s, (faces,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """N cells of air. Arrays have a last entry for no cell, where all is 0 and areas are 1."""
+    """N cells of air.
+
+    Arrays over cells have a last entry for no cell, where areas are 1 and all else is 0. The faces
+    of a cell are those to the west (smaller x), front (smaller y), floor, east, back and ceiling.
+    """
 
     widths_m: tuple[F64, F64, F64]
-    """Cells along the rows, across them, and from the floor up; solid ones included."""
+    """Widths of the cells along the rows, across them, and from the floor up, in m, those of solid
+    cells included."""
     beyond: I32
     """Cell beyond each face, N if none, (N + 1, 6)."""
     conductance_m: F64
-    """Free area over the distance of the centres, (N + 1, 6)."""
+    """Free area of each face over the distance of the centres, in m, (N + 1, 6)."""
     boundary_m3s: F64
-    """Flow that leaves the hall through a face, (N + 1, 6)."""
+    """Flow that leaves the hall through each face, in m3/s, (N + 1, 6)."""
     area_m2: F64
-    """Of the faces across each axis, (N + 1, 3)."""
-    fronts: Runs
-    backs: Runs
+    """Area of the faces across each axis, in m2, (N + 1, 3)."""
+    fronts: RackFaces
+    """Inlet faces of the racks."""
+    backs: RackFaces
+    """Exhaust faces of the racks."""
     supply_cell: I32
+    """Cells above floor tiles, (tile cells,)."""
     supply_m3s: F64
+    """Supply air into each cell above floor tiles, in m3/s, (tile cells,)."""
     return_cell: I32
+    """Cells before returns, (return cells,)."""
     return_m3s: F64
+    """Return air out of each cell before returns, in m3/s, (return cells,)."""
 
     @property
     def cells(self) -> int:
-        """Cells that hold air."""
+        """Number of cells that hold air."""
         return len(self.beyond) - 1
 
 
@@ -75,10 +89,52 @@ def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: fl
     in the end walls it leaves evenly above the height of the racks.
 
     Args:
-        hall: shape of the hall.
-        airflow_m3s: of each rack, (R,).
-        supply_m3s: of all floor tiles.
-        cell_m: longest cell.
+        hall: Shape of the hall.
+        airflow_m3s: Airflow of each rack, m3/s, (R,).
+        supply_m3s: Airflow of all floor tiles together, m3/s.
+        cell_m: Longest cell, m.
+
+    Raises:
+        ConfigError: a cell length out of range, or more cells than memory is made for.
+    """
+    plan = floor_plan(hall)
+    cuts = _cut_hall(hall, plan, cell_m)
+    beyond, conductance, area = _links(cuts, hall)
+    boundary = np.zeros((cuts.cells + 1, 6))
+    fronts, backs = _place_racks(boundary, cuts, hall, plan, airflow_m3s)
+    supply, returns = _place_tiles_and_returns(boundary, cuts, hall, airflow_m3s, supply_m3s)
+    return Grid(
+        cuts.widths_m, beyond, conductance, boundary, area, fronts, backs, *supply, *returns
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Cuts:
+    """A hall cut into X x Y x Z cells, those of the racks solid."""
+
+    widths_m: tuple[F64, F64, F64]
+    """Widths of the cells along the rows, across them, and from the floor up, in m."""
+    place_of_x: I32
+    """Place in its row of the racks at each x, (X,); -1 or racks per row in the end margins."""
+    strip_of_y: I32
+    """Strip at each y, aisles (even) and rows (odd) in turn, (Y,)."""
+    low: npt.NDArray[np.bool_]
+    """Whether each z is below the top of the racks, (Z,)."""
+    beside: npt.NDArray[np.bool_]
+    """Whether each x lies between the row ends, (X,)."""
+    number: I32
+    """Number of each cell of air, and the count of them for solid cells, (X, Y, Z)."""
+    cells: int
+    """Number of cells of air."""
+
+    @property
+    def aisle_of_y(self) -> I32:
+        """Aisle at each y, (Y,); -1 in rows. Odd aisles are cold."""
+        return np.where(self.strip_of_y % 2 == 0, self.strip_of_y // 2, -1)
+
+
+def _cut_hall(hall: HallConfig, plan: FloorPlan, cell_m: float) -> _Cuts:
+    """Cut the measures of a hall into cells and number those of air.
 
     Raises:
         ConfigError: a cell length out of range, or more cells than memory is made for.
@@ -89,11 +145,10 @@ def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: fl
     measures = hall.layout
     margin, pitch = measures.end_margin_m, measures.rack_pitch_m
     along = [margin, *[pitch] * hall.racks_per_row, margin]
-    plan = floor_plan(hall)
     across = _strips_m(plan, hall)
     up = [measures.rack_height_m, measures.ceiling_m - measures.rack_height_m]
     ends = (0, hall.racks_per_row) if margin else ()
-    x, rack_of_x = _cut(along, cell_m, ends)
+    x, segment_of_x = _cut(along, cell_m, ends)
     y, strip_of_y = _cut(across, cell_m, range(len(across) - 1))
     z, level = _cut(up, cell_m * _CELL_HEIGHT, (0,))
     boxes = len(x) * len(y) * len(z)
@@ -103,62 +158,84 @@ def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: fl
             f"{measures.ceiling_m:.4g} m makes {boxes:,} cells; valid is at most {MOST_CELLS:,}, "
             "with longer cells"
         )
-    rack_of_x -= 1
-    beside = (rack_of_x >= 0) & (rack_of_x < hall.racks_per_row)
-    aisle_of_y = np.where(strip_of_y % 2 == 0, strip_of_y // 2, -1)
-    low = level == 0
-
-    air = ~(beside[:, None, None] & (aisle_of_y < 0)[None, :, None] & low)
+    place_of_x = segment_of_x - 1
+    beside = (place_of_x >= 0) & (place_of_x < hall.racks_per_row)
+    low, in_row = level == 0, strip_of_y % 2 == 1
+    air = ~(beside[:, None, None] & in_row[None, :, None] & low)
     cells = int(air.sum())
     number = np.full(air.shape, cells, np.int32)
     number[air] = np.arange(cells, dtype=np.int32)
-    in_cold = (aisle_of_y >= 0) & (aisle_of_y % 2 == 1)
-    cold = beside[:, None, None] & in_cold[None, :, None] & low
-    leak = max(1.0 - measures.containment, LEAST_LEAK)
-    beyond, conductance, area = _links((x, y, z), number, cells, cold, leak)
+    return _Cuts((x, y, z), place_of_x, strip_of_y, low, beside, number, cells)
 
-    boundary = np.zeros((cells + 1, 6))
+
+def _place_racks(
+    boundary: F64, cuts: _Cuts, hall: HallConfig, plan: FloorPlan, airflow_m3s: F64
+) -> tuple[RackFaces, RackFaces]:
+    """Let the air of the racks through their faces; gives inlet and exhaust faces.
+
+    Args:
+        boundary: Flow that leaves the hall through each face, m3/s, (N + 1, 6); added to.
+        cuts: Cells of the hall.
+        hall: Gives the racks per row.
+        plan: Gives where racks face.
+        airflow_m3s: Airflow of each rack, m3/s, (R,).
+    """
+    x, _, z = cuts.widths_m
+    number, low_z = cuts.number, np.flatnonzero(cuts.low)
     fronts, backs = [], []
     for rack, flow in enumerate(airflow_m3s):
         row, place = divmod(rack, hall.racks_per_row)
-        xs, ys = np.flatnonzero(rack_of_x == place), np.flatnonzero(strip_of_y == 2 * row + 1)
-        share = x[xs][:, None] * z[low]
+        xs = np.flatnonzero(cuts.place_of_x == place)
+        ys = np.flatnonzero(cuts.strip_of_y == 2 * row + 1)
+        share = x[xs][:, None] * z[cuts.low]
         m3s = (flow * share / share.sum()).ravel()
         after, before = ys[-1] + 1, ys[0] - 1
         forward = plan.facing[rack] > 0
         ahead, behind = (after, before) if forward else (before, after)
-        front = number[xs[:, None], ahead, np.flatnonzero(low)].ravel()
-        back = number[xs[:, None], behind, np.flatnonzero(low)].ravel()
+        front = number[xs[:, None], ahead, low_z].ravel()
+        back = number[xs[:, None], behind, low_z].ravel()
         boundary[front, _FRONT if forward else _BACK] += m3s
         boundary[back, _BACK if forward else _FRONT] -= m3s
         fronts.append((front, m3s))
         backs.append((back, m3s))
+    return _rack_faces(fronts), _rack_faces(backs)
 
+
+def _place_tiles_and_returns(
+    boundary: F64, cuts: _Cuts, hall: HallConfig, airflow_m3s: F64, supply_m3s: float
+) -> tuple[tuple[I32, F64], tuple[I32, F64]]:
+    """Let supply air in and return air out; gives cells and flows, in m3/s, of both.
+
+    Args:
+        boundary: Flow that leaves the hall through each face, m3/s, (N + 1, 6); added to.
+        cuts: Cells of the hall.
+        hall: Gives rows and where the returns are.
+        airflow_m3s: Airflow of each rack, m3/s, (R,).
+        supply_m3s: Airflow of all floor tiles together, m3/s.
+    """
+    x, y, z = cuts.widths_m
+    number, aisle_of_y = cuts.number, cuts.aisle_of_y
     row_m3s = airflow_m3s.reshape(hall.rows, -1).sum(axis=1)
     tiles = np.zeros((len(x), len(y)))
     grilles = np.zeros((len(x), len(y)))
     for aisle in range(hall.rows + 1):
         drawn = row_m3s[max(aisle - 1, 0) : aisle + 1].sum() / row_m3s.sum()
-        floor = np.where(beside, x, 0.0)[:, None] * np.where(aisle_of_y == aisle, y, 0.0)
+        floor = np.where(cuts.beside, x, 0.0)[:, None] * np.where(aisle_of_y == aisle, y, 0.0)
         into = tiles if aisle % 2 else grilles
         into += supply_m3s * drawn * floor / floor.sum()
-    supply = _place(boundary, number[:, :, 0], tiles, _FLOOR, -1.0)
-    if measures.returns == "ceiling":
-        returns = _place(boundary, number[:, :, -1], grilles, _CEILING, 1.0)
-    else:
-        wall = y[:, None] * np.where(low, 0.0, z)
-        wall *= supply_m3s / (2.0 * wall.sum())
-        west = _place(boundary, number[0], wall, _WEST, 1.0)
-        east = _place(boundary, number[-1], wall, _EAST, 1.0)
-        returns = (np.concatenate([west[0], east[0]]), np.concatenate([west[1], east[1]]))
-    return Grid(
-        (x, y, z), beyond, conductance, boundary, area, _runs(fronts), _runs(backs), *supply,
-        *returns,
-    )  # fmt: skip
+    supply = _open_faces(boundary, number[:, :, 0], tiles, _FLOOR, -1.0)
+    if hall.layout.returns == "ceiling":
+        return supply, _open_faces(boundary, number[:, :, -1], grilles, _CEILING, 1.0)
+    wall = y[:, None] * np.where(cuts.low, 0.0, z)
+    wall *= supply_m3s / (2.0 * wall.sum())
+    west_cell, west_m3s = _open_faces(boundary, number[0], wall, _WEST, 1.0)
+    east_cell, east_m3s = _open_faces(boundary, number[-1], wall, _EAST, 1.0)
+    returns = np.concatenate([west_cell, east_cell]), np.concatenate([west_m3s, east_m3s])
+    return supply, returns
 
 
 def _strips_m(plan: FloorPlan, hall: HallConfig) -> F64:
-    """Depths of aisles and rows in turn, across the hall."""
+    """Depths of aisles and rows in turn, across the hall, in m, (2 rows + 1,)."""
     row_y = plan.centre_m[:: hall.racks_per_row, 1]
     half = hall.layout.rack_depth_m / 2
     sides = np.stack([row_y - half, row_y + half], axis=1).ravel()
@@ -166,10 +243,14 @@ def _strips_m(plan: FloorPlan, hall: HallConfig) -> F64:
 
 
 def _cut(lengths_m: Iterable[float], cell_m: float, edges: Sequence[int]) -> tuple[F64, I32]:
-    """Widths of the cells of consecutive segments, and the segment of each.
+    """Widths of the cells of consecutive segments, in m, and the segment of each.
 
-    ``edges`` are the segments after which an edge of a rack lies. Each segment has two cells or
-    more, so that none hides a gradient.
+    Each segment has two cells or more, so that none hides a gradient.
+
+    Args:
+        lengths_m: Lengths of the segments, m.
+        cell_m: Longest cell, m.
+        edges: Segments after which an edge of a rack lies.
     """
     widths, owner = [], []
     for segment, length in enumerate(lengths_m):
@@ -185,23 +266,30 @@ def _cut(lengths_m: Iterable[float], cell_m: float, edges: Sequence[int]) -> tup
     return np.concatenate(widths), np.concatenate(owner)
 
 
-def _links(
-    widths_m: tuple[F64, F64, F64],
-    number: I32,
-    cells: int,
-    cold: npt.NDArray[np.bool_],
-    leak: float,
-) -> tuple[I32, F64, F64]:
-    """Neighbours, conductances and face areas of all cells."""
+def _links(cuts: _Cuts, hall: HallConfig) -> tuple[I32, F64, F64]:
+    """Cells beyond the faces, their conductances and the areas of all cells of air.
+
+    Containment closes the faces between the cold aisles below the top of the racks and the rest of
+    the hall, but for a leak.
+
+    Returns:
+        ``beyond``, ``conductance_m`` and ``area_m2`` of ``Grid``.
+    """
+    number, cells, aisle_of_y = cuts.number, cuts.cells, cuts.aisle_of_y
+    in_cold_aisle = (aisle_of_y >= 0) & (aisle_of_y % 2 == 1)
+    cold = cuts.beside[:, None, None] & in_cold_aisle[None, :, None] & cuts.low
+    leak = max(1.0 - hall.layout.containment, LEAST_LEAK)
     air = number < cells
-    shape = number.shape
     beyond = np.full((cells + 1, 6), cells, np.int32)
     conductance = np.zeros((cells + 1, 6))
     area = np.ones((cells + 1, 3))
-    size = [np.reshape(w, [-1 if a == b else 1 for b in range(3)]) for a, w in enumerate(widths_m)]
+    size = [
+        np.reshape(width, [-1 if a == b else 1 for b in range(3)])
+        for a, width in enumerate(cuts.widths_m)
+    ]
     for axis in range(3):
         first, second = size[(axis + 1) % 3], size[(axis + 2) % 3]
-        across = np.broadcast_to(first * second, shape)
+        across = np.broadcast_to(first * second, number.shape)
         area[:-1, axis] = across[air]
         below = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
         above = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
@@ -215,18 +303,27 @@ def _links(
     return beyond, conductance, area
 
 
-def _place(boundary: F64, numbers: I32, m3s: F64, face: int, sign: float) -> tuple[I32, F64]:
-    """Let air through the faces where ``m3s`` is positive; gives the cells and their flows."""
+def _open_faces(boundary: F64, numbers: I32, m3s: F64, face: int, sign: float) -> tuple[I32, F64]:
+    """Let air through the faces where ``m3s`` is positive; gives the cells and their flows.
+
+    Args:
+        boundary: Flow that leaves the hall through each face, m3/s, (N + 1, 6); added to.
+        numbers: Cells of a layer of the hall.
+        m3s: Flow through the face of each of them, m3/s.
+        face: Which of the six faces.
+        sign: 1 where the flow leaves the hall, -1 where it enters.
+    """
     there = m3s > 0
     cell, flow = numbers[there], m3s[there]
     boundary[cell, face] += sign * flow
     return cell, flow
 
 
-def _runs(faces: Sequence[tuple[I32, F64]]) -> Runs:
+def _rack_faces(faces: Sequence[tuple[I32, F64]]) -> RackFaces:
+    """Faces of all racks end to end, from cells and flows of each."""
     counts = [len(cell) for cell, _ in faces]
-    return Runs(
-        start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
+    return RackFaces(
+        face_offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
         cell=np.concatenate([cell for cell, _ in faces]),
         m3s=np.concatenate([m3s for _, m3s in faces]),
     )

@@ -20,14 +20,16 @@ from sdc_taichi.hall import air_metrics
 from sdc_taichi.hall.matrix_file import MOST_MATRIX_RACKS
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M, LEAST_LEAK, Grid, build_grid
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, I32
 
 MIXING_M = 0.3
-"""Eddy diffusivity over air speed: half a floor tile. It is what upwind differences add on cells of
-0.6 m, so that it bounds theirs at any finer one and results do not drift with the cell."""
+"""Eddy diffusivity over air speed, in m: half a floor tile. It is what upwind differences add on
+cells of 0.6 m, so that it bounds theirs at any finer one and results do not drift with the cell."""
 
 _TOLERANCE = 1e-13
+"""Residual of a linear system over its right side at which it counts as solved."""
 _MOST_ITERATIONS = 20_000
+"""Most iterations for one linear system."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,31 +37,40 @@ class LayoutSolution:
     """Air and temperatures of a hall of R racks at its design point."""
 
     R: F64
-    """Share of rack j's intake that is rack i's exhaust, (R, R)."""
+    """Share of each rack's intake (rows) that is each rack's exhaust (columns), (R, R)."""
     supply_share: F64
     """Share of each rack's intake that comes from the floor tiles, (R,)."""
     approach_k: F64
-    """Inlet over supply, (R,)."""
+    """Inlet of each rack over supply air, in K, (R,)."""
     supply_c: float
+    """Supply air, in C."""
     return_c: float
+    """Return air, in C."""
     shi: float
+    """Supply heat index, see ``air_metrics.shi``."""
     rhi: float
+    """Return heat index, see ``air_metrics.rhi``."""
     rti_pct: float
+    """Return temperature index, in %, see ``air_metrics.rti``."""
     rci_hi_pct: float
+    """Rack cooling index at the high end against the allowable range of the ASHRAE class, in %."""
     rci_lo_pct: float
-    """Indices as in ``air_metrics``; RCI against the allowable range of the ASHRAE class."""
+    """Rack cooling index at the low end against the allowable range of the ASHRAE class, in %."""
     mass_residual: float
-    """Sum over the cells of air that appears or vanishes, over supply."""
+    """Sum over the cells of air that appears or vanishes, over supply air."""
     share_residual: float
     """Largest departure of a row of R and its share of supply air from 1."""
     energy_residual: float
-    """Heat that leaves by the returns less IT power, over IT power; the larger of through R and of
-    the temperatures solved on the grid."""
+    """Heat that leaves by the returns less IT power, over IT power: the larger of that through R
+    and that of the temperatures solved on the grid."""
     direct_difference_k: float
-    """Largest difference of inlets through R and of those solved on the grid."""
+    """Largest difference of inlets through R and of those solved on the grid, in K."""
     cells: int
+    """Cells that hold air."""
     seconds: float
+    """Time that the solution took, in s."""
     provenance: dict[str, Any]
+    """Where the matrix comes from, for its file."""
 
 
 def solve(
@@ -80,12 +91,12 @@ def solve(
     grid in which air passes the racks.
 
     Args:
-        config: gives shape of the hall and properties of air.
-        airflow_m3s: of each rack, (R,).
-        power_w: IT power of each rack, (R,).
-        supply_m3s: of all CRAC units.
-        supply_c: supply air.
-        cell_m: longest cell.
+        config: Gives shape of the hall and properties of air.
+        airflow_m3s: Airflow of each rack, m3/s, (R,).
+        power_w: IT power of each rack, W, (R,).
+        supply_m3s: Airflow of all CRAC units together, m3/s.
+        supply_c: Supply air, C.
+        cell_m: Longest cell, m.
 
     Raises:
         ConfigError: values out of range, or too many cells or racks.
@@ -95,42 +106,29 @@ def solve(
     airflow_m3s, power_w = _checked(config, airflow_m3s, power_w, supply_m3s, supply_c)
     hall = config.hall
     grid = build_grid(hall, airflow_m3s, supply_m3s, cell_m)
-    system = _System(grid, airflow_m3s)
-    mass_residual = system.find_flow() / supply_m3s
-    R, supply_share, returned_m3s = system.tags()
+    air = _GridAir(grid, airflow_m3s)
+    mass_residual = air.find_flow() / supply_m3s
+    R, supply_share, returned_m3s = air.exhaust_shares()
 
-    air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
-    rise_k = power_w / (air * airflow_m3s)
+    air_j_per_m3_k = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
+    rise_k = power_w / (air_j_per_m3_k * airflow_m3s)
     approach_k: F64 = np.asarray(np.linalg.solve(np.eye(hall.racks) - R, R @ rise_k), np.float64)
-    outlet_k = approach_k + rise_k
-    direct_k, direct_returned = system.temperatures(rise_k)
-    returned = float(returned_m3s @ outlet_k)
+    returned_m3k_s = float(returned_m3s @ (approach_k + rise_k))
+    direct_k, direct_m3k_s = air.temperatures(rise_k)
     it_m3k_s = float(airflow_m3s @ rise_k)
-    return_c = supply_c + returned / supply_m3s
-    inlet_c = supply_c + approach_k
-    inlet = air_metrics.rise_m3k_s(airflow_m3s, inlet_c, supply_c)
-    outlet = air_metrics.rise_m3k_s(airflow_m3s, inlet_c + rise_k, supply_c)
-    mean_rise_k = air_metrics.it_rise_k(inlet, outlet, airflow_m3s.sum())
-    low_c, high_c = air_metrics.allowable_c(config.protection.ashrae_class)
-    racks = hall.racks
+    return_c = supply_c + returned_m3k_s / supply_m3s
     return LayoutSolution(
         R=R,
         supply_share=supply_share,
         approach_k=approach_k,
         supply_c=float(supply_c),
         return_c=return_c,
-        shi=float(air_metrics.shi(inlet, outlet)),
-        rhi=float(air_metrics.rhi(inlet, outlet)),
-        rti_pct=float(air_metrics.rti(return_c, supply_c, mean_rise_k)),
-        rci_hi_pct=float(
-            air_metrics.rci_hi(air_metrics.over_27_sum_k(inlet_c), racks, allowable_c=high_c)
-        ),
-        rci_lo_pct=float(
-            air_metrics.rci_lo(air_metrics.under_18_sum_k(inlet_c), racks, allowable_c=low_c)
-        ),
+        **_indices(config, airflow_m3s, supply_c, return_c, supply_c + approach_k, rise_k),
         mass_residual=mass_residual,
         share_residual=float(np.abs(R.sum(axis=1) + supply_share - 1.0).max()),
-        energy_residual=max(abs(returned / it_m3k_s - 1.0), abs(direct_returned / it_m3k_s - 1.0)),
+        energy_residual=max(
+            abs(m3k_s / it_m3k_s - 1.0) for m3k_s in (returned_m3k_s, direct_m3k_s)
+        ),
         direct_difference_k=float(np.abs(direct_k - approach_k).max()),
         cells=grid.cells,
         seconds=time.perf_counter() - begun,
@@ -138,8 +136,46 @@ def solve(
     )
 
 
-class _System:
-    """The kernels' arguments for one grid, in the order of the calls."""
+def _indices(
+    config: DataCenterConfig,
+    airflow_m3s: F64,
+    supply_c: float,
+    return_c: float,
+    inlet_c: F64,
+    rise_k: F64,
+) -> dict[str, float]:
+    """Indices of air management by their names in ``LayoutSolution``.
+
+    Args:
+        config: Gives the ASHRAE class.
+        airflow_m3s: Airflow of each rack, m3/s, (R,).
+        supply_c: Supply air, C.
+        return_c: Return air, C.
+        inlet_c: Inlet of each rack, C, (R,).
+        rise_k: Temperature rise through each rack, K, (R,).
+    """
+    inlet = air_metrics.rise_m3k_s(airflow_m3s, inlet_c, supply_c)
+    outlet = air_metrics.rise_m3k_s(airflow_m3s, inlet_c + rise_k, supply_c)
+    it_rise_k = air_metrics.it_rise_k(inlet, outlet, airflow_m3s.sum())
+    low_c, high_c = air_metrics.allowable_c(config.protection.ashrae_class)
+    over_k, under_k = air_metrics.over_27_sum_k(inlet_c), air_metrics.under_18_sum_k(inlet_c)
+    racks = len(inlet_c)
+    return {
+        "shi": float(air_metrics.shi(inlet, outlet)),
+        "rhi": float(air_metrics.rhi(inlet, outlet)),
+        "rti_pct": float(air_metrics.rti(return_c, supply_c, it_rise_k)),
+        "rci_hi_pct": float(air_metrics.rci_hi(over_k, racks, allowable_c=high_c)),
+        "rci_lo_pct": float(air_metrics.rci_lo(under_k, racks, allowable_c=low_c)),
+    }
+
+
+class _GridAir:
+    """Linear systems of one grid of N cells and R racks: the flow, its tags and its temperatures.
+
+    Args:
+        grid: Cells, faces and given flows.
+        airflow_m3s: Airflow of each rack, m3/s, (R,).
+    """
 
     def __init__(self, grid: Grid, airflow_m3s: F64) -> None:
         self._threads = runtime.ensure_started()
@@ -149,21 +185,26 @@ class _System:
         self._grid = grid
         self._racks = len(airflow_m3s)
         fronts = grid.fronts
-        self._front_share = fronts.m3s / np.repeat(airflow_m3s, np.diff(fronts.start))
+        self._front_share = fronts.m3s / np.repeat(airflow_m3s, np.diff(fronts.face_offsets))
+        # Coefficients of the transport of tags, see ``kernels.airflow``.
         self._off = np.zeros_like(grid.conductance_m)
         self._diagonal = np.zeros(grid.cells)
 
     def find_flow(self) -> float:
-        """Find the flow and the coefficients of the tags; gives what the cells lose, m3/s."""
+        """Solve the potential and set the coefficients of the tags.
+
+        Returns:
+            Sum over the cells of air that appears or vanishes, m3/s.
+        """
         grid = self._grid
         diagonal = grid.conductance_m[:-1].sum(axis=1)
         # All flows are given, so the level of the potential is free: the last cell fixes it.
         diagonal[-1] *= 2.0
         entering = -grid.boundary_m3s[:-1].sum(axis=1)
         cells = np.arange(grid.cells, dtype=np.int32)
-        start = np.array([0, grid.cells], np.int32)
-        found = self._solve(grid.conductance_m, diagonal, start, cells, entering, "potential")
-        imbalance = np.empty(grid.cells)
+        offsets = np.array([0, grid.cells], np.int32)
+        found = self._solve(grid.conductance_m, diagonal, offsets, cells, entering, "potential")
+        imbalance_m3s = np.empty(grid.cells)
         self._kernels.transport_kernel()(
             grid.beyond,
             grid.conductance_m,
@@ -172,31 +213,44 @@ class _System:
             MIXING_M,
             found.solution[0],
             np.zeros(grid.cells + 1),
-            imbalance,
+            imbalance_m3s,
             self._off,
             self._diagonal,
         )
-        return float(np.abs(imbalance).sum())
+        return float(np.abs(imbalance_m3s).sum())
 
-    def tags(self) -> tuple[F64, F64, F64]:
-        """R, share of supply air per rack, and flow of every rack's exhaust into the returns."""
+    def exhaust_shares(self) -> tuple[F64, F64, F64]:
+        """Solve one tag for the exhaust of each rack, and one for the supply air.
+
+        Returns:
+            R, (R, R), share of supply air in the intake of each rack, (R,), and flow of every
+            rack's exhaust into the returns, m3/s, (R,).
+        """
         grid, backs = self._grid, self._grid.backs
-        last = backs.start[-1] + len(grid.supply_cell)
-        start = np.append(backs.start, last).astype(np.int32)
+        end = backs.face_offsets[-1] + len(grid.supply_cell)
+        offsets = np.append(backs.face_offsets, end).astype(np.int32)
         cell = np.concatenate([backs.cell, grid.supply_cell])
         amount = np.concatenate([backs.m3s, grid.supply_m3s])
-        found = self._solve(self._off, self._diagonal, start, cell, amount, "tags")
+        found = self._solve(self._off, self._diagonal, offsets, cell, amount, "tags")
         # The exact shares are positive; the solver leaves zeros of either sign.
         shares = np.maximum(found.intake, 0.0)
         return shares[:, :-1].copy(), shares[:, -1].copy(), found.returned[:-1]
 
     def temperatures(self, rise_k: F64) -> tuple[F64, float]:
-        """Inlets over supply, (R,), and m3 K/s in the returns, with air passing the racks."""
+        """Solve the temperatures of a hall in which air passes the racks.
+
+        Args:
+            rise_k: Temperature rise through each rack, K, (R,).
+
+        Returns:
+            Inlets over supply air, K, (R,), and flow times temperature over supply air in the
+            returns, m3 K/s.
+        """
         backs = self._grid.backs
-        amount = backs.m3s * np.repeat(rise_k, np.diff(backs.start))
-        start = np.array([0, len(amount)], np.int32)
+        amount = backs.m3s * np.repeat(rise_k, np.diff(backs.face_offsets))
+        offsets = np.array([0, len(amount)], np.int32)
         found = self._solve(
-            self._off, self._diagonal, start, backs.cell, amount, "temperatures", coupled=True
+            self._off, self._diagonal, offsets, backs.cell, amount, "temperatures", coupled=True
         )
         return found.intake[:, 0], float(found.returned[0])
 
@@ -204,17 +258,31 @@ class _System:
         self,
         off: F64,
         diagonal: F64,
-        start: Any,
-        cell: Any,
-        amount: F64,
+        source_offsets: I32,
+        source_cell: I32,
+        source: F64,
         what: str,
         *,
         coupled: bool = False,
-    ) -> _Found:
+    ) -> _SystemSolution:
+        """Solve one linear system for each right side, see ``kernels.airflow.solve_kernel``.
+
+        Args:
+            off: Coefficients of the cells beyond the faces, (N + 1, 6).
+            diagonal: Coefficient of each cell, (N,).
+            source_offsets: First source of each right side, and the number of sources, (T + 1,).
+            source_cell: Cell of each source.
+            source: What each source adds to the right side of its cell.
+            what: Name of the right sides, for errors.
+            coupled: Whether the mean over the front of a rack enters the cells at its back.
+
+        Raises:
+            SdcError: a system that is not solved to the tolerance.
+        """
         grid, kernels = self._grid, self._kernels
-        tags = len(start) - 1
+        tags = len(source_offsets) - 1
         slices = min(self._threads, tags)
-        found = _Found(
+        found = _SystemSolution(
             solution=np.zeros((1, grid.cells + 1)),
             intake=np.empty((self._racks, tags)),
             returned=np.empty(tags),
@@ -230,13 +298,13 @@ class _System:
             grid.beyond,
             off,
             diagonal,
-            start,
-            cell,
-            amount,
-            grid.fronts.start,
+            source_offsets,
+            source_cell,
+            source,
+            grid.fronts.face_offsets,
             grid.fronts.cell,
             self._front_share,
-            grid.backs.start,
+            grid.backs.face_offsets,
             grid.backs.cell,
             grid.backs.m3s,
             grid.return_cell,
@@ -259,18 +327,21 @@ class _System:
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _SystemSolution:
+    """Solution of linear systems for T right sides, in the unit of their sources per flow."""
+
     solution: F64
-    """Of a single tag, (1, N + 1)."""
+    """Values of the cells, (1, N + 1), filled where T is 1."""
     intake: F64
-    """Mean over the front of each rack, (R, tags)."""
+    """Mean value over the front of each rack, (R, T)."""
     returned: F64
-    """Flow into the returns, (tags,)."""
+    """Flow times value into the returns, (T,)."""
 
 
 def _checked(
     config: DataCenterConfig, airflow_m3s: F64, power_w: F64, supply_m3s: float, supply_c: float
 ) -> tuple[F64, F64]:
+    """Airflow and power of the racks as arrays, (R,), once all arguments of ``solve`` are valid."""
     racks = config.hall.racks
     if racks > MOST_MATRIX_RACKS:
         raise ConfigError(
@@ -287,6 +358,7 @@ def _checked(
 
 
 def _per_rack(name: str, given: F64, racks: int) -> F64:
+    """Values of the racks, (R,), if they are finite numbers above 0."""
     values: F64 = np.ascontiguousarray(given, dtype=np.float64)
     if values.shape != (racks,):
         raise ConfigError(f"{name} has shape {values.shape}, expected ({racks},)")
