@@ -54,7 +54,7 @@ def measure(n_dcs: int, racks: int, servers: int, repeats: int) -> dict[str, flo
     hall = Hall(fleet, "f32")
     off = np.random.default_rng(0).uniform(-0.1, 0.1, fleet.racks)
     uneven = replace(alike, rack_load=np.clip(load[fleet.rack_dc] + off, 0.0, 1.0))
-    settled = hall.settle(alike)
+    settled = hall.steady_state(alike)
     none, ample = np.zeros(n_dcs), np.full(n_dcs, 1e12)
     coil = Coil(
         setpoint_c=alike.unit_supply_c,

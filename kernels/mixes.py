@@ -1,43 +1,52 @@
-"""The exhaust mixes before the racks: where they start, their exchange, and when they stand still.
+"""The exhaust mixes before the racks: their first guess, their exchange, and when sweeps may stop.
 
-Halls that keep every weight exchange after each sweep, which tells exactly what the next would
-move. Their next sweep starts from where the mixes go when the share ``kept`` of what they change by
-comes back from the racks for ever. In larger halls, whose exchange costs more than a sweep: the
-weights of a mix sum to 1, so it moves by no more than the exhausts have moved since the last
-exchange; where all of them moved alike, the mixes are shifted and nothing is exchanged. Steps on by
-k/(1 - k) of a move, of which k is kept, are those of Aitken (1926).
+The mix before rack j is T_mix,j = sum_i w_ji T_out,i. *Dense* halls, of up to 64 racks, keep every
+weight. In steady air they exchange after each sweep, which tells exactly how far the next sweep
+would move any mix; the next sweep starts from where the mixes go when the share k of their change,
+the feedback gain, comes back from the racks for ever: d + k/(1 - k) W d instead of d (the step of
+Aitken 1926). In *sparse* halls an exchange costs more than a sweep. Weights sum to 1, so a mix
+moves by no more than the exhausts have moved since the last exchange; where all of them moved
+alike, the mixes are shifted by as much and nothing is exchanged.
 """
 
 from typing import no_type_check
 
 import taichi as ti
 
+from .arguments import row_index
 from .compiler.functions import larger, smaller
-from .decay import doublings, gone_per, halved
-from .sums import keep_range
-from .thermal import (
+from .decay import halvings_for, phi1, power_of_half
+from .hall_arguments import (
+    DENSE_LANES,
+    DONE,
+    EXHAUST_PATTERNS,
     LANES,
+    MIX_PATTERNS,
     N_BLOCK_TERMS,
+    NOT_CONVERGED,
     PATTERNS,
+    RACK_STATE,
     RUN_BLOCKS,
     RUN_LANES,
-    SOURCES,
-    STATE,
+    RUNNING,
 )
+from .sums import store_change_range
 
+EXHAUST_ROW = row_index(RACK_STATE, "exhaust_c")
+"""Row of side 0 of the exhausts; side 1 is the next one."""
+MIX_INPUT_ROW = row_index(RACK_STATE, "mix_input_k")
 ALIKE = 0.25
 """Where the outlets' moves since the last exchange differ from their middle by less than this share
 of the tolerance, the mixes are shifted instead of exchanged; they err by no more than that, which
-leaves the sweeps room to settle within the tolerance."""
-EXPECTED_KEPT, SEEN_KEPT = 0.5, 0.75
-"""Most of a common deviation that a sweep may keep by expectation, and as the last one showed: the
-step that ends it at once is then at most 2 and 4 times the sweep's own. Bounds against overshoot
+leaves the sweeps room to converge within the tolerance."""
+MOST_GAIN_EXPECTED, MOST_GAIN_SEEN = 0.5, 0.75
+"""Highest feedback gain that is trusted, from the table and as the last sweep showed: the step that
+sums all feedback at once is then at most 2 and 4 times the sweep's own. Bounds against overshoot
 where the airflow curves bend; a sweep that takes no such step never overshoots."""
-SEEN_FROM = 32.0
-"""Moves of fewer tolerances than this are too coarse in f32 to tell what a sweep keeps."""
+GAIN_SEEN_FROM = 32.0
+"""Moves of fewer tolerances than this are too coarse in f32 to tell the feedback gain."""
 PLAIN_EVERY = 4
-"""One sweep of so many goes by what was exchanged alone, so that a wrong share cannot go on for
-ever."""
+"""One sweep in so many takes its own step alone, so that a wrong gain cannot go on for ever."""
 STILL_PER_S = 1.0 / 128.0
 """Fastest rate at which CRAC air stirs the air before racks that stand still, as without fans in
 the room; a power of two, exact in both precisions."""
@@ -45,10 +54,10 @@ the room; a power of two, exact in both precisions."""
 
 @ti.func
 @no_type_check
-def cubic(x):
+def catmull_rom(x):
     """Weights of four points for the place x between the inner two (Catmull and Rom 1974).
 
-    Racks loaded alike take fewer sweeps from here than from a straight line.
+    Racks loaded alike take fewer sweeps from a cubic than from a straight line.
     """
     return ti.Vector(
         [
@@ -62,217 +71,257 @@ def cubic(x):
 
 @ti.func
 @no_type_check
-def expect(hall: ti.template(), n):
-    """How much of each pattern to start from, and last ``kept``.
+def look_up_steady_state(hall: ti.template(), n):
+    """Amounts of the patterns in the steady state by the table, a vector, and the feedback gain.
 
     By the supply air of the first unit; that of the others is near enough to start from.
     """
     dc = hall.dcs[n]
-    rows, columns = dc.start_rows, hall.start_columns
-    y = (hall.units[dc.first_unit].supply_c - dc.start_low_c) * dc.start_per_k
+    rows, columns = dc.supply_rows, hall.load_columns
+    y = (hall.units[dc.first_unit].supply_c - dc.table_low_c) * dc.table_rows_per_k
     y = ti.min(ti.max(y, 0.0), ti.cast(rows - 1, ti.f64))
     x = ti.min(ti.max(dc.utilisation, 0.0), 1.0) * ti.cast(columns - 1, ti.f64)
     row = ti.min(ti.cast(y, ti.i32), rows - 2)
     column = ti.min(ti.cast(x, ti.i32), columns - 2)
-    of_rows, of_columns = cubic(y - row), cubic(x - column)
-    at = dc.start + row * (columns + 2) + column
-    start = hall.zeros
+    row_weights, column_weights = catmull_rom(y - row), catmull_rom(x - column)
+    at = dc.first_steady_state + row * (columns + 2) + column
+    amounts = hall.zeros
     for i in ti.static(range(4)):
         for j in ti.static(range(4)):
-            start += hall.starts[at + j] * ti.cast(of_rows[i] * of_columns[j], hall.real)
+            weight = ti.cast(row_weights[i] * column_weights[j], hall.real)
+            amounts += hall.steady_states[at + j] * weight
         at += columns + 2
-    dc.kept = ti.cast(start[PATTERNS], ti.f64)
-    return start
+    dc.feedback_gain = ti.cast(amounts[MIX_PATTERNS], ti.f64)
+    return amounts
 
 
 @ti.func
 @no_type_check
-def start_mix(hall: ti.template(), n, block_at, now: ti.template(), start):
-    """Mix before the racks of a block that a steady state is looked for from.
+def guess_mix(hall: ti.template(), n, block_at, sweep: ti.template(), amounts):
+    """First guess of the exhaust mix before the racks of a block, in C.
 
-    The patterns of halls that keep every weight are mixes. Those of others are of the mixes and of
-    what the racks give, which the next exchanges are held against.
+    In sparse halls also of the exhausts, which the next exchange is held against.
     """
     block, chunk_0 = hall.blocks[block_at], hall.dcs[n].first_chunk
-    pattern = hall.dcs[n].pattern
-    pattern += (block_at - hall.chunks[chunk_0].first_block) * PATTERNS
-    mix_c = hall.zeros + now.reference_c
-    if now.at_once:
-        for k in ti.static(range(PATTERNS)):
-            mix_c += hall.starts[pattern + k] * start[k]
+    pattern_at = hall.dcs[n].first_pattern
+    pattern_at += (block_at - hall.chunks[chunk_0].first_block) * PATTERNS
+    mix_c = hall.zeros + sweep.reference_c
+    if sweep.exchanges_after:
+        for k in ti.static(range(MIX_PATTERNS)):
+            mix_c += hall.steady_states[pattern_at + k] * amounts[k]
     else:
-        gives_c = mix_c
-        for k in ti.static(range(2)):
-            mix_c += hall.starts[pattern + k] * start[k]
-            gives_c += hall.starts[pattern + 2 + k] * start[k]
-        gives_c *= block.strength
-        hall.rack_store[STATE.exhaust_c + now.side, block_at] = gives_c
-        block.exchanged_c = mix_c
+        exhaust_c = mix_c
+        for k in ti.static(range(EXHAUST_PATTERNS)):
+            mix_c += hall.steady_states[pattern_at + k] * amounts[k]
+            exhaust_c += hall.steady_states[pattern_at + MIX_PATTERNS + k] * amounts[k]
+        exhaust_c *= block.strength
+        hall.rack_state[EXHAUST_ROW + sweep.side, block_at] = exhaust_c
+        block.unshifted_mix_c = mix_c
     return mix_c
 
 
 @ti.func
 @no_type_check
-def mixed_from(hall: ti.template(), at, first, count):
-    """Mixes before the racks of a block, or what they change by, from all racks of the hall."""
-    sums = ti.Vector([ti.cast(0.0, hall.real)] * (SOURCES * LANES))
+def dense_mix(hall: ti.template(), weight_at, source_at, count):
+    """Weights of a block of a dense hall times a row of all racks of the hall, a vector."""
+    sums = ti.Vector([ti.cast(0.0, hall.real)] * (DENSE_LANES * LANES))
     e = 0
     while e < count:
-        x = hall.rack_sources[first + e]
-        sums += hall.mix[at + e] * ti.Vector(
-            [x[i // LANES] for i in ti.static(range(SOURCES * LANES))]
+        x = hall.rack_state_by_4[source_at + e]
+        sums += hall.mix_weights[weight_at + e] * ti.Vector(
+            [x[i // LANES] for i in ti.static(range(DENSE_LANES * LANES))]
         )
-        e += hall.step
+        e += hall.one
     out = hall.zeros
     for i in range(LANES):
-        for source in ti.static(range(SOURCES)):
+        for source in ti.static(range(DENSE_LANES)):
             out[i] += sums[source * LANES + i]
     return out
 
 
 @ti.func
 @no_type_check
-def mixed_from_runs(hall: ti.template(), block_at, side):
-    """The same of halls that drop weights, by runs of neighbouring racks."""
+def sparse_mix(hall: ti.template(), block_at, side):
+    """Exhaust mix before the racks of a block of a sparse hall, by runs of neighbouring racks."""
     mix_c = hall.zeros
-    from_0 = (STATE.exhaust_c + side) * hall.rack_store.shape[1] // RUN_BLOCKS
+    source_0 = (EXHAUST_ROW + side) * hall.rack_state.shape[1] // RUN_BLOCKS
     lane = 0
     while lane < LANES:
         at = block_at * LANES + lane
         parts = ti.Vector([ti.cast(0.0, hall.real)] * RUN_LANES)
-        run = hall.run_start[at]
-        while run < hall.run_start[at + 1]:
-            x = from_0 + hall.runs[run].first
-            w = hall.runs[run].offset
+        run = hall.run_offsets[at]
+        while run < hall.run_offsets[at + 1]:
+            x = source_0 + hall.runs[run].first_source
+            w = hall.runs[run].first_weight
             end = w + hall.runs[run].length
             while w < end:
-                parts += hall.weights[w] * hall.run_sources[x]
-                w += hall.step
-                x += hall.step
-            run += hall.step
-        t = hall.real(0.0)
+                parts += hall.run_weights[w] * hall.rack_state_by_16[x]
+                w += hall.one
+                x += hall.one
+            run += hall.one
+        total = hall.real(0.0)
         for j in range(RUN_LANES):
-            t += parts[j]
-        mix_c[lane] = t
-        lane += hall.step
+            total += parts[j]
+        mix_c[lane] = total
+        lane += hall.one
     mix_c *= hall.blocks[block_at].norm
     return mix_c
 
 
 @ti.func
 @no_type_check
-def exchanged(hall: ti.template(), n, block_at, side):
-    """Mix before the racks of a block from what the racks gave in the sweep before."""
+def exchange_exhausts(hall: ti.template(), n, block_at, side):
+    """Exhaust mix before the racks of a block from the exhausts on a side, in C."""
     dc, mix_c = hall.dcs[n], hall.zeros
-    at_once = False
+    is_dense = False
     if ti.static(hall.transient):
-        if dc.mix >= 0:
-            at_once = True
+        if dc.first_mix_weight >= 0:
+            is_dense = True
             block_0 = hall.chunks[dc.first_chunk].first_block
-            n_sources = dc.racks + (SOURCES - 1)
-            n_sources //= SOURCES
-            first = (STATE.exhaust_c + side) * hall.rack_store.shape[1] + block_0
-            mix_c = mixed_from(
+            n_sources = dc.racks + (DENSE_LANES - 1)
+            n_sources //= DENSE_LANES
+            source_block = (EXHAUST_ROW + side) * hall.rack_state.shape[1] + block_0
+            mix_c = dense_mix(
                 hall,
-                dc.mix + (block_at - block_0) * n_sources,
-                first * (LANES // SOURCES),
+                dc.first_mix_weight + (block_at - block_0) * n_sources,
+                source_block * (LANES // DENSE_LANES),
                 n_sources,
             )
-    if not at_once:
-        mix_c = mixed_from_runs(hall, block_at, side)
+    if not is_dense:
+        mix_c = sparse_mix(hall, block_at, side)
     return mix_c
 
 
 @ti.func
 @no_type_check
-def next_mix(hall: ti.template(), n, block_at, now: ti.template(), start):
-    """Mix before the racks of a block in the present sweep."""
+def next_mix(hall: ti.template(), n, block_at, sweep: ti.template(), amounts):
+    """Exhaust mix before the racks of a block in the present sweep, in C."""
     block = hall.blocks[block_at]
-    mix_c = block.exchanged_c
-    if now.anew:
-        mix_c = exchanged(hall, n, block_at, now.side)
-        block.exchanged_c = mix_c
+    mix_c = block.unshifted_mix_c
+    if sweep.exchanges_before:
+        mix_c = exchange_exhausts(hall, n, block_at, sweep.side)
+        block.unshifted_mix_c = mix_c
     elif ti.static(not hall.transient):
-        if now.begins:
-            mix_c = start_mix(hall, n, block_at, now, start)
-    return mix_c + now.shift_k
+        if sweep.is_first:
+            mix_c = guess_mix(hall, n, block_at, sweep, amounts)
+    return mix_c + sweep.shift_k
 
 
 @ti.func
 @no_type_check
-def exchange_at_once(hall: ti.template(), n, chunk_at, again, reference_c):
-    """Mixes of a data center of one chunk that keeps every weight, in two passes.
+def store_exhaust(
+    hall: ti.template(),
+    block_at,
+    sweep: ti.template(),
+    mixed_c,
+    outlet_c,
+    changes: ti.template(),
+):
+    """Store what the racks of a block give to the mixes, and how far that has changed.
 
-    The first tells what the mixes change by if the racks answer no more. The other lets the
-    share ``kept`` of that come back from the racks again and again, now and then not; what
-    comes back is exchanged once and taken as alike from then on.
+    Of air that failing fans do not move the mix before the rack is left, so a rack gives the share
+    k of its outlet and 1 - k of its mix.
+    """
+    block = hall.blocks[block_at]
+    exhaust_c = mixed_c + block.fan_airflow * (outlet_c - mixed_c)
+    exhaust_c *= block.strength
+    hall.rack_state[EXHAUST_ROW + 1 - sweep.side, block_at] = exhaust_c
+    if sweep.exchanges_after:
+        block.mix_input_k = exhaust_c - block.strength * sweep.reference_c
+    else:
+        change_k = exhaust_c - hall.rack_state[EXHAUST_ROW + sweep.side, block_at]
+        change_k *= block.per_strength
+        is_rack, far_k = block.per_server > hall.real(0.0), hall.zeros + hall.real(1e30)
+        changes.least_k = smaller(ti.select(is_rack, change_k, far_k), changes.least_k)
+        changes.most_k = larger(ti.select(is_rack, change_k, hall.zeros - far_k), changes.most_k)
+
+
+@ti.func
+@no_type_check
+def exchange_dense(hall: ti.template(), n, chunk_at, reference_c):
+    """Exchange the exhausts of a dense hall: mixes of the next sweep, and how far they move."""
+    base_c, least_k, most_k = hall.zeros + reference_c, hall.zeros, hall.zeros
+    block_at = hall.chunks[chunk_at].first_block
+    while block_at < hall.chunks[chunk_at + 1].first_block:
+        block = hall.blocks[block_at]
+        mix_c = base_c + dense_mix_of_inputs(hall, n, block_at)
+        block.unshifted_mix_c = mix_c
+        change_k = mix_c - block.mixed_c
+        least_k = smaller(change_k, least_k)
+        most_k = larger(change_k, most_k)
+        block_at += hall.one
+    store_change_range(hall, chunk_at, least_k, most_k)
+
+
+@ti.func
+@no_type_check
+def dense_mix_of_inputs(hall: ti.template(), n, block_at):
+    """Weights of a block of a dense hall times ``mix_input_k`` of all its racks, in K."""
+    dc = hall.dcs[n]
+    block_0 = hall.chunks[dc.first_chunk].first_block
+    n_sources = (dc.racks + (DENSE_LANES - 1)) // DENSE_LANES
+    source_block = MIX_INPUT_ROW * hall.rack_state.shape[1] + block_0
+    return dense_mix(
+        hall,
+        dc.first_mix_weight + (block_at - block_0) * n_sources,
+        source_block * (LANES // DENSE_LANES),
+        n_sources,
+    )
+
+
+@ti.func
+@no_type_check
+def add_feedback(hall: ti.template(), n, chunk_at):
+    """Move the next mixes of a dense hall on by what comes back from the racks, k/(1 - k) W d.
+
+    What comes back is exchanged once and taken as alike from then on.
     """
     dc, chunk = hall.dcs[n], hall.chunks[chunk_at]
-    block_0, block_1 = chunk.first_block, hall.chunks[chunk_at + 1].first_block
-    n_sources = (dc.racks + (SOURCES - 1)) // SOURCES
-    base_c = hall.zeros
-    if again == 0:
-        base_c += reference_c
-    else:
-        kept = ti.min(dc.kept, EXPECTED_KEPT)
-        if dc.sweep % PLAIN_EVERY == 0:
-            kept = 0.0
-        back = ti.cast(kept / (1.0 - kept), hall.real)
-        block_at = block_0
-        while block_at < block_1:
-            block = hall.blocks[block_at]
-            move_k = block.exchanged_c - block.mixed_c
-            block.given_k = move_k * block.strength * back
-            block_at += hall.step
-    least_k = hall.zeros
-    most_k = least_k
-    first = (STATE.given_k * hall.rack_store.shape[1] + block_0) * (LANES // SOURCES)
-    block_at = block_0
-    while block_at < block_1:
+    gain = ti.min(dc.feedback_gain, MOST_GAIN_EXPECTED)
+    if dc.sweep % PLAIN_EVERY == 0:
+        gain = 0.0
+    all_feedback = ti.cast(gain / (1.0 - gain), hall.real)
+    block_at = chunk.first_block
+    while block_at < hall.chunks[chunk_at + 1].first_block:
         block = hall.blocks[block_at]
-        at = dc.mix + (block_at - block_0) * n_sources
-        if again > 0:
-            base_c = block.exchanged_c
-        mixed_c = base_c + mixed_from(hall, at, first, n_sources)
-        block.exchanged_c = mixed_c
-        move_k = mixed_c - block.mixed_c
-        least_k = smaller(move_k, least_k)
-        most_k = larger(move_k, most_k)
-        block_at += hall.step
-    if again == 0:
-        keep_range(hall, chunk_at, least_k, most_k)
+        change_k = block.unshifted_mix_c - block.mixed_c
+        block.mix_input_k = change_k * block.strength * all_feedback
+        block_at += hall.one
+    block_at = chunk.first_block
+    while block_at < hall.chunks[chunk_at + 1].first_block:
+        block = hall.blocks[block_at]
+        block.unshifted_mix_c = block.unshifted_mix_c + dense_mix_of_inputs(hall, n, block_at)
+        block_at += hall.one
 
 
 @ti.func
 @no_type_check
-def parcels_of(hall: ti.template(), n, chunk_at, servers: ti.template()):
-    """How the recirculated air before the racks of a chunk follows its mix in a substep.
+def parcel_model(hall: ti.template(), n, chunk_at, servers: ti.template()):
+    """Rates at which the recirculated air before the racks of a chunk follows its mix.
 
-    With the time constant of its share of the room air; before racks that take in none, the CRAC
-    air stirs it.
+    With the time constant of each rack's share of the room air; before racks that take in none, the
+    CRAC air stirs it.
     """
     dc = hall.dcs[n]
     parcel_j_per_k = dc.parcel_j_per_k
     step_s = ti.cast(hall.substep_s, hall.real)
     per_m3 = servers.air_j_per_m3_k / parcel_j_per_k
-    stirring_m3s = ti.cast(dc.stirring_m3s, hall.real)
-    still_per_s = ti.min(
-        hall.real(STILL_PER_S), servers.air_j_per_m3_k * stirring_m3s / parcel_j_per_k
-    )
+    crac_m3s = ti.cast(dc.crac_m3s_per_rack, hall.real)
+    still_per_s = ti.min(hall.real(STILL_PER_S), servers.air_j_per_m3_k * crac_m3s / parcel_j_per_k)
     captured_m3s = hall.zeros
     block_at = hall.chunks[chunk_at].first_block
     while block_at < hall.chunks[chunk_at + 1].first_block:
         captured_m3s = larger(hall.blocks[block_at].captured_m3s, captured_m3s)
-        block_at += hall.step
+        block_at += hall.one
     most_m3s = captured_m3s[0]
     for i in range(1, LANES):
         most_m3s = ti.select(captured_m3s[i] > most_m3s, captured_m3s[i], most_m3s)
-    times = doublings(hall, ti.max(most_m3s * per_m3, still_per_s) * step_s)
-    scale = halved(hall, times)
+    halvings = halvings_for(hall, ti.max(most_m3s * per_m3, still_per_s) * step_s)
+    scale = power_of_half(hall, halvings)
     return ti.Struct(
         per_m3=per_m3,
         still_per_s=hall.zeros + still_per_s,
-        times=times,
+        halvings=halvings,
         scale=scale,
         scaled_s=step_s * scale,
         w_per_k=parcel_j_per_k * (hall.real(1.0) / step_s),
@@ -281,71 +330,74 @@ def parcels_of(hall: ti.template(), n, chunk_at, servers: ti.template()):
 
 @ti.func
 @no_type_check
-def follow_mixes(
-    hall: ti.template(), n, chunk_at, block_terms_0, now: ti.template(), servers: ti.template()
+def advance_parcels(
+    hall: ti.template(), n, chunk_at, block_terms_0, sweep: ti.template(), servers: ti.template()
 ):
-    """Means of the air before the racks of a chunk over a substep, and the heat that warms it.
+    """Recirculated air before the racks of a chunk over a substep, and the heat that warms it.
 
-    Parcels of room air before the racks: air enters at the mix and leaves at their own temperature,
+    Air enters a parcel of room air at the mix and leaves at the parcel's temperature,
     C_parcel dT/dt = rho*cp*V_captured (T_mix - T).
     """
-    parcels = parcels_of(hall, n, chunk_at, servers)
+    parcels = parcel_model(hall, n, chunk_at, servers)
     block_at, terms_at = hall.chunks[chunk_at].first_block, block_terms_0
     while block_at < hall.chunks[chunk_at + 1].first_block:
         block, terms = hall.blocks[block_at], hall.block_terms[terms_at]
-        mix_c, was_c = next_mix(hall, n, block_at, now, hall.zeros), block.mixed_c
+        mix_c, before_c = next_mix(hall, n, block_at, sweep, hall.zeros), block.mixed_c
         x = larger(block.captured_m3s * parcels.per_m3, parcels.still_per_s) * parcels.scaled_s
-        gone = gone_per(hall, x, parcels.times)
-        change_k = (mix_c - was_c) * (x * gone)
+        phi = phi1(hall, x, parcels.halvings)
+        change_k = (mix_c - before_c) * (x * phi)
         ones = hall.zeros + hall.real(1.0)
         is_rack = ti.select(block.per_server > hall.real(0.0), ones, hall.zeros)
         terms.parcel_w = is_rack * change_k * parcels.w_per_k
-        terms.mixed_c = mix_c + (was_c - mix_c) * (gone * parcels.scale)
-        block.mixed_c = was_c + change_k
-        block_at += hall.step
+        terms.mixed_c = mix_c + (before_c - mix_c) * (phi * parcels.scale)
+        block.mixed_c = before_c + change_k
+        block_at += hall.one
         terms_at += N_BLOCK_TERMS
 
 
 @ti.func
 @no_type_check
-def judge_sweep(hall: ti.template(), n, supply_c, uncovered, more):
-    """Whether a data center in steady air is at its end; CRAC units must cover what they did."""
+def status_after_sweep(hall: ti.template(), n, supply_c, most_f_change, is_last):
+    """Status of a data center in steady air: DONE where another sweep would move no mix."""
     dc, total = hall.dcs[n], hall.chunks[hall.dcs[n].first_chunk]
-    least_k, most_k, shift_k = total.least_k, total.most_k, dc.shift_k
+    least_k, most_k, shift_k = total.least_change_k, total.most_change_k, dc.shift_k
     left_k = ti.max(most_k - shift_k, shift_k - least_k)
-    # The mixes cool or warm by less than what they lie above supply air.
-    above_k = ti.abs(total.given_c / ti.cast(dc.racks, ti.f64) - supply_c)
-    left_k = ti.max(left_k, uncovered * above_k)
-    ends = True
-    dc.active = 0
+    # A unit that covers less or more of the need moves the inlets by no more than what the outlets
+    # lie above supply air.
+    above_k = ti.abs(total.outlet_sum_c / ti.cast(dc.racks, ti.f64) - supply_c)
+    left_k = ti.max(left_k, most_f_change * above_k)
+    status = DONE
+    # Written as a negation, a NaN goes on.
     if not left_k <= hall.tolerance_k:
-        dc.active = 2 * more - 1
-        ends = more == 0
-    return ends
+        status = RUNNING
+        if is_last:
+            status = NOT_CONVERGED
+    return status
 
 
 @ti.func
 @no_type_check
-def shift_mixes(hall: ti.template(), n, sweep, exchanged_now, middle_k, apart):
-    """Shift of all mixes of a data center that drops weights, in its next sweep.
+def update_shift(hall: ti.template(), n, sweep, has_exchanged, change_k, exchanges):
+    """Common shift of the mixes of a sparse hall in its next sweep.
 
-    Most of what is left is the same for all racks and shrinks by a factor, so a sweep can go all
-    the way: as expected, or as the last sweep showed, now and then not.
+    Most of what is left is the same for all racks and shrinks by the feedback gain each sweep, so
+    the mixes go all the way at once: by the gain of the table, or the one that the last sweep
+    showed; every PLAIN_EVERY sweeps by the sweep's own step alone.
     """
     dc, shift_k = hall.dcs[n], hall.dcs[n].shift_k
-    moved_k = middle_k - dc.moved_k
-    kept = ti.min(dc.kept, EXPECTED_KEPT)
-    moved_far = ti.abs(dc.shifted_k) > SEEN_FROM * hall.tolerance_k
-    if sweep > 0 and not exchanged_now and moved_far:
-        kept = ti.max(moved_k / dc.shifted_k, 0.0)
-        kept = ti.min(kept, SEEN_KEPT)
+    moved_k = change_k - dc.last_change_k
+    gain = ti.min(dc.feedback_gain, MOST_GAIN_EXPECTED)
+    moved_far = ti.abs(dc.last_shift_k) > GAIN_SEEN_FROM * hall.tolerance_k
+    if sweep > 0 and not has_exchanged and moved_far:
+        gain = ti.max(moved_k / dc.last_shift_k, 0.0)
+        gain = ti.min(gain, MOST_GAIN_SEEN)
     if sweep % PLAIN_EVERY == PLAIN_EVERY - 1:
-        kept = 0.0
-    beyond_k = kept / (1.0 - kept) * (middle_k - shift_k)
-    next_k = middle_k + beyond_k
-    dc.shifted_k = next_k - shift_k
-    dc.moved_k = middle_k
-    if apart:
+        gain = 0.0
+    beyond_k = gain / (1.0 - gain) * (change_k - shift_k)
+    next_k = change_k + beyond_k
+    dc.last_shift_k = next_k - shift_k
+    dc.last_change_k = change_k
+    if exchanges:
         next_k = beyond_k
-        dc.moved_k = 0.0
+        dc.last_change_k = 0.0
     dc.shift_k = next_k

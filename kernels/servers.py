@@ -1,25 +1,44 @@
-"""Servers of a block of racks: what they draw, the air that they take in, and what leaves them.
+"""Servers of a block of racks: the air that they take in, what they draw, and what leaves them.
 
-CPU power max(idle, full*(slope*T + offset + shift*u)); airflow ratio
-y = clip(slope*T + offset + shift*u); fan power reference*(y/reference ratio)^exponent (Sun et al.
-2021; EnergyPlus ElectricEquipment:ITE:AirCooled), T at most the curve limit.
+Curves of a server with inlet T, at most the curve limit, and utilisation u (Sun et al. 2021;
+EnergyPlus ElectricEquipment:ITE:AirCooled): power without fans max(idle, full (slope T + offset +
+shift u)), airflow ratio y = clip(slope T + offset + shift u), fan power
+reference (y / reference ratio)^exponent. ``sdc_taichi/plant/servers.py`` has them in NumPy.
 """
 
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import taichi as ti
 
 from .compiler.functions import larger, smaller
-from .decay import doublings, gone_per, halved
-from .thermal import LANES, OF_GROUPS, OF_RACKS, OUTLETS
+from .decay import halvings_for, phi1, power_of_half
+from .hall_arguments import LANES, LOADS_PER_GROUP, LOADS_PER_RACK, OUTLETS
 
 OUTLET_OF_SERVERS, OUTLET_OF_RACKS = OUTLETS.index("server"), OUTLETS.index("rack")
 
 
+class _ReleasedOutlet(NamedTuple):
+    """Rack outlet fit of the released SustainDC, see ``rack_outlet``."""
+
+    factor: float = 1.918
+    """Factor of the rise, dimensionless."""
+    power_excess: float = 1.096 - 1.0
+    """Exponent of power less 1."""
+    divisor: float = 0.526
+    """Divisor of the rise, dimensionless."""
+    flow_excess: float = 0.824 - 1.0
+    """Exponent of airflow less 1."""
+    offset_k: float = -14.01
+    """What is added to the rise, in K."""
+
+
+RELEASED_OUTLET = _ReleasedOutlet()
+
+
 @ti.func
 @no_type_check
-def servers_of(hall: ti.template(), n):
-    """What the servers of a data center have in common."""
+def server_model(hall: ti.template(), n):
+    """Curves and coefficients that all servers of a data center have in common."""
     dc = hall.dcs[n]
     per_reference = hall.real(1.0) / dc.fan_reference_ratio
     exponent = dc.fan_exponent
@@ -42,19 +61,20 @@ def servers_of(hall: ti.template(), n):
         fan_low=hall.zeros + dc.fan_low,
         fan_high=hall.zeros + dc.fan_high,
         fan_exponent=exponent,
-        fan_w=dc.fan_reference_w * at_full,
+        fan_full_w=dc.fan_reference_w * at_full,
         full_m3s=dc.fan_full_m3s,
         curve_limit_c=hall.zeros + dc.curve_limit_c,
         air_j_per_m3_k=air_j_per_m3_k,
         per_air=hall.real(1.0) / air_j_per_m3_k,
-        taken_up_j_per_m3_k=dc.effectiveness * air_j_per_m3_k,
+        # Heat that the air takes up per airflow and difference of server and inlet temperature.
+        uptake_j_per_m3_k=dc.effectiveness * air_j_per_m3_k,
     )
 
 
 @ti.func
 @no_type_check
-def first_share_of(hall: ti.template(), n, block_at):
-    """Where the shares of the CRAC units in the supply air of a block of racks begin."""
+def first_share_at(hall: ti.template(), n, block_at):
+    """First entry in unit_shares of a block of racks; the units of its hall follow."""
     dc = hall.dcs[n]
     n_units = hall.dcs[n + 1].first_unit - dc.first_unit
     block_0 = hall.chunks[dc.first_chunk].first_block
@@ -63,87 +83,87 @@ def first_share_of(hall: ti.template(), n, block_at):
 
 @ti.func
 @no_type_check
-def air_before(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.template()):
-    """Air before the racks of a block.
+def intake_air(hall: ti.template(), n, block_at, mixed_c, fresh_ratio: ti.template()):
+    """Air that the racks of a block take in, from the exhaust mix before them, in C.
 
-    ``approach``: supply air plus the rack's approach temperature. ``recirculation``: of the intake
-    of a server the share 1 - f (1 - c) is the exhaust mix before its rack; c is its share at the
-    design point and f <= 1 how much of their need the CRAC units cover, which is in the row
-    ``fresh_ratio`` of theirs.
+    ``approach``: supply air plus the rack's approach temperature. ``recirculation``:
+    T_in = T_mix + (1 - r_j g) sum_k s_jk f_k (T_sup,k - T_mix); ``fresh_ratio`` is the row of the
+    units that holds f.
     """
     block, dc = hall.blocks[block_at], hall.dcs[n]
     unit_0 = dc.first_unit
-    cover, fresh_k, captured_share = hall.zeros, hall.zeros, hall.zeros
+    cover, fresh_k, exhaust_share = hall.zeros, hall.zeros, hall.zeros
     if ti.static(hall.recirculates):
-        captured_share = block.captured_share
-        n_units, share_0 = hall.dcs[n + 1].first_unit - unit_0, first_share_of(hall, n, block_at)
+        exhaust_share = block.exhaust_share
+        n_units, share_0 = hall.dcs[n + 1].first_unit - unit_0, first_share_at(hall, n, block_at)
         unit = 0
         while unit < n_units:
-            ratio = ti.cast(hall.unit_state[fresh_ratio, unit_0 + unit], hall.real)
-            part = hall.shares[share_0 + unit] * ratio
+            f = ti.cast(hall.unit_state[fresh_ratio, unit_0 + unit], hall.real)
+            part = hall.unit_shares[share_0 + unit] * f
             cover += part
             fresh_k += part * ti.cast(hall.units[unit_0 + unit].supply_c, hall.real)
-            unit += hall.step
+            unit += hall.one
         fresh_k = fresh_k - cover * mixed_c
     else:
         mixed_c = block.approach_k + ti.cast(hall.units[unit_0].supply_c, hall.real)
     return ti.Struct(
         mixed_c=mixed_c,
+        # sum_k s_jk f_k.
         cover=cover,
-        captured_share=captured_share,
-        # Of supply air over the mix.
+        exhaust_share=exhaust_share,
+        # sum_k s_jk f_k (T_sup,k - T_mix).
         fresh_k=fresh_k,
-        # Inlet of a server that takes in no exhaust, and colder by height.
+        # Inlet of a server that takes in no exhaust; height warms it by as much for each g.
         least_c=mixed_c + fresh_k,
-        per_height_k=captured_share * fresh_k,
+        per_height_k=exhaust_share * fresh_k,
     )
 
 
 @ti.func
 @no_type_check
-def racks_of(hall: ti.template(), servers: ti.template(), block_at):
-    """Load of the racks of a block, and what all servers of a rack have in common."""
+def rack_model(hall: ti.template(), servers: ti.template(), block_at):
+    """Load of the racks of a block, and factors that all servers of a rack have in common."""
     block, u = hall.blocks[block_at], servers.utilisation
-    if hall.loads_of == OF_RACKS:
+    if hall.load_level == LOADS_PER_RACK:
         u = block.load
-    elif hall.loads_of == OF_GROUPS:
+    elif hall.load_level == LOADS_PER_GROUP:
         u = hall.zeros
     first_group = ti.Vector([0] * LANES)
-    if hall.loads_of == OF_GROUPS:
+    if hall.load_level == LOADS_PER_GROUP:
         for i in range(LANES):
             first_group[i] = hall.places[block_at * LANES + i].first_group
     powered = block.powered
-    breath = block.airflow * powered
+    available_airflow = block.fan_airflow * powered
     return ti.Struct(
         # A group does u + deviation*u*(1 - u), which conserves the work of its rack and stays
         # within 0..1.
-        uneven=u * (hall.real(1.0) - u),
+        deviation_scale=u * (hall.real(1.0) - u),
         cpu_base=u * servers.cpu_shift + servers.cpu_offset,
         fan_base=u * servers.fan_shift + servers.fan_offset,
         per_server=block.per_server,
-        # Where loads are looked up, if they are given for each group.
+        # Place of the first group in group_load, where loads are given per group.
         first_group=first_group,
-        # What all groups have in common is multiplied with their sums.
+        # Factors of sums over the groups, see apply_rack_factors.
         powered=powered,
-        breath=breath,
-        per_speed_m3s=breath * servers.full_m3s,
-        per_speed_w=breath * servers.fan_w,
+        available_airflow=available_airflow,
+        full_m3s=available_airflow * servers.full_m3s,
+        full_fan_w=available_airflow * servers.fan_full_w,
     )
 
 
 @ti.func
 @no_type_check
-def inlet_of(hall: ti.template(), air: ti.template(), group):
-    """Inlet of a group of each rack."""
+def group_inlet(hall: ti.template(), air: ti.template(), group):
+    """Inlet of a group of each rack of a block, in C."""
     inlet_c = air.least_c + group.inlet_offset_k
     if ti.static(hall.recirculates):
-        inlet_c = air.least_c - group.height * air.per_height_k
+        inlet_c = air.least_c - group.height_factor * air.per_height_k
     return inlet_c
 
 
 @ti.func
 @no_type_check
-def of_group(
+def compute_group(
     hall: ti.template(),
     servers: ti.template(),
     racks: ti.template(),
@@ -151,157 +171,166 @@ def of_group(
     group,
     z,
 ):
-    """Inlet of group z of each rack; of a server CPU power, and fan speed and power as ratios."""
-    inlet_c = inlet_of(hall, air, group)
-    # Utilisation over that of the rack, where not given.
-    apart = group.load_deviation * racks.uneven
-    if hall.loads_of == OF_GROUPS:
+    """Inlet in C, power without fans in W, and airflow and fan power ratios of a server.
+
+    Of group z of each rack of a block. Powers and airflows are those of a rack that is on for the
+    whole step and whose fans are in order.
+    """
+    inlet_c = group_inlet(hall, air, group)
+    # Utilisation over that of the rack, or utilisation itself where given per group.
+    deviation = group.load_deviation * racks.deviation_scale
+    if hall.load_level == LOADS_PER_GROUP:
         for i in range(LANES):
             at = racks.first_group[i] + z
-            apart[i] = hall.group_load[ti.min(at, hall.group_load.shape[0] - 1)]
+            deviation[i] = hall.group_load[ti.min(at, hall.group_load.shape[0] - 1)]
     on_curve_c = smaller(inlet_c, servers.curve_limit_c)
-    ratio = on_curve_c * servers.cpu_slope + (apart * servers.cpu_shift + racks.cpu_base)
-    draws_w = larger(group.idle_w, group.full_w * ratio)
-    speed = on_curve_c * servers.fan_slope + (apart * servers.fan_shift + racks.fan_base)
-    speed = smaller(larger(speed, servers.fan_low), servers.fan_high)
-    fan_power = speed
+    cpu_ratio = on_curve_c * servers.cpu_slope + (deviation * servers.cpu_shift + racks.cpu_base)
+    cpu_w = larger(group.idle_w, group.full_w * cpu_ratio)
+    airflow = on_curve_c * servers.fan_slope + (deviation * servers.fan_shift + racks.fan_base)
+    airflow = smaller(larger(airflow, servers.fan_low), servers.fan_high)
+    fan_power = airflow
     if servers.fan_exponent == hall.real(3.0):
-        fan_power = speed * speed * speed
+        fan_power = airflow * airflow * airflow
     elif servers.fan_exponent != hall.real(1.0):
         # x^p as x exp((p - 1) log x), which is 0 where x is.
-        beyond_1 = servers.fan_exponent - hall.real(1.0)
-        fan_power = speed * hall.exp_of(hall.log_of(speed) * beyond_1)
-    return inlet_c, draws_w, speed, fan_power
+        excess = servers.fan_exponent - hall.real(1.0)
+        fan_power = airflow * hall.exp_of(hall.log_of(airflow) * excess)
+    return inlet_c, cpu_w, airflow, fan_power
 
 
 @ti.func
 @no_type_check
-def no_groups(hall: ti.template()):
-    """Sums that begin."""
+def zero_rack_sums(hall: ti.template()):
+    """Sums over the groups of each rack of a block, before the first group."""
     return ti.Struct(
         cpu_w=hall.zeros,
         fan_w=hall.zeros,
         flow_m3s=hall.zeros,
         inlet_c=hall.zeros,
         inlet_m3k_s=hall.zeros,
-        high_m3s=hall.zeros,
+        height_m3s=hall.zeros,
     )
 
 
 @ti.func
 @no_type_check
 def add_group(
-    hall: ti.template(), sums: ti.template(), group, count, inlet_c, draws_w, speed, fan_power
+    hall: ti.template(), sums: ti.template(), group, count, inlet_c, cpu_w, airflow, fan_power
 ):
-    """A group of so many servers to the sums of its rack."""
-    counted = count * speed
-    sums.cpu_w += count * draws_w
+    """Add ``count`` servers of a group to the sums of their racks, still without rack factors."""
+    counted = count * airflow
+    sums.cpu_w += count * cpu_w
     sums.fan_w += count * fan_power
     sums.flow_m3s += counted
     sums.inlet_c += count * inlet_c
     if ti.static(hall.recirculates):
-        sums.high_m3s += counted * group.height
+        sums.height_m3s += counted * group.height_factor
     else:
         sums.inlet_m3k_s += counted * inlet_c
 
 
 @ti.func
 @no_type_check
-def complete(hall: ti.template(), sums: ti.template(), racks: ti.template(), air: ti.template()):
-    """Multiply the sums with what all groups have in common; return what they take in of fresh air.
+def apply_rack_factors(
+    hall: ti.template(), sums: ti.template(), racks: ti.template(), air: ti.template()
+):
+    """Turn the sums into W, m3/s and m3 K/s; return the need of the racks for supply air, m3/s.
 
-    As if the CRAC units covered all of their need.
+    The need is what the servers would take in of supply air if the CRAC units covered all of it,
+    (1 - r_j) V_j.
     """
     sums.cpu_w *= racks.powered
-    sums.fan_w *= racks.per_speed_w
-    sums.flow_m3s *= racks.per_speed_m3s
+    sums.fan_w *= racks.full_fan_w
+    sums.flow_m3s *= racks.full_m3s
     sums.inlet_c *= racks.per_server
     fresh_m3s = hall.zeros
     if ti.static(hall.recirculates):
-        fresh_m3s = sums.flow_m3s - air.captured_share * (sums.high_m3s * racks.per_speed_m3s)
+        fresh_m3s = sums.flow_m3s - air.exhaust_share * (sums.height_m3s * racks.full_m3s)
         sums.inlet_m3k_s = air.mixed_c * sums.flow_m3s + air.fresh_k * fresh_m3s
     else:
-        sums.inlet_m3k_s *= racks.per_speed_m3s
+        sums.inlet_m3k_s *= racks.full_m3s
     return fresh_m3s
 
 
 @ti.func
 @no_type_check
 def rack_outlet(hall: ti.template(), servers: ti.template(), sums: ti.template(), per_flow):
-    """What leaves a rack by the models that know racks alone; not with recirculation.
+    """Outlet of racks by the models that know racks alone (inlet model approach), in C.
 
     ``rack``: T + P/(rho*cp*V). ``released``: the fit T + 1.918*P^1.096/(0.526*rho*cp*V^0.824) -
-    14.01 of the released SustainDC. Its exponents are given over 1: P^1.096 / V^0.824 is
-    P/V exp(0.096 log P + 0.176 log V), whose exponential is of small numbers and loses no digits.
+    14.01 of the released SustainDC. P^1.096 / V^0.824 is P/V exp(0.096 log P + 0.176 log V), whose
+    exponential is of small numbers and loses no digits.
     """
-    drawn_w = sums.cpu_w + sums.fan_w
-    outlet_c = sums.inlet_c + drawn_w * per_flow * servers.per_air
+    power_w = sums.cpu_w + sums.fan_w
+    outlet_c = sums.inlet_c + power_w * per_flow * servers.per_air
     if hall.outlet_model != OUTLET_OF_RACKS:
-        powers = hall.log_of(drawn_w) * hall.constants[1]
-        flows = hall.log_of(sums.flow_m3s) * hall.constants[3]
-        fit = drawn_w * per_flow * hall.exp_of(powers - flows)
-        per_fit = hall.constants[0] / (hall.constants[2] * servers.air_j_per_m3_k)
-        outlet_c = sums.inlet_c + fit * per_fit
-        outlet_c += hall.constants[4]
+        power_part = hall.log_of(power_w) * hall.real(RELEASED_OUTLET.power_excess)
+        flow_part = hall.log_of(sums.flow_m3s) * hall.real(RELEASED_OUTLET.flow_excess)
+        fit = power_w * per_flow * hall.exp_of(power_part - flow_part)
+        divisor = hall.real(RELEASED_OUTLET.divisor) * servers.air_j_per_m3_k
+        outlet_c = sums.inlet_c + fit * (hall.real(RELEASED_OUTLET.factor) / divisor)
+        outlet_c += hall.real(RELEASED_OUTLET.offset_k)
     return outlet_c
 
 
 @ti.func
 @no_type_check
-def warming_of(hall: ti.template(), n, servers: ti.template()):
-    """How the servers of a data center become warmer in a substep, C dT/dt = P - eps K (T - T_in).
+def warming_model(hall: ti.template(), n, servers: ti.template()):
+    """How the servers of a data center warm in a substep: C dT/dt = P - eps K (T - T_in).
 
     C is the heat capacity of a server, K = rho*cp*V that of its air, eps how much of the difference
-    the air takes up. By the exact exponential.
+    the air takes up. Solved by the exact exponential, T(t) - T(0) = phi1(x) (P/C t - x (T(0) -
+    T_in)) with x = eps K t / C.
     """
     dc, step_s = hall.dcs[n], ti.cast(hall.substep_s, hall.real)
     server_j_per_k = dc.server_j_per_k
-    k_per_w, times = step_s / server_j_per_k, 0
+    k_per_w, halvings = step_s / server_j_per_k, 0
     if ti.static(hall.transient):
-        most = dc.fan_high * servers.full_m3s * servers.taken_up_j_per_m3_k * k_per_w
-        times = doublings(hall, most)
-        k_per_w *= halved(hall, times)
+        most = dc.fan_high * servers.full_m3s * servers.uptake_j_per_m3_k * k_per_w
+        halvings = halvings_for(hall, most)
+        k_per_w *= power_of_half(hall, halvings)
     return ti.Struct(
-        times=times,
+        halvings=halvings,
         k_per_w=k_per_w,
-        per_speed=servers.full_m3s * servers.taken_up_j_per_m3_k * k_per_w,
+        # x of a server at full airflow.
+        per_airflow=servers.full_m3s * servers.uptake_j_per_m3_k * k_per_w,
         w_per_k=server_j_per_k * (hall.real(1.0) / step_s),
     )
 
 
 @ti.func
 @no_type_check
-def warm(
-    hall: ti.template(), warming: ti.template(), racks: ti.template(), at, inlet_c, draws_w, speed
+def warm_servers(
+    hall: ti.template(), warming: ti.template(), racks: ti.template(), at, inlet_c, cpu_w, airflow
 ):
-    """Servers of a group in a substep; return by how much they have become warmer."""
+    """Warm the servers of a group by a substep; return the change of their temperature, in K."""
     before_c = hall.server_c[at]
-    # Without air a server keeps what it draws.
-    x = speed * (racks.breath * warming.per_speed)
-    change_k = draws_w * (racks.powered * warming.k_per_w) - (before_c - inlet_c) * x
-    change_k *= gone_per(hall, x, warming.times)
+    # Without air a server keeps all of its power.
+    x = airflow * (racks.available_airflow * warming.per_airflow)
+    change_k = cpu_w * (racks.powered * warming.k_per_w) - (before_c - inlet_c) * x
+    change_k *= phi1(hall, x, warming.halvings)
     hall.server_c[at] = before_c + change_k
     return change_k
 
 
 @ti.func
 @no_type_check
-def take_over(hall: ti.template(), block_at):
-    """Temperatures of the servers of a block before the step."""
-    block, last = hall.blocks[block_at], hall.servers_before.shape[0] - 1
+def load_server_temperatures(hall: ti.template(), block_at):
+    """Temperatures of the servers of a block at the start of the step, to server_c."""
+    block, last = hall.blocks[block_at], hall.server_c_before.shape[0] - 1
     for z in range(block.groups):
         before_c = hall.zeros
         for i in range(LANES):
             group = hall.places[block_at * LANES + i].first_group + z
-            before_c[i] = hall.servers_before[ti.min(group, last)]
-        hall.server_c[block.place + z] = before_c
+            before_c[i] = hall.server_c_before[ti.min(group, last)]
+        hall.server_c[block.first_place + z] = before_c
 
 
 @ti.func
 @no_type_check
-def hand_over(hall: ti.template(), block_at, z, count, after_c):
-    """Temperatures of the servers of a group after the step."""
+def store_server_temperatures(hall: ti.template(), block_at, z, count, after_c):
+    """Temperatures of the servers of a group at the end of the step, to server_c_after."""
     for i in range(LANES):
         if count[i] > hall.real(0.0):
             group = hall.places[block_at * LANES + i].first_group + z
-            hall.servers_after[group] = after_c[i]
+            hall.server_c_after[group] = after_c[i]

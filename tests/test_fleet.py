@@ -20,7 +20,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.config import apply_overrides, config_from_dict
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
-from sdc_taichi.kernels.thermal import DC_ROWS, GROUP_ROWS
+from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
 from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.sim.hall_solver import Conditions, Hall
 
@@ -57,7 +57,7 @@ def test_offsets_of_a_ragged_fleet() -> None:
     assert fleet.per_dc_servers().tolist() == [12, 1, 18]
     assert np.bincount(fleet.server_rack()).tolist() == [3, 3, 3, 3, 1, 5, 6, 7]
     assert fleet.approach_k.tolist() == [5.3, 5.0, 4.0, 4.5, 6.0, 1.5, 2.0, 5.0]
-    row = dict(zip(GROUP_ROWS, np.concatenate(fleet.group_rows, axis=1), strict=False))
+    row = dict(zip(GROUP_INPUTS, np.concatenate(fleet.group_rows, axis=1), strict=False))
     assert row["count"].tolist() == np.diff(fleet.server_offsets).tolist()
     assert row["full_w"].tolist()[-3:] == [100, 200, 300]
     assert row["idle_w"].tolist()[-3:] == [10, 20, 30]
@@ -77,7 +77,7 @@ def test_parameters_of_each_data_center_reach_the_kernel() -> None:
               "servers.fan_full_airflow_m3s=0.04", "servers.fan_airflow_ratio_limits=null",
               "hall.air_density_kg_m3=1.1"),
     ]  # fmt: skip
-    row = dict(zip(DC_ROWS, build_fleet(configs).dcs, strict=True))
+    row = dict(zip(DC_COEFFICIENTS, build_fleet(configs).dcs, strict=True))
     np.testing.assert_allclose(row["cpu_slope_per_k"], 1 / 600)
     np.testing.assert_allclose(row["cpu_offset"], -1 / 60)
     np.testing.assert_allclose(row["cpu_shift"], 0.99)

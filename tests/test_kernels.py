@@ -20,7 +20,9 @@ import reference_twin
 from sdc_taichi import DataCenterConfig, RuntimeStateError, Simulator, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.errors import SdcError
-from sdc_taichi.sim.hall_solver import _SERIAL_GROUPS, Coil, Conditions, Hall, HallSums, Precision
+from sdc_taichi.kernels.compiler import runtime
+from sdc_taichi.sim.hall_solver import SERIAL_GROUPS, Coil, Conditions, Hall, HallSums, Precision
+from sdc_taichi.sim.hall_tables import build_hall_tables, build_rows_along_racks
 from sdc_taichi.types import F64, ServerLayers
 
 OUTLETS = ("server", "rack", "released")
@@ -333,7 +335,7 @@ def test_a_batch_for_all_threads_equals_small_ones_on_one(precision: Precision) 
     count, rng = 90, np.random.default_rng(8)
     supply_c, load = rng.uniform(15, 24, count), rng.uniform(0, 1, count)
     batch, layers = solve_servers([config] * count, supply_c, load, precision)
-    assert build_fleet([config] * count).groups > _SERIAL_GROUPS
+    assert build_fleet([config] * count).groups > SERIAL_GROUPS
     for i in (0, 41, count - 1):
         alone, own = solve_servers([config], supply_c[i : i + 1], load[i : i + 1], precision)
         assert results_equal(alone, part_of(batch, [config] * count, i)), i
@@ -365,7 +367,7 @@ def digest_of_large_halls() -> str:
     precisions: tuple[Precision, ...] = ("f32", "f64")
     for precision in precisions:
         hall = Hall(coupled, precision)
-        steady, state = hall.solve(met), hall.settle(met)
+        steady, state = hall.solve(met), hall.steady_state(met)
         for found in (steady, *hall.advance(met, state, coil, 900.0, 300.0)):
             for f in fields(found):
                 digest.update(np.ascontiguousarray(getattr(found, f.name)).tobytes())
@@ -421,7 +423,7 @@ def test_server_layers_need_a_solve() -> None:
     layers = hall.servers()
     assert layers.power_w.shape == (12,)
     assert hall.servers(into=layers) is layers
-    hall.forget()
+    hall.discard_last_step()
     with pytest.raises(RuntimeStateError, match="no step has been done yet"):
         hall.servers()
 
@@ -546,15 +548,8 @@ def test_layers_of_any_layout_agree_with_the_twin(
     assert np.array_equal(hall.group_inlets(), layers.inlet_c[first])
 
 
-def test_a_bound_kernel_takes_new_arrays_and_refuses_other_types() -> None:
+def test_results_stay_when_the_hall_is_solved_again() -> None:
     hall = Hall(build_fleet(load_config("tiny")), "f32")
-    bound, calls = hall._kernel, []
-
-    def kernel(*args: Any) -> None:
-        calls.append(list(args))
-        bound(*args)
-
-    hall._kernel = kernel  # type: ignore[assignment]
     met = Conditions(np.array([20.0]), np.array([0.5]))
     first = hall.solve(met)
     before = [getattr(first, f.name).copy() for f in fields(first)]
@@ -564,18 +559,6 @@ def test_a_bound_kernel_takes_new_arrays_and_refuses_other_types() -> None:
         for f, kept in zip(fields(first), before, strict=True)
     )
     assert results_equal(first, hall.solve(met))
-
-    at = next(i for i, given in enumerate(calls[0]) if given is hall._rack_blocks)
-    racks = hall._rack_blocks
-    wrong = (racks.astype(np.float64), racks[0], np.repeat(racks, 2, axis=2)[:, :, ::2])
-    unaligned = np.zeros(racks.size + 1, np.float32)
-    unaligned = unaligned[int(unaligned.ctypes.data % 32 == 0) :][: racks.size]
-    for value, match in (
-        *((value, "other type or order") for value in wrong),
-        (unaligned.reshape(racks.shape), "start at whole ones"),
-    ):
-        with pytest.raises(TypeError, match=match):
-            bound(*calls[0][:at], value, *calls[0][at + 1 :])
 
 
 def test_layers_that_were_handed_out_are_not_kept() -> None:
@@ -589,31 +572,15 @@ def test_layers_that_were_handed_out_are_not_kept() -> None:
         assert left() is None
 
 
-def test_copies_of_a_hall_share_the_tables_of_layers() -> None:
-    """They come with the first layers, and what was there before is let go."""
-    sizes = []
+def test_copies_of_a_hall_share_the_inputs_of_their_groups() -> None:
+    runtime.ensure_started()
+    lengths = []
     for count in (1, 3):
-        hall = Hall(build_fleet([load_config("tiny")] * count), "f32")
-        hall.solve(Conditions(np.full(count, 20.0), np.full(count, 0.5)))
-        alone, before = len(hall._tables), weakref.ref(hall._tables.base)
-        hall.servers()
-        gc.collect()
-        assert before() is None
-        assert alone < len(hall._tables)
-        sizes.append(len(hall._tables))
-    assert sizes[0] == sizes[1]
-
-
-def test_tables_that_those_with_layers_replace_are_let_go_by_every_kind_of_step() -> None:
-    """Transient halls begin with a steady step, which holds its arrays as well."""
-    config = load_config("corrected", ["simulation.thermal=transient"])
-    with Simulator(config) as sim:
-        sim.reset()
-        sim.step()
-        before = weakref.ref(sim._started().hall._tables.base)
-        sim.servers()
-        gc.collect()
-        assert before() is None
+        tables = build_hall_tables(build_fleet([load_config("tiny")] * count), np.float32, 1)
+        groups = tables.arrays["group_inputs"]
+        along, _ = build_rows_along_racks(groups, tables.arrays["block_ints"])
+        lengths.append((len(groups), len(along)))
+    assert lengths[0] == lengths[1]
 
 
 def test_layers_that_do_not_fit_are_refused() -> None:

@@ -272,10 +272,10 @@ def test_most_sweeps_start_where_they_end(overrides: list[str]) -> None:
     fleet, rng = build_fleet([config] * 300), np.random.default_rng(0)
     hall = Hall(fleet, "f32")
     hall.solve(Conditions(rng.uniform(16.0, 23.0, 300), rng.uniform(0.0, 1.0, 300)))
-    assert hall._control["sweep"].mean() < 1.6
+    assert hall.sweeps.mean() < 1.6
     # Setpoints move by whole kelvins, where the table has its entries.
     hall.solve(Conditions(rng.integers(16, 24, 300).astype(float), rng.integers(0, 65, 300) / 64))
-    assert hall._control["sweep"].max() == 1
+    assert hall.sweeps.max() == 1
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

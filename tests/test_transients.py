@@ -184,7 +184,7 @@ def test_substeps_converge_to_the_differential_equations(low: float) -> None:
         for u in (0.2, 0.9)
     )  # fmt: skip
     hall = Hall(fleet, "f64")
-    settled = hall.settle(before)
+    settled = hall.steady_state(before)
     part = parts([config], after)[0]
     capacity = config.servers.heat_capacity_kj_per_k * 1e3
     counts = np.diff(fleet.server_offsets)
@@ -222,7 +222,7 @@ def test_servers_follow_the_exact_exponential_in_any_number_of_substeps(
 ) -> None:
     config = breathing_supply_air()
     fleet, hall = build_fleet(config), Hall(build_fleet(config), precision)
-    settled = hall.settle(Conditions(np.array([20.0]), np.array([0.1])))
+    settled = hall.steady_state(Conditions(np.array([20.0]), np.array([0.1])))
     met = Conditions(np.array([20.0]), np.array([0.8]))
     coil = Coil(np.array([20.0]), np.zeros(1), np.ones(1), np.full(1, 1e9), np.zeros(1))
     ends = []
@@ -330,7 +330,7 @@ def test_an_uncooled_hall_warms_by_its_power_over_its_heat_capacity(precision: P
         20 * units, np.array([0.6]), unit_low=0.3 * units, unit_high=0.3 * units,
         unit_running=0 * units,
     )  # fmt: skip
-    state, room_j = hall.settle(replace(met, unit_low=units, unit_high=units)), np.zeros(1)
+    state, room_j = hall.steady_state(replace(met, unit_low=units, unit_high=units)), np.zeros(1)
     servers = fleet.per_dc_servers()
     coil = Coil(20 * units, room_j, 2e3 * servers, np.full(1, 1e9), np.full(1, 800.0))
     means = []
@@ -362,7 +362,7 @@ def test_constant_conditions_end_in_the_quasi_steady_state(precision: Precision,
     met = replace(met, unit_running=np.ones(fleet.units), rack_airflow=breath)
     expected = hall.solve(met)
     other = replace(met, utilisation=1.0 - met.utilisation, rack_load=None, group_load=None)
-    state = hall.settle(other)
+    state = hall.steady_state(other)
     coil = Coil(
         met.unit_supply_c, np.zeros(1), np.ones(1), np.full(1, 1e12), np.zeros(1)
     )  # fmt: skip
@@ -390,7 +390,7 @@ def test_settled_halls_stay_settled(precision: Precision, seed: int) -> None:
     met = replace(random_conditions(rng, configs), powered=None)
     met = replace(met, unit_running=np.ones(fleet.units))
     hall = Hall(fleet, precision)
-    state = hall.settle(met)
+    state = hall.steady_state(met)
     coil = Coil(
         met.unit_supply_c, np.zeros(fleet.size), np.ones(fleet.size),
         np.full(fleet.size, 1e12), np.zeros(fleet.size),
@@ -485,14 +485,14 @@ def test_a_transient_hall_of_a_batch_equals_itself_alone(precision: Precision, s
     fleet, met = build_fleet(configs), random_conditions(rng, configs)
     coil = random_coil(rng, fleet, met.unit_supply_c)
     batch = Hall(fleet, precision)
-    settled = batch.settle(replace(met, powered=None))
+    settled = batch.steady_state(replace(met, powered=None))
     together, after = batch.advance(met, settled, coil, 900.0, 60.0)
     layers = batch.servers()
     for i, (config, part) in enumerate(zip(configs, parts(configs, met), strict=True)):
         alone = Hall(build_fleet(config), precision)
         where = {"server_c": part.groups, "need_m3s": part.units, "following": part.units}
         own = own_conditions(met, configs, i)
-        start = alone.settle(replace(own, powered=None))
+        start = alone.steady_state(replace(own, powered=None))
         one = slice(i, i + 1)
         sums, end = alone.advance(
             own,

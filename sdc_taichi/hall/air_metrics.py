@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.kernels import thermal
+from sdc_taichi.kernels import hall_arguments
 from sdc_taichi.types import F64, Reals, Values, as_array
 
-RECOMMENDED_C = thermal.RECOMMENDED_C
+RECOMMENDED_C = hall_arguments.RECOMMENDED_C
 """Lowest and highest recommended inlet, in C (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
 ALLOWABLE_C = {"A1": (15.0, 32.0), "A2": (10.0, 35.0), "A3": (5.0, 40.0), "A4": (5.0, 45.0)}
 """Lowest and highest allowable inlet, in C, by class (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""

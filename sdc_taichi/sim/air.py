@@ -106,7 +106,7 @@ class TransientAir:
 
     def initial(self, supply: Supply, demand: F64) -> dict[str, Any]:
         """Steady temperatures under the given load; arguments as in ``SteadyAir.initial``."""
-        steady = self._hall.settle(
+        steady = self._hall.steady_state(
             Conditions(
                 unit_supply_c=supply.unit_setpoint_c,
                 utilisation=demand,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from operator import attrgetter
 from typing import Any
 
@@ -21,6 +21,8 @@ from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.hall.mix_weights import MixWeights
 from sdc_taichi.hall.rack_servers import rack_servers
 from sdc_taichi.hall.recirculation import calibrate
+from sdc_taichi.kernels.arguments import in_row_order
+from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
 from sdc_taichi.types import F64, I32
 
 MOST_ENTRIES = int(np.iinfo(np.int32).max)
@@ -87,10 +89,10 @@ class Fleet:
     """Mean inlet over supply of each rack, (R,): as given, within the limits of the config; with
     recirculation what the hall has at its design point."""
     group_rows: tuple[F64, ...]
-    """Rows GROUP_ROWS of the thermal kernel by data center, (6, its groups); equal halls share one
+    """Rows GROUP_INPUTS of the hall kernels by data center, (6, its groups); equal halls share one
     array."""
     dcs: F64
-    """Rows DC_ROWS of the thermal kernel, (18, B)."""
+    """Rows DC_COEFFICIENTS of the hall kernels, (18, B)."""
     unit_design_m3s: F64
     """Airflow of each CRAC unit at full speed, (U,)."""
     it_airflow_m3s: F64
@@ -389,40 +391,19 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         design = design_point(config, servers)
         unit_design_m3s = np.array([design.crac_flow_m3s])
     air_j_per_m3_k = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
-    dc = (
-        curves.cpu_slope_per_k,
-        curves.cpu_offset,
-        curves.cpu_shift,
-        curves.fan_slope_per_k,
-        curves.fan_offset,
-        curves.fan_shift,
-        curves.fan_low,
-        curves.fan_high,
-        curves.fan_reference_ratio,
-        curves.fan_exponent,
-        curves.fan_reference_w,
-        design.fan_full_airflow_m3s,
-        air_j_per_m3_k,
-        curves.curve_limit_c,
-        fresh_share,
-        config.servers.heat_capacity_kj_per_k * 1e3,
-        config.servers.heat_exchange_effectiveness,
-        air_j_per_m3_k * floor_plan(hall).air_m3 / hall.racks,
-    )
+    coefficients = asdict(curves) | {
+        "fan_full_m3s": design.fan_full_airflow_m3s,
+        "air_j_per_m3_k": air_j_per_m3_k,
+        "fresh_share": fresh_share,
+        "server_j_per_k": config.servers.heat_capacity_kj_per_k * 1e3,
+        "effectiveness": config.servers.heat_exchange_effectiveness,
+        "parcel_j_per_k": air_j_per_m3_k * floor_plan(hall).air_m3 / hall.racks,
+    }
     return _HallArrays(
         groups_per_rack=np.diff(servers.group_offsets),
-        groups=np.stack(
-            [
-                servers.count,
-                servers.full_w,
-                servers.idle_w,
-                servers.inlet_offset_k,
-                servers.load_deviation,
-                servers.height_factor,
-            ]
-        ),
+        groups=np.stack([getattr(servers, name) for name in GROUP_INPUTS]),
         approach_k=approach_k,
-        dc=np.array(dc),
+        dc=np.array(in_row_order(DC_COEFFICIENTS, coefficients)),
         unit_design_m3s=unit_design_m3s,
         it_airflow_m3s=float(design.airflow_m3s.sum()),
         air=air,

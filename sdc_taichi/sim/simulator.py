@@ -125,7 +125,7 @@ class Simulator:
                 "data centers"
             )
         stages = self._started()
-        stages.hall.forget()
+        stages.hall.discard_last_step()
         self._timeline = self._timeline.reseeded(seeds)
         self.drivers = replace(self.drivers, start=first.astype(np.int64))
         supply = stages.crac_units.initial_supply()
@@ -222,7 +222,7 @@ class Simulator:
         snapshot.check_origin(values, self.fingerprint())
         like = self.reset() if self._state is None else self._state
         state = snapshot.to_state(values, like)
-        stages.hall.forget()
+        stages.hall.discard_last_step()
         self._state = state
         self._timeline = self._timeline.reseeded(state.seed)
         self.drivers = replace(self.drivers, start=state.start)
@@ -311,7 +311,7 @@ def _make_stages(
 ) -> _Stages:
     hall, units = Hall(fleet, precision), UnitIndex(fleet)
     sizing = size(fleet, hall, drivers.design_outdoor_c, drivers.design_wet_bulb_c)
-    hall.forget()
+    hall.discard_last_step()
     allocation = WorkAllocation(fleet)
     models = Facility(fleet, sizing, event_free=event_free)
     facility = FacilityStage(fleet, units, models, event_free=event_free)

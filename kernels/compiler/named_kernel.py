@@ -1,0 +1,138 @@
+"""Kernels defined from a spec of their arguments, and called by name."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import taichi as ti
+
+from ..arguments import Argument
+from .functions import SLICE, reals
+from .launch import BoundKernel
+from .named_rows import NamedRows, shared
+from .source import define
+
+_SOURCE = """\
+@ti.kernel
+def {name}({parameters}):
+    ti.loop_config(serialize=serial)
+    for k in range(slices * {slice}):
+        if k % {slice} == 0:
+            hall = ti.static(share(zeros=ti.Vector([ti.cast(0.0, real)] * {lanes}), {named}))
+            run_slice(hall, k // {slice})
+"""
+"""A loop over slices, each of which runs on one thread. Taichi reads the parameters of a kernel
+from its source, so this source is filled in from the spec."""
+
+
+def define_kernel(
+    name: str,
+    arguments: Mapping[str, Argument],
+    run_slice: Callable[..., None],
+    *,
+    precision: str,
+    lanes: int,
+    constants: Mapping[str, Any],
+    views: Mapping[str, tuple[Mapping[str, str], str]],
+) -> Any:
+    """Taichi kernel with the arguments of a spec.
+
+    Args:
+        name: of the kernel.
+        arguments: spec of the arguments by name, those that are templates first; ``serial`` and
+            ``slices`` among them.
+        run_slice: Taichi function (hall, slice) that does the part of a slice. ``hall`` has as
+            attributes the arguments, the items whose rows they hold, constants and views, ``real``,
+            and ``zeros``, a vector of lanes.
+        precision: ``f32`` or ``f64``, the type of ``real`` arguments.
+        lanes: length of ``zeros``.
+        constants: values known when the kernel is compiled, by name.
+        views: by name, rows that are told by the place of the first in an array of one dimension,
+            and the name of that array.
+    """
+    real = reals(precision)
+
+    def share(zeros: Any, **values: Any) -> Any:
+        parts: dict[str, list[tuple[Any, Any]]] = {}
+        for name, argument in arguments.items():
+            if argument.of:
+                parts.setdefault(argument.of, []).append((tuple(argument.rows), values[name]))
+        items = {of: NamedRows(*rows) for of, rows in parts.items()}
+        items |= {
+            of: NamedRows((tuple(rows), values[name]), apart=1)
+            for of, (rows, name) in views.items()
+        }
+        return shared(real=real, zeros=zeros, **constants, **values, **items)
+
+    source = _SOURCE.format(
+        name=name,
+        parameters=", ".join(f"{name}: types[{name!r}]" for name in arguments),
+        named=", ".join(f"{name}={name}" for name in arguments),
+        slice=SLICE,
+        lanes=lanes,
+    )
+    scope = {
+        "real": real,
+        "run_slice": run_slice,
+        "share": share,
+        "ti": ti,
+        "types": {name: _type(argument, real) for name, argument in arguments.items()},
+        "__name__": __name__,
+    }
+    return define(name, source, f"<kernel {name} in {precision}>", scope)
+
+
+def _type(argument: Argument, real: Any) -> Any:
+    """Taichi's type of an argument."""
+    if argument.kind == "template":
+        return ti.template()
+    element = {"i32": ti.i32, "f64": ti.f64, "real": real}[argument.kind]
+    if argument.ndim == 0:
+        return element
+    if argument.lanes > 1:
+        element = ti.types.vector(argument.lanes, element)
+    return ti.types.ndarray(dtype=element, ndim=argument.ndim)
+
+
+class NamedKernel:
+    """A kernel called with its arguments by name, which stay until they are given again.
+
+    Args:
+        kernel: a kernel of ``define_kernel``.
+        arguments: the spec that it was defined from.
+    """
+
+    def __init__(self, kernel: Any, arguments: Mapping[str, Argument]) -> None:
+        templates = sum(argument.kind == "template" for argument in arguments.values())
+        self._launch = BoundKernel(kernel, templates)
+        self._values: dict[str, Any] = dict.fromkeys(arguments)
+        self._missing = set(arguments)
+
+    def bind(self, **values: Any) -> None:
+        """Set arguments for this and later calls.
+
+        Raises:
+            TypeError: a name that is no argument of the kernel.
+        """
+        if not values.keys() <= self._values.keys():
+            unknown = sorted(values.keys() - self._values.keys())
+            raise TypeError(f"kernel: unknown arguments {', '.join(unknown)}")
+        self._values.update(values)
+        self._missing -= values.keys()
+
+    def __call__(self, **values: Any) -> None:
+        """Run the kernel with these arguments, and those that were given before.
+
+        Raises:
+            TypeError: a name that is no argument, an argument that was never given, or an array
+                of another type, order or alignment than the spec says.
+        """
+        self.bind(**values)
+        if self._missing:
+            raise TypeError(f"kernel: missing arguments {', '.join(sorted(self._missing))}")
+        self._launch(*self._values.values())
+
+    def release(self, *names: str) -> None:
+        """Let go of arguments, which the next call has to give again."""
+        self._launch.release(*(self._values[name] for name in names))
+        self._values.update(dict.fromkeys(names))
+        self._missing.update(names)

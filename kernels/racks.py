@@ -1,0 +1,251 @@
+"""Racks of a block in one sweep: from the air before them to their rows and sums."""
+
+from typing import no_type_check
+
+import taichi as ti
+
+from .arguments import row_index
+from .compiler.functions import larger, smaller
+from .hall_arguments import LANES, RECOMMENDED_C, UNIT_STATE
+from .mixes import store_exhaust
+from .servers import (
+    OUTLET_OF_SERVERS,
+    add_group,
+    apply_rack_factors,
+    compute_group,
+    group_inlet,
+    intake_air,
+    load_server_temperatures,
+    rack_model,
+    rack_outlet,
+    store_server_temperatures,
+    warm_servers,
+    zero_rack_sums,
+)
+
+FRESH_RATIO = row_index(UNIT_STATE, "fresh_ratio")
+
+
+@ti.func
+@no_type_check
+def compute_groups(
+    hall: ti.template(),
+    block_at,
+    sweep: ti.template(),
+    servers: ti.template(),
+    warming: ti.template(),
+    racks: ti.template(),
+    air: ti.template(),
+    sums: ti.template(),
+    inlets: ti.template(),
+):
+    """Add the groups of a block to the sums of their racks; return the heat servers store, in W."""
+    block, thermal_storage_w = hall.blocks[block_at], hall.zeros
+    z, n_groups, first_row, first_place = 0, block.groups, block.first_row, block.first_place
+    while z < n_groups:
+        group = hall.groups[first_row + z]
+        count = group.count
+        inlet_c, cpu_w, airflow, fan_power = compute_group(hall, servers, racks, air, group, z)
+        if ti.static(hall.transient):
+            at = first_place + z
+            change_k = warm_servers(hall, warming, racks, at, inlet_c, cpu_w, airflow)
+            thermal_storage_w += count * change_k
+            if sweep.is_last:
+                store_server_temperatures(hall, block_at, z, count, hall.server_c[at])
+        add_group(hall, sums, group, count, inlet_c, cpu_w, airflow, fan_power)
+        add_inlet(hall, inlets, inlet_c)
+        z += hall.one
+    if ti.static(hall.transient):
+        thermal_storage_w *= warming.w_per_k
+    return thermal_storage_w
+
+
+@ti.func
+@no_type_check
+def compute_block(
+    hall: ti.template(),
+    n,
+    block_at,
+    terms_at,
+    block_terms_at,
+    sweep: ti.template(),
+    servers: ti.template(),
+    warming: ti.template(),
+    hottest: ti.template(),
+    changes: ti.template(),
+):
+    """Compute the racks of a block in a sweep: their rows, and the lanes of the chunk's TERMS."""
+    block, terms = hall.blocks[block_at], hall.terms[terms_at]
+    block_terms = hall.block_terms[block_terms_at]
+    mixed_c, parcel_w = hall.zeros, hall.zeros
+    if ti.static(hall.transient):
+        mixed_c, parcel_w = block_terms.mixed_c, block_terms.parcel_w
+        if sweep.is_first:
+            load_server_temperatures(hall, block_at)
+    elif ti.static(hall.recirculates):
+        mixed_c = block.mixed_c
+    air = intake_air(hall, n, block_at, mixed_c, FRESH_RATIO)
+    racks = rack_model(hall, servers, block_at)
+    sums, inlets = zero_rack_sums(hall), no_inlets(hall)
+    thermal_storage_w = compute_groups(
+        hall, block_at, sweep, servers, warming, racks, air, sums, inlets
+    )
+    fresh_m3s = apply_rack_factors(hall, sums, racks, air)
+    flow_m3s, mean_c = sums.flow_m3s, sums.inlet_c
+
+    # The exact mean: heat stored plus heat removed is heat generated.
+    heat_w = sums.cpu_w + sums.fan_w - thermal_storage_w
+    outlet_m3k_s = sums.inlet_m3k_s + heat_w * servers.per_air
+    per_flow = hall.real(1.0) / larger(flow_m3s, hall.zeros + hall.real(1e-30))
+    outlet_c = outlet_m3k_s * per_flow
+    if ti.static(not hall.recirculates):
+        if hall.outlet_model != OUTLET_OF_SERVERS:
+            outlet_c = rack_outlet(hall, servers, sums, per_flow)
+    outlet_c = ti.select(flow_m3s > hall.real(0.0), outlet_c, mean_c)
+    if ti.static(hall.recirculates):
+        mean_c = ti.select(flow_m3s > hall.real(0.0), sums.inlet_m3k_s * per_flow, mean_c)
+        captured_m3s = flow_m3s - air.cover * fresh_m3s
+        return_m3k_s = outlet_m3k_s - captured_m3s * air.mixed_c - parcel_w * servers.per_air
+        # `x = x + y`, since `x += y` would be atomic.
+        terms.return_m3k_s = terms.return_m3k_s + return_m3k_s
+        block.captured_m3s = captured_m3s
+        block_terms.fresh_m3s = fresh_m3s
+        store_exhaust(hall, block_at, sweep, air.mixed_c, outlet_c, changes)
+    else:
+        # SHI and RHI are those of the racks, by whatever model their outlets are.
+        sums.inlet_m3k_s = flow_m3s * mean_c
+        outlet_m3k_s = flow_m3s * outlet_c
+    terms.inlet_m3k_s = terms.inlet_m3k_s + sums.inlet_m3k_s
+    terms.outlet_m3k_s = terms.outlet_m3k_s + outlet_m3k_s
+    terms.flow_m3s = terms.flow_m3s + flow_m3s
+    add_degrees_out_of_range(hall, block_at, terms_at, racks, air, inlets)
+    if ti.static(hall.transient):
+        terms.thermal_storage_w = terms.thermal_storage_w + (thermal_storage_w + parcel_w)
+    else:
+        terms.outlet_sum_c = terms.outlet_sum_c + outlet_c
+
+    results = ti.Struct(
+        cpu_w=sums.cpu_w,
+        fan_w=sums.fan_w,
+        airflow_m3s=flow_m3s,
+        inlet_c=mean_c,
+        outlet_c=outlet_c,
+        inlet_max_c=update_hottest(hall, block_at, racks, inlets, hottest),
+    )
+    store_racks(hall, block_at, sweep, results)
+
+
+@ti.func
+@no_type_check
+def no_inlets(hall: ti.template()):
+    """Range of the inlets of each rack of a block, before the first of its groups."""
+    return ti.Struct(
+        min_c=hall.zeros + hall.real(1e30),
+        max_c=hall.zeros - hall.real(1e30),
+        # The group with the hottest inlet, and how many groups have been seen.
+        hottest_group=hall.zeros,
+        groups=hall.zeros,
+    )
+
+
+@ti.func
+@no_type_check
+def add_inlet(hall: ti.template(), inlets: ti.template(), inlet_c):
+    """Widen the range of the inlets of each rack by those of a group.
+
+    Groups without servers repeat another group of their rack, and so change nothing.
+    """
+    inlets.min_c = smaller(inlet_c, inlets.min_c)
+    inlets.hottest_group = ti.select(inlet_c > inlets.max_c, inlets.groups, inlets.hottest_group)
+    inlets.max_c = larger(inlet_c, inlets.max_c)
+    inlets.groups += hall.real(1.0)
+
+
+@ti.func
+@no_type_check
+def no_hottest(hall: ti.template()):
+    """Hottest inlet of each lane of a chunk, before the first of its blocks."""
+    return ti.Struct(
+        inlet_c=hall.zeros - hall.real(1e30), block=ti.Vector([0] * LANES), group=hall.zeros
+    )
+
+
+@ti.func
+@no_type_check
+def update_hottest(
+    hall: ti.template(),
+    block_at,
+    racks: ti.template(),
+    inlets: ti.template(),
+    hottest: ti.template(),
+):
+    """Hottest inlet of each rack of a block in C, also to the hottest of each lane of the chunk."""
+    is_rack = racks.per_server > hall.real(0.0)
+    inlet_c = ti.select(is_rack, inlets.max_c, hall.zeros - hall.real(1e30))
+    is_hotter = inlet_c > hottest.inlet_c
+    hottest.block = ti.select(is_hotter, block_at, hottest.block)
+    hottest.group = ti.select(is_hotter, inlets.hottest_group, hottest.group)
+    hottest.inlet_c = larger(inlet_c, hottest.inlet_c)
+    return inlet_c
+
+
+@ti.func
+@no_type_check
+def add_degrees_out_of_range(
+    hall: ti.template(),
+    block_at,
+    terms_at,
+    racks: ti.template(),
+    air: ti.template(),
+    inlets: ti.template(),
+):
+    """Add what the inlets of a block lie beyond the recommended range by, which few ever leave."""
+    low_c, high_c = hall.real(RECOMMENDED_C[0]), hall.real(RECOMMENDED_C[1])
+    beyond_k = larger(inlets.max_c - high_c, low_c - inlets.min_c)
+    beyond_k *= racks.per_server
+    # Written like this, the compiler asks all lanes at once.
+    is_any = 0
+    for i in ti.static(range(LANES)):
+        is_any |= ti.cast(beyond_k[i] > hall.real(0.0), ti.i32)
+    if is_any != 0:
+        block, terms = hall.blocks[block_at], hall.terms[terms_at]
+        over_27_sum_k, under_18_sum_k, z, first_row = hall.zeros, hall.zeros, 0, block.first_row
+        while z < block.groups:
+            group = hall.groups[first_row + z]
+            inlet_c = group_inlet(hall, air, group)
+            over_27_sum_k += group.count * larger(inlet_c - high_c, hall.zeros)
+            under_18_sum_k += group.count * larger(low_c - inlet_c, hall.zeros)
+            z += hall.one
+        terms.over_27_sum_k = terms.over_27_sum_k + over_27_sum_k
+        terms.under_18_sum_k = terms.under_18_sum_k + under_18_sum_k
+
+
+@ti.func
+@no_type_check
+def store_racks(hall: ti.template(), block_at, sweep: ti.template(), results: ti.template()):
+    """Results of the racks of a block: of the last sweep, or means over the substeps.
+
+    The hottest inlet is the highest of any substep.
+    """
+    block = hall.blocks[block_at]
+    if ti.static(hall.transient):
+        if not sweep.is_first:
+            results.cpu_w += block.cpu_w
+            results.fan_w += block.fan_w
+            results.airflow_m3s += block.airflow_m3s
+            results.inlet_c += block.inlet_c
+            results.outlet_c += block.outlet_c
+            results.inlet_max_c = larger(results.inlet_max_c, block.inlet_max_c)
+        if sweep.is_last:
+            weight = ti.cast(hall.weight, hall.real)
+            results.cpu_w *= weight
+            results.fan_w *= weight
+            results.airflow_m3s *= weight
+            results.inlet_c *= weight
+            results.outlet_c *= weight
+    block.cpu_w = results.cpu_w
+    block.fan_w = results.fan_w
+    block.airflow_m3s = results.airflow_m3s
+    block.inlet_c = results.inlet_c
+    block.outlet_c = results.outlet_c
+    block.inlet_max_c = results.inlet_max_c

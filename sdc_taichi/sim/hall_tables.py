@@ -1,0 +1,481 @@
+"""Input arrays of the hall kernels, built once for a fleet.
+
+``kernels/README.md`` tells how halls lie in these arrays, ``kernels/hall_arguments.py`` what each
+array and row holds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.hall.mix_weights import DENSE_RACKS
+from sdc_taichi.kernels.arguments import in_row_order
+from sdc_taichi.kernels.hall_arguments import (
+    ARGUMENTS,
+    BLOCK_INTS,
+    CHUNK_BLOCKS,
+    CHUNK_INTS,
+    DC_CONTROL,
+    DC_DOUBLES,
+    DC_INTS,
+    DENSE_LANES,
+    EXHAUST_PATTERNS,
+    GROUP_INPUTS,
+    GROUP_OUT,
+    LANES,
+    MIX_PATTERNS,
+    PATTERNS,
+    RACK_INPUTS,
+    RACK_OUT,
+    RACK_STATE,
+    RUN_BLOCKS,
+    RUN_INTS,
+    RUN_LANES,
+    SCRATCH,
+    SUMS,
+    UNIT_INPUTS,
+    UNIT_STATE,
+)
+from sdc_taichi.sim.fleet import Fleet, offsets_from_counts
+from sdc_taichi.types import F64, I32
+
+Array = Any
+"""NumPy array of any type; arrays of vectors have an axis more than in the kernel."""
+
+
+@dataclass(frozen=True, slots=True)
+class RackPlaces:
+    """Where racks lie in the kernels' arrays: each data center fills whole blocks of LANES."""
+
+    blocks: npt.NDArray[np.int64]
+    """Number of blocks of each data center, (B,)."""
+    block_offsets: I32
+    """First block of each data center, (B + 1,)."""
+    of_racks: npt.NDArray[np.int64]
+    """Place of each rack, (R,)."""
+    racks_per_dc: int | None
+    """Racks of each data center where all have as many, else None."""
+
+    @property
+    def count(self) -> int:
+        """Number of places, of racks and padding."""
+        return int(LANES * self.block_offsets[-1])
+
+    def values_of_racks(self, rows: Array) -> Array:
+        """Copy of rows by place, (n, places), as values of the racks, (n, R)."""
+        rows, size = rows.reshape(len(rows), -1), len(self.blocks)
+        if self.racks_per_dc is None:
+            return rows[:, self.of_racks]
+        # The racks of a data center as one item, in a third of the time of one by one.
+        apart, item = rows.strides[0], np.dtype((np.void, self.racks_per_dc * rows.itemsize))
+        parts: Any = np.ndarray((len(rows), size), item, rows, strides=(apart, apart // size))
+        return parts.copy().view(rows.dtype)
+
+    def put(self, row: Array, values: Array) -> None:
+        """Write values of the racks, (R,), to a row by place, (places,)."""
+        if self.racks_per_dc is None:
+            row[self.of_racks] = values
+        else:
+            size, racks = len(self.blocks), self.racks_per_dc
+            row.reshape(size, -1)[:, :racks] = values.reshape(size, -1)
+
+
+@dataclass(frozen=True, slots=True)
+class HallTables:
+    """Arrays of the hall kernels for a fleet, and where its racks and groups lie in them."""
+
+    places: RackPlaces
+    """Where the racks are."""
+    arrays: dict[str, Array]
+    """Arrays by the names of the kernels' arguments."""
+    group_places: int
+    """Entries of arrays that have one per block and group, such as ``server_c``."""
+    slices: int
+    """Parts in which threads take on the tasks."""
+
+    def rows(self, argument: str) -> dict[str, Array]:
+        """Views of the named rows of an array of two dimensions, each flat."""
+        array, rows = self.arrays[argument], ARGUMENTS[argument].rows
+        return dict(zip(rows, array.reshape(len(rows), -1), strict=True))
+
+
+def vectors(dtype: npt.DTypeLike, *shape: int, lanes: int = LANES) -> Array:
+    """Zeros that the kernels take as vectors, (*shape, lanes)."""
+    from sdc_taichi.kernels.compiler.arrays import aligned
+
+    out = aligned((*shape, lanes), dtype)
+    out[:] = 0.0
+    return out
+
+
+def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> HallTables:
+    """Arrays of the hall kernels for a fleet.
+
+    Args:
+        fleet: the data centers.
+        dtype: float32 or float64, of temperatures and powers.
+        most_slices: most parts in which threads take on the tasks.
+
+    Raises:
+        ConfigError: more entries than the kernels can index.
+    """
+    places = _build_places(fleet)
+    task_offsets, chunk_ints, first_chunk = _build_chunks(fleet, places, most_slices)
+    slices = max(1, min(most_slices, len(task_offsets) - 1))
+    n_chunks, units = chunk_ints.shape[1] - 1, np.diff(fleet.unit_offsets)
+    block_ints, place_ints, group_inputs = _build_groups(fleet, places, dtype)
+    most_groups, group_places = block_ints[1].max(), block_ints[1].sum()
+    unit_shares, mix_weights, first_mix_weight = _build_air(fleet, places, dtype)
+    steady_states, table_rows = _build_steady_states(fleet, places, dtype)
+    dc_ints = {
+        "first_chunk": first_chunk,
+        "first_unit": fleet.unit_offsets,
+        "first_share": offsets_from_counts(places.blocks * units, "unit shares of blocks"),
+        "racks": np.diff(fleet.rack_offsets),
+        "first_mix_weight": first_mix_weight,
+    }
+    rack_state = vectors(dtype, len(RACK_STATE), places.count // LANES)
+    arrays = {
+        "task_offsets": task_offsets,
+        "dc_ints": _index_rows(DC_INTS, dc_ints | table_rows),
+        "chunk_ints": chunk_ints,
+        "block_ints": block_ints,
+        "place_ints": place_ints,
+        **_build_runs(fleet, places, dtype),
+        "dc_coefficients": np.array(fleet.dcs.T, dtype, order="C").reshape(-1),
+        "rack_inputs": _build_rack_inputs(fleet, places, dtype),
+        "group_inputs": group_inputs,
+        "unit_inputs": np.ones((len(UNIT_INPUTS), fleet.units), dtype),
+        "unit_shares": unit_shares,
+        "mix_weights": mix_weights,
+        "steady_states": steady_states,
+        "dc_control": np.zeros((len(DC_CONTROL), fleet.size), np.int32),
+        "dc_doubles": np.zeros((len(DC_DOUBLES), fleet.size)),
+        "unit_state": np.ones((len(UNIT_STATE), fleet.units)),
+        "rack_state": rack_state,
+        "rack_state_by_4": rack_state.reshape(-1, DENSE_LANES),
+        "rack_state_by_16": rack_state.reshape(-1, RUN_LANES),
+        "scratch": vectors(dtype, slices * SCRATCH),
+        "unit_need_m3s": np.zeros(max(int(chunk_ints[2, -1]), 1)),
+        "chunk_sums": np.zeros(len(SUMS) * n_chunks),
+        "group_values": vectors(dtype, len(GROUP_OUT), slices * int(most_groups)),
+        "rack_out": vectors(dtype, len(RACK_OUT), places.count // LANES),
+    }
+    tables = HallTables(places, arrays, int(group_places), slices)
+    tables.rows("unit_inputs")["design_m3s"][:] = fleet.unit_design_m3s
+    _set_data_center_values(fleet, tables.rows("dc_doubles"))
+    return tables
+
+
+def _build_places(fleet: Fleet) -> RackPlaces:
+    racks = np.diff(fleet.rack_offsets)
+    blocks = -(-racks // LANES)
+    if fleet.air is not None and racks.max() > DENSE_RACKS:
+        # Runs of weights need all halls to begin where vectors of RUN_LANES do.
+        blocks = -(-blocks // RUN_BLOCKS) * RUN_BLOCKS
+    block_offsets = offsets_from_counts(blocks, "blocks of racks")
+    within = np.arange(fleet.racks) - np.repeat(fleet.rack_offsets[:-1], racks)
+    return RackPlaces(
+        blocks=blocks,
+        block_offsets=block_offsets,
+        of_racks=LANES * np.repeat(block_offsets[:-1], racks) + within,
+        racks_per_dc=int(racks[0]) if np.all(racks == racks[0]) else None,
+    )
+
+
+def _build_chunks(fleet: Fleet, places: RackPlaces, most_slices: int) -> tuple[Array, Array, Array]:
+    """First chunk of each task and the end; rows CHUNK_INTS; first chunk of each data center."""
+    chunks = [np.arange(a, b, CHUNK_BLOCKS) for a, b in pairwise(places.block_offsets)]
+    per_dc = np.array([len(c) for c in chunks])
+    chunk_dc = np.repeat(np.arange(fleet.size), per_dc)
+    # Data centers of up to a slice are one task, larger ones a task per chunk.
+    is_one_task = per_dc * most_slices <= max(per_dc.sum(), most_slices)
+    begins_task = ~np.repeat(is_one_task, per_dc)
+    begins_task[np.cumsum(per_dc) - per_dc] = True
+    task_offsets = np.append(np.flatnonzero(begins_task), per_dc.sum()).astype(np.int32)
+    units = np.diff(fleet.unit_offsets)
+    rows = {
+        "first_block": np.concatenate([*chunks, places.block_offsets[-1:]]),
+        "dc": chunk_dc,
+        "first_need": offsets_from_counts(units[chunk_dc], "needs of chunks"),
+    }
+    return task_offsets, _index_rows(CHUNK_INTS, rows), offsets_from_counts(per_dc, "chunks")
+
+
+def _build_groups(
+    fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike
+) -> tuple[Array, Array, Array]:
+    """Rows BLOCK_INTS and PLACE_INTS, and the group inputs that equal blocks share."""
+    block = places.of_racks // LANES
+    groups = np.diff(fleet.group_offsets)
+    most = np.zeros(int(places.blocks.sum()), np.int64)
+    np.maximum.at(most, block, groups)
+    racks = np.bincount(block, minlength=len(most))
+    first_rack = np.cumsum(racks) - racks
+    # Padding, and the closing entry, begin where the rack before them ends.
+    rack = np.minimum(np.arange(LANES), racks[:, None]) + first_rack[:, None]
+    first_group = fleet.group_offsets[np.append(rack, fleet.racks)]
+    first_row, group_inputs = _build_group_inputs(fleet, places, first_rack, racks, most, dtype)
+    block_ints = {
+        "racks": racks,
+        "groups": most,
+        "first_row": first_row,
+        "first_place": offsets_from_counts(most, "groups of blocks")[:-1],
+        "first_row_along": [],
+    }
+    place_ints = {"first_group": first_group, "first_server": fleet.server_offsets[first_group]}
+    return (
+        _index_rows(BLOCK_INTS, block_ints),
+        np.stack(in_row_order(ARGUMENTS["place_ints"].rows, place_ints)),
+        group_inputs,
+    )
+
+
+def _build_group_inputs(
+    fleet: Fleet,
+    places: RackPlaces,
+    first_rack: Array,
+    racks: Array,
+    groups: Array,
+    dtype: npt.DTypeLike,
+) -> tuple[Array, Array]:
+    """First entry of each block, and the entries: rows GROUP_INPUTS by group, lanes racks."""
+    known: dict[Any, int] = {}
+    blocks_of_hall: dict[int, slice] = {}
+    entries, first_row, total = [], np.zeros(len(groups), np.int64), 0
+    for dc, (begin, end) in enumerate(pairwise(places.block_offsets)):
+        rows, blocks = fleet.group_rows[dc], slice(begin, end)
+        same = blocks_of_hall.setdefault(id(rows), blocks)
+        if same != blocks:
+            first_row[blocks] = first_row[same]
+            continue
+        group_0 = fleet.group_offsets[fleet.rack_offsets[dc]]
+        for i in range(begin, end):
+            a, n = first_rack[i], racks[i]
+            if n == 0:
+                continue
+            ends = fleet.group_offsets[a : a + n + 1] - group_0
+            key = (rows[:, ends[0] : ends[-1]].tobytes(), (ends - ends[0]).tobytes())
+            if key not in known:
+                known[key] = total
+                entries.append(_block_entry(rows, ends, groups[i], dtype))
+                total += int(groups[i])
+            first_row[i] = known[key]
+    out = vectors(dtype, total * len(GROUP_INPUTS))
+    out[:] = np.concatenate(entries).reshape(out.shape)
+    return first_row, out
+
+
+def _block_entry(rows: F64, ends: Array, groups: int, dtype: npt.DTypeLike) -> Array:
+    """Group inputs of a block, (groups, rows, LANES); ``ends`` begin and end the racks' groups."""
+    z, n = np.arange(groups), len(ends) - 1
+    group = ends[:-1] + np.minimum(z[:, None], np.diff(ends) - 1)
+    entry = np.zeros((groups, len(rows), LANES), dtype)
+    entry[:, :, :n] = rows[:, group].swapaxes(0, 1)
+    count = entry[:, list(GROUP_INPUTS).index("count")]
+    count[:, :n] *= z[:, None] < np.diff(ends)
+    # Lanes without a rack repeat the last one, but for the count of servers.
+    entry[:, :, n:] = entry[:, :, n - 1 : n]
+    count[:, n:] = 0.0
+    return entry
+
+
+def build_rows_along_racks(group_inputs: Array, block_ints: Array) -> tuple[Array, Array]:
+    """Group inputs with the same values once more, LANES groups of one rack at a time.
+
+    Layers alone are computed from those that are added.
+
+    Returns:
+        The longer group inputs, and the first entry along the racks of each block.
+    """
+    block = dict(zip(BLOCK_INTS, block_ints, strict=True))
+    entries = group_inputs.reshape(-1, len(GROUP_INPUTS), LANES)
+    first_row, one, of_block = np.unique(block["first_row"], return_index=True, return_inverse=True)
+    groups = block["groups"][one]
+    n_vectors = -(-groups // LANES)
+    first = len(entries) + offsets_from_counts(LANES * n_vectors, "groups along racks")
+    along = vectors(group_inputs.dtype, int(first[-1]) * entries.shape[1])
+    out = along.reshape(-1, *entries.shape[1:])
+    out[: len(entries)] = entries
+    for a, n, b, v in zip(first_row, groups, first[:-1], n_vectors, strict=True):
+        z = np.minimum(np.arange(LANES * v), n - 1)
+        squares = entries[a : a + n][z].reshape(v, LANES, -1, LANES)
+        out[b : b + LANES * v] = squares.transpose(3, 0, 2, 1).reshape(-1, *out.shape[1:])
+    return along, first[of_block]
+
+
+def _build_air(
+    fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike
+) -> tuple[Array, Array, Array]:
+    """Unit shares and weights of dense halls by block, and the first weight of each hall."""
+    first_mix_weight = np.full(fleet.size + 1, -1)
+    air = fleet.air
+    if air is None:
+        return vectors(dtype, 1), vectors(dtype, 1, lanes=DENSE_LANES * LANES), first_mix_weight
+    shares, weights, known, total = [], [], {}, 0
+    for dc, (racks, units) in enumerate(
+        zip(np.diff(fleet.rack_offsets), np.diff(fleet.unit_offsets), strict=True)
+    ):
+        n_places = int(places.blocks[dc]) * LANES
+        own = np.zeros((n_places, int(units)))
+        at = air.unit_share_offsets[dc]
+        own[:racks] = air.unit_shares[at : at + racks * units].reshape(racks, units)
+        shares.append(own.reshape(-1, LANES, int(units)).swapaxes(1, 2).reshape(-1, LANES))
+        if racks > DENSE_RACKS:
+            continue
+        entry = int(air.steady_state_of_dc[dc])
+        if entry not in known:
+            whole = -(-int(racks) // DENSE_LANES) * DENSE_LANES
+            square = np.zeros((n_places, whole))
+            square[:racks, :racks] = _dense_weights(fleet, dc)
+            by_block = square.reshape(-1, LANES, whole).swapaxes(1, 2)
+            weights.append(by_block.reshape(-1, DENSE_LANES * LANES))
+            known[entry] = total
+            total += len(weights[-1])
+        first_mix_weight[dc] = known[entry]
+    unit_shares = vectors(dtype, sum(map(len, shares)))
+    unit_shares[:] = np.concatenate(shares)
+    mix_weights = vectors(dtype, max(total, 1), lanes=DENSE_LANES * LANES)
+    if weights:
+        mix_weights[:] = np.concatenate(weights)
+    return unit_shares, mix_weights, first_mix_weight
+
+
+def _dense_weights(fleet: Fleet, dc: int) -> F64:
+    """Mix before every rack of a data center from the exhausts of all its racks, (R, R)."""
+    assert fleet.air is not None
+    weights = fleet.air.mix_weights
+    first, end = fleet.rack_offsets[dc : dc + 2]
+    out = np.zeros((end - first, end - first))
+    for rack in range(first, end):
+        for run in range(weights.run_offsets[rack], weights.run_offsets[rack + 1]):
+            at, at_weight = weights.run_first_rack[run], weights.run_first_weight[run]
+            count = weights.run_length[run]
+            part = weights.weights[at_weight : at_weight + count]
+            out[rack - first, at - first : at - first + count] += part
+    return out * weights.norm[first:end, None]
+
+
+def _build_steady_states(
+    fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike
+) -> tuple[Array, dict[str, Array]]:
+    """Patterns of each distinct hall by block, then its table; rows of DC_INTS that find both."""
+    names = ("first_pattern", "first_steady_state", "supply_rows")
+    air = fleet.air
+    if air is None:
+        return vectors(dtype, 1), dict.fromkeys(names, np.zeros(1))
+    parts: list[Array] = []
+    firsts = []
+    total = 0
+    first_dcs = np.unique(air.steady_state_of_dc, return_index=True)[1]
+    for table, blocks in zip(air.steady_states, places.blocks[first_dcs], strict=True):
+        patterns = np.zeros((PATTERNS, int(blocks) * LANES))
+        racks = table.patterns.shape[1]
+        is_sparse = racks > DENSE_RACKS
+        n_mix = EXHAUST_PATTERNS if is_sparse else len(table.patterns)
+        patterns[:n_mix, :racks] = table.patterns[:n_mix]
+        if is_sparse:
+            patterns[MIX_PATTERNS:, :racks] = table.patterns[n_mix:]
+        amounts = np.zeros((*table.feedback_gain.shape, LANES))
+        amounts[..., : table.pattern_shares.shape[2]] = table.pattern_shares
+        amounts[..., MIX_PATTERNS] = table.feedback_gain
+        # Cubics reach one row and column beyond.
+        beyond = ((1, 1), (1, 1), (0, 0))
+        amounts = np.pad(amounts, beyond, mode="reflect", reflect_type="odd")
+        by_block = patterns.reshape(-1, int(blocks), LANES).swapaxes(0, 1).reshape(-1, LANES)
+        firsts.append((total, total + len(by_block), len(table.supply_c)))
+        parts += [by_block, amounts.reshape(-1, LANES)]
+        total += len(parts[-2]) + len(parts[-1])
+    offsets_from_counts([total], "vectors of steady states")
+    out = vectors(dtype, total)
+    out[:] = np.concatenate(parts)
+    return out, dict(zip(names, np.array(firsts)[air.steady_state_of_dc].T, strict=True))
+
+
+def _build_runs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> dict[str, Array]:
+    """Runs of weights of sparse halls in whole vectors, filled up with zeros."""
+    air = fleet.air
+    run_counts = np.zeros(places.count, np.int64)
+    is_sparse = np.diff(fleet.rack_offsets)[fleet.rack_dc] > DENSE_RACKS
+    if air is None or not is_sparse.any():
+        return {
+            "run_offsets": offsets_from_counts(run_counts, "runs of weights"),
+            "run_ints": np.zeros((len(RUN_INTS), 1), np.int32),
+            "run_weights": vectors(dtype, 1, lanes=RUN_LANES),
+        }
+    mix_weights = air.mix_weights
+    counts = np.diff(mix_weights.run_offsets)
+    run_counts[places.of_racks[is_sparse]] = counts[is_sparse]
+    of_sparse = np.repeat(is_sparse, counts)
+    moved = places.of_racks[fleet.rack_offsets[:-1]] - fleet.rack_offsets[:-1]
+    first = (mix_weights.run_first_rack + np.repeat(moved[fleet.rack_dc], counts))[of_sparse]
+    length = mix_weights.run_length[of_sparse]
+    offset = mix_weights.run_first_weight[of_sparse].astype(np.int64)
+    # Runs that share weights share their vectors where they begin at the same lane.
+    lane = first % RUN_LANES
+    key = (offset * (int(length.max()) + 1) + length) * RUN_LANES + lane
+    _, one, same = np.unique(key, return_index=True, return_inverse=True)
+    n_vectors = -(-(lane + length) // RUN_LANES)
+    first_weight = offsets_from_counts(n_vectors[one], "vectors of weights")
+    weights = vectors(dtype, int(first_weight[-1]), lanes=RUN_LANES)
+    within = np.arange(int(length[one].sum()))
+    within -= np.repeat(np.cumsum(length[one]) - length[one], length[one])
+    to = np.repeat(first_weight[:-1].astype(np.int64) * RUN_LANES + lane[one], length[one]) + within
+    from_place = np.repeat(offset[one], length[one]) + within
+    weights.reshape(-1)[to] = mix_weights.weights[from_place]
+    runs = {
+        "first_source": first // RUN_LANES,
+        "length": n_vectors,
+        "first_weight": first_weight[same],
+    }
+    return {
+        "run_offsets": offsets_from_counts(run_counts, "runs of weights"),
+        "run_ints": _index_rows(RUN_INTS, runs),
+        "run_weights": weights,
+    }
+
+
+def _build_rack_inputs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -> Array:
+    """Rows RACK_INPUTS by place; loads are set in every step."""
+    air, ones = fleet.air, np.ones(fleet.racks)
+    values = {
+        "approach_k": fleet.approach_k,
+        "norm": ones if air is None else air.mix_weights.norm,
+        "load": 0.0 * ones,
+        "powered": ones,
+        "fan_airflow": ones,
+        "strength": ones if air is None else air.mix_weights.strength,
+        "per_strength": ones if air is None else 1.0 / air.mix_weights.strength,
+        "exhaust_share": 0.0 * ones if air is None else air.exhaust_share,
+        "per_server": 1.0 / fleet.per_rack_servers(),
+    }
+    out = vectors(dtype, len(RACK_INPUTS), places.count // LANES)
+    rows = out.reshape(len(out), -1)
+    for row, of_racks in zip(rows, in_row_order(RACK_INPUTS, values), strict=True):
+        row[places.of_racks] = of_racks
+    return out
+
+
+def _set_data_center_values(fleet: Fleet, dc: dict[str, Array]) -> None:
+    """Rows of DC_DOUBLES that stay the same in all steps."""
+    dc["design_it_airflow_m3s"][:] = fleet.it_airflow_m3s
+    air = fleet.air
+    if air is not None:
+        ends_c = np.array([table.supply_c[:2] for table in air.steady_states])
+        ends_c = ends_c[air.steady_state_of_dc].T
+        dc["table_low_c"][:] = ends_c[0]
+        dc["table_rows_per_k"][:] = 1.0 / (ends_c[1] - ends_c[0])
+
+
+def _index_rows(rows: Any, values: dict[str, Any]) -> npt.NDArray[np.int32]:
+    """Rows of indices by name, those without a closing entry filled up with 0."""
+    ordered = in_row_order(rows, values)
+    out = np.zeros((len(rows), max(map(len, ordered))), np.int32)
+    for row, value in zip(out, ordered, strict=True):
+        row[: len(value)] = value
+    return out
