@@ -12,7 +12,7 @@ import pytest
 from sdc_taichi.config import DataCenterConfig, EventKind, EventsConfig, load_config
 from sdc_taichi.exogenous import carbon
 from sdc_taichi.hall import air_metrics, placement
-from sdc_taichi.kernels import thermal
+from sdc_taichi.kernels import hall_arguments
 from sdc_taichi.plant import battery, chiller, cooling, tower, water, workload
 from sdc_taichi.sim import sizing
 from sdc_taichi.sim.events import schedule
@@ -29,7 +29,7 @@ REGISTRIES: dict[str, tuple[str, Collection[str]]] = {
     "battery.model": ("plant.battery.BATTERIES", battery.BATTERIES),
     "workload.model": ("plant.workload.MODELS", workload.MODELS),
     "workload.placement": ("hall.placement.POLICIES", placement.POLICIES),
-    "servers.outlet_model": ("kernels.thermal.OUTLETS", thermal.OUTLETS),
+    "servers.outlet_model": ("kernels.hall_arguments.OUTLETS", thermal.OUTLETS),
     "protection.ashrae_class": ("hall.air_metrics.ALLOWABLE_C", air_metrics.ALLOWABLE_C),
     "site.carbon_pairing": ("exogenous.carbon.Pairing", get_args(carbon.Pairing)),
 }
