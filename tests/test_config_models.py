@@ -29,7 +29,7 @@ REGISTRIES: dict[str, tuple[str, Collection[str]]] = {
     "battery.model": ("plant.battery.BATTERIES", battery.BATTERIES),
     "workload.model": ("plant.workload.MODELS", workload.MODELS),
     "workload.placement": ("hall.placement.POLICIES", placement.POLICIES),
-    "servers.outlet_model": ("kernels.hall_arguments.OUTLETS", thermal.OUTLETS),
+    "servers.outlet_model": ("kernels.hall_arguments.OUTLETS", hall_arguments.OUTLETS),
     "protection.ashrae_class": ("hall.air_metrics.ALLOWABLE_C", air_metrics.ALLOWABLE_C),
     "site.carbon_pairing": ("exogenous.carbon.Pairing", get_args(carbon.Pairing)),
 }
