@@ -15,8 +15,9 @@ from sdc_taichi.cli.arguments import Debug
 from sdc_taichi.errors import SdcError
 
 WEB_PORT = 9090
-_MAGIC = b"RRF"
-_STOP_S = 5.0
+"""Port of the page that ``--web`` serves, if it is free."""
+_RECORDING_MAGIC = b"RRF"
+_STOP_WAIT_S = 5.0
 
 
 def view_command(
@@ -57,7 +58,7 @@ def view_command(
     command, page = viewer_command(recording, web=web, port=port)
     if page is not None:
         typer.echo(f"Viewer: {page} (Ctrl-C ends it)")
-    code = _run(command)
+    code = _run_viewer(command)
     if code:
         hint = "" if web else "; without a screen, serve it to a browser with --web"
         raise SdcError(f"{recording}: the viewer ended with exit code {code}{hint}")
@@ -71,10 +72,10 @@ def check_recording(path: Path) -> None:
     """
     try:
         with path.open("rb") as file:
-            start = file.read(len(_MAGIC))
+            beginning = file.read(len(_RECORDING_MAGIC))
     except OSError as error:
         raise SdcError(f"{path}: cannot be read: {error.strerror}") from None
-    if start != _MAGIC:
+    if beginning != _RECORDING_MAGIC:
         raise SdcError(f"{path}: no Rerun recording; valid is a file of simulate --record")
 
 
@@ -138,7 +139,7 @@ def viewer_program() -> Path:
     return found
 
 
-def _run(command: list[str]) -> int:
+def _run_viewer(command: list[str]) -> int:
     """Exit code of the viewer; 0 when it was ended with Ctrl-C or SIGTERM."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     environment = {"RERUN_ANALYTICS": "0", "RUST_LOG": "error", **os.environ}
@@ -154,7 +155,7 @@ def _run(command: list[str]) -> int:
         if process.poll() is None:
             process.terminate()
             try:
-                process.wait(_STOP_S)
+                process.wait(_STOP_WAIT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
