@@ -28,10 +28,10 @@ from rrd import read, scalars
 from sdc_taichi import EpisodeRecorder, RecordEpisodes, SdcError, StepResult, load_config
 from sdc_taichi.control import View
 from sdc_taichi.envs.forecasts import ForecastError
-from sdc_taichi.envs.recording import cubes
-from sdc_taichi.viz import recorder as recorder_module
+from sdc_taichi.envs.recording import capped_cubic_schedule
+from sdc_taichi.viz import recording_cadence
 from sdc_taichi.viz.recorder import Recorder
-from sdc_taichi.viz.streams import RecordingWarning
+from sdc_taichi.viz.recording_output import RecordingWarning
 
 STEPS = 96
 ALL: Callable[[int], bool] = lambda episode: True  # noqa: E731
@@ -170,7 +170,7 @@ def test_rewards_of_ones_own_are_recorded_by_agent(tmp_path: Path) -> None:
 
 
 def test_default_episodes_are_those_of_record_video() -> None:
-    found = [episode for episode in range(2100) if cubes(episode)]
+    found = [episode for episode in range(2100) if capped_cubic_schedule(episode)]
     assert found == [0, 1, 8, 27, 64, 125, 216, 343, 512, 729, 1000, 2000]
 
 
@@ -495,7 +495,7 @@ def test_the_folder_goes_away_before_the_first_episode(tmp_path: Path) -> None:
 
 
 def test_the_folder_goes_away_in_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder_module, "BLOCK_STEPS", 10)
+    monkeypatch.setattr(recording_cadence, "MAX_BLOCK_STEPS", 10)
     folder, moved = tmp_path / "runs", tmp_path / "moved"
     folder.mkdir()
     settings = EpisodeRecorder(folder / "run.rrd", episode_trigger=ALL)

@@ -35,9 +35,9 @@ from sdc_taichi.plant.workload import age_histogram
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.run.folder_writer import simulate_to_folder
 from sdc_taichi.types import F64, ServerLayers
-from sdc_taichi.viz import hall_layers, recorder, recording_reader, recording_series
+from sdc_taichi.viz import hall_rasters, recording_blocks, recording_cadence, recording_series
 from sdc_taichi.viz.recorder import Recorder
-from sdc_taichi.viz.recording_events import failure_entries, protection_entries
+from sdc_taichi.viz.recording_log import failure_entries, protection_entries
 
 STEPS = 130  # of blocks of 96 in this test: more than one, and no multiple
 ODD_NAME = "hall/1 [a]"
@@ -126,7 +126,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             pytest.MonkeyPatch.context() as patch,
             Recorder(path, focus=["ny-0", ODD_NAME, "ny-2"], every=2) as rec,
         ):
-            patch.setattr(recorder, "BLOCK_STEPS", 96)
+            patch.setattr(recording_cadence, "MAX_BLOCK_STEPS", 96)
             rec.begin(sim, describe_run(sim, asked))
 
             def each(result: StepResult) -> None:
@@ -209,7 +209,7 @@ def test_units_rewards_and_fleet_are_recorded(run: Run) -> None:
         "lost_tasks": by_step["dropped_tasks"].sum() + by_step["lost_tasks"].sum(),
         "protected_racks": by_step["throttled_racks"].sum() + by_step["tripped_racks"].sum(),
     }
-    assert set(expected) == set(recording_series.FLEET)
+    assert set(expected) == set(recording_series.FLEET_PLOTS)
     for entity, values in expected.items():
         found = scalars(run.recorded[f"/fleet/{entity}"])[:, 0]
         np.testing.assert_allclose(found, values, rtol=1e-12, atol=1e-9, err_msg=entity)
@@ -231,7 +231,7 @@ def test_hottest_halls_are_named_with_their_place(run: Run) -> None:
 
 @pytest.mark.parametrize("dc", FOCUS)
 def test_actions_are_states_that_change(run: Run, dc: int) -> None:
-    for entity, (command, states) in recording_series.STATES.items():
+    for entity, (command, states) in recording_series.COMMAND_STATES.items():
         found = run.recorded[f"/dc/{FOCUS[dc]}/actions/{entity}"]
         assert found["StateConfiguration:values"] == [list(states)]
         changes = dict(zip(found["step"], (s for (s,) in found["StateChange:state"]), strict=True))
@@ -247,9 +247,11 @@ def test_actions_are_states_that_change(run: Run, dc: int) -> None:
 def test_heat_maps_are_the_racks_to_their_resolution(run: Run, dc: int) -> None:
     fleet = run.sim.fleet
     hall, racks = fleet.configs[dc].hall, slice(*fleet.rack_offsets[dc : dc + 2])
-    tiles = hall_layers.tiles(hall)
-    scales = {what: hall_layers.temperature_scale(what) for what in hall_layers.LIMITS_C}
-    scales["power"] = hall_layers.power_scale(fleet)
+    tiles = hall_rasters.tile_grid(hall)
+    scales = {
+        what: hall_rasters.temperature_scale(what) for what in hall_rasters.TEMPERATURE_RANGES_C
+    }
+    scales["power"] = hall_rasters.power_scale(fleet)
     for what, scale in scales.items():
         entity = run.recorded[f"/dc/{FOCUS[dc]}/map/{what}"]
         assert entity["step"] == list(range(0, STEPS, 2))
@@ -264,11 +266,11 @@ def test_heat_maps_are_the_racks_to_their_resolution(run: Run, dc: int) -> None:
             }[what][racks]
             for rack, value in enumerate(np.clip(racks_now, scale.low, scale.high)):
                 row, column = divmod(rack, hall.racks_per_row)
-                y, x = row * (tiles.height + 1), column * (tiles.width + 1)
-                tile = pixels[y : y + tiles.height, x : x + tiles.width]
+                y, x = row * (tiles.tile_height + 1), column * (tiles.tile_width + 1)
+                tile = pixels[y : y + tiles.tile_height, x : x + tiles.tile_width]
                 assert np.ptp(tile) == 0
-                assert abs(float(tile[0, 0]) - value) <= scale.quantum / 2 * 1.0001
-            assert np.all(pixels[tiles.height] == scale.low)
+                assert abs(float(tile[0, 0]) - value) <= scale.resolution / 2 * 1.0001
+            assert np.all(pixels[tiles.tile_height] == scale.low)
         assert np.ptp(shots[:, 0, 0]) > 0, "values change"
 
 
@@ -278,7 +280,7 @@ def test_hall_shows_the_hottest_server_of_every_height(run: Run, dc: int) -> Non
     hall = fleet.configs[dc].hall
     for what, layer in (("inlet", "inlet_c"), ("outlet", "outlet_c")):
         entity = run.recorded[f"/dc/{FOCUS[dc]}/hall/{what}"]
-        scale = hall_layers.temperature_scale(what)
+        scale = hall_rasters.temperature_scale(what)
         assert entity["VoxelGridMap:value_range"] == [[[scale.low, scale.high]]]
         for step, cells in zip(entity["step"], voxels(entity), strict=True):
             values = getattr(run.servers[step], layer)
@@ -288,7 +290,7 @@ def test_hall_shows_the_hottest_server_of_every_height(run: Run, dc: int) -> Non
                 height = np.arange(12) * ZONES // 12
                 expected += [values[first:last][height == zone].max() for zone in range(ZONES)]
             clipped = np.clip(expected, scale.low, scale.high)
-            np.testing.assert_allclose(cells, clipped, atol=scale.quantum / 2 * 1.0001)
+            np.testing.assert_allclose(cells, clipped, atol=scale.resolution / 2 * 1.0001)
         (indices,) = entity["VoxelGridMap:voxel_indices"]
         assert len({tuple(index) for index in indices}) == hall.racks * ZONES
 
@@ -403,7 +405,7 @@ def test_larger_halls_are_recorded_more_coarsely(
         ],
     )  # fmt: skip
     path = tmp_path / "large.rrd"
-    monkeypatch.setattr(recorder, "BLOCK_BYTES", 1_000_000)
+    monkeypatch.setattr(recording_cadence, "MAX_BLOCK_BYTES", 1_000_000)
     with Simulator(make_configs(large)) as sim, Recorder(path) as rec:
         sim.reset()
         rec.begin(sim)
@@ -415,8 +417,8 @@ def test_larger_halls_are_recorded_more_coarsely(
     assert entities["/dc/ny/series/pue"]["step"] == list(range(100))
     inlets = entities["/dc/ny/map/inlet"]
     assert inlets["step"] == list(range(0, 100, 4))
-    tiles = hall_layers.tiles(large.hall)
-    pixels = images(inlets)[-1][:: tiles.height + 1, :: tiles.width + 1].reshape(-1)
+    tiles = hall_rasters.tile_grid(large.hall)
+    pixels = images(inlets)[-1][:: tiles.tile_height + 1, :: tiles.tile_width + 1].reshape(-1)
     np.testing.assert_allclose(pixels, results[96].rack_inlet_c, atol=1 / 32)
     assert entities["/dc/ny/hall/outlet"]["step"] == list(range(0, 100, 12))
     assert voxels(entities["/dc/ny/hall/outlet"]).shape == (9, 300 * 5)
@@ -447,26 +449,26 @@ def test_hall_is_shown_more_often_in_events(tmp_path: Path) -> None:
     ("racks", "hours"), [(200, 0.0), (201, 1.0), (2_000, 1.0), (20_000, 3.0), (100_000, 6.0)]
 )
 def test_heat_maps_are_rarer_the_more_racks(racks: int, hours: float) -> None:
-    assert recorder._every_h(racks) == hours
+    assert recording_cadence.map_every_h(racks) == hours
 
 
 @pytest.mark.parametrize(("rows", "per_row"), [(4, 5), (20, 200), (50, 20), (1, 1), (250, 400)])
 def test_tiles_are_equal_and_legible(rows: int, per_row: int) -> None:
     hall = load_config("tiny").hall.model_copy(update={"rows": rows, "racks_per_row": per_row})
-    scale = hall_layers.Scale(-1.0, 1e6, 1.0, "")
-    shape = hall_layers.tiles(hall)
+    scale = hall_rasters.ColourScale(-1.0, 1e6, 1.0, "")
+    shape = hall_rasters.tile_grid(hall)
     values = np.arange(rows * per_row, dtype=np.float32)[None] % 2048
-    pixels = hall_layers.pixels(values, shape, scale)[0]
-    assert pixels.shape == shape.image
+    pixels = hall_rasters.heat_maps(values, shape, scale)[0]
+    assert pixels.shape == shape.image_shape
     counts = np.bincount(pixels[pixels >= 0].astype(int).reshape(-1))
-    assert np.all(counts % (shape.height * shape.width) == 0)
+    assert np.all(counts % (shape.tile_height * shape.tile_width) == 0)
     assert 0.4 <= pixels.shape[1] / pixels.shape[0] <= 5.5
     assert pixels.nbytes <= 1_000_000
 
 
 def test_values_are_clamped_to_the_range() -> None:
-    found = hall_layers.quantised(
-        np.array([-40.0, 20.03, 99.0, 30.0]), hall_layers.temperature_scale("inlet")
+    found = hall_rasters.quantised(
+        np.array([-40.0, 20.03, 99.0, 30.0]), hall_rasters.temperature_scale("inlet")
     )
     assert found.tolist() == [10.0, 20.0, 45.0, 30.0]
 
@@ -475,17 +477,17 @@ def test_values_are_clamped_to_the_range() -> None:
 def test_power_range_covers_the_largest_rack(full_w: float) -> None:
     power = ["servers.groups=null", f"servers.power_w=[{full_w}, 1]"]
     fleet = build_fleet(load_config("tiny", [*power, "hall.servers_per_rack=40"]))
-    scale = hall_layers.power_scale(fleet)
+    scale = hall_rasters.power_scale(fleet)
     count, full_w = np.concatenate(fleet.group_rows, axis=1)[:2]
     largest_kw = fleet.group_sums(count * full_w).max() / 1e3
     assert largest_kw * 1.1 <= scale.high <= largest_kw * 1.1 * 2.5 * 1.0001
-    exact = np.arange(0.0, scale.high, scale.quantum)
+    exact = np.arange(0.0, scale.high, scale.resolution)
     assert np.array_equal(exact.astype(np.float16).astype(np.float64), exact)
 
 
 def test_voxels_stand_where_the_racks_do() -> None:
     hall = load_config("large").hall
-    grid = hall_layers.voxels(hall, 5)
+    grid = hall_rasters.rack_voxels(hall, 5)
     from sdc_taichi.hall.floor_plan import floor_plan
 
     plan, measures = floor_plan(hall), hall.layout
@@ -528,7 +530,7 @@ def test_episodes_get_files_of_their_own(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_interrupted_recording_is_whole(tmp_path: Path, error: type[BaseException]) -> None:
-    path, steps = tmp_path / "cut.rrd", recorder.BLOCK_STEPS + 16
+    path, steps = tmp_path / "cut.rrd", recording_cadence.MAX_BLOCK_STEPS + 16
     path.write_text("older")
 
     def cut(sim: Simulator) -> None:
@@ -537,7 +539,7 @@ def test_interrupted_recording_is_whole(tmp_path: Path, error: type[BaseExceptio
             rec.begin(sim)
             for step in range(steps):
                 rec.add(sim.step())
-                if step < recorder.BLOCK_STEPS - 1:
+                if step < recording_cadence.MAX_BLOCK_STEPS - 1:
                     assert path.read_text() == "older", "replaced with the first block"
             raise error
 
@@ -549,13 +551,13 @@ def test_interrupted_recording_is_whole(tmp_path: Path, error: type[BaseExceptio
 
 
 @pytest.mark.parametrize(
-    ("where", "what"), [(hall_layers, "zone_peaks"), (recording_reader, "age_histogram")]
+    ("where", "what"), [(hall_rasters, "level_maxima"), (recording_blocks, "age_histogram")]
 )
 def test_recording_that_is_interrupted_amid_a_step_is_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: ModuleType, what: str
 ) -> None:
-    monkeypatch.setattr(recording_reader, "_ROWS_BYTES", 20_000)
-    monkeypatch.setattr(recorder, "BLOCK_STEPS", 96)
+    monkeypatch.setattr(recording_blocks, "_BUFFER_BYTES", 20_000)
+    monkeypatch.setattr(recording_cadence, "MAX_BLOCK_STEPS", 96)
     path, rec = tmp_path / "x.rrd", Recorder(tmp_path / "x.rrd", every=1)
     with small(2) as sim:
         sim.reset()
@@ -577,8 +579,8 @@ def test_recording_that_is_interrupted_amid_a_step_is_whole(
 
 
 def test_zones_are_found_once_per_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    peaks = Mock(side_effect=hall_layers.zone_peaks)
-    monkeypatch.setattr(hall_layers, "zone_peaks", peaks)
+    peaks = Mock(side_effect=hall_rasters.level_maxima)
+    monkeypatch.setattr(hall_rasters, "level_maxima", peaks)
     with small(2) as sim, Recorder(tmp_path / "x.rrd", every=1) as rec:
         sim.reset()
         rec.begin(sim)
@@ -657,10 +659,10 @@ import os, sys
 from pathlib import Path
 import rerun as rr
 from sdc_taichi import Simulator, load_config
-from sdc_taichi.viz import streams
+from sdc_taichi.viz import recording_output
 from sdc_taichi.viz.recorder import Recorder
 
-streams.DELETE_EVERY = 1
+recording_output.DELETE_EVERY = 1
 
 def recording(name):
     sim = Simulator(load_config("tiny"))

@@ -23,9 +23,11 @@ from rrd import VIEWER_ENVIRONMENT, read, verify
 from sdc_taichi import SdcError, Simulator, load_config, make_configs
 from sdc_taichi.cli.app import app
 from sdc_taichi.cli.view import viewer_program
-from sdc_taichi.viz import streams
-from sdc_taichi.viz.recorder import BLOCK_STEPS, Recorder
-from sdc_taichi.viz.streams import RecordingWarning, listens, served_at
+from sdc_taichi.viz import recording_output, recording_target
+from sdc_taichi.viz.recorder import Recorder
+from sdc_taichi.viz.recording_cadence import MAX_BLOCK_STEPS
+from sdc_taichi.viz.recording_output import RecordingWarning
+from sdc_taichi.viz.recording_target import listens, served_at
 
 PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli.app import main; main()")
 POSIX = pytest.mark.skipif(os.name != "posix", reason="signals and limits of POSIX")
@@ -56,7 +58,7 @@ def go_on(sim: Simulator, rec: Recorder, steps: int) -> None:
 
 
 def free_port() -> int:
-    return streams.check_port(0)
+    return recording_target.check_port(0)
 
 
 @contextlib.contextmanager
@@ -98,14 +100,14 @@ def test_room_is_kept_for_the_results_of_the_run(
     with small() as sim, Recorder(path) as rec:
         sim.reset()
         rec.begin(sim)
-        go_on(sim, rec, BLOCK_STEPS + 4)
+        go_on(sim, rec, MAX_BLOCK_STEPS + 4)
         usage = shutil.disk_usage(tmp_path)._replace(free=8_000_000)
         monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
         with pytest.warns(RecordingWarning, match="kept for the results of the run") as caught:
-            go_on(sim, rec, BLOCK_STEPS)
+            go_on(sim, rec, MAX_BLOCK_STEPS)
         assert len(caught) == 1
-        assert rec.lost
-    assert recorded_steps(path) == list(range(BLOCK_STEPS))
+        assert rec.failed
+    assert recorded_steps(path) == list(range(MAX_BLOCK_STEPS))
 
 
 @POSIX
@@ -135,7 +137,7 @@ main()
     )
     found = recorded_steps(tmp_path / "run/x.rrd")
     assert 0 < len(found) < 2400
-    assert len(found) % BLOCK_STEPS == 0
+    assert len(found) % MAX_BLOCK_STEPS == 0
 
 
 @POSIX
@@ -188,7 +190,7 @@ def test_run_without_a_viewer_goes_on(tmp_path: Path) -> None:
         with pytest.warns(RecordingWarning, match="no viewer listens"):
             rec.begin(sim)
         go_on(sim, rec, 200)
-        assert rec.lost
+        assert rec.failed
         rec.close()
         assert time.monotonic() - begin < 5.0
 
@@ -204,17 +206,17 @@ def test_viewer_that_is_killed_is_told_once() -> None:
         process.wait()
         begin = time.monotonic()
         with pytest.warns(RecordingWarning, match="the viewer has closed") as caught:
-            go_on(sim, rec, 3 * BLOCK_STEPS)
+            go_on(sim, rec, 3 * MAX_BLOCK_STEPS)
         assert len(caught) == 1
-        assert rec.lost
+        assert rec.failed
         rec.close()
         assert time.monotonic() - begin < 10.0
 
 
 @POSIX
 def test_viewer_that_hangs_does_not_hold_the_run_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streams, "MOST_BEHIND_BYTES", 500_000)
-    monkeypatch.setattr(streams, "WAIT_S", 0.2)
+    monkeypatch.setattr(recording_output, "MAX_UNSENT_BYTES", 500_000)
+    monkeypatch.setattr(recording_output, "VIEWER_WAIT_S", 0.2)
     port = free_port()
     with small() as sim, viewer(port) as process, Recorder(served_at(port)) as rec:
         sim.reset()
@@ -223,8 +225,8 @@ def test_viewer_that_hangs_does_not_hold_the_run_up(monkeypatch: pytest.MonkeyPa
         process.send_signal(signal.SIGSTOP)
         begin = time.monotonic()
         with pytest.warns(RecordingWarning, match="the viewer hangs, "):
-            go_on(sim, rec, 4 * BLOCK_STEPS)
-        assert rec.lost
+            go_on(sim, rec, 4 * MAX_BLOCK_STEPS)
+        assert rec.failed
         rec.close()
         assert time.monotonic() - begin < 20.0
 
@@ -235,7 +237,7 @@ def test_viewers_get_what_is_served(tmp_path: Path) -> None:
         sim.reset()
         rec.begin(sim)
         rec.add(sim.step())
-        address = rec.served
+        address = rec.served_address
         assert address is not None
         assert address.startswith("rerun+http://127.0.0.1:")
         assert listens(address), "from the first step on"
@@ -296,8 +298,8 @@ def test_run_that_is_ended_leaves_a_readable_recording(tmp_path: Path) -> None:
         finally:
             process.kill()
     left = recorded_steps(killed)
-    assert len(left) >= BLOCK_STEPS
-    assert len(left) % BLOCK_STEPS == 0
+    assert len(left) >= MAX_BLOCK_STEPS
+    assert len(left) % MAX_BLOCK_STEPS == 0
     assert left == list(range(len(left)))
     found = recorded_steps(path)
     assert found == list(range(len(found)))

@@ -63,7 +63,7 @@ def make_recorder(
     Raises:
         SdcError: options of a recording without one, or a recording that cannot be made.
     """
-    from sdc_taichi.viz.streams import DEFAULT_PORT, is_address
+    from sdc_taichi.viz.recording_target import DEFAULT_PORT, is_address
 
     if serve or port is not None:
         port = DEFAULT_PORT if port is None else port
@@ -101,14 +101,14 @@ def recording(
         yield lambda _: None
         return
     from sdc_taichi.run.description import describe_run
-    from sdc_taichi.viz.streams import RecordingWarning
+    from sdc_taichi.viz.recording_output import RecordingWarning
 
     with warnings.catch_warnings(), recorder:
         warnings.simplefilter("always", RecordingWarning)
         warnings.showwarning = _show_warning
         recorder.begin(sim, describe_run(sim, request))
-        if recorder.served is not None:
-            command = f"sdc-taichi view {recorder.served}"
+        if recorder.served_address is not None:
+            command = f"sdc-taichi view {recorder.served_address}"
             print(f"serving the run; watch it with: {command} [--web]", file=sys.stderr)
         yield recorder.add
 
@@ -126,17 +126,17 @@ def _show_warning(
 
 def print_recording(recorder: Recorder | None) -> None:
     """Print where the recording of a run is, if it is a file."""
-    if recorder is not None and recorder.file is not None and not recorder.lost:
+    if recorder is not None and recorder.file is not None and not recorder.failed:
         print(f"Recording: {recorder.file} (open with: sdc-taichi view {recorder.file})")
 
 
 def serve_until_interrupted(recorder: Recorder | None, interrupted: Callable[[], bool]) -> None:
     """Keep a run that is done on show until Ctrl-C, if it is served to viewers."""
-    if recorder is None or recorder.served is None or recorder.lost:
+    if recorder is None or recorder.served_address is None or recorder.failed:
         return
     recorder.flush()
     if not interrupted():
-        text = f"the run is done and still served at {recorder.served}; Ctrl-C ends it"
+        text = f"the run is done and still served at {recorder.served_address}; Ctrl-C ends it"
         print(text, file=sys.stderr)
     while not interrupted():
         time.sleep(0.1)

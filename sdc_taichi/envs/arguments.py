@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from sdc_taichi.config import DataCenterConfig, apply_overrides, load_config, with_values
 from sdc_taichi.envs.options import EnvOptions, make_options
-from sdc_taichi.envs.recording import RecordedCore, Recording
+from sdc_taichi.envs.recording import RecorderOption, RecordingCore
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.hall_solver import Precision
 
@@ -52,10 +52,10 @@ def single_core(
     options: EnvOptions | None,
     keywords: Mapping[str, Any],
     precision: Precision,
-    recorder: Recording,
+    recorder: RecorderOption,
     *,
     only_agent: str | None = None,
-) -> RecordedCore:
+) -> RecordingCore:
     """The core of an environment with one data center.
 
     Args:
@@ -75,7 +75,7 @@ def single_core(
     )
     if len(configs) != 1:
         raise ConfigError(f"config: {len(configs)} data centers; valid is one, or vector_env")
-    return RecordedCore(configs, chosen, None, precision, recorder)
+    return RecordingCore(configs, chosen, None, precision, recorder)
 
 
 def _configs(source: Any, overrides: Overrides) -> list[DataCenterConfig]:

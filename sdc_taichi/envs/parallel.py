@@ -14,7 +14,7 @@ from sdc_taichi.envs.arguments import ConfigSource, Overrides, single_core
 from sdc_taichi.envs.base import SingleEnv, as_floats, first_of_batch, start_day_option, start_days
 from sdc_taichi.envs.core import Observation
 from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.envs.recording import Recording
+from sdc_taichi.envs.recording import RecorderOption
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.hall_solver import Precision
 
@@ -55,7 +55,7 @@ class SdcParallelEnv(SingleEnv, ParallelEnv[str, Observation, Any]):  # type: ig
         options: EnvOptions | None = None,
         precision: Precision = "f32",
         render_mode: str | None = None,
-        recorder: Recording = None,
+        recorder: RecorderOption = None,
         **keywords: Any,
     ) -> None:
         rendering.check_render_mode(render_mode)
@@ -161,7 +161,7 @@ def aec_env(
     options: EnvOptions | None = None,
     precision: Precision = "f32",
     render_mode: str | None = None,
-    recorder: Recording = None,
+    recorder: RecorderOption = None,
     **keywords: Any,
 ) -> AECEnv[str, Observation, Any]:
     """A PettingZoo environment whose agents act in turn, by PettingZoo's own conversion.

@@ -13,7 +13,7 @@ from sdc_taichi.envs.base import SingleEnv, as_floats, first_of_batch, start_day
 from sdc_taichi.envs.core import Observation
 from sdc_taichi.envs.learners import learning_agent, make_learner
 from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.envs.recording import Recording
+from sdc_taichi.envs.recording import RecorderOption
 from sdc_taichi.sim.hall_solver import Precision
 
 
@@ -54,7 +54,7 @@ class SdcEnv(SingleEnv, gymnasium.Env[Any, Any]):
         precision: Precision = "f32",
         render_mode: str | None = None,
         registered_agent: str | None = None,
-        recorder: Recording = None,
+        recorder: RecorderOption = None,
         **keywords: Any,
     ) -> None:
         rendering.check_render_mode(render_mode)

@@ -17,7 +17,7 @@ from sdc_taichi.envs.core import Core, Observation
 from sdc_taichi.envs.episode_start import Seed
 from sdc_taichi.envs.learners import learning_agent, make_learner
 from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.envs.recording import RecordedCore, Recording
+from sdc_taichi.envs.recording import RecorderOption, RecordingCore
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F32, F64
@@ -63,7 +63,7 @@ class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         render_mode: str | None = None,
         registered_agent: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
-        recorder: Recording = None,
+        recorder: RecorderOption = None,
         **keywords: Any,
     ) -> None:
         rendering.check_render_mode(render_mode)
@@ -72,7 +72,7 @@ class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         configs, chosen = configs_and_options(
             config, overrides, options, keywords, only_agent=agent
         )
-        self.core = RecordedCore(configs, chosen, num_envs, precision, recorder)
+        self.core = RecordingCore(configs, chosen, num_envs, precision, recorder)
         self.num_envs = num_envs = self.core.num_envs
         self.render_mode = render_mode
         self.metadata = {
@@ -277,7 +277,7 @@ def vector_env(
     options: EnvOptions | None = None,
     precision: Precision = "f32",
     render_mode: str | None = None,
-    recorder: Recording = None,
+    recorder: RecorderOption = None,
     **keywords: Any,
 ) -> MultiAgentVectorEnv:
     """A batch of data centers with several learning agents each.
@@ -301,7 +301,7 @@ def vector_env(
         SdcError: a config, number or option that is not valid.
     """
     configs, chosen = configs_and_options(config, overrides, options, keywords)
-    core = RecordedCore(configs, chosen, num_envs, precision, recorder)
+    core = RecordingCore(configs, chosen, num_envs, precision, recorder)
     return MultiAgentVectorEnv(core, render_mode)
 
 

@@ -1,0 +1,379 @@
+"""Send a recording to a file, to a viewer, or to viewers that connect here.
+
+An output never stops or slows a simulation. The first failure is told in one warning and ends the
+output; a file then ends with the last block that was written whole.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import itertools
+import os
+import shutil
+import threading
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sdc_taichi.atomic_file import naming_errors
+from sdc_taichi.errors import SdcError
+
+from .recording_target import HOST, listens, served_at
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+    from rerun.chunk import Chunk
+
+FILE_BLOCK_S = 5.0
+"""Longest time that a file system may take to write one block, in s."""
+MAX_UNSENT_BYTES = 256_000_000
+"""Bytes that may wait for a slow viewer; one with more is waited for once, and then given up."""
+VIEWER_WAIT_S = 2.0
+"""Longest wait for a viewer that is behind, and for Rerun to let go of an output, in s."""
+DELETE_EVERY = 8
+"""Number of closed recordings that are deleted together; Rerun keeps four threads of each."""
+_PROMPT_VIEWER_S = 1e-3  # 0 would not tell whether a viewer keeps up
+_FOOTER = b"RRF2FOOT"
+_FOOTER_FROM_END = 12
+
+
+class RecordingWarning(UserWarning):
+    """A recording has ended early; the run goes on without it."""
+
+
+def import_rerun() -> Any:
+    """Import ``rerun``, which sends no statistics unless the user has chosen otherwise.
+
+    Raises:
+        SdcError: rerun-sdk is missing.
+    """
+    os.environ.setdefault("RERUN_ANALYTICS", "0")
+    # Read once, on import. Lost viewers and full disks are told by warnings of this module instead.
+    silence = "RUST_LOG" not in os.environ
+    if silence:
+        os.environ["RUST_LOG"] = "off"
+    try:
+        import rerun
+    except ImportError as error:
+        raise SdcError(
+            f"recording needs rerun-sdk ({error}); install it with: pip install rerun-sdk"
+        ) from None
+    finally:
+        if silence:
+            os.environ.pop("RUST_LOG", None)
+    return rerun
+
+
+class RecordingOutput:
+    """The way of one recording to its file and its viewers.
+
+    Args:
+        file: file to write, or None.
+        address: viewer to connect to, or None.
+        port: port of 127.0.0.1 to serve viewers on, or None.
+        name: name of the recording, which viewers show.
+        keep_bytes: bytes that the file leaves free on its disk.
+
+    Raises:
+        SdcError: the file cannot be written, or there is too little room for it.
+    """
+
+    def __init__(
+        self,
+        *,
+        file: Path | None,
+        address: str | None,
+        port: int | None,
+        name: str,
+        keep_bytes: int,
+    ) -> None:
+        self._file, self._address, self._port, self._name = file, address, port, name
+        self._keep_bytes = keep_bytes
+        self._stream: rr.RecordingStream | None = None
+        # Chunks of a block are sent together, because each sending wakes Rerun's threads.
+        self._chunks: list[Chunk] = []
+        self._whole_bytes = 0
+        self._unconfirmed_bytes = 0
+        self.failed = False
+        """Whether the output has ended early."""
+        if file is not None:
+            _check_room(file, keep_bytes)
+        if address is not None and not listens(address):
+            self._fail(f"no viewer listens at {address}")
+
+    @property
+    def is_live(self) -> bool:
+        """Whether somebody may be watching while the recording is made."""
+        return self._file is None or self._port is not None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether files and connections are open."""
+        return self._stream is not None
+
+    @property
+    def place(self) -> str:
+        """File or address, as warnings name it."""
+        return str(self._file or self._address or served_at(self._port or 0))
+
+    def open(self, blueprint: rrb.Blueprint) -> None:
+        """Open files and connections, and send the blueprint.
+
+        Args:
+            blueprint: views of the recording.
+        """
+        rr = import_rerun()
+        sinks: list[Any] = []
+        self._stream = rr.RecordingStream("sdc_taichi")
+        try:
+            if self._file is not None:
+                sinks.append(rr.FileSink(self._file))
+            if self._address is not None:
+                sinks.append(rr.GrpcSink(self._address))
+            if self._port is not None:
+                # The default binds every interface of the machine.
+                sinks.append(rr.GrpcServerSink(HOST, self._port))
+            self._stream.set_sinks(*sinks)
+            self._stream.send_recording_name(self._name)
+            closable: Any = _ClosableBlueprint(blueprint)
+            self._stream.send_blueprint(closable)
+            closable.close()
+        except (OSError, RuntimeError) as error:
+            self._fail(f"cannot be opened ({error})")
+
+    def has_room_for(self, size_bytes: int) -> bool:
+        """Whether a block of this size may be sent; confirms that the blocks before have arrived.
+
+        Args:
+            size_bytes: size of the block, about.
+        """
+        if self.failed:
+            return False
+        self._confirm_sent()
+        if not self.failed and self._file is not None:
+            try:
+                free = shutil.disk_usage(self._file.parent).free
+            except OSError as error:  # its folder has gone
+                self._fail(f"cannot be written ({error})")
+                return False
+            if free < self._keep_bytes + size_bytes:
+                self._fail(
+                    f"{free / 1e6:.1f} MB left on the disk, {self._keep_bytes / 1e6:.1f} MB of it "
+                    "kept for the results of the run"
+                )
+        behind = self._unconfirmed_bytes > MAX_UNSENT_BYTES
+        if not self.failed and behind and not self._arrives_within(VIEWER_WAIT_S):
+            self._fail(f"the viewer hangs, {self._unconfirmed_bytes / 1e6:.0f} MB behind")
+        self._unconfirmed_bytes += size_bytes
+        return not self.failed
+
+    def add_columns(self, entity: str, times: Sequence[Any], columns: Iterable[Any]) -> None:
+        """Add columns of an entity to the block, which ``send_block`` sends.
+
+        Args:
+            entity: path of the entity.
+            times: columns of times.
+            columns: columns of components, with a row for each time.
+        """
+        from rerun.chunk import Chunk
+
+        self._chunks.append(Chunk.from_columns(entity, times, columns))
+
+    def send_static(self, entity: str, component: Any) -> None:
+        """Send a component that holds at all times."""
+        if self._stream is not None:
+            self._stream.log(entity, component, static=True, strict=True)
+
+    def send_block(self) -> None:
+        """Send the block, which Rerun's threads write while the run goes on."""
+        chunks, self._chunks = self._chunks, []
+        if self._stream is not None:
+            self._stream.send_chunks(chunks)
+
+    def close(self) -> None:
+        """Write what is left, with the index of the file."""
+        if self._stream is None or self.failed:
+            return
+        self._confirm_sent(VIEWER_WAIT_S)
+        if not self.failed and self._file is None and self._unconfirmed_bytes:
+            self._fail("the viewer hangs")
+        if self.failed:
+            return
+        self._stream.disconnect()
+        self._stream = None
+        _delete_closed_recordings()
+        if self._file is not None and not _has_index(self._file):
+            self._truncate_to_whole_blocks()
+            self._warn("its index could not be written")
+
+    def _confirm_sent(self, viewer_s: float = _PROMPT_VIEWER_S) -> None:
+        """Find out whether what was sent has arrived; a file has ``FILE_BLOCK_S``.
+
+        Args:
+            viewer_s: time that a viewer has, in s.
+        """
+        if self._stream is None or not self._unconfirmed_bytes:
+            return
+        if self._file is None:
+            if self._arrives_within(viewer_s):
+                self._unconfirmed_bytes = 0
+            elif self._address is not None and not listens(self._address):
+                self._fail("the viewer has closed")
+            return
+        # Not while Python computes: a flush frees texts that were sent, with Python's lock.
+        flush = _BackgroundCall(lambda s: s.flush(timeout_sec=FILE_BLOCK_S), self._stream)
+        try:
+            if not flush.ends_within(FILE_BLOCK_S):
+                raise RuntimeError(f"nothing was written for {FILE_BLOCK_S:g} s")
+            if flush.error is not None:
+                raise flush.error
+            self._whole_bytes = self._file.stat().st_size
+            self._unconfirmed_bytes = 0
+        except (OSError, RuntimeError) as error:
+            full = self._file.exists() and shutil.disk_usage(self._file.parent).free < 4096
+            self._fail("the disk is full" if full else f"cannot be written ({error})")
+
+    def _arrives_within(self, seconds: float) -> bool:
+        """Whether what was sent to a viewer arrives in time."""
+        assert self._stream is not None
+        try:
+            self._stream.flush(timeout_sec=seconds)
+        except RuntimeError:
+            return False
+        return True
+
+    def _fail(self, reason: str) -> None:
+        """End the output early, with a warning."""
+        self.failed = True
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            # Rerun waits for a viewer that hangs, and for a file that it cannot write, for ever.
+            if not _BackgroundCall(stream.disconnect).ends_within(VIEWER_WAIT_S):
+                import rerun as rr
+
+                rr.unregister_shutdown()
+                _HANGING_STREAMS.append(stream)
+            self._truncate_to_whole_blocks()
+        self._warn(reason)
+
+    def _truncate_to_whole_blocks(self) -> None:
+        """Cut off a block that was not written whole, which readers would refuse."""
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                if self._whole_bytes == 0:
+                    self._file.unlink()
+                elif self._file.stat().st_size > self._whole_bytes:
+                    os.truncate(self._file, self._whole_bytes)
+
+    def _warn(self, reason: str) -> None:
+        warnings.warn(
+            f"recording {self.place}: {reason}; the run goes on without it",
+            RecordingWarning,
+            stacklevel=2,
+        )
+
+
+class _ClosableBlueprint:
+    """A blueprint that closes the stream that Rerun sends it by, which Rerun leaves open."""
+
+    def __init__(self, blueprint: rrb.Blueprint) -> None:
+        self._blueprint = blueprint
+        self._stream: rr.RecordingStream | None = None
+
+    def to_blueprint(self) -> Any:
+        """What Rerun sends."""
+        return self
+
+    def _log_to_stream(self, stream: rr.RecordingStream) -> None:
+        """Send the blueprint, as ``rrb.Blueprint`` does when Rerun calls it."""
+        self._stream = stream
+        self._blueprint._log_to_stream(stream)
+
+    def close(self) -> None:
+        """Close the stream after sending."""
+        if self._stream is not None:
+            self._stream.disconnect()
+            self._stream = None
+
+
+_HANGING_STREAMS: list[rr.RecordingStream] = []
+"""Kept for ever, because Rerun waits for them when they are deleted."""
+
+_closed = itertools.count(1)
+
+
+def _delete_closed_recordings() -> None:
+    """Delete the closed recordings, while there are no others, whoever made them.
+
+    Rerun would write open ones out first, wait for ever for one that hangs, and log to no other
+    than the global one any more.
+    """
+    import rerun as rr
+
+    if next(_closed) % DELETE_EVERY:
+        return
+    others = (issubclass(type(thing), rr.RecordingStream) for thing in gc.get_objects())
+    if rr.get_global_data_recording() is None and not any(others):
+        rr.init("sdc_taichi", init_logging=False)
+
+
+class _BackgroundCall(threading.Thread):
+    """A call in a thread of its own, because it may never return.
+
+    A flush of Rerun's may not, whatever its timeout, once writing has failed.
+
+    Args:
+        call: the function.
+        arguments: given to the function.
+    """
+
+    def __init__(self, call: Callable[..., object], *arguments: object) -> None:
+        super().__init__(target=call, args=arguments, daemon=True)
+        self.error: RuntimeError | None = None
+        """Error in which the call ended."""
+        try:
+            self.start()
+        except RuntimeError as error:  # as many threads as the system grants
+            self.error = error
+
+    def run(self) -> None:
+        """Call the function and keep its error."""
+        try:
+            super().run()
+        except RuntimeError as error:
+            self.error = error
+
+    def ends_within(self, seconds: float) -> bool:
+        """Whether the call ends in time."""
+        if self.error is None:
+            self.join(seconds)
+        return not self.is_alive()
+
+
+def _check_room(file: Path, keep_bytes: int) -> None:
+    """Make sure that the file can be opened and begun; Rerun waits for ever on a full disk."""
+    with naming_errors(file):
+        new = not file.exists()
+        with file.open("ab"):
+            pass
+        if new:
+            file.unlink()
+        free = shutil.disk_usage(file.parent).free
+    if free < keep_bytes:
+        raise SdcError(
+            f"{file}: {free / 1e6:.1f} MB left on the disk, expected {keep_bytes / 1e6:.1f} MB for "
+            "the results of the run besides the recording"
+        )
+
+
+def _has_index(file: Path) -> bool:
+    """Whether a recording ends with the index that Rerun writes last."""
+    try:
+        with file.open("rb") as opened:
+            opened.seek(-_FOOTER_FROM_END, os.SEEK_END)
+            return opened.read(len(_FOOTER)) == _FOOTER
+    except OSError:
+        return False

@@ -1,0 +1,326 @@
+"""Turn the blocks of one recording into entities of the Rerun viewer.
+
+Entities of a recording, NAME being a data center in focus:
+
+    dc/NAME/map/{inlet,outlet,power}   a pixel tile per rack
+    dc/NAME/hall/{inlet,outlet}        a voxel per rack and level, in 3D
+    dc/NAME/series/..., crac/...       lines, an entity per unit
+    dc/NAME/actions/...                commands, as states
+    dc/NAME/events                     log
+    fleet/...                          sums and extremes over all data centers
+    legend/..., summary                static
+
+Timelines are ``step``, from 0 at reset, and ``sim_time``, the start of the step on the data
+center's own clock (see ``year_clock.step_times``); the fleet has the clock of the first one in
+focus.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.hall.floor_plan import floor_plan
+from sdc_taichi.types import F64, I64, StepResult
+from sdc_taichi.year_clock import step_times
+
+from . import hall_rasters as rasters
+from .recording_blocks import Block, BlockBuilder
+from .recording_blueprint import FocusTab, make_blueprint
+from .recording_cadence import choose_cadence
+from .recording_log import ConditionLog, LogEntry
+from .recording_output import RecordingOutput
+from .recording_series import (
+    COMMAND_STATES,
+    FIELD_ROWS,
+    FLEET_PLOTS,
+    PLOTS,
+    QUEUE_ENTITY,
+    REWARDS_ENTITY,
+    append_pue,
+    plot_rows_and_factors,
+)
+from .recording_static import MAX_UNIT_LINES, data_center_entities, fleet_entities
+from .recording_summary import summary_markdown
+from .rerun_columns import TimeColumn, bytes_column, number_column
+
+if TYPE_CHECKING:
+    from sdc_taichi.sim.simulator import Simulator
+
+Real = TypeVar("Real", bound=np.floating[Any])
+"""Number type of the frames."""
+Frames: TypeAlias = dict[tuple[int, str], npt.NDArray[Real]]
+"""Heat maps or voxel values by data center in focus and quantity."""
+
+LIVE_BLOCK_S, FILE_BLOCK_S = 1.0, 60.0
+"""Longest time between two blocks if somebody may watch, and if nobody does, in s."""
+_NO_COMMAND = 2
+"""Stands for the sign of a command before the first step."""
+
+
+class RecordingWriter:
+    """Writes one recording, block by block.
+
+    Args:
+        sim: the simulator, before its first step.
+        names: names of its data centers in the recording.
+        focus: indices of the data centers in focus.
+        description: what ``describe_run`` says of the run, or a part of it.
+        output: where the recording goes.
+        every_steps: steps between two heat maps and between two frames of the 3D hall; None
+            follows the number of racks in focus.
+    """
+
+    def __init__(
+        self,
+        sim: Simulator,
+        names: Sequence[str],
+        focus: Sequence[int],
+        description: Mapping[str, Any],
+        output: RecordingOutput,
+        every_steps: int | None,
+    ) -> None:
+        fleet = sim.fleet
+        self._fleet, self._description, self._output = fleet, description, output
+        self._names, self._focus = names, focus
+        self._start = sim.drivers.start[focus]
+        self._cadence = choose_cadence(fleet, focus, every_steps)
+        self._builder = BlockBuilder(sim, names, focus, self._cadence)
+        self._plots = {e: plot_rows_and_factors(plot, sim.step_h) for e, plot in PLOTS.items()}
+        self._scales = {
+            quantity: rasters.temperature_scale(quantity)
+            for quantity in rasters.TEMPERATURE_RANGES_C
+        }
+        self._scales["power"] = rasters.power_scale(fleet)
+        self._tile_grids = [rasters.tile_grid(fleet.configs[dc].hall) for dc in focus]
+        self._condition_logs = [ConditionLog(fleet, dc) for dc in focus]
+        self._last_signs: dict[tuple[int, str], int] = {}
+        self.steps_added = 0
+        """Number of steps added."""
+        self._block_s = LIVE_BLOCK_S if output.is_live else FILE_BLOCK_S
+        # The first step of a live recording is shown at once.
+        self._written_at_s = time.monotonic() - (self._block_s if output.is_live else 0.0)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the recording has ended early."""
+        return self._output.failed
+
+    def add(self, result: StepResult, rewards: Mapping[str, F64] | None) -> None:
+        """Add a step, and write the block if it is complete.
+
+        Args:
+            result: result of the step.
+            rewards: reward terms by name, (B,) each.
+
+        Raises:
+            SdcError: the step does not follow the one before, or the rewards are not valid.
+        """
+        if self.failed:
+            return
+        self._builder.add(result, rewards)
+        self.steps_added += 1
+        is_late = time.monotonic() - self._written_at_s > self._block_s
+        if is_late or self._builder.steps == self._cadence.block_steps:
+            self._write_block()
+
+    def flush(self) -> None:
+        """Write the steps that wait for their block to be complete."""
+        if self._builder.steps and not self.failed:
+            self._write_block()
+
+    def close(self) -> None:
+        """Write what is left, and the index."""
+        self.flush()
+        self._output.close()
+
+    def _write_block(self) -> None:
+        """Write the block under way."""
+        self._written_at_s = time.monotonic()
+        block = self._builder.take()
+        values = append_pue(block.values)
+        for index, log in enumerate(self._condition_logs):
+            block.entries.extend(log.entries(block.steps, values[:, :, index]))
+        maps, voxels = self._heat_maps(block), self._voxel_values(block)
+        size_bytes = 2 * values.nbytes + sum(frames.nbytes for frames in maps.values())
+        size_bytes += sum(frames.nbytes for frames in voxels.values())
+        if not self._output.has_room_for(size_bytes):
+            return
+        if not self._output.is_open:
+            self._open()
+        times, map_times, hall_times = map(
+            self._times, (block.steps, block.map_steps, block.hall_steps)
+        )
+        self._write_fleet(block, times[0], hall_times[0])
+        for index, dc in enumerate(self._focus):
+            path, own = self._path(dc), values[:, :, index]
+            self._write_lines(block, index, path, times[index], own)
+            self._write_states(index, path, block.steps, own)
+            self._write_log(index, path, [e for e in block.entries if e.dc == dc])
+            self._write_frames(index, path, maps, map_times[index], voxels, hall_times[index])
+        self._output.send_block()
+
+    def _open(self) -> None:
+        """Open the output and send what holds at all times."""
+        import rerun as rr
+
+        tabs = []
+        for dc, grid in zip(self._focus, self._tile_grids, strict=True):
+            hall = self._fleet.configs[dc].hall
+            plan = floor_plan(hall)
+            size_m = plan.length_m, plan.width_m, hall.layout.ceiling_m
+            name, path = self._names[dc], self._path(dc)
+            tabs.append(FocusTab(name, path, size_m, self._scales, grid.image_shape))
+        rewards = self._builder.reward_names or ()
+        has_hottest = self._fleet.size > 1
+        self._output.open(make_blueprint(tabs, has_hottest=has_hottest, has_rewards=bool(rewards)))
+        names = {dc: self._names[dc] for dc in self._focus}
+        text = summary_markdown(self._description, self._fleet, names, self._scales, self._cadence)
+        self._output.send_static("summary", rr.TextDocument(text, media_type="text/markdown"))
+        for entity, component in fleet_entities(self._scales):
+            self._output.send_static(entity, component)
+        for dc, levels in zip(self._focus, self._cadence.levels, strict=True):
+            for entity, component in data_center_entities(
+                self._fleet, dc, self._path(dc), self._scales, levels, rewards
+            ):
+                self._output.send_static(entity, component)
+
+    def _write_fleet(
+        self, block: Block, times: list[TimeColumn], hall_times: list[TimeColumn]
+    ) -> None:
+        """Series over all data centers, and the hottest halls."""
+        import rerun as rr
+
+        for entity, plot in FLEET_PLOTS.items():
+            self._write_scalars(f"fleet/{entity}", times, plot.series(block.fleet)[:, None])
+        if block.hottest:
+            media_types = ["text/markdown"] * len(block.hottest)
+            texts = rr.TextDocument.columns(text=block.hottest, media_type=media_types)
+            self._output.add_columns("fleet/hottest", hall_times, texts)
+
+    def _write_lines(
+        self, block: Block, index: int, path: str, times: list[TimeColumn], values: F64
+    ) -> None:
+        """Series of a data center: plots, queue, rewards and CRAC units."""
+        for entity, (rows, factors) in self._plots.items():
+            self._write_scalars(f"{path}/series/{entity}", times, values[:, rows] * factors)
+        queue = block.queue_by_age[:, index]
+        self._write_scalars(f"{path}/series/{QUEUE_ENTITY}", times, queue)
+        if block.rewards is not None:
+            terms = block.rewards[:, :, index]
+            self._write_scalars(f"{path}/series/{REWARDS_ENTITY}", times, terms)
+        units = self._builder.units[index]
+        supply_c, flow_m3s = block.unit_supply_c[:, units], block.unit_flow_m3s[:, units]
+        if units.stop - units.start > MAX_UNIT_LINES:
+            supply_c, flow_m3s = _low_mean_high(supply_c), _low_mean_high(flow_m3s)
+        air_c = np.concatenate([supply_c, values[:, FIELD_ROWS["return_c"], None]], axis=1)
+        self._write_scalars(f"{path}/crac/temperature_c", times, air_c)
+        self._write_scalars(f"{path}/crac/airflow_m3s", times, flow_m3s)
+
+    def _write_scalars(self, entity: str, times: list[TimeColumn], values: F64) -> None:
+        """Lines of an entity, (T, lines)."""
+        import rerun as rr
+
+        scalars = number_column(rr.Scalars.descriptor_scalars(), values)
+        self._output.add_columns(entity, times, [scalars])
+
+    def _write_states(self, index: int, path: str, steps: I64, values: F64) -> None:
+        """Commands of a data center, in the steps in which their sign changes."""
+        import rerun as rr
+
+        for entity, (command, names) in COMMAND_STATES.items():
+            signs = np.sign(values[:, FIELD_ROWS[command]]).astype(np.int64)
+            before = np.append(self._last_signs.get((index, entity), _NO_COMMAND), signs[:-1])
+            changed = np.flatnonzero(signs != before)
+            self._last_signs[index, entity] = int(signs[-1])
+            if len(changed):
+                states = [names[sign + 1] for sign in signs[changed]]
+                times = self._times(steps[changed])[index]
+                columns = rr.StateChange.columns(state=states)
+                self._output.add_columns(f"{path}/actions/{entity}", times, columns)
+
+    def _write_log(self, index: int, path: str, entries: list[LogEntry]) -> None:
+        """Entries of the log of a data center."""
+        import rerun as rr
+
+        if not entries:
+            return
+        entries.sort(key=lambda entry: entry.step)
+        steps = np.array([entry.step for entry in entries])
+        # Day and time of day are in the text, for which the viewer's column of times is too narrow.
+        clock = np.datetime_as_string(self._clock(steps)[:, index], "m").tolist()
+        log = rr.TextLog.columns(
+            text=[f"{at[5:10]} {at[11:]} {e.text}" for at, e in zip(clock, entries, strict=True)],
+            level=[entry.level for entry in entries],
+        )
+        self._output.add_columns(f"{path}/events", self._times(steps)[index], log)
+
+    def _write_frames(
+        self,
+        index: int,
+        path: str,
+        maps: Frames[np.float16],
+        map_times: list[TimeColumn],
+        voxels: Frames[np.float32],
+        hall_times: list[TimeColumn],
+    ) -> None:
+        """Heat maps and 3D hall of a data center."""
+        import rerun as rr
+
+        pixels = rr.DepthImage.descriptor_buffer()
+        voxel_values = rr.VoxelGridMap.descriptor_values()
+        for quantity in self._scales:
+            if (index, quantity) in maps:
+                frames = maps[index, quantity]
+                column = bytes_column(pixels, frames.reshape(len(frames), -1))
+                self._output.add_columns(f"{path}/map/{quantity}", map_times, [column])
+            if (index, quantity) in voxels:
+                column = number_column(voxel_values, voxels[index, quantity])
+                self._output.add_columns(f"{path}/hall/{quantity}", hall_times, [column])
+
+    def _heat_maps(self, block: Block) -> Frames[np.float16]:
+        """Heat maps, (M, height, width)."""
+        if not len(block.map_steps):
+            return {}
+        return {
+            (index, quantity): rasters.heat_maps(
+                values[:, racks], self._tile_grids[index], self._scales[quantity]
+            )
+            for index, racks in enumerate(self._builder.racks)
+            for quantity, values in block.maps.items()
+        }
+
+    def _voxel_values(self, block: Block) -> Frames[np.float32]:
+        """Values of the voxels, (H, levels of the racks)."""
+        return {
+            (index, quantity): rasters.quantised(values[:, levels], self._scales[quantity])
+            for index, levels in enumerate(self._builder.levels)
+            for quantity, values in block.halls.items()
+        }
+
+    def _clock(self, steps: I64) -> npt.NDArray[np.datetime64]:
+        """Time at which steps begin on the clocks of the data centers in focus, (T, n)."""
+        return step_times(self._start, steps, self._fleet.steps_per_hour)
+
+    def _times(self, steps: I64) -> list[list[TimeColumn]]:
+        """Columns of both timelines for each data center in focus."""
+        step = TimeColumn("step", steps)
+        clocks = self._clock(steps).astype("datetime64[ns]").T
+        return [[step, TimeColumn("sim_time", clock)] for clock in clocks]
+
+    def _path(self, dc: int) -> str:
+        """Path of the entities of a data center."""
+        import rerun as rr
+
+        return f"dc/{rr.escape_entity_path_part(self._names[dc])}"
+
+
+def _low_mean_high(unit_values: F64) -> F64:
+    """Lowest, mean and highest over the CRAC units, (T, U) to (T, 3)."""
+    return np.stack(
+        [unit_values.min(axis=1), unit_values.mean(axis=1), unit_values.max(axis=1)], axis=1
+    )
