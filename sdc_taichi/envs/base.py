@@ -51,7 +51,7 @@ class SingleEnv(_Env):
         return rendering.frame(self.core, 0)
 
     def close(self) -> None:
-        """Let go of the simulator."""
+        """Close the simulator, which is unusable afterwards."""
         self.core.close()
 
 

@@ -20,7 +20,7 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import Idle, View, controlled, make_controller, viewer
 from sdc_taichi.envs.actions import ActionDecoder
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT
-from sdc_taichi.envs.episode_start import Seed, chosen_start_days, seeded_generators
+from sdc_taichi.envs.episode_reset import Seed, chosen_start_days, seeded_generators
 from sdc_taichi.envs.heat_map import heat_map, heat_map_space
 from sdc_taichi.envs.observer import Observer
 from sdc_taichi.envs.options import EnvOptions
@@ -295,7 +295,7 @@ class Core:
         return self._observe(self.view)
 
     def close(self) -> None:
-        """Let go of the simulator."""
+        """Close the simulator, which is unusable afterwards."""
         self.sim.close()
 
     def _observation_space(self, agent: str) -> spaces.Space[Any]:

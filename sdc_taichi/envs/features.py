@@ -5,7 +5,7 @@ zero, to ``v / high``, -1..1. Values beyond the range are cut at it. Nothing loo
 demand of the step to come and the forecasts.
 
 Add a feature here: its range in ``time_features`` or ``measured_features``, its computation in the
-method of ``observer`` of the same kind, and its row in docs/observations.md.
+method of ``observer`` for the same kind, and its row in docs/observations.md.
 """
 
 from __future__ import annotations

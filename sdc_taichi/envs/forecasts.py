@@ -223,15 +223,15 @@ class _ExtendedSeries:
         series, which = table.distinct()
         ahead = int(leads[-1])
         parts = [np.resize(one.astype(np.float32), len(one) + ahead) for one in series]
-        offsets = np.cumsum([0, *(len(part) for part in parts[:-1])])
+        first_entries = np.cumsum([0, *(len(part) for part in parts[:-1])])
         self._values = np.concatenate(parts)
-        self._offsets = offsets[which]
+        self._first_entries = first_entries[which]
         self._lengths = table.length
         self._leads = leads[:, None]
 
     def at(self, index: I64, dc: I64 | slice) -> F32:
         """Values of data centers ``dc`` at steps ``index`` and at each lead, (1 + k, n)."""
-        first = self._offsets[dc] + index % self._lengths[dc]
+        first = self._first_entries[dc] + index % self._lengths[dc]
         return np.asarray(self._values.take(first + self._leads))
 
 

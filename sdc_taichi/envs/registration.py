@@ -10,7 +10,7 @@ IDS: dict[str, str | None] = {
     "sdc_taichi/Cooling-v0": "agent_dc",
     "sdc_taichi/Battery-v0": "agent_bat",
 }
-"""Who learns, None being all ``agents`` as one."""
+"""Ids of the environments, and the one agent that learns in each; None is all ``agents`` as one."""
 
 
 def register() -> None:

@@ -116,7 +116,7 @@ class ScaledEpisode:
                 rows.rows.row_numbers(start), return_index=True, return_inverse=True
             )
             shared = rows.rows
-            self._read = TimeRows(shared.values, shared.offsets[dcs], shared.lengths[dcs]).at
+            self._read = TimeRows(shared.values, shared.first_rows[dcs], shared.lengths[dcs]).at
         else:
             self._read = partial(rows.compute, dc=dcs)
         self._start = start[dcs]
@@ -180,12 +180,12 @@ class _RowPerEntry:
     """The series that the rows were made from."""
     rows: F64
     """Rows of all distinct series, (entries, columns)."""
-    offsets: I64
+    first_rows: I64
     """Row of the first entry of each data center's series, (B,)."""
 
     def at(self, index: I64, dc: I64) -> F64:
         """Rows ``index`` of the series of data centers ``dc``, repeating, (n, columns)."""
-        return self.rows.take(self.offsets[dc] + index % self.series.length[dc], axis=0)
+        return self.rows.take(self.first_rows[dc] + index % self.series.length[dc], axis=0)
 
     def made_from(self, series: Table) -> bool:
         """Whether the rows are those of ``series``."""
@@ -200,8 +200,8 @@ def _row_per_entry(series: Table, build: Callable[[F64], F64]) -> _RowPerEntry:
     """Build the rows, (entries, columns), of each distinct series once."""
     distinct, which = series.distinct()
     parts = [build(values) for values in distinct]
-    offsets = np.concatenate([[0], np.cumsum([len(part) for part in parts[:-1]])])
-    return _RowPerEntry(series, np.concatenate(parts), offsets.astype(np.int64)[which])
+    first_rows = np.concatenate([[0], np.cumsum([len(part) for part in parts[:-1]])])
+    return _RowPerEntry(series, np.concatenate(parts), first_rows.astype(np.int64)[which])
 
 
 def _time_of_day_rows(steps_per_day: int) -> F64:

@@ -17,15 +17,19 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.floor_plan import floor_plan, row_distance_m
 
 Image = npt.NDArray[np.uint8]
+"""A picture, (height, width, 3), in red, green and blue of 0..255."""
 
 RENDER_MODES = ("rgb_array",)
+"""Valid values of ``render_mode`` beside None."""
 RANGE_C = (15.0, 35.0)
-"""From the coldest setpoint of the presets up to what class A2 allows (ASHRAE TC 9.9)."""
+"""Temperatures in C between which the colours run: from the coldest setpoint of the presets up to
+what class A2 allows (ASHRAE TC 9.9)."""
 PX_PER_M = 40.0
+"""Scale of a picture, in pixels per metre, unless the hall is larger than ``LONGEST_PX``."""
 LONGEST_PX = 1024
-"""Larger halls are drawn smaller, down to a pixel per rack."""
+"""Longest side of a picture in pixels; larger halls are drawn smaller, down to a pixel per rack."""
 _SEPARATED_PX = 6.0
-"""Racks of at least this width are drawn apart."""
+"""Least width of a rack in pixels at which neighbours are drawn apart."""
 _FLOOR, _COLD, _HOT = (225, 225, 225), (198, 219, 239), (252, 205, 190)
 _INFERNO = (
     (0, 0, 4), (24, 12, 60), (66, 10, 104), (106, 23, 110), (147, 38, 103), (188, 55, 84),
@@ -35,7 +39,7 @@ _INFERNO = (
 
 
 def check_render_mode(mode: str | None) -> None:
-    """Refuse modes there are none of.
+    """Refuse a mode that does not exist.
 
     Raises:
         ConfigError: neither None nor one of ``RENDER_MODES``.
@@ -78,8 +82,8 @@ def hall_image(hall: HallConfig, inlet_c: npt.NDArray[np.float64]) -> Image:
     """A plan of the hall with the racks coloured by their inlets.
 
     Args:
-        hall: its racks and measures.
-        inlet_c: inlet of each rack, (racks,).
+        hall: racks and measures of the hall.
+        inlet_c: inlet temperature of each rack, in C, (racks,).
 
     Returns:
         (height, width, 3); the size depends on the hall alone.
@@ -112,7 +116,7 @@ def hall_image(hall: HallConfig, inlet_c: npt.NDArray[np.float64]) -> Image:
 
 
 def colours(celsius: npt.NDArray[np.float64]) -> Image:
-    """Colours of temperatures, (n, 3); those out of ``RANGE_C`` get the colour of its end."""
+    """Colours, (n, 3), of temperatures in C, (n,), which are cut at the ends of ``RANGE_C``."""
     anchors = np.array(_INFERNO, dtype=np.float64)
     at_c = np.linspace(*RANGE_C, len(anchors))
     channels = [np.interp(celsius, at_c, anchor) for anchor in anchors.T]

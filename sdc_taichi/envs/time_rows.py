@@ -29,14 +29,14 @@ class TimeRows:
 
     values: npt.NDArray[Any]
     """Rows of all distinct series end to end, (rows, columns)."""
-    offsets: I64
+    first_rows: I64
     """First row that each data center reads, (B,)."""
     lengths: I64
     """Number of rows after which the series of each data center repeats, (B,)."""
 
     def row_numbers(self, index: I64) -> I64:
         """Row of ``values`` that each data center reads at step ``index`` of its series, (B,)."""
-        return self.offsets + index % self.lengths
+        return self.first_rows + index % self.lengths
 
     def at(self, index: I64) -> npt.NDArray[Any]:
         """Rows of all data centers at step ``index`` of their series, (B, columns)."""
@@ -72,8 +72,8 @@ def time_rows(
     if int(lengths.sum()) * row_bytes > MAX_ROW_BYTES:
         return None
     parts = [read(np.arange(n), np.full(n, dc)) for dc, n in zip(first, lengths, strict=True)]
-    offsets = np.cumsum(lengths) - lengths
-    return TimeRows(np.concatenate(parts), offsets[which.reshape(-1)], length)
+    first_rows = np.cumsum(lengths) - lengths
+    return TimeRows(np.concatenate(parts), first_rows[which.reshape(-1)], length)
 
 
 class EntryOrder:

@@ -14,7 +14,7 @@ from sdc_taichi.envs import rendering
 from sdc_taichi.envs.arguments import ConfigSource, Overrides, configs_and_options
 from sdc_taichi.envs.base import BatchEnv, start_day_option, start_days
 from sdc_taichi.envs.core import Core, Observation
-from sdc_taichi.envs.episode_start import Seed
+from sdc_taichi.envs.episode_reset import Seed
 from sdc_taichi.envs.learners import learning_agent, make_learner
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.recording import RecorderOption, RecordingCore
@@ -164,7 +164,7 @@ class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         return self._learner.observation(self.core.load_state_dict(values))
 
     def close_extras(self, **_: Any) -> None:
-        """Let go of the simulator."""
+        """Close the simulator, which is unusable afterwards."""
         self.core.close()
 
 
@@ -265,7 +265,7 @@ class MultiAgentVectorEnv(BatchEnv):
         return self.core.load_state_dict(values)
 
     def close(self) -> None:
-        """Let go of the simulator."""
+        """Close the simulator, which is unusable afterwards."""
         self.core.close()
 
 
