@@ -8,7 +8,8 @@ from sdc_taichi.config import DataCenterConfig, load_config, preset_names, with_
 from sdc_taichi.envs import registration
 from sdc_taichi.errors import ConfigError, DataError, RuntimeStateError, SdcError
 from sdc_taichi.sim.drivers import Drivers, drivers_from_arrays, load_drivers
-from sdc_taichi.sim.fleet import Fleet, build_fleet, make_configs
+from sdc_taichi.sim.fleet import Fleet, build_fleet
+from sdc_taichi.sim.fleet_configs import make_configs
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import (
     Actions,

@@ -198,7 +198,7 @@ def _data_centers(
     sample: Path | None,
     seed: int,
 ) -> list[DataCenterConfig]:
-    from sdc_taichi.sim.fleet import make_configs
+    from sdc_taichi.sim.fleet_configs import make_configs
 
     if start is not None:
         try:

@@ -10,11 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.config import (
-    DataCenterConfig,
-    with_values,
-)
-from sdc_taichi.errors import ConfigError, suggestion
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
@@ -26,6 +23,7 @@ from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
 from sdc_taichi.types import F64, I32
 
 MOST_ENTRIES = int(np.iinfo(np.int32).max)
+"""Most racks, servers or other entries of a fleet: what the kernels can index."""
 STAGE_MODELS = {
     "inlet": "hall.inlet_model",
     "outlet": "servers.outlet_model",
@@ -66,37 +64,41 @@ class HallAir:
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """Data centers that run in one simulator; B of them, R racks, G server groups, S servers.
+    """Data centers that run in one simulator, as flat arrays.
 
-    All of them share the stage models, the time step and the age horizon of the queue; size, site,
-    season and every other parameter may differ.
+    There are B data centers with R racks, U CRAC units, G server groups and S servers in all. They
+    share the stage models, the time step and the age horizon of the queue; size, site, season and
+    every other parameter may differ.
     """
 
     configs: tuple[DataCenterConfig, ...]
+    """Configuration of each data center, (B,)."""
     models: Mapping[str, str]
+    """Name of the model of each stage, by the stages of ``STAGE_MODELS``."""
     steps_per_hour: int
+    """Steps in an hour."""
     rack_offsets: I32
-    """First rack of each data center, (B + 1,)."""
+    """First rack of each data center, and the number of racks, (B + 1,)."""
     rack_dc: I32
     """Data center of each rack, (R,)."""
     unit_offsets: I32
-    """First CRAC unit of each data center, (B + 1,)."""
+    """First CRAC unit of each data center, and the number of units, (B + 1,)."""
     group_offsets: I32
-    """First group of each rack, (R + 1,)."""
+    """First server group of each rack, and the number of groups, (R + 1,)."""
     server_offsets: I32
-    """First server of each group, (G + 1,)."""
+    """First server of each group, and the number of servers, (G + 1,)."""
     approach_k: F64
-    """Mean inlet over supply of each rack, (R,): as given, within the limits of the config; with
-    recirculation what the hall has at its design point."""
+    """Mean inlet over supply of each rack, in K, (R,): as given, within the limits of the config;
+    with recirculation what the hall has at its design point."""
     group_rows: tuple[F64, ...]
     """Rows GROUP_INPUTS of the hall kernels by data center, (6, its groups); equal halls share one
     array."""
     dcs: F64
     """Rows DC_COEFFICIENTS of the hall kernels, (18, B)."""
     unit_design_m3s: F64
-    """Airflow of each CRAC unit at full speed, (U,)."""
+    """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
     it_airflow_m3s: F64
-    """Airflow through all servers at the design point, (B,)."""
+    """Airflow through all servers at the design point, in m3/s, (B,)."""
     air: HallAir | None
     """How air moves in the halls; None with inlet model ``approach``."""
 
@@ -117,7 +119,7 @@ class Fleet:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the data centers; only records need them to differ."""
+        """Names of the data centers; only run folders and recordings need them to differ."""
         return tuple(c.name for c in self.configs)
 
     @property
@@ -217,39 +219,22 @@ class _Air:
 
 
 def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet:
-    """Lay data centers out as flat arrays.
+    """Arrange data centers as flat arrays.
+
+    Args:
+        configs: One data center, or several.
 
     Raises:
         ConfigError: no data center, or stage models, time steps or age horizons that differ.
     """
-    listed = (configs,) if isinstance(configs, DataCenterConfig) else tuple(configs)
-    for config in listed:
-        if not isinstance(config, DataCenterConfig):
-            raise ConfigError(
-                f"fleet: {config!r} is no DataCenterConfig; load_config reads presets and files"
-            )
-    if not listed:
-        raise ConfigError("fleet: no data center given; valid is at least one")
+    listed = _listed(configs)
     models = {stage: _shared(listed, path) for stage, path in STAGE_MODELS.items()}
     steps_per_hour = _shared(listed, "simulation.steps_per_hour")
     _shared(listed, "hvac.total_of")
     _shared(listed, "simulation.substep_s")
     # One queue array serves the fleet; ages are read off its length.
     _shared(listed, "workload.age_horizon_h")
-    # Data centers that share what a hall is made of share one hall, which is laid out once.
-    cache: dict[Any, _HallArrays] = {}
-    # Copies share the sections themselves; comparing those takes a while where servers differ.
-    known: dict[Any, _HallArrays] = {}
-    halls = []
-    for config in listed:
-        same = tuple(map(id, (config.hall, config.servers, config.hvac)))
-        if same not in known:
-            setpoint = config.hvac.setpoint
-            made_of = config.hall, config.servers, config.hvac.crac, setpoint.min_c, setpoint.max_c
-            if made_of not in cache:
-                cache[made_of] = _hall_arrays(config)
-            known[same] = cache[made_of]
-        halls.append(known[same])
+    halls = _distinct_halls(listed)
     racks = np.array([len(h.groups_per_rack) for h in halls])
     return Fleet(
         configs=listed,
@@ -273,84 +258,39 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     )
 
 
-def make_configs(
-    base: DataCenterConfig,
-    *,
-    count: int | None = None,
-    sites: Sequence[str] = (),
-    sample: Mapping[str, Any] | None = None,
-    seed: int = 0,
-) -> list[DataCenterConfig]:
-    """Copies of one data center over sites, with domain randomisation.
-
-    Args:
-        base: the data center to copy.
-        count: number of copies; None is one per site. Sites are dealt in turn.
-        sites: location names; empty keeps the location of ``base``.
-        sample: config path to ``{"uniform": [low, high]}`` or ``{"choice": [a, b, ...]}``.
-        seed: seed of the sampling; copy i draws the same values whatever ``count`` is.
-
-    Raises:
-        ConfigError: count below 1, or a sampling rule or drawn value that is not valid.
-    """
-    if isinstance(sites, str):
-        raise ConfigError(f"sites {sites!r}: valid is a list of names")
-    count = max(len(sites), 1) if count is None else count
-    if count < 1:
-        raise ConfigError(f"fleet: {count} data centers; valid is at least 1")
-    if count < len(sites):
-        raise ConfigError(
-            f"fleet: {count} data centers for {len(sites)} sites; valid is at least one per site"
-        )
-    rules = dict(sample or {})
-    for path, rule in rules.items():
-        _check_rule(base, path, rule)
-    out = []
-    for index in range(count):
-        config = base
-        if sites:
-            site = base.site.model_copy(update={"location": sites[index % len(sites)].upper()})
-            config = config.model_copy(update={"site": site})
-        if rules:
-            rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, index])))
-            config = with_values(config, {path: _draw(rule, rng) for path, rule in rules.items()})
-        stem = config.site.location.lower()
-        name = stem if count <= max(len(sites), 1) else f"{stem}-{index:0{len(str(count - 1))}d}"
-        out.append(config.model_copy(update={"name": name}))
-    return out
-
-
-def _check_rule(base: DataCenterConfig, path: str, rule: Any) -> None:
-    where = f"sample {path}"
-    if not isinstance(rule, Mapping) or len(rule) != 1:
-        raise ConfigError(f"{where}: valid is {{uniform: [low, high]}} or {{choice: [a, b, ...]}}")
-    ((kind, values),) = rule.items()
-    if kind not in ("uniform", "choice"):
-        meant = suggestion(kind, ("uniform", "choice"), " (did you mean {!r}?)")
-        raise ConfigError(f"{where}: unknown kind {kind!r}; valid: uniform, choice{meant}")
-    if not isinstance(values, list | tuple) or not values:
-        raise ConfigError(f"{where}: {kind} needs a list, got {values!r}")
-    if kind == "uniform":
-        numbers = all(isinstance(v, int | float) and abs(v) < np.inf for v in values)
-        numbers &= not any(isinstance(v, bool) for v in values)
-        if len(values) != 2 or not numbers or not values[0] <= values[1]:
+def _listed(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> tuple[DataCenterConfig, ...]:
+    """Configs of a fleet, checked to be some."""
+    listed = (configs,) if isinstance(configs, DataCenterConfig) else tuple(configs)
+    for config in listed:
+        if not isinstance(config, DataCenterConfig):
             raise ConfigError(
-                f"{where}: uniform needs [low, high] with low <= high, got {values!r}"
+                f"fleet: {config!r} is no DataCenterConfig; load_config reads presets and files"
             )
-    with_values(base, {path: values[0]})
+    if not listed:
+        raise ConfigError("fleet: no data center given; valid is at least one")
+    return listed
 
 
-def _draw(rule: Mapping[str, Any], rng: np.random.Generator) -> Any:
-    ((kind, values),) = rule.items()
-    if kind == "choice":
-        return values[int(rng.integers(len(values)))]
-    low, high = values
-    if isinstance(low, int) and isinstance(high, int):
-        return int(rng.integers(low, high + 1))
-    return float(rng.uniform(low, high))
+def _distinct_halls(configs: Sequence[DataCenterConfig]) -> list[_HallArrays]:
+    """Arrays of each data center's hall, made once for data centers whose halls are alike."""
+    cache: dict[Any, _HallArrays] = {}
+    # Copies share the sections themselves; comparing those takes a while where servers differ.
+    known: dict[Any, _HallArrays] = {}
+    halls = []
+    for config in configs:
+        same = tuple(map(id, (config.hall, config.servers, config.hvac)))
+        if same not in known:
+            setpoint = config.hvac.setpoint
+            made_of = config.hall, config.servers, config.hvac.crac, setpoint.min_c, setpoint.max_c
+            if made_of not in cache:
+                cache[made_of] = _hall_arrays(config)
+            known[same] = cache[made_of]
+        halls.append(known[same])
+    return halls
 
 
 def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
+    """Value of a config field that all data centers of a fleet share."""
     found = [*map(attrgetter(path), configs)]
     for config, value in zip(configs, found, strict=True):
         if value != found[0]:
@@ -362,6 +302,7 @@ def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
 
 
 def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
+    """Arrays of the hall of one data center."""
     hall, crac, curves = config.hall, config.hvac.crac, config.servers.curves
     servers = rack_servers(config)
     if servers.count.sum() > MOST_ENTRIES:
@@ -454,12 +395,17 @@ def _joined(distinct: Sequence[MixWeights], entry: I32) -> MixWeights:
     )
 
 
-def _sums(values: npt.ArrayLike, start: I32) -> F64:
-    return np.asarray(np.add.reduceat(np.asarray(values, dtype=np.float64), start[:-1]))
+def _sums(values: npt.ArrayLike, offsets: I32) -> F64:
+    """Sums over the entries between consecutive offsets."""
+    return np.asarray(np.add.reduceat(np.asarray(values, dtype=np.float64), offsets[:-1]))
 
 
 def offsets_from_counts(counts: npt.ArrayLike, what: str) -> I32:
-    """Where each of so many entries begins, and where the last ends, (n + 1,).
+    """Where the parts of each entry begin, and where the last end, (n + 1,).
+
+    Args:
+        counts: Parts of each entry, (n,).
+        what: Name of the parts, for errors.
 
     Raises:
         ConfigError: naming ``what`` when there are more than the kernels can index.
