@@ -4,7 +4,8 @@ Each quantity is a climatology (annual and diurnal harmonics and their product) 
 autocorrelated residual, mapped onto the percentiles of the real series. Weather is dry bulb, dew
 point correlated with it, and pressure; carbon intensity follows from a generated fuel mix in which
 every fuel but the marginal one is drawn and the marginal one takes what wind leaves. The figures
-are in ``sdc_taichi.data/coefficients.json``; where they come from is in ``data/README.md``.
+are in ``sdc_taichi.data/coefficients.json``, found by ``examples/fit_year.py``; where they come
+from is in ``data/README.md``.
 
 Random numbers are raw PCG64 bits turned to normals by Box-Muller, because NumPy guarantees the bit
 stream but not ``Generator.normal`` across versions. Results are rounded to 1e-4 (workload 1e-6),
@@ -31,30 +32,33 @@ from sdc_taichi.exogenous.psychrometrics import (
 from sdc_taichi.exogenous.series import FloatArray, Series, SiteData
 from sdc_taichi.year_clock import DAYS_PER_YEAR, HOURS_PER_YEAR
 
-TRACE_HOURS = 53 * 168  # whole weeks, as the fitted traces; cut to the year at the end
+TRACE_HOURS = 53 * 168
+"""Hours of a generated workload trace: whole weeks, as in the fitted traces, cut to the year."""
 FUELS = ("WND", "SUN", "WAT", "OIL", "NG", "COL", "NUC", "OTH")
+"""Energy sources of EIA-930: wind, sun, water, oil, natural gas, coal, nuclear, other."""
 DEFAULT_SEED = 10
+"""Seed of the embedded year unless a config names another."""
 
 # Streams of random numbers of one site; slow and fast residuals of fuel i are 100 + i and 200 + i.
 _STREAM_SLOW_FUEL, _STREAM_FAST_FUEL, _STREAM_TRACE = 100, 200, 300
-_WARM_UP = 240
-"""Hours."""
+_WARM_UP_H = 240
 
-_Table = dict[str, Any]
+Figures = dict[str, Any]
+"""Fitted figures of a site, a grid, a quantity or a trace, by their names in coefficients.json."""
 
 
 @lru_cache(maxsize=1)
-def coefficients() -> _Table:
-    """The embedded figures (read only)."""
+def coefficients() -> Figures:
+    """All embedded figures, shared by every caller: not to be changed."""
     text = files("sdc_taichi.data").joinpath("coefficients.json").read_text(encoding="utf-8")
-    table: _Table = json.loads(text)
-    return table
+    figures: Figures = json.loads(text)
+    return figures
 
 
 def emission_factors() -> dict[str, float]:
     """Life-cycle emissions per fuel, g CO2e/kWh, that turn a fuel mix into ``avg_CI``."""
-    table: dict[str, float] = coefficients()["emission_factors_g_per_kwh"]
-    return dict(table)
+    factors: dict[str, float] = coefficients()["emission_factors_g_per_kwh"]
+    return dict(factors)
 
 
 def synthetic_sites() -> tuple[str, ...]:
@@ -84,12 +88,12 @@ def synthetic_site(name: str, seed: int = DEFAULT_SEED) -> SiteData:
     if name not in synthetic_sites():
         raise DataError(f"site {name!r}: expected one of {', '.join(synthetic_sites())}")
     _check_seed(seed)
-    table = coefficients()["weather"][name]
+    figures = coefficients()["weather"][name]
 
     def normals(stream: int) -> FloatArray:
         return _normals(seed, stream, name, HOURS_PER_YEAR)
 
-    outdoor, humidity, pressure = (np.round(x, 4) for x in _weather(table, normals))
+    outdoor, humidity, pressure = (np.round(x, 4) for x in _weather(figures, normals))
     mix = _fuel_mix(coefficients()["grid"][name], normals)
     factors = np.array([emission_factors()[fuel] for fuel in FUELS])
     generation = np.array([mix[fuel] for fuel in FUELS])
@@ -99,15 +103,15 @@ def synthetic_site(name: str, seed: int = DEFAULT_SEED) -> SiteData:
         source = f"synthetic year, seed {seed}, fitted to {fitted_to}"
         return Series(np.round(values, 4), 60.0, quantity, unit, source, synthetic=True)
 
-    station = f"OneBuilding TMYx {table['station']}"
-    grid = f"EIA-930 2022 {table['grid']}"
+    station = f"OneBuilding TMYx {figures['station']}"
+    grid = f"EIA-930 2022 {figures['grid']}"
     return SiteData(
         name=name,
-        label=table["label"],
-        latitude_deg=table["lat"],
-        longitude_deg=table["lon"],
-        elevation_m=table["elevation_m"],
-        utc_offset_h=table["utc_offset"],
+        label=figures["label"],
+        latitude_deg=figures["lat"],
+        longitude_deg=figures["lon"],
+        elevation_m=figures["elevation_m"],
+        utc_offset_h=figures["utc_offset"],
         outdoor_c=series("outdoor_c", "C", outdoor, station),
         wet_bulb_c=series("wet_bulb_c", "C", wet_bulb_c(outdoor, humidity, pressure), station),
         ci_g_per_kwh=series("ci_g_per_kwh", "g/kWh", intensity, grid),
@@ -133,9 +137,9 @@ def synthetic_trace(name: str, seed: int = DEFAULT_SEED) -> Series:
     if name not in synthetic_traces():
         raise DataError(f"trace {name!r}: expected one of {', '.join(synthetic_traces())}")
     _check_seed(seed)
-    table = coefficients()["workload"][name]
-    values = _workload(table, lambda i: _normals(seed, i, name, TRACE_HOURS))[:HOURS_PER_YEAR]
-    source = f"synthetic year, seed {seed}, fitted to {table['fitted_to']}"
+    figures = coefficients()["workload"][name]
+    values = _workload(figures, lambda i: _normals(seed, i, name, TRACE_HOURS))[:HOURS_PER_YEAR]
+    source = f"synthetic year, seed {seed}, fitted to {figures['fitted_to']}"
     return Series(np.round(values, 6), 60.0, "utilisation", "1", source, synthetic=True)
 
 
@@ -144,20 +148,100 @@ def _check_seed(seed: int) -> None:
         raise DataError(f"seed: {seed!r}, expected a whole number of 0 or more")
 
 
-class _Basis(NamedTuple):
-    """Columns, and their products with each other, which take longer than all else of a fit."""
+class Basis(NamedTuple):
+    """Functions of time whose weighted sum is a climatology."""
 
     columns: FloatArray
+    """One function per column, (hours, functions)."""
     products: FloatArray
+    """Scalar products of the columns, (functions, functions); costly, hence kept."""
 
     def project(self, z: FloatArray) -> FloatArray:
-        """Least-squares coefficients of z."""
+        """Least-squares coefficients, (functions,), of values z, (hours,)."""
         return np.asarray(np.linalg.solve(self.products, self.columns.T @ z), dtype=np.float64)
 
 
-def _basis(columns: list[FloatArray]) -> _Basis:
+def make_basis(columns: list[FloatArray]) -> Basis:
+    """Basis of the given functions, each (hours,)."""
     stacked = np.stack(columns, axis=1)
-    return _Basis(stacked, stacked.T @ stacked)
+    return Basis(stacked, stacked.T @ stacked)
+
+
+@lru_cache(maxsize=32)
+def climatology_basis(annual: int, diurnal: int, products: tuple[int, ...]) -> Basis:
+    """Constant, annual harmonics, diurnal harmonics, and products of both.
+
+    Args:
+        annual: order of the annual harmonics.
+        diurnal: order of the diurnal harmonics.
+        products: diurnal harmonics that are multiplied by the first annual one, so that the shape
+            of the day changes with the season.
+
+    Returns:
+        Basis of the hours of the year.
+    """
+    year = 2.0 * np.pi * (np.arange(HOURS_PER_YEAR) + 0.5) / HOURS_PER_YEAR
+    day = 2.0 * np.pi * (np.arange(24) + 0.5) / 24.0
+
+    def diurnals(m: int) -> list[FloatArray]:
+        return [np.tile(f(m * day), DAYS_PER_YEAR) for f in (np.cos, np.sin)]
+
+    columns = [np.ones(HOURS_PER_YEAR)]
+    for m in range(1, annual + 1):
+        columns += [np.cos(m * year), np.sin(m * year)]
+    for m in range(1, diurnal + 1):
+        columns += diurnals(m)
+    for m in products:
+        columns += [first * each for first in (np.cos(year), np.sin(year)) for each in diurnals(m)]
+    return make_basis(columns)
+
+
+def trace_basis(hours: int, annual: int, diurnal: int, weekly: int) -> Basis:
+    """Constant and harmonics of the year, the day and the week over the first hours of a year.
+
+    Args:
+        hours: length.
+        annual: order of the annual harmonics.
+        diurnal: order of the diurnal harmonics.
+        weekly: order of the weekly harmonics.
+    """
+    hour = np.arange(hours)
+    columns = [np.ones(hours)]
+    for angle, order in (
+        (2.0 * np.pi * hour / HOURS_PER_YEAR, annual),
+        (2.0 * np.pi * (hour % 24 + 0.5) / 24.0, diurnal),
+        (2.0 * np.pi * hour / 168.0, weekly),
+    ):
+        for m in range(1, order + 1):
+            columns += [np.cos(m * angle), np.sin(m * angle)]
+    return make_basis(columns)
+
+
+def solar_envelope(latitude_deg: float, lateness_h: float, saturation: float) -> FloatArray:
+    """Clear-sky output of a fleet of solar plants as a share of its greatest.
+
+    Sine of the solar elevation (declination by Cooper 1969), saturating as trackers do.
+
+    Args:
+        latitude_deg: centre of the fleet, degrees north.
+        lateness_h: solar noon of the fleet after 12:00 local standard time, hours.
+        saturation: 0 for output in proportion to the sine; the larger, the flatter around noon.
+
+    Returns:
+        Share in 0..1 of each hour of the year, (8760,).
+    """
+    hour = np.arange(HOURS_PER_YEAR)
+    declination = np.radians(23.45) * np.sin(2.0 * np.pi * (284 + hour // 24 + 1) / DAYS_PER_YEAR)
+    angle = np.radians(15.0) * (hour % 24 + 0.5 - 12.0 - lateness_h)
+    latitude = math.radians(latitude_deg)
+    sine = np.maximum(
+        0.0,
+        math.sin(latitude) * np.sin(declination)
+        + math.cos(latitude) * np.cos(declination) * np.cos(angle),
+    )
+    return np.asarray(
+        (1.0 - np.exp(-saturation * sine)) / (1.0 - math.exp(-saturation)), dtype=np.float64
+    )
 
 
 # Random numbers and residuals
@@ -203,12 +287,15 @@ def _ar2(noise: FloatArray, memory_h: float, smooth_h: float) -> FloatArray:
     f, g = math.exp(-1.0 / memory_h), math.exp(-1.0 / max(smooth_h, 1e-3))
     a, b = f + g, -f * g
     variance = (1.0 - b) / ((1.0 + b) * ((1.0 - b) ** 2 - a * a))
-    kicks = np.concatenate([noise[-_WARM_UP:], noise]) / math.sqrt(variance)
-    return _filtered(_filtered(kicks, f), g)[_WARM_UP:]
+    kicks = np.concatenate([noise[-_WARM_UP_H:], noise]) / math.sqrt(variance)
+    return _filtered(_filtered(kicks, f), g)[_WARM_UP_H:]
 
 
-def _residual(p: _Table, slow: FloatArray, fast: FloatArray, basis: _Basis) -> FloatArray:
-    """Slow part and fast part with a day-to-day memory, orthogonal to the climatology."""
+def _residual(p: Figures, slow: FloatArray, fast: FloatArray, basis: Basis) -> FloatArray:
+    """Residual: a slow part plus a fast part with a memory from day to day.
+
+    Orthogonal to the climatology and of the fitted standard deviation, so that it changes neither.
+    """
     if "tm" in p:
         z = math.sqrt(p["w"]) * _ar2(slow, p["ts"], p["tm"])
     else:
@@ -223,42 +310,32 @@ def _residual(p: _Table, slow: FloatArray, fast: FloatArray, basis: _Basis) -> F
     return np.asarray(z * (p["sd"] / z.std()), dtype=np.float64)
 
 
-# Climatology
+# Quantities
 
 
-@lru_cache(maxsize=32)
-def _climatology(annual: int, diurnal: int, products: tuple[int, ...]) -> _Basis:
-    """Columns: 1, annual and diurnal harmonics, first annual times given diurnal harmonics."""
-    year = 2.0 * np.pi * (np.arange(HOURS_PER_YEAR) + 0.5) / HOURS_PER_YEAR
-    day = 2.0 * np.pi * (np.arange(24) + 0.5) / 24.0
-
-    def diurnals(m: int) -> list[FloatArray]:
-        return [np.tile(f(m * day), DAYS_PER_YEAR) for f in (np.cos, np.sin)]
-
-    columns = [np.ones(HOURS_PER_YEAR)]
-    for m in range(1, annual + 1):
-        columns += [np.cos(m * year), np.sin(m * year)]
-    for m in range(1, diurnal + 1):
-        columns += diurnals(m)
-    for m in products:
-        columns += [first * each for first in (np.cos(year), np.sin(year)) for each in diurnals(m)]
-    return _basis(columns)
-
-
-def _pin(values: FloatArray, percentiles: list[float]) -> FloatArray:
-    """Monotone piecewise-linear map of the values' own percentiles onto the fitted ones."""
+def _match_percentiles(values: FloatArray, percentiles: list[float]) -> FloatArray:
+    """Map values onto the fitted percentiles: monotone, linear between their own percentiles."""
     own = np.asarray(np.percentile(values, coefficients()["pins_percent"]), dtype=np.float64)
     knots = np.maximum.accumulate(own + 1e-9 * np.arange(own.size))  # ties stay increasing
     return np.interp(values, knots, percentiles)
 
 
-def _series(p: _Table, slow: FloatArray, fast: FloatArray) -> FloatArray:
-    """Climatology and residual, then percentiles and climatology imposed in turn.
+def _quantity(p: Figures, slow: FloatArray, fast: FloatArray) -> FloatArray:
+    """One quantity over the year: its climatology plus a residual, on the fitted percentiles.
 
-    Both are targets of a typical year, and each disturbs the other a little.
+    Climatology and percentiles are imposed in turn: both are targets of a typical year, and each
+    disturbs the other a little.
+
+    Args:
+        p: figures of the quantity.
+        slow: standard normals of the slow part of the residual, (8760,).
+        fast: standard normals of its fast part, (8760,).
+
+    Returns:
+        (8760,), in the unit of the percentiles.
     """
     annual, diurnal, products = p["h"]
-    basis = _climatology(annual, diurnal, tuple(products))
+    basis = climatology_basis(annual, diurnal, tuple(products))
     c = np.array(p["c"])
     residual = _residual(p, slow, fast, basis)
     z = basis.columns @ c + residual - basis.columns @ basis.project(residual)
@@ -267,52 +344,33 @@ def _series(p: _Table, slow: FloatArray, fast: FloatArray) -> FloatArray:
     if "q" not in p:
         return np.asarray(values, dtype=np.float64)
     for _ in range(3):
-        pinned = _pin(values, p["q"])
+        pinned = _match_percentiles(values, p["q"])
         z = np.sqrt(np.maximum(pinned, 0.0)) if root else pinned
         z = z + basis.columns @ (c - basis.project(z))
         values = np.maximum(z, 0.0) ** 2 if root else z
-    return _pin(values, p["q"])
+    return _match_percentiles(values, p["q"])
 
 
 # Weather, grid, workload
 
 
 def _weather(
-    table: _Table, normals: Callable[[int], FloatArray]
+    figures: Figures, normals: Callable[[int], FloatArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Dry bulb (C), relative humidity (%) and station pressure (Pa)."""
     g = [normals(i) for i in range(5)]
-    outdoor = _series(table["T"], g[0], g[1])
-    rho_slow, rho_fast = table["D"]["rho"]
-    dew_point = _series(
-        table["D"],
+    outdoor = _quantity(figures["T"], g[0], g[1])
+    rho_slow, rho_fast = figures["D"]["rho"]
+    dew_point = _quantity(
+        figures["D"],
         rho_slow * g[0] + math.sqrt(1.0 - rho_slow**2) * g[2],
         rho_fast * g[1] + math.sqrt(1.0 - rho_fast**2) * g[3],
     )
     dew_point = np.minimum(dew_point, outdoor)  # drawn apart, so they can cross: saturated air
-    mean, spread, memory_h = table["P"]
+    mean, spread, memory_h = figures["P"]
     pressure = mean + spread * _ar1(g[4], math.exp(-1.0 / memory_h))
     humidity = np.clip(relative_humidity_from_dew_point_pct(outdoor, dew_point), 1.0, 100.0)
     return outdoor, humidity, pressure
-
-
-def _solar_envelope(latitude_deg: float, lateness_h: float, saturation: float) -> FloatArray:
-    """Clear-sky output of a fleet of plants in [0, 1].
-
-    Sine of the solar elevation (declination by Cooper 1969), saturating as trackers do.
-    """
-    hour = np.arange(HOURS_PER_YEAR)
-    declination = np.radians(23.45) * np.sin(2.0 * np.pi * (284 + hour // 24 + 1) / DAYS_PER_YEAR)
-    angle = np.radians(15.0) * (hour % 24 + 0.5 - 12.0 - lateness_h)
-    latitude = math.radians(latitude_deg)
-    sine = np.maximum(
-        0.0,
-        math.sin(latitude) * np.sin(declination)
-        + math.cos(latitude) * np.cos(declination) * np.cos(angle),
-    )
-    return np.asarray(
-        (1.0 - np.exp(-saturation * sine)) / (1.0 - math.exp(-saturation)), dtype=np.float64
-    )
 
 
 def _correlated(names: list[str], pairs: dict[str, float], noise: FloatArray) -> FloatArray:
@@ -327,49 +385,39 @@ def _correlated(names: list[str], pairs: dict[str, float], noise: FloatArray) ->
     return np.asarray(np.linalg.cholesky(matrix / scale[:, None] / scale) @ noise)
 
 
-def _fuel_mix(table: _Table, normals: Callable[[int], FloatArray]) -> dict[str, FloatArray]:
+def _fuel_mix(figures: Figures, normals: Callable[[int], FloatArray]) -> dict[str, FloatArray]:
     """Generation per fuel, MWh in the hour.
 
     NET is marginal fuel plus wind: a windy hour pushes gas (hydro in WA) down one for one.
     """
-    names: list[str] = table["order"]
+    names: list[str] = figures["order"]
     slow, fast = (
         _correlated(
             names,
-            table.get(f"corr_{part}", {}),
+            figures.get(f"corr_{part}", {}),
             np.stack([normals(stream + i) for i in range(len(names))]),
         )
         for part, stream in (("slow", _STREAM_SLOW_FUEL), ("fast", _STREAM_FAST_FUEL))
     )
-    mix = {fuel: np.full(HOURS_PER_YEAR, float(table["flat"].get(fuel, 0.0))) for fuel in FUELS}
+    mix = {fuel: np.full(HOURS_PER_YEAR, float(figures["flat"].get(fuel, 0.0))) for fuel in FUELS}
     for i, name in enumerate(names):
-        p = table["drv"][name]
+        p = figures["drv"][name]
         if name == "SUN":  # percentiles are those of daylight hours, after the envelope
-            envelope = _solar_envelope(*table["sun"])
-            clear = _series({k: x for k, x in p.items() if k != "q"}, slow[i], fast[i])
+            envelope = solar_envelope(*figures["sun"])
+            clear = _quantity({k: x for k, x in p.items() if k != "q"}, slow[i], fast[i])
             output = np.maximum(clear, 0.0) * envelope
             day = envelope > 0.0
-            output[day] = _pin(output[day], p["q"])
+            output[day] = _match_percentiles(output[day], p["q"])
             mix[name] = output
         else:
-            mix[name] = _series(p, slow[i], fast[i])
-    mix[table["marginal"]] = _pin(mix.pop("NET") - mix["WND"], table["q"])
+            mix[name] = _quantity(p, slow[i], fast[i])
+    mix[figures["marginal"]] = _match_percentiles(mix.pop("NET") - mix["WND"], figures["q"])
     return mix
 
 
-def _workload(table: _Table, normals: Callable[[int], FloatArray]) -> FloatArray:
+def _workload(figures: Figures, normals: Callable[[int], FloatArray]) -> FloatArray:
     """Utilisation over TRACE_HOURS hours: annual, daily and weekly harmonics plus residual."""
-    hour = np.arange(TRACE_HOURS)
-    day = 2.0 * np.pi * (hour % 24 + 0.5) / 24.0
-    columns = [np.ones(TRACE_HOURS)]
-    for angle, order in (
-        (2.0 * np.pi * hour / HOURS_PER_YEAR, table["annual"]),
-        (day, table["D"]),
-        (2.0 * np.pi * hour / 168.0, table["W"]),
-    ):
-        for m in range(1, order + 1):
-            columns += [np.cos(m * angle), np.sin(m * angle)]
-    basis = _basis(columns)
+    basis = trace_basis(TRACE_HOURS, figures["annual"], figures["D"], figures["W"])
     slow, fast = normals(_STREAM_TRACE), normals(_STREAM_TRACE + 1)
-    values = basis.columns @ np.array(table["c"]) + _residual(table, slow, fast, basis)
-    return _pin(values, table["q"])
+    values = basis.columns @ np.array(figures["c"]) + _residual(figures, slow, fast, basis)
+    return _match_percentiles(values, figures["q"])
