@@ -1,6 +1,8 @@
-"""Arrays that flow through a step. Shapes: B data centers, R racks of all, one row each.
+"""Actions, state and results of a step, and the array types of the package.
 
-Records that every step makes are not frozen, which would take three times as long to make.
+In shapes, B counts data centers, U CRAC units, R racks, G server groups and S servers, those of all
+data centers end to end. Dataclasses that every step makes are not frozen, which would take three
+times as long to make.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ Values = F64 | float
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 Status = npt.NDArray[np.int8]
+"""Status of racks, see ``hall.protection``."""
 Reals = npt.NDArray[np.floating[Any]]
+"""Real numbers in the precision of the server kernels."""
 
 
 def as_array(values: F64 | float) -> F64:
@@ -68,31 +72,39 @@ class BatteryAction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Actions:
-    """One command per data center, a list or an array; an enum or a number serves all of them.
+    """Commands of one step.
 
-    Numbers are continuous commands: ``load`` and ``battery`` within -1..1 are shares of what could
-    be deferred (negative) or drained, discharged (negative) or charged; ``cooling`` and ``fan`` are
-    in steps, may exceed 1 and may have one entry per CRAC unit. ``fan`` is for flow model
-    ``controlled`` alone, ``placement`` for policy ``weights``: relative loads of the racks, (R,),
-    or of the server groups, (G,), None being all alike.
+    A command is an enum or a number for all data centers, or a list or an array with one entry for
+    each of them. Numbers are continuous commands.
     """
 
     load: LoadAction | float | F64 | Sequence[LoadAction] = LoadAction.NEUTRAL
+    """Share of what can be deferred (below 0) or drained (above 0), -1..1, () or (B,)."""
     cooling: CoolAction | float | F64 | Sequence[CoolAction] = CoolAction.HOLD
+    """Steps of ``hvac.setpoint.step_k`` by which setpoints move, any finite number, (), (B,) or
+    (U,)."""
     battery: BatteryAction | float | F64 | Sequence[BatteryAction] = BatteryAction.IDLE
+    """Share of the battery's power limit, discharged (below 0) or charged, -1..1, () or (B,)."""
     fan: FanAction | float | F64 | Sequence[FanAction] = FanAction.HOLD
+    """Steps of ``hvac.crac.fan_step`` by which CRAC fan speeds move, any finite number, (), (B,) or
+    (U,); for flow model ``controlled`` alone."""
     placement: F64 | None = None
+    """Relative load of each rack, (R,), or server group, (G,); None loads all alike; for policy
+    ``weights`` alone."""
 
 
 @dataclass(slots=True)
 class Exogenous:
-    """What the world does during one step, each (B,)."""
+    """Weather, grid and demand during one step of B data centers."""
 
     outdoor_c: F64
+    """Dry-bulb temperature outside, in C, (B,)."""
     wet_bulb_c: F64
+    """Wet-bulb temperature outside, in C, (B,)."""
     ci_g_per_kwh: F64
+    """Carbon intensity of the grid, in g CO2e/kWh, (B,)."""
     demand: F64
-    """Work that arrives, as a share of capacity, 0..1."""
+    """Work that arrives as a share of capacity, 0..1, (B,)."""
 
 
 @dataclass(slots=True)
@@ -105,186 +117,241 @@ class State:
     step: int
     """Steps done since reset."""
     seed: I64
-    """Decides the sampled events, (B,)."""
+    """Seed of the sampled events of each data center, (B,)."""
     start: I64
     """Index of the first step in the year, (B,)."""
     setpoint_c: F64
-    """Setpoint of each CRAC unit, (U,)."""
+    """Supply air setpoint of each CRAC unit, in C, (U,)."""
     cooling_run: I64
-    """Equal non-zero cooling commands in a row, (U,)."""
+    """Equal cooling commands in a row that each CRAC unit has had, (U,)."""
     cooling_last: F64
-    """Last cooling command, (U,)."""
+    """Last cooling command of each CRAC unit, in steps, nan before the first, (U,)."""
     fan_speed: F64
-    """Controlled speed of each CRAC fan over design speed, (U,)."""
+    """Controlled speed of each CRAC fan over design speed, 0..1, (U,)."""
     queue: F64
-    """Queued tasks by the step that put them in, oldest first, accumulated, (B, L); read-only."""
+    """Tasks in the queue by the step that put them in, oldest first, accumulated, (B, L) with L
+    the steps that a queue tells apart; read-only."""
     stored_kwh: F64
-    """Energy in the battery, (B,)."""
+    """Energy in the battery, in kWh, (B,)."""
     room_heat_kwh: F64
-    """Heat held by the room over that at the setpoint, (B,); below 0 while its air is colder."""
+    """Heat held by the room over that at the setpoint, in kWh, below 0 while its air is colder,
+    (B,)."""
     rack_status: Status
-    """0 normal, 1 throttled, 2 tripped, (R,)."""
+    """Status of each rack: 0 normal, 1 throttled, 2 tripped, (R,)."""
     group_inlet_c: F64
-    """Inlet of each server group in the last step, (G,), for placement by temperature."""
+    """Inlet of each server group in the last step, in C, (G,); for placement by temperature."""
     server_c: Reals
-    """Temperature of the servers of each group, (G,), in transient halls, as what follows."""
+    """Temperature of the servers of each group, in C, (G,); for transient halls."""
     mixed_c: Reals
-    """Recirculated air before each rack, (R,)."""
+    """Temperature of the recirculated air before each rack, in C, (R,); for transient halls."""
     exhaust_c: Reals
-    """Outlet temperature times the strength of the rack, (R,)."""
+    """Outlet temperature of each rack times the strength of its exhaust, in C, (R,); for transient
+    halls."""
     captured_m3s: Reals
-    """Recirculated air that each rack takes in, (R,)."""
+    """Recirculated air that each rack takes in, in m3/s, (R,); for transient halls."""
     need_m3s: F64
-    """Supply air that the racks ask of each CRAC unit, (U,)."""
+    """Supply air that the racks ask of each CRAC unit, in m3/s, (U,); for transient halls."""
     following: F64
-    """Airflow of the servers over that at the design point, for each CRAC unit, (U,)."""
+    """Airflow of the servers over that at the design point, for each CRAC unit, (U,); for transient
+    halls."""
 
 
 @dataclass(slots=True)
 class StepResult:
-    """Every quantity of one step, (B,) unless stated; powers are means over the step.
+    """Every quantity of one step.
 
-    Energy units: kWh per step. 1 task is 1 % of the data center's capacity for one step. Arrays of
-    a step are parts of a few larger ones: whoever keeps some for long had better copy them.
+    Powers are means over the step, energies and volumes are totals. 1 task is 1 % of the capacity
+    of a data center for one step. Arrays of a step are parts of a few larger ones: whoever keeps
+    some for long had better copy them.
     """
 
     step: int
     """Index of the step, 0 at reset."""
     step_h: float
-    """Length of the step."""
+    """Length of the step, in h."""
     outdoor_c: F64
+    """Dry-bulb temperature outside, in C, (B,)."""
     wet_bulb_c: F64
+    """Wet-bulb temperature outside, in C, (B,)."""
     ci_g_per_kwh: F64
+    """Carbon intensity of the grid, in g CO2e/kWh, (B,)."""
     demand: F64
+    """Work that arrives as a share of capacity, 0..1, (B,)."""
     load_command: F64
+    """Share of what could be deferred (below 0) or drained (above 0), -1..1, (B,)."""
     cooling_command: F64
+    """Steps by which the setpoints were to move, mean over the CRAC units, (B,)."""
     battery_command: F64
+    """Share of the battery's power limit, discharged (below 0) or charged, -1..1, (B,)."""
 
     utilisation: F64
-    """Work that was started, as a share of capacity; ``lost_tasks`` of it went down."""
+    """Work that was started, as a share of capacity, including ``lost_tasks``, (B,)."""
     arrived_tasks: F64
+    """Work that arrived, in tasks, (B,)."""
     executed_tasks: F64
+    """Work that was done, in tasks, (B,)."""
     deferred_tasks: F64
-    """Work that entered the queue."""
+    """Work that entered the queue, in tasks, (B,)."""
     drained_tasks: F64
-    """Work that left the queue on command."""
+    """Work that left the queue on command, in tasks, (B,)."""
     due_tasks: F64
-    """Queued work whose deadline has come at the start of the step."""
+    """Queued work whose deadline had come at the start of the step, in tasks, (B,)."""
     overdue_tasks: F64
-    """Due work that did not fit into this step."""
+    """Due work that did not fit into the step, in tasks, (B,)."""
     dropped_tasks: F64
+    """Work that found the queue full, in tasks, (B,)."""
     lost_tasks: F64
-    """Work that had been started and went down with its servers."""
+    """Work that had been started and went down with its servers, in tasks, (B,)."""
     queue_tasks: F64
-    """Work in the queue at the end of the step."""
+    """Work in the queue at the end of the step, in tasks, (B,)."""
     oldest_age_h: F64
+    """Age of the oldest work in the queue at the end of the step, in h, (B,)."""
     mean_age_h: F64
+    """Mean age of the work in the queue at the end of the step, in h, (B,)."""
 
     setpoint_c: F64
-    """Mean over the CRAC units."""
+    """Supply air setpoint, mean over the CRAC units, in C, (B,)."""
     supply_c: F64
-    """CRAC supply air: the setpoint plus what unmet cooling has warmed the room by."""
+    """Supply air temperature, the setpoint plus what unmet cooling has warmed the room by, mean
+    over the CRAC airflow, in C, (B,)."""
     inlet_mean_c: F64
-    """Mean over racks of any size, as ``outlet_mean_c``."""
+    """Mean inlet of each rack, plain mean over the racks, in C, (B,)."""
     inlet_max_c: F64
+    """Hottest inlet of a server, in C, (B,)."""
     hottest_rack: F64
-    """Rack with the hottest inlet, counted from 0 in its data center."""
+    """Rack with the hottest inlet, counted from 0 in its data center, (B,)."""
     hottest_server: F64
-    """Server with the hottest inlet, counted from the floor of its rack."""
+    """Server with the hottest inlet, counted from 0 at the floor of its rack, (B,)."""
     over_27_mean_k: F64
-    """Mean over the servers of what their inlets exceed 27 C by; times hours, degree-hours."""
+    """What inlets exceed 27 C by, mean over the servers, in K, (B,); times hours, degree-hours."""
     shi: F64
-    """Supply heat index, 0 when all inlets get supply air; see ``air_metrics``."""
+    """Supply heat index, 0 when all inlets get supply air, (B,); see ``hall.air_metrics``."""
     rti_pct: F64
-    """Return temperature index; above 100 air recirculates on balance."""
+    """Return temperature index, in %, above 100 where air recirculates on balance, (B,)."""
     rci_hi_pct: F64
-    """Rack cooling index at the high end; 100 is no inlet above 27 C."""
+    """Rack cooling index at the high end, in %, 100 without an inlet above 27 C, (B,)."""
     rci_lo_pct: F64
+    """Rack cooling index at the low end, in %, 100 without an inlet below 18 C, (B,)."""
     throttled_racks: F64
-    """At the end of the step, as the next."""
+    """Racks that are throttled at the end of the step, (B,)."""
     tripped_racks: F64
+    """Racks that have tripped and are off at the end of the step, (B,)."""
     outlet_mean_c: F64
+    """Outlet of each rack, plain mean over the racks, in C, (B,)."""
     cpu_w: F64
+    """Power of the servers without their fans, in W, (B,)."""
     it_fan_w: F64
+    """Power of the server fans, in W, (B,)."""
     it_w: F64
+    """IT power, servers with their fans, in W, (B,)."""
     it_airflow_m3s: F64
+    """Airflow through the servers, in m3/s, (B,)."""
     crac_flow_m3s: F64
+    """Airflow of the CRAC units, in m3/s, (B,)."""
     return_c: F64
+    """Temperature of the air that returns to the CRAC units, in C, (B,)."""
     cooling_load_w: F64
-    """Heat that the CRAC units take from the room."""
+    """Heat that the CRAC units are to take from the room, in W, (B,)."""
 
     chilled_water_c: F64
+    """Temperature of the chilled water supply, in C, (B,)."""
     condenser_water_c: F64
-    """Water that leaves the tower."""
+    """Temperature of the water that leaves the tower, in C, (B,)."""
     economiser_w: F64
+    """Heat that the economiser takes off the chilled water, in W, (B,)."""
     chiller_load_w: F64
+    """Heat that the chiller takes off the chilled water, in W, (B,)."""
     unmet_w: F64
-    """Cooling load beyond the plant's capacity; it stays in the room."""
+    """Cooling load that is not removed and stays in the room, in W, (B,)."""
     recovered_w: F64
-    """Heat stored earlier that spare capacity removes."""
+    """Heat held by the room earlier that spare capacity removes, in W, (B,)."""
     heat_removed_w: F64
+    """Heat that the plant takes from the CRAC units, in W, (B,)."""
     rejected_w: F64
-    """Heat that the tower gives to the outside."""
+    """Heat that the tower gives to the outside, in W, (B,)."""
     room_heat_kwh: F64
-    """As in ``State``, at the end of the step."""
+    """Heat held by the room over that at the setpoint at the end of the step, in kWh, (B,)."""
     thermal_storage_w: F64
-    """Heat that went into servers and recirculated air (transient)."""
+    """Heat that goes into servers and recirculated air in transient halls, in W, (B,)."""
     chiller_w: F64
+    """Electric power of the chiller, in W, (B,)."""
     tower_fan_w: F64
+    """Electric power of the tower fan, in W, (B,)."""
     chilled_pump_w: F64
+    """Electric power of the chilled-water pumps, in W, (B,)."""
     condenser_pump_w: F64
+    """Electric power of the condenser-water pumps, in W, (B,)."""
     crac_fan_w: F64
+    """Electric power of the CRAC fans, in W, (B,)."""
     hvac_w: F64
-    """Sum of the devices that ``hvac.total_of`` names."""
+    """Electric power of the devices that ``hvac.total_of`` names, in W, (B,)."""
 
     evaporation_l: F64
+    """Water that the tower evaporates, in l, (B,)."""
     drift_l: F64
+    """Water that leaves the tower as drops, in l, (B,)."""
     blowdown_l: F64
+    """Water that is drained so that salt does not concentrate, in l, (B,)."""
     water_l: F64
-    """Make-up water."""
+    """Make-up water, in l, (B,)."""
 
     stored_kwh: F64
+    """Energy in the battery at the end of the step, in kWh, (B,)."""
     soc: F64
+    """State of charge of the battery at the end of the step, 0..1, (B,)."""
     charge_kwh: F64
-    """Drawn from the grid into the battery."""
+    """Energy drawn from the grid into the battery, in kWh, (B,)."""
     discharge_kwh: F64
-    """Delivered by the battery."""
+    """Energy delivered by the battery, in kWh, (B,)."""
     battery_loss_kwh: F64
+    """Energy that the battery loses, in kWh, (B,)."""
     it_kwh: F64
+    """IT energy, in kWh, (B,)."""
     hvac_kwh: F64
+    """HVAC energy, in kWh, (B,)."""
     grid_kwh: F64
+    """Energy bought from the grid, in kWh, (B,)."""
     unserved_kwh: F64
-    """What facility and battery lacked in an outage while they had power, see ``powered``."""
+    """Energy that facility and battery lack in an outage while there is power (see ``powered``), in
+    kWh, (B,)."""
     carbon_g: F64
+    """Emissions of the energy bought, in g CO2e, (B,)."""
     grid_up: F64
-    """1 with grid, 0 in an outage."""
+    """1 with grid, 0 in an outage, (B,)."""
     powered: F64
-    """Share of the step that the data center had power."""
+    """Share of the step that the data center has power, 0..1, (B,)."""
 
     unit_setpoint_c: F64
-    """(U,), as the other unit arrays."""
+    """Supply air setpoint of each CRAC unit, in C, (U,)."""
     unit_supply_c: F64
+    """Supply air temperature of each CRAC unit, in C, (U,)."""
     unit_flow_m3s: F64
+    """Airflow of each CRAC unit, in m3/s, (U,)."""
     unit_running: F64
-    """1 for CRAC units that run, 0 for those that are down."""
+    """1 for CRAC units that run, 0 for those that are down or without power, (U,)."""
     rack_status: Status
-    """0 normal, 1 throttled, 2 tripped, (R,)."""
+    """Status of each rack at the end of the step: 0 normal, 1 throttled, 2 tripped, (R,)."""
     rack_cpu_w: Reals
-    """(R,), as the other rack arrays."""
+    """Power of the servers of each rack without their fans, in W, (R,)."""
     rack_fan_w: Reals
+    """Power of the server fans of each rack, in W, (R,)."""
     rack_airflow_m3s: Reals
+    """Airflow through each rack, in m3/s, (R,)."""
     rack_inlet_c: Reals
+    """Inlet of each rack, mean over its servers, by airflow where air recirculates, in C, (R,)."""
     rack_inlet_max_c: Reals
+    """Hottest inlet of a server of each rack, in C, (R,)."""
     rack_outlet_c: Reals
+    """Outlet of each rack, in C, (R,)."""
 
     @property
     def rack_power_w(self) -> Reals:
-        """IT power per rack, (R,)."""
+        """IT power of each rack, servers with their fans, in W, (R,)."""
         return self.rack_cpu_w + self.rack_fan_w
 
     @property
     def facility_kwh(self) -> F64:
-        """IT and HVAC energy, without the battery, (B,)."""
+        """IT and HVAC energy, without the battery, in kWh, (B,)."""
         return self.it_kwh + self.hvac_kwh
 
     @property
@@ -313,8 +380,11 @@ _values_per_dc = attrgetter(*_PER_DC)
 
 @dataclass(frozen=True, slots=True)
 class ServerLayers:
-    """Per-server values of one step, each (S,); server order follows racks, then groups."""
+    """Values of every server in one step; servers follow racks, then groups."""
 
     inlet_c: Reals
+    """Inlet temperature of each server, in C, (S,)."""
     outlet_c: Reals
+    """Outlet temperature of each server, in C, (S,)."""
     power_w: Reals
+    """Power of each server with its fans, in W, (S,)."""

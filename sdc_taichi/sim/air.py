@@ -43,6 +43,7 @@ class SteadyAir:
         self._hall, self._units = hall, units
         self._room_kwh_per_k = sizing.room_kwh_per_k
         self._inlets = _GroupInlets(fleet, hall, keep=keep_inlets)
+        self._no_memory = dict.fromkeys(_HALL_FIELDS, _EMPTY)
 
     def initial(self, supply: Supply, demand: F64) -> dict[str, Any]:
         """Temperatures before the first step, by their names in ``State``.
@@ -51,7 +52,7 @@ class SteadyAir:
             supply: How the CRAC units run.
             demand: Work that runs, as a share of capacity, 0..1, (B,).
         """
-        return {**dict.fromkeys(_HALL_FIELDS, _EMPTY), "group_inlet_c": self._inlets.initial()}
+        return {**self._no_memory, "group_inlet_c": self._inlets.initial()}
 
     def solve(
         self, state: State, placement: Placement, supply: Supply, surroundings: Surroundings
@@ -73,8 +74,7 @@ class SteadyAir:
         warmed_k = self._units.of_each(state.room_heat_kwh / self._room_kwh_per_k)
         unit_supply_c = supply.unit_setpoint_c + warmed_k
         air = self._hall.solve(_conditions(unit_supply_c, placement, supply, surroundings))
-        thermal = {**dict.fromkeys(_HALL_FIELDS, _EMPTY), "group_inlet_c": self._inlets.last()}
-        return air, thermal
+        return air, {**self._no_memory, "group_inlet_c": self._inlets.last()}
 
 
 class TransientAir:

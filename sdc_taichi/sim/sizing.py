@@ -15,106 +15,98 @@ from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
 from sdc_taichi.types import F64
 
 WATER_DENSITY_KG_M3 = 1000.0
+"""Density of water, in kg/m3."""
 RELEASED_OUTDOOR_C = {"NY": 30.0, "WA": 20.0}
-"""Sizing temperatures of the released SustainDC by the first letters of the site; else 50 C."""
+"""Design dry bulbs of the released SustainDC, in C, by the first letters of the site; else 50 C."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sizing:
-    """Sized quantities, each (B,)."""
+    """Sized devices of B data centers."""
 
     it_w: F64
-    """IT power at full load and the highest setpoint."""
+    """IT power at full load and the highest setpoint, in W, (B,)."""
     it_airflow_m3s: F64
+    """Airflow through the servers at full load and the highest setpoint, in m3/s, (B,)."""
     crac_flow_m3s: F64
+    """Airflow of the CRAC units at full fan speed, in m3/s, (B,)."""
     crac_fan_w: F64
+    """Power of the CRAC fans at full speed, in W, (B,)."""
     design_outdoor_c: F64
+    """Design dry bulb of the site, in C, (B,)."""
     design_wet_bulb_c: F64
+    """Design wet bulb of the site, in C, (B,)."""
     facility_w: F64
-    """IT and HVAC power at the design point."""
+    """IT and HVAC power at the design point, in W, (B,)."""
     battery_kwh: F64
+    """Capacity of the battery, in kWh, (B,)."""
     room_kwh_per_k: F64
-    """Heat that warms the room, and its servers if quasi-steady, by 1 K."""
+    """Heat that warms the room, and its servers if quasi-steady, by 1 K, in kWh/K, (B,)."""
     water_side: WaterSideDesign
+    """Sized chiller, tower, pumps and economiser."""
 
 
 def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64) -> Sizing:
-    """Size the fleet.
+    """Size every device of a fleet by the sizing model that its configs name.
 
     Args:
-        fleet: the data centers.
-        hall: their halls; sizes are as exact as its precision.
-        design_outdoor_c: design dry bulb of each site's weather, (B,).
-        design_wet_bulb_c: design wet bulb of each site's weather, (B,).
+        fleet: B data centers.
+        hall: Their halls; sizes are as exact as its precision.
+        design_outdoor_c: Design dry bulb of each site's weather, C, (B,); that of a config goes
+            first.
+        design_wet_bulb_c: Design wet bulb of each site's weather, C, (B,); that of a config goes
+            first.
     """
-    outdoor = fleet.values("hvac.sizing.design_outdoor_c")
-    wet_bulb = fleet.values("hvac.sizing.design_wet_bulb_c")
+    outdoor_c = fleet.values("hvac.sizing.design_outdoor_c")
+    wet_bulb_c = fleet.values("hvac.sizing.design_wet_bulb_c")
     model = MODELS[fleet.models["sizing"]]
     return model(
         fleet,
         hall,
-        np.where(np.isnan(outdoor), design_outdoor_c, outdoor),
-        np.where(np.isnan(wet_bulb), design_wet_bulb_c, wet_bulb),
+        np.where(np.isnan(outdoor_c), design_outdoor_c, outdoor_c),
+        np.where(np.isnan(wet_bulb_c), design_wet_bulb_c, wet_bulb_c),
     )
 
 
 def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizing:
-    """Full load, highest setpoint and design wet bulb, with the margin of the config on top."""
+    """Full load, highest setpoint and design wet bulb, with the margin of the config on top.
+
+    Args:
+        fleet: B data centers.
+        hall: Their halls.
+        outdoor_c: Design dry bulb, C, (B,).
+        wet_bulb_c: Design wet bulb, C, (B,).
+    """
     v = fleet.values
     full = _solve(fleet, hall, v("hvac.setpoint.max_c"), np.ones(fleet.size))
     it_w = full.cpu_w + full.it_fan_w
-    crac_flow = fleet.unit_sums(fleet.unit_design_m3s)
-    crac_fan_w = v("hvac.crac.fan_w_per_m3s") * crac_flow
+    crac_flow_m3s = fleet.unit_sums(fleet.unit_design_m3s)
+    crac_fan_w = v("hvac.crac.fan_w_per_m3s") * crac_flow_m3s
     cooling_w = (it_w + crac_fan_w) * v("hvac.sizing.margin")
-
-    approach_k = v("hvac.tower.approach_min_k")
-    condenser_c = np.maximum(wet_bulb_c + approach_k, v("hvac.chiller.min_condenser_c"))
-    # The coldest chilled water asks most of the chiller.
-    chilled_c = v("hvac.setpoint.min_c") - v("hvac.chiller.coil_approach_k")
-
-    def run_chiller(load_w: F64, reference_w: F64) -> chiller.ChillerResult:
-        return chiller.CHILLERS[fleet.models["chiller"]](
-            load_w,
-            reference_w=reference_w,
-            chilled_water_c=chilled_c,
-            condenser_c=condenser_c,
-            outdoor_c=outdoor_c,
-            reference_cop=v("hvac.chiller.reference_cop"),
-        )
-
-    per_reference = run_chiller(np.zeros(fleet.size), np.ones(fleet.size)).available_w
-    chiller_w = cooling_w / per_reference
-    machine = run_chiller(cooling_w, chiller_w)
-    rejected_w = machine.rejected_w
-    design = WaterSideDesign(
-        cooling_w=cooling_w,
-        chiller_w=chiller_w,
-        reference_cop=v("hvac.chiller.reference_cop"),
-        rejected_w=rejected_w,
-        **_tower(fleet, cooling_w, rejected_w, outdoor_c, wet_bulb_c),
-        **_pumps(fleet, cooling_w, rejected_w),
-        **_common(fleet),
+    chiller_w, at_design = _design_chiller(fleet, cooling_w, outdoor_c, wet_bulb_c)
+    water_side = _water_side(
+        fleet, cooling_w, chiller_w, at_design.rejected_w, outdoor_c, wet_bulb_c
     )
     facility_w = (
         it_w
         + crac_fan_w
-        + machine.power_w
-        + design.tower_fan_w
-        + design.chilled_pump_w
-        + design.condenser_pump_w
+        + at_design.power_w
+        + water_side.tower_fan_w
+        + water_side.chilled_pump_w
+        + water_side.condenser_pump_w
     )
     hours = v("battery.hours_of_design_load")
     return Sizing(
         it_w=it_w,
         it_airflow_m3s=full.it_airflow_m3s,
-        crac_flow_m3s=crac_flow,
+        crac_flow_m3s=crac_flow_m3s,
         crac_fan_w=crac_fan_w,
         design_outdoor_c=outdoor_c,
         design_wet_bulb_c=wet_bulb_c,
         facility_w=facility_w,
         battery_kwh=_battery_kwh(fleet, facility_w * hours / 1e3),
         room_kwh_per_k=_room_kwh_per_k(fleet),
-        water_side=design,
+        water_side=water_side,
     )
 
 
@@ -124,20 +116,25 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
     Tower air and rated load: the cooling load at full load and highest setpoint, taken down to the
     lowest setpoint, with 50 - (design outdoor - lowest setpoint) K of air. Battery: one hour of
     1.1 times the highest IT power of 15..22 C plus 1.1 times rated load and chiller power.
+
+    Args:
+        fleet: B data centers.
+        hall: Their halls.
+        outdoor_c: Design dry bulb, C, (B,); not used, sites have those of ``RELEASED_OUTDOOR_C``.
+        wet_bulb_c: Design wet bulb, C, (B,).
     """
     v = fleet.values
-    ones = np.ones(fleet.size)
-    listed = np.array(
+    listed_c = np.array(
         [RELEASED_OUTDOOR_C.get(c.site.location.upper()[:2], 50.0) for c in fleet.configs]
     )
-    given = v("hvac.sizing.design_outdoor_c")
-    outdoor_c = np.where(np.isnan(given), listed, given)
-    low_c, air = v("hvac.setpoint.min_c"), air_j_per_m3_k(fleet)
-    full = _solve(fleet, hall, v("hvac.setpoint.max_c"), ones)
+    given_c = v("hvac.sizing.design_outdoor_c")
+    outdoor_c = np.where(np.isnan(given_c), listed_c, given_c)
+    low_c, supply_m3s_per_w = v("hvac.setpoint.min_c"), v("hvac.crac.supply_m3s_per_w")
+    full = _solve(fleet, hall, v("hvac.setpoint.max_c"), np.ones(fleet.size))
     it_w = full.cpu_w + full.it_fan_w
-    crac_flow = v("hvac.crac.supply_m3s_per_w") * it_w
+    crac_flow_m3s = supply_m3s_per_w * it_w
     rise_k = np.maximum(full.outlet_mean_c + mean_return_approach_k(fleet) - low_c, 0.0)
-    rated_w = air * crac_flow * rise_k
+    rated_w = air_j_per_m3_k(fleet) * crac_flow_m3s * rise_k
     highest_w = released_ranges(fleet, hall)["it_w"][1]
     machine = chiller.released(
         highest_w,
@@ -148,26 +145,18 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
         reference_cop=v("hvac.chiller.reference_cop"),
     )
     facility_w = 1.1 * (highest_w + rated_w + machine.power_w)
+    flow_ratio = supply_m3s_per_w / v("hvac.crac.reference_m3s_per_w")
     return Sizing(
         it_w=it_w,
         it_airflow_m3s=full.it_airflow_m3s,
-        crac_flow_m3s=crac_flow,
-        crac_fan_w=v("hvac.crac.released_fan_w")
-        * (v("hvac.crac.supply_m3s_per_w") / v("hvac.crac.reference_m3s_per_w")) ** 3,
+        crac_flow_m3s=crac_flow_m3s,
+        crac_fan_w=v("hvac.crac.released_fan_w") * flow_ratio**3,
         design_outdoor_c=outdoor_c,
         design_wet_bulb_c=wet_bulb_c,
         facility_w=facility_w,
         battery_kwh=_battery_kwh(fleet, facility_w / 1e3),
         room_kwh_per_k=_room_kwh_per_k(fleet),
-        water_side=WaterSideDesign(
-            cooling_w=rated_w,
-            chiller_w=rated_w,
-            reference_cop=v("hvac.chiller.reference_cop"),
-            rejected_w=rated_w,
-            **_tower(fleet, rated_w, rated_w, outdoor_c, wet_bulb_c),
-            **_pumps(fleet, rated_w, rated_w),
-            **_common(fleet),
-        ),
+        water_side=_water_side(fleet, rated_w, rated_w, rated_w, outdoor_c, wet_bulb_c),
     )
 
 
@@ -175,10 +164,15 @@ MODELS: dict[str, Callable[[Fleet, Hall, F64, F64], Sizing]] = {
     "design_day": design_day,
     "released": released,
 }
+"""Sizing models by the names that ``hvac.sizing.model`` takes."""
 
 
 def released_ranges(fleet: Fleet, hall: Hall) -> dict[str, tuple[F64, F64]]:
-    """Lowest and highest IT power and mean outlet over 15..22 C and 0..100 % load, each (B,)."""
+    """Lowest and highest values of a fleet over 15..22 C of supply air and 0..100 % of load.
+
+    Returns:
+        ``it_w``: IT power, W; ``outlet_c``: mean outlet, C; each as lowest and highest, (B,).
+    """
     it_w, outlet_c = [], []
     for supply_c in range(15, 23):
         for percent in range(0, 101, 10):
@@ -202,28 +196,62 @@ def _solve(fleet: Fleet, hall: Hall, supply_c: F64, utilisation: F64) -> HallSum
 
 
 def air_j_per_m3_k(fleet: Fleet) -> F64:
-    """Heat capacity of air per volume, (B,)."""
+    """Heat capacity of air per volume, J/(m3 K), (B,)."""
     return fleet.values("hall.air_density_kg_m3") * fleet.values(
         "hall.air_heat_capacity_j_per_kg_k"
     )
 
 
 def mean_return_approach_k(fleet: Fleet) -> F64:
-    """Return approach temperature, mean over the racks, (B,)."""
+    """Return approach temperature, mean over the racks, K, (B,)."""
     return np.array([np.mean(np.asarray(c.hall.return_approach_k)) for c in fleet.configs])
 
 
-def _common(fleet: Fleet) -> dict[str, F64]:
+def _design_chiller(
+    fleet: Fleet, cooling_w: F64, outdoor_c: F64, wet_bulb_c: F64
+) -> tuple[F64, chiller.ChillerResult]:
+    """Reference capacity, W, (B,), that just cools ``cooling_w``, and the chiller as it does so."""
+    v = fleet.values
+    model = chiller.CHILLERS[fleet.models["chiller"]]
+    tower_c = wet_bulb_c + v("hvac.tower.approach_min_k")
+    conditions = {
+        # The coldest chilled water asks most of the chiller.
+        "chilled_water_c": v("hvac.setpoint.min_c") - v("hvac.chiller.coil_approach_k"),
+        "condenser_c": np.maximum(tower_c, v("hvac.chiller.min_condenser_c")),
+        "outdoor_c": outdoor_c,
+        "reference_cop": v("hvac.chiller.reference_cop"),
+    }
+    idle, unit_w = np.zeros(fleet.size), np.ones(fleet.size)
+    available_w_per_w = model(idle, reference_w=unit_w, **conditions).available_w
+    chiller_w = cooling_w / available_w_per_w
+    return chiller_w, model(cooling_w, reference_w=chiller_w, **conditions)
+
+
+def _water_side(
+    fleet: Fleet,
+    cooling_w: F64,
+    chiller_w: F64,
+    rejected_w: F64,
+    outdoor_c: F64,
+    wet_bulb_c: F64,
+) -> WaterSideDesign:
+    """Chiller, tower, pumps and economiser for the given heat, each (B,)."""
     v = fleet.values
     approach_k = v("hvac.tower.approach_min_k")
-    return {
-        "coil_approach_k": v("hvac.chiller.coil_approach_k"),
-        "chilled_water_range_k": v("hvac.chiller.chilled_water_range_k"),
-        "approach_min_k": approach_k,
-        "exchanger_approach_k": v("hvac.tower.economiser_approach_k") - approach_k,
-        "min_condenser_c": v("hvac.chiller.min_condenser_c"),
-        "economiser": v("hvac.tower.economiser"),
-    }
+    return WaterSideDesign(
+        cooling_w=cooling_w,
+        chiller_w=chiller_w,
+        reference_cop=v("hvac.chiller.reference_cop"),
+        rejected_w=rejected_w,
+        coil_approach_k=v("hvac.chiller.coil_approach_k"),
+        chilled_water_range_k=v("hvac.chiller.chilled_water_range_k"),
+        approach_min_k=approach_k,
+        exchanger_approach_k=v("hvac.tower.economiser_approach_k") - approach_k,
+        min_condenser_c=v("hvac.chiller.min_condenser_c"),
+        economiser=v("hvac.tower.economiser"),
+        **_tower(fleet, cooling_w, rejected_w, outdoor_c, wet_bulb_c),
+        **_pumps(fleet, cooling_w, rejected_w),
+    )
 
 
 def _tower(
@@ -280,12 +308,13 @@ def _pumps(fleet: Fleet, cooling_w: F64, rejected_w: F64) -> dict[str, F64]:
 
 
 def _battery_kwh(fleet: Fleet, sized_kwh: F64) -> F64:
+    """Capacity of the battery, kWh, (B,): that of the config, or as sized."""
     given = fleet.values("battery.capacity_kwh")
     return np.where(np.isnan(given), sized_kwh, given)
 
 
 def _room_kwh_per_k(fleet: Fleet) -> F64:
-    """Heat capacity that follows the supply air, (B,).
+    """Heat capacity that follows the supply air, kWh/K, (B,).
 
     Quasi-steady halls: with the servers. Transient ones: servers and the air before the racks,
     which is that of the room, have temperatures of their own.
