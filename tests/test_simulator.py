@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import inspect
+import re
 import resource
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -31,6 +33,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.sim.drivers import Table
+from sdc_taichi.sim.facility import Facility
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64
 
@@ -436,6 +439,24 @@ def test_a_missing_snapshot_is_refused(tmp_path: Path) -> None:
         pytest.raises(SdcError, match=r"none\.npz: cannot be read as a snapshot"),
     ):
         sim.load(tmp_path / "none.npz")
+
+
+# --- documentation ------------------------------------------------------------------------------
+
+
+def test_the_docs_list_a_step_in_the_order_of_the_code() -> None:
+    docs = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text()
+    listed = docs.partition("## One step")[2].partition("## ")[0]
+    for function, pattern in (
+        (Simulator.step, r"^    ([a-z_.]+) "),
+        (Facility.step, r"^      ([a-z_]+) "),
+    ):
+        names = re.findall(pattern, listed, re.MULTILINE)
+        source = inspect.getsource(function)
+        places = [source.find(f"{name}(") for name in names]
+        assert len(names) > 5
+        assert min(places) >= 0, names[places.index(min(places))]
+        assert places == sorted(places)
 
 
 # --- misuse -------------------------------------------------------------------------------------

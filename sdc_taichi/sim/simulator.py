@@ -159,9 +159,9 @@ class Simulator:
         # Another user of Taichi may have ended the runtime; a forked child has none.
         runtime.ensure_started()
         commands = stages.decoder.decode(actions)
-        surroundings = stages.surroundings.at(
-            self.drivers.at(state.step), self._timeline.at(state.step), state.stored_kwh
-        )
+        exogenous = self.drivers.at(state.step)
+        event = self._timeline.at(state.step)
+        surroundings = stages.surroundings.at(exogenous, event, state.stored_kwh)
         capacity = stages.allocation.capacity(state, commands, surroundings)
         work = stages.workload.run(
             state.queue, surroundings.demand, commands.load_command, capacity.utilisation
