@@ -20,6 +20,8 @@ from sdc_taichi.envs.reward_terms import (
     FOSSIL_G_PER_KWH,
     TERMS,
     WATER_L_PER_KWH,
+    TermContext,
+    reward_term,
 )
 from sdc_taichi.envs.rewards import collaborative_rewards, register_reward
 from sdc_taichi.envs.single import SdcEnv
@@ -63,6 +65,23 @@ def test_terms_are_what_their_names_say() -> None:
         assert values.shape == (2,), name
         assert np.all(values <= 0), name
     assert np.all(found["carbon"] < -0.05)
+
+
+def test_a_term_of_ones_own_has_a_name_of_its_own() -> None:
+    def chilled(r: StepResult, c: TermContext) -> F64:
+        """Cooling energy."""
+        return -r.hvac_kwh / c.design_kwh
+
+    reward_term(chilled)
+    try:
+        with pytest.raises(ConfigError, match="'chilled': valid is a name that is not taken"):
+            reward_term(chilled)
+        env = core(rewards={"agent_dc": {"chilled": 1.0}}, collaboration=1.0)
+        env.reset(0)
+        done = env.step(act(1, 1))
+        assert done.rewards["agent_dc"] == env.reward_terms()["hvac_energy"] < 0
+    finally:
+        del TERMS["chilled"]
 
 
 def test_queued_tasks_cost_in_the_last_hour_of_the_day() -> None:
