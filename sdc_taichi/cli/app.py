@@ -5,12 +5,12 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Sequence
+from importlib import metadata
 from typing import Annotated, Any
 
 import typer
 import typer.core
 
-import sdc_taichi
 from sdc_taichi.cli.arguments import Debug
 from sdc_taichi.cli.config import config_app
 from sdc_taichi.cli.data import data_app
@@ -60,7 +60,7 @@ def main() -> None:
 
 def _show_version(asked: bool) -> None:
     if asked:
-        print(f"sdc-taichi {sdc_taichi.__version__}")
+        print(f"sdc-taichi {metadata.version('sdc-taichi')}")
         raise typer.Exit
 
 

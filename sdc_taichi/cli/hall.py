@@ -22,7 +22,6 @@ from sdc_taichi.cli.arguments import (
     read_config,
 )
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import ConfigError
 from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M
 from sdc_taichi.types import F64
 
@@ -77,9 +76,11 @@ def solve_hall(
     Potential flow on a grid: racks, floor tiles, returns and containment of hall.layout, full load
     at the highest setpoint. docs/layout-solver.md says what potential flow cannot tell.
     """
+    from sdc_taichi.layout_solver.solve import solve_at_design_point
+
     check_out_file(out, ".npz", force=force)
     config, _ = read_config(source, overrides)
-    solution = _solve(config, cell)
+    solution = solve_at_design_point(config, cell)
     if out is not None:
         _write_matrix(out, solution)
     if as_json:
@@ -88,27 +89,6 @@ def solve_hall(
     _print_layout_solution(config, solution)
     if out is not None:
         typer.echo(f"Matrix: {out} (for hall.recirculation.matrix_file)")
-
-
-def _solve(config: DataCenterConfig, cell_m: float) -> LayoutSolution:
-    from sdc_taichi.hall.design_point import design_point
-    from sdc_taichi.layout_solver.solve import solve
-
-    outlets = config.servers.outlet_model
-    if outlets != "server":
-        raise ConfigError(
-            f"{config.name}: servers.outlet_model {outlets}: hall solve heats the air of every "
-            "server by its own power; valid is server"
-        )
-    design = design_point(config)
-    return solve(
-        config,
-        airflow_m3s=design.airflow_m3s,
-        power_w=design.it_w,
-        supply_m3s=design.crac_flow_m3s,
-        supply_c=design.supply_c,
-        cell_m=cell_m,
-    )
 
 
 def layout_solution_values(config: DataCenterConfig, solution: LayoutSolution) -> dict[str, Any]:

@@ -9,14 +9,15 @@ from __future__ import annotations
 import hashlib
 import time
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
-import sdc_taichi
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.hall import air_metrics
+from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.matrix_file import MOST_MATRIX_RACKS
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M, LEAST_LEAK, Grid, build_grid
@@ -338,6 +339,37 @@ class _SystemSolution:
     """Flow times value into the returns, (T,)."""
 
 
+def solve_at_design_point(
+    config: DataCenterConfig, cell_m: float = DEFAULT_CELL_M
+) -> LayoutSolution:
+    """Solve the air of a hall at full load and the highest setpoint.
+
+    Args:
+        config: The data center.
+        cell_m: Longest cell, m.
+
+    Raises:
+        ConfigError: an outlet model that does not balance each server, values out of range, or too
+            many cells or racks.
+        SdcError: a system that cannot be solved to the tolerance.
+    """
+    outlets = config.servers.outlet_model
+    if outlets != "server":
+        raise ConfigError(
+            f"{config.name}: servers.outlet_model {outlets}: hall solve heats the air of every "
+            "server by its own power; valid is server"
+        )
+    design = design_point(config)
+    return solve(
+        config,
+        airflow_m3s=design.airflow_m3s,
+        power_w=design.it_w,
+        supply_m3s=design.crac_flow_m3s,
+        supply_c=design.supply_c,
+        cell_m=cell_m,
+    )
+
+
 def _checked(
     config: DataCenterConfig, airflow_m3s: F64, power_w: F64, supply_m3s: float, supply_c: float
 ) -> tuple[F64, F64]:
@@ -375,7 +407,7 @@ def _provenance(
     """Where a matrix comes from; without time and place, so that equal solves are equal files."""
     hall = config.hall
     return {
-        "package": f"sdc-taichi {sdc_taichi.__version__}",
+        "package": f"sdc-taichi {version('sdc-taichi')}",
         "solver": "potential flow, hybrid differences, BiCGSTAB with diagonal incomplete LU",
         "config": config.name,
         "config_sha256": hashlib.sha256(config.to_yaml().encode()).hexdigest(),
