@@ -2,229 +2,42 @@
 
 from __future__ import annotations
 
-import json
-from contextlib import suppress
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import reference_twin
-from sdc_taichi import (
-    ConfigError,
-    DataCenterConfig,
-    RuntimeStateError,
-    SdcError,
-    build_fleet,
-    load_config,
+from random_halls import (
+    AS_FOUND,
+    LONG,
+    MERGED,
+    PRECISIONS,
+    SEEDS,
+    SMALL,
+    TOLERANCE,
+    Part,
+    assert_agrees,
+    assert_close,
+    at_design,
+    flat,
+    own_conditions,
+    own_part,
+    parts,
+    random_conditions,
+    random_hall,
+    random_halls,
+    random_values,
+    steady_twin,
 )
+from sdc_taichi import DataCenterConfig, RuntimeStateError, SdcError, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
-from sdc_taichi.hall.mix_weights import DENSE_RACKS, layout_weights
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.sim.hall_solver import MOST_SWEEPS, Conditions, Hall, HallSums, Precision
 from sdc_taichi.types import F64, ServerLayers
-
-SEEDS = st.integers(0, 2**32 - 1)
-# A seed that fails is no simpler than another, so none is looked for.
-AS_FOUND = (Phase.explicit, Phase.generate)
-PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
-TOLERANCE: dict[Precision, float] = {"f64": 1e-12, "f32": 1e-5}
-
-SMALL = ((1, 1), (1, 4), (2, 3), (3, 2), (4, 5), (5, 3), (8, 8))
-MERGED = ((5, 14), (9, 8))
-"""More racks than are kept whole, in rows that are summed whole."""
-LONG = ((1, 70), (2, 66))
-"""Rows that are cut where their racks are out of reach."""
-
-
-def random_values(
-    rng: np.random.Generator, name: str, shape: tuple[int, int], *, even: bool = False
-) -> dict[str, Any]:
-    """Plain values of a hall of any measures and make-up; ``even`` for racks that are all alike."""
-    values = load_config("corrected").model_dump(mode="json")
-    hall, servers, crac = values["hall"], values["servers"], values["hvac"]["crac"]
-    racks = shape[0] * shape[1]
-    hall["rows"], hall["racks_per_row"] = shape
-    hall["layout"] = {
-        "rack_pitch_m": float(rng.uniform(0.5, 0.9)),
-        "rack_depth_m": float(rng.uniform(0.8, 1.3)),
-        "rack_height_m": float(rng.uniform(1.8, 2.4)),
-        "cold_aisle_m": float(rng.uniform(0.9, 2.4)),
-        "hot_aisle_m": float(rng.uniform(0.9, 2.4)),
-        "end_margin_m": float(rng.uniform(0.5, 4.0)),
-        "side_margin_m": float(rng.uniform(0.5, 3.0)),
-        "ceiling_m": float(rng.uniform(2.6, 5.0)),
-        "containment": float(rng.choice([0.0, 0.0, 0.3, 0.8])),
-    }
-    hall["recirculation"] = {
-        "decay_m": float(rng.uniform(1.5, 8.0)),
-        "cutoff": float(rng.choice([0.0, 1e-4, 1e-3])),
-    }
-    hall["supply_approach_k"] = rng.uniform(1.5, 5.0, racks).tolist()
-    hall["return_approach_k"] = rng.uniform(-5.0, 0.0, racks).tolist()
-    hall["height_zones"] = int(rng.integers(1, 8))
-    hall["height_gradient"] = float(rng.uniform(0.0, 0.6))
-    crac["units"] = int(rng.integers(1, 5))
-    crac["supply_length_m"] = float(rng.uniform(2.0, 10.0))
-    if rng.integers(3) == 0:
-        shares = rng.dirichlet(np.ones(crac["units"]), racks)
-        crac["unit_shares"] = (shares / shares.sum(axis=1, keepdims=True)).tolist()
-    if even or rng.integers(2):
-        hall["servers_per_rack"] = int(rng.integers(1, 40))
-        servers["power_w"] = [float(rng.uniform(100, 400)), float(rng.uniform(0, 50))]
-    else:
-        servers["power_w"] = None
-        servers["groups"] = [
-            [
-                {
-                    "count": int(rng.integers(3, 12)),
-                    "full_w": float(full_w),
-                    "idle_w": float(rng.uniform(0.0, 0.4) * full_w),
-                    "load_weight": float(rng.uniform(0.8, 1.2)),
-                }
-                for full_w in rng.uniform(150, 300, rng.integers(2, 4))
-            ]
-            for _ in range(racks)
-        ]
-    return {**values, "name": name}
-
-
-def random_hall(
-    rng: np.random.Generator, name: str, shape: tuple[int, int], *, even: bool = False
-) -> DataCenterConfig:
-    """A hall that closes: some draws breathe more air than their neighbours exhaust."""
-    for _ in range(50):
-        config = config_from_dict(random_values(rng, name, shape, even=even))
-        with suppress(ConfigError):
-            calibrate(config)
-            return config
-    raise AssertionError(f"no hall of {shape} closes")
-
-
-def random_halls(seed: int) -> list[DataCenterConfig]:
-    """A ragged fleet of one to four halls."""
-    rng = np.random.default_rng(seed)
-    shapes = [SMALL[i] for i in rng.integers(len(SMALL), size=rng.integers(1, 5))]
-    if rng.integers(2):
-        shapes[0] = (MERGED + LONG)[int(rng.integers(len(MERGED + LONG)))]
-    return [random_hall(rng, f"dc{i}", shape) for i, shape in enumerate(shapes)]
-
-
-def random_conditions(
-    rng: np.random.Generator, configs: list[DataCenterConfig], *, kind: int | None = None
-) -> Conditions:
-    """Anything that a hall may meet; ``kind`` 0 loads racks alike, 1 by rack and 2 by group."""
-    fleet = build_fleet(configs)
-    units, racks = fleet.units, fleet.racks
-    kind = int(rng.integers(3)) if kind is None else kind
-    low = rng.uniform(0.5, 1.0, units)
-    return Conditions(
-        unit_supply_c=rng.uniform(16, 26, fleet.size)[fleet.unit_dc] + rng.uniform(0, 2, units),
-        utilisation=rng.choice([0.0, 1.0, *rng.uniform(0, 1, 4)], fleet.size),
-        rack_load=rng.uniform(0, 1, racks) if kind == 1 else None,
-        group_load=rng.uniform(0, 1, fleet.groups) if kind == 2 else None,
-        powered=rng.choice([0.0, 0.4, 1.0, 1.0, 1.0], racks),
-        rack_airflow=rng.choice([0.05, 0.5, 1.0, 1.0, 1.0], racks),
-        unit_low=low,
-        unit_high=np.minimum(low + rng.choice([0.0, 0.3], units), 1.2),
-        unit_running=rng.choice([0.0, 1.0], units),
-    )
-
-
-@dataclass(frozen=True)
-class Part:
-    """Where one data center lies in a fleet, and what it meets."""
-
-    twin: reference_twin.HallTwin
-    units: slice
-    racks: slice
-    groups: slice
-    servers: slice
-    supply_c: F64
-    load: F64
-    low: F64
-    high: F64
-    running: F64
-    powered: F64
-    breath: F64
-
-
-def parts(configs: list[DataCenterConfig], met: Conditions) -> list[Part]:
-    """Every data center of a fleet, for the twin."""
-    fleet, out = build_fleet(configs), []
-    for i, config in enumerate(configs):
-        racks = slice(*fleet.rack_offsets[i : i + 2])
-        groups = slice(fleet.group_offsets[racks.start], fleet.group_offsets[racks.stop])
-        servers = slice(fleet.server_offsets[groups.start], fleet.server_offsets[groups.stop])
-        units = slice(*fleet.unit_offsets[i : i + 2])
-        twin = reference_twin.calibrated(config)
-        if met.group_load is not None:
-            counts = np.diff(fleet.server_offsets)[groups]
-            load = np.repeat(met.group_load[groups], counts)
-        elif met.rack_load is not None:
-            load = twin.load(met.rack_load[racks])
-        else:
-            load = twin.load(np.full(config.hall.racks, met.utilisation[i]))
-        ones, full = np.ones(config.hall.racks), np.ones(config.hvac.crac.units)
-        out.append(
-            Part(
-                twin, units, racks, groups, servers, met.unit_supply_c[units], load,
-                full if met.unit_low is None else met.unit_low[units],
-                full if met.unit_high is None else met.unit_high[units],
-                full if met.unit_running is None else met.unit_running[units],
-                ones if met.powered is None else met.powered[racks],
-                ones if met.rack_airflow is None else met.rack_airflow[racks],
-            )
-        )  # fmt: skip
-    return out
-
-
-def steady_twin(part: Part) -> reference_twin.Twin:
-    return reference_twin.steady(
-        part.twin,
-        part.supply_c,
-        part.load,
-        low=part.low,
-        high=part.high,
-        running=part.running,
-        powered=part.powered,
-        breath=part.breath,
-    )
-
-
-def assert_close(found: Any, expected: Any, rel: float, name: object, scale: float = 0.0) -> None:
-    """Equal to ``rel`` of themselves or of ``scale``."""
-    np.testing.assert_allclose(found, expected, rtol=rel, atol=rel * scale, err_msg=str(name))
-
-
-def assert_agrees(configs: list[DataCenterConfig], met: Conditions, precision: Precision) -> None:
-    """Everything that the kernels compute against the twin."""
-    rel = {"f64": 1e-11, "f32": 5e-4}[precision]
-    hall = Hall(build_fleet(configs), precision)
-    sums, layers = hall.solve(met), hall.servers()
-    for i, part in enumerate(parts(configs, met)):
-        twin, name = steady_twin(part), configs[i].name
-        for field, expected in twin.dcs.items():
-            where = part.units if field.startswith("unit_") else slice(i, i + 1)
-            # Sums over what exceeds a limit inherit the absolute error of each inlet.
-            scale = float(len(part.load)) if field in ("over_27_sum_k", "under_18_sum_k") else 0.0
-            assert_close(getattr(sums, field)[where], expected, rel, (name, field), scale)
-        for field, expected in twin.racks.items():
-            found = getattr(sums, f"rack_{field}")[part.racks]
-            assert_close(found, expected, rel, (name, "rack", field))
-        for field, expected in twin.servers.items():
-            found = getattr(layers, field)[part.servers]
-            assert_close(found, expected, rel, (name, "server", field))
-        hottest = layers.inlet_c[part.servers].max()
-        fleet = build_fleet(configs)
-        rack = part.racks.start + int(sums.hottest_rack[i])
-        server = fleet.server_offsets[fleet.group_offsets[rack]] + int(sums.hottest_server[i])
-        assert layers.inlet_c[server] == hottest == sums.inlet_max_c[i]
-
 
 # --- against the twin ---------------------------------------------------------------------------
 
@@ -356,122 +169,7 @@ def test_twin_sees_a_change_of_any_measure_of_the_hall() -> None:
         assert difference > 1e-6, f"{path} has no effect on the inlets"
 
 
-# --- weights ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("shape", SMALL + MERGED + LONG)
-def test_weights_are_those_of_the_paths(shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(shape[0] * shape[1])
-    hall = config_from_dict(random_values(rng, "dc", shape)).hall
-    flow = rng.uniform(0.5, 2.0, hall.racks)
-    exchange = layout_weights(hall, flow)
-    dense, expected = exchange.dense(), reference_twin.layout_weights(hall, flow)
-    assert_close(dense, expected, 1e-12, "weights", scale=1.0)
-    assert_close(dense.sum(axis=1), np.ones(hall.racks), 1e-12, "rows sum to 1")
-    assert np.all(dense >= 0)
-    values = rng.uniform(-3, 30, hall.racks)
-    assert_close(exchange.apply(values), expected @ values, 1e-11, "apply", scale=1.0)
-    found = exchange.apply_transposed(values)
-    assert_close(found, expected.T @ values, 1e-11, "transposed", scale=1.0)
-
-
-@pytest.mark.parametrize("shape", [(14, 8), (5, 70)])
-@pytest.mark.parametrize("cutoff", [0.0, 1e-3, 4e-3])
-def test_rows_of_deep_racks_are_within_reach(shape: tuple[int, int], cutoff: float) -> None:
-    values = random_values(np.random.default_rng(6), "dc", shape)
-    values["hall"]["layout"] |= {"rack_depth_m": 6.0, "cold_aisle_m": 1.0, "hot_aisle_m": 1.0}
-    values["hall"]["recirculation"] = {"decay_m": 3.0, "cutoff": cutoff}
-    hall = config_from_dict(values).hall
-    expected = reference_twin.layout_weights(hall, np.ones(hall.racks))
-    assert_close(layout_weights(hall).dense(), expected, 1e-12, "weights", scale=1.0)
-    assert np.all(expected > 0) == (cutoff == 0)
-
-
-@pytest.mark.parametrize("shape", [(4, 5), *MERGED, *LONG])
-def test_paths_of_many_decay_lengths_leave_weights(shape: tuple[int, int]) -> None:
-    # Measures in mm, as they come by mistake: exp(-path / decay) is below any number.
-    values = random_values(np.random.default_rng(7), "dc", shape, even=True)
-    layout = values["hall"]["layout"]
-    values["hall"]["layout"] = {
-        k: v if k in ("containment", "returns") else 1e3 * v for k, v in layout.items()
-    }
-    config = config_from_dict(values)
-    dense = layout_weights(config.hall).dense()
-    assert_close(dense.sum(axis=1), np.ones(config.hall.racks), 1e-12, "rows sum to 1")
-
-
-def test_a_cutoff_that_leaves_no_source_is_refused() -> None:
-    for shape, cutoff in (((10, 100), 0.01), ((200, 500), 1e-4)):
-        values = random_values(np.random.default_rng(8), "dc", (10, 100), even=True)
-        values["hall"] |= {
-            "rows": shape[0], "racks_per_row": shape[1], "layout": {},
-            "supply_approach_k": 5.0, "return_approach_k": -3.0,
-            "recirculation": {"decay_m": 50.0, "cutoff": cutoff},
-        }  # fmt: skip
-        values["hvac"]["crac"]["unit_shares"] = None
-        hall = config_from_dict(values).hall
-        with pytest.raises(ConfigError, match="without any source: their largest") as error:
-            layout_weights(hall)
-        assert f"hall.recirculation.cutoff {cutoff:g} with decay_m 50" in str(error.value)
-        largest = float(str(error.value).split("weight is ")[1].split(";")[0])
-        if shape == (10, 100):
-            smaller = hall.recirculation.model_copy(update={"cutoff": 0.5 * largest})
-            exchange = layout_weights(hall.model_copy(update={"recirculation": smaller}))
-            assert np.all(np.isfinite(exchange.norm))
-
-
-def test_more_weights_than_fit_are_refused() -> None:
-    values = random_values(np.random.default_rng(8), "dc", (1, 2), even=True)
-    values["hall"] |= {
-        "rows": 400, "racks_per_row": 2000, "layout": {}, "supply_approach_k": 5.0,
-        "return_approach_k": -3.0, "recirculation": {"cutoff": 0.0},
-    }  # fmt: skip
-    values["hvac"]["crac"]["unit_shares"] = None
-    with pytest.raises(ConfigError, match=r"keeps 6.39e.09 weights for 800,000 racks; valid is at"):
-        layout_weights(config_from_dict(values).hall)
-
-
-@pytest.mark.parametrize("shape", MERGED + LONG)
-@pytest.mark.parametrize("cutoff", [1e-4, 1e-3, 1e-2])
-def test_large_halls_drop_small_weights_alone(shape: tuple[int, int], cutoff: float) -> None:
-    assert shape[0] * shape[1] > DENSE_RACKS
-    values = random_values(np.random.default_rng(4), "dc", shape)
-    values["hall"]["recirculation"] = {"decay_m": 1.5, "cutoff": 0.0}
-    every = layout_weights(config_from_dict(values).hall).dense()
-    assert np.all(every > 0)
-    values["hall"]["recirculation"]["cutoff"] = cutoff
-    cut = layout_weights(config_from_dict(values).hall).dense()
-    kept = cut > 0
-    assert 0 < np.mean(~kept) < 1
-    # Racks at the rim collect down to a quarter of what those amid the hall do.
-    assert np.all(every[~kept] < 4 * cutoff * every.sum(axis=1).max())
-    ratio = np.divide(cut, every, out=np.full(cut.shape, np.nan), where=kept)
-    assert np.nanmax(np.nanmax(ratio, axis=1) - np.nanmin(ratio, axis=1)) < 1e-9
-    assert np.all(np.nanmin(ratio, axis=1) >= 1.0)
-
-
-@settings(phases=AS_FOUND, max_examples=20)
-@given(seed=SEEDS)
-def test_recirculation_takes_less_than_there_is(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    flows = calibrate(random_hall(rng, "dc", SMALL[int(rng.integers(len(SMALL)))]))
-    matrix = flows.matrix()
-    assert np.all(matrix >= 0)
-    assert np.all(matrix.sum(axis=1) <= 1.0)
-    assert np.all((flows.group_exhaust_share >= 0) & (flows.group_exhaust_share < 1))
-    assert np.max(np.abs(np.linalg.eigvals(matrix))) < 1.0
-    airflow = flows.design.airflow_m3s
-    assert np.all(airflow - matrix.T @ airflow >= 0), "a rack gives more air than it exhausts"
-
-
 # --- calibration --------------------------------------------------------------------------------
-
-
-def at_design(configs: list[DataCenterConfig]) -> HallSums:
-    setpoint_c = np.concatenate(
-        [np.full(c.hvac.crac.units, c.hvac.setpoint.max_c) for c in configs]
-    )
-    return Hall(build_fleet(configs), "f64").solve(Conditions(setpoint_c, np.ones(len(configs))))
 
 
 def test_design_point_of_the_paper_comes_out() -> None:
@@ -511,188 +209,6 @@ def test_containment_takes_its_share_of_the_paths() -> None:
         config = load_config("corrected", [f"hall.layout.containment={containment}"])
         part = calibrate(config).matrix()
         np.testing.assert_allclose(part, (1 - containment) * whole, rtol=1e-12, atol=1e-15)
-
-
-# --- matrices of the user's -----------------------------------------------------------------------
-
-
-def random_matrix(rng: np.random.Generator, racks: int) -> F64:
-    """An R of a hall of equal racks: no more leaves than comes out, a rack that breathes none."""
-    matrix = rng.uniform(0, 1, (racks, racks)) * (rng.random((racks, racks)) < 0.7)
-    matrix *= 0.35 / np.maximum(matrix.sum(axis=0), matrix.sum(axis=1)).max()
-    matrix[1] = 0.0
-    return matrix
-
-
-def heat_matrix(matrix: F64, overrides: list[str], scaled: bool, folder: Path) -> F64:
-    """D of a hall with this R: T_in - T_sup = R (I - R)^-1 K^-1 P, with its design airflow."""
-    path = folder / "known.npz"
-    np.savez(path, R=matrix)
-    given = [f"hall.recirculation.matrix_file={json.dumps(str(path))}",
-             f"hall.recirculation.calibrate={str(scaled).lower()}"]  # fmt: skip
-    config = load_config("corrected", [*overrides, *given])
-    per_k = config.hall.air_density_kg_m3 * config.hall.air_heat_capacity_j_per_kg_k
-    airflow_m3s = calibrate(config).design.airflow_m3s
-    return np.asarray(matrix @ np.linalg.inv(np.eye(len(matrix)) - matrix) / (per_k * airflow_m3s))
-
-
-@pytest.mark.parametrize("kind", ["R.npz", "D.npz", "R.csv", "D.csv"])
-@pytest.mark.parametrize("scaled", [True, False], ids=["calibrated", "as given"])
-def test_matrix_of_a_file_agrees_with_the_twin(kind: str, scaled: bool, tmp_path: Path) -> None:
-    rng = np.random.default_rng(2)
-    matrix = random_matrix(rng, 6)
-    if scaled:
-        # Calibration needs exhaust air for a rack with an approach temperature.
-        matrix[1] = matrix[0]
-    overrides = [
-        "hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
-        "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
-    ]  # fmt: skip
-    name, path = kind[0], tmp_path / kind
-    given = matrix if name == "R" else heat_matrix(matrix, overrides, scaled, tmp_path)
-    if path.suffix == ".npz":
-        np.savez(path, **{name: given})  # type: ignore[arg-type]
-    else:
-        np.savetxt(path, given, delimiter=",")
-    config = load_config(
-        "corrected",
-        [
-            *overrides,
-            f"hall.recirculation.matrix_file={json.dumps(str(path))}",
-            f"hall.recirculation.matrix_kind={name}",
-            f"hall.recirculation.calibrate={str(scaled).lower()}",
-        ],
-    )
-    met = Conditions(np.array([20.0]), np.array([0.7]))
-    twin = reference_twin.calibrated(config, matrix)
-    if not scaled:
-        np.testing.assert_allclose(calibrate(config).matrix(), matrix, rtol=1e-9, atol=1e-12)
-    ones, full = np.ones(6), np.ones(1)
-    expected = reference_twin.steady(
-        twin, met.unit_supply_c, twin.load(np.full(6, 0.7)), low=full, high=full, running=full,
-        powered=ones, breath=ones,
-    )  # fmt: skip
-    sums = Hall(build_fleet(config), "f64").solve(met)
-    for field in ("inlet_c", "outlet_c", "cpu_w", "airflow_m3s"):
-        assert_close(getattr(sums, f"rack_{field}"), expected.racks[field], 1e-10, field)
-    if not scaled:
-        assert sums.rack_inlet_c[1] == pytest.approx(20.0, abs=1e-9)
-
-
-def test_power_of_a_rack_warms_the_others_by_d(tmp_path: Path) -> None:
-    rng, path = np.random.default_rng(5), tmp_path / "cfd.npz"
-    overrides = [
-        "hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
-        "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
-        "servers.fan_full_airflow_m3s=0.012", "servers.fan_airflow_ratio_lb=[1,1]",
-        "servers.fan_airflow_ratio_ub=[1,1]",
-    ]  # fmt: skip
-    flow = calibrate(load_config("corrected", overrides)).design.airflow_m3s
-    matrix = random_matrix(rng, 6)
-    d_k_per_w = matrix @ np.linalg.inv(np.eye(6) - matrix) / (1.225 * 1006.0 * flow)
-    np.savez(path, D=d_k_per_w)
-    config = load_config(
-        "corrected",
-        [
-            *overrides,
-            f"hall.recirculation.matrix_file={json.dumps(str(path))}",
-            "hall.recirculation.calibrate=false",
-        ],
-    )
-    met = Conditions(np.array([19.0]), np.array([0.5]), rack_load=rng.uniform(0, 1, 6))
-    sums = Hall(build_fleet(config), "f64").solve(met)
-    power_w = sums.rack_cpu_w + sums.rack_fan_w
-    np.testing.assert_allclose(sums.rack_inlet_c, 19.0 + d_k_per_w @ power_w, rtol=1e-9)
-
-
-@pytest.mark.parametrize("full_m3s", [None, 0.02])
-def test_d_holds_at_the_design_point_of_servers_with_curves(
-    full_m3s: float | None, tmp_path: Path
-) -> None:
-    overrides = ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
-                 "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
-                 f"servers.fan_full_airflow_m3s={json.dumps(full_m3s)}"]  # fmt: skip
-    matrix = random_matrix(np.random.default_rng(0), 6)
-    d_k_per_w = heat_matrix(matrix, overrides, False, tmp_path)
-    np.savez(tmp_path / "cfd.npz", D=d_k_per_w)
-    path = json.dumps(str(tmp_path / "cfd.npz"))
-    named = [f"hall.recirculation.matrix_file={path}", "hall.recirculation.calibrate=false"]
-    sums = at_design([load_config("corrected", [*overrides, *named])])
-    rise_k = d_k_per_w @ (sums.rack_cpu_w + sums.rack_fan_w)
-    np.testing.assert_allclose(sums.rack_inlet_c - 23.0, rise_k, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ({"R": np.full((4, 4), 0.1)}, r"R has shape \(4, 4\), expected \(6, 6\)"),
-        ({"R": np.full((6, 6), np.nan)}, r"R\[0, 0\] is nan; valid is a finite number"),
-        ({"D": np.full((6, 6), -0.1)}, r"D\[0, 0\] is -0.1 K/W; valid is at least 0"),
-        ({"R": np.full((6, 6), 0.1j)}, "R holds complex128; valid are real numbers"),
-        ({"R": np.full((6, 6), True)}, "R holds bool; valid are real numbers"),
-        ({"R": np.full((6, 6), -0.1)}, "rack 0 takes a share of -0.1 of its air from rack 0"),
-        ({"R": np.full((6, 6), 0.2)}, "row 0 sums to 1.2; valid is below 1"),
-        ({"R": np.zeros((6, 6)), "D": np.zeros((6, 6))}, "valid is one of the arrays R and D"),
-        ({"X": np.zeros((6, 6))}, r"holds \['X'\]; valid is one of the arrays R and D"),
-        (b"no archive", "cannot be read as a matrix"),
-    ],
-)
-def test_a_matrix_that_cannot_be_is_refused(
-    content: dict[str, F64] | bytes, message: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "cfd.npz"
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    else:
-        np.savez(path, **content)  # type: ignore[arg-type]
-    config = load_config(
-        "corrected",
-        ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
-         "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
-         f"hall.recirculation.matrix_file={json.dumps(str(path))}",
-         "hall.recirculation.calibrate=false"],
-    )  # fmt: skip
-    with pytest.raises(ConfigError, match=message) as error:
-        build_fleet(config)
-    assert "cfd.npz" in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def matrix_hall(path: Path, *more: str) -> DataCenterConfig:
-    return load_config(
-        "corrected",
-        ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=[0, 3, 3, 3, 3, 3]",
-         "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
-         f"hall.recirculation.matrix_file={json.dumps(str(path))}", *more],
-    )  # fmt: skip
-
-
-def test_files_that_are_no_matrix_are_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "one.npy", np.full((6, 6), 0.1))
-    (tmp_path / "one.npy").rename(tmp_path / "one.npz")
-    with pytest.raises(ConfigError, match=r"one\.npz: holds one array without a name; valid is an"):
-        build_fleet(matrix_hall(tmp_path / "one.npz"))
-    with pytest.raises(ConfigError, match=r"ends in '.txt'; valid are .npz and .csv"):
-        build_fleet(matrix_hall(tmp_path / "r.txt", "hall.recirculation.matrix_kind=R"))
-
-
-def test_a_rack_without_exhaust_air_cannot_be_warmed_by_it(tmp_path: Path) -> None:
-    path, matrix = tmp_path / "r.npz", np.full((6, 6), 0.05)
-    matrix[[0, 2]] = 0.0
-    np.savez(path, R=matrix)
-    with pytest.raises(ConfigError, match=r"row 2 is zero, so .* rack 2 by the 3 K of hall.supply"):
-        build_fleet(matrix_hall(path))
-    matrix[2] = 0.05
-    np.savez(path, R=matrix)
-    found = at_design([matrix_hall(path)]).rack_inlet_c - 23.0
-    np.testing.assert_allclose(found, [0, 3, 3, 3, 3, 3], atol=1e-9)
-
-
-def test_settings_that_a_matrix_leaves_without_effect_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"containment 0.5 with recirculation.matrix_file: .* 0$"):
-        matrix_hall(tmp_path / "r.npz", "hall.layout.containment=0.5")
-    with pytest.raises(ConfigError, match="matrix_kind D needs a matrix_file; valid without one"):
-        load_config("corrected", ["hall.recirculation.matrix_kind=D"])
 
 
 # --- conservation -------------------------------------------------------------------------------
@@ -798,18 +314,6 @@ def test_without_recirculation_servers_breathe_supply_air(
     hall = Hall(build_fleet(config), precision)
     hall.solve(met)
     assert_close(hall.servers().inlet_c, np.full(4000, 19.0), TOLERANCE[precision] / 10, "inlet")
-
-
-def flat(config: DataCenterConfig) -> DataCenterConfig:
-    """Servers whose power and airflow depend on the load alone."""
-    servers = config.servers.model_copy(
-        update={
-            "cpu_power_ratio_ub": config.servers.cpu_power_ratio_lb,
-            "fan_airflow_ratio_lb": (0.3, 1.0),
-            "fan_airflow_ratio_ub": (0.3, 1.0),
-        }
-    )
-    return config.model_copy(update={"servers": servers})
 
 
 @pytest.mark.parametrize("simple", [True, False], ids=["flat", "curves"])
@@ -919,40 +423,6 @@ def test_servers_agree_with_their_racks_and_get_warmer_upwards(seed: int) -> Non
 
 
 # --- batches ------------------------------------------------------------------------------------
-
-
-def own_part(values: HallSums, configs: list[DataCenterConfig], index: int) -> dict[str, Any]:
-    """What a fleet computed for one of its data centers."""
-    fleet = build_fleet(configs)
-    racks = slice(*fleet.rack_offsets[index : index + 2])
-    units = slice(*fleet.unit_offsets[index : index + 2])
-    out = {}
-    for f in fields(values):
-        where = slice(index, index + 1)
-        if f.name.startswith("rack_"):
-            where = racks
-        elif f.name.startswith("unit_"):
-            where = units
-        out[f.name] = getattr(values, f.name)[where]
-    return out
-
-
-def own_conditions(met: Conditions, configs: list[DataCenterConfig], index: int) -> Conditions:
-    fleet = build_fleet(configs)
-    racks = slice(*fleet.rack_offsets[index : index + 2])
-    where = {
-        "utilisation": slice(index, index + 1),
-        "rack_load": racks,
-        "powered": racks,
-        "rack_airflow": racks,
-        "group_load": slice(fleet.group_offsets[racks.start], fleet.group_offsets[racks.stop]),
-    }
-    units = slice(*fleet.unit_offsets[index : index + 2])
-    own: dict[str, Any] = {
-        f.name: None if (v := getattr(met, f.name)) is None else v[where.get(f.name, units)]
-        for f in fields(met)
-    }
-    return Conditions(**own)
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

@@ -12,6 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import reference_twin
+from random_halls import (
+    AS_FOUND,
+    PRECISIONS,
+    SMALL,
+    Part,
+    flat,
+    own_conditions,
+    own_part,
+    parts,
+    random_conditions,
+    random_hall,
+    random_halls,
+)
 from sdc_taichi import (
     Actions,
     ConfigError,
@@ -27,19 +40,6 @@ from sdc_taichi.config import apply_overrides
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums, Precision
 from sdc_taichi.types import F64
-from test_recirculation import (
-    AS_FOUND,
-    PRECISIONS,
-    SMALL,
-    Part,
-    flat,
-    own_conditions,
-    own_part,
-    parts,
-    random_conditions,
-    random_hall,
-    random_halls,
-)
 
 SEEDS = st.integers(0, 2**32 - 1)
 TOLERANCE: dict[Precision, float] = {"f64": 1e-12, "f32": 1e-5}

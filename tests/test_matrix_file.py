@@ -1,0 +1,195 @@
+"""Recirculation matrices of the user's: against the twin, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import reference_twin
+from random_halls import assert_close, at_design
+from sdc_taichi import ConfigError, DataCenterConfig, build_fleet, load_config
+from sdc_taichi.hall.recirculation import calibrate
+from sdc_taichi.sim.hall_solver import Conditions, Hall
+from sdc_taichi.types import F64
+
+
+def random_matrix(rng: np.random.Generator, racks: int) -> F64:
+    """An R of a hall of equal racks: no more leaves than comes out, a rack that breathes none."""
+    matrix = rng.uniform(0, 1, (racks, racks)) * (rng.random((racks, racks)) < 0.7)
+    matrix *= 0.35 / np.maximum(matrix.sum(axis=0), matrix.sum(axis=1)).max()
+    matrix[1] = 0.0
+    return matrix
+
+
+def heat_matrix(matrix: F64, overrides: list[str], scaled: bool, folder: Path) -> F64:
+    """D of a hall with this R: T_in - T_sup = R (I - R)^-1 K^-1 P, with its design airflow."""
+    path = folder / "known.npz"
+    np.savez(path, R=matrix)
+    given = [f"hall.recirculation.matrix_file={json.dumps(str(path))}",
+             f"hall.recirculation.calibrate={str(scaled).lower()}"]  # fmt: skip
+    config = load_config("corrected", [*overrides, *given])
+    per_k = config.hall.air_density_kg_m3 * config.hall.air_heat_capacity_j_per_kg_k
+    airflow_m3s = calibrate(config).design.airflow_m3s
+    return np.asarray(matrix @ np.linalg.inv(np.eye(len(matrix)) - matrix) / (per_k * airflow_m3s))
+
+
+@pytest.mark.parametrize("kind", ["R.npz", "D.npz", "R.csv", "D.csv"])
+@pytest.mark.parametrize("scaled", [True, False], ids=["calibrated", "as given"])
+def test_matrix_of_a_file_agrees_with_the_twin(kind: str, scaled: bool, tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    matrix = random_matrix(rng, 6)
+    if scaled:
+        # Calibration needs exhaust air for a rack with an approach temperature.
+        matrix[1] = matrix[0]
+    overrides = [
+        "hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
+        "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
+    ]  # fmt: skip
+    name, path = kind[0], tmp_path / kind
+    given = matrix if name == "R" else heat_matrix(matrix, overrides, scaled, tmp_path)
+    if path.suffix == ".npz":
+        np.savez(path, **{name: given})  # type: ignore[arg-type]
+    else:
+        np.savetxt(path, given, delimiter=",")
+    config = load_config(
+        "corrected",
+        [
+            *overrides,
+            f"hall.recirculation.matrix_file={json.dumps(str(path))}",
+            f"hall.recirculation.matrix_kind={name}",
+            f"hall.recirculation.calibrate={str(scaled).lower()}",
+        ],
+    )
+    met = Conditions(np.array([20.0]), np.array([0.7]))
+    twin = reference_twin.calibrated(config, matrix)
+    if not scaled:
+        np.testing.assert_allclose(calibrate(config).matrix(), matrix, rtol=1e-9, atol=1e-12)
+    ones, full = np.ones(6), np.ones(1)
+    expected = reference_twin.steady(
+        twin, met.unit_supply_c, twin.load(np.full(6, 0.7)), low=full, high=full, running=full,
+        powered=ones, breath=ones,
+    )  # fmt: skip
+    sums = Hall(build_fleet(config), "f64").solve(met)
+    for field in ("inlet_c", "outlet_c", "cpu_w", "airflow_m3s"):
+        assert_close(getattr(sums, f"rack_{field}"), expected.racks[field], 1e-10, field)
+    if not scaled:
+        assert sums.rack_inlet_c[1] == pytest.approx(20.0, abs=1e-9)
+
+
+def test_power_of_a_rack_warms_the_others_by_d(tmp_path: Path) -> None:
+    rng, path = np.random.default_rng(5), tmp_path / "cfd.npz"
+    overrides = [
+        "hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
+        "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
+        "servers.fan_full_airflow_m3s=0.012", "servers.fan_airflow_ratio_lb=[1,1]",
+        "servers.fan_airflow_ratio_ub=[1,1]",
+    ]  # fmt: skip
+    flow = calibrate(load_config("corrected", overrides)).design.airflow_m3s
+    matrix = random_matrix(rng, 6)
+    d_k_per_w = matrix @ np.linalg.inv(np.eye(6) - matrix) / (1.225 * 1006.0 * flow)
+    np.savez(path, D=d_k_per_w)
+    config = load_config(
+        "corrected",
+        [
+            *overrides,
+            f"hall.recirculation.matrix_file={json.dumps(str(path))}",
+            "hall.recirculation.calibrate=false",
+        ],
+    )
+    met = Conditions(np.array([19.0]), np.array([0.5]), rack_load=rng.uniform(0, 1, 6))
+    sums = Hall(build_fleet(config), "f64").solve(met)
+    power_w = sums.rack_cpu_w + sums.rack_fan_w
+    np.testing.assert_allclose(sums.rack_inlet_c, 19.0 + d_k_per_w @ power_w, rtol=1e-9)
+
+
+@pytest.mark.parametrize("full_m3s", [None, 0.02])
+def test_d_holds_at_the_design_point_of_servers_with_curves(
+    full_m3s: float | None, tmp_path: Path
+) -> None:
+    overrides = ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
+                 "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
+                 f"servers.fan_full_airflow_m3s={json.dumps(full_m3s)}"]  # fmt: skip
+    matrix = random_matrix(np.random.default_rng(0), 6)
+    d_k_per_w = heat_matrix(matrix, overrides, False, tmp_path)
+    np.savez(tmp_path / "cfd.npz", D=d_k_per_w)
+    path = json.dumps(str(tmp_path / "cfd.npz"))
+    named = [f"hall.recirculation.matrix_file={path}", "hall.recirculation.calibrate=false"]
+    sums = at_design([load_config("corrected", [*overrides, *named])])
+    rise_k = d_k_per_w @ (sums.rack_cpu_w + sums.rack_fan_w)
+    np.testing.assert_allclose(sums.rack_inlet_c - 23.0, rise_k, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"R": np.full((4, 4), 0.1)}, r"R has shape \(4, 4\), expected \(6, 6\)"),
+        ({"R": np.full((6, 6), np.nan)}, r"R\[0, 0\] is nan; valid is a finite number"),
+        ({"D": np.full((6, 6), -0.1)}, r"D\[0, 0\] is -0.1 K/W; valid is at least 0"),
+        ({"R": np.full((6, 6), 0.1j)}, "R holds complex128; valid are real numbers"),
+        ({"R": np.full((6, 6), True)}, "R holds bool; valid are real numbers"),
+        ({"R": np.full((6, 6), -0.1)}, "rack 0 takes a share of -0.1 of its air from rack 0"),
+        ({"R": np.full((6, 6), 0.2)}, "row 0 sums to 1.2; valid is below 1"),
+        ({"R": np.zeros((6, 6)), "D": np.zeros((6, 6))}, "valid is one of the arrays R and D"),
+        ({"X": np.zeros((6, 6))}, r"holds \['X'\]; valid is one of the arrays R and D"),
+        (b"no archive", "cannot be read as a matrix"),
+    ],
+)
+def test_a_matrix_that_cannot_be_is_refused(
+    content: dict[str, F64] | bytes, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "cfd.npz"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.savez(path, **content)  # type: ignore[arg-type]
+    config = load_config(
+        "corrected",
+        ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
+         "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
+         f"hall.recirculation.matrix_file={json.dumps(str(path))}",
+         "hall.recirculation.calibrate=false"],
+    )  # fmt: skip
+    with pytest.raises(ConfigError, match=message) as error:
+        build_fleet(config)
+    assert "cfd.npz" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def matrix_hall(path: Path, *more: str) -> DataCenterConfig:
+    return load_config(
+        "corrected",
+        ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=[0, 3, 3, 3, 3, 3]",
+         "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
+         f"hall.recirculation.matrix_file={json.dumps(str(path))}", *more],
+    )  # fmt: skip
+
+
+def test_files_that_are_no_matrix_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "one.npy", np.full((6, 6), 0.1))
+    (tmp_path / "one.npy").rename(tmp_path / "one.npz")
+    with pytest.raises(ConfigError, match=r"one\.npz: holds one array without a name; valid is an"):
+        build_fleet(matrix_hall(tmp_path / "one.npz"))
+    with pytest.raises(ConfigError, match=r"ends in '.txt'; valid are .npz and .csv"):
+        build_fleet(matrix_hall(tmp_path / "r.txt", "hall.recirculation.matrix_kind=R"))
+
+
+def test_a_rack_without_exhaust_air_cannot_be_warmed_by_it(tmp_path: Path) -> None:
+    path, matrix = tmp_path / "r.npz", np.full((6, 6), 0.05)
+    matrix[[0, 2]] = 0.0
+    np.savez(path, R=matrix)
+    with pytest.raises(ConfigError, match=r"row 2 is zero, so .* rack 2 by the 3 K of hall.supply"):
+        build_fleet(matrix_hall(path))
+    matrix[2] = 0.05
+    np.savez(path, R=matrix)
+    found = at_design([matrix_hall(path)]).rack_inlet_c - 23.0
+    np.testing.assert_allclose(found, [0, 3, 3, 3, 3, 3], atol=1e-9)
+
+
+def test_settings_that_a_matrix_leaves_without_effect_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"containment 0.5 with recirculation.matrix_file: .* 0$"):
+        matrix_hall(tmp_path / "r.npz", "hall.layout.containment=0.5")
+    with pytest.raises(ConfigError, match="matrix_kind D needs a matrix_file; valid without one"):
+        load_config("corrected", ["hall.recirculation.matrix_kind=D"])
