@@ -24,16 +24,16 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.control import (
-    CONTROLLED,
+    CONTROLLABLE,
     Controller,
     View,
-    controlled,
+    controlled_by,
     controller_names,
     make_controller,
     trim_and_respond,
-    viewer,
+    view_maker,
 )
-from sdc_taichi.control.rules import quarter_command, slots_in_step, unrepeated
+from sdc_taichi.control.rules import avoid_repeats, quartile_command, slots_in_step
 from sdc_taichi.run.loop import simulate
 
 CHECKS = json.loads((Path(__file__).parent / "reference" / "physics_checks.json").read_text())
@@ -68,15 +68,15 @@ def one_with(ci: np.ndarray) -> tuple[DataCenterConfig, Drivers]:
 
 
 def test_what_a_spec_controls() -> None:
-    assert controlled("g36") == controlled("constant:20") == ("cooling",)
-    assert controlled("greedy-ci") == ("load", "battery")
-    assert controlled("random") == CONTROLLED
-    assert controlled("load=greedy-ci, cooling=g36") == ("load", "cooling")
+    assert controlled_by("g36") == controlled_by("constant:20") == ("cooling",)
+    assert controlled_by("greedy-ci") == ("load", "battery")
+    assert controlled_by("random") == CONTROLLABLE
+    assert controlled_by("load=greedy-ci, cooling=g36") == ("load", "cooling")
 
 
 def test_commands_that_are_not_repeated_stay_as_they_are() -> None:
     command = np.array([0.5, 0.5, -0.5, 0.0, 1.0])
-    found = unrepeated(command, np.array([0.5, 0.25, -0.5, 0.0, np.nan]))
+    found = avoid_repeats(command, np.array([0.5, 0.25, -0.5, 0.0, np.nan]))
     assert (found == command).tolist() == [False, True, False, True, True]
     np.testing.assert_allclose(found, command, rtol=1e-15)
 
@@ -148,7 +148,7 @@ def test_g36_lowers_the_setpoint_when_more_than_two_racks_are_hot() -> None:
 def test_g36_counts_the_racks_of_each_data_center() -> None:
     with Simulator(fleet_of(2)) as sim:
         sim.reset(0)
-        look, last = viewer(sim), sim.step()
+        look, last = view_maker(sim), sim.step()
         racks = np.where(sim.fleet.rack_dc == 0, 26.0, 28.0)
         hot = replace(last, rack_inlet_max_c=racks)
         command = np.asarray(g36(sim).act(look(hot)).cooling)
@@ -163,7 +163,7 @@ def g36(sim: Simulator) -> Controller:
 
 
 def test_idle_leaves_everything_alone(sim: Simulator) -> None:
-    assert make_controller("idle", sim.fleet).act(viewer(sim)(None)) == Actions()
+    assert make_controller("idle", sim.fleet).act(view_maker(sim)(None)) == Actions()
 
 
 def test_random_is_reproducible_and_independent_of_the_batch() -> None:
@@ -206,10 +206,10 @@ def test_fixed_setpoints_are_reached_at_once_and_kept(
 def test_quarters_of_a_window() -> None:
     rising = np.arange(12.0)
     rows = [rising, rising[::-1], np.ones(12), np.r_[5.0, np.zeros(6), np.full(5, 9.0)]]
-    assert quarter_command(np.array(rows)).tolist() == [1.0, -1.0, 0.0, 0.0]
+    assert quartile_command(np.array(rows)).tolist() == [1.0, -1.0, 0.0, 0.0]
     # Two of eight are lower: no longer in the lowest quarter.
-    assert quarter_command(np.array([[2.0, 0, 1, 3, 3, 3, 3, 3]])).tolist() == [0.0]
-    assert quarter_command(np.array([[2.0, 0, 3, 3, 3, 3, 3, 3]])).tolist() == [1.0]
+    assert quartile_command(np.array([[2.0, 0, 1, 3, 3, 3, 3, 3]])).tolist() == [0.0]
+    assert quartile_command(np.array([[2.0, 0, 3, 3, 3, 3, 3, 3]])).tolist() == [1.0]
 
 
 @pytest.mark.parametrize("name", ["lookahead-3h", "lookahead-24h"])
@@ -254,7 +254,7 @@ def test_greedy_follows_the_mean_of_the_coming_day() -> None:
 
 
 def test_view_before_and_after_a_step(sim: Simulator) -> None:
-    look = viewer(sim)
+    look = view_maker(sim)
     first = look(None)
     assert first.last is None
     assert first.state.step == 0
@@ -277,7 +277,7 @@ def test_forecast_is_what_comes_also_over_the_turn_of_the_year() -> None:
         sim.reset(0)
         for _ in range(5):
             last = sim.step()
-        forecast = viewer(sim)(last).forecast(30.0)
+        forecast = view_maker(sim)(last).forecast(30.0)
         coming = [sim.step() for _ in range(120)]
     for name in ("ci_g_per_kwh", "outdoor_c", "wet_bulb_c"):
         seen = np.array([getattr(r, name) for r in coming]).T
@@ -286,7 +286,7 @@ def test_forecast_is_what_comes_also_over_the_turn_of_the_year() -> None:
 
 def test_forecast_shorter_than_a_step_is_an_error(sim: Simulator) -> None:
     with pytest.raises(ConfigError, match=r"forecast of 0 h: valid is at least 0\.25 h"):
-        viewer(sim)(None).forecast(0.0)
+        view_maker(sim)(None).forecast(0.0)
 
 
 # Names
@@ -356,4 +356,4 @@ def test_own_controllers_need_no_base_class(sim: Simulator) -> None:
 
     kept = results(sim, Alternate(), 4)
     assert [float(r.battery_command[0]) for r in kept] == [-1.0, 1.0, -1.0, 1.0]
-    assert CONTROLLED == ("load", "cooling", "battery")
+    assert CONTROLLABLE == ("load", "cooling", "battery")

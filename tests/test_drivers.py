@@ -31,7 +31,7 @@ def test_utc_rows_shift_carbon_intensity_by_the_offset_of_the_site() -> None:
     assert shifted.at(noon).outdoor_c == local.at(noon).outdoor_c
 
 
-def test_copies_share_one_table() -> None:
+def test_copies_store_a_series_once() -> None:
     drivers = load_drivers(make_configs(load_config("tiny"), count=50, sites=["ny", "wa"]))
     assert len(drivers.outdoor_c.values) == 2 * 35040
     world = drivers.at(1000)

@@ -22,7 +22,7 @@ from sdc_taichi import (
     load_config,
     with_values,
 )
-from sdc_taichi.control import CONTROLLED
+from sdc_taichi.control import CONTROLLABLE
 from sdc_taichi.envs.actions import BATTERY_COMMANDS
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT
 from sdc_taichi.envs.core import OBSERVERS
@@ -234,8 +234,8 @@ def test_choices_are_what_there_is() -> None:
     assert choices("agents") == set(AGENTS)
     for by_agent in (COMMAND_OF_AGENT, DEFAULT_FEATURES, DEFAULT_SCALES):
         assert tuple(by_agent) == AGENTS
-    assert tuple(COMMAND_OF_AGENT.values()) == CONTROLLED
-    assert set(CONTROLLED) <= {field.name for field in fields(Actions)}
+    assert tuple(COMMAND_OF_AGENT.values()) == CONTROLLABLE
+    assert set(CONTROLLABLE) <= {field.name for field in fields(Actions)}
     assert {agent for agent in IDS.values() if agent is not None} == set(AGENTS)
     names = {feature.name for feature in all_features()}
     assert all(set(chosen) <= names for chosen in DEFAULT_FEATURES.values())

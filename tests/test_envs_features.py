@@ -24,7 +24,7 @@ from sdc_taichi import (
     load_config,
     make_configs,
 )
-from sdc_taichi.control import View, viewer
+from sdc_taichi.control import View, view_maker
 from sdc_taichi.envs import time_rows
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.features import (
@@ -42,7 +42,7 @@ from sdc_taichi.envs.forecasts import (
 )
 from sdc_taichi.envs.heat_map import HEAT_MAP_CHANNELS, heat_map, heat_map_space
 from sdc_taichi.envs.observer import Observer
-from sdc_taichi.sim.drivers import Table
+from sdc_taichi.sim.drivers import FleetSeries
 
 SITES = ("ny", "ca", "az")
 STARTS = ("01-01", "07-01", "12-31")
@@ -88,7 +88,7 @@ def watch(
     """Observations of an episode, the first before any step."""
     with Simulator(configs, drivers=drivers) as sim:
         sim.reset(0)
-        look = viewer(sim)
+        look = view_maker(sim)
         observer = Observer(sim.fleet, **options)
         view = look(None)
         observer.reset(view, keys(first + sim.size)[first:])
@@ -113,8 +113,8 @@ def parts(array: np.ndarray, features: tuple[Feature, ...]) -> dict[str, np.ndar
     return {f.name: part for f, part in zip(features, split, strict=True)}
 
 
-def at(table: Table, dc: int, index: int) -> float:
-    return float(table.values[table.offset[dc] + index % table.length[dc]])
+def at(table: FleetSeries, dc: int, index: int) -> float:
+    return float(table.values[table.offsets[dc] + index % table.lengths[dc]])
 
 
 def by_hand(view: View, dc: int, work: list[list[float]]) -> dict[str, list[float]]:
@@ -146,7 +146,7 @@ def by_hand(view: View, dc: int, work: list[list[float]]) -> dict[str, list[floa
     edges = [0.0, 6.0, 12.0, 18.0, 24.0, math.inf]
     limit_h = config.workload.queue_limit_h or 10.0
 
-    def ahead(table: Table, leads_h: tuple[float, ...]) -> list[float]:
+    def ahead(table: FleetSeries, leads_h: tuple[float, ...]) -> list[float]:
         return [at(table, dc, index + round(h * per_hour)) for h in leads_h]
 
     ci = at(drivers.ci_g_per_kwh, dc, index)
@@ -307,7 +307,7 @@ def test_same_seed_same_observations_also_after_reset(error: ForecastError) -> N
         runs = []
         for seed in (1, 1, 2):
             sim.reset(0)
-            see = viewer(sim)
+            see = view_maker(sim)
             view = see(None)
             observer.reset(view, keys(3, seed))
             states = [observer.state(view)]
@@ -322,7 +322,7 @@ def test_same_seed_same_observations_also_after_reset(error: ForecastError) -> N
 def test_forecasts_of_one_view_follow_the_keys_of_the_last_reset() -> None:
     with Simulator(fleet_of("tiny")) as sim:
         sim.reset(0)
-        view = viewer(sim)(None)
+        view = view_maker(sim)(None)
         observer = Observer(sim.fleet, forecast_error=ForecastError(0.2, 3.0))
         states = []
         for seed in (1, 2, 1):
@@ -335,7 +335,7 @@ def test_forecasts_of_one_view_follow_the_keys_of_the_last_reset() -> None:
 def test_start_may_move_between_episodes() -> None:
     with Simulator(fleet_of("tiny")) as sim:
         sim.reset(0)
-        view = viewer(sim)(None)
+        view = view_maker(sim)(None)
         observer = Observer(sim.fleet)
         observer.reset(view, [])
         before = observer.state(view)
@@ -352,7 +352,7 @@ def test_start_may_move_between_episodes() -> None:
 def test_what_is_handed_out_belongs_to_the_caller() -> None:
     with Simulator(fleet_of("tiny")) as sim:
         sim.reset(0)
-        view = viewer(sim)(None)
+        view = view_maker(sim)(None)
         observer = Observer(sim.fleet)
         observer.reset(view, [])
         first = observer.state(view), observer.observe(view)
@@ -370,9 +370,9 @@ def test_what_is_handed_out_belongs_to_the_caller() -> None:
 
 def changed(drivers: Drivers, name: str, from_index: int) -> Drivers:
     """Other values from ``from_index`` of the year on; design days stay."""
-    table: Table = getattr(drivers, name)
+    table: FleetSeries = getattr(drivers, name)
     values = table.values.copy()
-    for offset, length in set(zip(table.offset.tolist(), table.length.tolist(), strict=True)):
+    for offset, length in set(zip(table.offsets.tolist(), table.lengths.tolist(), strict=True)):
         part = values[offset + from_index : offset + length]
         part += 0.1 if name == "demand" else 5.0
     if name == "demand":
@@ -503,9 +503,9 @@ def test_series_that_end_repeat_from_their_own_start() -> None:
     with Simulator([load_config("tiny")]) as sim:
         drivers = sim.drivers
 
-    def table(n: int, low: float, high: float) -> Table:
+    def table(n: int, low: float, high: float) -> FleetSeries:
         values = rng.uniform(low, high, n)
-        return Table(values, np.zeros(1, np.int64), np.array([n]))
+        return FleetSeries(values, np.zeros(1, np.int64), np.array([n]))
 
     odd = replace(
         drivers,
@@ -638,7 +638,7 @@ def test_leads_follow_the_step() -> None:
 def test_reset_comes_first_and_brings_a_key_each() -> None:
     with Simulator(fleet_of("tiny")) as sim:
         sim.reset(0)
-        view = viewer(sim)(None)
+        view = view_maker(sim)(None)
         observer = Observer(sim.fleet, forecast_error=ForecastError(0.1, 0.0))
         with pytest.raises(RuntimeStateError, match="reset"):
             observer.observe(view)
@@ -672,7 +672,7 @@ def units(count: int, name: str) -> DataCenterConfig:
 def test_setpoints_of_equal_numbers_of_units_stand_side_by_side() -> None:
     with Simulator([units(2, "a"), units(2, "b")]) as sim:
         sim.reset(0)
-        view = viewer(sim)(sim.step(Actions(cooling=np.array([1.0, -1.0, 0.0, 2.0]))))
+        view = view_maker(sim)(sim.step(Actions(cooling=np.array([1.0, -1.0, 0.0, 2.0]))))
         observer = Observer(sim.fleet)
         observer.reset(view, [])
         found = parts(observer.state(view), observer.state_features)["setpoint"]
@@ -682,7 +682,7 @@ def test_setpoints_of_equal_numbers_of_units_stand_side_by_side() -> None:
 def test_setpoints_of_unlike_numbers_of_units_are_means() -> None:
     with Simulator([units(1, "a"), units(3, "b")]) as sim:
         sim.reset(0)
-        view = viewer(sim)(sim.step(Actions(cooling=np.array([2.0, 1.0, 1.0, -2.0]))))
+        view = view_maker(sim)(sim.step(Actions(cooling=np.array([2.0, 1.0, 1.0, -2.0]))))
         observer = Observer(sim.fleet)
         observer.reset(view, [])
         found = parts(observer.state(view), observer.state_features)["setpoint"]
@@ -723,7 +723,7 @@ def test_heat_map_needs_halls_of_one_shape() -> None:
         with pytest.raises(ConfigError, match="corrected has 4 x 5 racks, tiny has 2 x 2"):
             heat_map_space(sim.fleet)
         with pytest.raises(SdcError, match="heat map"):
-            heat_map(viewer(sim)(None))
+            heat_map(view_maker(sim)(None))
 
 
 # Documentation

@@ -28,13 +28,13 @@ from sdc_taichi import (
     drivers_from_arrays,
     load_config,
 )
-from sdc_taichi.control.view import View, viewer
+from sdc_taichi.control.view import View, view_maker
 from sdc_taichi.envs import released_rewards, released_rows
 from sdc_taichi.envs.released_features import FEATURES
 from sdc_taichi.envs.released_observer import ReleasedObserver
 from sdc_taichi.envs.released_rewards import ReleasedRewards
 from sdc_taichi.errors import DataError, RuntimeStateError
-from sdc_taichi.sim.drivers import Table
+from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64, I64, StepResult
 from test_reference import BATTERY, COOLING, FOLDERS, LOAD, TRAJECTORIES, rack_config
@@ -78,8 +78,8 @@ def drivers(*series: dict[str, F64], start: list[int]) -> Drivers:
     lengths = np.array([len(one["demand"]) for one in series])
     offsets = np.concatenate([[0], np.cumsum(lengths)[:-1]])
 
-    def table(name: str) -> Table:
-        return Table(np.concatenate([one[name] for one in series]), offsets, lengths)
+    def table(name: str) -> FleetSeries:
+        return FleetSeries(np.concatenate([one[name] for one in series]), offsets, lengths)
 
     return replace(
         drivers_from_arrays(1.0, 1.0, 1.0, 1.0, size=len(series)),
@@ -97,7 +97,7 @@ def run(
     """Vectors (steps + 1, B, n), rewards (steps, B), results and views of the steps."""
     observer, rewards = ReleasedObserver(), ReleasedRewards()
     sim.reset()
-    look = viewer(sim)
+    look = view_maker(sim)
     view = look(None)
     observer.reset(view)
     rewards.reset(view)
@@ -281,7 +281,7 @@ def bare_view(config: DataCenterConfig, d: Drivers, step: int) -> View:
     if "tiny" not in _VIEWS:
         sim = Simulator(config, drivers=d)
         sim.reset()
-        _VIEWS["tiny"] = viewer(sim)(None)
+        _VIEWS["tiny"] = view_maker(sim)(None)
     view = _VIEWS["tiny"]
     return replace(view, drivers=d, state=replace(view.state, step=step))
 
@@ -401,8 +401,8 @@ def test_series_that_several_share() -> None:
     """Two data centers that read one series see its table, each from its own start."""
     d = drivers(inputs(4), start=[0])
 
-    def twice(table: Table) -> Table:
-        return replace(table, offset=np.zeros(2, dtype=np.int64), length=np.full(2, YEAR))
+    def twice(table: FleetSeries) -> FleetSeries:
+        return replace(table, offsets=np.zeros(2, dtype=np.int64), lengths=np.full(2, YEAR))
 
     both = replace(
         drivers(inputs(0), inputs(0), start=[50, 7000]),
@@ -515,7 +515,7 @@ def test_rewards_need_a_carbon_intensity_that_varies() -> None:
     fleet = build_fleet([tiny, tiny.model_copy(update={"name": "other"})])
     with Simulator(fleet, drivers=drivers(*series, start=[0, 0])) as sim:
         sim.reset()
-        view = viewer(sim)(None)
+        view = view_maker(sim)(None)
         with pytest.raises(DataError, match="of data center 1 is 310 g/kWh throughout"):
             ReleasedRewards().reset(view)
         result = sim.step()

@@ -16,7 +16,7 @@ import pytest
 
 from sdc_taichi import SdcError, Simulator, StepResult, load_config, make_configs
 from sdc_taichi.config import EventKind
-from sdc_taichi.control import make_controller, viewer
+from sdc_taichi.control import make_controller, view_maker
 from sdc_taichi.exogenous.synthetic import synthetic_site, synthetic_sites, synthetic_traces
 from sdc_taichi.run.metrics import Metric
 from sdc_taichi.sim.fleet import Fleet
@@ -41,7 +41,7 @@ def run() -> Run:
         controller = make_controller("load=greedy-ci,cooling=g36,battery=greedy-ci", sim.fleet)
         sim.reset()
         controller.reset(0)
-        look = viewer(sim)
+        look = view_maker(sim)
         results: list[StepResult] = []
         for _ in range(96 * DAYS):
             results.append(sim.step(controller.act(look(results[-1] if results else None))))

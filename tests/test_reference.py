@@ -42,7 +42,7 @@ from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.plant import chiller, cooling, tower, water, workload
 from sdc_taichi.plant.battery import BATTERIES
 from sdc_taichi.plant.carbon import emitted_g
-from sdc_taichi.sim.drivers import Table
+from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums, Precision
 from sdc_taichi.sim.sizing import released_ranges
 from sdc_taichi.types import F64
@@ -142,7 +142,7 @@ def recorded_drivers(outdoor_c: Any, wet_bulb: Any, ci: Any, demand: Any) -> Dri
     outdoor = np.atleast_1d(np.asarray(outdoor_c, dtype=np.float64))
     wet = np.atleast_1d(np.asarray(wet_bulb, dtype=np.float64))
     drivers = drivers_from_arrays(outdoor, np.minimum(wet, outdoor), ci, demand)
-    return replace(drivers, wet_bulb_c=Table(wet, np.array([0]), np.array([len(wet)])))
+    return replace(drivers, wet_bulb_c=FleetSeries(wet, np.array([0]), np.array([len(wet)])))
 
 
 INPUT_COLUMNS = {

@@ -32,7 +32,7 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.config import apply_overrides
-from sdc_taichi.sim.drivers import Table
+from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.sim.facility import Facility
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64
@@ -619,14 +619,14 @@ def test_drivers_follow_site_season_and_trace() -> None:
     table: F64 = drivers.outdoor_c.at(drivers.start)
     assert len(set(table)) == 3
     same = load_drivers([configs[0], configs[0]])
-    assert np.array_equal(same.outdoor_c.offset, [0, 0]), "one copy serves equal sites"
+    assert np.array_equal(same.outdoor_c.offsets, [0, 0]), "one copy serves equal sites"
     july = load_drivers([configs[1]])
     assert july.start[0] == 181 * 96
     assert july.outdoor_c.at(july.start)[0] > table[2]
 
 
 def test_tables_gather_one_entry_per_data_center() -> None:
-    table = Table(np.array([1.0, 2.0, 3.0, 10.0, 20.0]), np.array([0, 3]), np.array([3, 2]))
+    table = FleetSeries(np.array([1.0, 2.0, 3.0, 10.0, 20.0]), np.array([0, 3]), np.array([3, 2]))
     found = [table.at(np.array([i, i])).tolist() for i in range(4)]
     assert found == [[1, 10], [2, 20], [3, 10], [1, 20]]
 

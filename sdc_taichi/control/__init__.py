@@ -4,7 +4,12 @@ A controller turns a view of the data centers into actions, and knows them by no
 Learning algorithms and physics never live here.
 """
 
-from sdc_taichi.control.registry import CONTROLLED, controlled, controller_names, make_controller
+from sdc_taichi.control.registry import (
+    CONTROLLABLE,
+    controlled_by,
+    controller_names,
+    make_controller,
+)
 from sdc_taichi.control.rules import (
     Controller,
     FixedSetpoint,
@@ -16,10 +21,10 @@ from sdc_taichi.control.rules import (
     TrimAndRespond,
     trim_and_respond,
 )
-from sdc_taichi.control.view import Forecast, Limits, View, viewer
+from sdc_taichi.control.view import Forecast, Limits, View, view_maker
 
 __all__ = [
-    "CONTROLLED",
+    "CONTROLLABLE",
     "Controller",
     "FixedSetpoint",
     "Forecast",
@@ -31,9 +36,9 @@ __all__ = [
     "Random",
     "TrimAndRespond",
     "View",
-    "controlled",
+    "controlled_by",
     "controller_names",
     "make_controller",
     "trim_and_respond",
-    "viewer",
+    "view_maker",
 ]

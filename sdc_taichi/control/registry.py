@@ -22,25 +22,28 @@ from sdc_taichi.control.view import limits_of
 from sdc_taichi.errors import ConfigError, suggestion
 from sdc_taichi.sim.fleet import Fleet
 
-CONTROLLED = ("load", "cooling", "battery")
-"""What a controller may give commands for, as specs name it."""
+CONTROLLABLE = ("load", "cooling", "battery")
+"""Names of the commands that a controller may give, as specs and ``Actions`` name them."""
 
 
-class _Entry(NamedTuple):
+class _NamedController(NamedTuple):
+    """A controller that specs name."""
+
     make: Callable[[], Controller]
-    agents: tuple[str, ...]
-    """What it controls."""
+    """Makes the controller."""
+    commands: tuple[str, ...]
+    """Which of ``CONTROLLABLE`` it gives; the others it leaves neutral."""
 
 
-_ENTRIES: dict[str, _Entry] = {
-    "idle": _Entry(Idle, CONTROLLED),
-    "random": _Entry(Random, CONTROLLED),
-    "g36": _Entry(TrimAndRespond, ("cooling",)),
-    "coldest": _Entry(lambda: FixedSetpoint("low"), ("cooling",)),
-    "warmest": _Entry(lambda: FixedSetpoint("high"), ("cooling",)),
-    "lookahead-3h": _Entry(lambda: Lookahead(3.0), ("battery",)),
-    "lookahead-24h": _Entry(lambda: Lookahead(24.0), ("battery",)),
-    "greedy-ci": _Entry(GreedyCarbon, ("load", "battery")),
+_CONTROLLERS: dict[str, _NamedController] = {
+    "idle": _NamedController(Idle, CONTROLLABLE),
+    "random": _NamedController(Random, CONTROLLABLE),
+    "g36": _NamedController(TrimAndRespond, ("cooling",)),
+    "coldest": _NamedController(lambda: FixedSetpoint("low"), ("cooling",)),
+    "warmest": _NamedController(lambda: FixedSetpoint("high"), ("cooling",)),
+    "lookahead-3h": _NamedController(lambda: Lookahead(3.0), ("battery",)),
+    "lookahead-24h": _NamedController(lambda: Lookahead(24.0), ("battery",)),
+    "greedy-ci": _NamedController(GreedyCarbon, ("load", "battery")),
 }
 _CONSTANT = "constant:C"
 _SUGGESTION = " (did you mean {!r}?)"
@@ -48,7 +51,7 @@ _SUGGESTION = " (did you mean {!r}?)"
 
 def controller_names() -> tuple[str, ...]:
     """Valid names; ``constant:C`` stands for a setpoint in C, such as ``constant:20``."""
-    return (*_ENTRIES, _CONSTANT)
+    return (*_CONTROLLERS, _CONSTANT)
 
 
 def make_controller(spec: str, fleet: Fleet) -> Controller:
@@ -64,43 +67,43 @@ def make_controller(spec: str, fleet: Fleet) -> Controller:
             constant setpoint that is out of range.
     """
     if "=" not in spec:
-        return _make(spec.strip(), fleet, CONTROLLED)
+        return _make(spec.strip(), fleet, CONTROLLABLE)
     chosen: dict[str, Controller] = {}
     for part in spec.split(","):
         agent, sign, name = (text.strip() for text in part.partition("="))
-        if not sign or agent not in CONTROLLED:
+        if not sign or agent not in CONTROLLABLE:
             raise ConfigError(
                 f"controller {spec!r}: {part.strip()!r}: valid is agent=name with one of the "
-                f"agents {', '.join(CONTROLLED)}{suggestion(agent, CONTROLLED, _SUGGESTION)}"
+                f"agents {', '.join(CONTROLLABLE)}{suggestion(agent, CONTROLLABLE, _SUGGESTION)}"
             )
         if agent in chosen:
             raise ConfigError(f"controller {spec!r}: {agent} is given twice")
         chosen[agent] = _make(name, fleet, (agent,))
-    return PerAgent(*(chosen.get(agent, Idle()) for agent in CONTROLLED))
+    return PerAgent(*(chosen.get(agent, Idle()) for agent in CONTROLLABLE))
 
 
-def controlled(spec: str) -> tuple[str, ...]:
+def controlled_by(spec: str) -> tuple[str, ...]:
     """What a valid spec of ``make_controller`` controls; ``idle`` and ``random`` do everything."""
     if "=" in spec:
         return tuple(part.partition("=")[0].strip() for part in spec.split(","))
-    entry = _ENTRIES.get(spec.strip())
-    return ("cooling",) if entry is None else entry.agents
+    entry = _CONTROLLERS.get(spec.strip())
+    return ("cooling",) if entry is None else entry.commands
 
 
 def _make(name: str, fleet: Fleet, agents: tuple[str, ...]) -> Controller:
     """Look a name up, for use on any of ``agents``."""
     kind, colon, text = name.partition(":")
     if kind == "constant":
-        entry = _Entry(lambda: _constant(text if colon else "", fleet), ("cooling",))
-    elif name in _ENTRIES:
-        entry = _ENTRIES[name]
+        entry = _NamedController(lambda: _constant(text if colon else "", fleet), ("cooling",))
+    elif name in _CONTROLLERS:
+        entry = _CONTROLLERS[name]
     else:
         valid = controller_names()
         meant = suggestion(name, valid, _SUGGESTION)
         raise ConfigError(f"controller {name!r}: unknown; valid: {', '.join(valid)}{meant}")
-    if not set(agents) & set(entry.agents):
+    if not set(agents) & set(entry.commands):
         (agent,) = agents
-        able = [n for n, e in _ENTRIES.items() if agent in e.agents]
+        able = [n for n, e in _CONTROLLERS.items() if agent in e.commands]
         able += [_CONSTANT] if agent == "cooling" else []
         raise ConfigError(
             f"controller {name!r}: does not act on {agent}; valid for {agent}: {', '.join(able)}"

@@ -19,13 +19,14 @@ SLOT_MIN = 5.0
 REQUEST_INLET_C = 27.0
 """Highest recommended inlet temperature (ASHRAE TC 9.9); a rack above it requests cooling."""
 _DRAWN_STEPS = 256
+"""Steps whose random commands are drawn at once."""
 
 
 class Controller(Protocol):
-    """What drives a simulator."""
+    """What gives the commands of each step: any object with these two methods."""
 
     def reset(self, seed: Any) -> None:
-        """Forget earlier episodes.
+        """Begin an episode, on which earlier ones have no influence.
 
         Args:
             seed: decides everything that is random; an integer, or in environments one for each
@@ -33,14 +34,21 @@ class Controller(Protocol):
         """
 
     def act(self, view: View) -> Actions:
-        """Commands for the step to come, each (B,) or one for all."""
+        """Commands for the step to come.
+
+        Args:
+            view: the situation before the step, of B data centers.
+
+        Returns:
+            Commands, each (B,) or one for all data centers; see ``Actions``.
+        """
 
 
 class Idle:
-    """Moves no work, holds the setpoint, leaves the battery alone."""
+    """Neutral commands: moves no work, holds the setpoint, leaves the battery alone."""
 
     def reset(self, seed: int | I64) -> None:
-        """Nothing to forget."""
+        """Do nothing: no memory."""
 
     def act(self, view: View) -> Actions:
         """Neutral commands."""
@@ -58,14 +66,14 @@ class Random:
         self.reset(0)
 
     def reset(self, seed: int | I64) -> None:
-        """Start the streams of ``seed``."""
+        """Draw anew from the streams of ``seed``."""
         self._seed = seed
         self._streams: list[np.random.Generator] = []
         self._drawn = np.empty((0, 0, 3))
         self._block = -1
 
     def act(self, view: View) -> Actions:
-        """The draw of this step of each stream."""
+        """Commands for work, setpoint and battery, each -1, 0 or 1."""
         block, at = divmod(view.state.step, _DRAWN_STEPS)
         if len(self._streams) != view.size or block < self._block:
             self._streams = [np.random.Generator(np.random.PCG64(s)) for s in self._seeds(view)]
@@ -93,7 +101,7 @@ class TrimAndRespond:
     """
 
     def reset(self, seed: int | I64) -> None:
-        """Nothing to forget: the setpoint is part of the simulator's state."""
+        """Do nothing: the setpoint is part of the simulator's state."""
 
     def act(self, view: View) -> Actions:
         """Setpoint command alone."""
@@ -110,7 +118,7 @@ class TrimAndRespond:
                 low_c=view.limits.setpoint_low_c,
                 high_c=view.limits.setpoint_high_c,
             )
-        return Actions(cooling=steps_to(target_c, view))
+        return Actions(cooling=setpoint_command(target_c, view))
 
 
 class FixedSetpoint:
@@ -124,7 +132,7 @@ class FixedSetpoint:
         self._setpoint_c = setpoint_c
 
     def reset(self, seed: int | I64) -> None:
-        """Nothing to forget."""
+        """Do nothing: no memory."""
 
     def act(self, view: View) -> Actions:
         """Setpoint command alone."""
@@ -134,7 +142,7 @@ class FixedSetpoint:
             target_c = view.limits.setpoint_high_c
         else:
             target_c = np.full(view.size, float(self._setpoint_c))
-        return Actions(cooling=steps_to(target_c, view))
+        return Actions(cooling=setpoint_command(target_c, view))
 
 
 class Lookahead:
@@ -146,20 +154,20 @@ class Lookahead:
     forecast, is that of Carbon Explorer (Acun et al., ASPLOS 2023).
 
     Args:
-        hours: length of the window.
+        hours: length of the window, in h.
     """
 
     def __init__(self, hours: float) -> None:
         self._hours = hours
 
     def reset(self, seed: int | I64) -> None:
-        """Nothing to forget."""
+        """Do nothing: no memory."""
 
     def act(self, view: View) -> Actions:
         """Battery command alone."""
         ci = view.forecast(self._hours).ci_g_per_kwh
         pays = ci.max(axis=1) * view.limits.battery_round_trip > ci.min(axis=1)
-        return Actions(battery=np.where(pays, quarter_command(ci), 0.0))
+        return Actions(battery=np.where(pays, quartile_command(ci), 0.0))
 
 
 class GreedyCarbon:
@@ -168,14 +176,14 @@ class GreedyCarbon:
     Above the mean it defers work and discharges, below it drains the queue and charges.
 
     Args:
-        hours: length of the window.
+        hours: length of the window, in h.
     """
 
     def __init__(self, hours: float = 24.0) -> None:
         self._hours = hours
 
     def reset(self, seed: int | I64) -> None:
-        """Nothing to forget."""
+        """Do nothing: no memory."""
 
     def act(self, view: View) -> Actions:
         """Commands for work and battery."""
@@ -204,7 +212,7 @@ class PerAgent:
             controller.reset(seed)
 
     def act(self, view: View) -> Actions:
-        """Of each controller the command it was chosen for."""
+        """Take from each controller the command that it is responsible for."""
         return Actions(
             load=self._load.act(view).load,
             cooling=self._cooling.act(view).cooling,
@@ -229,17 +237,17 @@ def trim_and_respond(
     max(max_respond_k, respond_k*(R - ignored)), within its range.
 
     Args:
-        setpoint_c: present setpoint, (B,).
+        setpoint_c: present setpoint, in C, (B,).
         requests: number of requests, (B,).
-        low_c: lowest setpoint.
-        high_c: highest setpoint.
-        trim_k: change without requests, upwards.
-        respond_k: change per request that counts, downwards.
-        max_respond_k: largest response of a slot.
-        ignored: requests without effect.
+        low_c: lowest setpoint, in C, (B,) or one for all.
+        high_c: highest setpoint, in C, (B,) or one for all.
+        trim_k: change of every slot, upwards, in K.
+        respond_k: change per request that counts, downwards, in K.
+        max_respond_k: largest change by requests in a slot, downwards, in K.
+        ignored: number of requests without effect.
 
     Returns:
-        The new setpoint, (B,).
+        The new setpoint, in C, (B,).
     """
     counted = np.maximum(np.asarray(requests, dtype=np.float64) - ignored, 0.0)
     response_k = np.maximum(max_respond_k, respond_k * counted)
@@ -247,41 +255,46 @@ def trim_and_respond(
 
 
 def slots_in_step(step: int, step_h: float) -> int:
-    """Slots of trim and respond that end within step ``step`` (0-based)."""
+    """Number of slots of trim and respond that end within a step.
+
+    Args:
+        step: the step, from 0.
+        step_h: length of a step, in h.
+    """
     minutes = round(step_h * 60.0)
     return int((step + 1) * minutes // SLOT_MIN - step * minutes // SLOT_MIN)
 
 
-def steps_to(target_c: F64, view: View) -> F64:
-    """Setpoint command that reaches ``target_c`` in one step, (B,)."""
+def setpoint_command(target_c: F64, view: View) -> F64:
+    """Cooling command, in steps, (B,), that moves the setpoint to ``target_c``, in C, (B,)."""
     command = (target_c - view.setpoint_c) / view.limits.setpoint_step_k
-    return unrepeated(command, view.cooling_last)
+    return avoid_repeats(command, view.cooling_last)
 
 
-def unrepeated(command: F64, last: F64) -> F64:
-    """Setpoint commands that mean what they say, (n,).
+def avoid_repeats(command: F64, last: F64) -> F64:
+    """Cooling commands that differ from those of the step before, if only in the last bit.
 
-    The accelerating setpoint multiplies a command that is repeated exactly; such a one differs in
-    its last bit here.
+    Setpoint model ``accelerating`` takes equal commands in a row for a wish to go faster and
+    multiplies them; a command that is computed means what it says.
 
     Args:
-        command: setpoint changes in steps, (n,).
-        last: those of the step before, (n,), not a number before the first.
+        command: setpoint changes, in steps, (n,).
+        last: those of the step before, in steps, (n,); not a number before the first step.
     """
     return np.where(command == last, np.nextafter(command, 0.0), command)
 
 
-def quarter_command(ci_g_per_kwh: F64) -> F64:
-    """1 where the first of n values is in the lowest quarter of its row, -1 in the highest, else 0.
+def quartile_command(ci_g_per_kwh: F64) -> F64:
+    """Battery command by where the present carbon intensity stands within a window.
 
-    A value is in the lowest quarter if fewer than n/4 of the row are lower. One that is in both,
-    as all are in a constant row, gives 0.
+    A value is in the lowest quarter of n if fewer than n/4 of them are lower. One that is in the
+    lowest and the highest, as all are in a constant window, gives 0.
 
     Args:
-        ci_g_per_kwh: carbon intensity, (B, n).
+        ci_g_per_kwh: carbon intensity of the window, in g CO2e/kWh, the present one first, (B, n).
 
     Returns:
-        Battery command, (B,).
+        1 (charge) in the lowest quarter, -1 (discharge) in the highest, else 0, (B,).
     """
     now, quarter = ci_g_per_kwh[:, :1], ci_g_per_kwh.shape[1] / 4.0
     low = np.count_nonzero(ci_g_per_kwh < now, axis=1) < quarter

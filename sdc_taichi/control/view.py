@@ -1,4 +1,4 @@
-"""What a controller may see before each step."""
+"""What a controller sees before each step: results, state, inputs, forecasts and limits."""
 
 from __future__ import annotations
 
@@ -18,69 +18,80 @@ from sdc_taichi.types import F64, I64, Exogenous, State, StepResult
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What bounds the commands, each (B,)."""
+    """Limits of setpoint and battery from the configs of a fleet."""
 
     setpoint_low_c: F64
+    """Lowest setpoint of the CRAC supply air, in C, (B,)."""
     setpoint_high_c: F64
+    """Highest setpoint of the CRAC supply air, in C, (B,)."""
     setpoint_step_k: F64
+    """Change of the setpoint by a cooling command of 1, in K, (B,)."""
     battery_round_trip: F64
-    """Energy delivered per energy drawn to charge."""
-
-
-def _first_of_units(per_unit: F64, fleet: Fleet) -> F64:
-    return per_unit[fleet.unit_offsets[:-1]]
+    """Energy that the battery delivers per energy drawn to charge it, 0..1, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """Perfect foresight of the inputs: the present step, then those that follow, each (B, n)."""
+    """Weather and carbon intensity of coming steps, exactly as they will be.
+
+    Column 0 is the step to come.
+    """
 
     drivers: Drivers
+    """Inputs of all steps."""
     index: I64
-    """Steps since the start of the year, (B, n)."""
+    """Coming steps, counted from the beginning of the year, (B, n)."""
 
     @property
     def ci_g_per_kwh(self) -> F64:
-        """Carbon intensity."""
+        """Carbon intensity of the grid, in g CO2e/kWh, (B, n)."""
         return self.drivers.ci_g_per_kwh.at(self.index)
 
     @property
     def outdoor_c(self) -> F64:
-        """Dry bulb."""
+        """Outdoor dry bulb, in C, (B, n)."""
         return self.drivers.outdoor_c.at(self.index)
 
     @property
     def wet_bulb_c(self) -> F64:
-        """Wet bulb."""
+        """Outdoor wet bulb, in C, (B, n)."""
         return self.drivers.wet_bulb_c.at(self.index)
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The situation before a step of a fleet of B data centers."""
+    """What a controller may see before a step of a fleet of B data centers."""
 
     last: StepResult | None
-    """Result of the step before; None before the first."""
+    """Result of the step before; None before the first step."""
     state: State
+    """State before the step to come."""
     drivers: Drivers
-    """Inputs of all steps; a controller that reads on sees the future."""
+    """Inputs of all steps; whoever reads those of later steps sees the future."""
     fleet: Fleet
+    """The data centers, with their configs."""
     sizing: Sizing
+    """Capacities of the devices."""
     limits: Limits
+    """Limits of setpoint and battery."""
     step_h: float
+    """Length of a step, in h."""
     precision: Precision
-    """Of the server kernels."""
+    """Floating-point precision of the hall kernels: ``f32`` or ``f64``."""
 
     @property
     def now(self) -> Exogenous:
-        """Inputs of the step to come."""
+        """Inputs of the step to come, each (B,)."""
         return self.drivers.at(self.state.step)
 
     def forecast(self, hours: float) -> Forecast:
-        """Inputs of the coming hours, the step to come first.
+        """Inputs of the coming hours, known exactly in advance.
+
+        Args:
+            hours: length of the forecast, rounded to whole steps.
 
         Raises:
-            ConfigError: less than a step.
+            ConfigError: the forecast is shorter than a step.
         """
         steps = round(hours / self.step_h)
         if steps < 1:
@@ -90,12 +101,15 @@ class View:
 
     @property
     def setpoint_c(self) -> F64:
-        """Setpoint of the first CRAC unit; built-in controllers move all units alike, (B,)."""
+        """Setpoint of the first CRAC unit of each data center, in C, (B,).
+
+        The controllers of this package move all units alike.
+        """
         return _first_of_units(self.state.setpoint_c, self.fleet)
 
     @property
     def cooling_last(self) -> F64:
-        """Last cooling command of the first CRAC unit, (B,)."""
+        """Last cooling command of the first CRAC unit of each data center, in steps, (B,)."""
         return _first_of_units(self.state.cooling_last, self.fleet)
 
     @property
@@ -105,7 +119,7 @@ class View:
 
 
 def limits_of(fleet: Fleet) -> Limits:
-    """Limits from the configs of a fleet."""
+    """Limits of setpoint and battery from the configs of a fleet."""
     return Limits(
         setpoint_low_c=fleet.values("hvac.setpoint.min_c"),
         setpoint_high_c=fleet.values("hvac.setpoint.max_c"),
@@ -115,16 +129,23 @@ def limits_of(fleet: Fleet) -> Limits:
     )
 
 
-def viewer(sim: Simulator) -> Callable[[StepResult | None], View]:
-    """A function from the last result to the view before the next step.
+def view_maker(sim: Simulator) -> Callable[[StepResult | None], View]:
+    """A function that makes the view before each step.
 
     Args:
         sim: a simulator that has been reset.
+
+    Returns:
+        Function of the last step's result, or of None before the first step.
     """
     step_h = sim.step_h
     limits, sizing = limits_of(sim.fleet), sim.sizing
 
-    def look(last: StepResult | None) -> View:
+    def view_after(last: StepResult | None) -> View:
         return View(last, sim.state, sim.drivers, sim.fleet, sizing, limits, step_h, sim.precision)
 
-    return look
+    return view_after
+
+
+def _first_of_units(per_unit: F64, fleet: Fleet) -> F64:
+    return per_unit[fleet.unit_offsets[:-1]]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sdc_taichi.control.rules import unrepeated
+from sdc_taichi.control.rules import avoid_repeats
 from sdc_taichi.envs.agents import COMMAND_OF_AGENT
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import SdcError
@@ -117,7 +117,7 @@ class ActionDecoder:
         command = np.minimum(np.maximum(command, -high), high)
         if agent == "agent_dc":
             command /= self._setpoint_step_k
-            command = unrepeated(command, state.cooling_last)
+            command = avoid_repeats(command, state.cooling_last)
         return command
 
 

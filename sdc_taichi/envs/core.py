@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.control import Idle, View, controlled, make_controller, viewer
+from sdc_taichi.control import Idle, View, controlled_by, make_controller, view_maker
 from sdc_taichi.envs.actions import ActionDecoder
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT
 from sdc_taichi.envs.episode_reset import Seed, chosen_start_days, seeded_generators
@@ -186,7 +186,7 @@ class Core:
         self._final_terms = {}
         self._others.reset(self.sim.state.seed)
         if self._view_after is None:
-            self._view_after = viewer(self.sim)
+            self._view_after = view_maker(self.sim)
         self._last = None
         self._view = view = self._view_after(None)
         self._observer.reset(view, self._keys)
@@ -359,7 +359,7 @@ def _check_others(options: EnvOptions) -> None:
     if "others" not in options.model_fields_set:
         return
     learned = [COMMAND_OF_AGENT[agent] for agent in options.agents]
-    named = controlled(options.others)
+    named = controlled_by(options.others)
     unused = set(named) & set(learned) if "=" in options.others else set(named) <= set(learned)
     if unused:
         raise ConfigError(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.errors import ConfigError, RuntimeStateError
-from sdc_taichi.sim.drivers import Drivers, Table
+from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.types import F32, F64, I64
 from sdc_taichi.year_clock import HOURS_PER_YEAR
 
@@ -123,7 +123,7 @@ class Forecasts:
         )
         self._error = error
         self._step_h = 1.0 / steps_per_hour
-        self._tables: tuple[Table, ...] = ()
+        self._tables: tuple[FleetSeries, ...] = ()
         self._walks: _RandomWalks | None = None
 
     def reset(self, drivers: Drivers, keys: Sequence[int] | I64 = ()) -> bool:
@@ -219,14 +219,14 @@ class _ExtendedSeries:
         leads: 0 for the present, then the leads in steps, (1 + k,).
     """
 
-    def __init__(self, table: Table, leads: I64) -> None:
+    def __init__(self, table: FleetSeries, leads: I64) -> None:
         series, which = table.distinct()
         ahead = int(leads[-1])
         parts = [np.resize(one.astype(np.float32), len(one) + ahead) for one in series]
         first_entries = np.cumsum([0, *(len(part) for part in parts[:-1])])
         self._values = np.concatenate(parts)
         self._first_entries = first_entries[which]
-        self._lengths = table.length
+        self._lengths = table.lengths
         self._leads = leads[:, None]
 
     def at(self, index: I64, dc: I64 | slice) -> F32:

@@ -27,7 +27,7 @@ from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, Fore
 from sdc_taichi.envs.time_rows import EntryOrder, TimeRows, time_rows
 from sdc_taichi.errors import RuntimeStateError
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP
-from sdc_taichi.sim.drivers import Drivers, Table
+from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.types import F32, F64, I64
@@ -285,7 +285,7 @@ class _TimeEntries:
         self._forecasts = forecasts
         self._time_of_day = _sine_and_cosine(24 * steps_per_hour)
         self._time_of_year = _sine_and_cosine(HOURS_PER_YEAR * steps_per_hour)
-        self._demand: Table | None = None
+        self._demand: FleetSeries | None = None
         self.rows: TimeRows | None = None
 
     def reset(self, drivers: Drivers, keys: Sequence[int] | I64, arranged_width: int) -> bool:
@@ -307,7 +307,7 @@ class _TimeEntries:
                 (drivers.ci_g_per_kwh, drivers.outdoor_c, drivers.wet_bulb_c, demand),
                 lambda index, dc: self._scaled(
                     index,
-                    demand.values[demand.offset[dc] + index],
+                    demand.values[demand.offsets[dc] + index],
                     self._forecasts.truth(index, dc),
                 ),
                 period=len(self._time_of_year),

@@ -20,7 +20,7 @@ from sdc_taichi.envs.released_features import (
     ranges,
 )
 from sdc_taichi.envs.time_rows import TimeRows, time_rows
-from sdc_taichi.sim.drivers import Table
+from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.types import F32, F64, I64
 
 SMOOTHED_STEPS = 4
@@ -83,7 +83,7 @@ class ReleasedRows:
         demand = self._demand
 
         def arriving(step: I64) -> F64:
-            return demand.values.take(demand.offset[dc] + step % demand.length[dc])
+            return demand.values.take(demand.offsets[dc] + step % demand.lengths[dc])
 
         return np.column_stack(
             [
@@ -176,7 +176,7 @@ _OUTDOOR_COLUMNS = _scaled_columns("outdoor", ("outdoor_next",), ("outdoor_slope
 class _RowPerEntry:
     """A row for each entry of a driver's series, those of all distinct series end to end."""
 
-    series: Table
+    series: FleetSeries
     """The series that the rows were made from."""
     rows: F64
     """Rows of all distinct series, (entries, columns)."""
@@ -185,18 +185,18 @@ class _RowPerEntry:
 
     def at(self, index: I64, dc: I64) -> F64:
         """Rows ``index`` of the series of data centers ``dc``, repeating, (n, columns)."""
-        return self.rows.take(self.first_rows[dc] + index % self.series.length[dc], axis=0)
+        return self.rows.take(self.first_rows[dc] + index % self.series.lengths[dc], axis=0)
 
-    def made_from(self, series: Table) -> bool:
+    def made_from(self, series: FleetSeries) -> bool:
         """Whether the rows are those of ``series``."""
         return (
             self.series.values is series.values
-            and np.array_equal(self.series.offset, series.offset)
-            and np.array_equal(self.series.length, series.length)
+            and np.array_equal(self.series.offsets, series.offsets)
+            and np.array_equal(self.series.lengths, series.lengths)
         )
 
 
-def _row_per_entry(series: Table, build: Callable[[F64], F64]) -> _RowPerEntry:
+def _row_per_entry(series: FleetSeries, build: Callable[[F64], F64]) -> _RowPerEntry:
     """Build the rows, (entries, columns), of each distinct series once."""
     distinct, which = series.distinct()
     parts = [build(values) for values in distinct]

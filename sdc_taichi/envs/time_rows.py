@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.sim.drivers import Table
+from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.types import F32, I64
 
 MAX_ROW_BYTES = 2**28
@@ -44,7 +44,7 @@ class TimeRows:
 
 
 def time_rows(
-    series: Sequence[Table],
+    series: Sequence[FleetSeries],
     read: Callable[[I64, I64], npt.NDArray[Any]],
     *,
     period: int,
@@ -62,11 +62,11 @@ def time_rows(
         None where there can be no such rows: the series of a data center differ in length, end
         within a period, or need more memory than ``MAX_ROW_BYTES``.
     """
-    length = series[0].length
-    alike = all(np.array_equal(one.length, length) for one in series)
+    length = series[0].lengths
+    alike = all(np.array_equal(one.lengths, length) for one in series)
     if not alike or np.any(length % period):
         return None
-    places = np.stack([*(one.offset for one in series), length], axis=1)
+    places = np.stack([*(one.offsets for one in series), length], axis=1)
     _, first, which = np.unique(places, axis=0, return_index=True, return_inverse=True)
     lengths = length[first]
     if int(lengths.sum()) * row_bytes > MAX_ROW_BYTES:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sdc_taichi.control import Controller, viewer
+from sdc_taichi.control import Controller, view_maker
 from sdc_taichi.run.metrics import Totals, add_step, empty_totals
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import StepResult
@@ -37,7 +37,7 @@ def simulate(
     """
     sim.reset(seed)
     controller.reset(seed)
-    view_of = viewer(sim)
+    view_of = view_maker(sim)
     totals = empty_totals(sim.size, sim.step_h)
     last: StepResult | None = None
     for _ in range(steps):

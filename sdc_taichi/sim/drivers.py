@@ -1,7 +1,7 @@
-"""What drives each data center of a fleet over time: weather, carbon intensity and demand.
+"""Inputs of a fleet over time: weather, carbon intensity of the grid, and demand.
 
-Every series is resampled to the time step once per site; a step gathers one entry per data center.
-Series may differ in length; each repeats from its own start.
+Every series is brought to the time step once per site; a step reads one value per data center.
+Series may differ in length; each repeats from its own beginning.
 """
 
 from __future__ import annotations
@@ -26,55 +26,78 @@ DESIGN_QUANTILE = 0.996
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
-    """Series of several data centers end to end; data center i reads ``length[i]`` entries."""
+class FleetSeries:
+    """One series over time for each data center, equal series stored once.
+
+    Series may differ in length; each repeats after its last value.
+    """
 
     values: F64
-    offset: I64
-    length: I64
+    """All distinct series end to end, (T,)."""
+    offsets: I64
+    """Where in ``values`` the series of each data center begins, (B,)."""
+    lengths: I64
+    """Number of values of each data center's series, (B,)."""
 
     def at(self, index: I64) -> F64:
-        """Entry ``index`` of every data center, repeating, (B,), or entries, (B, n)."""
+        """Values of every data center at steps of its series.
+
+        Args:
+            index: a step of each data center, (B,), or several, (B, n); beyond the end of a series
+                it begins anew.
+
+        Returns:
+            Same shape.
+        """
         if index.ndim > 1:
-            return self.values.take(self.offset[:, None] + index % self.length[:, None])
-        return self.values.take(self.entries(index))
+            return self.values.take(self.offsets[:, None] + index % self.lengths[:, None])
+        return self.values.take(self.places(index))
 
-    def entries(self, index: I64) -> I64:
-        """Where in ``values`` entry ``index`` of every data center is, (B,)."""
-        return self.offset + index % self.length
+    def places(self, index: I64) -> I64:
+        """Where in ``values`` a step of each data center's series lies, (B,)."""
+        return self.offsets + index % self.lengths
 
-    def aligned(self, other: Table) -> Table:
-        """This table, with the very places of ``other`` where they are the same."""
-        offset, length = (
-            theirs if np.array_equal(mine, theirs) else mine
-            for mine, theirs in ((self.offset, other.offset), (self.length, other.length))
+    def sharing_places(self, other: FleetSeries) -> FleetSeries:
+        """The same series, with the offset and length arrays of ``other`` where they are equal.
+
+        Series that share both arrays are read at places that are computed once.
+        """
+        offsets, lengths = (
+            theirs if np.array_equal(own, theirs) else own
+            for own, theirs in ((self.offsets, other.offsets), (self.lengths, other.lengths))
         )
-        return Table(self.values, offset, length)
+        return FleetSeries(self.values, offsets, lengths)
 
     def distinct(self) -> tuple[list[F64], I64]:
-        """The distinct series, and which of them each data center reads, (B,)."""
+        """The distinct series, and the number of the one that each data center reads, (B,)."""
         parts, which = np.unique(
-            np.stack([self.offset, self.length], axis=1), axis=0, return_inverse=True
+            np.stack([self.offsets, self.lengths], axis=1), axis=0, return_inverse=True
         )
         return [self.values[first : first + n] for first, n in parts], which.reshape(-1)
 
 
 @dataclass(frozen=True, slots=True)
 class Drivers:
-    """Exogenous inputs of a fleet."""
+    """Weather, carbon intensity and demand of a fleet over time."""
 
-    outdoor_c: Table
-    wet_bulb_c: Table
-    ci_g_per_kwh: Table
-    demand: Table
+    outdoor_c: FleetSeries
+    """Outdoor dry-bulb temperature, in C."""
+    wet_bulb_c: FleetSeries
+    """Outdoor wet-bulb temperature, in C."""
+    ci_g_per_kwh: FleetSeries
+    """Carbon intensity of the grid, in g CO2e/kWh."""
+    demand: FleetSeries
+    """Work that arrives in a step, as a share of the capacity, 0..1."""
     start: I64
-    """Index of the first step in the year, (B,)."""
+    """First simulated step, counted from the beginning of the year, (B,)."""
     design_outdoor_c: F64
+    """Dry bulb that the year exceeds for 0.4 % of its steps, in C, (B,)."""
     design_wet_bulb_c: F64
+    """Wet bulb that the year exceeds for 0.4 % of its steps, in C, (B,)."""
     sources: tuple[dict[str, str], ...]
-    """Where each series of each data center comes from; synthetic ones say so."""
+    """Source of weather, carbon and workload of each data center; synthetic ones say so, B."""
     synthetic: tuple[bool, ...]
-    """Whether any series of the data center is synthetic."""
+    """Whether any series of a data center is synthetic, B."""
     notes: tuple[str, ...]
     """What the loaders repaired or warned of, each text once."""
 
@@ -84,21 +107,21 @@ class Drivers:
         return len(self.start)
 
     def digest(self) -> bytes:
-        """SHA-256 of the series, which tells inputs apart."""
+        """SHA-256 of all series; equal inputs have equal digests."""
         sha = hashlib.sha256()
-        for table in (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh, self.demand):
-            for array in (table.values, table.offset, table.length):
+        for series in (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh, self.demand):
+            for array in (series.values, series.offsets, series.lengths):
                 sha.update(array.tobytes())
         return sha.digest()
 
     def at(self, step: int) -> Exogenous:
         """Inputs of step ``step`` after reset."""
         index, first = self.start + step, self.outdoor_c
-        entries = first.entries(index)
+        places = first.places(index)
 
-        def read(table: Table) -> F64:
-            alike = table.offset is first.offset and table.length is first.length
-            return table.values.take(entries if alike else table.entries(index))
+        def read(series: FleetSeries) -> F64:
+            shared = series.offsets is first.offsets and series.lengths is first.lengths
+            return series.values.take(places if shared else series.places(index))
 
         return Exogenous(
             outdoor_c=read(first),
@@ -116,11 +139,11 @@ def load_drivers(configs: Sequence[DataCenterConfig]) -> Drivers:
         DataError: a file that is not valid.
     """
     steps_per_hour = configs[0].simulation.steps_per_hour
-    sites: dict[object, _Site] = {}
-    traces: dict[object, tuple[Series, F64]] = {}
-    chosen: list[tuple[_Site, tuple[Series, F64]]] = []
+    read_sites: dict[object, _SiteInputs] = {}
+    read_traces: dict[object, _TraceInputs] = {}
+    sites, traces = [], []
     for config in configs:
-        site, work = config.site, config.workload
+        site = config.site
         site_key = (
             site.location,
             site.seed,
@@ -128,42 +151,37 @@ def load_drivers(configs: Sequence[DataCenterConfig]) -> Drivers:
             site.carbon_file,
             site.carbon_pairing,
         )
-        if site_key not in sites:
-            sites[site_key] = _read_site(config, steps_per_hour)
-        trace_key = site.workload_file or (work.trace, site.seed)
-        if trace_key not in traces:
-            trace = (
-                read_workload(site.workload_file)
-                if site.workload_file is not None
-                else load_trace(work.trace, seed=site.seed)
-            )
-            traces[trace_key] = (trace, resample(trace, steps_per_hour))
-        chosen.append((sites[site_key], traces[trace_key]))
+        if site_key not in read_sites:
+            read_sites[site_key] = _read_site(config, steps_per_hour)
+        sites.append(read_sites[site_key])
+        trace_key = site.workload_file or (config.workload.trace, site.seed)
+        if trace_key not in read_traces:
+            read_traces[trace_key] = _read_trace(config, steps_per_hour)
+        traces.append(read_traces[trace_key])
     days = np.array([day_of_year(c.site.start) for c in configs], dtype=np.int64)
-    outdoor_c = _table([site.outdoor_c for site, _ in chosen])
+    outdoor_c = _fleet_series([site.outdoor_c for site in sites])
+    inputs = list(zip(sites, traces, strict=True))
     return Drivers(
         outdoor_c=outdoor_c,
-        wet_bulb_c=_table([site.wet_bulb_c for site, _ in chosen]).aligned(outdoor_c),
-        ci_g_per_kwh=_table([site.ci_g_per_kwh for site, _ in chosen]).aligned(outdoor_c),
-        demand=_table([values for _, (_, values) in chosen]).aligned(outdoor_c),
+        wet_bulb_c=_fleet_series([x.wet_bulb_c for x in sites]).sharing_places(outdoor_c),
+        ci_g_per_kwh=_fleet_series([x.ci_g_per_kwh for x in sites]).sharing_places(outdoor_c),
+        demand=_fleet_series([x.demand for x in traces]).sharing_places(outdoor_c),
         start=days * 24 * steps_per_hour,
-        design_outdoor_c=np.array([site.design_outdoor_c for site, _ in chosen]),
-        design_wet_bulb_c=np.array([site.design_wet_bulb_c for site, _ in chosen]),
+        design_outdoor_c=np.array([site.design_outdoor_c for site in sites]),
+        design_wet_bulb_c=np.array([site.design_wet_bulb_c for site in sites]),
         sources=tuple(
             {
                 "weather": site.data.outdoor_c.source,
                 "carbon": site.data.ci_g_per_kwh.source,
-                "workload": trace.source,
+                "workload": trace.series.source,
             }
-            for site, (trace, _) in chosen
+            for site, trace in inputs
         ),
         synthetic=tuple(
-            site.data.outdoor_c.synthetic or site.data.ci_g_per_kwh.synthetic or trace.synthetic
-            for site, (trace, _) in chosen
+            any(s.synthetic for s in (site.data.outdoor_c, site.data.ci_g_per_kwh, trace.series))
+            for site, trace in inputs
         ),
-        notes=tuple(
-            dict.fromkeys(note for site, (trace, _) in chosen for note in _notes(site, trace))
-        ),
+        notes=tuple(dict.fromkeys(note for pair in inputs for note in _notes(*pair))),
     )
 
 
@@ -176,13 +194,13 @@ def drivers_from_arrays(
     size: int = 1,
     source: str = "arrays",
 ) -> Drivers:
-    """Inputs at the simulation's time step, from step 0 on.
+    """Inputs given as arrays at the simulation's time step; the first value is that of step 0.
 
     Args:
-        outdoor_c: dry bulb, (T,) for all data centers or (B, T).
-        wet_bulb_c: wet bulb, not above dry bulb, as above.
-        ci_g_per_kwh: carbon intensity, not negative, as above.
-        demand: arriving work as a share of capacity, 0..1, as above.
+        outdoor_c: dry bulb, in C, (T,) for all data centers or (B, T).
+        wet_bulb_c: wet bulb, not above the dry bulb, in C, (T,) or (B, T).
+        ci_g_per_kwh: carbon intensity, not negative, in g CO2e/kWh, (T,) or (B, T).
+        demand: arriving work as a share of the capacity, 0..1, (T,) or (B, T).
         size: number of data centers for arrays of shape (T,).
         source: text for the provenance.
 
@@ -224,7 +242,7 @@ def drivers_from_arrays(
                 f"valid is {valid}"
             )
     return Drivers(
-        **{name: _table(list(value)) for name, value in rows.items()},
+        **{name: _fleet_series(list(value)) for name, value in rows.items()},
         start=np.zeros(size, dtype=np.int64),
         design_outdoor_c=np.quantile(rows["outdoor_c"], DESIGN_QUANTILE, axis=1),
         design_wet_bulb_c=np.quantile(rows["wet_bulb_c"], DESIGN_QUANTILE, axis=1),
@@ -235,7 +253,9 @@ def drivers_from_arrays(
 
 
 @dataclass(frozen=True, slots=True)
-class _Site:
+class _SiteInputs:
+    """Weather and carbon intensity of one site at the time step of the simulation, each (T,)."""
+
     data: SiteData
     outdoor_c: F64
     wet_bulb_c: F64
@@ -244,7 +264,15 @@ class _Site:
     design_wet_bulb_c: float
 
 
-def _read_site(config: DataCenterConfig, steps_per_hour: int) -> _Site:
+@dataclass(frozen=True, slots=True)
+class _TraceInputs:
+    """A workload trace, and its demand at the time step of the simulation, (T,)."""
+
+    series: Series
+    demand: F64
+
+
+def _read_site(config: DataCenterConfig, steps_per_hour: int) -> _SiteInputs:
     site = config.site
     base = load_site(site.location, seed=site.seed)
     data = site_from_files(
@@ -256,7 +284,7 @@ def _read_site(config: DataCenterConfig, steps_per_hour: int) -> _Site:
     if site.carbon_pairing == "utc_rows" and site.carbon_file is None:
         # Local hour k gets the row of UTC hour k; files come with that pairing already.
         ci_g_per_kwh = np.roll(ci_g_per_kwh, -round(data.utc_offset_h * steps_per_hour))
-    return _Site(
+    return _SiteInputs(
         data=data,
         outdoor_c=outdoor_c,
         wet_bulb_c=wet_bulb_c,
@@ -266,25 +294,35 @@ def _read_site(config: DataCenterConfig, steps_per_hour: int) -> _Site:
     )
 
 
-def _notes(site: _Site, trace: Series) -> tuple[str, ...]:
-    series = (site.data.outdoor_c, site.data.wet_bulb_c, site.data.ci_g_per_kwh, trace)
+def _read_trace(config: DataCenterConfig, steps_per_hour: int) -> _TraceInputs:
+    file = config.site.workload_file
+    series = (
+        load_trace(config.workload.trace, seed=config.site.seed)
+        if file is None
+        else read_workload(file)
+    )
+    return _TraceInputs(series, resample(series, steps_per_hour))
+
+
+def _notes(site: _SiteInputs, trace: _TraceInputs) -> tuple[str, ...]:
+    series = (site.data.outdoor_c, site.data.wet_bulb_c, site.data.ci_g_per_kwh, trace.series)
     return tuple(f"{s.source}: {note}" for s in series for note in s.notes)
 
 
-def _table(rows: Sequence[F64]) -> Table:
-    """Put each distinct row once; rows are told apart by identity."""
-    first: dict[int, int] = {}
-    parts: list[F64] = []
+def _fleet_series(series: Sequence[F64]) -> FleetSeries:
+    """Join one series per data center; the very same array is stored once."""
+    offset_of: dict[int, int] = {}
+    stored: list[F64] = []
     total = 0
     offsets = []
-    for row in rows:
-        if id(row) not in first:
-            first[id(row)] = total
-            parts.append(row)
-            total += len(row)
-        offsets.append(first[id(row)])
-    return Table(
-        values=np.concatenate(parts),
-        offset=np.array(offsets, dtype=np.int64),
-        length=np.array([len(row) for row in rows], dtype=np.int64),
+    for values in series:
+        if id(values) not in offset_of:
+            offset_of[id(values)] = total
+            stored.append(values)
+            total += len(values)
+        offsets.append(offset_of[id(values)])
+    return FleetSeries(
+        values=np.concatenate(stored),
+        offsets=np.array(offsets, dtype=np.int64),
+        lengths=np.array([len(values) for values in series], dtype=np.int64),
     )
