@@ -24,13 +24,15 @@ from sdc_taichi import (
     Drivers,
     Simulator,
     StepResult,
+    View,
     build_fleet,
     drivers_from_arrays,
     load_config,
+    make_controller,
+    simulate,
 )
-from sdc_taichi.control import Controller, View, make_controller
+from sdc_taichi.control import Controller
 from sdc_taichi.hall.floor_plan import floor_plan
-from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import Metric, metrics_per_dc
 from sdc_taichi.types import F64
 from sdc_taichi.viz import floor_plan as plans

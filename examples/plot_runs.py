@@ -14,12 +14,9 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sdc_taichi import Simulator, load_config
-from sdc_taichi.control import make_controller
+from sdc_taichi import RunRequest, Simulator, load_config, make_controller, simulate_to_folder
 from sdc_taichi.exogenous.synthetic import synthetic_sites, synthetic_traces
-from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.folder_reader import read_run, read_steps
-from sdc_taichi.run.folder_writer import simulate_to_folder
 from sdc_taichi.viz import dashboards, data_figures, fleet_figures
 from sdc_taichi.viz.animation import write_animation
 from sdc_taichi.viz.figures import DPI, webp

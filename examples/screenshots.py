@@ -33,8 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from sdc_taichi import Actions, Simulator, StepResult, load_config
-from sdc_taichi.viz.recorder import Recorder
+from sdc_taichi import Actions, Recorder, Simulator, StepResult, load_config
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient

@@ -28,9 +28,16 @@ from matplotlib.figure import Figure
 from train_skrl import ALGORITHMS, BatchEnv, learner, prepare, trainer
 
 import sdc_taichi
-from sdc_taichi import DataCenterConfig, Simulator, StepResult, build_fleet, load_config
-from sdc_taichi.control import View, make_controller
-from sdc_taichi.run.loop import simulate
+from sdc_taichi import (
+    DataCenterConfig,
+    Simulator,
+    StepResult,
+    View,
+    build_fleet,
+    load_config,
+    make_controller,
+    simulate,
+)
 from sdc_taichi.types import F64
 
 SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
