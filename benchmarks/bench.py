@@ -23,6 +23,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import counts
 import env
 import fresh
 import numpy as np
@@ -224,6 +225,24 @@ def breakdown(
     for part, per_s in parts.items():
         share = 1.0 / per_s / env_s
         yield Figure("environments", f"{name}: {part} of the step", share)
+
+
+def calls(quick: bool) -> Iterator[Figure]:
+    """Calls of a step, which are to be few, and as many in a batch as alone."""
+    many = 8 if quick else 96
+    for name, overrides, at_most in (
+        ("corrected", (), 4),
+        ("corrected, transient", ("simulation.thermal=transient",), 5),
+    ):
+        found = counts.kernel_calls_of(counts.simulator_step(many, *overrides))
+        yield Figure("calls", f"{name}: kernels of a step", found, "calls", at_most=at_most)
+    for name, make, at_most in (
+        ("simulator", counts.simulator_step, 300),
+        ("vector_env", counts.environment_step, 350),
+    ):
+        few, most = (counts.calls_of(make(size), "call") for size in (2, many))
+        yield Figure("calls", f"{name}: Python functions of a step", few, "calls", at_most=at_most)
+        yield Figure("calls", f"{name}: N = {many} beyond N = 2", most - few, "calls", at_most=0)
 
 
 def scaling(quick: bool) -> Iterator[Figure]:
@@ -523,7 +542,7 @@ def main() -> None:
     print(json.dumps(facts, indent=1))
     figures: list[Figure] = []
     # Environments first: steps of a process that has held gigabytes take a tenth longer.
-    for part in (environments, kernel_and_peers, scaling, starting, recording):
+    for part in (environments, kernel_and_peers, calls, scaling, starting, recording):
         for figure in part(quick):
             show(figure, figures[-1].part if figures else "", quick)
             figures.append(figure)

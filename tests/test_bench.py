@@ -58,6 +58,7 @@ def test_every_part_has_figures_that_are_numbers_or_say_why_not(written: dict[st
     figures = written["figures"]
     assert {f["part"] for f in figures} == {
         "kernel",
+        "calls",
         "environments",
         "scaling",
         "start",

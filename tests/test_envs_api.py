@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 import pickle
 import re
@@ -23,7 +22,6 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from pettingzoo.test.state_test import state_test
 
 import sdc_taichi
-from call_counts import calls_of
 from sdc_taichi import ConfigError, RuntimeStateError, SdcError, load_config
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.agents import AGENTS
@@ -572,27 +570,6 @@ def test_what_the_standards_do_not_know_is_reached_through_unwrapped() -> None:
         assert not hasattr(turns, name)
     assert isinstance(turns.unwrapped, SdcParallelEnv)
     assert turns.unwrapped.reward_terms() == {}
-
-
-@pytest.mark.parametrize("seen", ["default", "sustaindc"])
-def test_calls_per_step_are_few_whatever_the_batch(
-    seen: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What a step costs above the simulator, counted: calls of Python and C functions."""
-    counted = []
-    for num_envs in (1, 3, 64):
-        env = multi_agent(num_envs, **tiny(), **SEEN[seen], rewards=seen)
-        env.reset(seed=0)
-        actions = {agent: np.ones(num_envs, dtype=np.int64) for agent in AGENTS}
-        env.step(actions)
-        result = env.core.view.last
-        with monkeypatch.context() as patch:
-            patch.setattr(env.core.sim, "step", lambda actions, result=result: result)
-            env.step(actions)
-            step = functools.partial(env.step, actions)
-            counted.append(calls_of(step, "call", "c_call"))
-    assert len(set(counted)) == 1
-    assert counted[0] < 160
 
 
 # --- what one learner sees of several agents ---

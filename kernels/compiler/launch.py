@@ -11,21 +11,18 @@ from typing import Any
 
 import numpy as np
 import taichi as ti
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from .arrays import address_of
 from .runtime import uses_plain_taichi
 
-OPTIONS = {"cfg_optimization": False, "fast_math": False, "real_matrix_scalarize": False}
+OPTIONS = {"fast_math": False, "real_matrix_scalarize": False}
 """Options that kernels are compiled with, whoever started the runtime.
 
-``cfg_optimization`` is Taichi's analysis of the control flow, which takes four fifths of the time
-to compile and finds nothing that LLVM does not. Without ``fast_math`` results are the same bits in
-every kernel. Without ``real_matrix_scalarize`` a vector is loaded, stored and computed as one
-vector of the processor."""
+Without ``fast_math`` a sum has the same bits in every kernel. Without ``real_matrix_scalarize`` a
+vector is loaded, stored and computed as one vector of the processor."""
 
 _compiling = threading.RLock()
-"""Taichi's options and its translation are those of the process."""
+"""Held while a kernel is compiled, as the options belong to the runtime of the whole process."""
 
 
 class BoundKernel:
@@ -132,34 +129,13 @@ def _translate(primal: Any, args: tuple[Any, ...]) -> Any:
 
     Whole numbers in kernels have 32 bits, whatever whoever started the runtime chose.
     """
-    with (
-        _replaced(ti.lang.impl.get_runtime(), "default_ip", ti.i32),
-        _replaced(ASTTransformerContext, "get_pos_info", _position),
-    ):
-        return primal.ensure_compiled(*args)
-
-
-def _position(self: Any, node: Any) -> str:
-    """Where a node of a kernel's source stands, for messages.
-
-    Taichi makes an excerpt of the source for each node and marks its columns, which takes longer
-    than the rest of the translation.
-    """
-    name, line = self.func.func.__name__, node.lineno
-    return (
-        f'File "{self.file}", line {line + self.lineno_offset}, in {name}:\n{self.src[line - 1]}\n'
-    )
-
-
-@contextmanager
-def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """Set an attribute of an object, and put back what was there on leaving."""
-    before = getattr(owner, name)
+    runtime = ti.lang.impl.get_runtime()
+    before = runtime.default_ip
     try:
-        setattr(owner, name, value)
-        yield
+        runtime.default_ip = ti.i32
+        return primal.ensure_compiled(*args)
     finally:
-        setattr(owner, name, before)
+        runtime.default_ip = before
 
 
 @contextmanager
