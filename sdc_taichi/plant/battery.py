@@ -292,4 +292,5 @@ def _battery(
 
 
 def _sigmoid(x: Values) -> Values:
+    """Logistic function 1/(1 + exp(-x))."""
     return 1.0 / (1.0 + np.exp(-x))

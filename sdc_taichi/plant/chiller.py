@@ -443,8 +443,10 @@ def _quotient(numerator: Values, denominator: Values) -> F64:
 
 
 def _quadratic(c: tuple[float, ...], x: Values) -> Values:
+    """c0 + c1*x + c2*x^2."""
     return c[0] + x * (c[1] + x * c[2])
 
 
 def _biquadratic(c: tuple[float, ...], x: Values, y: Values) -> Values:
+    """c0 + c1*x + c2*x^2 + c3*y + c4*y^2 + c5*x*y."""
     return c[0] + c[1] * x + c[2] * x**2 + c[3] * y + c[4] * y**2 + c[5] * x * y
