@@ -10,7 +10,7 @@ import pytest
 import exogenous_builders as build
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import read_carbon, read_epw, read_workload, statistics, wet_bulb_c
-from sdc_taichi.exogenous.files import read_metadata, write_parquet
+from sdc_taichi.exogenous.series_file import read_metadata, write_parquet
 from sdc_taichi.year_clock import MONTH_OF_DAY
 
 

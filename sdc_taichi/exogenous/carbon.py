@@ -9,20 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sdc_taichi.errors import DataError
-from sdc_taichi.exogenous import files
+from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.series import FloatArray, Series
+from sdc_taichi.exogenous.stamps import Stamp, by_start_of_interval
 from sdc_taichi.exogenous.synthetic import FUELS, emission_factors
-from sdc_taichi.year_clock import DAYS_PER_YEAR, MINUTES_PER_DAY
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Stamp = Literal["auto", "start", "end"]
 Pairing = Literal["local", "utc_rows"]
+"""Whether rows are moved to local time, or kept as if UTC were local time."""
 
 COLUMNS = ("timestamp", *FUELS, "avg_CI")
+"""Columns of a carbon table with its fuel mix."""
 MAX_CI_G_PER_KWH = 2000.0
+"""Highest valid carbon intensity, in g/kWh."""
 MIX_TOLERANCE_G = 1.0
+"""Largest difference of ``avg_CI`` from what the fuel mix gives, in g/kWh."""
 _MAX_GENERATION_MWH = 1e7
 _TIMEZONE = r"(?:[Zz]|UTC|[+-]\d\d:?\d\d)$"
 
@@ -69,9 +72,42 @@ def read_carbon(
     if pairing not in ("local", "utc_rows"):
         raise DataError(f"pairing: {pairing!r}, expected 'local' or 'utc_rows'")
     if files.is_parquet(path):
-        metadata = files.read_metadata(path)
+        metadata = series_file.read_metadata(path)
         if metadata is not None:
             return _read_imported(path, metadata, utc_offset_h, pairing)
+    minutes, start_utc, columns, values, notes = _generation(path)
+    intensity = values[:, -1]
+    local = start_utc + np.timedelta64(round(utc_offset_h * 3600), "s")
+    if pairing == "utc_rows":
+        local = start_utc
+        notes.append("rows kept in UTC order, as the released SustainDC pairs them")
+    else:
+        solar = values[:, columns.index("SUN")] if "SUN" in columns else None
+        noon_h = 12.0 if longitude_deg is None else 12.0 + utc_offset_h - longitude_deg / 15.0
+        without_leap, _, _ = files.without_leap_days(intensity, local, minutes)
+        files.check_length(path, len(without_leap), minutes)
+        intensity, shift, note = by_start_of_interval(
+            stamp, intensity, solar, local, minutes, noon_h
+        )
+        local = local - shift * np.timedelta64(round(minutes * 60), "s")
+        notes.append(note)
+    intensity, since, leap_notes = files.without_leap_days(intensity, local, minutes)
+    intensity, year_notes = files.whole_years(path, intensity, since, minutes)
+    notes += leap_notes + year_notes
+    return Series(
+        intensity, minutes, "ci_g_per_kwh", "g/kWh", path.name, synthetic=False, notes=tuple(notes)
+    )
+
+
+def _generation(
+    path: Path,
+) -> tuple[float, np.datetime64, tuple[str, ...], FloatArray, list[str]]:
+    """Contiguous rows of a carbon table, repaired.
+
+    Returns:
+        Resolution in minutes, first stamp (UTC), names of the columns (fuels if there are any,
+        then ``avg_CI``), values, (T, columns), and notes.
+    """
     frame, first_row = files.read_table(path)
     notes = []
     if "timestamp" not in frame.columns and frame.columns[0].strip() in files.BLANK_HEADERS:
@@ -83,49 +119,28 @@ def read_carbon(
     minutes, positions, start_utc = _stamps(path, frame, rows)
     columns = (*FUELS, "avg_CI") if with_fuels else ("avg_CI",)
     values, number_notes = _numbers(path, frame, columns, rows)
-    notes += number_notes
     values = files.spread(values, positions)
     grid_rows = rows[np.minimum(np.searchsorted(positions, np.arange(len(values))), rows.size - 1)]
     values, gap_notes = _repair(path, values, minutes, columns, grid_rows, len(frame))
-    notes += gap_notes
-    intensity = values[:, -1]
-
-    local = start_utc + np.timedelta64(round(utc_offset_h * 3600), "s")
-    if pairing == "utc_rows":
-        local = start_utc
-        notes.append("rows kept in UTC order, as the released SustainDC pairs them")
-    else:
-        solar = values[:, columns.index("SUN")] if with_fuels else None
-        noon = 12.0 if longitude_deg is None else 12.0 + utc_offset_h - longitude_deg / 15.0
-        without_leap, _, _ = files.without_leap_days(intensity, local, minutes)
-        files.check_length(path, len(without_leap), minutes)
-        intensity, shift, note = _apply_stamp(stamp, intensity, solar, local, minutes, noon)
-        local = local - shift * np.timedelta64(round(minutes * 60), "s")
-        notes.append(note)
-    intensity, since, leap_notes = files.without_leap_days(intensity, local, minutes)
-    intensity, year_notes = files.whole_years(path, intensity, since, minutes)
-    notes += leap_notes + year_notes
-    return Series(
-        intensity, minutes, "ci_g_per_kwh", "g/kWh", path.name, synthetic=False, notes=tuple(notes)
-    )
+    return minutes, start_utc, columns, values, notes + number_notes + gap_notes
 
 
 def _read_imported(
     path: Path, metadata: dict[str, object], utc_offset_h: float, pairing: Pairing
 ) -> Series:
-    kind = files.metadata_value(path, metadata, "kind", str)
+    kind = series_file.metadata_value(path, metadata, "kind", str)
     if kind != "carbon":
         raise DataError(f"{path}: metadata kind: {kind!r}, expected 'carbon'")
-    offset = files.metadata_value(path, metadata, "utc_offset_h", float)
+    offset = series_file.metadata_value(path, metadata, "utc_offset_h", float)
     if offset != utc_offset_h:
         raise DataError(
             f"{path}: metadata utc_offset_h: {offset:g}, expected {utc_offset_h:g} as the site has"
         )
-    if files.metadata_value(path, metadata, "pairing", str) != pairing:
+    if series_file.metadata_value(path, metadata, "pairing", str) != pairing:
         raise DataError(f"{path}: metadata pairing: {metadata['pairing']!r}, expected {pairing!r}")
-    minutes = files.metadata_value(path, metadata, "minutes", float)
-    columns = files.read_columns(path, {"ci_g_per_kwh": (0.0, MAX_CI_G_PER_KWH)}, minutes)
-    return files.imported_series(path, metadata, "ci_g_per_kwh", "g/kWh", columns, minutes)
+    minutes = series_file.metadata_value(path, metadata, "minutes", float)
+    columns = series_file.read_columns(path, {"ci_g_per_kwh": (0.0, MAX_CI_G_PER_KWH)}, minutes)
+    return series_file.imported_series(path, metadata, "ci_g_per_kwh", "g/kWh", columns, minutes)
 
 
 def _stamps(
@@ -234,7 +249,7 @@ def _repair(
                 f"{int(partial.sum())} rows with under half of the 25 h median generation "
                 "interpolated"
             )
-        for suspect, what in _suspects(values[:, :-1], total, median):
+        for suspect, what in _suspicious_rows(values[:, :-1], total, median):
             first = int(rows[np.argmax(suspect)])
             notes.append(
                 f"warning: {int(suspect.sum())} rows with {what} kept (first: row {first})"
@@ -246,10 +261,10 @@ def _repair(
     return np.stack(filled, axis=1), notes
 
 
-def _suspects(
+def _suspicious_rows(
     fuels: FloatArray, total: FloatArray, median: FloatArray
 ) -> list[tuple[NDArray[np.bool_], str]]:
-    """Rows that look wrong but are kept, and why; only kinds that occur."""
+    """Rows that look wrong but are kept, (T,), with the reason; only reasons that occur."""
     nuclear, other = fuels[:, FUELS.index("NUC")], fuels[:, FUELS.index("OTH")]
     reporting = np.where(np.isnan(total), np.inf, (fuels > 0.0).sum(axis=1))
     kinds = [
@@ -261,102 +276,3 @@ def _suspects(
         ((reporting == 1) & (np.median(reporting) >= 3), "one fuel only"),
     ]
     return [(rows, why) for rows, why in kinds if rows.any()]
-
-
-# What a stamp marks
-
-
-def _apply_stamp(
-    stamp: Stamp,
-    intensity: FloatArray,
-    solar: FloatArray | None,
-    local: np.datetime64,
-    minutes: float,
-    noon_h: float,
-) -> tuple[FloatArray, int, str]:
-    """Intervals in order of their start.
-
-    Returns:
-        Values one per interval, by how many intervals the first one starts before its stamp
-        (0 or 1), and a note.
-    """
-    if stamp != "auto":
-        return intensity, int(stamp == "end"), f"stamps mark the {stamp} of the interval (given)"
-    lateness = None if solar is None else _solar_lateness(solar, local, minutes, noon_h)
-    if lateness is None:
-        return intensity, 1, "stamps mark the end of the interval (assumed: no solar generation)"
-    before, after, day = _split(lateness)
-    if (before > 0.0) == (after > 0.0):
-        word = "end" if before > 0.0 else "start"
-        return intensity, int(before > 0.0), f"stamps mark the {word} of the interval (solar noon)"
-    per_day = round(MINUTES_PER_DAY / minutes)
-    cut = min(day * per_day, len(intensity) - 1)
-    date = (local + np.timedelta64(day, "D")).astype("datetime64[D]")
-    if before > 0.0:  # end, then start: one interval is never reported
-        gap = 0.5 * (intensity[cut - 1] + intensity[cut])
-        joined = np.insert(intensity, cut, gap)
-        return joined, 1, f"stamps mark the end until {date}, then the start (solar noon); 1 filled"
-    # start, then end: one interval is reported twice, and the last of the year never
-    joined = np.append(np.delete(intensity, cut), 0.5 * (intensity[-1] + intensity[0]))
-    return joined, 0, f"stamps mark the start until {date}, then the end (solar noon); 1 filled"
-
-
-def _solar_lateness(
-    solar: FloatArray, local: np.datetime64, minutes: float, noon_h: float
-) -> FloatArray | None:
-    """Hours from solar noon to the centre of solar generation by stamp, per day; NaN on dark days.
-
-    Mean solar noon is corrected by the equation of time (Spencer 1971).
-    """
-    times = local.astype("datetime64[s]") + np.timedelta64(round(minutes * 60), "s") * np.arange(
-        solar.size
-    )
-    day = (times.astype("datetime64[D]") - times[0].astype("datetime64[D]")).astype(np.int64)
-    hour = (times - times.astype("datetime64[D]")) / np.timedelta64(1, "h")
-    total = np.bincount(day, solar)
-    bright = total > 0.1 * np.median(total[total > 0.0]) if (total > 0.0).any() else total > 0.0
-    if bright.sum() < 30:
-        return None
-    year_angle = (
-        2.0
-        * np.pi
-        / DAYS_PER_YEAR
-        * (
-            (times[0].astype("datetime64[D]") - times[0].astype("datetime64[Y]")).astype(np.int64)
-            + np.arange(total.size)
-        )
-    )
-    equation_h = (
-        0.000075
-        + 0.001868 * np.cos(year_angle)
-        - 0.032077 * np.sin(year_angle)
-        - 0.014615 * np.cos(2.0 * year_angle)
-        - 0.040849 * np.sin(2.0 * year_angle)
-    ) * (12.0 / np.pi)
-    late = np.full(total.size, np.nan)
-    late[bright] = np.bincount(day, solar * hour)[bright] / total[bright]
-    return np.asarray(late - (noon_h - equation_h), dtype=np.float64)
-
-
-def _split(lateness: FloatArray) -> tuple[float, float, int]:
-    """Means before and after the day that best splits the series in two, and that day.
-
-    A split counts only if both parts last 30 days and differ by 0.4 h (a change of what a stamp
-    marks is an hour); otherwise both means are that of the whole.
-    """
-    days = np.flatnonzero(~np.isnan(lateness))
-    values = lateness[days]
-    n = values.size
-    whole = float(np.median(values))
-    count = np.arange(1, n)
-    left = np.cumsum(values)[:-1]
-    right = values.sum() - left
-    explained = left**2 / count + right**2 / (n - count)
-    allowed = (count >= 30) & (n - count >= 30)
-    if not allowed.any():
-        return whole, whole, 0
-    at = int(np.argmax(np.where(allowed, explained, -np.inf))) + 1
-    before, after = float(values[:at].mean()), float(values[at:].mean())
-    if abs(after - before) < 0.4:
-        return whole, whole, 0
-    return before, after, int(days[at])

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from sdc_taichi.errors import DataError
-from sdc_taichi.exogenous import files
-from sdc_taichi.exogenous.carbon import Stamp, read_carbon
+from sdc_taichi.exogenous import files, series_file
+from sdc_taichi.exogenous.carbon import read_carbon
 from sdc_taichi.exogenous.registry import (
     find_name,
     imported_sites,
@@ -18,6 +18,7 @@ from sdc_taichi.exogenous.registry import (
     user_data_dir,
 )
 from sdc_taichi.exogenous.series import Series
+from sdc_taichi.exogenous.stamps import Stamp
 from sdc_taichi.exogenous.synthetic import (
     coefficients,
     synthetic_site,
@@ -28,17 +29,23 @@ from sdc_taichi.exogenous.weather import read_epw
 from sdc_taichi.exogenous.workload import read_workload
 
 KINDS = ("weather", "carbon", "workload")
+"""Kinds of files, in the order in which a folder is imported."""
 
 
 @dataclass(frozen=True)
 class Imported:
-    """One imported file: what it became, where it lies, and what was done to it."""
+    """A file that was imported."""
 
     kind: str
+    """What it holds: ``weather``, ``carbon`` or ``workload``."""
     name: str
+    """Name of the site or trace that it became, or became part of."""
     source: Path
+    """The file that was read."""
     target: Path
+    """The Parquet file that was written."""
     notes: tuple[str, ...]
+    """Repairs, with counts, and warnings."""
 
 
 def file_kind(path: Path) -> str:
@@ -49,10 +56,10 @@ def file_kind(path: Path) -> str:
     """
     path = files.existing_file(path)
     if files.is_parquet(path):
-        metadata = files.read_metadata(path) or {}
+        metadata = series_file.read_metadata(path) or {}
         if metadata.get("kind") in KINDS:
             return str(metadata["kind"])
-        header = set(files.column_names(path))
+        header = set(series_file.column_names(path))
     else:
         with path.open("rb") as handle:
             line = handle.readline(4096).decode("utf-8", errors="replace").lstrip("\ufeff").strip()
@@ -220,7 +227,7 @@ def _store(
     from importlib.metadata import version
 
     notes = series[0].notes
-    files.write_parquet(
+    series_file.write_parquet(
         target,
         {s.name: s.values for s in series},
         {

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from sdc_taichi.errors import DataError, similar_names
-from sdc_taichi.exogenous import files
-from sdc_taichi.exogenous.carbon import Pairing, Stamp, read_carbon
+from sdc_taichi.exogenous import series_file
+from sdc_taichi.exogenous.carbon import Pairing, read_carbon
 from sdc_taichi.exogenous.series import Series, SiteData, make_site, site_weather
+from sdc_taichi.exogenous.stamps import Stamp
 from sdc_taichi.exogenous.synthetic import (
     DEFAULT_SEED,
     synthetic_site,
@@ -201,7 +202,7 @@ def site_from_files(
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    metadata = files.read_metadata(path)
+    metadata = series_file.read_metadata(path)
     if metadata is None:
         raise DataError(f"{path}: no sdc_taichi metadata, expected a file written by `data import`")
     return metadata

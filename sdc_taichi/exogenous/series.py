@@ -1,7 +1,7 @@
-"""Time series that drive a site: a year (or more) of values on the simulator's clock.
+"""Time series of a site: a year or more of values on the simulator's clock.
 
-Clock: local standard time, 365-day years without 29 February. Index 0 is the interval that starts
-on 1 January at 00:00, and a value stands for its whole interval.
+The clock is local standard time in years of 365 days (``sdc_taichi.year_clock``). Index 0 is the
+interval that begins on 1 January at 00:00; a value stands for its whole interval.
 """
 
 from __future__ import annotations
@@ -20,25 +20,22 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Values on a regular grid, periodic beyond the end.
-
-    Attributes:
-        values: shape (T,), float64, read-only, finite, in ``unit``.
-        minutes: length of one interval, minutes.
-        name: what it is, e.g. ``outdoor_c``.
-        unit: unit of the values.
-        source: where the values come from.
-        synthetic: whether the values were generated rather than measured.
-        notes: what was repaired, with counts, and warnings.
-    """
+    """Values at regular intervals, periodic beyond the end."""
 
     values: FloatArray
+    """Value of each interval, in ``unit``, (T,); finite, read-only."""
     minutes: float
+    """Length of an interval, in minutes."""
     name: str
+    """Name of the quantity, such as ``outdoor_c``."""
     unit: str
+    """Unit of the values, such as ``C``."""
     source: str
+    """Origin of the values: a file, or what a synthetic year is fitted to."""
     synthetic: bool
+    """Whether the values were generated rather than measured."""
     notes: tuple[str, ...] = field(default=())
+    """Repairs, with counts, and warnings."""
 
     def __post_init__(self) -> None:
         """Take a read-only copy of the values and check them.
@@ -68,17 +65,26 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Weather:
-    """Weather of one station on the simulator's clock, with its location."""
+    """Weather of a station on the simulator's clock, and where the station is."""
 
     label: str
+    """Place, such as ``Phoenix, Arizona``."""
     latitude_deg: float
+    """Latitude, in degrees north."""
     longitude_deg: float
+    """Longitude, in degrees east."""
     elevation_m: float
+    """Elevation above sea level, in m."""
     utc_offset_h: float
+    """Local standard time minus UTC, in h."""
     outdoor_c: Series
+    """Outdoor dry bulb, in C."""
     wet_bulb_c: Series
+    """Outdoor wet bulb, in C."""
     relative_humidity_pct: Series | None = None
+    """Relative humidity, in %; None if it is not known."""
     pressure_pa: Series | None = None
+    """Air pressure at the station, in Pa; None if it is not known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,20 +96,31 @@ class SiteData:
     """
 
     name: str
+    """Name by which configs call the site."""
     label: str
+    """Place, such as ``Phoenix, Arizona``."""
     latitude_deg: float
+    """Latitude, in degrees north."""
     longitude_deg: float
+    """Longitude, in degrees east."""
     elevation_m: float
+    """Elevation above sea level, in m."""
     utc_offset_h: float
+    """Local standard time minus UTC, in h."""
     outdoor_c: Series
+    """Outdoor dry bulb, in C."""
     wet_bulb_c: Series
+    """Outdoor wet bulb, in C."""
     ci_g_per_kwh: Series
+    """Carbon intensity of the grid, in g CO2e/kWh."""
     relative_humidity_pct: Series | None = None
+    """Relative humidity, in %; None if it is not known."""
     pressure_pa: Series | None = None
+    """Air pressure at the station, in Pa; None if it is not known."""
 
     @property
     def series(self) -> tuple[Series, ...]:
-        """All series that exist, temperatures first."""
+        """All series that are known, temperatures first."""
         every = (
             self.outdoor_c,
             self.wet_bulb_c,
@@ -167,7 +184,7 @@ def step_minutes(steps_per_hour: int) -> int:
 
 
 def resample(series: Series, steps_per_hour: int, *, hold: bool = False) -> FloatArray:
-    """Bring a series to the step of a simulation.
+    """Values of a series at the time step of a simulation.
 
     To a finer step, values are interpolated linearly between interval centres, periodically at
     the wrap, so the year is neither stretched nor shifted; with ``hold`` (flows such as work)
@@ -200,9 +217,13 @@ def resample(series: Series, steps_per_hour: int, *, hold: bool = False) -> Floa
     if n < values.size:
         if values.size % n == 0:
             return np.asarray(values.reshape(n, -1).mean(axis=1), dtype=np.float64)
-        return _rebin(values, n)
+        return _mean_by_overlap(values, n)
     if hold:
-        return np.repeat(values, n // values.size) if n % values.size == 0 else _rebin(values, n)
+        return (
+            np.repeat(values, n // values.size)
+            if n % values.size == 0
+            else _mean_by_overlap(values, n)
+        )
     centres = (np.arange(n) + 0.5) * (values.size / n) - 0.5
     left = np.floor(centres).astype(np.int64)
     share = centres - left
@@ -212,9 +233,9 @@ def resample(series: Series, steps_per_hour: int, *, hold: bool = False) -> Floa
     )
 
 
-def _rebin(values: FloatArray, n: int) -> FloatArray:
-    """Mean over each of n equal intervals of a function that is constant over each value's own."""
-    mean = values.mean()  # taken off first, so that the running sum stays small
+def _mean_by_overlap(values: FloatArray, n: int) -> FloatArray:
+    """Values on n equal intervals: the mean of what overlaps each, weighted by the overlap."""
+    mean = values.mean()  # subtracted first, so that the running sum stays small
     total = np.concatenate([[0.0], np.cumsum(values - mean)])
     edges = np.linspace(0.0, values.size, n + 1)
     return np.asarray(
@@ -224,7 +245,13 @@ def _rebin(values: FloatArray, n: int) -> FloatArray:
 
 
 def check_physical(name: str, values: ArrayLike, low: float, high: float) -> None:
-    """Reject values outside [low, high].
+    """Reject values outside low..high.
+
+    Args:
+        name: what the values are, for the message.
+        values: any shape.
+        low: least valid value.
+        high: greatest valid value.
 
     Raises:
         DataError: names the first index outside.

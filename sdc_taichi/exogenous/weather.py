@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sdc_taichi.errors import DataError
-from sdc_taichi.exogenous import files
+from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.psychrometrics import wet_bulb_c
 from sdc_taichi.exogenous.series import FloatArray, Series, Weather
 from sdc_taichi.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH, HOURS_PER_YEAR
@@ -51,7 +51,7 @@ def read_epw(path: str | Path) -> Weather:
     """
     path = files.existing_file(path)
     if files.is_parquet(path):
-        metadata = files.read_metadata(path)
+        metadata = series_file.read_metadata(path)
         if metadata is None:
             raise DataError(
                 f"{path}: Parquet without sdc_taichi metadata (location, UTC offset, resolution), "
@@ -267,17 +267,17 @@ def _is_code(text: pd.Series[str], code: float) -> pd.Series[bool]:
 
 
 def _read_imported(path: Path, metadata: dict[str, Any]) -> Weather:
-    kind = files.metadata_value(path, metadata, "kind", str)
+    kind = series_file.metadata_value(path, metadata, "kind", str)
     if kind != "weather":
         raise DataError(f"{path}: metadata kind: {kind!r}, expected 'weather'")
-    minutes = files.metadata_value(path, metadata, "minutes", float)
+    minutes = series_file.metadata_value(path, metadata, "minutes", float)
     limits = {
         "outdoor_c": OUTDOOR_LIMITS_C,
         "wet_bulb_c": (-100.0, 70.0),
         "relative_humidity_pct": (0.0, 100.0),
         "pressure_pa": PRESSURE_LIMITS_PA,
     }
-    columns = files.read_columns(path, limits, minutes)
+    columns = series_file.read_columns(path, limits, minutes)
     above = columns["wet_bulb_c"] > columns["outdoor_c"] + 1e-6
     if above.any():
         at = int(np.argmax(above))
@@ -285,14 +285,14 @@ def _read_imported(path: Path, metadata: dict[str, Any]) -> Weather:
         raise files.fault(path, at + 1, "wet_bulb_c", float(columns["wet_bulb_c"][at]), valid)
     units = {"outdoor_c": "C", "wet_bulb_c": "C", "relative_humidity_pct": "%", "pressure_pa": "Pa"}
     series = {
-        name: files.imported_series(path, metadata, name, unit, columns, minutes)
+        name: series_file.imported_series(path, metadata, name, unit, columns, minutes)
         for name, unit in units.items()
     }
     return Weather(
-        label=files.metadata_value(path, metadata, "label", str),
-        latitude_deg=files.metadata_value(path, metadata, "latitude_deg", float),
-        longitude_deg=files.metadata_value(path, metadata, "longitude_deg", float),
-        elevation_m=files.metadata_value(path, metadata, "elevation_m", float),
-        utc_offset_h=files.metadata_value(path, metadata, "utc_offset_h", float),
+        label=series_file.metadata_value(path, metadata, "label", str),
+        latitude_deg=series_file.metadata_value(path, metadata, "latitude_deg", float),
+        longitude_deg=series_file.metadata_value(path, metadata, "longitude_deg", float),
+        elevation_m=series_file.metadata_value(path, metadata, "elevation_m", float),
+        utc_offset_h=series_file.metadata_value(path, metadata, "utc_offset_h", float),
         **series,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sdc_taichi.errors import DataError
-from sdc_taichi.exogenous import files
+from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.series import Series
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ Rows: TypeAlias = NDArray[np.int64]
 Stamps: TypeAlias = NDArray[np.datetime64]
 
 _INDEX_HEADERS = frozenset({"index", "hour", "step", "time", "timestamp", "datetime"})
-_HINT = " (divide percentages by 100)"
+_PERCENT_HINT = " (divide percentages by 100)"
 
 
 def read_workload(path: str | Path, *, minutes: float | None = None) -> Series:
@@ -44,40 +44,15 @@ def read_workload(path: str | Path, *, minutes: float | None = None) -> Series:
     if minutes is not None and not (np.isfinite(minutes) and minutes > 0.0):
         raise DataError(f"minutes: {minutes!r}, expected a positive number")
     if files.is_parquet(path):
-        metadata = files.read_metadata(path)
+        metadata = series_file.read_metadata(path)
         if metadata is not None:
             return _read_imported(path, metadata)
     frame, first_row = files.read_table(path)
     files.require_columns(path, frame, ("cpu_load",))
     rows = first_row + np.arange(len(frame))
-    values = files.numbers(path, frame["cpu_load"], "cpu_load", rows, 0.0, 1.0, _HINT)
+    values = files.numbers(path, frame["cpu_load"], "cpu_load", rows, 0.0, 1.0, _PERCENT_HINT)
     blank = int(np.isnan(values).sum())
-    notes = []
-    positions = np.arange(len(frame))
-    start = np.datetime64("2001-01-01T00:00:00", "s")
-    first, stamped = str(frame.columns[0]), False
-    blank_header = first.strip() in files.BLANK_HEADERS
-    if blank_header or first.strip().lower() in _INDEX_HEADERS:
-        text = frame[first].str.strip()
-        stamped = not text.iloc[0].replace(".", "", 1).isdigit()
-        if stamped:
-            stamps = _stamps(path, text, first, rows)
-            found, positions = files.grid_of_stamps(path, stamps, rows, first)
-            if minutes is not None and found != minutes:
-                raise DataError(f"{path}: column {first}: steps of {found:g} min, not {minutes:g}")
-            minutes, start = found, stamps[0]
-        else:
-            positions = _running_index(path, text, first, rows)
-        if blank_header:
-            notes.append("blank first header read as " + ("timestamp" if stamped else "index"))
-    minutes = 60.0 if minutes is None else float(minutes)
-    longest = np.diff(positions).max(initial=1)
-    if (longest - 1) * minutes > files.MAX_GAP_H * 60.0:
-        at = int(np.argmax(np.diff(positions))) + 1
-        hours = (longest - 1) * minutes / 60.0
-        raise files.fault(
-            path, int(rows[at]), first, f"{hours:g} h without rows", "gaps of at most 24 h"
-        )
+    minutes, positions, first_stamp, notes = _clock(path, frame, rows, minutes)
     values = files.spread(values, positions)
     absent = values.size - len(frame)
     for count, what in ((absent, "absent rows"), (blank, "rows without values")):
@@ -88,8 +63,8 @@ def read_workload(path: str | Path, *, minutes: float | None = None) -> Series:
     if values.size % 168 == 0 and np.array_equal(values[168:], values[:-168]):
         notes.append(f"warning: the same 168 rows repeat {values.size // 168} times")
     since = 0.0
-    if stamped:
-        values, since, leap_notes = files.without_leap_days(values, start, minutes)
+    if first_stamp is not None:
+        values, since, leap_notes = files.without_leap_days(values, first_stamp, minutes)
         notes += leap_notes
     values, year_notes = files.whole_years(path, values, since, minutes)
     return Series(
@@ -103,8 +78,54 @@ def read_workload(path: str | Path, *, minutes: float | None = None) -> Series:
     )
 
 
+def _clock(
+    path: Path, frame: pd.DataFrame, rows: Rows, minutes: float | None
+) -> tuple[float, Rows, np.datetime64 | None, list[str]]:
+    """Where the rows lie in time, by the first column if it holds stamps or a running index.
+
+    Args:
+        path: file, for messages.
+        frame: the table, as text.
+        rows: rows of the file, for messages, (T,).
+        minutes: resolution that was asked for, in minutes, or None.
+
+    Returns:
+        Resolution in minutes, place of each row on a regular grid, (T,), first stamp (None without
+        stamps), and notes.
+
+    Raises:
+        DataError: stamps of another resolution, or a gap of over 24 h.
+    """
+    first = str(frame.columns[0])
+    blank_header = first.strip() in files.BLANK_HEADERS
+    positions, first_stamp = np.arange(len(frame)), None
+    notes = []
+    if blank_header or first.strip().lower() in _INDEX_HEADERS:
+        text = frame[first].str.strip()
+        if text.iloc[0].replace(".", "", 1).isdigit():
+            positions = _running_index(path, text, first, rows)
+        else:
+            stamps = _stamps(path, text, first, rows)
+            found, positions = files.grid_of_stamps(path, stamps, rows, first)
+            if minutes is not None and found != minutes:
+                raise DataError(f"{path}: column {first}: steps of {found:g} min, not {minutes:g}")
+            minutes, first_stamp = found, stamps[0]
+        if blank_header:
+            kind = "index" if first_stamp is None else "timestamp"
+            notes.append(f"blank first header read as {kind}")
+    minutes = 60.0 if minutes is None else float(minutes)
+    longest = np.diff(positions).max(initial=1)
+    if (longest - 1) * minutes > files.MAX_GAP_H * 60.0:
+        at = int(np.argmax(np.diff(positions))) + 1
+        hours = (longest - 1) * minutes / 60.0
+        raise files.fault(
+            path, int(rows[at]), first, f"{hours:g} h without rows", "gaps of at most 24 h"
+        )
+    return minutes, positions, first_stamp, notes
+
+
 def _stamps(path: Path, text: pd.Series[str], column: str, rows: Rows) -> Stamps:
-    """Local stamps; a UTC offset would leave open whose local time is meant."""
+    """Stamps in local standard time, (T,); with a UTC offset it would be unclear whose they are."""
     import pandas as pd
 
     parsed = pd.to_datetime(text, errors="coerce", format="ISO8601", utc=True)
@@ -117,7 +138,7 @@ def _stamps(path: Path, text: pd.Series[str], column: str, rows: Rows) -> Stamps
 
 
 def _running_index(path: Path, text: pd.Series[str], column: str, rows: Rows) -> Rows:
-    """Positions from a running index of whole numbers, from 0."""
+    """Places on the regular grid, from 0, of a running index of whole numbers, (T,)."""
     index = files.numbers(path, text, column, rows, 0.0, 1e9)
     steps = np.diff(index, prepend=index[0] - 1.0)
     bad = ~((index == np.round(index)) & (steps >= 1.0))
@@ -129,9 +150,9 @@ def _running_index(path: Path, text: pd.Series[str], column: str, rows: Rows) ->
 
 
 def _read_imported(path: Path, metadata: dict[str, object]) -> Series:
-    kind = files.metadata_value(path, metadata, "kind", str)
+    kind = series_file.metadata_value(path, metadata, "kind", str)
     if kind != "workload":
         raise DataError(f"{path}: metadata kind: {kind!r}, expected 'workload'")
-    minutes = files.metadata_value(path, metadata, "minutes", float)
-    columns = files.read_columns(path, {"utilisation": (0.0, 1.0)}, minutes)
-    return files.imported_series(path, metadata, "utilisation", "1", columns, minutes)
+    minutes = series_file.metadata_value(path, metadata, "minutes", float)
+    columns = series_file.read_columns(path, {"utilisation": (0.0, 1.0)}, minutes)
+    return series_file.imported_series(path, metadata, "utilisation", "1", columns, minutes)

@@ -1,0 +1,155 @@
+"""The Parquet format that `data import` writes: series of one kind with their provenance.
+
+Columns are the series by name, rows the intervals of the simulator's clock; the schema metadata
+holds JSON with format, kind, name, resolution, source and notes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sdc_taichi.atomic_file import atomic_write
+from sdc_taichi.errors import DataError, SdcError
+from sdc_taichi.exogenous.files import check_length, fault, read_arrow, rows_per_year
+from sdc_taichi.exogenous.series import FloatArray, Series
+
+METADATA_KEY = b"sdc_taichi"
+"""Key of the JSON in the metadata of the Parquet schema."""
+FORMAT = "sdc-series/1"
+"""Version of the format."""
+
+
+def write_parquet(
+    path: Path, columns: Mapping[str, FloatArray], metadata: Mapping[str, Any]
+) -> None:
+    """Write columns with metadata, atomically: a reader sees the old file or the whole new one.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pa.table(dict(columns)).replace_schema_metadata(
+        {METADATA_KEY: json.dumps({"format": FORMAT, **metadata}).encode()}
+    )
+    try:
+        with atomic_write(path, parents=True) as file:
+            pq.write_table(table, file)
+    except SdcError as error:
+        raise DataError(str(error)) from None
+
+
+def read_metadata(path: Path) -> dict[str, Any] | None:
+    """Metadata of a Parquet file that `data import` wrote; None if it is another Parquet file.
+
+    Raises:
+        DataError: not readable, or metadata of another version.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        schema = pq.read_schema(path)
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).split(". ")[0].splitlines()[0]
+        raise DataError(f"{path}: not a readable Parquet file: {reason}") from None
+    raw = (schema.metadata or {}).get(METADATA_KEY)
+    if raw is None:
+        return None
+    try:
+        metadata: dict[str, Any] = json.loads(raw)
+    except ValueError:
+        raise DataError(f"{path}: metadata sdc_taichi: not JSON") from None
+    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+        found = metadata.get("format") if isinstance(metadata, dict) else metadata
+        raise DataError(f"{path}: metadata format: {found!r}, expected {FORMAT!r}")
+    return metadata
+
+
+def metadata_value(path: Path, metadata: Mapping[str, Any], key: str, kind: type) -> Any:
+    """One metadata value of the expected type.
+
+    Raises:
+        DataError: missing or of another type.
+    """
+    value = metadata.get(key)
+    good = isinstance(value, int | float) if kind is float else isinstance(value, kind)
+    if not good or isinstance(value, bool) or (kind is float and not math.isfinite(value or 0)):
+        raise DataError(f"{path}: metadata {key}: {value!r}, expected {kind.__name__}")
+    return kind(value)
+
+
+def read_columns(
+    path: Path, limits: Mapping[str, tuple[float, float]], minutes: float
+) -> dict[str, FloatArray]:
+    """Columns of a Parquet file that `data import` wrote, checked like any other input.
+
+    Args:
+        path: the file.
+        limits: column to lowest and highest physical value.
+        minutes: resolution, from the metadata.
+
+    Raises:
+        DataError: a column is missing, not numeric, not finite, out of limits, or shorter than
+            a year.
+    """
+    table = read_arrow(path)
+    out = {}
+    for column, (low, high) in limits.items():
+        if column not in table.column_names:
+            found = ", ".join(table.column_names)
+            raise DataError(f"{path}: missing column {column}; found {found}")
+        try:
+            values = np.asarray(table[column].to_numpy(), dtype=np.float64)
+        except (TypeError, ValueError):
+            kind = table.schema.field(column).type
+            raise DataError(f"{path}: column {column}: type {kind}, expected numbers") from None
+        good = (values >= low) & (values <= high)
+        if not good.all():
+            at = int(np.argmin(good))
+            valid = f"a number from {low:g} to {high:g}"
+            raise fault(path, at + 1, column, float(values[at]), valid)
+        check_length(path, values.size, minutes)
+        if values.size % rows_per_year(path, minutes):
+            raise DataError(f"{path}: {values.size} rows, expected whole years of 365 days")
+        out[column] = values
+    return out
+
+
+def imported_series(
+    path: Path,
+    metadata: Mapping[str, Any],
+    column: str,
+    unit: str,
+    columns: Mapping[str, FloatArray],
+    minutes: float,
+) -> Series:
+    """Series of one column of a Parquet file that `data import` wrote, with its provenance."""
+    source = metadata_value(path, metadata, "source_file", str)
+    digest = metadata_value(path, metadata, "sha256", str)
+    notes = metadata_value(path, metadata, "notes", list)
+    return Series(
+        columns[column],
+        minutes,
+        column,
+        unit,
+        f"{source} (sha256 {digest[:12]})",
+        synthetic=False,
+        notes=tuple(str(note) for note in notes),
+    )
+
+
+def column_names(path: Path) -> list[str]:
+    """Names of the columns of a Parquet file.
+
+    Raises:
+        DataError: not readable.
+    """
+    return [str(name) for name in read_arrow(path).column_names]
