@@ -17,7 +17,7 @@ pytestmark = pytest.mark.repo
 
 def test_python_of_the_readme_runs(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
-    printed = ["8000 servers", "'agent_ls': (64, 40)"]
+    printed = ["12000 servers", "'agent_ls': (64, 40)", "lookahead-24h: "]
     for code, text in zip(blocks, printed, strict=True):
         done = subprocess.run(
             [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
