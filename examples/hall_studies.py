@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+import hall_figures
 import numpy as np
 
 from sdc_taichi import (
@@ -35,8 +36,7 @@ from sdc_taichi.control import Controller
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.run.metrics import Metric, metrics_per_dc
 from sdc_taichi.types import F64
-from sdc_taichi.viz import floor_plan as plans
-from sdc_taichi.viz import hall_figures
+from sdc_taichi.viz.floor_plan_figure import floor_plan_figure
 
 MOVED_KW = 15.0
 MODES = ("quasi_steady", "transient")
@@ -417,11 +417,11 @@ def main(folder: Path, quick: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     hours = 2.5 if quick else 4.0
     four = load_config("corrected", ["hvac.crac.units=4"])
-    plans.draw(four).savefig(folder / "hall_plan.png")
+    floor_plan_figure(four).savefig(folder / "hall_plan.png")
 
     moved = move_load()
     print_moved(moved)
-    hall_figures.moved_load(
+    hall_figures.load_shift(
         moved.config.hall, moved.change_k, moved.distance_m, (moved.source, moved.target)
     ).savefig(folder / "moved_load.png")
 
@@ -447,7 +447,7 @@ def main(folder: Path, quick: bool) -> None:
     shown = ("NY", "summer", "random")
     at = runs[MODES[0]].names.index(shown)
     days = slice(0, steps) if quick else slice(96, 3 * 96)
-    hall_figures.modes(
+    hall_figures.thermal_modes(
         {mode: (r.inlet_max_c[days, at], r.hvac_w[days, at]) for mode, r in runs.items()},
         "New York in July, random actions",
     ).savefig(folder / "modes.png")

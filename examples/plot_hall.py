@@ -10,12 +10,25 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from sdc_taichi import Actions, Simulator, StepResult, load_config
-from sdc_taichi.viz.figures import hall_map, overview, readme_picture
+from sdc_taichi import Actions, Fleet, SdcError, Simulator, StepResult, load_config
+from sdc_taichi.viz.figures import (
+    check_result,
+    clock_text,
+    draw_hall,
+    hall_map,
+    overview,
+    step_time,
+)
+from sdc_taichi.viz.plotting import check_steps, format_time_axis, new_figure
+from sdc_taichi.viz.step_panels import COLUMNS, draw_carbon, draw_power, draw_storage
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DAY = 96
 STEPS = 7 * DAY
@@ -34,6 +47,37 @@ def run(sim: Simulator) -> list[StepResult]:
         load = command if command < 0.0 else DRAIN_SHARE * command
         results.append(sim.step(Actions(load=load, battery=BATTERY_SHARE * command)))
     return results
+
+
+def readme_picture(result: StepResult, fleet: Fleet, steps: pd.DataFrame, dc: int = 0) -> Figure:
+    """The hall at one step beside power and carbon of the run, 1600 x 700 pixels at 100 dpi.
+
+    Args:
+        result: one step of the run; it is marked in the series.
+        fleet: the fleet it belongs to.
+        steps: the run of that data center, as for ``overview``.
+        dc: index of the data center.
+
+    Raises:
+        SdcError: as ``hall_map`` and ``overview``, or a step that the run does not have.
+    """
+    figure = new_figure(16.0, 7.0)
+    check_result(result, fleet, dc)
+    check_steps(steps, COLUMNS)
+    when = step_time(result, fleet, dc)
+    if when not in steps["time"].to_numpy():
+        raise SdcError(f"step {result.step} at {when}: the run has no such time")
+    left, right = figure.subfigures(1, 2, width_ratios=[4, 5], squeeze=False)[0]
+    for quantity, axes in zip(("inlet", "outlet"), left.subplots(2, 1), strict=True):
+        draw_hall(axes, quantity, result, fleet, dc)
+    left.suptitle(f"Racks on {clock_text(result, fleet, dc)}", fontsize=13)
+    right.suptitle("Power, carbon, queue and battery", fontsize=13)
+    all_axes = right.subplots(3, 1, sharex=True, height_ratios=[4, 3, 3])
+    for axes, draw in zip(all_axes, (draw_power, draw_carbon, draw_storage), strict=True):
+        draw(axes, steps)
+        axes.axvline(when, color="black", linewidth=1, linestyle=":")
+    format_time_axis(all_axes[-1])
+    return figure
 
 
 def main(folder: Path) -> None:

@@ -14,12 +14,14 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import input_figures
+
 from sdc_taichi import RunRequest, Simulator, load_config, make_controller, simulate_to_folder
 from sdc_taichi.exogenous.synthetic import synthetic_sites, synthetic_traces
 from sdc_taichi.run.folder_reader import read_run, read_steps
 from sdc_taichi.viz import dashboards, data_figures, fleet_figures
 from sdc_taichi.viz.animation import write_animation
-from sdc_taichi.viz.figures import DPI, webp
+from sdc_taichi.viz.plotting import DPI, webp
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,16 +91,16 @@ def plot_failure(folder: Path) -> None:
 def plot_inputs(folder: Path) -> None:
     """Workload, temperature and carbon intensity of the embedded years."""
     note = "synthetic years, seed 10"
-    traces = data_figures.trace_series(synthetic_traces())
-    outdoor = data_figures.site_series(synthetic_sites(), "outdoor_c")
-    carbon = data_figures.site_series(synthetic_sites(), "ci_g_per_kwh")
+    traces = input_figures.trace_series(synthetic_traces())
+    outdoor = input_figures.site_series(synthetic_sites(), "outdoor_c")
+    carbon = input_figures.site_series(synthetic_sites(), "ci_g_per_kwh")
     work, heat, grid = data_figures.WORKLOAD, data_figures.TEMPERATURE, data_figures.CARBON
     for name, figure in (
-        ("workload", data_figures.panels(traces, work, note)),
-        ("workload_week", data_figures.week(traces, work, note)),
-        ("temperature", data_figures.panels(outdoor, heat, note)),
+        ("workload", input_figures.year_panels(traces, work, note)),
+        ("workload_week", input_figures.first_week(traces, work, note)),
+        ("temperature", input_figures.year_panels(outdoor, heat, note)),
         ("temperature_compared", data_figures.comparison(outdoor, heat, note)),
-        ("carbon", data_figures.panels(carbon, grid, note)),
+        ("carbon", input_figures.year_panels(carbon, grid, note)),
         ("carbon_compared", data_figures.comparison(carbon, grid, note)),
         ("carbon_variation", data_figures.carbon_variation(carbon, note)),
     ):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import importlib.util
 import itertools
 from collections.abc import Callable
 from pathlib import Path
@@ -17,10 +16,17 @@ import pytest
 from sdc_taichi import SdcError, Simulator, StepResult, load_config, make_configs
 from sdc_taichi.config import EventKind
 from sdc_taichi.control import make_controller, view_maker
-from sdc_taichi.exogenous.synthetic import synthetic_site, synthetic_sites, synthetic_traces
+from sdc_taichi.exogenous.synthetic import synthetic_site
 from sdc_taichi.run.metrics import Metric
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.viz import animation, dashboards, data_figures, figures, fleet_figures
+from sdc_taichi.viz import (
+    animation,
+    dashboards,
+    data_figures,
+    figures,
+    fleet_figures,
+    plotting,
+)
 
 DAYS = 3
 DOLLARS = "_x$_{$"
@@ -295,7 +301,7 @@ def test_scatter_shows_every_step(steps: pd.DataFrame) -> None:
     hours = many["time"].dt.hour + many["time"].dt.minute / 60
     figure = dashboards.setpoint_scatter(many.assign(outdoor_c=hours))
     drawn = figure.axes[0].collections[0].get_offsets()
-    assert len(drawn) == dashboards.SCATTER_MARKS < len(many)
+    assert len(drawn) == dashboards.MAX_SCATTER_POINTS < len(many)
     assert len(np.unique(drawn[:, 0])) == 96, "every time of day"
 
 
@@ -359,13 +365,11 @@ def series_of(steps: pd.DataFrame) -> dict[str, pd.Series]:
         (lambda steps: fleet_figures.fleet_overview(fleet_of(steps)), {"PUE"}),
         (
             lambda steps: fleet_figures.fleet_map(
-                figures.step_edges(steps), steps[["inlet_max_c"]].to_numpy(), ["ny"]
+                plotting.step_edges(steps), steps[["inlet_max_c"]].to_numpy(), ["ny"]
             ),
             set(),
         ),
-        (lambda steps: data_figures.panels(series_of(steps), data_figures.CARBON), set()),
         (lambda steps: data_figures.comparison(series_of(steps), data_figures.WORKLOAD), set()),
-        (lambda steps: data_figures.week(series_of(steps), data_figures.TEMPERATURE), set()),
         (lambda steps: data_figures.carbon_variation(series_of(steps)), set()),
     ],
 )
@@ -451,7 +455,7 @@ def test_fleet_map_shows_the_hottest_first() -> None:
     inlets = np.random.default_rng(0).uniform(20, 30, (5, 100))
     figure: Any = fleet_figures.fleet_map(time, inlets, [f"dc{i}" for i in range(100)])
     axes = figure.axes[0]
-    order = np.argsort(-inlets.max(axis=0))[: fleet_figures.MAP_ROWS]
+    order = np.argsort(-inlets.max(axis=0))[: fleet_figures.MAX_MAP_ROWS]
     assert [t.get_text() for t in axes.get_yticklabels()] == [f"dc{i}" for i in order]
     np.testing.assert_array_equal(axes.collections[0].get_array(), inlets[:, order].T)
     assert axes.get_ylabel() == "the 40 hottest of 100 data centers"
@@ -471,27 +475,17 @@ def test_every_length_has_ticks(steps: int) -> None:
 
 
 def test_lines_differ() -> None:
-    styles = [tuple(fleet_figures.line_style(i).items()) for i in range(32)]
+    styles = [tuple(plotting.line_style(i).items()) for i in range(32)]
     assert len(set(styles)) == 32
 
 
-def test_panels_show_daily_means_and_ranges() -> None:
-    names = synthetic_sites()[:5]
-    series = data_figures.site_series(names, "outdoor_c")
-    figure: Any = data_figures.panels(series, data_figures.TEMPERATURE, "synthetic")
-    assert [axes.get_title(loc="left") for axes in figure.axes[:5]] == list(names)
-    hours = np.reshape(synthetic_site(names[1]).outdoor_c.values, (365, -1))
-    axes = figure.axes[1]
-    np.testing.assert_allclose(axes.lines[0].get_ydata(), hours.mean(axis=1))
-    (band,) = axes.collections
-    spread = band.get_paths()[0].vertices[:, 1]
-    assert (spread.min(), spread.max()) == (hours.min(), hours.max())
-    assert not any(axes.get_visible() for axes in figure.axes[5:]), "no empty panels"
-    assert render(figure).std() > 5
+def hourly_carbon(site: str) -> pd.Series:
+    times = pd.date_range("2001-01-01", periods=8760, freq="h")
+    return pd.Series(synthetic_site(site).ci_g_per_kwh.values, index=times)
 
 
 def test_comparison_shows_weeks_and_hours() -> None:
-    series = data_figures.site_series(["NY", "CA"], "ci_g_per_kwh")
+    series = {name: hourly_carbon(name) for name in ("NY", "CA")}
     figure: Any = data_figures.comparison(series, data_figures.CARBON)
     left, right = figure.axes
     values = synthetic_site("CA").ci_g_per_kwh.values
@@ -513,23 +507,13 @@ def test_the_leap_day_is_no_gap(steps: pd.DataFrame) -> None:
     values = both.set_index("time")["ci_g_per_kwh"]
     assert len(data_figures.daily(values).mean()) == 2
     assert data_figures.mean_and_variation("x", values)[0] == pytest.approx(values.mean())
-    assert figures.step_hours(both[95:]) == 0.25
+    assert plotting.step_hours(both[95:]) == 0.25
     storage: Any = dashboards.day(both, "03-01").axes[4]
     (queue,) = storage.lines
     ends = queue.get_xdata(orig=False)
     assert [clock(x) for x in (ends[0], ends[1], ends[-1])] == [
         "03-01 00:00", "03-01 00:15", "03-02 00:00",
     ]  # fmt: skip
-
-
-def test_week_of_workloads() -> None:
-    series = data_figures.trace_series(synthetic_traces())
-    figure: Any = data_figures.week(series, data_figures.WORKLOAD)
-    (axes,) = figure.axes
-    assert [line.get_label() for line in axes.lines] == list(synthetic_traces())
-    for line, values in zip(axes.lines, series.values(), strict=True):
-        per_day = round(pd.Timedelta(days=1) / (values.index[1] - values.index[0]))
-        np.testing.assert_array_equal(line.get_ydata(), 100 * values[: 7 * per_day])
 
 
 def test_variation_is_that_of_each_day() -> None:
@@ -549,22 +533,9 @@ def test_variation_is_that_of_each_day() -> None:
 def test_series_that_are_too_short() -> None:
     one = pd.Series([1.0], index=pd.date_range("2001-01-01", periods=1, freq="h"))
     with pytest.raises(SdcError, match="no series"):
-        data_figures.panels({}, data_figures.CARBON)
+        data_figures.comparison({}, data_figures.CARBON)
     with pytest.raises(SdcError, match="series 'x': 1 values"):
         data_figures.comparison({"x": one}, data_figures.CARBON)
-    early = pd.Series(1.0, index=pd.date_range("2001-01-01", periods=24, freq="h"))
-    late = pd.Series(1.0, index=pd.date_range("2001-07-01", periods=24, freq="h"))
-    with pytest.raises(SdcError, match="series 'early' ends before 2001-07-01"):
-        data_figures.week({"early": early, "late": late}, data_figures.CARBON)
-
-
-def test_names_are_written_as_they_are() -> None:
-    series = data_figures.site_series(["NY"], "ci_g_per_kwh")
-    figure = data_figures.week({DOLLARS: series["NY"]}, data_figures.CARBON)
-    assert render(figure).std() > 5
-    (text,) = figure.axes[0].get_legend().get_texts()  # type: ignore[union-attr]
-    assert text.get_text() == r" _x\$_{\$"
-    assert figures.short("a\n b" + 60 * "c") == "a b" + 46 * "c" + "…"
 
 
 def test_animation_shows_every_rack(run: Run, tmp_path: Path) -> None:
@@ -663,24 +634,5 @@ def test_animation_without_steps_or_of_another_fleet(run: Run, tmp_path: Path) -
         animation._pixel_index(20_000, 1)
 
 
-@pytest.mark.repo
-def test_example_animates_a_failure(tmp_path: Path) -> None:
-    from PIL import Image
-
-    example = Path(__file__).parent.parent / "examples" / "plot_runs.py"
-    spec = importlib.util.spec_from_file_location("plot_runs", example)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    module.plot_failure(tmp_path)
-    (path,) = tmp_path.iterdir()
-    picture: Any = Image.open(path)
-    assert picture.n_frames == module.FAILURE_STEPS
-    assert path.stat().st_size < 300_000
-    brightness = []
-    for frame in (40, 60, 80):  # before the first failure, in it, after it
-        picture.seek(frame)
-        brightness.append(np.asarray(picture.convert("L"))[40:500].mean())
-    assert brightness[1] > brightness[2] > 0
-    assert brightness[1] > 2 * brightness[0]
+def test_long_names_are_cut() -> None:
+    assert plotting.short_name("a\n b" + 60 * "c") == "a b" + 46 * "c" + "…"

@@ -12,7 +12,7 @@ import pytest
 
 from sdc_taichi import SdcError, load_config
 from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
-from sdc_taichi.viz import floor_plan
+from sdc_taichi.viz.floor_plan_figure import floor_plan_figure
 
 WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[400, 40]"]
 HALLS = {
@@ -31,7 +31,7 @@ def drawn(request: pytest.FixtureRequest) -> tuple[DesignHall, Any, Any]:
 
     source, overrides = HALLS[request.param]
     found = solve_design_hall(load_config(source, overrides))
-    figure = floor_plan.draw(found)
+    figure = floor_plan_figure(found)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
     return found, figure, canvas.get_renderer()
@@ -136,11 +136,11 @@ def test_units_stand_outside_their_wall(drawn: tuple[DesignHall, Any, Any]) -> N
 
 def test_a_config_draws_as_its_description_does() -> None:
     config = load_config("tiny")
-    figure = floor_plan.draw(config)
+    figure = floor_plan_figure(config)
     np.testing.assert_array_equal(racks_of(figure).get_array(), solve_design_hall(config).inlet_c)
 
 
 def test_missing_matplotlib_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(SdcError, match=r'pip install "sdc-taichi\[plot\]"'):
-        floor_plan.draw(load_config("tiny"))
+        floor_plan_figure(load_config("tiny"))

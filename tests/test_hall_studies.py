@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import re
 import sys
 from collections.abc import Iterator
@@ -15,23 +15,17 @@ import numpy as np
 import pytest
 
 from sdc_taichi import SdcError, load_config
-from sdc_taichi.viz import hall_figures
 
 pytestmark = pytest.mark.repo
 
-EXAMPLE = Path(__file__).parent.parent / "examples" / "hall_studies.py"
+EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 @pytest.fixture(scope="module")
 def study() -> Iterator[ModuleType]:
-    spec = importlib.util.spec_from_file_location("hall_studies", EXAMPLE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["hall_studies"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["hall_studies"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(EXAMPLES)
+        yield importlib.import_module("hall_studies")
 
 
 @pytest.fixture(scope="module")
@@ -139,17 +133,17 @@ def test_quick_run_writes_small_pictures_and_all_tables(
 def test_pictures_refuse_what_does_not_fit(study: ModuleType, moved: Any) -> None:
     hall = moved.config.hall
     with pytest.raises(SdcError, match=r"change_k has shape \(3,\), expected \(80,\)"):
-        hall_figures.moved_load(hall, np.zeros(3), moved.distance_m, (0, 1))
+        study.hall_figures.load_shift(hall, np.zeros(3), moved.distance_m, (0, 1))
     sim, results = study.failing_units(0, steps_per_hour=4, hours=1.0)
     with pytest.raises(SdcError, match="hours 9: the run has no step that ends then"):
-        hall_figures.failure_maps(results, sim.fleet, [9.0])
+        study.hall_figures.failure_maps(results, sim.fleet, [9.0])
     with pytest.raises(SdcError, match="run 'none' has no steps"):
-        hall_figures.failure_curves({"none": []}, sim.fleet)
+        study.hall_figures.failure_curves({"none": []}, sim.fleet)
 
 
-def test_pictures_need_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_need_matplotlib(study: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(SdcError, match=r'pip install "sdc-taichi\[plot\]"'):
-        hall_figures.modes({}, "")
+        study.hall_figures.thermal_modes({}, "")
     with pytest.raises(SdcError, match=r'pip install "sdc-taichi\[plot\]"'):
-        hall_figures.moved_load(load_config("tiny").hall, np.zeros(4), np.zeros(4), (0, 1))
+        study.hall_figures.load_shift(load_config("tiny").hall, np.zeros(4), np.zeros(4), (0, 1))

@@ -25,7 +25,16 @@ from sdc_taichi.run import folder_reader
 from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.folder_reader import read_run, read_steps
 from sdc_taichi.run.folder_writer import simulate_to_folder
-from sdc_taichi.viz import dashboards, fleet_figures, report
+from sdc_taichi.viz import (
+    dashboards,
+    report,
+    report_html,
+    report_metrics,
+    report_pictures,
+    report_sections,
+    report_text,
+)
+from sdc_taichi.viz.plotting import format_number
 
 NASTY = '<script>alert("1")</script> & $x_{$\n</style>東'
 STEPS = 2 * 96
@@ -135,16 +144,16 @@ def test_names_are_text(html: str, page: Page) -> None:
 def test_tables_hold_the_metrics(folder: Path, page: Page) -> None:
     about = json.loads((folder / "greedy" / "metrics.json").read_text("utf-8"))
     columns = [dc["metrics"] for dc in about["data_centers"]] + [about["total"]]
-    for _, group in report.METRICS:
+    for _, group in report_metrics.METRICS:
         for key, label, unit in group:
-            expected = [fleet_figures.number(column[key]) for column in columns]
+            expected = [format_number(column[key]) for column in columns]
             assert [label, unit, *expected] in page.rows(label), key
     assert ["metric", "unit", "ny", NASTY, "all"] in page.rows("metric")
 
 
 def test_every_metric_is_in_the_tables(folder: Path) -> None:
     about = json.loads((folder / "greedy" / "metrics.json").read_text("utf-8"))
-    listed = [key for _, group in report.METRICS for key, *_ in group]
+    listed = [key for _, group in report_metrics.METRICS for key, *_ in group]
     assert len(set(listed)) == len(listed)
     # Said elsewhere: where the hottest inlet was; the same as what the battery delivered.
     others = {"hottest_dc", "hottest_row", "hottest_rack", "hottest_server", "hottest_step"}
@@ -182,7 +191,7 @@ def test_work_adds_up(folder: Path, page: Page) -> None:
     steps = pd.read_parquet(folder / "greedy" / "steps.parquet", columns=["step", "queue_tasks"])
     left = steps["queue_tasks"][steps["step"] == STEPS - 1].sum()
     assert left > 0, "this run leaves work"
-    number = fleet_figures.number
+    number = format_number
     assert (
         f"Of {number(total['arrived_tasks'])} tasks that arrived, "
         f"{number(total['executed_tasks'])} were done, 0 dropped (0 %) and 0 lost with their "
@@ -193,7 +202,7 @@ def test_work_adds_up(folder: Path, page: Page) -> None:
 def test_small_powers_keep_their_digits(folder: Path, page: Page) -> None:
     (steps,) = read_steps(read_run(folder / "greedy"), [0], ["inlet_max_c", "it_w", "hvac_w"])
     at = steps.iloc[int(steps["inlet_max_c"].to_numpy().argmax())]
-    it, hvac = (fleet_figures.number(at[name] / 1e3) for name in ("it_w", "hvac_w"))
+    it, hvac = (format_number(at[name] / 1e3) for name in ("it_w", "hvac_w"))
     assert "." in hvac
     assert f"IT {it} kW, HVAC {hvac} kW" in page.text
     (alt,) = [str(i["alt"]) for i in page.all("img") if "Highest power" in str(i["alt"])]
@@ -211,7 +220,9 @@ def test_equal_inputs_share_a_line(page: Page) -> None:
 
 def test_words_stay_whole_but_for_long_ones(folder: Path) -> None:
     run = read_run(folder / "greedy")
-    cells = re.findall(r'<t[hd][^>]*?(?: class="([^"]+)")?>([^<]*)</t', report._summary(run))
+    cells = re.findall(
+        r'<t[hd][^>]*?(?: class="([^"]+)")?>([^<]*)</t', report_sections.summary_section(run)
+    )
     classes = {text: kind for kind, text in cells}
     assert classes[run.metrics["fingerprint"]] == "long"
     assert classes["fingerprint of configs, inputs and precision"] == ""
@@ -230,7 +241,7 @@ def many_events(run: folder_reader.RunFolder) -> folder_reader.RunFolder:
 
 
 def test_many_events_are_told_by_kind(folder: Path) -> None:
-    page = read_page(report._events(many_events(read_run(folder / "greedy"))))
+    page = read_page(report_sections.events_section(many_events(read_run(folder / "greedy"))))
     name = NASTY
     assert page.tables[0][1:] == [
         ["crac down", "30", "1", "15", "28 February 01:00 in ny"],
@@ -243,9 +254,9 @@ def test_many_events_are_told_by_kind(folder: Path) -> None:
 def test_times_of_long_runs_have_a_year(folder: Path) -> None:
     run = read_run(folder / "greedy")
     long = folder_reader.RunFolder(run.path, run.metrics | {"steps_done": 400 * 96})
-    moment = report._local(long, 0, 366 * 96)
-    assert report._clock(long, moment) == "1 March (year 2) 00:00"
-    assert report._clock(run, moment) == "1 March 00:00"
+    moment = report_text.local_time(long, 0, 366 * 96)
+    assert report_text.time_text(long, moment) == "1 March (year 2) 00:00"
+    assert report_text.time_text(run, moment) == "1 March 00:00"
 
 
 def test_events_are_listed(page: Page) -> None:
@@ -261,7 +272,7 @@ def test_runs_are_compared(folder: Path, page: Page) -> None:
     )
     change = 100 * (theirs["cfp_kg"] / ours["cfp_kg"] - 1)
     label = "carbon footprint"
-    expected = [fleet_figures.number(t["cfp_kg"]) for t in (ours, theirs)]
+    expected = [format_number(t["cfp_kg"]) for t in (ours, theirs)]
     assert [label, "kg CO₂e", expected[0], f"{expected[1]} ({change:+.2f} %)"] in page.rows(label)
     (radar,) = [str(i["alt"]) for i in page.all("img") if "Radar" in str(i["alt"])]
     assert f"carbon footprint {max(expected)} kg CO₂e" in radar
@@ -271,7 +282,11 @@ def test_runs_are_compared(folder: Path, page: Page) -> None:
 def test_runs_of_other_configs_say_so(folder: Path, tmp_path: Path) -> None:
     colder = [c.model_copy(update={"name": f"x{i}"}) for i, c in enumerate(two_halls())]
     simulate(tmp_path / "colder", colder, STEPS)
-    page = read_page(report._comparison([read_run(folder / "idle"), read_run(tmp_path / "colder")]))
+    page = read_page(
+        report_metrics.comparison_section(
+            [read_run(folder / "idle"), read_run(tmp_path / "colder")]
+        )
+    )
     assert "Other configs, inputs or precision than idle (idle): idle (colder)." in page.text
 
 
@@ -285,7 +300,7 @@ def test_runs_of_other_length_are_refused(folder: Path, tmp_path: Path) -> None:
 
 
 def test_interrupted_run_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "_pictures", lambda *_: "")
+    monkeypatch.setattr(report_pictures, "_data_center_pictures", lambda *_: "")
     simulate(tmp_path / "cut", [load_config("tiny")], 960, done=30)
     (tmp_path / "cut" / "report.html").write_text("older")
     done = call(tmp_path / "cut")
@@ -300,10 +315,16 @@ def test_interrupted_run_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_equal_runs_give_equal_bytes(folder: Path, html: str) -> None:
     run = read_run(folder / "greedy")
-    dc = report._shown(run)[0]
-    for text in (report._summary(run), report._metrics(run), report._fleet(run)):
+    dc = report_pictures.shown_data_centers(run)[0]
+    for text in (
+        report_sections.summary_section(run),
+        report_metrics.metrics_section(run),
+        report_pictures.fleet_section(run),
+    ):
         assert text in html
-    drawn = report.picture(dashboards.hot_racks(dc.steps, dc.config.hall, "ny"), "", "")
+    drawn = report_html.picture_element(
+        dashboards.hot_racks(dc.steps, dc.config.hall, "ny"), "", ""
+    )
     assert re.findall(r'src="[^"]+"', drawn)[0] in html
 
 
@@ -322,10 +343,10 @@ def test_files_are_named_with_their_hashes(folder: Path) -> None:
     for dc in run.metrics["data_centers"]:
         dc["provenance"]["weather"] = "LGA.epw"
         dc["sha256"] = {"weather": digest, "recirculation": digest}
-    page = read_page(report._provenance(run))
+    page = read_page(report_sections.provenance_section(run))
     assert page.rows("weather") == [["weather", "LGA.epw", digest, f"ny, {NASTY}"]]
     assert page.rows("recirculation")[0][2] == digest
-    assert "SYNTHETIC" not in read_page(report._summary(run)).text
+    assert "SYNTHETIC" not in read_page(report_sections.summary_section(run)).text
 
 
 @pytest.fixture(scope="module")
@@ -342,11 +363,11 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_large_fleet_shows_extremes(fleet: Path) -> None:
     run = read_run(fleet)
-    page = read_page(report._metrics(run))
+    page = read_page(report_metrics.metrics_section(run))
     by_pue = sorted(run.metrics["data_centers"], key=lambda dc: dc["metrics"]["pue"])
     worst, best = by_pue[-1], by_pue[0]
     (row,) = page.rows("PUE")
-    number = fleet_figures.number
+    number = format_number
     mean = np.mean([dc["metrics"]["pue"] for dc in by_pue])
     assert row[2:] == [
         f"{number(best['metrics']['pue'])} {best['name']}",
@@ -369,14 +390,14 @@ def test_large_fleet_has_few_pictures(fleet: Path, monkeypatch: pytest.MonkeyPat
         drawn.append(dc.index)
         return ""
 
-    monkeypatch.setattr(report, "_pictures", draw)
+    monkeypatch.setattr(report_pictures, "_data_center_pictures", draw)
     html = report.report_html(run)
     page = read_page(html)
     assert page.problems == []
     assert "Run of 60 data centers under idle" in page.text
     sections = re.findall(r"Data center ([a-z0-9-]+)</h2>", html)
     assert sections == [run.names[index] for index in drawn]
-    assert 2 <= len(sections) <= report.SHOWN_DCS
+    assert 2 <= len(sections) <= report_pictures.MAX_SHOWN_DCS
     worst = max(run.metrics["data_centers"], key=lambda dc: dc["metrics"]["pue"])
     assert worst["name"] in sections
     assert re.search(r"Shown because it has the [^.]*highest PUE[^.]* of 60\.", page.text)
@@ -385,9 +406,9 @@ def test_large_fleet_has_few_pictures(fleet: Path, monkeypatch: pytest.MonkeyPat
 
 def test_equal_data_centers_are_not_told_apart(tmp_path: Path) -> None:
     simulate(tmp_path / "run", make_configs(load_config("tiny"), count=6), 2)
-    (shown,) = report._shown(read_run(tmp_path / "run"))
+    (shown,) = report_pictures.shown_data_centers(read_run(tmp_path / "run"))
     assert shown.index == 0
-    assert shown.why == "hottest inlet, PUE and carbon are equal in all"
+    assert shown.reason == "hottest inlet, PUE and carbon are equal in all"
 
 
 def test_fleet_sums_and_maxima(fleet: Path) -> None:

@@ -17,7 +17,7 @@ from sdc_taichi.control import make_controller
 from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.folder_reader import read_run
 from sdc_taichi.run.folder_writer import simulate_to_folder
-from sdc_taichi.viz import figures
+from sdc_taichi.viz import plotting
 from sdc_taichi.viz.report import write_report
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -83,7 +83,7 @@ def test_browser_shows_the_pictures(browser: str, report: Path, tmp_path: Path) 
     run_browser(browser, report, tmp_path, "--hide-scrollbars", size, f"--screenshot={target}")
     shot = np.asarray(Image.open(target).convert("RGB"))
     assert shot.shape[:2] == (7000, 1300)
-    blue = [int(figures.BLUE[i : i + 2], 16) for i in (1, 3, 5)]
+    blue = [int(plotting.BLUE[i : i + 2], 16) for i in (1, 3, 5)]
     drawn = (np.abs(shot.astype(int) - blue).max(axis=2) <= 3).mean()
     # Of the IT power in the stacked plots; the headings' lines alone are below a thousandth.
     assert drawn > 0.005

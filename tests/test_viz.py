@@ -24,7 +24,7 @@ from sdc_taichi import (
     load_config,
     make_configs,
 )
-from sdc_taichi.viz import figures, hall_figures
+from sdc_taichi.viz import figures, step_panels
 
 STEPS = 110  # more than a block, and no multiple of one
 ODD_NAME = "hall/1 [a]"
@@ -68,8 +68,6 @@ def test_missing_matplotlib_is_explained(
         figures.hall_map(results[0], sim.fleet)
     with pytest.raises(SdcError, match=explained):
         figures.overview(frame(results))
-    with pytest.raises(SdcError, match=explained):
-        figures.readme_picture(results[0], sim.fleet, frame(results))
 
 
 def test_import_is_light() -> None:
@@ -163,7 +161,7 @@ def test_overview_shows_the_run(run: tuple[Simulator, list[StepResult]]) -> None
         ((steps["it_w"] + steps["hvac_w"]) / 1e3).max()
     )
     assert [area.get_label() for area in power.collections] == [
-        name for name, _ in figures.POWERS.values()
+        name for name, _ in step_panels.POWERS.values()
     ]
     assert not power.lines
     np.testing.assert_array_equal(carbon.lines[0].get_ydata()[:-1], steps["ci_g_per_kwh"])
@@ -188,18 +186,6 @@ def test_overview_marks_devices_left_out_of_the_total(
     np.testing.assert_allclose(line.get_ydata()[:-1], (steps["it_w"] + steps["chiller_w"]) / 1e3)
 
 
-def test_readme_picture(run: tuple[Simulator, list[StepResult]], tmp_path: Path) -> None:
-    sim, results = run
-    figure = figures.readme_picture(results[50], sim.fleet, frame(results))
-    figure.savefig(tmp_path / "x.png")
-    assert png_size(tmp_path / "x.png") == (1600, 700)
-    titles = [sub.get_suptitle() for sub in figure.subfigs]
-    assert titles[0] == "Racks on 1 January 12:30"
-    assert render(figure).std() > 10
-    with pytest.raises(SdcError, match="the run has no such time"):
-        figures.readme_picture(results[50], sim.fleet, frame(results[:50]))
-
-
 def test_bad_results_and_tables(run: tuple[Simulator, list[StepResult]]) -> None:
     sim, results = run
     steps = frame(results)
@@ -213,24 +199,6 @@ def test_bad_results_and_tables(run: tuple[Simulator, list[StepResult]]) -> None
         figures.overview(pd.concat([steps, steps]))
     with pytest.raises(SdcError, match="1 rows"):
         figures.overview(steps[:1])
-
-
-def test_outages_are_shaded_for_their_own_data_center() -> None:
-    down = "events.scheduled=[{kind: crac_down, unit: 0, start_h: 1, duration_h: 1}]"
-    base = ["hvac.crac.units=2", "hvac.sizing.design_wet_bulb_c=26"]
-    halls = [load_config("corrected", [*base, "name=a"]), load_config("corrected", [*base, down])]
-    with Simulator(halls) as sim:
-        sim.reset()
-        results = [sim.step() for _ in range(10)]
-
-    def shaded(dc: int) -> list[Any]:
-        figure = hall_figures.failure_curves({"run": results}, sim.fleet, dc)
-        return [c.get_paths() for axes in figure.axes for c in axes.collections]
-
-    assert shaded(0) == [[], []]
-    for paths in shaded(1):
-        (path,) = paths
-        assert 1.0 <= path.vertices[:, 0].min() < path.vertices[:, 0].max() == 2.0
 
 
 @pytest.mark.repo

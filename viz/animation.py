@@ -19,15 +19,16 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, StepResult
 
-from .figures import colour_range, short, step_time
+from .figures import step_time
+from .plotting import colour_range, short_name
 
 if TYPE_CHECKING:
     from PIL import Image as PillowImage
 
-MAP_PX = 600
-"""Width that racks are enlarged to; a hall with more racks in a row is drawn a pixel each."""
-MOST_PX = 16_383
-"""Largest picture that WebP stores, per side."""
+MAP_WIDTH_PX = 600
+"""Width that racks are enlarged to, in pixels; racks of longer rows are a pixel each."""
+MAX_SIDE_PX = 16_383
+"""Longest side of a picture that WebP stores, in pixels."""
 _MARGIN_PX, _TITLE_PX, _BAR_PX, _LABEL_PX = 12, 34, 14, 22
 _FONT_PX = 15
 _LEVELS = 256
@@ -43,17 +44,17 @@ def write_animation(
     limits_c: tuple[float, float] | None = None,
     frame_ms: int = 100,
 ) -> None:
-    """Write the racks of one hall step by step, with time, hottest rack and colour bar.
+    """Write an animation of the racks of one hall, with time, hottest rack and colour bar.
 
     Args:
         path: the file, named ``.webp``; one that exists is replaced.
         results: the steps to show, in order; only the racks' temperatures are kept in memory.
         fleet: the fleet they belong to.
         dc: index of the data center.
-        what: the temperature at the racks' inlets or outlets.
-        limits_c: ends of the colour bar, beyond which colours stay; None is the range of all
+        what: whether inlet or outlet temperatures are shown.
+        limits_c: ends of the colour bar, in C, beyond which colours stay; None is the range of all
             frames.
-        frame_ms: time that a frame is shown.
+        frame_ms: time that a frame is shown, in ms.
 
     Raises:
         SdcError: Pillow or matplotlib is missing, the path does not end in ``.webp`` or cannot be
@@ -77,7 +78,7 @@ def write_animation(
         rack, when = int(values[frame].argmax()), times[frame]
         row, column = divmod(rack, hall.racks_per_row)
         text = (
-            f"{short(fleet.names[dc])}: {when.day} {when:%b %H:%M}, hottest "
+            f"{short_name(fleet.names[dc])}: {when.day} {when:%b %H:%M}, hottest "
             f"{values[frame, rack]:.1f} °C, row {row} rack {column}"
         )
         colours = np.append(palette[levels[frame].astype(np.uint8)], [[255, 255, 255]], axis=0)
@@ -109,6 +110,7 @@ def _check_arguments(
     limits_c: Sequence[float] | None,
     frame_ms: int,
 ) -> None:
+    """Refuse arguments that are not valid, before any step is computed."""
     try:
         import matplotlib  # noqa: F401
         import PIL  # noqa: F401
@@ -132,7 +134,7 @@ def _check_arguments(
 def _temperatures(
     results: Iterable[StepResult], fleet: Fleet, dc: int, what: str
 ) -> tuple[F64, list[datetime]]:
-    """Temperatures of the hall's racks in every step, (n, R), and the steps' beginnings."""
+    """Temperatures of the hall's racks in every step, in C, (n, R), and the times of the steps."""
     racks = slice(*fleet.rack_offsets[dc : dc + 2])
     rows, times = [], []
     for result in results:
@@ -147,16 +149,16 @@ def _temperatures(
 
 
 def _pixel_index(rows: int, per_row: int) -> npt.NDArray[np.int64]:
-    """Rack of every pixel, row 0 on top; gaps between large tiles have the number of racks."""
-    wide = max(1, MAP_PX // per_row)
-    high = max(1, min(wide, MAP_PX // rows))
+    """Rack of every pixel, row 0 on top; pixels of gaps have the number of racks."""
+    wide = max(1, MAP_WIDTH_PX // per_row)
+    high = max(1, min(wide, MAP_WIDTH_PX // rows))
     if high < wide // 3:
         wide = 3 * high
     width, height = per_row * wide, rows * high
-    if max(width + 2 * _MARGIN_PX, height + _TITLE_PX + _BAR_PX + _LABEL_PX) > MOST_PX:
+    if max(width + 2 * _MARGIN_PX, height + _TITLE_PX + _BAR_PX + _LABEL_PX) > MAX_SIDE_PX:
         raise SdcError(
-            f"{rows} rows of {per_row} racks: too large for WebP, which holds {MOST_PX} pixels a "
-            "side"
+            f"{rows} rows of {per_row} racks: too large for WebP, which holds {MAX_SIDE_PX} "
+            "pixels a side"
         )
     index = np.arange(rows * per_row).reshape(rows, per_row)
     index = np.repeat(np.repeat(index, high, axis=0), wide, axis=1)
@@ -167,7 +169,7 @@ def _pixel_index(rows: int, per_row: int) -> npt.NDArray[np.int64]:
 
 
 def _palette() -> npt.NDArray[np.float64]:
-    """Colours of the levels, (256, 3), 0..255."""
+    """Colours of the map, (256, 3), 0..255."""
     from matplotlib import colormaps
 
     return np.round(255.0 * colormaps["inferno"](np.arange(_LEVELS))[:, :3])
@@ -194,7 +196,7 @@ def _canvas(
     from PIL import Image, ImageDraw
 
     height, width = index.shape
-    wide = max(width, MAP_PX)
+    wide = max(width, MAP_WIDTH_PX)
     size = (wide + 2 * _MARGIN_PX, height + _TITLE_PX + _BAR_PX + _LABEL_PX + _MARGIN_PX)
     picture = Image.new("RGB", size, "white")
     bar = palette[np.arange(wide) * _LEVELS // wide].astype(np.uint8)

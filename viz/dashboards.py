@@ -1,6 +1,6 @@
 """Dashboards of a run of one data center, from the rows that it has in steps.parquet.
 
-Every function takes a pandas table with a column ``time`` and the columns of
+Every function takes a pandas DataFrame with a column ``time`` and the columns of
 ``StepResult.per_dc()``, one row per step, and returns a matplotlib ``Figure``. Times are local
 standard time; the year is a placeholder.
 """
@@ -18,34 +18,32 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.types import F64
 
-from .figures import (
+from .plotting import (
     BLUE,
     GREEN,
     GREY,
-    LABELLED_RACKS,
+    MAX_LABELLED_RACKS,
     ORANGE,
     PINK,
     RED,
     SKY,
+    add_title,
     check_steps,
-    clean,
-    day_of_run,
-    draw_carbon,
-    draw_power,
+    date_text,
+    draw_rack_grid,
     draw_steps,
-    draw_storage,
-    finish,
-    format_time,
+    format_time_axis,
+    literal_text,
     new_figure,
     outline_hottest,
-    plain,
-    rack_grid,
-    scaled,
-    set_title,
-    short,
+    scale_thousands,
+    short_name,
     step_edges,
     step_hours,
+    style_axes,
+    style_axes_with_legend,
 )
+from .step_panels import COLUMNS, draw_carbon, draw_power, draw_storage
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,7 +60,7 @@ DAY_COLUMNS = (
     "tripped_racks",
     "grid_up",
 )
-"""Columns that ``day`` reads beyond ``figures.COLUMNS``."""
+"""Columns that ``day`` reads besides those of the panels over time."""
 
 CARPETS = (
     ("outdoor_c", 1.0, "outdoor (°C)", "inferno"),
@@ -72,19 +70,21 @@ CARPETS = (
     ("ci_g_per_kwh", 1.0, "carbon intensity (g CO₂e/kWh)", "cividis"),
     ("carbon_kg_per_h", 1.0, "emitted (kg CO₂e/h)", "cividis"),
 )
-"""What ``year`` shows by day and hour: column, factor, label, colour map."""
+"""Quantities that ``year`` shows by day and hour: column, factor, label, colour map."""
 
 ENERGY_COLUMNS = ("it_kwh", "hvac_kwh", "carbon_g")
-SCATTER_MARKS = 6_000
-"""Most points of a scatter; of longer runs as many are drawn."""
-MOST_BARS_NAMED = 13
+"""Columns of which ``year`` shows sums by month or day."""
+MAX_SCATTER_POINTS = 6_000
+"""Largest number of points of a scatter; of longer runs so many steps are drawn by lot."""
+MAX_NAMED_BARS = 13
+"""Largest number of bars with a name below."""
 EVENT_SHADES = {
     "crac_down": (BLUE, "//"),
     "chiller_derate": (GREEN, "\\\\"),
     "rack_fan_failure": (GREY, ".."),
     "heat_wave": ("#B8A800", "--"),
 }
-"""Colour and hatching; a grid outage is shaded where steps.parquet has it."""
+"""Colour and hatching of events by kind; grid outages are shaded by the column ``grid_up``."""
 _DAY = np.timedelta64(1, "D")
 
 
@@ -96,7 +96,7 @@ def day(
     Hours in which racks are throttled or tripped, the grid is down or an event lasts are shaded.
 
     Args:
-        steps: the run.
+        steps: steps of the data center.
         date: ``MM-DD``, the first such day of the run, or with the year of its times before it.
         title: written above, such as the name of the data center.
         events: those of the data center in metrics.json.
@@ -107,11 +107,11 @@ def day(
     from matplotlib.dates import DateFormatter, HourLocator
 
     figure = new_figure(12.0, 12.0)
-    check_steps(steps)
+    check_steps(steps, COLUMNS)
     check_steps(steps, ("time", *DAY_COLUMNS))
     first, after = _rows_of_day(steps, date)
     shown = steps.iloc[first:after]
-    check_steps(shown)
+    check_steps(shown, COLUMNS)
     panels = figure.subplots(5, 1, sharex=True, height_ratios=[4, 4, 3, 2, 3])
     _draw_day_temperatures(panels[0], shown, events)
     draw_power(panels[1], shown)
@@ -123,14 +123,14 @@ def day(
     panels[-1].xaxis.set_major_formatter(DateFormatter("%H:%M"))  # type: ignore[no-untyped-call]
     begin = shown["time"].iloc[0].normalize()
     panels[-1].set_xlim(begin, begin + _DAY)
-    name = day_of_run(begin, over_a_year=_is_over_a_year(steps))
+    name = date_text(begin, over_a_year=_is_over_a_year(steps))
     panels[-1].set_xlabel(f"local standard time on {name}")
-    set_title(figure, short(title))
+    add_title(figure, short_name(title))
     return figure
 
 
 def hottest_day(steps: pd.DataFrame) -> str:
-    """Day of the hottest inlet as ``day`` takes it, the first of equal ones."""
+    """Day of the hottest inlet as ``day`` takes it, the first if several are equal."""
     hottest = steps["time"].iloc[int(steps["inlet_max_c"].to_numpy().argmax())]
     return str(hottest.strftime("%Y-%m-%d"))
 
@@ -139,7 +139,7 @@ def year(steps: pd.DataFrame, title: str = "") -> Figure:
     """A run of two days to years: what each hour of each day was like, and monthly totals.
 
     Args:
-        steps: the run.
+        steps: steps of the data center.
         title: written above, such as the name of the data center.
 
     Raises:
@@ -162,7 +162,7 @@ def year(steps: pd.DataFrame, title: str = "") -> Figure:
         axes.tick_params(labelbottom=False)
         axes.set_xlabel("")
     _draw_totals(grid[3], steps)
-    set_title(figure, short(title))
+    add_title(figure, short_name(title))
     return figure
 
 
@@ -173,7 +173,7 @@ def setpoint_scatter(steps: pd.DataFrame, title: str = "") -> Figure:
     setpoint, by HVAC power over IT power and by the hottest inlet.
 
     Args:
-        steps: the run.
+        steps: steps of the data center.
         title: written above, such as the name of the data center.
 
     Raises:
@@ -183,7 +183,7 @@ def setpoint_scatter(steps: pd.DataFrame, title: str = "") -> Figure:
     check_steps(steps, ("time", "outdoor_c", "it_w", "hvac_w", "setpoint_c", "inlet_max_c"))
     shown = steps[(steps["it_w"] > 0).to_numpy()]
     # In a fixed random order, so that no season hides another.
-    shown = shown.iloc[np.random.default_rng(0).permutation(len(shown))[:SCATTER_MARKS]]
+    shown = shown.iloc[np.random.default_rng(0).permutation(len(shown))[:MAX_SCATTER_POINTS]]
     share = 100.0 * shown["hvac_w"] / shown["it_w"]
     for axes, values, label, cmap in zip(
         figure.subplots(1, 3, sharex=True, sharey=True),
@@ -206,7 +206,7 @@ def setpoint_scatter(steps: pd.DataFrame, title: str = "") -> Figure:
         axes.grid(alpha=0.25)
         if axes.get_subplotspec().is_first_col():
             axes.set_ylabel("IT power (kW)")
-    set_title(figure, short(title))
+    add_title(figure, short_name(title))
     return figure
 
 
@@ -216,7 +216,7 @@ def battery_profile(steps: pd.DataFrame, title: str = "") -> Figure:
     Lines are means over the days of the run, bands hold 80 % of them.
 
     Args:
-        steps: the run.
+        steps: steps of the data center.
         title: written above, such as the name of the data center.
 
     Raises:
@@ -243,11 +243,11 @@ def battery_profile(steps: pd.DataFrame, title: str = "") -> Figure:
     panels[2].set_ylabel("battery charge (%)")
     panels[2].set_ylim(0, 100)
     for axes in panels:
-        finish(axes)
+        style_axes_with_legend(axes)
     panels[-1].set_xticks(range(0, 25, 3), [f"{h:02d}:00" for h in range(0, 25, 3)])
     panels[-1].set_xlim(0, 24)
     panels[-1].set_xlabel("local standard time")
-    set_title(figure, short(title))
+    add_title(figure, short_name(title))
     return figure
 
 
@@ -255,7 +255,7 @@ def hot_racks(steps: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
     """Where the hottest inlet was: hours that each rack had it, and how hot it was there.
 
     Args:
-        steps: the run.
+        steps: steps of the data center.
         hall: the hall of the data center.
         title: written above, such as the name of the data center.
 
@@ -276,9 +276,11 @@ def hot_racks(steps: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
     np.maximum.at(peak, racks, steps["inlet_max_c"].to_numpy())
     axes = figure.subplots()
     grid = hours.reshape(shape)
-    image = rack_grid(axes, np.ma.masked_equal(grid, 0.0), "viridis", (0.0, float(hours.max())))
+    image = draw_rack_grid(
+        axes, np.ma.masked_equal(grid, 0.0), "viridis", (0.0, float(hours.max()))
+    )
     axes.set_facecolor("#EEEEEE")
-    if hall.racks <= LABELLED_RACKS:
+    if hall.racks <= MAX_LABELLED_RACKS:
         for rack in np.flatnonzero(hours):
             row, column = divmod(int(rack), hall.racks_per_row)
             ink = "black" if hours[rack] > 0.6 * hours.max() else "white"
@@ -286,7 +288,7 @@ def hot_racks(steps: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
             axes.text(column + 0.5, row + 0.5, text, color=ink, ha="center", va="center",
                       fontsize=9)  # fmt: skip
     where = outline_hottest(axes, peak.reshape(shape))
-    lead = f"{plain(title)}: " if title else ""
+    lead = f"{literal_text(title)}: " if title else ""
     axes.set_title(f"{lead}hottest inlet {peak.max():.1f} °C, {where}", fontsize=10, loc="left")
     ticks = MaxNLocator(6, steps=[1, 2, 5, 10])
     figure.colorbar(image, ax=axes, label="time as the hottest rack (h)", ticks=ticks)
@@ -294,11 +296,20 @@ def hot_racks(steps: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
 
 
 def _is_over_a_year(steps: pd.DataFrame) -> bool:
+    """Whether a run is longer than a year, so that its days occur more than once."""
     return bool(steps["time"].iloc[-1] - steps["time"].iloc[0] >= 365 * _DAY)
 
 
 def _rows_of_day(steps: pd.DataFrame, date: str) -> tuple[int, int]:
-    """First row of a day, and the first after it."""
+    """First row of a day, and the first row after it.
+
+    Args:
+        steps: steps of the data center.
+        date: ``MM-DD``, the first such day of the run, or with the year of its times before it.
+
+    Raises:
+        SdcError: the run does not have the day.
+    """
     days, first = np.unique(steps["time"].to_numpy().astype("datetime64[D]"), return_index=True)
     names = [str(each) for each in days]
     found = [i for i, name in enumerate(names) if date in (name, name[-5:])]
@@ -314,6 +325,7 @@ def _rows_of_day(steps: pd.DataFrame, date: str) -> tuple[int, int]:
 def _draw_day_temperatures(
     axes: Axes, steps: pd.DataFrame, events: Sequence[Mapping[str, Any]]
 ) -> None:
+    """Draw temperatures over a day, and shade what was out of order."""
     for name, colour, label, width in (
         ("outdoor_c", GREY, "outdoor", 1.4),
         ("wet_bulb_c", SKY, "wet bulb", 1.4),
@@ -324,24 +336,8 @@ def _draw_day_temperatures(
     ):
         draw_steps(axes, steps, steps[name], color=colour, linewidth=width, label=label)
     axes.axhline(RECOMMENDED_C[1], color=RED, linewidth=0.8, linestyle=":")
-    flags = [
-        ((steps["throttled_racks"] > 0).to_numpy(), ORANGE, "", "racks throttled"),
-        ((steps["tripped_racks"] > 0).to_numpy(), RED, "", "racks tripped"),
-        ((steps["grid_up"] < 1).to_numpy(), PINK, "", "grid down"),
-    ]
-    if events:
-        step = steps["step"].to_numpy()
-        for kind in dict.fromkeys(str(event["kind"]) for event in events):
-            lasts = [
-                (step >= event["start_step"]) & (step < event["end_step"])
-                for event in events
-                if event["kind"] == kind
-            ]
-            if kind != "grid_outage":
-                shade = EVENT_SHADES.get(kind, (GREY, ""))
-                flags.append((np.any(lasts, axis=0), *shade, kind.replace("_", " ")))
     edges = step_edges(steps)
-    for flag, colour, hatch, label in flags:
+    for flag, colour, hatch, label in _disturbances(steps, events):
         change = np.diff(flag.astype(np.int8), prepend=0, append=0)
         spans = zip(np.flatnonzero(change == 1), np.flatnonzero(change == -1), strict=True)
         for count, (first, after) in enumerate(spans):
@@ -349,11 +345,36 @@ def _draw_day_temperatures(
                          edgecolor=(colour, 0.5), hatch=hatch, linewidth=0,
                          label="" if count else label)  # fmt: skip
     axes.set_ylabel("temperature (°C)")
-    finish(axes)
+    style_axes_with_legend(axes)
+
+
+def _disturbances(
+    steps: pd.DataFrame, events: Sequence[Mapping[str, Any]]
+) -> list[tuple[npt.NDArray[np.bool_], str, str, str]]:
+    """What was out of order: whether in each step, colour, hatching and label."""
+    found = [
+        ((steps["throttled_racks"] > 0).to_numpy(), ORANGE, "", "racks throttled"),
+        ((steps["tripped_racks"] > 0).to_numpy(), RED, "", "racks tripped"),
+        ((steps["grid_up"] < 1).to_numpy(), PINK, "", "grid down"),
+    ]
+    if not events:
+        return found
+    step = steps["step"].to_numpy()
+    for kind in dict.fromkeys(str(event["kind"]) for event in events):
+        if kind == "grid_outage":
+            continue
+        lasts = [
+            (step >= event["start_step"]) & (step < event["end_step"])
+            for event in events
+            if event["kind"] == kind
+        ]
+        colour, hatch = EVENT_SHADES.get(kind, (GREY, ""))
+        found.append((np.any(lasts, axis=0), colour, hatch, kind.replace("_", " ")))
+    return found
 
 
 def _draw_commands(axes: Axes, steps: pd.DataFrame) -> None:
-    # Of different width, because they are often equal.
+    """Draw the commands, as lines of different width because they are often equal."""
     for name, colour, label, width in (
         ("load_command", PINK, "load (− defer, + drain)", 5.0),
         ("cooling_command", SKY, "setpoint (steps)", 2.8),
@@ -363,11 +384,19 @@ def _draw_commands(axes: Axes, steps: pd.DataFrame) -> None:
     axes.set_ylabel("command")
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, -1.1), max(high, 1.1))
-    finish(axes)
+    style_axes_with_legend(axes)
 
 
 def _draw_carpet(axes: Axes, times: pd.Series, values: F64, label: str, cmap: str) -> None:
-    """Days to the right, hours of the day upwards; hours that the run does not have stay white."""
+    """Draw days to the right and hours of the day upwards; hours without a step stay white.
+
+    Args:
+        axes: where to draw.
+        times: times of the steps.
+        values: a value per step.
+        label: label of the colour bar, with the unit.
+        cmap: name of the colour map.
+    """
     from matplotlib.dates import date2num
     from matplotlib.ticker import MaxNLocator
 
@@ -388,7 +417,7 @@ def _draw_carpet(axes: Axes, times: pd.Series, values: F64, label: str, cmap: st
         interpolation="nearest",
     )
     axes.xaxis_date()
-    format_time(axes)
+    format_time_axis(axes)
     axes.set_yticks(range(0, 25, 6), [f"{h:02d}:00" for h in range(0, 25, 6)])
     axes.set_ylabel("time of day")
     axes.spines[:].set_visible(False)
@@ -397,7 +426,12 @@ def _draw_carpet(axes: Axes, times: pd.Series, values: F64, label: str, cmap: st
 
 
 def _draw_totals(both: npt.NDArray[np.object_], steps: pd.DataFrame) -> None:
-    """Energy and carbon per month, or per day of runs up to two months."""
+    """Draw energy and carbon per month, or per day of runs up to two months.
+
+    Args:
+        both: axes of energy and of carbon.
+        steps: steps of the data center.
+    """
     import pandas as pd
 
     times = steps["time"]
@@ -408,18 +442,20 @@ def _draw_totals(both: npt.NDArray[np.object_], steps: pd.DataFrame) -> None:
     places = np.arange(len(sums))
     per = "month" if months else "day"
     energy, carbon = both
-    tops, unit = scaled(sums[["it_kwh", "hvac_kwh"]].to_numpy().cumsum(axis=1), "kWh", "MWh")
+    tops, unit = scale_thousands(
+        sums[["it_kwh", "hvac_kwh"]].to_numpy().cumsum(axis=1), "kWh", "MWh"
+    )
     energy.bar(places, tops[:, 0], color=BLUE, label="IT")
     energy.bar(places, tops[:, 1] - tops[:, 0], bottom=tops[:, 0], color=ORANGE, label="HVAC")
     energy.set_ylabel(f"energy ({unit}/{per})")
-    finish(energy)
-    emitted, unit = scaled(sums["carbon_g"].to_numpy() / 1e3, "kg", "t")
+    style_axes_with_legend(energy)
+    emitted, unit = scale_thousands(sums["carbon_g"].to_numpy() / 1e3, "kg", "t")
     carbon.bar(places, emitted, color=GREY)
     carbon.set_ylabel(f"emitted ({unit} CO₂e/{per})")
-    clean(carbon)
-    every = -(-len(sums) // MOST_BARS_NAMED)
+    style_axes(carbon)
+    every = -(-len(sums) // MAX_NAMED_BARS)
     over = _is_over_a_year(steps)
-    span = " to ".join(day_of_run(times.iloc[i], over_a_year=over) for i in (0, -1))
+    span = " to ".join(date_text(times.iloc[i], over_a_year=over) for i in (0, -1))
     for axes in (energy, carbon):
         axes.set_axisbelow(True)
         axes.set_xticks(places[::every], names[::every])
@@ -427,13 +463,21 @@ def _draw_totals(both: npt.NDArray[np.object_], steps: pd.DataFrame) -> None:
 
 
 def _hour_of_day(steps: pd.DataFrame) -> F64:
+    """Time of day at which each step begins, in h."""
     times = steps["time"].to_numpy()
     since = times - times.astype("datetime64[D]")
     return np.asarray(since / np.timedelta64(1, "h"), dtype=np.float64)
 
 
 def _draw_daily_band(axes: Axes, values: pd.Series, hours: F64, colour: str) -> None:
-    """Values by the hour of the day for which they stand."""
+    """Draw the mean over the days and the band of 80 % of them, by the hour of the day.
+
+    Args:
+        axes: where to draw.
+        values: a value per step.
+        hours: hour of the day that each value stands for.
+        colour: colour of line and band.
+    """
     groups = values.groupby(hours)
     mean, low, high = groups.mean(), groups.quantile(0.1), groups.quantile(0.9)
     axes.fill_between(

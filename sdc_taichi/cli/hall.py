@@ -163,9 +163,9 @@ def _print_layout_solution(config: DataCenterConfig, solution: LayoutSolution) -
 
 
 def _write_floor_plan(out: Path, hall: DesignHall) -> None:
-    from sdc_taichi.viz.floor_plan import draw
+    from sdc_taichi.viz.floor_plan_figure import floor_plan_figure
 
-    figure = draw(hall)
+    figure = floor_plan_figure(hall)
     with atomic_write(out, parents=True) as file:
         figure.savefig(file, format="png")
 

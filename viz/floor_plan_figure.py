@@ -3,46 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.hall.floor_plan import FloorPlan
 from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
 from sdc_taichi.types import F64
 
-from .figures import (
-    BLUE,
-    DPI,
-    GREY,
-    ORANGE,
-    SKY,
-    colour_range,
-    is_turned,
-    new_figure,
-    on_page,
-    rack_boxes,
-)
+from .plotting import BLUE, DPI, GREY, ORANGE, SKY, colour_range, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 LONG_SIDE_IN = 11.0
+"""Largest width of the plan, in inches."""
 SHORT_SIDE_IN = (2.2, 8.0)
-"""Least and largest height of the plan; a hall beyond them is stretched, and the axis says so."""
-MOST_STRETCH = 1.02
+"""Least and largest height of the plan, in inches; halls beyond them are drawn stretched."""
+MAX_UNTOLD_STRETCH = 1.02
+"""Stretch up to which the axis does not mention it."""
 RACK_LABEL_PX = (34.0, 15.0)
-"""Room that the number in a rack needs, width and height."""
-ROW_PX = 6.0
-"""Rows closer than this are drawn without aisles and fronts, which would make false patterns."""
+"""Width and height that the number in a rack needs, in pixels."""
+MIN_ROW_PITCH_PX = 6.0
+"""Distance of rows below which aisles and fronts are left out, in pixels; they would blur."""
 LINE_LABEL_PX = 13.0
-"""Height of a line of text."""
+"""Height of a line of text, in pixels."""
 UNIT_SIZE_M = (0.9, 2.0)
-"""Symbol of a CRAC unit, off the wall and along it."""
+"""Size of the symbol of a CRAC unit, off the wall and along it, in m."""
 
 
-def draw(hall: DataCenterConfig | DesignHall) -> Figure:
+def floor_plan_figure(hall: DataCenterConfig | DesignHall) -> Figure:
     """Walls, rows, aisles, floor tiles, returns and CRAC units, to scale.
 
     The longer side of the room runs to the right. Labels that would not fit are left out.
@@ -55,32 +48,60 @@ def draw(hall: DataCenterConfig | DesignHall) -> Figure:
     """
     figure = new_figure(1.0, 1.0)
     found = solve_design_hall(hall) if isinstance(hall, DataCenterConfig) else hall
-    _Drawing(found, figure).draw()
+    _FloorPlanDrawing(found, figure).draw()
     return figure
 
 
-class _Drawing:
-    """One plan: what lies where on the page."""
+def is_transposed(plan: FloorPlan) -> bool:
+    """Whether y runs to the right, because that is the longer side of the room."""
+    return plan.width_m > plan.length_m
 
-    def __init__(self, found: DesignHall, figure: Figure) -> None:
-        self._found, self._figure = found, figure
-        self._hall, self._size = found.config.hall, found.config.hall.layout
-        plan = found.plan
+
+def to_page(plan: FloorPlan, xy: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Points of the room, (..., 2) in m, as a picture places them, longer side to the right."""
+    return xy[..., ::-1] if is_transposed(plan) else xy
+
+
+def rack_boxes(plan: FloorPlan, pitch_m: float, depth_m: float) -> F64:
+    """Corners of the racks as a picture places them, (R, 4, 2) in m.
+
+    Args:
+        plan: floor plan of the hall.
+        pitch_m: width of a rack along the row, in m.
+        depth_m: depth of a rack, in m.
+    """
+    half = np.array([pitch_m / 2, depth_m / 2])
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    return to_page(plan, plan.centre_m[:, None] + corners * half)
+
+
+class _FloorPlanDrawing:
+    """Drawing of one floor plan.
+
+    Args:
+        hall: the hall with its air at the design point.
+        figure: where to draw.
+    """
+
+    def __init__(self, hall: DesignHall, figure: Figure) -> None:
+        self._found, self._figure = hall, figure
+        self._hall, self._size = hall.config.hall, hall.config.hall.layout
+        plan = hall.plan
         room = (plan.length_m, plan.width_m)
-        self._turned = is_turned(plan)
-        self._room = room[::-1] if self._turned else room
+        self._is_transposed = is_transposed(plan)
+        self._room = room[::-1] if self._is_transposed else room
         # Units stand outside the end walls, so that the room is drawn clear; large halls get
         # larger symbols.
-        deep, wide = self._room[::-1] if self._turned else self._room
+        deep, wide = self._room[::-1] if self._is_transposed else self._room
         self._unit_m = (
-            max(UNIT_SIZE_M[0], (0.15 if self._turned else 0.02) * deep),
+            max(UNIT_SIZE_M[0], (0.15 if self._is_transposed else 0.02) * deep),
             max(UNIT_SIZE_M[1], 0.02 * wide),
         )
         near = 1.3 * self._unit_m[0]
-        far = near if len(found.unit_m3s) > 1 else 0.3 * near
+        far = near if len(hall.unit_m3s) > 1 else 0.3 * near
         # Left and right, then top and bottom of the page.
         rims = ((0.3 * near, 0.3 * near), (near, far))
-        self._rims = rims if self._turned else rims[::-1]
+        self._rims = rims if self._is_transposed else rims[::-1]
         wide, high = (r + sum(m) for r, m in zip(self._room, self._rims, strict=True))
         high_in = float(np.clip(LONG_SIDE_IN * high / wide, *SHORT_SIDE_IN))
         wide_in = min(LONG_SIDE_IN, high_in * wide / high)
@@ -89,10 +110,13 @@ class _Drawing:
         rows = self._hall.rows
         ends_y = plan.centre_m[[0, -1], 1]
         self._row_gap_m = float(np.ptp(ends_y)) / (rows - 1) if rows > 1 else plan.width_m
-        self._coarse = self._row_gap_m * self._px_per_m[0 if self._turned else 1] < ROW_PX
+        self._is_coarse = (
+            self._row_gap_m * self._px_per_m[0 if self._is_transposed else 1] < MIN_ROW_PITCH_PX
+        )
         figure.set_size_inches(wide_in + 1.9, high_in + 1.3)
 
     def draw(self) -> None:
+        """Draw the hall."""
         from matplotlib.ticker import MaxNLocator
 
         axes = self._figure.subplots()
@@ -103,24 +127,26 @@ class _Drawing:
         for axis, length_m in zip((axes.xaxis, axes.yaxis), self._room, strict=True):
             ticks = MaxNLocator(8, steps=[1, 2, 5, 10]).tick_values(0.0, length_m)
             axis.set_ticks([t for t in ticks if 0.0 <= t <= length_m])
-        if not self._coarse:
+        if not self._is_coarse:
             self._draw_aisles(axes)
             self._draw_fronts(axes)
         self._draw_racks(axes)
         self._draw_walls(axes)
         self._draw_units(axes)
-        self._write(axes)
+        self._write_labels(axes)
 
     def _place(self, x: float, y: float) -> tuple[float, float]:
-        """Coordinates on the page."""
-        across, up = on_page(self._found.plan, np.array([x, y]))
+        """Point of the room as the picture places it, in m."""
+        across, up = to_page(self._found.plan, np.array([x, y]))
         return float(across), float(up)
 
     def _box(self, x0: float, x1: float, y0: float, y1: float) -> F64:
-        return on_page(self._found.plan, np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]))
+        """Corners of a rectangle of the room as the picture places them, (4, 2) in m."""
+        return to_page(self._found.plan, np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]))
 
     def _fits(self, x_m: float, y_m: float, px: tuple[float, float]) -> bool:
-        across, up = (y_m, x_m) if self._turned else (x_m, y_m)
+        """Whether a rectangle of the room is drawn at least as large as ``px``."""
+        across, up = (y_m, x_m) if self._is_transposed else (x_m, y_m)
         return across * self._px_per_m[0] >= px[0] and up * self._px_per_m[1] >= px[1]
 
     def _draw_aisles(self, axes: Axes) -> None:
@@ -146,6 +172,7 @@ class _Drawing:
                 self._label_aisle(axes, name, float(low[i]), float(high[i]))
 
     def _draw_openings(self, axes: Axes, low: F64, high: F64, name: str, colour: str) -> None:
+        """Draw floor tiles or ceiling grilles of aisles."""
         from matplotlib.collections import LineCollection
 
         x0, x1 = self._found.plan.row_ends_m
@@ -161,9 +188,10 @@ class _Drawing:
         )
 
     def _label_aisle(self, axes: Axes, name: str, y0: float, y1: float) -> None:
+        """Write the name of an aisle into it, if it fits."""
         x0, x1 = self._found.plan.row_ends_m
-        along_px = (x1 - x0) * self._px_per_m[1 if self._turned else 0]
-        across_px = (y1 - y0) * self._px_per_m[0 if self._turned else 1]
+        along_px = (x1 - x0) * self._px_per_m[1 if self._is_transposed else 0]
+        across_px = (y1 - y0) * self._px_per_m[0 if self._is_transposed else 1]
         if across_px < LINE_LABEL_PX or along_px < 75.0:
             return
         axes.text(
@@ -172,7 +200,7 @@ class _Drawing:
             ha="center",
             va="center",
             fontsize=9,
-            rotation=90 if self._turned else 0,
+            rotation=90 if self._is_transposed else 0,
             bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5},
         )
 
@@ -183,7 +211,7 @@ class _Drawing:
         plan = self._found.plan
         front_y = plan.front_m[:: self._hall.racks_per_row, 1]
         ends = plan.row_ends_m
-        thick = float(np.clip(0.06 * self._px_per_m[0 if self._turned else 1], 0.3, 3.5))
+        thick = float(np.clip(0.06 * self._px_per_m[0 if self._is_transposed else 1], 0.3, 3.5))
         axes.add_collection(
             LineCollection(
                 [[self._place(x, y) for x in ends] for y in front_y],
@@ -195,11 +223,12 @@ class _Drawing:
         )
 
     def _draw_racks(self, axes: Axes) -> None:
+        """Draw racks in the colours of their inlets, with numbers where they fit."""
         from matplotlib.collections import PolyCollection
         from matplotlib.ticker import MaxNLocator
 
         found, plan, size = self._found, self._found.plan, self._size
-        deep_m = self._row_gap_m if self._coarse else size.rack_depth_m
+        deep_m = self._row_gap_m if self._is_coarse else size.rack_depth_m
         boxes = rack_boxes(plan, size.rack_pitch_m, deep_m)
         edged = self._fits(size.rack_pitch_m, size.rack_depth_m, (8.0, 8.0))
         low, high = colour_range(found.inlet_c)
@@ -228,7 +257,7 @@ class _Drawing:
         )
 
     def _mark_hottest(self, axes: Axes, corners: F64) -> None:
-        """Outline the rack, or ring it where it is too small."""
+        """Outline the rack with the hottest server, or ring it where it is too small."""
         from matplotlib.patches import Polygon
 
         found = self._found
@@ -243,6 +272,7 @@ class _Drawing:
                   ls="none", label=label)  # fmt: skip
 
     def _draw_walls(self, axes: Axes) -> None:
+        """Draw the walls, and return grilles in them."""
         from matplotlib.collections import PolyCollection
 
         plan = self._found.plan
@@ -260,6 +290,7 @@ class _Drawing:
             )  # fmt: skip
 
     def _draw_units(self, axes: Axes) -> None:
+        """Draw CRAC units outside of the end walls, with their airflow where it fits."""
         from matplotlib.collections import PolyCollection
 
         found, plan = self._found, self._found.plan
@@ -276,26 +307,29 @@ class _Drawing:
                 boxes, facecolor="#DDDDDD", edgecolor="black", linewidth=1.0, label="CRAC unit"
             )
         )
-        whole = self._fits(depth, wide, (72.0, 28.0) if self._turned else (28.0, 72.0))
+        whole = self._fits(depth, wide, (72.0, 28.0) if self._is_transposed else (28.0, 72.0))
         brief = self._fits(depth, wide, (16.0, 12.0))
         for unit, (x, y) in labels:
             if not brief:
                 break
-            text = f"CRAC {unit}\n{_short(found.unit_m3s[unit])} m³/s" if whole else f"{unit}"
+            text = (
+                f"CRAC {unit}\n{_airflow_text(found.unit_m3s[unit])} m³/s" if whole else f"{unit}"
+            )
             axes.text(
                 x, y, text, ha="center", va="center", fontsize=7.5,
-                rotation=0 if self._turned or not whole else 90,
+                rotation=0 if self._is_transposed or not whole else 90,
             )  # fmt: skip
 
-    def _write(self, axes: Axes) -> None:
+    def _write_labels(self, axes: Axes) -> None:
+        """Write title, labels of the axes, row numbers and legend."""
         found, hall = self._found, self._hall
         names: list[Callable[..., object]] = [axes.set_xlabel, axes.set_ylabel]
         words = ["y, across the rows (m)", "x, along the rows (m)"]
-        if not self._turned:
+        if not self._is_transposed:
             words = words[::-1]
-        if not 1 / MOST_STRETCH < self._stretch < MOST_STRETCH:
+        if not 1 / MAX_UNTOLD_STRETCH < self._stretch < MAX_UNTOLD_STRETCH:
             words[1] += f"\nstretched {self._stretch:.1f} times"
-        if self._coarse:
+        if self._is_coarse:
             words[0] += "; rows too close to draw their aisles"
         for name, text in zip(names, words, strict=True):
             name(text)
@@ -306,7 +340,7 @@ class _Drawing:
         axes.set_title(
             f"{found.config.name}: {hall.rows} rows of {hall.racks_per_row} racks, "
             f"{found.plan.length_m:.4g} x {found.plan.width_m:.4g} m, "
-            f"{found.it_w.sum() / 1e3:,.0f} kW IT, {_short(flow)} m³/s supply "
+            f"{found.it_w.sum() / 1e3:,.0f} kW IT, {_airflow_text(flow)} m³/s supply "
             f"at {found.supply_c:g} °C",
             fontsize=10,
             loc="left",
@@ -324,8 +358,8 @@ class _Drawing:
 
     def _label_rows(self, axes: Axes, row_y: F64) -> None:
         """Row numbers beside the row ends, as many as fit."""
-        per_m = self._px_per_m[0 if self._turned else 1]
-        if self._size.end_margin_m * self._px_per_m[1 if self._turned else 0] < 16.0:
+        per_m = self._px_per_m[0 if self._is_transposed else 1]
+        if self._size.end_margin_m * self._px_per_m[1 if self._is_transposed else 0] < 16.0:
             return
         gap_m = float(row_y[-1] - row_y[0]) / max(len(row_y) - 1, 1)
         every = 1 if len(row_y) == 1 else int(np.ceil(max(1.0, 22.0 / max(gap_m * per_m, 1e-9))))
@@ -334,10 +368,12 @@ class _Drawing:
             u, v = self._place(x, row_y[row])
             axes.text(
                 u, v, f"row {row}" if gap_m * per_m > 40.0 else f"{row}",
-                ha="center" if self._turned else "right", va="bottom" if self._turned else "center",
+                ha="center" if self._is_transposed else "right",
+                va="bottom" if self._is_transposed else "center",
                 fontsize=8, color=GREY,
             )  # fmt: skip
 
 
-def _short(value: float) -> str:
+def _airflow_text(value: float) -> str:
+    """A flow with three digits, or all those before the point."""
     return f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"

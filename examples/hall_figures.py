@@ -12,8 +12,8 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan, unit_places_m
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, StepResult
-
-from .figures import BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY, new_figure, on_page, rack_boxes
+from sdc_taichi.viz.floor_plan_figure import rack_boxes, to_page
+from sdc_taichi.viz.plotting import BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 _MODE_COLOURS = {"quasi_steady": ORANGE, "transient": BLUE}
 
 
-def moved_load(hall: HallConfig, change_k: F64, distance_m: F64, racks: tuple[int, int]) -> Figure:
+def load_shift(hall: HallConfig, change_k: F64, distance_m: F64, racks: tuple[int, int]) -> Figure:
     """How the inlets change when load moves from one rack to another: plan, and by distance.
 
     Args:
         hall: the hall of R racks.
-        change_k: change of every inlet, (R,).
-        distance_m: of every inlet to the nearer exhaust of the two racks, (R,).
-        racks: from which rack the load moves, and to which.
+        change_k: change of every inlet, in K, (R,).
+        distance_m: distance from every inlet to the nearer exhaust of the two racks, in m, (R,).
+        racks: the rack that loses load, and the one that gains it.
 
     Raises:
         SdcError: matplotlib is missing, or the arrays have no entry per rack.
@@ -44,7 +44,7 @@ def moved_load(hall: HallConfig, change_k: F64, distance_m: F64, racks: tuple[in
     image = _draw_racks(left, hall, plan, change_k, "PuOr_r", (-reach, reach))
     for rack, sign in zip(racks, "−+", strict=True):
         ink = "white" if abs(change_k[rack]) > 0.6 * reach else "black"
-        where = on_page(plan, plan.centre_m[rack])
+        where = to_page(plan, plan.centre_m[rack])
         left.text(*where, sign, color=ink, ha="center", va="center", fontsize=13, weight="bold")
     left.set_title("Change of the inlet; load moves from − to +", fontsize=10, loc="left")
     figure.colorbar(
@@ -61,7 +61,7 @@ def moved_load(hall: HallConfig, change_k: F64, distance_m: F64, racks: tuple[in
         xlabel="distance from the inlet to the nearer of the two exhausts (m)",
         ylabel="change of the inlet (K)",
     )
-    _finish(right)
+    _style_axes(right)
     return figure
 
 
@@ -82,7 +82,7 @@ def failure_maps(
     hall = fleet.configs[dc].hall
     plan = floor_plan(hall)
     racks, units = slice(*fleet.rack_offsets[dc : dc + 2]), slice(*fleet.unit_offsets[dc : dc + 2])
-    shown = [_at(results, hour) for hour in hours]
+    shown = [_step_ending_at(results, hour) for hour in hours]
     values = [np.asarray(r.rack_inlet_c[racks], dtype=np.float64) for r in shown]
     limits = float(np.min(values)), float(np.max(values))
     columns = min(3, len(shown))
@@ -99,7 +99,7 @@ def failure_maps(
             strict=True,
         ):
             marker, colour = ("s", GREY) if runs else ("X", RED)
-            where = on_page(plan, place)
+            where = to_page(plan, place)
             axes.plot(*where, marker, color=colour, markersize=11, clip_on=False)
         minutes = round(60 * (result.step + 1) * result.step_h)
         axes.set(xlabel="", ylabel="")
@@ -152,12 +152,12 @@ def failure_curves(runs: Mapping[str, Sequence[StepResult]], fleet: Fleet, dc: i
         top.set_ylabel("temperature (°C)")
         top.set_title(title, fontsize=10, loc="left", pad=24)
         bottom.set(xlabel="time (h)", ylabel="% of racks, of capacity", ylim=(-3, 103))
-        _finish(top)
-        _finish(bottom)
+        _style_axes(top)
+        _style_axes(bottom)
     return figure
 
 
-def modes(series: Mapping[str, tuple[F64, F64]], title: str) -> Figure:
+def thermal_modes(series: Mapping[str, tuple[F64, F64]], title: str) -> Figure:
     """Hottest inlet and HVAC power of quasi-steady and transient runs, step by step.
 
     Args:
@@ -177,8 +177,8 @@ def modes(series: Mapping[str, tuple[F64, F64]], title: str) -> Figure:
     top.set_ylabel("hottest inlet (°C)")
     top.set_title(title, fontsize=10, loc="left", pad=24)
     bottom.set(xlabel="time (h)", ylabel="HVAC power (kW)")
-    _finish(top)
-    _finish(bottom)
+    _style_axes(top)
+    _style_axes(bottom)
     return figure
 
 
@@ -190,14 +190,14 @@ def _draw_racks(
     cmap: str,
     limits: tuple[float, float],
 ) -> PolyCollection:
-    """Racks to scale with their fronts, and the walls."""
+    """Draw racks to scale with their fronts, and the walls."""
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.patches import Rectangle
 
     boxes = rack_boxes(plan, hall.layout.rack_pitch_m, hall.layout.rack_depth_m)
     front_y = plan.front_m[:: hall.racks_per_row, 1]
     fronts = np.array([[(x, y) for x in plan.row_ends_m] for y in front_y])
-    room = on_page(plan, np.array([plan.length_m, plan.width_m]))
+    room = to_page(plan, np.array([plan.length_m, plan.width_m]))
     image = PolyCollection(
         list(boxes),
         array=values,
@@ -207,18 +207,18 @@ def _draw_racks(
         linewidth=0.4,
     )
     axes.add_collection(image)
-    axes.add_collection(LineCollection(list(on_page(plan, fronts)), colors=SKY, linewidths=2))
+    axes.add_collection(LineCollection(list(to_page(plan, fronts)), colors=SKY, linewidths=2))
     axes.add_patch(Rectangle((0, 0), *room, fill=False, linewidth=1.2))
     rim = 0.04 * float(room.max())
     axes.set(aspect="equal", xlim=(-rim, room[0] + rim), ylim=(room[1] + rim, -rim))
-    names = on_page(plan, np.array(["along the rows (m)", "across the rows (m)"]))
+    names = to_page(plan, np.array(["along the rows (m)", "across the rows (m)"]))
     axes.set(xlabel=names[0], ylabel=names[1])
     axes.spines[:].set_visible(False)
     return image
 
 
-def _at(results: Sequence[StepResult], hour: float) -> StepResult:
-    """The step that ends at ``hour``."""
+def _step_ending_at(results: Sequence[StepResult], hour: float) -> StepResult:
+    """The step that ends at a time since reset, in h."""
     for result in results:
         if abs((result.step + 1) * result.step_h - hour) < result.step_h / 2:
             return result
@@ -226,11 +226,13 @@ def _at(results: Sequence[StepResult], hour: float) -> StepResult:
 
 
 def _check_length(name: str, values: F64, racks: int) -> None:
+    """Refuse an array that has not one entry per rack."""
     if np.shape(values) != (racks,):
         raise SdcError(f"{name} has shape {np.shape(values)}, expected ({racks},), one per rack")
 
 
-def _finish(axes: Axes) -> None:
+def _style_axes(axes: Axes) -> None:
+    """Give axes a grid in place of a frame, and a legend above."""
     axes.spines[:].set_visible(False)
     axes.grid(alpha=0.25)
     axes.legend(

@@ -1,0 +1,286 @@
+"""What all pictures share: colours, figures, axes, and the words on them.
+
+pyplot is not used, so no window or global state is touched. Colours are those of Okabe and Ito
+(2008), "Color Universal Design", and the maps inferno, viridis and cividis, which readers with
+colour vision deficiency can tell apart.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterable
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.errors import SdcError
+from sdc_taichi.types import F64
+from sdc_taichi.year_clock import FIRST_YEAR
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
+    from matplotlib.figure import Figure
+
+DPI = 100
+"""Default resolution of pictures, in pixels per inch."""
+MAX_LABELLED_RACKS = 60
+"""Number of racks up to which the racks of a hall show their values as numbers."""
+MIN_COLOUR_RANGE_K = 2.0
+"""Least range of a colour bar, so that differences of a few tenths look small, in K."""
+MAX_NAME_LENGTH = 50
+"""Largest number of characters of a name in a picture."""
+TIE_K = 0.05
+"""Difference up to which racks count as equally hot, which numbers on them do not show, in K."""
+
+BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
+PINK, SKY, GREY = "#CC79A7", "#56B4E9", "#777777"
+LINE_COLOURS = (BLUE, ORANGE, GREEN, RED, PINK, SKY, "black", "#B8A800")
+"""Colours of lines in the order in which they are taken; the yellow is darkened for white paper."""
+LINE_STYLES = ("-", "--", ":", "-.")
+"""Dashes of lines, changed when all colours are taken."""
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure of ``DPI``.
+
+    Raises:
+        SdcError: matplotlib is missing.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise SdcError(
+            f'pictures need matplotlib ({error}); install it with: pip install "sdc-taichi[plot]"'
+        ) from None
+    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+
+
+def webp(figure: Figure, dpi: int = DPI) -> tuple[int, int, bytes]:
+    """Draw a figure as a lossless WebP, two thirds of the size of a PNG.
+
+    Args:
+        figure: the figure.
+        dpi: pixels per inch.
+
+    Returns:
+        Width and height in pixels, and the content of the file.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
+
+    figure.set_dpi(dpi)
+    canvas: Any = FigureCanvasAgg(figure)
+    with warnings.catch_warnings():
+        # Characters that the font lacks show as boxes, which need no warning each.
+        warnings.filterwarnings("ignore", message="Glyph ")
+        canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    out = io.BytesIO()
+    picture.save(out, "WEBP", lossless=True, method=2, quality=0)
+    return (*picture.size, out.getvalue())
+
+
+def add_title(figure: Figure, text: str) -> None:
+    """Write a title above a figure at the left, literally; an empty one takes no room."""
+    if text:
+        figure.suptitle(text.replace("$", r"\$"), x=0.01, ha="left")
+
+
+def short_name(name: str) -> str:
+    """A name on one line of at most ``MAX_NAME_LENGTH`` characters."""
+    line = " ".join(name.split())
+    return line if len(line) <= MAX_NAME_LENGTH else line[: MAX_NAME_LENGTH - 1] + "…"
+
+
+def literal_text(name: str) -> str:
+    """A short name that matplotlib writes unchanged.
+
+    matplotlib reads formulas between dollar signs and hides legends that begin with "_".
+    """
+    line = short_name(name)
+    return (" " if line.startswith("_") else "") + line.replace("$", r"\$")
+
+
+def format_number(value: float) -> str:
+    """A value with four significant digits, or whole with separators from 1000 on."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+
+
+def date_text(moment: datetime, *, over_a_year: bool) -> str:
+    """Day and month of a time.
+
+    Args:
+        moment: the time.
+        over_a_year: whether the run is longer than a year; then its year is given too.
+    """
+    year = f" (year {moment.year - FIRST_YEAR + 1})" if over_a_year else ""
+    return f"{moment.day} {moment:%B}{year}"
+
+
+def check_steps(steps: pd.DataFrame, columns: Iterable[str]) -> None:
+    """Check that a DataFrame holds the steps of one data center.
+
+    Args:
+        steps: one row per step.
+        columns: names of the columns that it must have.
+
+    Raises:
+        SdcError: a column is missing, fewer than two rows, or times that do not increase.
+    """
+    missing = [name for name in columns if name not in steps.columns]
+    if missing:
+        raise SdcError(f"steps: missing columns {', '.join(missing)}")
+    times = steps["time"].to_numpy()
+    if len(times) < 2 or not np.all(times[1:] > times[:-1]):
+        raise SdcError(
+            f"steps: {len(times)} rows; valid are two or more with increasing time, "
+            "of one data center"
+        )
+
+
+def step_edges(steps: pd.DataFrame) -> npt.NDArray[np.datetime64]:
+    """Beginnings of n steps and the end of the last, (n + 1,); n of two or more."""
+    times: npt.NDArray[np.datetime64] = steps["time"].to_numpy()
+    # The shortest, because the clock skips 29 February.
+    return np.append(times, times[-1] + np.diff(times).min())
+
+
+def step_hours(steps: pd.DataFrame) -> float:
+    """Length of the steps, in h."""
+    return float(np.diff(steps["time"].to_numpy()).min() / np.timedelta64(1, "h"))
+
+
+def repeat_last(values: npt.ArrayLike) -> F64:
+    """Values of n steps with the last repeated, to draw them to its end, (n + 1,)."""
+    array = np.asarray(values, dtype=np.float64)
+    return np.append(array, array[-1])
+
+
+def scale_thousands(values: F64, unit: str, thousands: str) -> tuple[F64, str]:
+    """Values with their unit, or in thousands with that unit if one of them reaches a thousand."""
+    return (values / 1e3, thousands) if values.max() >= 1e3 else (values, unit)
+
+
+def colour_range(values: F64) -> tuple[float, float]:
+    """Range of temperatures for colours, at least ``MIN_COLOUR_RANGE_K`` wide."""
+    middle = (values.min() + values.max()) / 2
+    half = max((values.max() - values.min()) / 2, MIN_COLOUR_RANGE_K / 2)
+    return float(middle - half), float(middle + half)
+
+
+def line_style(index: int) -> dict[str, Any]:
+    """Colour and dashes of one of many lines, different for the first 32."""
+    colours = len(LINE_COLOURS)
+    dashes = LINE_STYLES[index // colours % len(LINE_STYLES)]
+    return {"color": LINE_COLOURS[index % colours], "linestyle": dashes}
+
+
+def draw_steps(axes: Axes, steps: pd.DataFrame, values: npt.ArrayLike, **style: Any) -> None:
+    """Draw a line that is level over each step.
+
+    Args:
+        axes: where to draw.
+        steps: steps of one data center.
+        values: a value per step.
+        style: properties of the line.
+    """
+    style = {"linewidth": 1.4} | style
+    axes.plot(step_edges(steps), repeat_last(values), drawstyle="steps-post", **style)
+
+
+def draw_rack_grid(axes: Axes, grid: F64, cmap: str, limits: tuple[float, float]) -> QuadMesh:
+    """Draw racks as a grid, row 0 on top, racks of a row to the right.
+
+    Args:
+        axes: where to draw.
+        grid: values, (rows, racks per row).
+        cmap: name of the colour map.
+        limits: values at the ends of the colour map.
+    """
+    image = axes.pcolormesh(
+        grid,
+        cmap=cmap,
+        vmin=limits[0],
+        vmax=limits[1],
+        edgecolors="white" if grid.size <= MAX_LABELLED_RACKS else "none",
+        linewidth=1.5,
+    )
+    axes.invert_yaxis()
+    for axis, count in zip((axes.yaxis, axes.xaxis), grid.shape, strict=True):
+        shown = np.arange(0, count, max(1, count // 10))
+        axis.set_ticks(shown + 0.5, [str(i) for i in shown])
+        axis.set_tick_params(length=0)
+    axes.set(xlabel="rack in row", ylabel="row")
+    axes.spines[:].set_visible(False)
+    return image
+
+
+def outline_hottest(axes: Axes, grid: F64) -> str:
+    """Outline the hottest racks of a small hall, or ring the first one of a large hall.
+
+    Args:
+        axes: axes with the racks as a grid.
+        grid: temperatures in C, (rows, racks per row).
+
+    Returns:
+        The place of the hottest rack in words.
+    """
+    from matplotlib.patches import Rectangle
+
+    hottest = np.argwhere(grid >= grid.max() - TIE_K)
+    row, rack = np.unravel_index(grid.argmax(), grid.shape)
+    place = f"row {row} rack {rack}" + (f" and {len(hottest) - 1} more" * (len(hottest) > 1))
+    if len(hottest) == grid.size > 1:
+        place = "all racks alike"
+    elif grid.size <= MAX_LABELLED_RACKS:
+        for y, x in hottest + 0.04:
+            axes.add_patch(Rectangle((x, y), 0.92, 0.92, fill=False, color=SKY, linewidth=2.5))
+    else:
+        axes.plot(rack + 0.5, row + 0.5, "o", color=SKY, markersize=12, mfc="none", mew=2.5)
+    return place
+
+
+def style_axes(axes: Axes) -> None:
+    """Give axes a grid in place of a frame, and let curves run from edge to edge."""
+    axes.margins(x=0)
+    axes.spines[:].set_visible(False)
+    axes.grid(alpha=0.25)
+
+
+def style_axes_with_legend(axes: Axes) -> None:
+    """Give axes a grid in place of a frame, and a legend above."""
+    style_axes(axes)
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(0, 1),
+        ncols=7,
+        fontsize=9,
+        frameon=False,
+        borderaxespad=0.2,
+        columnspacing=1.2,
+        handlelength=1.2,
+    )
+
+
+def format_time_axis(axes: Axes) -> None:
+    """Label a time axis with days and hours, without the year, which is a placeholder."""
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
+    # With fewer or more at least, it finds no interval for 4 to 5 days, and warns.
+    locator = AutoDateLocator(minticks=4, maxticks=9)  # type: ignore[no-untyped-call]
+    formats = ["%b", "%b", "%d %b", "%H:%M", "%H:%M", "%H:%M:%S"]
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(
+        ConciseDateFormatter(  # type: ignore[no-untyped-call]
+            locator,
+            formats=formats,
+            zero_formats=["%b", "%b", "%d %b", "%d %b", "%H:%M", "%H:%M"],
+            show_offset=False,
+        )
+    )
+    axes.set_xlabel("local standard time")

@@ -1,0 +1,268 @@
+"""Sections of a report with pictures: all data centers, single data centers, inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.run.folder_reader import (
+    RunFolder,
+    read_configs,
+    read_fleet_steps,
+    read_steps,
+)
+
+from . import dashboards, data_figures, figures, fleet_figures
+from .plotting import format_number, scale_thousands
+from .report_html import picture_element
+from .report_text import time_text
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MAX_SHOWN_DCS = 4
+"""Largest number of data centers of which all have pictures."""
+YEAR_FROM_H = 48.0
+"""Length of a run from which it is drawn by day and hour, in h."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShownDataCenter:
+    """A data center with pictures of its own."""
+
+    index: int
+    """Index of the data center."""
+    reason: str
+    """Why it is shown, in words; empty if all are."""
+    steps: pd.DataFrame
+    """Rows that it has in steps.parquet."""
+    config: DataCenterConfig
+    """Its config."""
+
+
+def fleet_section(run: RunFolder) -> str:
+    """All data centers together, and which halls ran hot when."""
+    fleet = read_fleet_steps(run)
+    count = len(run.names)
+    powers_kw = (fleet.series["it_w"] + fleet.series["hvac_w"]).to_numpy() / 1e3
+    power, unit = scale_thousands(powers_kw, "kW", "MW")
+    out = picture_element(
+        fleet_figures.fleet_overview(fleet.series),
+        f"Power, PUE, emitted carbon and hottest inlets of all {count} data centers over the run. "
+        f"Highest power {power.max():.3g} {unit}, "
+        f"hottest inlet {fleet.series['inlet_max_c'].max():.1f} °C.",
+        f"Sums over the {count:,} data centers step by step, each on its own clock; the axis shows "
+        f"that of {run.names[0]}. Below, the hottest inlet of each data center: median, the middle "
+        "80 % and the highest.",
+    )
+    if len(fleet.inlet_max_c) > 1:
+        order = np.argsort(-fleet.inlet_max_c.max(axis=0), kind="stable")[:3]
+        hottest = ", ".join(run.names[dc] for dc in order)
+        cut = (
+            f" The {fleet_figures.MAX_MAP_ROWS} hottest of {count:,} are shown."
+            if count > fleet_figures.MAX_MAP_ROWS
+            else ""
+        )
+        out += picture_element(
+            fleet_figures.fleet_map(fleet.edge_times, fleet.inlet_max_c, run.names),
+            f"Hottest inlet of each data center over time, hottest data centers first: {hottest}.",
+            f"Which halls ran hot, and when: the hottest inlet of each.{cut}",
+        )
+    return out
+
+
+def shown_data_centers(run: RunFolder) -> list[ShownDataCenter]:
+    """The data centers with pictures: all of a few, else those with extreme metrics."""
+    dcs = run.metrics["data_centers"]
+    if len(dcs) <= MAX_SHOWN_DCS:
+        reasons = dict.fromkeys(range(len(dcs)), "")
+    else:
+        reasons = {}
+        for key, best, text in (
+            ("hottest_inlet_c", max, "hottest inlet"),
+            ("pue", max, "highest PUE"),
+            ("cue_kg_per_kwh", max, "most carbon per IT energy"),
+            ("cue_kg_per_kwh", min, "least carbon per IT energy"),
+        ):
+            known = [i for i, dc in enumerate(dcs) if dc["metrics"][key] is not None]
+            # Equal values tell nobody apart.
+            if len({dcs[i]["metrics"][key] for i in known}) > 1:
+                found = best(known, key=lambda i: dcs[i]["metrics"][key])
+                reasons[found] = (
+                    f"{reasons[found]}, {text}" if found in reasons else f"it has the {text}"
+                )
+        reasons = reasons or {0: "hottest inlet, PUE and carbon are equal in all"}
+    all_steps = read_steps(run, list(reasons))
+    configs = read_configs(run, list(reasons))
+    return [
+        ShownDataCenter(index, reason, steps, config)
+        for (index, reason), steps, config in zip(reasons.items(), all_steps, configs, strict=True)
+    ]
+
+
+def data_center_section(run: RunFolder, dc: ShownDataCenter) -> str:
+    """A data center in words and pictures, with its config."""
+    steps, hall = dc.steps, dc.config.hall
+    out = []
+    if dc.reason:
+        out.append(f"<p>Shown because {dc.reason} of {len(run.names):,}.</p>\n")
+    text = f"{hall.rows} rows of {hall.racks_per_row} racks, site {dc.config.site.location}."
+    if dc.config.description:
+        text = f"{dc.config.description.rstrip('.')}; {text}"
+    out.append(f"<p>{escape(text)}</p>\n")
+    if len(steps) < 2:
+        out.append("<p>A single step has no pictures.</p>\n")
+        return "".join(out) + _config_element(dc)
+    hottest = steps.iloc[int(steps["inlet_max_c"].to_numpy().argmax())]
+    hottest_text = (
+        f"{hottest['inlet_max_c']:.1f} °C on {time_text(run, hottest['time'].to_pydatetime())}"
+    )
+    out.append(
+        f"<p>At its hottest inlet, {hottest_text}: outdoor {hottest['outdoor_c']:.1f} °C, wet bulb "
+        f"{hottest['wet_bulb_c']:.1f} °C, setpoint {hottest['setpoint_c']:.1f} °C, supply air "
+        f"{hottest['supply_c']:.1f} °C, IT {format_number(hottest['it_w'] / 1e3)} kW, HVAC "
+        f"{format_number(hottest['hvac_w'] / 1e3)} kW, airflow of CRAC units "
+        f"{format_number(hottest['crac_flow_m3s'])} and of servers "
+        f"{format_number(hottest['it_airflow_m3s'])} m³/s.</p>\n"
+    )
+    return "".join(out) + _data_center_pictures(run, dc, hottest_text) + _config_element(dc)
+
+
+def _data_center_pictures(run: RunFolder, dc: ShownDataCenter, hottest_text: str) -> str:
+    """Pictures of one data center.
+
+    Args:
+        run: the run.
+        dc: the data center.
+        hottest_text: its hottest inlet in words.
+    """
+    name, steps = run.names[dc.index], dc.steps
+    out = [_hot_racks_picture(name, dc), _whole_run_picture(run, name, steps)]
+    date = dashboards.hottest_day(steps)
+    if int((steps["time"].dt.strftime("%Y-%m-%d") == date).sum()) > 1:
+        events = run.metrics["data_centers"][dc.index]["events"]
+        out.append(
+            picture_element(
+                dashboards.day(steps, date, name, events),
+                f"Temperatures, power, carbon, commands, queue and battery of {name} on the day of "
+                f"its hottest inlet, {hottest_text}.",
+                "The day of the hottest inlet. The dotted line is 27 °C, the highest recommended "
+                "inlet; failures and racks under protection are shaded.",
+            )
+        )
+    out.append(
+        picture_element(
+            dashboards.setpoint_scatter(steps, name),
+            f"Steps of {name} by outdoor temperature and IT power, coloured by setpoint, by HVAC "
+            "over IT power and by hottest inlet.",
+            "Which setpoint was used at which weather and load, what cooling cost there and how "
+            "hot it became.",
+        )
+    )
+    if float(steps["charge_kwh"].max()) > 0 or float(steps["discharge_kwh"].max()) > 0:
+        out.append(
+            picture_element(
+                dashboards.battery_profile(steps, name),
+                f"Carbon intensity, battery power and battery charge of {name} by time of day.",
+                "What the battery did over the day. Lines are means over the days, bands hold 80 % "
+                "of them.",
+            )
+        )
+    return "".join(out)
+
+
+def _hot_racks_picture(name: str, dc: ShownDataCenter) -> str:
+    """How long each rack had the hottest inlet."""
+    steps, hall = dc.steps, dc.config.hall
+    racks = steps["hottest_rack"].astype(int)
+    most_often = int(racks.mode().iloc[0])
+    row, column = divmod(most_often, hall.racks_per_row)
+    share_pct = 100 * float((racks == most_often).mean())
+    return picture_element(
+        dashboards.hot_racks(steps, hall, name),
+        f"Racks of {name} by the time that each had the hottest inlet of the hall; most often "
+        f"row {row}, rack {column}, {share_pct:.0f} % of the time.",
+        "Where the hall ran hot: how long each rack had the hottest inlet, and how hot it was "
+        "there. Grey racks never had it. Row 0 is on top.",
+    )
+
+
+def _whole_run_picture(run: RunFolder, name: str, steps: pd.DataFrame) -> str:
+    """The run by day and hour, or step by step; none of a run of a day or less."""
+    if run.hours >= YEAR_FROM_H:
+        return picture_element(
+            dashboards.year(steps, name),
+            f"Weather, hottest inlet, power and carbon of {name} by day and hour of the day, "
+            "and energy and carbon by day or month.",
+            "The run by day, to the right, and time of day, upwards.",
+        )
+    if run.hours > 24.0:
+        return picture_element(
+            figures.overview(steps),
+            f"Weather, power by device, carbon, queue and battery of {name} over the run.",
+            f"The whole run of {name}.",
+        )
+    return ""
+
+
+def _config_element(dc: ShownDataCenter) -> str:
+    """The config of a data center, folded up."""
+    text = escape(dc.config.to_yaml())
+    return f"<details><summary>Configuration</summary><pre>{text}</pre></details>\n"
+
+
+def inputs_section(run: RunFolder, shown: Sequence[ShownDataCenter]) -> str:
+    """Weather, carbon intensity and work as the run read them."""
+    names = [run.names[dc.index] for dc in shown]
+    origin = "as the run read them" + (", SYNTHETIC in part" if run.metrics["synthetic"] else "")
+    out = []
+    for column, quantity, label in (
+        ("outdoor_c", data_figures.TEMPERATURE, "Outdoor temperature"),
+        ("ci_g_per_kwh", data_figures.CARBON, "Carbon intensity"),
+        ("demand", data_figures.WORKLOAD, "Arriving work"),
+    ):
+        series = _shared_series(names, [dc.steps.set_index("time")[column] for dc in shown])
+        means = ", ".join(
+            f"{name} {quantity.factor * values.mean():.4g}" for name, values in series.items()
+        )
+        out.append(
+            picture_element(
+                data_figures.comparison(series, quantity),
+                f"{label} by time and by hour of the day. Means: {means}.",
+                f"{label}, {origin}.",
+            )
+        )
+        # A day without emissions has no relative variation.
+        has_means = all(data_figures.daily(values).mean().min() > 0 for values in series.values())
+        if column == "ci_g_per_kwh" and has_means and len(series) > 1:
+            out.append(
+                picture_element(
+                    data_figures.carbon_variation(series),
+                    "Mean carbon intensity against its variation within the day.",
+                    "Mean carbon intensity against its variation within the day: to the right, the "
+                    "time of use matters more.",
+                )
+            )
+    return "".join(out)
+
+
+def _shared_series(names: Sequence[str], all_series: Sequence[pd.Series]) -> dict[str, pd.Series]:
+    """Series by name; data centers with equal series share one.
+
+    Args:
+        names: names of the data centers.
+        all_series: series of each data center.
+    """
+    users: list[tuple[list[str], pd.Series]] = []
+    for name, values in zip(names, all_series, strict=True):
+        same = next((own for own, series in users if series.equals(values)), None)
+        if same is None:
+            users.append(([name], values))
+        else:
+            same.append(name)
+    return {", ".join(own): series for own, series in users}
