@@ -210,8 +210,8 @@ def test_facility_as_in_numpy(overrides: list[str] | str, event_free: bool) -> N
         facility = Facility(sim.fleet, sim.sizing, event_free=event_free)
         inputs = random_inputs(sim, rng, n)
     for run, names in (
-        (facility.step, facility.inputs),
-        (facility.removable_w, facility.plant_inputs),
+        (facility.step, facility.input_names),
+        (facility.removable_w, facility.plant_input_names),
     ):
         x = {name: inputs[name] for name in names}
 

@@ -22,7 +22,8 @@ HOURS_PER_BLOCK = 8760
 """Sampled events are drawn in blocks of 365 days, each from a stream of its own."""
 _HOURS_PER_WINDOW = 120  # Divides a block. Events are looked up once per window.
 _KINDS: tuple[EventKind, ...] = get_args(EventKind)
-_WHOLE = -1
+_NO_TARGET = -1
+"""Target of events of all CRAC units, or of none to name."""
 
 Mask = npt.NDArray[np.bool_]
 
@@ -82,7 +83,8 @@ class _Events:
     end_step: I64
     """First step since reset after the event, (E,)."""
 
-    def chosen(self, mask: Mask) -> _Events:
+    def where(self, mask: Mask) -> _Events:
+        """Events of a mask, (E,), in their order."""
         return _Events(*(getattr(self, f.name)[mask] for f in fields(self)))
 
 
@@ -126,7 +128,7 @@ class Timeline:
         self._blocks_back = int(np.ceil(longest_h / HOURS_PER_BLOCK))
         self._blocks: dict[int, _Events] = {}
         self._window = -1
-        self._near = scheduled
+        self._in_window = scheduled
         self._normal = _read_only(
             Disturbance(
                 active=False,
@@ -158,7 +160,7 @@ class Timeline:
 
     def at(self, step: int) -> Disturbance:
         """What events do to step ``step`` after reset; one shared object while there are none."""
-        found = self._at(step)
+        found = self._covering(step)
         if not len(found.kind):
             return self._normal
         normal = self._normal
@@ -166,17 +168,17 @@ class Timeline:
         chiller, airflow = normal.chiller_share.copy(), normal.rack_airflow.copy()
         offset_k = normal.outdoor_offset_k.copy()
         is_kind = {kind: found.kind == code for code, kind in enumerate(_KINDS)}
-        down = found.chosen(is_kind["crac_down"])
-        one = down.target != _WHOLE
+        down = found.where(is_kind["crac_down"])
+        one = down.target != _NO_TARGET
         unit_up[self._unit_offsets[down.dc[one]] + down.target[one]] = False
         without = np.zeros(len(grid_up), dtype=np.bool_)
         without[down.dc[~one]] = True
         unit_up &= ~np.repeat(without, np.diff(self._unit_offsets))
-        derated = found.chosen(is_kind["chiller_derate"])
+        derated = found.where(is_kind["chiller_derate"])
         np.multiply.at(chiller, derated.dc, derated.value)
-        failed = found.chosen(is_kind["rack_fan_failure"])
+        failed = found.where(is_kind["rack_fan_failure"])
         np.multiply.at(airflow, self._rack_offsets[failed.dc] + failed.target, failed.value)
-        wave = found.chosen(is_kind["heat_wave"])
+        wave = found.where(is_kind["heat_wave"])
         np.add.at(offset_k, wave.dc, wave.value)
         grid_up[found.dc[is_kind["grid_outage"]]] = False
         return _read_only(
@@ -192,7 +194,7 @@ class Timeline:
 
     def active(self, step: int) -> list[ActiveEvent]:
         """Events that cover step ``step``, by data center and start."""
-        found = self._at(step)
+        found = self._covering(step)
         out = []
         for i in np.lexsort((found.first_step, found.dc)):
             kind, value = _KINDS[found.kind[i]], float(found.value[i])
@@ -201,7 +203,7 @@ class Timeline:
                 ActiveEvent(
                     kind=kind,
                     dc=int(found.dc[i]),
-                    target=None if target == _WHOLE else target,
+                    target=None if target == _NO_TARGET else target,
                     share=value if kind in ("chiller_derate", "rack_fan_failure") else None,
                     offset_k=value if kind == "heat_wave" else None,
                     start_step=int(found.first_step[i]),
@@ -210,17 +212,18 @@ class Timeline:
             )
         return out
 
-    def _at(self, step: int) -> _Events:
+    def _covering(self, step: int) -> _Events:
         if self.event_free:
             return self._scheduled
         steps = _HOURS_PER_WINDOW * self._steps_per_hour
         window = step // steps
         if window != self._window:
-            self._near = self._within(window * steps, (window + 1) * steps)
+            self._in_window = self._overlapping(window * steps, (window + 1) * steps)
             self._window = window
-        return self._near.chosen((self._near.first_step <= step) & (step < self._near.end_step))
+        events = self._in_window
+        return events.where((events.first_step <= step) & (step < events.end_step))
 
-    def _within(self, low: int, high: int) -> _Events:
+    def _overlapping(self, low: int, high: int) -> _Events:
         """Events that cover any of the steps low..high-1, which lie in one block."""
         listed = [self._scheduled]
         if self._rules:
@@ -231,13 +234,13 @@ class Timeline:
                 for block in wanted
             }
             listed += self._blocks.values()
-        together = _joined(listed)
-        return together.chosen((together.first_step < high) & (low < together.end_step))
+        together = _concatenated(listed)
+        return together.where((together.first_step < high) & (low < together.end_step))
 
     def _sampled(self, block: int) -> _Events:
-        return _joined([self._drawn(rule, block) for rule in self._rules])
+        return _concatenated([self._sampled_by_rule(rule, block) for rule in self._rules])
 
-    def _drawn(self, rule: _Rule, block: int) -> _Events:
+    def _sampled_by_rule(self, rule: _Rule, block: int) -> _Events:
         """Events of one rule that start in one block of 365 days."""
         sequence = np.random.SeedSequence([int(self._seed[rule.dc]), *rule.key, block])
         rng = np.random.Generator(np.random.PCG64(sequence))
@@ -245,7 +248,7 @@ class Timeline:
         n = int(rng.poisson(event.per_year))
         start_h = HOURS_PER_BLOCK * (block + rng.random(n))
         duration_h = rng.uniform(*event.duration_h, n)
-        target = rng.integers(rule.targets, size=n) if rule.targets else np.full(n, _WHOLE)
+        target = rng.integers(rule.targets, size=n) if rule.targets else np.full(n, _NO_TARGET)
         return _events(
             event, rule.dc, target, start_h, duration_h, steps_per_hour=self._steps_per_hour
         )
@@ -282,7 +285,7 @@ def schedule(
                 _events(
                     event,
                     dc,
-                    np.array([_WHOLE if target is None else target]),
+                    np.array([_NO_TARGET if target is None else target]),
                     np.array([event.start_h]),
                     np.array([event.duration_h]),
                     steps_per_hour=steps_per_hour,
@@ -293,7 +296,7 @@ def schedule(
         for i, rule in enumerate(config.events.sampled):
             rules.append(_Rule(dc, (key, i), targets.get(rule.kind, 0), rule))
     return Timeline(
-        _joined(listed),
+        _concatenated(listed),
         tuple(rules),
         rack_offsets=np.asarray(rack_offsets, dtype=np.int64),
         unit_offsets=np.asarray(unit_offsets, dtype=np.int64),
@@ -326,7 +329,7 @@ def _events(
     )
 
 
-def _joined(listed: Sequence[_Events]) -> _Events:
+def _concatenated(listed: Sequence[_Events]) -> _Events:
     return _Events(*(np.concatenate([getattr(e, f.name) for e in listed]) for f in fields(_Events)))
 
 

@@ -208,10 +208,10 @@ class Facility:
         self._air_j_per_m3_k = air_j_per_m3_k(fleet)
         self._return_approach_k = mean_return_approach_k(fleet)
         self._fan_w_per_m3s = sizing.crac_fan_w / sizing.crac_flow_m3s
-        self.plant_inputs = _PLANT_INPUTS + (() if event_free else _PLANT_EVENT_INPUTS)
+        self.plant_input_names = _PLANT_INPUTS + (() if event_free else _PLANT_EVENT_INPUTS)
         """Names of the inputs that ``removable_w`` reads."""
-        self.inputs = (
-            *self.plant_inputs,
+        self.input_names = (
+            *self.plant_input_names,
             *_STEP_INPUTS,
             *(_RECIRCULATION_INPUTS if self._recirculates else _APPROACH_INPUTS),
             *(_TRANSIENT_INPUTS if self._transient else ()),
@@ -219,25 +219,26 @@ class Facility:
         )
         """Names of the inputs that ``step`` reads."""
 
-    def removable_w(self, met: FacilityInputs) -> dict[str, F64]:
+    def removable_w(self, inputs: FacilityInputs) -> dict[str, F64]:
         """Heat that the plant can take with the coils in use, W, as ``heat_removed_w``, (B,)."""
-        return {"heat_removed_w": self._operate(self._coil_capacity_w(met), met).heat_removed_w}
+        plant = self._operate(self._coil_capacity_w(inputs), inputs)
+        return {"heat_removed_w": plant.heat_removed_w}
 
-    def step(self, met: FacilityInputs) -> dict[str, F64]:
+    def step(self, inputs: FacilityInputs) -> dict[str, F64]:
         """Everything that follows from the air of the halls.
 
         Args:
-            met: What the step starts from.
+            inputs: What the step starts from.
 
         Returns:
             Quantities of ``StepResult`` by their names there, and ``supply_warming_k``, supply air
             over the setpoint, K, each (B,).
         """
-        it_w = met.cpu_w + met.it_fan_w
-        air = self._crac_air(met, it_w)
-        plant = self._operate(self._requested_w(met, air), met)
-        heat = self._balance_heat(met, air, plant)
-        water = self._use_water(met, air, plant)
+        it_w = inputs.cpu_w + inputs.it_fan_w
+        air = self._crac_air(inputs, it_w)
+        plant = self._operate(self._requested_w(inputs, air), inputs)
+        heat = self._balance_heat(inputs, air, plant)
+        water = self._use_water(inputs, air, plant)
         hvac_w = self._hvac_w(air, plant)
         found: dict[str, Any] = {
             "it_w": it_w,
@@ -246,8 +247,8 @@ class Facility:
             **fields_of(plant),
             **fields_of(heat),
             **fields_of(water),
-            **self._energy(met, it_w, hvac_w),
-            **self._air_indices(met, air),
+            **self._energy(inputs, it_w, hvac_w),
+            **self._air_indices(inputs, air),
         }
         return {name: values for name, values in found.items() if name in _RESULTS}
 
@@ -269,102 +270,103 @@ class Facility:
         lasts = np.minimum(carried_kwh / (design_kw * self._step_h), 1.0)
         return np.where(grid_up, all_step, lasts)
 
-    def _crac_air(self, met: FacilityInputs, it_w: F64) -> _CracAir:
+    def _crac_air(self, inputs: FacilityInputs, it_w: F64) -> _CracAir:
         """Airflow, supply and return air, fans and heat of the CRAC units."""
         if self._recirculates:
-            fan_w = self._while_powered(self._fan_w_per_m3s * met.cubed_flow_m3s, met)
+            fan_w = self._while_powered(self._fan_w_per_m3s * inputs.cubed_flow_m3s, inputs)
             return _CracAir(
-                crac_flow_m3s=met.crac_flow_m3s,
+                crac_flow_m3s=inputs.crac_flow_m3s,
                 crac_fan_w=fan_w,
-                supply_c=met.supply_c,
+                supply_c=inputs.supply_c,
                 # Units differ by their setpoints alone; the room warms the air of all alike.
-                supply_warming_k=met.supply_c - met.setpoint_m3k_s / met.crac_flow_m3s,
-                return_c=met.return_c,
-                cooling_load_w=met.cooling_load_w if self._transient else it_w + fan_w,
+                supply_warming_k=inputs.supply_c - inputs.setpoint_m3k_s / inputs.crac_flow_m3s,
+                return_c=inputs.return_c,
+                cooling_load_w=inputs.cooling_load_w if self._transient else it_w + fan_w,
             )
-        flow, speed = self._flow(it_w, met.it_airflow_m3s, speed=met.fan_speed, **self._flow_limits)
+        flow, speed = self._flow(
+            it_w, inputs.it_airflow_m3s, speed=inputs.fan_speed, **self._flow_limits
+        )
         full_w = crac_fan_w(speed, design_flow_m3s=1.0, design_w=self._sizing.crac_fan_w)
-        fan_w = self._while_powered(full_w, met)
+        fan_w = self._while_powered(full_w, inputs)
         return_c, load_w = self._load(
             it_w,
             fan_w,
             flow,
-            met.supply_c,
-            met.plant_setpoint_c,
-            met.outlet_mean_c,
+            inputs.supply_c,
+            inputs.plant_setpoint_c,
+            inputs.outlet_mean_c,
             air_j_per_m3_k=self._air_j_per_m3_k,
             return_approach_k=self._return_approach_k,
         )
         return _CracAir(
             crac_flow_m3s=flow,
             crac_fan_w=fan_w,
-            supply_c=met.supply_c,
-            supply_warming_k=met.supply_c - met.plant_setpoint_c,
+            supply_c=inputs.supply_c,
+            supply_warming_k=inputs.supply_c - inputs.plant_setpoint_c,
             return_c=return_c,
             cooling_load_w=load_w,
         )
 
-    def _requested_w(self, met: FacilityInputs, air: _CracAir) -> F64:
+    def _requested_w(self, inputs: FacilityInputs, air: _CracAir) -> F64:
         """Heat that the CRAC units ask the plant to take: load, and heat held by the room."""
         if self._transient:
-            return met.coil_w
-        wanted_w = air.cooling_load_w + met.room_heat_kwh * 1e3 / self._step_h
+            return inputs.coil_w
+        wanted_w = air.cooling_load_w + inputs.room_heat_kwh * 1e3 / self._step_h
         if self._event_free:
             return wanted_w
         # Heat of the air that passes units that are down stays in the room.
-        idle_rise_m3k_s = (
-            air.return_c - air.supply_warming_k
-        ) * met.idle_flow_m3s - met.idle_setpoint_m3k_s
+        unwarmed_return_c = air.return_c - air.supply_warming_k
+        idle_rise_m3k_s = unwarmed_return_c * inputs.idle_flow_m3s - inputs.idle_setpoint_m3k_s
         passing_w = self._air_j_per_m3_k * idle_rise_m3k_s
-        reached_w = np.clip(wanted_w - passing_w, 0.0, self._coil_capacity_w(met))
-        return np.where(met.no_unit_down > 0, wanted_w, reached_w)
+        reached_w = np.clip(wanted_w - passing_w, 0.0, self._coil_capacity_w(inputs))
+        return np.where(inputs.no_unit_down > 0, wanted_w, reached_w)
 
-    def _operate(self, requested_w: F64, met: FacilityInputs) -> WaterSideResult:
+    def _operate(self, requested_w: F64, inputs: FacilityInputs) -> WaterSideResult:
         """The plant, which stands still while there is no power."""
         design = self._sizing.water_side
         if not self._event_free:
-            on = np.where(met.powered > 0, met.powered, 1.0)
-            requested_w = np.where(met.powered > 0, requested_w / on, 0.0)
-            design = replace(design, chiller_w=design.chiller_w * met.chiller_share)
+            on = np.where(inputs.powered > 0, inputs.powered, 1.0)
+            requested_w = np.where(inputs.powered > 0, requested_w / on, 0.0)
+            design = replace(design, chiller_w=design.chiller_w * inputs.chiller_share)
         found = water_side.operate(
             requested_w,
-            setpoint_c=met.plant_setpoint_c,
-            outdoor_c=met.outdoor_c,
-            wet_bulb_c=met.wet_bulb_c,
+            setpoint_c=inputs.plant_setpoint_c,
+            outdoor_c=inputs.outdoor_c,
+            wet_bulb_c=inputs.wet_bulb_c,
             design=design,
             chiller=self._chiller,
             tower=self._tower,
             limited=self._stores_heat,
         )
-        return found if self._event_free else found.scaled(met.powered)
+        return found if self._event_free else found.scaled(inputs.powered)
 
     def _balance_heat(
-        self, met: FacilityInputs, air: _CracAir, plant: WaterSideResult
+        self, inputs: FacilityInputs, air: _CracAir, plant: WaterSideResult
     ) -> _HeatBalance:
         """Heat that was not removed stays in the room; spare capacity fetches it later."""
         load_w, removed_w = air.cooling_load_w, plant.heat_removed_w
         if self._transient:
             # The room has kept its heat within the step; here is what the plant fell short of.
-            short_kwh = (met.coil_w - removed_w) * self._step_h / 1e3
-            room_heat_kwh = met.room_j / 3.6e6 + short_kwh
+            short_kwh = (inputs.coil_w - removed_w) * self._step_h / 1e3
+            room_heat_kwh = inputs.room_j / 3.6e6 + short_kwh
             unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, removed_w)
         else:
             unmet_w, recovered_w, room_heat_kwh = cooling.balance_room_heat(
-                load_w, removed_w, met.room_heat_kwh, self._step_h
+                load_w, removed_w, inputs.room_heat_kwh, self._step_h
             )
         if not self._stores_heat:
             unmet_w = recovered_w = 0.0 * load_w
         return _HeatBalance(unmet_w, recovered_w, room_heat_kwh)
 
-    def _use_water(self, met: FacilityInputs, air: _CracAir, plant: WaterSideResult) -> WaterUse:
+    def _use_water(self, inputs: FacilityInputs, air: _CracAir, plant: WaterSideResult) -> WaterUse:
         """Water that the tower evaporates, loses and gets."""
         return self._water_model(
             rejected_w=plant.rejected_w,
             range_k=plant.tower_range_k,
             water_kg_s=plant.tower_water_kg_s,
-            wet_bulb_c=met.wet_bulb_c,
+            wet_bulb_c=inputs.wet_bulb_c,
             return_c=air.return_c,
-            supply_setpoint_c=met.plant_setpoint_c,
+            supply_setpoint_c=inputs.plant_setpoint_c,
             dt_s=self._step_h * 3600.0,
             **self._water,
         )
@@ -375,14 +377,14 @@ class Facility:
         first, *rest = (power_w[f"{device}_w"] for device in self._hvac_devices)
         return cast(F64, sum(rest, first))
 
-    def _energy(self, met: FacilityInputs, it_w: F64, hvac_w: F64) -> dict[str, F64]:
+    def _energy(self, inputs: FacilityInputs, it_w: F64, hvac_w: F64) -> dict[str, F64]:
         """Battery, grid and emissions; without grid the battery gives what it can."""
-        command = met.battery_command
+        command = inputs.battery_command
         if not self._event_free:
-            command = np.where(met.grid_up > 0, command, -1.0)
-        battery = self._run_battery(met.stored_kwh, command, load_kw=(it_w + hvac_w) / 1e3)
+            command = np.where(inputs.grid_up > 0, command, -1.0)
+        battery = self._run_battery(inputs.stored_kwh, command, load_kw=(it_w + hvac_w) / 1e3)
         needed_kwh = battery.grid_kwh
-        grid_kwh = needed_kwh if self._event_free else needed_kwh * met.grid_up
+        grid_kwh = needed_kwh if self._event_free else needed_kwh * inputs.grid_up
         battery_kwh = self._sizing.battery_kwh
         return {
             **fields_of(battery),
@@ -391,19 +393,21 @@ class Facility:
             "hvac_kwh": hvac_w * self._step_h / 1e3,
             "grid_kwh": grid_kwh,
             "unserved_kwh": needed_kwh - grid_kwh,
-            "carbon_g": emitted_g(grid_kwh, met.ci_g_per_kwh),
+            "carbon_g": emitted_g(grid_kwh, inputs.ci_g_per_kwh),
         }
 
-    def _air_indices(self, met: FacilityInputs, air: _CracAir) -> dict[str, F64]:
+    def _air_indices(self, inputs: FacilityInputs, air: _CracAir) -> dict[str, F64]:
         """Indices of how well the air of the hall is managed."""
         servers, (low_c, high_c) = self._servers, self._allowable_c
-        it_rise_k = air_metrics.it_rise_k(met.inlet_m3k_s, met.outlet_m3k_s, met.it_airflow_m3s)
+        it_rise_k = air_metrics.it_rise_k(
+            inputs.inlet_m3k_s, inputs.outlet_m3k_s, inputs.it_airflow_m3s
+        )
         return {
-            "over_27_mean_k": met.over_27_sum_k / servers,
-            "shi": air_metrics.shi(met.inlet_m3k_s, met.outlet_m3k_s),
+            "over_27_mean_k": inputs.over_27_sum_k / servers,
+            "shi": air_metrics.shi(inputs.inlet_m3k_s, inputs.outlet_m3k_s),
             "rti_pct": air_metrics.rti(air.return_c, air.supply_c, it_rise_k),
-            "rci_hi_pct": air_metrics.rci_hi(met.over_27_sum_k, servers, allowable_c=high_c),
-            "rci_lo_pct": air_metrics.rci_lo(met.under_18_sum_k, servers, allowable_c=low_c),
+            "rci_hi_pct": air_metrics.rci_hi(inputs.over_27_sum_k, servers, allowable_c=high_c),
+            "rci_lo_pct": air_metrics.rci_lo(inputs.under_18_sum_k, servers, allowable_c=low_c),
         }
 
     def _run_battery(self, stored_kwh: F64, command: F64, *, load_kw: F64) -> BatteryResult:
@@ -417,11 +421,11 @@ class Facility:
             **self._battery,
         )
 
-    def _coil_capacity_w(self, met: FacilityInputs) -> F64:
+    def _coil_capacity_w(self, inputs: FacilityInputs) -> F64:
         """Heat that the coils in use can take, mean over the step."""
         cooling_w = self._sizing.water_side.cooling_w
-        return cooling_w if self._event_free else cooling_w * met.coil_share * met.powered
+        return cooling_w if self._event_free else cooling_w * inputs.coil_share * inputs.powered
 
-    def _while_powered(self, power_w: F64, met: FacilityInputs) -> F64:
+    def _while_powered(self, power_w: F64, inputs: FacilityInputs) -> F64:
         """Mean over the step of a power that is drawn while there is power."""
-        return power_w if self._event_free else power_w * met.powered
+        return power_w if self._event_free else power_w * inputs.powered

@@ -40,7 +40,7 @@ class FacilityStage:
     def removable_w(self, supply: Supply, surroundings: Surroundings) -> F64:
         """Heat that the plant can take during a step, W, (B,)."""
         known = {**vars(surroundings), **vars(supply)}
-        inputs = {name: known[name] for name in self._facility.plant_inputs}
+        inputs = {name: known[name] for name in self._facility.plant_input_names}
         return self._removable(**inputs)["heat_removed_w"]
 
     def step(
@@ -69,7 +69,7 @@ class FacilityStage:
             "stored_kwh": state.stored_kwh,
             "room_heat_kwh": state.room_heat_kwh,
         }
-        found = self._step(**{name: known[name] for name in self._facility.inputs})
+        found = self._step(**{name: known[name] for name in self._facility.input_names})
         warming_k = self._units.of_each(found.pop("supply_warming_k"))
         found["unit_supply_c"] = supply.unit_setpoint_c + warming_k
         found["unit_flow_m3s"] = air.unit_flow_m3s if self._recirculates else found["crac_flow_m3s"]
