@@ -22,7 +22,7 @@ from sdc_taichi.exogenous import (
     synthetic_trace,
     wet_bulb_c,
 )
-from sdc_taichi.exogenous.synthetic import _normals, synthetic_sites, synthetic_traces
+from sdc_taichi.exogenous.synthetic import seeded_normals, synthetic_sites, synthetic_traces
 
 SEEDS = range(10)
 # Measured years in local standard time: OneBuilding TMYx, EIA-930 2022, Alibaba 2018, Google 2011.
@@ -196,7 +196,11 @@ def test_random_bits_are_those_of_pcg64() -> None:
 
 
 def test_normals_are_normal_and_independent_between_sites_and_streams() -> None:
-    a, b, c = _normals(0, 0, "NY", 50_000), _normals(0, 0, "VA", 50_000), _normals(0, 1, "NY", 9)
+    a, b, c = (
+        seeded_normals(0, 0, "NY", 50_000),
+        seeded_normals(0, 0, "VA", 50_000),
+        seeded_normals(0, 1, "NY", 9),
+    )
     assert abs(a.mean()) < 0.02
     assert abs(a.std() - 1.0) < 0.02
     assert abs(float(np.mean(a**4)) - 3.0) < 0.2

@@ -10,7 +10,7 @@ import pytest
 
 from sdc_taichi import Simulator, drivers_from_arrays, load_config
 from sdc_taichi.kernels.compiler import runtime
-from sdc_taichi.kernels.compiler.stage import COPIED_UP_TO, SERIAL_UP_TO, CompiledStage, _kernel
+from sdc_taichi.kernels.compiler.stage import COPIED_UP_TO, SERIAL_UP_TO, CompiledStage
 from sdc_taichi.plant import workload
 from sdc_taichi.sim.facility import Facility, FacilityInputs
 from sdc_taichi.types import F64
@@ -104,14 +104,6 @@ def test_other_arguments_than_those_of_the_first_call_are_an_error() -> None:
     stage(x=np.zeros(2), y=np.ones(2))
     with pytest.raises(TypeError, match=r"arguments \['y', 'x'\]"):
         stage(y=np.zeros(2), x=np.ones(2))
-
-
-def test_equal_stages_are_compiled_once() -> None:
-    compiled(lambda x: 5.0 * x, x=np.ones(3))
-    before = _kernel.cache_info().currsize
-    for size in (3, 4, 9):
-        compiled(lambda x: 5.0 * x, x=np.ones(size))
-    assert _kernel.cache_info().currsize == before
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ Without ``fast_math`` a sum has the same bits in every kernel. Without ``real_ma
 vector is loaded, stored and computed as one vector of the processor."""
 
 _compiling = threading.RLock()
-"""Held while a kernel is compiled, as the options belong to the runtime of the whole process."""
+"""Held while options are set: they belong to the runtime, which the whole process shares."""
 
 
 class BoundKernel:

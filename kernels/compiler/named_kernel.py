@@ -58,7 +58,7 @@ def define_kernel(
                 parts.setdefault(argument.of, []).append((tuple(argument.rows), values[name]))
         items = {of: NamedRows(*rows) for of, rows in parts.items()}
         items |= {
-            of: NamedRows((tuple(rows), values[name]), apart=1)
+            of: NamedRows((tuple(rows), values[name]), stride=1)
             for of, (rows, name) in views.items()
         }
         return shared(real=real, zeros=zeros, **constants, **values, **items)

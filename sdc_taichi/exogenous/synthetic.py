@@ -91,7 +91,7 @@ def synthetic_site(name: str, seed: int = DEFAULT_SEED) -> SiteData:
     figures = coefficients()["weather"][name]
 
     def normals(stream: int) -> FloatArray:
-        return _normals(seed, stream, name, HOURS_PER_YEAR)
+        return seeded_normals(seed, stream, name, HOURS_PER_YEAR)
 
     outdoor, humidity, pressure = (np.round(x, 4) for x in _weather(figures, normals))
     mix = _fuel_mix(coefficients()["grid"][name], normals)
@@ -138,7 +138,9 @@ def synthetic_trace(name: str, seed: int = DEFAULT_SEED) -> Series:
         raise DataError(f"trace {name!r}: expected one of {', '.join(synthetic_traces())}")
     _check_seed(seed)
     figures = coefficients()["workload"][name]
-    values = _workload(figures, lambda i: _normals(seed, i, name, TRACE_HOURS))[:HOURS_PER_YEAR]
+    values = _workload(figures, lambda i: seeded_normals(seed, i, name, TRACE_HOURS))[
+        :HOURS_PER_YEAR
+    ]
     source = f"synthetic year, seed {seed}, fitted to {figures['fitted_to']}"
     return Series(np.round(values, 6), 60.0, "utilisation", "1", source, synthetic=True)
 
@@ -247,7 +249,7 @@ def solar_envelope(latitude_deg: float, lateness_h: float, saturation: float) ->
 # Random numbers and residuals
 
 
-def _normals(seed: int, stream: int, name: str, n: int) -> FloatArray:
+def seeded_normals(seed: int, stream: int, name: str, n: int) -> FloatArray:
     """Standard normals of one stream of one site, from raw bits (Box and Muller 1958)."""
     key = zlib.crc32(name.encode())
     bits = np.random.PCG64(np.random.SeedSequence([int(seed), stream, key]))
