@@ -10,7 +10,7 @@ Of the residual the file keeps its standard deviation and its memory, and of the
 percentiles. See docs/data.md for what to add for a site of your own.
 
 The memory of a residual (keys w, ts, tf, tm and Phi) is read from the present coefficients.json
-where that has the quantity: those figures came from a search by hand that cannot be repeated.
+where that has the quantity: those figures came from a numerical search that was not kept.
 For what it lacks, or for all quantities with --refit, ``fit_memory`` finds w, ts and tf.
 
 --site fits that site alone and keeps the figures of all others, whose files are not needed then.

@@ -250,7 +250,7 @@ def solar_envelope(latitude_deg: float, lateness_h: float, saturation: float) ->
 
 
 def seeded_normals(seed: int, stream: int, name: str, n: int) -> FloatArray:
-    """Standard normals of one stream of one site, from raw bits (Box and Muller 1958)."""
+    """Standard normals, (n,), of a stream of a site, from raw bits (Box and Muller 1958)."""
     key = zlib.crc32(name.encode())
     bits = np.random.PCG64(np.random.SeedSequence([int(seed), stream, key]))
     half = (n + 1) // 2
@@ -359,24 +359,36 @@ def _quantity(p: Figures, slow: FloatArray, fast: FloatArray) -> FloatArray:
 def _weather(
     figures: Figures, normals: Callable[[int], FloatArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Dry bulb (C), relative humidity (%) and station pressure (Pa)."""
-    g = [normals(i) for i in range(5)]
-    outdoor = _quantity(figures["T"], g[0], g[1])
+    """Dry bulb (C), relative humidity (%) and station pressure (Pa), each (8760,)."""
+    noise = [normals(i) for i in range(5)]
+    outdoor = _quantity(figures["T"], noise[0], noise[1])
     rho_slow, rho_fast = figures["D"]["rho"]
     dew_point = _quantity(
         figures["D"],
-        rho_slow * g[0] + math.sqrt(1.0 - rho_slow**2) * g[2],
-        rho_fast * g[1] + math.sqrt(1.0 - rho_fast**2) * g[3],
+        rho_slow * noise[0] + math.sqrt(1.0 - rho_slow**2) * noise[2],
+        rho_fast * noise[1] + math.sqrt(1.0 - rho_fast**2) * noise[3],
     )
-    dew_point = np.minimum(dew_point, outdoor)  # drawn apart, so they can cross: saturated air
+    dew_point = np.minimum(
+        dew_point, outdoor
+    )  # drawn apart, so they may cross; the air is saturated then
     mean, spread, memory_h = figures["P"]
-    pressure = mean + spread * _ar1(g[4], math.exp(-1.0 / memory_h))
+    pressure = mean + spread * _ar1(noise[4], math.exp(-1.0 / memory_h))
     humidity = np.clip(relative_humidity_from_dew_point_pct(outdoor, dew_point), 1.0, 100.0)
     return outdoor, humidity, pressure
 
 
 def _correlated(names: list[str], pairs: dict[str, float], noise: FloatArray) -> FloatArray:
-    """Mix independent rows to the given pairwise correlations, made positive definite."""
+    """Rows of noise mixed from independent ones, so that pairs of them correlate as given.
+
+    Args:
+        names: of the rows.
+        pairs: correlations by ``A-B``; those left out are 0. A matrix that is not positive definite
+            is changed to one that is.
+        noise: independent standard normals, (rows, hours).
+
+    Returns:
+        (rows, hours).
+    """
     matrix = np.eye(len(names))
     for pair, value in pairs.items():
         i, j = (names.index(name) for name in pair.split("-"))
@@ -388,9 +400,10 @@ def _correlated(names: list[str], pairs: dict[str, float], noise: FloatArray) ->
 
 
 def _fuel_mix(figures: Figures, normals: Callable[[int], FloatArray]) -> dict[str, FloatArray]:
-    """Generation per fuel, MWh in the hour.
+    """Generation of each fuel, MWh in the hour, (8760,).
 
-    NET is marginal fuel plus wind: a windy hour pushes gas (hydro in WA) down one for one.
+    NET, the marginal fuel plus wind, is drawn like a fuel; the marginal fuel is what wind leaves of
+    it. So a windy hour takes from gas (from hydro in WA) as much as wind gives.
     """
     names: list[str] = figures["order"]
     slow, fast = (
@@ -418,7 +431,7 @@ def _fuel_mix(figures: Figures, normals: Callable[[int], FloatArray]) -> dict[st
 
 
 def _workload(figures: Figures, normals: Callable[[int], FloatArray]) -> FloatArray:
-    """Utilisation over TRACE_HOURS hours: annual, daily and weekly harmonics plus residual."""
+    """Utilisation, 0..1, (TRACE_HOURS,): annual, daily and weekly harmonics plus a residual."""
     basis = trace_basis(TRACE_HOURS, figures["annual"], figures["D"], figures["W"])
     slow, fast = normals(_STREAM_TRACE), normals(_STREAM_TRACE + 1)
     values = basis.columns @ np.array(figures["c"]) + _residual(figures, slow, fast, basis)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +18,36 @@ if TYPE_CHECKING:
     import pandas as pd
 
 HEADER_LINES = 8
+"""Lines before the first row of data."""
 DATA_COLUMNS = 35
-# Limits and missing codes of the EPW format (EnergyPlus Auxiliary Programs, EPW data dictionary).
+"""Columns of a row of data."""
 OUTDOOR_LIMITS_C = (-70.0, 70.0)
+"""Limits of dry bulb and dew point in EPW files, in C."""
 PRESSURE_LIMITS_PA = (31_000.0, 120_000.0)
-_DRY_BULB = ("dry bulb (column 7)", 6, OUTDOOR_LIMITS_C, 99.9)
-_DEW_POINT = ("dew point (column 8)", 7, (-70.0, 70.0), 99.9)
-_HUMIDITY = ("relative humidity (column 9)", 8, (0.0, 110.0), 999.0)
-_PRESSURE = ("station pressure (column 10)", 9, PRESSURE_LIMITS_PA, 999_999.0)
-# Dew point above dry bulb by more than the rounding of both would put the wet bulb above it too.
+"""Limits of station pressure in EPW files, in Pa."""
+
+
+class _Column(NamedTuple):
+    """A column of EPW files (EnergyPlus Auxiliary Programs, EPW data dictionary)."""
+
+    name: str
+    """Name for messages."""
+    position: int
+    """Place in a row, from 0."""
+    limits: tuple[float, float]
+    """Least and greatest valid value."""
+    missing: float
+    """Number that stands for a missing value."""
+
+
+_DRY_BULB = _Column("dry bulb (column 7)", 6, OUTDOOR_LIMITS_C, 99.9)
+_DEW_POINT = _Column("dew point (column 8)", 7, OUTDOOR_LIMITS_C, 99.9)
+_HUMIDITY = _Column("relative humidity (column 9)", 8, (0.0, 110.0), 999.0)
+_PRESSURE = _Column("station pressure (column 10)", 9, PRESSURE_LIMITS_PA, 999_999.0)
+_USED = (_DRY_BULB, _HUMIDITY, _PRESSURE)
+"""Columns that give the weather; the dew point is only checked."""
 _DEW_POINT_SLACK_K = 0.2
+"""By this much a dew point may exceed the dry bulb, as both are rounded."""
 _DAYS_PER_MONTH = np.array(DAYS_PER_MONTH)
 _FIRST_DAY_OF_MONTH = np.array(FIRST_DAY_OF_MONTH)
 
@@ -59,7 +79,7 @@ def read_epw(path: str | Path) -> Weather:
             )
         return _read_imported(path, metadata)
     lines = path.read_bytes().decode("latin-1").splitlines()
-    label, latitude, longitude, offset, elevation = _location(path, lines)
+    location = _location(path, lines)
     per_hour = _records_per_hour(path, lines)
     frame = _rows(path, lines)
     hours, frame, leap_rows = _hours(path, frame)
@@ -74,9 +94,12 @@ def read_epw(path: str | Path) -> Weather:
         notes.append(f"{absent} absent rows interpolated")
     rows = frame.index.to_numpy()
     rows = rows[np.minimum(np.searchsorted(positions, np.arange(len(values))), rows.size - 1)]
-    names = (_DRY_BULB[0], _HUMIDITY[0], _PRESSURE[0])
     values = np.stack(
-        [files.fill_gaps(path, values[:, i], minutes, n, rows) for i, n in enumerate(names)], axis=1
+        [
+            files.fill_gaps(path, values[:, i], minutes, column.name, rows)
+            for i, column in enumerate(_USED)
+        ],
+        axis=1,
     )
     values, year_notes = files.whole_years(path, values, float(hours[0]) * 60.0, minutes)
     notes += year_notes
@@ -87,11 +110,7 @@ def read_epw(path: str | Path) -> Weather:
         return Series(x, minutes, name, unit, path.name, synthetic=False, notes=tuple(notes))
 
     return Weather(
-        label=label,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        elevation_m=elevation,
-        utc_offset_h=offset,
+        **location,
         outdoor_c=series("outdoor_c", "C", outdoor),
         wet_bulb_c=series("wet_bulb_c", "C", wet_bulb),
         relative_humidity_pct=series("relative_humidity_pct", "%", humidity),
@@ -99,8 +118,8 @@ def read_epw(path: str | Path) -> Weather:
     )
 
 
-def _location(path: Path, lines: list[str]) -> tuple[str, float, float, float, float]:
-    """Label, latitude, longitude, UTC offset (h) and elevation (m) of the first line."""
+def _location(path: Path, lines: list[str]) -> dict[str, Any]:
+    """Place of the station by the first line, as fields of ``Weather``."""
     fields = [x.strip() for x in lines[0].split(",")] if lines else [""]
     if fields[0].upper() != "LOCATION":
         raise DataError(
@@ -108,24 +127,22 @@ def _location(path: Path, lines: list[str]) -> tuple[str, float, float, float, f
         )
     if len(fields) < 10:
         raise DataError(f"{path}: row 1: {len(fields)} fields, expected 10 of LOCATION")
-    limits = {
-        "latitude": (6, -90.0, 90.0),
-        "longitude": (7, -180.0, 180.0),
-        "UTC offset": (8, -12.0, 14.0),
-        "elevation": (9, -1000.0, 9999.9),
-    }
-    numbers = []
-    for name, (at, low, high) in limits.items():
+    label = ", ".join(x for x in (fields[1], fields[2], fields[3]) if x and x != "-")
+    location: dict[str, Any] = {"label": label}
+    for field, name, at, low, high in (
+        ("latitude_deg", "latitude", 6, -90.0, 90.0),
+        ("longitude_deg", "longitude", 7, -180.0, 180.0),
+        ("utc_offset_h", "UTC offset", 8, -12.0, 14.0),
+        ("elevation_m", "elevation", 9, -1000.0, 9999.9),
+    ):
         try:
             value = float(fields[at])
         except ValueError:
             value = np.nan
         if not low <= value <= high:
             raise files.fault(path, 1, name, fields[at], f"a number from {low:g} to {high:g}")
-        numbers.append(value)
-    label = ", ".join(x for x in (fields[1], fields[2], fields[3]) if x and x != "-")
-    latitude, longitude, offset, elevation = numbers
-    return label, latitude, longitude, offset, elevation
+        location[field] = value
+    return location
 
 
 def _records_per_hour(path: Path, lines: list[str]) -> int:
@@ -167,7 +184,7 @@ def _rows(path: Path, lines: list[str]) -> pd.DataFrame:
 
 
 def _hours(path: Path, frame: pd.DataFrame) -> tuple[NDArray[np.int64], pd.DataFrame, int]:
-    """Hour of the 365-day year per row, the rows without 29 February, and how many that were."""
+    """Hour of the 365-day year of each row, (T,), rows without 29 February, and how many it had."""
     dates, rows = {}, frame.index.to_numpy()
     for name, at, high in (("month", 1, 12), ("day", 2, 31), ("hour", 3, 24)):
         column = f"{name} (column {at + 1})"
@@ -195,7 +212,7 @@ def _hours(path: Path, frame: pd.DataFrame) -> tuple[NDArray[np.int64], pd.DataF
 def _positions(
     path: Path, frame: pd.DataFrame, hours: NDArray[np.int64], per_hour: int
 ) -> NDArray[np.int64]:
-    """Place of each row on the regular grid, from 0; years follow each other."""
+    """Place of each row on a regular grid that begins with the first row, (T,)."""
     rows = frame.index.to_numpy()
     starts = np.flatnonzero(np.diff(hours, prepend=hours[0] - 1))
     counts = np.diff(starts, append=hours.size)
@@ -230,32 +247,32 @@ def _positions(
 
 
 def _columns(path: Path, frame: pd.DataFrame) -> tuple[FloatArray, list[str]]:
-    """Dry bulb, relative humidity and pressure, NaN where missing; shape (T, 3)."""
+    """Dry bulb, relative humidity and pressure, (T, 3), NaN where missing, and notes."""
     values, notes, rows = {}, [], frame.index.to_numpy()
-    for column, at, (low, high), code in (_DRY_BULB, _DEW_POINT, _HUMIDITY, _PRESSURE):
-        text = frame[at].str.strip()
-        coded = _is_code(text, code)
-        x = files.numbers(path, text.mask(coded, "nan"), column, rows, low, high)
+    for column in (_DRY_BULB, _DEW_POINT, _HUMIDITY, _PRESSURE):
+        text = frame[column.position].str.strip()
+        text = text.mask(_is_code(text, column.missing), "nan")
+        x = files.numbers(path, text, column.name, rows, *column.limits)
         values[column] = x
         missing = int(np.isnan(x).sum())
-        if missing and column != _DEW_POINT[0]:
-            notes.append(f"{missing} missing values of {column} interpolated")
-    outdoor, humidity = values[_DRY_BULB[0]], values[_HUMIDITY[0]]
-    above = values[_DEW_POINT[0]] > outdoor + _DEW_POINT_SLACK_K
+        if missing and column in _USED:
+            notes.append(f"{missing} missing values of {column.name} interpolated")
+    outdoor, humidity = values[_DRY_BULB], values[_HUMIDITY]
+    above = values[_DEW_POINT] > outdoor + _DEW_POINT_SLACK_K
     if above.any():
         at = int(np.argmax(above))
-        dew_point = float(values[_DEW_POINT[0]][at])
+        dew_point = float(values[_DEW_POINT][at])
         valid = f"at most the dry bulb of {outdoor[at]:g} C (the wet bulb would lie above it)"
-        raise files.fault(path, int(frame.index[at]), _DEW_POINT[0], dew_point, valid)
+        raise files.fault(path, int(frame.index[at]), _DEW_POINT.name, dew_point, valid)
     over = humidity > 100.0
     if over.any():
         notes.append(f"{int(over.sum())} values of relative humidity over 100 % set to 100 %")
-        values[_HUMIDITY[0]] = np.where(over, 100.0, humidity)
-    pressure = values[_PRESSURE[0]]
+        values[_HUMIDITY] = np.where(over, 100.0, humidity)
+    pressure = values[_PRESSURE]
     known = pressure[~np.isnan(pressure)]
     if known.size and known.std() < 100.0:
         notes.append(f"warning: station pressure is nearly constant ({known.mean():.0f} Pa)")
-    return np.stack([values[x[0]] for x in (_DRY_BULB, _HUMIDITY, _PRESSURE)], axis=1), notes
+    return np.stack([values[column] for column in _USED], axis=1), notes
 
 
 def _is_code(text: pd.Series[str], code: float) -> pd.Series[bool]:
