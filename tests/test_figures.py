@@ -549,7 +549,7 @@ def test_animation_shows_every_rack(run: Run, tmp_path: Path) -> None:
     picture: Any = Image.open(path)
     assert (picture.n_frames, picture.format) == (30, "WEBP")
     palette = animation._palette()
-    index = animation._pixel_index(4, 5)
+    index = animation._rack_of_pixel(4, 5)
     for frame in (0, 14, 29):
         picture.seek(frame)
         pixels = np.asarray(picture.convert("RGB"))
@@ -591,7 +591,7 @@ def test_animation_of_a_data_center_of_many(tmp_path: Path) -> None:
     pixels = np.asarray(Image.open(tmp_path / "x.WEBP").convert("RGB")).astype(int)
     outlets = results[0].rack_outlet_c[4:]
     order = np.argsort(outlets, kind="stable")
-    index = animation._pixel_index(2, 2)
+    index = animation._rack_of_pixel(2, 2)
     at = [np.argwhere(index == rack)[0] + (34, 12) for rack in order]
     brightness = [pixels[y, x].sum() for y, x in at]
     assert brightness == sorted(brightness)
@@ -599,7 +599,7 @@ def test_animation_of_a_data_center_of_many(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("rows", "per_row"), [(4, 5), (250, 400), (1, 1), (2, 900), (900, 2)])
 def test_every_rack_has_pixels_alike(rows: int, per_row: int) -> None:
-    counts = np.bincount(animation._pixel_index(rows, per_row).ravel(), minlength=rows * per_row)
+    counts = np.bincount(animation._rack_of_pixel(rows, per_row).ravel(), minlength=rows * per_row)
     assert counts.min() > 0
     assert np.ptp(counts[: rows * per_row]) == 0
 
@@ -631,7 +631,7 @@ def test_animation_without_steps_or_of_another_fleet(run: Run, tmp_path: Path) -
         with pytest.raises(SdcError, match="result of 4 racks, expected 20"):
             animation.write_animation(tmp_path / "x.webp", [sim.step()], run[0])
     with pytest.raises(SdcError, match="too large for WebP"):
-        animation._pixel_index(20_000, 1)
+        animation._rack_of_pixel(20_000, 1)
 
 
 def test_long_names_are_cut() -> None:

@@ -1,4 +1,4 @@
-"""The report of a recorded run: it says what the files hold, and needs nothing beside itself."""
+"""The report of a run: it says what the files hold, and needs nothing beside itself."""
 
 from __future__ import annotations
 

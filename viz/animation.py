@@ -68,10 +68,10 @@ def write_animation(
     low, high = colour_range(values) if limits_c is None else limits_c
     levels = np.clip((values - low) * ((_LEVELS - 1) / (high - low)) + 0.5, 0, _LEVELS - 1)
     hall = fleet.configs[dc].hall
-    index = _pixel_index(hall.rows, hall.racks_per_row)
+    rack_of_pixel = _rack_of_pixel(hall.rows, hall.racks_per_row)
     palette = _palette()
     font = _font()
-    canvas, corner = _canvas(index, palette, (low, high), what, font)
+    canvas, corner = _canvas(rack_of_pixel, palette, (low, high), what, font)
     picture: Any = canvas.copy()
 
     def draw_frame(frame: int) -> None:
@@ -83,7 +83,7 @@ def write_animation(
         )
         colours = np.append(palette[levels[frame].astype(np.uint8)], [[255, 255, 255]], axis=0)
         picture.paste(canvas)
-        picture.paste(Image.fromarray(colours.astype(np.uint8)[index]), corner)
+        picture.paste(Image.fromarray(colours.astype(np.uint8)[rack_of_pixel]), corner)
         ImageDraw.Draw(picture).text((_MARGIN_PX, 8), text, fill="black", font=font)
 
     # Pillow asks a picture of several frames for one after the other, so one is in memory.
@@ -148,7 +148,7 @@ def _temperatures(
     return np.stack(rows).astype(np.float64), times
 
 
-def _pixel_index(rows: int, per_row: int) -> npt.NDArray[np.int64]:
+def _rack_of_pixel(rows: int, per_row: int) -> npt.NDArray[np.int64]:
     """Rack of every pixel, row 0 on top; pixels of gaps have the number of racks."""
     wide = max(1, MAP_WIDTH_PX // per_row)
     high = max(1, min(wide, MAP_WIDTH_PX // rows))
@@ -186,16 +186,16 @@ def _font() -> Any:
 
 
 def _canvas(
-    index: npt.NDArray[np.int64],
+    rack_of_pixel: npt.NDArray[np.int64],
     palette: F64,
     limits_c: tuple[float, float],
     what: str,
     font: Any,
 ) -> tuple[PillowImage.Image, tuple[int, int]]:
-    """The picture without racks and title, and where the racks go."""
+    """The picture without racks and title, and the corner where the racks go, in pixels."""
     from PIL import Image, ImageDraw
 
-    height, width = index.shape
+    height, width = rack_of_pixel.shape
     wide = max(width, MAP_WIDTH_PX)
     size = (wide + 2 * _MARGIN_PX, height + _TITLE_PX + _BAR_PX + _LABEL_PX + _MARGIN_PX)
     picture = Image.new("RGB", size, "white")

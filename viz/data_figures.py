@@ -48,8 +48,11 @@ class Quantity:
 
 
 TEMPERATURE = Quantity("outdoor temperature (°C)", RED)
+"""Outdoor temperature, of series in C."""
 CARBON = Quantity("carbon intensity (g CO₂e/kWh)", "black")
+"""Carbon intensity, of series in g CO2e/kWh."""
 WORKLOAD = Quantity("workload (% of capacity)", BLUE, 100.0)
+"""Work, of series in shares of the capacity."""
 
 
 def comparison(series: Mapping[str, pd.Series], quantity: Quantity, title: str = "") -> Figure:

@@ -269,6 +269,7 @@ class RecordingOutput:
                     os.truncate(self._file, self._whole_bytes)
 
     def _warn(self, reason: str) -> None:
+        """Warn that the recording has ended early."""
         warnings.warn(
             f"recording {self.place}: {reason}; the run goes on without it",
             RecordingWarning,

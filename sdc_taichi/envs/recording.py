@@ -264,6 +264,7 @@ class _EpisodeRecordings:
         self._close_recorder = self._recorder = self._place = None
 
     def _warn_without_recording(self, error: SdcError) -> None:
+        """Warn that the present episode is not recorded any further."""
         message = f"{error}; episode {self._episode} goes on without a recording"
         warnings.warn(message, RecordingWarning, stacklevel=3)
 
