@@ -39,7 +39,7 @@ from sdc_taichi.exogenous.synthetic import (
     solar_envelope,
     trace_basis,
 )
-from sdc_taichi.year_clock import DAYS_PER_YEAR, HOURS_PER_YEAR
+from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, HOURS_PER_YEAR
 
 F64 = npt.NDArray[np.float64]
 Figures = dict[str, Any]

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from sdc_taichi import SdcError
 from sdc_taichi.exogenous.registry import load_site, load_trace
 from sdc_taichi.exogenous.series import Series
+from sdc_taichi.exogenous.year_clock import FIRST_YEAR, MINUTES_PER_YEAR
 from sdc_taichi.viz.data_figures import DAILY_FROM_DAYS, Quantity, check_series, daily, days_of
 from sdc_taichi.viz.plotting import (
     add_title,
@@ -24,7 +25,6 @@ from sdc_taichi.viz.plotting import (
     style_axes,
     style_axes_with_legend,
 )
-from sdc_taichi.year_clock import FIRST_YEAR, MINUTES_PER_YEAR
 
 
 def site_series(names: Sequence[str], field: str, seed: int = 10) -> dict[str, pd.Series]:

@@ -11,7 +11,7 @@ import exogenous_builders as build
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import read_carbon, read_epw, read_workload, statistics, wet_bulb_c
 from sdc_taichi.exogenous.series_file import read_metadata, write_parquet
-from sdc_taichi.year_clock import MONTH_OF_DAY
+from sdc_taichi.exogenous.year_clock import MONTH_OF_DAY
 
 
 def write(path: Path, lines: list[str] | tuple[str, ...], newline: str = "\n") -> Path:

@@ -7,7 +7,7 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 
-from sdc_taichi.year_clock import (
+from sdc_taichi.exogenous.year_clock import (
     DAYS_PER_MONTH,
     FIRST_DAY_OF_MONTH,
     MONTH_OF_DAY,

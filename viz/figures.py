@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sdc_taichi.errors import SdcError
+from sdc_taichi.exogenous.year_clock import day_of_year, step_times
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import Reals, StepResult
-from sdc_taichi.year_clock import day_of_year, step_times
 
 from .plotting import (
     MAX_LABELLED_RACKS,

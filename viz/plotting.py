@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
+from sdc_taichi.exogenous.year_clock import FIRST_YEAR
 from sdc_taichi.types import F64
-from sdc_taichi.year_clock import FIRST_YEAR
 
 if TYPE_CHECKING:
     import pandas as pd

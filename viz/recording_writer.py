@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.exogenous.year_clock import step_times
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.types import F64, I64, StepResult
-from sdc_taichi.year_clock import step_times
 
 from . import hall_rasters as rasters
 from .recording_blocks import Block, BlockBuilder

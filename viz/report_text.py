@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR, day_of_year, step_times
 from sdc_taichi.run.folder_reader import RunFolder
 from sdc_taichi.run.folder_writer import METRICS_FILE
-from sdc_taichi.year_clock import HOURS_PER_YEAR, day_of_year, step_times
 
 from .plotting import date_text, format_number
 

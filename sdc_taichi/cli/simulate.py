@@ -30,7 +30,7 @@ from sdc_taichi.cli.session import (
 from sdc_taichi.cli.summary import print_summary
 from sdc_taichi.config import DataCenterConfig, load_yaml
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.year_clock import day_of_year
+from sdc_taichi.exogenous.year_clock import day_of_year
 
 if TYPE_CHECKING:
     from sdc_taichi.types import StepResult

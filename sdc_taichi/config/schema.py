@@ -28,7 +28,7 @@ from sdc_taichi.config.fields import (
 from sdc_taichi.config.hall_schema import HallConfig, ServerConfig, ServerGroup
 from sdc_taichi.config.hvac_schema import HvacConfig
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.year_clock import day_of_year
+from sdc_taichi.exogenous.year_clock import day_of_year
 
 
 class BatteryConfig(Section):

@@ -28,11 +28,11 @@ from sdc_taichi.envs.released_observer import ReleasedObserver
 from sdc_taichi.envs.rewards import Rewards
 from sdc_taichi.envs.saved_state import check_state
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
+from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F32, F64, I64, Actions, State, StepResult
-from sdc_taichi.year_clock import day_of_year
 
 Observation = F32 | dict[str, F32]
 """Observations, (B, n), or with the heat map a dict of ``features`` (B, n) and ``heat_map`` (B,

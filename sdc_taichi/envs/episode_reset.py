@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, day_of_year
 from sdc_taichi.types import I64
-from sdc_taichi.year_clock import DAYS_PER_YEAR, day_of_year
 
 Seed = int | Sequence[int | None] | I64 | None
 """Seed of environment 0, to which environment i adds i; or one for each environment, of which None

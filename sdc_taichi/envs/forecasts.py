@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.errors import ConfigError, RuntimeStateError
+from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.types import F32, F64, I64
-from sdc_taichi.year_clock import HOURS_PER_YEAR
 
 CI_LEADS_H = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0)
 """Leads of the carbon-intensity forecast unless told otherwise, in h."""

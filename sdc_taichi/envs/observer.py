@@ -26,12 +26,12 @@ from sdc_taichi.envs.features import (
 from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, ForecastError, Forecasts
 from sdc_taichi.envs.time_rows import EntryOrder, TimeRows, time_rows
 from sdc_taichi.errors import RuntimeStateError
+from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP
 from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.types import F32, F64, I64
-from sdc_taichi.year_clock import HOURS_PER_YEAR
 
 if TYPE_CHECKING:
     from sdc_taichi.kernels.compiler.stage import CompiledStage

@@ -22,7 +22,7 @@ from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, Fore
 from sdc_taichi.envs.rewards import REWARD_SETS
 from sdc_taichi.envs.tariff import Tariff
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.year_clock import DAYS_PER_YEAR, MONTH_OF_DAY
+from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MONTH_OF_DAY
 
 
 def _plain_int(value: Any) -> Any:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous.series import FloatArray
-from sdc_taichi.year_clock import (
+from sdc_taichi.exogenous.year_clock import (
     MINUTES_PER_DAY,
     MINUTES_PER_YEAR,
     is_leap_day,

@@ -1,6 +1,6 @@
 """Time series of a site: a year or more of values on the simulator's clock.
 
-The clock is local standard time in years of 365 days (``sdc_taichi.year_clock``). Index 0 is the
+The clock is local standard time in years of 365 days (``exogenous.year_clock``). Index 0 is the
 interval that begins on 1 January at 00:00; a value stands for its whole interval.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sdc_taichi.errors import DataError
-from sdc_taichi.year_clock import MINUTES_PER_DAY
+from sdc_taichi.exogenous.year_clock import MINUTES_PER_DAY
 
 FloatArray = NDArray[np.float64]
 

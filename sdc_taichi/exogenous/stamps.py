@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from sdc_taichi.exogenous.series import FloatArray
-from sdc_taichi.year_clock import DAYS_PER_YEAR, MINUTES_PER_DAY
+from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MINUTES_PER_DAY
 
 Stamp = Literal["auto", "start", "end"]
 """What a stamp marks of its interval; ``auto`` reads it from the solar generation."""

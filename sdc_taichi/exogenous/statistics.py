@@ -6,7 +6,7 @@ import numpy as np
 
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous.series import FloatArray, Series, resample
-from sdc_taichi.year_clock import DAYS_PER_YEAR, HOURS_PER_YEAR, MONTH_OF_DAY
+from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, HOURS_PER_YEAR, MONTH_OF_DAY
 
 
 def statistics(series: Series) -> dict[str, float]:

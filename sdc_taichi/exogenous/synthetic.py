@@ -30,7 +30,7 @@ from sdc_taichi.exogenous.psychrometrics import (
     wet_bulb_c,
 )
 from sdc_taichi.exogenous.series import FloatArray, Series, SiteData
-from sdc_taichi.year_clock import DAYS_PER_YEAR, HOURS_PER_YEAR
+from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, HOURS_PER_YEAR
 
 TRACE_HOURS = 53 * 168
 """Hours of a generated workload trace: whole weeks, as in the fitted traces, cut to the year."""

@@ -12,7 +12,7 @@ from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.psychrometrics import wet_bulb_c
 from sdc_taichi.exogenous.series import FloatArray, Series, Weather
-from sdc_taichi.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH, HOURS_PER_YEAR
+from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH, HOURS_PER_YEAR
 
 if TYPE_CHECKING:
     import pandas as pd

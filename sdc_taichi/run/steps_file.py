@@ -11,9 +11,9 @@ from typing import Any, Self
 import numpy as np
 
 from sdc_taichi.atomic_file import AtomicFile, delete_leftovers, naming_errors
+from sdc_taichi.exogenous.year_clock import step_times
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
-from sdc_taichi.year_clock import step_times
 
 STEPS_FILE = "steps.parquet"
 """Name of the file in a run folder."""

@@ -18,8 +18,8 @@ from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous.registry import load_site, load_trace, site_from_files
 from sdc_taichi.exogenous.series import Series, SiteData, resample
 from sdc_taichi.exogenous.workload import read_workload
+from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.types import F64, I64, Exogenous
-from sdc_taichi.year_clock import day_of_year
 
 DESIGN_QUANTILE = 0.996
 """Share of the year that a design temperature covers, the 0.4 % of ASHRAE design conditions."""
