@@ -1,4 +1,4 @@
-"""Read a run folder: its metrics.json and steps.parquet (see docs/cli.md).
+"""Read a run folder: its metrics.json and steps.parquet (see docs/run-folder.md).
 
 Rows of steps.parquet follow each other step by step, and within a step in the order of the data
 centers, so a column is an array (steps, data centers). It is read a row group at a time: a year of

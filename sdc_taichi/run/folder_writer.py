@@ -2,7 +2,7 @@
 
 A run folder holds ``steps.parquet``, ``metrics.json`` and ``config.yaml`` (one data center) or
 ``configs.yaml`` (several, one YAML document each). Every file is written beside its place and
-renamed when it is whole. Equal runs give equal bytes. See docs/cli.md for the columns.
+renamed when it is whole. Equal runs give equal bytes. See docs/run-folder.md for the columns.
 """
 
 from __future__ import annotations
