@@ -74,14 +74,14 @@ def imported(module: str) -> set[str]:
             names = [a.name for a in node.names if a.name.split(".")[0] == "sdc_taichi"]
             found |= {module_of(name.partition(".")[2]) for name in names}
         elif isinstance(node, ast.ImportFrom):
+            named = (node.module or "").split(".")
             if node.level:
-                base = package[: len(package) - node.level + 1]
-            elif node.module and node.module.split(".")[0] == "sdc_taichi":
-                base = []
+                parts = [*package[: len(package) - node.level + 1], *filter(None, named)]
+            elif named[0] == "sdc_taichi":
+                parts = named[1:]
             else:
                 continue
-            below = (node.module or "").split(".") if node.level else node.module.split(".")[1:]
-            stem = ".".join([*base, *filter(None, below)])
+            stem = ".".join(parts)
             found |= {module_of(f"{stem}.{a.name}".strip(".")) for a in node.names}
     return found - {module}
 
