@@ -172,10 +172,19 @@ class Simulator:
         plant = stages.facility.step(state, commands, surroundings, supply, air)
         racks = stages.allocation.protect(state, work, placement, air.rack_inlet_max_c)
         self._state = _next_state(state, work, supply, plant, racks, thermal)
+        # Where stages have a quantity of the same name, the later one has the final value.
         return _step_result(
-            {"step": state.step, "step_h": self.step_h},
-            *(vars(stage) for stage in (commands, surroundings, work, supply, air, racks)),
-            plant,
+            {
+                "step": state.step,
+                "step_h": self.step_h,
+                **vars(commands),
+                **vars(surroundings),
+                **vars(work),
+                **vars(supply),
+                **vars(air),
+                **plant,
+                **vars(racks),
+            }
         )
 
     def active_events(self, step: int) -> list[ActiveEvent]:
@@ -362,13 +371,10 @@ def _next_state(
 _values_of_result = itemgetter(*(f.name for f in fields(StepResult)))
 
 
-def _step_result(*stages: Mapping[str, Any]) -> StepResult:
-    """Result of a step from the quantities of its stages, of the last one that has each.
+def _step_result(found: Mapping[str, Any]) -> StepResult:
+    """Result of a step from all quantities of its stages, by the names of ``StepResult``.
 
     Raises:
         KeyError: A field of ``StepResult`` that no stage has.
     """
-    found: dict[str, Any] = {}
-    for quantities in stages:
-        found |= quantities
     return StepResult(*_values_of_result(found))

@@ -89,6 +89,7 @@ class WorkAllocation:
             "trip_c": trip_c[fleet.rack_dc],
             "restart_c": fleet.values("protection.restart_c")[fleet.rack_dc],
         }
+        self._unlimited = Capacity(utilisation=1.0, bins=None)
         self._throttle_share = fleet.values("protection.throttle_share")[fleet.rack_dc]
         self._allowable_high_c = np.array([allowable_c(c)[1] for c in classes])
 
@@ -107,7 +108,7 @@ class WorkAllocation:
         """
         weights = commands.group_weights
         if weights is None and self._fully_on(state.rack_status, surroundings):
-            return Capacity(utilisation=1.0, bins=None)
+            return self._unlimited
         per_rack = protection.capacity(state.rack_status, self._throttle_share)
         per_rack = per_rack * surroundings.powered[self._fleet.rack_dc]
         bins = per_rack if self._per_rack else self._spread(per_rack)
@@ -169,12 +170,13 @@ class WorkAllocation:
             placement: Where it runs.
             rack_inlet_max_c: Hottest inlet of each rack, C, (R,).
         """
+        lost_share = np.maximum(work.utilisation - placement.placed_utilisation, 0.0)
         before, status = state.rack_status, state.rack_status.copy()
         if self._protected:
             inlet_max_c = rack_inlet_max_c.astype(np.float64)
             status = protection.protect(before, inlet_max_c, **self._limits)
-        unplaced = np.maximum(work.utilisation - placement.placed_utilisation, 0.0)
-        lost_tasks = TASKS_PER_STEP * (unplaced + self._tripped_work(before, status, placement))
+            lost_share = lost_share + self._tripped_work(before, status, placement)
+        lost_tasks = TASKS_PER_STEP * lost_share
         return RackOutcome(
             rack_status=status,
             throttled_racks=self._racks_in(status, THROTTLED),
@@ -201,10 +203,7 @@ class WorkAllocation:
 
     def _tripped_work(self, before: Status, after: Status, placement: Placement) -> F64:
         """Work of the racks that trip in a step, as a share of all servers, (B,)."""
-        fleet = self._fleet
-        if not self._protected:
-            return np.zeros(fleet.size)
-        tripped = (after == TRIPPED) & (before != TRIPPED)
+        fleet, tripped = self._fleet, (after == TRIPPED) & (before != TRIPPED)
         if not tripped.any():
             return np.zeros(fleet.size)
         if placement.group_load is not None:
