@@ -172,7 +172,6 @@ class Simulator:
         plant = stages.facility.step(state, commands, surroundings, supply, air)
         racks = stages.allocation.protect(state, work, placement, air.rack_inlet_max_c)
         self._state = _next_state(state, work, supply, plant, racks, thermal)
-        # Where stages have a quantity of the same name, the later one has the final value.
         return _step_result(
             {
                 "step": state.step,
@@ -373,6 +372,8 @@ _values_of_result = itemgetter(*(f.name for f in fields(StepResult)))
 
 def _step_result(found: Mapping[str, Any]) -> StepResult:
     """Result of a step from all quantities of its stages, by the names of ``StepResult``.
+
+    Where stages have a quantity of the same name, the later one has the final value.
 
     Raises:
         KeyError: A field of ``StepResult`` that no stage has.
