@@ -2,7 +2,7 @@
 
 Taichi has them for single numbers, as calls that take four to ten times as long per lane. Both are
 series without branches, the same for all lanes, so that results never depend on a lane's
-neighbours. They err by at most three units in the last digit.
+neighbours. Both err by at most three units in the last digit.
 """
 
 from functools import cache
@@ -16,8 +16,9 @@ from .compiler.functions import larger, smaller
 _FORMATS = {"f32": (23, 127), "f64": (52, 1023)}
 """Bits of the fraction, and bias of the exponent (IEEE 754)."""
 _LOG_TERMS = {"f32": 5, "f64": 11}
+"""Terms of the logarithm; the first left out is less than a quarter of the sum's last digit."""
 _EXP_TERMS = {"f32": 8, "f64": 14}
-"""The first that is left out is less than a quarter of the last digit of the sum."""
+"""Terms of the exponential; the first left out is less than a quarter of the sum's last digit."""
 _LOG_2 = log(2.0)
 _LOG_2_HIGH, _LOG_2_LOW = 355.0 / 512.0, -2.121944400546905827679e-4
 """Log 2 as a sum of two (Cody and Waite 1980); the first has few bits, so that its products with
@@ -26,7 +27,7 @@ whole numbers are exact."""
 
 @cache
 def log_and_exp(precision: str, lanes: int) -> tuple[Any, Any]:
-    """Functions for kernels, of vectors of so many lanes.
+    """Taichi functions of a vector, (lanes,): its natural logarithm, and its exponential.
 
     Both stay within normal numbers: the logarithm of 0 is that of the smallest, and x times a power
     of x is 0 where x is.
@@ -48,7 +49,7 @@ def log_and_exp(precision: str, lanes: int) -> tuple[Any, Any]:
     @ti.func
     @no_type_check
     def log_of(x):
-        """Of 2^e m with m in [3/4, 3/2); log m = 2 atanh((m - 1) / (m + 1))."""
+        """Logarithm of 2^e m with m in [3/4, 3/2); log m = 2 atanh((m - 1) / (m + 1))."""
         normal = larger(x, ti.Vector([real(2.0 ** (1 - bias))] * lanes))
         bits = ti.Vector([ti.cast(0, whole)] * lanes)
         for i in range(lanes):
@@ -68,7 +69,7 @@ def log_and_exp(precision: str, lanes: int) -> tuple[Any, Any]:
     @ti.func
     @no_type_check
     def exp_of(x):
-        """Of k log 2 + r with r at most half of log 2."""
+        """Exponential of k log 2 + r with r at most half of log 2."""
         low = ti.Vector([real((1.5 - bias) * _LOG_2)] * lanes)
         high = ti.Vector([real(bias * _LOG_2)] * lanes)
         within = smaller(larger(x, low), high)

@@ -1,4 +1,4 @@
-"""The queue of delay-tolerant work at the end of a step, see ``plant.workload``."""
+"""The queue of delay-tolerant work at the end of a step, see ``sim/queue.py``."""
 
 from functools import cache
 from typing import Any, no_type_check
@@ -20,18 +20,23 @@ SERIAL_UP_TO = 512
 def queue_kernel() -> Any:
     """Kernel that takes work out of the queue, puts new work in, and reads the ages.
 
-    Row k of the queues is the work still queued that was put in by the end of step k, oldest first.
-    Work of no more than ``negligible`` is left by rounding, and has no age. A task goes through a
-    few rows of many data centers at a time, side by side as they lie in memory. Of the oldest rows
-    those that are known to hold nothing are not read.
+    Row k of a queue is the work still queued that was put in by the end of step k, oldest first, in
+    L rows. A task goes through TASK_ROWS rows of TASK_BLOCKS vectors at a time, as they lie in
+    memory; the oldest rows that are known to be 0 are not read.
 
-    Arguments: whether one thread does it; 1, which the compiler cannot know and so makes no copies
-    of loops; negligible work; row of the queue that is due when the next step starts, L for none,
-    for each lane of each vector; how many of the first rows of each vector will be 0 after the
-    step, which is kept up to date for the next one. All others are ``backend.vector_rows`` of data
-    centers: the queues before, L; the work taken and deferred. For the results: the queues after,
-    L, and four: work that waits, what of it will be due, the age of the oldest work and the mean
-    age in steps.
+    Arguments, all arrays but the first four being ``compiler.arrays.vector_rows`` of data centers:
+
+    - serial: whether the calling thread does all.
+    - one: 1, see "Loops of step 1" in README.md.
+    - negligible: work up to this is round-off, and has no age.
+    - due_row: row of the queue that is due when the next step starts, L for none, (vectors, lanes).
+    - empty_rows: how many of the oldest rows of a vector will be 0 after the step; read and kept up
+      to date, (vectors,).
+    - before: queues before the step, (L, vectors).
+    - moved: work taken out, and work put in, (2, vectors).
+    - after: queues after the step, (L, vectors).
+    - found: work that waits, work that will be due, age of the oldest work and mean age in steps,
+      (4, vectors).
     """
     blocks = ti.types.ndarray(dtype=ti.types.vector(F64_LANES, ti.f64), ndim=2)
     ints = ti.types.ndarray(dtype=ti.i32, ndim=2)
@@ -41,10 +46,10 @@ def queue_kernel() -> Any:
     @no_type_check
     def queue_after(
         serial: ti.template(),
-        step: ti.i32,
+        one: ti.i32,
         negligible: ti.f64,
         due_row: ints,
-        empty: ints_1d,
+        empty_rows: ints_1d,
         before: blocks,
         moved: blocks,
         after: blocks,
@@ -65,7 +70,7 @@ def queue_kernel() -> Any:
                     found[0, block] = zeros
                     found[2, block] = zeros
                     found[3, block] = zeros
-                    block += step
+                    block += one
                 row = 0
                 while row < last:
                     row_end = ti.min(row + TASK_ROWS, last)
@@ -73,10 +78,10 @@ def queue_kernel() -> Any:
                     while block < end:
                         out, filled = moved[0, block], found[0, block]
                         aged, waited = found[2, block], found[3, block]
-                        k, zero_end = row, ti.min(empty[block], row_end)
+                        k, zero_end = row, ti.min(empty_rows[block], row_end)
                         while k < zero_end:
                             after[k, block] = zeros
-                            k += step
+                            k += one
                         while k < row_end:
                             left = before[k + 1, block] - out
                             filled += ti.select(left > zeros, ones, zeros)
@@ -87,11 +92,11 @@ def queue_kernel() -> Any:
                             waits = left > limit
                             aged += ti.select(waits, ones, zeros)
                             waited += ti.select(waits, left, zeros)
-                            k += step
+                            k += one
                         found[0, block] = filled
                         found[2, block] = aged
                         found[3, block] = waited
-                        block += step
+                        block += one
                     row = row_end
                 block = first
                 while block < end:
@@ -99,7 +104,7 @@ def queue_kernel() -> Any:
                     filled, most = found[0, block], ti.f64(0.0)
                     for i in range(F64_LANES):
                         most = ti.max(most, filled[i])
-                    empty[block] = ti.max(last - 1 - ti.cast(most, ti.i32), 0)
+                    empty_rows[block] = ti.max(last - 1 - ti.cast(most, ti.i32), 0)
                     total = after[last - 1, block] + moved[1, block]
                     after[last, block] = total
                     due = zeros
@@ -112,6 +117,6 @@ def queue_kernel() -> Any:
                     found[0, block] = total
                     found[1, block] = due
                     found[3, block] = ti.select(some, mean, zeros)
-                    block += step
+                    block += one
 
     return queue_after
