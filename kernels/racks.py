@@ -37,7 +37,7 @@ def compute_groups(
     racks: ti.template(),
     air: ti.template(),
     sums: ti.template(),
-    inlets: ti.template(),
+    extremes: ti.template(),
 ):
     """Add the groups of a block to the sums of their racks; return the heat servers store, in W."""
     block, thermal_storage_w = hall.blocks[block_at], hall.zeros
@@ -53,7 +53,7 @@ def compute_groups(
             if sweep.is_last:
                 store_server_temperatures(hall, block_at, z, count, hall.server_c[at])
         add_group(hall, sums, group, count, inlet_c, cpu_w, airflow, fan_power)
-        add_inlet(hall, inlets, inlet_c)
+        update_extremes(hall, extremes, inlet_c)
         z += hall.one
     if ti.static(hall.transient):
         thermal_storage_w *= warming.w_per_k
@@ -86,9 +86,9 @@ def compute_block(
         mixed_c = block.mixed_c
     air = intake_air(hall, n, block_at, mixed_c, FRESH_RATIO)
     racks = rack_model(hall, servers, block_at)
-    sums, inlets = zero_rack_sums(hall), no_inlets(hall)
+    sums, extremes = zero_rack_sums(hall), no_extremes(hall)
     thermal_storage_w = compute_groups(
-        hall, block_at, sweep, servers, warming, racks, air, sums, inlets
+        hall, block_at, sweep, servers, warming, racks, air, sums, extremes
     )
     fresh_m3s = apply_rack_factors(hall, sums, racks, air)
     flow_m3s, mean_c = sums.flow_m3s, sums.inlet_c
@@ -118,7 +118,7 @@ def compute_block(
     terms.inlet_m3k_s = terms.inlet_m3k_s + sums.inlet_m3k_s
     terms.outlet_m3k_s = terms.outlet_m3k_s + outlet_m3k_s
     terms.flow_m3s = terms.flow_m3s + flow_m3s
-    add_degrees_out_of_range(hall, block_at, terms_at, racks, air, inlets)
+    add_degrees_out_of_range(hall, block_at, terms_at, racks, air, extremes)
     if ti.static(hall.transient):
         terms.thermal_storage_w = terms.thermal_storage_w + (thermal_storage_w + parcel_w)
     else:
@@ -130,18 +130,18 @@ def compute_block(
         airflow_m3s=flow_m3s,
         inlet_c=mean_c,
         outlet_c=outlet_c,
-        inlet_max_c=update_hottest(hall, block_at, racks, inlets, hottest),
+        inlet_max_c=update_hottest(hall, block_at, racks, extremes, hottest),
     )
     store_racks(hall, block_at, sweep, results)
 
 
 @ti.func
 @no_type_check
-def no_inlets(hall: ti.template()):
-    """Range of the inlets of each rack of a block, before the first of its groups."""
+def no_extremes(hall: ti.template()):
+    """Coolest and hottest inlet of each rack of a block, before the first of its groups."""
     return ti.Struct(
-        min_c=hall.zeros + hall.real(1e30),
-        max_c=hall.zeros - hall.real(1e30),
+        inlet_min_c=hall.zeros + hall.real(1e30),
+        inlet_max_c=hall.zeros - hall.real(1e30),
         # The group with the hottest inlet, and how many groups have been seen.
         hottest_group=hall.zeros,
         groups=hall.zeros,
@@ -150,15 +150,17 @@ def no_inlets(hall: ti.template()):
 
 @ti.func
 @no_type_check
-def add_inlet(hall: ti.template(), inlets: ti.template(), inlet_c):
-    """Widen the range of the inlets of each rack by those of a group.
+def update_extremes(hall: ti.template(), extremes: ti.template(), inlet_c):
+    """Extremes of each rack with those of one more group.
 
     Groups without servers repeat another group of their rack, and so change nothing.
     """
-    inlets.min_c = smaller(inlet_c, inlets.min_c)
-    inlets.hottest_group = ti.select(inlet_c > inlets.max_c, inlets.groups, inlets.hottest_group)
-    inlets.max_c = larger(inlet_c, inlets.max_c)
-    inlets.groups += hall.real(1.0)
+    extremes.inlet_min_c = smaller(inlet_c, extremes.inlet_min_c)
+    extremes.hottest_group = ti.select(
+        inlet_c > extremes.inlet_max_c, extremes.groups, extremes.hottest_group
+    )
+    extremes.inlet_max_c = larger(inlet_c, extremes.inlet_max_c)
+    extremes.groups += hall.real(1.0)
 
 
 @ti.func
@@ -176,15 +178,15 @@ def update_hottest(
     hall: ti.template(),
     block_at,
     racks: ti.template(),
-    inlets: ti.template(),
+    extremes: ti.template(),
     hottest: ti.template(),
 ):
     """Hottest inlet of each rack of a block in C, also to the hottest of each lane of the chunk."""
     is_rack = racks.per_server > hall.real(0.0)
-    inlet_c = ti.select(is_rack, inlets.max_c, hall.zeros - hall.real(1e30))
+    inlet_c = ti.select(is_rack, extremes.inlet_max_c, hall.zeros - hall.real(1e30))
     is_hotter = inlet_c > hottest.inlet_c
     hottest.block = ti.select(is_hotter, block_at, hottest.block)
-    hottest.group = ti.select(is_hotter, inlets.hottest_group, hottest.group)
+    hottest.group = ti.select(is_hotter, extremes.hottest_group, hottest.group)
     hottest.inlet_c = larger(inlet_c, hottest.inlet_c)
     return inlet_c
 
@@ -197,11 +199,11 @@ def add_degrees_out_of_range(
     terms_at,
     racks: ti.template(),
     air: ti.template(),
-    inlets: ti.template(),
+    extremes: ti.template(),
 ):
     """Add what the inlets of a block lie beyond the recommended range by, which few ever leave."""
     low_c, high_c = hall.real(RECOMMENDED_C[0]), hall.real(RECOMMENDED_C[1])
-    beyond_k = larger(inlets.max_c - high_c, low_c - inlets.min_c)
+    beyond_k = larger(extremes.inlet_max_c - high_c, low_c - extremes.inlet_min_c)
     beyond_k *= racks.per_server
     # Written like this, the compiler asks all lanes at once.
     is_any = 0
