@@ -101,8 +101,8 @@ GROUP_INPUTS = {
     "load_deviation": "load over that of the rack as a share of u (1 - u), u the rack's load",
     "height_factor": "exhaust share over that of the rack, g of docs/hall.md",
 }
-"""Where a rack has fewer groups than its block, or in padding, all but ``count`` repeat another
-group, so that no lane computes with numbers out of reach."""
+"""Where a rack has fewer groups than its block, or in padding, all but ``count`` repeat its last
+group, as do loads and server temperatures: no lane computes with numbers out of reach."""
 DC_COEFFICIENTS = {
     "cpu_slope_per_k": "power without fans over full power: rise with the inlet, 1/K",
     "cpu_offset": "power ratio at 0 C and no load",
@@ -168,9 +168,10 @@ RACK_OUT = {
     "airflow_m3s": "airflow, m3/s",
     "inlet_c": "mean inlet, weighted by airflow with recirculation, C",
     "outlet_c": "outlet, C",
-    "inlet_max_c": "hottest inlet, C",
+    "inlet_max_c": "hottest inlet of a server, C",
+    "outlet_max_c": "hottest outlet of a server, C",
 }
-"""Of the last sweep; in transient halls means over the substeps, and the highest inlet of any."""
+"""Of the last sweep; in transient halls means over the substeps, and the highest of any."""
 GROUP_OUT = {
     "inlet_c": "inlet, C",
     "outlet_c": "outlet, C",
@@ -196,8 +197,8 @@ BLOCK_TERMS = {
 N_TERMS, N_BLOCK_TERMS = len(TERMS), len(BLOCK_TERMS)
 SCRATCH = N_TERMS + CHUNK_BLOCKS * N_BLOCK_TERMS
 """Vectors of work space for a chunk: its TERMS, then BLOCK_TERMS block by block."""
-RACK_SUMS = tuple(name for name in RACK_OUT if name != "inlet_max_c")
-"""Rows of RACK_OUT whose sums over the racks are wanted."""
+RACK_SUMS = tuple(name for name in RACK_OUT if not name.endswith("_max_c"))
+"""Rows of RACK_OUT whose sums over the racks are wanted; they come first."""
 SUMS = (
     {name: f"sum over the racks: {RACK_OUT[name]}" for name in RACK_SUMS}
     | {name: f"sum over the racks: {text}" for name, text in TERMS.items()}

@@ -94,6 +94,7 @@ def broadcast_rack(
     of_racks.full_m3s = ti.Vector([racks.full_m3s[lane]] * LANES)
     of_racks.full_fan_w = ti.Vector([racks.full_fan_w[lane]] * LANES)
     of_racks.first_group = ti.Vector([racks.first_group[lane] + i for i in range(LANES)])
+    of_racks.last_group = ti.Vector([racks.last_group[lane]] * LANES)
     of_air.least_c = ti.Vector([air.least_c[lane]] * LANES)
     of_air.per_height_k = ti.Vector([air.per_height_k[lane]] * LANES)
 

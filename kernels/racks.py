@@ -14,8 +14,10 @@ from .servers import (
     apply_rack_factors,
     compute_group,
     group_inlet,
+    group_outlet,
     intake_air,
     load_server_temperatures,
+    outlet_model,
     rack_model,
     rack_outlet,
     store_server_temperatures,
@@ -36,6 +38,7 @@ def compute_groups(
     warming: ti.template(),
     racks: ti.template(),
     air: ti.template(),
+    outlets: ti.template(),
     sums: ti.template(),
     extremes: ti.template(),
 ):
@@ -46,14 +49,17 @@ def compute_groups(
         group = hall.groups[first_row + z]
         count = group.count
         inlet_c, cpu_w, airflow, fan_power = compute_group(hall, servers, racks, air, group, z)
+        server_c = hall.zeros
         if ti.static(hall.transient):
             at = first_place + z
             change_k = warm_servers(hall, warming, racks, at, inlet_c, cpu_w, airflow)
             thermal_storage_w += count * change_k
+            server_c = hall.server_c[at]
             if sweep.is_last:
-                store_server_temperatures(hall, block_at, z, count, hall.server_c[at])
+                store_server_temperatures(hall, block_at, z, count, server_c)
         add_group(hall, sums, group, count, inlet_c, cpu_w, airflow, fan_power)
-        update_extremes(hall, extremes, inlet_c)
+        outlet_c = group_outlet(hall, outlets, inlet_c, cpu_w, airflow, fan_power, server_c)
+        update_extremes(hall, extremes, z, inlet_c, outlet_c)
         z += hall.one
     if ti.static(hall.transient):
         thermal_storage_w *= warming.w_per_k
@@ -86,9 +92,10 @@ def compute_block(
         mixed_c = block.mixed_c
     air = intake_air(hall, n, block_at, mixed_c, FRESH_RATIO)
     racks = rack_model(hall, servers, block_at)
+    outlets = outlet_model(hall, n, servers, racks)
     sums, extremes = zero_rack_sums(hall), no_extremes(hall)
     thermal_storage_w = compute_groups(
-        hall, block_at, sweep, servers, warming, racks, air, sums, extremes
+        hall, block_at, sweep, servers, warming, racks, air, outlets, sums, extremes
     )
     fresh_m3s = apply_rack_factors(hall, sums, racks, air)
     flow_m3s, mean_c = sums.flow_m3s, sums.inlet_c
@@ -102,6 +109,10 @@ def compute_block(
         if hall.outlet_model != OUTLET_OF_SERVERS:
             outlet_c = rack_outlet(hall, servers, sums, per_flow)
     outlet_c = ti.select(flow_m3s > hall.real(0.0), outlet_c, mean_c)
+    outlet_max_c = extremes.outlet_max_c
+    if ti.static(not hall.recirculates):
+        if hall.outlet_model != OUTLET_OF_SERVERS:
+            outlet_max_c = outlet_c
     if ti.static(hall.recirculates):
         mean_c = ti.select(flow_m3s > hall.real(0.0), sums.inlet_m3k_s * per_flow, mean_c)
         captured_m3s = flow_m3s - air.cover * fresh_m3s
@@ -131,6 +142,7 @@ def compute_block(
         inlet_c=mean_c,
         outlet_c=outlet_c,
         inlet_max_c=update_hottest(hall, block_at, racks, extremes, hottest),
+        outlet_max_c=outlet_max_c,
     )
     store_racks(hall, block_at, sweep, results)
 
@@ -138,29 +150,28 @@ def compute_block(
 @ti.func
 @no_type_check
 def no_extremes(hall: ti.template()):
-    """Coolest and hottest inlet of each rack of a block, before the first of its groups."""
+    """Coolest and hottest inlet and hottest outlet of each rack, before the first of its groups."""
     return ti.Struct(
         inlet_min_c=hall.zeros + hall.real(1e30),
         inlet_max_c=hall.zeros - hall.real(1e30),
-        # The group with the hottest inlet, and how many groups have been seen.
+        outlet_max_c=hall.zeros - hall.real(1e30),
+        # The group with the hottest inlet.
         hottest_group=hall.zeros,
-        groups=hall.zeros,
     )
 
 
 @ti.func
 @no_type_check
-def update_extremes(hall: ti.template(), extremes: ti.template(), inlet_c):
-    """Extremes of each rack with those of one more group.
+def update_extremes(hall: ti.template(), extremes: ti.template(), z, inlet_c, outlet_c):
+    """Extremes of each rack with those of its group z.
 
     Groups without servers repeat another group of their rack, and so change nothing.
     """
     extremes.inlet_min_c = smaller(inlet_c, extremes.inlet_min_c)
-    extremes.hottest_group = ti.select(
-        inlet_c > extremes.inlet_max_c, extremes.groups, extremes.hottest_group
-    )
+    is_hotter = inlet_c > extremes.inlet_max_c
+    extremes.hottest_group = ti.select(is_hotter, ti.cast(z, hall.real), extremes.hottest_group)
     extremes.inlet_max_c = larger(inlet_c, extremes.inlet_max_c)
-    extremes.groups += hall.real(1.0)
+    extremes.outlet_max_c = larger(outlet_c, extremes.outlet_max_c)
 
 
 @ti.func
@@ -227,7 +238,7 @@ def add_degrees_out_of_range(
 def store_racks(hall: ti.template(), block_at, sweep: ti.template(), results: ti.template()):
     """Results of the racks of a block: of the last sweep, or means over the substeps.
 
-    The hottest inlet is the highest of any substep.
+    The hottest inlet and outlet are the highest of any substep.
     """
     block = hall.blocks[block_at]
     if ti.static(hall.transient):
@@ -238,6 +249,7 @@ def store_racks(hall: ti.template(), block_at, sweep: ti.template(), results: ti
             results.inlet_c += block.inlet_c
             results.outlet_c += block.outlet_c
             results.inlet_max_c = larger(results.inlet_max_c, block.inlet_max_c)
+            results.outlet_max_c = larger(results.outlet_max_c, block.outlet_max_c)
         if sweep.is_last:
             weight = ti.cast(hall.weight, hall.real)
             results.cpu_w *= weight
@@ -251,3 +263,4 @@ def store_racks(hall: ti.template(), block_at, sweep: ti.template(), results: ti
     block.inlet_c = results.inlet_c
     block.outlet_c = results.outlet_c
     block.inlet_max_c = results.inlet_max_c
+    block.outlet_max_c = results.outlet_max_c

@@ -129,9 +129,12 @@ def rack_model(hall: ti.template(), servers: ti.template(), block_at):
     elif hall.load_level == LOADS_PER_GROUP:
         u = hall.zeros
     first_group = ti.Vector([0] * LANES)
+    last_group = first_group
     if hall.load_level == LOADS_PER_GROUP:
         for i in range(LANES):
-            first_group[i] = hall.places[block_at * LANES + i].first_group
+            place = block_at * LANES + i
+            first_group[i] = hall.places[place].first_group
+            last_group[i] = hall.places[place + 1].first_group - 1
     powered = block.powered
     available_airflow = block.fan_airflow * powered
     return ti.Struct(
@@ -141,8 +144,9 @@ def rack_model(hall: ti.template(), servers: ti.template(), block_at):
         cpu_base=u * servers.cpu_shift + servers.cpu_offset,
         fan_base=u * servers.fan_shift + servers.fan_offset,
         per_server=block.per_server,
-        # Place of the first group in group_load, where loads are given per group.
+        # Places of the first and last group in group_load, where loads are given per group.
         first_group=first_group,
+        last_group=last_group,
         # Factors of sums over the groups, see apply_rack_factors.
         powered=powered,
         available_airflow=available_airflow,
@@ -181,8 +185,9 @@ def compute_group(
     deviation = group.load_deviation * racks.deviation_scale
     if hall.load_level == LOADS_PER_GROUP:
         for i in range(LANES):
-            at = racks.first_group[i] + z
-            deviation[i] = hall.group_load[ti.min(at, hall.group_load.shape[0] - 1)]
+            # Where a rack has no group z, its last group once more.
+            at = ti.min(racks.first_group[i] + z, racks.last_group[i])
+            deviation[i] = hall.group_load[at]
     on_curve_c = smaller(inlet_c, servers.curve_limit_c)
     cpu_ratio = on_curve_c * servers.cpu_slope + (deviation * servers.cpu_shift + racks.cpu_base)
     cpu_w = larger(group.idle_w, group.full_w * cpu_ratio)
@@ -196,6 +201,50 @@ def compute_group(
         excess = servers.fan_exponent - hall.real(1.0)
         fan_power = airflow * hall.exp_of(hall.log_of(airflow) * excess)
     return inlet_c, cpu_w, airflow, fan_power
+
+
+@ti.func
+@no_type_check
+def outlet_model(hall: ti.template(), n, servers: ti.template(), racks: ti.template()):
+    """Factors of ``group_outlet`` that all servers of a rack have in common."""
+    per_k = hall.real(1.0) / larger(
+        racks.full_m3s * servers.air_j_per_m3_k, hall.zeros + hall.real(1e-30)
+    )
+    is_blown = racks.full_m3s > hall.real(0.0)
+    return ti.Struct(
+        # Rise at full airflow per W of power without fans, and at full fan power.
+        cpu_k_per_w=racks.powered * per_k,
+        fan_k=racks.full_fan_w * per_k,
+        # Share of server over inlet temperature that the air takes up.
+        uptake=ti.select(is_blown, hall.zeros + hall.dcs[n].effectiveness, hall.zeros),
+    )
+
+
+@ti.func
+@no_type_check
+def group_outlet(
+    hall: ti.template(),
+    outlets: ti.template(),
+    inlet_c,
+    cpu_w,
+    airflow,
+    fan_power,
+    server_c,
+):
+    """Outlet of a server of each rack of a block in C, from the values of ``compute_group``.
+
+    T + P/(rho*cp*V); in transient halls T + eps (T_s - T) + P_fan/(rho*cp*V), with the server's own
+    temperature T_s. One division, where ``layers.py`` divides by the airflow itself.
+    """
+    # Where the curve gives no airflow, the outlet is out of reach, but a number.
+    some_airflow = airflow + hall.real(1e-30)
+    outlet_c = inlet_c
+    if ti.static(hall.transient):
+        outlet_c += outlets.uptake * (server_c - inlet_c)
+        outlet_c += fan_power * outlets.fan_k / some_airflow
+    else:
+        outlet_c += (cpu_w * outlets.cpu_k_per_w + fan_power * outlets.fan_k) / some_airflow
+    return outlet_c
 
 
 @ti.func
@@ -315,14 +364,20 @@ def warm_servers(
 
 @ti.func
 @no_type_check
+def group_at(hall: ti.template(), place, z):
+    """Group z of the rack at a place; where it has fewer, its last group once more."""
+    return ti.min(hall.places[place].first_group + z, hall.places[place + 1].first_group - 1)
+
+
+@ti.func
+@no_type_check
 def load_server_temperatures(hall: ti.template(), block_at):
     """Temperatures of the servers of a block at the start of the step, to server_c."""
-    block, last = hall.blocks[block_at], hall.server_c_before.shape[0] - 1
+    block = hall.blocks[block_at]
     for z in range(block.groups):
         before_c = hall.zeros
         for i in range(LANES):
-            group = hall.places[block_at * LANES + i].first_group + z
-            before_c[i] = hall.server_c_before[ti.min(group, last)]
+            before_c[i] = hall.server_c_before[group_at(hall, block_at * LANES + i, z)]
         hall.server_c[block.first_place + z] = before_c
 
 

@@ -343,6 +343,9 @@ class StepResult:
     """Hottest inlet of a server of each rack, in C, (R,)."""
     rack_outlet_c: Reals
     """Outlet of each rack, in C, (R,)."""
+    rack_outlet_max_c: Reals
+    """Hottest outlet of a server of each rack, in C, (R,); in transient halls the highest of any
+    substep."""
 
     @property
     def rack_power_w(self) -> Reals:

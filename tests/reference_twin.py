@@ -580,6 +580,11 @@ def advance(
         carried = hall.per_rack(flow * inlet_c + (to_air + fan) / air)
         plain = hall.per_rack(inlet_c) / count
         outlet_c = np.where(still, plain, carried / np.where(still, 1.0, rack_flow))
+        warmed_k = s.heat_exchange_effectiveness * (warmer - inlet_c)
+        warmed_k += fan / (air * np.where(blown, flow, 1.0))
+        server_outlet_c = inlet_c + np.where(blown, warmed_k, 0.0)
+        hottest_c = np.full(len(rack_flow), -np.inf)
+        np.maximum.at(hottest_c, hall.rack, server_outlet_c)
         inflow = hall.per_rack(flow * inlet_c) / np.where(still, 1.0, rack_flow)
         rack_inlet = np.where(still, plain, inflow)
         captured = hall.per_rack(flow * moved.exhaust)
@@ -608,7 +613,7 @@ def advance(
                 "rack_cpu_w": hall.per_rack(cpu), "rack_fan_w": hall.per_rack(fan),
                 "rack_airflow_m3s": rack_flow, "rack_inlet_c": rack_inlet,
                 "rack_outlet_c": outlet_c,
-                "inlet_max_c": inlet_c.max(),
+                "inlet_max_c": inlet_c.max(), "rack_outlet_max_c": hottest_c,
             }
         )  # fmt: skip
         now = Memory(
@@ -616,8 +621,8 @@ def advance(
             np.full(len(ratio), flow.sum() / hall.it_airflow_m3s),
             now.room_j + (load_w - coil_w) * h,
         )  # fmt: skip
-    found: dict[str, Any] = {
-        name: sum(p[name] for p in parts) / substeps for name in parts[0] if name != "inlet_max_c"
-    }
-    found["inlet_max_c"] = max(float(p["inlet_max_c"]) for p in parts)
+    found: dict[str, Any] = {}
+    for name in parts[0]:
+        values = np.array([p[name] for p in parts])
+        found[name] = values.max(axis=0) if name.endswith("_max_c") else sum(values) / substeps
     return found, now

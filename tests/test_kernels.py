@@ -181,10 +181,11 @@ def test_server_layers_are_the_values_of_their_group(precision: Precision, seed:
         (sums.rack_inlet_c * np.bincount(rack_of), servers["inlet_c"]),
     ):
         assert_close(total, np.bincount(rack_of, layer, fleet.racks), rel, "sum per rack")
-    hottest = np.maximum.reduceat(
-        servers["inlet_c"], fleet.server_offsets[fleet.group_offsets[:-1]]
-    )
+    first_server = fleet.server_offsets[fleet.group_offsets[:-1]]
+    hottest = np.maximum.reduceat(servers["inlet_c"], first_server)
     assert np.array_equal(sums.rack_inlet_max_c, hottest)
+    hottest = np.maximum.reduceat(servers["outlet_c"], first_server)
+    assert_close(sums.rack_outlet_max_c, hottest, rel, "hottest outlet")
 
 
 @pytest.mark.parametrize("precision", ["f64", "f32"])
@@ -546,6 +547,46 @@ def test_layers_of_any_layout_agree_with_the_twin(
         assert_close(found, expected, TOLERANCE[precision], name)
         assert np.array_equal(found, np.repeat(found[first], counts)), name
     assert np.array_equal(hall.group_inlets(), layers.inlet_c[first])
+
+
+CRAC_AND_RACK_FAIL = (
+    "events.scheduled=[{kind: crac_down, unit: 0, start_h: 0, duration_h: 1},"
+    "{kind: rack_fan_failure, rack: 3, start_h: 0, duration_h: 1, share: 0.2},"
+    "{kind: grid_outage, start_h: 0.5, duration_h: 1}]"
+)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [],
+        ["hvac.crac.units=2", "protection.ashrae_class=A1", CRAC_AND_RACK_FAIL],
+        ["hall.servers_per_rack=12", "hall.height_zones=12", "workload.placement=fill"],
+    ],
+    ids=["default", "events", "own groups"],
+)
+def test_the_hottest_outlet_of_a_rack_is_that_of_its_hottest_server(overrides: list[str]) -> None:
+    with Simulator(load_config("corrected", overrides), precision="f64") as sim:
+        sim.reset(seed=1)
+        first_server = sim.fleet.server_offsets[sim.fleet.group_offsets[:-1]]
+        for _ in range(5):
+            result = sim.step()
+            hottest = np.maximum.reduceat(sim.servers().outlet_c, first_server)
+            assert_close(result.rack_outlet_max_c, hottest, 1e-12, "hottest outlet")
+
+
+def test_groups_that_a_rack_has_not_do_not_count_for_its_hottest_outlet() -> None:
+    """Loads per group of what lies behind a rack's groups are those of the next rack."""
+    fleet = build_fleet(load_config("tiny"))
+    hall = Hall(fleet, "f64")
+    groups = np.diff(fleet.group_offsets)
+    assert groups[0] < groups[1]
+    load = np.zeros(fleet.groups)
+    load[fleet.group_offsets[1]] = 1.0
+    sums = hall.solve(Conditions(np.array([20.0]), np.array([0.2]), group_load=load))
+    first_server = fleet.server_offsets[fleet.group_offsets[:-1]]
+    hottest = np.maximum.reduceat(hall.servers().outlet_c, first_server)
+    assert_close(sums.rack_outlet_max_c, hottest, 1e-12, "hottest outlet")
 
 
 def test_results_stay_when_the_hall_is_solved_again() -> None:

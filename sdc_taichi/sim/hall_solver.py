@@ -166,6 +166,8 @@ class HallSums:
     """Hottest inlet of each rack, in transient halls of any substep, in C, (R,)."""
     rack_outlet_c: Reals
     """Outlet of each rack, in C, (R,)."""
+    rack_outlet_max_c: Reals
+    """Hottest outlet of a server of each rack, in transient halls of any substep, in C, (R,)."""
 
 
 RESULT_NAMES = (*DC_OUT, *(f"rack_{name}" for name in RACK_OUT))
