@@ -1,4 +1,4 @@
-"""The thermal kernel again, in plain NumPy f64, straight from the configuration.
+"""The hall kernel again, in plain NumPy f64, straight from the configuration.
 
 Every server on its own, dense matrices over the racks, no groups, no offsets, no Taichi: an
 independent way to the same numbers.

@@ -1,4 +1,4 @@
-"""The thermal kernels against their NumPy twin, and what must hold to the bit."""
+"""The hall kernels against their NumPy twin, and what must hold to the bit."""
 
 from __future__ import annotations
 

@@ -191,11 +191,11 @@ class _HallArrays:
     groups_per_rack: I32
     """Server groups of each rack, (R,)."""
     groups: F64
-    """Rows GROUP_ROWS of the thermal kernel, (6, G)."""
+    """Rows GROUP_INPUTS of the hall kernels, (6, G)."""
     approach_k: F64
     """Mean inlet over supply of each rack at the design point, in K, (R,)."""
     dc: F64
-    """Rows DC_ROWS of the thermal kernel, (18,)."""
+    """Rows DC_COEFFICIENTS of the hall kernels, (18,)."""
     unit_design_m3s: F64
     """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
     it_airflow_m3s: float

@@ -214,10 +214,8 @@ class Hall:
             "load_columns": len(TABLE_LOADS),
             "tolerance_k": TOLERANCE_K[precision],
         }
-        for kernel, names in (
-            (self._step_kernel, STEP_ARGUMENTS),
-            (self._layers_kernel, LAYERS_ARGUMENTS),
-        ):
+        kernels = self._step_kernel, self._layers_kernel
+        for kernel, names in zip(kernels, (STEP_ARGUMENTS, LAYERS_ARGUMENTS), strict=True):
             kernel.bind(**{name: value for name, value in constant.items() if name in names})
 
         self._none = np.zeros(1, self._dtype)
@@ -310,11 +308,8 @@ class Hall:
         server_c = np.zeros(self._fleet.groups, self._dtype)
         # A substep that lasts for ever brings servers to their steady temperatures; what it makes
         # of the air is put back.
-        air = (
-            self._memory["mixed_c"],
-            self._unit_state["fresh_ratio"],
-            self._unit_state["supply_c"],
-        )
+        air = [self._memory["mixed_c"]]
+        air += [self._unit_state[name] for name in ("fresh_ratio", "supply_c")]
         steady = [row.copy() for row in air]
         self._memory["exhaust_c"][:] = self._exhaust()
         self._begin_step(exchanges_before=1)
