@@ -8,9 +8,10 @@ and a temporary per operation, and some hundred of them cost more than the arith
 are thousands of data centers.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from hashlib import sha256
+from operator import itemgetter
 from typing import Any, no_type_check
 
 import numpy as np
@@ -42,10 +43,15 @@ class CompiledStage:
             use arithmetic, comparisons and the NumPy functions of ``trace.py``, but no branch on
             values. It never changes its arguments, and infinities and NaN are no numbers here.
         size: n.
+        reads: names of the arguments that ``select`` finds; None where it is not called.
     """
 
-    def __init__(self, stage: Callable[..., Arrays], size: int) -> None:
+    def __init__(
+        self, stage: Callable[..., Arrays], size: int, *, reads: Sequence[str] | None = None
+    ) -> None:
         self._stage, self._size = stage, size
+        self._reads = tuple(reads or ())
+        self._values_read = itemgetter(*self._reads) if reads else None
         self._kernel: BoundKernel | None = None
 
     def __call__(self, **inputs: npt.NDArray[np.float64]) -> dict[str, npt.NDArray[np.float64]]:
@@ -55,14 +61,22 @@ class CompiledStage:
             TypeError: the stage does what cannot be compiled, or arguments are not those of the
                 first call.
         """
-        if self._size <= COPIED_UP_TO:
-            rows = self.rows(**inputs).copy()
-        else:
-            self._set_inputs(inputs)
-            out = vector_rows(len(self._result_names), self._size)
-            self._run(out)
-            rows = unpadded(out, self._size)
-        return dict(zip(self._result_names, rows, strict=True))
+        self._set_inputs(inputs)
+        return self._new_results()
+
+    def select(self, quantities: Arrays) -> dict[str, npt.NDArray[np.float64]]:
+        """Results by name, as of a call with those of ``quantities`` that the stage reads.
+
+        Raises:
+            TypeError: the stage does what cannot be compiled.
+            KeyError: a quantity that the stage reads is missing.
+        """
+        assert self._values_read is not None, "made without reads"
+        if self._kernel is None:
+            self._compile(self._reads)
+        for row, values in zip(self._input_rows, self._values_read(quantities), strict=True):
+            row[...] = values
+        return self._new_results()
 
     def rows(self, **inputs: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Results in their order, (number of results, n); the next call overwrites them.
@@ -85,6 +99,17 @@ class CompiledStage:
             )
         for row, values in zip(self._input_rows, inputs.values(), strict=True):
             row[...] = values
+
+    def _new_results(self) -> dict[str, npt.NDArray[np.float64]]:
+        """Run; results by name, rows of one new array."""
+        if self._size <= COPIED_UP_TO:
+            self._run(self._outputs)
+            rows = self._results.copy()
+        else:
+            out = vector_rows(len(self._result_names), self._size)
+            self._run(out)
+            rows = unpadded(out, self._size)
+        return dict(zip(self._result_names, rows, strict=True))
 
     def _run(self, out: Any) -> None:
         assert self._kernel is not None

@@ -29,19 +29,21 @@ class FacilityStage:
     ) -> None:
         from sdc_taichi.kernels.compiler.stage import CompiledStage
 
-        self._units, self._facility, self._event_free = units, facility, event_free
+        self._units, self._event_free = units, event_free
         self._recirculates = fleet.models["inlet"] == "recirculation"
         self._unit_design_m3s = fleet.unit_design_m3s
-        self._step = CompiledStage(lambda **x: facility.step(FacilityInputs(**x)), fleet.size)
+        self._step = CompiledStage(
+            lambda **x: facility.step(FacilityInputs(**x)), fleet.size, reads=facility.input_names
+        )
         self._removable = CompiledStage(
-            lambda **x: facility.removable_w(FacilityInputs(**x)), fleet.size
+            lambda **x: facility.removable_w(FacilityInputs(**x)),
+            fleet.size,
+            reads=facility.plant_input_names,
         )
 
     def removable_w(self, supply: Supply, surroundings: Surroundings) -> F64:
         """Heat that the plant can take during a step, W, (B,)."""
-        known = {**vars(surroundings), **vars(supply)}
-        inputs = {name: known[name] for name in self._facility.plant_input_names}
-        return self._removable(**inputs)["heat_removed_w"]
+        return self._removable.select(vars(surroundings) | vars(supply))["heat_removed_w"]
 
     def step(
         self,
@@ -69,7 +71,7 @@ class FacilityStage:
             "stored_kwh": state.stored_kwh,
             "room_heat_kwh": state.room_heat_kwh,
         }
-        found = self._step(**{name: known[name] for name in self._facility.input_names})
+        found = self._step.select(known)
         warming_k = self._units.of_each(found.pop("supply_warming_k"))
         found["unit_supply_c"] = supply.unit_setpoint_c + warming_k
         found["unit_flow_m3s"] = air.unit_flow_m3s if self._recirculates else found["crac_flow_m3s"]
