@@ -10,6 +10,8 @@ from typing import Any, no_type_check
 import numpy as np
 import pytest
 import taichi as ti
+from taichi._lib import core
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext, Builder
 from taichi.lang.exception import TaichiCompilationError
 
 from sdc_taichi import ConfigError
@@ -96,10 +98,14 @@ def test_an_error_says_where_it_is_and_leaves_taichi_as_it_was() -> None:
         for i in range(1):
             x[i] = _faulty(x[i])
 
-    options = {name: getattr(ti.cfg, name) for name in OPTIONS}
+    def replaced() -> list[Any]:
+        return [Builder.__call__, ASTTransformerContext.get_pos_info, core.DebugInfo]
+
+    options, before = {name: getattr(ti.cfg, name) for name in OPTIONS}, replaced()
     with pytest.raises(TaichiCompilationError, match=r"test_launch\.py.*in _faulty:\s+return x \+"):
         BoundKernel(wrong, 0)(np.zeros(1))
     assert {name: getattr(ti.cfg, name) for name in OPTIONS} == options
+    assert replaced() == before
     # Taichi's own message marks the columns.
     with pytest.raises(TaichiCompilationError, match=r"in _faulty:\s+return x \+.*\n\s+\^+"):
         wrong(np.zeros(1))

@@ -13,6 +13,7 @@ import numpy as np
 import taichi as ti
 
 from .arrays import address_of
+from .positions import no_positions
 from .runtime import uses_plain_taichi
 
 OPTIONS = {"fast_math": False, "real_matrix_scalarize": False}
@@ -133,7 +134,12 @@ def _translate(primal: Any, args: tuple[Any, ...]) -> Any:
     before = runtime.default_ip
     try:
         runtime.default_ip = ti.i32
-        return primal.ensure_compiled(*args)
+        try:
+            with no_positions():
+                return primal.ensure_compiled(*args)
+        except Exception:
+            # Once more for the message, which says where in the source the error is.
+            return primal.ensure_compiled(*args)
     finally:
         runtime.default_ip = before
 
