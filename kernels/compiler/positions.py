@@ -1,4 +1,4 @@
-"""Translation of kernels without positions in their source, which Taichi keeps for messages alone."""
+"""Translation of kernels without positions in the source, which Taichi keeps for messages alone."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
