@@ -1,8 +1,34 @@
-"""Air in a hall on a grid of cells: sparse systems of seven points per cell, solved per tag.
+"""Air in a hall on a grid of cells: coefficients of the flow, and BiCGSTAB for its linear systems.
 
 Cells that hold air are numbered 0..N-1; index N stands for no cell: its unknown stays zero. Faces
-of a cell are numbered -x, -y, -z, +x, +y, +z, and lower faces lead to lower numbers. A system is
-``diagonal * x - sum over faces of off * x of the cell beyond = rhs`` with off >= 0.
+of a cell are numbered -x, -y, -z, +x, +y, +z, and lower faces lead to lower numbers. The matrix A
+of a system has ``diagonal`` on its diagonal, and -``off_diagonal``, at most 0, in the column of the
+cell beyond each face. With ``through_racks`` air passes the racks: what leaves a back face is the
+mean of the unknown over the front of its rack, times the airflow of the face.
+
+One system A x = b, by the preconditioned, stabilised method of bi-conjugate gradients (van der
+Vorst 1992, SIAM J. Sci. Stat. Comput. 13(2)). The functions named on the right do each line:
+
+    x <- 0                                                          solve_right_side
+    repeat, at most MOST_STARTS times:
+        r <- b - A x;  r^ <- r;  p <- r;  rho <- (r^, r)            start_iterations
+        if |r| <= tolerance |b|: done
+        repeat until |r| <= tolerance |b|, or a divisor is 0:       iterate
+            y <- K^-1 p;  v <- A y                                  precondition, multiply
+            alpha <- rho / (r^, v)
+            x <- x + alpha y;  r <- r - alpha v                     advance
+            z <- K^-1 r;  t <- A z                                  precondition, multiply
+            omega <- (t, r) / (t, t)
+            x <- x + omega z;  r <- r - omega t                     advance
+            beta <- (r^, r) / rho * alpha / omega;  rho <- (r^, r)
+            p <- r + beta (p - omega v)                             update_search_direction
+
+K = (D + L) D^-1 (D + U) is the diagonal incomplete LU factorisation (Pommerell 1992, dissertation,
+ETH Zurich), L and U being the parts of A below and above its diagonal, racks left out. As r is
+updated and not computed anew in an iteration, it drifts from b - A x: hence the repeated starts,
+which go on from the x that was found. All starts together do at most ``most_iterations``.
+
+Each right side is solved by one thread, so that the number of threads changes no bit.
 """
 
 from functools import cache
@@ -10,12 +36,60 @@ from typing import Any, no_type_check
 
 import taichi as ti
 
-from .compiler.functions import SLICE, part_of
+from .arguments import Argument
+from .compiler.functions import part_of
+from .compiler.named_kernel import define_kernel
 
-VECTORS = 9
-"""Work vectors of one thread: solution, residual, shadow residual, direction, and products."""
+WORK_VECTORS = 9
+"""Vectors of N + 1 numbers that a thread works with."""
 
-_X, _R, _SHADOW, _P, _V, _T, _Y, _Z, _PIVOT = range(VECTORS)
+(
+    _SOLUTION,  # x
+    _RESIDUAL,  # r
+    _SHADOW_RESIDUAL,  # r^
+    _SEARCH_DIRECTION,  # p
+    _A_DIRECTION,  # v = A y
+    _A_CORRECTION,  # t = A z
+    _DIRECTION,  # y = K^-1 p
+    _CORRECTION,  # z = K^-1 r
+    _INVERSE_PIVOT,  # 1 / D
+) = range(WORK_VECTORS)
+
+MOST_STARTS = 20
+"""Most starts for a right side, the first included."""
+
+SYSTEM_ARGUMENTS = {
+    "serial": Argument("template"),  # on the calling thread alone
+    "through_racks": Argument("template"),  # whether air passes the racks
+    "slices": Argument("i32"),  # parts of the right sides, a thread for each
+    "most_iterations": Argument("i32"),  # for one right side
+    "tolerance": Argument("f64"),  # residual over right side that counts as solved
+    # The matrix.
+    "beyond": Argument("i32", 2),  # cell beyond each face, N if none, (N + 1, 6)
+    "off_diagonal": Argument("f64", 2),  # coefficient of the cell beyond, at least 0, (N + 1, 6)
+    "diagonal": Argument("f64", 1),  # coefficient of the cell itself, (N,)
+    "front_offsets": Argument("i32", 1),  # first front face of each rack, and the end, (R + 1,)
+    "front_cell": Argument("i32", 1),  # cell before each front face
+    "front_share": Argument("f64", 1),  # share of each front face in the airflow of its rack
+    "back_offsets": Argument("i32", 1),  # first back face of each rack, and the end, (R + 1,)
+    "back_cell": Argument("i32", 1),  # cell before each back face
+    "back_m3s": Argument("f64", 1),  # airflow out of each back face, m3/s
+    # The right sides.
+    "source_offsets": Argument("i32", 1),  # first source of each right side, and the end, (T + 1,)
+    "source_cell": Argument("i32", 1),  # cell of each source
+    "source": Argument("f64", 1),  # what each source adds to the right side in its cell
+    # Work space.
+    "work": Argument("f64", 3),  # (slices, WORK_VECTORS, N + 1)
+    # Results, and the returns at which the solutions are read.
+    "return_cell": Argument("i32", 1),  # cells before returns
+    "return_m3s": Argument("f64", 1),  # flow out of each of them, m3/s
+    "first_solution": Argument("f64", 1),  # solution of the first right side, (N + 1,)
+    "intake": Argument("f64", 2),  # mean solution over the front of each rack, (R, T)
+    "returned": Argument("f64", 1),  # flow times solution, summed over the returns, (T,)
+    "relative_residual": Argument("f64", 1),  # |r| / |b|, 0 where b is 0, (T,)
+    "iterations": Argument("i32", 1),  # iterations done, (T,)
+}
+"""Arguments of the kernel of ``bicgstab_kernel`` by name, those that are templates first."""
 
 
 @cache
@@ -26,7 +100,20 @@ def transport_kernel() -> Any:
     q*(c_P + c_N)/2 + G*(c_P - c_N) with G = max(mixing*speed*conductance, |q|/2): central
     differences where the mixing keeps them bounded, upwind elsewhere (hybrid scheme of Spalding
     1972, International Journal for Numerical Methods in Engineering 4(4)). ``speed`` is the mean
-    of both cells. ``boundary`` is the flow that leaves the hall through a face, (N, 6).
+    of both cells.
+
+    Arguments of the kernel:
+
+    - beyond: cell beyond each face, N if none, (N + 1, 6).
+    - conductance_m: free area of each face over the distance of the centres, m, (N + 1, 6).
+    - boundary_m3s: flow that leaves the hall through each face, m3/s, (N + 1, 6).
+    - area_m2: area of the faces across each axis, m2, (N + 1, 3).
+    - mixing_m: eddy diffusivity over air speed, m.
+    - potential_m2s: potential of the flow, m2/s, (N + 1,).
+    - speed_ms: speed of the air, m/s, written but for the last entry, 0, (N + 1,).
+    - imbalance_m3s: flow out of each cell, m3/s, 0 but for round-off, written, (N,).
+    - off_diagonal: coefficients of the cells beyond the faces, m3/s, written, (N + 1, 6).
+    - diagonal: coefficients of the cells themselves, m3/s, written, (N,).
     """
     reals_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
     reals_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -34,250 +121,265 @@ def transport_kernel() -> Any:
 
     @ti.kernel
     @no_type_check
-    def transport(
+    def set_transport(
         beyond: ints_2d,
-        conductance: reals_2d,
-        boundary: reals_2d,
-        area: reals_2d,
-        mixing: ti.f64,
-        potential: reals_1d,
-        speed: reals_1d,
-        imbalance: reals_1d,
-        off: reals_2d,
+        conductance_m: reals_2d,
+        boundary_m3s: reals_2d,
+        area_m2: reals_2d,
+        mixing_m: ti.f64,
+        potential_m2s: reals_1d,
+        speed_ms: reals_1d,
+        imbalance_m3s: reals_1d,
+        off_diagonal: reals_2d,
         diagonal: reals_1d,
     ):
         for c in range(diagonal.shape[0]):
-            net = ti.cast(0.0, ti.f64)
-            square = ti.cast(0.0, ti.f64)
+            leaving_m3s = ti.cast(0.0, ti.f64)
+            speed_squared = ti.cast(0.0, ti.f64)
             for axis in range(3):
-                low = boundary[c, axis] + conductance[c, axis] * (
-                    potential[c] - potential[beyond[c, axis]]
+                low_m3s = boundary_m3s[c, axis] + conductance_m[c, axis] * (
+                    potential_m2s[c] - potential_m2s[beyond[c, axis]]
                 )
-                high = boundary[c, axis + 3] + conductance[c, axis + 3] * (
-                    potential[c] - potential[beyond[c, axis + 3]]
+                high_m3s = boundary_m3s[c, axis + 3] + conductance_m[c, axis + 3] * (
+                    potential_m2s[c] - potential_m2s[beyond[c, axis + 3]]
                 )
-                net += low + high
-                u = (high - low) / (2.0 * area[c, axis])
-                square += u * u
-            imbalance[c] = net
-            speed[c] = ti.sqrt(square)
+                leaving_m3s += low_m3s + high_m3s
+                velocity_ms = (high_m3s - low_m3s) / (2.0 * area_m2[c, axis])
+                speed_squared += velocity_ms * velocity_ms
+            imbalance_m3s[c] = leaving_m3s
+            speed_ms[c] = ti.sqrt(speed_squared)
         for c in range(diagonal.shape[0]):
             total = ti.cast(0.0, ti.f64)
-            for f in range(6):
-                n = beyond[c, f]
-                q = conductance[c, f] * (potential[c] - potential[n])
-                g = ti.max(
-                    0.5 * mixing * (speed[c] + speed[n]) * conductance[c, f], 0.5 * ti.abs(q)
+            for face in range(6):
+                n = beyond[c, face]
+                q = conductance_m[c, face] * (potential_m2s[c] - potential_m2s[n])
+                G = ti.max(
+                    0.5 * mixing_m * (speed_ms[c] + speed_ms[n]) * conductance_m[c, face],
+                    0.5 * ti.abs(q),
                 )
-                off[c, f] = g - 0.5 * q
-                total += g + 0.5 * q + ti.max(boundary[c, f], 0.0)
+                off_diagonal[c, face] = G - 0.5 * q
+                total += G + 0.5 * q + ti.max(boundary_m3s[c, face], 0.0)
             diagonal[c] = total
 
-    return transport
+    return set_transport
 
 
 @cache
-def solve_kernel() -> Any:
-    """Kernel that solves one system per tag, each on one thread, so that threads change no bit.
+def bicgstab_kernel() -> Any:
+    """Kernel that solves the linear system for every right side, see the head of this module.
 
-    Stabilised bi-conjugate gradients (van der Vorst 1992, SIAM J. Sci. Stat. Comput. 13(2)) with a
-    diagonal incomplete LU as preconditioner (Pommerell 1992, dissertation, ETH Zurich). The
-    residual is computed afresh at every start, and a system that is not at the tolerance is
-    started again from where it is.
-
-    ``source`` pairs cells with amounts, in runs per tag. With ``coupled`` air passes the racks: the
-    mean over the front faces of a rack enters the cells at its back.
-    Out: solution (tags, N + 1) where ``keep``, else (1, N + 1) untouched; means over the fronts of
-    each rack (racks, tags); sum over the returns (tags,); residual over right-hand side, and
-    iterations, (tags,).
+    SYSTEM_ARGUMENTS are its arguments.
     """
-    reals_3d = ti.types.ndarray(dtype=ti.f64, ndim=3)
-    reals_2d = ti.types.ndarray(dtype=ti.f64, ndim=2)
-    reals_1d = ti.types.ndarray(dtype=ti.f64, ndim=1)
-    ints_2d = ti.types.ndarray(dtype=ti.i32, ndim=2)
-    ints_1d = ti.types.ndarray(dtype=ti.i32, ndim=1)
+    return define_kernel(
+        "solve_systems",
+        SYSTEM_ARGUMENTS,
+        run_slice,
+        precision="f64",
+        lanes=1,
+        constants={},
+        views={},
+    )
 
-    @ti.func
-    @no_type_check
-    def dot(work: reals_3d, s, a, b, n):
+
+@ti.func
+@no_type_check
+def run_slice(system: ti.template(), s):
+    """Solve the right sides of slice ``s`` in ``work[s]``."""
+    no_cell = system.diagonal.shape[0]
+    for vector in range(system.work.shape[1]):
+        system.work[s, vector, no_cell] = 0.0
+    factorise(system, s)
+    first, end = part_of(s, system.slices, system.relative_residual.shape[0])
+    for rhs in range(first, end):
+        solve_right_side(system, s, rhs)
+        store_results(system, s, rhs)
+
+
+@ti.func
+@no_type_check
+def factorise(system: ti.template(), s):
+    """Compute 1 / D: D_c = A_cc - sum of A_cb A_bc / D_b over the lower cells b beside c."""
+    cells = system.diagonal.shape[0]
+    for c in range(cells):
+        pivot = system.diagonal[c]
+        for face in range(3):
+            b = system.beyond[c, face]
+            if b < cells:
+                pivot -= (
+                    system.off_diagonal[c, face]
+                    * system.off_diagonal[b, face + 3]
+                    * system.work[s, _INVERSE_PIVOT, b]
+                )
+        system.work[s, _INVERSE_PIVOT, c] = 1.0 / pivot
+
+
+@ti.func
+@no_type_check
+def precondition(system: ti.template(), s, vector, out):
+    """Set ``out`` to K^-1 times a work vector: D + L forwards, then I + D^-1 U backwards."""
+    cells = system.diagonal.shape[0]
+    for c in range(cells):
+        total = system.work[s, vector, c]
+        for face in ti.static(range(3)):
+            total += system.off_diagonal[c, face] * system.work[s, out, system.beyond[c, face]]
+        system.work[s, out, c] = total * system.work[s, _INVERSE_PIVOT, c]
+    for i in range(cells):
+        c = cells - 1 - i
         total = ti.cast(0.0, ti.f64)
-        for c in range(n):
-            total += work[s, a, c] * work[s, b, c]
-        return total
+        for face in ti.static(range(3, 6)):
+            total += system.off_diagonal[c, face] * system.work[s, out, system.beyond[c, face]]
+        system.work[s, out, c] += total * system.work[s, _INVERSE_PIVOT, c]
 
-    @ti.func
-    @no_type_check
-    def multiply(
-        coupled: ti.template(),
-        beyond: ints_2d,
-        off: reals_2d,
-        diagonal: reals_1d,
-        front_start: ints_1d,
-        front_cell: ints_1d,
-        front_share: reals_1d,
-        back_start: ints_1d,
-        back_cell: ints_1d,
-        back_m3s: reals_1d,
-        work: reals_3d,
-        s,
-        a,
-        out,
-    ):
-        for c in range(diagonal.shape[0]):
-            total = diagonal[c] * work[s, a, c]
-            for f in ti.static(range(6)):
-                total -= off[c, f] * work[s, a, beyond[c, f]]
-            work[s, out, c] = total
-        if ti.static(coupled):
-            for j in range(front_start.shape[0] - 1):
-                mean = ti.cast(0.0, ti.f64)
-                for i in range(front_start[j], front_start[j + 1]):
-                    mean += front_share[i] * work[s, a, front_cell[i]]
-                for i in range(back_start[j], back_start[j + 1]):
-                    work[s, out, back_cell[i]] -= back_m3s[i] * mean
 
-    @ti.func
-    @no_type_check
-    def precondition(beyond: ints_2d, off: reals_2d, diagonal: reals_1d, work: reals_3d, s, a, out):
-        cells = diagonal.shape[0]
-        for c in range(cells):
-            total = work[s, a, c]
-            for f in ti.static(range(3)):
-                total += off[c, f] * work[s, out, beyond[c, f]]
-            work[s, out, c] = total * work[s, _PIVOT, c]
-        for i in range(cells):
-            c = cells - 1 - i
-            total = ti.cast(0.0, ti.f64)
-            for f in ti.static(range(3, 6)):
-                total += off[c, f] * work[s, out, beyond[c, f]]
-            work[s, out, c] += total * work[s, _PIVOT, c]
+@ti.func
+@no_type_check
+def multiply(system: ti.template(), s, vector, out):
+    """Set ``out`` to A times a work vector."""
+    for c in range(system.diagonal.shape[0]):
+        total = system.diagonal[c] * system.work[s, vector, c]
+        for face in ti.static(range(6)):
+            total -= system.off_diagonal[c, face] * system.work[s, vector, system.beyond[c, face]]
+        system.work[s, out, c] = total
+    if ti.static(system.through_racks):
+        for rack in range(system.front_offsets.shape[0] - 1):
+            mean = front_mean(system, s, vector, rack)
+            for i in range(system.back_offsets[rack], system.back_offsets[rack + 1]):
+                system.work[s, out, system.back_cell[i]] -= system.back_m3s[i] * mean
 
-    @ti.kernel
-    @no_type_check
-    def solve(
-        coupled: ti.template(),
-        keep: ti.template(),
-        slices: ti.i32,
-        most_iterations: ti.i32,
-        tolerance: ti.f64,
-        beyond: ints_2d,
-        off: reals_2d,
-        diagonal: reals_1d,
-        source_start: ints_1d,
-        source_cell: ints_1d,
-        source: reals_1d,
-        front_start: ints_1d,
-        front_cell: ints_1d,
-        front_share: reals_1d,
-        back_start: ints_1d,
-        back_cell: ints_1d,
-        back_m3s: reals_1d,
-        return_cell: ints_1d,
-        return_m3s: reals_1d,
-        work: reals_3d,
-        solution: reals_2d,
-        intake: reals_2d,
-        returned: reals_1d,
-        residual: reals_1d,
-        iterations: ints_1d,
-    ):
-        for k in range(slices * SLICE):
-            if k % SLICE == 0:
-                s = k // SLICE
-                n = diagonal.shape[0]
-                for v in range(work.shape[1]):
-                    work[s, v, n] = 0.0
-                for c in range(n):
-                    pivot = diagonal[c]
-                    for f in range(3):
-                        b = beyond[c, f]
-                        if b < n:
-                            pivot -= off[c, f] * off[b, f + 3] * work[s, _PIVOT, b]
-                    work[s, _PIVOT, c] = 1.0 / pivot
-                first, end = part_of(s, slices, residual.shape[0])
-                for tag in range(first, end):
-                    for c in range(n):
-                        work[s, _X, c] = 0.0
-                        work[s, _Z, c] = 0.0
-                    for i in range(source_start[tag], source_start[tag + 1]):
-                        work[s, _Z, source_cell[i]] += source[i]
-                    goal = tolerance * ti.sqrt(dot(work, s, _Z, _Z, n))
-                    done = 0
-                    rounds = 0
-                    size = ti.cast(0.0, ti.f64)
-                    while rounds < 20:
-                        rounds += 1
-                        for c in range(n):
-                            work[s, _Z, c] = 0.0
-                        for i in range(source_start[tag], source_start[tag + 1]):
-                            work[s, _Z, source_cell[i]] += source[i]
-                        multiply(
-                            coupled, beyond, off, diagonal, front_start, front_cell, front_share,
-                            back_start, back_cell, back_m3s, work, s, _X, _R,
-                        )  # fmt: skip
-                        for c in range(n):
-                            work[s, _R, c] = work[s, _Z, c] - work[s, _R, c]
-                            work[s, _SHADOW, c] = work[s, _R, c]
-                            work[s, _P, c] = work[s, _R, c]
-                        rho = dot(work, s, _R, _R, n)
-                        size = ti.sqrt(rho)
-                        if size <= goal or done >= most_iterations:
-                            break
-                        going = 1
-                        while going == 1:
-                            done += 1
-                            precondition(beyond, off, diagonal, work, s, _P, _Y)
-                            multiply(
-                                coupled, beyond, off, diagonal, front_start, front_cell,
-                                front_share, back_start, back_cell, back_m3s, work, s, _Y, _V,
-                            )  # fmt: skip
-                            against = dot(work, s, _SHADOW, _V, n)
-                            if against == 0.0:
-                                break
-                            alpha = rho / against
-                            for c in range(n):
-                                work[s, _X, c] += alpha * work[s, _Y, c]
-                                work[s, _R, c] -= alpha * work[s, _V, c]
-                            precondition(beyond, off, diagonal, work, s, _R, _Z)
-                            multiply(
-                                coupled, beyond, off, diagonal, front_start, front_cell,
-                                front_share, back_start, back_cell, back_m3s, work, s, _Z, _T,
-                            )  # fmt: skip
-                            square = dot(work, s, _T, _T, n)
-                            if square == 0.0:
-                                break
-                            omega = dot(work, s, _T, _R, n) / square
-                            for c in range(n):
-                                work[s, _X, c] += omega * work[s, _Z, c]
-                                work[s, _R, c] -= omega * work[s, _T, c]
-                            following = dot(work, s, _SHADOW, _R, n)
-                            size = ti.sqrt(dot(work, s, _R, _R, n))
-                            if size <= goal or done >= most_iterations:
-                                going = 0
-                            elif omega == 0.0 or rho == 0.0:
-                                going = 0
-                            else:
-                                beta = following / rho * alpha / omega
-                                rho = following
-                                for c in range(n):
-                                    work[s, _P, c] = work[s, _R, c] + beta * (
-                                        work[s, _P, c] - omega * work[s, _V, c]
-                                    )
-                    residual[tag] = 0.0
-                    if goal > 0.0:
-                        residual[tag] = tolerance * size / goal
-                    iterations[tag] = done
-                    for j in range(front_start.shape[0] - 1):
-                        mean = ti.cast(0.0, ti.f64)
-                        for i in range(front_start[j], front_start[j + 1]):
-                            mean += front_share[i] * work[s, _X, front_cell[i]]
-                        intake[j, tag] = mean
-                    total = ti.cast(0.0, ti.f64)
-                    for i in range(return_cell.shape[0]):
-                        total += return_m3s[i] * work[s, _X, return_cell[i]]
-                    returned[tag] = total
-                    if ti.static(keep):
-                        for c in range(n + 1):
-                            solution[tag, c] = work[s, _X, c]
 
-    return solve
+@ti.func
+@no_type_check
+def front_mean(system: ti.template(), s, vector, rack):
+    """Mean of a work vector over the front of a rack, by airflow."""
+    mean = ti.cast(0.0, ti.f64)
+    for i in range(system.front_offsets[rack], system.front_offsets[rack + 1]):
+        mean += system.front_share[i] * system.work[s, vector, system.front_cell[i]]
+    return mean
+
+
+@ti.func
+@no_type_check
+def dot(system: ti.template(), s, a, b):
+    """Scalar product of two work vectors."""
+    total = ti.cast(0.0, ti.f64)
+    for c in range(system.diagonal.shape[0]):
+        total += system.work[s, a, c] * system.work[s, b, c]
+    return total
+
+
+@ti.func
+@no_type_check
+def load_right_side(system: ti.template(), s, rhs, out):
+    """Set ``out`` to right side ``rhs``."""
+    for c in range(system.diagonal.shape[0]):
+        system.work[s, out, c] = 0.0
+    for i in range(system.source_offsets[rhs], system.source_offsets[rhs + 1]):
+        system.work[s, out, system.source_cell[i]] += system.source[i]
+
+
+@ti.func
+@no_type_check
+def solve_right_side(system: ti.template(), s, rhs):
+    """Solve for right side ``rhs``; store its iterations and its residual over the right side."""
+    for c in range(system.diagonal.shape[0]):
+        system.work[s, _SOLUTION, c] = 0.0
+    load_right_side(system, s, rhs, _RESIDUAL)
+    goal = system.tolerance * ti.sqrt(dot(system, s, _RESIDUAL, _RESIDUAL))
+    residual_norm = ti.cast(0.0, ti.f64)
+    iterations, starts, ends = 0, 0, False
+    while starts < MOST_STARTS and not ends:
+        starts += 1
+        rho = start_iterations(system, s, rhs)
+        residual_norm = ti.sqrt(rho)
+        ends = residual_norm <= goal or iterations >= system.most_iterations
+        if not ends:
+            residual_norm, iterations = iterate(system, s, rho, goal, iterations)
+    system.relative_residual[rhs] = 0.0
+    if goal > 0.0:
+        system.relative_residual[rhs] = system.tolerance * residual_norm / goal
+    system.iterations[rhs] = iterations
+
+
+@ti.func
+@no_type_check
+def start_iterations(system: ti.template(), s, rhs):
+    """Set r, r^ and p to b - A x, and return rho."""
+    load_right_side(system, s, rhs, _RESIDUAL)
+    multiply(system, s, _SOLUTION, _A_DIRECTION)
+    for c in range(system.diagonal.shape[0]):
+        residual = system.work[s, _RESIDUAL, c] - system.work[s, _A_DIRECTION, c]
+        system.work[s, _RESIDUAL, c] = residual
+        system.work[s, _SHADOW_RESIDUAL, c] = residual
+        system.work[s, _SEARCH_DIRECTION, c] = residual
+    return dot(system, s, _RESIDUAL, _RESIDUAL)
+
+
+@ti.func
+@no_type_check
+def iterate(system: ti.template(), s, rho_at_start, goal, iterations_before):
+    """Iterate until |r| is at the goal, iterations are used up, or a divisor is 0.
+
+    Returns:
+        |r|, and the iterations done since the first start.
+    """
+    rho, iterations = rho_at_start, iterations_before
+    residual_norm = ti.sqrt(rho)
+    ends = False
+    while not ends:
+        iterations += 1
+        precondition(system, s, _SEARCH_DIRECTION, _DIRECTION)
+        multiply(system, s, _DIRECTION, _A_DIRECTION)
+        shadow_product = dot(system, s, _SHADOW_RESIDUAL, _A_DIRECTION)
+        if shadow_product == 0.0:
+            break
+        alpha = rho / shadow_product
+        advance(system, s, alpha, _DIRECTION, _A_DIRECTION)
+        precondition(system, s, _RESIDUAL, _CORRECTION)
+        multiply(system, s, _CORRECTION, _A_CORRECTION)
+        correction_square = dot(system, s, _A_CORRECTION, _A_CORRECTION)
+        if correction_square == 0.0:
+            break
+        omega = dot(system, s, _A_CORRECTION, _RESIDUAL) / correction_square
+        advance(system, s, omega, _CORRECTION, _A_CORRECTION)
+        next_rho = dot(system, s, _SHADOW_RESIDUAL, _RESIDUAL)
+        residual_norm = ti.sqrt(dot(system, s, _RESIDUAL, _RESIDUAL))
+        ends = residual_norm <= goal or iterations >= system.most_iterations
+        ends = ends or omega == 0.0 or rho == 0.0
+        if not ends:
+            update_search_direction(system, s, next_rho / rho * alpha / omega, omega)
+            rho = next_rho
+    return residual_norm, iterations
+
+
+@ti.func
+@no_type_check
+def advance(system: ti.template(), s, step, direction, a_direction):
+    """Move x by a step along a direction, and r by what A makes of it."""
+    for c in range(system.diagonal.shape[0]):
+        system.work[s, _SOLUTION, c] += step * system.work[s, direction, c]
+        system.work[s, _RESIDUAL, c] -= step * system.work[s, a_direction, c]
+
+
+@ti.func
+@no_type_check
+def update_search_direction(system: ti.template(), s, beta, omega):
+    """Set p to r + beta (p - omega v)."""
+    for c in range(system.diagonal.shape[0]):
+        system.work[s, _SEARCH_DIRECTION, c] = system.work[s, _RESIDUAL, c] + beta * (
+            system.work[s, _SEARCH_DIRECTION, c] - omega * system.work[s, _A_DIRECTION, c]
+        )
+
+
+@ti.func
+@no_type_check
+def store_results(system: ti.template(), s, rhs):
+    """Store what is asked of the solution for right side ``rhs``."""
+    for rack in range(system.front_offsets.shape[0] - 1):
+        system.intake[rack, rhs] = front_mean(system, s, _SOLUTION, rack)
+    total = ti.cast(0.0, ti.f64)
+    for i in range(system.return_cell.shape[0]):
+        total += system.return_m3s[i] * system.work[s, _SOLUTION, system.return_cell[i]]
+    system.returned[rhs] = total
+    if rhs == 0:
+        for c in range(system.diagonal.shape[0] + 1):
+            system.first_solution[c] = system.work[s, _SOLUTION, c]

@@ -188,7 +188,7 @@ class _GridAir:
         fronts = grid.fronts
         self._front_share = fronts.m3s / np.repeat(airflow_m3s, np.diff(fronts.face_offsets))
         # Coefficients of the transport of tags, see ``kernels.airflow``.
-        self._off = np.zeros_like(grid.conductance_m)
+        self._off_diagonal = np.zeros_like(grid.conductance_m)
         self._diagonal = np.zeros(grid.cells)
 
     def find_flow(self) -> float:
@@ -207,16 +207,16 @@ class _GridAir:
         found = self._solve(grid.conductance_m, diagonal, offsets, cells, entering, "potential")
         imbalance_m3s = np.empty(grid.cells)
         self._kernels.transport_kernel()(
-            grid.beyond,
-            grid.conductance_m,
-            grid.boundary_m3s,
-            grid.area_m2,
-            MIXING_M,
-            found.solution[0],
-            np.zeros(grid.cells + 1),
-            imbalance_m3s,
-            self._off,
-            self._diagonal,
+            beyond=grid.beyond,
+            conductance_m=grid.conductance_m,
+            boundary_m3s=grid.boundary_m3s,
+            area_m2=grid.area_m2,
+            mixing_m=MIXING_M,
+            potential_m2s=found.first_solution,
+            speed_ms=np.zeros(grid.cells + 1),
+            imbalance_m3s=imbalance_m3s,
+            off_diagonal=self._off_diagonal,
+            diagonal=self._diagonal,
         )
         return float(np.abs(imbalance_m3s).sum())
 
@@ -232,7 +232,7 @@ class _GridAir:
         offsets = np.append(backs.face_offsets, end).astype(np.int32)
         cell = np.concatenate([backs.cell, grid.supply_cell])
         amount = np.concatenate([backs.m3s, grid.supply_m3s])
-        found = self._solve(self._off, self._diagonal, offsets, cell, amount, "tags")
+        found = self._solve(self._off_diagonal, self._diagonal, offsets, cell, amount, "tags")
         # The exact shares are positive; the solver leaves zeros of either sign.
         shares = np.maximum(found.intake, 0.0)
         return shares[:, :-1].copy(), shares[:, -1].copy(), found.returned[:-1]
@@ -251,76 +251,83 @@ class _GridAir:
         amount = backs.m3s * np.repeat(rise_k, np.diff(backs.face_offsets))
         offsets = np.array([0, len(amount)], np.int32)
         found = self._solve(
-            self._off, self._diagonal, offsets, backs.cell, amount, "temperatures", coupled=True
+            self._off_diagonal,
+            self._diagonal,
+            offsets,
+            backs.cell,
+            amount,
+            "temperatures",
+            through_racks=True,
         )
         return found.intake[:, 0], float(found.returned[0])
 
     def _solve(
         self,
-        off: F64,
+        off_diagonal: F64,
         diagonal: F64,
         source_offsets: I32,
         source_cell: I32,
         source: F64,
         what: str,
         *,
-        coupled: bool = False,
+        through_racks: bool = False,
     ) -> _SystemSolution:
-        """Solve one linear system for each right side, see ``kernels.airflow.solve_kernel``.
+        """Solve one linear system for each right side, see ``kernels.airflow``.
 
         Args:
-            off: Coefficients of the cells beyond the faces, (N + 1, 6).
+            off_diagonal: Coefficients of the cells beyond the faces, (N + 1, 6).
             diagonal: Coefficient of each cell, (N,).
             source_offsets: First source of each right side, and the number of sources, (T + 1,).
             source_cell: Cell of each source.
             source: What each source adds to the right side of its cell.
             what: Name of the right sides, for errors.
-            coupled: Whether the mean over the front of a rack enters the cells at its back.
+            through_racks: Whether the mean over the front of a rack enters the cells at its back.
 
         Raises:
             SdcError: a system that is not solved to the tolerance.
         """
         grid, kernels = self._grid, self._kernels
-        tags = len(source_offsets) - 1
-        slices = min(self._threads, tags)
+        right_sides = len(source_offsets) - 1
+        slices = min(self._threads, right_sides)
         found = _SystemSolution(
-            solution=np.zeros((1, grid.cells + 1)),
-            intake=np.empty((self._racks, tags)),
-            returned=np.empty(tags),
+            first_solution=np.empty(grid.cells + 1),
+            intake=np.empty((self._racks, right_sides)),
+            returned=np.empty(right_sides),
+            relative_residual=np.empty(right_sides),
+            iterations=np.empty(right_sides, np.int32),
         )
-        residual = np.empty(tags)
-        iterations = np.empty(tags, np.int32)
-        kernels.solve_kernel()(
-            coupled,
-            tags == 1,
-            slices,
-            _MOST_ITERATIONS,
-            _TOLERANCE,
-            grid.beyond,
-            off,
-            diagonal,
-            source_offsets,
-            source_cell,
-            source,
-            grid.fronts.face_offsets,
-            grid.fronts.cell,
-            self._front_share,
-            grid.backs.face_offsets,
-            grid.backs.cell,
-            grid.backs.m3s,
-            grid.return_cell,
-            grid.return_m3s,
-            np.empty((slices, kernels.VECTORS, grid.cells + 1)),
-            found.solution,
-            found.intake,
-            found.returned,
-            residual,
-            iterations,
+        kernels.bicgstab_kernel()(
+            serial=False,
+            through_racks=through_racks,
+            slices=slices,
+            most_iterations=_MOST_ITERATIONS,
+            tolerance=_TOLERANCE,
+            beyond=grid.beyond,
+            off_diagonal=off_diagonal,
+            diagonal=diagonal,
+            front_offsets=grid.fronts.face_offsets,
+            front_cell=grid.fronts.cell,
+            front_share=self._front_share,
+            back_offsets=grid.backs.face_offsets,
+            back_cell=grid.backs.cell,
+            back_m3s=grid.backs.m3s,
+            source_offsets=source_offsets,
+            source_cell=source_cell,
+            source=source,
+            work=np.empty((slices, kernels.WORK_VECTORS, grid.cells + 1)),
+            return_cell=grid.return_cell,
+            return_m3s=grid.return_m3s,
+            first_solution=found.first_solution,
+            intake=found.intake,
+            returned=found.returned,
+            relative_residual=found.relative_residual,
+            iterations=found.iterations,
         )
+        residual, iterations = found.relative_residual, found.iterations
         worst = int(np.argmax(np.where(np.isfinite(residual), residual, np.inf)))
         if not residual[worst] <= 100 * _TOLERANCE:
             raise SdcError(
-                f"layout solver: {what} {worst} of {tags} stopped at a residual of "
+                f"layout solver: {what} {worst} of {right_sides} stopped at a residual of "
                 f"{residual[worst]:.3g} after {iterations[worst]} iterations; valid is at most "
                 f"{100 * _TOLERANCE:g}: change cell_m, or measures of very different size"
             )
@@ -331,12 +338,16 @@ class _GridAir:
 class _SystemSolution:
     """Solution of linear systems for T right sides, in the unit of their sources per flow."""
 
-    solution: F64
-    """Values of the cells, (1, N + 1), filled where T is 1."""
+    first_solution: F64
+    """Values of the cells for the first right side, (N + 1,)."""
     intake: F64
     """Mean value over the front of each rack, (R, T)."""
     returned: F64
     """Flow times value into the returns, (T,)."""
+    relative_residual: F64
+    """Norm of the residual over that of the right side, (T,)."""
+    iterations: I32
+    """Iterations done for each right side, (T,)."""
 
 
 def solve_at_design_point(
