@@ -171,7 +171,8 @@ RACK_OUT = {
     "inlet_max_c": "hottest inlet of a server, C",
     "outlet_max_c": "hottest outlet of a server, C",
 }
-"""Of the last sweep; in transient halls means over the substeps, and the highest of any."""
+"""Values of each rack in the last sweep; in transient halls means over the substeps, and maxima of
+all substeps."""
 GROUP_OUT = {
     "inlet_c": "inlet, C",
     "outlet_c": "outlet, C",
@@ -193,7 +194,7 @@ BLOCK_TERMS = {
     "mixed_c": "mean of the recirculated air over the substep, C (transient)",
     "parcel_w": "heat that warms the recirculated air in the substep, W (transient)",
 }
-"""Of each block of a chunk in the present sweep."""
+"""Values of each block of a chunk in the present sweep."""
 N_TERMS, N_BLOCK_TERMS = len(TERMS), len(BLOCK_TERMS)
 SCRATCH = N_TERMS + CHUNK_BLOCKS * N_BLOCK_TERMS
 """Vectors of work space for a chunk: its TERMS, then BLOCK_TERMS block by block."""
@@ -211,8 +212,8 @@ SUMS = (
         "most_change_k": "upper bound of the exhaust mixes less unshifted_mix_c, K",
     }
 )
-"""Of each chunk. Sums of TERMS before ``flow_m3s`` run over the substeps of transient halls, those
-of RACK_OUT are of its means over the substeps."""
+"""Sums and extremes of each chunk. In transient halls, sums of TERMS before ``flow_m3s`` run over
+the substeps, and sums of RACK_OUT are of its means over the substeps."""
 DC_OUT = {
     "cpu_w": "power without fans, W",
     "it_fan_w": "power of the server fans, W",
@@ -268,7 +269,7 @@ ARGUMENTS = {
     "place_ints": _numbers("i32", 2, PLACE_INTS, "places"),
     "run_offsets": _numbers("i32", 1),  # first run of weights of each place, and the end
     "run_ints": _numbers("i32", 2, RUN_INTS, "runs"),
-    # What the halls are and meet.
+    # Halls, and their boundary conditions.
     "dc_coefficients": _numbers("real", 1, DC_COEFFICIENTS, "dcs"),
     "rack_inputs": _vectors(2, RACK_INPUTS, "blocks"),
     "group_inputs": _vectors(1, GROUP_INPUTS, "groups"),
@@ -278,7 +279,7 @@ ARGUMENTS = {
     "mix_weights": _vectors(1, lanes=DENSE_LANES * LANES),  # of dense halls
     "run_weights": _vectors(1, lanes=RUN_LANES),  # of sparse halls
     "steady_states": _vectors(1),  # patterns of each hall, and its table
-    # What goes on from sweep to sweep.
+    # State that is carried from sweep to sweep.
     "dc_control": _numbers("i32", 2, DC_CONTROL, "dcs"),
     "dc_doubles": _numbers("f64", 2, DC_DOUBLES, "dcs"),
     "unit_state": _numbers("f64", 2, UNIT_STATE, "units"),

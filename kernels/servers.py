@@ -29,7 +29,7 @@ class _ReleasedOutlet(NamedTuple):
     flow_excess: float = 0.824 - 1.0
     """Exponent of airflow less 1."""
     offset_k: float = -14.01
-    """What is added to the rise, in K."""
+    """Constant added to the rise, in K."""
 
 
 RELEASED_OUTLET = _ReleasedOutlet()

@@ -52,7 +52,7 @@ def run_crac_units(hall: ti.template(), n, it_flow_m3s, is_last):
         supply_m3k_s=none,
         bypass_m3k_s=none,
         most_f_change=none,
-        # Of units that are running, whose fans alone draw power.
+        # Sums over the running units, whose fans alone draw power.
         fan_m3s=none,
         running_m3s=none,
         running_m3k_s=none,

@@ -39,7 +39,7 @@ def fields_of(values: Any) -> dict[str, Any]:
 
 
 class LoadAction(Enum):
-    """What to do with delay-tolerant work; the value is the command in -1..1."""
+    """Commands for delay-tolerant work; the values are commands in -1..1."""
 
     DEFER = -1
     NEUTRAL = 0
@@ -63,7 +63,7 @@ class FanAction(Enum):
 
 
 class BatteryAction(Enum):
-    """What the battery does, as a share of its power limit."""
+    """Commands of the battery, as shares of its power limit."""
 
     DISCHARGE = -1
     IDLE = 0
@@ -109,7 +109,7 @@ class Exogenous:
 
 @dataclass(slots=True)
 class State:
-    """What is carried from step to step; everything else derives from it.
+    """Values that are carried from step to step; everything else derives from them.
 
     Arrays that the models in use do not need are empty.
     """
@@ -223,7 +223,8 @@ class StepResult:
     hottest_server: F64
     """Server with the hottest inlet, counted from 0 at the floor of its rack, (B,)."""
     over_27_mean_k: F64
-    """What inlets exceed 27 C by, mean over the servers, in K, (B,); times hours, degree-hours."""
+    """Mean over the servers of the inlet temperature in excess of 27 C, in K, (B,); times hours,
+    degree-hours."""
     shi: F64
     """Supply heat index, 0 when all inlets get supply air, (B,); see ``hall.air_metrics``."""
     rti_pct: F64

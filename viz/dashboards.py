@@ -117,7 +117,7 @@ def day(
     draw_power(panels[1], shown)
     draw_carbon(panels[2], shown)
     _draw_commands(panels[3], shown)
-    # What the day begins with is what the step before left.
+    # The day begins with the storage that the step before left.
     draw_storage(panels[4], steps.iloc[max(first - 1, 0) : after])
     panels[-1].xaxis.set_major_locator(HourLocator(range(0, 24, 3)))  # type: ignore[no-untyped-call]
     panels[-1].xaxis.set_major_formatter(DateFormatter("%H:%M"))  # type: ignore[no-untyped-call]
@@ -351,7 +351,7 @@ def _draw_day_temperatures(
 def _disturbances(
     steps: pd.DataFrame, events: Sequence[Mapping[str, Any]]
 ) -> list[tuple[npt.NDArray[np.bool_], str, str, str]]:
-    """What was out of order: whether in each step, colour, hatching and label."""
+    """Disturbances of the run: mask over the steps, colour, hatching and label of each."""
     found = [
         ((steps["throttled_racks"] > 0).to_numpy(), ORANGE, "", "racks throttled"),
         ((steps["tripped_racks"] > 0).to_numpy(), RED, "", "racks tripped"),

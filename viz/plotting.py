@@ -1,4 +1,4 @@
-"""What all pictures share: colours, figures, axes, and the words on them.
+"""Shared parts of all pictures: colours, figures, axes, and the words on them.
 
 pyplot is not used, so no window or global state is touched. Colours are those of Okabe and Ito
 (2008), "Color Universal Design", and the maps inferno, viridis and cividis, which readers with

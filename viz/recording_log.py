@@ -36,7 +36,7 @@ class LogEntry(NamedTuple):
     level: str
     """``INFO``, ``WARN`` or ``ERROR``."""
     text: str
-    """What happened, on one line."""
+    """Message, on one line."""
 
 
 def _short_number(value: float) -> str:

@@ -285,7 +285,7 @@ class _ClosableBlueprint:
         self._stream: rr.RecordingStream | None = None
 
     def to_blueprint(self) -> Any:
-        """What Rerun sends."""
+        """Blueprint that Rerun sends."""
         return self
 
     def _log_to_stream(self, stream: rr.RecordingStream) -> None:

@@ -1,4 +1,4 @@
-"""What holds at all times of a recording: names, colours, formats, colour bars and the hall."""
+"""Static parts of a recording: names, colours, formats, colour bars and the hall."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def _steps_text(steps: int) -> str:
 
 
 def _levels_text(cadence: Cadence) -> str:
-    """What front and back of a rack of the 3D hall show, in words."""
+    """Words for the temperatures that front and back of a rack of the 3D hall show."""
     if not cadence.has_servers:
         return "of its servers, its back the mean outlet"
     return f"at each of {_count_text(max(cadence.levels), 'height')}, its back the hottest outlet"

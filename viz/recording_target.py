@@ -69,7 +69,7 @@ def check_port(port: int) -> int:
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port < 65536:
         raise SdcError(f"port {port!r}: valid is 0 to 65535, 0 being any free one")
     with socket.socket() as probe:
-        # As servers do it, so that a port whose last connections are just closing counts as free.
+        # Servers set this too; a port whose last connections are just closing counts as free.
         if os.name == "posix":
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

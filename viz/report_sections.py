@@ -51,7 +51,7 @@ def summary_section(run: RunFolder) -> str:
 
 
 def _notices(run: RunFolder) -> list[str]:
-    """What a reader must know first: an interruption, synthetic inputs, notes of the loaders."""
+    """Notices at the top of a report: an interruption, synthetic inputs, notes of the loaders."""
     done, asked = run.metrics["steps_done"], run.metrics["steps_asked"]
     texts = []
     if done < asked:

@@ -1,4 +1,4 @@
-"""What kernels are written with: number types, tasks of a parallel loop, functions of vectors."""
+"""Building blocks of kernels: number types, tasks of a parallel loop, functions of vectors."""
 
 from typing import Any, no_type_check
 

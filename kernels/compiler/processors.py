@@ -45,7 +45,7 @@ def quota(
 
 
 def _text(file: Path) -> str:
-    """What a file of the system says; nothing where there is none."""
+    """Text of a file of the operating system; empty if it cannot be read."""
     try:
         return file.read_text("utf-8", errors="replace")
     except (OSError, ValueError):  # the latter of names that no file may have

@@ -63,7 +63,7 @@ def ensure_started() -> int:
         )
     import taichi as ti
 
-    # As `ti.cfg` tells it, but in a fifteenth of the time: steps ask several times.
+    # Gives the same as `ti.cfg` in a fifteenth of the time: steps ask several times.
     runtime = ti.lang.impl.get_runtime
     if _known[0] is None or _known[0] is not runtime().prog:
         with _starting:

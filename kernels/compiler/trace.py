@@ -82,7 +82,7 @@ class Traced(NDArrayOperatorsMixin):
 
 
 class Trace:
-    """What a function does to arrays (n,), each different operation once.
+    """Operations of a function on arrays (n,), each different operation once.
 
     Args:
         size: n.

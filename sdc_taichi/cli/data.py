@@ -41,7 +41,7 @@ Seed = Annotated[int, typer.Option(help="Seed of the synthetic year.", min=0)]
 
 
 class StampOption(StrEnum):
-    """What a stamp of a carbon file marks."""
+    """Meaning of a stamp of a carbon file: the start or the end of its interval."""
 
     AUTO = "auto"
     START = "start"

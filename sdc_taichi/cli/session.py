@@ -1,4 +1,4 @@
-"""What goes on beside a simulation: Ctrl-C, the progress bar, and the Rerun recording."""
+"""Ctrl-C, the progress bar and the Rerun recording during a simulation."""
 
 from __future__ import annotations
 

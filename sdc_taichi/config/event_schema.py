@@ -29,7 +29,7 @@ _OPTIONAL: dict[EventKind, tuple[str, ...]] = {"crac_down": ("unit",)}
 
 
 class ProtectionConfig(Section):
-    """What servers do when their inlets leave the allowable range of their ASHRAE class.
+    """Response of servers to inlets above the allowable range of their ASHRAE class.
 
     Above the limit a rack throttles; ``trip_margin_k`` above it, it switches off and loses the
     work of the step, until its inlet is at most ``restart_c``.
@@ -50,7 +50,7 @@ class ScheduledEvent(Section):
     """Something that goes wrong at a known time."""
 
     kind: EventKind
-    """What goes wrong."""
+    """Kind of event."""
     start_h: NonNegative
     """Start of the event after reset, in h."""
     duration_h: Positive
@@ -60,7 +60,7 @@ class ScheduledEvent(Section):
     rack: Index | None = None
     """Rack whose fans fail, counted from 0, row by row."""
     share: Share | None = None
-    """What is left of the chiller's capacity, or of the rack's airflow, 0..1."""
+    """Chiller capacity or rack airflow that remains, as a share of the full value, 0..1."""
     offset_k: Finite | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
 
@@ -77,13 +77,13 @@ class SampledEvent(Section):
     """
 
     kind: EventKind
-    """What goes wrong."""
+    """Kind of event."""
     per_year: Annotated[Finite, Field(gt=0, le=8760)]
     """Mean number of events in a year, at most one an hour."""
     duration_h: Pair
     """Shortest and longest duration of an event, in h."""
     share: Share | None = None
-    """What is left of the chiller's capacity, or of the rack's airflow, 0..1."""
+    """Chiller capacity or rack airflow that remains, as a share of the full value, 0..1."""
     offset_k: Finite | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
 

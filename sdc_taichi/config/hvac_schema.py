@@ -60,8 +60,8 @@ class CracConfig(Section):
     reference_m3s_per_w: Positive = 9.438e-5
     """Airflow per IT power at which a fan draws ``released_fan_w``, in m3/s per W."""
     flow_model: Literal["constant", "follow_servers", "per_watt", "controlled"] = "follow_servers"
-    """What the airflow of the units follows: nothing, the airflow of the servers, IT power, or the
-    actions of an agent."""
+    """Control of the units' airflow: constant, by the airflow of the servers, by IT power, or by
+    the actions of an agent."""
     min_flow_ratio: PositiveShare = 0.6
     """Lowest airflow of a running unit over its design airflow, 0..1."""
     fan_step: PositiveShare = 0.05

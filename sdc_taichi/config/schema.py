@@ -152,7 +152,7 @@ class DataCenterConfig(Section):
     name: str = "dc"
     """Name of the data center in results and messages."""
     description: str = ""
-    """What the data center is, in one line."""
+    """Description of the data center, on one line."""
     hall: HallConfig
     """Racks, their approach temperatures and the layout of the hall."""
     servers: ServerConfig = ServerConfig()

@@ -68,7 +68,7 @@ _PAIRS = (
 
 
 def read(values: Mapping[str, Any], label: str) -> dict[str, Any]:
-    """What a SustainDC file says, as values of the schema on top of preset ``sustaindc``.
+    """Translate a SustainDC file into values of the schema on top of preset ``sustaindc``.
 
     The CHILLER_COP values and HP_PROLIANT are checked but, as in the released code, not used.
 

@@ -83,7 +83,7 @@ def make_controller(spec: str, fleet: Fleet) -> Controller:
 
 
 def controlled_by(spec: str) -> tuple[str, ...]:
-    """What a valid spec of ``make_controller`` controls; ``idle`` and ``random`` do everything."""
+    """Commands that a valid spec of ``make_controller`` gives; all for ``idle`` and ``random``."""
     if "=" in spec:
         return tuple(part.partition("=")[0].strip() for part in spec.split(","))
     entry = _CONTROLLERS.get(spec.strip())

@@ -23,7 +23,7 @@ _DRAWN_STEPS = 256
 
 
 class Controller(Protocol):
-    """What gives the commands of each step: any object with these two methods."""
+    """Source of the commands of each step: any object with these two methods."""
 
     def reset(self, seed: Any) -> None:
         """Begin an episode, on which earlier ones have no influence.

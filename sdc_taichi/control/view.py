@@ -1,4 +1,4 @@
-"""What a controller sees before each step: results, state, inputs, forecasts and limits."""
+"""View of a controller before each step: results, state, inputs, forecasts and limits."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Forecast:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What a controller may see before a step of a fleet of B data centers."""
+    """Data that a controller may see before a step of a fleet of B data centers."""
 
     last: StepResult | None
     """Result of the step before; None before the first step."""

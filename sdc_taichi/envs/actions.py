@@ -122,7 +122,7 @@ class ActionDecoder:
 
 
 def checked_array(given: Any, name: str) -> npt.NDArray[Any]:
-    """What a user gave as an array of any kind and shape.
+    """Convert a value that a user gave to an array of any kind and shape.
 
     Args:
         given: a number, an array, or nested lists.

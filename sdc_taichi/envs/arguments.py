@@ -1,4 +1,4 @@
-"""What every environment is made of, read alike from the arguments of all entry points.
+"""Parts of every environment, read alike from the arguments of all entry points.
 
 ``parallel_env``, ``aec_env``, ``gymnasium.make``, ``gymnasium.make_vec`` and ``vector_env`` take
 the same ``config``, ``overrides``, ``options`` and options by keyword, and refuse the same ones.

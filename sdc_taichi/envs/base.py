@@ -1,4 +1,4 @@
-"""What the environments of all standards share: reset options, infos, and methods beyond them."""
+"""Shared parts of the environments of all standards: reset options, infos, added methods."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RESET_OPTIONS = ("start_day",)
 
 
 class _Env:
-    """What all environments offer beyond their standards."""
+    """Attributes and methods that all environments have beyond their standards."""
 
     core: Core
     """The data centers."""
@@ -31,7 +31,7 @@ class _Env:
 
 
 class SingleEnv(_Env):
-    """What environments with one data center offer beyond their standards."""
+    """Methods that environments with one data center have beyond their standards."""
 
     def state(self) -> F32:
         """Shared state for centralised critics, (m,), of ``state_space``."""
@@ -56,7 +56,7 @@ class SingleEnv(_Env):
 
 
 class BatchEnv(_Env):
-    """What batches of environments offer beyond their standards."""
+    """Methods that batches of environments have beyond their standards."""
 
     def state(self) -> F32:
         """Shared state for centralised critics, (B, m)."""

@@ -41,7 +41,7 @@ rows, racks per row, channels)."""
 
 @dataclass(slots=True)
 class Transition:
-    """What a step of all environments gives."""
+    """Result of one step of all environments."""
 
     observations: dict[str, Observation]
     """Observations before the next step, by learning agent."""
@@ -123,7 +123,7 @@ class Core:
             agents=self.agents,
             days=options.days,
         )
-        # As plain values, to tell environments apart.
+        # Plain values that tell environments apart.
         self._identity = options.model_dump(exclude={"rewards"}) | {
             "rewards": self._rewards.identity
         }

@@ -36,7 +36,7 @@ class Feature:
     high: float
     """Upper end of the range, in ``unit``; higher values are cut at it."""
     description: str
-    """What the value is, for the docs."""
+    """Meaning of the value, for the docs."""
     size: int = 1
     """Number of entries side by side."""
 

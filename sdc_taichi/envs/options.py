@@ -1,4 +1,4 @@
-"""What an environment lets agents do, see and be rewarded for."""
+"""Options of an environment: actions, observations and rewards of its agents."""
 
 from __future__ import annotations
 

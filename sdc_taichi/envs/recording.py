@@ -67,7 +67,7 @@ class EpisodeRecorder:
 
 
 RecorderOption: TypeAlias = "str | os.PathLike[str] | Recorder | EpisodeRecorder | None"
-"""What environments take as ``recorder``: an ``EpisodeRecorder``, or the target of one."""
+"""Argument ``recorder`` of environments: an ``EpisodeRecorder``, or the target of one."""
 
 
 class RecordingCore(Core):

@@ -40,7 +40,7 @@ PRICE_PER_KWH = 0.1
 
 @dataclass(frozen=True, slots=True)
 class TermContext:
-    """What a term may refer to beside the result of the step."""
+    """Quantities that a reward term may use beside the result of the step."""
 
     design_kwh: F64
     """Energy of a step at the design point, in kWh, (B,)."""
@@ -113,7 +113,7 @@ def cost(r: StepResult, c: TermContext) -> F64:
 
 @reward_term
 def demand_charge(r: StepResult, c: TermContext) -> F64:
-    """What the step adds to the highest power above half the design power, in units of `cost`.
+    """Increase of the peak power, counted from half the design power, in units of `cost`.
 
     The charge of a bill times the length of the episode over 30 days. Half the design power is
     billed in any case, so it is no part of the reward.
@@ -144,7 +144,7 @@ def water(r: StepResult, c: TermContext) -> F64:
 
 @reward_term
 def hot_inlets(r: StepResult, c: TermContext) -> F64:
-    """What inlets exceed the recommended 27 C by, mean over servers, K (ASHRAE TC 9.9)."""
+    """Mean over servers of the inlet temperature above the recommended 27 C, K (ASHRAE TC 9.9)."""
     return -r.over_27_mean_k
 
 

@@ -342,7 +342,7 @@ def _import_path(function: RewardFunction) -> str:
 def _checked_by_agent(
     returned: Mapping[Any, Any], agents: Sequence[str], size: int
 ) -> dict[str, F64]:
-    """What a user's function returned for each learning agent; the rest is left out."""
+    """Values that a user's function returned for each learning agent, without other agents."""
     for agent in returned:
         if agent not in AGENTS:
             raise SdcError(
@@ -355,7 +355,7 @@ def _checked_by_agent(
 
 
 def _checked_values(returned: Any, whose: str, size: int) -> F64:
-    """What a user's function returned for one agent or all, (B,)."""
+    """Values that a user's function returned for one agent or for all, checked, (B,)."""
     try:
         values = np.asarray(returned, dtype=np.float64)
     except (TypeError, ValueError):

@@ -37,7 +37,7 @@ class Imported:
     """A file that was imported."""
 
     kind: str
-    """What it holds: ``weather``, ``carbon`` or ``workload``."""
+    """Kind of data in the file: ``weather``, ``carbon`` or ``workload``."""
     name: str
     """Name of the site or trace that it became, or became part of."""
     source: Path
@@ -150,7 +150,7 @@ def import_workload(path: Path, name: str, data_dir: Path | None = None) -> Impo
 
 
 def plan_folder(folder: Path) -> tuple[list[tuple[str, Path, str]], list[tuple[Path, str]]]:
-    """What to import from a SustainDC ``data`` folder, or one with carbon, weather, workload.
+    """Plan the import of a SustainDC ``data`` folder, or of one with carbon, weather, workload.
 
     Every weather file becomes a site, with the carbon file of its state: ``NY-real`` for the
     station the embedded year is fitted to (else the first of the state), other stations with

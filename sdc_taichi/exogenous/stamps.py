@@ -1,4 +1,4 @@
-"""What the stamps of a carbon file mark: the start or the end of their interval.
+"""Meaning of the stamps of a carbon file: the start or the end of their interval.
 
 EIA-930 stamps mark the end of the hour, yet some authorities report the start, or did until some
 day. Solar generation tells: its centre of gravity lies after solar noon where stamps mark the end,
@@ -15,7 +15,7 @@ from sdc_taichi.exogenous.series import FloatArray
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MINUTES_PER_DAY
 
 Stamp = Literal["auto", "start", "end"]
-"""What a stamp marks of its interval; ``auto`` reads it from the solar generation."""
+"""Moment of its interval that a stamp marks; ``auto`` infers it from the solar generation."""
 
 
 def by_start_of_interval(

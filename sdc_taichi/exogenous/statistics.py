@@ -1,4 +1,4 @@
-"""What a year looks like in a dozen numbers, for tables and for comparing synthetic with real."""
+"""Statistics of a year in a dozen numbers, for tables and for comparing synthetic with real."""
 
 from __future__ import annotations
 

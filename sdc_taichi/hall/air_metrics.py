@@ -61,7 +61,7 @@ def rise_m3k_s(
 
 
 def over_27_sum_k(inlet_c: F64) -> F64:
-    """Sum over the racks of what their inlets exceed 27 C by, in K, (...).
+    """Sum over the racks of the inlet temperature in excess of 27 C, in K, (...).
 
     Args:
         inlet_c: Inlet temperature of each rack, C, (..., N).
@@ -146,7 +146,7 @@ def rci_hi(over_k: Values, racks: Values, *, allowable_c: Values) -> F64:
     is over-temperatures that average to the allowable limit, and worse is negative.
 
     Args:
-        over_k: Sum over the inlets of what they exceed 27 C by, K.
+        over_k: Sum over the inlets of their excess over 27 C, K.
         racks: Number of inlets in the sum, at least 1.
         allowable_c: Upper end of the allowable range, C, above 27.
     """

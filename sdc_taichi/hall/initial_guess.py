@@ -155,7 +155,7 @@ def _sampled_racks(servers: RackServers, recirculation: Recirculation) -> _HallP
 
 
 def _columns(servers: RackServers, recirculation: Recirculation) -> F64:
-    """What the steady states read of the server groups, see ``_HallPart``, (5, G)."""
+    """Values of the server groups that the steady states need, see ``_HallPart``, (5, G)."""
     return np.stack(
         [
             servers.count,

@@ -349,7 +349,7 @@ def _runs(hall: HallConfig, window: _Window, blocks: _Blocks) -> _Runs:
     first_shift, last_shift = _shift_bounds(hall, window, row)
     counts = last_shift - first_shift + 1
     run_offsets = np.concatenate([[0], np.cumsum(counts)])
-    # Of each run: its rack, the row of its sources, and the row and place of the rack.
+    # Each run has a rack, a row of sources, and the row and place of its rack.
     rack = np.repeat(np.arange(hall.racks), counts)
     shift = first_shift[rack] + np.arange(len(rack)) - run_offsets[rack]
     row, place = row[rack], place[rack]

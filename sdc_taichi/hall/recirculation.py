@@ -160,7 +160,7 @@ def _contained_approach_k(
     contained = config.model_copy(update={"servers": config.servers.model_copy(update=full)})
 
     def approach_k(at: DesignPoint) -> F64:
-        # What the units cannot supply comes from the exhaust mix too.
+        # Air that the units cannot supply comes from the exhaust mix too.
         need = float(np.sum((1.0 - share) * at.airflow_m3s))
         covered = min(1.0, fresh_share * design.crac_flow_m3s / need)
         return (1.0 - (1.0 - share) * covered) * weights.apply(at.outlet_rise_k)

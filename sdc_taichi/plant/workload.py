@@ -22,7 +22,7 @@ TASKS_PER_STEP = 100.0
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """What happens to the work of B data centers in one step."""
+    """Amounts of work that arrive, start, wait and leave in one step of B data centers."""
 
     utilisation: F64
     """Work that starts, as a share of capacity, 0..1, (B,)."""
@@ -138,7 +138,7 @@ def tasks(
     free = np.maximum(cap - arrived - forced, 0.0)
     drainable = np.minimum(np.minimum(waiting - forced, flexible), free)
     drained = np.floor(np.maximum(command, 0.0) * drainable)
-    # As released: tasks that find the queue full count as dropped and run all the same.
+    # In the released code, tasks that find the queue full count as dropped and run all the same.
     started = arrived - deferred + forced + drained
     return Work(
         utilisation=started / TASKS_PER_STEP,

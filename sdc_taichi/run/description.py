@@ -1,4 +1,4 @@
-"""What a run is, before its first step: versions, seed, inputs and data centers."""
+"""Description of a run before its first step: versions, seed, inputs and data centers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FORMAT = "sdc-run/1"
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
-    """What a run is asked to do."""
+    """Controller, length and seed of a run, as requested."""
 
     controller: str
     """Name of the controller, as metrics.json and reports show it."""

@@ -14,7 +14,7 @@ Definitions (PUE, CUE and WUE after The Green Grid, white papers 49, 32 and 35):
     wue_l_per_kwh    make-up water / IT
     cue_kg_per_kwh   cfp_kg / IT, cfp_kg being grid energy times carbon intensity, step by step
     battery_throughput_kwh  energy delivered, as warranties count it
-    over_27_degree_h  what inlets exceed 27 C by, summed over time, mean over the servers
+    over_27_degree_h  inlet temperature in excess of 27 C, summed over time, mean over the servers
     shi, rhi, rti_pct, rci_hi_pct, rci_lo_pct  means over the steps (see ``air_metrics``)
     rci_hi_min_pct   rci_hi_pct of the worst step
 

@@ -162,7 +162,7 @@ class _GroupInlets:
 def _conditions(
     unit_supply_c: F64, placement: Placement, supply: Supply, surroundings: Surroundings
 ) -> Conditions:
-    """What the halls meet during a step."""
+    """Boundary conditions of the halls during a step."""
     return Conditions(
         unit_supply_c=unit_supply_c,
         utilisation=placement.utilisation,

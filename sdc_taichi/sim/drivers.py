@@ -58,7 +58,7 @@ class FleetSeries:
         return self.offsets + index % self.lengths
 
     def sharing_places(self, other: FleetSeries) -> FleetSeries:
-        """The same series, with the offset and length arrays of ``other`` where they are equal.
+        """Copy that shares the offset and length arrays of ``other`` where they are equal.
 
         Series that share both arrays are read at places that are computed once.
         """
@@ -99,7 +99,7 @@ class Drivers:
     synthetic: tuple[bool, ...]
     """Whether any series of a data center is synthetic, B."""
     notes: tuple[str, ...]
-    """What the loaders repaired or warned of, each text once."""
+    """Repairs and warnings of the loaders, each text once."""
 
     @property
     def size(self) -> int:

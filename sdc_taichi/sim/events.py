@@ -30,16 +30,16 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """What events do to one step; arrays are read-only. U CRAC units, R racks, B data centers."""
+    """Effects of events on one step, as read-only arrays: U CRAC units, R racks, B data centers."""
 
     active: bool
     """Whether any event covers the step; without one, all is as if there were no events."""
     unit_up: Mask
     """Whether each CRAC unit is in order, (U,)."""
     chiller_share: F64
-    """What is left of the chiller's capacity, 0..1, (B,)."""
+    """Chiller capacity that is available, as a share of its full capacity, 0..1, (B,)."""
     rack_airflow: F64
-    """What is left of each rack's airflow, 0..1, (R,)."""
+    """Airflow of each rack that remains, as a share of its full airflow, 0..1, (R,)."""
     outdoor_offset_k: F64
     """Offset of dry bulb and wet bulb alike, so that their order is kept, in K, (B,)."""
     grid_up: Mask
@@ -51,15 +51,15 @@ class ActiveEvent:
     """One event that covers a step."""
 
     kind: EventKind
-    """What happens, as in ``events`` of the config."""
+    """Kind of event, as in ``events`` of the config."""
     dc: int
     """Data center that meets the event, counted from 0."""
     target: int | None
     """CRAC unit or rack, counted within its data center; None is all of them, or none to name."""
     share: float | None
-    """What the event leaves of capacity or airflow, 0..1; None for kinds without a share."""
+    """Share of capacity or airflow that remains, 0..1; None for kinds without a share."""
     offset_k: float | None
-    """What the event adds to the outdoor temperatures, in K; None for kinds without an offset."""
+    """Addition to the outdoor temperatures, in K; None for kinds without an offset."""
     start_step: int
     """First step since reset that the event covers."""
     end_step: int
@@ -146,7 +146,7 @@ class Timeline:
         return not self._rules and not len(self._scheduled.kind)
 
     def reseeded(self, seed: I64 | int) -> Timeline:
-        """The same events with sampled ones of other seeds, (B,) or one for all."""
+        """Timeline whose sampled events are drawn with other seeds, (B,) or one for all."""
         if not self._rules:
             return self
         return Timeline(
@@ -159,7 +159,7 @@ class Timeline:
         )
 
     def at(self, step: int) -> Disturbance:
-        """What events do to step ``step`` after reset; one shared object while there are none."""
+        """Effects of events on step ``step`` after reset; a shared object while there are none."""
         found = self._covering(step)
         if not len(found.kind):
             return self._normal

@@ -61,7 +61,7 @@ _RESULTS = {f.name for f in fields(StepResult)} | {"supply_warming_k"}
 
 @dataclass(frozen=True, slots=True)
 class FacilityInputs:
-    """What a step of B data centers starts from, without what the models of a fleet do not read.
+    """Inputs of a step of B data centers; those that no model of a fleet reads are left out.
 
     Sums go over the CRAC units, racks or servers of a data center.
     """
@@ -80,9 +80,9 @@ class FacilityInputs:
     it_airflow_m3s: F64 = NOT_USED
     """Airflow through the servers, in m3/s, (B,)."""
     over_27_sum_k: F64 = NOT_USED
-    """Sum over the servers of what their inlets exceed 27 C by, in K, (B,)."""
+    """Sum over the servers of the inlet temperature in excess of 27 C, in K, (B,)."""
     under_18_sum_k: F64 = NOT_USED
-    """Sum over the servers of what their inlets fall short of 18 C by, in K, (B,)."""
+    """Sum over the servers of the inlet temperature's shortfall below 18 C, in K, (B,)."""
     inlet_m3k_s: F64 = NOT_USED
     """Sum over the racks of airflow times inlet temperature over supply, in m3 K/s, (B,)."""
     outlet_m3k_s: F64 = NOT_USED
@@ -126,7 +126,7 @@ class FacilityInputs:
     grid_up: F64 = NOT_USED
     """1 with grid, 0 in an outage, (B,); for fleets with events."""
     chiller_share: F64 = NOT_USED
-    """What is left of the chiller's capacity, 0..1, (B,); for fleets with events."""
+    """Share of the chiller's capacity that is available, 0..1, (B,); for fleets with events."""
     coil_share: F64 = NOT_USED
     """Design airflow of the CRAC units that run over that of all, (B,); for fleets with events."""
     no_unit_down: F64 = NOT_USED

@@ -47,7 +47,7 @@ that the servers draw."""
 
 @dataclass(slots=True)
 class Conditions:
-    """What the halls meet during one step."""
+    """Boundary conditions of the halls during one step."""
 
     unit_supply_c: F64
     """Supply air of each CRAC unit, in C, (U,)."""
@@ -80,8 +80,8 @@ class HallState:
     mixed_c: Reals
     """Temperature of the recirculated air before each rack, in C, (R,)."""
     exhaust_c: Reals
-    """What each rack gives to the exhaust mixes, times its strength, in C, (R,): its outlet, and
-    for the share of its air that failing fans do not move the mix before it."""
+    """Temperature that each rack gives to the exhaust mixes, times its strength, in C, (R,): its
+    outlet, and for the share of its air that failing fans do not move the mix before it."""
     captured_m3s: Reals
     """Recirculated air that each rack takes in, in m3/s, (R,)."""
     need_m3s: F64
@@ -127,9 +127,9 @@ class HallSums:
     outlet_m3k_s: F64
     """Sum over the servers of airflow times outlet temperature over supply, in m3 K/s, (B,)."""
     over_27_sum_k: F64
-    """Sum over the servers of what their inlets exceed 27 C by, in K, (B,)."""
+    """Sum over the servers of the inlet temperature in excess of 27 C, in K, (B,)."""
     under_18_sum_k: F64
-    """Sum over the servers of what their inlets fall short of 18 C by, in K, (B,)."""
+    """Sum over the servers of the inlet temperature's shortfall below 18 C, in K, (B,)."""
     hottest_rack: F64
     """Rack with the hottest inlet, counted from 0 in its data center, (B,)."""
     hottest_server: F64
@@ -202,7 +202,7 @@ class Hall:
         fresh_share = fleet.dcs[row_index(DC_COEFFICIENTS, "fresh_share")]
         self._fresh_m3s = fresh_share[fleet.unit_dc] * fleet.unit_design_m3s
         self._overridden_rows: set[str] = set()
-        """Of ``powered`` and ``fan_airflow``, what the last step set to other values than 1."""
+        """Rows (``powered``, ``fan_airflow``) that the last step set to other values than 1."""
 
         self._step_kernel = NamedKernel(hall.hall_kernel(precision), STEP_ARGUMENTS)
         self._layers_kernel = NamedKernel(layers.layers_kernel(precision), LAYERS_ARGUMENTS)
@@ -543,7 +543,7 @@ class Hall:
         self._has_rows_along_racks = True
 
     def _exhaust(self) -> Any:
-        """What the racks gave to the mixes in the last sweep, times strength, by place."""
+        """Temperatures that racks gave to the mixes in the last sweep, times strength, by place."""
         side = self._control["exhaust_side"]
         other_side = self._memory["exhaust_odd_c"], self._memory["exhaust_c"]
         # Mostly all data centers have exchanged equally often.

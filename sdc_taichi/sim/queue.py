@@ -56,7 +56,7 @@ class Queue:
         self._last: F64 | None = None
         """That queue as others see it, (B, L)."""
         self._begin = (np.zeros(0), np.zeros(0))
-        """What waits and what is due in it."""
+        """Work that waits and work that is due in the queue ``_last``, in tasks, each (B,)."""
 
     def begin_step(self, queue: F64) -> tuple[F64, F64]:
         """Work that waits when a step begins, and what of it is due, in tasks, each (B,).

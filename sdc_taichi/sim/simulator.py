@@ -292,7 +292,7 @@ class Simulator:
 
 @dataclass(frozen=True, slots=True)
 class _Stages:
-    """What a step passes through, and what the stages share."""
+    """Stages of a step, and the objects that they share."""
 
     hall: Hall
     """Temperatures and power of servers and air."""
@@ -303,7 +303,7 @@ class _Stages:
     surroundings: SurroundingsModel
     """Weather, demand, and what is out of order."""
     workload: Workload
-    """What runs, waits, is due or dropped."""
+    """Work that runs, waits, is due or dropped."""
     allocation: WorkAllocation
     """Which racks work, and what they protect themselves from."""
     crac_units: CracUnits

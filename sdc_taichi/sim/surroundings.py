@@ -1,4 +1,4 @@
-"""What a step meets: weather, carbon intensity and demand, and what events do to the fleet."""
+"""Surroundings of a step: weather, carbon intensity, demand, and effects of events on the fleet."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sdc_taichi.types import F64, Exogenous
 
 @dataclass
 class Surroundings:
-    """What one step meets: B data centers, U CRAC units, R racks."""
+    """Surroundings of one step of B data centers, U CRAC units and R racks."""
 
     outdoor_c: F64
     """Dry-bulb temperature outside, in C, (B,)."""
@@ -32,13 +32,13 @@ class Surroundings:
     fully_powered: bool
     """Whether all data centers have power throughout the step."""
     chiller_share: F64
-    """What is left of the chiller's capacity, 0..1, (B,)."""
+    """Chiller capacity that is available, as a share of its full capacity, 0..1, (B,)."""
     unit_running: F64
     """1 for CRAC units that run, 0 for those that are down or without power, (U,)."""
     all_running: bool
     """Whether all CRAC units run."""
     rack_airflow: F64 | None
-    """What is left of each rack's airflow, 0..1, (R,); None is all of it."""
+    """Airflow of each rack that remains, as a share of its full airflow, 0..1, (R,); None is 1."""
 
 
 class SurroundingsModel:

@@ -47,7 +47,7 @@ class Placement:
 
 @dataclass
 class RackOutcome:
-    """What racks make of their work and inlets in one step: B data centers, R racks."""
+    """Results of one step of R racks in B data centers, from their work and inlets."""
 
     rack_status: Status
     """Status at the end of the step: 0 normal, 1 throttled, 2 tripped, (R,)."""
