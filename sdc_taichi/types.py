@@ -201,7 +201,7 @@ class StepResult:
     dropped_tasks: F64
     """Work that found the queue full, in tasks, (B,)."""
     lost_tasks: F64
-    """Work that had been started and went down with its servers, in tasks, (B,)."""
+    """Work that had been started and found no server or went down with it, in tasks, (B,)."""
     queue_tasks: F64
     """Work in the queue at the end of the step, in tasks, (B,)."""
     oldest_age_h: F64
