@@ -162,17 +162,22 @@ RACK_STATE = {
     "unshifted_mix_c": "exhaust mix of the next sweep but for the shift of its data center, C",
     "mix_input_k": "what the weights of dense halls are multiplied with, K",
 }
-RACK_OUT = {
+RACK_MEANS = {
     "cpu_w": "power without fans, W",
     "fan_w": "power of the server fans, W",
     "airflow_m3s": "airflow, m3/s",
     "inlet_c": "mean inlet, weighted by airflow with recirculation, C",
     "outlet_c": "outlet, C",
+}
+"""Values of each rack in the last sweep, in transient halls means over the substeps; they are also
+summed over the racks."""
+RACK_EXTREMES = {
     "inlet_max_c": "hottest inlet of a server, C",
     "outlet_max_c": "hottest outlet of a server, C",
 }
-"""Values of each rack in the last sweep; in transient halls means over the substeps, and maxima of
-all substeps."""
+"""Extremes of each rack in the last sweep, in transient halls in any substep."""
+RACK_OUT = RACK_MEANS | RACK_EXTREMES
+"""Results of each rack."""
 GROUP_OUT = {
     "inlet_c": "inlet, C",
     "outlet_c": "outlet, C",
@@ -198,10 +203,8 @@ BLOCK_TERMS = {
 N_TERMS, N_BLOCK_TERMS = len(TERMS), len(BLOCK_TERMS)
 SCRATCH = N_TERMS + CHUNK_BLOCKS * N_BLOCK_TERMS
 """Vectors of work space for a chunk: its TERMS, then BLOCK_TERMS block by block."""
-RACK_SUMS = tuple(name for name in RACK_OUT if not name.endswith("_max_c"))
-"""Rows of RACK_OUT whose sums over the racks are wanted; they come first."""
 SUMS = (
-    {name: f"sum over the racks: {RACK_OUT[name]}" for name in RACK_SUMS}
+    {name: f"sum over the racks: {text}" for name, text in RACK_MEANS.items()}
     | {name: f"sum over the racks: {text}" for name, text in TERMS.items()}
     | {
         "inlet_max_c": "hottest inlet, C",
@@ -213,7 +216,7 @@ SUMS = (
     }
 )
 """Sums and extremes of each chunk. In transient halls, sums of TERMS before ``flow_m3s`` run over
-the substeps, and sums of RACK_OUT are of its means over the substeps."""
+the substeps, and sums of RACK_MEANS are of means over the substeps."""
 DC_OUT = {
     "cpu_w": "power without fans, W",
     "it_fan_w": "power of the server fans, W",

@@ -1,6 +1,6 @@
 """Sums and extremes over the racks of a chunk, and over the chunks of a data center.
 
-Rows of SUMS fall in three ranges by when they are wanted. Sums of RACK_OUT (rows 0 to
+Rows of SUMS fall in three ranges by when they are wanted. Sums of RACK_MEANS (rows 0 to
 ``FIRST_TERM``) are wanted at the end of a step; sums of TERMS up to ``FIRST_OF_SWEEP`` at the end
 as well, over all substeps of transient halls; the rest after every sweep, by the CRAC units and the
 rule to stop.
@@ -11,10 +11,10 @@ from typing import no_type_check
 import taichi as ti
 
 from .arguments import row_index
-from .hall_arguments import LANES, RACK_SUMS, SUMS, TERMS
+from .hall_arguments import LANES, RACK_MEANS, SUMS, TERMS
 
 N_SUMS = len(SUMS)
-FIRST_TERM = len(RACK_SUMS)
+FIRST_TERM = len(RACK_MEANS)
 """First row that is the sum of one of TERMS, in their order."""
 FIRST_OF_SWEEP = row_index(SUMS, "flow_m3s")
 """First row that belongs to the present sweep or substep alone."""
@@ -38,7 +38,7 @@ def sum_lanes(lanes):
 @ti.func
 @no_type_check
 def sum_racks(hall: ti.template(), chunk_at, row):
-    """Sum of a row of RACK_OUT over the racks of a chunk, in f64: lane by lane, then the lanes."""
+    """Sum over the racks of a chunk of a row of RACK_MEANS, in f64: lane by lane, then lanes."""
     lanes = ti.Vector([ti.cast(0.0, ti.f64)] * LANES)
     block_at = hall.chunks[chunk_at].first_block
     while block_at < hall.chunks[chunk_at + 1].first_block:

@@ -29,7 +29,14 @@ def script() -> ModuleType:
 
 
 def test_the_measured_files_give_the_embedded_figures(script: ModuleType, real_data: Path) -> None:
-    text = script.as_text(script.fit(real_data, coefficients()))
+    there = [
+        name
+        for name in script.PLACES
+        if list(real_data.glob(f"weather/USA_{name}_*.epw"))
+        and list(real_data.glob(f"carbon/{name}_*.csv"))
+    ]
+    every = set(there) == set(script.PLACES)
+    text = script.as_text(script.fit(real_data, coefficients(), sites=[] if every else there))
     assert text == (ROOT / "data" / "coefficients.json").read_text("utf-8")
 
 
