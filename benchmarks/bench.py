@@ -106,7 +106,7 @@ def start(part: str, *arguments: Any, **variables: str) -> subprocess.Popen[str]
 
 def kernel_and_peers(quick: bool) -> Iterator[Figure]:
     """Flat halls: share of the memory roof, reduction alone, and the peers."""
-    threads, rounds = runtime.ensure_started(), 3 if quick else 20
+    threads, rounds = runtime.ensure_started(), 1 if quick else 20
     fleets = {
         " x ".join(map(str, size)): fleet_of(*size, "approach")
         for size in (QUICK_SIZES if quick else SIZES)
@@ -176,7 +176,7 @@ def difference(given: Arguments, layers: ServerLayers, sums: Any) -> float:
 
 def environments(quick: bool) -> Iterator[Figure]:
     """Environment steps per second, three agents with observations and rewards."""
-    seconds = 0.02 if quick else 1.0
+    seconds = 0.005 if quick else 1.0
     many, some, most = (8, 2, 4) if quick else (4096, 64, 1024)
     corrected = sdc_taichi.load_config("corrected")
     transient = ["simulation.thermal=transient"]
@@ -247,7 +247,7 @@ def calls(quick: bool) -> Iterator[Figure]:
 
 def scaling(quick: bool) -> Iterator[Figure]:
     """Cost against size, threads, processes, memory, and growth."""
-    repeats = 3 if quick else 10
+    repeats = 1 if quick else 10
     per_server = {}
     for count in CURVE[:3] if quick else CURVE:
         servers = 4000 * count
@@ -278,7 +278,7 @@ def scaling(quick: bool) -> Iterator[Figure]:
         yield Figure(
             "scaling", f"memory, servers {name}", used["held"], "B/server", at_most, None, note
         )
-    count = 100 if quick else 10_000
+    count = 10 if quick else 10_000
     grown = child("cycles", count) / 2**20
     yield Figure("scaling", f"growth over {count:,} reset and close cycles", grown, "MB", 1.0)
 
@@ -289,7 +289,7 @@ def side_by_side(quick: bool) -> Iterator[Figure]:
     if (cores or 1) < 2:
         yield Figure("scaling", "two threads over one", None, note="skipped: one core")
         return
-    seconds, rounds = (0.05, 1) if quick else (1.0, 5)
+    seconds, rounds = (0.01, 1) if quick else (1.0, 5)
     size = [16, 20, 200] if quick else [4096, 20, 200]
     servers = int(np.prod(size))
     found = []
@@ -298,9 +298,9 @@ def side_by_side(quick: bool) -> Iterator[Figure]:
         found.append(2.0 * one / two)
     yield Figure("scaling", "memory roof, two threads over one", float(np.median(found)))
     hall = " x ".join(map(str, size))
+    halls = (("step with layers", hall, 1.7), ("reduction", hall, 1.7))
     for what, shape, least in (
-        ("step with layers", hall, 1.7),
-        ("reduction", hall, 1.7),
+        *(() if quick else halls),
         ("environments", f"N = {size[0]}", None),
     ):
         # The three of a round follow each other: what memory bears from outside meets all of them.
@@ -364,7 +364,7 @@ def free_bytes() -> int:
 
 def starting(quick: bool) -> Iterator[Figure]:
     """Import, init and first step in a new process, with an empty and a filled kernel cache."""
-    for what in ("environment",) if quick else ("simulator", "environment"):
+    for what in ("simulator",) if quick else ("simulator", "environment"):
         with tempfile.TemporaryDirectory() as cache:
             # Bytecode is kept, as of an installed package, whatever the shell says.
             around = {"TI_OFFLINE_CACHE_FILE_PATH": cache, "PYTHONDONTWRITEBYTECODE": ""}
@@ -380,8 +380,12 @@ def starting(quick: bool) -> Iterator[Figure]:
 def recording(quick: bool) -> Iterator[Figure]:
     """A month of simulators and environments with a recorder and without."""
     days, repeats = (1, 1) if quick else (31, 7)
-    runs = [(f"simulator, {count} data centers", simulated, count) for count in (1, 4, 64)]
-    runs += [("PettingZoo, N = 1", played, 1), ("vector_env, N = 64", played, 64)]
+    runs = [
+        (f"simulator, {count} data centers", simulated, count)
+        for count in ((1, 2) if quick else (1, 4, 64))
+    ]
+    most = 2 if quick else 64
+    runs += [("PettingZoo, N = 1", played, 1), (f"vector_env, N = {most}", played, most)]
     for name, make, count in runs:
         spent: list[list[float]] = [[], []]
         with contextlib.ExitStack() as made:

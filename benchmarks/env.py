@@ -20,7 +20,7 @@ import numpy as np
 import sdc_taichi
 
 SIZES = (1, 64, 1024, 4096, 16384)
-QUICK_SIZES = (1, 8)
+QUICK_SIZES = (2,)
 SYNC_MOST = 64
 RELEASED_PER_S = 680.0
 
@@ -76,7 +76,7 @@ def main() -> None:
     given = parser.parse_args()
     overrides = ["simulation.thermal=transient"] if given.transient else []
     config = sdc_taichi.load_config(given.preset, overrides)
-    seconds = 0.05 if given.quick else 1.0
+    seconds = 0.01 if given.quick else 1.0
     print("     N   vector_env     make_vec       sync  to sync  to 680/s")
     peer = 0.0
     for num_envs in QUICK_SIZES if given.quick else SIZES:

@@ -18,6 +18,8 @@ from sdc_taichi import Simulator, drivers_from_arrays, load_config
 from sdc_taichi.config import apply_overrides
 
 DRY_BULB_ABOVE_WET_K = 5.0
+WET_BULBS_C = np.arange(-5.0, 28.0, 1.0)
+UTILISATIONS = np.arange(0.2, 1.01, 0.05)
 
 
 def power_kw(
@@ -64,8 +66,7 @@ def main(folder: Path) -> None:
     """Draw the figure and print the tables."""
     from matplotlib.figure import Figure
 
-    wet_bulb = np.arange(-5.0, 28.0, 1.0)
-    load = np.arange(0.2, 1.01, 0.05)
+    wet_bulb, load = WET_BULBS_C, UTILISATIONS
     studies = {
         "corrected": (np.arange(16.0, 23.01, 0.5), ()),
         "sustaindc": (np.append(np.arange(15.0, 21.6, 0.5), 21.6), ("site.location=CA",)),

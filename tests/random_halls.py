@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ import reference_twin
 from sdc_taichi import ConfigError, DataCenterConfig, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.hall.recirculation import calibrate
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums, Precision
 from sdc_taichi.types import F64
 
@@ -94,20 +97,27 @@ def random_hall(
     raise AssertionError(f"no hall of {shape} closes")
 
 
-def random_halls(seed: int) -> list[DataCenterConfig]:
+@lru_cache(maxsize=128)
+def fleet_of(*configs: DataCenterConfig) -> Fleet:
+    """The fleet of these data centers, which tests of both precisions share."""
+    return build_fleet(configs)
+
+
+@lru_cache(maxsize=32)
+def random_halls(seed: int) -> tuple[DataCenterConfig, ...]:
     """A ragged fleet of one to four halls."""
     rng = np.random.default_rng(seed)
     shapes = [SMALL[i] for i in rng.integers(len(SMALL), size=rng.integers(1, 5))]
     if rng.integers(2):
         shapes[0] = (MERGED + LONG)[int(rng.integers(len(MERGED + LONG)))]
-    return [random_hall(rng, f"dc{i}", shape) for i, shape in enumerate(shapes)]
+    return tuple(random_hall(rng, f"dc{i}", shape) for i, shape in enumerate(shapes))
 
 
 def random_conditions(
-    rng: np.random.Generator, configs: list[DataCenterConfig], *, kind: int | None = None
+    rng: np.random.Generator, configs: Sequence[DataCenterConfig], *, kind: int | None = None
 ) -> Conditions:
     """Anything that a hall may meet; ``kind`` 0 loads racks alike, 1 by rack and 2 by group."""
-    fleet = build_fleet(configs)
+    fleet = fleet_of(*configs)
     units, racks = fleet.units, fleet.racks
     kind = int(rng.integers(3)) if kind is None else kind
     low = rng.uniform(0.5, 1.0, units)
@@ -142,9 +152,9 @@ class Part:
     breath: F64
 
 
-def parts(configs: list[DataCenterConfig], met: Conditions) -> list[Part]:
+def parts(configs: Sequence[DataCenterConfig], met: Conditions) -> list[Part]:
     """Every data center of a fleet, for the twin."""
-    fleet, out = build_fleet(configs), []
+    fleet, out = fleet_of(*configs), []
     for i, config in enumerate(configs):
         racks = slice(*fleet.rack_offsets[i : i + 2])
         groups = slice(fleet.group_offsets[racks.start], fleet.group_offsets[racks.stop])
@@ -190,10 +200,12 @@ def assert_close(found: Any, expected: Any, rel: float, name: object, scale: flo
     np.testing.assert_allclose(found, expected, rtol=rel, atol=rel * scale, err_msg=str(name))
 
 
-def assert_agrees(configs: list[DataCenterConfig], met: Conditions, precision: Precision) -> None:
+def assert_agrees(
+    configs: Sequence[DataCenterConfig], met: Conditions, precision: Precision
+) -> None:
     """Everything that the kernels compute against the twin."""
     rel = {"f64": 1e-11, "f32": 5e-4}[precision]
-    hall = Hall(build_fleet(configs), precision)
+    hall = Hall(fleet_of(*configs), precision)
     sums, layers = hall.solve(met), hall.servers()
     for i, part in enumerate(parts(configs, met)):
         twin, name = steady_twin(part), configs[i].name
@@ -209,17 +221,17 @@ def assert_agrees(configs: list[DataCenterConfig], met: Conditions, precision: P
             found = getattr(layers, field)[part.servers]
             assert_close(found, expected, rel, (name, "server", field))
         hottest = layers.inlet_c[part.servers].max()
-        fleet = build_fleet(configs)
+        fleet = fleet_of(*configs)
         rack = part.racks.start + int(sums.hottest_rack[i])
         server = fleet.server_offsets[fleet.group_offsets[rack]] + int(sums.hottest_server[i])
         assert layers.inlet_c[server] == hottest == sums.inlet_max_c[i]
 
 
-def at_design(configs: list[DataCenterConfig]) -> HallSums:
+def at_design(configs: Sequence[DataCenterConfig]) -> HallSums:
     setpoint_c = np.concatenate(
         [np.full(c.hvac.crac.units, c.hvac.setpoint.max_c) for c in configs]
     )
-    return Hall(build_fleet(configs), "f64").solve(Conditions(setpoint_c, np.ones(len(configs))))
+    return Hall(fleet_of(*configs), "f64").solve(Conditions(setpoint_c, np.ones(len(configs))))
 
 
 def flat(config: DataCenterConfig) -> DataCenterConfig:
@@ -234,9 +246,9 @@ def flat(config: DataCenterConfig) -> DataCenterConfig:
     return config.model_copy(update={"servers": servers})
 
 
-def own_part(values: HallSums, configs: list[DataCenterConfig], index: int) -> dict[str, Any]:
+def own_part(values: HallSums, configs: Sequence[DataCenterConfig], index: int) -> dict[str, Any]:
     """What a fleet computed for one of its data centers."""
-    fleet = build_fleet(configs)
+    fleet = fleet_of(*configs)
     racks = slice(*fleet.rack_offsets[index : index + 2])
     units = slice(*fleet.unit_offsets[index : index + 2])
     out = {}
@@ -250,8 +262,8 @@ def own_part(values: HallSums, configs: list[DataCenterConfig], index: int) -> d
     return out
 
 
-def own_conditions(met: Conditions, configs: list[DataCenterConfig], index: int) -> Conditions:
-    fleet = build_fleet(configs)
+def own_conditions(met: Conditions, configs: Sequence[DataCenterConfig], index: int) -> Conditions:
+    fleet = fleet_of(*configs)
     racks = slice(*fleet.rack_offsets[index : index + 2])
     where = {
         "utilisation": slice(index, index + 1),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -200,21 +201,15 @@ def path_lengths_m(hall: HallConfig) -> F64:
     for row in range(1, hall.rows):
         aisle = m.cold_aisle_m if row % 2 else m.hot_aisle_m
         row_y.append(row_y[-1] + m.rack_depth_m + aisle)
-    places = [
-        ((k + 0.5) * m.rack_pitch_m, row_y[row], 1 if row % 2 == 0 else -1)
-        for row in range(hall.rows)
-        for k in range(hall.racks_per_row)
-    ]
-    ends = (0.0, hall.racks_per_row * m.rack_pitch_m)
+    x = np.tile((np.arange(hall.racks_per_row) + 0.5) * m.rack_pitch_m, hall.rows)
+    y = np.repeat(row_y, hall.racks_per_row)
+    facing = np.repeat([1 if row % 2 == 0 else -1 for row in range(hall.rows)], hall.racks_per_row)
     half = m.rack_depth_m / 2
-    out = np.empty((hall.racks, hall.racks))
-    for j, (xj, yj, facing) in enumerate(places):
-        for i, (xi, yi, other) in enumerate(places):
-            across = abs((yj + facing * half) - (yi - other * half))
-            over = m.rack_height_m + float(np.hypot(xj - xi, across))
-            around = min(abs(xi - end) + abs(xj - end) for end in ends) + across
-            out[j, i] = min(over, around)
-    return out
+    across = np.abs((y + facing * half)[:, None] - (y - facing * half))
+    over = m.rack_height_m + np.hypot(x[:, None] - x, across)
+    ends = (0.0, hall.racks_per_row * m.rack_pitch_m)
+    around = np.min([np.abs(x - end) + np.abs(x - end)[:, None] for end in ends], axis=0) + across
+    return np.asarray(np.minimum(over, around))
 
 
 def layout_weights(hall: HallConfig, airflow: F64) -> F64:
@@ -265,7 +260,13 @@ def _supply_shares(config: DataCenterConfig) -> F64:
     return np.asarray(out / out.sum(axis=1, keepdims=True))
 
 
-def calibrated(config: DataCenterConfig, matrix: F64 | None = None) -> HallTwin:
+@lru_cache(maxsize=128)
+def calibrated(config: DataCenterConfig) -> HallTwin:
+    """A hall at its design point, which tests of both precisions share."""
+    return calibrated_to(config)
+
+
+def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTwin:
     """A hall at its design point; ``matrix`` is the R of a user's file."""
     hall, s = config.hall, config.servers
     racks = hall.racks

@@ -386,7 +386,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
         "print(runtime.ensure_started(), t.digest_of_large_halls())"
     )
     found = {}
-    for threads in (1, 2, 3):
+    for threads in (1, 3):
         done = subprocess.run(
             [sys.executable, "-c", code],
             cwd=os.path.dirname(__file__),

@@ -64,7 +64,7 @@ def test_matrix_of_a_file_agrees_with_the_twin(kind: str, scaled: bool, tmp_path
         ],
     )
     met = Conditions(np.array([20.0]), np.array([0.7]))
-    twin = reference_twin.calibrated(config, matrix)
+    twin = reference_twin.calibrated_to(config, matrix)
     if not scaled:
         np.testing.assert_allclose(calibrate(config).matrix(), matrix, rtol=1e-9, atol=1e-12)
     ones, full = np.ones(6), np.ones(1)

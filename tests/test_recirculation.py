@@ -24,6 +24,7 @@ from random_halls import (
     assert_close,
     at_design,
     flat,
+    fleet_of,
     own_conditions,
     own_part,
     parts,
@@ -94,7 +95,7 @@ def test_most_sweeps_start_where_they_end(overrides: list[str]) -> None:
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_every_server_may_be_its_own(precision: Precision) -> None:
     config = load_config("corrected", ["hall.servers_per_rack=12", "hall.height_zones=12"])
-    fleet = build_fleet(config)
+    fleet = fleet_of(config)
     assert fleet.groups == fleet.servers == 20 * 12
     rng = np.random.default_rng(3)
     assert_agrees([config], random_conditions(rng, [config], kind=2), precision)
@@ -108,7 +109,7 @@ def test_fans_without_limits_of_their_airflow(precision: Precision) -> None:
     )
     assert_agrees([config], Conditions(np.array([18.0]), np.array([0.05])), precision)
     # The curve is below 0 here, and fans do not blow backwards; heat goes to the room all the same.
-    sums = Hall(build_fleet(config), precision).solve(Conditions(np.array([4.0]), np.zeros(1)))
+    sums = Hall(fleet_of(config), precision).solve(Conditions(np.array([4.0]), np.zeros(1)))
     assert sums.it_airflow_m3s[0] == sums.it_fan_w[0] == 0.0
     carried = 1.225 * 1006.0 * sums.crac_flow_m3s[0] * (sums.return_c[0] - 4.0)
     assert carried == pytest.approx(sums.cpu_w[0], rel=TOLERANCE[precision])
@@ -124,7 +125,7 @@ def test_halls_of_any_size_give_up_after_as_many_sweeps(
         [f"hall.rows={shape[0]}", f"hall.racks_per_row={shape[1]}", "hall.supply_approach_k=5",
          "hall.return_approach_k=-3", "servers.power_w=[200, 20]"],
     )  # fmt: skip
-    hall, least = Hall(build_fleet(config), precision), np.array([1e-3])
+    hall, least = Hall(fleet_of(config), precision), np.array([1e-3])
     still = Conditions(np.array([20.0]), np.ones(1), unit_low=least, unit_high=least)
     with pytest.raises(SdcError, match=r"or set simulation\.thermal") as error:
         hall.solve(still)
@@ -138,7 +139,7 @@ def test_halls_of_any_size_give_up_after_as_many_sweeps(
 def test_conditions_that_are_no_numbers_are_refused(inlet_model: str) -> None:
     config = load_config("corrected", [f"hall.inlet_model={inlet_model}"])
     for supply_c, load in ((np.nan, 0.5), (18.0, np.nan)):
-        hall = Hall(build_fleet(config), "f32")
+        hall = Hall(fleet_of(config), "f32")
         with pytest.raises(SdcError, match="is not finite; valid are finite numbers"):
             hall.solve(Conditions(np.array([supply_c]), np.array([load])))
 
@@ -241,7 +242,7 @@ def leaving(part: Part, sums: HallSums, layers: ServerLayers) -> tuple[float, fl
 def test_all_power_leaves_with_the_air(precision: Precision, seed: int) -> None:
     configs = random_halls(seed)
     met = random_conditions(np.random.default_rng(seed + 1), configs)
-    hall = Hall(build_fleet(configs), precision)
+    hall = Hall(fleet_of(*configs), precision)
     sums, layers = hall.solve(met), hall.servers()
     for i, part in enumerate(parts(configs, met)):
         heat_w, power_w, left_over = leaving(part, sums, layers)
@@ -264,7 +265,7 @@ def test_racks_with_failing_fans_give_no_more_heat_than_they_have(
 ) -> None:
     config, breath = load_config("corrected"), np.ones(20)
     breath[failed] = share
-    hall = Hall(build_fleet(config), "f64")
+    hall = Hall(fleet_of(config), "f64")
     before = hall.solve(Conditions(np.array([18.0]), np.ones(1)))
     met = Conditions(np.array([18.0]), np.ones(1), rack_airflow=breath)
     sums, layers = hall.solve(met), hall.servers()
@@ -293,7 +294,7 @@ def test_racks_loaded_alike_give_no_more_air_than_they_exhaust(
     rng = np.random.default_rng(seed)
     config = random_hall(rng, "dc", SMALL[int(rng.integers(len(SMALL)))])
     met = Conditions(np.full(config.hvac.crac.units, supply_c), np.array([load]))
-    hall = Hall(build_fleet(config), "f64")
+    hall = Hall(fleet_of(config), "f64")
     sums, layers = hall.solve(met), hall.servers()
     part = parts([config], met)[0]
     heat_w, power_w, left_over = leaving(part, sums, layers)
@@ -311,7 +312,7 @@ def test_without_recirculation_servers_breathe_supply_air(
     config = load_config("corrected", [change, "hvac.crac.units=3"])
     # A contained hall needs more supply air than an open one.
     met = Conditions(np.full(3, 19.0), np.array([0.3]))
-    hall = Hall(build_fleet(config), precision)
+    hall = Hall(fleet_of(config), precision)
     hall.solve(met)
     assert_close(hall.servers().inlet_c, np.full(4000, 19.0), TOLERANCE[precision] / 10, "inlet")
 
@@ -323,7 +324,7 @@ def test_more_supply_air_never_warms_an_inlet(simple: bool, seed: int, load: flo
     rng = np.random.default_rng(seed)
     config = random_hall(rng, "dc", SMALL[int(rng.integers(len(SMALL)))])
     config = flat(config) if simple else config
-    hall, units = Hall(build_fleet(config), "f64"), np.ones(config.hvac.crac.units)
+    hall, units = Hall(fleet_of(config), "f64"), np.ones(config.hvac.crac.units)
     inlets = [
         hall.solve(
             Conditions(20 * units, np.array([load]), unit_low=f * units, unit_high=f * units)
@@ -340,7 +341,7 @@ def moved_load_k(
     config: DataCenterConfig, giver: int, taker: int, power_w: float
 ) -> tuple[F64, float]:
     """Change of all inlets when a rack takes ``power_w`` from another, and what really moved."""
-    hall, racks = Hall(build_fleet(config), "f64"), config.hall.racks
+    hall, racks = Hall(fleet_of(config), "f64"), config.hall.racks
     load = np.full(racks, 0.5)
 
     def solve(change: float) -> HallSums:
@@ -394,9 +395,9 @@ def test_servers_agree_with_their_racks_and_get_warmer_upwards(seed: int) -> Non
     rng = np.random.default_rng(seed)
     config = random_hall(rng, "dc", SMALL[int(rng.integers(len(SMALL)))], even=True)
     met = random_conditions(rng, [config], kind=0)
-    hall = Hall(build_fleet(config), "f64")
+    hall = Hall(fleet_of(config), "f64")
     sums, layers = hall.solve(met), hall.servers()
-    fleet = build_fleet(config)
+    fleet = fleet_of(config)
     rack, air = fleet.server_rack(), reference_twin.calibrated(config).air_j_per_m3_k
     warming = layers.outlet_c - layers.inlet_c
     on = warming > 0
@@ -431,10 +432,10 @@ def test_servers_agree_with_their_racks_and_get_warmer_upwards(seed: int) -> Non
 def test_a_hall_of_a_batch_equals_itself_alone(precision: Precision, seed: int) -> None:
     configs = random_halls(seed)
     met = random_conditions(np.random.default_rng(seed + 1), configs)
-    batch = Hall(build_fleet(configs), precision)
+    batch = Hall(fleet_of(*configs), precision)
     together, layers = batch.solve(met), batch.servers()
     for i, (config, part) in enumerate(zip(configs, parts(configs, met), strict=True)):
-        alone = Hall(build_fleet(config), precision)
+        alone = Hall(fleet_of(config), precision)
         sums, own = alone.solve(own_conditions(met, configs, i)), alone.servers()
         for name, expected in own_part(together, configs, i).items():
             assert np.array_equal(getattr(sums, name), expected), (config.name, name)
@@ -448,7 +449,7 @@ def test_a_hall_forgets_what_it_solved_before(precision: Precision) -> None:
     configs = random_halls(5)
     rng = np.random.default_rng(0)
     first, second = (random_conditions(rng, configs) for _ in range(2))
-    hall, fresh = (Hall(build_fleet(configs), precision) for _ in range(2))
+    hall, fresh = (Hall(fleet_of(*configs), precision) for _ in range(2))
     hall.solve(first)
     hall.servers()
     again, expected = hall.solve(second), fresh.solve(second)

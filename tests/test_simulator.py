@@ -583,10 +583,10 @@ def test_memory_does_not_grow_with_simulators_made_and_closed() -> None:
         cycle(i)
     gc.collect()
     before = resident_mb()
-    for i in range(300):
+    for i in range(150):
         cycle(i)
     gc.collect()
-    assert resident_mb() - before < 20.0
+    assert resident_mb() - before < 10.0
 
 
 def test_server_layers_are_given_back() -> None:

@@ -144,7 +144,7 @@ def whole(steps: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 @pytest.mark.parametrize("model", MODELS)
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(steps=STEPS, limits=LIMITS)
 def test_every_step_equals_a_line_of_batches(
     model: str, steps: list[tuple[float, float]], limits: Limits
@@ -172,7 +172,7 @@ def test_every_step_equals_a_line_of_batches(
         np.testing.assert_allclose(age_histogram(queue, edges)[0], bins, rtol=0, atol=1e-7)
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(steps=STEPS, limits=LIMITS)
 def test_fluid_work_is_conserved_and_within_its_limits(
     steps: list[tuple[float, float]], limits: Limits
@@ -204,7 +204,7 @@ def test_fluid_work_is_conserved_and_within_its_limits(
     assert arrived == pytest.approx(executed + queue[0, -1] + dropped, abs=1e-9)
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(steps=STEPS, limits=LIMITS)
 def test_whole_tasks_stay_whole_and_are_conserved(
     steps: list[tuple[float, float]], limits: Limits
