@@ -9,6 +9,7 @@ import subprocess
 import sys
 import weakref
 from dataclasses import fields
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import reference_twin
+from random_halls import fleet_of
 from sdc_taichi import DataCenterConfig, RuntimeStateError, Simulator, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.errors import SdcError
@@ -102,7 +104,7 @@ def solve(
     configs: list[DataCenterConfig], supply_c: F64, load: F64, precision: Precision
 ) -> HallSums:
     """Sums per data center and rack of a fleet."""
-    fleet = build_fleet(configs)
+    fleet = fleet_of(*configs)
     return Hall(fleet, precision).solve(Conditions(supply_c[fleet.unit_dc], load))
 
 
@@ -110,7 +112,7 @@ def solve_servers(
     configs: list[DataCenterConfig], supply_c: F64, load: F64, precision: Precision
 ) -> tuple[HallSums, dict[str, Any]]:
     """Sums and server layers of a fleet."""
-    fleet = build_fleet(configs)
+    fleet = fleet_of(*configs)
     hall = Hall(fleet, precision)
     sums, layers = hall.solve(Conditions(supply_c[fleet.unit_dc], load)), hall.servers()
     return sums, {f.name: getattr(layers, f.name) for f in fields(layers)}
@@ -253,7 +255,7 @@ def test_a_second_run_is_equal_to_the_bit(precision: Precision) -> None:
 
 def part_of(sums: HallSums, configs: list[DataCenterConfig], index: int) -> HallSums:
     """The sums of one data center of a fleet."""
-    fleet = build_fleet(configs)
+    fleet = fleet_of(*configs)
     whole = np.arange(fleet.size + 1)
     start: dict[str, Any] = {"rack": fleet.rack_offsets, "unit": fleet.unit_offsets}
     found = {}
@@ -305,6 +307,7 @@ def test_fan_exponents_may_differ_within_a_fleet(precision: Precision) -> None:
         assert results_equal(alone, part_of(batch, configs, i)), f"dc{i}"
 
 
+@cache
 def hall_of_many_racks(racks: int) -> DataCenterConfig:
     """Enough racks and servers for every thread to get slices of both kernels."""
     rng = np.random.default_rng(racks)
