@@ -444,6 +444,7 @@ def test_a_missing_snapshot_is_refused(tmp_path: Path) -> None:
 # --- documentation ------------------------------------------------------------------------------
 
 
+@pytest.mark.repo
 def test_the_docs_list_a_step_in_the_order_of_the_code() -> None:
     docs = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text()
     listed = docs.partition("## One step")[2].partition("## ")[0]
