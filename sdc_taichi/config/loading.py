@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -158,9 +160,14 @@ def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
 
 
 def _read_preset(name: str) -> tuple[str, dict[str, Any]]:
-    text = resources.files("sdc_taichi.configs").joinpath(f"{name}.yaml").read_text("utf-8")
     label = f"preset {name}"
-    return label, _with_base(label, _parse_yaml(text, label))
+    return label, deepcopy(_parse_preset(name, label))
+
+
+@cache
+def _parse_preset(name: str, label: str) -> dict[str, Any]:
+    text = resources.files("sdc_taichi.configs").joinpath(f"{name}.yaml").read_text("utf-8")
+    return _with_base(label, _parse_yaml(text, label))
 
 
 def _with_base(label: str, values: dict[str, Any]) -> dict[str, Any]:
