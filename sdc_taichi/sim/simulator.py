@@ -14,7 +14,7 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim import snapshot
-from sdc_taichi.sim.actions import ActionDecoder
+from sdc_taichi.sim.actions import ActionDecoder, Commands
 from sdc_taichi.sim.air import SteadyAir, TransientAir
 from sdc_taichi.sim.crac_units import CracUnits, Supply
 from sdc_taichi.sim.drivers import Drivers, load_drivers
@@ -22,9 +22,9 @@ from sdc_taichi.sim.events import ActiveEvent, schedule
 from sdc_taichi.sim.facility import Facility
 from sdc_taichi.sim.facility_stage import FacilityStage
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Hall, Precision
+from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
 from sdc_taichi.sim.sizing import Sizing, size
-from sdc_taichi.sim.surroundings import SurroundingsModel
+from sdc_taichi.sim.surroundings import Surroundings, SurroundingsModel
 from sdc_taichi.sim.unit_index import UnitIndex
 from sdc_taichi.sim.work_allocation import RackOutcome, WorkAllocation
 from sdc_taichi.sim.workload import Workload, WorkResult
@@ -173,17 +173,7 @@ class Simulator:
         racks = stages.allocation.protect(state, work, placement, air.rack_inlet_max_c)
         self._state = _next_state(state, work, supply, plant, racks, thermal)
         return _step_result(
-            {
-                "step": state.step,
-                "step_h": self.step_h,
-                **vars(commands),
-                **vars(surroundings),
-                **vars(work),
-                **vars(supply),
-                **vars(air),
-                **plant,
-                **vars(racks),
-            }
+            state.step, self.step_h, commands, surroundings, work, supply, air, racks, plant
         )
 
     def active_events(self, step: int) -> list[ActiveEvent]:
@@ -370,7 +360,17 @@ def _next_state(
 _values_of_result = itemgetter(*(f.name for f in fields(StepResult)))
 
 
-def _step_result(found: Mapping[str, Any]) -> StepResult:
+def _step_result(
+    step: int,
+    step_h: float,
+    commands: Commands,
+    surroundings: Surroundings,
+    work: WorkResult,
+    supply: Supply,
+    air: HallSums,
+    racks: RackOutcome,
+    plant: Mapping[str, Any],
+) -> StepResult:
     """Result of a step from all quantities of its stages, by the names of ``StepResult``.
 
     Where stages have a quantity of the same name, the later one has the final value.
@@ -378,4 +378,15 @@ def _step_result(found: Mapping[str, Any]) -> StepResult:
     Raises:
         KeyError: A field of ``StepResult`` that no stage has.
     """
+    found = {
+        "step": step,
+        "step_h": step_h,
+        **vars(commands),
+        **vars(surroundings),
+        **vars(work),
+        **vars(supply),
+        **vars(air),
+        **plant,
+        **vars(racks),
+    }
     return StepResult(*_values_of_result(found))
