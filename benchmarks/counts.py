@@ -1,4 +1,4 @@
-"""What a step costs in calls, which other jobs on the machine do not disturb."""
+"""Calls of a step, a measure of its cost that other jobs on the machine do not disturb."""
 
 import sys
 from collections.abc import Callable

@@ -85,7 +85,7 @@ MEMORY = ("w", "ts", "tf", "tm", "Phi")
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """What the measured files of a site do not say."""
+    """Facts about a site that its measured files do not hold."""
 
     label: str
     """City and state."""

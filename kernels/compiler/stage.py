@@ -8,7 +8,7 @@ and a temporary per operation, and some hundred of them cost more than the arith
 are thousands of data centers.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from hashlib import sha256
 from operator import itemgetter
@@ -72,10 +72,7 @@ class CompiledStage:
             KeyError: a quantity that the stage reads is missing.
         """
         assert self._values_read is not None, "made without reads"
-        if self._kernel is None:
-            self._compile(self._reads)
-        for row, values in zip(self._input_rows, self._values_read(quantities), strict=True):
-            row[...] = values
+        self._copy_inputs(self._reads, self._values_read(quantities))
         return self._new_results()
 
     def rows(self, **inputs: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -90,15 +87,20 @@ class CompiledStage:
         return self._results
 
     def _set_inputs(self, inputs: Arrays) -> None:
-        """Copy arguments to their rows, which are the same in every call."""
-        if self._kernel is None:
-            self._compile(tuple(inputs))
-        if tuple(inputs) != self._input_names:
+        """Take arguments by name, which are the same in every call."""
+        names = tuple(inputs)
+        if self._kernel is not None and names != self._input_names:
             raise TypeError(
-                f"arguments {[*inputs]}, expected {[*self._input_names]} as on the first call"
+                f"arguments {[*names]}, expected {[*self._input_names]} as on the first call"
             )
-        for row, values in zip(self._input_rows, inputs.values(), strict=True):
-            row[...] = values
+        self._copy_inputs(names, inputs.values())
+
+    def _copy_inputs(self, names: tuple[str, ...], values: Iterable[Any]) -> None:
+        """Copy values to the rows of the kernel, which the first call compiles."""
+        if self._kernel is None:
+            self._compile(names)
+        for row, value in zip(self._input_rows, values, strict=True):
+            row[...] = value
 
     def _new_results(self) -> dict[str, npt.NDArray[np.float64]]:
         """Run; results by name, rows of one new array."""
