@@ -33,7 +33,7 @@ class BatchEnv(EnvBase):
     how an episode ended and asks for the reset afterwards, so what follows is kept until it does.
 
     Args:
-        env: what ``sdc_taichi.vector_env`` returns.
+        env: what ``sdc_taichi.vector_env`` returns with ``autoreset_mode="SameStep"``.
         seed: of the first reset.
     """
 
@@ -141,7 +141,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)  # faster than two at these sizes
     torch.manual_seed(given.seed)
-    env = BatchEnv(sdc_taichi.vector_env(given.num_envs, days=given.days))
+    batch = sdc_taichi.vector_env(given.num_envs, days=given.days, autoreset_mode="SameStep")
+    env = BatchEnv(batch)
     check_env_specs(env, break_when_any_done="both")
     env.set_seed(given.seed)
     start = time.perf_counter()

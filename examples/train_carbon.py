@@ -113,7 +113,12 @@ def data_centers(sites: Sequence[str], weeks: Sequence[int]) -> list[DataCenterC
 def make_env(configs: Sequence[DataCenterConfig]) -> BatchEnv:
     """All three agents of the data centers; an episode is the week of each."""
     env = sdc_taichi.vector_env(
-        len(configs), config=list(configs), days=DAYS, start="fixed", rewards=carbon_reward
+        len(configs),
+        config=list(configs),
+        days=DAYS,
+        start="fixed",
+        rewards=carbon_reward,
+        autoreset_mode="SameStep",
     )
     return BatchEnv(env, seed=0)
 

@@ -102,9 +102,10 @@ class Outcome:
 
 def make(agent: str, num_envs: int, days: int, seed: int) -> VecMonitor:
     """The batch of one agent, with episode rewards in its infos."""
-    batch = BatchVecEnv(gymnasium.make_vec(IDS[agent], num_envs=num_envs, days=days))
-    batch.seed(seed)
-    return VecMonitor(batch)
+    batch = gymnasium.make_vec(IDS[agent], num_envs=num_envs, days=days, autoreset_mode="SameStep")
+    env = BatchVecEnv(batch)
+    env.seed(seed)
+    return VecMonitor(env)
 
 
 def train(

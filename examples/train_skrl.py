@@ -41,7 +41,7 @@ class BatchEnv(MultiAgentEnvWrapper):
     states before that are in ``infos["final"]``, where ``SeesFinal`` finds them.
 
     Args:
-        env: what ``sdc_taichi.vector_env`` returns.
+        env: what ``sdc_taichi.vector_env`` returns with ``autoreset_mode="SameStep"``.
         seed: of the first reset.
     """
 
@@ -252,7 +252,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
     prepare(given.seed)
-    env = BatchEnv(sdc_taichi.vector_env(given.num_envs, days=given.days), given.seed)
+    batch = sdc_taichi.vector_env(given.num_envs, days=given.days, autoreset_mode="SameStep")
+    env = BatchEnv(batch, given.seed)
     agent = learner(env, given.algorithm, rollout=given.rollout, hidden=given.hidden)
     rollouts = max(1, given.steps // (given.num_envs * given.rollout))
     start = time.perf_counter()

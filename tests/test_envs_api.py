@@ -18,6 +18,7 @@ import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import vector as wrappers
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from pettingzoo.test.state_test import state_test
 
@@ -62,10 +63,6 @@ BUSY: dict[str, Any] = {
 }
 """Everything at once that is random or goes on from step to step."""
 
-bounds_warning = pytest.mark.filterwarnings(
-    # Gymnasium recommends -1..1; a setpoint change is in K.
-    "ignore:.*For Box action spaces, we recommend using a symmetric and normalized:UserWarning"
-)
 probe_warning = pytest.mark.filterwarnings(
     # What PettingZoo's checkers pass as a reset option.
     "ignore:reset options. 'options' is without effect:UserWarning"
@@ -137,7 +134,6 @@ def test_aec_api(agents: tuple[str, ...], seen: str, mode: str) -> None:
     state_test(make(), parallel, num_cycles=5)
 
 
-@bounds_warning
 @pytest.mark.parametrize("name", IDS)
 @pytest.mark.parametrize("seen", SEEN)
 @pytest.mark.parametrize("mode", MODES)
@@ -147,7 +143,6 @@ def test_gymnasium_api(name: str, seen: str, mode: str) -> None:
     env.close()
 
 
-@bounds_warning
 @advice
 @probe_warning
 @pytest.mark.parametrize("mode", MODES)
@@ -201,6 +196,69 @@ def test_batch_is_what_gymnasium_makes_of_single_environments(
     one_by_one.close()
 
 
+def test_batches_start_the_next_episodes_when_gymnasiums_own_do() -> None:
+    default = inspect.signature(SyncVectorEnv).parameters["autoreset_mode"].default
+    batches: list[Any] = [
+        gymnasium.make_vec("sdc_taichi/Joint-v0", num_envs=2, **tiny()),
+        SdcVectorEnv(2, **tiny()),
+        multi_agent(2, **tiny()),
+    ]
+    for env in batches:
+        assert env.metadata["autoreset_mode"] is default
+
+
+@pytest.mark.parametrize("seen", SEEN)
+def test_gymnasiums_vector_wrappers(seen: str) -> None:
+    """Around a batch they give what they give around single environments."""
+    given: list[list[Any]] = []
+    for vectorization in (None, "sync"):
+        env: Any = gymnasium.make_vec(
+            "sdc_taichi/Battery-v0",
+            num_envs=2,
+            vectorization_mode=vectorization,
+            **tiny(actions="continuous", **SEEN[seen]),
+        )
+        env = wrappers.RecordEpisodeStatistics(env)
+        env = wrappers.NormalizeObservation(wrappers.FlattenObservation(env))
+        env.action_space.seed(0)
+        out = [env.reset(seed=3)]
+        for _ in range(STEPS + 2):
+            out.append(env.step(env.action_space.sample()))
+            out[-1][4].get("episode", {}).pop("t", None)  # seconds
+        ended = [infos["episode"]["l"].tolist() for *_, infos in out[1:] if "episode" in infos]
+        assert ended == [[STEPS, STEPS]]
+        given.append(out)
+        env.close()
+    assert same(*given)
+
+
+def test_a_multi_agent_batch_without_autoreset_waits_for_reset() -> None:
+    env = multi_agent(2, autoreset_mode="Disabled", **tiny())
+    hold = {agent: np.ones(2, np.int64) for agent in AGENTS}
+    env.reset(seed=0)
+    for _ in range(STEPS):
+        *_, truncated, infos = env.step(hold)
+    assert all(flags.all() for flags in truncated.values())
+    assert "final_obs" not in infos
+    with pytest.raises(RuntimeStateError, match="call reset"):
+        env.step(hold)
+    env.reset()
+    env.step(hold)
+
+
+def test_multi_agent_batches_have_the_attributes_of_pettingzoo() -> None:
+    env, parallel = multi_agent(2, **BUSY), sdc_taichi.parallel_env(**BUSY)
+    assert env.num_agents == len(env.agents) == 3
+    assert env.max_num_agents == parallel.max_num_agents
+    assert env.unwrapped is env
+    for agent in AGENTS:
+        assert env.observation_space(agent) == parallel.observation_space(agent)
+        assert env.action_space(agent) == parallel.action_space(agent)
+        assert env.action_space(agent) is env.action_space(agent)
+    with pytest.raises(ConfigError, match="agent 'agent_x': does not learn here"):
+        env.action_space("agent_x")
+
+
 def test_without_autoreset_the_batch_waits_for_reset() -> None:
     env = gymnasium.make_vec(
         "sdc_taichi/Battery-v0", num_envs=2, autoreset_mode="Disabled", **tiny()
@@ -246,10 +304,13 @@ def multi_agent(num_envs: int, **options: Any) -> Any:
 
 
 @pytest.mark.parametrize("agents", [("agent_ls", "agent_dc"), ("agent_bat",), AGENTS], ids="+".join)
-@pytest.mark.parametrize("heat_map", [False, True])
-def test_alone_as_in_a_batch(agents: tuple[str, ...], heat_map: bool) -> None:
+@pytest.mark.parametrize(
+    ("heat_map", "mode"), [(False, AutoresetMode.SAME_STEP), (True, AutoresetMode.NEXT_STEP)]
+)
+def test_alone_as_in_a_batch(agents: tuple[str, ...], heat_map: bool, mode: AutoresetMode) -> None:
     options = {**BUSY, **playing(agents), "heat_map": heat_map}
-    batch = multi_agent(3, **options)
+    batch = multi_agent(3, autoreset_mode=mode, **options)
+    assert batch.metadata["autoreset_mode"] is mode
     singles = [sdc_taichi.parallel_env(**options) for _ in range(3)]
     found, infos = batch.reset(seed=11)
     for i, env in enumerate(singles):
@@ -262,9 +323,10 @@ def test_alone_as_in_a_batch(agents: tuple[str, ...], heat_map: bool) -> None:
         actions = {a: rng.integers(0, 3, size=(3, *(batch.action_spaces[a].shape))) for a in agents}
         found, gained, terminated, truncated, infos = batch.step(actions)
         ended = step == STEPS - 1
-        seen = infos["final_obs"] if ended else found
-        state = infos["final_state"] if ended else batch.state()
-        assert ("final_obs" in infos) == ended
+        ends_here = ended and mode is AutoresetMode.SAME_STEP
+        seen = infos["final_obs"] if ends_here else found
+        state = infos["final_state"] if ends_here else batch.state()
+        assert ("final_obs" in infos) == ("final_state" in infos) == ends_here
         for i, env in enumerate(singles):
             o, r, d, t, info = env.step(rows(actions, i))
             assert same(rows(seen, i), o), step
@@ -273,11 +335,19 @@ def test_alone_as_in_a_batch(agents: tuple[str, ...], heat_map: bool) -> None:
             assert t == {a: bool(truncated[a][i]) for a in agents} == dict.fromkeys(agents, ended)
             assert np.array_equal(state[i], env.state())
             assert info[agents[0]] == {name: infos[name][i] for name in info[agents[0]]}
-            if ended:
-                again, begun = env.reset()
-                assert same(rows(found, i), again)
-                assert begun[agents[0]]["start_day"] == infos["start_day"][i]
-                assert np.array_equal(batch.state()[i], env.state())
+        if not ended:
+            continue
+        if mode is AutoresetMode.NEXT_STEP:
+            found, gained, terminated, truncated, infos = batch.step({})  # ignored
+            assert infos.keys() == {"start_day"}
+            assert same(gained, {a: np.zeros(3, np.float32) for a in agents})
+            assert same(terminated, {a: np.zeros(3, np.bool_) for a in agents})
+            assert same(truncated, terminated)
+        for i, env in enumerate(singles):
+            again, begun = env.reset()
+            assert same(rows(found, i), again)
+            assert begun[agents[0]]["start_day"] == infos["start_day"][i]
+            assert np.array_equal(batch.state()[i], env.state())
 
 
 def test_the_same_seed_gives_the_same_episodes_after_reset() -> None:
@@ -314,7 +384,7 @@ def trajectory(env: Any, start: Any, steps: int) -> list[Any]:
     return out
 
 
-@pytest.mark.parametrize("saved_after", [0, 1, 40, STEPS - 1])
+@pytest.mark.parametrize("saved_after", [0, 1, 40, STEPS - 1, STEPS])
 def test_goes_on_from_what_was_saved(saved_after: int) -> None:
     env = multi_agent(2, **{**BUSY, **playing(("agent_ls", "agent_dc"))})
     trajectory(env, env.reset(seed=2), saved_after)
@@ -487,9 +557,24 @@ def test_continuous_setpoint_changes_are_what_was_asked_for(agents: tuple[str, .
     env = sdc_taichi.parallel_env(config, agents=agents, actions="continuous", days=1)
     env.reset(seed=0)
     hold = dict.fromkeys(agents, np.zeros(1, dtype=np.float32))
-    raised = hold | {"agent_dc": np.array([0.5], dtype=np.float32)}
+    # A share of the largest change, 2 K by default.
+    raised = hold | {"agent_dc": np.array([0.25], dtype=np.float32)}
     found = [env.step(raised)[4]["agent_dc"]["setpoint_c"] for _ in range(6)]
     assert found == pytest.approx([18.5, 19.0, 19.5, 20.0, 20.5, 21.0], abs=1e-6)
+    slow = sdc_taichi.parallel_env(
+        config, agents=agents, actions="continuous", days=1, setpoint_change_k=0.5
+    )
+    slow.reset(seed=0)
+    lowered = hold | {"agent_dc": np.array([1.0], dtype=np.float32)}
+    assert slow.step(lowered)[4]["agent_dc"]["setpoint_c"] == pytest.approx(18.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("units", [1, 2])
+def test_continuous_actions_are_within_one(units: int) -> None:
+    config = load_config("corrected", [f"hvac.crac.units={units}"])
+    env = SdcEnv(config, actions="continuous", setpoint_change_k=3.0)
+    expected = gymnasium.spaces.Box(-1.0, 1.0, (2 + units,), np.float32)
+    assert env.action_space == expected
 
 
 def test_forecast_errors_leave_the_days_alone() -> None:
@@ -528,8 +613,8 @@ def test_single_values_may_come_as_arrays() -> None:
 
 def test_terms_of_the_step_that_ends_an_episode() -> None:
     batches: list[Any] = [
-        gymnasium.make_vec("sdc_taichi/Joint-v0", num_envs=2, **tiny()),
-        multi_agent(2, **tiny()),
+        gymnasium.make_vec("sdc_taichi/Joint-v0", num_envs=2, autoreset_mode="SameStep", **tiny()),
+        multi_agent(2, autoreset_mode="SameStep", **tiny()),
     ]
     single = SdcEnv(**tiny())
     single.reset(seed=3)

@@ -24,6 +24,8 @@ pytestmark = pytest.mark.repo
 EXAMPLES = Path(__file__).parent.parent / "examples"
 AGENTS = ("agent_ls", "agent_dc", "agent_bat")
 DAY = 96
+SAME_STEP: dict[str, Any] = {"days": 1, "autoreset_mode": "SameStep"}
+"""Options of the batches that the adapters of the examples take."""
 Load = Callable[..., Any]
 
 
@@ -52,8 +54,8 @@ def example(monkeypatch: pytest.MonkeyPatch) -> Iterator[Load]:
 
 def test_sb3_adapter_hands_on_what_the_batch_gives(example: Load) -> None:
     sb3 = example("train_sb3", "stable_baselines3")
-    env = sb3.BatchVecEnv(gymnasium.make_vec("sdc_taichi/Battery-v0", num_envs=3, days=1))
-    twin = gymnasium.make_vec("sdc_taichi/Battery-v0", num_envs=3, days=1)
+    env = sb3.BatchVecEnv(gymnasium.make_vec("sdc_taichi/Battery-v0", **SAME_STEP, num_envs=3))
+    twin = gymnasium.make_vec("sdc_taichi/Battery-v0", **SAME_STEP, num_envs=3)
     env.seed(5)
     np.testing.assert_array_equal(env.reset(), twin.reset(seed=5)[0])
     rng = np.random.default_rng(0)
@@ -122,7 +124,7 @@ def test_skrl_trains_all_agents(
 def test_skrl_updates_every_policy_from_the_right_inputs(example: Load, algorithm: str) -> None:
     skrl = example("train_skrl", "skrl")
     skrl.prepare(1)
-    env = skrl.BatchEnv(sdc_taichi.vector_env(2, days=1), seed=1)
+    env = skrl.BatchEnv(sdc_taichi.vector_env(2, **SAME_STEP), seed=1)
     agent = skrl.learner(env, algorithm, rollout=8, hidden=(8,))
     before = {a: agent.policies[a].net[0].weight.detach().clone() for a in AGENTS}
     skrl.trainer(env, agent, 16).train()
@@ -141,7 +143,7 @@ def test_skrl_values_the_state_in_which_an_episode_was_cut_off(
     skrl = example("train_skrl", "skrl")
     torch = importlib.import_module("torch")
     skrl.prepare(2)
-    env = skrl.BatchEnv(sdc_taichi.vector_env(2, days=1), seed=2)
+    env = skrl.BatchEnv(sdc_taichi.vector_env(2, **SAME_STEP), seed=2)
     ends: list[Any] = []
     plain_step = env.step
 
@@ -182,8 +184,8 @@ def test_torchrl_env_passes_its_check(example: Load, capsys: pytest.CaptureFixtu
 
 def test_torchrl_env_gives_what_the_batch_gives(example: Load) -> None:
     rl = example("torchrl_env", "torchrl", "tensordict")
-    env = rl.BatchEnv(sdc_taichi.vector_env(2, days=1), seed=4)
-    twin = sdc_taichi.vector_env(2, days=1)
+    env = rl.BatchEnv(sdc_taichi.vector_env(2, **SAME_STEP), seed=4)
+    twin = sdc_taichi.vector_env(2, **SAME_STEP)
     observations, _ = twin.reset(seed=4)
     rollout = env.rollout(DAY + 2, break_when_any_done=False)
     for t in range(DAY + 2):
@@ -207,7 +209,7 @@ def test_torchrl_env_gives_what_the_batch_gives(example: Load) -> None:
 
 def test_torchrl_env_starts_anew_within_an_episode_and_refuses_a_part(example: Load) -> None:
     rl = example("torchrl_env", "torchrl", "tensordict")
-    env = rl.BatchEnv(sdc_taichi.vector_env(2, days=1), seed=4)
+    env = rl.BatchEnv(sdc_taichi.vector_env(2, **SAME_STEP), seed=4)
     start = env.reset()
     env.rollout(5, auto_reset=False, tensordict=start.clone())
     env.set_seed(4)

@@ -77,8 +77,7 @@ class ActionDecoder:
     def _space(self, agent: str) -> spaces.Space[Any]:
         units = self._units if agent == "agent_dc" else 1
         if self._continuous:
-            high = self._setpoint_change_k if agent == "agent_dc" else 1.0
-            return spaces.Box(-high, high, (units,), dtype=np.float32)
+            return spaces.Box(-1.0, 1.0, (units,), dtype=np.float32)
         return spaces.Discrete(3) if units == 1 else spaces.MultiDiscrete([3] * units)
 
     def _decode(self, agent: str, actions: Mapping[str, Any], state: State) -> F64:
@@ -105,17 +104,15 @@ class ActionDecoder:
     def _decode_continuous(self, agent: str, given: npt.NDArray[Any], state: State) -> F64:
         if given.dtype.kind not in "iuf":
             raise SdcError(f"action of {agent}: {given.flat[0]!r}; valid is a number")
-        space = self.spaces[agent]
-        assert isinstance(space, spaces.Box)
-        high = float(space.high[0])
         # Bounds in f32, as agents have them.
-        inside = np.abs(given) <= high * (1.0 + 1e-6)
+        inside = np.abs(given) <= 1.0 + 1e-6
         if not np.all(inside):
             wrong = given[~inside].flat[0]
-            raise SdcError(f"action of {agent}: {wrong}; valid is within {-high:g}..{high:g}")
+            raise SdcError(f"action of {agent}: {wrong}; valid is within -1..1")
         command: F64 = given.astype(np.float64).reshape(-1)
-        command = np.minimum(np.maximum(command, -high), high)
+        command = np.minimum(np.maximum(command, -1.0), 1.0)
         if agent == "agent_dc":
+            command *= self._setpoint_change_k
             command /= self._setpoint_step_k
             command = avoid_repeats(command, state.cooling_last)
         return command

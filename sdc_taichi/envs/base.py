@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.core import Core, Observation
@@ -77,6 +78,37 @@ class BatchEnv(_Env):
         """
         rendering.require_render_mode(self.render_mode)
         return tuple(rendering.frame(self.core, i) for i in range(self.core.num_envs))
+
+
+class AgentSpaces:
+    """Spaces by agent, as PettingZoo's environments give them."""
+
+    observation_spaces: dict[str, spaces.Space[Any]]
+    """Space of the observations of one environment, by agent."""
+    action_spaces: dict[str, spaces.Space[Any]]
+    """Space of the actions of one environment, by agent."""
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """The space of an agent's observations in one environment.
+
+        Raises:
+            ConfigError: an agent that does not learn here.
+        """
+        return _space_of(agent, self.observation_spaces)
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """The space of an agent's actions in one environment.
+
+        Raises:
+            ConfigError: an agent that does not learn here.
+        """
+        return _space_of(agent, self.action_spaces)
+
+
+def _space_of(agent: str, by_agent: Mapping[str, spaces.Space[Any]]) -> spaces.Space[Any]:
+    if agent not in by_agent:
+        raise ConfigError(f"agent {agent!r}: does not learn here; valid: {list(by_agent)}")
+    return by_agent[agent]
 
 
 def start_day_option(options: Mapping[str, Any] | None, *, strict: bool = True) -> Any:

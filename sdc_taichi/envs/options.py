@@ -52,7 +52,7 @@ class EnvOptions(BaseModel):
     """Order of the battery's discrete actions: charge, hold, discharge as in the paper, or charge,
     discharge, hold as in the released code; None is that of the preset."""
     setpoint_change_k: Annotated[float, Field(gt=0, le=20)] = 2.0
-    """Largest change of the setpoint by a continuous action in one step, in K."""
+    """Change of the setpoint in one step by a continuous action of 1, the largest, in K."""
     days: Annotated[Whole, Field(ge=1, le=365)] = 7
     """Length of an episode, in days."""
     start: Literal["sampled", "fixed"] = "sampled"

@@ -5,21 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.arguments import ConfigSource, Overrides, single_core
-from sdc_taichi.envs.base import SingleEnv, as_floats, first_of_batch, start_day_option, start_days
+from sdc_taichi.envs.base import (
+    AgentSpaces,
+    SingleEnv,
+    as_floats,
+    first_of_batch,
+    start_day_option,
+    start_days,
+)
 from sdc_taichi.envs.core import Observation
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.recording import RecorderOption
-from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.hall_solver import Precision
 
 
-class SdcParallelEnv(SingleEnv, ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
+class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
     """A PettingZoo environment: the learning agents of one data center act at the same time.
 
     Episodes end by truncation: their length is a choice, the data center goes on. Infos are the
@@ -115,27 +120,6 @@ class SdcParallelEnv(SingleEnv, ParallelEnv[str, Observation, Any]):  # type: ig
             dict.fromkeys(agents, transition.ended),
             {agent: dict(info) for agent in agents},
         )
-
-    def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The space of an agent's observations.
-
-        Raises:
-            ConfigError: an agent that does not learn here.
-        """
-        return self._space_of(agent, self.observation_spaces)
-
-    def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The space of an agent's actions.
-
-        Raises:
-            ConfigError: an agent that does not learn here.
-        """
-        return self._space_of(agent, self.action_spaces)
-
-    def _space_of(self, agent: str, by_agent: Mapping[str, spaces.Space[Any]]) -> spaces.Space[Any]:
-        if agent not in by_agent:
-            raise ConfigError(f"agent {agent!r}: does not learn here; valid: {list(by_agent)}")
-        return by_agent[agent]
 
     def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
         """Go on from the ``state_dict`` of an environment made alike.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.arguments import ConfigSource, Overrides, configs_and_options
-from sdc_taichi.envs.base import BatchEnv, start_day_option, start_days
+from sdc_taichi.envs.base import AgentSpaces, BatchEnv, start_day_option, start_days
 from sdc_taichi.envs.core import Core, Observation
 from sdc_taichi.envs.episode_reset import Seed
 from sdc_taichi.envs.learners import learning_agent, make_learner
@@ -24,12 +24,15 @@ from sdc_taichi.types import F32, F64
 
 Flags = npt.NDArray[np.bool_]
 
+_METADATA: dict[str, Any] = {"render_modes": list(rendering.RENDER_MODES), "render_fps": 8}
+
 
 class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
     """Data centers with one learner each that step together, as ``gymnasium.make_vec`` gives them.
 
     Gives what Gymnasium's ``SyncVectorEnv`` gives for single environments. All episodes have the
-    same length and end, by truncation, in the same step.
+    same length and end, by truncation, in the same step. The step after that starts the next ones:
+    it ignores its actions and returns first observations, rewards of 0 and ``start_day``.
 
     Args:
         num_envs: number of environments.
@@ -41,8 +44,9 @@ class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         precision: precision of the server kernels, ``f32`` or ``f64``.
         render_mode: None or ``rgb_array``.
         registered_agent: set by the ids of one agent.
-        autoreset_mode: when the next episodes start, as the enum or its value: in the step that
-            ends the last ones, in the step after it, or only by ``reset``.
+        autoreset_mode: when the next episodes start, as the enum or its value: ``NextStep``, in the
+            step after the one that ends the last ones; ``SameStep``, in that step itself;
+            ``Disabled``, by ``reset`` alone.
         recorder: records episodes of the first environment into a file ending in .rrd, or what
             ``EpisodeRecorder`` says.
         keywords: fields of ``EnvOptions``, in place of those in ``options``.
@@ -62,7 +66,7 @@ class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         precision: Precision = "f32",
         render_mode: str | None = None,
         registered_agent: str | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         recorder: RecorderOption = None,
         **keywords: Any,
     ) -> None:
@@ -75,11 +79,7 @@ class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         self.core = RecordingCore(configs, chosen, num_envs, precision, recorder)
         self.num_envs = num_envs = self.core.num_envs
         self.render_mode = render_mode
-        self.metadata = {
-            "render_modes": list(rendering.RENDER_MODES),
-            "render_fps": 8,
-            "autoreset_mode": self._mode,
-        }
+        self.metadata = _METADATA | {"autoreset_mode": self._mode}
         self._learner = make_learner(self.core, agent)
         self.single_observation_space = self._learner.observation_space
         self.single_action_space = self._learner.action_space
@@ -168,8 +168,13 @@ class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         self.core.close()
 
 
-class MultiAgentVectorEnv(BatchEnv):
+class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
     """Data centers with several learning agents each that step together; see ``vector_env``.
+
+    Args:
+        core: the data centers.
+        render_mode: None or ``rgb_array``.
+        autoreset_mode: when the next episodes start, as in ``vector_env``.
 
     Attributes:
         num_envs: number of environments, B.
@@ -177,17 +182,21 @@ class MultiAgentVectorEnv(BatchEnv):
         observation_spaces: spaces of the observations of one environment, by agent.
         action_spaces: spaces of the actions of one environment, by agent.
         state_space: space of the shared state of one environment.
+        metadata: name, render modes, and ``autoreset_mode`` as Gymnasium's enum.
+
+    Raises:
+        ConfigError: a mode that is not valid.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012  as Gymnasium has it
-        "name": "sdc_taichi_v0",
-        "render_modes": list(rendering.RENDER_MODES),
-        "render_fps": 8,
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }
-
-    def __init__(self, core: Core, render_mode: str | None = None) -> None:
+    def __init__(
+        self,
+        core: Core,
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    ) -> None:
         rendering.check_render_mode(render_mode)
+        self._mode = _autoreset_mode(autoreset_mode)
+        self.metadata = {"name": "sdc_taichi_v0", **_METADATA, "autoreset_mode": self._mode}
         self.core = core
         self.render_mode = render_mode
         self.num_envs = core.num_envs
@@ -196,6 +205,21 @@ class MultiAgentVectorEnv(BatchEnv):
         self.observation_spaces = core.observation_spaces
         self.action_spaces = core.action_spaces
         self.state_space = core.state_space
+
+    @property
+    def num_agents(self) -> int:
+        """Number of the learning agents."""
+        return len(self.agents)
+
+    @property
+    def max_num_agents(self) -> int:
+        """Number of the agents that may ever learn, which are the same."""
+        return len(self.possible_agents)
+
+    @property
+    def unwrapped(self) -> Self:
+        """The environment itself, as it wraps no other."""
+        return self
 
     def reset(
         self, seed: Seed = None, options: Mapping[str, Any] | None = None
@@ -221,7 +245,7 @@ class MultiAgentVectorEnv(BatchEnv):
     ) -> tuple[
         dict[str, Observation], dict[str, F32], dict[str, Flags], dict[str, Flags], dict[str, Any]
     ]:
-        """Advance all environments; those whose episode ends start the next one.
+        """Advance all environments, or start their next episodes as ``autoreset_mode`` says.
 
         Args:
             actions: by agent, (B,) whole numbers, or (B, k) numbers with continuous actions or
@@ -229,29 +253,44 @@ class MultiAgentVectorEnv(BatchEnv):
 
         Returns:
             Observations, rewards, terminations and truncations by agent, and infos. Infos have
-            every (B,) quantity of ``StepResult`` of this step by name and, when the episodes ended
-            with it, ``final_obs`` (by agent), ``final_state``, and ``start_day`` of the next ones,
-            to which the observations belong then.
+            every (B,) quantity of ``StepResult`` of this step by name. In mode ``SameStep`` the
+            step that ends episodes adds ``final_obs`` (by agent), ``final_state``, and
+            ``start_day`` of the next ones, to which the observations belong then. In mode
+            ``NextStep`` the step after it ignores its actions: observations are those of ``reset``,
+            rewards are 0, and infos have ``start_day`` alone.
 
         Raises:
             SdcError: actions that are missing, too many, or outside their space.
-            RuntimeStateError: before ``reset``.
+            RuntimeStateError: before ``reset``, or after the end of the episodes in mode
+                ``Disabled``.
         """
+        if self._mode is AutoresetMode.NEXT_STEP and self.core.episode_over:
+            first, begun = self.reset()
+            return (
+                first,
+                {agent: np.zeros(self.num_envs, dtype=np.float32) for agent in self.agents},
+                self._flags(False),
+                self._flags(False),
+                begun,
+            )
         transition = self.core.step(actions)
         observations = transition.observations
         infos: dict[str, Any] = transition.result.per_dc()
-        if transition.ended:
+        if transition.ended and self._mode is AutoresetMode.SAME_STEP:
             infos["final_obs"], infos["final_state"] = observations, self.core.state()
             observations = self.core.next_episode()
             infos["start_day"] = start_days(self.core)
-        ended = np.ones if transition.ended else np.zeros
         return (
             observations,
             {agent: reward.astype(np.float32) for agent, reward in transition.rewards.items()},
-            {agent: np.zeros(self.num_envs, dtype=np.bool_) for agent in self.agents},
-            {agent: ended(self.num_envs, dtype=np.bool_) for agent in self.agents},
+            self._flags(False),
+            self._flags(transition.ended),
             infos,
         )
+
+    def _flags(self, value: bool) -> dict[str, Flags]:
+        """One flag for all environments, (B,), by agent."""
+        return {agent: np.full(self.num_envs, value) for agent in self.agents}
 
     def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
         """Go on from the ``state_dict`` of a batch made alike.
@@ -277,13 +316,14 @@ def vector_env(
     options: EnvOptions | None = None,
     precision: Precision = "f32",
     render_mode: str | None = None,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     recorder: RecorderOption = None,
     **keywords: Any,
 ) -> MultiAgentVectorEnv:
     """A batch of data centers with several learning agents each.
 
-    All episodes have the same length and end, by truncation, in the same step, which also starts
-    the next ones.
+    All episodes have the same length and end, by truncation, in the same step. The step after that
+    starts the next ones: it ignores its actions and returns first observations and rewards of 0.
 
     Args:
         num_envs: number of environments; None is one per config.
@@ -293,6 +333,9 @@ def vector_env(
         options: options; None is the default ones.
         precision: precision of the server kernels, ``f32`` or ``f64``.
         render_mode: None or ``rgb_array``.
+        autoreset_mode: when the next episodes start, as Gymnasium's enum or its value:
+            ``NextStep``, in the step after the one that ends the last ones; ``SameStep``, in that
+            step itself; ``Disabled``, by ``reset`` alone.
         recorder: records episodes of the first environment into a file ending in .rrd, or what
             ``EpisodeRecorder`` says.
         keywords: fields of ``EnvOptions``, in place of those in ``options``.
@@ -302,7 +345,7 @@ def vector_env(
     """
     configs, chosen = configs_and_options(config, overrides, options, keywords)
     core = RecordingCore(configs, chosen, num_envs, precision, recorder)
-    return MultiAgentVectorEnv(core, render_mode)
+    return MultiAgentVectorEnv(core, render_mode, autoreset_mode)
 
 
 def _autoreset_mode(given: AutoresetMode | str) -> AutoresetMode:
