@@ -72,10 +72,15 @@ def test_a_term_of_ones_own_has_a_name_of_its_own() -> None:
         """Cooling energy."""
         return -r.hvac_kwh / c.design_kwh
 
-    reward_term(chilled)
+    def another(r: StepResult, c: TermContext) -> F64:
+        return -r.hvac_kwh
+
+    another.__name__ = "chilled"
+    for _ in range(2):  # A notebook cell may run twice.
+        reward_term(chilled)
     try:
         with pytest.raises(ConfigError, match="'chilled': valid is a name that is not taken"):
-            reward_term(chilled)
+            reward_term(another)
         env = core(rewards={"agent_dc": {"chilled": 1.0}}, collaboration=1.0)
         env.reset(0)
         done = env.step(act(1, 1))
@@ -186,9 +191,17 @@ def test_functions_of_the_user() -> None:
         done = env.step(act(1, 1))
         for agent in AGENTS:
             np.testing.assert_array_equal(done.rewards[agent], -done.result.water_l)
-    for _ in range(2):  # A notebook cell may run twice.
-        register_reward("saved_water", water_saved)
-    assert core(rewards="saved_water") is not None
+    for factor in (1.0, 2.0):  # A notebook cell may run twice, with changes.
+
+        def energy_drawn(result: StepResult, view: View, factor: float = factor) -> F64:
+            return -factor * result.grid_kwh
+
+        register_reward("energy_drawn", energy_drawn)
+    env = core(rewards="energy_drawn")
+    env.reset(0)
+    done = env.step(act(1, 1))
+    np.testing.assert_array_equal(done.rewards["agent_dc"], -2.0 * done.result.grid_kwh)
+    register_reward("saved_water", water_saved)
     for name in ("saved_water", "default", "not a name", 3):
         with pytest.raises(ConfigError, match=f"{name!r}: valid is a name that is not taken"):
             register_reward(name, lambda result, view: -result.water_l)  # type: ignore[arg-type]

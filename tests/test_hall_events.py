@@ -585,6 +585,28 @@ def test_the_seed_decides_what_goes_wrong() -> None:
     assert not np.array_equal(found[0], found[1])
 
 
+def test_data_centers_of_one_name_meet_events_of_their_own() -> None:
+    config = load_config(
+        "tiny", ["events.sampled=[{kind: grid_outage, per_year: 2000, duration_h: [1, 2]}]"]
+    )
+    other = config.model_copy(update={"name": "other"})
+
+    def supplied(configs: list[DataCenterConfig], seed: Any) -> list[F64]:
+        with Simulator(configs) as sim:
+            state = sim.reset(seed=seed)
+            steps = [sim.step().grid_up for _ in range(96)]
+            assert state.seed.tolist() == (seeds if len(configs) == 4 else [seed])
+            return list(np.array(steps).T)
+
+    seeds = [3, 4, 3, 5]
+    fleet = [config, config, other, config]
+    found = supplied(fleet, 3)
+    assert len({each.tobytes() for each in found}) == 4
+    for i, each in enumerate(found):
+        assert np.array_equal(each, supplied([fleet[i]], seeds[i])[0])
+    assert np.array_equal(found, supplied(fleet, seeds))
+
+
 def test_a_dark_hall_of_flow_by_power_returns_supply_air() -> None:
     results = simulate(
         ["hall.inlet_model=approach", "hvac.crac.flow_model=per_watt", "battery.capacity_kwh=0",

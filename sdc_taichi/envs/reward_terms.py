@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdc_taichi.envs.tariff import Tariff
+from sdc_taichi.envs.user_functions import is_replacement
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64, StepResult
@@ -66,10 +67,12 @@ TERMS: dict[str, Term] = {}
 def reward_term(function: Term) -> Term:
     """Add a function to ``TERMS`` under its own name.
 
+    One of the same module and name takes its place, as when a cell of a notebook runs again.
+
     Raises:
         ConfigError: another term has the name.
     """
-    if function.__name__ in TERMS:
+    if not is_replacement(TERMS.get(function.__name__), function):
         raise ConfigError(f"reward term {function.__name__!r}: valid is a name that is not taken")
     TERMS[function.__name__] = function
     return function

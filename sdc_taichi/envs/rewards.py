@@ -6,7 +6,6 @@ option ``rewards``: itself, the name that ``register_reward`` gave it, or its im
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +17,7 @@ from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.released_rewards import ReleasedRewards
 from sdc_taichi.envs.reward_terms import TERMS, TermContext
 from sdc_taichi.envs.tariff import Tariff
+from sdc_taichi.envs.user_functions import function_named, import_path, register_function
 from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
 from sdc_taichi.types import F64, I64, StepResult
 
@@ -50,17 +50,13 @@ def register_reward(name: str, reward: RewardFunction) -> None:
 
     Args:
         name: an identifier that no other reward has.
-        reward: the function; see ``RewardFunction``.
+        reward: the function; see ``RewardFunction``. One of the same module and name as the
+            function before takes its place, as when a cell of a notebook runs again.
 
     Raises:
         ConfigError: a name that another function has, or no function.
     """
-    if not callable(reward):
-        raise ConfigError(f"reward {name!r}: is a {type(reward).__name__}; valid is a function")
-    taken = name in REWARD_SETS or _registered.get(name, reward) is not reward
-    if not isinstance(name, str) or not name.isidentifier() or taken:
-        raise ConfigError(f"reward {name!r}: valid is a name that is not taken")
-    _registered[name] = reward
+    register_function("reward", name, reward, _registered, reserved=REWARD_SETS)
 
 
 class Rewards:
@@ -103,7 +99,7 @@ class Rewards:
         elif self._released is None:
             self._function = rewards if callable(rewards) else _function_named(rewards)
         self.identity: Any = (
-            _import_path(self._function) if self._function else self._scales or "sustaindc"
+            import_path(self._function) if self._function else self._scales or "sustaindc"
         )
         scales = self._scales or {}
         self.used_terms = [name for name in TERMS if any(name in own for own in scales.values())]
@@ -315,28 +311,13 @@ def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[
 
 def _function_named(given: Any) -> RewardFunction:
     """A registered function, or one by its import path ``module:name``."""
-    module, _, name = given.partition(":") if isinstance(given, str) else ("", "", "")
-    if isinstance(given, str) and given in _registered:
-        return _registered[given]
-    if not module or not name or module.startswith("."):
-        valid = [*REWARD_SETS, *_registered]
-        raise ConfigError(
-            f"rewards {given!r}: unknown; valid: {', '.join(valid)}, a dict of agent to term to "
-            "scale, a function, or its import path module:name"
-        )
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"rewards {given!r}: cannot be imported ({error})") from None
-    if not callable(found):
-        raise ConfigError(f"rewards {given!r}: is a {type(found).__name__}; valid is a function")
-    return found  # type: ignore[no-any-return]
-
-
-def _import_path(function: RewardFunction) -> str:
-    """Module and name of a function, or of the class of another callable."""
-    named = function if hasattr(function, "__qualname__") else type(function)
-    return f"{named.__module__}:{named.__qualname__}"
+    found: RewardFunction = function_named(
+        "rewards",
+        given,
+        _registered,
+        valid=f"{', '.join([*REWARD_SETS, *_registered])}, a dict of agent to term to scale",
+    )
+    return found
 
 
 def _checked_by_agent(

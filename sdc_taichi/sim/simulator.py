@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from operator import itemgetter
@@ -108,7 +109,9 @@ class Simulator:
 
         Args:
             seed: Decides the sampled events, an integer of 0..2**63 - 1, or one for each data
-                center; None is 0. The stages are deterministic.
+                center; None is 0. Data centers of different names meet different events with one
+                seed; of those that share a name, the first takes an integer as it is, the second
+                the next one, and so on. The stages are deterministic.
             start: Index of the first step in the year, (B,); None is the start of the drivers.
 
         Returns:
@@ -270,8 +273,16 @@ class Simulator:
 
     def _seeds(self, given: int | Sequence[int] | I64) -> I64:
         """Seeds of the data centers, (B,)."""
-        listed: list[Any] = np.ravel(given).tolist() if np.ndim(given) else [given] * self.size
+        listed: list[Any] = np.ravel(given).tolist() if np.ndim(given) else [given]
         whole = all(isinstance(x, int | np.integer) and not isinstance(x, bool) for x in listed)
+        if whole and not np.ndim(given):
+            # Streams of events are told apart by seed and name.
+            names, seen = self.fleet.names, Counter[str]()
+            listed = [listed[0]] * len(names)
+            if len(set(names)) < len(names):
+                for i, name in enumerate(names):
+                    listed[i] += seen[name]
+                    seen[name] += 1
         if len(listed) != self.size or not whole or not all(0 <= x < 2**63 for x in listed):
             raise ConfigError(
                 f"seed {given!r}: valid is an integer of 0..2**63 - 1, or one for each of "

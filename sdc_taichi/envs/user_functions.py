@@ -1,0 +1,83 @@
+"""Functions of the user that options name: registered ones, and those with an import path."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from sdc_taichi.errors import ConfigError
+
+
+def register_function(
+    kind: str,
+    name: str,
+    function: Callable[..., Any],
+    registered: dict[str, Any],
+    *,
+    reserved: Sequence[str] = (),
+) -> None:
+    """Make a function available by a name.
+
+    A function of the same module and name as the one before takes its place: it is the same cell of
+    a notebook, run again.
+
+    Args:
+        kind: what the function is, for errors.
+        name: an identifier that no other function has.
+        function: the function.
+        registered: functions by name, to which it is added.
+        reserved: names that no function may have.
+
+    Raises:
+        ConfigError: a name that another function has, or no function.
+    """
+    if not callable(function):
+        raise ConfigError(f"{kind} {name!r}: is a {type(function).__name__}; valid is a function")
+    identifier = isinstance(name, str) and name.isidentifier()
+    if not identifier or name in reserved or not is_replacement(registered.get(name), function):
+        raise ConfigError(f"{kind} {name!r}: valid is a name that is not taken")
+    registered[name] = function
+
+
+def function_named(option: str, given: Any, registered: dict[str, Any], *, valid: str) -> Any:
+    """A registered function, or one by its import path ``module:name``.
+
+    Args:
+        option: name of the option, for errors.
+        given: what the option was given.
+        registered: functions by name.
+        valid: what the option takes besides functions and their import paths, for errors.
+
+    Raises:
+        ConfigError: an unknown name, or a path without a function.
+    """
+    module, _, name = given.partition(":") if isinstance(given, str) else ("", "", "")
+    if isinstance(given, str) and given in registered:
+        return registered[given]
+    if not module or not name or module.startswith("."):
+        raise ConfigError(
+            f"{option} {given!r}: unknown; valid: {valid}, a function, or its import path "
+            "module:name"
+        )
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"{option} {given!r}: cannot be imported ({error})") from None
+    if not callable(found):
+        raise ConfigError(f"{option} {given!r}: is a {type(found).__name__}; valid is a function")
+    return found
+
+
+def import_path(function: Callable[..., Any]) -> str:
+    """Module and name of a function, or of the class of another callable."""
+    named = function if hasattr(function, "__qualname__") else type(function)
+    return f"{named.__module__}:{named.__qualname__}"
+
+
+def is_replacement(before: Callable[..., Any] | None, function: Callable[..., Any]) -> bool:
+    """Whether a function may have a name: nothing had it before, or the same function did.
+
+    A function counts as the same if its module and name are those of the one before.
+    """
+    return before is None or import_path(function) == import_path(before)
