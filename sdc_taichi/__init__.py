@@ -25,6 +25,7 @@ from sdc_taichi.types import (
 
 if TYPE_CHECKING:
     from sdc_taichi.control import View, make_controller
+    from sdc_taichi.envs.costs import register_cost
     from sdc_taichi.envs.forecasts import ForecastError
     from sdc_taichi.envs.options import EnvOptions
     from sdc_taichi.envs.parallel import aec_env, parallel_env
@@ -74,6 +75,7 @@ __all__ = [
     "make_controller",
     "parallel_env",
     "preset_names",
+    "register_cost",
     "register_reward",
     "simulate",
     "simulate_to_folder",
@@ -93,6 +95,7 @@ _LAZY = {
     "aec_env": "sdc_taichi.envs.parallel",
     "make_controller": "sdc_taichi.control",
     "parallel_env": "sdc_taichi.envs.parallel",
+    "register_cost": "sdc_taichi.envs.costs",
     "register_reward": "sdc_taichi.envs.rewards",
     "simulate": "sdc_taichi.run.loop",
     "simulate_to_folder": "sdc_taichi.run.folder_writer",

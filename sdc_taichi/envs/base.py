@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sdc_taichi.envs import rendering
-from sdc_taichi.envs.core import Core, Observation
+from sdc_taichi.envs.core import Core, Observation, Transition
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.types import F32, F64, I64
 
@@ -138,6 +138,13 @@ def start_days(core: Core) -> I64:
     """First day of the episode of each environment, counted from 0 in the year, (B,)."""
     view = core.view
     return np.asarray(view.state.start // (24 * view.fleet.steps_per_hour), dtype=np.int64)
+
+
+def step_info(transition: Transition) -> dict[str, F64]:
+    """Quantities of a step and the costs that are wanted, by name, (B,) each."""
+    info = transition.result.per_dc()
+    info.update(transition.costs)
+    return info
 
 
 def as_floats(quantities: Mapping[str, F64]) -> dict[str, float]:

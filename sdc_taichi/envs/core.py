@@ -20,6 +20,7 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import Idle, View, controlled_by, make_controller, view_maker
 from sdc_taichi.envs.actions import ActionDecoder
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT
+from sdc_taichi.envs.costs import Costs
 from sdc_taichi.envs.episode_reset import Seed, chosen_start_days, seeded_generators
 from sdc_taichi.envs.heat_map import heat_map, heat_map_space
 from sdc_taichi.envs.observer import Observer
@@ -49,6 +50,9 @@ class Transition:
     """Rewards by learning agent, (B,) each."""
     joint_reward: F64
     """Reward of all learning agents as one, (B,)."""
+    costs: dict[str, F64]
+    """Costs that the option ``costs`` names: ``cost``, their weighed sum, and ``cost_NAME`` for
+    each, (B,) each; empty without the option."""
     ended: bool
     """Whether the episodes are over; all have the same length."""
     result: StepResult
@@ -123,8 +127,9 @@ class Core:
             agents=self.agents,
             days=options.days,
         )
-        # Plain values that tell environments apart.
-        self._identity = options.model_dump(exclude={"rewards"}) | {
+        self._costs = Costs(options.costs, fleet)
+        # Plain values that tell environments apart. Nothing depends on costs.
+        self._identity = options.model_dump(exclude={"rewards", "costs"}) | {
             "rewards": self._rewards.identity
         }
         self._observer = OBSERVERS[options.observations](fleet, options)
@@ -219,6 +224,7 @@ class Core:
             observations=self._observe(view),
             rewards=rewards,
             joint_reward=joint_reward,
+            costs=self._costs.of(result, view),
             ended=self.episode_over,
             result=result,
         )

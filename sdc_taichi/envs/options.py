@@ -79,6 +79,9 @@ class EnvOptions(BaseModel):
     the rest evenly (paper, section 4.5). 1 is no collaboration."""
     tariff: Tariff = Tariff()
     """Prices for the reward terms ``cost`` and ``demand_charge``."""
+    costs: Any = None
+    """Costs of each step for ``info["cost"]``: a list of names, functions or import paths
+    ``module:name``, or a dict of them to weights; None is none."""
 
     @field_validator("agents", "months")
     @classmethod

@@ -17,6 +17,7 @@ from sdc_taichi.envs.base import (
     first_of_batch,
     start_day_option,
     start_days,
+    step_info,
 )
 from sdc_taichi.envs.core import Observation
 from sdc_taichi.envs.options import EnvOptions
@@ -29,7 +30,7 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
 
     Episodes end by truncation: their length is a choice, the data center goes on. Infos are the
     same for all agents: ``start_day`` after ``reset``, then every (B,) quantity of ``StepResult``
-    by name.
+    by name and the costs that the option ``costs`` names.
 
     Args:
         config: a preset, a file or a config.
@@ -110,7 +111,7 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         if isinstance(actions, Mapping):
             actions = {agent: [action] for agent, action in actions.items()}
         transition = self.core.step(actions)
-        agents, info = self.agents, as_floats(transition.result.per_dc())
+        agents, info = self.agents, as_floats(step_info(transition))
         if transition.ended:
             self.agents = []
         return (

@@ -17,7 +17,12 @@ from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.released_rewards import ReleasedRewards
 from sdc_taichi.envs.reward_terms import TERMS, TermContext
 from sdc_taichi.envs.tariff import Tariff
-from sdc_taichi.envs.user_functions import function_named, import_path, register_function
+from sdc_taichi.envs.user_functions import (
+    checked_values,
+    function_named,
+    import_path,
+    register_function,
+)
 from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
 from sdc_taichi.types import F64, I64, StepResult
 
@@ -157,7 +162,7 @@ class Rewards:
         if self._function is not None:
             returned = self._function(result, view)
             if not isinstance(returned, Mapping):
-                for_all = _checked_values(returned, "all agents", view.size)
+                for_all = checked_values("rewards function", returned, "all agents", view.size)
                 return dict.fromkeys(self._agents, for_all), for_all
             return _with_sum(_checked_by_agent(returned, self._agents, view.size))
         assert self._released is not None
@@ -332,25 +337,9 @@ def _checked_by_agent(
     for agent in agents:
         if agent not in returned:
             raise SdcError(f"rewards function: returned none for {agent}")
-    return {agent: _checked_values(returned[agent], agent, size) for agent in agents}
-
-
-def _checked_values(returned: Any, whose: str, size: int) -> F64:
-    """Values that a user's function returned for one agent or for all, checked, (B,)."""
-    try:
-        values = np.asarray(returned, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise SdcError(
-            f"rewards function: returned {returned!r} for {whose}; valid is ({size},) of numbers"
-        ) from None
-    finite = np.isfinite(values)
-    if values.shape not in ((), (size,)) or not finite.all():
-        odd = "" if finite.all() else f" with {values[~finite].flat[0]}"
-        raise SdcError(
-            f"rewards function: returned {values.dtype} {values.shape}{odd} for {whose}; valid is "
-            f"({size},) of finite numbers"
-        )
-    return np.broadcast_to(values, (size,))
+    return {
+        agent: checked_values("rewards function", returned[agent], agent, size) for agent in agents
+    }
 
 
 def _with_sum(by_agent: dict[str, F64]) -> tuple[dict[str, F64], F64]:

@@ -9,7 +9,14 @@ import gymnasium
 
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.arguments import ConfigSource, Overrides, single_core
-from sdc_taichi.envs.base import SingleEnv, as_floats, first_of_batch, start_day_option, start_days
+from sdc_taichi.envs.base import (
+    SingleEnv,
+    as_floats,
+    first_of_batch,
+    start_day_option,
+    start_days,
+    step_info,
+)
 from sdc_taichi.envs.core import Observation
 from sdc_taichi.envs.learners import learning_agent, make_learner
 from sdc_taichi.envs.options import EnvOptions
@@ -21,7 +28,8 @@ class SdcEnv(SingleEnv, gymnasium.Env[Any, Any]):
     """One data center with one learner.
 
     Episodes end by truncation: their length is a choice, the data center goes on. Infos:
-    ``start_day`` after ``reset``, then every (B,) quantity of ``StepResult`` by name.
+    ``start_day`` after ``reset``, then every (B,) quantity of ``StepResult`` by name and the costs
+    that the option ``costs`` names.
 
     Args:
         config: a preset, a file or a config.
@@ -95,7 +103,7 @@ class SdcEnv(SingleEnv, gymnasium.Env[Any, Any]):
         transition = self.core.step(self._learner.actions([action]))
         observation = first_of_batch(self._learner.observation(transition.observations))
         reward = float(self._learner.reward(transition)[0])
-        info = as_floats(transition.result.per_dc())
+        info = as_floats(step_info(transition))
         return observation, reward, False, transition.ended, info
 
     def load_state_dict(self, values: Mapping[str, Any]) -> Observation:

@@ -6,7 +6,10 @@ import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sdc_taichi.errors import ConfigError
+import numpy as np
+
+from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.types import F64
 
 
 def register_function(
@@ -73,6 +76,34 @@ def import_path(function: Callable[..., Any]) -> str:
     """Module and name of a function, or of the class of another callable."""
     named = function if hasattr(function, "__qualname__") else type(function)
     return f"{named.__module__}:{named.__qualname__}"
+
+
+def checked_values(what: str, returned: Any, whose: str, size: int) -> F64:
+    """Values that a user's function returned, checked, (B,).
+
+    Args:
+        what: what the function is, for errors.
+        returned: what it returned.
+        whose: for whom it returned that, for errors.
+        size: number of data centers, B.
+
+    Raises:
+        SdcError: values that are no numbers, not finite, or of another shape.
+    """
+    try:
+        values = np.asarray(returned, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise SdcError(
+            f"{what}: returned {returned!r} for {whose}; valid is ({size},) of numbers"
+        ) from None
+    finite = np.isfinite(values)
+    if values.shape not in ((), (size,)) or not finite.all():
+        odd = "" if finite.all() else f" with {values[~finite].flat[0]}"
+        raise SdcError(
+            f"{what}: returned {values.dtype} {values.shape}{odd} for {whose}; valid is "
+            f"({size},) of finite numbers"
+        )
+    return np.broadcast_to(values, (size,))
 
 
 def is_replacement(before: Callable[..., Any] | None, function: Callable[..., Any]) -> bool:

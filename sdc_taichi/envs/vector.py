@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.arguments import ConfigSource, Overrides, configs_and_options
-from sdc_taichi.envs.base import AgentSpaces, BatchEnv, start_day_option, start_days
+from sdc_taichi.envs.base import AgentSpaces, BatchEnv, start_day_option, start_days, step_info
 from sdc_taichi.envs.core import Core, Observation
 from sdc_taichi.envs.episode_reset import Seed
 from sdc_taichi.envs.learners import learning_agent, make_learner
@@ -130,7 +130,7 @@ class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
             return observation, np.zeros(self.num_envs), none, none.copy(), infos
         transition = self.core.step(self._learner.actions(actions))
         observation = self._learner.observation(transition.observations)
-        infos = self._infos(transition.result.per_dc())
+        infos = self._infos(step_info(transition))
         if transition.ended and self._mode is AutoresetMode.SAME_STEP:
             final = {"final_obs": self._one_by_one(observation), "final_info": infos}
             observation = self._learner.observation(self.core.next_episode())
@@ -253,9 +253,10 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
 
         Returns:
             Observations, rewards, terminations and truncations by agent, and infos. Infos have
-            every (B,) quantity of ``StepResult`` of this step by name. In mode ``SameStep`` the
-            step that ends episodes adds ``final_obs`` (by agent), ``final_state``, and
-            ``start_day`` of the next ones, to which the observations belong then. In mode
+            every (B,) quantity of ``StepResult`` of this step and its costs by name. In mode
+            ``SameStep`` the step that ends episodes adds ``final_obs`` (by agent),
+            ``final_state``, and ``start_day`` of the next ones, to which the observations belong
+            then. In mode
             ``NextStep`` the step after it ignores its actions: observations are those of ``reset``,
             rewards are 0, and infos have ``start_day`` alone.
 
@@ -275,7 +276,7 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
             )
         transition = self.core.step(actions)
         observations = transition.observations
-        infos: dict[str, Any] = transition.result.per_dc()
+        infos: dict[str, Any] = step_info(transition)
         if transition.ended and self._mode is AutoresetMode.SAME_STEP:
             infos["final_obs"], infos["final_state"] = observations, self.core.state()
             observations = self.core.next_episode()

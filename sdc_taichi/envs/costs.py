@@ -1,0 +1,163 @@
+"""Costs of a step, for learners whose policy has to keep a constraint: named, 0 or more.
+
+They are apart from rewards: libraries for safe reinforcement learning hold the sum of
+``info["cost"]`` over an episode below a limit.
+
+A user's own cost is a function of the result of a step and the view after it. It is named in the
+option ``costs`` as itself, by the name that ``register_cost`` gave it, or by its import path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sdc_taichi.control.view import View
+from sdc_taichi.envs.user_functions import (
+    checked_values,
+    function_named,
+    import_path,
+    register_function,
+)
+from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.types import F64, StepResult
+
+CostFunction = Callable[[StepResult, View], Any]
+"""A cost. It gets the result of a step and the view after it, and returns numbers of at least 0,
+(B,)."""
+
+
+def hot_inlets(result: StepResult, view: View) -> F64:
+    """Inlet temperature above the recommended 27 C, mean over servers, K h (ASHRAE TC 9.9)."""
+    return result.over_27_mean_k * result.step_h
+
+
+def throttled_racks(result: StepResult, view: View) -> F64:
+    """Racks that protection throttles or has switched off, rack h."""
+    return (result.throttled_racks + result.tripped_racks) * result.step_h
+
+
+def overdue_work(result: StepResult, view: View) -> F64:
+    """Work past its deadline in each step that it waits, and work dropped or lost, tasks."""
+    return result.overdue_tasks + result.dropped_tasks + result.lost_tasks
+
+
+COSTS: dict[str, CostFunction] = {
+    function.__name__: function for function in (hot_inlets, throttled_racks, overdue_work)
+}
+"""Costs by name that need no registration."""
+_registered: dict[str, CostFunction] = {}
+
+
+def register_cost(name: str, cost: CostFunction) -> None:
+    """Make a function available as a name in the option ``costs``.
+
+    Args:
+        name: an identifier that no other cost has.
+        cost: the function; see ``CostFunction``. One of the same module and name as the function
+            before takes its place, as when a cell of a notebook runs again.
+
+    Raises:
+        ConfigError: a name that another function has, or no function.
+    """
+    register_function("cost", name, cost, _registered, reserved=tuple(COSTS))
+
+
+class Costs:
+    """Costs that the option ``costs`` names.
+
+    Args:
+        given: names, functions or their import paths, or a dict of them to weights; None is none.
+        fleet: the data centers.
+
+    Raises:
+        ConfigError: an unknown name, one given twice, a weight that is not valid, or a cost that is
+            always 0.
+    """
+
+    def __init__(self, given: Any, fleet: Fleet) -> None:
+        self._functions: dict[str, CostFunction] = {}
+        self._weights: dict[str, float] = {}
+        for one, weight in _with_weights(given):
+            name, function = _named(one)
+            if name in self._functions:
+                raise ConfigError(f"costs: {name!r} is named twice")
+            self._functions[name], self._weights[name] = function, _checked_weight(name, weight)
+        unprotected = all(c.protection.ashrae_class is None for c in fleet.configs)
+        if self._functions.get("throttled_racks") is throttled_racks and unprotected:
+            raise ConfigError(
+                "costs: throttled_racks is always 0 without protection; valid with "
+                "protection.ashrae_class"
+            )
+
+    def of(self, result: StepResult, view: View) -> dict[str, F64]:
+        """Costs of a step: their weighed sum as ``cost``, each as ``cost_NAME``, (B,) each.
+
+        Args:
+            result: the step.
+            view: the view after it.
+
+        Returns:
+            Empty if no costs are wanted.
+
+        Raises:
+            SdcError: a user's function returned something of another shape, not finite, or below 0.
+        """
+        if not self._functions:
+            return {}
+        out = {"cost": np.zeros(view.size)}
+        for name, function in self._functions.items():
+            cost = function(result, view)
+            if function is not COSTS.get(name):
+                cost = checked_values(f"cost {name}", cost, "all data centers", view.size)
+                if (cost < 0.0).any():
+                    raise SdcError(f"cost {name}: returned {cost.min():g}; valid is at least 0")
+            out["cost"] += self._weights[name] * cost
+            out[f"cost_{name}"] = cost
+        return out
+
+
+def costs_markdown() -> str:
+    """The table of costs in docs/environments.md."""
+    rows = [f"| `{name}` | {function.__doc__} |" for name, function in COSTS.items()]
+    return "\n".join(["| cost | of a step |", "|---|---|", *rows])
+
+
+def _with_weights(given: Any) -> list[tuple[Any, Any]]:
+    """Costs and their weights, 1 where only costs are given."""
+    if given is None:
+        return []
+    if isinstance(given, Mapping) and given:
+        return list(given.items())
+    if isinstance(given, Sequence) and not isinstance(given, str | bytes) and given:
+        return [(one, 1.0) for one in given]
+    raise ConfigError(
+        f"costs {given!r}: valid is None, a list of costs, or a dict of cost to weight; costs are "
+        f"{', '.join([*COSTS, *_registered])}, functions, and import paths module:name"
+    )
+
+
+def _named(given: Any) -> tuple[str, CostFunction]:
+    """Name and function of a cost."""
+    if not callable(given):
+        function = function_named(
+            "cost", given, COSTS | _registered, valid=", ".join([*COSTS, *_registered])
+        )
+        return str(given).rpartition(":")[2], function
+    name = getattr(given, "__name__", type(given).__name__)
+    if not name.isidentifier():
+        raise ConfigError(
+            f"cost {import_path(given)}: has no name; valid is a function with a name, or one that "
+            "register_cost gave a name"
+        )
+    return name, given
+
+
+def _checked_weight(name: str, weight: Any) -> float:
+    number = isinstance(weight, int | float | np.number) and not isinstance(weight, bool)
+    if not number or not 0.0 <= weight < np.inf:
+        raise ConfigError(f"costs: {name} has weight {weight!r}; valid is a number of at least 0")
+    return float(weight)
