@@ -14,8 +14,8 @@ from typing import Any
 
 import env
 import numpy as np
-from roof import core_s, plain_store
 from thermal import fleet_of
+from yardsticks import core_s, interpreter_loop, plain_store
 
 import sdc_taichi
 from sdc_taichi.config import with_values
@@ -62,8 +62,13 @@ def stepped(fleet: Fleet) -> tuple[Callable[[], object], Callable[[], object]]:
     return lambda: hall.solve(met), whole
 
 
-def first_step(what: str) -> float:
-    """Time of day at the end of the first step of one data center, or of its environment."""
+def first_step(what: str) -> dict[str, float]:
+    """When the first step of one data center, or of its environment, ended, and what it took.
+
+    Returns:
+        Time of day at the end, core time of the process until then and that of the interpreter
+        yardstick right after it, all in s.
+    """
     if what == "environment":
         one = sdc_taichi.parallel_env("corrected")
         one.reset(seed=0)
@@ -72,7 +77,13 @@ def first_step(what: str) -> float:
         sim = sdc_taichi.Simulator(sdc_taichi.load_config("corrected"))
         sim.reset()
         sim.step()
-    return time.time()
+    end_s, spent_s = time.time(), time.process_time()
+    yardstick = {"yardstick": interpreter_loop()}
+    return {
+        "end_s": end_s,
+        "core_s": spent_s,
+        "yardstick_s": float(np.median(core_s(yardstick, 100)["yardstick"])),
+    }
 
 
 def resident() -> int:

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from roof import core_s, plain_store
+from yardsticks import core_s, plain_store
 
 from sdc_taichi import build_fleet, load_config, make_configs
 from sdc_taichi.sim.fleet import Fleet

@@ -8,6 +8,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,35 @@ def test_only_agreement_is_judged_at_tiny_size(written: dict[str, Any]) -> None:
     assert len(judged) == len(peers)
     # What is judged at full size has a target here, too.
     assert sum(f["target"] != "" for f in figures) > 20
+
+
+@pytest.mark.slow
+def test_speed_is_judged_by_ratios_alone(written: dict[str, Any]) -> None:
+    judged = [f for f in written["figures"] if f["target"]]
+    assert {f["unit"] for f in judged} <= {"", "relative", "calls", "B/server", "MB"}
+    for figure in judged:
+        if figure["part"] in ("environments", "start", "recording"):
+            assert figure["absolute"].endswith((" us/step", " steps/s", " s")), figure
+
+
+def test_yardsticks_of_a_call_are_shares_of_its_own_core_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    yardsticks = importlib.import_module("yardsticks")
+    clock_s = [0.0]
+    monkeypatch.setattr(yardsticks.time, "process_time", lambda: clock_s[0])
+    monkeypatch.setattr(yardsticks.time, "perf_counter", lambda: clock_s[0])
+
+    def call(seconds: float) -> Callable[[], None]:
+        def run() -> None:
+            clock_s[0] += seconds
+
+        return run
+
+    ratios = yardsticks.core_ratios({"a": call(3e-3), "b": call(5e-4)}, call(1e-3), 3)
+    assert ratios == pytest.approx({"a": 3.0, "b": 0.5})
+    assert yardsticks.interpreter_loop(rounds=2)() == [False, False]
 
 
 @pytest.mark.parametrize("peer", ["numba", "c"])
