@@ -159,10 +159,11 @@ def beside_peers(name: str, fleet: Fleet, threads: int, rounds: int) -> Iterator
     ):
         limits = (at_most, at_least) if alike else ()
         yield Figure("kernel", f"{name}: {called}", over(what, other), "", *limits)
+    slowest = 1.6 if alike else 2.2
     for peer, given in peers.items():
         where = f"{name}: {peer}"
         yield each(peer, peer)
-        yield Figure("kernel", f"{where}, ours over it", over("step", peer), at_most=1.6)
+        yield Figure("kernel", f"{where}, ours over it", over("step", peer), at_most=slowest)
         summed = np.stack([sums.cpu_w, sums.it_fan_w, sums.it_airflow_m3s])
         apart = difference(given, layers, summed)
         yield Figure("kernel", f"{where}, largest difference", apart, "relative", at_most=1e-5)
@@ -298,21 +299,11 @@ def side_by_side(quick: bool) -> Iterator[Figure]:
         return
     seconds, rounds = (0.01, 1) if quick else (1.0, 3)
     size = [16, 20, 200] if quick else [4096, 20, 200]
-    servers = int(np.prod(size))
-    found = []
-    for _ in range(rounds):
-        one, two = (child("roof", servers, 5, SDC_TAICHI_THREADS=t) for t in "12")
-        found.append(2.0 * one / two)
-    roof = float(np.median(found))
-    yield Figure("scaling", "memory roof, two threads over one", roof)
-    hall = " x ".join(map(str, size))
-    # Stores to memory gain what the roof gains; what computes gains from a second core.
-    for what, shape, threads_least, processes_least in (
-        *(() if quick else (("step with layers", hall, 0.75 * roof, 0.75 * roof),)),
-        *(() if quick else (("reduction", hall, 1.1, 1.3),)),
-        ("environments", f"N = {size[0]}", 1.1, 1.3),
-    ):
-        # The three of a round follow each other: what memory bears from outside meets all of them.
+    hall, batch = " x ".join(map(str, size)), f"N = {size[0]}"
+
+    def gains(what: str) -> tuple[float, float]:
+        """Steps per second of two threads, and of two processes, over one; medians."""
+        # The three of a round follow each other: what comes from outside meets all of them.
         per_s = np.array(
             [
                 [rates(what, size, seconds, *how) for how in ((1, 1), (1, 2), (2, 1))]
@@ -320,11 +311,24 @@ def side_by_side(quick: bool) -> Iterator[Figure]:
             ]
         )
         threads, processes = np.median(per_s[:, 1:] / per_s[:, :1], axis=0).tolist()
-        where = f"{what} {shape}"
-        yield Figure("scaling", f"{where}, two threads over one", threads, at_least=threads_least)
-        yield Figure(
-            "scaling", f"{where}, two processes over one", processes, at_least=processes_least
-        )
+        return threads, processes
+
+    stores, computes = gains("roof")[1], gains("interpreter")[1]
+    yield Figure("scaling", "memory roof, two processes over one", stores)
+    yield Figure("scaling", "interpreter yardstick, two processes over one", computes)
+    for what, shape, gain, which in (
+        *(() if quick else (("step with layers", hall, stores, "the roof's"),)),
+        *(() if quick else (("reduction", hall, computes, "the interpreter's"),)),
+        ("environments", batch, computes, "the interpreter's"),
+    ):
+        threads, processes = gains(what)
+        for name, found, least in (
+            ("two threads", threads, 0.5),
+            ("two processes", processes, 0.7),
+        ):
+            where = f"{what} {shape}, gain by {name} over {which}"
+            beside = f"{number(found)} times"
+            yield Figure("scaling", where, found / gain, at_least=least, absolute=beside)
 
 
 def rates(what: str, size: list[int], seconds: float, processes: int, threads: int) -> float:

@@ -127,11 +127,6 @@ def cycles(count: int) -> float:
     return float(resident() - before)
 
 
-def roof(servers: int, repeats: int) -> float:
-    """Core time of the memory roof, s, with the threads of this process."""
-    return float(np.median(core_s({"roof": plain_store(servers)}, repeats)["roof"]))
-
-
 def rate(what: str, size: list[int], seconds: float) -> float:
     """Steps of ``size`` per second from when a line comes in, which answers ``ready``."""
     if what == "environments":
@@ -143,6 +138,10 @@ def rate(what: str, size: list[int], seconds: float) -> float:
             return batch.step(actions)
 
         call: Callable[[], object] = step
+    elif what == "roof":
+        call = plain_store(int(np.prod(size)))
+    elif what == "interpreter":
+        call = interpreter_loop()
     else:
         reduction, whole = stepped(fleet_of(size[0], size[1], size[2], "approach"))
         call = reduction if what == "reduction" else whole
@@ -153,9 +152,7 @@ def rate(what: str, size: list[int], seconds: float) -> float:
     return env.rate(call, 1, seconds)
 
 
-PARTS: dict[str, Callable[..., Any]] = {
-    f.__name__: f for f in (first_step, memory, cycles, roof, rate)
-}
+PARTS: dict[str, Callable[..., Any]] = {f.__name__: f for f in (first_step, memory, cycles, rate)}
 
 if __name__ == "__main__":
     print(json.dumps(PARTS[sys.argv[1]](*json.loads(sys.argv[2]))))

@@ -146,13 +146,15 @@ class _GroupInlets:
     """Inlets of the server groups in the last step, as far as placement needs them."""
 
     def __init__(self, fleet: Fleet, hall: Hall, *, keep: bool) -> None:
-        self._hall, self._keep = hall, keep
-        setpoint_c = fleet.values("hvac.setpoint.initial_c")[fleet.rack_dc]
-        self._initial_c = np.repeat(setpoint_c + fleet.approach_k, np.diff(fleet.group_offsets))
+        self._fleet, self._hall, self._keep = fleet, hall, keep
 
     def initial(self) -> F64:
         """Inlets at the initial setpoints, in C, (G,); empty if nothing needs them."""
-        return self._initial_c.copy() if self._keep else _EMPTY
+        if not self._keep:
+            return _EMPTY
+        fleet = self._fleet
+        setpoint_c = fleet.values("hvac.setpoint.initial_c")[fleet.rack_dc]
+        return np.repeat(setpoint_c + fleet.approach_k, np.diff(fleet.group_offsets))
 
     def last(self) -> F64:
         """Inlets of the last step, in C, (G,); empty if nothing needs them."""
