@@ -533,7 +533,7 @@ def plot(figures: list[Figure], path: Path) -> None:
         for f in figures
         if f.unit == "ns/server" and f.part == "scaling" and f.value is not None
     ]
-    roofs = [f.value for f in figures if f.name.endswith("memory roof") and f.value is not None]
+    roofs = [f.value for f in figures if f.name.endswith(": memory roof") and f.value is not None]
     canvas = Canvas(figsize=(6.4, 4.0), layout="constrained")
     FigureCanvasAgg(canvas)
     axes = canvas.subplots()
@@ -574,7 +574,7 @@ def main() -> None:
     facts["roof_gb_per_s_and_core"] = {
         f.name.split(":")[0]: round(12.0 / f.value, 1)
         for f in figures
-        if f.name.endswith("memory roof") and f.value
+        if f.name.endswith(": memory roof") and f.value
     }
     missed = [f for f in figures if f.met(quick) is False]
     judged = sum(f.met(quick) is not None for f in figures)
