@@ -886,10 +886,20 @@ def test_out_of_order() -> None:
         env.reset(seed=0)
         assert env.reward_terms() == {}
         env.step(action)
+        saved = env.state_dict()
         env.close()
         env.close()
-        with pytest.raises(RuntimeStateError, match="closed"):
-            env.reset()
+        for too_late in (
+            env.reset,
+            lambda env=env, action=action: env.step(action),
+            env.state,
+            env.render,
+            env.reward_terms,
+            env.state_dict,
+            lambda env=env, saved=saved: env.load_state_dict(saved),
+        ):
+            with pytest.raises(RuntimeStateError, match="the environment is closed; create a new"):
+                too_late()
     for env, action in envs[:2]:
         again: Any = type(env)(**tiny())
         again.reset(seed=0)

@@ -1,12 +1,20 @@
-"""Memory that a step takes."""
+"""Memory that a step takes, and that what was closed or dropped gives back."""
 
 from __future__ import annotations
 
+import gc
 import tracemalloc
+import weakref
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
 
-from sdc_taichi import Simulator, drivers_from_arrays, load_config
+import sdc_taichi
+from sdc_taichi import ForecastError, Simulator, drivers_from_arrays, load_config
 
 
 @pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
@@ -31,3 +39,100 @@ def test_a_step_has_no_temporary_of_the_size_of_the_servers(thermal: str) -> Non
         tracemalloc.stop()
     assert sim.fleet.servers >= 100_000
     assert most < sim.fleet.servers
+
+
+TRANSIENT = ["simulation.thermal=transient"]
+HOLD = {"agent_ls": 1, "agent_dc": 1, "agent_bat": 1}
+MAKERS: dict[str, Callable[[Path], Any]] = {
+    "parallel": lambda _: sdc_taichi.parallel_env("tiny", days=1),
+    "aec": lambda _: sdc_taichi.aec_env("tiny", days=1),
+    "gymnasium": lambda _: gymnasium.make("sdc_taichi/Joint-v0", config="tiny", days=1),
+    "make_vec": lambda _: gymnasium.make_vec("sdc_taichi/Joint-v0", config="tiny", days=1),
+    "vector_env": lambda _: sdc_taichi.vector_env(1, "tiny", days=1),
+    "with everything": lambda folder: sdc_taichi.parallel_env(
+        load_config("corrected", TRANSIENT),
+        days=1,
+        heat_map=True,
+        forecast_error=ForecastError(0.1, 1.0),
+        rewards=lambda result, view: -result.grid_kwh,
+        recorder=folder / "run.rrd",
+    ),
+    "released": lambda _: sdc_taichi.parallel_env(
+        "sustaindc", days=1, observations="sustaindc", rewards="sustaindc"
+    ),
+}
+
+
+@pytest.fixture
+def no_garbage_collection() -> Iterator[None]:
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def use(env: Any, steps: int) -> None:
+    """Reset and step, whatever the standard."""
+    env.reset(seed=1)
+    for _ in range(steps):
+        if hasattr(env, "agent_iter"):
+            env.step(1)
+        elif hasattr(env, "possible_agents"):
+            env.step({a: [1] for a in HOLD} if hasattr(env, "num_envs") else HOLD)
+        else:
+            env.step(np.ones(env.action_space.shape, dtype=np.int64))
+
+
+@pytest.mark.usefixtures("no_garbage_collection")
+@pytest.mark.parametrize("steps", [0, 2])
+@pytest.mark.parametrize("kind", MAKERS)
+def test_an_environment_frees_its_memory_without_garbage_collection(
+    kind: str, steps: int, tmp_path: Path
+) -> None:
+    env = MAKERS[kind](tmp_path)
+    use(env, steps)
+    core = env.unwrapped.core
+    left = [
+        weakref.ref(part)
+        for part in (core.sim, core.sim._stages.hall, core._observer, core._rewards, core)
+    ]
+    env.close()
+    # Of what was closed but is still referred to, nothing large is left.
+    assert [ref() is None for ref in left] == [False, True, True, True, False]
+    del core, env
+    assert [ref() for ref in left] == [None] * 5
+
+
+@pytest.mark.usefixtures("no_garbage_collection")
+def test_dropped_without_being_closed() -> None:
+    env, sim = sdc_taichi.vector_env(2, "tiny", days=1), Simulator(load_config("tiny"))
+    use(env, 0)
+    sim.reset()
+    sim.step()
+    left = [weakref.ref(x) for x in (env.core, env.core._observer, sim, sim._stages.hall)]  # type: ignore[union-attr]
+    del env, sim
+    assert [ref() for ref in left] == [None] * 4
+
+
+@pytest.mark.usefixtures("no_garbage_collection")
+@pytest.mark.parametrize("kind", ["gymnasium", "vector_env", "simulator"])
+def test_what_is_closed_and_kept_holds_next_to_nothing(kind: str, tmp_path: Path) -> None:
+    def closed() -> Any:
+        env = Simulator(load_config("tiny")) if kind == "simulator" else MAKERS[kind](tmp_path)
+        if isinstance(env, Simulator):
+            env.reset()
+            env.step()
+        else:
+            use(env, 2)
+        env.close()
+        return env
+
+    closed()
+    tracemalloc.start()
+    try:
+        kept = [closed() for _ in range(4)]
+        size, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    # 200 of them hold less than 20 MB.
+    assert size < len(kept) * 100_000

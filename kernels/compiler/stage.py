@@ -49,7 +49,8 @@ class CompiledStage:
     def __init__(
         self, stage: Callable[..., Arrays], size: int, *, reads: Sequence[str] | None = None
     ) -> None:
-        self._stage, self._size = stage, size
+        self._stage: Callable[..., Arrays] | None = stage
+        self._size = size
         self._reads = tuple(reads or ())
         self._values_read = itemgetter(*self._reads) if reads else None
         self._kernel: BoundKernel | None = None
@@ -119,6 +120,7 @@ class CompiledStage:
         self._kernel(serial, 1, self._shared, self._constants, self._inputs, out)
 
     def _compile(self, names: tuple[str, ...]) -> None:
+        assert self._stage is not None
         trace = Trace(self._size)
         inputs = {name: trace.entry(f"inputs[{row}, i]") for row, name in enumerate(names)}
         results = {name: trace.lift(x) for name, x in self._stage(**inputs).items()}
@@ -135,6 +137,9 @@ class CompiledStage:
         self._results: npt.NDArray[np.float64] = unpadded(self._outputs, self._size)
         source = _source(trace.statements(list(results.values())))
         self._kernel = BoundKernel(_kernel(source), templates=1)
+        # It often is a method of the object that has this one: a circle, which only the garbage
+        # collector would find, with all arrays that the object holds.
+        self._stage = None
 
 
 def _source(body: list[str]) -> str:

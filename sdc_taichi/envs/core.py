@@ -149,6 +149,7 @@ class Core:
         self._last: tuple[State, dict[str, F64]] | None = None
         self._final_terms: dict[str, F64] = {}
         self._keys: I64 = np.zeros(size, dtype=np.int64)
+        self._closed = False
 
     def reset(self, seed: Seed = None, start_day: Any = None) -> dict[str, Observation]:
         """Start an episode in all environments.
@@ -164,7 +165,9 @@ class Core:
 
         Raises:
             SdcError: a seed or day that is not valid.
+            RuntimeStateError: after ``close``.
         """
+        self._check_open()
         chosen = None if start_day is None else chosen_start_days(start_day, self.num_envs)
         self._generators = seeded_generators(seed, self._generators, self.num_envs)
         drawn = [rng.integers(2**63 - 1, size=3) for rng in self._generators]
@@ -234,9 +237,10 @@ class Core:
         """The situation before the next step.
 
         Raises:
-            RuntimeStateError: before ``reset``.
+            RuntimeStateError: before ``reset``, or after ``close``.
         """
         if self._view is None:
+            self._check_open()
             raise RuntimeStateError("the environment has not been reset; call reset() first")
         return self._view
 
@@ -247,7 +251,8 @@ class Core:
 
     def state(self) -> F32:
         """Shared state for centralised critics, (B, m): all features, whoever learns."""
-        return self._observer.state(self.view)
+        view = self.view
+        return self._observer.state(view)
 
     def reward_terms(self) -> dict[str, F64]:
         """Reward terms of the last step by name, unscaled, (B,) each; empty before the first.
@@ -278,6 +283,7 @@ class Core:
         Raises:
             SdcError: made by other environments, incomplete, or not valid; nothing has changed.
         """
+        self._check_open()
         saved = check_state(
             values,
             options=self._identity,
@@ -301,8 +307,18 @@ class Core:
         return self._observe(self.view)
 
     def close(self) -> None:
-        """Close the simulator, which is unusable afterwards."""
+        """Release the simulator and all tables; the environments are unusable afterwards."""
+        if self._closed:
+            return
+        self._closed = True
         self.sim.close()
+        self._view = self._view_after = self._last = None
+        self._final_terms = {}
+        del self._observer, self._rewards, self._others, self._decoder
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise RuntimeStateError("the environment is closed; create a new one")
 
     def _observation_space(self, agent: str) -> spaces.Space[Any]:
         features = self._observer.spaces[agent]

@@ -54,12 +54,14 @@ class Simulator:
         if precision not in ("f32", "f64"):
             raise ConfigError(f"precision {precision!r}: valid are f32 and f64")
         self.fleet = fleet if isinstance(fleet, Fleet) else build_fleet(fleet)
-        self.drivers = load_drivers(self.fleet.configs) if drivers is None else drivers
-        if self.drivers.size != self.fleet.size:
+        given = load_drivers(self.fleet.configs) if drivers is None else drivers
+        if given.size != self.fleet.size:
             raise ConfigError(
-                f"drivers of {self.drivers.size} data centers for a fleet of {self.fleet.size}"
+                f"drivers of {given.size} data centers for a fleet of {self.fleet.size}"
             )
-        self._initial_start = self.drivers.start
+        # None once the simulator is closed.
+        self._drivers: Drivers | None = given
+        self._initial_start = given.start
         self.precision: Precision = precision
         self.step_h = 1.0 / self.fleet.steps_per_hour
         self._timeline = schedule(
@@ -71,7 +73,6 @@ class Simulator:
         )
         self._stages: _Stages | None = None
         self._state: State | None = None
-        self._closed = False
 
     def __getstate__(self) -> dict[str, Any]:
         if self._stages is not None:
@@ -87,13 +88,25 @@ class Simulator:
         return self.fleet.size
 
     @property
+    def drivers(self) -> Drivers:
+        """Exogenous inputs; their ``start`` is the first step of the present run.
+
+        Raises:
+            RuntimeStateError: after ``close``.
+        """
+        self._check_open()
+        assert self._drivers is not None
+        return self._drivers
+
+    @property
     def state(self) -> State:
         """The present state.
 
         Raises:
-            RuntimeStateError: before ``reset``.
+            RuntimeStateError: before ``reset``, or after ``close``.
         """
         if self._state is None:
+            self._check_open()
             raise RuntimeStateError("the simulator has not been reset; call reset() first")
         return self._state
 
@@ -130,7 +143,7 @@ class Simulator:
         stages = self._started()
         stages.hall.discard_last_step()
         self._timeline = self._timeline.reseeded(seeds)
-        self.drivers = replace(self.drivers, start=first.astype(np.int64))
+        self._drivers = replace(self.drivers, start=first.astype(np.int64))
         supply = stages.crac_units.initial_supply()
         self._state = State(
             step=0,
@@ -226,7 +239,7 @@ class Simulator:
         stages.hall.discard_last_step()
         self._state = state
         self._timeline = self._timeline.reseeded(state.seed)
-        self.drivers = replace(self.drivers, start=state.start)
+        self._drivers = replace(self.drivers, start=state.start)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to an .npz file, atomically and without pickle.
@@ -249,11 +262,10 @@ class Simulator:
         return snapshot.fingerprint(self.fleet, self.drivers, self.precision)
 
     def close(self) -> None:
-        """Let go of the kernel arrays; the simulator is unusable afterwards."""
+        """Release state, inputs and kernel arrays; a closed simulator has only its ``fleet``."""
         if self._stages is not None:
             self._stages.workload.close()
-        self._stages = None
-        self._closed = True
+        self._stages = self._state = self._drivers = None
 
     def __enter__(self) -> Self:
         return self
@@ -263,13 +275,16 @@ class Simulator:
 
     def _started(self) -> _Stages:
         """The stages, made on first use: they size all devices and need the Taichi runtime."""
-        if self._closed:
-            raise RuntimeStateError("the simulator is closed; create a new one")
+        self._check_open()
         if self._stages is None:
             self._stages = _make_stages(
                 self.fleet, self.drivers, self.precision, event_free=self._timeline.event_free
             )
         return self._stages
+
+    def _check_open(self) -> None:
+        if self._drivers is None:
+            raise RuntimeStateError("the simulator is closed; create a new one")
 
     def _seeds(self, given: int | Sequence[int] | I64) -> I64:
         """Seeds of the data centers, (B,)."""
