@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from sdc_taichi.atomic_file import AtomicFile, atomic_write, delete_leftovers, temporary_name
+from sdc_taichi.atomic_file import AtomicFile, FileClaim, atomic_write
 from sdc_taichi.errors import SdcError
 
 
@@ -46,7 +50,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
 
 def test_a_discarded_file_never_appears_and_a_committed_one_stays(tmp_path: Path) -> None:
     given_up, kept = AtomicFile(tmp_path / "a"), AtomicFile(tmp_path / "b")
-    assert names(tmp_path) == sorted(temporary_name(tmp_path / x).name for x in "ab")
+    assert names(tmp_path) == [".a.part", ".b.part"]
     given_up.discard()
     kept.commit()
     kept.discard()
@@ -58,8 +62,71 @@ def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
         AtomicFile(tmp_path / "missing" / "a")
 
 
-def test_leftovers_of_killed_processes_go(tmp_path: Path) -> None:
-    for name in (".a.txt.123.part", ".b.txt.123.part", "a.txt"):
-        (tmp_path / name).write_bytes(b"")
-    delete_leftovers(tmp_path / "a.txt")
-    assert names(tmp_path) == [".b.txt.123.part", "a.txt"]
+def test_a_file_is_written_by_one_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    with AtomicFile(path) as first:
+        first.file.write(b"first")
+        with pytest.raises(SdcError, match=r"a\.txt: another process is writing it; valid is"):
+            AtomicFile(path)
+        first.commit()
+    with AtomicFile(path) as second:
+        assert path.read_bytes() == b"first"
+        second.commit()
+    assert path.read_bytes() == b""
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_what_a_killed_process_left_is_taken_over(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    code = (
+        "import os, sys, pathlib; from sdc_taichi.atomic_file import AtomicFile;"
+        "given = AtomicFile(pathlib.Path(sys.argv[1])); given.file.write(b'left over');"
+        "given.file.flush(); os._exit(9)"
+    )
+    subprocess.run([sys.executable, "-c", code, path], timeout=60, check=False)
+    assert names(tmp_path) == [".a.txt.part"]
+    with atomic_write(path) as file:
+        file.write(b"new")
+    assert path.read_bytes() == b"new"
+    assert names(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="files that are open cannot be renamed on Windows")
+@pytest.mark.parametrize("end", ["renamed", "deleted"])
+def test_a_claim_that_ends_while_another_opens_the_file_is_noticed(
+    end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = FileClaim(tmp_path / "a")
+    open_file = os.open
+
+    def open_late(*arguments: Any) -> int:
+        opened = open_file(*arguments)
+        monkeypatch.undo()
+        first.rename() if end == "renamed" else first.release()
+        return opened
+
+    monkeypatch.setattr(os, "open", open_late)
+    second = FileClaim(tmp_path / "a")
+    assert os.fstat(second.file.fileno()).st_ino == (tmp_path / ".a.part").stat().st_ino
+    with pytest.raises(SdcError, match="another process"):
+        FileClaim(tmp_path / "a")
+    second.release()
+    assert names(tmp_path) == (["a"] if end == "renamed" else [])
+
+
+def test_a_claim_that_is_forgotten_leaves_nothing(tmp_path: Path) -> None:
+    FileClaim(tmp_path / "a")
+    assert names(tmp_path) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no locks on Windows")
+def test_without_locks_nobody_is_kept_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    with atomic_write(tmp_path / "a") as file:
+        file.write(b"whole")
+        assert names(tmp_path) == [f".a.{os.getpid()}.part"]
+    assert (tmp_path / "a").read_bytes() == b"whole"
+    assert names(tmp_path) == ["a"]

@@ -24,6 +24,7 @@ import sdc_taichi
 from sdc_taichi import (
     Actions,
     DataCenterConfig,
+    Recorder,
     Simulator,
     StepResult,
     config,
@@ -554,6 +555,28 @@ def test_failing_run_leaves_the_former_one_whole(tmp_path: Path) -> None:
     with Simulator(load_config("tiny")) as sim, pytest.raises(RuntimeError, match="broken"):
         simulate_to_folder(sim, Broken(), RunRequest("broken", 20), out)
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+
+
+def test_a_second_run_into_a_folder_is_refused_and_leaves_the_first_alone(tmp_path: Path) -> None:
+    out, recording = tmp_path / "run", tmp_path / "hall.rrd"
+    refused: list[str] = []
+
+    def start_another(result: StepResult) -> None:
+        if result.step == 1:
+            for arguments in (("--out", out), ("--out", tmp_path / "b", "--record", recording)):
+                done = call("simulate", "tiny", "--days", 0.25, *arguments)
+                assert done.exit_code == 2
+                refused.extend(done.stderr.splitlines())
+
+    with Simulator(load_config("tiny")) as sim, Recorder(recording) as recorder:
+        recorder.begin(sim)
+        controller = make_controller("idle", sim.fleet)
+        simulate_to_folder(sim, controller, RunRequest("idle", 4), out, on_step=start_another)
+    end = "another process is writing it; valid is another name, or to wait until it has ended"
+    assert refused == [f"error: {file}: {end}" for file in (out / "metrics.json", recording)]
+    assert names_in(out) == FILES | {"config.yaml"}
+    assert names_in(tmp_path) == {"run"}
+    simulate(out)
 
 
 def test_folder_with_other_files_needs_force(tmp_path: Path) -> None:

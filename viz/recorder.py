@@ -103,8 +103,8 @@ class Recorder:
             description: what ``describe_run`` says of the run; None is what the simulator knows.
 
         Raises:
-            SdcError: a name in focus that there is not, a file that cannot be written, or too
-                little room on its disk.
+            SdcError: a name in focus that there is not, a file that cannot be written or that
+                another process records to, or too little room on its disk.
         """
         self.close()
         self._episodes += 1
@@ -123,6 +123,8 @@ class Recorder:
         fleet = sim.fleet
         values = int(description.get("steps_asked", 0)) * fleet.size * len(fields(StepResult))
         keep_bytes = KEEP_BYTES + KEEP_BYTES_PER_VALUE * values + KEEP_BYTES_PER_DC * fleet.size
+        names = distinct_names(fleet.names)
+        focus = _focus_indices(names, self._focus)
         output = RecordingOutput(
             file=self.file,
             address=self._address,
@@ -130,8 +132,6 @@ class Recorder:
             name=self.file.stem if self.file is not None else "sdc-taichi",
             keep_bytes=keep_bytes,
         )
-        names = distinct_names(fleet.names)
-        focus = _focus_indices(names, self._focus)
         return RecordingWriter(sim, names, focus, description, output, self._every)
 
     def add(self, result: StepResult, *, rewards: Mapping[str, F64] | None = None) -> None:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sdc_taichi.atomic_file import naming_errors
+from sdc_taichi.atomic_file import FileClaim, naming_errors
 from sdc_taichi.errors import SdcError
 
 from .recording_target import HOST, listens, served_at
@@ -78,7 +78,8 @@ class RecordingOutput:
         keep_bytes: bytes that the file leaves free on its disk.
 
     Raises:
-        SdcError: the file cannot be written, or there is too little room for it.
+        SdcError: the file cannot be written, another process is writing it, or there is too little
+            room for it.
     """
 
     def __init__(
@@ -99,8 +100,7 @@ class RecordingOutput:
         self._unconfirmed_bytes = 0
         self.failed = False
         """Whether the output has ended early."""
-        if file is not None:
-            _check_room(file, keep_bytes)
+        self._claim = None if file is None else _claim(file, keep_bytes)
         if address is not None and not listens(address):
             self._fail(f"no viewer listens at {address}")
 
@@ -194,6 +194,14 @@ class RecordingOutput:
             self._stream.send_chunks(chunks)
 
     def close(self) -> None:
+        """Write what is left, with the index of the file, and let others write the file."""
+        try:
+            self._finish()
+        finally:
+            if self._claim is not None:
+                self._claim.release()
+
+    def _finish(self) -> None:
         """Write what is left, with the index of the file."""
         if self._stream is None or self.failed:
             return
@@ -352,6 +360,17 @@ class _BackgroundCall(threading.Thread):
         if self.error is None:
             self.join(seconds)
         return not self.is_alive()
+
+
+def _claim(file: Path, keep_bytes: int) -> FileClaim:
+    """Claim a file that can be written and has room; no other process then records to it."""
+    claim = FileClaim(file)
+    try:
+        _check_room(file, keep_bytes)
+    except BaseException:
+        claim.release()
+        raise
+    return claim
 
 
 def _check_room(file: Path, keep_bytes: int) -> None:

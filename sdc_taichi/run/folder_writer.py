@@ -2,7 +2,8 @@
 
 A run folder holds ``steps.parquet``, ``metrics.json`` and ``config.yaml`` (one data center) or
 ``configs.yaml`` (several, one YAML document each). Every file is written beside its place and
-renamed when it is whole. Equal runs give equal bytes. See docs/run-folder.md for the columns.
+renamed when it is whole, and a second run into the folder is refused meanwhile. Equal runs give
+equal bytes. See docs/run-folder.md for the columns.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from sdc_taichi.atomic_file import atomic_write, naming_errors
+from sdc_taichi.atomic_file import AtomicFile, atomic_write, naming_errors
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import Controller
 from sdc_taichi.errors import ConfigError
@@ -60,8 +61,8 @@ def simulate_to_folder(
         The content of metrics.json; None, and no files, if it was stopped before the first step.
 
     Raises:
-        SdcError: the folder is not free, a file cannot be written, or the controller gave actions
-            that are not valid.
+        SdcError: the folder is not free, another run is writing to it, a file cannot be written,
+            or the controller gave actions that are not valid.
     """
     sim.fleet.require_distinct_names()
     has_former_run = prepare_folder(out, force=force)
@@ -72,7 +73,9 @@ def simulate_to_folder(
     metadata = {**description, "configs_yaml": configs}
     # A dict, because it keeps the order in which events began.
     events: dict[ActiveEvent, None] = {}
-    with StepsWriter(out / STEPS_FILE, sim, metadata) as writer:
+    # Open from the first step to the last file, it keeps a second run out of the folder.
+    metrics_file = AtomicFile(out / METRICS_FILE)
+    with metrics_file, StepsWriter(out / STEPS_FILE, sim, metadata) as writer:
 
         def write_step(result: StepResult) -> None:
             writer.add(result)
@@ -86,13 +89,15 @@ def simulate_to_folder(
         if totals.steps == 0:
             return None
         writer.commit()
-    write_text(out / config_name, configs)
-    if has_former_run:
-        for name in (other_name, REPORT_FILE):
-            with naming_errors(out / name):
-                (out / name).unlink(missing_ok=True)
-    content = _metrics_content(description, totals, sim.fleet, events)
-    write_text(out / METRICS_FILE, metrics_json(content) + "\n")
+        write_text(out / config_name, configs)
+        if has_former_run:
+            for name in (other_name, REPORT_FILE):
+                with naming_errors(out / name):
+                    (out / name).unlink(missing_ok=True)
+        content = _metrics_content(description, totals, sim.fleet, events)
+        with naming_errors(metrics_file.path):
+            metrics_file.file.write(f"{metrics_json(content)}\n".encode())
+        metrics_file.commit()
     return content
 
 

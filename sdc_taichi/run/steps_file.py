@@ -10,7 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from sdc_taichi.atomic_file import AtomicFile, delete_leftovers, naming_errors
+from sdc_taichi.atomic_file import AtomicFile, naming_errors
 from sdc_taichi.exogenous.year_clock import step_times
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
@@ -34,7 +34,7 @@ class StepsWriter:
         metadata: stored as JSON under ``METADATA_KEY`` in the file's metadata.
 
     Raises:
-        SdcError: the file cannot be written.
+        SdcError: the file cannot be written, or another process is writing it.
     """
 
     def __init__(self, path: Path, sim: Simulator, metadata: Mapping[str, Any]) -> None:
@@ -46,8 +46,6 @@ class StepsWriter:
         self._filled = 0
         self._first_step = 0
         self._writer: Any = None
-        with naming_errors(path):
-            delete_leftovers(path)
         self._output = AtomicFile(path)
 
     def add(self, result: StepResult) -> None:
