@@ -22,6 +22,17 @@ class RuntimeStateError(SdcError):
     """The simulator was used in a state that cannot work (closed, forked, not reset)."""
 
 
+def shortened(value: object, most: int = 80) -> str:
+    """A value as messages quote it, cut to a number of characters.
+
+    Args:
+        value: any value; its ``repr`` is quoted.
+        most: number of characters after which it is cut.
+    """
+    text = repr(value[: most + 1] if isinstance(value, str | bytes | list | tuple) else value)
+    return text if len(text) <= most else text[:most] + "…"
+
+
 def similar_names(name: object, valid: Iterable[str], most: int = 1) -> list[str]:
     """Valid names that a misspelt ``name`` may have meant, the most similar first.
 

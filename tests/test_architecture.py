@@ -15,6 +15,8 @@ ROOMS = (
     "errors",
     "types",
     "atomic_file",
+    "user_file",
+    "number_text",
     "configs",
     "data",
     "kernels",

@@ -198,7 +198,7 @@ def test_values_that_are_not_valid_are_named(assigned: Any, message: str) -> Non
         ("name.first=x", "name is a value, not a section"),
         ("hall.supply_approach_k.4=1", "index '4' is not in 0..3"),
         ("site.seed=[1", "is no YAML value"),
-        ("site.start=2001-13-45", "is no YAML value (month must be in 1..12)"),
+        ("site.start=2001-13-45", "is no day of a 365-day year"),
         ("hvac={setpoint: {initial_c: 20, initial_c: 21}}", "'initial_c' is given twice"),
         ("hvac.chiller.model=carno", "'carnot'"),
         ("simulation.steps_per_hour=7", "7 does not divide 60 minutes; valid are 1, 2, 3, 4"),

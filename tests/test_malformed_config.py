@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 import re
 from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
-from sdc_taichi import DataCenterConfig, load_config
+from sdc_taichi import ConfigError, DataCenterConfig, load_config
 from sdc_taichi.cli.app import app
 
 HALL, HVAC, SERVERS = (
@@ -95,6 +98,14 @@ def fails(arguments: list[str], parts: list[str]) -> None:
         ),
         ("extends: tiny\nhall: null", ["hall:", "None"]),
         ("extends: tiny\nhall: {1: 2}", ["hall.1", "Keys should be strings"]),
+        ("extends: tiny\nhall: &hall {a: *hall}", ["not valid YAML", "refers to itself"]),
+        (
+            "a: &a [1, 1, 1]\n"
+            + "".join(
+                f"{x}: &{x} [{', '.join([f'*{y}'] * 9)}]\n" for y, x in pairwise("abcdefghi")
+            ),
+            ["not valid YAML", "repetitions of anchors counted; valid is at most 10,000,000"],
+        ),
         (
             "extends: tiny\nservers: {groups: [[{count: 1, full_w: 10, idle_w: 20}]]}",
             ["servers.groups.0.0: idle_w 20 must not exceed full_w 10"],
@@ -115,11 +126,30 @@ def test_yaml(tmp_path: Path, text: str, parts: list[str]) -> None:
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     binary = tmp_path / "binary.yaml"
     binary.write_bytes(b"\xff\xfe\x00")
-    fails(["config", "show", str(binary)], [f"{binary}: cannot be read", "0xff"])
-    fails(["config", "show", str(tmp_path)], [f"{tmp_path}: cannot be read", "directory"])
+    fails(["config", "show", str(binary)], [f"{binary}: byte 0 is 0xff; valid is UTF-8 text"])
+    fails(["config", "show", str(tmp_path)], [f"{tmp_path}: is a folder; valid is a file"])
     missing = str(tmp_path / "no.yaml")
     fails(["config", "show", missing], [f"{missing}: no such file or preset"])
     fails(["config", "show", "corected"], ["corected", "did you mean 'corrected'?"])
+    pipe, large = tmp_path / "pipe.yaml", tmp_path / "large.yaml"
+    os.mkfifo(pipe)
+    with large.open("wb") as file:
+        file.truncate(200_000_000)
+    fails(["config", "show", str(pipe)], [f"{pipe}: is a pipe; valid is a file"])
+    fails(["config", "show", "/dev/zero"], ["/dev/zero: is a device; valid is a file"])
+    fails(["config", "show", str(large)], [f"{large}: has 200.0 MB; valid is at most"])
+    fails(["config", "show", "a\0b"], ["'a\\x00b': is no name of a file"])
+    fails(["config", "show", "x" * 5000], ["File name too long"])
+
+
+def test_what_is_too_long_for_the_name_of_a_file_is_an_override() -> None:
+    done = CliRunner().invoke(app, ["config", "show", "tiny", "name=" + "x" * 5000])
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert f"name: {'x' * 5000}\n" in done.stdout
+    for field in ("weather_file", "carbon_file", "workload_file"):
+        fails(["config", "check", "tiny", f"site.{field}=" + "x" * 5000], ["File name too long"])
+    named = "hall.recirculation.matrix_file=" + "x" * 5000 + ".npz"
+    fails(["config", "check", "corrected", named], ["File name too long"])
 
 
 # Overrides
@@ -131,6 +161,18 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         ("=3", ["override '=3'", "section.key=value"]),
         ("a..b=3", ["override 'a..b=3'", "section.key=value"]),
         ("hall.rows=: :", ["override 'hall.rows=: :'", "YAML"]),
+        ("int=3", ["int: unknown key"]),
+        ("hall.float=3", ["hall.float: unknown key"]),
+        ("hall.[x]=3", ["hall.[x]: unknown key"]),
+        ("servers.groups.²=[]", ["index '²' is not in 0..3"]),
+        ("hall.rows=²", ["hall.rows", "valid integer", "'²'"]),
+        ("hall.rows=!!bool abc", ["is no YAML value", "'abc' is neither true nor false"]),
+        ("hall.rows=!!int abc", ["is no YAML value", "'abc' is no whole number"]),
+        ("hall.rows=!!float abc", ["is no YAML value", "'abc' is no finite decimal number"]),
+        ("hall.rows=!!timestamp abc", ["is no YAML value", "timestamp"]),
+        ("hvac.setpoint.initial_c=1:30.5", ["initial_c", "valid number", "'1:30.5'"]),
+        ("hvac.setpoint.initial_c=1:30", ["initial_c", "valid number", "'1:30'"]),
+        ("hall.rows=" + "9" * 5000, ["has over 300 digits"]),
         ("hall.rows=0", ["hall.rows", "greater than or equal to 1", "0"]),
         ("hall.rows=2.5", ["hall.rows", "integer", "2.5"]),
         ("hall.rows=3", ["supply_approach_k has 4 entries, expected 6"]),
@@ -246,6 +288,7 @@ def dc3(values: dict[str, Any]) -> None:
             ["DEFAULT_SERVER_POWER_CHARACTERISTICS[3]: length 1, expected 2"],
         ),
         (lambda v: v[SERVERS].update(ITFAN_REF_P={"a": 1}), ["ITFAN_REF_P", "is not a number"]),
+        (lambda v: v[HVAC].update(C_AIR=10**200), ["C_AIR", "is not a number within"]),
     ],
 )
 def test_dc_config(
@@ -253,6 +296,31 @@ def test_dc_config(
 ) -> None:
     path = dc_config(tmp_path, change)
     fails(["config", "check", str(path)], [f"{path}: ", *parts])
+
+
+def with_value(values: dict[str, Any], section: str, key: str, value: object) -> None:
+    values[section][key] = value
+
+
+@pytest.mark.parametrize("wrong", [None, [], [[1]], [None], {}, "x", True])
+def test_every_value_of_a_dc_config_is_checked(tmp_path: Path, wrong: Any) -> None:
+    for section, values in DC_CONFIG.items():
+        for key in values:
+            path = dc_config(tmp_path, partial(with_value, section=section, key=key, value=wrong))
+            with pytest.raises(ConfigError, match=f"{section}.{key}: "):
+                load_config(path)
+
+
+def test_a_dc_config_that_gives_a_key_twice_or_no_number(tmp_path: Path) -> None:
+    path = dc_config(tmp_path, lambda _: None)
+    text = path.read_text()
+    for old, new, part in (
+        ('"C_AIR": 1006', '"C_AIR": 1006, "C_AIR": 1005', "'C_AIR' is given twice"),
+        ('"C_AIR": 1006', '"C_AIR": NaN', "NaN is no finite number"),
+        ('"C_AIR": 1006', '"C_AIR": 1e999', "'1e999' is no finite decimal number"),
+    ):
+        path.write_text(text.replace(old, new))
+        fails(["config", "check", str(path)], [f"{path}: not valid JSON", part])
 
 
 def test_json_that_is_none(tmp_path: Path) -> None:
@@ -293,8 +361,8 @@ def test_sample(tmp_path: Path, text: str, parts: list[str]) -> None:
 
 
 def test_sample_that_is_no_file(tmp_path: Path) -> None:
-    for path, part in ((tmp_path / "no.yaml", "No such file"), (tmp_path, "directory")):
-        fails(["simulate", "tiny", "--sample", str(path)], [f"{path}: cannot be read", part])
+    for path, part in ((tmp_path / "no.yaml", "no such file"), (tmp_path, "is a folder")):
+        fails(["simulate", "tiny", "--sample", str(path)], [f"{path}: {part}"])
 
 
 # Arguments

@@ -262,7 +262,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
     "parquet cut off": (
         "w.parquet",
         lambda: parquet(WEATHER_COLUMNS, WEATHER_META)[:-100],
-        ("not a readable Parquet file",),
+        ("cannot be read as a Parquet file",),
     ),
     "parquet weather without metadata": (
         "w.parquet",

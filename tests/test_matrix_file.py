@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -134,7 +136,10 @@ def test_d_holds_at_the_design_point_of_servers_with_curves(
         ({"R": np.full((6, 6), 0.2)}, "row 0 sums to 1.2; valid is below 1"),
         ({"R": np.zeros((6, 6)), "D": np.zeros((6, 6))}, "valid is one of the arrays R and D"),
         ({"X": np.zeros((6, 6))}, r"holds \['X'\]; valid is one of the arrays R and D"),
-        (b"no archive", "cannot be read as a matrix"),
+        ({"D": np.full((6, 6), 1e308)}, r"D\[0, 0\] is 1e\+308 K/W; valid is 0..1000 K/W"),
+        ({"R": np.full((6, 6), 1e308)}, r"R\[0, 0\] is 1e\+308; valid is 0..1$"),
+        ({"R": np.full((6, 6), None)}, r"R is object \(6, 6\); valid are numbers"),
+        (b"no archive", r"cannot be read as an \.npz file"),
     ],
 )
 def test_a_matrix_that_cannot_be_is_refused(
@@ -174,6 +179,65 @@ def test_files_that_are_no_matrix_are_refused(tmp_path: Path) -> None:
         build_fleet(matrix_hall(tmp_path / "one.npz"))
     with pytest.raises(ConfigError, match=r"ends in '.txt'; valid are .npz and .csv"):
         build_fleet(matrix_hall(tmp_path / "r.txt", "hall.recirculation.matrix_kind=R"))
+
+
+def archive(path: Path, header: str, values: bytes, flag_bits: int = 0) -> bytes:
+    """An .npz file of one compressed array with this header."""
+    start = np.lib.format.magic(1, 0) + len(header).to_bytes(2, "little") + header.encode()
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("R.npy", start + values)
+    content = bytearray(path.read_bytes())
+    content[6] |= flag_bits
+    content[content.index(b"PK\1\2") + 8] |= flag_bits
+    path.write_bytes(content)
+    return bytes(content)
+
+
+def test_archives_that_are_damaged_encrypted_or_larger_than_they_seem(tmp_path: Path) -> None:
+    path = tmp_path / "r.npz"
+    header = "{'descr': '<f8', 'fortran_order': False, 'shape': (%s), }\n"
+    values = np.full((6, 6), 0.05).tobytes()
+    whole = archive(path, header % "6, 6", values)
+    build_fleet(matrix_hall(path))
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        damaged = bytearray(whole[: rng.integers(1, len(whole))] if seed % 2 else whole)
+        damaged[rng.integers(len(damaged))] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        with contextlib.suppress(ConfigError):
+            build_fleet(matrix_hall(path))
+    for shape, content, flag_bits, message in (
+        ("6, 6", values, 1, "array R: .*encrypted"),
+        ("99999999, 99999999", values, 0, r"R has shape \(99999999, 99999999\), expected \(6, 6\)"),
+        ("6, 6", values + bytes(9), 0, "R goes on after its last value"),
+        ("6, 6", values[:-8], 0, "array R: "),
+        ("6, -6", values, 0, "valid are numbers"),
+    ):
+        archive(path, header % shape, content, flag_bits)
+        with pytest.raises(ConfigError, match=rf"r\.npz: .*{message}"):
+            build_fleet(matrix_hall(path))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b,c,d,e,f\n", "line 1: 'a' is no number; valid are numbers alone, without a header"),
+        ("0;0;0;0;0;0\n", "line 1: '0;0;0;0;0;0' is no number; valid are .*, separated by ','"),
+        ("0 0 0 0 0 0\n", "line 1: '0 0 0 0 0 0' is no number; valid are .*, separated by ','"),
+        ("0,0,0,0,0,0\n\n0,x,0,0,0,0\n", "line 3: 'x' is no number; valid are numbers alone$"),
+        ("0,0,0,0,0,0\n0,0\n", "line 2: 2 numbers; valid are 6, as above"),
+        ("0,0,0,0,0,\xff\n", "cannot be read as a matrix: .*utf-8.*0xff"),
+        ("", r"R has shape \(0, 1\), expected \(6, 6\)"),
+        ("0,0,nan,0,0,0\n" * 6, r"R\[0, 2\] is nan; valid is a finite number"),
+    ],
+)
+def test_a_csv_file_that_is_no_matrix_is_told_by_line(
+    text: str, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "r.csv"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(ConfigError, match=rf"r\.csv: {message}"):
+        build_fleet(matrix_hall(path, "hall.recirculation.matrix_kind=R"))
 
 
 def test_a_rack_without_exhaust_air_cannot_be_warmed_by_it(tmp_path: Path) -> None:

@@ -53,9 +53,9 @@ def check_path(path: str | os.PathLike[str]) -> Path:
     target = Path(path)
     if target.suffix != ".rrd":
         raise SdcError(f"{target}: a recording's name must end in .rrd")
-    if target.is_dir() or not target.parent.is_dir():
-        wrong = target if target.is_dir() else target.parent
-        state = "is a folder" if target.is_dir() else "is no folder"
+    is_folder = os.path.isdir(target)
+    if is_folder or not os.path.isdir(target.parent):
+        wrong, state = (target, "is a folder") if is_folder else (target.parent, "is no folder")
         raise SdcError(f"{target}: cannot be written ({wrong} {state})")
     return target
 

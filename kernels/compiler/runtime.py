@@ -9,8 +9,13 @@ import sys
 import threading
 from collections.abc import Iterator
 
-from sdc_taichi.errors import ConfigError, RuntimeStateError
+from sdc_taichi.errors import ConfigError, RuntimeStateError, shortened
 from sdc_taichi.kernels.compiler import processors
+from sdc_taichi.number_text import parse_whole
+
+MOST_THREADS = 1024
+"""Largest number of threads that may be asked for: more than any machine has processors that gain
+from it."""
 
 _forked = False
 _starting = threading.Lock()
@@ -107,6 +112,9 @@ def _thread_limit() -> int:
     text = os.environ.get("SDC_TAICHI_THREADS", "").strip()
     if not text:
         return 0
-    if not text.isdigit() or int(text) < 1:
-        raise ConfigError(f"SDC_TAICHI_THREADS={text!r}: valid is a positive integer")
-    return int(text)
+    with contextlib.suppress(ValueError):
+        if 1 <= (threads := parse_whole(text)) <= MOST_THREADS:
+            return threads
+    raise ConfigError(
+        f"SDC_TAICHI_THREADS={shortened(text)}: valid is a positive integer up to {MOST_THREADS}"
+    )

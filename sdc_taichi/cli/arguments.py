@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -57,9 +58,9 @@ def check_out_file(out: Path | None, suffix: str, *, force: bool) -> None:
         return
     if out.suffix.lower() != suffix:
         raise ConfigError(f"--out {out}: valid is a name that ends in {suffix}")
-    if out.is_dir():
+    if os.path.isdir(out):
         raise ConfigError(f"--out {out}: is a folder; valid is a file")
-    if out.exists() and not force:
+    if os.path.exists(out) and not force:
         raise ConfigError(f"--out {out}: exists; choose another name or replace it with --force")
 
 
@@ -72,7 +73,7 @@ def read_config(
         ConfigError: two presets or files, or a config that is not valid.
     """
     given = source or []
-    files = [text for text in given if "=" not in text or Path(text).is_file()]
+    files = [text for text in given if "=" not in text or os.path.isfile(text)]
     if len(files) > 1:
         raise ConfigError(
             f"{files[1]!r}: a second preset or file after {files[0]!r}; valid is one, and "

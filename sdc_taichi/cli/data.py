@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -190,7 +191,7 @@ def _plan_import(
     path: Path, site: str | None
 ) -> tuple[list[tuple[str, Path, str]], list[tuple[Path, str]]]:
     """Kind, file and name of each import, and the files that are left out, with the reasons."""
-    if path.is_dir():
+    if os.path.isdir(path):
         if site is not None:
             raise DataError(f"--site {site}: names one file, but {path} is a folder")
         return importing.plan_folder(path)

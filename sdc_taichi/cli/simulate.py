@@ -31,6 +31,7 @@ from sdc_taichi.cli.summary import print_summary
 from sdc_taichi.config import DataCenterConfig, load_yaml
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import day_of_year
+from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 
 if TYPE_CHECKING:
     from sdc_taichi.types import StepResult
@@ -217,11 +218,9 @@ def _data_centers(
 
 
 def _read_sample(path: Path) -> dict[str, Any]:
+    text = read_text(path, MOST_CONFIG_BYTES, ConfigError)
     try:
-        rules = load_yaml(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise ConfigError(f"{path}: cannot be read: {reason}") from None
+        rules = load_yaml(text)
     except ValueError as error:
         raise ConfigError(f"{path}: not valid YAML ({error})") from None
     wrong = [name for name in rules if not isinstance(name, str)] if isinstance(rules, dict) else []

@@ -13,6 +13,7 @@ import typer
 
 from sdc_taichi.cli.arguments import Debug
 from sdc_taichi.errors import SdcError
+from sdc_taichi.user_file import open_input
 
 WEB_PORT = 9090
 """Port of the page that ``--web`` serves, if it is free."""
@@ -70,11 +71,8 @@ def check_recording(path: Path) -> None:
     Raises:
         SdcError: it cannot be read, or is none.
     """
-    try:
-        with path.open("rb") as file:
-            beginning = file.read(len(_RECORDING_MAGIC))
-    except OSError as error:
-        raise SdcError(f"{path}: cannot be read: {error.strerror}") from None
+    with open_input(path) as file:
+        beginning = file.read(len(_RECORDING_MAGIC))
     if beginning != _RECORDING_MAGIC:
         raise SdcError(f"{path}: no Rerun recording; valid is a file of simulate --record")
 

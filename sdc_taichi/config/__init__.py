@@ -15,11 +15,11 @@ from sdc_taichi.config.loading import (
     apply_overrides,
     config_from_dict,
     load_config,
-    load_yaml,
     preset_names,
     with_values,
 )
 from sdc_taichi.config.messages import explain
+from sdc_taichi.config.plain_values import load_json, load_yaml
 from sdc_taichi.config.schema import DataCenterConfig
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "config_from_dict",
     "explain",
     "load_config",
+    "load_json",
     "load_yaml",
     "preset_names",
     "with_values",

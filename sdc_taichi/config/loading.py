@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -11,13 +11,15 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from sdc_taichi.config import sustaindc
 from sdc_taichi.config.messages import explain
+from sdc_taichi.config.plain_values import load_json, load_yaml
 from sdc_taichi.config.schema import DataCenterConfig
-from sdc_taichi.errors import ConfigError, suggestion
+from sdc_taichi.errors import ConfigError, shortened, suggestion
+from sdc_taichi.number_text import parse_whole
+from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 
 DEFAULT_PRESET = "corrected"
 """Preset that is read where none is named."""
@@ -109,46 +111,20 @@ def with_values(config: DataCenterConfig, assigned: Mapping[str, Any]) -> DataCe
     return config_from_dict(values, config.name)
 
 
-def load_yaml(text: str) -> Any:
-    """The plain values that a YAML text holds.
-
-    Raises:
-        ValueError: not valid, or a key given twice; says on one line what is wrong.
-    """
-    try:
-        return yaml.load(text, _Loader)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise ValueError(" ".join(str(error).split())) from None
-
-
-class _Loader(yaml.SafeLoader):
-    """Refuses a mapping that gives a key twice, of which YAML would drop the first."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key in [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]:
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    problem=f"{key.value!r} is given twice", problem_mark=key.start_mark
-                )
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
 def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
     """Label and values of a preset or a file, with what it extends."""
     if isinstance(source, str) and source in preset_names():
         return _read_preset(source)
-    path = Path(source)
     try:
-        text = path.read_text("utf-8")
-    except FileNotFoundError:
+        text = read_text(source, MOST_CONFIG_BYTES, ConfigError)
+    except ConfigError as error:
+        if not isinstance(error.__cause__, FileNotFoundError):
+            raise
         meant = suggestion(source, preset_names())
         raise ConfigError(
             f"{source}: no such file or preset{meant} (presets: {', '.join(preset_names())})"
         ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{source}: cannot be read ({error})") from None
+    path = Path(source)
     label = str(path)
     if path.suffix.lower() != ".json":
         return label, _with_base(label, _parse_yaml(text, label))
@@ -214,8 +190,8 @@ def _parse_yaml(text: str, label: str) -> dict[str, Any]:
 
 def _parse_json(text: str, label: str) -> dict[str, Any]:
     try:
-        values = json.loads(text)
-    except (RecursionError, ValueError) as error:
+        values = load_json(text)
+    except ValueError as error:
         raise ConfigError(f"{label}: not valid JSON ({error})") from None
     return _require_mapping(values, label)
 
@@ -230,11 +206,13 @@ def _require_mapping(values: Any, label: str) -> dict[str, Any]:
 def _apply_override(values: dict[str, Any], override: str) -> None:
     path, sign, text = override.partition("=")
     if not sign:
-        raise ConfigError(f"override {override!r}: valid is section.key=value")
+        raise ConfigError(f"override {shortened(override)}: valid is section.key=value")
     try:
         value = load_yaml(text)
     except ValueError as error:
-        raise ConfigError(f"override {override!r}: {text!r} is no YAML value ({error})") from None
+        raise ConfigError(
+            f"override {shortened(override)}: {shortened(text)} is no YAML value ({error})"
+        ) from None
     _assign(values, path, value, override)
 
 
@@ -242,7 +220,7 @@ def _assign(values: dict[str, Any], path: str, value: Any, override: str) -> Non
     """Put a value at a dotted path; messages quote ``override``."""
     *sections, last = path.strip().split(".")
     if not all([*sections, last]):
-        raise ConfigError(f"override {override!r}: valid is section.key=value")
+        raise ConfigError(f"override {shortened(override)}: valid is section.key=value")
     node: Any = values
     for key in sections:
         if isinstance(node, list):
@@ -250,7 +228,7 @@ def _assign(values: dict[str, Any], path: str, value: Any, override: str) -> Non
         else:
             node = node.setdefault(key, {})
         if not isinstance(node, dict | list):
-            raise ConfigError(f"override {override!r}: {key} is a value, not a section")
+            raise ConfigError(f"override {shortened(override)}: {key} is a value, not a section")
     if isinstance(node, list):
         node[_list_index(node, last, override)] = value
     else:
@@ -260,6 +238,9 @@ def _assign(values: dict[str, Any], path: str, value: Any, override: str) -> Non
 
 
 def _list_index(node: list[Any], key: str, override: str) -> int:
-    if not key.isdigit() or int(key) >= len(node):
-        raise ConfigError(f"override {override!r}: index {key!r} is not in 0..{len(node) - 1}")
-    return int(key)
+    with contextlib.suppress(ValueError):
+        if 0 <= (index := parse_whole(key)) < len(node):
+            return index
+    raise ConfigError(
+        f"override {shortened(override)}: index {shortened(key)} is not in 0..{len(node) - 1}"
+    )

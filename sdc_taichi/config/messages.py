@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from sdc_taichi.errors import suggestion_or_valid
+from sdc_taichi.errors import shortened, suggestion_or_valid
 
 MOST_PROBLEMS = 3
 """Number of problems that a message lists; of further ones it gives the number."""
@@ -23,11 +23,15 @@ def explain(error: ValidationError, label: str, model: type[BaseModel]) -> str:
     """
     problems: dict[str, str] = {}
     for item in error.errors(include_url=False):
-        keys = [str(part) for part in item["loc"] if not _is_union_branch(part)]
-        where = ".".join(keys)
+        *sections, last = item["loc"] or ("",)
+        parts = [part for part in sections if not _is_union_branch(part)]
+        # The last part of these is a key of the user's, whatever it looks like.
+        if item["type"] in ("extra_forbidden", "invalid_key") or not _is_union_branch(last):
+            parts.append(last)
+        where = ".".join(map(str, parts))
         if item["type"] == "extra_forbidden":
-            valid = _keys_of(model, keys[:-1])
-            text = f"{where}: unknown key{suggestion_or_valid(keys[-1], valid)}"
+            valid = _keys_of(model, parts[:-1])
+            text = f"{where}: unknown key{suggestion_or_valid(last, valid)}"
         elif item["type"] == "missing":
             text = f"{where}: missing"
         else:
@@ -35,7 +39,7 @@ def explain(error: ValidationError, label: str, model: type[BaseModel]) -> str:
             text = f"{where}: {message}" if where else message
             value = item["input"]
             if value is None or isinstance(value, str | int | float | bool):
-                text += f" (got {value!r})"
+                text += f" (got {shortened(value)})"
         # Each branch of a union has a problem of its own; the first says enough.
         problems.setdefault(where, text)
     left_out = len(problems) - MOST_PROBLEMS
@@ -48,11 +52,11 @@ def _is_union_branch(part: str | int) -> bool:
     return isinstance(part, str) and (part in {"int", "float"} or "[" in part)
 
 
-def _keys_of(model: type[BaseModel], path: Sequence[str]) -> list[str]:
+def _keys_of(model: type[BaseModel], path: Sequence[str | int]) -> list[str]:
     """Valid keys of the section at ``path`` in ``model``; entries of lists are skipped."""
     section = model
     for key in path:
-        if not key.isdigit():
+        if isinstance(key, str):
             section = _section_in(section.model_fields[key].annotation) or section
     return list(section.model_fields)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from sdc_taichi.errors import ConfigError, suggestion
+from sdc_taichi.errors import ConfigError, shortened, suggestion
 
 _HALL, _HVAC, _SERVERS = SECTIONS = (
     "data_center_configuration",
@@ -53,11 +53,25 @@ _KEYS: dict[str, tuple[str, ...]] = {
         "HP_PROLIANT",
     ),
 }
+LARGEST = 1e12
+"""Largest number of a file; the bounds of the schema are narrower."""
 _PER_RACK = (
     (_HALL, "RACK_SUPPLY_APPROACH_TEMP_LIST"),
     (_HALL, "RACK_RETURN_APPROACH_TEMP_LIST"),
     (_SERVERS, "DEFAULT_SERVER_POWER_CHARACTERISTICS"),
 )
+_DEPTHS = {
+    "RACK_SUPPLY_APPROACH_TEMP_LIST": 1,
+    "RACK_RETURN_APPROACH_TEMP_LIST": 1,
+    "CPU_POWER_RATIO_LB": 1,
+    "CPU_POWER_RATIO_UB": 1,
+    "IT_FAN_AIRFLOW_RATIO_LB": 1,
+    "IT_FAN_AIRFLOW_RATIO_UB": 1,
+    "INLET_TEMP_RANGE": 1,
+    "DEFAULT_SERVER_POWER_CHARACTERISTICS": 2,
+    "HP_PROLIANT": 1,
+}
+"""How deep lists of numbers are nested in the values of keys that are no single number."""
 _PAIRS = (
     "CPU_POWER_RATIO_LB",
     "CPU_POWER_RATIO_UB",
@@ -166,7 +180,8 @@ def _problems(values: Mapping[str, Any]) -> list[str]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and abs(value) <= LARGEST
 
 
 def _is_count(value: Any) -> bool:
@@ -180,12 +195,24 @@ def _length(value: Any) -> int:
 def _number_problems(values: Mapping[str, Any]) -> Iterator[str]:
     for section, keys in _KEYS.items():
         for key in keys:
-            value = values[section].get(key, 0)
-            flat = value if isinstance(value, list) else [value]
-            flat = [x for item in flat for x in (item if isinstance(item, list) else [item])]
-            wrong = next((x for x in flat if not _is_number(x)), None)
-            if wrong is not None or not flat:
-                yield f"{section}.{key}: {wrong!r} is not a number"
+            if key not in values[section]:
+                continue
+            value, depth = values[section][key], _DEPTHS.get(key, 0)
+            if key == "CPUS_PER_RACK" and isinstance(value, list):
+                depth = 1
+            problem = _shape_problem(value, depth)
+            if problem:
+                yield f"{section}.{key}: {problem}"
+
+
+def _shape_problem(value: Any, depth: int) -> str | None:
+    """What is wrong with a number, or with lists of numbers that are nested ``depth`` deep."""
+    if depth == 0:
+        text = f"{shortened(value)} is not a number within {-LARGEST:g}..{LARGEST:g}"
+        return None if _is_number(value) else text
+    if not isinstance(value, list) or not value:
+        return f"{shortened(value)} is not a list of {'lists of ' * (depth - 1)}numbers"
+    return next(filter(None, (_shape_problem(entry, depth - 1) for entry in value)), None)
 
 
 def _count_racks(hall: Mapping[str, Any]) -> tuple[int | None, list[str]]:

@@ -20,6 +20,7 @@ from sdc_taichi.control.rules import (
 )
 from sdc_taichi.control.view import limits_of
 from sdc_taichi.errors import ConfigError, suggestion
+from sdc_taichi.number_text import parse_number
 from sdc_taichi.sim.fleet import Fleet
 
 CONTROLLABLE = ("load", "cooling", "battery")
@@ -113,7 +114,7 @@ def _make(name: str, fleet: Fleet, agents: tuple[str, ...]) -> Controller:
 
 def _constant(text: str, fleet: Fleet) -> Controller:
     try:
-        setpoint_c = float(text)
+        setpoint_c = parse_number(text)
     except ValueError:
         setpoint_c = math.nan
     limits = limits_of(fleet)

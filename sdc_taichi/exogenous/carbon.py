@@ -64,7 +64,7 @@ def read_carbon(
     Raises:
         DataError: names file, row, column, value and what would be valid.
     """
-    path = files.existing_file(path)
+    path = Path(path)
     if not (np.isfinite(utc_offset_h) and -12.0 <= utc_offset_h <= 14.0):
         raise DataError(f"utc_offset_h: {utc_offset_h!r}, expected -12 to 14")
     if stamp not in ("auto", "start", "end"):

@@ -10,7 +10,7 @@ import hashlib
 import math
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,14 @@ from sdc_taichi.exogenous.year_clock import (
     is_leap_day,
     minutes_into_year,
 )
+from sdc_taichi.user_file import MOST_TABLE_BYTES, decoding, open_input
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
+MOST_ROWS = 20_000_000
+"""Largest number of rows of a Parquet file, which may be compressed: 38 years of minutes."""
 MAX_GAP_H = 24.0
 """Longest gap that is interpolated, in h."""
 BLANK_HEADERS = frozenset({"", "Unnamed: 0"})
@@ -40,31 +44,24 @@ def fault(path: Path, row: int, column: str, value: object, valid: str) -> DataE
     return DataError(f"{path}: row {row}, column {column}: {value!r}, expected {valid}")
 
 
-def existing_file(path: str | Path) -> Path:
-    """The path, if it is a file.
+def sha256(path: Path) -> str:
+    """Hash of a file's bytes, hexadecimal.
 
     Raises:
-        DataError: it is missing, or a folder.
+        DataError: the file cannot be read.
     """
-    path = Path(path)
-    if path.is_dir():
-        raise DataError(f"{path}: is a folder, expected a file")
-    if not path.is_file():
-        raise DataError(f"{path}: no such file")
-    return path
-
-
-def sha256(path: Path) -> str:
-    """Hash of a file's bytes, hexadecimal."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with open_input(path, error=DataError) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def is_parquet(path: Path) -> bool:
-    """Whether a file is Parquet, by its name or its first bytes."""
-    if path.suffix.lower() in {".parquet", ".pq"}:
-        return True
-    with path.open("rb") as handle:
-        return handle.read(4) == b"PAR1"
+    """Whether a file is Parquet, by its name or its first bytes.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    with open_input(path, MOST_TABLE_BYTES, DataError) as file:
+        return path.suffix.lower() in {".parquet", ".pq"} or file.read(4) == b"PAR1"
 
 
 # Reading
@@ -88,28 +85,8 @@ def read_table(path: Path) -> tuple[pd.DataFrame, int]:
         first_row = 1
         frame = frame.astype(object).where(frame.notna(), "").astype(str)
     else:
-        try:
-            with warnings.catch_warnings():
-                # A row of another width than the header is reported by what is missing then.
-                warnings.simplefilter("ignore", pd.errors.ParserWarning)
-                frame = pd.read_csv(
-                    path,
-                    dtype=str,
-                    keep_default_na=False,
-                    skip_blank_lines=False,
-                    encoding="utf-8-sig",
-                    index_col=False,
-                    on_bad_lines="error",
-                )
-        except pd.errors.EmptyDataError:
-            raise DataError(f"{path}: empty, expected a header and rows") from None
-        except pd.errors.ParserError as error:
-            reason = " ".join(str(error).split())
-            raise DataError(f"{path}: not a CSV table: {reason}") from None
-        except UnicodeDecodeError as error:
-            raise DataError(f"{path}: byte {error.start}: not UTF-8 text") from None
+        frame = _read_csv(path)
         first_row = 2
-        frame = frame.fillna("")
     while len(frame) and not "".join(str(x) for x in frame.iloc[-1]).strip():
         frame = frame.iloc[:-1]
     if frame.empty:
@@ -117,20 +94,66 @@ def read_table(path: Path) -> tuple[pd.DataFrame, int]:
     return frame, first_row
 
 
-def read_arrow(path: Path) -> Any:
+def _read_csv(path: Path) -> pd.DataFrame:
+    """Table of a CSV file, all columns as text."""
+    import pandas as pd
+
+    with (
+        open_input(path, MOST_TABLE_BYTES, DataError) as file,
+        decoding(path, "a CSV table", DataError),
+        warnings.catch_warnings(),
+    ):
+        # A row of another width than the header is reported by what is missing then.
+        warnings.simplefilter("ignore", pd.errors.ParserWarning)
+        try:
+            frame = pd.read_csv(
+                file,
+                dtype=str,
+                keep_default_na=False,
+                skip_blank_lines=False,
+                encoding="utf-8-sig",
+                index_col=False,
+                on_bad_lines="error",
+            )
+        except pd.errors.EmptyDataError:
+            raise DataError(f"{path}: empty, expected a header and rows") from None
+        except UnicodeDecodeError as error:
+            raise DataError(f"{path}: byte {error.start}: not UTF-8 text") from None
+    return frame.fillna("")
+
+
+def read_arrow(path: Path) -> pa.Table:
     """Arrow table of a Parquet file.
+
+    Raises:
+        DataError: not a readable Parquet file, or one of too many rows.
+    """
+    import pyarrow.parquet as pq
+
+    with (
+        open_input(path, MOST_TABLE_BYTES, DataError) as file,
+        decoding(path, "a Parquet file", DataError),
+    ):
+        opened = pq.ParquetFile(file)
+        rows = opened.metadata.num_rows
+        if rows > MOST_ROWS:
+            raise DataError(f"{path}: {rows:,} rows, expected at most {MOST_ROWS:,}")
+        return opened.read()
+
+
+def read_schema(path: Path) -> pa.Schema:
+    """Names, types and metadata of the columns of a Parquet file.
 
     Raises:
         DataError: not a readable Parquet file.
     """
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    try:
-        return pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).split(". ")[0].splitlines()[0]
-        raise DataError(f"{path}: not a readable Parquet file: {reason}") from None
+    with (
+        open_input(path, MOST_TABLE_BYTES, DataError) as file,
+        decoding(path, "a Parquet file", DataError),
+    ):
+        return pq.read_schema(file)
 
 
 def require_columns(path: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> None:

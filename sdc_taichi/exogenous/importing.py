@@ -27,6 +27,7 @@ from sdc_taichi.exogenous.synthetic import (
 )
 from sdc_taichi.exogenous.weather import read_epw
 from sdc_taichi.exogenous.workload import read_workload
+from sdc_taichi.user_file import MOST_TABLE_BYTES, list_folder, open_input
 
 KINDS = ("weather", "carbon", "workload")
 """Kinds of files, in the order in which a folder is imported."""
@@ -54,14 +55,13 @@ def file_kind(path: Path) -> str:
     Raises:
         DataError: none of them.
     """
-    path = files.existing_file(path)
     if files.is_parquet(path):
         metadata = series_file.read_metadata(path) or {}
         if metadata.get("kind") in KINDS:
             return str(metadata["kind"])
         header = set(series_file.column_names(path))
     else:
-        with path.open("rb") as handle:
+        with open_input(path, MOST_TABLE_BYTES, DataError) as handle:
             line = handle.readline(4096).decode("utf-8", errors="replace").lstrip("\ufeff").strip()
         if line.upper().startswith("LOCATION,"):
             return "weather"
@@ -170,10 +170,11 @@ def plan_folder(folder: Path) -> tuple[list[tuple[str, Path, str]], list[tuple[P
         "workload": ("workload", ".csv"),
     }
     found: dict[str, list[Path]] = {kind: [] for kind in KINDS}
-    for child in sorted(folder.iterdir()):
-        if child.is_dir() and child.name.casefold() in subfolders:
-            kind, suffix = subfolders[child.name.casefold()]
-            found[kind] += sorted(x for x in child.iterdir() if x.suffix.lower() == suffix)
+    for name in list_folder(folder, DataError):
+        if name.casefold() in subfolders:
+            kind, suffix = subfolders[name.casefold()]
+            inside = [folder / name / x for x in list_folder(folder / name, DataError)]
+            found[kind] += [path for path in inside if path.suffix.lower() == suffix]
     if not any(found.values()):
         raise DataError(
             f"{folder}: expected subfolders CarbonIntensity, Weather, Workload with EPW and CSV "

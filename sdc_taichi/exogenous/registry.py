@@ -27,6 +27,7 @@ from sdc_taichi.exogenous.synthetic import (
 )
 from sdc_taichi.exogenous.weather import read_epw
 from sdc_taichi.exogenous.workload import read_workload
+from sdc_taichi.user_file import list_folder
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
@@ -45,15 +46,20 @@ def user_data_dir(data_dir: str | Path | None = None) -> Path:
 def imported_sites(data_dir: str | Path | None = None) -> dict[str, dict[str, Path]]:
     """Imported sites: name to ``{"weather": path, "carbon": path}``, either may be missing."""
     sites: dict[str, dict[str, Path]] = {}
-    for path in sorted((user_data_dir(data_dir) / "sites").glob("*/*.parquet")):
-        if path.stem in ("weather", "carbon"):
-            sites.setdefault(path.parent.name, {})[path.stem] = path
+    folder = user_data_dir(data_dir) / "sites"
+    for name in list_folder(folder, DataError):
+        paths = {part: folder / name / f"{part}.parquet" for part in ("carbon", "weather")}
+        found = {part: path for part, path in paths.items() if os.path.lexists(path)}
+        if found:
+            sites[name] = found
     return sites
 
 
 def imported_traces(data_dir: str | Path | None = None) -> dict[str, Path]:
     """Imported workload traces: name to path."""
-    return {p.stem: p for p in sorted((user_data_dir(data_dir) / "traces").glob("*.parquet"))}
+    folder = user_data_dir(data_dir) / "traces"
+    names = [x for x in list_folder(folder, DataError) if x.endswith(".parquet")]
+    return {name.removesuffix(".parquet"): folder / name for name in names}
 
 
 def site_names(data_dir: str | Path | None = None) -> tuple[str, ...]:

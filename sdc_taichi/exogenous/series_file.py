@@ -16,7 +16,7 @@ import numpy as np
 
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import DataError, SdcError
-from sdc_taichi.exogenous.files import check_length, fault, read_arrow, rows_per_year
+from sdc_taichi.exogenous.files import check_length, fault, read_arrow, read_schema, rows_per_year
 from sdc_taichi.exogenous.series import FloatArray, Series
 
 METADATA_KEY = b"sdc_taichi"
@@ -52,20 +52,12 @@ def read_metadata(path: Path) -> dict[str, Any] | None:
     Raises:
         DataError: not readable, or metadata of another version.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        schema = pq.read_schema(path)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).split(". ")[0].splitlines()[0]
-        raise DataError(f"{path}: not a readable Parquet file: {reason}") from None
-    raw = (schema.metadata or {}).get(METADATA_KEY)
+    raw = (read_schema(path).metadata or {}).get(METADATA_KEY)
     if raw is None:
         return None
     try:
         metadata: dict[str, Any] = json.loads(raw)
-    except ValueError:
+    except (RecursionError, ValueError):
         raise DataError(f"{path}: metadata sdc_taichi: not JSON") from None
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
         found = metadata.get("format") if isinstance(metadata, dict) else metadata
@@ -152,4 +144,4 @@ def column_names(path: Path) -> list[str]:
     Raises:
         DataError: not readable.
     """
-    return [str(name) for name in read_arrow(path).column_names]
+    return [str(name) for name in read_schema(path).names]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,6 +14,8 @@ from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.psychrometrics import wet_bulb_c
 from sdc_taichi.exogenous.series import FloatArray, Series, Weather
 from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH, HOURS_PER_YEAR
+from sdc_taichi.number_text import parse_number, parse_whole
+from sdc_taichi.user_file import MOST_TABLE_BYTES, read_bytes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -69,7 +72,7 @@ def read_epw(path: str | Path) -> Weather:
     Raises:
         DataError: names file, row, column, value and what would be valid.
     """
-    path = files.existing_file(path)
+    path = Path(path)
     if files.is_parquet(path):
         metadata = series_file.read_metadata(path)
         if metadata is None:
@@ -78,7 +81,7 @@ def read_epw(path: str | Path) -> Weather:
                 "expected an EPW file or one written by `data import`"
             )
         return _read_imported(path, metadata)
-    lines = path.read_bytes().decode("latin-1").splitlines()
+    lines = read_bytes(path, MOST_TABLE_BYTES, DataError).decode("latin-1").splitlines()
     location = _location(path, lines)
     per_hour = _records_per_hour(path, lines)
     frame = _rows(path, lines)
@@ -136,7 +139,7 @@ def _location(path: Path, lines: list[str]) -> dict[str, Any]:
         ("elevation_m", "elevation", 9, -1000.0, 9999.9),
     ):
         try:
-            value = float(fields[at])
+            value = parse_number(fields[at])
         except ValueError:
             value = np.nan
         if not low <= value <= high:
@@ -156,9 +159,10 @@ def _records_per_hour(path: Path, lines: list[str]) -> int:
             "(the last of 8 header lines)"
         )
     text = fields[2] if len(fields) > 2 else ""
-    if not text.isdigit() or int(text) < 1 or 60 % int(text):
-        raise files.fault(path, 8, "records per hour", text, "a divisor of 60")
-    return int(text)
+    with contextlib.suppress(ValueError):
+        if (per_hour := parse_whole(text)) > 0 and 60 % per_hour == 0:
+            return per_hour
+    raise files.fault(path, 8, "records per hour", text, "a divisor of 60")
 
 
 def _rows(path: Path, lines: list[str]) -> pd.DataFrame:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.series import Series
+from sdc_taichi.number_text import parse_number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,7 +41,7 @@ def read_workload(path: str | Path, *, minutes: float | None = None) -> Series:
     Raises:
         DataError: names file, row, column, value and what would be valid.
     """
-    path = files.existing_file(path)
+    path = Path(path)
     if minutes is not None and not (np.isfinite(minutes) and minutes > 0.0):
         raise DataError(f"minutes: {minutes!r}, expected a positive number")
     if files.is_parquet(path):
@@ -102,7 +103,7 @@ def _clock(
     notes = []
     if blank_header or first.strip().lower() in _INDEX_HEADERS:
         text = frame[first].str.strip()
-        if text.iloc[0].replace(".", "", 1).isdigit():
+        if _is_number(text.iloc[0]):
             positions = _running_index(path, text, first, rows)
         else:
             stamps = _stamps(path, text, first, rows)
@@ -122,6 +123,14 @@ def _clock(
             path, int(rows[at]), first, f"{hours:g} h without rows", "gaps of at most 24 h"
         )
     return minutes, positions, first_stamp, notes
+
+
+def _is_number(text: str) -> bool:
+    try:
+        parse_number(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _stamps(path: Path, text: pd.Series[str], column: str, rows: Rows) -> Stamps:

@@ -40,7 +40,7 @@ def day_of_year(month_day: object) -> int:
     Raises:
         ValueError: the text is no day of a 365-day year.
     """
-    match = re.fullmatch(r"(\d{1,2})-(\d{1,2})", str(month_day).strip())
+    match = re.fullmatch(r"([0-9]{1,2})-([0-9]{1,2})", str(month_day).strip())
     if match:
         month, day = int(match[1]), int(match[2])
         if 1 <= month <= 12 and 1 <= day <= DAYS_PER_MONTH[month - 1]:

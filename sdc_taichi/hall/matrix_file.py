@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import io
+import math
+import warnings
+from collections.abc import Iterable
 from pathlib import Path
-from zipfile import BadZipFile
+from typing import BinaryIO
 
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.hall.design_point import DesignPoint
+from sdc_taichi.number_text import parse_number
 from sdc_taichi.types import F64
+from sdc_taichi.user_file import MOST_MATRIX_BYTES, ArrayFile, decoding, open_input
 
 MOST_MATRIX_RACKS = 8192
 """Most racks of a hall with a matrix of the user's: half a gigabyte in f64."""
+MOST_D_K_PER_W = 1000.0
+"""Highest valid entry of D, in K/W: a rack of 1 W that warms another's intake by 1,000 K."""
 
+_NPY_MAGIC = b"\x93NUMPY"
 _ROUND_OFF = 1e-9
 """Negative shares, and negative entries of D over the largest, that are no more than rounding."""
 
@@ -30,11 +39,16 @@ def read_matrix(config: DataCenterConfig, path: Path) -> tuple[str, F64]:
     """
     kind, matrix = _read_numbers(config, path)
     racks = config.hall.racks
-    if matrix.shape != (racks, racks):
-        raise ConfigError(f"{path}: {kind} has shape {matrix.shape}, expected ({racks}, {racks})")
+    _check_shape(path, kind, matrix.shape, racks)
     if not np.all(np.isfinite(matrix)):
         j, i = np.argwhere(~np.isfinite(matrix))[0]
         raise ConfigError(f"{path}: {kind}[{j}, {i}] is {matrix[j, i]}; valid is a finite number")
+    highest, unit = (1.0, "") if kind == "R" else (MOST_D_K_PER_W, " K/W")
+    j, i = np.unravel_index(np.argmax(np.abs(matrix)), matrix.shape)
+    if abs(matrix[j, i]) > highest:
+        raise ConfigError(
+            f"{path}: {kind}[{j}, {i}] is {matrix[j, i]:.6g}{unit}; valid is 0..{highest:g}{unit}"
+        )
     return kind, matrix
 
 
@@ -103,29 +117,79 @@ def _read_numbers(config: DataCenterConfig, path: Path) -> tuple[str, F64]:
         raise ConfigError(f"{path}: ends in {path.suffix!r}; valid are .npz and .csv")
     if suffix == ".csv" and wanted is None:
         raise ConfigError(f"{path}: a .csv needs hall.recirculation.matrix_kind R or D")
-    try:
+    with open_input(path, MOST_MATRIX_BYTES, ConfigError) as file:
         if suffix == ".csv":
-            return str(wanted), np.loadtxt(path, delimiter=",", ndmin=2, dtype=np.float64)
-        with open(path, "rb") as raw:
-            file = np.load(raw, allow_pickle=False)
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise ConfigError(
-                    f"{path}: holds one array without a name; valid is an .npz with R or D"
-                )
-            found = [name for name in ("R", "D") if name in file.files]
-            if len(found) != 1:
-                raise ConfigError(
-                    f"{path}: holds {sorted(file.files)}; valid is one of the arrays R and D"
-                )
-            if wanted not in (None, found[0]):
-                raise ConfigError(
-                    f"{path}: holds {found[0]}, hall.recirculation.matrix_kind is {wanted}"
-                )
-            matrix = file[found[0]]
-    except (OSError, ValueError, EOFError, KeyError, BadZipFile) as error:
-        if isinstance(error, ConfigError):
+            return str(wanted), _read_csv(path, file)
+        return _read_npz(path, file, racks, wanted)
+
+
+def _read_npz(path: Path, file: BinaryIO, racks: int, wanted: str | None) -> tuple[str, F64]:
+    """Kind and numbers of an .npz file, (racks, racks)."""
+    if file.read(len(_NPY_MAGIC)) == _NPY_MAGIC:
+        raise ConfigError(f"{path}: holds one array without a name; valid is an .npz with R or D")
+    arrays = ArrayFile(file, path, ConfigError)
+    found = [name for name in ("R", "D") if name in arrays.names]
+    if len(found) != 1:
+        raise ConfigError(
+            f"{path}: holds {sorted(arrays.names)}; valid is one of the arrays R and D"
+        )
+    (kind,) = found
+    if wanted not in (None, kind):
+        raise ConfigError(f"{path}: holds {kind}, hall.recirculation.matrix_kind is {wanted}")
+    shape, dtype = arrays.header(kind)
+    if dtype.kind not in "fiu":
+        raise ConfigError(f"{path}: {kind} holds {dtype}; valid are real numbers")
+    _check_shape(path, kind, shape, racks)
+    matrix = arrays.read(kind, math.prod(shape) * dtype.itemsize)
+    return kind, np.asarray(matrix, dtype=np.float64)
+
+
+def _read_csv(path: Path, file: BinaryIO) -> F64:
+    """Numbers of a .csv file, of whatever shape."""
+    with (
+        io.TextIOWrapper(file, "utf-8-sig") as text,
+        decoding(path, "a matrix", ConfigError),
+        warnings.catch_warnings(),
+    ):
+        # Of a file without numbers, whose shape says so.
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            return np.loadtxt(text, delimiter=",", ndmin=2, dtype=np.float64)
+        except ValueError:
+            text.seek(0)
+            _check_lines(path, text)
             raise
-        raise ConfigError(f"{path}: cannot be read as a matrix ({error})") from None
-    if matrix.dtype.kind not in "fiu":
-        raise ConfigError(f"{path}: {found[0]} holds {matrix.dtype}; valid are real numbers")
-    return found[0], np.asarray(matrix, dtype=np.float64)
+
+
+def _check_lines(path: Path, lines: Iterable[str]) -> None:
+    """Find the first line of a .csv file that is no row of as many numbers as the first.
+
+    Raises:
+        ConfigError: naming the line and what is wrong with it.
+    """
+    width = 0
+    for number, line in enumerate(lines, start=1):
+        text = line.split("#")[0].strip()
+        if not text:
+            continue
+        cells = text.split(",")
+        for cell in cells:
+            try:
+                parse_number(cell)
+            except ValueError:
+                found = shortened(cell.strip())
+                why = ", separated by ','" if ";" in cell or len(cell.split()) > 1 else ""
+                why += ", without a header" if not width else ""
+                raise ConfigError(
+                    f"{path}: line {number}: {found} is no number; valid are numbers alone{why}"
+                ) from None
+        if width and len(cells) != width:
+            raise ConfigError(
+                f"{path}: line {number}: {len(cells)} numbers; valid are {width}, as above"
+            )
+        width = len(cells)
+
+
+def _check_shape(path: Path, kind: str, shape: tuple[int, ...], racks: int) -> None:
+    if shape != (racks, racks):
+        raise ConfigError(f"{path}: {kind} has shape {shape}, expected ({racks}, {racks})")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -94,4 +95,4 @@ def _file_hashes(configs: Sequence[DataCenterConfig]) -> dict[str, str]:
     Drivers made from arrays need no such file, so one that is gone has the hash "missing".
     """
     paths = {path for config in configs for path in _input_files(config).values()}
-    return {p: sha256(Path(p)) if Path(p).is_file() else "missing" for p in sorted(paths)}
+    return {p: sha256(Path(p)) if os.path.isfile(p) else "missing" for p in sorted(paths)}

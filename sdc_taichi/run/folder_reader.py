@@ -7,7 +7,9 @@ a large fleet needs no more memory than the columns and data centers that are as
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,15 +18,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.config import DataCenterConfig, config_from_dict
-from sdc_taichi.errors import SdcError
+from sdc_taichi.config import DataCenterConfig, config_from_dict, load_json, load_yaml
+from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.run.description import FORMAT
 from sdc_taichi.run.folder_writer import METRICS_FILE
 from sdc_taichi.run.steps_file import METADATA_KEY, STEPS_FILE
 from sdc_taichi.types import F64
+from sdc_taichi.user_file import MOST_METRICS_BYTES, decoding, open_input, read_text
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
 MAX_INTERVALS = 400
 """Largest number of intervals in ``FleetSteps.inlet_max_c``."""
@@ -58,8 +63,6 @@ _EVENT_TYPES: Mapping[str, type | tuple[type, ...]] = {
     "start_step": int,
     "end_step": int,
 }
-_MAX_VALUE_LENGTH = 80
-"""Characters of a value that an error message shows."""
 _INTERVALS_H = (0.25, 0.5, 1, 2, 3, 6, 12, 24, 48, 96, 168, 336, 720, 2160, 8760)
 
 
@@ -111,8 +114,8 @@ def read_run(folder: str | Path) -> RunFolder:
             damaged or of another run.
     """
     path = Path(folder)
-    if not path.is_dir():
-        found = "is a file" if path.exists() else "no such folder"
+    if not os.path.isdir(path):
+        found = "is a file" if os.path.exists(path) else "no such folder"
         raise SdcError(f"{path}: {found}; valid is a folder that simulate wrote a run to")
     run = RunFolder(path, _read_metrics(path / METRICS_FILE))
     _check_steps_file(run)
@@ -192,8 +195,6 @@ def read_configs(run: RunFolder, dcs: Sequence[int]) -> list[DataCenterConfig]:
     Raises:
         SdcError: they are missing or not valid.
     """
-    import yaml
-
     text = _stored_metadata(run.steps_path).get("configs_yaml")
     if not isinstance(text, str):
         raise SdcError(f"{run.steps_path}: no configs_yaml; valid is a file written by simulate")
@@ -206,22 +207,21 @@ def read_configs(run: RunFolder, dcs: Sequence[int]) -> list[DataCenterConfig]:
         )
     label = f"{run.steps_path}: configs_yaml"
     try:
-        return [config_from_dict(yaml.safe_load(documents[dc]), label) for dc in dcs]
-    except yaml.YAMLError as error:
-        raise SdcError(f"{label}: not valid YAML ({_one_line(error)})") from None
+        return [config_from_dict(load_yaml(documents[dc]), label) for dc in dcs]
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise SdcError(f"{label}: not valid YAML ({error})") from None
 
 
 def _read_metrics(path: Path) -> dict[str, Any]:
     """Content of metrics.json, checked field by field."""
+    with _part_of_run():
+        text = read_text(path, MOST_METRICS_BYTES)
     try:
-        content = json.loads(path.read_text("utf-8"))
-    except FileNotFoundError:
-        raise SdcError(
-            f"{path}: no such file; valid is a folder that simulate wrote a whole run to"
-        ) from None
-    except (OSError, ValueError, RecursionError) as error:
-        reason = getattr(error, "strerror", None) or _one_line(error)
-        raise SdcError(f"{path}: cannot be read: {reason}") from None
+        content = load_json(text)
+    except ValueError as error:
+        raise SdcError(f"{path}: not valid JSON: {error}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         found = content.get("format") if isinstance(content, dict) else type(content).__name__
         raise SdcError(f"{path}: format {found!r}; valid is {FORMAT!r}, simulate the run again")
@@ -245,6 +245,22 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     if not 0 < step_h <= 1:
         raise SdcError(f"{path}: step_h {step_h!r}; valid is above 0 up to 1")
     return dict(content)
+
+
+@contextlib.contextmanager
+def _part_of_run() -> Iterator[None]:
+    """Say of a file that is missing what should hold it.
+
+    Raises:
+        SdcError: as in the block.
+    """
+    try:
+        yield
+    except SdcError as error:
+        if not isinstance(error.__cause__, FileNotFoundError):
+            raise
+        valid = "valid is a folder that simulate wrote a whole run to"
+        raise SdcError(f"{error}; {valid}") from None
 
 
 def is_number(value: object) -> bool:
@@ -288,10 +304,11 @@ def _check_steps_file(run: RunFolder) -> None:
     for name in {**stored, **given}:
         if stored.get(name) != given.get(name):
             raise SdcError(
-                f"{path}: {name} {_shortened(stored.get(name))} is not that of {METRICS_FILE}, "
-                f"{_shortened(given.get(name))}; simulate the run again"
+                f"{path}: {name} {shortened(stored.get(name))} is not that of {METRICS_FILE}, "
+                f"{shortened(given.get(name))}; simulate the run again"
             )
-    rows = _open_parquet(path).metadata.num_rows
+    with _open_parquet(path) as file:
+        rows = file.metadata.num_rows
     expected = run.metrics["steps_done"] * len(run.names)
     if rows != expected:
         raise SdcError(
@@ -310,37 +327,28 @@ def _flat_description(content: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _shortened(value: object) -> str:
-    """A value as an error message shows it."""
-    text = repr(value)
-    return text if len(text) <= _MAX_VALUE_LENGTH else text[:_MAX_VALUE_LENGTH] + "…"
-
-
-def _open_parquet(path: Path) -> Any:
-    """The Parquet file, of which the metadata have been read.
+@contextlib.contextmanager
+def _open_parquet(path: Path) -> Iterator[pq.ParquetFile]:
+    """Open a Parquet file, of which the metadata are read.
 
     Raises:
         SdcError: there is no such file, or it is damaged.
     """
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    try:
-        return pq.ParquetFile(path)
-    except FileNotFoundError:
-        raise SdcError(
-            f"{path}: no such file; valid is a folder that simulate wrote a whole run to"
-        ) from None
-    except (OSError, pa.ArrowException) as error:
-        raise SdcError(f"{path}: cannot be read as Parquet: {_one_line(error)}") from None
+    with _part_of_run(), open_input(path) as file:
+        with decoding(path, "a Parquet file"):
+            opened = pq.ParquetFile(file)
+        yield opened
 
 
 def _stored_metadata(path: Path) -> dict[str, Any]:
     """Description of the run that the metadata of steps.parquet hold."""
-    metadata = _open_parquet(path).schema_arrow.metadata or {}
+    with _open_parquet(path) as file:
+        metadata = file.schema_arrow.metadata or {}
     try:
         stored = json.loads(metadata[METADATA_KEY])
-    except (KeyError, ValueError):
+    except (KeyError, RecursionError, ValueError):
         stored = None
     if not isinstance(stored, dict):
         raise SdcError(f"{path}: no sdc_taichi metadata; valid is a file written by simulate")
@@ -349,39 +357,51 @@ def _stored_metadata(path: Path) -> dict[str, Any]:
 
 def _column_names(run: RunFolder) -> list[str]:
     """Columns of steps.parquet that hold quantities."""
-    names = _open_parquet(run.steps_path).schema_arrow.names
+    with _open_parquet(run.steps_path) as file:
+        names = file.schema_arrow.names
     return [name for name in names if name not in ("dc", "step", "time")]
 
 
 def _row_groups(run: RunFolder, columns: Sequence[str]) -> Iterator[dict[str, npt.NDArray[Any]]]:
     """Row groups as arrays (steps, data centers), ``step`` and ``time`` among them."""
-    import pyarrow as pa
-
-    path, size = run.steps_path, len(run.names)
-    file = _open_parquet(path)
+    path = run.steps_path
     wanted = ("dc", "step", "time", *columns)
-    known = set(file.schema_arrow.names)
-    missing = [name for name in wanted if name not in known]
-    if missing:
-        raise SdcError(f"{path}: no column {', '.join(missing)}; simulate the run again")
-    done = 0
-    for index in range(file.num_row_groups):
-        try:
-            table = file.read_row_group(index, columns=list(wanted))
-        except (OSError, pa.ArrowException) as error:
-            raise SdcError(f"{path}: row group {index} is damaged: {_one_line(error)}") from None
-        if table.num_rows % size:
-            raise SdcError(f"{path}: row group {index} has {table.num_rows} rows, not whole steps")
-        group = {name: _as_array(path, name, table).reshape(-1, size) for name in wanted[1:]}
-        steps = np.arange(done, done + table.num_rows // size)
-        names = table.column("dc").slice(0, size).to_pylist()
-        if names != run.names or not np.all(group["step"] == steps[:, None]):
-            raise SdcError(
-                f"{path}: row group {index}: rows are not in order of step and data center as in "
-                f"{METRICS_FILE}; simulate the run again"
-            )
-        done += len(steps)
-        yield group
+    with _open_parquet(path) as file:
+        known = set(file.schema_arrow.names)
+        missing = [name for name in wanted if name not in known]
+        if missing:
+            raise SdcError(f"{path}: no column {', '.join(missing)}; simulate the run again")
+        done = 0
+        for index in range(file.num_row_groups):
+            with decoding(path, f"row group {index}"):
+                table = file.read_row_group(index, columns=list(wanted))
+            group = _as_steps(run, index, table, done)
+            done += len(group["step"])
+            yield group
+
+
+def _as_steps(run: RunFolder, index: int, table: pa.Table, done: int) -> dict[str, Any]:
+    """A row group as arrays (steps, data centers), checked.
+
+    Args:
+        run: the run.
+        index: number of the row group, for messages.
+        table: its columns.
+        done: number of steps in the row groups before.
+    """
+    path, size = run.steps_path, len(run.names)
+    if table.num_rows % size:
+        raise SdcError(f"{path}: row group {index} has {table.num_rows} rows, not whole steps")
+    names = [name for name in table.column_names if name != "dc"]
+    group = {name: _as_array(path, name, table).reshape(-1, size) for name in names}
+    steps = np.arange(done, done + table.num_rows // size)
+    dcs = table.column("dc").slice(0, size).to_pylist()
+    if dcs != run.names or not np.all(group["step"] == steps[:, None]):
+        raise SdcError(
+            f"{path}: row group {index}: rows are not in order of step and data center as in "
+            f"{METRICS_FILE}; simulate the run again"
+        )
+    return group
 
 
 def _as_array(path: Path, name: str, table: Any) -> npt.NDArray[Any]:
@@ -394,8 +414,3 @@ def _as_array(path: Path, name: str, table: Any) -> npt.NDArray[Any]:
             f"is {kind} without"
         )
     return np.asarray(column.to_numpy())
-
-
-def _one_line(error: Exception) -> str:
-    """Message of an error without line breaks."""
-    return " ".join(str(error).split())

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import State, fields_of
+from sdc_taichi.user_file import ArrayFile, open_input
 
 VERSION = 3
 """Version of what a snapshot holds."""
@@ -108,13 +108,11 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     Raises:
         SdcError: The file cannot be read.
     """
-    try:
-        # Opened here: np.load leaves its own file open when the archive is broken.
-        with open(path, "rb") as raw:
-            file = np.load(raw, allow_pickle=False)
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, BadZipFile) as error:
-        raise SdcError(f"{path}: cannot be read as a snapshot ({error})") from None
+    with open_input(path) as file:
+        arrays = ArrayFile(file, path)
+        # Files of ``write`` are not compressed.
+        most_bytes = os.fstat(file.fileno()).st_size
+        return {name: arrays.read(name, most_bytes) for name in arrays.names}
 
 
 def _checked(name: str, value: Any, like: Any) -> Any:
