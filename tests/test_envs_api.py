@@ -276,14 +276,6 @@ def test_without_autoreset_the_batch_waits_for_reset() -> None:
     env.step(np.array([1, 1]))
 
 
-def test_ids_carry_no_time_limit_of_their_own() -> None:
-    for name in IDS:
-        env = gymnasium.make(f"sdc_taichi:{name}", **tiny())
-        assert env.spec is not None
-        assert env.spec.max_episode_steps is None
-        assert "TimeLimit" not in str(env)
-
-
 def test_bounds_are_finite() -> None:
     for options in SEEN.values():
         for agents in SUBSETS:

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 import sdc_taichi
+from sdc_taichi.envs.registration import IDS
 
 pytestmark = pytest.mark.repo
 
@@ -218,6 +219,19 @@ def test_torchrl_env_starts_anew_within_an_episode_and_refuses_a_part(example: L
     part["_reset"] = importlib.import_module("torch").tensor([[True], [False]])
     with pytest.raises(ValueError, match="single ones cannot be reset"):
         env.reset(part)
+    env.close()
+
+
+@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("actions", ["discrete", "continuous"])
+def test_sb3_has_nothing_to_say_against_single_environments(
+    name: str, actions: str, example: Load
+) -> None:
+    """Its checker warns of spaces that its learners do badly with; warnings are errors here."""
+    example("train_sb3", "stable_baselines3")
+    checker = importlib.import_module("stable_baselines3.common.env_checker")
+    env = gymnasium.make(name, config="tiny", days=1, actions=actions)
+    checker.check_env(env.unwrapped)
     env.close()
 
 

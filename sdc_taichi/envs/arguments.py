@@ -10,14 +10,22 @@ import os
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
-from sdc_taichi.config import DataCenterConfig, apply_overrides, load_config, with_values
+from sdc_taichi.config import (
+    DataCenterConfig,
+    apply_overrides,
+    config_from_dict,
+    load_config,
+    with_values,
+)
 from sdc_taichi.envs.options import EnvOptions, make_options
 from sdc_taichi.envs.recording import RecorderOption, RecordingCore
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.hall_solver import Precision
 
-ConfigSource: TypeAlias = str | os.PathLike[str] | DataCenterConfig | Sequence[DataCenterConfig]
-"""A preset, a file, a config, or for batches several configs."""
+OneConfig: TypeAlias = DataCenterConfig | Mapping[str, Any]
+"""A config, or its sections as plain values."""
+ConfigSource: TypeAlias = str | os.PathLike[str] | OneConfig | Sequence[OneConfig]
+"""A preset, a file, a config or its sections, or for batches several of the latter."""
 Overrides: TypeAlias = Mapping[str, Any] | Sequence[str]
 """Values put into the config: section.key to value, or a list of ``section.key=value``."""
 
@@ -87,10 +95,18 @@ def _configs(source: Any, overrides: Overrides) -> list[DataCenterConfig]:
     listed: list[Any] = list(source) if isinstance(source, Sequence) else [source]
     if not listed:
         raise ConfigError("config: an empty list; valid is at least one data center")
-    for one in listed:
-        if not isinstance(one, DataCenterConfig):
-            raise ConfigError(f"config {one!r}: valid is a preset, a file, or DataCenterConfigs")
-    return [_with_overrides(one, overrides) for one in listed]
+    return [_with_overrides(_checked_config(one), overrides) for one in listed]
+
+
+def _checked_config(given: Any) -> DataCenterConfig:
+    if isinstance(given, Mapping):
+        return config_from_dict(dict(given))
+    if not isinstance(given, DataCenterConfig):
+        raise ConfigError(
+            f"config {given!r}: valid is a preset, a file, DataCenterConfigs, or dicts of their "
+            "sections"
+        )
+    return given
 
 
 def _with_overrides(config: DataCenterConfig, overrides: Overrides) -> DataCenterConfig:

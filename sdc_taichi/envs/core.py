@@ -94,6 +94,7 @@ class Core:
         options: the options.
         agents: agents that learn.
         num_envs: number of environments, B.
+        steps: number of steps of an episode.
         sim: the simulator of all data centers.
         features: features of each agent, in the order of its observation.
         observation_spaces: space of each agent's observation in one environment.
@@ -141,7 +142,7 @@ class Core:
         self.action_spaces = self._decoder.spaces
         self.state_space = self._observer.state_space
         self._steps_per_day = 24 * fleet.steps_per_hour
-        self._steps = options.days * self._steps_per_day
+        self.steps = options.days * self._steps_per_day
         self._start_days = np.array(options.start_days())
         self._generators: list[np.random.Generator] = []
         self._view_after: Any = None
@@ -247,7 +248,7 @@ class Core:
     @property
     def episode_over(self) -> bool:
         """Whether an episode has ended and the next has not begun."""
-        return self._view is not None and self._view.state.step >= self._steps
+        return self._view is not None and self._view.state.step >= self.steps
 
     def state(self) -> F32:
         """Shared state for centralised critics, (B, m): all features, whoever learns."""

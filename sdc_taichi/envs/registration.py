@@ -16,7 +16,8 @@ IDS: dict[str, str | None] = {
 def register() -> None:
     """Register the ids that are not yet registered; nothing else is imported before ``make``.
 
-    Episodes end by themselves, so there is no ``max_episode_steps``.
+    The length of an episode depends on the arguments: ``max_episode_steps`` is in the spec of each
+    environment (``sdc_taichi.envs.spec``).
     """
     for name, agent in IDS.items():
         if name not in gymnasium.registry:

@@ -21,10 +21,11 @@ from sdc_taichi.envs.core import Observation
 from sdc_taichi.envs.learners import learning_agent, make_learner
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.recording import RecorderOption
+from sdc_taichi.envs.spec import HasSpec
 from sdc_taichi.sim.hall_solver import Precision
 
 
-class SdcEnv(SingleEnv, gymnasium.Env[Any, Any]):
+class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
     """One data center with one learner.
 
     Episodes end by truncation: their length is a choice, the data center goes on. Infos:

@@ -18,6 +18,7 @@ from sdc_taichi.envs.episode_reset import Seed
 from sdc_taichi.envs.learners import learning_agent, make_learner
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.recording import RecorderOption, RecordingCore
+from sdc_taichi.envs.spec import HasSpec, check_steps
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F32, F64
@@ -27,7 +28,7 @@ Flags = npt.NDArray[np.bool_]
 _METADATA: dict[str, Any] = {"render_modes": list(rendering.RENDER_MODES), "render_fps": 8}
 
 
-class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
+class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
     """Data centers with one learner each that step together, as ``gymnasium.make_vec`` gives them.
 
     Gives what Gymnasium's ``SyncVectorEnv`` gives for single environments. All episodes have the
@@ -47,6 +48,8 @@ class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         autoreset_mode: when the next episodes start, as the enum or its value: ``NextStep``, in the
             step after the one that ends the last ones; ``SameStep``, in that step itself;
             ``Disabled``, by ``reset`` alone.
+        max_episode_steps: ends episodes after fewer steps than their days have, as Gymnasium's
+            ``TimeLimit`` does around a single environment; None and -1 do not.
         recorder: records episodes of the first environment into a file ending in .rrd, or what
             ``EpisodeRecorder`` says.
         keywords: fields of ``EnvOptions``, in place of those in ``options``.
@@ -67,6 +70,7 @@ class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         render_mode: str | None = None,
         registered_agent: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
         recorder: RecorderOption = None,
         **keywords: Any,
     ) -> None:
@@ -77,6 +81,7 @@ class SdcVectorEnv(BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
             config, overrides, options, keywords, only_agent=agent
         )
         self.core = RecordingCore(configs, chosen, num_envs, precision, recorder)
+        self.core.steps = check_steps(max_episode_steps, self.core)
         self.num_envs = num_envs = self.core.num_envs
         self.render_mode = render_mode
         self.metadata = _METADATA | {"autoreset_mode": self._mode}
