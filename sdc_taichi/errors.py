@@ -1,4 +1,7 @@
-"""Errors a user can cause; every message names the place, the value and what would be valid."""
+"""Errors a user can cause; every message names the place, the value and what would be valid.
+
+What the user should know although work goes on is an ``SdcWarning``.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,20 @@ class DataError(SdcError):
     """A weather, carbon or workload file or series is not valid."""
 
 
+class PhysicalLimitError(SdcError):
+    """A result lies beyond what any data center can reach, as an input of no sense leads to."""
+
+
 class RuntimeStateError(SdcError):
     """The simulator was used in a state that cannot work (closed, forked, not reset)."""
+
+
+class SdcWarning(UserWarning):
+    """Base of all warnings of the package; the command line prints each as one line."""
+
+
+class OddInputWarning(SdcWarning):
+    """An input is possible, but probably not what was meant."""
 
 
 def shortened(value: object, most: int = 80) -> str:

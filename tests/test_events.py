@@ -137,7 +137,7 @@ def test_overlapping_events_add_up() -> None:
         (1.0, 1.0, 4, range(4, 8)),
         (1.1, 0.01, 4, range(4, 5)),
         (1.2, 0.1, 4, range(4, 6)),
-        (0.0, 1e-6, 4, range(1)),
+        (0.0, 1e-3, 4, range(1)),
         # In binary (0.1 + 0.2)*10 is above 3 and 2.05*60 below 123.
         (0.1, 0.2, 10, range(1, 3)),
         (2.05, 1.0, 60, range(123, 183)),

@@ -45,7 +45,7 @@ def random_rack(rng: np.random.Generator) -> list[dict[str, float]]:
         full = float(rng.uniform(80, 500))
         groups.append(
             {
-                "count": int(rng.integers(1, 40)),
+                "count": int(rng.integers(1, 20)),
                 "full_w": full,
                 "idle_w": float(rng.uniform(0, 0.6) * full),
                 "load_weight": float(rng.uniform(0.8, 1.3)),
@@ -80,12 +80,12 @@ def random_config(
     else:
         full = rng.uniform(80, 500, racks)
         servers["power_w"] = np.stack([full, full * rng.uniform(0, 0.6, racks)], axis=1).tolist()
-        hall["servers_per_rack"] = rng.integers(1, 300, racks).tolist()
+        hall["servers_per_rack"] = rng.integers(1, 80, racks).tolist()
     config = config_from_dict({**values, "name": name}, name)
     if rng.integers(3):
         return config
     nameplate_w = sum(g.count * g.full_w for rack in config.rack_groups() for g in rack)
-    hall["capacity_mw"] = nameplate_w * float(rng.uniform(1, 3)) / 1e6
+    hall["capacity_mw"] = nameplate_w * float(rng.uniform(1, 1.5)) / 1e6
     return config_from_dict({**values, "name": name}, name)
 
 

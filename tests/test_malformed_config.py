@@ -112,7 +112,7 @@ def fails(arguments: list[str], parts: list[str]) -> None:
         ),
         (
             "extends: tiny\nservers: {groups: [[{count: 1, full_w: .inf, idle_w: 2}]]}",
-            ["servers.groups.0.0.full_w", "within -1e12..1e12"],
+            ["servers.groups.0.0.full_w", "finite number"],
         ),
     ],
 )
@@ -180,8 +180,8 @@ def test_what_is_too_long_for_the_name_of_a_file_is_an_override() -> None:
         ("hall.supply_aproach_k=3", ["hall.supply_aproach_k", "did you mean 'supply_approach_k'?"]),
         ("hall.supply_approach_k=[1, 2]", ["supply_approach_k has 2 entries, expected 4"]),
         ("hall.rows=true", ["hall.rows", "number", "True"]),
-        ("hall.capacity_mw=1e9", ["servers; valid is at most 2,147,483,647"]),
-        ("hall.capacity_mw=1e-9", ["hall.capacity_mw 1e-09", "without servers", "at least"]),
+        ("hall.capacity_mw=1e9", ["hall.capacity_mw", "less than or equal to 100000"]),
+        ("hall.capacity_mw=1e-6", ["hall.capacity_mw 1e-06", "without servers", "at least"]),
         ("hvac.total_of=[chiller, chiller]", ["hvac.total_of", "each one once"]),
         ("hvac.total_of=[]", ["hvac.total_of", "at least one device"]),
         ("hvac.chiller.coil_approach_k=50", ["coil_approach_k 50", "within 4..20 C"]),
@@ -197,7 +197,7 @@ def test_what_is_too_long_for_the_name_of_a_file_is_an_override() -> None:
         ("hvac.total_of=[chiler]", ["hvac.total_of.0", "'chiller'", "'chiler'"]),
         ("hvac.setpoint.min_c=30", ["hvac.setpoint", "initial_c 18", "min_c 30"]),
         ("hvac.setpoint.initial_c=.nan", ["hvac.setpoint.initial_c", "finite"]),
-        ("hvac.water.cycles_of_concentration=1", ["cycles_of_concentration", "greater than 1"]),
+        ("hvac.water.cycles_of_concentration=1", ["cycles_of_concentration", "1.01"]),
         ("battery.capacity_kwh=-1", ["battery.capacity_kwh", "-1"]),
         ("battery.lower_v=1", ["battery: lower_v 1 must be below upper_v 1"]),
         ("workload.deadline_h=48", ["workload: deadline_h 48", "age_horizon_h 24"]),

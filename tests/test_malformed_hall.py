@@ -53,7 +53,7 @@ EVENT = "events.scheduled=[{{kind: {}, start_h: 1, duration_h: 1{}}}]"
         ),
         (
             "events.sampled=[{kind: grid_outage, per_year: 2, duration_h: [3, 2]}]",
-            ["duration_h (3, 2) must be (low, high) with 0 < low <= high"],
+            ["duration_h (3, 2) must be (low, high) with low <= high"],
         ),
         (
             "events.sampled=[{kind: grid_outage, per_year: 2, hours: [3, 2]}]",

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sdc_taichi.atomic_file import FileClaim, naming_errors
-from sdc_taichi.errors import SdcError
+from sdc_taichi.errors import SdcError, SdcWarning
 
 from .recording_target import HOST, listens, served_at
 
@@ -40,7 +40,7 @@ _FOOTER = b"RRF2FOOT"
 _FOOTER_FROM_END = 12
 
 
-class RecordingWarning(UserWarning):
+class RecordingWarning(SdcWarning):
     """A recording has ended early; the run goes on without it."""
 
 

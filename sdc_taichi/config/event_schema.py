@@ -6,17 +6,16 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sdc_taichi.config.fields import (
-    Finite,
-    Index,
-    NonNegative,
-    Pair,
-    Positive,
-    Section,
-    Share,
-)
+from sdc_taichi.config.fields import AirC, Index, RiseK, Section, Share
 
 EventKind = Literal["crac_down", "chiller_derate", "rack_fan_failure", "heat_wave", "grid_outage"]
+
+WaveK = Annotated[float, Field(ge=-40, le=40)]
+"""Addition to temperatures outdoors, -40..40 K: the largest departure from the climate on record is
+39 K (Dome C, Antarctica, March 2022)."""
+
+DurationH = Annotated[float, Field(ge=0.001, le=876_000)]
+"""Duration of an event, 0.001..876,000 h: from a few seconds to a century."""
 
 _REQUIRED: dict[EventKind, tuple[str, ...]] = {
     "crac_down": (),
@@ -40,9 +39,9 @@ class ProtectionConfig(Section):
     protection."""
     throttle_share: Share = 0.5
     """Utilisation that a throttled rack may reach, 0..1."""
-    trip_margin_k: NonNegative = 5.0
+    trip_margin_k: RiseK = 5.0
     """Inlet above the limit at which a rack switches off, in K."""
-    restart_c: Finite = 27.0
+    restart_c: AirC = 27.0
     """Warmest inlet at which a rack that has switched off starts again, in C."""
 
 
@@ -51,9 +50,10 @@ class ScheduledEvent(Section):
 
     kind: EventKind
     """Kind of event."""
-    start_h: NonNegative
-    """Start of the event after reset, in h."""
-    duration_h: Positive
+    start_h: Annotated[float, Field(ge=0, le=876_000)]
+    """Start of the event after reset, in h, before the end of the run; at most 876,000, a
+    century."""
+    duration_h: DurationH
     """Duration of the event, in h."""
     unit: Index | None = None
     """CRAC unit that is down, counted from 0; None is all of them."""
@@ -61,7 +61,7 @@ class ScheduledEvent(Section):
     """Rack whose fans fail, counted from 0, row by row."""
     share: Share | None = None
     """Chiller capacity or rack airflow that remains, as a share of the full value, 0..1."""
-    offset_k: Finite | None = None
+    offset_k: WaveK | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
 
     @model_validator(mode="after")
@@ -78,22 +78,20 @@ class SampledEvent(Section):
 
     kind: EventKind
     """Kind of event."""
-    per_year: Annotated[Finite, Field(gt=0, le=8760)]
-    """Mean number of events in a year, at most one an hour."""
-    duration_h: Pair
+    per_year: Annotated[float, Field(ge=1e-6, le=8760)]
+    """Mean number of events in a year, from one in a million years to one an hour."""
+    duration_h: tuple[DurationH, DurationH]
     """Shortest and longest duration of an event, in h."""
     share: Share | None = None
     """Chiller capacity or rack airflow that remains, as a share of the full value, 0..1."""
-    offset_k: Finite | None = None
+    offset_k: WaveK | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
 
     @model_validator(mode="after")
     def _has_what_its_kind_needs(self) -> Self:
         low, high = self.duration_h
-        if not 0 < low <= high:
-            raise ValueError(
-                f"duration_h ({low:g}, {high:g}) must be (low, high) with 0 < low <= high"
-            )
+        if not low <= high:
+            raise ValueError(f"duration_h ({low:g}, {high:g}) must be (low, high) with low <= high")
         _check_fields_of_kind(self)
         return self
 

@@ -1,56 +1,95 @@
-"""Types of the fields of a configuration, the base of its sections, and checks that they share."""
+"""Types of the fields of a configuration, the base of its sections, and checks that they share.
+
+A field of a number has bounds at both ends, which a test holds. They are what no machine, hall or
+weather can exceed, not what is usual, so that a value in another unit is refused and every real one
+is taken. A type below says why; a field with bounds of its own says so in its docstring.
+"""
 
 from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
+from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C
 
-def _no_bool(value: Any) -> Any:
-    if isinstance(value, bool):
-        raise ValueError("should be a number")
-    return value
-
-
-def _bounded(value: float) -> float:
-    # Beyond any hall, and products of two still fit the kernels' f32.
-    if abs(value) > 1e12:
-        raise ValueError("should be within -1e12..1e12")
-    return value
-
-
-Finite = Annotated[
-    float, BeforeValidator(_no_bool), AfterValidator(_bounded), Field(allow_inf_nan=False)
-]
-"""Any number within -1e12..1e12."""
-Positive = Annotated[Finite, Field(gt=0)]
-"""A number above 0."""
-NonNegative = Annotated[Finite, Field(ge=0)]
-"""A number of at least 0."""
-Share = Annotated[Finite, Field(ge=0, le=1)]
-"""A number within 0..1."""
-PositiveShare = Annotated[Finite, Field(gt=0, le=1)]
-"""A number above 0 and at most 1."""
-Whole = Annotated[int, BeforeValidator(_no_bool)]
-"""Any integer."""
-Count = Annotated[Whole, Field(ge=1)]
-"""An integer of at least 1."""
-Index = Annotated[Whole, Field(ge=0)]
-"""An integer of at least 0."""
-Pair = tuple[Finite, Finite]
-"""Two numbers."""
+Share = Annotated[float, Field(ge=0, le=1)]
+"""A share, 0..1."""
+WorkingShare = Annotated[float, Field(ge=0.01, le=1)]
+"""A share of what a machine does at its design point, 0.01..1: at less than a hundredth of its flow
+or with less than a hundredth of its efficiency, it is out of order."""
+AirC = Annotated[float, Field(ge=0, le=60)]
+"""Temperature of air that servers take in or units supply, 0..60 C: coils freeze below, and no
+ASHRAE class of servers (A4: 45 C) comes near the upper end."""
+OutdoorC = Annotated[float, Field(ge=OUTDOOR_LIMITS_C[0], le=OUTDOOR_LIMITS_C[1])]
+"""Temperature outdoors, -90..60 C: the extremes on record (WMO) are -89.2 C (Vostok 1983) and 56.7
+C (Furnace Creek 1913)."""
+DifferenceK = Annotated[float, Field(ge=-50, le=50)]
+"""Difference of two temperatures of a hall or plant, -50..50 K: as much as lies between its coldest
+water and its hottest air."""
+RiseK = Annotated[float, Field(ge=0, le=50)]
+"""Difference of two temperatures of a hall or plant of which the second is not below the first,
+0..50 K."""
+ExchangerK = Annotated[float, Field(ge=0.1, le=50)]
+"""Difference of temperatures that drives a heat exchanger, 0.1..50 K: towards 0 K its area has no
+limit."""
+WaterRangeK = Annotated[float, Field(ge=0.5, le=50)]
+"""Difference of temperatures between water that flows to and fro, 0.5..50 K: its flow is the heat
+over the range, and at less than 0.5 K ten times that of any plant."""
+LengthM = Annotated[float, Field(ge=0.01, le=1000)]
+"""Length within a hall, 0.01..1,000 m; the largest buildings measure about a kilometre."""
+Hours = Annotated[float, Field(ge=0.001, le=8760)]
+"""Duration of part of a year, 0.001..8,760 h."""
+ServerW = Annotated[float, Field(ge=1, le=1e5)]
+"""Power of a server at full load, 1..100,000 W: from a single-board computer to a rack in one
+chassis; less is power in kW given as W."""
+IdleW = Annotated[float, Field(ge=0, le=1e5)]
+"""Power of a server or its fans at any load, 0..100,000 W."""
+DeviceW = Annotated[float, Field(ge=0, le=1e9)]
+"""Power of a device that serves a whole hall, 0..1e9 W."""
+FlowM3sPerW = Annotated[float, Field(ge=1e-5, le=0.01)]
+"""Airflow per power, 1e-5..0.01 m3/s per W: the power warms the air by 81 K at the lower end, more
+than any server bears, and by less than 0.1 K at the upper."""
+PowerRatio = Annotated[float, Field(ge=0, le=2)]
+"""Power over that at full load, 0..2; turbo clocks and leakage add less than its double."""
+FlowRatio = Annotated[float, Field(ge=-1, le=10)]
+"""Airflow of a server over its full airflow on a straight line, -1..10; below 0 the fans stand."""
+CRate = Annotated[float, Field(ge=0.001, le=1000)]
+"""Power of a battery over its capacity, 0.001..1,000 1/h: from iron-air batteries that last for
+days to flywheels and capacitors that last for seconds."""
+Count = Annotated[int, Field(ge=1, le=10_000)]
+"""A number of parts, 1..10,000: more servers or zones than any rack has."""
+Index = Annotated[int, Field(ge=0, le=2**63 - 1)]
+"""A number that counts from 0, or a seed, 0..2**63 - 1."""
 FileName = Annotated[str, Field(min_length=1)]
 """Path of a file."""
 
 
 class Section(BaseModel):
-    """Base of every section: frozen, and without keys that it does not name."""
+    """Base of every section: frozen, of finite numbers, and without keys that it does not name."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, protected_namespaces=()
+    )
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _truth_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
+        # Python takes True for 1.
+        assert info.field_name is not None
+        if cls.model_fields[info.field_name].annotation is not bool and _has_truth(value):
+            raise ValueError("should be a number or text, not true or false")
+        return value
 
 
-def check_ordered(value: Pair | None) -> Pair | None:
+def _has_truth(value: Any) -> bool:
+    """Whether a value is true or false, or a list that holds one at any depth."""
+    if isinstance(value, list | tuple):
+        return any(map(_has_truth, value))
+    return isinstance(value, bool)
+
+
+def check_ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
     """A pair unchanged; None passes.
 
     Raises:

@@ -8,15 +8,19 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from sdc_taichi.config.fields import (
+    AirC,
     Count,
+    DifferenceK,
     FileName,
-    Finite,
-    NonNegative,
-    Pair,
-    Positive,
-    PositiveShare,
+    FlowRatio,
+    IdleW,
+    LengthM,
+    PowerRatio,
+    RiseK,
     Section,
+    ServerW,
     Share,
+    WorkingShare,
     check_one_per_rack,
     check_ordered,
 )
@@ -24,6 +28,12 @@ from sdc_taichi.plant.servers import ServerCurves, linear_curve
 
 MOST_RACKS = 10_000_000
 """Largest number of racks of a hall."""
+RackCount = Annotated[int, Field(ge=1, le=MOST_RACKS)]
+"""A number of rows or racks, 1..10,000,000."""
+PowerPair = tuple[ServerW, IdleW]
+"""CPU power of a server at full load and idle, in W."""
+RackLength = Annotated[float, Field(ge=0.1, le=5)]
+"""A measure of a rack, in m, 0.1..5; racks are 0.6 m wide, 1.2 m deep and 2.1 m high or near."""
 
 
 class LayoutConfig(Section):
@@ -32,22 +42,22 @@ class LayoutConfig(Section):
     Row 0 lies along the first wall and faces away from it, row 1 faces row 0, and so on.
     """
 
-    rack_pitch_m: Positive = 0.6
+    rack_pitch_m: RackLength = 0.6
     """Distance between the centres of neighbouring racks of a row, in m."""
-    rack_depth_m: Positive = 1.2
+    rack_depth_m: RackLength = 1.2
     """Depth of a rack, from front to back, in m."""
-    rack_height_m: Positive = 2.1
+    rack_height_m: RackLength = 2.1
     """Height of a rack, in m."""
-    cold_aisle_m: Positive = 1.2
+    cold_aisle_m: LengthM = 1.2
     """Width of a cold aisle, between the fronts of two rows, in m."""
-    hot_aisle_m: Positive = 1.2
+    hot_aisle_m: LengthM = 1.2
     """Width of a hot aisle, between the backs of two rows, in m."""
-    end_margin_m: NonNegative = 1.8
-    """Distance between the ends of the rows and the walls, in m."""
-    side_margin_m: Positive = 1.2
+    end_margin_m: Annotated[float, Field(ge=0, le=1000)] = 1.8
+    """Distance between the ends of the rows and the walls, in m, 0..1,000."""
+    side_margin_m: LengthM = 1.2
     """Distance between the outer rows and the walls, in m."""
-    ceiling_m: Positive = 3.6
-    """Height of the hall, in m."""
+    ceiling_m: Annotated[float, Field(ge=0.1, le=100)] = 3.6
+    """Height of the hall, in m, 0.1..100; taller buildings have storeys."""
     containment: Share = 0.0
     """Share of the paths from hot to cold aisles that containment closes, 0..1."""
     returns: Literal["ceiling", "end_wall"] = "ceiling"
@@ -65,9 +75,9 @@ class LayoutConfig(Section):
 class RecirculationConfig(Section):
     """How exhaust air reaches the inlets of the racks."""
 
-    decay_m: Positive = 3.0
+    decay_m: LengthM = 3.0
     """Length over which the exhaust of another rack loses weight by a factor of e, in m."""
-    cutoff: Annotated[Finite, Field(ge=0, le=0.01)] = 1e-4
+    cutoff: Annotated[float, Field(ge=0, le=0.01)] = 1e-4
     """Share of what a rack amid the hall collects below which the weight of a source is left out,
     in halls of more than 64 racks; 0 keeps all sources."""
     matrix_file: FileName | None = None
@@ -95,42 +105,45 @@ class RecirculationConfig(Section):
 class HallConfig(Section):
     """Rows of racks, their approach temperatures, and how many servers they hold."""
 
-    rows: Count
+    rows: RackCount
     """Number of rows of racks."""
-    racks_per_row: Count
+    racks_per_row: RackCount
     """Number of racks of each row."""
     servers_per_rack: Count | tuple[Count, ...] = 200
     """Number of servers of a rack: one for all racks, or one per rack."""
-    capacity_mw: Positive | None = None
-    """IT nameplate power that the number of servers is scaled to, in MW; None keeps
-    ``servers_per_rack``."""
+    capacity_mw: Annotated[float, Field(ge=1e-6, le=1e5)] | None = None
+    """IT nameplate power that the number of servers is scaled to, in MW, from a server of 1 W to
+    1e5, more than all data centers of the world draw; None keeps ``servers_per_rack``."""
     inlet_model: Literal["approach", "recirculation"] = "approach"
     """Source of rack inlets: given approach temperatures, or the exhaust air of the racks."""
-    supply_approach_k: NonNegative | tuple[NonNegative, ...]
+    supply_approach_k: RiseK | tuple[RiseK, ...]
     """Rack inlet above the CRAC supply at the design point, in K: one for all racks, or one per
     rack."""
-    supply_approach_limits_k: Pair | None = None
+    supply_approach_limits_k: tuple[RiseK, RiseK] | None = None
     """Lowest and highest supply approach, which bound ``supply_approach_k``, in K; None is no
     bounds."""
-    return_approach_k: Finite | tuple[Finite, ...]
+    return_approach_k: DifferenceK | tuple[DifferenceK, ...]
     """CRAC return air above the rack outlet, in K, negative where supply air bypasses the racks:
     one for all racks, or one per rack."""
     layout: LayoutConfig = LayoutConfig()
     """Measures of the hall."""
     recirculation: RecirculationConfig = RecirculationConfig()
     """How exhaust air reaches rack inlets, for inlet model ``recirculation``."""
-    height_zones: Count = 5
+    height_zones: Annotated[int, Field(ge=1, le=100)] = 5
     """Number of zones over the height of a rack that each share an inlet temperature, for inlet
-    model ``recirculation``."""
-    height_gradient: Annotated[Finite, Field(ge=0, lt=1)] = 0.4
+    model ``recirculation``, 1..100; the tallest racks have 58 units."""
+    height_gradient: Annotated[float, Field(ge=0, lt=1)] = 0.4
     """Relative rise of the recirculated share of the intake from the middle of a rack to its top,
     and its fall to the floor, 0..1."""
-    room_heat_capacity_kj_per_k_per_server: Positive = 2.0
-    """Heat capacity of room, coils and all else that follows the supply air, in kJ/K per server."""
-    air_density_kg_m3: Positive = 1.225
-    """Density of the air, in kg/m3."""
-    air_heat_capacity_j_per_kg_k: Positive = 1006.0
-    """Specific heat capacity of the air, in J/(kg K)."""
+    room_heat_capacity_kj_per_k_per_server: Annotated[float, Field(ge=0.01, le=1e5)] = 2.0
+    """Heat capacity of room, coils and all else that follows the supply air, in kJ/K per server,
+    0.01..1e5: from 10 l of air to 100 t of concrete."""
+    air_density_kg_m3: Annotated[float, Field(ge=0.4, le=1.6)] = 1.225
+    """Density of the air, in kg/m3, 0.4..1.6: from the summit of Mount Everest to sea level at
+    -50 C."""
+    air_heat_capacity_j_per_kg_k: Annotated[float, Field(ge=990, le=1200)] = 1006.0
+    """Specific heat capacity of the air, in J/(kg K), 990..1,200: from dry air to air of 100 g of
+    water per kg."""
 
     @property
     def racks(self) -> int:
@@ -153,7 +166,7 @@ class HallConfig(Section):
 
     @field_validator("supply_approach_limits_k")
     @classmethod
-    def _ordered(cls, value: Pair | None) -> Pair | None:
+    def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
         return check_ordered(value)
 
     @model_validator(mode="after")
@@ -177,14 +190,14 @@ class ServerGroup(Section):
 
     count: Count
     """Number of servers."""
-    full_w: Positive
+    full_w: ServerW
     """CPU power of one server at full load and a power ratio of 1, in W."""
-    idle_w: NonNegative
+    idle_w: IdleW
     """Least CPU power of one server, in W."""
-    load_weight: NonNegative = 1.0
+    load_weight: Annotated[float, Field(ge=0, le=1000)] = 1.0
     """Load of a server relative to the mean of its rack, by count, at little load; at most twice
     that mean."""
-    inlet_offset_k: Finite = 0.0
+    inlet_offset_k: DifferenceK = 0.0
     """Inlet of a server above the inlet of its rack, by its height in the rack, in K."""
 
     @model_validator(mode="after")
@@ -197,57 +210,59 @@ class ServerGroup(Section):
 class ServerConfig(Section):
     """Power and airflow of the servers (ITE:AirCooled form of EnergyPlus, curves of Sun 2021)."""
 
-    power_w: Annotated[tuple[Pair, ...], Field(min_length=1)] | None = None
+    power_w: Annotated[tuple[PowerPair, ...], Field(min_length=1)] | None = None
     """(full, idle) CPU power of one server, in W: one pair for all racks, or one per rack. Without
     it and without groups a server draws 150 W at full load and 10 W idle."""
     groups: tuple[tuple[ServerGroup, ...], ...] | None = None
     """Server groups, in place of ``power_w`` and ``servers_per_rack``: one entry for all racks, or
     one per rack."""
-    cpu_power_ratio_lb: Pair = (0.01, 1.00)
+    cpu_power_ratio_lb: tuple[PowerRatio, PowerRatio] = (0.01, 1.00)
     """CPU power over full power at the coldest inlet of ``inlet_range_c``: at no load, and at full
     load."""
-    cpu_power_ratio_ub: Pair = (0.03, 1.02)
+    cpu_power_ratio_ub: tuple[PowerRatio, PowerRatio] = (0.03, 1.02)
     """CPU power over full power at the warmest inlet of ``inlet_range_c``: at no load, and at full
     load."""
-    cpu_slope_offset_per_k: Finite = 0.0
-    """Addition to the slope of CPU power over full power against the inlet, in 1/K."""
-    inlet_range_c: Pair = (16.0, 28.0)
+    cpu_slope_offset_per_k: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    """Addition to the slope of CPU power over full power against the inlet, in 1/K, -1..1: a kelvin
+    changes no server's power by more than that at full load."""
+    inlet_range_c: tuple[AirC, AirC] = (16.0, 28.0)
     """Coldest and warmest inlet, between which the curves are given, in C."""
-    curve_limit_c: Finite | None = 45.0
+    curve_limit_c: AirC | None = 45.0
     """Inlet above which power and airflow no longer rise (upper limit of ASHRAE class A4), in C;
     without a limit, None, a room that cannot be cooled draws ever more power."""
-    fan_airflow_ratio_lb: Pair = (0.01, 0.225)
+    fan_airflow_ratio_lb: tuple[FlowRatio, FlowRatio] = (0.01, 0.225)
     """Server airflow over full airflow at the coldest inlet of ``inlet_range_c``: at no load, and
     at full load."""
-    fan_airflow_ratio_ub: Pair = (0.225, 1.0)
+    fan_airflow_ratio_ub: tuple[FlowRatio, FlowRatio] = (0.225, 1.0)
     """Server airflow over full airflow at the warmest inlet of ``inlet_range_c``: at no load, and
     at full load."""
     fan_model: Literal["linear", "released"] = "linear"
     """Airflow ratio against inlet temperature and load: as the ratios above give it, or scaled as
     in the released SustainDC."""
-    fan_airflow_ratio_limits: Pair | None = None
+    fan_airflow_ratio_limits: tuple[FlowRatio, FlowRatio] | None = None
     """Lowest and highest airflow ratio; None bounds the ratio at 0 alone, since fans never blow
     backwards."""
-    fan_power_exponent: Annotated[Finite, Field(ge=1, le=3)] = 3.0
+    fan_power_exponent: Annotated[float, Field(ge=1, le=3)] = 3.0
     """Exponent of fan power over the airflow ratio, 1..3."""
-    fan_full_airflow_m3s: Positive | None = 0.051
-    """Airflow through one server at airflow ratio 1, in m3/s; None takes the airflow on which the
-    supply and return approach temperatures close at the design point."""
-    fan_reference_ratio: Positive = 1.0
-    """Airflow ratio at which the fans of a server draw ``fan_reference_w``."""
-    fan_reference_w: NonNegative = 10.0
+    fan_full_airflow_m3s: Annotated[float, Field(ge=1e-4, le=100)] | None = 0.051
+    """Airflow through one server at airflow ratio 1, in m3/s, 1e-4..100: from the fan of a laptop
+    to ten racks in one; None takes the airflow on which the supply and return approach temperatures
+    close at the design point."""
+    fan_reference_ratio: Annotated[float, Field(ge=0.01, le=10)] = 1.0
+    """Airflow ratio at which the fans of a server draw ``fan_reference_w``, 0.01..10."""
+    fan_reference_w: IdleW = 10.0
     """Fan power of one server at the reference airflow ratio, in W."""
     outlet_model: Literal["server", "rack", "released"] = "server"
     """Outlet temperature from a heat balance per server, from one per rack, or from the fit of the
     released SustainDC."""
-    heat_capacity_kj_per_k: Positive = 9.75
-    """Heat capacity of one server, in kJ/K."""
-    heat_exchange_effectiveness: PositiveShare = 0.95
+    heat_capacity_kj_per_k: Annotated[float, Field(ge=0.01, le=1e4)] = 9.75
+    """Heat capacity of one server, in kJ/K, 0.01..10,000: from 10 g to 10 t of metal."""
+    heat_exchange_effectiveness: WorkingShare = 0.95
     """Effectiveness of the heat exchange between the mass of a server and the air that passes it,
-    0..1."""
+    0.01..1."""
 
     @property
-    def power_pairs(self) -> tuple[Pair, ...]:
+    def power_pairs(self) -> tuple[PowerPair, ...]:
         """(full, idle) CPU power of one server, in W: one pair for all racks, or one per rack."""
         return self.power_w or ((150.0, 10.0),)
 
@@ -293,7 +308,7 @@ class ServerConfig(Section):
 
     @field_validator("inlet_range_c", "fan_airflow_ratio_limits")
     @classmethod
-    def _ordered(cls, value: Pair | None) -> Pair | None:
+    def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
         return check_ordered(value)
 
     @model_validator(mode="after")
@@ -301,9 +316,9 @@ class ServerConfig(Section):
         if self.power_w is not None and self.groups is not None:
             raise ValueError("power_w and groups are both given; valid is one, null for the other")
         for rack, (full_w, idle_w) in enumerate(self.power_pairs):
-            if not full_w > 0 or not 0 <= idle_w <= full_w:
+            if idle_w > full_w:
                 raise ValueError(
                     f"power_w entry {rack} is ({full_w:g}, {idle_w:g}); "
-                    "valid is (full, idle) with full > 0 and 0 <= idle <= full"
+                    "valid is (full, idle) with idle <= full"
                 )
         return self

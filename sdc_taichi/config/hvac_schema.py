@@ -7,13 +7,17 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from sdc_taichi.config.fields import (
-    Finite,
-    NonNegative,
-    Positive,
-    PositiveShare,
+    AirC,
+    DeviceW,
+    ExchangerK,
+    FlowM3sPerW,
+    LengthM,
+    OutdoorC,
+    RiseK,
     Section,
     Share,
-    Whole,
+    WaterRangeK,
+    WorkingShare,
 )
 from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C
 
@@ -26,14 +30,15 @@ class SetpointConfig(Section):
     model: Literal["symmetric", "accelerating"] = "symmetric"
     """How a command moves the setpoint: by one step, or by a step that grows with equal commands
     in a row, as in the released SustainDC."""
-    min_c: Finite = 16.0
+    min_c: AirC = 16.0
     """Lowest setpoint, in C."""
-    max_c: Finite = 23.0
+    max_c: AirC = 23.0
     """Highest setpoint, in C."""
-    initial_c: Finite = 18.0
+    initial_c: AirC = 18.0
     """Setpoint after a reset, in C."""
-    step_k: Positive = 1.0
-    """Change of the setpoint by one action, in K."""
+    step_k: Annotated[float, Field(ge=0.001, le=50)] = 1.0
+    """Change of the setpoint by one action, in K, 0.001..50: from less than any sensor tells to
+    more than any range of setpoints."""
 
     @model_validator(mode="after")
     def _inside(self) -> Self:
@@ -48,29 +53,32 @@ class SetpointConfig(Section):
 class CracConfig(Section):
     """CRAC units: airflow per IT watt at design, fan power, who supplies whom."""
 
-    units: Annotated[Whole, Field(ge=1, le=64)] = 1
+    units: Annotated[int, Field(ge=1, le=64)] = 1
     """Number of CRAC units, along both end walls in turn and evenly spread over the rows."""
     unit_shares: tuple[tuple[Share, ...], ...] | None = None
     """Share of each unit in the supply air of each rack, 0..1: one row of shares per rack, each row
     summing to 1; None is by distance."""
-    supply_length_m: Positive = 6.0
+    supply_length_m: LengthM = 6.0
     """Length over which a unit loses weight in the supply of a rack by a factor of e, in m."""
-    supply_m3s_per_w: Positive = 5.663e-5
+    supply_m3s_per_w: FlowM3sPerW = 5.663e-5
     """Design airflow of all units per IT power at the design point, in m3/s per W."""
-    reference_m3s_per_w: Positive = 9.438e-5
+    reference_m3s_per_w: FlowM3sPerW = 9.438e-5
     """Airflow per IT power at which a fan draws ``released_fan_w``, in m3/s per W."""
     flow_model: Literal["constant", "follow_servers", "per_watt", "controlled"] = "follow_servers"
     """Control of the units' airflow: constant, by the airflow of the servers, by IT power, or by
     the actions of an agent."""
-    min_flow_ratio: PositiveShare = 0.6
+    min_flow_ratio: WorkingShare = 0.6
     """Lowest airflow of a running unit over its design airflow, 0..1."""
-    fan_step: PositiveShare = 0.05
-    """Change of fan speed over design speed by one action, for flow model ``controlled``, 0..1."""
-    coasting_flow_ratio: PositiveShare = 0.1
-    """Airflow through a unit that is down over its design airflow, 0..1."""
-    fan_w_per_m3s: NonNegative = 1000.0
-    """Design fan power per design airflow (specific fan power), in W per m3/s."""
-    released_fan_w: NonNegative = 150.0
+    fan_step: Annotated[float, Field(ge=0.001, le=1)] = 0.05
+    """Change of fan speed over design speed by one action, for flow model ``controlled``, 0.001..1:
+    from less than any drive tells to the whole range."""
+    coasting_flow_ratio: WorkingShare = 0.1
+    """Airflow through a unit that is down over its design airflow, 0.01..1: as much leaks through
+    closed dampers."""
+    fan_w_per_m3s: Annotated[float, Field(ge=0, le=20_000)] = 1000.0
+    """Design fan power per design airflow (specific fan power), in W per m3/s, 0..20,000: four
+    times the worst class of EN 16798-3."""
+    released_fan_w: DeviceW = 150.0
     """CRAC_FAN_REF_P of the SustainDC format: power of one unscaled fan, in W."""
 
 
@@ -87,14 +95,16 @@ class ChillerConfig(Section):
         "paper",
     ] = "carnot"
     """How power and capacity of the chiller follow from load and temperatures."""
-    reference_cop: Positive = 5.96
-    """COP at the reference point, in W of heat per W of power."""
-    coil_approach_k: Positive = 8.0
+    reference_cop: Annotated[float, Field(ge=0.5, le=50)] = 5.96
+    """COP at the reference point, in W of heat per W of power, 0.5..50: from an absorption chiller
+    to Carnot's limit at a lift of 6 K."""
+    coil_approach_k: ExchangerK = 8.0
     """Supply air setpoint above the chilled water that the coils take, in K."""
-    chilled_water_range_k: Positive = 6.0
+    chilled_water_range_k: WaterRangeK = 6.0
     """Chilled water that returns above chilled water that is supplied, in K."""
-    min_condenser_c: Finite = 12.78
-    """Lowest temperature of the condenser water that enters the chiller, in C."""
+    min_condenser_c: Annotated[float, Field(ge=0, le=60)] = 12.78
+    """Lowest temperature of the condenser water that enters the chiller, in C, 0..60: water that is
+    liquid, and below the condensing temperatures of refrigerants."""
 
 
 class TowerConfig(Section):
@@ -102,21 +112,22 @@ class TowerConfig(Section):
 
     model: Literal["yorkcalc", "released", "paper"] = "yorkcalc"
     """How fan power and water temperature of the tower follow from the heat to reject."""
-    approach_min_k: Positive = 4.0
+    approach_min_k: ExchangerK = 4.0
     """Least approach: coldest water that the tower gives, above wet bulb, in K."""
-    water_range_k: Positive = 5.56
+    water_range_k: WaterRangeK = 5.56
     """Water that enters the tower above water that leaves it, at the design point, in K."""
-    fan_w_per_w_rejected: NonNegative = 0.02
-    """Design fan power per heat rejected at the design point, in W per W."""
-    paper_fan_w: NonNegative = 1000.0
+    fan_w_per_w_rejected: Annotated[float, Field(ge=0, le=1)] = 0.02
+    """Design fan power per heat rejected at the design point, in W per W, 0..1: at 1 the fan alone
+    would warm the air as much as the heat does."""
+    paper_fan_w: DeviceW = 1000.0
     """CT_FAN_REF_P of the SustainDC format: fan power of the paper's tower at its reference
     airflow, in W."""
-    paper_airflow_m3s: Positive = 2.8315
+    paper_airflow_m3s: Annotated[float, Field(ge=0.01, le=1e6)] = 2.8315
     """CT_REFRENCE_AIR_FLOW_RATE of the SustainDC format: reference airflow of the paper's tower, in
-    m3/s."""
+    m3/s, 0.01..1e6: from a fan of 10 cm to the largest towers of power stations and beyond."""
     economiser: bool = True
     """Whether a waterside economiser cools the return water before the chiller."""
-    economiser_approach_k: NonNegative = 5.0
+    economiser_approach_k: RiseK = 5.0
     """Approach of tower and heat exchanger together: coldest water that the exchanger gives, above
     wet bulb, in K."""
 
@@ -136,15 +147,16 @@ class PumpConfig(Section):
     model: Literal["sized", "released"] = "sized"
     """Whether pumps are sized for their flow, or draw the unscaled power of the released
     SustainDC."""
-    pressure_drop_pa: Positive = 300_000.0
-    """Pressure drop of each water loop at design flow, in Pa."""
-    efficiency: PositiveShare = 0.75
-    """Hydraulic power over electric power of a pump, 0..1."""
-    min_flow_ratio: PositiveShare = 0.6
+    pressure_drop_pa: Annotated[float, Field(ge=100, le=1e7)] = 300_000.0
+    """Pressure drop of each water loop at design flow, in Pa, 100..1e7: from 1 cm of water to ten
+    times what flanges of class PN 10 hold."""
+    efficiency: WorkingShare = 0.75
+    """Hydraulic power over electric power of a pump, 0.01..1."""
+    min_flow_ratio: WorkingShare = 0.6
     """Lowest flow of a running pump over its design flow, 0..1."""
-    released_chilled_w: NonNegative = 0.0
+    released_chilled_w: DeviceW = 0.0
     """Power of the chilled-water pump of pump model ``released``, in W."""
-    released_condenser_w: NonNegative = 0.0
+    released_condenser_w: DeviceW = 0.0
     """Power of the condenser-water pump of pump model ``released``, in W."""
 
 
@@ -153,10 +165,12 @@ class WaterConfig(Section):
 
     model: Literal["mass_balance", "released", "paper"] = "mass_balance"
     """How evaporation, drift and blowdown of the tower are computed."""
-    cycles_of_concentration: Annotated[Finite, Field(gt=1)] = 5.0
-    """Concentration of solids in the tower water over that in the make-up water."""
-    drift_share: Share = 2e-5
-    """Drift over the water flow of the tower, 0..1."""
+    cycles_of_concentration: Annotated[float, Field(ge=1.01, le=1000)] = 5.0
+    """Concentration of solids in the tower water over that in the make-up water, 1.01..1,000:
+    blowdown is 100 evaporations at the lower end, and of rain water a thousandth at the upper."""
+    drift_share: Annotated[float, Field(ge=0, le=0.01)] = 2e-5
+    """Drift over the water flow of the tower, 0..0.01; towers without drift eliminators lose up to
+    0.003."""
 
 
 class SizingConfig(Section):
@@ -165,13 +179,23 @@ class SizingConfig(Section):
     model: Literal["design_day", "released"] = "design_day"
     """Rules of sizing: full load on the design day of the site, or the rules of the released
     SustainDC."""
-    margin: Annotated[Finite, Field(ge=1)] = 1.15
-    """Sized cooling power over the cooling load at the design point."""
-    design_wet_bulb_c: Finite | None = None
+    margin: Annotated[float, Field(ge=1, le=10)] = 1.15
+    """Sized cooling power over the cooling load at the design point, 1..10; redundancy of 2N is
+    2."""
+    design_wet_bulb_c: OutdoorC | None = None
     """Design wet bulb of the site, in C; None takes the 99.6 % quantile of its weather."""
-    design_outdoor_c: Finite | None = None
+    design_outdoor_c: OutdoorC | None = None
     """Design dry bulb of the site, in C; None takes the 99.6 % quantile of its weather, or with
     sizing model ``released`` 30 in NY, 20 in WA and else 50."""
+
+    @model_validator(mode="after")
+    def _wet_bulb_below_dry_bulb(self) -> Self:
+        dry, wet = self.design_outdoor_c, self.design_wet_bulb_c
+        if dry is not None and wet is not None and wet > dry:
+            raise ValueError(
+                f"design_wet_bulb_c {wet:g} must not be above design_outdoor_c {dry:g}"
+            )
+        return self
 
 
 class HvacConfig(Section):
@@ -202,9 +226,9 @@ class HvacConfig(Section):
         "crac_fan",
     )
     """Devices whose power counts in the HVAC total."""
-    ups_efficiency: PositiveShare = 0.96
-    """Efficiency of the UPS, 0..1, for the PUE with UPS losses alone; the grid balance is IT + HVAC
-    + battery."""
+    ups_efficiency: WorkingShare = 0.96
+    """Efficiency of the UPS, 0.01..1, for the PUE with UPS losses alone; the grid balance is IT +
+    HVAC + battery."""
 
     @field_validator("total_of")
     @classmethod

@@ -14,15 +14,13 @@ from pydantic import Field, field_validator, model_validator
 
 from sdc_taichi.config.event_schema import EventsConfig, ProtectionConfig
 from sdc_taichi.config.fields import (
+    CRate,
     FileName,
-    Finite,
+    Hours,
     Index,
-    NonNegative,
-    Positive,
-    PositiveShare,
     Section,
     Share,
-    Whole,
+    WorkingShare,
     check_one_per_rack,
 )
 from sdc_taichi.config.hall_schema import HallConfig, ServerConfig, ServerGroup
@@ -36,28 +34,31 @@ class BatteryConfig(Section):
 
     model: Literal["clc", "released", "paper"] = "clc"
     """How energy stored, drawn and delivered follow from a command."""
-    capacity_kwh: NonNegative | None = None
-    """Capacity, in kWh; None sizes it to ``hours_of_design_load``."""
-    hours_of_design_load: NonNegative = 1.0
-    """Facility power at the design point that the sized capacity lasts for, in h."""
+    capacity_kwh: Annotated[float, Field(ge=0, le=1e8)] | None = None
+    """Capacity, in kWh, up to 1e8, five times the largest plant under construction (19 GWh, Abu
+    Dhabi 2025); None sizes it to ``hours_of_design_load``."""
+    hours_of_design_load: Annotated[float, Field(ge=0, le=1000)] = 1.0
+    """Facility power at the design point that the sized capacity lasts for, in h, 0..1,000;
+    batteries made to last longest, of iron and air, last for 100 h."""
     initial_soc: Share = 0.0
     """State of charge after a reset, 0..1."""
-    charge_efficiency: PositiveShare = 0.97
-    """Energy stored per energy drawn from the bus, 0..1."""
-    discharge_factor: Annotated[Finite, Field(ge=1)] = 1.04
-    """Energy drawn from the store per energy delivered, at least 1."""
-    charge_limit_c_rate: Positive = 3.0
+    charge_efficiency: WorkingShare = 0.97
+    """Energy stored per energy drawn from the bus, 0.01..1."""
+    discharge_factor: Annotated[float, Field(ge=1, le=100)] = 1.04
+    """Energy drawn from the store per energy delivered, 1..100, which is no loss to an efficiency
+    of a hundredth."""
+    charge_limit_c_rate: CRate = 3.0
     """Largest rate into the store, in capacities per hour (1/h)."""
-    discharge_limit_c_rate: Positive = 3.0
+    discharge_limit_c_rate: CRate = 3.0
     """Largest rate out of the store, in capacities per hour (1/h)."""
-    upper_u_h: Annotated[Finite, Field(le=0)] = -0.04
+    upper_u_h: Annotated[float, Field(ge=-100, le=0)] = -0.04
     """Slope u of the upper limit of the stored energy, u P + v capacity, against the charge power
-    P, in h."""
+    P, in h, -100..0; it is the time for which what is left out would last."""
     upper_v: Share = 1.0
     """Share v of the capacity in the upper limit of the stored energy, 0..1."""
-    lower_u_h: NonNegative = 0.01
+    lower_u_h: Annotated[float, Field(ge=0, le=100)] = 0.01
     """Slope u of the lower limit of the stored energy, u P + v capacity, against the discharge
-    power P, in h."""
+    power P, in h, 0..100; it is the time for which what is left would last."""
     lower_v: Share = 0.0
     """Share v of the capacity in the lower limit of the stored energy, 0..1."""
 
@@ -79,13 +80,13 @@ class WorkloadConfig(Section):
     """Policy by which the work of a step is spread over the racks."""
     flexible_share: Share = 0.2
     """Share of the work that may wait, 0..1."""
-    max_utilisation: PositiveShare = 1.0
-    """Highest utilisation of the data center, 0..1."""
-    queue_limit_h: Positive | None = 2.5
+    max_utilisation: WorkingShare = 1.0
+    """Highest utilisation of the data center, 0.01..1."""
+    queue_limit_h: Hours | None = 2.5
     """Queue capacity in hours of the whole data center at full utilisation; None is unlimited."""
-    deadline_h: Positive | None = 24.0
+    deadline_h: Hours | None = 24.0
     """Time after which work that waits is due, in h; None is no deadline."""
-    age_horizon_h: Annotated[Positive, Field(le=8760)] = 24.0
+    age_horizon_h: Hours = 24.0
     """Age up to which the age of waiting work is exact, in h; older work counts as one step older
     than this."""
 
@@ -130,9 +131,9 @@ class SimulationConfig(Section):
 
     thermal: Literal["quasi_steady", "transient"] = "quasi_steady"
     """Whether temperatures belong to the present load, or remember earlier steps."""
-    substep_s: Annotated[Finite, Field(ge=5, le=120)] = 60.0
+    substep_s: Annotated[float, Field(ge=5, le=120)] = 60.0
     """Longest substep of transient temperatures, in s."""
-    steps_per_hour: Annotated[Whole, Field(ge=1, le=60)] = 4
+    steps_per_hour: Annotated[int, Field(ge=1, le=60)] = 4
     """Number of steps in an hour."""
 
     @field_validator("steps_per_hour")

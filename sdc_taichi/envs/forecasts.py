@@ -12,9 +12,10 @@ from __future__ import annotations
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
@@ -27,6 +28,12 @@ WEATHER_LEADS_H = (3.0, 6.0, 12.0, 24.0)
 """Leads of the weather forecasts unless told otherwise, in h."""
 LONGEST_LEAD_H = float(HOURS_PER_YEAR)
 """Longest valid lead, in h."""
+MOST_CI_SHARE = 10.0
+"""Largest error of carbon intensity, ten times its value: no forecast is that poor."""
+MOST_TEMPERATURE_K = 40.0
+"""Largest error of temperatures, in K: the largest departure from the climate on record is 39 K."""
+LeadH = Annotated[float, Field(gt=0, le=LONGEST_LEAD_H, allow_inf_nan=False)]
+"""Lead of a forecast, above 0 and at most a year of 8,760 h."""
 _DRAWN_STEPS = 128
 """Steps of the random walks that are drawn at once."""
 _ALL = slice(None)
@@ -37,26 +44,24 @@ class ForecastError:
     """How forecasts err: standard deviations at a lead of 24 h. Zero is perfect foresight.
 
     Raises:
-        ConfigError: a value that is negative or not finite.
+        ConfigError: a value that is no number or out of bounds.
     """
 
-    ci_share: float = 0.0
-    """Standard deviation of the carbon intensity at 24 h, as a share of its true value; forecasts
-    are cut at zero."""
-    temperature_k: float = 0.0
-    """Standard deviation of dry bulb and wet bulb at 24 h, in K. Both err alike, so that the wet
-    bulb stays below the dry bulb."""
+    ci_share: Annotated[float, Field(ge=0, le=MOST_CI_SHARE)] = 0.0
+    """Standard deviation of the carbon intensity at 24 h, as a share of its true value, 0..10;
+    forecasts are cut at zero."""
+    temperature_k: Annotated[float, Field(ge=0, le=MOST_TEMPERATURE_K)] = 0.0
+    """Standard deviation of dry bulb and wet bulb at 24 h, in K, 0..40. Both err alike, so that the
+    wet bulb stays below the dry bulb."""
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name in ("ci_share", "temperature_k"):
+        for name, most in (("ci_share", MOST_CI_SHARE), ("temperature_k", MOST_TEMPERATURE_K)):
             value: Any = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | float | np.number):
                 raise ConfigError(f"forecast error {name}: {value!r} is no number")
-            if not 0.0 <= value < np.inf:
-                raise ConfigError(
-                    f"forecast error {name}: {value:g}; valid is a finite number from 0 on"
-                )
+            if not 0.0 <= value <= most:
+                raise ConfigError(f"forecast error {name}: {value:g}; valid is 0..{most:g}")
 
 
 PERFECT = ForecastError()

@@ -18,7 +18,13 @@ from pydantic import (
 
 from sdc_taichi.config import explain
 from sdc_taichi.envs.agents import AGENTS, Agent
-from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, ForecastError
+from sdc_taichi.envs.forecasts import (
+    CI_LEADS_H,
+    PERFECT,
+    WEATHER_LEADS_H,
+    ForecastError,
+    LeadH,
+)
 from sdc_taichi.envs.rewards import REWARD_SETS
 from sdc_taichi.envs.tariff import Tariff
 from sdc_taichi.errors import ConfigError
@@ -30,9 +36,9 @@ def _plain_int(value: Any) -> Any:
     return int(value) if isinstance(value, np.integer) else value
 
 
-Whole = Annotated[int, Field(strict=True), BeforeValidator(_plain_int)]
-"""A whole number of Python or NumPy, no float and no bool."""
-Month = Annotated[Whole, Field(ge=1, le=12)]
+PLAIN_INT = BeforeValidator(_plain_int)
+"""Takes whole numbers of NumPy too, where ``Field(strict=True)`` takes no float and no bool."""
+Month = Annotated[int, Field(strict=True, ge=1, le=12), PLAIN_INT]
 """A month, 1..12."""
 
 
@@ -53,7 +59,7 @@ class EnvOptions(BaseModel):
     discharge, hold as in the released code; None is that of the preset."""
     setpoint_change_k: Annotated[float, Field(gt=0, le=20)] = 2.0
     """Change of the setpoint in one step by a continuous action of 1, the largest, in K."""
-    days: Annotated[Whole, Field(ge=1, le=365)] = 7
+    days: Annotated[int, Field(strict=True, ge=1, le=365), PLAIN_INT] = 7
     """Length of an episode, in days."""
     start: Literal["sampled", "fixed"] = "sampled"
     """Whether episodes start at midnight of a day drawn from ``months``, or on ``site.start``."""
@@ -63,9 +69,9 @@ class EnvOptions(BaseModel):
     """Whether agents observe named features or the vectors of the released code."""
     features: Mapping[str, tuple[str, ...]] | None = None
     """Names of the features that agents observe, by agent; agents left out have the default."""
-    ci_leads_h: tuple[float, ...] = CI_LEADS_H
+    ci_leads_h: tuple[LeadH, ...] = CI_LEADS_H
     """Leads of the carbon-intensity forecast, in h."""
-    weather_leads_h: tuple[float, ...] = WEATHER_LEADS_H
+    weather_leads_h: tuple[LeadH, ...] = WEATHER_LEADS_H
     """Leads of the weather forecasts, in h."""
     forecast_error: ForecastError = PERFECT
     """How forecasts err."""

@@ -40,6 +40,8 @@ DEFAULT_SCALES: dict[str, dict[str, float]] = {
 """Scales of the terms of each agent by default: r_LS, r_DC and r_BAT of the paper (4.5, F.2), with
 carbon and energies over those of the design point."""
 
+MOST_SCALE = 1e9
+"""Largest scale of a term, of either sign, which leaves room for prices in any currency."""
 BILLED_SHARE = 0.5
 """Share of the design power that is billed whatever the episode draws."""
 BILL_DAYS = 30.0
@@ -309,8 +311,11 @@ def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[
                     f"rewards of {agent}: unknown term {name!r}{suggestion_or_valid(name, TERMS)}"
                 )
             number = isinstance(scale, int | float | np.number) and not isinstance(scale, bool)
-            if not number or not np.isfinite(scale):
-                raise ConfigError(f"rewards of {agent}: {name} is {scale!r}; valid is a number")
+            if not number or not abs(scale) <= MOST_SCALE:
+                raise ConfigError(
+                    f"rewards of {agent}: {name} is {scale!r}; valid is a number within "
+                    f"-{MOST_SCALE:g}..{MOST_SCALE:g}"
+                )
     return {agent: dict(given.get(agent, DEFAULT_SCALES[agent])) for agent in AGENTS}
 
 

@@ -6,8 +6,8 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-Price = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-"""A finite price that is not negative."""
+Price = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+"""A price, 0..1e9, which leaves room for currencies of many zeros."""
 
 
 class Tariff(BaseModel):

@@ -17,6 +17,10 @@ from sdc_taichi.exogenous.year_clock import MINUTES_PER_DAY
 
 FloatArray = NDArray[np.float64]
 
+OUTDOOR_LIMITS_C = (-90.0, 60.0)
+"""Limits of temperatures outdoors, in C: the extremes on record (WMO) are -89.2 C (Vostok 1983) and
+56.7 C (Furnace Creek 1913). Any summer in degrees Fahrenheit lies above them."""
+
 
 @dataclass(frozen=True, eq=False)
 class Series:
