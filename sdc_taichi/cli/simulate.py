@@ -132,6 +132,7 @@ def simulate_command(
     from sdc_taichi.control import make_controller
     from sdc_taichi.run.description import RunRequest
     from sdc_taichi.run.folder_writer import metrics_json, prepare_folder, simulate_to_folder
+    from sdc_taichi.sim.events import require_events_start_before
     from sdc_taichi.sim.fleet import build_fleet
     from sdc_taichi.sim.simulator import Simulator
 
@@ -141,6 +142,7 @@ def simulate_command(
     configs = _with_files(configs, sites, weather, carbon, workload)
     fleet = build_fleet(configs)
     request = RunRequest(controller, _whole_steps(days, fleet.steps_per_hour), seed)
+    require_events_start_before(24.0 * days, fleet.configs)
     driver = make_controller(controller, fleet)
     recorder = make_recorder(record, focus, every, serve, serve_port)
     folder = out if out is not None else _default_folder(label, configs)

@@ -28,6 +28,10 @@ from sdc_taichi.config.hvac_schema import HvacConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import day_of_year
 
+MOST_RACK_W = 200e3
+"""Highest nameplate of the servers of a rack that air cools, in W: its air, 8 m3/s at a rise of 20
+K, would blow through its door of 1.3 m2 at 6 m/s. The densest on the market take about 100 kW."""
+
 
 class BatteryConfig(Section):
     """Battery: model, capacity and limits (C/L/C of Kazhamiaka, Rosenberg and Keshav 2019)."""
@@ -252,6 +256,13 @@ class DataCenterConfig(Section):
             for index, rack in enumerate(groups):
                 _check_load_weights(index, rack)
         self._check_airflow()
+        rack_w = self.rack_nameplate_w()
+        most = int(np.argmax(rack_w))
+        if rack_w[most] > MOST_RACK_W:
+            raise ValueError(
+                f"hall: rack {most} has servers of {rack_w[most] / 1e3:.4g} kW; valid is at most "
+                f"{MOST_RACK_W / 1e3:g} kW in air (power_w is in W; fewer servers or more racks)"
+            )
         return self
 
     def _check_airflow(self) -> None:
@@ -269,6 +280,18 @@ class DataCenterConfig(Section):
                 f"coldest inlet of rack {worst}, and no load; it must be positive (raise "
                 "fan_airflow_ratio_lb or set fan_airflow_ratio_limits)"
             )
+
+    def rack_nameplate_w(self) -> np.ndarray:
+        """Power at full load of the servers of every rack, without their fans, in W, (R,)."""
+        if self.servers.groups is None:
+            full_w = np.array([full for full, _ in self.servers.power_pairs])
+            rack_w = full_w * np.asarray(self.hall.servers_per_rack, dtype=np.float64)
+        else:
+            rack_w = np.array([sum(g.count * g.full_w for g in r) for r in self.servers.groups])
+        rack_w = np.broadcast_to(rack_w, (self.hall.racks,))
+        if self.hall.capacity_mw is None:
+            return rack_w
+        return np.asarray(rack_w * (self.hall.capacity_mw * 1e6 / rack_w.sum()))
 
     def rack_groups(self) -> tuple[tuple[ServerGroup, ...], ...]:
         """Server groups of every rack, with ``hall.capacity_mw`` applied to the counts.

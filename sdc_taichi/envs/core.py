@@ -30,6 +30,7 @@ from sdc_taichi.envs.rewards import Rewards
 from sdc_taichi.envs.saved_state import check_state
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
 from sdc_taichi.exogenous.year_clock import day_of_year
+from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
@@ -118,6 +119,7 @@ class Core:
         self.num_envs = size
         self.sim = Simulator([configs[i % len(configs)] for i in range(size)], precision=precision)
         fleet = self.sim.fleet
+        require_events_start_before(24.0 * options.days, fleet.configs, "the episode")
         self._others = make_controller(options.others, fleet)
         _check_others(options)
         self._others_act = set(self.agents) != set(AGENTS) and not isinstance(self._others, Idle)

@@ -20,6 +20,11 @@ FloatArray = NDArray[np.float64]
 OUTDOOR_LIMITS_C = (-90.0, 60.0)
 """Limits of temperatures outdoors, in C: the extremes on record (WMO) are -89.2 C (Vostok 1983) and
 56.7 C (Furnace Creek 1913). Any summer in degrees Fahrenheit lies above them."""
+MEAN_LIMITS_C = (-65.0, 40.0)
+"""Limits of the mean temperature of a year, in C: about -58 C on the Antarctic plateau, 34.6 C at
+Dallol (Ethiopia) are the extremes."""
+MOST_SPREAD_K = 115.0
+"""Largest difference of temperatures in a year, in K: 105 K at Verkhoyansk is the extreme."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +94,27 @@ class Weather:
     """Relative humidity, in %; None if it is not known."""
     pressure_pa: Series | None = None
     """Air pressure at the station, in Pa; None if it is not known."""
+
+    def __post_init__(self) -> None:
+        """Check that the year is one of a place on Earth.
+
+        Raises:
+            DataError: a mean or a spread of temperatures that no place has.
+        """
+        outdoor = self.outdoor_c
+        mean, spread = float(outdoor.values.mean()), float(np.ptp(outdoor.values))
+        low, high = MEAN_LIMITS_C
+        fahrenheit = "(degrees Fahrenheit taken for C?)"
+        if not low <= mean <= high:
+            raise DataError(
+                f"{outdoor.source}: mean dry bulb {mean:.1f} C, expected {low:g} to {high:g} C "
+                f"{fahrenheit}"
+            )
+        if spread > MOST_SPREAD_K:
+            raise DataError(
+                f"{outdoor.source}: dry bulbs differ by {spread:.1f} K, expected at most "
+                f"{MOST_SPREAD_K:g} K {fahrenheit}"
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.psychrometrics import wet_bulb_c
-from sdc_taichi.exogenous.series import FloatArray, Series, Weather
+from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C, FloatArray, Series, Weather
 from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH, HOURS_PER_YEAR
 from sdc_taichi.number_text import parse_number, parse_whole
 from sdc_taichi.user_file import MOST_TABLE_BYTES, read_bytes
@@ -24,8 +24,6 @@ HEADER_LINES = 8
 """Lines before the first row of data."""
 DATA_COLUMNS = 35
 """Columns of a row of data."""
-OUTDOOR_LIMITS_C = (-70.0, 70.0)
-"""Limits of dry bulb and dew point in EPW files, in C."""
 PRESSURE_LIMITS_PA = (31_000.0, 120_000.0)
 """Limits of station pressure in EPW files, in Pa."""
 
@@ -41,10 +39,13 @@ class _Column(NamedTuple):
     """Least and greatest valid value."""
     missing: float
     """Number that stands for a missing value."""
+    hint: str = ""
+    """What a value beyond the limits may be, for messages."""
 
 
-_DRY_BULB = _Column("dry bulb (column 7)", 6, OUTDOOR_LIMITS_C, 99.9)
-_DEW_POINT = _Column("dew point (column 8)", 7, OUTDOOR_LIMITS_C, 99.9)
+_FAHRENHEIT = " C (degrees Fahrenheit taken for C?)"
+_DRY_BULB = _Column("dry bulb (column 7)", 6, OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT)
+_DEW_POINT = _Column("dew point (column 8)", 7, OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT)
 _HUMIDITY = _Column("relative humidity (column 9)", 8, (0.0, 110.0), 999.0)
 _PRESSURE = _Column("station pressure (column 10)", 9, PRESSURE_LIMITS_PA, 999_999.0)
 _USED = (_DRY_BULB, _HUMIDITY, _PRESSURE)
@@ -256,7 +257,7 @@ def _columns(path: Path, frame: pd.DataFrame) -> tuple[FloatArray, list[str]]:
     for column in (_DRY_BULB, _DEW_POINT, _HUMIDITY, _PRESSURE):
         text = frame[column.position].str.strip()
         text = text.mask(_is_code(text, column.missing), "nan")
-        x = files.numbers(path, text, column.name, rows, *column.limits)
+        x = files.numbers(path, text, column.name, rows, *column.limits, column.hint)
         values[column] = x
         missing = int(np.isnan(x).sum())
         if missing and column in _USED:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from sdc_taichi.control import Controller, view_maker
 from sdc_taichi.run.metrics import Totals, add_step, empty_totals
+from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import StepResult
 
@@ -33,8 +34,11 @@ def simulate(
         Totals of the steps that were simulated, from which ``run.metrics`` makes metrics.
 
     Raises:
+        ConfigError: an event that starts after the end of the run.
+        PhysicalLimitError: a result that no data center can reach.
         SdcError: the controller gave actions that are not valid.
     """
+    require_events_start_before(steps * sim.step_h, sim.fleet.configs)
     sim.reset(seed)
     controller.reset(seed)
     view_of = view_maker(sim)

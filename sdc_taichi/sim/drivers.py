@@ -15,8 +15,9 @@ import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import DataError
+from sdc_taichi.exogenous.carbon import MAX_CI_G_PER_KWH
 from sdc_taichi.exogenous.registry import load_site, load_trace, site_from_files
-from sdc_taichi.exogenous.series import Series, SiteData, resample
+from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C, Series, SiteData, resample
 from sdc_taichi.exogenous.workload import read_workload
 from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.types import F64, I64, Exogenous
@@ -197,9 +198,9 @@ def drivers_from_arrays(
     """Inputs given as arrays at the simulation's time step; the first value is that of step 0.
 
     Args:
-        outdoor_c: dry bulb, in C, (T,) for all data centers or (B, T).
+        outdoor_c: dry bulb, -90..60 C, (T,) for all data centers or (B, T).
         wet_bulb_c: wet bulb, not above the dry bulb, in C, (T,) or (B, T).
-        ci_g_per_kwh: carbon intensity, not negative, in g CO2e/kWh, (T,) or (B, T).
+        ci_g_per_kwh: carbon intensity, 0..2,000 g CO2e/kWh, (T,) or (B, T).
         demand: arriving work as a share of the capacity, 0..1, (T,) or (B, T).
         size: number of data centers for arrays of shape (T,).
         source: text for the provenance.
@@ -227,9 +228,9 @@ def drivers_from_arrays(
             raise DataError(f"{source}: {name} has values that are not finite")
         rows[name] = np.broadcast_to(value, shape)
     limits: dict[str, tuple[float, float | F64]] = {
-        "outdoor_c": (-90.0, 70.0),
-        "wet_bulb_c": (-90.0, rows["outdoor_c"] + 1e-9),
-        "ci_g_per_kwh": (0.0, np.inf),
+        "outdoor_c": OUTDOOR_LIMITS_C,
+        "wet_bulb_c": (-100.0, rows["outdoor_c"] + 1e-9),
+        "ci_g_per_kwh": (0.0, MAX_CI_G_PER_KWH),
         "demand": (0.0, 1.0),
     }
     for name, (low, high) in limits.items():

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig, EventKind, SampledEvent, ScheduledEvent
+from sdc_taichi.errors import ConfigError
 from sdc_taichi.types import F64, I64
 
 HOURS_PER_BLOCK = 8760
@@ -303,6 +304,28 @@ def schedule(
         steps_per_hour=steps_per_hour,
         seed=seed,
     )
+
+
+def require_events_start_before(
+    end_h: float, configs: Sequence[DataCenterConfig], what: str = "the run"
+) -> None:
+    """Make sure that every scheduled event starts before a run ends.
+
+    Args:
+        end_h: length of the run, in h.
+        configs: data centers.
+        what: name of the run, for the message.
+
+    Raises:
+        ConfigError: naming data center and event.
+    """
+    for config in configs:
+        for index, event in enumerate(config.events.scheduled):
+            if event.start_h >= end_h:
+                raise ConfigError(
+                    f"{config.name}: events.scheduled.{index}.start_h {event.start_h:g}: {what} "
+                    f"ends after {end_h:g} h; valid is an earlier start or more days"
+                )
 
 
 def _events(

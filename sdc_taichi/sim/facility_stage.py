@@ -9,6 +9,7 @@ from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.facility import Facility, FacilityInputs
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import HallSums
+from sdc_taichi.sim.physical_limits import within_limits
 from sdc_taichi.sim.surroundings import Surroundings
 from sdc_taichi.sim.unit_index import UnitIndex
 from sdc_taichi.types import F64, State
@@ -33,7 +34,9 @@ class FacilityStage:
         self._recirculates = fleet.models["inlet"] == "recirculation"
         self._unit_design_m3s = fleet.unit_design_m3s
         self._step = CompiledStage(
-            lambda **x: facility.step(FacilityInputs(**x)), fleet.size, reads=facility.input_names
+            lambda **x: _checked_step(facility, x),
+            fleet.size,
+            reads=(*facility.input_names, *_only_checked(facility)),
         )
         self._removable = CompiledStage(
             lambda **x: facility.removable_w(FacilityInputs(**x)),
@@ -54,6 +57,8 @@ class FacilityStage:
         air: HallSums,
     ) -> dict[str, Any]:
         """Everything that follows from the air of the halls, by the names of ``StepResult``.
+
+        ``within_limits`` is 1 for data centers whose results are physical, else 0, (B,).
 
         Args:
             state: State at the start of the step, with battery and heat held by the room.
@@ -93,3 +98,15 @@ class FacilityStage:
             sums["idle_flow_m3s"] = units.sum(idle_m3s)
             sums["idle_setpoint_m3k_s"] = units.sum(idle_m3s * supply.unit_setpoint_c)
         return sums
+
+
+def _only_checked(facility: Facility) -> tuple[str, ...]:
+    """Names of quantities of a hall that the facility does not read, but that have limits."""
+    return tuple(x for x in ("inlet_max_c", "outlet_mean_c") if x not in facility.input_names)
+
+
+def _checked_step(facility: Facility, quantities: dict[str, Any]) -> dict[str, Any]:
+    """Results of a facility, and whether they and those of its hall are physical."""
+    inputs = FacilityInputs(**{name: quantities[name] for name in facility.input_names})
+    found = facility.step(inputs)
+    return {**found, "within_limits": within_limits({**quantities, **found})}

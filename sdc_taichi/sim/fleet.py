@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.config.odd_values import warn_of_odd_values
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
@@ -226,8 +227,12 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
 
     Raises:
         ConfigError: no data center, or stage models, time steps or age horizons that differ.
+
+    Warns:
+        OddInputWarning: what is possible, but probably not meant.
     """
     listed = _listed(configs)
+    warn_of_odd_values(listed)
     models = {stage: _shared(listed, path) for stage, path in STAGE_MODELS.items()}
     steps_per_hour = _shared(listed, "simulation.steps_per_hour")
     _shared(listed, "hvac.total_of")

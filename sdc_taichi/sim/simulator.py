@@ -24,6 +24,7 @@ from sdc_taichi.sim.facility import Facility
 from sdc_taichi.sim.facility_stage import FacilityStage
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
+from sdc_taichi.sim.physical_limits import require_within_limits
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.sim.surroundings import Surroundings, SurroundingsModel
 from sdc_taichi.sim.unit_index import UnitIndex
@@ -168,6 +169,7 @@ class Simulator:
             actions: Named commands; None is neutral load, held setpoint and idle battery.
 
         Raises:
+            PhysicalLimitError: A result that no data center can reach; the state is as before.
             RuntimeStateError: Before ``reset``, after ``close``, or in a forked child.
             SdcError: A command that is not finite, out of range or of the wrong shape.
         """
@@ -187,10 +189,12 @@ class Simulator:
         air, thermal = stages.air.solve(state, placement, supply, surroundings)
         plant = stages.facility.step(state, commands, surroundings, supply, air)
         racks = stages.allocation.protect(state, work, placement, air.rack_inlet_max_c)
-        self._state = _next_state(state, work, supply, plant, racks, thermal)
-        return _step_result(
+        result = _step_result(
             state.step, self.step_h, commands, surroundings, work, supply, air, racks, plant
         )
+        require_within_limits(plant["within_limits"], result, self.fleet.configs)
+        self._state = _next_state(state, work, supply, plant, racks, thermal)
+        return result
 
     def active_events(self, step: int) -> list[ActiveEvent]:
         """Events that cover step ``step`` of the present run."""

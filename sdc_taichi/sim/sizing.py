@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sdc_taichi.errors import PhysicalLimitError
 from sdc_taichi.plant import chiller, tower
 from sdc_taichi.plant.fans_pumps import hydraulic_pump_w
 from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, fields_of
 
 WATER_DENSITY_KG_M3 = 1000.0
 """Density of water, in kg/m3."""
@@ -56,16 +57,37 @@ def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64
             first.
         design_wet_bulb_c: Design wet bulb of each site's weather, C, (B,); that of a config goes
             first.
+
+    Raises:
+        PhysicalLimitError: A device whose size is negative, infinite or not a number.
     """
     outdoor_c = fleet.values("hvac.sizing.design_outdoor_c")
     wet_bulb_c = fleet.values("hvac.sizing.design_wet_bulb_c")
     model = MODELS[fleet.models["sizing"]]
-    return model(
+    found = model(
         fleet,
         hall,
         np.where(np.isnan(outdoor_c), design_outdoor_c, outdoor_c),
         np.where(np.isnan(wet_bulb_c), design_wet_bulb_c, wet_bulb_c),
     )
+    _check_sizes(fleet, found)
+    return found
+
+
+def _check_sizes(fleet: Fleet, found: Sizing) -> None:
+    """Make sure that devices can be built: capacities, flows and powers are finite and positive."""
+    sizes = fields_of(found) | fields_of(found.water_side)
+    for name, values in sizes.items():
+        if name == "water_side" or name.endswith("_c"):
+            continue
+        wrong = ~(np.isfinite(values) & (values >= 0))
+        if wrong.any():
+            dc = int(np.argmax(wrong))
+            raise PhysicalLimitError(
+                f"{fleet.names[dc]}: sized {name} is {values[dc]:g}; physical is a finite number "
+                "of at least 0. Power, airflow and setpoints of the configuration do not fit "
+                "together"
+            )
 
 
 def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizing:

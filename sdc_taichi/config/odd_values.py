@@ -1,0 +1,83 @@
+"""What is possible in a configuration, but probably not what was meant."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from sdc_taichi.config.schema import DataCenterConfig
+from sdc_taichi.errors import OddInputWarning
+
+LEAST_USUAL_SERVER_W = 20.0
+"""Servers of less power at full load are rare, while 1..20 is the power of large ones in kW."""
+MOST_USUAL_RACK_W = 60e3
+"""Racks of more power are rarely cooled by air alone: about 3 m3/s pass their doors at 15 K."""
+MOST_USUAL_COP = 15.0
+"""Chillers with magnetic bearings reach about 12 at their reference point."""
+USUAL_SETPOINTS_C = (10.0, 35.0)
+"""Supply air that is colder condenses water on every surface; ASHRAE class A2 ends at 35 C."""
+LEAST_USUAL_PUMP_EFFICIENCY = 0.2
+"""Even small circulators reach a fifth."""
+
+
+def odd_values(config: DataCenterConfig) -> Iterator[str]:
+    """What is odd about a configuration: field, value and what is usual."""
+    yield from _odd_servers(config)
+    chiller, setpoint, pumps = config.hvac.chiller, config.hvac.setpoint, config.hvac.pumps
+    if chiller.reference_cop > MOST_USUAL_COP:
+        yield (
+            f"hvac.chiller.reference_cop {chiller.reference_cop:g}: the best chillers reach about "
+            f"12, and {MOST_USUAL_COP:g} is beyond them"
+        )
+    low, high = USUAL_SETPOINTS_C
+    for name in ("min_c", "max_c"):
+        value = getattr(setpoint, name)
+        if not low <= value <= high:
+            yield f"hvac.setpoint.{name} {value:g}: supply air is usually {low:g}..{high:g} C"
+    if pumps.model == "sized" and pumps.efficiency < LEAST_USUAL_PUMP_EFFICIENCY:
+        yield (
+            f"hvac.pumps.efficiency {pumps.efficiency:g}: even small pumps reach "
+            f"{LEAST_USUAL_PUMP_EFFICIENCY:g}"
+        )
+
+
+def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
+    """Warn of what is odd about data centers, once for all that have it in common.
+
+    Warns:
+        OddInputWarning: for each odd value.
+    """
+    names: dict[str, list[str]] = {}
+    known: dict[tuple[int, ...], list[str]] = {}
+    for config in configs:
+        # Copies share the sections themselves.
+        same = tuple(map(id, (config.hall, config.servers, config.hvac)))
+        if same not in known:
+            known[same] = [*odd_values(config)]
+        for text in known[same]:
+            names.setdefault(text, []).append(config.name)
+    for text, listed in names.items():
+        others = f" and {len(listed) - 1} more" if len(listed) > 1 else ""
+        warnings.warn(f"{listed[0]}{others}: {text}", OddInputWarning, stacklevel=3)
+
+
+def _odd_servers(config: DataCenterConfig) -> Iterator[str]:
+    servers = config.servers
+    listed_w = (
+        [full_w for full_w, _ in servers.power_pairs]
+        if servers.groups is None
+        else [group.full_w for rack in servers.groups for group in rack]
+    )
+    field = "servers.power_w" if servers.groups is None else "servers.groups"
+    least_w = min(listed_w)
+    if least_w < LEAST_USUAL_SERVER_W:
+        yield f"{field}: a server of {least_w:g} W at full load; power is in W, not in kW"
+    rack_w = config.rack_nameplate_w()
+    rack = int(np.argmax(rack_w))
+    if rack_w[rack] > MOST_USUAL_RACK_W:
+        yield (
+            f"hall: rack {rack} has servers of {rack_w[rack] / 1e3:.4g} kW; racks of more than "
+            f"{MOST_USUAL_RACK_W / 1e3:g} kW are rarely cooled by air alone"
+        )
