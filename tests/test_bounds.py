@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from sdc_taichi import ConfigError, DataCenterConfig, EnvOptions, load_config, preset_names
+from sdc_taichi import (
+    ConfigError,
+    DataCenterConfig,
+    DataError,
+    EnvOptions,
+    Simulator,
+    drivers_from_arrays,
+    load_config,
+    parallel_env,
+    preset_names,
+    simulate,
+)
+from sdc_taichi.control import make_controller
+from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
+from sdc_taichi.exogenous.series import Series, Weather
+from sdc_taichi.sim.fleet import build_fleet
+from sdc_taichi.sim.physical_limits import LIMITS, within_limits
+from sdc_taichi.types import StepResult
 
 BOUNDS = (("minimum", "exclusiveMinimum"), ("maximum", "exclusiveMaximum"))
 
@@ -83,3 +102,91 @@ def test_a_design_wet_bulb_is_not_above_the_dry_bulb() -> None:
     given = ["hvac.sizing.design_outdoor_c=30", "hvac.sizing.design_wet_bulb_c=31"]
     with pytest.raises(ConfigError, match="design_wet_bulb_c 31 must not be above"):
         load_config("tiny", given)
+
+
+def test_no_rack_in_air_has_more_power_than_air_carries() -> None:
+    with pytest.raises(ConfigError, match="rack 0 has servers of 320 kW; valid is at most 200 kW"):
+        load_config("corrected", ["servers.power_w=[1600, 20]"])
+    with pytest.raises(ConfigError, match=r"rack 0 has servers of 306\.9 kW"):
+        load_config("corrected", ["hall.capacity_mw=5"])
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("servers.power_w=[8, 2]", "a server of 8 W at full load; power is in W, not in kW"),
+        ("servers.power_w=[400, 40]", "rack 0 has servers of 80 kW"),
+        ("hvac.chiller.reference_cop=20", "reference_cop 20"),
+        ("hvac.setpoint.max_c=40", "max_c 40: supply air is usually 10..35 C"),
+        ("hvac.pumps.efficiency=0.1", "efficiency 0.1"),
+    ],
+)
+def test_what_is_odd_is_warned_of_once(override: str, part: str) -> None:
+    chiller = [] if "chiller" in override else ["hvac.chiller.model=eir_york"]
+    first = load_config("corrected", [override, *chiller])
+    again = [first.model_copy(update={"name": name}) for name in "ab"]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        build_fleet([first, *again])
+    assert [w.category for w in caught] == [OddInputWarning]
+    assert str(caught[0].message).startswith("corrected and 2 more: ")
+    assert part in str(caught[0].message)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30, -1e30])
+def test_limits_hold_of_every_quantity_that_has_them(bad: float) -> None:
+    quantities = {name: np.zeros(2) for name in LIMITS}
+    assert within_limits(quantities).tolist() == [1, 1]
+    for name in LIMITS:
+        found = within_limits(quantities | {name: np.array([0.0, bad])})
+        assert found.tolist() == [1, 0], name
+
+
+def test_a_result_beyond_physics_ends_the_run_and_changes_nothing() -> None:
+    still = [f"servers.fan_airflow_ratio_{end}=[1e-6, 1e-6]" for end in ("lb", "ub")]
+    still += ["name=still", "servers.fan_airflow_ratio_limits=null"]
+    with Simulator([load_config("tiny"), load_config("tiny", still)]) as sim:
+        sim.reset()
+        before = sim.state
+        with pytest.raises(PhysicalLimitError, match=r"^still: outlet_mean_c is .* in step 0; "):
+            sim.step()
+        assert sim.state is before
+    env = parallel_env(load_config("tiny", still), days=1)
+    env.reset(seed=0)
+    with pytest.raises(PhysicalLimitError, match=r"^still: outlet_mean_c"):
+        env.step({agent: 0 for agent in env.agents})
+    env.close()
+
+
+def test_an_event_starts_before_the_end_of_the_run() -> None:
+    event = "events.scheduled=[{kind: grid_outage, start_h: 24, duration_h: 1}]"
+    config = load_config("tiny", [event])
+    with Simulator(config) as sim:
+        with pytest.raises(ConfigError, match=r"tiny: events\.scheduled\.0\.start_h 24: the run"):
+            simulate(sim, make_controller("idle", sim.fleet), 96)
+        simulate(sim, make_controller("idle", sim.fleet), 97)
+    with pytest.raises(ConfigError, match=r"events\.scheduled\.0\.start_h 24: the episode ends"):
+        parallel_env(config, days=1)
+
+
+def test_weather_is_one_of_a_place_on_earth() -> None:
+    def weather(low: float, high: float) -> Weather:
+        values = np.linspace(low, high, 8760)
+        series = Series(values, 60.0, "outdoor_c", "C", "x.epw", synthetic=False)
+        return Weather("X", 0.0, 0.0, 0.0, 0.0, outdoor_c=series, wet_bulb_c=series)
+
+    weather(-68.0, 37.0)
+    with pytest.raises(DataError, match=r"x\.epw: mean dry bulb 50\.0 C.*Fahrenheit"):
+        weather(42.0, 58.0)
+    with pytest.raises(DataError, match=r"differ by 120\.0 K"):
+        weather(-70.0, 50.0)
+    year = [20.0], [15.0], [300.0], [0.5]
+    drivers_from_arrays(*year)
+    with pytest.raises(DataError, match=r"outdoor_c of data center 0 at step 0 is 68"):
+        drivers_from_arrays([68.0], *year[1:])
+    with pytest.raises(DataError, match=r"ci_g_per_kwh .* is 5000"):
+        drivers_from_arrays(*year[:2], [5000.0], year[3])
+
+
+def test_limits_are_those_of_fields_of_results() -> None:
+    assert set(LIMITS) <= set(StepResult.__dataclass_fields__)

@@ -359,6 +359,6 @@ def test_groups_and_power_pairs_exclude_each_other() -> None:
         config_from_dict(values)
     pairs = load_config("tiny", ["servers.power_w=[300, 30]"])
     assert pairs.servers.groups is None
-    groups = load_config("corrected", ["servers.groups=[[{count: 2, full_w: 9, idle_w: 1}]]"])
+    groups = load_config("corrected", ["servers.groups=[[{count: 2, full_w: 99, idle_w: 1}]]"])
     assert groups.servers.power_w is None
     assert build_fleet(groups).servers == 40

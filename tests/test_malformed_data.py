@@ -151,7 +151,11 @@ CASES: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
     "epw text": (WEATHER, lambda: epw(cell(123, 6, "warm")), ("row 123", "dry bulb", "'warm'")),
     "epw too hot": (WEATHER, lambda: epw(cell(124, 6, "85")), ("row 124", "dry bulb", "'85'")),
     "epw infinite": (WEATHER, lambda: epw(cell(125, 6, "inf")), ("row 125", "'inf'")),
-    "epw fahrenheit": (WEATHER, lambda: epw(cell(9, 6, "77.0")), ("row 9", "77.0", "70")),
+    "epw fahrenheit": (
+        WEATHER,
+        lambda: epw(cell(9, 6, "77.0")),
+        ("row 9", "77.0", "-90 to 60 C", "Fahrenheit"),
+    ),
     "epw humidity": (WEATHER, lambda: epw(cell(200, 8, "111")), ("row 200", "humidity", "'111'")),
     "epw pressure in hPa": (
         WEATHER,

@@ -68,7 +68,7 @@ def mixed_fleet(preset: str = "corrected") -> list[DataCenterConfig]:
     base = load_config(preset)
     changes: list[list[str]] = [
         ["site.location=NY"],
-        ["site.location=AZ", "site.start=07-01", "hall.capacity_mw=3.5", "site.seed=4"],
+        ["site.location=AZ", "site.start=07-01", "hall.capacity_mw=0.9", "site.seed=4"],
         ["site.location=WA", "site.start=12-31", "workload.trace=google_1"],
         ["hall.rows=1", "hall.racks_per_row=3", "hall.supply_approach_k=4.2",
          "hall.return_approach_k=-3", "servers.power_w=[300, 60]", "hall.servers_per_rack=[7,1,9]"],
@@ -591,7 +591,7 @@ def test_memory_does_not_grow_with_simulators_made_and_closed() -> None:
 
 
 def test_server_layers_are_given_back() -> None:
-    config = load_config("large", ["hall.servers_per_rack=2000"])
+    config = load_config("large", ["hall.servers_per_rack=2000", "servers.power_w=[25, 2]"])
     drivers = short_drivers(steps=4)
     layer_mb = 3 * 4 * config.hall.racks * 2000 / 1e6
 
