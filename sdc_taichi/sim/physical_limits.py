@@ -6,7 +6,9 @@ its field could tell. A run ends there, since what follows would be numbers with
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -44,12 +46,11 @@ def within_limits(quantities: Mapping[str, Any]) -> Any:
     Args:
         quantities: quantities of a step by name, with all of ``LIMITS``, (B,) each.
     """
-    inside = None
-    for name, (low, high) in LIMITS.items():
-        values = quantities[name]
-        one = (values >= low) & (values <= high)
-        inside = one if inside is None else inside & one
-    return np.where(inside, 1.0, 0.0)
+    inside = [
+        (quantities[name] >= low) & (quantities[name] <= high)
+        for name, (low, high) in LIMITS.items()
+    ]
+    return np.where(reduce(operator.and_, inside), 1.0, 0.0)
 
 
 def require_within_limits(
