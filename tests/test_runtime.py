@@ -15,6 +15,7 @@ from typing import Any, Literal
 import pytest
 
 from sdc_taichi import Drivers, RuntimeStateError, Simulator, drivers_from_arrays, load_config
+from sdc_taichi.kernels.compiler import runtime, startup
 from sdc_taichi.kernels.compiler.processors import quota
 from sdc_taichi.kernels.compiler.runtime import uses_plain_taichi
 
@@ -227,3 +228,68 @@ def test_another_user_of_taichi_may_have_chosen_other_literals() -> None:
         sim.reset()
         expected = f"{sim.step().it_w.tobytes().hex()} True"
     assert done.stdout.splitlines()[-1] == expected
+
+
+def test_a_home_that_cannot_be_written_and_foreign_variables_change_nothing(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "temporary").mkdir()
+    code = """
+import os
+from sdc_taichi.kernels.compiler import runtime
+runtime.ensure_started()
+import taichi as ti
+
+@ti.kernel
+def double(x: ti.f64) -> ti.f64:
+    return 2.0 * x
+
+print(double(21.0), ti.cfg.arch == ti.cpu, ti.cfg.debug)
+print(os.environ["TI_ARCH"], "HOME" in os.environ)
+"""
+    (tmp_path / "script.py").write_text(code)
+    environment = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME")}
+    environment |= {
+        "TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "file" / "cache"),
+        "TI_ARCH": "abacus",
+        "TI_DEBUG": "much",
+        "TI_LOG_LEVEL": "loud",
+        "TI_DEFAULT_FP": "7",
+        "TMPDIR": str(tmp_path / "temporary"),
+    }
+    done = subprocess.run(
+        [sys.executable, tmp_path / "script.py"],
+        env=environment, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert (done.stdout, done.returncode) == ("42.0 True False\nabacus False\n", 0), done.stderr
+    assert done.stderr.count("Warning:") == 1
+    said = f"{tmp_path / 'file' / 'cache'}: cannot be written (Not a directory); kernels are"
+    assert f"KernelCacheWarning: {said} compiled in every process\n" in done.stderr
+    assert list((tmp_path / "temporary").iterdir()) == []
+
+
+def test_what_killed_processes_left_among_the_kernels_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock, index = tmp_path / "ticache.lock", tmp_path / "ticache.tcb"
+    monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", str(tmp_path))
+    key = (65).to_bytes(8, "little") + b"T" * 65
+    body = bytes([1, 0, 7, 0, 4, 0, *8 * [0], 1, *7 * [0]]) + 2 * key + bytes(24)
+    good = (len(body) + 8).to_bytes(8, "little") + body
+    for content, kept in ((good, True), (good[:30] + b"\xff" * 8 + good[38:], False)):
+        index.write_bytes(content)
+        lock.write_bytes(b"")
+        assert startup.kernel_folder() == tmp_path
+        assert lock.exists(), "a lock of this moment is that of a process that runs"
+        assert index.exists() == kept
+    os.utime(lock, (0, 0))
+    startup.kernel_folder()
+    assert not lock.exists()
+
+
+def test_the_start_needs_a_current_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    def deleted() -> str:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(os, "getcwd", deleted)
+    with pytest.raises(RuntimeStateError, match="the current folder has been deleted"):
+        runtime._start_taichi()

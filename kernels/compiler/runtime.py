@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import os
 import sys
@@ -10,7 +11,7 @@ import threading
 from collections.abc import Iterator
 
 from sdc_taichi.errors import ConfigError, RuntimeStateError, shortened
-from sdc_taichi.kernels.compiler import processors
+from sdc_taichi.kernels.compiler import processors, startup
 from sdc_taichi.number_text import parse_whole
 
 MOST_THREADS = 1024
@@ -56,7 +57,7 @@ def ensure_started() -> int:
     Raises:
         RuntimeStateError: in a child forked after the start, where Taichi would hang; or the
             runtime was started with whole numbers of another length than 32 bits, and
-            ``SDC_TAICHI_PLAIN`` is 1.
+            ``SDC_TAICHI_PLAIN`` is 1; or Taichi cannot be loaded or started.
         ConfigError: ``SDC_TAICHI_THREADS`` is no positive integer.
     """
     global _known
@@ -66,6 +67,8 @@ def ensure_started() -> int:
             "'spawn' method (multiprocessing.get_context('spawn')) or create simulators only in "
             "the children"
         )
+    if "taichi" not in sys.modules:
+        _import_taichi()
     import taichi as ti
 
     # Gives the same as `ti.cfg` in a fifteenth of the time: steps ask several times.
@@ -83,15 +86,53 @@ def ensure_started() -> int:
     return _known[1]
 
 
+def _import_taichi() -> None:
+    """Import Taichi.
+
+    Raises:
+        RuntimeStateError: it is not installed, or memory is short.
+    """
+    with _starting, startup.taichi_environment():
+        try:
+            importlib.import_module("taichi")
+        except (ImportError, MemoryError) as error:
+            raise RuntimeStateError(f"Taichi cannot be loaded: {error}") from error
+
+
 def _start_taichi() -> None:
+    """Start Taichi.
+
+    Raises:
+        RuntimeStateError: memory is short, or there is no current folder.
+        ConfigError: ``SDC_TAICHI_THREADS`` is no positive integer.
+    """
     import taichi as ti
 
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise RuntimeStateError(
+            "the current folder has been deleted; valid is one that exists, which Taichi needs"
+        ) from None
     threads = _thread_limit() or int(min(len(processors.allowed()), processors.quota()))
     before = processors.thread_ids()
-    with _without_banner():
-        ti.init(arch=ti.cpu, offline_cache=True, log_level=ti.ERROR, cpu_max_num_threads=threads)
-    # Taichi sets up memory at the first launch or here, which has to be in the thread that starts.
-    ti.sync()
+    folder = startup.kernel_folder()
+    with startup.taichi_environment(), _without_banner():
+        try:
+            ti.init(
+                arch=ti.cpu,
+                offline_cache=True,
+                offline_cache_file_path=str(folder),
+                log_level=ti.CRITICAL,
+                cpu_max_num_threads=threads,
+            )
+            # Taichi sets up memory at the first launch or here, which has to be in the thread that
+            # starts.
+            ti.sync()
+        except (RuntimeError, MemoryError) as error:
+            raise RuntimeStateError(
+                f"Taichi cannot start: {error}; it needs 1 GiB of address space (ulimit -v)"
+            ) from error
     if not uses_plain_taichi():
         others = {thread.native_id for thread in threading.enumerate()}
         processors.bind(processors.thread_ids() - before - others, ti.cfg.cpu_max_num_threads)
