@@ -33,6 +33,10 @@ RUN_BLOCKS = RUN_LANES // LANES
 """Blocks in a vector of RUN_LANES racks."""
 CHUNK_BLOCKS = 16
 """Most blocks of a chunk; fewer racks are not worth a thread of their own."""
+RANKS_PER_K = 2.0**27
+"""Ranks of temperatures in a kelvin, by which the hottest rack is found. In f64 the temperatures of
+alike racks differ in their last bits, which depend on the processor; their ranks, 7.5 nK apart,
+agree. Numbers in f32 are further apart than ranks."""
 MIX_PATTERNS = LANES - 1
 """Patterns of the exhaust mixes in the table of steady states. An entry of the table is one vector:
 how much of each pattern, and last the feedback gain."""

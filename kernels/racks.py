@@ -24,6 +24,7 @@ from .servers import (
     warm_servers,
     zero_rack_sums,
 )
+from .sums import rank
 
 FRESH_RATIO = row_index(UNIT_STATE, "fresh_ratio")
 
@@ -195,7 +196,7 @@ def update_hottest(
     """Hottest inlet of each rack of a block in C, also to the hottest of each lane of the chunk."""
     is_rack = racks.per_server > hall.real(0.0)
     inlet_c = ti.select(is_rack, extremes.inlet_max_c, hall.zeros - hall.real(1e30))
-    is_hotter = inlet_c > hottest.inlet_c
+    is_hotter = rank(hall, inlet_c) > rank(hall, hottest.inlet_c)
     hottest.block = ti.select(is_hotter, block_at, hottest.block)
     hottest.group = ti.select(is_hotter, extremes.hottest_group, hottest.group)
     hottest.inlet_c = larger(inlet_c, hottest.inlet_c)

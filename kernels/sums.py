@@ -11,7 +11,7 @@ from typing import no_type_check
 import taichi as ti
 
 from .arguments import row_index
-from .hall_arguments import LANES, RACK_MEANS, SUMS, TERMS
+from .hall_arguments import LANES, RACK_MEANS, RANKS_PER_K, SUMS, TERMS
 
 N_SUMS = len(SUMS)
 FIRST_TERM = len(RACK_MEANS)
@@ -71,21 +71,32 @@ def sum_chunk(hall: ti.template(), chunk_at, terms_at, first_row, end_row, adds)
 
 @ti.func
 @no_type_check
+def rank(hall: ti.template(), temperature_c):
+    """Rank of a temperature, or of each of a vector: those of alike racks are equal."""
+    return ti.floor(temperature_c * hall.real(RANKS_PER_K) + hall.real(0.5))
+
+
+@ti.func
+@no_type_check
 def find_hottest_rack(hall: ti.template(), chunk_at, hottest: ti.template(), adds):
-    """The hottest of the hottest inlets of each lane of a chunk; of equal ones the first rack's.
+    """The hottest of the hottest inlets of each lane of a chunk; of equal ranks the first rack's.
 
     ``adds``: only where it is hotter than those of the substeps before.
     """
     chunk = hall.chunks[chunk_at]
     most_c, block, lane, group = hall.real(-1e30), 0, 0, hall.real(0.0)
-    i = 0
+    highest, i = rank(hall, most_c), 0
     while i < LANES:
         inlet_c = hottest.inlet_c[i]
-        if inlet_c > most_c or (inlet_c == most_c and hottest.block[i] < block):
-            most_c, block, lane, group = inlet_c, hottest.block[i], i, hottest.group[i]
+        own = rank(hall, inlet_c)
+        if own > highest or (own == highest and hottest.block[i] < block):
+            highest, block, lane, group = own, hottest.block[i], i, hottest.group[i]
+        most_c = ti.max(inlet_c, most_c)
         i += hall.one
-    if not adds or ti.cast(most_c, ti.f64) > chunk.inlet_max_c:
+    before_c = chunk.inlet_max_c
+    if not adds or ti.cast(most_c, ti.f64) > before_c:
         chunk.inlet_max_c = ti.cast(most_c, ti.f64)
+    if not adds or ti.cast(highest, ti.f64) > rank(hall, before_c):
         chunk.hottest_block = ti.cast(block, ti.f64)
         chunk.hottest_lane = ti.cast(lane, ti.f64)
         chunk.hottest_group = ti.cast(group, ti.f64)
@@ -127,11 +138,11 @@ def combine_chunks(hall: ti.template(), n):
     total, chunk_at = hall.chunks[first], first + 1
     while chunk_at < hall.dcs[n + 1].first_chunk:
         chunk = hall.chunks[chunk_at]
-        if chunk.inlet_max_c > total.inlet_max_c:
-            total.inlet_max_c = chunk.inlet_max_c
+        if rank(hall, chunk.inlet_max_c) > rank(hall, total.inlet_max_c):
             total.hottest_block = chunk.hottest_block
             total.hottest_lane = chunk.hottest_lane
             total.hottest_group = chunk.hottest_group
+        total.inlet_max_c = ti.max(total.inlet_max_c, chunk.inlet_max_c)
         total.least_change_k = ti.min(total.least_change_k, chunk.least_change_k)
         total.most_change_k = ti.max(total.most_change_k, chunk.most_change_k)
         chunk_at += hall.one

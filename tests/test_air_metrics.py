@@ -21,8 +21,8 @@ def test_indices_of_a_hall_of_two_racks() -> None:
     inlet = air_metrics.rise_m3k_s(flow_m3s, inlet_c, 18.0)
     outlet = air_metrics.rise_m3k_s(flow_m3s, outlet_c, 18.0)
     assert (float(inlet), float(outlet)) == (16.0, 50.0)
-    assert float(air_metrics.shi(inlet, outlet)) == pytest.approx(0.32)
-    assert float(air_metrics.rhi(inlet, outlet)) == pytest.approx(0.68)
+    assert float(air_metrics.shi(inlet, outlet, 3.0)) == pytest.approx(0.32)
+    assert float(air_metrics.rhi(inlet, outlet, 3.0)) == pytest.approx(0.68)
     rise_k = air_metrics.it_rise_k(inlet, outlet, flow_m3s.sum())
     assert float(rise_k) == pytest.approx(34.0 / 3.0)
     # The CRAC units supply 4 m3/s, so 34 m3 K/s of heat warm it by 8.5 K.
@@ -87,13 +87,15 @@ def test_rti_of_the_reference_hall() -> None:
 def test_no_heat_and_no_airflow_have_defined_indices() -> None:
     still, air_c = np.zeros((1, 3)), np.full((1, 3), 22.0)
     rise = air_metrics.rise_m3k_s(still, air_c, 18.0)
-    np.testing.assert_array_equal(air_metrics.shi(rise, rise), [0.0])
-    np.testing.assert_array_equal(air_metrics.rhi(rise, rise), [1.0])
+    np.testing.assert_array_equal(air_metrics.shi(rise, rise, 0.0), [0.0])
+    np.testing.assert_array_equal(air_metrics.rhi(rise, rise, 0.0), [1.0])
     np.testing.assert_array_equal(air_metrics.it_rise_k(rise, rise, still.sum(axis=1)), [0.0])
     np.testing.assert_array_equal(air_metrics.rti(np.array([20.0]), 18.0, np.zeros(1)), [0.0])
     # What rounding leaves of no rise is none.
-    np.testing.assert_array_equal(air_metrics.shi(np.array([4e-15]), np.array([-5e-324])), [0.0])
-    np.testing.assert_array_equal(air_metrics.shi(np.array([4e-15]), np.array([5e-324])), [0.0])
+    for left in (-5e-324, 5e-324, 3e-5):
+        found = air_metrics.shi(np.array([4e-15]), np.array([left]), 1.0)
+        np.testing.assert_array_equal(found, [0.0])
+        np.testing.assert_array_equal(air_metrics.rti(np.array([18.5]), 18.0, left), [0.0])
 
 
 def test_sums_over_axes_and_offsets_agree() -> None:
@@ -146,14 +148,24 @@ def test_shi_is_a_share_and_grows_with_recirculation(
         inlet_c = 18.0 + scale * above_k
         inlet = air_metrics.rise_m3k_s(flow_m3s, inlet_c, 18.0)
         outlet = air_metrics.rise_m3k_s(flow_m3s, inlet_c + it_k, 18.0)
-        return float(air_metrics.shi(inlet, outlet))
+        return float(air_metrics.shi(inlet, outlet, flow_m3s.sum()))
 
     assert index(0.0) == 0.0
     assert 0.0 <= index(1.0) <= index(2.0) + 1e-12 < 1.0
 
 
-@pytest.mark.parametrize("share", [-2.5e-16, -1e-7, 1e-7])
-def test_shi_of_what_rounding_leaves_is_zero_of_no_sign(share: float) -> None:
-    found = air_metrics.shi(np.array([share * 40.0]), np.array([40.0]))
+@pytest.mark.parametrize("inlet_rise_k", [-2.5e-16, -1.1e-5, 1.1e-5])
+@pytest.mark.parametrize("outlet_rise_k", [0.5, 10.0])
+def test_shi_of_what_rounding_leaves_is_zero_of_no_sign(
+    inlet_rise_k: float, outlet_rise_k: float
+) -> None:
+    airflow_m3s = np.array([12.0])
+    found = air_metrics.shi(inlet_rise_k * airflow_m3s, outlet_rise_k * airflow_m3s, airflow_m3s)
     assert found == 0.0
     assert not np.signbit(found).any()
+
+
+def test_alike_temperatures_have_one_rank() -> None:
+    assert np.unique(air_metrics.rank(27.0 + np.array([0.0, -2e-14, 4e-15, 3e-10]))).size == 1
+    ranks = air_metrics.rank(np.array([26.0, np.nextafter(np.float32(27), 0), 27.0, np.inf]))
+    assert np.all(np.diff(ranks) > 0)

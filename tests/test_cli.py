@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from sdc_taichi.control import View, make_controller
 from sdc_taichi.run import loop
 from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.folder_writer import simulate_to_folder
+from sdc_taichi.run.metrics import add_step, empty_totals
 
 PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli.app import main; main()")
 HEAVY = {"taichi", "pandas", "pyarrow", "psychrolib", "matplotlib", "rerun"}
@@ -158,6 +160,18 @@ def test_hottest_rack_is_found_in_its_data_center() -> None:
     with Simulator(hot) as sim:
         totals = loop.simulate(sim, make_controller("idle", sim.fleet), 5)
     assert totals.hottest_rack.tolist() == [0, 1, 2, 3]
+
+
+def test_the_first_of_equal_inlets_is_the_hottest_and_one_at_the_limit_is_not_above() -> None:
+    totals = empty_totals(1, 0.25)
+    with Simulator(load_config("tiny")) as sim:
+        sim.reset()
+        result = sim.step()
+    for step in range(3):
+        inlet_c = np.array([27.0 + step * 4e-15])
+        add_step(totals, replace(result, inlet_max_c=inlet_c, step=step))
+    assert totals.hottest_step.tolist() == [0]
+    assert totals.hot_steps.tolist() == [0]
 
 
 def test_steps_hold_every_quantity_of_every_step(two_sites: Path) -> None:

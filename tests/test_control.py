@@ -250,6 +250,14 @@ def test_greedy_follows_the_mean_of_the_coming_day() -> None:
     assert kept[-1].queue_tasks[0] == 0
 
 
+def test_greedy_idles_where_the_coming_day_rounds_to_the_mean() -> None:
+    # The first of these is the mean, but for the rounding of the sum.
+    config, drivers = one_with(300.1 + np.tile([0.0, 1.1, -1.1], 96))
+    with Simulator(config, drivers=drivers) as sim:
+        kept = results(sim, make_controller("greedy-ci", sim.fleet), 1)
+    assert kept[0].load_command[0] == 0.0
+
+
 # What a controller sees
 
 

@@ -552,6 +552,13 @@ def test_layers_of_any_layout_agree_with_the_twin(
     assert np.array_equal(hall.group_inlets(), layers.inlet_c[first])
 
 
+def test_the_first_of_alike_racks_is_the_hottest() -> None:
+    # Without power all racks take in supply air, but for the rounding of their mixes.
+    config = load_config("corrected", ["servers.power_w=[300,0]"])
+    sums = Hall(fleet_of(config), "f64").solve(Conditions(np.array([18.0]), np.zeros(1)))
+    assert sums.hottest_rack[0] == 0
+
+
 CRAC_AND_RACK_FAIL = (
     "events.scheduled=[{kind: crac_down, unit: 0, start_h: 0, duration_h: 1},"
     "{kind: rack_fan_failure, rack: 3, start_h: 0, duration_h: 1, share: 0.2},"

@@ -205,6 +205,13 @@ def test_full_battery_takes_nothing_and_an_empty_one_gives_nothing(name: str) ->
     assert run(name, [2000.0], -1.0, load_kw=0.0).discharge_kwh[0] == 0.0
 
 
+def test_a_battery_that_gives_all_it_holds_is_empty() -> None:
+    # What rounding left would count as power in the next step of an outage.
+    stored_kwh = np.linspace(1.0, 2000.0, 997)
+    found = run("clc", stored_kwh, -1.0, load_kw=1e9, lower_u_h=0.0, discharge_limit_c_rate=1e9)
+    assert not np.any(found.stored_kwh)
+
+
 # -------------------------------------------------------------------------------- single equations
 
 

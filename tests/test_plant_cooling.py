@@ -13,6 +13,7 @@ from sdc_taichi.plant.cooling import (
     SETPOINTS,
     STORES_UNMET_HEAT,
     balance_room_heat,
+    unmet_and_recovered,
 )
 from sdc_taichi.types import F64
 
@@ -155,8 +156,16 @@ def test_heat_that_is_not_removed_is_held(
     assert stored - held_kwh == pytest.approx(
         (load_w - removed_w) * step_h / 1e3, abs=1e-12 * scale
     )
-    assert unmet - recovered == pytest.approx(load_w - removed_w, abs=1e-6)
+    assert unmet - recovered == pytest.approx(load_w - removed_w, abs=1e-6 + 1e-12 * load_w)
     assert min(unmet, recovered) == 0.0
     assert stored >= 0.0
     if capacity_w > load_w + held_kwh * 1e3 / step_h:
         assert stored <= 1e-12 * scale
+
+
+def test_loads_that_differ_by_rounding_leave_no_unmet_heat() -> None:
+    load_w = np.full(3, 9e5)
+    removed_w = load_w + np.array([-2e-10, 2e-10, -1e-3])
+    unmet_w, recovered_w = unmet_and_recovered(load_w, removed_w)
+    np.testing.assert_allclose(unmet_w, [0.0, 0.0, 1e-3], rtol=1e-6)
+    assert not recovered_w.any()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sdc_taichi.errors import SdcError
-from sdc_taichi.hall.air_metrics import RECOMMENDED_C
+from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, rank
 from sdc_taichi.plant.workload import age_histogram
 from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.types import F64, I64, Reals, Status, StepResult
@@ -260,8 +260,8 @@ class BlockBuilder:
         first = self._steps[-1] + 1 - len(by_dc)
         rows = np.array([step - first for step in self._hall_steps if step >= first], dtype=np.intp)
         values = by_dc[rows[:, None], [FIELD_ROWS[field] for field in HOTTEST_FIELDS]]
-        top = np.argsort(-values[:, 0], axis=1, kind="stable")[:, None, :HOTTEST_HALLS]
-        above = np.count_nonzero(values[:, 0] > RECOMMENDED_C[1], axis=1)
+        top = np.argsort(-rank(values[:, 0]), axis=1, kind="stable")[:, None, :HOTTEST_HALLS]
+        above = np.count_nonzero(values[:, 0] > RECOMMENDED_C[1] + LEAST_EXCESS_K, axis=1)
         return above, np.concatenate([top, np.take_along_axis(values, top, axis=2)], axis=1)
 
     def _check(self, result: StepResult) -> None:

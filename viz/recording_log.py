@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.hall.air_metrics import RECOMMENDED_C, allowable_c
+from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, allowable_c
 from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
 from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.fleet import Fleet
@@ -75,7 +75,7 @@ def _conditions(allowable_max_c: float) -> tuple[_Condition, ...]:
             f"inlet above recommended {recommended:g} C: {{value}} C at {{place}}",
             f"inlets back within recommended {recommended:g} C, hottest was {{most}} C",
             "inlet_max_c",
-            recommended,
+            recommended + LEAST_EXCESS_K,
             "WARN",
             number_format="{:.1f}".format,
         ),
@@ -83,7 +83,7 @@ def _conditions(allowable_max_c: float) -> tuple[_Condition, ...]:
             f"inlet above allowable {allowable_max_c:g} C: {{value}} C at {{place}}",
             f"inlets back within allowable {allowable_max_c:g} C, hottest was {{most}} C",
             "inlet_max_c",
-            allowable_max_c,
+            allowable_max_c + LEAST_EXCESS_K,
             "ERROR",
             number_format="{:.1f}".format,
         ),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sdc_taichi.sim.design_hall import TIE_DIGITS, DesignHall
+from sdc_taichi.hall.air_metrics import rank
+from sdc_taichi.sim.design_hall import DesignHall
 from sdc_taichi.types import F64
 
 LISTED_ROWS = 12
@@ -91,7 +92,7 @@ def _rows(found: DesignHall) -> list[str]:
     listed = np.arange(hall.rows)
     note = []
     if hall.rows > LISTED_ROWS:
-        order = np.argsort(-np.round(hottest, TIE_DIGITS), kind="stable")
+        order = np.argsort(-rank(hottest), kind="stable")
         listed = np.sort(order[:LISTED_ROWS])
         note = [f"({LISTED_ROWS} hottest of {hall.rows:,} rows)"]
     approach, inlet = per_row(found.approach_k), per_row(found.inlet_c)

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.control.view import View
+from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K
 from sdc_taichi.types import F64, I64, Actions
 
 SLOT_MIN = 5.0
@@ -108,7 +109,9 @@ class TrimAndRespond:
         if view.last is None:
             requests = np.zeros(view.size)
         else:
-            hot = np.asarray(view.last.rack_inlet_max_c > REQUEST_INLET_C, dtype=np.float64)
+            hot = np.asarray(
+                view.last.rack_inlet_max_c > REQUEST_INLET_C + LEAST_EXCESS_K, dtype=np.float64
+            )
             requests = np.add.reduceat(hot, view.fleet.rack_offsets[:-1])
         target_c = view.setpoint_c
         for _ in range(slots_in_step(view.state.step, view.step_h)):
@@ -188,9 +191,9 @@ class GreedyCarbon:
     def act(self, view: View) -> Actions:
         """Commands for work and battery."""
         ci = view.forecast(self._hours).ci_g_per_kwh
-        # The mean of equal values may differ from them in the last bit.
-        flat = np.ptp(ci, axis=1) == 0.0
-        command = np.where(flat, 0.0, np.sign(ci.mean(axis=1) - ci[:, 0]))
+        mean, now = ci.mean(axis=1), ci[:, 0]
+        # The mean of a window may differ in the last bit from what it is exactly.
+        command = np.where(np.abs(mean - now) > 1e-9 * mean, np.sign(mean - now), 0.0)
         return Actions(load=command, battery=command)
 
 

@@ -18,17 +18,34 @@ ALLOWABLE_C = {"A1": (15.0, 32.0), "A2": (10.0, 35.0), "A3": (5.0, 40.0), "A4": 
 """Lowest and highest allowable inlet, in C, by class (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
 
 _USUAL_CLASS = "A2"
-
-_NO_RISE = 1e-9
-"""Rises (K, m3 K/s) up to this are none: a ratio to what rounding left would mean nothing."""
-
-_ROUND_OFF_SHARE = 1e-6
-"""Indices up to this are 0: sums of f32 temperatures hold no smaller share of the exhaust heat."""
+LEAST_EXCESS_K = 1e-5
+"""Least excess over a limit, in K: in f32 an inlet that is to be at the limit may lie above it by
+two last digits, 4e-6 K."""
+_ROUND_OFF_K = 1e-4
+"""Mean rises up to this, in K, of either sign are none: f32 temperatures hold no smaller ones, and
+their last bits depend on the order of sums."""
+_NO_AIRFLOW_M3S = 1e-9
+"""Airflow up to this, in m3/s, is none."""
 
 
 def allowable_c(ashrae_class: str | None) -> tuple[float, float]:
     """Lowest and highest allowable inlet of a class of ``ALLOWABLE_C``, in C; None is A2."""
     return ALLOWABLE_C[ashrae_class or _USUAL_CLASS]
+
+
+def rank(temperature_c: Reals) -> F64:
+    """Rank of temperatures by which they are compared, as in ``kernels.sums.rank``.
+
+    Temperatures of alike racks differ in their last bits, which depend on the processor; their
+    ranks, 1/``RANKS_PER_K`` apart, agree, so that the first of alike racks is the hottest.
+
+    Args:
+        temperature_c: Temperatures, C, of any shape.
+
+    Returns:
+        A whole number for each, the higher the hotter.
+    """
+    return np.asarray(np.floor(temperature_c * hall_arguments.RANKS_PER_K + 0.5))
 
 
 def rise_m3k_s(
@@ -78,7 +95,7 @@ def under_18_sum_k(inlet_c: F64) -> F64:
     return np.asarray(np.maximum(RECOMMENDED_C[0] - inlet_c, 0.0).sum(axis=-1))
 
 
-def shi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:
+def shi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values, airflow_m3s: Values) -> F64:
     """Supply heat index, sum V*(T_in - T_sup) / sum V*(T_out - T_sup).
 
     The share of the heat in the exhaust that the air had before it reached the racks (Sharma, Bash
@@ -88,23 +105,27 @@ def shi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:
     Args:
         inlet_rise_m3k_s: ``rise_m3k_s`` of the inlets, m3 K/s.
         outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets, m3 K/s.
+        airflow_m3s: Sum of the airflow of the racks, m3/s.
 
     Returns:
-        SHI, dimensionless, and 0 where the outlets have no rise, as without load or airflow, or
-        where rounding alone has left something of either sign.
+        SHI, dimensionless, and 0 where inlets or outlets have no mean rise beyond round-off, as
+        without load or airflow.
     """
-    share = _ratio(inlet_rise_m3k_s, outlet_rise_m3k_s)
-    return as_array(np.where(np.maximum(share, -share) > _ROUND_OFF_SHARE, share, 0.0))
+    round_off_m3k_s = np.multiply(airflow_m3s, _ROUND_OFF_K)
+    inlets_differ = np.maximum(inlet_rise_m3k_s, np.negative(inlet_rise_m3k_s)) > round_off_m3k_s
+    share = _ratio(inlet_rise_m3k_s, outlet_rise_m3k_s, round_off_m3k_s)
+    return as_array(np.where(inlets_differ, share, 0.0))
 
 
-def rhi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values) -> F64:
+def rhi(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values, airflow_m3s: Values) -> F64:
     """Return heat index, 1 - SHI, dimensionless (Sharma, Bash and Patel 2002).
 
     Args:
         inlet_rise_m3k_s: ``rise_m3k_s`` of the inlets, m3 K/s.
         outlet_rise_m3k_s: ``rise_m3k_s`` of the outlets, m3 K/s.
+        airflow_m3s: Sum of the airflow of the racks, m3/s.
     """
-    return as_array(1.0 - shi(inlet_rise_m3k_s, outlet_rise_m3k_s))
+    return as_array(1.0 - shi(inlet_rise_m3k_s, outlet_rise_m3k_s, airflow_m3s))
 
 
 def it_rise_k(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values, airflow_m3s: Values) -> F64:
@@ -118,7 +139,7 @@ def it_rise_k(inlet_rise_m3k_s: Values, outlet_rise_m3k_s: Values, airflow_m3s: 
     Returns:
         Rise, K, and 0 where there is no airflow.
     """
-    return _ratio(np.subtract(outlet_rise_m3k_s, inlet_rise_m3k_s), airflow_m3s)
+    return _ratio(np.subtract(outlet_rise_m3k_s, inlet_rise_m3k_s), airflow_m3s, _NO_AIRFLOW_M3S)
 
 
 def rti(return_c: Values, supply_c: Values, it_rise_k: Values) -> F64:
@@ -135,7 +156,7 @@ def rti(return_c: Values, supply_c: Values, it_rise_k: Values) -> F64:
     Returns:
         RTI, %, and 0 where the equipment does not warm its air: all that is supplied bypasses it.
     """
-    return 100.0 * _ratio(np.subtract(return_c, supply_c), it_rise_k)
+    return 100.0 * _ratio(np.subtract(return_c, supply_c), it_rise_k, _ROUND_OFF_K)
 
 
 def rci_hi(over_k: Values, racks: Values, *, allowable_c: Values) -> F64:
@@ -167,7 +188,7 @@ def rci_lo(under_k: Values, racks: Values, *, allowable_c: Values) -> F64:
     return as_array(100.0 * (1.0 - under_k / (racks * (RECOMMENDED_C[0] - allowable_c))))
 
 
-def _ratio(part: Values, whole: Values) -> F64:
+def _ratio(part: Values, whole: Values, round_off: Values) -> F64:
     """Part over whole, 0 where the whole is no more than round-off."""
-    some = np.greater(whole, _NO_RISE)
+    some = np.greater(whole, round_off)
     return as_array(np.where(some, part / np.where(some, whole, 1.0), 0.0))

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
+from sdc_taichi.hall.air_metrics import rank
 from sdc_taichi.types import F64, I64
 
 POLICIES = ("uniform", "fill", "coolest-first", "inlet-aware", "weights")
@@ -114,8 +115,8 @@ def place(
     - ``uniform``: the same load everywhere; where that exceeds a bin's capacity, the bins that have
       room share the rest evenly.
     - ``fill``: bins in order of their index, each up to its capacity.
-    - ``coolest-first``: bins in order of their inlet temperature, ties by index, each up to its
-      capacity.
+    - ``coolest-first``: bins in order of their inlet temperature, those of equal rank
+      (``air_metrics.rank``) by index, each up to its capacity.
     - ``inlet-aware``: loads in proportion to the headroom max(limit - inlet, ``MIN_HEADROOM_K``),
       up to capacity.
     - ``weights``: loads in proportion to ``weights``, up to capacity; weight 0 gets none, even when
@@ -157,7 +158,7 @@ def place(
     usable = np.where(weight > 0.0, capacity, 0.0)
     placed, work, full = _placeable(utilisation, bins, count, usable)
     if policy in ("fill", "coolest-first"):
-        order = np.arange(len(count)) if policy == "fill" else bins.order(inlet_c)
+        order = np.arange(len(count)) if policy == "fill" else bins.order(rank(inlet_c))
         load = _fill_in_order(order, work, bins, count, usable)
     else:
         load = _in_proportion(weight, work, bins, count, usable)

@@ -157,13 +157,14 @@ def _indices(
     """
     inlet = air_metrics.rise_m3k_s(airflow_m3s, inlet_c, supply_c)
     outlet = air_metrics.rise_m3k_s(airflow_m3s, inlet_c + rise_k, supply_c)
-    it_rise_k = air_metrics.it_rise_k(inlet, outlet, airflow_m3s.sum())
+    flow_m3s = float(airflow_m3s.sum())
+    it_rise_k = air_metrics.it_rise_k(inlet, outlet, flow_m3s)
     low_c, high_c = air_metrics.allowable_c(config.protection.ashrae_class)
     over_k, under_k = air_metrics.over_27_sum_k(inlet_c), air_metrics.under_18_sum_k(inlet_c)
     racks = len(inlet_c)
     return {
-        "shi": float(air_metrics.shi(inlet, outlet)),
-        "rhi": float(air_metrics.rhi(inlet, outlet)),
+        "shi": float(air_metrics.shi(inlet, outlet, flow_m3s)),
+        "rhi": float(air_metrics.rhi(inlet, outlet, flow_m3s)),
         "rti_pct": float(air_metrics.rti(return_c, supply_c, it_rise_k)),
         "rci_hi_pct": float(air_metrics.rci_hi(over_k, racks, allowable_c=high_c)),
         "rci_lo_pct": float(air_metrics.rci_lo(under_k, racks, allowable_c=low_c)),

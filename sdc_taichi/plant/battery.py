@@ -35,6 +35,9 @@ import numpy as np
 
 from sdc_taichi.types import F64, Values
 
+_ROUND_OFF_SHARE = 1e-12
+"""Share of the stored energy that rounding may leave in a battery that is emptied exactly."""
+
 
 @dataclass(frozen=True, slots=True)
 class BatteryResult:
@@ -261,10 +264,11 @@ def _step(
     charge_kwh = np.maximum(command, 0.0) * charge_limit_kw * dt_h
     discharge_kwh = np.maximum(-command, 0.0) * np.minimum(discharge_limit_kw, load_kw) * dt_h
     after_kwh = stored_kwh + charge_efficiency * charge_kwh - discharge_factor * discharge_kwh
+    # Emptying or filling exactly can miss by the last bits, and an empty battery carries nothing.
+    after_kwh = np.where(after_kwh > _ROUND_OFF_SHARE * stored_kwh, after_kwh, 0.0)
     return _battery(
         stored_kwh,
-        # Emptying or filling exactly can overshoot by the last bit.
-        np.clip(after_kwh, 0.0, capacity_kwh),
+        np.minimum(after_kwh, capacity_kwh),
         charge_kwh=charge_kwh,
         discharge_kwh=discharge_kwh,
         load_kwh=load_kw * dt_h,

@@ -260,6 +260,11 @@ STORES_UNMET_HEAT = frozenset({"heat_balance"})
 """Load models whose heat is conserved; the others remove whatever load they compute."""
 
 
+ROUND_OFF_SHARE = 1e-12
+"""Heat that differs by no more than this share is the same: sums of many devices hold no more
+digits, and their last bits depend on the processor."""
+
+
 def balance_room_heat(
     load_w: F64, heat_removed_w: F64, room_heat_kwh: F64, step_h: float
 ) -> tuple[F64, F64, F64]:
@@ -283,6 +288,8 @@ def balance_room_heat(
 def unmet_and_recovered(load_w: F64, heat_removed_w: F64) -> tuple[F64, F64]:
     """Load beyond the heat removed, and heat removed beyond the load.
 
+    Both are differences of sums that may agree; what rounding leaves of them is none.
+
     Args:
         load_w: Cooling load, W, (B,).
         heat_removed_w: Heat that the plant took out, W, (B,).
@@ -290,4 +297,9 @@ def unmet_and_recovered(load_w: F64, heat_removed_w: F64) -> tuple[F64, F64]:
     Returns:
         Unmet load and recovered heat, W, each (B,) and at least 0.
     """
-    return np.maximum(load_w - heat_removed_w, 0.0), np.maximum(heat_removed_w - load_w, 0.0)
+    round_off_w = ROUND_OFF_SHARE * np.maximum(load_w, heat_removed_w)
+    unmet_w, recovered_w = load_w - heat_removed_w, heat_removed_w - load_w
+    return (
+        np.where(unmet_w > round_off_w, unmet_w, 0.0),
+        np.where(recovered_w > round_off_w, recovered_w, 0.0),
+    )

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.hall.air_metrics import RECOMMENDED_C
+from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, rank
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, StepResult
 
@@ -120,11 +120,11 @@ def add_step(totals: Totals, result: StepResult) -> None:
     totals.steps += 1
     for name, total in totals.sums.items():
         total += getattr(result, name)
-    totals.hot_steps += result.inlet_max_c > RECOMMENDED_C[1]
+    totals.hot_steps += result.inlet_max_c > RECOMMENDED_C[1] + LEAST_EXCESS_K
     np.maximum(totals.queue_max_tasks, result.queue_tasks, out=totals.queue_max_tasks)
     np.maximum(totals.overdue_max_tasks, result.overdue_tasks, out=totals.overdue_max_tasks)
-    hotter = np.flatnonzero(result.inlet_max_c > totals.hottest_inlet_c)
-    totals.hottest_inlet_c[hotter] = result.inlet_max_c[hotter]
+    hotter = np.flatnonzero(rank(result.inlet_max_c) > rank(totals.hottest_inlet_c))
+    np.maximum(totals.hottest_inlet_c, result.inlet_max_c, out=totals.hottest_inlet_c)
     totals.hottest_step[hotter] = result.step
     totals.hottest_rack[hotter] = result.hottest_rack[hotter]
     totals.hottest_server[hotter] = result.hottest_server[hotter]
@@ -167,14 +167,14 @@ def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
     """
     sums = {name: float(values.sum()) for name, values in totals.sums.items()}
     behind_ups_kwh = float((totals.sums["it_kwh"] / fleet.values("hvac.ups_efficiency")).sum())
-    hottest = int(np.argmax(totals.hottest_inlet_c))
+    hottest = int(np.argmax(rank(totals.hottest_inlet_c)))
     servers = fleet.per_dc_servers()
     return _energy_and_work(sums, behind_ups_kwh, totals.step_h) | {
         "queue_mean_tasks": sums["queue_tasks"] / totals.steps / fleet.size,
         "queue_max_tasks": float(totals.queue_max_tasks.max()),
         "overdue_max_tasks": float(totals.overdue_max_tasks.max()),
         "inlet_above_27_h": int(totals.hot_steps.sum()) * totals.step_h,
-        "hottest_inlet_c": float(totals.hottest_inlet_c[hottest]),
+        "hottest_inlet_c": float(totals.hottest_inlet_c.max()),
         "hottest_dc": fleet.names[hottest],
         **_hottest_place(totals, hottest, fleet),
         **_mean_metrics(totals, {name: sums[name] / fleet.size for name in _MEAN_FIELDS}),

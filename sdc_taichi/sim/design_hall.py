@@ -15,15 +15,14 @@ from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
 from sdc_taichi.types import F64
 
-TIE_DIGITS = 6
-"""Decimal digits, of C, up to which temperatures are compared: alike racks differ in the last bits
-of a number, and the first of them is to be named."""
 EXACT_RADIUS_RACKS = 2000
 """Number of racks up to which the spectral radius is computed; in larger halls the row sums bound
 it."""
 _RADIUS_TOLERANCE = 1e-9
 _MOST_ITERATIONS = 1000
 _NO_APPROACH_K = 1e-9
+_ROUND_OFF_SHARE = 1e-9
+"""Share of air up to which none is left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +95,7 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
     approach_k = inlet_c - supply_c
     # Round-off of either sign is no approach temperature.
     approach_k[np.abs(approach_k) < _NO_APPROACH_K] = 0.0
-    group = int(np.argmax(np.round(hall.group_inlets(), TIE_DIGITS)))
+    group = int(np.argmax(air_metrics.rank(hall.group_inlets())))
     rack = int(np.searchsorted(fleet.group_offsets, group, side="right")) - 1
     first_server = fleet.server_offsets[fleet.group_offsets[rack]]
     return DesignHall(
@@ -132,11 +131,12 @@ def _air_flows(fleet: Fleet, sums: HallSums, approach_k: F64, supply_c: float) -
     return_c = float(sums.return_c[0])
     inlet_rise, outlet_rise = sums.inlet_m3k_s, sums.outlet_m3k_s
     rise_k = air_metrics.it_rise_k(inlet_rise, outlet_rise, sums.it_airflow_m3s)
+    bypass_share = 1.0 - float(np.sum((1.0 - share) * airflow_m3s)) / flow_m3s
     return AirFlows(
         exhaust_share=share,
-        bypass_share=max(1.0 - float(np.sum((1.0 - share) * airflow_m3s)) / flow_m3s, 0.0),
+        bypass_share=bypass_share if bypass_share > _ROUND_OFF_SHARE else 0.0,
         return_c=return_c,
-        shi=float(air_metrics.shi(inlet_rise, outlet_rise)[0]),
+        shi=float(air_metrics.shi(inlet_rise, outlet_rise, sums.it_airflow_m3s)[0]),
         rti_pct=float(air_metrics.rti(return_c, supply_c, rise_k)[0]),
         spectral_radius_bounds=_spectral_radius_bounds(air.mix_weights, share),
     )

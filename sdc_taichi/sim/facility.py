@@ -355,7 +355,8 @@ class Facility:
                 load_w, removed_w, inputs.room_heat_kwh, self._step_h
             )
         if not self._stores_heat:
-            unmet_w = recovered_w = 0.0 * load_w
+            # Of no sign, even where the load is negative.
+            unmet_w = recovered_w = 0.0 * load_w + 0.0
         return _HeatBalance(unmet_w, recovered_w, room_heat_kwh)
 
     def _use_water(self, inputs: FacilityInputs, air: _CracAir, plant: WaterSideResult) -> WaterUse:
@@ -404,7 +405,7 @@ class Facility:
         )
         return {
             "over_27_mean_k": inputs.over_27_sum_k / servers,
-            "shi": air_metrics.shi(inputs.inlet_m3k_s, inputs.outlet_m3k_s),
+            "shi": air_metrics.shi(inputs.inlet_m3k_s, inputs.outlet_m3k_s, inputs.it_airflow_m3s),
             "rti_pct": air_metrics.rti(air.return_c, air.supply_c, it_rise_k),
             "rci_hi_pct": air_metrics.rci_hi(inputs.over_27_sum_k, servers, allowable_c=high_c),
             "rci_lo_pct": air_metrics.rci_lo(inputs.under_18_sum_k, servers, allowable_c=low_c),

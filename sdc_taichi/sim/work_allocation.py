@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdc_taichi.hall import protection
-from sdc_taichi.hall.air_metrics import allowable_c
+from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, allowable_c
 from sdc_taichi.hall.placement import make_bins, place
 from sdc_taichi.hall.protection import THROTTLED, TRIPPED
 from sdc_taichi.plant.workload import TASKS_PER_STEP
@@ -84,10 +84,10 @@ class WorkAllocation:
         limit_c = np.array([np.inf if c is None else allowable_c(c)[1] for c in classes])
         trip_c = limit_c + fleet.values("protection.trip_margin_k")
         self._protected = bool(np.any(np.isfinite(limit_c)))
+        restart_c = fleet.values("protection.restart_c")
         self._limits = {
-            "limit_c": limit_c[fleet.rack_dc],
-            "trip_c": trip_c[fleet.rack_dc],
-            "restart_c": fleet.values("protection.restart_c")[fleet.rack_dc],
+            name: each[fleet.rack_dc] + LEAST_EXCESS_K
+            for name, each in (("limit_c", limit_c), ("trip_c", trip_c), ("restart_c", restart_c))
         }
         self._unlimited = Capacity(utilisation=1.0, bins=None)
         self._throttle_share = fleet.values("protection.throttle_share")[fleet.rack_dc]
