@@ -11,6 +11,7 @@ import exogenous_builders as build
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import read_carbon, read_epw, read_workload, statistics, wet_bulb_c
 from sdc_taichi.exogenous.series_file import read_metadata, write_parquet
+from sdc_taichi.exogenous.stamps import Stamp
 from sdc_taichi.exogenous.year_clock import MONTH_OF_DAY
 
 
@@ -36,6 +37,26 @@ def test_solar_dip_lands_on_local_noon(
     np.testing.assert_allclose(by_hour, by_hour[::-1], rtol=0, atol=1e-3 * by_hour.max())
     assert set(np.argsort(by_hour)[:2]) == {11, 12}
     assert not series.synthetic
+
+
+@pytest.mark.parametrize(("longitude_deg", "warned"), [(-75, False), (-95, False), (-110, True)])
+@pytest.mark.parametrize("stamp", ["auto", "end"])
+def test_the_sun_of_another_region_is_warned_of(
+    longitude_deg: float, warned: bool, stamp: Stamp, tmp_path: Path
+) -> None:
+    path = write(tmp_path / "ci.csv", build.carbon_lines())
+    series = read_carbon(path, -5.0, stamp, longitude_deg=longitude_deg)
+    found = [note for note in series.notes if "another region" in note]
+    assert len(found) == warned
+    assert all("warning: solar generation is centred" in note for note in found)
+
+
+def test_a_grid_without_emissions_is_taken(tmp_path: Path) -> None:
+    stamps = [line.split(",")[0] for line in build.carbon_lines()[1:]]
+    plain = ["timestamp,avg_CI", *(f"{stamp},0" for stamp in stamps)]
+    wind = [build.CARBON_HEADER, *(f"{stamp},900,0,0,0,0,0,0,0,11" for stamp in stamps)]
+    assert read_carbon(write(tmp_path / "zero.csv", plain), -5.0).values.max() == 0.0
+    assert read_carbon(write(tmp_path / "wind.csv", wind), -5.0).values.max() == 11.0
 
 
 def test_the_wrong_stamp_is_an_hour_off(tmp_path: Path) -> None:
@@ -311,6 +332,19 @@ def test_workload_of_five_minutes_and_of_three_years(tmp_path: Path) -> None:
     by_day = series.values.reshape(365, 48).mean(axis=1)
     np.testing.assert_allclose(by_day[:59], 0.5)  # January and February lead
     np.testing.assert_allclose(by_day[59:], 0.2)
+
+
+def test_columns_by_other_names(tmp_path: Path) -> None:
+    plain = build.workload_lines()
+    path = write(tmp_path / "a.csv", plain)
+    renamed = write(tmp_path / "b.csv", [plain[0].replace("cpu_load", "cpu [1]"), *plain[1:]])
+    series = read_workload(renamed, columns={"cpu_load": "cpu [1]"})
+    np.testing.assert_array_equal(series.values, read_workload(path).values)
+    assert "cpu [1] read as cpu_load" in series.notes
+    with pytest.raises(DataError, match="missing column load; found"):
+        read_workload(path, columns={"cpu_load": "load"})
+    with pytest.raises(DataError, match="expected each column once"):
+        read_workload(path, columns={"timestamp": "cpu_load", "cpu_load": "cpu_load"})
 
 
 def test_workload_gaps_are_interpolated(tmp_path: Path) -> None:

@@ -122,6 +122,17 @@ def test_nothing_is_paired_silently(sources: Path) -> None:
         site_from_files(None, carbon=carbon(sources))
 
 
+@pytest.mark.parametrize(("state", "warned"), [("NY", False), ("CA", True)])
+def test_carbon_named_after_another_state_is_warned_of(
+    state: str, warned: bool, sources: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / f"{state}_NG_&_avgCI.csv"
+    path.write_bytes(Path(carbon(sources)).read_bytes())
+    for base, weather in ((None, epw(sources)), (synthetic_site("NY"), None)):
+        notes = site_from_files(base, weather, path).ci_g_per_kwh.notes
+        assert any("named after CA" in note for note in notes) == warned
+
+
 # Commands
 
 
@@ -230,6 +241,44 @@ def test_files_that_are_none_of_the_three(tmp_path: Path, user_folder: Path) -> 
     path.write_text(build.text(build.carbon_lines()))
     with pytest.raises(DataError, match="expected --site NAME"):
         run("import", str(path))
+
+
+@pytest.mark.parametrize("life_cycle", ["Life cycle", "LCA"])
+def test_a_table_of_electricity_maps(life_cycle: str, tmp_path: Path, user_folder: Path) -> None:
+    columns = [f"Carbon intensity gCO₂eq/kWh ({kind})" for kind in ("direct", life_cycle)]
+    stamps = [line.split(",")[0].removesuffix("+00:00") for line in build.carbon_lines()[1:]]
+    rows = (f"{stamp},France,France,FR,20,{i % 24}" for i, stamp in enumerate(stamps))
+    path = tmp_path / "FR_2022_hourly.csv"
+    header = f"Datetime (UTC),Country,Zone name,Zone id,{','.join(columns)}"
+    path.write_text(build.text([header, *rows]))
+    hint = f"--map 'timestamp=Datetime (UTC)' --map 'avg_CI={columns[1]}' --stamp start"
+    arguments = ["import", str(path), "--site", "paris", "--utc-offset", "1"]
+    assert hint in " ".join(str(CliRunner().invoke(data_app, arguments).exception).split())
+    with pytest.raises(DataError, match=r"missing column timestamp, avg_CI.*Electricity Maps"):
+        read_carbon(path, 1.0)
+    mapped = ["--map", "timestamp=Datetime (UTC)", "--map", f"avg_CI={columns[1]}"]
+    assert run(*arguments, *mapped, "--stamp", "start").exit_code == 0
+    stored = user_folder / "sites" / "paris" / "carbon.parquet"
+    np.testing.assert_array_equal(read_carbon(stored, 1.0).values[:25], [23, *range(24)])
+
+
+@pytest.mark.parametrize(
+    ("mapped", "message"),
+    [
+        ("avg_CI", "expected NAME=COLUMN"),
+        ("avgCI=x", "did you mean 'avg_CI'"),
+        ("avg_CI=x", "row 1: expected an EPW file"),
+        ("cpu_load=avg_CI", "row 2, column cpu_load: '[0-9.]+', expected a number from 0 to 1"),
+    ],
+)
+def test_mappings_that_are_not_valid(
+    mapped: str, message: str, sources: Path, user_folder: Path
+) -> None:
+    with pytest.raises(DataError, match=message):
+        run("import", carbon(sources), "--site", "x", "--map", mapped)
+    for path in (epw(sources), str(sources)):
+        with pytest.raises(DataError, match="--map"):
+            run("import", path, "--map", "avg_CI=x")
 
 
 def test_show_a_site_and_a_trace(user_folder: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -14,8 +14,9 @@ from rich.table import Table
 
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.cli.arguments import out_option
-from sdc_taichi.errors import DataError
+from sdc_taichi.errors import DataError, suggestion
 from sdc_taichi.exogenous import importing
+from sdc_taichi.exogenous.carbon import COLUMNS
 from sdc_taichi.exogenous.registry import (
     find_name,
     imported_sites,
@@ -35,6 +36,9 @@ from sdc_taichi.exogenous.synthetic import (
     synthetic_trace,
     synthetic_traces,
 )
+
+MAPPED_COLUMNS = (*COLUMNS, "cpu_load")
+"""Columns that ``--map`` may give by another name."""
 
 data_app = typer.Typer(help="Sites and workload traces.", no_args_is_help=True)
 
@@ -155,12 +159,21 @@ def import_data(
     stamp: Annotated[
         StampOption, typer.Option(help="What a stamp of a carbon file marks.")
     ] = StampOption.AUTO,
+    mapped: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map",
+            metavar="NAME=COLUMN",
+            help="Column of the file that holds timestamp, avg_CI, a fuel or cpu_load; repeatable.",
+        ),
+    ] = None,
 ) -> None:
     """Validate and align files, and store them in the user's data folder."""
     console = Console()
     if base is not None:
         base = find_name("base", base, synthetic_sites())
-    jobs, left_out = _plan_import(path, site)
+    columns = _columns(mapped or [])
+    jobs, left_out = _plan_import(path, site, columns)
     done: list[importing.Imported] = []
     failed: list[DataError] = []
     for kind, file, name in jobs:
@@ -169,10 +182,10 @@ def import_data(
                 item = importing.import_weather(file, name, base)
             elif kind == "carbon":
                 item = importing.import_carbon(
-                    file, name, base, utc_offset_h=utc_offset, stamp=stamp.value
+                    file, name, base, utc_offset_h=utc_offset, stamp=stamp.value, columns=columns
                 )
             else:
-                item = importing.import_workload(file, name)
+                item = importing.import_workload(file, name, columns=columns)
         except DataError as error:
             failed.append(error)
             continue
@@ -187,15 +200,33 @@ def import_data(
         raise DataError(f"{len(failed)} of {len(jobs)} files not imported; first: {failed[0]}")
 
 
+def _columns(mapped: list[str]) -> dict[str, str]:
+    """Names of columns as readers expect them, and their names in the file, of ``--map``."""
+    columns: dict[str, str] = {}
+    for text in mapped:
+        name, sign, column = text.partition("=")
+        if not sign or not column or name not in MAPPED_COLUMNS or name in columns:
+            raise DataError(
+                f"--map {text}: expected NAME=COLUMN, each name once, of "
+                f"{', '.join(MAPPED_COLUMNS)}{suggestion(name, MAPPED_COLUMNS)}"
+            )
+        columns[name] = column
+    return columns
+
+
 def _plan_import(
-    path: Path, site: str | None
+    path: Path, site: str | None, columns: Mapping[str, str]
 ) -> tuple[list[tuple[str, Path, str]], list[tuple[Path, str]]]:
     """Kind, file and name of each import, and the files that are left out, with the reasons."""
     if os.path.isdir(path):
+        if columns:
+            raise DataError(f"--map: names columns of one file, but {path} is a folder")
         if site is not None:
             raise DataError(f"--site {site}: names one file, but {path} is a folder")
         return importing.plan_folder(path)
-    kind = importing.file_kind(path)
+    kind = importing.file_kind(path, columns)
+    if kind == "weather" and columns:
+        raise DataError(f"--map: without effect on the weather file {path}")
     name = site or (importing.default_name(path) if kind == "workload" else None)
     if name is None:
         raise DataError(f"{path}: a {kind} file, expected --site NAME to import it under")

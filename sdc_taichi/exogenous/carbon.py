@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -11,7 +13,7 @@ from numpy.typing import NDArray
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.series import FloatArray, Series
-from sdc_taichi.exogenous.stamps import Stamp, by_start_of_interval
+from sdc_taichi.exogenous.stamps import Stamp, by_start_of_interval, region_notes
 from sdc_taichi.exogenous.synthetic import FUELS, emission_factors
 
 if TYPE_CHECKING:
@@ -37,6 +39,7 @@ def read_carbon(
     *,
     pairing: Pairing = "local",
     longitude_deg: float | None = None,
+    columns: Mapping[str, str] = MappingProxyType({}),
 ) -> Series:
     """Read carbon intensity and bring it to the site's local standard time.
 
@@ -56,7 +59,11 @@ def read_carbon(
         stamp: what a stamp marks.
         pairing: ``"utc_rows"`` keeps the order of the rows as the released SustainDC does, which
             pairs UTC hours with local ones.
-        longitude_deg: of the site, for ``"auto"``; the middle of the time zone if None.
+        longitude_deg: of the site, for ``"auto"`` and for a warning if the sun of the grid is
+            another; None is the middle of the time zone, without a warning.
+        columns: names above, and the names that they have in the table instead, such as
+            ``{"timestamp": "Datetime (UTC)"}``; stamps of a column whose name says UTC need no
+            offset.
 
     Returns:
         Carbon intensity, g/kWh, resolution of the file, whole years of 365 days.
@@ -75,17 +82,19 @@ def read_carbon(
         metadata = series_file.read_metadata(path)
         if metadata is not None:
             return _read_imported(path, metadata, utc_offset_h, pairing)
-    minutes, start_utc, columns, values, notes = _generation(path)
+    minutes, start_utc, known, values, notes = _generation(path, columns)
     intensity = values[:, -1]
     local = start_utc + np.timedelta64(round(utc_offset_h * 3600), "s")
     if pairing == "utc_rows":
         local = start_utc
         notes.append("rows kept in UTC order, as the released SustainDC pairs them")
     else:
-        solar = values[:, columns.index("SUN")] if "SUN" in columns else None
+        solar = values[:, known.index("SUN")] if "SUN" in known else None
         noon_h = 12.0 if longitude_deg is None else 12.0 + utc_offset_h - longitude_deg / 15.0
         without_leap, _, _ = files.without_leap_days(intensity, local, minutes)
         files.check_length(path, len(without_leap), minutes)
+        if solar is not None and longitude_deg is not None:
+            notes += region_notes(solar, local, minutes, noon_h)
         intensity, shift, note = by_start_of_interval(
             stamp, intensity, solar, local, minutes, noon_h
         )
@@ -100,7 +109,7 @@ def read_carbon(
 
 
 def _generation(
-    path: Path,
+    path: Path, given: Mapping[str, str]
 ) -> tuple[float, np.datetime64, tuple[str, ...], FloatArray, list[str]]:
     """Contiguous rows of a carbon table, repaired.
 
@@ -108,15 +117,16 @@ def _generation(
         Resolution in minutes, first stamp (UTC), names of the columns (fuels if there are any,
         then ``avg_CI``), values, (T, columns), and notes.
     """
-    frame, first_row = files.read_table(path)
-    notes = []
+    frame, first_row = files.read_table(path, given)
+    notes = [f"{own} read as {name}" for name, own in given.items()]
     if "timestamp" not in frame.columns and frame.columns[0].strip() in files.BLANK_HEADERS:
         frame = frame.rename(columns={frame.columns[0]: "timestamp"})
         notes.append("blank first header read as timestamp")
     with_fuels = any(fuel in frame.columns for fuel in FUELS)
     files.require_columns(path, frame, COLUMNS if with_fuels else ("timestamp", "avg_CI"))
     rows = first_row + np.arange(len(frame))
-    minutes, positions, start_utc = _stamps(path, frame, rows)
+    in_utc = "UTC" in given.get("timestamp", "")
+    minutes, positions, start_utc = _stamps(path, frame, rows, in_utc=in_utc)
     columns = (*FUELS, "avg_CI") if with_fuels else ("avg_CI",)
     values, number_notes = _numbers(path, frame, columns, rows)
     values = files.spread(values, positions)
@@ -144,9 +154,16 @@ def _read_imported(
 
 
 def _stamps(
-    path: Path, frame: pd.DataFrame, rows: NDArray[np.int64]
+    path: Path, frame: pd.DataFrame, rows: NDArray[np.int64], *, in_utc: bool
 ) -> tuple[float, NDArray[np.int64], np.datetime64]:
-    """Resolution, grid positions and first stamp (UTC) of the timestamp column."""
+    """Resolution, grid positions and first stamp (UTC) of the timestamp column.
+
+    Args:
+        path: file, for messages.
+        frame: the table, as text.
+        rows: rows of the file, for messages, (T,).
+        in_utc: whether stamps without an offset are in UTC.
+    """
     import pandas as pd
 
     text = frame["timestamp"].str.strip()
@@ -157,7 +174,7 @@ def _stamps(
         valid = "a time such as 2022-01-01 00:00:00+00:00"
         raise files.fault(path, int(rows[at]), "timestamp", text.iloc[at], valid)
     naive = ~text.str.contains(_TIMEZONE, regex=True).to_numpy(dtype=bool)
-    if naive.any():
+    if naive.any() and not in_utc:
         at = int(np.argmax(naive))
         valid = "a UTC offset at the end, such as +00:00"
         raise files.fault(path, int(rows[at]), "timestamp", text.iloc[at], valid)
@@ -185,7 +202,8 @@ def _numbers(
         ],
         axis=1,
     )
-    if not np.isnan(values[:, -1]).all() and np.nanmax(values[:, -1]) < 2.0:
+    # A grid of renewables alone has 0 all year.
+    if not np.isnan(values[:, -1]).all() and 0.0 < np.nanmax(values[:, -1]) < 2.0:
         raise DataError(
             f"{path}: row {int(rows[0])}, column avg_CI: at most {np.nanmax(values[:, -1]):g} in "
             "all rows, expected g/kWh (multiply kg/kWh by 1000)"

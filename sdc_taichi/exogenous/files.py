@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 import warnings
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,14 +70,20 @@ def is_parquet(path: Path) -> bool:
 # Reading
 
 
-def read_table(path: Path) -> tuple[pd.DataFrame, int]:
+def read_table(
+    path: Path, columns: Mapping[str, str] = MappingProxyType({})
+) -> tuple[pd.DataFrame, int]:
     """Read a CSV file as text, or a Parquet file that `data import` did not write.
+
+    Args:
+        path: the file.
+        columns: names that columns get, and their names in the file; the rest keep theirs.
 
     Returns:
         The table, all columns as text, and the row number of its first line of data.
 
     Raises:
-        DataError: not readable as a table, or without rows.
+        DataError: not readable as a table, without rows, or without one of ``columns``.
     """
     import pandas as pd
 
@@ -91,7 +100,22 @@ def read_table(path: Path) -> tuple[pd.DataFrame, int]:
         frame = frame.iloc[:-1]
     if frame.empty:
         raise DataError(f"{path}: no rows of data")
-    return frame, first_row
+    return _renamed(path, frame, columns), first_row
+
+
+def _renamed(path: Path, frame: pd.DataFrame, columns: Mapping[str, str]) -> pd.DataFrame:
+    """The table with columns under the names that they are to have, time stamps first."""
+    if not columns:
+        return frame
+    require_columns(path, frame, tuple(columns.values()))
+    taken = [name for name, own in columns.items() if name in frame.columns and name != own]
+    if taken or len(set(columns.values())) < len(columns):
+        raise DataError(
+            f"{path}: columns {dict(columns)}: expected each column once, and none that the file "
+            f"names so itself"
+        )
+    frame = frame.rename(columns={own: name for name, own in columns.items()})
+    return frame[sorted(frame.columns, key=lambda name: name != "timestamp")]
 
 
 def _read_csv(path: Path) -> pd.DataFrame:
@@ -169,8 +193,25 @@ def require_columns(path: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -
         )
         raise DataError(
             f"{path}: row 1: missing column {', '.join(missing)}; found {present}; "
-            f"expected {', '.join(columns)}"
+            f"expected {', '.join(columns)}{mapping_hint(frame.columns)}"
         )
+
+
+def mapping_hint(found: Iterable[object]) -> str:
+    """End of a message about columns: how a table of Electricity Maps is imported; else empty.
+
+    Args:
+        found: names of the columns of the file.
+    """
+    names = [str(name) for name in found]
+    intensities = [x for x in names if x.casefold().startswith("carbon intensity gco")]
+    if "Datetime (UTC)" not in names or not intensities:
+        return ""
+    of_life_cycle = [x for x in intensities if re.search("life cycle|lca", x.casefold())]
+    return (
+        " (a table of Electricity Maps: data import FILE --map 'timestamp=Datetime (UTC)' "
+        f"--map 'avg_CI={(of_life_cycle or intensities)[0]}' --stamp start)"
+    )
 
 
 def numbers(

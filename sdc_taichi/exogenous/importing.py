@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import csv
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from sdc_taichi.errors import DataError
@@ -49,8 +51,12 @@ class Imported:
     """Repairs, with counts, and warnings."""
 
 
-def file_kind(path: Path) -> str:
+def file_kind(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> str:
     """Whether a file is ``weather``, ``carbon`` or ``workload``, by its content.
+
+    Args:
+        path: the file.
+        columns: names of columns as the readers expect them, and their names in the file.
 
     Raises:
         DataError: none of them.
@@ -65,14 +71,15 @@ def file_kind(path: Path) -> str:
             line = handle.readline(4096).decode("utf-8", errors="replace").lstrip("\ufeff").strip()
         if line.upper().startswith("LOCATION,"):
             return "weather"
-        header = {cell.strip().strip('"') for cell in line.split(",")}
-    if "avg_CI" in header:
-        return "carbon"
-    if "cpu_load" in header:
-        return "workload"
+        header = {cell.strip() for cell in next(csv.reader([line]), [])}
+    kinds = {"avg_CI": "carbon", "cpu_load": "workload"}
+    for column, kind in sorted(kinds.items(), key=lambda item: item[0] not in columns):
+        if columns.get(column, column) in header:
+            return kind
+    hint = files.mapping_hint(header) or " or --map avg_CI=COLUMN, --map cpu_load=COLUMN"
     raise DataError(
         f"{path}: row 1: expected an EPW file (LOCATION,...), a column avg_CI (carbon) or "
-        "a column cpu_load (workload)"
+        f"a column cpu_load (workload){hint}"
     )
 
 
@@ -109,11 +116,12 @@ def import_carbon(
     *,
     utc_offset_h: float | None = None,
     stamp: Stamp = "auto",
+    columns: Mapping[str, str] = MappingProxyType({}),
 ) -> Imported:
     """Store a carbon file as ``sites/NAME/carbon.parquet``.
 
     The UTC offset is that of the weather imported under the same name, else ``utc_offset_h``, else
-    the base's.
+    the base's. ``stamp`` and ``columns`` are those of ``read_carbon``.
 
     Raises:
         DataError: none of them is known, or they differ.
@@ -136,17 +144,24 @@ def import_carbon(
             f"{path}: UTC offset of site {name!r} unknown, expected the weather file imported "
             "first, --base SITE or --utc-offset HOURS"
         )
-    series = read_carbon(path, offset, stamp, longitude_deg=longitude)
+    series = read_carbon(path, offset, stamp, longitude_deg=longitude, columns=columns)
     metadata = {"kind": "carbon", "utc_offset_h": offset, "pairing": "local", "base": base}
     target = user_data_dir(data_dir) / "sites" / name / "carbon.parquet"
     return _store(path, name, target, [series], metadata)
 
 
-def import_workload(path: Path, name: str, data_dir: Path | None = None) -> Imported:
-    """Store a workload file as ``traces/NAME.parquet``."""
+def import_workload(
+    path: Path,
+    name: str,
+    data_dir: Path | None = None,
+    *,
+    columns: Mapping[str, str] = MappingProxyType({}),
+) -> Imported:
+    """Store a workload file, with ``columns`` of ``read_workload``, as ``traces/NAME.parquet``."""
     name = _stored_name(new_name("trace", name, synthetic_traces()), imported_traces(data_dir))
     target = user_data_dir(data_dir) / "traces" / f"{name}.parquet"
-    return _store(path, name, target, [read_workload(path)], {"kind": "workload"})
+    trace = read_workload(path, columns=columns)
+    return _store(path, name, target, [trace], {"kind": "workload"})
 
 
 def plan_folder(folder: Path) -> tuple[list[tuple[str, Path, str]], list[tuple[Path, str]]]:

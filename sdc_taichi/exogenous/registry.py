@@ -29,6 +29,7 @@ from sdc_taichi.exogenous.weather import read_epw
 from sdc_taichi.exogenous.workload import read_workload
 from sdc_taichi.user_file import list_folder
 
+_STATE_OF_CARBON_FILE = re.compile(r"([A-Z]{2})_NG_")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
@@ -197,6 +198,8 @@ def site_from_files(
             pairing=pairing,
             longitude_deg=station.longitude_deg,
         )
+        here = base.name if weather is None and base is not None else _state(station.label)
+        intensity = _with_region_note(intensity, here)
     elif base is not None:
         intensity = base.ci_g_per_kwh
         if base.utc_offset_h != station.utc_offset_h:
@@ -205,6 +208,27 @@ def site_from_files(
     else:
         raise DataError("carbon: no file and no base site, expected one of them")
     return make_site(name, station, intensity)
+
+
+def _state(label: str) -> str | None:
+    """State of a weather station of the USA, by the label of its file; else None."""
+    *_, state, country = ("", "", *label.split(", "))
+    return state if country == "USA" else None
+
+
+def _with_region_note(intensity: Series, state: str | None) -> Series:
+    """Carbon intensity with a warning if its file is named after another state, as SustainDC's are.
+
+    Args:
+        intensity: read from a file.
+        state: two letters of the state of the weather; None if it is not known.
+    """
+    named = _STATE_OF_CARBON_FILE.match(intensity.source)
+    told = any("another region" in note for note in intensity.notes)
+    if named is None or state is None or named[1] == state or told:
+        return intensity
+    note = f"warning: named after {named[1]}, another region than the weather's, {state}"
+    return replace(intensity, notes=(*intensity.notes, note))
 
 
 def _metadata(path: Path) -> dict[str, Any]:

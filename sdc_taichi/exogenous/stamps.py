@@ -14,6 +14,10 @@ import numpy as np
 from sdc_taichi.exogenous.series import FloatArray
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MINUTES_PER_DAY
 
+MOST_LATENESS_H = 1.5
+"""Largest distance of the centre of solar generation from solar noon at the site, in h: half an
+hour for what stamps mark, and an hour for 15 degrees of longitude that solar plants may lie away.
+Arizona has the largest of the embedded sites, 1.1 h."""
 Stamp = Literal["auto", "start", "end"]
 """Moment of its interval that a stamp marks; ``auto`` infers it from the solar generation."""
 
@@ -59,6 +63,28 @@ def by_start_of_interval(
     # start, then end: one interval is reported twice, and the last of the year never
     joined = np.append(np.delete(intensity, cut), 0.5 * (intensity[-1] + intensity[0]))
     return joined, 0, f"stamps mark the start until {date}, then the end (solar noon); 1 filled"
+
+
+def region_notes(
+    solar: FloatArray, local: np.datetime64, minutes: float, noon_h: float
+) -> list[str]:
+    """A warning if the sun over a grid is not that of the site, else nothing.
+
+    Args:
+        solar: solar generation in the order of the file, any unit, (T,).
+        local: first stamp, in local standard time of the site.
+        minutes: length of an interval, in minutes.
+        noon_h: mean solar noon at the site, in hours of local standard time.
+    """
+    lateness = _solar_lateness(solar, local, minutes, noon_h)
+    mean_h = 0.0 if lateness is None else float(np.nanmean(lateness))
+    if abs(mean_h) <= MOST_LATENESS_H:
+        return []
+    word = "after" if mean_h > 0.0 else "before"
+    return [
+        f"warning: solar generation is centred {abs(mean_h):.1f} h {word} solar noon at the site, "
+        "so it may be of another region than the weather"
+    ]
 
 
 def _solar_lateness(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -23,7 +25,12 @@ _INDEX_HEADERS = frozenset({"index", "hour", "step", "time", "timestamp", "datet
 _PERCENT_HINT = " (divide percentages by 100)"
 
 
-def read_workload(path: str | Path, *, minutes: float | None = None) -> Series:
+def read_workload(
+    path: str | Path,
+    *,
+    minutes: float | None = None,
+    columns: Mapping[str, str] = MappingProxyType({}),
+) -> Series:
     """Read a workload trace.
 
     The table has ``cpu_load`` in [0, 1] and, optionally, a first column with a running index or
@@ -34,6 +41,7 @@ def read_workload(path: str | Path, *, minutes: float | None = None) -> Series:
     Args:
         path: CSV or Parquet.
         minutes: resolution of a file without stamps; None means hourly.
+        columns: ``cpu_load`` or ``timestamp``, and the names that they have in the table instead.
 
     Returns:
         Utilisation, whole years of 365 days.
@@ -48,12 +56,13 @@ def read_workload(path: str | Path, *, minutes: float | None = None) -> Series:
         metadata = series_file.read_metadata(path)
         if metadata is not None:
             return _read_imported(path, metadata)
-    frame, first_row = files.read_table(path)
+    frame, first_row = files.read_table(path, columns)
     files.require_columns(path, frame, ("cpu_load",))
     rows = first_row + np.arange(len(frame))
     values = files.numbers(path, frame["cpu_load"], "cpu_load", rows, 0.0, 1.0, _PERCENT_HINT)
     blank = int(np.isnan(values).sum())
     minutes, positions, first_stamp, notes = _clock(path, frame, rows, minutes)
+    notes += [f"{own} read as {name}" for name, own in columns.items()]
     values = files.spread(values, positions)
     absent = values.size - len(frame)
     for count, what in ((absent, "absent rows"), (blank, "rows without values")):
