@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 from sdc_taichi.config import DataCenterConfig, load_config, preset_names, with_values
 from sdc_taichi.envs import registration
-from sdc_taichi.errors import ConfigError, DataError, RuntimeStateError, SdcError
+from sdc_taichi.errors import (
+    ConfigError,
+    DataError,
+    OddInputWarning,
+    PhysicalLimitError,
+    RuntimeStateError,
+    SdcError,
+    SdcWarning,
+)
 from sdc_taichi.sim.drivers import Drivers, drivers_from_arrays, load_drivers
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.fleet_configs import make_configs
@@ -56,11 +64,14 @@ __all__ = [
     "Fleet",
     "ForecastError",
     "LoadAction",
+    "OddInputWarning",
+    "PhysicalLimitError",
     "RecordEpisodes",
     "Recorder",
     "RunRequest",
     "RuntimeStateError",
     "SdcError",
+    "SdcWarning",
     "ServerLayers",
     "Simulator",
     "State",

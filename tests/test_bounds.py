@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import re
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from pydantic import BaseModel
+from typer.testing import CliRunner
 
 from sdc_taichi import (
     ConfigError,
@@ -22,6 +26,8 @@ from sdc_taichi import (
     preset_names,
     simulate,
 )
+from sdc_taichi.cli.app import app
+from sdc_taichi.config.reference import fields_markdown
 from sdc_taichi.control import make_controller
 from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
 from sdc_taichi.exogenous.series import Series, Weather
@@ -158,6 +164,29 @@ def test_a_result_beyond_physics_ends_the_run_and_changes_nothing() -> None:
     env.close()
 
 
+HOT = [
+    "hvac.tower.economiser=false",
+    "servers.heat_capacity_kj_per_k=0.5",
+    "hall.room_heat_capacity_kj_per_k_per_server=0.5",
+    "hvac.pumps.efficiency=0.1",
+    "events.scheduled=[{kind: chiller_derate, share: 0, start_h: 0.5, duration_h: 9}]",
+]
+
+
+def test_a_run_that_ends_at_a_limit_keeps_the_steps_before(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    done = CliRunner().invoke(
+        app, ["simulate", "tiny", *HOT, "--days", "1", "--quiet", "--out", str(out)]
+    )
+    assert done.exit_code == 2
+    warning, error = done.stderr.splitlines()
+    assert warning.startswith("warning: tiny: hvac.pumps.efficiency 0.1: ")
+    steps = json.loads((out / "metrics.json").read_text())["steps_done"]
+    assert 2 < steps < 20
+    assert re.match(rf"error: ny: [a-z_]+ is .* in step {steps}; physical is", error)
+    assert error.endswith(f"{out} holds the {steps} steps before")
+
+
 def test_an_event_starts_before_the_end_of_the_run() -> None:
     event = "events.scheduled=[{kind: grid_outage, start_h: 24, duration_h: 1}]"
     config = load_config("tiny", [event])
@@ -190,3 +219,11 @@ def test_weather_is_one_of_a_place_on_earth() -> None:
 
 def test_limits_are_those_of_fields_of_results() -> None:
     assert set(LIMITS) <= set(StepResult.__dataclass_fields__)
+
+
+@pytest.mark.repo
+def test_the_docs_show_every_field_with_its_bounds() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "configuration.md").read_text("utf-8")
+    made = fields_markdown()
+    assert made in text, "docs/configuration.md: append what fields_markdown() makes"
+    assert "| `reference_cop` | `5.96` | 0.5..50 |" in made

@@ -16,6 +16,7 @@ from sdc_taichi.cli.config import config_app
 from sdc_taichi.cli.data import data_app
 from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.cli.report import report_command
+from sdc_taichi.cli.session import warnings_in_lines
 from sdc_taichi.cli.simulate import simulate_command
 from sdc_taichi.cli.view import view_command
 from sdc_taichi.errors import SdcError
@@ -30,7 +31,8 @@ class _Commands(typer.core.TyperGroup):
         given = sys.argv[1:] if args is None else list(args)
         extra["standalone_mode"] = False
         try:
-            code = super().main(args, *more, **extra)
+            with warnings_in_lines():
+                code = super().main(args, *more, **extra)
         except Exception as error:
             if "--debug" in given:
                 traceback.print_exc()

@@ -1,4 +1,4 @@
-"""Ctrl-C, the progress bar and the Rerun recording during a simulation."""
+"""Warnings, Ctrl-C, the progress bar and the Rerun recording during a command."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Any
 
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, SdcWarning
 
 if TYPE_CHECKING:
     from sdc_taichi.run.description import RunRequest
@@ -24,6 +24,25 @@ def print_notes(notes: Iterable[str]) -> None:
     """Print what was found out about the inputs of a run, on stderr."""
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def warnings_in_lines() -> Iterator[None]:
+    """Print each warning of the package once, as one line on stderr."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+        shown: set[str] = set()
+
+        def show_once(message: Warning | str, category: type[Warning], *place: Any) -> None:
+            if not issubclass(category, SdcWarning):
+                show(message, category, *place)
+            elif str(message) not in shown:
+                shown.add(str(message))
+                print(f"warning: {message}", file=sys.stderr)
+
+        warnings.simplefilter("always", SdcWarning)
+        warnings.showwarning = show_once
+        yield
 
 
 @contextlib.contextmanager
@@ -101,27 +120,13 @@ def recording(
         yield lambda _: None
         return
     from sdc_taichi.run.description import describe_run
-    from sdc_taichi.viz.recording_output import RecordingWarning
 
-    with warnings.catch_warnings(), recorder:
-        warnings.simplefilter("always", RecordingWarning)
-        warnings.showwarning = _show_warning
+    with recorder:
         recorder.begin(sim, describe_run(sim, request))
         if recorder.served_address is not None:
             command = f"sdc-taichi view {recorder.served_address}"
             print(f"serving the run; watch it with: {command} [--web]", file=sys.stderr)
         yield recorder.add
-
-
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
-    print(f"warning: {message}", file=sys.stderr)
 
 
 def print_recording(recorder: Recorder | None) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sdc_taichi.config.fields import AirC, Index, RiseK, Section, Share
+from sdc_taichi.config.fields import AirC, RiseK, Section, Share
 
 EventKind = Literal["crac_down", "chiller_derate", "rack_fan_failure", "heat_wave", "grid_outage"]
 
@@ -55,10 +55,10 @@ class ScheduledEvent(Section):
     century."""
     duration_h: DurationH
     """Duration of the event, in h."""
-    unit: Index | None = None
-    """CRAC unit that is down, counted from 0; None is all of them."""
-    rack: Index | None = None
-    """Rack whose fans fail, counted from 0, row by row."""
+    unit: Annotated[int, Field(ge=0, le=63)] | None = None
+    """CRAC unit that is down, counted from 0, below their number; None is all of them."""
+    rack: Annotated[int, Field(ge=0, le=9_999_999)] | None = None
+    """Rack whose fans fail, counted from 0, row by row, below their number."""
     share: Share | None = None
     """Chiller capacity or rack airflow that remains, as a share of the full value, 0..1."""
     offset_k: WaveK | None = None

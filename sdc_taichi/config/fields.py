@@ -59,8 +59,8 @@ CRate = Annotated[float, Field(ge=0.001, le=1000)]
 days to flywheels and capacitors that last for seconds."""
 Count = Annotated[int, Field(ge=1, le=10_000)]
 """A number of parts, 1..10,000: more servers or zones than any rack has."""
-Index = Annotated[int, Field(ge=0, le=2**63 - 1)]
-"""A number that counts from 0, or a seed, 0..2**63 - 1."""
+Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
+"""Seed of what is random, 0..2**63 - 1."""
 FileName = Annotated[str, Field(min_length=1)]
 """Path of a file."""
 

@@ -68,7 +68,7 @@ class CracConfig(Section):
     """Control of the units' airflow: constant, by the airflow of the servers, by IT power, or by
     the actions of an agent."""
     min_flow_ratio: WorkingShare = 0.6
-    """Lowest airflow of a running unit over its design airflow, 0..1."""
+    """Lowest airflow of a running unit over its design airflow, 0.01..1."""
     fan_step: Annotated[float, Field(ge=0.001, le=1)] = 0.05
     """Change of fan speed over design speed by one action, for flow model ``controlled``, 0.001..1:
     from less than any drive tells to the whole range."""
@@ -153,7 +153,7 @@ class PumpConfig(Section):
     efficiency: WorkingShare = 0.75
     """Hydraulic power over electric power of a pump, 0.01..1."""
     min_flow_ratio: WorkingShare = 0.6
-    """Lowest flow of a running pump over its design flow, 0..1."""
+    """Lowest flow of a running pump over its design flow, 0.01..1."""
     released_chilled_w: DeviceW = 0.0
     """Power of the chilled-water pump of pump model ``released``, in W."""
     released_condenser_w: DeviceW = 0.0

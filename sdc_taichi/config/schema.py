@@ -17,8 +17,8 @@ from sdc_taichi.config.fields import (
     CRate,
     FileName,
     Hours,
-    Index,
     Section,
+    Seed,
     Share,
     WorkingShare,
     check_one_per_rack,
@@ -111,7 +111,7 @@ class SiteConfig(Section):
     """Name of the site, which gives weather and carbon intensity (see ``sdc-taichi data list``)."""
     start: str = "01-01"
     """Month and day of the first step, MM-DD, local standard time."""
-    seed: Index = 10
+    seed: Seed = 10
     """Seed of the synthetic year; imported data ignore it."""
     weather_file: FileName | None = None
     """EPW file in place of the weather of ``location``; None is no file."""

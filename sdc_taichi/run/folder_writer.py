@@ -19,10 +19,10 @@ import yaml
 from sdc_taichi.atomic_file import AtomicFile, atomic_write, naming_errors
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import Controller
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, PhysicalLimitError
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.run.loop import simulate
-from sdc_taichi.run.metrics import Totals, metrics_of_fleet, metrics_per_dc
+from sdc_taichi.run.metrics import Totals, empty_totals, metrics_of_fleet, metrics_per_dc
 from sdc_taichi.run.steps_file import STEPS_FILE, StepsWriter
 from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.fleet import Fleet
@@ -61,6 +61,8 @@ def simulate_to_folder(
         The content of metrics.json; None, and no files, if it was stopped before the first step.
 
     Raises:
+        PhysicalLimitError: a result that no data center can reach, after the files of the steps
+            before it are written.
         SdcError: the folder is not free, another run is writing to it, a file cannot be written,
             or the controller gave actions that are not valid.
     """
@@ -83,9 +85,23 @@ def simulate_to_folder(
             if on_step is not None:
                 on_step(result)
 
-        totals = simulate(
-            sim, controller, request.steps, request.seed, on_step=write_step, stop=stop
-        )
+        totals = empty_totals(sim.size, sim.step_h)
+        beyond: PhysicalLimitError | None = None
+        try:
+            simulate(
+                sim,
+                controller,
+                request.steps,
+                request.seed,
+                on_step=write_step,
+                stop=stop,
+                totals=totals,
+            )
+        except PhysicalLimitError as error:
+            if totals.steps == 0:
+                raise
+            # The steps before are as good as those of a run that was interrupted.
+            beyond = error
         if totals.steps == 0:
             return None
         writer.commit()
@@ -98,6 +114,8 @@ def simulate_to_folder(
         with naming_errors(metrics_file.path):
             metrics_file.file.write(f"{metrics_json(content)}\n".encode())
         metrics_file.commit()
+    if beyond is not None:
+        raise PhysicalLimitError(f"{beyond}; {out} holds the {totals.steps} steps before")
     return content
 
 

@@ -19,6 +19,7 @@ def simulate(
     *,
     on_step: Callable[[StepResult], None] | None = None,
     stop: Callable[[], bool] | None = None,
+    totals: Totals | None = None,
 ) -> Totals:
     """Reset a simulator and its controller, and run them for some steps.
 
@@ -29,6 +30,7 @@ def simulate(
         seed: of the simulator's events and of the controller.
         on_step: called with the result of every step.
         stop: asked before every step; true ends the run.
+        totals: totals that each step is added to as it is done; None makes new ones.
 
     Returns:
         Totals of the steps that were simulated, from which ``run.metrics`` makes metrics.
@@ -42,7 +44,7 @@ def simulate(
     sim.reset(seed)
     controller.reset(seed)
     view_of = view_maker(sim)
-    totals = empty_totals(sim.size, sim.step_h)
+    totals = empty_totals(sim.size, sim.step_h) if totals is None else totals
     last: StepResult | None = None
     for _ in range(steps):
         if stop is not None and stop():

@@ -1,0 +1,121 @@
+"""The fields of a configuration as a document: default, bounds and meaning of each."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import itertools
+import json
+import re
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from pydantic import BaseModel
+
+from sdc_taichi.config import fields as types
+from sdc_taichi.config.event_schema import SampledEvent, ScheduledEvent
+from sdc_taichi.config.hall_schema import ServerGroup
+from sdc_taichi.config.schema import DataCenterConfig
+
+LISTED = {
+    "servers.groups": ServerGroup,
+    "events.scheduled": ScheduledEvent,
+    "events.sampled": SampledEvent,
+}
+"""Sections that stand in lists, by the path of the list."""
+
+
+def fields_markdown() -> str:
+    """The tables of docs/configuration.md, one per section, and reasons of shared bounds."""
+    tables = [_table(name, model) for name, model in _sections("", DataCenterConfig)]
+    tables += [_table(f"{path}[]", model) for path, model in LISTED.items()]
+    reasons = [f"- {text}" for text in _types().values()]
+    return "\n\n".join([*tables, "## Bounds that fields share", "\n".join(reasons)])
+
+
+def _sections(path: str, model: type[BaseModel]) -> Iterator[tuple[str, type[BaseModel]]]:
+    yield path, model
+    for name, field in model.model_fields.items():
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield from _sections(f"{path}.{name}".lstrip("."), kind)
+
+
+def _table(path: str, model: type[BaseModel]) -> str:
+    schema, docs = model.model_json_schema(), _docstrings(model)
+    rows = [
+        f"| `{name}` | {_default(schema, name)} | {_valid(entry, schema)} | {docs[name]} |"
+        for name, entry in schema["properties"].items()
+        if not _is_section(entry)
+    ]
+    head = [f"## {f'`{path}`' if path else 'A data center'}", "", inspect.getdoc(model) or "", ""]
+    columns = ["| field | default | valid | meaning |", "|---|---|---|---|"]
+    return "\n".join([*head, *(columns + rows if rows else [])]).rstrip()
+
+
+def _is_section(entry: dict[str, Any]) -> bool:
+    return "$ref" in entry
+
+
+def _default(schema: dict[str, Any], name: str) -> str:
+    if name in schema.get("required", ()):
+        return "required"
+    value = schema["properties"][name].get("default")
+    return "" if value in ("", []) else f"`{json.dumps(value)}`"
+
+
+def _valid(entry: dict[str, Any], schema: dict[str, Any]) -> str:
+    """What a JSON schema takes, in words as short as they can be."""
+    if "anyOf" in entry:
+        return " or ".join(_valid(one, schema) for one in entry["anyOf"])
+    if "enum" in entry:
+        return ", ".join(f"`{one}`" for one in entry["enum"])
+    kind = entry.get("type")
+    if kind in ("number", "integer"):
+        low = entry.get("minimum", entry.get("exclusiveMinimum"))
+        high = entry.get("maximum", entry.get("exclusiveMaximum"))
+        above = "above " if "exclusiveMinimum" in entry else ""
+        below = "below " if "exclusiveMaximum" in entry else ""
+        whole = "whole " if kind == "integer" else ""
+        return f"{whole}{above}{_number(low)}..{below}{_number(high)}"
+    if kind == "array":
+        if "prefixItems" in entry:
+            return f"[{', '.join(_valid(one, schema) for one in entry['prefixItems'])}]"
+        items = _valid(entry["items"], schema)
+        return f"list of {items.replace('list', 'lists', 1) if items[:4] == 'list' else items}"
+    if "$ref" in entry:
+        return "sections as below"
+    return {"boolean": "true, false", "null": "null"}.get(str(kind), "text")
+
+
+def _number(value: float) -> str:
+    if value == 2**63 - 1:
+        return "2^63 - 1"
+    return re.sub(r"e([+-])0*(\d)", lambda e: f"e{e[1].strip('+')}{e[2]}", f"{value:g}")
+
+
+def _docstrings(model: type[BaseModel]) -> dict[str, str]:
+    """Docstring of each field of a section, on one line."""
+    tree = ast.parse(inspect.getsource(sys.modules[model.__module__]))
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    return _docstrings_in(classes[model.__name__].body)
+
+
+def _types() -> dict[str, str]:
+    """Docstring of each type of numbers that fields share, on one line."""
+    found = _docstrings_in(ast.parse(inspect.getsource(types)).body)
+    return {name: text for name, text in found.items() if ".." in text}
+
+
+def _docstrings_in(body: list[ast.stmt]) -> dict[str, str]:
+    """Docstrings that stand below assignments, by the names that are assigned to."""
+    found = {}
+    for field, text in itertools.pairwise(body):
+        target = field.target if isinstance(field, ast.AnnAssign) else None
+        if isinstance(field, ast.Assign):
+            target = field.targets[0]
+        doc = text.value if isinstance(text, ast.Expr) else None
+        if isinstance(target, ast.Name) and isinstance(doc, ast.Constant):
+            found[target.id] = " ".join(str(doc.value).split())
+    return found
