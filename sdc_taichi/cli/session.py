@@ -9,7 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TextIO
 
 from sdc_taichi.errors import ConfigError, SdcWarning
 
@@ -33,9 +33,16 @@ def warnings_in_lines() -> Iterator[None]:
         show = warnings.showwarning
         shown: set[str] = set()
 
-        def show_once(message: Warning | str, category: type[Warning], *place: Any) -> None:
+        def show_once(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
             if not issubclass(category, SdcWarning):
-                show(message, category, *place)
+                show(message, category, filename, lineno, file, line)
             elif str(message) not in shown:
                 shown.add(str(message))
                 print(f"warning: {message}", file=sys.stderr)

@@ -18,7 +18,7 @@ from sdc_taichi.config.event_schema import SampledEvent, ScheduledEvent
 from sdc_taichi.config.hall_schema import ServerGroup
 from sdc_taichi.config.schema import DataCenterConfig
 
-LISTED = {
+LISTED: dict[str, type[BaseModel]] = {
     "servers.groups": ServerGroup,
     "events.scheduled": ScheduledEvent,
     "events.sampled": SampledEvent,
@@ -89,7 +89,7 @@ def _valid(entry: dict[str, Any], schema: dict[str, Any]) -> str:
     return {"boolean": "true, false", "null": "null"}.get(str(kind), "text")
 
 
-def _number(value: float) -> str:
+def _number(value: Any) -> str:
     if value == 2**63 - 1:
         return "2^63 - 1"
     return re.sub(r"e([+-])0*(\d)", lambda e: f"e{e[1].strip('+')}{e[2]}", f"{value:g}")
@@ -112,8 +112,10 @@ def _docstrings_in(body: list[ast.stmt]) -> dict[str, str]:
     """Docstrings that stand below assignments, by the names that are assigned to."""
     found = {}
     for field, text in itertools.pairwise(body):
-        target = field.target if isinstance(field, ast.AnnAssign) else None
-        if isinstance(field, ast.Assign):
+        target: ast.expr | None = None
+        if isinstance(field, ast.AnnAssign):
+            target = field.target
+        elif isinstance(field, ast.Assign):
             target = field.targets[0]
         doc = text.value if isinstance(text, ast.Expr) else None
         if isinstance(target, ast.Name) and isinstance(doc, ast.Constant):
