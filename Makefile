@@ -9,6 +9,10 @@ READY := $(VENV)/.installed
 READY_TRAIN := $(VENV)/.installed-train
 PIP_FLAGS := -qq --disable-pip-version-check
 SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
+# The oldest Python and libraries that pyproject.toml admits.
+OLDEST := .venv-oldest
+READY_OLDEST := $(OLDEST)/.installed
+PYTHON_OLDEST ?= python3.11
 # Installed before the libraries on top of it, which would take the newest build. May carry options
 # of pip, such as an index of builds for the CPU alone.
 TORCH ?= torch==2.13.0
@@ -21,7 +25,7 @@ TYPED := build/typecheck
 SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
 
-.PHONY: help demo test test-train bench lint wheel-test clean
+.PHONY: help demo test test-oldest test-train bench lint wheel-test clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -31,6 +35,10 @@ demo: $(READY) ## Simulate July in New York and California; results in runs/demo
 
 test: $(READY) ## Run all tests; those on measured files need SDC_REAL_DATA.
 	$(PY) -m pytest $(SPREAD)
+
+# Old libraries warn of what changed in their own dependencies since.
+test-oldest: $(READY_OLDEST) ## Run all tests with Python 3.11 and the oldest libraries that are supported.
+	$(OLDEST)/bin/python -m pytest $(SPREAD) -W ignore::DeprecationWarning
 
 test-train: $(READY_TRAIN) ## Install the training libraries and test the examples that use them.
 	$(PY) -m pytest tests/test_training.py
@@ -51,13 +59,21 @@ wheel-test: $(READY) ## Build the wheel and run the tests against it, away from 
 	.ci/wheel-test $(PY) $(SPREAD)
 
 clean: ## Remove everything that can be built again, the environment included.
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLDEST) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(READY_TRAIN): $(READY)
 	@echo "Installing the training libraries into $(VENV) (once, a few minutes at most)"
 	@$(PY) -m pip install $(PIP_FLAGS) $(TORCH)
 	@$(PY) -m pip install $(PIP_FLAGS) --editable '.[plot,dev,train]'
+	@touch $@
+
+$(READY_OLDEST): pyproject.toml .ci/lowest_versions.py
+	@echo "Installing the oldest supported libraries into $(OLDEST) (once, a few minutes at most)"
+	@$(PYTHON_OLDEST) -m venv --clear $(OLDEST)
+	@$(OLDEST)/bin/python .ci/lowest_versions.py > $(OLDEST)/constraints.txt
+	@$(OLDEST)/bin/python -m pip install $(PIP_FLAGS) --constraint $(OLDEST)/constraints.txt \
+	    --editable '.[plot,test]' setuptools
 	@touch $@
 
 $(READY): pyproject.toml

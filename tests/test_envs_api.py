@@ -376,6 +376,15 @@ def trajectory(env: Any, start: Any, steps: int) -> list[Any]:
     return out
 
 
+def test_batch_is_closed_until_it_is_made() -> None:
+    """Gymnasium before 1.4 closes on deletion whatever says that it is open, whole or not."""
+    assert SdcVectorEnv.__new__(SdcVectorEnv).closed
+    env = SdcVectorEnv(2, **tiny())
+    assert not env.closed
+    env.close()
+    assert env.closed
+
+
 @pytest.mark.parametrize("saved_after", [0, 1, 40, STEPS - 1, STEPS])
 def test_goes_on_from_what_was_saved(saved_after: int) -> None:
     env = multi_agent(2, **{**BUSY, **playing(("agent_ls", "agent_dc"))})

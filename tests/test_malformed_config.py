@@ -371,7 +371,7 @@ def test_sample_that_is_no_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["--days", "x"], ["--days", "number"]),
+        (["--days", "x"], ["--days"]),
         (["--days", "nan"], ["--days nan", "positive number of days"]),
         (["--days", "-1"], ["--days -1", "positive number of days"]),
         (["--days", "0"], ["--days 0", "positive number of days"]),
@@ -379,9 +379,9 @@ def test_sample_that_is_no_file(tmp_path: Path) -> None:
         (["--days", "1.5", "simulation.steps_per_hour=1", "--days", "0.1"], ["60 min", "n/24"]),
         (["--start", "13-01"], ["--start", "13-01", "MM-DD"]),
         (["--start", "02-29"], ["--start", "02-29", "MM-DD"]),
-        (["--dcs", "0"], ["--dcs", "greater than or equal to 1"]),
-        (["--dcs", "99999999999"], ["--dcs", "less than or equal to 100000"]),
-        (["--seed", "-1"], ["--seed", "greater than or equal to 0"]),
+        (["--dcs", "0"], ["--dcs", "1"]),
+        (["--dcs", "99999999999"], ["--dcs", "100000"]),
+        (["--seed", "-1"], ["--seed", "0"]),
         (["--precision", "f16"], ["--precision", "'f16'", "'f32', 'f64'"]),
         (["--controller", "g37"], ["'g37'", "did you mean 'g36'?"]),
         (["--controller", "cooling=lookahead-3h"], ["does not act on cooling", "g36"]),

@@ -35,6 +35,10 @@ from sdc_taichi.viz.recording_target import check_path, is_address
 if TYPE_CHECKING:
     from sdc_taichi.viz.recorder import Recorder
 
+    _VectorWrapper: TypeAlias = VectorWrapper[Any, Any, Any]
+else:
+    _VectorWrapper = VectorWrapper  # Gymnasium 1.4 is the first in which it takes parameters.
+
 
 def capped_cubic_schedule(episode: int) -> bool:
     """Whether an episode is recorded by default: 0, 1, 8, 27 ... and from 1000 on every thousandth.
@@ -142,7 +146,7 @@ class RecordingCore(Core):
         return {**done.rewards, **self._rewards.terms(done.result, self._rewards.used_terms)}
 
 
-class RecordEpisodes(VectorWrapper[Any, Any, Any]):
+class RecordEpisodes(_VectorWrapper):
     """Records chosen environments of what ``gymnasium.make_vec`` makes for the ids of sdc_taichi.
 
     ``RecordEpisodes(env, target, ...)`` does the same as ``make_vec`` with

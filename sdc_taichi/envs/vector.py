@@ -58,6 +58,12 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         SdcError: a config, number or option that is not valid.
     """
 
+    closed = True
+    """Whether there is nothing to close: before the environment is made, and once it is closed.
+
+    Gymnasium closes on deletion whatever says that it is open, even what could not be made.
+    """
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -93,6 +99,7 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         self.state_space = self.core.state_space
         self._everyone = np.ones(num_envs, dtype=np.bool_)
         self._everyone.flags.writeable = False
+        self.closed = False
 
     def reset(
         self, *, seed: Seed = None, options: dict[str, Any] | None = None
