@@ -436,7 +436,7 @@ def test_saved_by_another_environment() -> None:
     before = env.state_dict()
     with pytest.raises(SdcError, match="made by 1 environments; valid is 2"):
         other.load_state_dict(before)
-    with pytest.raises(SdcError, match=r"missing \['options', 'actions'"):
+    with pytest.raises(SdcError, match=r"missing \['options', 'inputs', 'actions'"):
         env.load_state_dict({"simulator": before["simulator"]})
     with pytest.raises(SdcError, match=r"state: unknown \['more'\]"):
         env.load_state_dict({**before, "more": 1})

@@ -126,7 +126,7 @@ def _data_center_lines(
         f"## {name}",
         config.description,
         "",
-        f"- site {config.site.location}, from {config.site.start}, seed {config.site.seed}",
+        f"- site {config.site.location}, from {config.site.start}",
         f"- hall of {_count_text(config.hall.rows, 'row')} with "
         f"{_count_text(config.hall.racks_per_row, 'rack')} each, {_count_text(servers, 'server')}",
         *(f"- {kind}: {source}" for kind, source in provenance.items()),

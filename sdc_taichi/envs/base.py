@@ -12,7 +12,7 @@ from gymnasium import spaces
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.core import Core, Observation, Transition
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
-from sdc_taichi.types import F32, F64, I64
+from sdc_taichi.types import F32, F64
 
 RESET_OPTIONS = ("start_day",)
 """Names that ``reset(options=...)`` takes."""
@@ -134,10 +134,9 @@ def start_day_option(options: Mapping[str, Any] | None, *, strict: bool = True) 
     return given.get("start_day")
 
 
-def start_days(core: Core) -> I64:
-    """First day of the episode of each environment, counted from 0 in the year, (B,)."""
-    view = core.view
-    return np.asarray(view.state.start // (24 * view.fleet.steps_per_hour), dtype=np.int64)
+def first_info(core: Core) -> dict[str, Any]:
+    """Infos of the first of a batch before the first step, as numbers and text."""
+    return {name: values.tolist()[0] for name, values in core.start_info().items()}
 
 
 def step_info(transition: Transition) -> dict[str, F64]:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium import spaces
 
 from sdc_taichi.config import DataCenterConfig
@@ -21,6 +22,7 @@ from sdc_taichi.control import Idle, View, controlled_by, make_controller, view_
 from sdc_taichi.envs.actions import ActionDecoder
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT
 from sdc_taichi.envs.costs import Costs
+from sdc_taichi.envs.drawn_inputs import Draw, DrawnInputs, draw_info, draws_inputs
 from sdc_taichi.envs.episode_reset import Seed, chosen_start_days, seeded_generators
 from sdc_taichi.envs.heat_map import heat_map, heat_map_space
 from sdc_taichi.envs.observer import Observer
@@ -68,6 +70,7 @@ def _named_features(fleet: Fleet, options: EnvOptions) -> Observer:
         ci_leads_h=options.ci_leads_h,
         weather_leads_h=options.weather_leads_h,
         forecast_error=options.forecast_error,
+        new_inputs=draws_inputs(options),
     )
 
 
@@ -117,7 +120,11 @@ class Core:
         self.options = options
         self.agents: tuple[str, ...] = options.agents
         self.num_envs = size
-        self.sim = Simulator([configs[i % len(configs)] for i in range(size)], precision=precision)
+        of_each = [configs[i % len(configs)] for i in range(size)]
+        self._inputs = DrawnInputs(of_each, options) if draws_inputs(options) else None
+        self._draw: Draw | None = None
+        first = None if self._inputs is None else self._inputs.first()
+        self.sim = Simulator(of_each, drivers=first, precision=precision)
         fleet = self.sim.fleet
         require_events_start_before(24.0 * options.days, fleet.configs, "the episode")
         self._others = make_controller(options.others, fleet)
@@ -176,7 +183,11 @@ class Core:
         drawn = [rng.integers(2**63 - 1, size=3) for rng in self._generators]
         events, drawn_days, self._keys = np.array(drawn, dtype=np.int64).T
         days = self._drawn_start_days(drawn_days) if chosen is None else chosen
-        self.sim.reset(events, days * self._steps_per_day)
+        inputs = None
+        if self._inputs is not None:
+            self._draw = self._inputs.draw(self._generators)
+            inputs = self._inputs.drivers(self._draw)
+        self.sim.reset(events, days * self._steps_per_day, inputs)
         self._begin()
         return self._observe(self.view)
 
@@ -252,6 +263,15 @@ class Core:
         """Whether an episode has ended and the next has not begun."""
         return self._view is not None and self._view.state.step >= self.steps
 
+    def start_info(self) -> dict[str, npt.NDArray[Any]]:
+        """Facts of the episodes under way by name, (B,) each: ``start_day``, and what was drawn.
+
+        ``start_day`` is counted from 0 in the year. With the option ``years`` there is ``year``,
+        the seed of the synthetic series, with ``traces`` there is ``trace``.
+        """
+        start = self.view.state.start // self._steps_per_day
+        return {"start_day": np.asarray(start, dtype=np.int64), **draw_info(self._draw)}
+
     def state(self) -> F32:
         """Shared state for centralised critics, (B, m): all features, whoever learns."""
         view = self.view
@@ -270,6 +290,7 @@ class Core:
         state, commands = self._last or (self.view.state, None)
         return {
             "options": deepcopy(self._identity),
+            "inputs": None if self._draw is None else asdict(self._draw),
             "simulator": self.sim.state_dict(state),
             "actions": None if commands is None else dict(commands),
             "rewards": self._rewards.peaks_kw(),
@@ -290,17 +311,16 @@ class Core:
         saved = check_state(
             values,
             options=self._identity,
-            fingerprint=self.sim.fingerprint(),
-            num_envs=self.num_envs,
-            units=self.sim.fleet.units,
+            inputs=self._inputs,
+            sim=self.sim,
         )
         try:
-            self.sim.load_state_dict(values["simulator"])
+            self.sim.load_state_dict(values["simulator"], saved.drivers)
         except (TypeError, ValueError) as error:
             if isinstance(error, SdcError):
                 raise
             raise SdcError(f"state: simulator is not valid ({error})") from None
-        self._generators, self._keys = saved.generators, saved.keys
+        self._generators, self._keys, self._draw = saved.generators, saved.keys, saved.draw
         self._begin()
         if saved.commands is not None:
             # The last step once more: what agents see of it is no part of the state.
@@ -315,7 +335,7 @@ class Core:
             return
         self._closed = True
         self.sim.close()
-        self._view = self._view_after = self._last = None
+        self._view = self._view_after = self._last = self._inputs = None
         self._final_terms = {}
         del self._observer, self._rewards, self._others, self._decoder
 

@@ -24,7 +24,7 @@ from sdc_taichi.envs.features import (
     time_features,
 )
 from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, ForecastError, Forecasts
-from sdc_taichi.envs.time_rows import EntryOrder, TimeRows, time_rows
+from sdc_taichi.envs.time_rows import EntryOrder, RowStretches, TimeRows, time_rows
 from sdc_taichi.errors import RuntimeStateError
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP
@@ -47,6 +47,7 @@ class Observer:
         ci_leads_h: leads of the carbon-intensity forecast in h, rising multiples of the step.
         weather_leads_h: leads of the weather forecasts in h, rising multiples of the step.
         forecast_error: how forecasts err.
+        new_inputs: whether episodes may have other inputs than those before.
 
     Attributes:
         features: features of each agent, in the order of its observation.
@@ -67,6 +68,7 @@ class Observer:
         ci_leads_h: Sequence[float] = CI_LEADS_H,
         weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
         forecast_error: ForecastError = PERFECT,
+        new_inputs: bool = False,
     ) -> None:
         forecasts = Forecasts(
             fleet.steps_per_hour,
@@ -85,7 +87,10 @@ class Observer:
         self._measured = measured_features(self._units)
         self._measured_width = sum(feature.size for feature in self._measured)
         self._time = _TimeEntries(
-            time_features(ci_leads_h, weather_leads_h), forecasts, fleet.steps_per_hour
+            time_features(ci_leads_h, weather_leads_h),
+            forecasts,
+            fleet.steps_per_hour,
+            new_inputs,
         )
         slices = feature_slices(self.state_features)
         entry_numbers = range(self._time.width + self._measured_width)
@@ -117,13 +122,9 @@ class Observer:
         Raises:
             ConfigError: another number of keys than of data centers.
         """
-        orders, time = self._orders, self._time
-        if time.reset(view.drivers, keys, sum(order.width for order in orders.values())):
-            self._arranged_rows = {}
-            if time.rows is not None:
-                self._arranged_rows = {
-                    agent: order.arrange(time.rows.values) for agent, order in orders.items()
-                }
+        arranged_width = sum(order.width for order in self._orders.values())
+        if self._time.reset(view.drivers, keys, arranged_width):
+            self._arrange_rows()
         if view.sizing is not self._sizing:
             oldest = view.state.queue.shape[1] - 1
             # Column k of the queue counts the tasks that are at least (oldest - k) steps old.
@@ -171,14 +172,22 @@ class Observer:
             return entries
         if self._stage is None:
             raise RuntimeStateError("the observer has not been reset; call reset() first")
-        index, rows = view.drivers.start + view.state.step, time.rows
-        measured = self._measure(view)
+        index = view.drivers.start + view.state.step
+        if time.next_stretch(view.state.step):
+            self._arrange_rows()
+        rows, measured = time.rows, self._measure(view)
         if rows is None:
             entries = _Entries(view, time.compute(index, view.state.step), None, measured)
         else:
             entries = _Entries(view, rows.values, rows.row_numbers(index), measured)
         self._entries = entries
         return entries
+
+    def _arrange_rows(self) -> None:
+        """Bring the rows of time entries into the order of each agent's observation."""
+        self._arranged_rows = {}
+        if (rows := self._time.rows) is not None:
+            self._arranged_rows = {a: o.arrange(rows.values) for a, o in self._orders.items()}
 
     def _measure(self, view: View) -> F32:
         """Scaled entries of queue, hall and battery, (m, B), one contiguous row each."""
@@ -266,27 +275,40 @@ class _Entries(NamedTuple):
 class _TimeEntries:
     """Scaled features that depend on time alone, as rows of all steps if these are few enough.
 
+    Else there are rows of a stretch of steps ahead, and with forecasts that err none.
+
     Args:
         features: what ``time_features`` gives.
         forecasts: carbon intensity and weather at the leads of ``features``.
         steps_per_hour: number of steps in an hour.
+        new_inputs: whether episodes may have other inputs than those before, so that rows of all
+            steps do not pay.
 
     Attributes:
         width: number of entries.
-        rows: rows of all steps, once per site; None if they are computed step by step.
+        rows: rows of all steps, once per site, or of a stretch; None with forecasts that err.
     """
 
     def __init__(
-        self, features: Sequence[Feature], forecasts: Forecasts, steps_per_hour: int
+        self,
+        features: Sequence[Feature],
+        forecasts: Forecasts,
+        steps_per_hour: int,
+        new_inputs: bool,
     ) -> None:
+        self._new_inputs = new_inputs
         self._features = {f.name: f for f in features}
         self._slices = feature_slices(features)
         self.width = sum(f.size for f in features)
+        self._row_bytes = 4 * self.width
         self._forecasts = forecasts
         self._time_of_day = _sine_and_cosine(24 * steps_per_hour)
         self._time_of_year = _sine_and_cosine(HOURS_PER_YEAR * steps_per_hour)
-        self._demand: FleetSeries | None = None
+        self._series: tuple[FleetSeries, ...] = ()
+        self._stretches: RowStretches | None = None
         self.rows: TimeRows | None = None
+        # Steps after reset that the rows of a stretch are for.
+        self._stretch = range(0)
 
     def reset(self, drivers: Drivers, keys: Sequence[int] | I64, arranged_width: int) -> bool:
         """Start an episode.
@@ -300,25 +322,52 @@ class _TimeEntries:
             Whether ``rows`` are others than before.
         """
         demand = drivers.demand
-        changed = self._forecasts.reset(drivers, keys) or demand is not self._demand
-        self._demand = demand
-        if changed and self._forecasts.perfect:
-            self.rows = time_rows(
-                (drivers.ci_g_per_kwh, drivers.outdoor_c, drivers.wet_bulb_c, demand),
-                lambda index, dc: self._scaled(
-                    index,
-                    demand.values[demand.offsets[dc] + index],
-                    self._forecasts.truth(index, dc),
-                ),
-                period=len(self._time_of_year),
-                row_bytes=4 * (self.width + arranged_width),
+        changed = self._forecasts.reset(drivers, keys)
+        changed = changed or not self._series or demand is not self._series[-1]
+        self._stretch = range(0)
+        if changed:
+            self._series = (drivers.ci_g_per_kwh, drivers.outdoor_c, drivers.wet_bulb_c, demand)
+            self._row_bytes = 4 * (self.width + arranged_width)
+            self.rows = self._stretches = None
+            if self._forecasts.perfect and not self._new_inputs:
+                period = len(self._time_of_year)
+                self.rows = time_rows(
+                    self._series, self._read, period=period, row_bytes=self._row_bytes
+                )
+        if self._forecasts.perfect and (self.rows is None or self._stretches is not None):
+            self._stretches = RowStretches(
+                self._series,
+                self._read,
+                start=drivers.start,
+                most_steps=len(self._time_of_day),
+                row_bytes=self._row_bytes,
             )
         return changed
 
+    def next_stretch(self, step: int) -> bool:
+        """Go on to the stretch with a step, if rows are made in stretches.
+
+        Args:
+            step: the step after reset.
+
+        Returns:
+            Whether ``rows`` are others than before.
+        """
+        if self._stretches is None or step in self._stretch:
+            return False
+        self.rows, self._stretch = self._stretches.beginning_at(step)
+        return True
+
+    def _read(self, index: I64, dc: I64) -> F32:
+        """Entries of data centers ``dc`` at steps of the year, (n, width)."""
+        demand = self._series[-1]
+        now = demand.values[demand.offsets[dc] + index % demand.lengths[dc]]
+        return self._scaled(index, now, self._forecasts.truth(index, dc))
+
     def compute(self, index: I64, step: int) -> F32:
         """Entries of all data centers, (B, n), at steps of the year, (B,), ``step`` after reset."""
-        assert self._demand is not None
-        return self._scaled(index, self._demand.at(index), self._forecasts.forecast(index, step))
+        demand = self._series[-1].at(index)
+        return self._scaled(index, demand, self._forecasts.forecast(index, step))
 
     def _scaled(self, index: I64, demand: F64, forecasts: tuple[F32, F32, F32]) -> F32:
         """Scaled entries, (n, width).

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
@@ -40,6 +41,12 @@ PLAIN_INT = BeforeValidator(_plain_int)
 """Takes whole numbers of NumPy too, where ``Field(strict=True)`` takes no float and no bool."""
 Month = Annotated[int, Field(strict=True, ge=1, le=12), PLAIN_INT]
 """A month, 1..12."""
+MOST_YEARS = 2**31
+"""Largest number of years to draw from."""
+Year = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1), PLAIN_INT]
+"""Seed of a synthetic year, 0..2**63 - 1."""
+YearCount = Annotated[int, Field(strict=True, ge=1, le=MOST_YEARS), PLAIN_INT]
+"""Number of years to draw from."""
 
 
 class EnvOptions(BaseModel):
@@ -65,6 +72,13 @@ class EnvOptions(BaseModel):
     """Whether episodes start at midnight of a day drawn from ``months``, or on ``site.start``."""
     months: tuple[Month, ...] = tuple(range(1, 13))
     """Months, 1..12, that sampled episodes lie in from start to end."""
+    years: YearCount | tuple[Year, ...] | None = None
+    """Years that episodes are drawn from, as seeds of the synthetic series in place of
+    ``site.seed``: a number n for the seeds 0 to n - 1, or a list of seeds; None is ``site.seed``
+    alone."""
+    traces: tuple[Annotated[str, Field(min_length=1)], ...] | None = None
+    """Workload traces that episodes are drawn from, names or files, in place of
+    ``workload.trace``; None is that alone."""
     observations: Literal["default", "sustaindc"] = "default"
     """Whether agents observe named features or the vectors of the released code."""
     features: Mapping[str, tuple[str, ...]] | None = None
@@ -89,11 +103,21 @@ class EnvOptions(BaseModel):
     """Costs of each step for ``info["cost"]``: a list of names, functions or import paths
     ``module:name``, or a dict of them to weights; None is none."""
 
-    @field_validator("agents", "months")
+    @field_validator("years", "traces", mode="before")
     @classmethod
-    def _at_least_one_each_once(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
-        if not value or len(set(value)) < len(value):
-            raise ValueError(f"{list(value)}; valid is one or more, each once")
+    def _plain_list(cls, value: Any) -> Any:
+        """Ranges and paths as lists of numbers and text."""
+        if isinstance(value, range):
+            return list(value)
+        if isinstance(value, list | tuple):
+            return [os.fspath(x) if isinstance(x, os.PathLike) else x for x in value]
+        return value
+
+    @field_validator("agents", "months", "years", "traces")
+    @classmethod
+    def _at_least_one_each_once(cls, value: Any) -> Any:
+        if isinstance(value, tuple) and (not value or len(set(value)) < len(value)):
+            raise ValueError(f"{list(value)[:8]}; valid is one or more, each once")
         return value
 
     @field_validator("agents")

@@ -14,9 +14,9 @@ from sdc_taichi.envs.base import (
     AgentSpaces,
     SingleEnv,
     as_floats,
+    first_info,
     first_of_batch,
     start_day_option,
-    start_days,
     step_info,
 )
 from sdc_taichi.envs.core import Observation
@@ -29,8 +29,8 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
     """A PettingZoo environment: the learning agents of one data center act at the same time.
 
     Episodes end by truncation: their length is a choice, the data center goes on. Infos are the
-    same for all agents: ``start_day`` after ``reset``, then every (B,) quantity of ``StepResult``
-    by name and the costs that the option ``costs`` names.
+    same for all agents: ``start_day`` and what was drawn after ``reset``, then every (B,) quantity
+    of ``StepResult`` by name and the costs that the option ``costs`` names.
 
     Args:
         config: a preset, a file or a config.
@@ -87,7 +87,7 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         """
         observations = self.core.reset(seed, start_day_option(options, strict=False))
         self.agents = list(self.possible_agents)
-        info = {"start_day": int(start_days(self.core)[0])}
+        info = first_info(self.core)
         return _first_of_each(observations), {agent: dict(info) for agent in self.agents}
 
     def step(

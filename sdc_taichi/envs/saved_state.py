@@ -11,10 +11,13 @@ import numpy.typing as npt
 
 from sdc_taichi.envs.actions import checked_array
 from sdc_taichi.envs.agents import COMMAND_OF_AGENT
+from sdc_taichi.envs.drawn_inputs import Draw, DrawnInputs
 from sdc_taichi.errors import SdcError
+from sdc_taichi.sim.drivers import Drivers
+from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, I64
 
-PARTS = ("options", "simulator", "actions", "rewards", "generators", "keys")
+PARTS = ("options", "inputs", "simulator", "actions", "rewards", "generators", "keys")
 """Entries of a state; all are plain values, arrays, or dicts and lists of them."""
 
 
@@ -28,34 +31,43 @@ class SavedState:
     """Seeds of the errors of forecasts, (B,)."""
     peaks_kw: F64
     """Highest billed power before the last step and with it, in kW, (2, B)."""
+    draw: Draw | None
+    """Years and traces of the episodes; None if they draw none."""
+    drivers: Drivers | None
+    """Inputs of the episodes; None if they draw none."""
     commands: dict[str, F64] | None
     """Commands of the last step by field of ``Actions``, (B,) or (U,) each; None before the
     first."""
 
 
 def check_state(
-    values: Any, *, options: Mapping[str, Any], fingerprint: str, num_envs: int, units: int
+    values: Any, *, options: Mapping[str, Any], inputs: DrawnInputs | None, sim: Simulator
 ) -> SavedState:
     """Check a state against the environments that are to go on from it.
 
     Args:
         values: what ``state_dict`` gave.
         options: plain values that tell the environments apart.
-        fingerprint: that of their simulator.
-        num_envs: number of environments.
-        units: number of CRAC units of all data centers.
+        inputs: what draws their years and traces; None if nothing does.
+        sim: their simulator.
 
     Raises:
         SdcError: made by other environments, incomplete, or not valid.
     """
+    num_envs, units = sim.size, sim.fleet.units
     _check_parts(values, num_envs)
-    # The simulator checks it too; another fleet would be taken for wrong actions before.
-    if str(values["simulator"].get("fingerprint", fingerprint)) != fingerprint:
-        raise SdcError("state: made by another fleet, inputs or precision than this one")
     for name, mine in options.items():
         made = values["options"].get(name)
         if type(made) is not type(mine) or made != mine:
             raise SdcError(f"state: made with {name} {made!r}; valid is {mine!r}, as here")
+    draw = drivers = None
+    if inputs is not None:
+        draw = inputs.checked(values["inputs"], num_envs)
+        drivers = inputs.drivers(draw)
+    # The simulator checks it too; another fleet would be taken for wrong actions before.
+    fingerprint = sim.fingerprint(drivers)
+    if str(values["simulator"].get("fingerprint", fingerprint)) != fingerprint:
+        raise SdcError("state: made by another fleet, inputs or precision than this one")
     generators = [np.random.Generator(np.random.PCG64()) for _ in range(num_envs)]
     try:
         for rng, state in zip(generators, values["generators"], strict=True):
@@ -72,7 +84,7 @@ def check_state(
             f"(2, {num_envs})"
         )
     commands = _checked_commands(values["actions"], num_envs, units)
-    return SavedState(generators, keys, peaks_kw.astype(np.float64), commands)
+    return SavedState(generators, keys, peaks_kw.astype(np.float64), draw, drivers, commands)
 
 
 def _check_parts(values: Any, num_envs: int) -> None:

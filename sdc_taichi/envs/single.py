@@ -12,9 +12,9 @@ from sdc_taichi.envs.arguments import ConfigSource, Overrides, single_core
 from sdc_taichi.envs.base import (
     SingleEnv,
     as_floats,
+    first_info,
     first_of_batch,
     start_day_option,
-    start_days,
     step_info,
 )
 from sdc_taichi.envs.core import Observation
@@ -29,8 +29,8 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
     """One data center with one learner.
 
     Episodes end by truncation: their length is a choice, the data center goes on. Infos:
-    ``start_day`` after ``reset``, then every (B,) quantity of ``StepResult`` by name and the costs
-    that the option ``costs`` names.
+    ``start_day`` and what was drawn after ``reset``, then every (B,) quantity of ``StepResult`` by
+    name and the costs that the option ``costs`` names.
 
     Args:
         config: a preset, a file or a config.
@@ -92,7 +92,7 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
         observations = self.core.reset(seed, start_day_option(options))
         super().reset(seed=None if seed is None else int(seed))
         observation = first_of_batch(self._learner.observation(observations))
-        return observation, {"start_day": int(start_days(self.core)[0])}
+        return observation, first_info(self.core)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Advance by one step.

@@ -19,8 +19,12 @@ from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.types import F32, I64
 
 MAX_ROW_BYTES = 2**28
-"""Most memory that the rows of one observer take, in bytes; series that need more are read step by
-step."""
+"""Most memory that the rows of one observer take, in bytes; series that need more are read
+in stretches."""
+STRETCH_BYTES = 2**23
+"""Memory of the rows of a stretch, in bytes."""
+_ENDLESS = 2**62
+"""Length of rows that do not repeat, in steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +78,47 @@ def time_rows(
     parts = [read(np.arange(n), np.full(n, dc)) for dc, n in zip(first, lengths, strict=True)]
     first_rows = np.cumsum(lengths) - lengths
     return TimeRows(np.concatenate(parts), first_rows[which.reshape(-1)], length)
+
+
+class RowStretches:
+    """Rows of an episode, computed for some steps ahead at a time.
+
+    They are computed once for data centers that read the same series from the same step on.
+
+    Args:
+        series: the series that the rows depend on, each for all data centers.
+        read: computes rows, (n, columns), from steps of the year, (n,), and data centers, (n,).
+        start: first step of each data center in the year, (B,).
+        most_steps: largest number of steps of a stretch.
+        row_bytes: memory of a row and of whatever else is kept per row, in bytes.
+    """
+
+    def __init__(
+        self,
+        series: Sequence[FleetSeries],
+        read: Callable[[I64, I64], npt.NDArray[Any]],
+        *,
+        start: I64,
+        most_steps: int,
+        row_bytes: int,
+    ) -> None:
+        places = [start, *(a for one in series for a in (one.offsets, one.lengths))]
+        _, first, which = np.unique(
+            np.stack(places, axis=1), axis=0, return_index=True, return_inverse=True
+        )
+        self._read, self._start, self._first = read, start, first
+        # Few enough rows that the processor keeps them in its cache.
+        self._steps = min(max(STRETCH_BYTES // (len(first) * row_bytes), 1), most_steps)
+        self._dcs = np.repeat(first, self._steps)
+        self._first_rows = which.reshape(-1) * self._steps - start
+        self._lengths = np.full(len(start), _ENDLESS, dtype=np.int64)
+
+    def beginning_at(self, step: int) -> tuple[TimeRows, range]:
+        """Rows of the stretch that begins at a step, and the steps that they are for."""
+        steps = range(step, step + self._steps)
+        index = self._start[self._first][:, None] + np.array(steps)
+        rows = self._read(index.reshape(-1), self._dcs)
+        return TimeRows(rows, self._first_rows - step, self._lengths), steps
 
 
 class EntryOrder:

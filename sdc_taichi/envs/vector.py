@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.arguments import ConfigSource, Overrides, configs_and_options
-from sdc_taichi.envs.base import AgentSpaces, BatchEnv, start_day_option, start_days, step_info
+from sdc_taichi.envs.base import AgentSpaces, BatchEnv, start_day_option, step_info
 from sdc_taichi.envs.core import Core, Observation
 from sdc_taichi.envs.episode_reset import Seed
 from sdc_taichi.envs.learners import learning_agent, make_learner
@@ -123,7 +123,7 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
             )
         observations = self.core.reset(seed, start_day_option(given))
         super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
-        return self._learner.observation(observations), self._infos(self._start_info())
+        return self._learner.observation(observations), self._infos(self.core.start_info())
 
     def step(self, actions: Any) -> tuple[Observation, F64, Flags, Flags, dict[str, Any]]:
         """Advance all environments.
@@ -146,12 +146,9 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         if transition.ended and self._mode is AutoresetMode.SAME_STEP:
             final = {"final_obs": self._one_by_one(observation), "final_info": infos}
             observation = self._learner.observation(self.core.next_episode())
-            infos = self._infos({**final, **self._start_info()})
+            infos = self._infos({**final, **self.core.start_info()})
         ended = np.full(self.num_envs, transition.ended)
         return observation, self._learner.reward(transition), none, ended, infos
-
-    def _start_info(self) -> dict[str, Any]:
-        return {"start_day": start_days(self.core)}
 
     def _infos(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Infos with Gymnasium's masks of the environments that have them, which is all."""
@@ -244,13 +241,14 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
                 each environment.
 
         Returns:
-            Observations by agent, (B, n) each, and infos: ``start_day``, (B,).
+            Observations by agent, (B, n) each, and infos: ``start_day`` and what was drawn, (B,)
+            each.
 
         Raises:
             ConfigError: a seed, option or day that is not valid.
         """
         observations = self.core.reset(seed, start_day_option(options))
-        return observations, {"start_day": start_days(self.core)}
+        return observations, self.core.start_info()
 
     def step(
         self, actions: Mapping[str, Any]
@@ -292,7 +290,7 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
         if transition.ended and self._mode is AutoresetMode.SAME_STEP:
             infos["final_obs"], infos["final_state"] = observations, self.core.state()
             observations = self.core.next_episode()
-            infos["start_day"] = start_days(self.core)
+            infos |= self.core.start_info()
         return (
             observations,
             {agent: reward.astype(np.float32) for agent, reward in transition.rewards.items()},

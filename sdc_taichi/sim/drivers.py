@@ -7,15 +7,18 @@ Series may differ in length; each repeats from its own beginning.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import DataError
-from sdc_taichi.exogenous.carbon import MAX_CI_G_PER_KWH
+from sdc_taichi.exogenous.carbon import MAX_CI_G_PER_KWH, Pairing
 from sdc_taichi.exogenous.registry import load_site, load_trace, site_from_files
 from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C, Series, SiteData, resample
 from sdc_taichi.exogenous.workload import read_workload
@@ -24,6 +27,9 @@ from sdc_taichi.types import F64, I64, Exogenous
 
 DESIGN_QUANTILE = 0.996
 """Share of the year that a design temperature covers, the 0.4 % of ASHRAE design conditions."""
+MAX_KEPT_BYTES = 2**28
+"""Most memory of series that are kept for later episodes, in bytes: some 900 synthetic years of a
+site and a trace."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +138,162 @@ class Drivers:
         )
 
 
+class InputReader:
+    """Reads the inputs of a fleet: those that its configs name, or other years and traces.
+
+    What was read is kept, up to ``MAX_KEPT_BYTES``, what was used last the longest.
+
+    Args:
+        configs: data centers, B.
+    """
+
+    def __init__(self, configs: Sequence[DataCenterConfig]) -> None:
+        self._steps_per_hour = configs[0].simulation.steps_per_hour
+        self._sites = [_site_key(config) for config in configs]
+        self._traces = [
+            _trace_key(c.site.workload_file or c.workload.trace, c.site.seed, c.site.workload_file)
+            for c in configs
+        ]
+        self._days = np.array([day_of_year(c.site.start) for c in configs], dtype=np.int64)
+        self._kept: OrderedDict[_SiteKey | _TraceKey, SiteData | Series] = OrderedDict()
+        self._kept_bytes = 0
+        self._design_c: tuple[F64, F64] | None = None
+
+    def read(
+        self, years: Sequence[int] | None = None, traces: Sequence[str] | None = None
+    ) -> Drivers:
+        """Inputs of the fleet on its time step.
+
+        Design temperatures are those of the years of the configs, whatever the years read: a data
+        center is sized once.
+
+        Args:
+            years: seed of the synthetic series of each data center, B; None is ``site.seed``.
+            traces: name of the workload trace of each data center, or a file, which has a dot or a
+                slash, B; None is what the config names.
+
+        Raises:
+            ConfigError: an unknown site or trace.
+            DataError: a file that is not valid.
+        """
+        site_keys, trace_keys = self._sites, self._traces
+        if traces is not None:
+            trace_keys = [
+                _trace_key(trace, site.seed, trace if is_file(trace) else None)
+                for trace, site in zip(traces, site_keys, strict=True)
+            ]
+        if years is not None:
+            site_keys = self._of_years(site_keys, years)
+            trace_keys = self._of_years(trace_keys, years)
+        sites = {key: self._site(key) for key in dict.fromkeys(site_keys)}
+        series = {key: self._trace(key) for key in dict.fromkeys(trace_keys)}
+        of_sites = {key: self._site_arrays(key, site) for key, site in sites.items()}
+        of_traces = {key: resample(x, self._steps_per_hour) for key, x in series.items()}
+        if self._design_c is None:
+            self._design_c = self._design_temperatures(of_sites)
+        outdoor_c = _fleet_series([of_sites[key].outdoor_c for key in site_keys])
+        inputs = [(sites[s], series[t]) for s, t in zip(site_keys, trace_keys, strict=True)]
+        return Drivers(
+            outdoor_c=outdoor_c,
+            wet_bulb_c=_fleet_series(
+                [of_sites[key].wet_bulb_c for key in site_keys]
+            ).sharing_places(outdoor_c),
+            ci_g_per_kwh=_fleet_series(
+                [of_sites[key].ci_g_per_kwh for key in site_keys]
+            ).sharing_places(outdoor_c),
+            demand=_fleet_series([of_traces[key] for key in trace_keys]).sharing_places(outdoor_c),
+            start=self._days * 24 * self._steps_per_hour,
+            design_outdoor_c=self._design_c[0],
+            design_wet_bulb_c=self._design_c[1],
+            sources=tuple(
+                {
+                    "weather": site.outdoor_c.source,
+                    "carbon": site.ci_g_per_kwh.source,
+                    "workload": trace.source,
+                }
+                for site, trace in inputs
+            ),
+            synthetic=tuple(_site_is_synthetic(site) or trace.synthetic for site, trace in inputs),
+            notes=tuple(
+                dict.fromkeys(
+                    note
+                    for site, trace in dict.fromkeys(zip(site_keys, trace_keys, strict=True))
+                    for note in _notes(sites[site], series[trace])
+                )
+            ),
+        )
+
+    def is_synthetic(self) -> list[bool]:
+        """Whether any series of each data center is synthetic, so that years differ, B."""
+        return [
+            self._is_synthetic(site) or self._is_synthetic(trace)
+            for site, trace in zip(self._sites, self._traces, strict=True)
+        ]
+
+    def check_trace(self, trace: str) -> Series:
+        """Read a workload trace by its name, or from a file, before an episode needs it.
+
+        Raises:
+            DataError: an unknown name, or a file that is not valid.
+        """
+        return self._trace(
+            _trace_key(trace, self._sites[0].seed, trace if is_file(trace) else None)
+        )
+
+    def _of_years(self, keys: Sequence[_Key], years: Sequence[int]) -> list[_Key]:
+        """Keys of other years; measured series have one alone."""
+        synthetic = {key: self._is_synthetic(key) for key in dict.fromkeys(keys)}
+        return [
+            key._replace(seed=int(year)) if synthetic[key] else key
+            for key, year in zip(keys, years, strict=True)
+        ]
+
+    def _is_synthetic(self, key: _SiteKey | _TraceKey) -> bool:
+        if isinstance(key, _TraceKey):
+            return self._trace(key).synthetic
+        return _site_is_synthetic(self._site(key))
+
+    def _design_temperatures(self, of_sites: Mapping[_SiteKey, _SiteArrays]) -> tuple[F64, F64]:
+        """Design dry bulb and wet bulb of the years that the configs name, in C, (B,) each."""
+        design = {}
+        for key in dict.fromkeys(self._sites):
+            arrays = of_sites.get(key) or self._site_arrays(key, self._site(key))
+            design[key] = [
+                float(np.quantile(values, DESIGN_QUANTILE))
+                for values in (arrays.outdoor_c, arrays.wet_bulb_c)
+            ]
+        outdoor_c, wet_bulb_c = np.array([design[key] for key in self._sites]).T
+        return outdoor_c.copy(), wet_bulb_c.copy()
+
+    def _site(self, key: _SiteKey) -> SiteData:
+        found: Any = self._kept_or_read(key, _read_site)
+        return found  # type: ignore[no-any-return]
+
+    def _trace(self, key: _TraceKey) -> Series:
+        found: Any = self._kept_or_read(key, _read_trace)
+        return found  # type: ignore[no-any-return]
+
+    def _kept_or_read(
+        self, key: _SiteKey | _TraceKey, read: Callable[[Any], SiteData | Series]
+    ) -> SiteData | Series:
+        if key not in self._kept:
+            self._kept[key] = read(key)
+            self._kept_bytes += _size_bytes(self._kept[key])
+            while self._kept_bytes > MAX_KEPT_BYTES and len(self._kept) > 1:
+                self._kept_bytes -= _size_bytes(self._kept.popitem(last=False)[1])
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+    def _site_arrays(self, key: _SiteKey, site: SiteData) -> _SiteArrays:
+        outdoor_c = resample(site.outdoor_c, self._steps_per_hour)
+        wet_bulb_c = resample(site.wet_bulb_c, self._steps_per_hour)
+        ci_g_per_kwh = resample(site.ci_g_per_kwh, self._steps_per_hour)
+        if key.carbon_pairing == "utc_rows" and key.carbon_file is None:
+            # Local hour k gets the row of UTC hour k; files come with that pairing already.
+            ci_g_per_kwh = np.roll(ci_g_per_kwh, -round(site.utc_offset_h * self._steps_per_hour))
+        return _SiteArrays(outdoor_c, wet_bulb_c, ci_g_per_kwh)
+
+
 def load_drivers(configs: Sequence[DataCenterConfig]) -> Drivers:
     """Read or generate the inputs that the site and workload sections name.
 
@@ -139,51 +301,12 @@ def load_drivers(configs: Sequence[DataCenterConfig]) -> Drivers:
         ConfigError: an unknown site or trace.
         DataError: a file that is not valid.
     """
-    steps_per_hour = configs[0].simulation.steps_per_hour
-    read_sites: dict[object, _SiteInputs] = {}
-    read_traces: dict[object, _TraceInputs] = {}
-    sites, traces = [], []
-    for config in configs:
-        site = config.site
-        site_key = (
-            site.location,
-            site.seed,
-            site.weather_file,
-            site.carbon_file,
-            site.carbon_pairing,
-        )
-        if site_key not in read_sites:
-            read_sites[site_key] = _read_site(config, steps_per_hour)
-        sites.append(read_sites[site_key])
-        trace_key = site.workload_file or (config.workload.trace, site.seed)
-        if trace_key not in read_traces:
-            read_traces[trace_key] = _read_trace(config, steps_per_hour)
-        traces.append(read_traces[trace_key])
-    days = np.array([day_of_year(c.site.start) for c in configs], dtype=np.int64)
-    outdoor_c = _fleet_series([site.outdoor_c for site in sites])
-    inputs = list(zip(sites, traces, strict=True))
-    return Drivers(
-        outdoor_c=outdoor_c,
-        wet_bulb_c=_fleet_series([x.wet_bulb_c for x in sites]).sharing_places(outdoor_c),
-        ci_g_per_kwh=_fleet_series([x.ci_g_per_kwh for x in sites]).sharing_places(outdoor_c),
-        demand=_fleet_series([x.demand for x in traces]).sharing_places(outdoor_c),
-        start=days * 24 * steps_per_hour,
-        design_outdoor_c=np.array([site.design_outdoor_c for site in sites]),
-        design_wet_bulb_c=np.array([site.design_wet_bulb_c for site in sites]),
-        sources=tuple(
-            {
-                "weather": site.data.outdoor_c.source,
-                "carbon": site.data.ci_g_per_kwh.source,
-                "workload": trace.series.source,
-            }
-            for site, trace in inputs
-        ),
-        synthetic=tuple(
-            any(s.synthetic for s in (site.data.outdoor_c, site.data.ci_g_per_kwh, trace.series))
-            for site, trace in inputs
-        ),
-        notes=tuple(dict.fromkeys(note for pair in inputs for note in _notes(*pair))),
-    )
+    return InputReader(configs).read()
+
+
+def is_file(trace: str) -> bool:
+    """Whether a workload trace is named by its file, which has a dot or a slash, unlike a name."""
+    return "." in trace or "/" in trace or os.sep in trace
 
 
 def drivers_from_arrays(
@@ -253,60 +376,83 @@ def drivers_from_arrays(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _SiteInputs:
+class _SiteKey(NamedTuple):
+    """Settings that decide weather and carbon intensity of a data center."""
+
+    location: str
+    """Name of the site."""
+    seed: int
+    """Seed of the synthetic year."""
+    weather_file: str | None
+    """File in place of the weather of the site; None is no file."""
+    carbon_file: str | None
+    """File in place of the carbon intensity of the site; None is no file."""
+    carbon_pairing: Pairing
+    """How carbon intensity meets weather in time."""
+
+
+class _TraceKey(NamedTuple):
+    """Settings that decide the arriving work of a data center."""
+
+    name: str
+    """Name of the trace, or its file."""
+    seed: int
+    """Seed of the synthetic year."""
+    file: str | None
+    """File of the trace; None is no file."""
+
+
+_Key = TypeVar("_Key", _SiteKey, _TraceKey)
+
+
+class _SiteArrays(NamedTuple):
     """Weather and carbon intensity of one site at the time step of the simulation, each (T,)."""
 
-    data: SiteData
     outdoor_c: F64
+    """Outdoor dry-bulb temperature, in C, (T,)."""
     wet_bulb_c: F64
+    """Outdoor wet-bulb temperature, in C, (T,)."""
     ci_g_per_kwh: F64
-    design_outdoor_c: float
-    design_wet_bulb_c: float
+    """Carbon intensity of the grid, in g CO2e/kWh, (T,)."""
 
 
-@dataclass(frozen=True, slots=True)
-class _TraceInputs:
-    """A workload trace, and its demand at the time step of the simulation, (T,)."""
-
-    series: Series
-    demand: F64
-
-
-def _read_site(config: DataCenterConfig, steps_per_hour: int) -> _SiteInputs:
+def _site_key(config: DataCenterConfig) -> _SiteKey:
     site = config.site
-    base = load_site(site.location, seed=site.seed)
+    return _SiteKey(
+        site.location, site.seed, site.weather_file, site.carbon_file, site.carbon_pairing
+    )
+
+
+def _trace_key(name: str, seed: int, file: str | None) -> _TraceKey:
+    """Key of a trace; a file is the same whatever the seed, and is read once."""
+    return _TraceKey(name, seed if file is None else 0, file)
+
+
+def _read_site(key: _SiteKey) -> SiteData:
+    """Weather and carbon intensity, without the series that no step reads."""
+    base = load_site(key.location, seed=key.seed)
     data = site_from_files(
-        base, weather=site.weather_file, carbon=site.carbon_file, pairing=site.carbon_pairing
+        base, weather=key.weather_file, carbon=key.carbon_file, pairing=key.carbon_pairing
     )
-    outdoor_c = resample(data.outdoor_c, steps_per_hour)
-    wet_bulb_c = resample(data.wet_bulb_c, steps_per_hour)
-    ci_g_per_kwh = resample(data.ci_g_per_kwh, steps_per_hour)
-    if site.carbon_pairing == "utc_rows" and site.carbon_file is None:
-        # Local hour k gets the row of UTC hour k; files come with that pairing already.
-        ci_g_per_kwh = np.roll(ci_g_per_kwh, -round(data.utc_offset_h * steps_per_hour))
-    return _SiteInputs(
-        data=data,
-        outdoor_c=outdoor_c,
-        wet_bulb_c=wet_bulb_c,
-        ci_g_per_kwh=ci_g_per_kwh,
-        design_outdoor_c=float(np.quantile(outdoor_c, DESIGN_QUANTILE)),
-        design_wet_bulb_c=float(np.quantile(wet_bulb_c, DESIGN_QUANTILE)),
-    )
+    return replace(data, relative_humidity_pct=None, pressure_pa=None)
 
 
-def _read_trace(config: DataCenterConfig, steps_per_hour: int) -> _TraceInputs:
-    file = config.site.workload_file
-    series = (
-        load_trace(config.workload.trace, seed=config.site.seed)
-        if file is None
-        else read_workload(file)
-    )
-    return _TraceInputs(series, resample(series, steps_per_hour))
+def _read_trace(key: _TraceKey) -> Series:
+    return load_trace(key.name, seed=key.seed) if key.file is None else read_workload(key.file)
 
 
-def _notes(site: _SiteInputs, trace: _TraceInputs) -> tuple[str, ...]:
-    series = (site.data.outdoor_c, site.data.wet_bulb_c, site.data.ci_g_per_kwh, trace.series)
+def _site_is_synthetic(site: SiteData) -> bool:
+    return site.outdoor_c.synthetic or site.ci_g_per_kwh.synthetic
+
+
+def _size_bytes(found: SiteData | Series) -> int:
+    if isinstance(found, Series):
+        return found.values.nbytes
+    return sum(_size_bytes(x) for x in (found.outdoor_c, found.wet_bulb_c, found.ci_g_per_kwh))
+
+
+def _notes(site: SiteData, trace: Series) -> tuple[str, ...]:
+    series = (site.outdoor_c, site.wet_bulb_c, site.ci_g_per_kwh, trace)
     return tuple(f"{s.source}: {note}" for s in series for note in s.notes)
 
 

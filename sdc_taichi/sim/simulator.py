@@ -56,12 +56,8 @@ class Simulator:
             raise ConfigError(f"precision {precision!r}: valid are f32 and f64")
         self.fleet = fleet if isinstance(fleet, Fleet) else build_fleet(fleet)
         given = load_drivers(self.fleet.configs) if drivers is None else drivers
-        if given.size != self.fleet.size:
-            raise ConfigError(
-                f"drivers of {given.size} data centers for a fleet of {self.fleet.size}"
-            )
         # None once the simulator is closed.
-        self._drivers: Drivers | None = given
+        self._drivers: Drivers | None = self._checked_drivers(given)
         self._initial_start = given.start
         self.precision: Precision = precision
         self.step_h = 1.0 / self.fleet.steps_per_hour
@@ -117,7 +113,10 @@ class Simulator:
         return self._started().sizing
 
     def reset(
-        self, seed: int | Sequence[int] | I64 | None = None, start: I64 | None = None
+        self,
+        seed: int | Sequence[int] | I64 | None = None,
+        start: I64 | None = None,
+        drivers: Drivers | None = None,
     ) -> State:
         """Go back to the first step.
 
@@ -127,15 +126,19 @@ class Simulator:
                 seed; of those that share a name, the first takes an integer as it is, the second
                 the next one, and so on. The stages are deterministic.
             start: Index of the first step in the year, (B,); None is the start of the drivers.
+            drivers: Inputs from here on; None keeps those that there are. Devices stay as they were
+                sized with the first ones.
 
         Returns:
             The initial state.
 
         Raises:
-            ConfigError: A seed or start that is not valid.
+            ConfigError: A seed, start or drivers that are not valid.
         """
         seeds = self._seeds(0 if seed is None else seed)
-        first = self._initial_start if start is None else np.asarray(start)
+        inputs = self._checked_drivers(self.drivers if drivers is None else drivers)
+        initial = self._initial_start if drivers is None else drivers.start
+        first = initial if start is None else np.asarray(start)
         if first.shape != (self.size,) or first.dtype.kind not in "iu" or np.any(first < 0):
             raise ConfigError(
                 f"start {start!r}: valid is one integer of at least 0 for each of {self.size} "
@@ -144,7 +147,8 @@ class Simulator:
         stages = self._started()
         stages.hall.discard_last_step()
         self._timeline = self._timeline.reseeded(seeds)
-        self._drivers = replace(self.drivers, start=first.astype(np.int64))
+        self._initial_start = initial
+        self._drivers = replace(inputs, start=first.astype(np.int64))
         supply = stages.crac_units.initial_supply()
         self._state = State(
             step=0,
@@ -230,20 +234,25 @@ class Simulator:
         """
         return snapshot.to_dict(self.state if state is None else state, self.fingerprint())
 
-    def load_state_dict(self, values: Mapping[str, Any]) -> None:
+    def load_state_dict(self, values: Mapping[str, Any], drivers: Drivers | None = None) -> None:
         """Continue from a ``state_dict`` of a simulator with the same fleet, inputs and precision.
+
+        Args:
+            values: The state.
+            drivers: Inputs from here on; None keeps those that there are.
 
         Raises:
             SdcError: The snapshot is of another version or fleet, incomplete, or of wrong shape.
         """
         stages = self._started()
-        snapshot.check_origin(values, self.fingerprint())
+        inputs = self._checked_drivers(self.drivers if drivers is None else drivers)
+        snapshot.check_origin(values, self.fingerprint(inputs))
         like = self.reset() if self._state is None else self._state
         state = snapshot.to_state(values, like)
         stages.hall.discard_last_step()
         self._state = state
         self._timeline = self._timeline.reseeded(state.seed)
-        self._drivers = replace(self.drivers, start=state.start)
+        self._drivers = replace(inputs, start=state.start)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to an .npz file, atomically and without pickle.
@@ -261,9 +270,15 @@ class Simulator:
         """
         self.load_state_dict(snapshot.read(path))
 
-    def fingerprint(self) -> str:
-        """SHA-256 of configs, inputs and precision, which tells simulators apart."""
-        return snapshot.fingerprint(self.fleet, self.drivers, self.precision)
+    def fingerprint(self, drivers: Drivers | None = None) -> str:
+        """SHA-256 of configs, inputs and precision, which tells simulators apart.
+
+        Args:
+            drivers: Inputs; None is the present ones.
+        """
+        return snapshot.fingerprint(
+            self.fleet, self.drivers if drivers is None else drivers, self.precision
+        )
 
     def close(self) -> None:
         """Release state, inputs and kernel arrays; a closed simulator has only its ``fleet``."""
@@ -289,6 +304,18 @@ class Simulator:
     def _check_open(self) -> None:
         if self._drivers is None:
             raise RuntimeStateError("the simulator is closed; create a new one")
+
+    def _checked_drivers(self, drivers: Drivers) -> Drivers:
+        """Inputs, of as many data centers as there are.
+
+        Raises:
+            ConfigError: Those of more or fewer.
+        """
+        if drivers.size != self.fleet.size:
+            raise ConfigError(
+                f"drivers of {drivers.size} data centers for a fleet of {self.fleet.size}"
+            )
+        return drivers
 
     def _seeds(self, given: int | Sequence[int] | I64) -> I64:
         """Seeds of the data centers, (B,)."""

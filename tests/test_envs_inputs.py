@@ -1,0 +1,250 @@
+"""Years and workload traces that episodes draw."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import re
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import data_equivalence
+
+import sdc_taichi
+from sdc_taichi import ConfigError, DataError, SdcError, Simulator, load_config, load_drivers
+from sdc_taichi.envs import time_rows
+from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.exogenous.registry import load_trace
+from sdc_taichi.sim import drivers
+from sdc_taichi.sim.drivers import InputReader
+
+STEPS = 96
+TRACES = ("alibaba_1", "alibaba_2")
+DRAWN: dict[str, Any] = {"config": "tiny", "days": 1, "years": 5, "traces": TRACES}
+IDLE = dict.fromkeys(AGENTS, 1)
+
+
+@pytest.fixture
+def trace_file(tmp_path: Path) -> Path:
+    path = tmp_path / "flat.csv"
+    hours = np.tile([0.25, 0.5], 4380)
+    path.write_text("hour,cpu_load\n" + "\n".join(f"{i},{x}" for i, x in enumerate(hours)))
+    return path
+
+
+def run_episode(env: Any, steps: int = STEPS) -> dict[str, Any]:
+    """Weather, carbon intensity and arriving work of each step of a PettingZoo environment."""
+    seen = [env.step(IDLE)[4]["agent_dc"] for _ in range(steps)]
+    return {n: [info[n] for info in seen] for n in ("outdoor_c", "ci_g_per_kwh", "demand")}
+
+
+def test_an_episode_has_the_inputs_of_what_it_drew() -> None:
+    env = sdc_taichi.parallel_env(**DRAWN)
+    found = set()
+    for seed in range(2):
+        info = env.reset(seed=seed)[1]["agent_dc"]
+        assert set(info) == {"start_day", "year", "trace"}
+        assert info["year"] in range(5)
+        assert info["trace"] in TRACES
+        found.add((info["year"], info["trace"]))
+        config = load_config(
+            "tiny", [f"site.seed={info['year']}", f"workload.trace={info['trace']}"]
+        )
+        expected = load_drivers([config])
+        index = np.array([info["start_day"] * STEPS + np.arange(10)])
+        for name, values in run_episode(env, 10).items():
+            assert values == getattr(expected, name).at(index)[0].tolist(), name
+        # Recordings and descriptions tell the year by this.
+        assert f"seed {info['year']}," in env.core.sim.drivers.sources[0]["weather"]
+        # What learners see is computed from these inputs too.
+        plain = sdc_taichi.parallel_env(config, days=1)
+        plain.reset(options={"start_day": info["start_day"]})
+        for _ in range(10):
+            plain.step(IDLE)
+        assert np.array_equal(plain.state()[:36], env.state()[:36])
+    assert len(found) > 1
+
+
+def test_the_seed_decides_and_episodes_differ() -> None:
+    env = sdc_taichi.parallel_env(**{**DRAWN, "years": 50})
+
+    def episodes() -> list[tuple[int, str, int]]:
+        infos = [env.reset(seed=3)[1], *(env.reset()[1] for _ in range(4))]
+        return [tuple(info["agent_bat"].values()) for info in infos]
+
+    first = episodes()
+    assert first == episodes()
+    assert len({year for _, year, _ in first}) > 2
+    # Days are those that the same seed gives without the options, in the first episode.
+    plain = sdc_taichi.parallel_env("tiny", days=1)
+    assert plain.reset(seed=3)[1]["agent_bat"] == {"start_day": first[0][0]}
+
+
+def test_without_a_choice_results_are_those_without_the_option() -> None:
+    config = load_config("tiny")
+    drawn = sdc_taichi.parallel_env(
+        "tiny", days=1, years=[config.site.seed], traces=[config.workload.trace]
+    )
+    plain = sdc_taichi.parallel_env("tiny", days=1)
+    assert drawn.reset(seed=0)[0].keys() == plain.reset(seed=0)[0].keys()
+    for _ in range(STEPS):
+        assert data_equivalence(drawn.step(IDLE), plain.step(IDLE), exact=True)
+
+
+@pytest.mark.parametrize(("seen", "stretch_bytes"), [("default", 2**15), ("sustaindc", 2**23)])
+def test_every_kind_of_environment_draws_the_same(
+    seen: str, stretch_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time_rows, "STRETCH_BYTES", stretch_bytes)
+    options = {**DRAWN, "observations": seen}
+    mode = "SameStep"
+    multi: Any = sdc_taichi.vector_env(3, autoreset_mode=mode, **options)
+    batch: Any = gymnasium.make_vec(
+        "sdc_taichi/Joint-v0", num_envs=3, autoreset_mode=mode, **options
+    )
+    singles: list[Any] = [sdc_taichi.parallel_env(**options) for _ in range(3)]
+    found, infos = multi.reset(seed=8)
+    of_batch = batch.reset(seed=8)[1]
+    assert infos["year"].dtype == np.int64
+    for step in range(STEPS + 4):
+        for name in ("year", "trace", "start_day") if step in (0, STEPS) else ():
+            assert of_batch[name].tolist() == infos[name].tolist()
+            assert of_batch[f"_{name}"].all()
+        for i, env in enumerate(singles):
+            if step in (0, STEPS):
+                alone, info = env.reset(seed=8 + i) if step == 0 else env.reset()
+                assert info["agent_ls"] == {n: infos[n][i] for n in info["agent_ls"]}
+            else:
+                alone = env.step(IDLE)[0]
+            for agent in AGENTS:
+                assert np.array_equal(found[agent][i], alone[agent]), (step, agent)
+        found, *_, infos = multi.step({a: np.ones(3, dtype=int) for a in AGENTS})
+        of_batch = batch.step(np.ones((3, 3), dtype=int))[4]
+    years = multi.core.start_info()["year"]
+    assert len(set(years.tolist())) > 1
+
+
+@pytest.mark.parametrize("saved_after", [0, 40, STEPS])
+def test_saved_states_go_on_in_the_same_year(saved_after: int) -> None:
+    env, other = (sdc_taichi.parallel_env(**DRAWN) for _ in range(2))
+    env.reset(seed=4)
+    run_episode(env, saved_after)
+    saved = pickle.dumps(env.state_dict())
+    other.reset(seed=1)
+    other.load_state_dict(pickle.loads(saved))
+    assert other.core.start_info() == env.core.start_info()
+    if saved_after < STEPS:
+        assert run_episode(other, 20) == run_episode(env, 20)
+    assert other.reset()[1] == env.reset()[1]
+
+
+def test_states_of_other_draws_are_refused_and_change_nothing() -> None:
+    env = sdc_taichi.parallel_env(**DRAWN)
+    env.reset(seed=0)
+    saved = env.state_dict()
+    before = env.core.start_info()
+    for inputs, message in (
+        (None, "inputs are not valid"),
+        ({"years": (1,)}, "inputs are not valid"),
+        ({"years": (7,), "traces": ("alibaba_1",)}, "years (7,): not drawn by these"),
+        ({"years": (True,), "traces": ("alibaba_1",)}, "years (True,): not drawn"),
+        ({"years": (1, 2), "traces": ("alibaba_1",)}, "years (1, 2): not drawn"),
+        ({"years": None, "traces": ("alibaba_1",)}, "years None: not drawn"),
+        ({"years": (1,), "traces": ("other",)}, "traces ('other',): not drawn"),
+    ):
+        with pytest.raises(SdcError, match=re.escape(message)):
+            env.load_state_dict({**saved, "inputs": inputs})
+        assert env.core.start_info() == before
+    other = {**saved["inputs"], "years": ((saved["inputs"]["years"][0] + 1) % 5,)}
+    with pytest.raises(SdcError, match="another fleet, inputs"):
+        env.load_state_dict({**saved, "inputs": other})
+
+
+def test_devices_stay_as_they_were_sized() -> None:
+    env = sdc_taichi.parallel_env("corrected", days=1, years=range(100, 103))
+    plain = sdc_taichi.parallel_env("corrected", days=1)
+    for one in (env, plain):
+        one.reset(seed=0)
+    assert env.core.view.sizing.facility_w == plain.core.view.sizing.facility_w
+    assert env.core.start_info()["year"][0] in range(100, 103)
+
+
+def test_traces_from_files(trace_file: Path) -> None:
+    env = sdc_taichi.parallel_env("tiny", days=1, traces=[trace_file])
+    _, infos = env.reset(seed=0)
+    assert infos["agent_ls"]["trace"] == str(trace_file)
+    assert set(run_episode(env)["demand"]) <= {0.25, 0.5} | set(
+        np.round(np.linspace(0.25, 0.5, 9), 12)
+    )
+    # It carries into a spec that can be written.
+    made = gymnasium.make("sdc_taichi/Load-v0", config="tiny", years=3, traces=[str(trace_file)])
+    assert made.spec is not None
+    assert json.loads(made.spec.to_json())["kwargs"]["years"] == 3
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"years": 0}, "years"),
+    ({"years": []}, "valid is one or more, each once"),
+    ({"years": [1, 1]}, "valid is one or more, each once"),
+    ({"years": [-1]}, "years"),
+    ({"years": 1.5}, "years"),
+    ({"years": True}, "years"),
+    ({"traces": []}, "valid is one or more, each once"),
+    ({"traces": "alibaba_1"}, "traces"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), WRONG)
+def test_options_that_are_not_valid(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        sdc_taichi.parallel_env("tiny", **options)
+
+
+def test_options_without_effect_or_data() -> None:
+    with pytest.raises(DataError, match="trace 'alibaba_9'"):
+        sdc_taichi.parallel_env("tiny", traces=["alibaba_1", "alibaba_9"])
+    with pytest.raises(SdcError, match=r"no_such\.csv"):
+        sdc_taichi.parallel_env("tiny", traces=["./no_such.csv"])
+
+
+def test_years_need_something_synthetic(trace_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drivers, "_site_is_synthetic", lambda site: False)
+    with pytest.raises(ConfigError, match=r"years: without effect on .*no input is synthetic"):
+        sdc_taichi.parallel_env("tiny", overrides=[f"site.workload_file={trace_file}"], years=3)
+
+
+def test_what_is_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = [InputReader([load_config("tiny")]).read([year]) for year in range(3)]
+    monkeypatch.setattr(drivers, "MAX_KEPT_BYTES", 600_000)
+    reader = InputReader([load_config("tiny")])
+    for year in (0, 1, 2, 1):
+        again = reader.read([year])
+        assert np.array_equal(again.outdoor_c.values, alone[year].outdoor_c.values)
+        assert again.digest() == alone[year].digest()
+    assert 0 < reader._kept_bytes <= 600_000
+    assert len(reader._kept) < 8
+    demand = load_trace(load_config("tiny").workload.trace, seed=2).values
+    assert alone[2].demand.values[2::4] == pytest.approx(demand, abs=0.2)
+
+
+def test_a_simulator_takes_other_inputs_at_reset() -> None:
+    config = load_config("tiny")
+    other = load_drivers([load_config("tiny", ["site.seed=3"])])
+    with Simulator(config) as sim:
+        first = sim.reset(seed=0)
+        mine = sim.drivers
+        sim.reset(drivers=other)
+        result = sim.step()
+        assert result.outdoor_c == other.at(0).outdoor_c != mine.at(0).outdoor_c
+        saved = sim.state_dict()
+        sim.reset(drivers=mine)
+        with pytest.raises(SdcError, match="made by another fleet, inputs"):
+            sim.load_state_dict(saved)
+        sim.load_state_dict(saved, other)
+        assert sim.step().outdoor_c == other.at(1).outdoor_c
+        assert first.step == 0
+        with pytest.raises(ConfigError, match="drivers of 2 data centers for a fleet of 1"):
+            sim.reset(drivers=load_drivers([config] * 2))
