@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from numbers import Integral
 
 
 class SdcError(ValueError):
@@ -35,6 +36,26 @@ class SdcWarning(UserWarning):
 
 class OddInputWarning(SdcWarning):
     """An input is possible, but probably not what was meant."""
+
+
+def whole_number(what: str, value: object, low: int, high: int) -> int:
+    """A whole number of Python or NumPy that was given as an argument.
+
+    Args:
+        what: name of the argument, for the message.
+        value: what was given.
+        low: least valid value.
+        high: largest valid value.
+
+    Raises:
+        ConfigError: no whole number, or one out of bounds.
+    """
+    # NumPy's whole numbers are registered as integral.
+    if isinstance(value, bool) or not isinstance(value, Integral) or not low <= int(value) <= high:
+        raise ConfigError(
+            f"{what} {shortened(value)}: valid is a whole number of {low:,}..{high:,}"
+        )
+    return int(value)
 
 
 def shortened(value: object, most: int = 80) -> str:

@@ -81,13 +81,13 @@ class Actions:
     load: LoadAction | float | F64 | Sequence[LoadAction] = LoadAction.NEUTRAL
     """Share of what can be deferred (below 0) or drained (above 0), -1..1, () or (B,)."""
     cooling: CoolAction | float | F64 | Sequence[CoolAction] = CoolAction.HOLD
-    """Steps of ``hvac.setpoint.step_k`` by which setpoints move, any finite number, (), (B,) or
-    (U,)."""
+    """Steps of ``hvac.setpoint.step_k`` by which setpoints move, a number within -1e6..1e6, (),
+    (B,) or (U,)."""
     battery: BatteryAction | float | F64 | Sequence[BatteryAction] = BatteryAction.IDLE
     """Share of the battery's power limit, discharged (below 0) or charged, -1..1, () or (B,)."""
     fan: FanAction | float | F64 | Sequence[FanAction] = FanAction.HOLD
-    """Steps of ``hvac.crac.fan_step`` by which CRAC fan speeds move, any finite number, (), (B,) or
-    (U,); for flow model ``controlled`` alone."""
+    """Steps of ``hvac.crac.fan_step`` by which CRAC fan speeds move, a number within -1e6..1e6, (),
+    (B,) or (U,); for flow model ``controlled`` alone."""
     placement: F64 | None = None
     """Relative load of each rack, (R,), or server group, (G,); None loads all alike; for policy
     ``weights`` alone."""

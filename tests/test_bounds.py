@@ -15,20 +15,24 @@ from pydantic import BaseModel
 from typer.testing import CliRunner
 
 from sdc_taichi import (
+    Actions,
     ConfigError,
     DataCenterConfig,
     DataError,
     EnvOptions,
+    SdcError,
     Simulator,
     drivers_from_arrays,
     load_config,
+    make_configs,
     parallel_env,
     preset_names,
     simulate,
+    vector_env,
 )
 from sdc_taichi.cli.app import app
 from sdc_taichi.config.reference import fields_markdown
-from sdc_taichi.control import make_controller
+from sdc_taichi.control import make_controller, view_maker
 from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
 from sdc_taichi.exogenous.series import Series, Weather
 from sdc_taichi.sim.fleet import build_fleet
@@ -227,3 +231,36 @@ def test_the_docs_show_every_field_with_its_bounds() -> None:
     made = fields_markdown()
     assert made in text, "docs/configuration.md: append what fields_markdown() makes"
     assert "| `reference_cop` | `5.96` | 0.5..50 |" in made
+
+
+@pytest.mark.parametrize("bad", [-1, 2.5, True, "3", 10**18])
+def test_numbers_of_steps_copies_and_environments_have_bounds(bad: Any) -> None:
+    config = load_config("tiny")
+    with pytest.raises(ConfigError, match=r"fleet: count .*whole number of 1"):
+        make_configs(config, count=bad)
+    with pytest.raises(ConfigError, match=r"num_envs .*whole number of 1"):
+        vector_env(bad, config)
+    with Simulator(config) as sim:
+        controller = make_controller("idle", sim.fleet)
+        with pytest.raises(ConfigError, match=r"steps .*whole number of 0"):
+            simulate(sim, controller, bad)
+
+
+@pytest.mark.parametrize("days", ["40000", "1e300", "inf"])
+def test_a_run_ends_within_a_century(days: str) -> None:
+    done = CliRunner().invoke(app, ["simulate", "tiny", "--days", days])
+    assert done.exit_code == 2
+    assert "at most 36,500" in done.stderr
+
+
+def test_commands_and_forecasts_have_bounds() -> None:
+    with Simulator(load_config("tiny")) as sim:
+        sim.reset()
+        with pytest.raises(SdcError, match=r"action cooling: 1e\+300; valid"):
+            sim.step(Actions(cooling=1e300))
+        view = view_maker(sim)(None)
+        for hours in (np.nan, np.inf, -1.0, 0.1, 1e9):
+            with pytest.raises(ConfigError, match=r"valid is 0\.25\.\.8,760 h"):
+                view.forecast(hours)
+        with pytest.raises(ConfigError, match="start"):
+            sim.reset(start=np.array([2**62]))

@@ -293,7 +293,7 @@ def test_forecast_is_what_comes_also_over_the_turn_of_the_year() -> None:
 
 
 def test_forecast_shorter_than_a_step_is_an_error(sim: Simulator) -> None:
-    with pytest.raises(ConfigError, match=r"forecast of 0 h: valid is at least 0\.25 h"):
+    with pytest.raises(ConfigError, match=r"forecast of 0 h: valid is 0\.25\.\.8,760 h"):
         view_maker(sim)(None).forecast(0.0)
 
 

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 EXIT_INTERRUPTED = 130
 """Exit code of a run that Ctrl-C ended."""
+MOST_DAYS = 36_500
+"""Longest run, in days: a century."""
 MAX_DCS = 100_000
 """Largest number of data centers of ``--dcs``."""
 
@@ -65,7 +67,10 @@ def simulate_command(
         ),
     ] = "idle",
     seed: Annotated[
-        int, typer.Option(min=0, help="Of controller and --sample (not of the synthetic year).")
+        int,
+        typer.Option(
+            min=0, max=2**63 - 1, help="Of controller and --sample (not of the synthetic year)."
+        ),
     ] = 0,
     precision: Annotated[
         Literal["f32", "f64"], typer.Option(help="Of the per-server kernels.")
@@ -268,10 +273,10 @@ def _with_files(
 def _whole_steps(days: float, steps_per_hour: int) -> int:
     per_day = 24 * steps_per_hour
     steps = days * per_day
-    if not 0 < steps < 1e12 or abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
+    if not 0 < days <= MOST_DAYS or abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
         raise ConfigError(
-            f"--days {days:g}: valid is a positive number of days that makes whole steps of "
-            f"{60 // steps_per_hour} min, that is n/{per_day}"
+            f"--days {days:g}: valid is a positive number of days, at most {MOST_DAYS:,}, that "
+            f"makes whole steps of {60 // steps_per_hour} min, that is n/{per_day}"
         )
     return round(steps)
 

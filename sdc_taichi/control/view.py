@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
@@ -91,11 +92,13 @@ class View:
             hours: length of the forecast, rounded to whole steps.
 
         Raises:
-            ConfigError: the forecast is shorter than a step.
+            ConfigError: the forecast is shorter than a step, or longer than a year.
         """
+        if not self.step_h / 2 < hours <= HOURS_PER_YEAR:
+            raise ConfigError(
+                f"forecast of {hours:g} h: valid is {self.step_h:g}..{HOURS_PER_YEAR:,} h"
+            )
         steps = round(hours / self.step_h)
-        if steps < 1:
-            raise ConfigError(f"forecast of {hours:g} h: valid is at least {self.step_h:g} h")
         first = self.drivers.start + self.state.step
         return Forecast(self.drivers, first[:, None] + np.arange(steps))
 

@@ -30,7 +30,7 @@ from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.released_observer import ReleasedObserver
 from sdc_taichi.envs.rewards import Rewards
 from sdc_taichi.envs.saved_state import check_state
-from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
+from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError, whole_number
 from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.fleet import Fleet
@@ -41,6 +41,9 @@ from sdc_taichi.types import F32, F64, I64, Actions, State, StepResult
 Observation = F32 | dict[str, F32]
 """Observations, (B, n), or with the heat map a dict of ``features`` (B, n) and ``heat_map`` (B,
 rows, racks per row, channels)."""
+
+MOST_ENVS = 10_000_000
+"""Most environments of a batch, more than any memory holds."""
 
 
 @dataclass(slots=True)
@@ -367,12 +370,10 @@ class Core:
 
 def _checked_size(num_envs: Any, configs: int) -> int:
     """Number of environments, one for each config at least."""
-    size = configs if num_envs is None else num_envs
-    if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
-        raise ConfigError(f"num_envs {size!r}: valid is a whole number of at least 1")
+    size = whole_number("num_envs", configs if num_envs is None else num_envs, 1, MOST_ENVS)
     if size < configs:
         raise ConfigError(f"num_envs {size}: valid is at least {configs}, one for each config")
-    return int(size)
+    return size
 
 
 def _equal_units(fleet: Fleet) -> int:

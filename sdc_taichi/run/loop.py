@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sdc_taichi.control import Controller, view_maker
+from sdc_taichi.errors import whole_number
 from sdc_taichi.run.metrics import Totals, add_step, empty_totals
 from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import StepResult
+
+MOST_STEPS = 100 * 8760 * 60
+"""Most steps of a run: a century of minutes."""
 
 
 def simulate(
@@ -26,7 +30,7 @@ def simulate(
     Args:
         sim: the simulator.
         controller: gives the actions of every step.
-        steps: number of steps.
+        steps: number of steps, at most ``MOST_STEPS``.
         seed: of the simulator's events and of the controller.
         on_step: called with the result of every step.
         stop: asked before every step; true ends the run.
@@ -36,10 +40,11 @@ def simulate(
         Totals of the steps that were simulated, from which ``run.metrics`` makes metrics.
 
     Raises:
-        ConfigError: an event that starts after the end of the run.
+        ConfigError: a number of steps out of bounds, or an event that starts after the end.
         PhysicalLimitError: a result that no data center can reach.
         SdcError: the controller gave actions that are not valid.
     """
+    steps = whole_number("steps", steps, 0, MOST_STEPS)
     require_events_start_before(steps * sim.step_h, sim.fleet.configs)
     sim.reset(seed)
     controller.reset(seed)

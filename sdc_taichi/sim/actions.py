@@ -13,6 +13,9 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.unit_index import UnitIndex
 from sdc_taichi.types import F64, Actions, BatteryAction, CoolAction, FanAction, LoadAction
 
+MOST_MOVES = 1e6
+"""Most steps by which a setpoint or a fan may be told to move, far beyond the range of either."""
+
 
 @dataclass
 class Commands:
@@ -108,7 +111,7 @@ class ActionDecoder:
 
     def _unit_command(self, name: str, given: Any, kind: type[Enum]) -> F64:
         """A command for each CRAC unit, (U,), given for all, per data center or per unit."""
-        command = self._command(name, given, kind, also=self._n_units)
+        command = self._command(name, given, kind, limit=MOST_MOVES, also=self._n_units)
         return command if len(command) == self._n_units else self._units.of_each(command)
 
     def _command(
@@ -117,7 +120,7 @@ class ActionDecoder:
         given: Any,
         kind: type[Enum],
         *,
-        limit: float = np.inf,
+        limit: float,
         also: int | None = None,
     ) -> F64:
         """A finite command within -limit..limit for each data center, (B,), or ``also`` entries."""
@@ -140,8 +143,8 @@ class ActionDecoder:
             )
         largest = np.maximum.reduce(np.abs(command), axis=None)
         # Comparisons with NaN are false, so that it ends here too.
-        if not (largest <= limit and largest < np.inf):
-            wrong = ~(np.abs(command) <= limit) | ~np.isfinite(command)
+        if not largest <= limit:
+            wrong = ~(np.abs(command) <= limit)
             value = command[wrong].flat[0] if command.ndim else command
             raise SdcError(
                 f"action {name}: {value}; valid is a finite number within -{limit:g}..{limit:g}"

@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig, with_values
-from sdc_taichi.errors import ConfigError, suggestion
+from sdc_taichi.errors import ConfigError, suggestion, whole_number
+
+MOST_DCS = 10_000_000
+"""Most data centers of a fleet, more than any memory holds."""
 
 
 def make_configs(
@@ -34,8 +37,8 @@ def make_configs(
     if isinstance(sites, str):
         raise ConfigError(f"sites {sites!r}: valid is a list of names")
     count = max(len(sites), 1) if count is None else count
-    if count < 1:
-        raise ConfigError(f"fleet: {count} data centers; valid is at least 1")
+    count = whole_number("fleet: count", count, 1, MOST_DCS)
+    seed = whole_number("fleet: seed", seed, 0, 2**63 - 1)
     if count < len(sites):
         raise ConfigError(
             f"fleet: {count} data centers for {len(sites)} sites; valid is at least one per site"

@@ -32,6 +32,9 @@ from sdc_taichi.sim.work_allocation import RackOutcome, WorkAllocation
 from sdc_taichi.sim.workload import Workload, WorkResult
 from sdc_taichi.types import I64, Actions, ServerLayers, State, StepResult
 
+LAST_START = 2**53
+"""Latest first step: beyond, steps would not be exact as f64."""
+
 
 class Simulator:
     """Data centers that step together.
@@ -125,7 +128,8 @@ class Simulator:
                 center; None is 0. Data centers of different names meet different events with one
                 seed; of those that share a name, the first takes an integer as it is, the second
                 the next one, and so on. The stages are deterministic.
-            start: Index of the first step in the year, (B,); None is the start of the drivers.
+            start: Index of the first step in the year, 0..``LAST_START``, (B,); None is the start
+                of the drivers.
             drivers: Inputs from here on; None keeps those that there are. Devices stay as they were
                 sized with the first ones.
 
@@ -139,10 +143,11 @@ class Simulator:
         inputs = self._checked_drivers(self.drivers if drivers is None else drivers)
         initial = self._initial_start if drivers is None else drivers.start
         first = initial if start is None else np.asarray(start)
-        if first.shape != (self.size,) or first.dtype.kind not in "iu" or np.any(first < 0):
+        whole = first.shape == (self.size,) and first.dtype.kind in "iu"
+        if not whole or np.any((first < 0) | (first > LAST_START)):
             raise ConfigError(
-                f"start {start!r}: valid is one integer of at least 0 for each of {self.size} "
-                "data centers"
+                f"start {start!r}: valid is one integer of 0..{LAST_START:,} for each of "
+                f"{self.size} data centers"
             )
         stages = self._started()
         stages.hall.discard_last_step()
