@@ -9,9 +9,44 @@ import difflib
 from collections.abc import Iterable
 from numbers import Integral
 
+MOST_CHARACTERS = 800
+"""Length of the longest message; the middle of a longer one is left out."""
+
+
+def printable(text: object) -> str:
+    """Text that is safe to print: control characters, which a terminal obeys, are escaped.
+
+    So are characters that change the direction of writing, and other invisible ones.
+
+    Args:
+        text: what is to be printed, such as the name of a file.
+    """
+    whole = str(text)
+    if whole.isprintable():
+        return whole
+    return "".join(
+        c if c.isprintable() or c == "\u00a0" else c.encode("unicode_escape").decode()
+        for c in whole
+    )
+
+
+def one_line(text: str) -> str:
+    """Text of a message on one line of bounded length that is safe to print."""
+    if len(text) > MOST_CHARACTERS:
+        kept = MOST_CHARACTERS // 2
+        text = f"{text[:kept]} ... {text[-kept:]}"
+    return printable(" ".join(text.split()))
+
 
 class SdcError(ValueError):
-    """Base of all errors caused by input; the command line prints them without a traceback."""
+    """Base of all errors caused by input; the command line prints them without a traceback.
+
+    Args:
+        message: what was found where, and what would be valid; kept as ``one_line`` makes it.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
 
 
 class ConfigError(SdcError):

@@ -241,7 +241,7 @@ def test_the_same_command_again_replaces_its_run(tmp_path: Path) -> None:
     out = tmp_path / "run"
     simulate(out, "--site", "ny,ca")
     assert names_in(out) == FILES | {"configs.yaml"}
-    (out / ".steps.parquet.123.part").write_bytes(b"left by a killed run")
+    (out / ".steps.parquet.part").write_bytes(b"left by a killed run")
     (out / "report.html").write_text("of the run before")
     simulate(out, "--site", "ny", "--days", 0.5)
     assert names_in(out) == FILES | {"config.yaml"}

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.errors import SdcError
+from sdc_taichi.errors import SdcError, printable
 from sdc_taichi.exogenous.year_clock import FIRST_YEAR
 from sdc_taichi.types import F64
 
@@ -93,7 +93,7 @@ def add_title(figure: Figure, text: str) -> None:
 
 def short_name(name: str) -> str:
     """A name on one line of at most ``MAX_NAME_LENGTH`` characters."""
-    line = " ".join(name.split())
+    line = printable(" ".join(name.split()))
     return line if len(line) <= MAX_NAME_LENGTH else line[: MAX_NAME_LENGTH - 1] + "…"
 
 

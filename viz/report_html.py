@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING
 
+from sdc_taichi.errors import printable
+
 from .plotting import webp
 
 if TYPE_CHECKING:
@@ -99,7 +101,7 @@ def html_page(title: str, lead: str, sections: Mapping[str, str], own_page: set[
         for name, content in sections.items()
     )
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-    return (
+    page = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -107,6 +109,7 @@ def html_page(title: str, lead: str, sections: Mapping[str, str], own_page: set[
         f'<h1>{escape(title)}</h1>\n<p class="lead">{escape(lead)}</p>\n'
         f'<nav aria-label="Contents"><ul>\n{links}</ul></nav>\n{body}</main>\n</body>\n</html>\n'
     )
+    return "\n".join(map(printable, page.split("\n")))
 
 
 def picture_element(figure: Figure, alt: str, caption: str) -> str:

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from sdc_taichi.errors import RuntimeStateError
+from sdc_taichi.errors import RuntimeStateError, SdcWarning
 
 CACHE_VARIABLE = "TI_OFFLINE_CACHE_FILE_PATH"
 """Variable by which users of Taichi name the folder of compiled kernels, here too."""
@@ -28,7 +28,7 @@ _HEADER_BYTES, _ENTRY_BYTES, _KEY_BYTES = 30, 170, 65
 _VERSION = b"\1\0\7\0\4\0"
 
 
-class KernelCacheWarning(UserWarning):
+class KernelCacheWarning(SdcWarning):
     """Compiled kernels cannot be kept for the next process."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -18,10 +19,11 @@ from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.cli.report import report_command
 from sdc_taichi.cli.session import warnings_in_lines
 from sdc_taichi.cli.simulate import simulate_command
+from sdc_taichi.cli.streams import guard_streams, output_failure
 from sdc_taichi.cli.view import view_command
-from sdc_taichi.errors import SdcError
+from sdc_taichi.errors import SdcError, one_line
 
-EXIT_FAILURE, EXIT_INPUT = 1, 2
+EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
 class _Commands(typer.core.TyperGroup):
@@ -37,6 +39,9 @@ class _Commands(typer.core.TyperGroup):
             if "--debug" in given:
                 traceback.print_exc()
             code = _print_error(error)
+        failure = output_failure()
+        if failure is not None and not code:
+            code = _print_error(SdcError(failure))
         sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -56,8 +61,12 @@ app.command("simulate")(simulate_command)
 
 
 def main() -> None:
-    """Entry point of the console script."""
-    app()
+    """Run the command line of this process, and exit."""
+    guard_streams()
+    try:
+        app()
+    except KeyboardInterrupt:  # commands being put together, or the last line being printed
+        sys.exit(EXIT_INTERRUPTED)
 
 
 def _show_version(asked: bool) -> None:
@@ -86,10 +95,21 @@ def _print_error(error: Exception) -> int:
         text, code = error.format_message(), error.exit_code
     elif isinstance(error, SdcError):
         text, code = str(error), EXIT_INPUT
+    elif isinstance(error, FileNotFoundError) and not _has_current_folder():
+        text, code = "the current folder has been deleted; valid is one that exists", EXIT_INPUT
+    elif isinstance(error, MemoryError):
+        text, code = f"memory is short{f' ({error})' if str(error) else ''}", EXIT_FAILURE
     else:
         text = f"{type(error).__name__}: {error} (unexpected; --debug shows where)"
         code = EXIT_FAILURE
-    line = " ".join(text.split())
-    if line:
+    if line := one_line(text):
         print(f"error: {line}", file=sys.stderr)
     return code
+
+
+def _has_current_folder() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return False
+    return True

@@ -7,6 +7,7 @@ import typer
 from sdc_taichi.cli.arguments import Overrides, Source, read_config
 from sdc_taichi.cli.session import print_notes
 from sdc_taichi.config import load_config, preset_names
+from sdc_taichi.errors import printable
 
 config_app = typer.Typer(help="Show and check configurations.", no_args_is_help=True)
 
@@ -30,8 +31,8 @@ def check_config(source: Source = None, overrides: Overrides = None) -> None:
     print_notes(drivers.notes)
     nameplate_kw = sum(g.count * g.full_w for rack in config.rack_groups() for g in rack) / 1e3
     print(
-        f"{label}: valid; {fleet.racks} racks, {fleet.servers:,} servers, {nameplate_kw:,.6g} kW "
-        f"nameplate, site {config.site.location}"
+        f"{printable(label)}: valid; {fleet.racks} racks, {fleet.servers:,} servers, "
+        f"{nameplate_kw:,.6g} kW nameplate, site {printable(config.site.location)}"
     )
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.cli.arguments import out_option
+from sdc_taichi.cli.console import PlainConsole
 from sdc_taichi.errors import DataError, suggestion
 from sdc_taichi.exogenous import importing
 from sdc_taichi.exogenous.carbon import COLUMNS
@@ -56,7 +56,7 @@ class StampOption(StrEnum):
 @data_app.command("list")
 def list_data() -> None:
     """List sites and workload traces, their source, and whether they are synthetic or real."""
-    console = Console()
+    console = PlainConsole()
     sites = Table("site", "place", "kind", "weather", "carbon", title="Sites")
     for name in synthetic_sites():
         site = synthetic_site(name)
@@ -99,7 +99,7 @@ def show_data(
     ] = None,
 ) -> None:
     """Show the statistics of a site or a workload trace, and a picture of it."""
-    console = Console()
+    console = PlainConsole()
     found = find_name("site or trace", name, (*site_names(), *trace_names()))
     if found in site_names():
         site = load_site(found, seed=seed)
@@ -169,7 +169,7 @@ def import_data(
     ] = None,
 ) -> None:
     """Validate and align files, and store them in the user's data folder."""
-    console = Console()
+    console = PlainConsole()
     if base is not None:
         base = find_name("base", base, synthetic_sites())
     columns = _columns(mapped or [])
@@ -233,18 +233,17 @@ def _plan_import(
     return [(kind, path, name)], []
 
 
-def _print_imported(console: Console, item: importing.Imported) -> None:
+def _print_imported(console: PlainConsole, item: importing.Imported) -> None:
     console.print(
         f"{item.kind} {item.name}: {item.source.name} -> {item.target}",
         soft_wrap=True,
-        markup=False,
     )
     for note in item.notes:
-        console.print(f"  {note}", soft_wrap=True, markup=False)
+        console.print(f"  {note}", soft_wrap=True)
 
 
 def _print_missing_parts(
-    console: Console, done: Sequence[importing.Imported], base: str | None
+    console: PlainConsole, done: Sequence[importing.Imported], base: str | None
 ) -> None:
     """Say of each imported site that lacks weather or carbon where that comes from."""
     for name in dict.fromkeys(item.name for item in done if item.kind != "workload"):

@@ -22,6 +22,7 @@ from sdc_taichi.cli.arguments import (
     read_config,
 )
 from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.errors import printable
 from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M
 from sdc_taichi.types import F64
 
@@ -54,7 +55,7 @@ def show_hall(
         return
     typer.echo(describe_hall(hall))
     if out is not None:
-        typer.echo(f"Floor plan: {out}")
+        typer.echo(f"Floor plan: {printable(out)}")
 
 
 @hall_app.command("solve")
@@ -88,7 +89,7 @@ def solve_hall(
         return
     _print_layout_solution(config, solution)
     if out is not None:
-        typer.echo(f"Matrix: {out} (for hall.recirculation.matrix_file)")
+        typer.echo(f"Matrix: {printable(out)} (for hall.recirculation.matrix_file)")
 
 
 def layout_solution_values(config: DataCenterConfig, solution: LayoutSolution) -> dict[str, Any]:
@@ -134,7 +135,7 @@ def _print_layout_solution(config: DataCenterConfig, solution: LayoutSolution) -
     grid = " x ".join(str(n) for n in solution.provenance["grid"])
     hall = config.hall
     typer.echo(
-        f"{config.name}: {hall.rows} rows of {hall.racks_per_row} racks, grid {grid}, "
+        f"{printable(config.name)}: {hall.rows} rows of {hall.racks_per_row} racks, grid {grid}, "
         f"{solution.cells:,} cells of air, {solution.seconds:.1f} s"
     )
     table = Table("inlet over supply, K")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sdc_taichi.errors import printable
 from sdc_taichi.hall.air_metrics import rank
 from sdc_taichi.sim.design_hall import DesignHall
 from sdc_taichi.types import F64
@@ -25,8 +26,9 @@ def _room_lines(found: DesignHall) -> list[str]:
     grilles = "in the end walls" if size.returns == "end_wall" else "above the hot aisles"
     cold, hot = hall.rows // 2, (hall.rows - 1) // 2
     return [
-        f"{found.config.name}: {_count(hall.rows, 'row')} of {_count(hall.racks_per_row, 'rack')}, "
-        f"{found.servers:,} servers, inlet model {hall.inlet_model}",
+        f"{printable(found.config.name)}: {_count(hall.rows, 'row')} of "
+        f"{_count(hall.racks_per_row, 'rack')}, {found.servers:,} servers, "
+        f"inlet model {hall.inlet_model}",
         f"room          {plan.length_m:.4g} x {plan.width_m:.4g} x {size.ceiling_m:.4g} m, "
         f"{plan.air_m3:,.4g} m3 of air",
         f"racks         {size.rack_pitch_m:g} m wide, {size.rack_depth_m:g} m deep, "

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from sdc_taichi.cli.arguments import check_out_file, force_option, out_option
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, printable
 
 
 def report_command(
@@ -44,5 +44,7 @@ def report_command(
     for run in runs:
         done, asked = run.metrics["steps_done"], run.metrics["steps_asked"]
         if done < asked:
-            typer.echo(f"note: {run.path}: interrupted after {done} of {asked} steps", err=True)
-    typer.echo(f"Report: {write_report(runs[0], runs[1:], out)}")
+            typer.echo(
+                f"note: {printable(run.path)}: interrupted after {done} of {asked} steps", err=True
+            )
+    typer.echo(f"Report: {printable(write_report(runs[0], runs[1:], out))}")

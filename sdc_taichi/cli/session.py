@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from sdc_taichi.errors import ConfigError, SdcWarning
+from sdc_taichi.errors import ConfigError, SdcWarning, one_line, printable
 
 if TYPE_CHECKING:
     from sdc_taichi.run.description import RunRequest
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def print_notes(notes: Iterable[str]) -> None:
     """Print what was found out about the inputs of a run, on stderr."""
     for note in notes:
-        print(f"note: {note}", file=sys.stderr)
+        print(f"note: {printable(note)}", file=sys.stderr)
 
 
 @contextlib.contextmanager
@@ -45,7 +45,7 @@ def warnings_in_lines() -> Iterator[None]:
                 show(message, category, filename, lineno, file, line)
             elif str(message) not in shown:
                 shown.add(str(message))
-                print(f"warning: {message}", file=sys.stderr)
+                print(f"warning: {one_line(str(message))}", file=sys.stderr)
 
         warnings.simplefilter("always", SdcWarning)
         warnings.showwarning = show_once
@@ -139,7 +139,8 @@ def recording(
 def print_recording(recorder: Recorder | None) -> None:
     """Print where the recording of a run is, if it is a file."""
     if recorder is not None and recorder.file is not None and not recorder.failed:
-        print(f"Recording: {recorder.file} (open with: sdc-taichi view {recorder.file})")
+        file = printable(recorder.file)
+        print(f"Recording: {file} (open with: sdc-taichi view {file})")
 
 
 def serve_until_interrupted(recorder: Recorder | None, interrupted: Callable[[], bool]) -> None:

@@ -29,7 +29,7 @@ from sdc_taichi.cli.session import (
 )
 from sdc_taichi.cli.summary import print_summary
 from sdc_taichi.config import DataCenterConfig, load_yaml
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, printable
 from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 
@@ -175,7 +175,8 @@ def simulate_command(
             serve_until_interrupted(recorder, interrupted)
     if metrics["steps_done"] < request.steps:
         print(
-            f"interrupted after {metrics['steps_done']} of {request.steps} steps; {folder} holds "
+            f"interrupted after {metrics['steps_done']} of {request.steps} steps; "
+            f"{printable(folder)} holds "
             "the steps done",
             file=sys.stderr,
         )

@@ -51,12 +51,11 @@ def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_h
         folder: the run folder.
         steps_per_hour: number of steps in an hour.
     """
-    from rich.console import Console
+    from sdc_taichi.cli.console import PlainConsole
 
     # A pipe or a file has no width to fit into.
-    console = Console(
-        markup=False, highlight=False, width=None if sys.stdout.isatty() else 200, soft_wrap=True
-    )
+    width = None if sys.stdout.isatty() else 200
+    console = PlainConsole(highlight=False, width=width, soft_wrap=True)
     dcs, steps = metrics["data_centers"], metrics["steps_done"]
     days = steps / steps_per_hour / 24
     count = "1 data center" if len(dcs) == 1 else f"{len(dcs)} data centers"

@@ -336,7 +336,12 @@ class DataCenterConfig(Section):
 
     def to_yaml(self) -> str:
         """YAML text that ``load_config`` reads back equal."""
-        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+        values = self.model_dump(mode="json")
+        text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
+        if all(map(str.isprintable, text.split("\n"))):
+            return text
+        # Escapes what a terminal would obey, and reads back equal.
+        return yaml.safe_dump(values, sort_keys=False)
 
 
 def _check_load_weights(index: int, rack: tuple[ServerGroup, ...]) -> None:

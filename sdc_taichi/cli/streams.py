@@ -1,0 +1,59 @@
+"""Standard output and error of the program, which never end a command that has work to do."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import sys
+from typing import IO, TextIO
+
+
+class _Stream(io.FileIO):
+    """A standard stream that remembers its first failure and drops what it cannot write."""
+
+    failure: OSError | None = None
+    """What the system said when it first could not be written."""
+
+    def write(self, data: object) -> int | None:  # type: ignore[override]
+        """Write bytes, or drop them."""
+        try:
+            return super().write(data)  # type: ignore[arg-type]
+        except OSError as error:
+            self.failure = self.failure or error
+            return memoryview(data).nbytes  # type: ignore[arg-type]
+
+
+def guard_streams() -> None:
+    """Have the standard streams drop what cannot be written, and escape what cannot be encoded."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if os.name == "nt" and stream.isatty():  # consoles of Windows are no files
+            continue
+        raw = _Stream(stream.fileno(), "w", closefd=False)
+        guarded = io.TextIOWrapper(
+            io.BufferedWriter(raw),
+            encoding=stream.encoding,
+            errors="backslashreplace",
+            line_buffering=stream.line_buffering,
+        )
+        setattr(sys, name, guarded)
+        # Taichi takes another one for that of a notebook.
+        setattr(sys, f"__{name}__", guarded)
+
+
+def output_failure() -> str | None:
+    """What kept standard output from being written, if anything did.
+
+    A reader that wanted no more, such as ``head``, is no failure.
+    """
+    sys.stdout.flush()
+    failure = getattr(_raw(sys.stdout), "failure", None)
+    if failure is None or failure.errno == errno.EPIPE:
+        return None
+    return f"standard output: cannot be written: {failure.strerror}"
+
+
+def _raw(stream: TextIO) -> IO[bytes] | None:
+    """The file below a text stream, if there is one."""
+    return getattr(getattr(stream, "buffer", None), "raw", None)
