@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 import reference_twin
+from ledgers import LEDGERS, TRANSIENT_LEDGERS, Run, quantities, residual, stocks
 from sdc_taichi import (
     Actions,
     DataCenterConfig,
@@ -34,28 +34,6 @@ PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
 SEASONS: dict[Precision, tuple[str, ...]] = {"f64": MONTHS, "f32": MONTHS[::3]}
 """Rounding in f32 shows in a month of each season as well as in all twelve."""
 THERMAL = ("quasi_steady", "transient")
-
-
-@dataclass(frozen=True)
-class Run:
-    """What a fleet did: every quantity of a step by name, (T, B), and the state before step 0."""
-
-    values: dict[str, F64]
-    start: dict[str, F64]
-    fleet_values: Callable[[str], F64]
-    step_h: float
-    flow_balance: F64
-    """Of every watched step, (n, B)."""
-
-    def __getitem__(self, name: str) -> F64:
-        return self.values[name]
-
-    def before(self, name: str) -> F64:
-        """A stock at the start of each step, (T, B)."""
-        return np.concatenate([self.start[name][None], self.values[name][:-1]])
-
-    def kwh(self, name: str) -> F64:
-        return self.values[name] * self.step_h / 1e3
 
 
 def held(rng: np.random.Generator, steps: int, size: int, draw: Callable[[int], F64]) -> F64:
@@ -112,34 +90,17 @@ def record(
     flows = []
     with Simulator(configs, precision=precision, drivers=drivers) as sim:
         state = sim.reset()
-        start = {
-            "stored_kwh": state.stored_kwh,
-            "room_heat_kwh": state.room_heat_kwh,
-            "queue_tasks": state.queue[:, -1],
-        }
-        fleet = sim.fleet
-        first = fleet.rack_offsets[:-1]
-        v = fleet.values
-        air = (v("hall.air_density_kg_m3") * v("hall.air_heat_capacity_j_per_kg_k"))[fleet.rack_dc]
+        start = stocks(state)
         for t in range(steps):
             result = sim.step(Actions(load[t], cooling[t], battery[t]))
-            rack_cpu, rack_fan, rack_flow, rack_in, rack_out = (
-                getattr(result, f"rack_{name}").astype(np.float64)
-                for name in ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "outlet_c")
-            )
-            now = result.per_dc() | {
-                "racks_cpu_w": np.add.reduceat(rack_cpu, first),
-                "racks_fan_w": np.add.reduceat(rack_fan, first),
-                "racks_airflow_m3s": np.add.reduceat(rack_flow, first),
-                "racks_air_w": np.add.reduceat(air * rack_flow * (rack_out - rack_in), first),
-            }
+            now = quantities(sim.fleet, result)
             if watch_flows_every and t % watch_flows_every == 0:
                 flows.append(flow_balance(sim, twins, result))
             for name, value in now.items():
                 if t == 0:
                     values[name] = np.empty((steps, size))
                 values[name][t] = value
-    return Run(values, start, fleet.values, sim.step_h, np.array(flows))
+    return Run(values, start, sim.fleet.values, sim.step_h, np.array(flows))
 
 
 def sites_and_seasons(
@@ -243,113 +204,6 @@ def heat_wave(request: pytest.FixtureRequest) -> tuple[Precision, Run]:
 def failed() -> Run:
     """Transient halls in trouble, f64."""
     return record(*troubled("transient"), "f64")
-
-
-Ledger = Callable[[Run], list[F64]]
-"""The terms of a balance with their signs, each (T, B); they add up to zero."""
-
-
-def concentrating_l(run: Run) -> F64:
-    """Water that has to leave for the concentration to hold, drift included, (T, B)."""
-    cycles = run.fleet_values("hvac.water.cycles_of_concentration")
-    return np.asarray(run["evaporation_l"] / (cycles - 1.0))
-
-
-LEDGERS: dict[str, Ledger] = {
-    "heat": lambda r: [
-        r.kwh("it_w"),
-        r.kwh("crac_fan_w"),
-        -r.kwh("thermal_storage_w"),
-        -r.kwh("heat_removed_w"),
-        r.before("room_heat_kwh"),
-        -r["room_heat_kwh"],
-    ],
-    "cooling load": lambda r: [
-        r["cooling_load_w"],
-        -r["heat_removed_w"],
-        -r["unmet_w"],
-        r["recovered_w"],
-    ],
-    "coils": lambda r: [r["cooling_load_w"], -r["it_w"], -r["crac_fan_w"], r["thermal_storage_w"]],
-    "server air": lambda r: [r["it_w"], -r["racks_air_w"]],
-    "room air": lambda r: [
-        r["it_w"],
-        -r.fleet_values("hall.air_density_kg_m3")
-        * r.fleet_values("hall.air_heat_capacity_j_per_kg_k")
-        * r["crac_flow_m3s"]
-        * (r["return_c"] - r["supply_c"]),
-    ],
-    "cooling": lambda r: [r["heat_removed_w"], -r["economiser_w"], -r["chiller_load_w"]],
-    "rejected heat": lambda r: [r["rejected_w"], -r["heat_removed_w"], -r["chiller_w"]],
-    "work": lambda r: [
-        r["arrived_tasks"],
-        -r["executed_tasks"],
-        -r["lost_tasks"],
-        -r["dropped_tasks"],
-        r.before("queue_tasks"),
-        -r["queue_tasks"],
-    ],
-    "queue": lambda r: [
-        r.before("queue_tasks"),
-        r["deferred_tasks"],
-        -r["drained_tasks"],
-        r["overdue_tasks"] - r["due_tasks"],
-        -r["queue_tasks"],
-    ],
-    "battery": lambda r: [
-        r.before("stored_kwh"),
-        r.fleet_values("battery.charge_efficiency") * r["charge_kwh"],
-        -r.fleet_values("battery.discharge_factor") * r["discharge_kwh"],
-        -r["stored_kwh"],
-    ],
-    "battery loss": lambda r: [
-        r.before("stored_kwh"),
-        r["charge_kwh"],
-        -r["discharge_kwh"],
-        -r["battery_loss_kwh"],
-        -r["stored_kwh"],
-    ],
-    "grid": lambda r: [
-        r["grid_kwh"],
-        r["unserved_kwh"],
-        -r.kwh("it_w"),
-        -r.kwh("hvac_w"),
-        -r["charge_kwh"],
-        r["discharge_kwh"],
-    ],
-    "hvac": lambda r: [
-        r["hvac_w"],
-        -r["chiller_w"],
-        -r["tower_fan_w"],
-        -r["chilled_pump_w"],
-        -r["condenser_pump_w"],
-        -r["crac_fan_w"],
-    ],
-    "water": lambda r: [r["water_l"], -r["evaporation_l"], -r["drift_l"], -r["blowdown_l"]],
-    "blowdown": lambda r: [
-        concentrating_l(r),
-        # Without heat to evaporate water, drift alone thins what is left.
-        -np.minimum(r["drift_l"], concentrating_l(r)),
-        -r["blowdown_l"],
-    ],
-    "carbon": lambda r: [r["carbon_g"], -r["grid_kwh"] * r["ci_g_per_kwh"]],
-    "server power": lambda r: [r["it_w"], -r["cpu_w"], -r["it_fan_w"]],
-    "rack CPU power": lambda r: [r["cpu_w"], -r["racks_cpu_w"]],
-    "rack fan power": lambda r: [r["it_fan_w"], -r["racks_fan_w"]],
-    "rack airflow": lambda r: [r["it_airflow_m3s"], -r["racks_airflow_m3s"]],
-}
-
-
-TRANSIENT_LEDGERS = [name for name in LEDGERS if name not in ("server air", "room air")]
-"""Servers and air hold heat there, and products of means are no means of products."""
-
-
-def residual(terms: list[F64], floor: float = 0.0) -> F64:
-    """What is left over the largest term, at least ``floor`` of that of the whole run, (T, B)."""
-    total = np.sum(terms, axis=0)
-    largest = np.max(np.abs(terms), axis=0)
-    largest = np.maximum(largest, floor * largest.max(axis=0))
-    return np.asarray(np.abs(total) / np.where(largest > 0, largest, 1.0))
 
 
 def assert_closes(name: str, run: Run, tolerance: float, floor: float = 0.0) -> None:

@@ -114,6 +114,8 @@ def fails(arguments: list[str], parts: list[str]) -> None:
             "extends: tiny\nservers: {groups: [[{count: 1, full_w: .inf, idle_w: 2}]]}",
             ["servers.groups.0.0.full_w", "finite number"],
         ),
+        ('extends: tiny\nname: "\\ud800"', ["name: ", "valid string", r"'\ud800'"]),
+        (f"extends: tiny\nname: {'x' * 10_001}", ["name: ", "at most 10000 characters"]),
     ],
 )
 def test_yaml(tmp_path: Path, text: str, parts: list[str]) -> None:

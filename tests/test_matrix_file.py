@@ -139,6 +139,7 @@ def test_d_holds_at_the_design_point_of_servers_with_curves(
         ({"D": np.full((6, 6), 1e308)}, r"D\[0, 0\] is 1e\+308 K/W; valid is 0..1000 K/W"),
         ({"R": np.full((6, 6), 1e308)}, r"R\[0, 0\] is 1e\+308; valid is 0..1$"),
         ({"R": np.full((6, 6), None)}, r"R is object \(6, 6\); valid are numbers"),
+        ({"R": np.full((6, 6), 0.16)}, "rack 0 needs .* intake to be exhaust air"),
         (b"no archive", r"cannot be read as an \.npz file"),
     ],
 )

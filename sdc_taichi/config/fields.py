@@ -61,6 +61,8 @@ Count = Annotated[int, Field(ge=1, le=10_000)]
 """A number of parts, 1..10,000: more servers or zones than any rack has."""
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 """Seed of what is random, 0..2**63 - 1."""
+Text = Annotated[str, Field(max_length=10_000)]
+"""Text of up to 10,000 characters, all of which a file can hold."""
 FileName = Annotated[str, Field(min_length=1)]
 """Path of a file."""
 

@@ -20,6 +20,7 @@ from sdc_taichi.config.fields import (
     Section,
     Seed,
     Share,
+    Text,
     WorkingShare,
     check_one_per_rack,
 )
@@ -78,7 +79,7 @@ class WorkloadConfig(Section):
 
     model: Literal["fluid", "tasks"] = "fluid"
     """Whether work is a continuous quantity, or whole tasks as in the released SustainDC."""
-    trace: str = "alibaba_1"
+    trace: Text = "alibaba_1"
     """Name of the workload trace (see ``sdc-taichi data list``)."""
     placement: Literal["uniform", "fill", "coolest-first", "inlet-aware", "weights"] = "uniform"
     """Policy by which the work of a step is spread over the racks."""
@@ -107,7 +108,7 @@ class WorkloadConfig(Section):
 class SiteConfig(Section):
     """Where the data center stands and when its year starts."""
 
-    location: str = "NY"
+    location: Text = "NY"
     """Name of the site, which gives weather and carbon intensity (see ``sdc-taichi data list``)."""
     start: str = "01-01"
     """Month and day of the first step, MM-DD, local standard time."""
@@ -154,9 +155,9 @@ class SimulationConfig(Section):
 class DataCenterConfig(Section):
     """Everything that defines one data center."""
 
-    name: str = "dc"
+    name: Text = "dc"
     """Name of the data center in results and messages."""
-    description: str = ""
+    description: Text = ""
     """Description of the data center, on one line."""
     hall: HallConfig
     """Racks, their approach temperatures and the layout of the hall."""

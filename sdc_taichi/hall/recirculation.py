@@ -68,6 +68,19 @@ def calibrate(config: DataCenterConfig, servers: RackServers | None = None) -> R
     """
     servers = rack_servers(config) if servers is None else servers
     design = design_point(config, servers)
+    path = config.hall.recirculation.matrix_file
+    try:
+        return _calibrated(config, servers, design)
+    except ConfigError as error:
+        # What follows from a matrix is wrong because of it, if the hall alone is right.
+        named = path is None or str(path) in str(error)
+        raise ConfigError(str(error) if named else f"{path}: {error}") from None
+
+
+def _calibrated(
+    config: DataCenterConfig, servers: RackServers, design: DesignPoint
+) -> Recirculation:
+    """Recirculation of a hall that has a design point without it."""
     if config.hall.recirculation.matrix_file is None:
         weights = layout_weights(config.hall, design.airflow_m3s)
         share = design.approach_k / weights.apply(design.outlet_rise_k)
