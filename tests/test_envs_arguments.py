@@ -24,7 +24,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.control import CONTROLLABLE
 from sdc_taichi.envs.actions import BATTERY_COMMANDS
-from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT
+from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT
 from sdc_taichi.envs.core import OBSERVERS
 from sdc_taichi.envs.features import DEFAULT_FEATURES, all_features
 from sdc_taichi.envs.registration import IDS
@@ -235,7 +235,9 @@ def test_choices_are_what_there_is() -> None:
     for by_agent in (COMMAND_OF_AGENT, DEFAULT_FEATURES, DEFAULT_SCALES):
         assert tuple(by_agent) == AGENTS
     assert tuple(COMMAND_OF_AGENT.values()) == CONTROLLABLE
-    assert set(CONTROLLABLE) <= {field.name for field in fields(Actions)}
+    can_decide = {name for names in COMMANDS_OF_AGENT.values() for name in names}
+    assert can_decide == {field.name for field in fields(Actions)}
+    assert all(COMMAND_OF_AGENT[a] == names[0] for a, names in COMMANDS_OF_AGENT.items())
     assert {agent for agent in IDS.values() if agent is not None} == set(AGENTS)
     names = {feature.name for feature in all_features()}
     assert all(set(chosen) <= names for chosen in DEFAULT_FEATURES.values())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,15 +10,18 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sdc_taichi.control.rules import avoid_repeats
-from sdc_taichi.envs.agents import COMMAND_OF_AGENT
 from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.errors import SdcError
-from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.sim.fleet import STAGE_MODELS, Fleet
 from sdc_taichi.types import F64, State
 
 BATTERY_COMMANDS = {"paper": (1.0, 0.0, -1.0), "sustaindc": (1.0, -1.0, 0.0)}
 """Commands of the battery's discrete actions 0, 1 and 2, by value of ``action_order``: 1 charges,
 -1 discharges."""
+PLACEMENT_FACTOR = 10.0
+"""Relative load of a rack at an action of 1, and 1 over that of one at -1."""
+_NEEDED_MODELS = {"fan": ("crac_flow", "controlled"), "placement": ("placement", "weights")}
+"""Stage and model that a command needs."""
 
 
 class ActionDecoder:
@@ -26,19 +29,34 @@ class ActionDecoder:
 
     Args:
         fleet: the data centers, B.
-        options: which agents learn and what their actions mean.
-        units: number of CRAC units of each data center.
+        options: which agents learn, what they decide and what their actions mean.
 
     Attributes:
         spaces: space of the actions of each agent in one environment.
+        commands: commands that learning agents decide.
+
+    Raises:
+        ConfigError: data centers that differ in the number of what is decided on, or whose models
+            do not take a command.
     """
 
-    def __init__(self, fleet: Fleet, options: EnvOptions, units: int) -> None:
+    def __init__(self, fleet: Fleet, options: EnvOptions) -> None:
         self._agents: tuple[str, ...] = options.agents
         self._continuous = options.actions == "continuous"
-        self._units = units
-        self._setpoint_change_k = options.setpoint_change_k
-        self.spaces: dict[str, spaces.Space[Any]] = {a: self._space(a) for a in self._agents}
+        decided = {agent: options.commands_of(agent) for agent in self._agents}
+        self.commands = tuple(name for names in decided.values() for name in names)
+        _check_models(fleet, self.commands)
+        units = equal_number(fleet.unit_offsets, "CRAC units; hvac.crac.units")
+        widths = {"cooling": units, "fan": units}
+        if "placement" in self.commands:
+            widths["placement"] = equal_number(fleet.rack_offsets, "racks, which")
+        self._columns: dict[str, tuple[tuple[str, slice | None], ...]] = {
+            agent: _columns(names, widths) for agent, names in decided.items()
+        }
+        self.spaces: dict[str, spaces.Space[Any]] = {
+            agent: self._space(sum(widths.get(name, 1) for name in names))
+            for agent, names in decided.items()
+        }
         self._shapes = {
             agent: (fleet.size, *(space.shape or ())) for agent, space in self.spaces.items()
         }
@@ -46,19 +64,24 @@ class ActionDecoder:
         if order is None:
             models = {c.battery.model for c in fleet.configs}
             order = "sustaindc" if models == {"released"} else "paper"
+        three_ways = np.array([-1.0, 0.0, 1.0])
         self._discrete_commands = {
-            "agent_ls": np.array([-1.0, 0.0, 1.0]),
-            "agent_dc": np.array([-1.0, 0.0, 1.0]),
-            "agent_bat": np.array(BATTERY_COMMANDS[order]),
+            "load": three_ways,
+            "cooling": three_ways,
+            "fan": three_ways,
+            "battery": np.array(BATTERY_COMMANDS[order]),
+            "placement": PLACEMENT_FACTOR**three_ways,
         }
+        self._setpoint_change_k = options.setpoint_change_k
         self._setpoint_step_k = np.repeat(fleet.values("hvac.setpoint.step_k"), units)
+        self._fan_steps = options.fan_change / np.repeat(fleet.values("hvac.crac.fan_step"), units)
 
     def decode(self, actions: Mapping[str, Any], state: State) -> dict[str, F64]:
-        """Commands of the learning agents by name, (B,) each, or (U,) for all CRAC units.
+        """Commands of the learning agents by name, (B,) each, (U,) or (R,).
 
         Args:
             actions: one entry per learning agent, (B,) whole numbers, or (B, k) numbers with
-                continuous actions or several CRAC units.
+                continuous actions or several numbers to an action.
             state: the situation before the step.
 
         Raises:
@@ -66,22 +89,24 @@ class ActionDecoder:
         """
         if not isinstance(actions, Mapping):
             raise SdcError(f"actions: {actions!r}; valid is a dict of {list(self._agents)}")
-        commands = {
-            COMMAND_OF_AGENT[agent]: self._decode(agent, actions, state) for agent in self._agents
-        }
-        if len(actions) > len(commands):
+        commands: dict[str, F64] = {}
+        for agent in self._agents:
+            given = self._checked(agent, actions)
+            for name, columns in self._columns[agent]:
+                part = given if columns is None else given[:, columns]
+                commands[name] = self._command(name, part.reshape(-1), state)
+        if len(actions) > len(self._agents):
             extra = sorted(set(map(str, actions)) - set(self._agents))
             raise SdcError(f"actions: {extra} do not learn here; valid: {list(self._agents)}")
         return commands
 
-    def _space(self, agent: str) -> spaces.Space[Any]:
-        units = self._units if agent == "agent_dc" else 1
+    def _space(self, width: int) -> spaces.Space[Any]:
         if self._continuous:
-            return spaces.Box(-1.0, 1.0, (units,), dtype=np.float32)
-        return spaces.Discrete(3) if units == 1 else spaces.MultiDiscrete([3] * units)
+            return spaces.Box(-1.0, 1.0, (width,), dtype=np.float32)
+        return spaces.Discrete(3) if width == 1 else spaces.MultiDiscrete([3] * width)
 
-    def _decode(self, agent: str, actions: Mapping[str, Any], state: State) -> F64:
-        """Command of one agent, (B,), or (U,) for all CRAC units."""
+    def _checked(self, agent: str, actions: Mapping[str, Any]) -> npt.NDArray[Any]:
+        """Action of one agent within its space, as int64 or float64."""
         if agent not in actions:
             raise SdcError(f"actions: none for {agent}; valid: {list(self._agents)}")
         given = checked_array(actions[agent], f"action of {agent}")
@@ -90,32 +115,85 @@ class ActionDecoder:
                 f"action of {agent}: shape {given.shape}, expected {self._shapes[agent]}"
             )
         if self._continuous:
-            return self._decode_continuous(agent, given, state)
+            return _checked_numbers(agent, given)
         whole = given.dtype.kind in "iu"
         if whole:
-            chosen = given.reshape(-1).astype(np.int64)
+            chosen = given.astype(np.int64)
             # Read without sign, what is below 0 is beyond 2 too.
-            if np.maximum.reduce(chosen.view(np.uint64)) <= 2:
-                return self._discrete_commands[agent].take(chosen)
+            if np.maximum.reduce(chosen.view(np.uint64), axis=None) <= 2:
+                return chosen
             given = given[(given < 0) | (given > 2)]
         kind = "" if whole else f" ({given.dtype})"
         raise SdcError(f"action of {agent}: {given.flat[0]}{kind}; valid is 0, 1 or 2")
 
-    def _decode_continuous(self, agent: str, given: npt.NDArray[Any], state: State) -> F64:
-        if given.dtype.kind not in "iuf":
-            raise SdcError(f"action of {agent}: {given.flat[0]!r}; valid is a number")
-        # Bounds in f32, as agents have them.
-        inside = np.abs(given) <= 1.0 + 1e-6
-        if not np.all(inside):
-            wrong = given[~inside].flat[0]
-            raise SdcError(f"action of {agent}: {wrong}; valid is within -1..1")
-        command: F64 = given.astype(np.float64).reshape(-1)
-        command = np.minimum(np.maximum(command, -1.0), 1.0)
-        if agent == "agent_dc":
-            command *= self._setpoint_change_k
-            command /= self._setpoint_step_k
-            command = avoid_repeats(command, state.cooling_last)
-        return command
+    def _command(self, name: str, given: npt.NDArray[Any], state: State) -> F64:
+        """A command from its part of an action, one number for each of what it is about."""
+        if not self._continuous:
+            return self._discrete_commands[name].take(given)
+        if name == "placement":
+            return np.asarray(PLACEMENT_FACTOR**given)
+        if name == "fan":
+            return np.asarray(given * self._fan_steps)
+        if name == "cooling":
+            command = given * self._setpoint_change_k / self._setpoint_step_k
+            return avoid_repeats(command, state.cooling_last)
+        return given
+
+
+def equal_number(offsets: npt.NDArray[np.integer], what: str) -> int:
+    """Number of units or racks that every data center has.
+
+    Args:
+        offsets: first one of each data center, and their number, (B + 1,).
+        what: what is counted, for errors.
+
+    Raises:
+        ConfigError: data centers that differ in it.
+    """
+    numbers = np.diff(offsets)
+    if np.any(numbers != numbers[0]):
+        raise ConfigError(
+            f"environments of one batch have the same number of {what} is {numbers.tolist()[:8]}"
+        )
+    return int(numbers[0])
+
+
+def _check_models(fleet: Fleet, commands: Sequence[str]) -> None:
+    """Refuse commands that the models of the fleet do not take.
+
+    Raises:
+        ConfigError: naming the field of the config, its value and what would be valid.
+    """
+    for name, (stage, needed) in _NEEDED_MODELS.items():
+        model = fleet.models[stage]
+        if name in commands and model != needed:
+            raise ConfigError(
+                f"commands: {name} needs {STAGE_MODELS[stage]}={needed}; it is {model}"
+            )
+
+
+def _columns(
+    names: Sequence[str], widths: Mapping[str, int]
+) -> tuple[tuple[str, slice | None], ...]:
+    """Commands of an agent, and the columns of its action; None for all of them."""
+    if len(names) == 1:
+        return ((names[0], None),)
+    ends = np.cumsum([widths.get(name, 1) for name in names]).tolist()
+    starts = [0, *ends[:-1]]
+    return tuple(
+        (name, slice(first, end)) for name, first, end in zip(names, starts, ends, strict=True)
+    )
+
+
+def _checked_numbers(agent: str, given: npt.NDArray[Any]) -> F64:
+    """A continuous action, cut at the ends of its space, which are those of f32."""
+    if given.dtype.kind not in "iuf":
+        raise SdcError(f"action of {agent}: {given.flat[0]!r}; valid is a number")
+    inside = np.abs(given) <= 1.0 + 1e-6
+    if not np.all(inside):
+        wrong = given[~inside].flat[0]
+        raise SdcError(f"action of {agent}: {wrong}; valid is within -1..1")
+    return np.minimum(np.maximum(given.astype(np.float64), -1.0), 1.0)
 
 
 def checked_array(given: Any, name: str) -> npt.NDArray[Any]:

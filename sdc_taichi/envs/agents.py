@@ -1,4 +1,4 @@
-"""The three agents of a data center, and the command of the simulator that each gives."""
+"""The three agents of a data center, and the commands of the simulator that each can give."""
 
 from __future__ import annotations
 
@@ -9,4 +9,10 @@ Agent = Literal["agent_ls", "agent_dc", "agent_bat"]
 AGENTS: tuple[str, ...] = get_args(Agent)
 """All agents, in the order in which their actions and observations stand side by side."""
 COMMAND_OF_AGENT = {"agent_ls": "load", "agent_dc": "cooling", "agent_bat": "battery"}
-"""Field of ``Actions`` that each agent sets."""
+"""Field of ``Actions`` that each agent sets by default."""
+COMMANDS_OF_AGENT: dict[str, tuple[str, ...]] = {
+    "agent_ls": ("load", "placement"),
+    "agent_dc": ("cooling", "fan", "placement"),
+    "agent_bat": ("battery",),
+}
+"""Fields of ``Actions`` that each agent can set."""

@@ -74,6 +74,7 @@ def _named_features(fleet: Fleet, options: EnvOptions) -> Observer:
         weather_leads_h=options.weather_leads_h,
         forecast_error=options.forecast_error,
         new_inputs=draws_inputs(options),
+        commands={agent: options.commands_of(agent) for agent in options.agents},
     )
 
 
@@ -133,6 +134,9 @@ class Core:
         self._others = make_controller(options.others, fleet)
         _check_others(options)
         self._others_act = set(self.agents) != set(AGENTS) and not isinstance(self._others, Idle)
+        self._commands_of_others = [
+            command for agent, command in COMMAND_OF_AGENT.items() if agent not in self.agents
+        ]
         self._rewards = Rewards(
             options.rewards,
             options.collaboration,
@@ -146,7 +150,7 @@ class Core:
             "rewards": self._rewards.identity
         }
         self._observer = OBSERVERS[options.observations](fleet, options)
-        self._decoder = ActionDecoder(fleet, options, _equal_units(fleet))
+        self._decoder = ActionDecoder(fleet, options)
         self.features = {a: self._observer.features[a] for a in self.agents}
         self.observation_spaces: dict[str, spaces.Space[Any]] = {
             a: self._observation_space(a) for a in self.agents
@@ -234,8 +238,8 @@ class Core:
         commands = self._decoder.decode(actions, view.state)
         if self._others_act:
             by_others = self._others.act(view)
-            for name in COMMAND_OF_AGENT.values():
-                commands.setdefault(name, _as_numbers(getattr(by_others, name)))
+            for name in self._commands_of_others:
+                commands[name] = _as_numbers(getattr(by_others, name))
         result = self.sim.step(Actions(**commands))
         self._last = (view.state, commands)
         self._view = view = self._view_after(result)
@@ -374,21 +378,6 @@ def _checked_size(num_envs: Any, configs: int) -> int:
     if size < configs:
         raise ConfigError(f"num_envs {size}: valid is at least {configs}, one for each config")
     return size
-
-
-def _equal_units(fleet: Fleet) -> int:
-    """Number of CRAC units that every data center has.
-
-    Raises:
-        ConfigError: data centers that differ in it.
-    """
-    units = np.diff(fleet.unit_offsets)
-    if np.any(units != units[0]):
-        raise ConfigError(
-            "environments of one batch have the same number of CRAC units; hvac.crac.units "
-            f"is {units.tolist()[:8]}"
-        )
-    return int(units[0])
 
 
 def _as_numbers(command: Any) -> F64:

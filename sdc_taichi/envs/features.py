@@ -88,6 +88,9 @@ They are the paper's lists (A.1.2, A.2.4, A.3.3) with ages of the queue and weat
 agent, the work to come for the cooling agent, and the change of the carbon intensity.
 """
 
+FEATURE_OF_COMMAND = {"fan": "fan_speed", "placement": "rack_inlets"}
+"""Feature that an agent observes by default because it decides a command."""
+
 
 def time_features(
     ci_leads_h: Sequence[float] = CI_LEADS_H, weather_leads_h: Sequence[float] = WEATHER_LEADS_H
@@ -115,17 +118,19 @@ def time_features(
     return tuple(feature for feature in features if feature.size)
 
 
-def measured_features(units: int = 1) -> tuple[Feature, ...]:
+def measured_features(units: int = 1, fans: int = 0, racks: int = 0) -> tuple[Feature, ...]:
     """Features measured in the data center: queue, hall and battery.
 
     Args:
         units: number of CRAC units whose setpoints stand side by side.
+        fans: number of CRAC fans whose speeds are decided; 0 if none are.
+        racks: number of racks that work is placed on by agents; 0 if it is not.
     """
     bins = [f"{a:g}-{b:g}" for a, b in pairwise(AGE_EDGES_H)]
     ages = f"{', '.join(bins)}, over {AGE_EDGES_H[-1]:g} h"
     limit = f"`workload.queue_limit_h`, or {UNLIMITED_QUEUE_H:g} h of full work where there is none"
     setpoint = "of the CRAC unit, mean of several" if units == 1 else "of each CRAC unit"
-    return (
+    features = (
         Feature("queue", "share", 0.0, 1.0, f"queued work over {limit}"),
         Feature("oldest_age", "h", 0.0, 24.0, "age of the oldest queued work"),
         Feature("mean_age", "h", 0.0, 24.0, "mean age of queued work"),
@@ -137,13 +142,18 @@ def measured_features(units: int = 1) -> tuple[Feature, ...]:
         Feature("hvac_energy", "share", 0.0, 1.2, "HVAC energy of the last step over design"),
         Feature("dc_load", "share", 0.0, 1.2, "IT and HVAC power of the last step over design"),
         Feature("soc", "share", 0.0, 1.0, "state of charge; 0 without a battery"),
+        Feature("fan_speed", "share", 0.0, 1.0, "speed of each CRAC fan over design", fans),
+        Feature("rack_inlets", "C", 10.0, 50.0, "hottest inlet of each rack, last step", racks),
     )
+    return tuple(feature for feature in features if feature.size)
 
 
 def all_features(
     ci_leads_h: Sequence[float] = CI_LEADS_H,
     weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
     units: int = 1,
+    fans: int = 0,
+    racks: int = 0,
 ) -> tuple[Feature, ...]:
     """All features in the order of the shared state.
 
@@ -151,18 +161,25 @@ def all_features(
         ci_leads_h: leads of the carbon-intensity forecast, in h.
         weather_leads_h: leads of the weather forecasts, in h.
         units: number of CRAC units whose setpoints stand side by side.
+        fans: number of CRAC fans whose speeds are decided; 0 if none are.
+        racks: number of racks that work is placed on by agents; 0 if it is not.
     """
-    return (*time_features(ci_leads_h, weather_leads_h), *measured_features(units))
+    return (*time_features(ci_leads_h, weather_leads_h), *measured_features(units, fans, racks))
 
 
 def features_by_agent(
-    chosen: Mapping[str, Sequence[str]] | None, known: Sequence[Feature]
+    chosen: Mapping[str, Sequence[str]] | None,
+    known: Sequence[Feature],
+    commands: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, tuple[Feature, ...]]:
     """Features of every agent; agents that are not mentioned have ``DEFAULT_FEATURES``.
+
+    By default, an agent also observes what the commands that it decides act on.
 
     Args:
         chosen: names of features by agent; None changes nothing.
         known: the features that there are.
+        commands: commands that agents decide, by agent; None is the default ones.
 
     Raises:
         ConfigError: an unknown agent or feature, a feature named twice, or no feature.
@@ -176,7 +193,9 @@ def features_by_agent(
     by_name = {feature.name: feature for feature in known}
     out: dict[str, tuple[Feature, ...]] = {}
     for agent in AGENTS:
-        names = given.get(agent, [n for n in DEFAULT_FEATURES[agent] if n in by_name])
+        acted_on = [FEATURE_OF_COMMAND.get(name, "") for name in (commands or {}).get(agent, ())]
+        default = [n for n in (*DEFAULT_FEATURES[agent], *acted_on) if n in by_name]
+        names = given.get(agent, default)
         if isinstance(names, str) or not names:
             raise ConfigError(f"features of {agent}: {names!r}; valid is a list of names")
         for name in names:

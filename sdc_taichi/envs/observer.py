@@ -48,6 +48,7 @@ class Observer:
         weather_leads_h: leads of the weather forecasts in h, rising multiples of the step.
         forecast_error: how forecasts err.
         new_inputs: whether episodes may have other inputs than those before.
+        commands: commands that agents decide, by agent; None is the default ones.
 
     Attributes:
         features: features of each agent, in the order of its observation.
@@ -69,6 +70,7 @@ class Observer:
         weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
         forecast_error: ForecastError = PERFECT,
         new_inputs: bool = False,
+        commands: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         forecasts = Forecasts(
             fleet.steps_per_hour,
@@ -79,12 +81,17 @@ class Observer:
         units_of_each = np.diff(fleet.unit_offsets)
         self._equal_units = bool(np.all(units_of_each == units_of_each[0]))
         self._units = int(units_of_each[0]) if self._equal_units else 1
-        self.state_features = all_features(ci_leads_h, weather_leads_h, self._units)
+        decided = {name for names in (commands or {}).values() for name in names}
+        self._fans = self._units if "fan" in decided else 0
+        self._racks = int(fleet.rack_offsets[1]) if "placement" in decided else 0
+        self.state_features = all_features(
+            ci_leads_h, weather_leads_h, self._units, self._fans, self._racks
+        )
         self.state_space = features_space(self.state_features)
-        self.features = features_by_agent(features, self.state_features)
+        self.features = features_by_agent(features, self.state_features, commands)
         self.spaces = {agent: features_space(found) for agent, found in self.features.items()}
 
-        self._measured = measured_features(self._units)
+        self._measured = measured_features(self._units, self._fans, self._racks)
         self._measured_width = sum(feature.size for feature in self._measured)
         self._time = _TimeEntries(
             time_features(ci_leads_h, weather_leads_h),
@@ -208,7 +215,19 @@ class Observer:
         else:
             of_last_step = _read_last_step(last)
         given |= zip(_LAST_STEP_QUANTITIES, of_last_step, strict=True)
-        return self._stage.rows(**given).astype(np.float32)
+        if self._fans:
+            speeds = state.fan_speed.reshape(-1, self._fans).T
+            given |= {f"fan_{i}": speed for i, speed in enumerate(speeds)}
+        measured: F32 = self._stage.rows(**given).astype(np.float32)
+        return np.concatenate([measured, self._rack_inlets(view)]) if self._racks else measured
+
+    def _rack_inlets(self, view: View) -> F32:
+        """Scaled hottest inlet of each rack in the last step, (racks, B)."""
+        if view.last is None:
+            inlet_c = np.tile(mean_setpoint_c(view).astype(np.float32), (self._racks, 1))
+        else:
+            inlet_c = view.last.rack_inlet_max_c.reshape(-1, self._racks).T.astype(np.float32)
+        return scale(inlet_c, self._measured[-1])
 
     def _measuring_stage(self, sizing: Sizing, step_h: float) -> CompiledStage:
         """The compiled stage from the quantities in ``_measure`` to scaled entries in order."""
@@ -220,6 +239,8 @@ class Observer:
         per_facility_kwh = _inverse(sizing.facility_w * kwh)
         per_battery_kwh = _inverse(sizing.battery_kwh)
         edges, units = range(len(self._age_columns)), range(self._units)
+        # Racks may be many, and have nothing in common with other entries.
+        compiled = [f for f in self._measured if f.name != "rack_inlets"]
 
         def entries(**x: F64) -> dict[str, F64]:
             counts = x["waiting"] > NEGLIGIBLE_TASKS
@@ -237,10 +258,11 @@ class Observer:
                 "hvac_energy": [x["hvac_kwh"] * per_hvac_kwh],
                 "dc_load": [(x["it_kwh"] + x["hvac_kwh"]) * per_facility_kwh],
                 "soc": [x["stored_kwh"] * per_battery_kwh],
+                "fan_speed": [x[f"fan_{i}"] for i in range(self._fans)],
             }
             return {
                 f"{f.name}_{i}": np.clip((value - f.low) / (f.high - f.low), 0.0, 1.0)
-                for f in self._measured
+                for f in compiled
                 for i, value in enumerate(values[f.name])
             }
 

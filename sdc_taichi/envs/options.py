@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from sdc_taichi.config import explain
-from sdc_taichi.envs.agents import AGENTS, Agent
+from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT, Agent
 from sdc_taichi.envs.forecasts import (
     CI_LEADS_H,
     PERFECT,
@@ -28,7 +28,7 @@ from sdc_taichi.envs.forecasts import (
 )
 from sdc_taichi.envs.rewards import REWARD_SETS
 from sdc_taichi.envs.tariff import Tariff
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MONTH_OF_DAY
 
 
@@ -43,6 +43,8 @@ Month = Annotated[int, Field(strict=True, ge=1, le=12), PLAIN_INT]
 """A month, 1..12."""
 MOST_YEARS = 2**31
 """Largest number of years to draw from."""
+MOST_LISTED_YEARS = 100_000
+"""Largest number of years in a range, which is kept as a list."""
 Year = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1), PLAIN_INT]
 """Seed of a synthetic year, 0..2**63 - 1."""
 YearCount = Annotated[int, Field(strict=True, ge=1, le=MOST_YEARS), PLAIN_INT]
@@ -64,8 +66,15 @@ class EnvOptions(BaseModel):
     action_order: Literal["paper", "sustaindc"] | None = None
     """Order of the battery's discrete actions: charge, hold, discharge as in the paper, or charge,
     discharge, hold as in the released code; None is that of the preset."""
+    commands: Mapping[str, tuple[str, ...]] | None = None
+    """Commands that agents decide, in the order in which they stand in the action, by agent: of
+    agent_ls ``load`` and ``placement``, of agent_dc ``cooling``, ``fan`` and ``placement``; agents
+    left out decide ``load``, ``cooling`` and ``battery``."""
     setpoint_change_k: Annotated[float, Field(gt=0, le=20)] = 2.0
     """Change of the setpoint in one step by a continuous action of 1, the largest, in K."""
+    fan_change: Annotated[float, Field(ge=0.001, le=1)] = 0.2
+    """Change of the CRAC fan speed over design speed in one step by a continuous action of 1, the
+    largest, 0.001..1; fans hold no smaller steps, and the whole range is 1."""
     days: Annotated[int, Field(strict=True, ge=1, le=365), PLAIN_INT] = 7
     """Length of an episode, in days."""
     start: Literal["sampled", "fixed"] = "sampled"
@@ -108,6 +117,8 @@ class EnvOptions(BaseModel):
     def _plain_list(cls, value: Any) -> Any:
         """Ranges and paths as lists of numbers and text."""
         if isinstance(value, range):
+            if len(value) > MOST_LISTED_YEARS:
+                raise ValueError(f"{value}; valid is a range of at most {MOST_LISTED_YEARS:,}")
             return list(value)
         if isinstance(value, list | tuple):
             return [os.fspath(x) if isinstance(x, os.PathLike) else x for x in value]
@@ -118,6 +129,20 @@ class EnvOptions(BaseModel):
     def _at_least_one_each_once(cls, value: Any) -> Any:
         if isinstance(value, tuple) and (not value or len(set(value)) < len(value)):
             raise ValueError(f"{list(value)[:8]}; valid is one or more, each once")
+        return value
+
+    @field_validator("commands")
+    @classmethod
+    def _commands_of_agents(cls, value: Any) -> Any:
+        for agent, names in (value or {}).items():
+            if agent not in AGENTS:
+                raise ValueError(f"unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}")
+            valid = COMMANDS_OF_AGENT[agent]
+            for name in names:
+                if name not in valid:
+                    raise ValueError(f"{agent}: {name!r}{suggestion_or_valid(name, valid)}")
+            if not names or len(set(names)) < len(names):
+                raise ValueError(f"{agent}: {list(names)}; valid is one or more, each once")
         return value
 
     @field_validator("agents")
@@ -131,12 +156,16 @@ class EnvOptions(BaseModel):
             given = [name for name in names if name in self.model_fields_set]
             if given and without_effect:
                 raise ValueError(f"{', '.join(given)}: without effect {why}")
-        for agent in self.features or {}:
-            if agent in AGENTS and agent not in self.agents:
-                raise ValueError(
-                    f"features: without effect for {agent}, which does not learn; valid for "
-                    f"{', '.join(self.agents)}"
-                )
+        for option in ("features", "commands"):
+            for agent in getattr(self, option) or {}:
+                if agent in AGENTS and agent not in self.agents:
+                    raise ValueError(
+                        f"{option}: without effect for {agent}, which does not learn; valid for "
+                        f"{', '.join(self.agents)}"
+                    )
+        decided = [name for agent in self.agents for name in self.commands_of(agent)]
+        if decided.count("placement") > 1:
+            raise ValueError("commands: placement is decided by two agents; valid is one")
         if self.start == "sampled" and not self.start_days():
             raise ValueError(
                 f"days {self.days}: no episode of that length lies in the months "
@@ -165,14 +194,24 @@ class EnvOptions(BaseModel):
                 "as agent_bat does not learn; valid where it does",
             ),
             (
-                ("setpoint_change_k",),
+                ("setpoint_change_k", "fan_change"),
                 not continuous,
                 "with actions discrete; valid with continuous",
             ),
             (
-                ("setpoint_change_k",),
+                ("setpoint_change_k", "fan_change"),
                 "agent_dc" not in self.agents,
                 "as agent_dc does not learn; valid where it does",
+            ),
+            (
+                ("setpoint_change_k",),
+                "cooling" not in self.commands_of("agent_dc"),
+                "without the command cooling of agent_dc; valid with it",
+            ),
+            (
+                ("fan_change",),
+                "fan" not in self.commands_of("agent_dc"),
+                "without the command fan of agent_dc; valid with it",
             ),
             (
                 ("collaboration",),
@@ -180,6 +219,10 @@ class EnvOptions(BaseModel):
                 "on a function's rewards; valid with rewards default, sustaindc or a dict",
             ),
         ]
+
+    def commands_of(self, agent: str) -> tuple[str, ...]:
+        """Commands that an agent decides if it learns, in the order of its action."""
+        return (self.commands or {}).get(agent, (COMMAND_OF_AGENT[agent],))
 
     def start_days(self) -> list[int]:
         """Days of the year, from 0, on which a sampled episode may start.

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.envs.actions import checked_array
-from sdc_taichi.envs.agents import COMMAND_OF_AGENT
+from sdc_taichi.envs.agents import COMMANDS_OF_AGENT
 from sdc_taichi.envs.drawn_inputs import Draw, DrawnInputs
 from sdc_taichi.errors import SdcError
 from sdc_taichi.sim.drivers import Drivers
@@ -83,7 +83,7 @@ def check_state(
             f"state: rewards are {peaks_kw.dtype} {peaks_kw.shape}; valid is finite numbers "
             f"(2, {num_envs})"
         )
-    commands = _checked_commands(values["actions"], num_envs, units)
+    commands = _checked_commands(values["actions"], num_envs, units, sim.fleet.racks)
     return SavedState(generators, keys, peaks_kw.astype(np.float64), draw, drivers, commands)
 
 
@@ -105,18 +105,19 @@ def _check_parts(values: Any, num_envs: int) -> None:
         raise SdcError(f"state: made by {made_by} environments; valid is {num_envs}")
 
 
-def _checked_commands(given: Any, num_envs: int, units: int) -> dict[str, F64] | None:
-    """Commands of the last step, (B,) or (U,) each; None before the first step."""
+def _checked_commands(given: Any, num_envs: int, units: int, racks: int) -> dict[str, F64] | None:
+    """Commands of the last step, (B,), (U,) or (R,) each; None before the first step."""
     if given is None:
         return None
-    if not isinstance(given, Mapping) or not set(given) <= set(COMMAND_OF_AGENT.values()):
+    known = {name for names in COMMANDS_OF_AGENT.values() for name in names}
+    if not isinstance(given, Mapping) or not set(given) <= known:
         raise SdcError("state: actions are not valid; valid is what state_dict() gave")
     out: dict[str, F64] = {}
     for name, command in given.items():
         values = checked_array(command, f"state: actions of {name}")
-        shapes = [(), (num_envs,)]
-        shapes += [(units,)] if name == "cooling" else []
-        highest = np.inf if name == "cooling" else 1.0
+        several = {"cooling": units, "fan": units, "placement": racks}
+        shapes = [(), (num_envs,), (several.get(name),)]
+        highest = np.inf if name in several else 1.0
         if values.shape not in shapes or not _finite_within(values, highest):
             raise SdcError(f"state: actions of {name} are not valid: {command!r}")
         out[name] = values.astype(np.float64)
