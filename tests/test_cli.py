@@ -396,6 +396,29 @@ def test_weather_files_go_to_their_sites(tmp_path: Path, real_files: dict[str, P
     ]
     outdoor = steps_of(tmp_path / "run").pivot(index="step", columns="dc", values="outdoor_c")
     assert (outdoor["ca"] - outdoor["ny"]).to_numpy() == pytest.approx(np.full(96, 10.0))
+    assert [dc["location"] for dc in report["data_centers"]] == ["Test.Station", "Test.Station"]
+
+
+def test_a_data_center_is_where_its_weather_is(
+    tmp_path: Path, real_files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "hall.yaml").write_text(
+        f"extends: tiny\nname: mine\nsite: {{weather_file: {real_files['weather']}}}\n"
+    )
+    for given in (["hall.yaml"], ["tiny", "--weather", str(real_files["weather"])]):
+        done = call("simulate", *given, "--days", 1, "--json")
+        assert done.exit_code == 0, done.output
+        (dc,) = json.loads(done.stdout)["data_centers"]
+        assert (dc["name"], dc["location"]) == ("test-station", "Test.Station")
+        folder = tmp_path / "runs" / f"{Path(given[0]).stem}-test-station-01-01"
+        assert set(steps_of(folder)["dc"]) == {"test-station"}
+    assert "site Test.Station" in call("config", "check", "hall.yaml").stdout
+    done = call("simulate", "hall.yaml", "--site", "ny,wa", "--days", 1)
+    assert done.exit_code == 2
+    assert f"sites ny, wa: site.weather_file {str(real_files['weather'])!r}" in done.stderr
+    own = ["--weather", real_files["weather"]] * 2
+    assert call("simulate", "hall.yaml", "--site", "ny,wa", "--days", 1, *own).exit_code == 0
 
 
 # What is printed

@@ -22,6 +22,7 @@ from sdc_taichi.config import apply_overrides, config_from_dict
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
 from sdc_taichi.plant.water_side import WaterSideDesign
+from sdc_taichi.sim.fleet_configs import locations
 from sdc_taichi.sim.hall_solver import Conditions, Hall
 
 TINY = load_config("tiny")
@@ -235,6 +236,27 @@ def test_copies_are_dealt_over_the_sites() -> None:
     names = [c.name for c in make_configs(TINY, count=12)]
     assert names == sorted(names), "names sort as numbers do"
     assert build_fleet(make_configs(TINY, count=3, sites=["ny", "az"])).size == 3
+
+
+def test_copies_are_named_after_their_places(tmp_path: Path) -> None:
+    header = "LOCATION,{},SP,BRA,T,0,-23.5,-46.6,-3.0,800.0\n"
+    places = {"São Paulo (2)": "são-paulo-2", "-": "of-no-city", "": "of-no-city", "..": "unnamed"}
+    for city, name in places.items():
+        path = tmp_path / "of no city.epw"
+        for encoding in ("utf-8", "latin-1"):
+            path.write_text(header.format(city), encoding)
+            base = load_config("tiny", [f"site.weather_file={path}"])
+            assert [c.name for c in make_configs(base)] == [name]
+            assert locations([base]) == [city if city.strip("-") else "of no city"]
+    path.unlink()
+    assert [c.name for c in make_configs(base, count=2)] == ["of-no-city-0", "of-no-city-1"]
+
+
+@pytest.mark.parametrize("field", ["weather_file", "carbon_file"])
+def test_sites_beside_a_file_for_all_of_them_are_refused(field: str) -> None:
+    base = load_config("tiny", [f"site.{field}=x.any"])
+    with pytest.raises(ConfigError, match=rf"sites ny, wa: site\.{field} 'x\.any' of tiny would"):
+        make_configs(base, sites=["ny", "wa"])
 
 
 def test_a_copy_draws_the_same_whatever_the_count() -> None:

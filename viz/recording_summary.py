@@ -120,13 +120,14 @@ def _data_center_lines(
     servers = int(fleet.server_offsets[fleet.group_offsets[last]]) - int(
         fleet.server_offsets[fleet.group_offsets[first]]
     )
+    location = description.get("location", config.site.location)
     provenance: Mapping[str, str] = description.get("provenance", {})
     hashes: Mapping[str, str] = description.get("sha256", {})
     return [
         f"## {name}",
         config.description,
         "",
-        f"- site {config.site.location}, from {config.site.start}",
+        f"- site {location}, from {config.site.start}",
         f"- hall of {_count_text(config.hall.rows, 'row')} with "
         f"{_count_text(config.hall.racks_per_row, 'rack')} each, {_count_text(servers, 'server')}",
         *(f"- {kind}: {source}" for kind, source in provenance.items()),

@@ -111,7 +111,8 @@ def data_center_section(run: RunFolder, dc: ShownDataCenter) -> str:
     out = []
     if dc.reason:
         out.append(f"<p>Shown because {dc.reason} of {len(run.names):,}.</p>\n")
-    text = f"{hall.rows} rows of {hall.racks_per_row} racks, site {dc.config.site.location}."
+    location = run.metrics["data_centers"][dc.index]["location"]
+    text = f"{hall.rows} rows of {hall.racks_per_row} racks, site {location}."
     if dc.config.description:
         text = f"{dc.config.description.rstrip('.')}; {text}"
     out.append(f"<p>{escape(text)}</p>\n")

@@ -24,6 +24,7 @@ def check_config(source: Source = None, overrides: Overrides = None) -> None:
     """Check a configuration and the inputs it names, without simulating."""
     from sdc_taichi.sim.drivers import load_drivers
     from sdc_taichi.sim.fleet import build_fleet
+    from sdc_taichi.sim.fleet_configs import locations
 
     config, label = read_config(source, overrides)
     fleet = build_fleet(config)
@@ -32,7 +33,7 @@ def check_config(source: Source = None, overrides: Overrides = None) -> None:
     nameplate_kw = sum(g.count * g.full_w for rack in config.rack_groups() for g in rack) / 1e3
     print(
         f"{printable(label)}: valid; {fleet.racks} racks, {fleet.servers:,} servers, "
-        f"{nameplate_kw:,.6g} kW nameplate, site {printable(config.site.location)}"
+        f"{nameplate_kw:,.6g} kW nameplate, site {printable(locations(fleet.configs)[0])}"
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -143,8 +143,8 @@ def simulate_command(
 
     base, label = read_config(source, overrides)
     sites = _site_names(site)
-    configs = _data_centers(base, sites, start, dcs, sample, seed)
-    configs = _with_files(configs, sites, weather, carbon, workload)
+    files = _files_of_sites(sites, weather, carbon, workload)
+    configs = _data_centers(base, sites, files, start, dcs, sample, seed)
     fleet = build_fleet(configs)
     request = RunRequest(controller, _whole_steps(days, fleet.steps_per_hour), seed)
     require_events_start_before(24.0 * days, fleet.configs)
@@ -202,11 +202,13 @@ def _site_names(site: str | None) -> list[str]:
 def _data_centers(
     base: DataCenterConfig,
     sites: list[str],
+    files: Mapping[str, list[str]],
     start: str | None,
     dcs: int | None,
     sample: Path | None,
     seed: int,
 ) -> list[DataCenterConfig]:
+    """Configs of ``--site``, ``--dcs`` and ``--sample`` that read the files of their sites."""
     from sdc_taichi.sim.fleet_configs import make_configs
 
     if start is not None:
@@ -214,15 +216,25 @@ def _data_centers(
             day_of_year(start)
         except ValueError as error:
             raise ConfigError(f"--start: {error}") from None
-        moved = base.site.model_copy(update={"start": start.strip()})
-        base = base.model_copy(update={"site": moved})
+        base = _with_site(base, start=start.strip())
+    # Files of a site are its own, and without sites there is one of each.
+    base = _with_site(base, **{field: None if sites else of[0] for field, of in files.items()})
     rules = None if sample is None else _read_sample(sample)
     try:
-        return make_configs(base, count=dcs, sites=sites, sample=rules, seed=seed)
+        configs = make_configs(base, count=dcs, sites=sites, sample=rules, seed=seed)
     except ConfigError as error:
         if sample is None:
             raise
         raise ConfigError(f"{sample}: {error}") from None
+    return [
+        _with_site(config, **{field: of[i % len(of)] for field, of in files.items()})
+        for i, config in enumerate(configs)
+    ]
+
+
+def _with_site(config: DataCenterConfig, **update: str | None) -> DataCenterConfig:
+    site = config.site.model_copy(update=update)
+    return config.model_copy(update={"site": site})
 
 
 def _read_sample(path: Path) -> dict[str, Any]:
@@ -241,17 +253,17 @@ def _read_sample(path: Path) -> dict[str, Any]:
     return rules
 
 
-def _with_files(
-    configs: list[DataCenterConfig],
+def _files_of_sites(
     sites: list[str],
     weather: list[str] | None,
     carbon: list[str] | None,
     workload: list[str] | None,
-) -> list[DataCenterConfig]:
-    """Configs that read the files of their sites; sites are dealt in turn."""
+) -> dict[str, list[str]]:
+    """Fields of ``site`` that files are given for, and the files, one per site or one for all."""
     count = max(len(sites), 1)
-    files = {"weather_file": weather, "carbon_file": carbon, "workload_file": workload}
-    for field, paths in files.items():
+    given = {"weather_file": weather, "carbon_file": carbon, "workload_file": workload}
+    found = {}
+    for field, paths in given.items():
         if not paths:
             continue
         shared = field == "workload_file" and len(paths) == 1
@@ -261,14 +273,8 @@ def _with_files(
                 f"--{option}: {len(paths)} given for {count} of --site; valid is one per site, in "
                 "their order"
             )
-        absolute = [str(Path(path).absolute()) for path in paths]
-        configs = [
-            config.model_copy(
-                update={"site": config.site.model_copy(update={field: absolute[i % len(absolute)]})}
-            )
-            for i, config in enumerate(configs)
-        ]
-    return configs
+        found[field] = [str(Path(path).absolute()) for path in paths]
+    return found
 
 
 def _whole_steps(days: float, steps_per_hour: int) -> int:
@@ -283,6 +289,8 @@ def _whole_steps(days: float, steps_per_hour: int) -> int:
 
 
 def _default_folder(label: str, configs: Sequence[DataCenterConfig]) -> Path:
-    sites = list(dict.fromkeys(c.site.location.lower() for c in configs))
+    from sdc_taichi.sim.fleet_configs import place_names
+
+    sites = list(dict.fromkeys(place_names(configs)))
     where = "-".join(sites) if len(sites) <= 4 else f"{len(sites)}sites"
     return Path("runs") / f"{Path(label).stem}-{where}-{configs[0].site.start}"

@@ -15,7 +15,7 @@ from sdc_taichi.exogenous.psychrometrics import wet_bulb_c
 from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C, FloatArray, Series, Weather
 from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH, HOURS_PER_YEAR
 from sdc_taichi.number_text import parse_number, parse_whole
-from sdc_taichi.user_file import MOST_TABLE_BYTES, read_bytes
+from sdc_taichi.user_file import MOST_TABLE_BYTES, open_input, read_bytes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,6 +52,7 @@ _USED = (_DRY_BULB, _HUMIDITY, _PRESSURE)
 """Columns that give the weather; the dew point is only checked."""
 _DEW_POINT_SLACK_K = 0.2
 """By this much a dew point may exceed the dry bulb, as both are rounded."""
+_LONGEST_LINE = 4096
 _DAYS_PER_MONTH = np.array(DAYS_PER_MONTH)
 _FIRST_DAY_OF_MONTH = np.array(FIRST_DAY_OF_MONTH)
 
@@ -82,7 +83,7 @@ def read_epw(path: str | Path) -> Weather:
                 "expected an EPW file or one written by `data import`"
             )
         return _read_imported(path, metadata)
-    lines = read_bytes(path, MOST_TABLE_BYTES, DataError).decode("latin-1").splitlines()
+    lines = _decoded(read_bytes(path, MOST_TABLE_BYTES, DataError)).splitlines()
     location = _location(path, lines)
     per_hour = _records_per_hour(path, lines)
     frame = _rows(path, lines)
@@ -120,6 +121,34 @@ def read_epw(path: str | Path) -> Weather:
         relative_humidity_pct=series("relative_humidity_pct", "%", humidity),
         pressure_pa=series("pressure_pa", "Pa", pressure),
     )
+
+
+def read_city(path: str | Path) -> str:
+    """City of the station of a weather file, by its header; empty if it names none.
+
+    Args:
+        path: EPW, or Parquet written by ``data import``.
+
+    Raises:
+        DataError: the file cannot be read, or is neither.
+    """
+    path = Path(path)
+    if files.is_parquet(path):
+        metadata = series_file.read_metadata(path) or {}
+        return str(metadata.get("label", "")).split(", ")[0]
+    with open_input(path, MOST_TABLE_BYTES, DataError) as file:
+        line = _decoded(file.readline(_LONGEST_LINE))
+    _location(path, [line])
+    city = line.split(",")[1].strip()
+    return "" if city == "-" else city
+
+
+def _decoded(content: bytes) -> str:
+    """Text of an EPW file; names of places are UTF-8 or Latin-1."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
 
 
 def _location(path: Path, lines: list[str]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.exogenous.files import sha256
+from sdc_taichi.sim.fleet_configs import locations
 from sdc_taichi.sim.simulator import Simulator
 
 FORMAT = "sdc-run/1"
@@ -54,14 +55,18 @@ def describe_run(sim: Simulator, request: RunRequest) -> dict[str, Any]:
         "data_centers": [
             {
                 "name": config.name,
-                "location": config.site.location,
+                "location": location,
                 "start": config.site.start,
                 "synthetic": synthetic,
                 "provenance": sources,
                 "sha256": {kind: hashes[path] for kind, path in _input_files(config).items()},
             }
-            for config, synthetic, sources in zip(
-                sim.fleet.configs, drivers.synthetic, drivers.sources, strict=True
+            for config, location, synthetic, sources in zip(
+                sim.fleet.configs,
+                locations(sim.fleet.configs),
+                drivers.synthetic,
+                drivers.sources,
+                strict=True,
             )
         ],
     }

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig, with_values
-from sdc_taichi.errors import ConfigError, suggestion, whole_number
+from sdc_taichi.errors import ConfigError, DataError, suggestion, whole_number
+from sdc_taichi.exogenous.weather import read_city
 
 MOST_DCS = 10_000_000
 """Most data centers of a fleet, more than any memory holds."""
@@ -24,6 +28,9 @@ def make_configs(
 ) -> list[DataCenterConfig]:
     """Copies of one data center over sites, with domain randomisation.
 
+    A copy is named after its site, or else after its place, see ``locations``; where there are more
+    copies than sites, its number is added.
+
     Args:
         base: The data center to copy.
         count: Number of copies; None is one per site. Sites are dealt in turn.
@@ -32,10 +39,17 @@ def make_configs(
         seed: Seed of the sampling; copy i draws the same values whatever ``count`` is.
 
     Raises:
-        ConfigError: count below 1, or a sampling rule or drawn value that is not valid.
+        ConfigError: count below 1, sites beside a weather or carbon file that would be read for
+            each of them, or a sampling rule or drawn value that is not valid.
     """
     if isinstance(sites, str):
         raise ConfigError(f"sites {sites!r}: valid is a list of names")
+    for field in ("weather_file", "carbon_file"):
+        if sites and (file := getattr(base.site, field)) is not None:
+            raise ConfigError(
+                f"sites {', '.join(sites)}: site.{field} {file!r} of {base.name} would be read for "
+                "each of them; valid is one of the two"
+            )
     count = max(len(sites), 1) if count is None else count
     count = whole_number("fleet: count", count, 1, MOST_DCS)
     seed = whole_number("fleet: seed", seed, 0, 2**63 - 1)
@@ -55,11 +69,40 @@ def make_configs(
         if rules:
             rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, index])))
             config = with_values(config, {path: _draw(rule, rng) for path, rule in rules.items()})
-        name = config.site.location.lower()
-        if count > max(len(sites), 1):
-            name += f"-{index:0{len(str(count - 1))}d}"
-        configs.append(config.model_copy(update={"name": name}))
-    return configs
+        configs.append(config)
+    digits = len(str(count - 1)) if count > max(len(sites), 1) else 0
+    return [
+        config.model_copy(update={"name": f"{name}-{index:0{digits}d}" if digits else name})
+        for index, (config, name) in enumerate(zip(configs, place_names(configs), strict=True))
+    ]
+
+
+def locations(configs: Sequence[DataCenterConfig]) -> list[str]:
+    """Where data centers stand: ``site.location``, or the city of the weather file in its place.
+
+    A weather file without a city, or one that cannot be read, is named by its stem.
+    """
+    cities: dict[str, str] = {}
+    found = []
+    for config in configs:
+        file = config.site.weather_file
+        if file is not None and file not in cities:
+            cities[file] = _city(file)
+        found.append(config.site.location if file is None else cities[file])
+    return found
+
+
+def place_names(configs: Sequence[DataCenterConfig]) -> list[str]:
+    """Locations as names: lower case, with ``-`` for all but letters, digits, ``_`` and ``-``."""
+    names = (re.sub(r"[^\w-]+", "-", place.lower()).strip("-") for place in locations(configs))
+    return [name or "unnamed" for name in names]
+
+
+def _city(weather_file: str) -> str:
+    with contextlib.suppress(DataError):
+        if city := read_city(weather_file):
+            return city
+    return Path(weather_file).stem
 
 
 def _check_rule(base: DataCenterConfig, path: str, rule: Any) -> None:
