@@ -191,6 +191,15 @@ def test_a_run_that_ends_at_a_limit_keeps_the_steps_before(tmp_path: Path) -> No
     assert error.endswith(f"{out} holds the {steps} steps before")
 
 
+def test_the_outlet_of_a_rack_has_a_limit_too() -> None:
+    failure = "{kind: rack_fan_failure, rack: 3, start_h: 0, duration_h: 9, share: 0.01}"
+    changes = ["name=b", f"events.scheduled=[{failure}]"]
+    with Simulator([load_config("corrected"), load_config("corrected", changes)]) as sim:
+        sim.reset()
+        with pytest.raises(PhysicalLimitError, match=r"^b: outlet of rack 3 is .* C in step 0; "):
+            sim.step()
+
+
 def test_an_event_starts_before_the_end_of_the_run() -> None:
     event = "events.scheduled=[{kind: grid_outage, start_h: 24, duration_h: 1}]"
     config = load_config("tiny", [event])

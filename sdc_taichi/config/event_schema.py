@@ -17,6 +17,9 @@ WaveK = Annotated[float, Field(ge=-40, le=40)]
 DurationH = Annotated[float, Field(ge=0.001, le=876_000)]
 """Duration of an event, 0.001..876,000 h: from a few seconds to a century."""
 
+LEAST_DRAUGHT_SHARE = 0.01
+"""Least share of its airflow that a rack keeps without fans, as warm air rises through it."""
+
 _REQUIRED: dict[EventKind, tuple[str, ...]] = {
     "crac_down": (),
     "chiller_derate": ("share",),
@@ -115,5 +118,8 @@ def _check_fields_of_kind(event: ScheduledEvent | SampledEvent) -> None:
             raise ValueError(f"{name} has no meaning for {event.kind}")
         if not given and name in required:
             raise ValueError(f"{event.kind} needs {name}")
-    if event.kind == "rack_fan_failure" and event.share == 0.0:
-        raise ValueError("share 0 leaves a rack without air; valid is above 0")
+    if event.kind == "rack_fan_failure" and (event.share or 0.0) < LEAST_DRAUGHT_SHARE:
+        raise ValueError(
+            f"share {event.share:g} leaves a rack without air; valid is at least "
+            f"{LEAST_DRAUGHT_SHARE:g}"
+        )

@@ -15,7 +15,7 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import PhysicalLimitError
-from sdc_taichi.types import F64, StepResult
+from sdc_taichi.types import F64, I32, StepResult
 
 AIR_LIMITS_C = (-100.0, 400.0)
 """Limits of air and water, in C: colder than any weather, and where insulation of cables burns by
@@ -54,7 +54,7 @@ def within_limits(quantities: Mapping[str, Any]) -> Any:
 
 
 def require_within_limits(
-    inside: F64, result: StepResult, configs: Sequence[DataCenterConfig]
+    inside: F64, result: StepResult, configs: Sequence[DataCenterConfig], rack_offsets: I32
 ) -> None:
     """Make sure that a step ended within the limits.
 
@@ -62,11 +62,13 @@ def require_within_limits(
         inside: what ``within_limits`` has found, (B,).
         result: the result of the step.
         configs: configurations of the data centers.
+        rack_offsets: first rack of each data center, and the number of racks, (B + 1,).
 
     Raises:
         PhysicalLimitError: naming data center, step and quantity.
     """
-    if np.minimum.reduce(inside) == 1.0:
+    hottest_c = np.maximum.reduce(result.rack_outlet_max_c)
+    if np.minimum.reduce(inside) == 1.0 and hottest_c <= AIR_LIMITS_C[1]:
         return
     dc = int(np.argmin(inside))
     for name, (low, high) in LIMITS.items():
@@ -77,3 +79,10 @@ def require_within_limits(
                 f"{low:g}..{high:g}. Airflow, power and events of the configuration do not fit "
                 "together"
             )
+    rack = int(np.argmax(result.rack_outlet_max_c))
+    dc = int(np.searchsorted(rack_offsets, rack, side="right")) - 1
+    raise PhysicalLimitError(
+        f"{configs[dc].name}: outlet of rack {rack - rack_offsets[dc]} is {hottest_c:.6g} C in "
+        f"step {result.step}; physical is at most {AIR_LIMITS_C[1]:g} C. Its fans move too "
+        "little air"
+    )

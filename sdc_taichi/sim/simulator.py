@@ -201,7 +201,8 @@ class Simulator:
         result = _step_result(
             state.step, self.step_h, commands, surroundings, work, supply, air, racks, plant
         )
-        require_within_limits(plant["within_limits"], result, self.fleet.configs)
+        fleet = self.fleet
+        require_within_limits(plant["within_limits"], result, fleet.configs, fleet.rack_offsets)
         self._state = _next_state(state, work, supply, plant, racks, thermal)
         return result
 
