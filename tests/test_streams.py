@@ -55,6 +55,16 @@ def test_shown_configs_are_safe_to_print_and_read_back_equal(tmp_path: Path) -> 
     assert sdc_taichi.load_config(str(tmp_path / "mine.yaml")) == config
 
 
+def test_any_name_may_stand_in_a_picture(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.png"
+    done = CliRunner().invoke(
+        app.app, ["hall", "show", "tiny", r'name="$x_{ \e[2J 工"', "--out", str(plan)]
+    )
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert done.stdout.startswith(r"$x_{ \x1b[2J 工: 2 rows of 2 racks")
+    assert plan.read_bytes()[1:4] == b"PNG"
+
+
 @POSIX
 def test_what_cannot_be_written_is_remembered_and_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     def guarded(file: Any) -> None:

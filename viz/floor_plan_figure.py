@@ -13,7 +13,7 @@ from sdc_taichi.hall.floor_plan import FloorPlan
 from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
 from sdc_taichi.types import F64
 
-from .plotting import BLUE, DPI, GREY, ORANGE, SKY, colour_range, new_figure
+from .plotting import BLUE, DPI, GREY, ORANGE, SKY, colour_range, literal_text, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -338,7 +338,7 @@ class _FloorPlanDrawing:
         self._label_rows(axes, row_y)
         flow = found.unit_m3s.sum()
         axes.set_title(
-            f"{found.config.name}: {hall.rows} rows of {hall.racks_per_row} racks, "
+            f"{literal_text(found.config.name)}: {hall.rows} rows of {hall.racks_per_row} racks, "
             f"{found.plan.length_m:.4g} x {found.plan.width_m:.4g} m, "
             f"{found.it_w.sum() / 1e3:,.0f} kW IT, {_airflow_text(flow)} m³/s supply "
             f"at {found.supply_c:g} °C",

@@ -7,15 +7,18 @@ colour vision deficiency can tell apart.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import SdcError, printable
 from sdc_taichi.exogenous.year_clock import FIRST_YEAR
 from sdc_taichi.types import F64
@@ -75,14 +78,35 @@ def webp(figure: Figure, dpi: int = DPI) -> tuple[int, int, bytes]:
 
     figure.set_dpi(dpi)
     canvas: Any = FigureCanvasAgg(figure)
-    with warnings.catch_warnings():
-        # Characters that the font lacks show as boxes, which need no warning each.
-        warnings.filterwarnings("ignore", message="Glyph ")
+    with _without_glyph_warnings():
         canvas.draw()
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     out = io.BytesIO()
     picture.save(out, "WEBP", lossless=True, method=2, quality=0)
     return (*picture.size, out.getvalue())
+
+
+def save_picture(figure: Figure, path: Path, *, parents: bool = False) -> None:
+    """Write a figure to a file, whole or not at all.
+
+    Args:
+        figure: the figure.
+        path: the file; its suffix says the format.
+        parents: also create the folders it lies in.
+
+    Raises:
+        SdcError: the file cannot be written.
+    """
+    with atomic_write(path, parents=parents) as file, _without_glyph_warnings():
+        figure.savefig(file, format=path.suffix.lstrip(".").lower())
+
+
+@contextlib.contextmanager
+def _without_glyph_warnings() -> Iterator[None]:
+    """Have characters that the font lacks drawn as boxes without a warning for each."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph ")
+        yield
 
 
 def add_title(figure: Figure, text: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sdc_taichi.errors import printable
 from sdc_taichi.exogenous.series import Series, resample
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, FIRST_DAY_OF_MONTH, HOURS_PER_YEAR
 
@@ -23,8 +24,9 @@ def draw_year(series: tuple[Series, ...], title: str) -> Figure:
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.0, 1.0 + 1.9 * len(series)), layout="constrained")
-    figure.suptitle(f"{title} (synthetic)" if any(s.synthetic for s in series) else title)
+    figure = Figure(figsize=(10.0, 1.0 + 1.9 * len(series)), dpi=120, layout="constrained")
+    written = printable(title).replace("$", r"\$")
+    figure.suptitle(f"{written} (synthetic)" if any(s.synthetic for s in series) else written)
     axes = figure.subplots(len(series), 2, squeeze=False, width_ratios=(3, 1))
     for (year, day), s in zip(axes, series, strict=True):
         hourly = resample(s, 1)[:HOURS_PER_YEAR].reshape(DAYS_PER_YEAR, 24)

@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.cli.arguments import out_option
 from sdc_taichi.cli.console import PlainConsole
 from sdc_taichi.errors import DataError, suggestion
@@ -133,15 +132,14 @@ def _write_picture(series: tuple[Series, ...], title: str, out: Path) -> None:
         raise DataError(
             'a picture needs matplotlib: pip install "sdc-taichi[plot]" (or leave out --out)'
         ) from None
+    from sdc_taichi.viz.plotting import save_picture
     from sdc_taichi.viz.year_figure import draw_year
 
     known = FigureCanvasAgg.get_supported_filetypes()
     suffix = out.suffix.lstrip(".").lower()
     if suffix not in known:
         raise DataError(f"{out}: suffix {out.suffix!r}, expected one of .{', .'.join(known)}")
-    figure = draw_year(series, title)
-    with atomic_write(out) as file:
-        figure.savefig(file, dpi=120, format=suffix)
+    save_picture(draw_year(series, title), out)
 
 
 @data_app.command("import")

@@ -165,10 +165,9 @@ def _print_layout_solution(config: DataCenterConfig, solution: LayoutSolution) -
 
 def _write_floor_plan(out: Path, hall: DesignHall) -> None:
     from sdc_taichi.viz.floor_plan_figure import floor_plan_figure
+    from sdc_taichi.viz.plotting import save_picture
 
-    figure = floor_plan_figure(hall)
-    with atomic_write(out, parents=True) as file:
-        figure.savefig(file, format="png")
+    save_picture(floor_plan_figure(hall), out, parents=True)
 
 
 def _write_matrix(out: Path, solution: LayoutSolution) -> None:
