@@ -18,7 +18,7 @@ import input_figures
 
 from sdc_taichi import RunRequest, Simulator, load_config, make_controller, simulate_to_folder
 from sdc_taichi.exogenous.synthetic import synthetic_sites, synthetic_traces
-from sdc_taichi.run.folder_reader import read_run, read_steps
+from sdc_taichi.run.folder_reader import read_racks, read_run, read_steps
 from sdc_taichi.viz import dashboards, data_figures, fleet_figures
 from sdc_taichi.viz.animation import write_animation
 from sdc_taichi.viz.plotting import DPI, webp
@@ -68,7 +68,8 @@ def plot_year(folder: Path, scratch: Path) -> None:
     save(dashboards.setpoint_scatter(steps, "New York"), folder / "setpoint_scatter.webp", dpi=85)
     save(dashboards.battery_profile(steps, "New York"), folder / "battery_profile.webp")
     hall = load_config("corrected").hall
-    save(dashboards.hot_racks(steps, hall, "New York"), folder / "hot_racks.webp")
+    (racks,) = read_racks(read_run(scratch), [0])
+    save(dashboards.hot_racks(racks, hall, "New York"), folder / "hot_racks.webp")
 
 
 def plot_controllers(folder: Path, scratch: Path) -> None:

@@ -199,7 +199,8 @@ class StepResult:
     overdue_tasks: F64
     """Due work that did not fit into the step, in tasks, (B,)."""
     dropped_tasks: F64
-    """Work that found the queue full, in tasks, (B,)."""
+    """Work that found the queue full, in tasks, (B,); with model ``tasks`` it runs at once, as part
+    of ``executed_tasks``."""
     lost_tasks: F64
     """Work that had been started and found no server or went down with it, in tasks, (B,)."""
     queue_tasks: F64

@@ -113,6 +113,7 @@ def test_metrics_are_those_of_the_recorded_steps(two_sites: Path) -> None:
             "overdue_task_h": total["overdue_tasks"] * h,
             "overdue_max_tasks": rows["overdue_tasks"].max(),
             "queue_mean_tasks": rows["queue_tasks"].mean(),
+            "queue_end_tasks": rows["queue_tasks"].iloc[-1],
             "queue_max_tasks": rows["queue_tasks"].max(),
             "inlet_above_27_h": (rows["inlet_max_c"] > 27).sum() * h,
             "hottest_inlet_c": rows["inlet_max_c"].max(),

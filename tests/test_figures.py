@@ -319,27 +319,32 @@ def test_battery_profile_is_the_mean_day(steps: pd.DataFrame) -> None:
     assert charge.lines[0].get_xdata()[0] == 0.25, "at the end of the step"
 
 
-def test_hot_racks_counts_hours(run: Run, steps: pd.DataFrame) -> None:
-    hall = run[0].configs[0].hall
-    figure: Any = dashboards.hot_racks(steps, hall, "ny")
-    mesh = figure.axes[0].collections[0]
-    racks = steps["hottest_rack"].astype(int)
-    expected = 0.25 * np.bincount(racks, minlength=hall.racks)
-    np.testing.assert_array_equal(np.ma.filled(mesh.get_array(), 0.0).ravel(), expected)
-    texts = [text.get_text() for text in figure.axes[0].texts]
-    assert len(texts) == racks.nunique()
-    hottest = int(racks.iloc[int(steps["inlet_max_c"].to_numpy().argmax())])
-    row, rack = divmod(hottest, hall.racks_per_row)
-    title = figure.axes[0].get_title(loc="left")
-    assert f"ny: hottest inlet {steps['inlet_max_c'].max():.1f} °C, row {row} rack {rack}" in title
-    with pytest.raises(SdcError, match=r"hottest_rack 20; the hall has racks 0\.\.19"):
-        dashboards.hot_racks(steps.assign(hottest_rack=20.0), hall)
+def test_hot_racks_shows_hours_and_ties() -> None:
+    hall = load_config("corrected").hall
+    hours = np.zeros(hall.racks)
+    hours[[1, 3, 7]] = 2.5, 2.5, 0.25
+    peak = np.full(hall.racks, 24.0)
+    peak[[1, 3]] = 27.2, 27.19999
+    racks = pd.DataFrame({"hottest_h": hours, "inlet_max_c": peak})
+    figure: Any = dashboards.hot_racks(racks, hall, "ny")
+    axes = figure.axes[0]
+    shown = np.ma.filled(axes.collections[0].get_array(), 0.0).ravel()
+    np.testing.assert_array_equal(shown, hours)
+    texts = [text.get_text() for text in axes.texts]
+    assert texts == ["2.5 h\nto 27.2 °C", "2.5 h\nto 27.2 °C", "0.25 h\nto 24.0 °C"]
+    row, rack = divmod(1, hall.racks_per_row)
+    title = axes.get_title(loc="left")
+    assert title == f"ny: hottest inlet 27.2 °C, row {row} rack {rack} and 1 more"
+    with pytest.raises(SdcError, match=r"19 rows; valid is one for each of 20 racks"):
+        dashboards.hot_racks(racks[1:], hall)
+    with pytest.raises(SdcError, match="missing columns hottest_h"):
+        dashboards.hot_racks(racks[["inlet_max_c"]], hall)
     wide = load_config(
         "corrected",
         ["hall.rows=10", "hall.racks_per_row=20", "hall.supply_approach_k=4",
          "hall.return_approach_k=-3", "servers.power_w=[150, 10]"],
     ).hall  # fmt: skip
-    figure = dashboards.hot_racks(steps, wide)
+    figure = dashboards.hot_racks(pd.concat([racks] * 10, ignore_index=True), wide)
     assert not figure.axes[0].texts
     assert len(figure.axes[0].lines) == 1
     assert render(figure).std() > 5

@@ -15,11 +15,14 @@ from sdc_taichi import (
     Drivers,
     Simulator,
     StepResult,
+    View,
     drivers_from_arrays,
     load_config,
     make_configs,
+    simulate,
 )
 from sdc_taichi.exogenous import site_names
+from sdc_taichi.run.metrics import metrics_of_fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64
 
@@ -322,6 +325,30 @@ def test_heat_wave_stores_heat_and_gives_it_back(heat_wave: tuple[Precision, Run
     warmed = run["supply_c"] - run["setpoint_c"]
     np.testing.assert_allclose(warmed, run.before("room_heat_kwh") / kwh_per_k, atol=1e-12)
     assert not np.any((run["unmet_w"] > 0) & (run["recovered_w"] > 0))
+
+
+class _Defer:
+    """Defers all that may wait."""
+
+    def reset(self, seed: int) -> None:
+        """Nothing is random here."""
+
+    def act(self, view: View) -> Actions:
+        return Actions(load=-1.0)
+
+
+@pytest.mark.parametrize(("model", "dropped_and_not_run"), [("fluid", 1.0), ("tasks", 0.0)])
+def test_work_of_a_run_adds_up_with_a_full_queue(model: str, dropped_and_not_run: float) -> None:
+    values = [f"workload.model={model}", "workload.queue_limit_h=1"]
+    with Simulator(load_config("tiny", values)) as sim:
+        found = metrics_of_fleet(simulate(sim, _Defer(), 96), sim.fleet)
+    arrived, executed, dropped, lost, queued = (
+        float(found[f"{name}_tasks"] or 0.0)
+        for name in ("arrived", "executed", "dropped", "lost", "queue_end")
+    )
+    assert dropped > 0
+    assert queued > 0
+    assert arrived == pytest.approx(executed + lost + queued + dropped_and_not_run * dropped)
 
 
 @pytest.mark.slow

@@ -18,13 +18,22 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from report_reader import Page, pictures, read_page
-from sdc_taichi import DataCenterConfig, SdcError, Simulator, load_config, make_configs
+from sdc_taichi import (
+    DataCenterConfig,
+    SdcError,
+    Simulator,
+    StepResult,
+    load_config,
+    make_configs,
+)
 from sdc_taichi.cli.app import app
 from sdc_taichi.control import make_controller
+from sdc_taichi.hall.air_metrics import TIE_K
 from sdc_taichi.run import folder_reader
 from sdc_taichi.run.description import RunRequest
-from sdc_taichi.run.folder_reader import read_run, read_steps
+from sdc_taichi.run.folder_reader import read_racks, read_run, read_steps
 from sdc_taichi.run.folder_writer import simulate_to_folder
+from sdc_taichi.run.steps_file import METADATA_KEY, RACKS_KEY
 from sdc_taichi.viz import (
     dashboards,
     report,
@@ -323,9 +332,34 @@ def test_equal_runs_give_equal_bytes(folder: Path, html: str) -> None:
     ):
         assert text in html
     drawn = report_html.picture_element(
-        dashboards.hot_racks(dc.steps, dc.config.hall, "ny"), "", ""
+        dashboards.hot_racks(dc.racks, dc.config.hall, "ny"), "", ""
     )
     assert re.findall(r'src="[^"]+"', drawn)[0] in html
+
+
+def test_alike_racks_are_equally_long_the_hottest(tmp_path: Path) -> None:
+    configs = make_configs(load_config("corrected"), sites=["NY", "CA"])
+    with Simulator(configs) as sim:
+        names = ("rack_inlet_max_c", "inlet_max_c", "hottest_rack")
+        seen: dict[str, list[Any]] = {name: [] for name in names}
+
+        def keep(result: StepResult) -> None:
+            for name, values in seen.items():
+                values.append(np.array(getattr(result, name)))
+
+        driver = make_controller("random", sim.fleet)
+        request = RunRequest("random", 40)
+        simulate_to_folder(sim, driver, request, tmp_path / "run", on_step=keep)
+        first = sim.fleet.rack_offsets
+    inlet_c, highest_c = (np.array(seen[name]) for name in names[:2])
+    for dc, racks in enumerate(read_racks(read_run(tmp_path / "run"), [0, 1])):
+        own_c = inlet_c[:, first[dc] : first[dc + 1]]
+        alike = own_c >= highest_c[:, [dc]] - TIE_K
+        np.testing.assert_array_equal(racks["hottest_h"], 0.25 * alike.sum(axis=0))
+        np.testing.assert_allclose(racks["inlet_max_c"], own_c.max(axis=0), atol=6e-4)
+        assert np.count_nonzero(racks["hottest_h"] == racks["hottest_h"].max()) > 1
+        by_one = np.bincount([int(step[dc]) for step in seen["hottest_rack"]], minlength=len(racks))
+        assert np.all(racks["hottest_h"] >= 0.25 * by_one)
 
 
 def test_one_step_has_tables_alone(tmp_path: Path) -> None:
@@ -472,7 +506,15 @@ def edit_steps(folder: Path, change: Callable[[Any], Any]) -> None:
     path = folder / "steps.parquet"
     table = pq.read_table(path)
     changed = change(table)
-    pq.write_table(changed.replace_schema_metadata(table.schema.metadata), path)
+    stored = pq.read_metadata(path).metadata
+    kept = {key: stored[key] for key in (METADATA_KEY, RACKS_KEY)} | dict(changed.schema.metadata)
+    pq.write_table(changed.replace_schema_metadata(kept), path)
+
+
+def edit_racks(folder: Path, racks: object) -> None:
+    """Write other racks into the file's metadata."""
+    stored = {RACKS_KEY: json.dumps(racks).encode()}
+    edit_steps(folder, lambda t: t.replace_schema_metadata({**t.schema.metadata, **stored}))
 
 
 def cut_in_half(path: Path) -> None:
@@ -496,7 +538,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "older format": (
         lambda f: edit_metrics(f, lambda a: a.update(format="sdc-run/0")),
-        r"metrics\.json: format 'sdc-run/0'; valid is 'sdc-run/1'",
+        r"metrics\.json: format 'sdc-run/0'; valid is 'sdc-run/2'",
     ),
     "a list": (
         lambda f: (f / "metrics.json").write_text("[]"),
@@ -633,6 +675,22 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "no column": (
         lambda f: edit_steps(f, lambda t: t.drop_columns(["inlet_max_c"])),
         r"steps\.parquet: no column inlet_max_c",
+    ),
+    "no racks": (
+        lambda f: edit_racks(f, [{}]),
+        r"steps\.parquet: no sdc_taichi_racks of 2 data centers",
+    ),
+    "racks of longer runs": (
+        lambda f: edit_racks(f, [{"hottest_steps": [STEPS + 1], "inlet_max_c": [20.0]}] * 2),
+        rf"steps\.parquet: sdc_taichi_racks\[0\] is .*; valid are hottest_steps, 0\.\.{STEPS}",
+    ),
+    "racks without numbers": (
+        lambda f: edit_racks(f, [{"hottest_steps": ["x"], "inlet_max_c": None}] * 2),
+        r"steps\.parquet: sdc_taichi_racks\[0\] is ",
+    ),
+    "racks of another hall": (
+        lambda f: edit_racks(f, [{"hottest_steps": [1], "inlet_max_c": [20.0]}] * 2),
+        r"steps\.parquet: sdc_taichi_racks\[0\]: 1 racks; valid is",
     ),
     "whole numbers": (
         lambda f: edit_steps(

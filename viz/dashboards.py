@@ -251,29 +251,29 @@ def battery_profile(steps: pd.DataFrame, title: str = "") -> Figure:
     return figure
 
 
-def hot_racks(steps: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
-    """Where the hottest inlet was: hours that each rack had it, and how hot it was there.
+def hot_racks(racks: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
+    """Where the hall ran hot: how long each rack had the hottest inlet, and its highest inlet.
+
+    Racks that are equally hot, up to ``TIE_K``, all have the hottest inlet.
 
     Args:
-        steps: steps of the data center.
+        racks: racks of the data center, as ``read_racks`` returns them.
         hall: the hall of the data center.
         title: written above, such as the name of the data center.
 
     Raises:
-        SdcError: matplotlib or a column is missing, or a rack that the hall does not have.
+        SdcError: matplotlib or a column is missing, or there is not a row for each rack.
     """
     from matplotlib.ticker import MaxNLocator
 
     figure = new_figure(9.6, 4.2)
-    check_steps(steps, ("time", "hottest_rack", "inlet_max_c"))
-    racks = steps["hottest_rack"].to_numpy().astype(np.int64)
-    if racks.min() < 0 or racks.max() >= hall.racks:
-        wrong = racks.min() if racks.min() < 0 else racks.max()
-        raise SdcError(f"steps: hottest_rack {wrong}; the hall has racks 0..{hall.racks - 1}")
+    missing = [name for name in ("hottest_h", "inlet_max_c") if name not in racks.columns]
+    if missing:
+        raise SdcError(f"racks: missing columns {', '.join(missing)}")
+    if len(racks) != hall.racks:
+        raise SdcError(f"racks: {len(racks)} rows; valid is one for each of {hall.racks} racks")
     shape = (hall.rows, hall.racks_per_row)
-    hours = np.bincount(racks, minlength=hall.racks) * step_hours(steps)
-    peak = np.full(hall.racks, -np.inf)
-    np.maximum.at(peak, racks, steps["inlet_max_c"].to_numpy())
+    hours, peak = racks["hottest_h"].to_numpy(), racks["inlet_max_c"].to_numpy()
     axes = figure.subplots()
     grid = hours.reshape(shape)
     image = draw_rack_grid(
@@ -291,7 +291,7 @@ def hot_racks(steps: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
     lead = f"{literal_text(title)}: " if title else ""
     axes.set_title(f"{lead}hottest inlet {peak.max():.1f} °C, {where}", fontsize=10, loc="left")
     ticks = MaxNLocator(6, steps=[1, 2, 5, 10])
-    figure.colorbar(image, ax=axes, label="time as the hottest rack (h)", ticks=ticks)
+    figure.colorbar(image, ax=axes, label="time with the hottest inlet (h)", ticks=ticks)
     return figure
 
 

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import SdcError, printable
 from sdc_taichi.exogenous.year_clock import FIRST_YEAR
+from sdc_taichi.hall.air_metrics import TIE_K
 from sdc_taichi.types import F64
 
 if TYPE_CHECKING:
@@ -37,8 +38,6 @@ MIN_COLOUR_RANGE_K = 2.0
 """Least range of a colour bar, so that differences of a few tenths look small, in K."""
 MAX_NAME_LENGTH = 50
 """Largest number of characters of a name in a picture."""
-TIE_K = 0.05
-"""Difference up to which racks count as equally hot, which numbers on them do not show, in K."""
 
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PINK, SKY, GREY = "#CC79A7", "#56B4E9", "#777777"

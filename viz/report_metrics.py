@@ -51,9 +51,10 @@ METRICS = (
         (
             ("arrived_tasks", "arrived", "tasks"),
             ("executed_tasks", "executed", "tasks"),
+            ("queue_end_tasks", "queued at the end", "tasks"),
             ("queue_mean_tasks", "mean queue", "tasks"),
             ("queue_max_tasks", "longest queue", "tasks"),
-            ("dropped_tasks", "dropped, the queue being full", "tasks"),
+            ("dropped_tasks", "found the queue full", "tasks"),
             ("lost_tasks", "lost with their servers", "tasks"),
             ("overdue_task_h", "overdue", "task h"),
             ("overdue_max_tasks", "most overdue at a time", "tasks"),

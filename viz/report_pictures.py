@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.errors import SdcError
+from sdc_taichi.hall.air_metrics import TIE_K
 from sdc_taichi.run.folder_reader import (
     RunFolder,
     read_configs,
     read_fleet_steps,
+    read_racks,
     read_steps,
 )
 
@@ -41,6 +44,8 @@ class ShownDataCenter:
     """Why it is shown, in words; empty if all are."""
     steps: pd.DataFrame
     """Rows that it has in steps.parquet."""
+    racks: pd.DataFrame
+    """Its racks over the run, as ``read_racks`` returns them."""
     config: DataCenterConfig
     """Its config."""
 
@@ -97,11 +102,17 @@ def shown_data_centers(run: RunFolder) -> list[ShownDataCenter]:
                     f"{reasons[found]}, {text}" if found in reasons else f"it has the {text}"
                 )
         reasons = reasons or {0: "hottest inlet, PUE and carbon are equal in all"}
-    all_steps = read_steps(run, list(reasons))
-    configs = read_configs(run, list(reasons))
+    shown = list(reasons)
+    parts = read_steps(run, shown), read_racks(run, shown), read_configs(run, shown)
+    for dc, racks, config in zip(shown, *parts[1:], strict=True):
+        if len(racks) != config.hall.racks:
+            raise SdcError(
+                f"{run.steps_path}: sdc_taichi_racks[{dc}]: {len(racks)} racks; valid is "
+                f"{config.hall.racks} as in its hall"
+            )
     return [
-        ShownDataCenter(index, reason, steps, config)
-        for (index, reason), steps, config in zip(reasons.items(), all_steps, configs, strict=True)
+        ShownDataCenter(index, reason, steps, racks, config)
+        for (index, reason), steps, racks, config in zip(reasons.items(), *parts, strict=True)
     ]
 
 
@@ -143,7 +154,7 @@ def _data_center_pictures(run: RunFolder, dc: ShownDataCenter, hottest_text: str
         hottest_text: its hottest inlet in words.
     """
     name, steps = run.names[dc.index], dc.steps
-    out = [_hot_racks_picture(name, dc), _whole_run_picture(run, name, steps)]
+    out = [_hot_racks_picture(run, dc), _whole_run_picture(run, name, steps)]
     date = dashboards.hottest_day(steps)
     if int((steps["time"].dt.strftime("%Y-%m-%d") == date).sum()) > 1:
         events = run.metrics["data_centers"][dc.index]["events"]
@@ -177,19 +188,20 @@ def _data_center_pictures(run: RunFolder, dc: ShownDataCenter, hottest_text: str
     return "".join(out)
 
 
-def _hot_racks_picture(name: str, dc: ShownDataCenter) -> str:
+def _hot_racks_picture(run: RunFolder, dc: ShownDataCenter) -> str:
     """How long each rack had the hottest inlet."""
-    steps, hall = dc.steps, dc.config.hall
-    racks = steps["hottest_rack"].astype(int)
-    most_often = int(racks.mode().iloc[0])
-    row, column = divmod(most_often, hall.racks_per_row)
-    share_pct = 100 * float((racks == most_often).mean())
+    name, hall = run.names[dc.index], dc.config.hall
+    hours = dc.racks["hottest_h"].to_numpy()
+    row, rack = divmod(int(hours.argmax()), hall.racks_per_row)
+    others = int(np.count_nonzero(hours == hours.max())) - 1
     return picture_element(
-        dashboards.hot_racks(steps, hall, name),
+        dashboards.hot_racks(dc.racks, hall, name),
         f"Racks of {name} by the time that each had the hottest inlet of the hall; most often "
-        f"row {row}, rack {column}, {share_pct:.0f} % of the time.",
-        "Where the hall ran hot: how long each rack had the hottest inlet, and how hot it was "
-        "there. Grey racks never had it. Row 0 is on top.",
+        f"row {row}, rack {rack}{f' and {others} more' * (others > 0)}, "
+        f"{100 * hours.max() / run.hours:.0f} % of the time.",
+        "Where the hall ran hot: how long each rack had the hottest inlet, and its highest inlet. "
+        f"Racks within {TIE_K:g} K of the hottest count with it; grey racks never did. Row 0 is on "
+        "top.",
     )
 
 

@@ -111,14 +111,18 @@ def _work_texts(run: RunFolder) -> list[str]:
     arrived = total["arrived_tasks"]
     dropped, lost = total["dropped_tasks"], total["lost_tasks"]
     dropped_pct = 100 * dropped / arrived if arrived else 0.0
-    # Queues are empty at first; sums of many steps leave round-off.
-    left = arrived - total["executed_tasks"] - dropped - lost
-    left = left if left > 1e-9 * arrived else 0.0
+    (config,) = read_configs(run, [0])
+    full = (
+        f"were done, {format_number(dropped)} of them at once because the queue was full "
+        f"({dropped_pct:.3g} %), and {format_number(lost)}"
+        if config.workload.model == "tasks"
+        else f"were done, {format_number(dropped)} dropped ({dropped_pct:.3g} %) and "
+        f"{format_number(lost)}"
+    )
     texts = [
         f"Of {format_number(arrived)} tasks that arrived, {metric_text(total, 'executed_tasks')} "
-        f"were done, {format_number(dropped)} dropped ({dropped_pct:.3g} %) and "
-        f"{format_number(lost)} lost with their servers; {format_number(left)} were queued at the "
-        "end."
+        f"{full} lost with their servers; {metric_text(total, 'queue_end_tasks')} were queued at "
+        "the end."
     ]
     if total["battery_charge_kwh"] > 0:
         texts.append(

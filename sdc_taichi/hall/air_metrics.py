@@ -17,6 +17,8 @@ RECOMMENDED_C = hall_arguments.RECOMMENDED_C
 ALLOWABLE_C = {"A1": (15.0, 32.0), "A2": (10.0, 35.0), "A3": (5.0, 40.0), "A4": (5.0, 45.0)}
 """Lowest and highest allowable inlet, in C, by class (ASHRAE TC 9.9 Thermal Guidelines, 2021)."""
 
+TIE_K = 0.05
+"""Difference up to which racks count as equally hot, in K: numbers on pictures do not show it."""
 _USUAL_CLASS = "A2"
 LEAST_EXCESS_K = 1e-5
 """Least excess over a limit, in K: in f32 an inlet that is to be at the limit may lie above it by

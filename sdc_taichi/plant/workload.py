@@ -39,7 +39,7 @@ class Work:
     overdue_tasks: F64
     """Due work that does not fit into the step, in tasks, (B,)."""
     dropped_tasks: F64
-    """Work that finds the queue full, in tasks, (B,)."""
+    """Work that finds the queue full, in tasks, (B,); with ``tasks`` it starts all the same."""
     dequeued_tasks: F64
     """Work that leaves the queue, drained or due, in tasks, (B,)."""
 
@@ -109,12 +109,13 @@ def tasks(
     max_utilisation: F64,
     queue_limit: F64,
 ) -> Work:
-    """Whole tasks as the released SustainDC counts them.
+    """Whole tasks as the released SustainDC counts them: arrived = executed + queued.
 
     Fixed work is rounded up and flexible work down, so a step may execute one task more than
     arrived. Tasks older than the deadline run first up to the utilisation cap; a drain takes no
     more than the step's flexible tasks and stops at the cap. Work above the cap that nobody
-    deferred still runs, as in the released code.
+    deferred still runs, as in the released code, and so do tasks that find the queue full: they
+    count as dropped and as started.
 
     Args:
         demand: Arriving work as a share of capacity, 0..1, (B,).
@@ -138,7 +139,6 @@ def tasks(
     free = np.maximum(cap - arrived - forced, 0.0)
     drainable = np.minimum(np.minimum(waiting - forced, flexible), free)
     drained = np.floor(np.maximum(command, 0.0) * drainable)
-    # In the released code, tasks that find the queue full count as dropped and run all the same.
     started = arrived - deferred + forced + drained
     return Work(
         utilisation=started / TASKS_PER_STEP,

@@ -16,7 +16,7 @@ from sdc_taichi.exogenous.files import sha256
 from sdc_taichi.sim.fleet_configs import locations
 from sdc_taichi.sim.simulator import Simulator
 
-FORMAT = "sdc-run/1"
+FORMAT = "sdc-run/2"
 """Version of the format of metrics.json, which its field ``format`` names."""
 
 

@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,7 @@ from sdc_taichi.config import DataCenterConfig, config_from_dict, load_json, loa
 from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.run.description import FORMAT
 from sdc_taichi.run.folder_writer import METRICS_FILE
-from sdc_taichi.run.steps_file import METADATA_KEY, STEPS_FILE
+from sdc_taichi.run.steps_file import METADATA_KEY, RACKS_KEY, STEPS_FILE
 from sdc_taichi.types import F64
 from sdc_taichi.user_file import MOST_METRICS_BYTES, decoding, open_input, read_text
 
@@ -214,6 +214,46 @@ def read_configs(run: RunFolder, dcs: Sequence[int]) -> list[DataCenterConfig]:
         raise SdcError(f"{label}: not valid YAML ({error})") from None
 
 
+def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
+    """Racks of some data centers over the run, a DataFrame each with a row per rack, in order.
+
+    Columns are ``hottest_h``, the time in which the hottest inlet of the rack was that of the hall,
+    up to ``TIE_K``, in h, and ``inlet_max_c``, the highest inlet of the rack, in C.
+
+    Args:
+        run: the run.
+        dcs: indices of the data centers.
+
+    Raises:
+        SdcError: steps.parquet is damaged or lacks them.
+    """
+    import pandas as pd
+
+    stored = _stored_json(run.steps_path, RACKS_KEY)
+    if not isinstance(stored, list) or len(stored) != len(run.names):
+        raise SdcError(
+            f"{run.steps_path}: no sdc_taichi_racks of {len(run.names)} data centers; simulate the "
+            "run again"
+        )
+    done, step_h = run.metrics["steps_done"], float(run.metrics["step_h"])
+    out = []
+    for dc in dcs:
+        try:
+            steps, highest = (
+                np.array(stored[dc][name], dtype=float) for name in ("hottest_steps", "inlet_max_c")
+            )
+        except (KeyError, TypeError, ValueError):
+            steps, highest = np.full((2, 1), np.nan)
+        whole = steps.ndim == 1 and steps.shape == highest.shape and len(steps) > 0
+        if not (whole and np.all((steps >= 0) & (steps <= done)) and np.all(np.isfinite(highest))):
+            raise SdcError(
+                f"{run.steps_path}: sdc_taichi_racks[{dc}] is {shortened(stored[dc])}; valid are "
+                f"hottest_steps, 0..{done}, and inlet_max_c of each rack"
+            )
+        out.append(pd.DataFrame({"hottest_h": steps * step_h, "inlet_max_c": highest}))
+    return out
+
+
 def _read_metrics(path: Path) -> dict[str, Any]:
     """Content of metrics.json, checked field by field."""
     with _part_of_run():
@@ -344,15 +384,20 @@ def _open_parquet(path: Path) -> Iterator[pq.ParquetFile]:
 
 def _stored_metadata(path: Path) -> dict[str, Any]:
     """Description of the run that the metadata of steps.parquet hold."""
-    with _open_parquet(path) as file:
-        metadata = file.schema_arrow.metadata or {}
-    try:
-        stored = json.loads(metadata[METADATA_KEY])
-    except (KeyError, RecursionError, ValueError):
-        stored = None
+    stored = _stored_json(path, METADATA_KEY)
     if not isinstance(stored, dict):
         raise SdcError(f"{path}: no sdc_taichi metadata; valid is a file written by simulate")
     return stored
+
+
+def _stored_json(path: Path, key: bytes) -> object:
+    """What the metadata of steps.parquet hold under a key; None if there is no JSON under it."""
+    with _open_parquet(path) as file:
+        metadata = file.metadata.metadata or {}
+    try:
+        return cast(object, json.loads(metadata[key]))
+    except (KeyError, RecursionError, ValueError):
+        return None
 
 
 def _column_names(run: RunFolder) -> list[str]:

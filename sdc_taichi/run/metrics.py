@@ -77,6 +77,8 @@ class Totals:
     """Sum over the steps of each summed field of ``StepResult``, in its unit, (B,) each."""
     hot_steps: I64
     """Number of steps with an inlet above the recommended 27 C, (B,)."""
+    queue_end_tasks: F64
+    """Queue at the end of the last step, in tasks, (B,)."""
     queue_max_tasks: F64
     """Longest queue, in tasks, (B,)."""
     overdue_max_tasks: F64
@@ -105,6 +107,7 @@ def empty_totals(size: int, step_h: float) -> Totals:
         step_h=step_h,
         sums={name: np.zeros(size) for name in _SUMMED_FIELDS},
         hot_steps=np.zeros(size, dtype=np.int64),
+        queue_end_tasks=np.zeros(size),
         queue_max_tasks=np.zeros(size),
         overdue_max_tasks=np.zeros(size),
         hottest_inlet_c=np.full(size, -np.inf),
@@ -121,6 +124,7 @@ def add_step(totals: Totals, result: StepResult) -> None:
     for name, total in totals.sums.items():
         total += getattr(result, name)
     totals.hot_steps += result.inlet_max_c > RECOMMENDED_C[1] + LEAST_EXCESS_K
+    totals.queue_end_tasks[:] = result.queue_tasks
     np.maximum(totals.queue_max_tasks, result.queue_tasks, out=totals.queue_max_tasks)
     np.maximum(totals.overdue_max_tasks, result.overdue_tasks, out=totals.overdue_max_tasks)
     hotter = np.flatnonzero(rank(result.inlet_max_c) > rank(totals.hottest_inlet_c))
@@ -142,6 +146,7 @@ def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
             _energy_and_work(sums, behind_ups_kwh, totals.step_h)
             | {
                 "queue_mean_tasks": sums["queue_tasks"] / totals.steps,
+                "queue_end_tasks": float(totals.queue_end_tasks[dc]),
                 "queue_max_tasks": float(totals.queue_max_tasks[dc]),
                 "overdue_max_tasks": float(totals.overdue_max_tasks[dc]),
                 "inlet_above_27_h": int(totals.hot_steps[dc]) * totals.step_h,
@@ -171,6 +176,7 @@ def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
     servers = fleet.per_dc_servers()
     return _energy_and_work(sums, behind_ups_kwh, totals.step_h) | {
         "queue_mean_tasks": sums["queue_tasks"] / totals.steps / fleet.size,
+        "queue_end_tasks": float(totals.queue_end_tasks.sum()),
         "queue_max_tasks": float(totals.queue_max_tasks.max()),
         "overdue_max_tasks": float(totals.overdue_max_tasks.max()),
         "inlet_above_27_h": int(totals.hot_steps.sum()) * totals.step_h,

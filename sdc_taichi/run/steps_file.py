@@ -12,6 +12,8 @@ import numpy as np
 
 from sdc_taichi.atomic_file import AtomicFile, naming_errors
 from sdc_taichi.exogenous.year_clock import step_times
+from sdc_taichi.hall.air_metrics import TIE_K
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
 
@@ -19,7 +21,15 @@ STEPS_FILE = "steps.parquet"
 """Name of the file in a run folder."""
 METADATA_KEY = b"sdc_taichi"
 """Key of the file's metadata under which the run is described, as JSON."""
+RACKS_KEY = b"sdc_taichi_racks"
+"""Key of the file's metadata under which it is told how hot each rack became, as JSON.
+
+A list with an object for each data center: ``hottest_steps``, the number of steps in which the
+hottest inlet of each rack was that of the hall, up to ``TIE_K``, and ``inlet_max_c``, the highest
+inlet of each rack over the run, in C.
+"""
 _ROWS_PER_GROUP = 1 << 16
+_RACKS_AT_A_TIME = 1 << 14
 
 
 class StepsWriter:
@@ -46,6 +56,7 @@ class StepsWriter:
         self._filled = 0
         self._first_step = 0
         self._writer: Any = None
+        self._racks = _RackCounts(sim.fleet)
         self._output = AtomicFile(path)
 
     def add(self, result: StepResult) -> None:
@@ -62,6 +73,7 @@ class StepsWriter:
         if self._filled == 0:
             self._first_step = result.step
         self._values[:, self._filled] = self._columns(result)
+        self._racks.add(result)
         self._filled += 1
         if self._filled == self._steps_per_group:
             self._write_row_group()
@@ -73,7 +85,9 @@ class StepsWriter:
             SdcError: the file cannot be written.
         """
         self._write_row_group()
+        racks = json.dumps(self._racks.per_dc(), allow_nan=False)
         with naming_errors(self._output.path):
+            self._writer.add_key_value_metadata({RACKS_KEY: racks.encode()})
             self._writer.close()
         self._output.commit()
 
@@ -109,4 +123,47 @@ class StepsWriter:
                     self._output.file, group.schema, compression="zstd", use_dictionary=["dc"]
                 )
             self._writer.write_table(group)
+        self._filled = 0
+
+
+class _RackCounts:
+    """How long each rack of a fleet had the hottest inlet of its hall, and its highest inlet.
+
+    Steps are counted several at a time, because each operation on a few racks takes as long as
+    it takes on a thousand.
+    """
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._first, self._rack_dc = fleet.rack_offsets, fleet.rack_dc
+        rows = max(1, _RACKS_AT_A_TIME // fleet.racks)
+        self._inlet_c = np.empty((rows, fleet.racks))
+        self._hottest_c = np.empty((rows, fleet.size))
+        self._filled = 0
+        self._steps = np.zeros(fleet.racks, dtype=np.int64)
+        self._highest_c = np.full(fleet.racks, -np.inf)
+
+    def add(self, result: StepResult) -> None:
+        """Add a step."""
+        self._inlet_c[self._filled] = result.rack_inlet_max_c
+        self._hottest_c[self._filled] = result.inlet_max_c
+        self._filled += 1
+        if self._filled == len(self._inlet_c):
+            self._count()
+
+    def per_dc(self) -> list[dict[str, list[float]]]:
+        """What ``RACKS_KEY`` says, of the steps added."""
+        self._count()
+        ends = self._first[1:-1]
+        parts = np.split(self._steps, ends), np.split(self._highest_c.round(3), ends)
+        return [
+            {"hottest_steps": steps.tolist(), "inlet_max_c": highest_c.tolist()}
+            for steps, highest_c in zip(*parts, strict=True)
+        ]
+
+    def _count(self) -> None:
+        """Count the steps that were added since the last time."""
+        inlet_c = self._inlet_c[: self._filled]
+        limit_c = self._hottest_c[: self._filled] - TIE_K
+        self._steps += np.count_nonzero(inlet_c >= limit_c[:, self._rack_dc], axis=0)
+        self._highest_c = np.maximum(self._highest_c, inlet_c.max(axis=0, initial=-np.inf))
         self._filled = 0

@@ -31,7 +31,7 @@ class WorkResult:
     overdue_tasks: F64
     """Due work that does not fit into the step, (B,)."""
     dropped_tasks: F64
-    """Work that finds the queue full, (B,)."""
+    """Work that finds the queue full, (B,); with ``tasks`` it starts all the same."""
     dequeued_tasks: F64
     """Work that leaves the queue, drained or due, (B,)."""
     queue: F64
