@@ -71,6 +71,17 @@ class BoundKernel:
             launch.release({id(array) for array in arrays})
 
 
+def run_once(kernel: Any, **arguments: Any) -> None:
+    """Run a kernel that is seldom called, through Taichi's public interface, with OPTIONS.
+
+    Args:
+        kernel: a Taichi kernel.
+        arguments: its arguments by name.
+    """
+    with _compiling, _options(ti.cfg):
+        kernel(**arguments)
+
+
 class _Launch:
     """One compiled kernel with its arguments in place."""
 

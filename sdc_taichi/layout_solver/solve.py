@@ -182,8 +182,9 @@ class _GridAir:
     def __init__(self, grid: Grid, airflow_m3s: F64) -> None:
         self._threads = runtime.ensure_started()
         from sdc_taichi.kernels import airflow
+        from sdc_taichi.kernels.compiler.launch import run_once
 
-        self._kernels = airflow
+        self._kernels, self._run = airflow, run_once
         self._grid = grid
         self._racks = len(airflow_m3s)
         fronts = grid.fronts
@@ -207,7 +208,8 @@ class _GridAir:
         offsets = np.array([0, grid.cells], np.int32)
         found = self._solve(grid.conductance_m, diagonal, offsets, cells, entering, "potential")
         imbalance_m3s = np.empty(grid.cells)
-        self._kernels.transport_kernel()(
+        self._run(
+            self._kernels.transport_kernel(),
             beyond=grid.beyond,
             conductance_m=grid.conductance_m,
             boundary_m3s=grid.boundary_m3s,
@@ -297,7 +299,8 @@ class _GridAir:
             relative_residual=np.empty(right_sides),
             iterations=np.empty(right_sides, np.int32),
         )
-        kernels.bicgstab_kernel()(
+        self._run(
+            kernels.bicgstab_kernel(),
             serial=False,
             through_racks=through_racks,
             slices=slices,
