@@ -15,6 +15,8 @@ np.seterr(divide="raise", invalid="raise")
 # The same examples on every machine, and no time limit per example: first calls compile kernels.
 hypothesis.settings.register_profile("reproducible", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("reproducible")
+# Others: pytest --hypothesis-profile=others --hypothesis-seed=1
+hypothesis.settings.register_profile("others", deadline=None)
 
 
 @pytest.fixture(scope="session")

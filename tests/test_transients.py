@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import reference_twin
@@ -355,6 +355,7 @@ def test_an_uncooled_hall_warms_by_its_power_over_its_heat_capacity(precision: P
 @pytest.mark.parametrize("precision", PRECISIONS)
 @settings(phases=AS_FOUND, max_examples=5)
 @given(seed=SEEDS)
+@example(seed=119144)  # 270 steps
 def test_constant_conditions_end_in_the_quasi_steady_state(precision: Precision, seed: int) -> None:
     rng = np.random.default_rng(seed)
     config = random_hall(rng, "dc", SMALL[int(rng.integers(len(SMALL)))])
@@ -369,14 +370,30 @@ def test_constant_conditions_end_in_the_quasi_steady_state(precision: Precision,
     coil = Coil(
         met.unit_supply_c, np.zeros(1), np.ones(1), np.full(1, 1e12), np.zeros(1)
     )  # fmt: skip
-    for _ in range(80):
+    # Some halls take days, until a step changes less than they may be off in the end.
+    change_k = np.inf
+    for _ in range(3000):
+        before = state
         sums, state = hall.advance(met, state, coil, 900.0, 100.0)
+        change_k = max(
+            np.max(np.abs(getattr(state, name) - getattr(before, name)))
+            for name in ("server_c", "mixed_c")
+        )
+        if change_k <= {"f64": 1e-9, "f32": 1e-5}[precision]:
+            break
+    else:
+        raise AssertionError(f"still changes by {change_k} K in a step")
     rel = {"f64": 1e-7, "f32": 1e-4}[precision]
     through = float(expected.cpu_w[0] + expected.it_fan_w[0]) + 1.0
     for f in fields(HallSums):
         if f.name in ("hottest_rack", "hottest_server", "coil_w", "cooling_load_w", "room_j"):
             continue
-        scale = through if f.name == "thermal_storage_w" else 1.0
+        scale = {
+            "thermal_storage_w": through,
+            # Each server's inlet errs on its own.
+            "over_27_sum_k": float(fleet.servers),
+            "under_18_sum_k": float(fleet.servers),
+        }.get(f.name, 1.0)
         np.testing.assert_allclose(
             getattr(sums, f.name), getattr(expected, f.name), rtol=rel, atol=30 * rel * scale,
             err_msg=f.name,
