@@ -25,7 +25,7 @@ TYPED := build/typecheck
 SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
 
-.PHONY: help demo test test-oldest test-train bench fuzz lint wheel-test clean
+.PHONY: help demo test test-oldest test-processors test-train bench fuzz lint wheel-test clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -39,6 +39,9 @@ test: $(READY) ## Run all tests; those on measured files need SDC_REAL_DATA.
 # Old libraries warn of what changed in their own dependencies since.
 test-oldest: $(READY_OLDEST) ## Run all tests with Python 3.11 and the oldest libraries that are supported.
 	$(OLDEST)/bin/python -m pytest $(SPREAD) -W ignore::DeprecationWarning
+
+test-processors: $(READY) ## Run tests of results as on older processors, and with one thread.
+	$(PY) tests/other_processors.py $(SPREAD)
 
 test-train: $(READY_TRAIN) ## Install the training libraries and test the examples that use them.
 	$(PY) -m pytest tests/test_training.py
