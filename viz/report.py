@@ -1,8 +1,9 @@
 """One HTML file that tells what a run did: summary, tables, pictures.
 
 The file holds everything it shows, styles and pictures as data, and no script; its content security
-policy forbids whatever would reach for the network. Equal runs give equal bytes. What grows with
-the number of data centers is limited: tables show the extremes, pictures a few chosen data centers.
+policy forbids whatever would reach for the network. Equal runs give equal bytes, as
+docs/run-folder.md says. What grows with the number of data centers is limited: tables show the
+extremes, pictures a few chosen data centers.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from typing import Any
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.exogenous.files import sha256
+from sdc_taichi.run.processor import processor_features
 from sdc_taichi.sim.fleet_configs import locations
 from sdc_taichi.sim.simulator import Simulator
 
@@ -74,12 +75,16 @@ def describe_run(sim: Simulator, request: RunRequest) -> dict[str, Any]:
 
 @functools.cache
 def _versions() -> Mapping[str, str]:
-    """Versions of Python and of the packages that results depend on, by name.
+    """Versions of Python and packages, and features of the processor, that results depend on.
 
     They are kept, because looking them up reads the packages' metadata from disk.
     """
     packages = ("sdc-taichi", "taichi", "numpy", "pyarrow")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+    return {
+        "python": platform.python_version(),
+        **{name: version(name) for name in packages},
+        **processor_features(),
+    }
 
 
 def _input_files(config: DataCenterConfig) -> dict[str, str]:

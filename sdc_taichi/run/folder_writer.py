@@ -3,7 +3,7 @@
 A run folder holds ``steps.parquet``, ``metrics.json`` and ``config.yaml`` (one data center) or
 ``configs.yaml`` (several, one YAML document each). Every file is written beside its place and
 renamed when it is whole, and a second run into the folder is refused meanwhile. Equal runs give
-equal bytes. See docs/run-folder.md for the columns.
+equal bytes on processors with the same features. See docs/run-folder.md for the columns.
 """
 
 from __future__ import annotations

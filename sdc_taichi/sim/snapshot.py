@@ -14,7 +14,7 @@ import numpy as np
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import SdcError
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS
-from sdc_taichi.sim.drivers import Drivers
+from sdc_taichi.sim.drivers import Drivers, common_digits
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import State, fields_of
 from sdc_taichi.user_file import ArrayFile, open_input
@@ -24,7 +24,10 @@ VERSION = 3
 
 
 def fingerprint(fleet: Fleet, drivers: Drivers, precision: str) -> str:
-    """SHA-256 of configs, inputs and precision, which tells simulators apart."""
+    """SHA-256 of configs, inputs and precision, which tells simulators apart.
+
+    The same on every processor, so that a state may go on on another one.
+    """
     digest = hashlib.sha256(precision.encode())
     # Environments of a batch share their configs.
     texts: dict[int, bytes] = {}
@@ -37,7 +40,7 @@ def fingerprint(fleet: Fleet, drivers: Drivers, precision: str) -> str:
     if (air := fleet.air) is not None:
         mix = air.mix_weights
         for part in (mix.weights, mix.norm, mix.strength, air.exhaust_share, fleet.dcs):
-            digest.update(part.tobytes())
+            digest.update(common_digits(part))
     return digest.hexdigest()
 
 
