@@ -271,7 +271,7 @@ def test_other_presets_and_models_fit_too(listed: list[str]) -> None:
 
 def test_values_beyond_a_range_are_cut_at_it() -> None:
     n = 200
-    ci = np.where(np.arange(n) % 2 == 0, 0.0, 3000.0)
+    ci = np.where(np.arange(n) % 2 == 0, 0.0, 2000.0)
     outdoor = np.where(np.arange(n) % 2 == 0, -60.0, 60.0)
     drivers = drivers_from_arrays(outdoor, outdoor - 1.0, ci, np.full(n, 0.5))
     leads: dict[str, Any] = {"ci_leads_h": [0.25], "weather_leads_h": [0.25]}
