@@ -200,6 +200,17 @@ def test_the_outlet_of_a_rack_has_a_limit_too() -> None:
             sim.step()
 
 
+def test_air_that_finds_no_steady_state_ends_the_run_in_a_step_that_is_named() -> None:
+    down = "events.scheduled=[{kind: crac_down, start_h: 0.25, duration_h: 9}]"
+    changes = ["hvac.crac.coasting_flow_ratio=0.01", down]
+    with Simulator(load_config("corrected", changes)) as sim:
+        sim.reset()
+        sim.step()
+        with pytest.raises(PhysicalLimitError, match=r"^corrected: no steady .* \(step 1\)$"):
+            for _ in range(9):
+                sim.step()
+
+
 def test_an_event_starts_before_the_end_of_the_run() -> None:
     event = "events.scheduled=[{kind: grid_outage, start_h: 24, duration_h: 1}]"
     config = load_config("tiny", [event])

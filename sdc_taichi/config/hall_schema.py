@@ -210,7 +210,7 @@ class ServerGroup(Section):
 class ServerConfig(Section):
     """Power and airflow of the servers (ITE:AirCooled form of EnergyPlus, curves of Sun 2021)."""
 
-    power_w: Annotated[tuple[PowerPair, ...], Field(min_length=1)] | None = None
+    power_w: tuple[PowerPair, ...] | None = None
     """(full, idle) CPU power of one server, in W: one pair for all racks, or one per rack. Without
     it and without groups a server draws 150 W at full load and 10 W idle."""
     groups: tuple[tuple[ServerGroup, ...], ...] | None = None
@@ -301,10 +301,12 @@ class ServerConfig(Section):
     @field_validator("power_w", mode="before")
     @classmethod
     def _one_pair_is_a_list_of_one(cls, value: Any) -> Any:
+        if isinstance(value, list | tuple) and not value:
+            raise ValueError("should have at least 1 pair")
         flat = isinstance(value, list | tuple) and not any(
             isinstance(x, list | tuple) for x in value
         )
-        return [value] if flat and value else value
+        return [value] if flat else value
 
     @field_validator("inlet_range_c", "fan_airflow_ratio_limits")
     @classmethod

@@ -69,7 +69,7 @@ class SteadyAir:
             Sums and means over the step, and temperatures at its end by their names in ``State``.
 
         Raises:
-            SdcError: No steady state, or temperatures or power beyond any number.
+            PhysicalLimitError: No steady state, or temperatures or power beyond any number.
         """
         warmed_k = self._units.of_each(state.room_heat_kwh / self._room_kwh_per_k)
         unit_supply_c = supply.unit_setpoint_c + warmed_k
@@ -122,7 +122,7 @@ class TransientAir:
         """Air, temperatures and power of a step; arguments and results as in ``SteadyAir.solve``.
 
         Raises:
-            SdcError: Temperatures or power beyond any number.
+            PhysicalLimitError: Temperatures or power beyond any number.
         """
         coil = Coil(
             setpoint_c=supply.unit_setpoint_c,

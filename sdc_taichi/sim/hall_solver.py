@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sdc_taichi.errors import RuntimeStateError, SdcError
+from sdc_taichi.errors import PhysicalLimitError, RuntimeStateError, SdcError
 from sdc_taichi.hall.initial_guess import TABLE_LOADS
 from sdc_taichi.kernels.arguments import in_row_order, row_index
 from sdc_taichi.kernels.compiler import runtime
@@ -246,7 +246,8 @@ class Hall:
             met: supply air, load and what is out of order.
 
         Raises:
-            SdcError: no steady state, as when no unit moves air, or conditions that are not finite.
+            PhysicalLimitError: no steady state, as when no unit moves air.
+            SdcError: conditions that are not finite.
         """
         self._set_conditions(met)
         self._unit_state["fresh_ratio"][:] = 1.0
@@ -258,7 +259,7 @@ class Hall:
             self._run_sweeps(dc_out, MOST_SWEEPS)
             status = self._control["status"]
             if np.minimum.reduce(status) == NOT_CONVERGED:
-                raise SdcError(
+                raise PhysicalLimitError(
                     f"{self._fleet.names[int(np.argmin(status))]}: no steady air temperatures in "
                     f"{MOST_SWEEPS} sweeps; the CRAC units move too little air: raise "
                     "hvac.crac.coasting_flow_ratio or min_flow_ratio, or set "
@@ -581,7 +582,7 @@ class Hall:
             racks = self._places.values_of_racks(racks)
         if not isfinite(np.add.reduce(dc_out, axis=None)):
             finite = np.isfinite(dc_out).all(axis=0)
-            raise SdcError(
+            raise PhysicalLimitError(
                 f"{self._fleet.names[int(np.argmin(finite))]}: temperatures or power of the hall "
                 "are beyond any number; valid are smaller powers or larger airflows"
             )

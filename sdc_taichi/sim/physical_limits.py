@@ -36,6 +36,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("grid_kwh", "stored_kwh", "unserved_kwh"), ENERGY_LIMITS_KWH),
 }
 """Lowest and highest value of quantities of ``StepResult``. Others follow from these."""
+_WHY = "Airflow, power and events of the configuration do not fit together"
 
 
 def within_limits(quantities: Mapping[str, Any]) -> Any:
@@ -76,13 +77,11 @@ def require_within_limits(
         if not low <= value <= high:
             raise PhysicalLimitError(
                 f"{configs[dc].name}: {name} is {value:.6g} in step {result.step}; physical is "
-                f"{low:g}..{high:g}. Airflow, power and events of the configuration do not fit "
-                "together"
+                f"{low:g}..{high:g}. {_WHY}"
             )
     rack = int(np.argmax(result.rack_outlet_max_c))
     dc = int(np.searchsorted(rack_offsets, rack, side="right")) - 1
     raise PhysicalLimitError(
         f"{configs[dc].name}: outlet of rack {rack - rack_offsets[dc]} is {hottest_c:.6g} C in "
-        f"step {result.step}; physical is at most {AIR_LIMITS_C[1]:g} C. Its fans move too "
-        "little air"
+        f"step {result.step}; physical is at most {AIR_LIMITS_C[1]:g} C. {_WHY}"
     )

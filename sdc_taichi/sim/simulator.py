@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import ConfigError, RuntimeStateError
+from sdc_taichi.errors import ConfigError, PhysicalLimitError, RuntimeStateError
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.actions import ActionDecoder, Commands
@@ -195,7 +195,10 @@ class Simulator:
         )
         placement = stages.allocation.place(state, commands, surroundings, work, capacity)
         supply = stages.crac_units.supply(state, commands, surroundings)
-        air, thermal = stages.air.solve(state, placement, supply, surroundings)
+        try:
+            air, thermal = stages.air.solve(state, placement, supply, surroundings)
+        except PhysicalLimitError as error:
+            raise PhysicalLimitError(f"{error} (step {state.step})") from None
         plant = stages.facility.step(state, commands, surroundings, supply, air)
         racks = stages.allocation.protect(state, work, placement, air.rack_inlet_max_c)
         result = _step_result(
