@@ -185,7 +185,8 @@ CASES: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
     ),
     "carbon empty": (CARBON, lambda: b"", ("empty",)),
     "carbon header only": (CARBON, lambda: carbon(lambda x: x[:1]), ("no rows",)),
-    "carbon binary": (CARBON, lambda: b"timestamp,avg_CI\n\xff\xfe\x00", ("UTF-8",)),
+    "carbon binary": (CARBON, lambda: b"timestamp,avg_CI\n\xff\xfe", ("UTF-8",)),
+    "carbon in UTF-16": (CARBON, lambda: b"t\0i\0m\0e\0,\0a\0", ("zero bytes", "UTF-8")),
     "carbon fuel missing": (CARBON, lambda: carbon(without_column(7)), ("row 1", "NUC")),
     "carbon intensity missing": (CARBON, lambda: carbon(without_column(9)), ("row 1", "avg_CI")),
     "carbon row too long": (
@@ -218,6 +219,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
         ("row 2", "NUC", "8760 h"),
     ),
     "carbon text": (CARBON, lambda: carbon(cell(300, 5, "n.v.")), ("row 300", "NG", "'n.v.'")),
+    "carbon long text": (CARBON, lambda: carbon(cell(300, 5, "x" * 9000)), ("row 300", "xx…, ex")),
     "carbon negative": (CARBON, lambda: carbon(cell(301, 2, "-3")), ("row 301", "SUN", "'-3'")),
     "carbon off its mix": (
         CARBON,

@@ -47,7 +47,7 @@ def load_config(
         ConfigError: naming the file, the key, the value and what would be valid.
     """
     if isinstance(overrides, str):
-        raise ConfigError(f"overrides {overrides!r}: valid is a list of section.key=value")
+        raise ConfigError(f"overrides {shortened(overrides)}: valid is a list of section.key=value")
     label, values = _read_source(DEFAULT_PRESET if source is None else source)
     for override in overrides:
         _apply_override(values, override)
@@ -102,12 +102,12 @@ def with_values(config: DataCenterConfig, assigned: Mapping[str, Any]) -> DataCe
     """
     if not isinstance(assigned, Mapping) or not all(isinstance(path, str) for path in assigned):
         raise ConfigError(
-            f"values {assigned!r}: valid is a mapping of dotted paths to values, such as "
+            f"values {shortened(assigned)}: valid is a mapping of dotted paths to values, such as "
             "{'hvac.setpoint.initial_c': 20}"
         )
     values = config.model_dump(mode="json")
     for path, value in assigned.items():
-        _assign(values, path, value, f"{path}={value!r}")
+        _assign(values, path, value, f"{path}={shortened(value)}")
     return config_from_dict(values, config.name)
 
 
@@ -153,7 +153,7 @@ def _with_base(label: str, values: dict[str, Any]) -> dict[str, Any]:
         return values
     if base not in preset_names():
         raise ConfigError(
-            f"{label}: extends: {base!r} is no preset; valid: {', '.join(preset_names())}"
+            f"{label}: extends: {shortened(base)} is no preset; valid: {', '.join(preset_names())}"
         )
     _, merged = _read_preset(str(base))
     merged = _merged(merged, values)

@@ -219,7 +219,7 @@ def _count_racks(hall: Mapping[str, Any]) -> tuple[int | None, list[str]]:
     """Number of racks, None if it cannot be told, and what is wrong with rows and racks per row."""
     counts = {key: hall.get(key, 1) for key in ("NUM_ROWS", "NUM_RACKS_PER_ROW")}
     problems = [
-        f"{_HALL}.{key}: {count!r} is no positive integer"
+        f"{_HALL}.{key}: {shortened(count)} is no positive integer"
         for key, count in counts.items()
         if _is_number(count) and not _is_count(count)
     ]
@@ -243,7 +243,7 @@ def _servers_per_rack_problems(hall: Mapping[str, Any], racks: int | None) -> It
     per_rack = hall.get("CPUS_PER_RACK", 1)
     for count in per_rack if isinstance(per_rack, list) else [per_rack]:
         if _is_number(count) and not _is_count(count):
-            yield f"{where}: {count!r} is no positive integer"
+            yield f"{where}: {shortened(count)} is no positive integer"
     if isinstance(per_rack, list) and racks is not None and len(per_rack) != racks:
         yield f"{where}: length {len(per_rack)}, expected {racks}"
 
@@ -252,7 +252,7 @@ def _efficiency_problems(hvac: Mapping[str, Any]) -> Iterator[str]:
     for key in ("CW_PUMP_EFFICIENCY", "CT_PUMP_EFFICIENCY"):
         efficiency = hvac.get(key, 1)
         if _is_number(efficiency) and efficiency <= 0:
-            yield f"{_HVAC}.{key}: {efficiency!r} must be positive"
+            yield f"{_HVAC}.{key}: {shortened(efficiency)} must be positive"
 
 
 def _pair_problems(servers: Mapping[str, Any]) -> Iterator[str]:

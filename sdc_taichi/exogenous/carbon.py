@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sdc_taichi.errors import DataError
+from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.series import FloatArray, Series
 from sdc_taichi.exogenous.stamps import Stamp, by_start_of_interval, region_notes
@@ -75,9 +75,9 @@ def read_carbon(
     if not (np.isfinite(utc_offset_h) and -12.0 <= utc_offset_h <= 14.0):
         raise DataError(f"utc_offset_h: {utc_offset_h!r}, expected -12 to 14")
     if stamp not in ("auto", "start", "end"):
-        raise DataError(f"stamp: {stamp!r}, expected 'auto', 'start' or 'end'")
+        raise DataError(f"stamp: {shortened(stamp)}, expected 'auto', 'start' or 'end'")
     if pairing not in ("local", "utc_rows"):
-        raise DataError(f"pairing: {pairing!r}, expected 'local' or 'utc_rows'")
+        raise DataError(f"pairing: {shortened(pairing)}, expected 'local' or 'utc_rows'")
     if files.is_parquet(path):
         metadata = series_file.read_metadata(path)
         if metadata is not None:
@@ -140,14 +140,16 @@ def _read_imported(
 ) -> Series:
     kind = series_file.metadata_value(path, metadata, "kind", str)
     if kind != "carbon":
-        raise DataError(f"{path}: metadata kind: {kind!r}, expected 'carbon'")
+        raise DataError(f"{path}: metadata kind: {shortened(kind)}, expected 'carbon'")
     offset = series_file.metadata_value(path, metadata, "utc_offset_h", float)
     if offset != utc_offset_h:
         raise DataError(
             f"{path}: metadata utc_offset_h: {offset:g}, expected {utc_offset_h:g} as the site has"
         )
     if series_file.metadata_value(path, metadata, "pairing", str) != pairing:
-        raise DataError(f"{path}: metadata pairing: {metadata['pairing']!r}, expected {pairing!r}")
+        raise DataError(
+            f"{path}: metadata pairing: {shortened(metadata['pairing'])}, expected {pairing!r}"
+        )
     minutes = series_file.metadata_value(path, metadata, "minutes", float)
     columns = series_file.read_columns(path, {"ci_g_per_kwh": (0.0, MAX_CI_G_PER_KWH)}, minutes)
     return series_file.imported_series(path, metadata, "ci_g_per_kwh", "g/kWh", columns, minutes)

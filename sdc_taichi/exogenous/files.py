@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sdc_taichi.errors import DataError
+from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous.series import FloatArray
 from sdc_taichi.exogenous.year_clock import (
     MINUTES_PER_DAY,
@@ -40,11 +40,12 @@ BLANK_HEADERS = frozenset({"", "Unnamed: 0"})
 """Blank column names; pandas calls a blank first one ``Unnamed: 0``."""
 MISSING_TEXT = frozenset({"", "nan", "na", "n/a", "null", "none"})
 """Texts, in lower case, that stand for a missing number."""
+_FIRST_BYTES = 4096
 
 
 def fault(path: Path, row: int, column: str, value: object, valid: str) -> DataError:
     """Error that names file, row, column, value and what would be valid."""
-    return DataError(f"{path}: row {row}, column {column}: {value!r}, expected {valid}")
+    return DataError(f"{path}: row {row}, column {column}: {shortened(value)}, expected {valid}")
 
 
 def sha256(path: Path) -> str:
@@ -127,6 +128,9 @@ def _read_csv(path: Path) -> pd.DataFrame:
         decoding(path, "a CSV table", DataError),
         warnings.catch_warnings(),
     ):
+        if b"\0" in file.read(_FIRST_BYTES):
+            raise DataError(f"{path}: holds zero bytes, expected UTF-8 text")
+        file.seek(0)
         # A row of another width than the header is reported by what is missing then.
         warnings.simplefilter("ignore", pd.errors.ParserWarning)
         try:
@@ -189,7 +193,7 @@ def require_columns(path: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -
     missing = [c for c in columns if c not in frame.columns]
     if missing:
         present = ", ".join(
-            "(blank)" if str(c) in BLANK_HEADERS else str(c) for c in frame.columns[:12]
+            "(blank)" if str(c) in BLANK_HEADERS else str(c)[:48] for c in frame.columns[:12]
         )
         raise DataError(
             f"{path}: row 1: missing column {', '.join(missing)}; found {present}; "

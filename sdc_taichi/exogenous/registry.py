@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sdc_taichi.errors import DataError, similar_names
+from sdc_taichi.errors import DataError, shortened, similar_names
 from sdc_taichi.exogenous import series_file
 from sdc_taichi.exogenous.carbon import Pairing, read_carbon
 from sdc_taichi.exogenous.series import Series, SiteData, make_site, site_weather
@@ -84,7 +84,7 @@ def find_name(kind: str, name: str, valid: tuple[str, ...]) -> str:
     if found is None:
         near = similar_names(name, valid, most=3)
         nearest = f"; nearest: {', '.join(near)}" if near else ""
-        raise DataError(f"{kind} {name!r}: expected one of {', '.join(valid)}{nearest}")
+        raise DataError(f"{kind} {shortened(name)}: expected one of {', '.join(valid)}{nearest}")
     return found
 
 
@@ -96,8 +96,8 @@ def new_name(kind: str, name: str, embedded: tuple[str, ...]) -> str:
     """
     if not _NAME.fullmatch(name):
         raise DataError(
-            f"{kind} {name!r}: expected 1 to 64 letters, digits, '_' or '-', beginning with a "
-            "letter or digit"
+            f"{kind} {shortened(name)}: expected 1 to 64 letters, digits, '_' or '-', beginning "
+            "with a letter or digit"
         )
     if name.casefold() in {x.casefold() for x in embedded}:
         raise DataError(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.atomic_file import atomic_write
-from sdc_taichi.errors import DataError, SdcError
+from sdc_taichi.errors import DataError, SdcError, shortened
 from sdc_taichi.exogenous.files import check_length, fault, read_arrow, read_schema, rows_per_year
 from sdc_taichi.exogenous.series import FloatArray, Series
 
@@ -61,7 +61,7 @@ def read_metadata(path: Path) -> dict[str, Any] | None:
         raise DataError(f"{path}: metadata sdc_taichi: not JSON") from None
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
         found = metadata.get("format") if isinstance(metadata, dict) else metadata
-        raise DataError(f"{path}: metadata format: {found!r}, expected {FORMAT!r}")
+        raise DataError(f"{path}: metadata format: {shortened(found)}, expected {FORMAT!r}")
     return metadata
 
 
@@ -74,7 +74,7 @@ def metadata_value(path: Path, metadata: Mapping[str, Any], key: str, kind: type
     value = metadata.get(key)
     good = isinstance(value, int | float) if kind is float else isinstance(value, kind)
     if not good or isinstance(value, bool) or (kind is float and not math.isfinite(value or 0)):
-        raise DataError(f"{path}: metadata {key}: {value!r}, expected {kind.__name__}")
+        raise DataError(f"{path}: metadata {key}: {shortened(value)}, expected {kind.__name__}")
     return kind(value)
 
 

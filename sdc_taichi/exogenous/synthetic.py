@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sdc_taichi.errors import DataError
+from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous.psychrometrics import (
     relative_humidity_from_dew_point_pct,
     wet_bulb_c,
@@ -86,7 +86,7 @@ def synthetic_site(name: str, seed: int = DEFAULT_SEED) -> SiteData:
         DataError: unknown name or invalid seed.
     """
     if name not in synthetic_sites():
-        raise DataError(f"site {name!r}: expected one of {', '.join(synthetic_sites())}")
+        raise DataError(f"site {shortened(name)}: expected one of {', '.join(synthetic_sites())}")
     _check_seed(seed)
     figures = coefficients()["weather"][name]
 
@@ -135,7 +135,7 @@ def synthetic_trace(name: str, seed: int = DEFAULT_SEED) -> Series:
         DataError: unknown name or invalid seed.
     """
     if name not in synthetic_traces():
-        raise DataError(f"trace {name!r}: expected one of {', '.join(synthetic_traces())}")
+        raise DataError(f"trace {shortened(name)}: expected one of {', '.join(synthetic_traces())}")
     _check_seed(seed)
     figures = coefficients()["workload"][name]
     values = _workload(figures, lambda i: seeded_normals(seed, i, name, TRACE_HOURS))[
@@ -147,7 +147,7 @@ def synthetic_trace(name: str, seed: int = DEFAULT_SEED) -> Series:
 
 def _check_seed(seed: int) -> None:
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise DataError(f"seed: {seed!r}, expected a whole number of 0 or more")
+        raise DataError(f"seed: {shortened(seed)}, expected a whole number of 0 or more")
 
 
 class Basis(NamedTuple):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sdc_taichi.errors import DataError
+from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.psychrometrics import wet_bulb_c
 from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C, FloatArray, Series, Weather
@@ -320,7 +320,7 @@ def _is_code(text: pd.Series[str], code: float) -> pd.Series[bool]:
 def _read_imported(path: Path, metadata: dict[str, Any]) -> Weather:
     kind = series_file.metadata_value(path, metadata, "kind", str)
     if kind != "weather":
-        raise DataError(f"{path}: metadata kind: {kind!r}, expected 'weather'")
+        raise DataError(f"{path}: metadata kind: {shortened(kind)}, expected 'weather'")
     minutes = series_file.metadata_value(path, metadata, "minutes", float)
     limits = {
         "outdoor_c": OUTDOOR_LIMITS_C,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sdc_taichi.errors import DataError
+from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.series import Series
 from sdc_taichi.number_text import parse_number
@@ -170,7 +170,7 @@ def _running_index(path: Path, text: pd.Series[str], column: str, rows: Rows) ->
 def _read_imported(path: Path, metadata: dict[str, object]) -> Series:
     kind = series_file.metadata_value(path, metadata, "kind", str)
     if kind != "workload":
-        raise DataError(f"{path}: metadata kind: {kind!r}, expected 'workload'")
+        raise DataError(f"{path}: metadata kind: {shortened(kind)}, expected 'workload'")
     minutes = series_file.metadata_value(path, metadata, "minutes", float)
     columns = series_file.read_columns(path, {"utilisation": (0.0, 1.0)}, minutes)
     return series_file.imported_series(path, metadata, "utilisation", "1", columns, minutes)

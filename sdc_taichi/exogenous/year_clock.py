@@ -13,6 +13,8 @@ from itertools import accumulate
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.errors import shortened
+
 DAYS_PER_MONTH = (31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31)
 """Days of each month, January first."""
 FIRST_DAY_OF_MONTH = (0, *accumulate(DAYS_PER_MONTH))
@@ -46,7 +48,8 @@ def day_of_year(month_day: object) -> int:
         if 1 <= month <= 12 and 1 <= day <= DAYS_PER_MONTH[month - 1]:
             return FIRST_DAY_OF_MONTH[month - 1] + day - 1
     raise ValueError(
-        f"start {month_day!r} is no day of a 365-day year; valid is MM-DD, for example 07-01"
+        f"start {shortened(month_day)} is no day of a 365-day year; valid is MM-DD, for example "
+        "07-01"
     )
 
 

@@ -114,7 +114,7 @@ def _read_numbers(config: DataCenterConfig, path: Path) -> tuple[str, F64]:
         )
     suffix = path.suffix.lower()
     if suffix not in (".npz", ".csv"):
-        raise ConfigError(f"{path}: ends in {path.suffix!r}; valid are .npz and .csv")
+        raise ConfigError(f"{path}: ends in {shortened(path.suffix)}; valid are .npz and .csv")
     if suffix == ".csv" and wanted is None:
         raise ConfigError(f"{path}: a .csv needs hall.recirculation.matrix_kind R or D")
     with open_input(path, MOST_MATRIX_BYTES, ConfigError) as file:
@@ -131,7 +131,7 @@ def _read_npz(path: Path, file: BinaryIO, racks: int, wanted: str | None) -> tup
     found = [name for name in ("R", "D") if name in arrays.names]
     if len(found) != 1:
         raise ConfigError(
-            f"{path}: holds {sorted(arrays.names)}; valid is one of the arrays R and D"
+            f"{path}: holds {shortened(sorted(arrays.names))}; valid is one of the arrays R and D"
         )
     (kind,) = found
     if wanted not in (None, kind):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig, with_values
-from sdc_taichi.errors import ConfigError, DataError, suggestion, whole_number
+from sdc_taichi.errors import ConfigError, DataError, shortened, suggestion, whole_number
 from sdc_taichi.exogenous.weather import read_city
 
 MOST_DCS = 10_000_000
@@ -43,7 +43,7 @@ def make_configs(
             each of them, or a sampling rule or drawn value that is not valid.
     """
     if isinstance(sites, str):
-        raise ConfigError(f"sites {sites!r}: valid is a list of names")
+        raise ConfigError(f"sites {shortened(sites)}: valid is a list of names")
     for field in ("weather_file", "carbon_file"):
         if sites and (file := getattr(base.site, field)) is not None:
             raise ConfigError(
@@ -117,15 +117,15 @@ def _check_rule(base: DataCenterConfig, path: str, rule: Any) -> None:
     ((kind, values),) = rule.items()
     if kind not in ("uniform", "choice"):
         meant = suggestion(kind, ("uniform", "choice"), " (did you mean {!r}?)")
-        raise ConfigError(f"{where}: unknown kind {kind!r}; valid: uniform, choice{meant}")
+        raise ConfigError(f"{where}: unknown kind {shortened(kind)}; valid: uniform, choice{meant}")
     if not isinstance(values, list | tuple) or not values:
-        raise ConfigError(f"{where}: {kind} needs a list, got {values!r}")
+        raise ConfigError(f"{where}: {kind} needs a list, got {shortened(values)}")
     if kind == "uniform":
         numbers = all(isinstance(v, int | float) and abs(v) < np.inf for v in values)
         numbers &= not any(isinstance(v, bool) for v in values)
         if len(values) != 2 or not numbers or not values[0] <= values[1]:
             raise ConfigError(
-                f"{where}: uniform needs [low, high] with low <= high, got {values!r}"
+                f"{where}: uniform needs [low, high] with low <= high, got {shortened(values)}"
             )
     with_values(base, {path: values[0]})
 

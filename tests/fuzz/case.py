@@ -20,11 +20,13 @@ import taichi  # noqa: F401  whose import warns
 
 from sdc_taichi import SdcError
 from sdc_taichi.cli import app
+from sdc_taichi.errors import MOST_CHARACTERS
 
 T = TypeVar("T")
 
-LONGEST_ERROR = 700
-"""Characters of the longest line of error, the names of files not counted."""
+LONGEST_ERROR = MOST_CHARACTERS + 20
+"""Characters of the longest line of error, the names of files not counted: those of the message and
+what stands before and in place of what is left out."""
 OUTPUT = "out"
 """Folder beside the inputs in which a case may write."""
 TIME_LIMIT_S = 60
