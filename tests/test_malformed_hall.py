@@ -119,11 +119,11 @@ def test_matrix_file_without_recirculation() -> None:
 
 
 def test_matrix_file_that_is_missing_or_broken(tmp_path: Path) -> None:
-    assert "No such file" in matrix_error(tmp_path / "none.npz")
+    assert "no such file" in matrix_error(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("no archive")
-    assert "cannot be read as a matrix" in matrix_error(tmp_path / "text.npz")
+    assert "cannot be read as an .npz file" in matrix_error(tmp_path / "text.npz")
     (tmp_path / "words.csv").write_text("a,b\nc,d\n")
-    assert "cannot be read as a matrix" in matrix_error(
+    assert "line 1: 'a' is no number; valid are numbers alone" in matrix_error(
         tmp_path / "words.csv", "hall.recirculation.matrix_kind=R"
     )
 

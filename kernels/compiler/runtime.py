@@ -131,7 +131,7 @@ def _start_taichi() -> None:
             ti.sync()
         except (RuntimeError, MemoryError) as error:
             raise RuntimeStateError(
-                f"Taichi cannot start: {error}; it needs 1 GiB of address space (ulimit -v)"
+                f"Taichi cannot start: {error}; it reserves 1 GiB of address space (ulimit -v)"
             ) from error
     if not uses_plain_taichi():
         others = {thread.native_id for thread in threading.enumerate()}
