@@ -471,23 +471,42 @@ def test_saved_with_other_options(options: dict[str, Any], message: str) -> None
 
 SPOILT: list[tuple[str, Any, str]] = [
     ("options", None, "options is a NoneType"),
+    ("options", {"days": 1}, r"options without \['action_order', "),
     ("simulator", 3, "simulator is a int"),
     ("simulator", {}, "snapshot: missing"),
     ("generators", None, "generators is a NoneType"),
-    ("generators", [{}, {}], "a generator is not valid"),
-    ("generators", ["x", 3], "a generator is not valid"),
-    ("keys", None, "keys are object"),
+    ("generators", [{}, {}], "generator 0 is not valid"),
+    ("generators", ["x", 3], "generator 0 is not valid"),
+    ("keys", None, "keys is a NoneType; valid is an array"),
     ("keys", np.array([1.5, 2.0]), "keys are float64"),
     ("keys", np.array([1, 2, 3]), r"keys are int64 \(3,\)"),
-    ("rewards", None, "rewards are object"),
+    ("rewards", None, "rewards is a NoneType; valid is an array"),
     ("rewards", np.full((2, 2), np.nan), "valid is finite numbers"),
     ("rewards", np.zeros((1, 2)), r"rewards are float64 \(1, 2\)"),
-    ("actions", 3, "actions are not valid"),
-    ("actions", {"jump": np.zeros(2)}, "actions are not valid"),
-    ("actions", {"load": np.array([2.0, 0.0])}, "actions of load"),
-    ("actions", {"cooling": np.array([np.inf, 0.0])}, "actions of cooling"),
-    ("actions", {"battery": "charge"}, "actions of battery"),
+    ("rewards", np.zeros((2, 2)), "cannot be continued .highest billed power"),
+    ("rewards", np.full((2, 2), 1e300), "cannot be continued .highest billed power"),
+    ("actions", None, "no actions after 4 steps"),
+    ("actions", 3, "actions are 3; valid is a dict"),
+    ("actions", {"jump": np.zeros(2)}, r"actions are \['jump'\]; valid is a dict"),
+    ("actions", {"load": np.zeros(2), "cooling": np.zeros(2)}, "'battery', 'cooling', 'load'"),
 ]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("load", np.array([2.0, 0.0]), "actions of load are .*; valid is within -1..1"),
+        ("load", np.zeros(3), r"actions of load are float64 \(3,\)"),
+        ("cooling", np.array([np.inf, 0.0]), r"actions of cooling are .*; valid is within -1e\+06"),
+        ("battery", "charge", "actions of battery is a str; valid is an array"),
+    ],
+)
+def test_spoilt_commands(name: str, value: Any, message: str) -> None:
+    env = multi_agent(2, **tiny())
+    trajectory(env, env.reset(seed=7), 5)
+    state = env.state_dict()
+    with pytest.raises(SdcError, match=message):
+        env.load_state_dict({**state, "actions": {**state["actions"], name: value}})
 
 
 @pytest.mark.parametrize(("part", "value", "message"), SPOILT)

@@ -360,6 +360,7 @@ def test_a_wrong_snapshot_is_refused(
 ) -> None:
     with Simulator(load_config("tiny"), drivers=short_drivers()) as sim:
         sim.reset()
+        sim.step()
         good = sim.state_dict()
         sim.step()
         before = sim.state_dict()
@@ -413,7 +414,7 @@ def test_a_file_that_is_no_snapshot_is_refused(content: bytes, tmp_path: Path) -
     path.write_bytes(content)
     with (
         Simulator(load_config("tiny"), drivers=short_drivers()) as sim,
-        pytest.raises(SdcError, match=r"state\.npz: cannot be read as a snapshot"),
+        pytest.raises(SdcError, match=r"state\.npz: cannot be read as an \.npz file"),
     ):
         sim.load(path)
 
@@ -429,14 +430,14 @@ def test_an_array_file_or_half_a_snapshot_is_refused(tmp_path: Path) -> None:
         damaged[200:260] = bytes(60)
         (tmp_path / "damaged.npz").write_bytes(damaged)
         for name in ("array.npy", "half.npz", "damaged.npz"):
-            with pytest.raises(SdcError, match=f"{name}: cannot be read as a snapshot"):
+            with pytest.raises(SdcError, match=f"{name}: cannot be read as"):
                 sim.load(tmp_path / name)
 
 
 def test_a_missing_snapshot_is_refused(tmp_path: Path) -> None:
     with (
         Simulator(load_config("tiny"), drivers=short_drivers()) as sim,
-        pytest.raises(SdcError, match=r"none\.npz: cannot be read as a snapshot"),
+        pytest.raises(SdcError, match=r"none\.npz: no such file"),
     ):
         sim.load(tmp_path / "none.npz")
 

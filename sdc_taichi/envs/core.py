@@ -29,7 +29,7 @@ from sdc_taichi.envs.observer import Observer
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.released_observer import ReleasedObserver
 from sdc_taichi.envs.rewards import Rewards
-from sdc_taichi.envs.saved_state import check_state
+from sdc_taichi.envs.saved_state import SavedState, check_state
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError, whole_number
 from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.sim.events import require_events_start_before
@@ -137,6 +137,8 @@ class Core:
         self._commands_of_others = [
             command for agent, command in COMMAND_OF_AGENT.items() if agent not in self.agents
         ]
+        learned = [name for agent in self.agents for name in options.commands_of(agent)]
+        self._command_names = learned + (self._commands_of_others if self._others_act else [])
         self._rewards = Rewards(
             options.rewards,
             options.collaboration,
@@ -196,7 +198,9 @@ class Core:
             inputs = self._inputs.drivers(self._draw)
         self.sim.reset(events, days * self._steps_per_day, inputs)
         self._begin()
-        return self._observe(self.view)
+        observations = self._observe(self.view)
+        self._on_begin()
+        return observations
 
     def next_episode(self) -> dict[str, Observation]:
         """Start the next episodes within the step that ended the last ones.
@@ -220,6 +224,9 @@ class Core:
         self._view = view = self._view_after(None)
         self._observer.reset(view, self._keys)
         self._rewards.reset(view)
+
+    def _on_begin(self) -> None:
+        """Called when an episode has begun, or has been continued from a saved state."""
 
     def step(self, actions: Mapping[str, Any]) -> Transition:
         """Advance all environments.
@@ -294,12 +301,13 @@ class Core:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that decides how the episode goes on, for ``load_state_dict``; picklable."""
-        state, commands = self._last or (self.view.state, None)
+        view = self.view
+        state, commands = self._last or (view.state, None)
         return {
             "options": deepcopy(self._identity),
             "inputs": None if self._draw is None else asdict(self._draw),
             "simulator": self.sim.state_dict(state),
-            "actions": None if commands is None else dict(commands),
+            "actions": deepcopy(commands),
             "rewards": self._rewards.peaks_kw(),
             "generators": [rng.bit_generator.state for rng in self._generators],
             "keys": self._keys.copy(),
@@ -320,21 +328,53 @@ class Core:
             options=self._identity,
             inputs=self._inputs,
             sim=self.sim,
+            commands=self._command_names,
+            steps=self.steps,
         )
+        before, terms = self._present(), self._final_terms
         try:
-            self.sim.load_state_dict(values["simulator"], saved.drivers)
-        except (TypeError, ValueError) as error:
+            self._continue_from(saved)
+            observations = self._observe(self.view)
+            self._on_begin()
+        except BaseException as error:
+            self._continue_from(before)
+            self._final_terms = terms
             if isinstance(error, SdcError):
-                raise
-            raise SdcError(f"state: simulator is not valid ({error})") from None
+                raise SdcError(f"state: cannot be continued ({error})") from None
+            raise
+        return observations
+
+    def _present(self) -> SavedState | None:
+        """The state under way; None before the first episode."""
+        if self._view is None:
+            return None
+        state, commands = self._last or (self._view.state, None)
+        return SavedState(
+            simulator=state,
+            drivers=self.sim.drivers,
+            draw=self._draw,
+            generators=self._generators,
+            keys=self._keys,
+            peaks_kw=self._rewards.peaks_kw(),
+            commands=commands,
+        )
+
+    def _continue_from(self, saved: SavedState | None) -> None:
+        """Go on from a state; None is that before the first episode."""
+        if saved is None:
+            self.sim.continue_from(None)
+            self._generators, self._draw, self._view, self._last = [], None, None, None
+            return
+        self.sim.continue_from(saved.simulator, saved.drivers)
         self._generators, self._keys, self._draw = saved.generators, saved.keys, saved.draw
         self._begin()
+        result = None
         if saved.commands is not None:
             # The last step once more: what agents see of it is no part of the state.
             self._last = (self.sim.state, saved.commands)
-            self._view = self._view_after(self.sim.step(Actions(**saved.commands)))
-        self._rewards.load_peaks_kw(saved.peaks_kw)
-        return self._observe(self.view)
+            result = self.sim.step(Actions(**saved.commands))
+            self._view = self._view_after(result)
+        self._rewards.load_peaks_kw(saved.peaks_kw, result)
 
     def close(self) -> None:
         """Release the simulator and all tables; the environments are unusable afterwards."""
@@ -344,7 +384,7 @@ class Core:
         self.sim.close()
         self._view = self._view_after = self._last = self._inputs = None
         self._final_terms = {}
-        del self._observer, self._rewards, self._others, self._decoder
+        del self._observer, self._rewards, self._others, self._decoder, self._inputs
 
     def _check_open(self) -> None:
         if self._closed:

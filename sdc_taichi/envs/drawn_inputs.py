@@ -10,7 +10,7 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.sim.drivers import Drivers, InputReader
 from sdc_taichi.types import I64
 
@@ -98,7 +98,9 @@ class DrawnInputs:
                 listed = isinstance(values, list | tuple) and len(values) == num_envs
                 good = listed and all(type(x) is type(valid[0]) and x in valid for x in values)
             if not good:
-                raise SdcError(f"state: {name} {values!r}: not drawn by these environments")
+                raise SdcError(
+                    f"state: {name} {shortened(values)}: not drawn by these environments"
+                )
         return Draw(None if years is None else tuple(years), traces and tuple(traces))
 
 

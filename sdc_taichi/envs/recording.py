@@ -120,9 +120,8 @@ class RecordingCore(Core):
             recorder = EpisodeRecorder(recorder)
         self._recordings = _EpisodeRecordings(recorder, self.sim)
 
-    def _begin(self) -> None:
-        """Begin an episode, and its recording if it is chosen."""
-        super()._begin()
+    def _on_begin(self) -> None:
+        """Begin the recording of an episode if it is chosen."""
         if self._recordings is not None:
             self._recordings.begin(self.sim)
 

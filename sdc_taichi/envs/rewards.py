@@ -23,7 +23,9 @@ from sdc_taichi.envs.user_functions import (
     import_path,
     register_function,
 )
-from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
+from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
+from sdc_taichi.sim.physical_limits import POWER_LIMITS_W
+from sdc_taichi.sim.state_limits import ROUNDING
 from sdc_taichi.types import F64, I64, StepResult
 
 RewardFunction = Callable[[StepResult, View], Any]
@@ -44,6 +46,8 @@ MOST_SCALE = 1e9
 """Largest scale of a term, of either sign, which leaves room for prices in any currency."""
 BILLED_SHARE = 0.5
 """Share of the design power that is billed whatever the episode draws."""
+MAX_PEAK_KW = POWER_LIMITS_W[1] / 1e3
+"""Highest power that can be billed, in kW."""
 BILL_DAYS = 30.0
 """Days between two bills."""
 END_OF_DAY_START_H = 23.0
@@ -179,9 +183,28 @@ class Rewards:
         """Highest billed power of the episode before the last step and with it, in kW, (2, B)."""
         return np.stack([self._peak_before_kw, self._peak_kw])
 
-    def load_peaks_kw(self, peaks_kw: F64) -> None:
-        """Go on from what ``peaks_kw`` gave, (2, B)."""
-        self._peak_before_kw, self._peak_kw = peaks_kw.copy()
+    def load_peaks_kw(self, peaks_kw: F64, last: StepResult | None) -> None:
+        """Go on from what ``peaks_kw`` gave, (2, B), in an episode that has been reset.
+
+        Args:
+            peaks_kw: highest billed power before the last step and with it, in kW, (2, B).
+            last: result of the last step; None before the first.
+
+        Raises:
+            SdcError: powers that do not belong to that step.
+        """
+        before_kw, with_last_kw = peaks_kw
+        least_kw = self._peak_kw
+        expected_kw = least_kw if last is None else _peak_kw(before_kw, last)
+        fits = np.isclose(with_last_kw, expected_kw, rtol=ROUNDING, atol=0.0)
+        fits &= (before_kw >= least_kw * (1.0 - ROUNDING)) & (before_kw <= MAX_PEAK_KW)
+        if not np.all(fits):
+            raise SdcError(
+                f"highest billed power in kW is {shortened(peaks_kw.tolist())} before the last "
+                f"step and with it; valid is at least {shortened(least_kw.tolist())}, and "
+                f"{shortened(expected_kw.tolist())} with it"
+            )
+        self._peak_before_kw, self._peak_kw = before_kw.copy(), with_last_kw.copy()
 
     def _weighed_terms(self, result: StepResult) -> dict[str, F64]:
         """Rewards by learning agent, of all of them as ``joint``, and ``peak_kw``, (B,) each."""

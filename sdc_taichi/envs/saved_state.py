@@ -2,46 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from sdc_taichi.envs.actions import checked_array
-from sdc_taichi.envs.agents import COMMANDS_OF_AGENT
+from sdc_taichi.envs.actions import PLACEMENT_FACTOR
 from sdc_taichi.envs.drawn_inputs import Draw, DrawnInputs
-from sdc_taichi.errors import SdcError
+from sdc_taichi.errors import SdcError, shortened
+from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR
+from sdc_taichi.sim.actions import MOST_MOVES
 from sdc_taichi.sim.drivers import Drivers
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.types import F64, I64
+from sdc_taichi.sim.snapshot import as_array
+from sdc_taichi.types import F64, I64, State
 
 PARTS = ("options", "inputs", "simulator", "actions", "rewards", "generators", "keys")
 """Entries of a state; all are plain values, arrays, or dicts and lists of them."""
+COMMAND_LIMITS = {
+    "load": (-1.0, 1.0),
+    "cooling": (-MOST_MOVES, MOST_MOVES),
+    "fan": (-MOST_MOVES, MOST_MOVES),
+    "placement": (1.0 / PLACEMENT_FACTOR, PLACEMENT_FACTOR),
+    "battery": (-1.0, 1.0),
+}
+"""Lowest and highest command that an agent or a controller can give, by field of ``Actions``."""
 
 
 @dataclass(frozen=True, slots=True)
 class SavedState:
-    """Parts of a state, checked; the simulator checks its own."""
+    """Parts of a state of B environments with U CRAC units and R racks, checked."""
 
+    simulator: State
+    """State of the simulator before the last step."""
+    drivers: Drivers | None
+    """Inputs of the episodes; None if they draw none."""
+    draw: Draw | None
+    """Years and traces of the episodes; None if they draw none."""
     generators: list[np.random.Generator]
     """Generator of each environment, which draws its episodes."""
     keys: I64
     """Seeds of the errors of forecasts, (B,)."""
     peaks_kw: F64
     """Highest billed power before the last step and with it, in kW, (2, B)."""
-    draw: Draw | None
-    """Years and traces of the episodes; None if they draw none."""
-    drivers: Drivers | None
-    """Inputs of the episodes; None if they draw none."""
     commands: dict[str, F64] | None
-    """Commands of the last step by field of ``Actions``, (B,) or (U,) each; None before the
-    first."""
+    """Commands of the last step by field of ``Actions``, (), (B,), (U,) or (R,) each; None before
+    the first."""
 
 
 def check_state(
-    values: Any, *, options: Mapping[str, Any], inputs: DrawnInputs | None, sim: Simulator
+    values: Any,
+    *,
+    options: Mapping[str, Any],
+    inputs: DrawnInputs | None,
+    sim: Simulator,
+    commands: Sequence[str],
+    steps: int,
 ) -> SavedState:
     """Check a state against the environments that are to go on from it.
 
@@ -50,41 +68,46 @@ def check_state(
         options: plain values that tell the environments apart.
         inputs: what draws their years and traces; None if nothing does.
         sim: their simulator.
+        commands: names of the commands that each of their steps has.
+        steps: number of steps of an episode.
 
     Raises:
         SdcError: made by other environments, incomplete, or not valid.
     """
-    num_envs, units = sim.size, sim.fleet.units
-    _check_parts(values, num_envs)
-    for name, mine in options.items():
-        made = values["options"].get(name)
-        if type(made) is not type(mine) or made != mine:
-            raise SdcError(f"state: made with {name} {made!r}; valid is {mine!r}, as here")
+    _check_parts(values, sim.size)
+    _check_options(values["options"], options)
     draw = drivers = None
     if inputs is not None:
-        draw = inputs.checked(values["inputs"], num_envs)
+        draw = inputs.checked(values["inputs"], sim.size)
         drivers = inputs.drivers(draw)
-    # The simulator checks it too; another fleet would be taken for wrong actions before.
-    fingerprint = sim.fingerprint(drivers)
-    if str(values["simulator"].get("fingerprint", fingerprint)) != fingerprint:
-        raise SdcError("state: made by another fleet, inputs or precision than this one")
-    generators = [np.random.Generator(np.random.PCG64()) for _ in range(num_envs)]
-    try:
-        for rng, state in zip(generators, values["generators"], strict=True):
-            rng.bit_generator.state = state
-    except (TypeError, ValueError, KeyError, OverflowError) as error:
-        raise SdcError(f"state: a generator is not valid ({error})") from None
-    keys = checked_array(values["keys"], "state: keys")
-    if keys.shape != (num_envs,) or keys.dtype != np.int64 or keys.min() < 0:
-        raise SdcError(f"state: keys are {keys.dtype} {keys.shape}; valid is int64 from 0 on")
-    peaks_kw = checked_array(values["rewards"], "state: rewards")
-    if peaks_kw.shape != (2, num_envs) or not _finite_within(peaks_kw, np.inf):
+    elif values["inputs"] is not None:
+        raise SdcError("state: inputs were drawn; valid is None, as these environments draw none")
+    state = sim.read_state(values["simulator"], drivers)
+    given = _checked_commands(values["actions"], commands, sim.fleet)
+    if given is None and state.step > 0:
+        raise SdcError(f"state: no actions after {state.step} steps; valid is before the first")
+    done = state.step + (given is not None)
+    if done > steps:
+        raise SdcError(f"state: {done} steps; valid is at most {steps}, the episode")
+    steps_per_day = 24 * sim.fleet.steps_per_hour
+    first_days, rest = np.divmod(state.start, steps_per_day)
+    if np.any(rest) or np.any(first_days >= DAYS_PER_YEAR):
         raise SdcError(
-            f"state: rewards are {peaks_kw.dtype} {peaks_kw.shape}; valid is finite numbers "
-            f"(2, {num_envs})"
+            f"state: simulator starts in step {shortened(state.start.tolist())} of the year; "
+            f"valid is midnight, a multiple of {steps_per_day}, of one of {DAYS_PER_YEAR} days"
         )
-    commands = _checked_commands(values["actions"], num_envs, units, sim.fleet.racks)
-    return SavedState(generators, keys, peaks_kw.astype(np.float64), draw, drivers, commands)
+    keys = as_array("state: keys", values["keys"])
+    if keys.shape != (sim.size,) or keys.dtype != np.int64 or keys.min() < 0:
+        raise SdcError(f"state: keys are {keys.dtype} {keys.shape}; valid is int64 from 0 on")
+    return SavedState(
+        simulator=state,
+        drivers=drivers,
+        draw=draw,
+        generators=[_checked_generator(x, i) for i, x in enumerate(values["generators"])],
+        keys=keys.copy(),
+        peaks_kw=_checked_peaks_kw(values["rewards"], sim.size),
+        commands=given,
+    )
 
 
 def _check_parts(values: Any, num_envs: int) -> None:
@@ -94,7 +117,7 @@ def _check_parts(values: Any, num_envs: int) -> None:
     missing = [name for name in PARTS if name not in values]
     if missing:
         raise SdcError(f"state: missing {missing}; valid is what state_dict() gave")
-    extra = sorted(map(str, values.keys() - set(PARTS)))
+    extra = sorted(str(name)[:80] for name in values.keys() - set(PARTS))
     if extra:
         raise SdcError(f"state: unknown {extra}; valid is what state_dict() gave")
     for name, kind in (("options", Mapping), ("simulator", Mapping), ("generators", list)):
@@ -105,26 +128,104 @@ def _check_parts(values: Any, num_envs: int) -> None:
         raise SdcError(f"state: made by {made_by} environments; valid is {num_envs}")
 
 
-def _checked_commands(given: Any, num_envs: int, units: int, racks: int) -> dict[str, F64] | None:
-    """Commands of the last step, (B,), (U,) or (R,) each; None before the first step."""
+def _check_options(made: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
+    """Refuse a state that was made with other options."""
+    unknown = sorted(str(name)[:80] for name in made.keys() - mine.keys())
+    missing = sorted(mine.keys() - made.keys())
+    if unknown or missing:
+        raise SdcError(
+            f"state: options without {missing}, with unknown {unknown}; valid is what "
+            "state_dict() gave"
+        )
+    for name, value in mine.items():
+        if not _are_equal(made[name], value):
+            raise SdcError(
+                f"state: made with {name} {shortened(made[name])}; valid is {shortened(value)}, "
+                "as here"
+            )
+
+
+def _are_equal(one: Any, other: Any) -> bool:
+    """Whether plain values are equal and of equal types throughout."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, Mapping):
+        return one.keys() == other.keys() and all(_are_equal(one[k], other[k]) for k in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(_are_equal, one, other))
+    return bool(one == other) if np.ndim(one) == 0 else np.array_equal(one, other)
+
+
+def _checked_generator(state: Any, index: int) -> np.random.Generator:
+    """The generator of an environment, whose state has the form that NumPy gives it."""
+    rng = np.random.Generator(np.random.PCG64(0))
+    if not _is_pcg64_state(state):
+        raise SdcError(
+            f"state: generator {index} is not valid ({shortened(state)}); valid is the state of a "
+            "PCG64 of NumPy"
+        )
+    rng.bit_generator.state = state
+    return rng
+
+
+def _is_pcg64_state(state: Any) -> bool:
+    """Whether a value is what ``numpy.random.PCG64.state`` gives."""
+    limits = {"state": 2**128, "inc": 2**128, "has_uint32": 2, "uinteger": 2**32}
+    if not isinstance(state, Mapping) or not isinstance(state.get("state"), Mapping):
+        return False
+    numbers = {name: x for name, x in state.items() if name not in ("bit_generator", "state")}
+    numbers |= state["state"]
+    return (
+        _are_equal(state.get("bit_generator"), "PCG64")
+        and len(state) == len(limits)
+        and numbers.keys() == limits.keys()
+        and all(type(x) is int and 0 <= x < limits[name] for name, x in numbers.items())
+        and numbers["inc"] % 2 == 1
+    )
+
+
+def _checked_peaks_kw(given: Any, num_envs: int) -> F64:
+    """Highest billed power before the last step and with it, in kW, (2, B)."""
+    peaks_kw = as_array("state: rewards", given)
+    if peaks_kw.shape != (2, num_envs) or peaks_kw.dtype != np.float64:
+        raise SdcError(
+            f"state: rewards are {peaks_kw.dtype} {peaks_kw.shape}; valid is float64 (2, "
+            f"{num_envs})"
+        )
+    if not np.all(np.isfinite(peaks_kw)):
+        raise SdcError(
+            f"state: rewards are {shortened(peaks_kw.tolist())}; valid is finite numbers"
+        )
+    return peaks_kw.copy()
+
+
+def _checked_commands(given: Any, names: Sequence[str], fleet: Fleet) -> dict[str, F64] | None:
+    """Commands of the last step, (), (B,), (U,) or (R,) each; None before the first step."""
     if given is None:
         return None
-    known = {name for names in COMMANDS_OF_AGENT.values() for name in names}
-    if not isinstance(given, Mapping) or not set(given) <= known:
-        raise SdcError("state: actions are not valid; valid is what state_dict() gave")
-    out: dict[str, F64] = {}
-    for name, command in given.items():
-        values = checked_array(command, f"state: actions of {name}")
-        several = {"cooling": units, "fan": units, "placement": racks}
-        shapes = [(), (num_envs,), (several.get(name),)]
-        highest = np.inf if name in several else 1.0
-        if values.shape not in shapes or not _finite_within(values, highest):
-            raise SdcError(f"state: actions of {name} are not valid: {command!r}")
-        out[name] = values.astype(np.float64)
-    return out
+    if not isinstance(given, Mapping) or set(given) != set(names):
+        found = sorted(map(str, given)) if isinstance(given, Mapping) else given
+        raise SdcError(
+            f"state: actions are {shortened(found)}; valid is a dict of {sorted(names)}, or None "
+            "before the first step"
+        )
+    return {name: _checked_command(name, given[name], fleet) for name in names}
 
 
-def _finite_within(values: npt.NDArray[Any], highest: float) -> bool:
-    """Whether an array has finite numbers alone, of at most a size."""
-    numbers = values.dtype.kind in "iuf"
-    return numbers and bool(np.all(np.isfinite(values) & (np.abs(values) <= highest)))
+def _checked_command(name: str, given: Any, fleet: Fleet) -> F64:
+    """A command of the last step."""
+    values = as_array(f"state: actions of {name}", given)
+    of_parts = {"cooling": fleet.units, "fan": fleet.units, "placement": fleet.racks}
+    shapes = [(), (fleet.size,)] + ([(of_parts[name],)] if name in of_parts else [])
+    if values.shape not in shapes or values.dtype != np.float64:
+        raise SdcError(
+            f"state: actions of {name} are {values.dtype} {values.shape}; valid is float64 of "
+            f"{' or '.join(map(str, shapes))}"
+        )
+    low, high = COMMAND_LIMITS[name]
+    if not np.all((values >= low) & (values <= high)):
+        raise SdcError(
+            f"state: actions of {name} are {shortened(values.tolist())}; valid is within "
+            f"{low:g}..{high:g}"
+        )
+    return values.copy()

@@ -26,14 +26,12 @@ from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
 from sdc_taichi.sim.physical_limits import require_within_limits
 from sdc_taichi.sim.sizing import Sizing, size
+from sdc_taichi.sim.state_limits import LAST_START, state_limits
 from sdc_taichi.sim.surroundings import Surroundings, SurroundingsModel
 from sdc_taichi.sim.unit_index import UnitIndex
 from sdc_taichi.sim.work_allocation import RackOutcome, WorkAllocation
 from sdc_taichi.sim.workload import Workload, WorkResult
 from sdc_taichi.types import I64, Actions, ServerLayers, State, StepResult
-
-LAST_START = 2**53
-"""Latest first step: beyond, steps would not be exact as f64."""
 
 
 class Simulator:
@@ -149,16 +147,19 @@ class Simulator:
                 f"start {start!r}: valid is one integer of 0..{LAST_START:,} for each of "
                 f"{self.size} data centers"
             )
-        stages = self._started()
-        stages.hall.discard_last_step()
-        self._timeline = self._timeline.reseeded(seeds)
+        inputs = replace(inputs, start=first.astype(np.int64))
+        self.continue_from(self._initial_state(seeds, inputs), inputs)
         self._initial_start = initial
-        self._drivers = replace(inputs, start=first.astype(np.int64))
+        return self.state
+
+    def _initial_state(self, seeds: I64, drivers: Drivers) -> State:
+        """The state before the first step; see ``reset``."""
+        stages = self._started()
         supply = stages.crac_units.initial_supply()
-        self._state = State(
+        return State(
             step=0,
             seed=seeds,
-            start=self.drivers.start,
+            start=drivers.start,
             setpoint_c=supply.unit_setpoint_c,
             cooling_run=supply.cooling_run,
             cooling_last=supply.cooling_last,
@@ -167,9 +168,8 @@ class Simulator:
             stored_kwh=self.fleet.values("battery.initial_soc") * stages.sizing.battery_kwh,
             room_heat_kwh=np.zeros(self.size),
             rack_status=np.zeros(self.fleet.racks, dtype=np.int8),
-            **stages.air.initial(supply, self.drivers.at(0).demand),
+            **stages.air.initial(supply, drivers.at(0).demand),
         )
-        return self._state
 
     def step(self, actions: Actions | None = None) -> StepResult:
         """Advance all data centers by one step.
@@ -251,17 +251,42 @@ class Simulator:
             drivers: Inputs from here on; None keeps those that there are.
 
         Raises:
-            SdcError: The snapshot is of another version or fleet, incomplete, or of wrong shape.
+            SdcError: The snapshot is of another version or fleet, incomplete, or not valid; nothing
+                has changed.
         """
-        stages = self._started()
+        self.continue_from(self.read_state(values, drivers), drivers)
+
+    def read_state(self, values: Mapping[str, Any], drivers: Drivers | None = None) -> State:
+        """The state that a ``state_dict`` holds, checked; the present one stays.
+
+        Args:
+            values: The state.
+            drivers: Inputs it was made with; None is the present ones.
+
+        Raises:
+            SdcError: The snapshot is of another version or fleet, incomplete, or not valid.
+        """
+        sizing = self.sizing
         inputs = self._checked_drivers(self.drivers if drivers is None else drivers)
         snapshot.check_origin(values, self.fingerprint(inputs))
-        like = self.reset() if self._state is None else self._state
-        state = snapshot.to_state(values, like)
-        stages.hall.discard_last_step()
+        like = self._state
+        if like is None:
+            like = self._initial_state(np.zeros(self.size, dtype=np.int64), inputs)
+        return snapshot.to_state(values, like, lambda step: state_limits(self.fleet, sizing, step))
+
+    def continue_from(self, state: State | None, drivers: Drivers | None = None) -> None:
+        """Continue from a state of this simulator; None is that before the first ``reset``.
+
+        Args:
+            state: What ``read_state`` returned, or ``state`` was before.
+            drivers: Inputs from here on; None keeps those that there are.
+        """
+        inputs = self.drivers if drivers is None else drivers
+        self._started().hall.discard_last_step()
         self._state = state
-        self._timeline = self._timeline.reseeded(state.seed)
-        self._drivers = replace(inputs, start=state.start)
+        if state is not None:
+            self._timeline = self._timeline.reseeded(state.seed)
+            self._drivers = replace(inputs, start=state.start)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to an .npz file, atomically and without pickle.

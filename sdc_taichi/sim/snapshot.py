@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.atomic_file import atomic_write
-from sdc_taichi.errors import SdcError
+from sdc_taichi.errors import SdcError, shortened
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS
 from sdc_taichi.sim.drivers import Drivers, common_digits
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.state_limits import MOST_STEPS, Limits
 from sdc_taichi.types import State, fields_of
 from sdc_taichi.user_file import ArrayFile, open_input
 
@@ -57,7 +59,7 @@ def to_dict(state: State, fingerprint: str) -> dict[str, Any]:
     return out
 
 
-def check_origin(values: Mapping[str, Any], fingerprint: str) -> None:
+def check_origin(values: Any, fingerprint: str) -> None:
     """Make sure that values are a whole snapshot of one simulator.
 
     Args:
@@ -67,32 +69,57 @@ def check_origin(values: Mapping[str, Any], fingerprint: str) -> None:
     Raises:
         SdcError: Values that are incomplete, or of another version or simulator.
     """
+    if not isinstance(values, Mapping):
+        raise SdcError(
+            f"snapshot: is a {type(values).__name__}; valid is what state_dict() returned"
+        )
     expected = {f.name for f in fields(State)} | {"version", "fingerprint"}
-    missing, extra = sorted(expected - set(values)), sorted(set(values) - expected)
+    missing = sorted(expected - set(values))
+    extra = sorted(str(name)[:80] for name in set(values) - expected)
     if missing or extra:
         raise SdcError(
             f"snapshot: missing {missing}, unknown {extra}; it is no state of this program"
         )
-    if int(values["version"]) != VERSION:
-        raise SdcError(f"snapshot: version {values['version']}, expected {VERSION}")
-    if str(values["fingerprint"]) != fingerprint:
-        raise SdcError("snapshot: made by another fleet, inputs or precision than this one")
+    for name, wanted in (("version", VERSION), ("fingerprint", fingerprint)):
+        found, model = as_array(f"snapshot: {name}", values[name]), np.asarray(wanted)
+        if found.shape != () or found.dtype != model.dtype:
+            raise SdcError(f"snapshot: {name} is {shortened(found.tolist())}, expected {wanted!r}")
+        if found != model and name == "version":
+            raise SdcError(f"snapshot: version {found}, expected {VERSION}")
+        if found != model:
+            raise SdcError("snapshot: made by another fleet, inputs or precision than this one")
 
 
-def to_state(values: Mapping[str, Any], like: State) -> State:
+def to_state(
+    values: Mapping[str, Any], like: State, limits_at: Callable[[int], Mapping[str, Limits]]
+) -> State:
     """The state that a snapshot holds.
 
     Args:
         values: Arrays by name, see ``check_origin``.
         like: State of the simulator that goes on from it, for shapes and types.
+        limits_at: Lowest and highest values of the fields by name, after so many steps.
 
     Raises:
         SdcError: Values of wrong shape, type or range.
     """
-    state = State(**{name: _checked(name, values[name], x) for name, x in fields_of(like).items()})
-    if np.any(np.diff(state.queue, axis=1) < -NEGLIGIBLE_TASKS):
+    step = int(_checked("step", values["step"], like.step, (0, MOST_STEPS)))
+    limits = limits_at(step)
+    checked = {
+        name: _checked(name, values[name], model, limits[name])
+        for name, model in fields_of(like).items()
+        if name != "step"
+    }
+    # The last command is no number before the first step.
+    last = checked["cooling_last"]
+    if np.any(np.isnan(last) != (step == 0)):
+        raise SdcError(
+            f"snapshot: cooling_last is {shortened(last.tolist())} after {step} steps; "
+            "valid is nan before the first step and numbers from then on"
+        )
+    if np.any(np.diff(checked["queue"], axis=1) < -NEGLIGIBLE_TASKS):
         raise SdcError("snapshot: queue falls from older to newer work; valid never falls")
-    return state
+    return State(step=step, **checked)
 
 
 def write(path: str | os.PathLike[str], values: Mapping[str, Any]) -> None:
@@ -118,16 +145,38 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
         return {name: arrays.read(name, most_bytes) for name in arrays.names}
 
 
-def _checked(name: str, value: Any, like: Any) -> Any:
-    """A field of a state, of the shape, type and range that it must have."""
-    model, given = np.asarray(like), np.asarray(value)
+def as_array(label: str, value: Any) -> npt.NDArray[Any]:
+    """An array or number of NumPy as an array.
+
+    Args:
+        label: What it is, for errors.
+        value: Any value.
+
+    Raises:
+        SdcError: A value of another kind.
+    """
+    if not isinstance(value, np.ndarray | np.generic):
+        raise SdcError(f"{label} is a {type(value).__name__}; valid is an array of NumPy")
+    return np.asarray(value)
+
+
+def _checked(name: str, value: Any, like: Any, limits: Limits) -> Any:
+    """A copy of a field of a state, of the shape, type and range that it must have."""
+    model, given = np.asarray(like), as_array(f"snapshot: {name}", value)
     if given.shape != model.shape or given.dtype != model.dtype:
         raise SdcError(
             f"snapshot: {name} is {given.dtype} {given.shape}, expected {model.dtype} {model.shape}"
         )
-    # Room heat is below zero while the air is colder than the setpoint.
-    low = -np.inf if name.endswith("_c") or name == "room_heat_kwh" else 0.0
-    # The last command is not a number before the first step.
-    if name != "cooling_last" and not np.all(np.isfinite(given) & (given >= low)):
-        raise SdcError(f"snapshot: {name} has values that are negative or not finite")
-    return int(given) if given.ndim == 0 else given.copy()
+    if given.size == 0:
+        return given.copy()
+    low, high = (np.broadcast_to(limit, given.shape) for limit in limits)
+    is_valid = (given >= low) & (given <= high)
+    if name == "cooling_last":
+        is_valid |= np.isnan(given)
+    if not np.all(is_valid):
+        at = np.unravel_index(np.argmin(is_valid), given.shape)
+        place = f" of entry {', '.join(map(str, at))}" if at else ""
+        raise SdcError(
+            f"snapshot: {name}{place} is {given[at]:.9g}; valid is {low[at]:.9g}..{high[at]:.9g}"
+        )
+    return given.copy()
