@@ -85,6 +85,41 @@ def test_every_kind_of_environment_tells_the_same_costs() -> None:
     assert of_single["cost_grid_kwh_twice"] == 2 * of_single["grid_kwh"] > 0
 
 
+class WithCost(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """The wrapper in docs/environments.md."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, info["cost"], terminated, truncated, info
+
+
+def test_six_values_for_safety_gymnasium() -> None:
+    made = gymnasium.make("sdc_taichi/Joint-v0", **options(costs=["hot_inlets"]))
+    env: Any = WithCost(made)
+    env.reset(seed=0)
+    _, _, cost, terminated, truncated, info = env.step(DEFER)
+    assert cost == info["cost_hot_inlets"] >= 0
+    assert not terminated
+    assert not truncated
+
+
+def test_costs_of_the_step_that_ends_an_episode() -> None:
+    for mode in ("SameStep", "NextStep"):
+        env: Any = gymnasium.make_vec(
+            "sdc_taichi/Battery-v0",
+            num_envs=2,
+            autoreset_mode=mode,
+            **{**options(costs=[grid_kwh]), "config": "tiny"},
+        )
+        env.reset(seed=0)
+        for _ in range(96):
+            infos = env.step(np.array([1, 0]))[4]
+        last = infos["final_info"] if mode == "SameStep" else infos
+        assert last["cost"].tolist() == last["grid_kwh"].tolist()
+        assert ("cost" in infos) == (mode == "NextStep")
+        assert "cost" in env.step(np.array([1, 0]))[4] or mode == "NextStep"
+
+
 def grid_kwh_twice(result: StepResult, view: View) -> list[float]:
     return (2 * result.grid_kwh).tolist()  # type: ignore[no-any-return]
 
