@@ -761,3 +761,12 @@ def test_configs_are_read_from_the_steps(folder: Path) -> None:
     assert [first, second] == two_halls()
     with pytest.raises(SdcError):
         folder_reader.read_configs(folder_reader.RunFolder(folder / "none", run.metrics), [0])
+
+
+def test_changes_by_rounding_have_no_sign_of_their_own() -> None:
+    first = dict.fromkeys(report_metrics.COMPARED, 100.0)
+    second = dict.fromkeys(report_metrics.COMPARED, np.nextafter(100.0, 0.0))
+    page = report_metrics._comparison_table(["one", "other"], [first, second])
+    assert "(+0.00 %)" in page
+    assert "-0" not in page
+    assert format_number(-0.0) == "0"

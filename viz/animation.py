@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import SdcError
+from sdc_taichi.hall.air_metrics import rank
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, StepResult
 
@@ -75,7 +76,7 @@ def write_animation(
     picture: Any = canvas.copy()
 
     def draw_frame(frame: int) -> None:
-        rack, when = int(values[frame].argmax()), times[frame]
+        rack, when = int(rank(values[frame]).argmax()), times[frame]
         row, column = divmod(rack, hall.racks_per_row)
         text = (
             f"{short_name(fleet.names[dc])}: {when.day} {when:%b %H:%M}, hottest "

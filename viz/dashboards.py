@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sdc_taichi.config import HallConfig
 from sdc_taichi.errors import SdcError
-from sdc_taichi.hall.air_metrics import RECOMMENDED_C
+from sdc_taichi.hall.air_metrics import RECOMMENDED_C, rank
 from sdc_taichi.types import F64
 
 from .plotting import (
@@ -131,7 +131,7 @@ def day(
 
 def hottest_day(steps: pd.DataFrame) -> str:
     """Day of the hottest inlet as ``day`` takes it, the first if several are equal."""
-    hottest = steps["time"].iloc[int(steps["inlet_max_c"].to_numpy().argmax())]
+    hottest = steps["time"].iloc[int(rank(steps["inlet_max_c"].to_numpy()).argmax())]
     return str(hottest.strftime("%Y-%m-%d"))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
+from sdc_taichi.hall.air_metrics import rank
 from sdc_taichi.run.metrics import Metric
 from sdc_taichi.types import F64
 
@@ -168,7 +169,7 @@ def fleet_map(edges: npt.NDArray[np.datetime64], inlet_max_c: F64, names: Sequen
         raise SdcError(
             f"inlet_max_c has shape {inlet_max_c.shape}, expected {(len(edges) - 1, len(names))}"
         )
-    order = np.argsort(-inlet_max_c.max(axis=0), kind="stable")[:MAX_MAP_ROWS]
+    order = np.argsort(-rank(inlet_max_c.max(axis=0)), kind="stable")[:MAX_MAP_ROWS]
     shown = inlet_max_c[:, order].T
     figure = new_figure(12.0, 1.6 + 0.24 * max(len(order), 4))
     axes = figure.subplots()

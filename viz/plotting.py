@@ -131,7 +131,7 @@ def literal_text(name: str) -> str:
 
 def format_number(value: float) -> str:
     """A value with four significant digits, or whole with separators from 1000 on."""
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:z.4g}"
 
 
 def date_text(moment: datetime, *, over_a_year: bool) -> str:

@@ -231,7 +231,7 @@ def _comparison_table(labels: Sequence[str], totals: Sequence[Mapping[str, Any]]
             text = metric_text(total, key)
             # A temperature has no zero to be a share of.
             if index and base and total[key] is not None and not key.endswith("_c"):
-                text += f" ({100 * (total[key] / base - 1):+.2f} %)"
+                text += f" ({100 * (total[key] / base - 1):+z.2f} %)"
             cells.append(Cell(text, True))
         rows.append(cells)
     heads = [Cell("metric"), Cell("unit"), *(Cell(label, True) for label in labels)]

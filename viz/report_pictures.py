@@ -11,7 +11,7 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import SdcError
-from sdc_taichi.hall.air_metrics import TIE_K
+from sdc_taichi.hall.air_metrics import TIE_K, rank
 from sdc_taichi.run.folder_reader import (
     RunFolder,
     read_configs,
@@ -66,7 +66,7 @@ def fleet_section(run: RunFolder) -> str:
         "80 % and the highest.",
     )
     if len(fleet.inlet_max_c) > 1:
-        order = np.argsort(-fleet.inlet_max_c.max(axis=0), kind="stable")[:3]
+        order = np.argsort(-rank(fleet.inlet_max_c.max(axis=0)), kind="stable")[:3]
         hottest = ", ".join(run.names[dc] for dc in order)
         cut = (
             f" The {fleet_figures.MAX_MAP_ROWS} hottest of {count:,} are shown."
@@ -130,7 +130,7 @@ def data_center_section(run: RunFolder, dc: ShownDataCenter) -> str:
     if len(steps) < 2:
         out.append("<p>A single step has no pictures.</p>\n")
         return "".join(out) + _config_element(dc)
-    hottest = steps.iloc[int(steps["inlet_max_c"].to_numpy().argmax())]
+    hottest = steps.iloc[int(rank(steps["inlet_max_c"].to_numpy()).argmax())]
     hottest_text = (
         f"{hottest['inlet_max_c']:.1f} °C on {time_text(run, hottest['time'].to_pydatetime())}"
     )

@@ -147,7 +147,7 @@ def _print_layout_solution(config: DataCenterConfig, solution: LayoutSolution) -
     ):
         inner, outer = _row_means(config, values)
         cells = (float(values.mean()), outer, inner, float(values.min()), float(values.max()))
-        table.add_row(label, *("" if x is None else f"{x:.2f}" for x in cells))
+        table.add_row(label, *("" if x is None else f"{x:z.2f}" for x in cells))
     console.print(table)
     exhaust = 100 * solution.R.sum(axis=1)
     lines = (

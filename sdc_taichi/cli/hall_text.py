@@ -78,7 +78,7 @@ def _air_lines(found: DesignHall) -> list[str]:
         f"exhaust share {100 * share.mean():.2f} % of the racks' intake (r), per rack "
         f"{_span(100 * share, 2)} %; spectral radius of R {known}{high:.4f}",
         f"bypass        {100 * air.bypass_share:.2f} % of the CRAC air",
-        f"return air    {air.return_c:.2f} C, {air.return_c - found.outlet_c.mean():+.2f} K from "
+        f"return air    {air.return_c:.2f} C, {air.return_c - found.outlet_c.mean():+z.2f} K from "
         "the mean outlet",
         f"indices       SHI {air.shi:.3f}, RHI {1 - air.shi:.3f}, RTI {air.rti_pct:.1f} %",
     ]
