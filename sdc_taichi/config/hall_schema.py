@@ -249,7 +249,8 @@ class ServerConfig(Section):
     to ten racks in one; None takes the airflow on which the supply and return approach temperatures
     close at the design point."""
     fan_reference_ratio: Annotated[float, Field(ge=0.01, le=10)] = 1.0
-    """Airflow ratio at which the fans of a server draw ``fan_reference_w``, 0.01..10."""
+    """Airflow ratio at which the fans of a server draw ``fan_reference_w``, 0.01..10: from fans
+    that hardly turn to ten times full airflow."""
     fan_reference_w: IdleW = 10.0
     """Fan power of one server at the reference airflow ratio, in W."""
     outlet_model: Literal["server", "rack", "released"] = "server"
