@@ -17,6 +17,7 @@ from sdc_taichi.exogenous import read_carbon, read_epw, read_workload
 from sdc_taichi.exogenous.importing import file_kind
 from sdc_taichi.number_text import parse_number, parse_whole
 from sdc_taichi.run.folder_reader import read_run
+from sdc_taichi.run.folder_writer import prepare_folder
 from sdc_taichi.sim import snapshot
 from sdc_taichi.user_file import decoding, open_input, read_text
 
@@ -68,6 +69,12 @@ def test_a_run_folder_is_read_as_carefully(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("[" * 100_000)
     with pytest.raises(SdcError, match="nested too deeply"):
         read_run(tmp_path)
+
+
+def test_a_folder_with_a_pipe_for_metrics_is_no_run_folder(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "metrics.json")
+    with pytest.raises(SdcError, match=r"holds files that are not of a run \(metrics\.json\)"):
+        prepare_folder(tmp_path)
 
 
 def test_a_snapshot_that_is_larger_than_its_file_is_not_read(tmp_path: Path) -> None:

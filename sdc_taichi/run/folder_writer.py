@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from sdc_taichi.atomic_file import AtomicFile, atomic_write, naming_errors
-from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.config import DataCenterConfig, load_json
 from sdc_taichi.control import Controller
 from sdc_taichi.errors import ConfigError, PhysicalLimitError
 from sdc_taichi.run.description import RunRequest, describe_run
@@ -28,6 +28,7 @@ from sdc_taichi.sim.events import ActiveEvent
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import StepResult
+from sdc_taichi.user_file import MOST_METRICS_BYTES, read_text
 
 METRICS_FILE = "metrics.json"
 """Written last, so that its presence marks the folder of a whole run."""
@@ -209,7 +210,7 @@ def _is_left_by_broken_run(path: Path) -> bool:
 def _is_run_folder(out: Path) -> bool:
     """Whether a folder holds the metrics.json of a run."""
     try:
-        content = json.loads((out / METRICS_FILE).read_text("utf-8"))
-    except (OSError, ValueError):
+        content = load_json(read_text(out / METRICS_FILE, MOST_METRICS_BYTES))
+    except ValueError:  # errors of files among them
         return False
     return isinstance(content, dict) and str(content.get("format", "")).startswith("sdc-run/")
