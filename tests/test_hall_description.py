@@ -24,6 +24,8 @@ from sdc_taichi.sim.design_hall import (
 
 WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[400, 40]"]
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*racks of more than 60 kW")
+
 
 @pytest.fixture(scope="module")
 def corrected() -> DesignHall:

@@ -14,7 +14,11 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-pytestmark = [pytest.mark.repo, pytest.mark.slow]
+pytestmark = [
+    pytest.mark.repo,
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:.*racks of more than 60 kW"),
+]
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "screenshots.py"
 ROWS, RACKS_PER_ROW = 10, 16
