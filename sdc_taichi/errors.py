@@ -32,10 +32,11 @@ def printable(text: object) -> str:
 
 def one_line(text: str) -> str:
     """Text of a message on one line of bounded length that is safe to print."""
-    if len(text) > MOST_CHARACTERS:
+    line = printable(" ".join(text.split()))
+    if len(line) > MOST_CHARACTERS:
         kept = MOST_CHARACTERS // 2
-        text = f"{text[:kept]} ... {text[-kept:]}"
-    return printable(" ".join(text.split()))
+        line = f"{line[:kept]} ... {line[-kept:]}"
+    return line
 
 
 class SdcError(ValueError):
