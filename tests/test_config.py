@@ -75,7 +75,9 @@ def test_a_config_written_back_reads_back_equal(preset: str, tmp_path: Path) -> 
         # Libraries built with fast maths flush subnormal numbers to zero in the whole process.
         st.floats(0, 1, allow_subnormal=False),
         st.one_of(st.none(), st.floats(1e-9, 1e8)),
-        st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), max_size=12),
+        st.text(
+            st.characters(codec="utf-8", exclude_categories=["C", "Z"]), min_size=1, max_size=12
+        ),
     )
 )
 def test_any_number_and_name_survives_being_written(

@@ -115,6 +115,8 @@ def fails(arguments: list[str], parts: list[str]) -> None:
             ["servers.groups.0.0.full_w", "finite number"],
         ),
         ('extends: tiny\nname: "\\ud800"', ["name: ", "valid string", r"'\ud800'"]),
+        ("extends: tiny\nname: ''", ["name: ", "at least 1 character"]),
+        ("extends: tiny\nname: ' '", ["name: ", "(got ' ')"]),
         (f"extends: tiny\nname: {'x' * 10_001}", ["name: ", "at most 10000 characters"]),
     ],
 )

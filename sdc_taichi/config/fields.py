@@ -63,6 +63,8 @@ Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 """Seed of what is random, 0..2**63 - 1."""
 Text = Annotated[str, Field(max_length=10_000)]
 """Text of up to 10,000 characters, all of which a file can hold."""
+Name = Annotated[str, Field(min_length=1, max_length=10_000, pattern=r"\S")]
+"""Name of 1 to 10,000 characters, not blank, all of which a file can hold."""
 FileName = Annotated[str, Field(min_length=1)]
 """Path of a file."""
 

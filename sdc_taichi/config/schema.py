@@ -17,6 +17,7 @@ from sdc_taichi.config.fields import (
     CRate,
     FileName,
     Hours,
+    Name,
     Section,
     Seed,
     Share,
@@ -79,7 +80,7 @@ class WorkloadConfig(Section):
 
     model: Literal["fluid", "tasks"] = "fluid"
     """Whether work is a continuous quantity, or whole tasks as in the released SustainDC."""
-    trace: Text = "alibaba_1"
+    trace: Name = "alibaba_1"
     """Name of the workload trace (see ``sdc-taichi data list``)."""
     placement: Literal["uniform", "fill", "coolest-first", "inlet-aware", "weights"] = "uniform"
     """Policy by which the work of a step is spread over the racks."""
@@ -108,7 +109,7 @@ class WorkloadConfig(Section):
 class SiteConfig(Section):
     """Where the data center stands and when its year starts."""
 
-    location: Text = "NY"
+    location: Name = "NY"
     """Name of the site, which gives weather and carbon intensity (see ``sdc-taichi data list``)."""
     start: str = "01-01"
     """Month and day of the first step, MM-DD, local standard time."""
@@ -155,7 +156,7 @@ class SimulationConfig(Section):
 class DataCenterConfig(Section):
     """Everything that defines one data center."""
 
-    name: Text = "dc"
+    name: Name = "dc"
     """Name of the data center in results and messages."""
     description: Text = ""
     """Description of the data center, on one line."""

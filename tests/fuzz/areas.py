@@ -36,5 +36,5 @@ AREAS = {
     "states": Plan(states, 260, 40),
     "run_folders": Plan(run_folders, 120, 20),
     "command_lines": Plan(command_lines, 150, 24),
-    "faults": Plan(faults, 70, 0),
+    "faults": Plan(faults, 70, 5),
 }
