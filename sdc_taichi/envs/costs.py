@@ -21,7 +21,7 @@ from sdc_taichi.envs.user_functions import (
     import_path,
     register_function,
 )
-from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, StepResult
 
@@ -135,8 +135,8 @@ def _with_weights(given: Any) -> list[tuple[Any, Any]]:
     if isinstance(given, Sequence) and not isinstance(given, str | bytes) and given:
         return [(one, 1.0) for one in given]
     raise ConfigError(
-        f"costs {given!r}: valid is None, a list of costs, or a dict of cost to weight; costs are "
-        f"{', '.join([*COSTS, *_registered])}, functions, and import paths module:name"
+        f"costs {shortened(given)}: valid is None, a list of costs, or a dict of cost to weight; "
+        f"costs are {', '.join([*COSTS, *_registered])}, functions, and import paths module:name"
     )
 
 
@@ -159,5 +159,7 @@ def _named(given: Any) -> tuple[str, CostFunction]:
 def _checked_weight(name: str, weight: Any) -> float:
     number = isinstance(weight, int | float | np.number) and not isinstance(weight, bool)
     if not number or not 0.0 <= weight < np.inf:
-        raise ConfigError(f"costs: {name} has weight {weight!r}; valid is a number of at least 0")
+        raise ConfigError(
+            f"costs: {name} has weight {shortened(weight)}; valid is a number of at least 0"
+        )
     return float(weight)

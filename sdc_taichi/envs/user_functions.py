@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.types import F64
 
 
@@ -36,10 +36,12 @@ def register_function(
         ConfigError: a name that another function has, or no function.
     """
     if not callable(function):
-        raise ConfigError(f"{kind} {name!r}: is a {type(function).__name__}; valid is a function")
+        raise ConfigError(
+            f"{kind} {shortened(name)}: is a {type(function).__name__}; valid is a function"
+        )
     identifier = isinstance(name, str) and name.isidentifier()
     if not identifier or name in reserved or not is_replacement(registered.get(name), function):
-        raise ConfigError(f"{kind} {name!r}: valid is a name that is not taken")
+        raise ConfigError(f"{kind} {shortened(name)}: valid is a name that is not taken")
     registered[name] = function
 
 
@@ -60,15 +62,17 @@ def function_named(option: str, given: Any, registered: dict[str, Any], *, valid
         return registered[given]
     if not module or not name or module.startswith("."):
         raise ConfigError(
-            f"{option} {given!r}: unknown; valid: {valid}, a function, or its import path "
+            f"{option} {shortened(given)}: unknown; valid: {valid}, a function, or its import path "
             "module:name"
         )
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{option} {given!r}: cannot be imported ({error})") from None
+        raise ConfigError(f"{option} {shortened(given)}: cannot be imported ({error})") from None
     if not callable(found):
-        raise ConfigError(f"{option} {given!r}: is a {type(found).__name__}; valid is a function")
+        raise ConfigError(
+            f"{option} {shortened(given)}: is a {type(found).__name__}; valid is a function"
+        )
     return found
 
 
@@ -94,7 +98,7 @@ def checked_values(what: str, returned: Any, whose: str, size: int) -> F64:
         values = np.asarray(returned, dtype=np.float64)
     except (TypeError, ValueError):
         raise SdcError(
-            f"{what}: returned {returned!r} for {whose}; valid is ({size},) of numbers"
+            f"{what}: returned {shortened(returned)} for {whose}; valid is ({size},) of numbers"
         ) from None
     finite = np.isfinite(values)
     if values.shape not in ((), (size,)) or not finite.all():
