@@ -127,11 +127,14 @@ def add_step(totals: Totals, result: StepResult) -> None:
     totals.queue_end_tasks[:] = result.queue_tasks
     np.maximum(totals.queue_max_tasks, result.queue_tasks, out=totals.queue_max_tasks)
     np.maximum(totals.overdue_max_tasks, result.overdue_tasks, out=totals.overdue_max_tasks)
-    hotter = np.flatnonzero(rank(result.inlet_max_c) > rank(totals.hottest_inlet_c))
-    np.maximum(totals.hottest_inlet_c, result.inlet_max_c, out=totals.hottest_inlet_c)
-    totals.hottest_step[hotter] = result.step
-    totals.hottest_rack[hotter] = result.hottest_rack[hotter]
-    totals.hottest_server[hotter] = result.hottest_server[hotter]
+    hotter = np.flatnonzero(result.inlet_max_c > totals.hottest_inlet_c)
+    if hotter.size:
+        inlet_c, before_c = result.inlet_max_c[hotter], totals.hottest_inlet_c[hotter]
+        totals.hottest_inlet_c[hotter] = inlet_c
+        hotter = hotter[rank(inlet_c) > rank(before_c)]
+        totals.hottest_step[hotter] = result.step
+        totals.hottest_rack[hotter] = result.hottest_rack[hotter]
+        totals.hottest_server[hotter] = result.hottest_server[hotter]
     np.minimum(totals.rci_hi_min_pct, result.rci_hi_pct, out=totals.rci_hi_min_pct)
 
 
