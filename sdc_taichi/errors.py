@@ -43,11 +43,12 @@ class SdcError(ValueError):
     """Base of all errors caused by input; the command line prints them without a traceback.
 
     Args:
-        message: what was found where, and what would be valid; kept as ``one_line`` makes it.
+        message: what was found where, and what would be valid; kept as ``one_line`` makes it. An
+            error in its place, as Gymnasium hands one on from a worker process, is its message.
     """
 
-    def __init__(self, message: str) -> None:
-        super().__init__(one_line(message))
+    def __init__(self, message: object) -> None:
+        super().__init__(one_line(str(message)))
 
 
 class ConfigError(SdcError):
