@@ -34,7 +34,7 @@ AREAS = {
     "data_files": Plan(data_files, 300, 45),
     "matrices": Plan(matrices, 200, 35),
     "states": Plan(states, 260, 40),
-    "run_folders": Plan(run_folders, 120, 20),
+    "run_folders": Plan(run_folders, 120, 22),
     "command_lines": Plan(command_lines, 150, 24),
-    "faults": Plan(faults, 70, 5),
+    "faults": Plan(faults, 70, 4),
 }

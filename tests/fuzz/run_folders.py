@@ -22,7 +22,7 @@ from sdc_taichi.config import with_values
 from sdc_taichi.run.folder_reader import read_configs, read_fleet_steps, read_run, read_steps
 from sdc_taichi.viz.report import write_report
 
-REPORTS = 0.04
+REPORTS = 0.02
 """Share of the cases that draw a report, which takes a second."""
 
 
@@ -55,7 +55,7 @@ def run_folders(scratch: Scratch) -> None:
     read_configs(run, dcs)
     read_steps(run, dcs)
     read_fleet_steps(run)
-    if scratch.chance(0.3 if by_name else REPORTS):
+    if scratch.chance(0.25 if by_name else REPORTS):
         text = write_report(run, [], scratch.output("report.html")).read_text("utf-8")
         for odd in ("<script>alert", "\x1b", "\x07", "\x00"):
             if odd in text:
