@@ -152,20 +152,35 @@ def test_limits_hold_of_every_quantity_that_has_them(bad: float) -> None:
         assert found.tolist() == [1, 0], name
 
 
-def test_a_result_beyond_physics_ends_the_run_and_changes_nothing() -> None:
-    still = [f"servers.fan_airflow_ratio_{end}=[1e-6, 1e-6]" for end in ("lb", "ub")]
-    still += ["name=still", "servers.fan_airflow_ratio_limits=null"]
-    with Simulator([load_config("tiny"), load_config("tiny", still)]) as sim:
+def test_a_result_beyond_physics_ends_the_run_and_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(LIMITS, "it_w", (0.0, 1.0))
+    with Simulator([load_config("tiny")] * 2) as sim:
         sim.reset()
         before = sim.state
-        with pytest.raises(PhysicalLimitError, match=r"^still: outlet_mean_c is .* in step 0; "):
+        with pytest.raises(PhysicalLimitError, match=r"^tiny: it_w is .* in step 0; physical is"):
             sim.step()
         assert sim.state is before
-    env = parallel_env(load_config("tiny", still), days=1)
+
+
+def test_environments_end_at_a_limit_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(LIMITS, "hvac_w", (-2.0, -1.0))
+    env = parallel_env("tiny", days=1)
     env.reset(seed=0)
-    with pytest.raises(PhysicalLimitError, match=r"^still: outlet_mean_c"):
+    with pytest.raises(PhysicalLimitError, match=r"^tiny: hvac_w is .* in step 0; "):
         env.step({agent: 0 for agent in env.agents})
     env.close()
+
+
+def test_a_hall_that_would_burn_at_its_design_point_is_refused() -> None:
+    still = [f"servers.fan_airflow_ratio_{end}=[1e-6, 1e-6]" for end in ("lb", "ub")]
+    still += ["name=still", "servers.fan_airflow_ratio_limits=null"]
+    with (
+        Simulator([load_config("tiny"), load_config("tiny", still)]) as sim,
+        pytest.raises(PhysicalLimitError, match=r"^still: outlet of rack \d is .*; physical is"),
+    ):
+        sim.reset()
 
 
 HOT = [
@@ -187,7 +202,7 @@ def test_a_run_that_ends_at_a_limit_keeps_the_steps_before(tmp_path: Path) -> No
     assert ": hvac.pumps.efficiency 0.1: even small pumps" in warning
     steps = json.loads((out / "metrics.json").read_text())["steps_done"]
     assert 2 < steps < 20
-    assert re.match(rf"error: \w+: [a-z_]+ is .* in step {steps}; physical is", error)
+    assert re.match(rf"error: \w+: outlet of rack \d is .* \(step {steps}\); ", error)
     assert error.endswith(f"{out} holds the {steps} steps before")
 
 
@@ -196,7 +211,7 @@ def test_the_outlet_of_a_rack_has_a_limit_too() -> None:
     changes = ["name=b", f"events.scheduled=[{failure}]"]
     with Simulator([load_config("corrected"), load_config("corrected", changes)]) as sim:
         sim.reset()
-        with pytest.raises(PhysicalLimitError, match=r"^b: outlet of rack 3 is .* C in step 0; "):
+        with pytest.raises(PhysicalLimitError, match=r"^b: outlet of rack 3 is .* \(step 0\)$"):
             sim.step()
 
 

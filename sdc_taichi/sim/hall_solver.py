@@ -29,6 +29,7 @@ from sdc_taichi.kernels.hall_arguments import (
 )
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_tables import build_hall_tables, build_rows_along_racks, vectors
+from sdc_taichi.sim.physical_limits import require_bearable_outlets
 from sdc_taichi.types import F64, I32, Reals, ServerLayers
 
 Precision = Literal["f32", "f64"]
@@ -172,6 +173,7 @@ class HallSums:
 
 RESULT_NAMES = (*DC_OUT, *(f"rack_{name}" for name in RACK_OUT))
 """Fields of ``HallSums`` that the kernel writes, in the order of its rows."""
+_OUTLET_MAX_ROW = [*RACK_OUT].index("outlet_max_c")
 
 
 class Hall:
@@ -580,12 +582,7 @@ class Hall:
         racks = self._rack_out.reshape(len(self._rack_out), -1)
         if not self._returns_buffers:
             racks = self._places.values_of_racks(racks)
-        if not isfinite(np.add.reduce(dc_out, axis=None)):
-            finite = np.isfinite(dc_out).all(axis=0)
-            raise PhysicalLimitError(
-                f"{self._fleet.names[int(np.argmin(finite))]}: temperatures or power of the hall "
-                "are beyond any number; valid are smaller powers or larger airflows"
-            )
+        require_bearable_outlets(racks[_OUTLET_MAX_ROW], self._fleet)
         self._was_transient = transient
         return HallSums(
             unit_flow_m3s=self._unit_state["flow_m3s"].copy(),

@@ -15,7 +15,8 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import PhysicalLimitError
-from sdc_taichi.types import F64, I32, StepResult
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.types import F64, Reals, StepResult
 
 AIR_LIMITS_C = (-100.0, 400.0)
 """Limits of air and water, in C: colder than any weather, and where insulation of cables burns by
@@ -54,34 +55,44 @@ def within_limits(quantities: Mapping[str, Any]) -> Any:
     return np.where(reduce(operator.and_, inside), 1.0, 0.0)
 
 
-def require_within_limits(
-    inside: F64, result: StepResult, configs: Sequence[DataCenterConfig], rack_offsets: I32
-) -> None:
-    """Make sure that a step ended within the limits.
+def limit_error(
+    inside: F64, result: StepResult, configs: Sequence[DataCenterConfig]
+) -> PhysicalLimitError:
+    """The error of a step with a result beyond its limits: names data center, quantity and step.
 
     Args:
-        inside: what ``within_limits`` has found, (B,).
+        inside: what ``within_limits`` has found, (B,), not 1 everywhere.
         result: the result of the step.
         configs: configurations of the data centers.
-        rack_offsets: first rack of each data center, and the number of racks, (B + 1,).
+    """
+    dc = int(np.argmin(inside))
+    values = {name: float(getattr(result, name)[dc]) for name in LIMITS}
+    name = next(name for name, (low, high) in LIMITS.items() if not low <= values[name] <= high)
+    low, high = LIMITS[name]
+    return PhysicalLimitError(
+        f"{configs[dc].name}: {name} is {values[name]:.6g} in step {result.step}; physical is "
+        f"{low:g}..{high:g}. {_WHY}"
+    )
+
+
+def require_bearable_outlets(outlet_max_c: Reals, fleet: Fleet) -> None:
+    """Make sure that no rack of a hall burns, which its neighbours may hide in means.
+
+    Args:
+        outlet_max_c: hottest outlet of each rack, in C, (R,).
+        fleet: the data centers.
 
     Raises:
-        PhysicalLimitError: naming data center, step and quantity.
+        PhysicalLimitError: an outlet beyond the limit, or that is not a number; names data center
+            and rack.
     """
-    hottest_c = np.maximum.reduce(result.rack_outlet_max_c)
-    if np.minimum.reduce(inside) == 1.0 and hottest_c <= AIR_LIMITS_C[1]:
+    hottest_c = np.maximum.reduce(outlet_max_c)
+    # Comparisons with NaN are false, so that it ends here too.
+    if hottest_c <= AIR_LIMITS_C[1]:
         return
-    dc = int(np.argmin(inside))
-    for name, (low, high) in LIMITS.items():
-        value = getattr(result, name)[dc]
-        if not low <= value <= high:
-            raise PhysicalLimitError(
-                f"{configs[dc].name}: {name} is {value:.6g} in step {result.step}; physical is "
-                f"{low:g}..{high:g}. {_WHY}"
-            )
-    rack = int(np.argmax(result.rack_outlet_max_c))
-    dc = int(np.searchsorted(rack_offsets, rack, side="right")) - 1
+    rack = int(np.argmax(outlet_max_c))
+    dc = int(fleet.rack_dc[rack])
     raise PhysicalLimitError(
-        f"{configs[dc].name}: outlet of rack {rack - rack_offsets[dc]} is {hottest_c:.6g} C in "
-        f"step {result.step}; physical is at most {AIR_LIMITS_C[1]:g} C. {_WHY}"
+        f"{fleet.names[dc]}: outlet of rack {rack - fleet.rack_offsets[dc]} is {hottest_c:.6g} C; "
+        f"physical is at most {AIR_LIMITS_C[1]:g} C. {_WHY}"
     )

@@ -24,7 +24,7 @@ from sdc_taichi.sim.facility import Facility
 from sdc_taichi.sim.facility_stage import FacilityStage
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
-from sdc_taichi.sim.physical_limits import require_within_limits
+from sdc_taichi.sim.physical_limits import limit_error
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.sim.state_limits import LAST_START, state_limits
 from sdc_taichi.sim.surroundings import Surroundings, SurroundingsModel
@@ -204,8 +204,8 @@ class Simulator:
         result = _step_result(
             state.step, self.step_h, commands, surroundings, work, supply, air, racks, plant
         )
-        fleet = self.fleet
-        require_within_limits(plant["within_limits"], result, fleet.configs, fleet.rack_offsets)
+        if np.minimum.reduce(plant["within_limits"]) < 1.0:
+            raise limit_error(plant["within_limits"], result, self.fleet.configs)
         self._state = _next_state(state, work, supply, plant, racks, thermal)
         return result
 
