@@ -654,7 +654,7 @@ def test_layers_that_do_not_fit_are_refused() -> None:
 def test_air_beyond_any_number_leaves_no_layers() -> None:
     hall = Hall(build_fleet(load_config("tiny")), "f32")
     hall.solve(Conditions(np.array([20.0]), np.array([0.5])))
-    with pytest.raises(SdcError, match=r"outlet of rack 0 is .*; physical is at most 400 C"):
+    with pytest.raises(SdcError, match="beyond any number"):
         hall.solve(Conditions(np.array([3e38]), np.array([0.5])))
     with pytest.raises(RuntimeStateError, match="no step has been done"):
         hall.servers()

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sdc_taichi.errors import PhysicalLimitError, RuntimeStateError, SdcError
+from sdc_taichi.errors import RuntimeStateError, SdcError
 from sdc_taichi.hall.initial_guess import TABLE_LOADS
 from sdc_taichi.kernels.arguments import in_row_order, row_index
 from sdc_taichi.kernels.compiler import runtime
@@ -29,7 +29,7 @@ from sdc_taichi.kernels.hall_arguments import (
 )
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_tables import build_hall_tables, build_rows_along_racks, vectors
-from sdc_taichi.sim.physical_limits import require_bearable_outlets
+from sdc_taichi.sim.physical_limits import no_number_error, no_steady_air_error
 from sdc_taichi.types import F64, I32, Reals, ServerLayers
 
 Precision = Literal["f32", "f64"]
@@ -231,6 +231,8 @@ class Hall:
         """Whether the racks' results are returned without a copy. Other outlets than those of
         the servers are read again by the layers."""
         self._has_rows_along_racks = False
+        self.hottest_outlet_c = 0.0
+        """Hottest outlet of a server of all halls in the last step, in C."""
         self._was_transient: bool | None = None
         """Whether the last step was transient; None without one."""
         self._group_layers: tuple[ServerLayers, dict[str, Any]] | None = None
@@ -261,12 +263,7 @@ class Hall:
             self._run_sweeps(dc_out, MOST_SWEEPS)
             status = self._control["status"]
             if np.minimum.reduce(status) == NOT_CONVERGED:
-                raise PhysicalLimitError(
-                    f"{self._fleet.names[int(np.argmin(status))]}: no steady air temperatures in "
-                    f"{MOST_SWEEPS} sweeps; the CRAC units move too little air: raise "
-                    "hvac.crac.coasting_flow_ratio or min_flow_ratio, or set "
-                    "simulation.thermal=transient"
-                )
+                raise no_steady_air_error(self._fleet.names[int(np.argmin(status))], MOST_SWEEPS)
         return self._results(dc_out, transient=False)
 
     def advance(
@@ -582,7 +579,11 @@ class Hall:
         racks = self._rack_out.reshape(len(self._rack_out), -1)
         if not self._returns_buffers:
             racks = self._places.values_of_racks(racks)
-        require_bearable_outlets(racks[_OUTLET_MAX_ROW], self._fleet)
+        outlets_c = racks[_OUTLET_MAX_ROW]
+        self.hottest_outlet_c = float(np.maximum.reduce(outlets_c))
+        # What is no number anywhere in a hall is none in its outlets.
+        if not isfinite(self.hottest_outlet_c):
+            raise no_number_error(outlets_c, self._fleet)
         self._was_transient = transient
         return HallSums(
             unit_flow_m3s=self._unit_state["flow_m3s"].copy(),

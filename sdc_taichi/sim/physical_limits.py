@@ -7,13 +7,12 @@ its field could tell. A run ends there, since what follows would be numbers with
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import reduce
 from typing import Any
 
 import numpy as np
 
-from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import PhysicalLimitError
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, Reals, StepResult
@@ -55,44 +54,54 @@ def within_limits(quantities: Mapping[str, Any]) -> Any:
     return np.where(reduce(operator.and_, inside), 1.0, 0.0)
 
 
-def limit_error(
-    inside: F64, result: StepResult, configs: Sequence[DataCenterConfig]
-) -> PhysicalLimitError:
+def limit_error(inside: F64, result: StepResult, fleet: Fleet) -> PhysicalLimitError:
     """The error of a step with a result beyond its limits: names data center, quantity and step.
 
     Args:
-        inside: what ``within_limits`` has found, (B,), not 1 everywhere.
+        inside: what ``within_limits`` has found, (B,).
         result: the result of the step.
-        configs: configurations of the data centers.
+        fleet: the data centers.
     """
     dc = int(np.argmin(inside))
     values = {name: float(getattr(result, name)[dc]) for name in LIMITS}
-    name = next(name for name, (low, high) in LIMITS.items() if not low <= values[name] <= high)
-    low, high = LIMITS[name]
+    beyond = [name for name, (low, high) in LIMITS.items() if not low <= values[name] <= high]
+    if beyond:
+        low, high = LIMITS[beyond[0]]
+        found = f"{beyond[0]} is {values[beyond[0]]:.6g}"
+    else:
+        # A single rack may burn, which the means of its hall hide.
+        (low, high), rack = AIR_LIMITS_C, int(np.argmax(result.rack_outlet_max_c))
+        dc = int(fleet.rack_dc[rack])
+        number = rack - fleet.rack_offsets[dc]
+        found = f"outlet of rack {number} is {result.rack_outlet_max_c[rack]:.6g} C"
     return PhysicalLimitError(
-        f"{configs[dc].name}: {name} is {values[name]:.6g} in step {result.step}; physical is "
-        f"{low:g}..{high:g}. {_WHY}"
+        f"{fleet.names[dc]}: {found} in step {result.step}; physical is {low:g}..{high:g}. {_WHY}"
     )
 
 
-def require_bearable_outlets(outlet_max_c: Reals, fleet: Fleet) -> None:
-    """Make sure that no rack of a hall burns, which its neighbours may hide in means.
+def no_steady_air_error(name: str, sweeps: int) -> PhysicalLimitError:
+    """The error of a hall whose air finds no steady state.
 
     Args:
-        outlet_max_c: hottest outlet of each rack, in C, (R,).
-        fleet: the data centers.
-
-    Raises:
-        PhysicalLimitError: an outlet beyond the limit, or that is not a number; names data center
-            and rack.
+        name: name of the data center.
+        sweeps: number of sweeps that were tried.
     """
-    hottest_c = np.maximum.reduce(outlet_max_c)
-    # Comparisons with NaN are false, so that it ends here too.
-    if hottest_c <= AIR_LIMITS_C[1]:
-        return
-    rack = int(np.argmax(outlet_max_c))
-    dc = int(fleet.rack_dc[rack])
-    raise PhysicalLimitError(
-        f"{fleet.names[dc]}: outlet of rack {rack - fleet.rack_offsets[dc]} is {hottest_c:.6g} C; "
-        f"physical is at most {AIR_LIMITS_C[1]:g} C. {_WHY}"
+    return PhysicalLimitError(
+        f"{name}: no steady air temperatures in {sweeps} sweeps; the CRAC units move too little "
+        "air: raise hvac.crac.coasting_flow_ratio or min_flow_ratio, or set "
+        "simulation.thermal=transient"
+    )
+
+
+def no_number_error(outlet_max_c: Reals, fleet: Fleet) -> PhysicalLimitError:
+    """The error of a hall with results that are infinite or not a number.
+
+    Args:
+        outlet_max_c: hottest outlet of each rack, in C, (R,), one of them no number.
+        fleet: the data centers.
+    """
+    dc = int(fleet.rack_dc[int(np.argmin(np.isfinite(outlet_max_c)))])
+    return PhysicalLimitError(
+        f"{fleet.names[dc]}: temperatures or power of the hall are beyond any number; valid are "
+        "smaller powers or larger airflows"
     )

@@ -24,7 +24,7 @@ from sdc_taichi.sim.facility import Facility
 from sdc_taichi.sim.facility_stage import FacilityStage
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
-from sdc_taichi.sim.physical_limits import limit_error
+from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.sim.state_limits import LAST_START, state_limits
 from sdc_taichi.sim.surroundings import Surroundings, SurroundingsModel
@@ -204,8 +204,9 @@ class Simulator:
         result = _step_result(
             state.step, self.step_h, commands, surroundings, work, supply, air, racks, plant
         )
-        if np.minimum.reduce(plant["within_limits"]) < 1.0:
-            raise limit_error(plant["within_limits"], result, self.fleet.configs)
+        inside, hottest_c = plant["within_limits"], stages.hall.hottest_outlet_c
+        if np.minimum.reduce(inside) < 1.0 or hottest_c > AIR_LIMITS_C[1]:
+            raise limit_error(inside, result, self.fleet)
         self._state = _next_state(state, work, supply, plant, racks, thermal)
         return result
 
