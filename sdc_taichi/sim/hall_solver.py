@@ -29,7 +29,7 @@ from sdc_taichi.kernels.hall_arguments import (
 )
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_tables import build_hall_tables, build_rows_along_racks, vectors
-from sdc_taichi.sim.physical_limits import no_number_error, no_steady_air_error
+from sdc_taichi.sim.physical_limits import BEYOND_NUMBERS_C, no_number_error, no_steady_air_error
 from sdc_taichi.types import F64, I32, Reals, ServerLayers
 
 Precision = Literal["f32", "f64"]
@@ -582,7 +582,7 @@ class Hall:
         outlets_c = racks[_OUTLET_MAX_ROW]
         self.hottest_outlet_c = float(np.maximum.reduce(outlets_c))
         # What is no number anywhere in a hall is none in its outlets.
-        if not isfinite(self.hottest_outlet_c):
+        if not self.hottest_outlet_c < BEYOND_NUMBERS_C:
             raise no_number_error(outlets_c, self._fleet)
         self._was_transient = transient
         return HallSums(

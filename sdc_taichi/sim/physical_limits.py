@@ -22,6 +22,8 @@ AIR_LIMITS_C = (-100.0, 400.0)
 itself."""
 WEATHER_LIMITS_C = (-130.0, 100.0)
 """Limits of weather with its heat waves, in C: the bounds of both together."""
+BEYOND_NUMBERS_C = 1e12
+"""Outlet, in C, from which on sums over a hall may not fit the kernels' f32."""
 POWER_LIMITS_W = (-1e-3, 1e12)
 """Limits of powers, in W: none is negative but for rounding, and the world draws some 3e12 W of
 electricity."""
@@ -100,7 +102,7 @@ def no_number_error(outlet_max_c: Reals, fleet: Fleet) -> PhysicalLimitError:
         outlet_max_c: hottest outlet of each rack, in C, (R,), one of them no number.
         fleet: the data centers.
     """
-    dc = int(fleet.rack_dc[int(np.argmin(np.isfinite(outlet_max_c)))])
+    dc = int(fleet.rack_dc[int(np.argmin(outlet_max_c < BEYOND_NUMBERS_C))])
     return PhysicalLimitError(
         f"{fleet.names[dc]}: temperatures or power of the hall are beyond any number; valid are "
         "smaller powers or larger airflows"
