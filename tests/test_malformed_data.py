@@ -14,7 +14,7 @@ import pytest
 
 import exogenous_builders as build
 from sdc_taichi.errors import DataError
-from sdc_taichi.exogenous import read_carbon, read_epw, read_workload
+from sdc_taichi.exogenous import files, read_carbon, read_epw, read_workload
 
 Lines = list[str]
 
@@ -399,3 +399,9 @@ def test_a_folder_or_nothing_is_no_file(reader: Callable[[Path], Any], tmp_path:
         reader(tmp_path)
     with pytest.raises(DataError, match="no such file"):
         reader(tmp_path / "absent.csv")
+
+
+@pytest.mark.parametrize("minutes", [0.0, -60.0, 7.0, 2880.0, 1e308])
+def test_resolutions_that_do_not_divide_a_day_are_refused(minutes: float) -> None:
+    with pytest.raises(DataError, match="expected a positive one that divides a day"):
+        files.rows_per_year(Path("x.parquet"), minutes)

@@ -298,7 +298,7 @@ def rows_per_year(path: Path, minutes: float) -> int:
         DataError: the resolution is not positive or does not divide a day.
     """
     per_day = MINUTES_PER_DAY / minutes if minutes > 0.0 else 0.5
-    if abs(per_day - round(per_day)) > 1e-9:
+    if per_day < 1.0 - 1e-9 or abs(per_day - round(per_day)) > 1e-9:
         raise DataError(
             f"{path}: resolution {minutes:g} min, expected a positive one that divides a day"
         )
