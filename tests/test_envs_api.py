@@ -785,7 +785,7 @@ def test_made_of_bad_numbers() -> None:
         sdc_taichi.parallel_env(configs)
     assert multi_agent(None, config=configs, days=1).num_envs == 2  # type: ignore[arg-type]
     units = [load_config("corrected"), load_config("corrected", ["hvac.crac.units=2"])]
-    with pytest.raises(ConfigError, match=r"hvac\.crac\.units is \[1, 2\]"):
+    with pytest.raises(ConfigError, match=r"\(hvac\.crac\.units\); it is \[1, 2\]"):
         multi_agent(2, config=units)
 
 

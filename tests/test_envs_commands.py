@@ -213,7 +213,7 @@ def test_commands_fit_the_config_and_other_options() -> None:
             "servers.power_w=[300, 40]",
         ],
     )
-    with pytest.raises(ConfigError, match=r"same number of racks, which is \[20, 4\]"):
+    with pytest.raises(ConfigError, match=r"same number of racks; it is \[20, 4\]"):
         sdc_taichi.vector_env(config=[large, small], commands={"agent_ls": ["placement"]})
     env = sdc_taichi.parallel_env(**ALL)
     env.reset(seed=0)

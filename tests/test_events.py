@@ -17,7 +17,7 @@ from sdc_taichi.config import (
     load_config,
 )
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.sim.events import HOURS_PER_BLOCK, ActiveEvent, Timeline, schedule
+from sdc_taichi.sim.events import HOURS_PER_BLOCK, ActiveEvent, Timeline, schedule, seeds_of_fleet
 
 BASE = load_config("corrected")
 HOURLY = "{kind: grid_outage, per_year: 8760, duration_h: [1, 2]}"
@@ -247,6 +247,17 @@ def test_the_seed_decides_sampled_events_alone() -> None:
     assert met(other, 0, 2000) == met(timeline(data_center(**events), seed=2), 0, 2000)
     shared = met(other, 0, 2000) & met(line, 0, 2000)
     assert shared == {ActiveEvent("grid_outage", 0, None, None, None, 8, 20)}
+
+
+def test_copies_of_runs_with_other_seeds_have_other_seeds() -> None:
+    runs = (0, 1, 2, 3, 2**63 - 2, 2**63 - 1)
+    found = [seeds_of_fleet(seed, ["a", "b", "a", "a", "b"]) for seed in runs]
+    for seed, seeds in zip(runs, found, strict=True):
+        assert seeds.dtype == np.int64
+        assert seeds.min() >= 0
+        assert seeds.tolist() == [seed, seed, seeds[2], seeds[3], seeds[2]]
+        assert seeds_of_fleet(seed, ["a", "a"]).tolist() == [seed, seeds[2]]
+    assert len(set(np.ravel(found).tolist())) == 3 * len(runs)
 
 
 @pytest.mark.parametrize("high_h", [30.0, 30000.0])

@@ -21,6 +21,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
+from sdc_taichi.sim.events import seeds_of_fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64
 from test_transients import assert_same, part_of, run
@@ -598,7 +599,8 @@ def test_data_centers_of_one_name_meet_events_of_their_own() -> None:
             assert state.seed.tolist() == (seeds if len(configs) == 4 else [seed])
             return list(np.array(steps).T)
 
-    seeds = [3, 4, 3, 5]
+    seeds = seeds_of_fleet(3, ["tiny", "tiny", "other", "tiny"]).tolist()
+    assert seeds[0] == seeds[2] == 3
     fleet = [config, config, other, config]
     found = supplied(fleet, 3)
     assert len({each.tobytes() for each in found}) == 4

@@ -46,10 +46,10 @@ class ActionDecoder:
         decided = {agent: options.commands_of(agent) for agent in self._agents}
         self.commands = tuple(name for names in decided.values() for name in names)
         _check_models(fleet, self.commands)
-        units = equal_number(fleet.unit_offsets, "CRAC units; hvac.crac.units")
+        units = equal_number(fleet.unit_offsets, "CRAC units (hvac.crac.units)")
         widths = {"cooling": units, "fan": units}
         if "placement" in self.commands:
-            widths["placement"] = equal_number(fleet.rack_offsets, "racks, which")
+            widths["placement"] = equal_number(fleet.rack_offsets, "racks")
         self._columns: dict[str, tuple[tuple[str, slice | None], ...]] = {
             agent: _columns(names, widths) for agent, names in decided.items()
         }
@@ -153,7 +153,8 @@ def equal_number(offsets: npt.NDArray[np.integer], what: str) -> int:
     numbers = np.diff(offsets)
     if np.any(numbers != numbers[0]):
         raise ConfigError(
-            f"environments of one batch have the same number of {what} is {numbers.tolist()[:8]}"
+            f"environments of one batch need the same number of {what}; "
+            f"it is {numbers.tolist()[:8]}"
         )
     return int(numbers[0])
 

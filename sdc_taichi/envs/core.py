@@ -1,4 +1,4 @@
-"""Episodes of many data centers at once, which all environments cover thinly.
+"""Episodes of many data centers at once; the environments are thin wrappers around them.
 
 A step decodes actions, lets a named controller play the agents that do not learn, advances the
 simulator, and takes rewards and observations from the view after the step. Arrays have the
@@ -34,6 +34,7 @@ from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError, whole_nu
 from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.fleet_configs import MOST_DCS
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F32, F64, I64, Actions, State, StepResult
@@ -41,9 +42,6 @@ from sdc_taichi.types import F32, F64, I64, Actions, State, StepResult
 Observation = F32 | dict[str, F32]
 """Observations, (B, n), or with the heat map a dict of ``features`` (B, n) and ``heat_map`` (B,
 rows, racks per row, channels)."""
-
-MOST_ENVS = 10_000_000
-"""Most environments of a batch, more than any memory holds."""
 
 
 @dataclass(slots=True)
@@ -169,6 +167,19 @@ class Core:
         self._final_terms: dict[str, F64] = {}
         self._keys: I64 = np.zeros(size, dtype=np.int64)
         self._closed = False
+
+    def end_after(self, steps: int) -> None:
+        """End episodes after fewer steps than their days have.
+
+        Args:
+            steps: number of steps of an episode.
+
+        Raises:
+            ConfigError: an event that would start after the end.
+        """
+        fleet = self.sim.fleet
+        require_events_start_before(steps / fleet.steps_per_hour, fleet.configs, "the episode")
+        self.steps = steps
 
     def reset(self, seed: Seed = None, start_day: Any = None) -> dict[str, Observation]:
         """Start an episode in all environments.
@@ -382,7 +393,7 @@ class Core:
             return
         self._closed = True
         self.sim.close()
-        self._view = self._view_after = self._last = self._inputs = None
+        self._view = self._view_after = self._last = None
         self._final_terms = {}
         del self._observer, self._rewards, self._others, self._decoder, self._inputs
 
@@ -414,7 +425,7 @@ class Core:
 
 def _checked_size(num_envs: Any, configs: int) -> int:
     """Number of environments, one for each config at least."""
-    size = whole_number("num_envs", configs if num_envs is None else num_envs, 1, MOST_ENVS)
+    size = whole_number("num_envs", configs if num_envs is None else num_envs, 1, MOST_DCS)
     if size < configs:
         raise ConfigError(f"num_envs {size}: valid is at least {configs}, one for each config")
     return size

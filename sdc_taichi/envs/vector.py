@@ -33,7 +33,7 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
 
     Gives what Gymnasium's ``SyncVectorEnv`` gives for single environments. All episodes have the
     same length and end, by truncation, in the same step. The step after that starts the next ones:
-    it ignores its actions and returns first observations, rewards of 0 and ``start_day``.
+    it ignores its actions and returns first observations, rewards of 0 and the infos of ``reset``.
 
     Args:
         num_envs: number of environments.
@@ -87,7 +87,7 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
             config, overrides, options, keywords, only_agent=agent
         )
         self.core = RecordingCore(configs, chosen, num_envs, precision, recorder)
-        self.core.steps = check_steps(max_episode_steps, self.core)
+        self.core.end_after(check_steps(max_episode_steps, self.core))
         self.num_envs = num_envs = self.core.num_envs
         self.render_mode = render_mode
         self.metadata = _METADATA | {"autoreset_mode": self._mode}
@@ -266,9 +266,8 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
             every (B,) quantity of ``StepResult`` of this step and its costs by name. In mode
             ``SameStep`` the step that ends episodes adds ``final_obs`` (by agent),
             ``final_state``, and ``start_day`` of the next ones, to which the observations belong
-            then. In mode
-            ``NextStep`` the step after it ignores its actions: observations are those of ``reset``,
-            rewards are 0, and infos have ``start_day`` alone.
+            then. In mode ``NextStep`` the step after it ignores its actions: observations and infos
+            are those of ``reset``, and rewards are 0.
 
         Raises:
             SdcError: actions that are missing, too many, or outside their space.

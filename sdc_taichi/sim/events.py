@@ -8,6 +8,7 @@ than it lasts, by one step on average.
 from __future__ import annotations
 
 import zlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import get_args
@@ -271,7 +272,7 @@ def schedule(
     overlap, shares multiply, offsets add, and a unit is down as long as any of them has it down.
 
     Args:
-        configs: data centers, B of them, with names that differ.
+        configs: data centers, B of them.
         rack_offsets: first rack of each data center and their total, (B + 1,).
         unit_offsets: first CRAC unit of each data center and their total, (B + 1,).
         steps_per_hour: steps per hour.
@@ -306,6 +307,27 @@ def schedule(
     )
 
 
+def seeds_of_fleet(seed: int, names: Sequence[str]) -> I64:
+    """Seeds of the data centers of a fleet, of which no two meet the same events, (B,).
+
+    The first data center of each name takes the seed itself, as one alone does. Copies, which share
+    its name, take numbers of NumPy's ``SeedSequence(seed)`` in turn, so that their seeds are not
+    those of runs with seeds close by.
+
+    Args:
+        seed: seed of the run, 0..2**63 - 1.
+        names: names of the data centers, B of them.
+    """
+    seen = Counter[str]()
+    copies = []
+    for name in names:
+        copies.append(seen[name])
+        seen[name] += 1
+    # A sequence of any length starts with the same numbers; halved, they are valid seeds.
+    drawn = np.random.SeedSequence(seed).generate_state(max(copies), np.uint64) >> 1
+    return np.concatenate([[seed], drawn.astype(np.int64)])[copies]
+
+
 def require_events_start_before(
     end_h: float, configs: Sequence[DataCenterConfig], what: str = "the run"
 ) -> None:
@@ -324,7 +346,7 @@ def require_events_start_before(
             if event.start_h >= end_h:
                 raise ConfigError(
                     f"{config.name}: events.scheduled.{index}.start_h {event.start_h:g}: {what} "
-                    f"ends after {end_h:g} h; valid is an earlier start or more days"
+                    f"ends after {end_h:g} h; valid is an earlier start or a later end"
                 )
 
 

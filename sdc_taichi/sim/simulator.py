@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from operator import itemgetter
@@ -19,7 +18,7 @@ from sdc_taichi.sim.actions import ActionDecoder, Commands
 from sdc_taichi.sim.air import SteadyAir, TransientAir
 from sdc_taichi.sim.crac_units import CracUnits, Supply
 from sdc_taichi.sim.drivers import Drivers, load_drivers
-from sdc_taichi.sim.events import ActiveEvent, schedule
+from sdc_taichi.sim.events import ActiveEvent, schedule, seeds_of_fleet
 from sdc_taichi.sim.facility import Facility
 from sdc_taichi.sim.facility_stage import FacilityStage
 from sdc_taichi.sim.fleet import Fleet, build_fleet
@@ -124,8 +123,8 @@ class Simulator:
         Args:
             seed: Decides the sampled events, an integer of 0..2**63 - 1, or one for each data
                 center; None is 0. Data centers of different names meet different events with one
-                seed; of those that share a name, the first takes an integer as it is, the second
-                the next one, and so on. The stages are deterministic.
+                seed; of those that share a name, the first takes an integer as it is, the others
+                seeds that are drawn from it. The stages are deterministic.
             start: Index of the first step in the year, 0..``LAST_START``, (B,); None is the start
                 of the drivers.
             drivers: Inputs from here on; None keeps those that there are. Devices stay as they were
@@ -356,19 +355,14 @@ class Simulator:
         """Seeds of the data centers, (B,)."""
         listed: list[Any] = np.ravel(given).tolist() if np.ndim(given) else [given]
         whole = all(isinstance(x, int | np.integer) and not isinstance(x, bool) for x in listed)
-        if whole and not np.ndim(given):
-            # Streams of events are told apart by seed and name.
-            names, seen = self.fleet.names, Counter[str]()
-            listed = [listed[0]] * len(names)
-            if len(set(names)) < len(names):
-                for i, name in enumerate(names):
-                    listed[i] += seen[name]
-                    seen[name] += 1
-        if len(listed) != self.size or not whole or not all(0 <= x < 2**63 for x in listed):
+        expected = self.size if np.ndim(given) else 1
+        if len(listed) != expected or not whole or not all(0 <= x < 2**63 for x in listed):
             raise ConfigError(
                 f"seed {given!r}: valid is an integer of 0..2**63 - 1, or one for each of "
                 f"{self.size} data centers"
             )
+        if not np.ndim(given):
+            return seeds_of_fleet(int(listed[0]), self.fleet.names)
         return np.array(listed, dtype=np.int64)
 
 
