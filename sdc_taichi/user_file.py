@@ -32,7 +32,6 @@ MOST_MATRIX_BYTES = 2 << 30
 MOST_METRICS_BYTES = 1 << 30
 """Largest metrics.json, in bytes: 10 kB for each of 100,000 data centers."""
 _HEADER_BYTES = 1 << 16
-_MOST_REASON_LENGTH = 200
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a pipe"),
@@ -120,23 +119,28 @@ def decoding(
     except MemoryError as failed:
         raise error(f"{path}: cannot be read as {content}: not enough memory") from failed
     except Exception as failed:
-        raise error(f"{path}: cannot be read as {content}: {_reason(failed)}") from failed
+        reason = str(failed) or type(failed).__name__
+        raise error(f"{path}: cannot be read as {content}: {reason}") from failed
 
 
 def read_bytes(
-    path: str | os.PathLike[str], most_bytes: float, error: type[SdcError] = SdcError
+    path: str | os.PathLike[str], most_bytes: int, error: type[SdcError] = SdcError
 ) -> bytes:
     """Content of a file.
 
     Raises:
-        SdcError: of class ``error``, as of ``open_input``.
+        SdcError: of class ``error``, as of ``open_input``, or the file holds more than it said, as
+            one that grows does.
     """
     with open_input(path, most_bytes, error) as file:
-        return file.read()
+        content = file.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise error(f"{path}: has more than {most_bytes / 1e6:,.1f} MB, the most that is valid")
+    return content
 
 
 def read_text(
-    path: str | os.PathLike[str], most_bytes: float, error: type[SdcError] = SdcError
+    path: str | os.PathLike[str], most_bytes: int, error: type[SdcError] = SdcError
 ) -> str:
     """Text of a UTF-8 file, with or without a byte-order mark.
 
@@ -225,9 +229,3 @@ class ArrayFile:
         if dtype.hasobject or any(n < 0 for n in shape):
             raise self._error(f"{self._path}: {name} is {dtype} {shape}; valid are numbers")
         return shape, dtype
-
-
-def _reason(failed: Exception) -> str:
-    """What an error says, on one line of limited length."""
-    text = " ".join(str(failed).split()) or type(failed).__name__
-    return text if len(text) <= _MOST_REASON_LENGTH else text[:_MOST_REASON_LENGTH] + "…"

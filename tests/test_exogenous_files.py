@@ -343,7 +343,9 @@ def test_columns_by_other_names(tmp_path: Path) -> None:
     assert "cpu [1] read as cpu_load" in series.notes
     with pytest.raises(DataError, match="missing column load; found"):
         read_workload(path, columns={"cpu_load": "load"})
-    with pytest.raises(DataError, match="expected each column once"):
+    with pytest.raises(
+        DataError, match="expected each column once, and no name that another column"
+    ):
         read_workload(path, columns={"timestamp": "cpu_load", "cpu_load": "cpu_load"})
 
 

@@ -229,6 +229,7 @@ def test_archives_that_are_damaged_encrypted_or_larger_than_they_seem(tmp_path: 
         ("0,0,0,0,0,0\n0,0\n", "line 2: 2 numbers; valid are 6, as above"),
         ("0,0,0,0,0,\xff\n", "cannot be read as a matrix: .*utf-8.*0xff"),
         ("", r"R has shape \(0, 1\), expected \(6, 6\)"),
+        (" \n \t # note\n0,0,0,0,0,0 # racks\n   \n", r"R has shape \(1, 6\), expected \(6, 6\)"),
         ("0,0,nan,0,0,0\n" * 6, r"R\[0, 2\] is nan; valid is a finite number"),
     ],
 )

@@ -6,13 +6,14 @@ import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from sdc_taichi.config import load_config, load_json, load_yaml
-from sdc_taichi.errors import DataError, SdcError
+from sdc_taichi.errors import MOST_CHARACTERS, DataError, SdcError
 from sdc_taichi.exogenous import read_carbon, read_epw, read_workload
 from sdc_taichi.exogenous.importing import file_kind
 from sdc_taichi.number_text import parse_number, parse_whole
@@ -88,6 +89,19 @@ def test_a_snapshot_that_is_larger_than_its_file_is_not_read(tmp_path: Path) -> 
         snapshot.read(path)
 
 
+def test_a_file_that_holds_more_than_it_says_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, empty = tmp_path / "a.yaml", tmp_path / "empty.yaml"
+    path.write_bytes(b"x" * 101)
+    empty.touch()
+    status = os.stat(empty)
+    monkeypatch.setattr("sdc_taichi.user_file.os", SimpleNamespace(stat=lambda path: status))
+    with pytest.raises(DataError, match=r"a\.yaml: has more than 0\.0 MB, the most that is valid"):
+        read_text(path, 100, DataError)
+    assert read_text(path, 101) == "x" * 101
+
+
 def test_a_byte_order_mark_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     path.write_bytes(b"\xef\xbb\xbfa: 1")
@@ -102,7 +116,7 @@ def test_errors_are_of_one_class_and_keep_their_cause(tmp_path: Path) -> None:
         with pytest.raises(DataError) as caught, decoding("a", "a table", DataError):
             raise failed
         assert str(caught.value).startswith("a: cannot be read as a table: ")
-        assert len(str(caught.value)) < 300
+        assert len(str(caught.value)) < MOST_CHARACTERS + 10
     with pytest.raises(SdcError, match="as it is"), decoding("a", "a table", DataError):
         raise SdcError("as it is")
 
@@ -134,6 +148,46 @@ def test_numbers_of_yaml_are_decimal() -> None:
     values = load_yaml("[1, -1.5, 1.0e-3, .inf, 1:30, 1:30.5, 017, 0x1f, 1_000, 2001-02-03, 1e3]")
     rest = ["1:30", "1:30.5", 17, "0x1f", "1_000", "2001-02-03", "1e3"]
     assert values == [1, -1.5, 0.001, np.inf, *rest]
+
+
+def test_a_merge_key_is_a_key_like_any_other() -> None:
+    rows = "a: &a {k: 1}\nb: {<<: *a, k: 2}\nc: ="
+    assert load_yaml(rows) == {"a": {"k": 1}, "b": {"<<": {"k": 1}, "k": 2}, "c": "="}
+    bomb = "a0: &a0 {k: 1}\n" + "".join(
+        f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 10)}]}}\n" for i in range(1, 10)
+    )
+    for text in (bomb, bomb.replace("<<", "!!merge m")):
+        with pytest.raises(ValueError, match=r"repetitions of anchors|tag:yaml\.org,2002:merge"):
+            load_yaml(text)
+
+
+@pytest.mark.parametrize("node", ["x", "''", "[1]", "{a: 1}"])
+def test_a_tag_of_another_kind_of_node_is_refused(node: str) -> None:
+    kinds = {"map": "{", "seq": "["}
+    for tag in ("null", "bool", "int", "float", "str", "map", "seq", "merge", "value"):
+        if tag in ("null", "str") and node[0] not in "[{":
+            continue
+        if kinds.get(tag) == node[0]:
+            assert load_yaml(f"!!{tag} {node}") == load_yaml(node)
+            continue
+        with pytest.raises(SdcError, match=r"override .hvac=!!.* is no YAML value \("):
+            load_config("tiny", [f"hvac=!!{tag} {node}"])
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["hall.rows=1_000", "hall.supply_approach_k=['1_0', 2, 3, 4]", "hall.racks_per_row='١٢'",
+     "hvac.chiller.reference_cop='1_0'", "site.seed=1_0", "hall.capacity_mw=1e999"],
+)  # fmt: skip
+def test_texts_of_fields_of_numbers(override: str) -> None:
+    path = override.partition("=")[0]
+    with pytest.raises(SdcError, match=f"{path}: should be a finite decimal number, such as"):
+        load_config("tiny", [override])
+
+
+def test_texts_that_are_numbers_are_taken() -> None:
+    config = load_config("tiny", ["hvac.chiller.reference_cop='5.5'", "name=1_000"])
+    assert (config.hvac.chiller.reference_cop, config.name) == (5.5, "1_000")
 
 
 @pytest.mark.parametrize("text", ["²", "0", "1_0", "١", "99999", "-1", "1.0"])

@@ -7,11 +7,12 @@ is taken. A type below says why; a field with bounds of its own says so in its d
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C
+from sdc_taichi.number_text import parse_number
 
 Share = Annotated[float, Field(ge=0, le=1)]
 """A share, 0..1."""
@@ -78,11 +79,16 @@ class Section(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _truth_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
-        # Python takes True for 1.
+    def _check_numbers(cls, value: Any, info: ValidationInfo) -> Any:
+        # Python takes True for 1, and pydantic the text 1_000 for a thousand.
         assert info.field_name is not None
-        if cls.model_fields[info.field_name].annotation is not bool and _has_truth(value):
+        kind = cls.model_fields[info.field_name].annotation
+        if kind is bool:
+            return value
+        if _has_truth(value):
             raise ValueError("should be a number or text, not true or false")
+        if _has_odd_number(value) and not _takes_text(kind):
+            raise ValueError("should be a finite decimal number, such as 1000 or 1.5e-3")
         return value
 
 
@@ -91,6 +97,30 @@ def _has_truth(value: Any) -> bool:
     if isinstance(value, list | tuple):
         return any(map(_has_truth, value))
     return isinstance(value, bool)
+
+
+def _has_odd_number(value: Any) -> bool:
+    """Whether a value is a text that Python alone reads as a number, or a list that holds one."""
+    if isinstance(value, list | tuple):
+        return any(map(_has_odd_number, value))
+    if not isinstance(value, str):
+        return False
+    try:
+        float(value)
+    except ValueError:
+        return False
+    try:
+        parse_number(value)
+    except ValueError:
+        return True
+    return False
+
+
+def _takes_text(kind: Any) -> bool:
+    """Whether a type is of texts, of names of choices, or has a part that is."""
+    if isinstance(kind, str) or (isinstance(kind, type) and issubclass(kind, str)):
+        return True
+    return any(map(_takes_text, get_args(kind)))
 
 
 def check_ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:

@@ -1,7 +1,8 @@
 """Plain values of YAML and JSON texts: mappings, lists, texts, numbers, booleans and nothing.
 
 Both formats allow more than a configuration has a use for. Here a key is given once, and a number
-is decimal: YAML 1.1 also reads ``1:30`` as 90 and ``017`` as 15.
+is decimal: YAML 1.1 also reads ``1:30`` as 90 and ``017`` as 15. Its merge key ``<<``, by which a
+few lines make millions of keys, is a key like any other.
 """
 
 from __future__ import annotations
@@ -31,8 +32,7 @@ def load_yaml(text: str) -> Any:
     """The plain values that a YAML text holds.
 
     Raises:
-        ValueError: not valid, a key given twice, or too many values; says on one line what is
-            wrong.
+        ValueError: not valid, a key given twice, or too many values; says what is wrong.
     """
     try:
         values = yaml.load(text, _Loader)
@@ -40,7 +40,7 @@ def load_yaml(text: str) -> Any:
     except RecursionError:
         raise ValueError("nested too deeply") from None
     except (yaml.YAMLError, ValueError) as error:
-        raise ValueError(" ".join(str(error).split())) from None
+        raise ValueError(str(error)) from None
     if count > MOST_VALUES:
         raise ValueError(
             f"{count:,} values, repetitions of anchors counted; valid is at most {MOST_VALUES:,}"
@@ -52,8 +52,8 @@ def load_json(text: str) -> Any:
     """The plain values that a JSON text holds.
 
     Raises:
-        ValueError: not valid, a key given twice, or a number that is not finite; says on one line
-            what is wrong.
+        ValueError: not valid, a key given twice, or a number that is not finite; says what is
+            wrong.
     """
     try:
         return json.loads(
@@ -74,12 +74,17 @@ class _Loader(yaml.SafeLoader):
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        if not isinstance(node, yaml.MappingNode):
+            raise _not_valid("expected a mapping", node)
         seen = set()
         for key in [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]:
             if key.value in seen:
                 raise _not_valid(f"{shortened(key.value)} is given twice", key)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Leave a mapping as it is, even where a key has the tag of merge keys."""
 
     def construct_yaml_bool(self, node: yaml.ScalarNode) -> bool:
         text = self.construct_scalar(node)
@@ -110,10 +115,9 @@ def _set_plain_tags() -> None:
     _Loader.yaml_constructors = {
         tag: getattr(_Loader, f"construct_yaml_{name}") for tag, name in tags.items()
     } | {None: yaml.SafeLoader.construct_undefined}
-    others = ("int", "float", "timestamp")
-    left_out = [f"tag:yaml.org,2002:{name}" for name in others]
+    kept = [f"tag:yaml.org,2002:{name}" for name in ("null", "bool")]
     _Loader.yaml_implicit_resolvers = {
-        first: [(tag, pattern) for tag, pattern in found if tag not in left_out]
+        first: [(tag, pattern) for tag, pattern in found if tag in kept]
         for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
     for name, pattern in (("int", _WHOLE), ("float", _NUMBER)):

@@ -112,8 +112,8 @@ def _renamed(path: Path, frame: pd.DataFrame, columns: Mapping[str, str]) -> pd.
     taken = [name for name, own in columns.items() if name in frame.columns and name != own]
     if taken or len(set(columns.values())) < len(columns):
         raise DataError(
-            f"{path}: columns {dict(columns)}: expected each column once, and none that the file "
-            f"names so itself"
+            f"{path}: columns {dict(columns)}: expected each column once, and no name that "
+            f"another column of the file has"
         )
     frame = frame.rename(columns={own: name for name, own in columns.items()})
     return frame[sorted(frame.columns, key=lambda name: name != "timestamp")]

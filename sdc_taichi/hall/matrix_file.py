@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -154,11 +154,20 @@ def _read_csv(path: Path, file: BinaryIO) -> F64:
         # Of a file without numbers, whose shape says so.
         warnings.simplefilter("ignore", UserWarning)
         try:
-            return np.loadtxt(text, delimiter=",", ndmin=2, dtype=np.float64)
+            rows = (row for _, row in _rows(text))
+            return np.loadtxt(rows, delimiter=",", comments=None, ndmin=2, dtype=np.float64)
         except ValueError:
             text.seek(0)
             _check_lines(path, text)
             raise
+
+
+def _rows(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
+    """Number of each line that is neither blank nor a comment, from 1, and its text."""
+    for number, line in enumerate(lines, start=1):
+        text = line.partition("#")[0].strip()
+        if text:
+            yield number, text
 
 
 def _check_lines(path: Path, lines: Iterable[str]) -> None:
@@ -168,11 +177,8 @@ def _check_lines(path: Path, lines: Iterable[str]) -> None:
         ConfigError: naming the line and what is wrong with it.
     """
     width = 0
-    for number, line in enumerate(lines, start=1):
-        text = line.split("#")[0].strip()
-        if not text:
-            continue
-        cells = text.split(",")
+    for number, row in _rows(lines):
+        cells = row.split(",")
         for cell in cells:
             try:
                 parse_number(cell)

@@ -17,12 +17,19 @@ SCALARS = (
 )  # fmt: skip
 """Texts that stand where a value is expected."""
 
+_TAGGED = [
+    f"!!{tag} {node}"
+    for tag in ("null", "bool", "int", "float", "str", "seq", "map", "merge", "value")
+    for node in ("x", "''", "[1]", "{a: 1}")
+]
 YAML_VALUES = (
+    *_TAGGED,
     ".nan", ".inf", "-.inf", "~", "''", "[]", "{}", "[[]]", "[1, [2, [3]]]", "{a: 1}", "[null]",
     "!!bool abc", "!!timestamp abc", "!!float x", "!!int ''", "!!binary '#'", "!!set {a, b}",
     "!!omap [a: 1]", "!!python/object/apply:os.abort []", "!!python/name:os.system", "!x y",
     "&a [*a]", "&a {b: *a}", "*nowhere", '"\\e[31m\\a\\0"', '"\\u202E"', '"\\ud800"', "|", "? ",
     "'open", "@", "`", "{int: 1, float: 2, 'a[b': 3}", "{1: 2}", "{[1]: 2}", "{a: 1, a: 2}",
+    "{<<: {a: 1}}", "{!!merge m: [{a: 1}]}", "{!!value v: 1}", "=", "1_000", "'1_0'", "'١'",
     "[" * 3000 + "]" * 3000, "{a: " * 300 + "1" + "}" * 300, "[" + "1, " * 20_000 + "1]",
 )  # fmt: skip
 """YAML that stands where a value is expected."""
