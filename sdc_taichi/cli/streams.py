@@ -6,7 +6,7 @@ import errno
 import io
 import os
 import sys
-from typing import IO, TextIO
+from typing import IO, Any, TextIO
 
 
 class _Stream(io.FileIO):
@@ -31,11 +31,14 @@ def guard_streams() -> None:
         if os.name == "nt" and stream.isatty():  # consoles of Windows are no files
             continue
         raw = _Stream(stream.fileno(), "w", closefd=False)
+        # As Python does it, which writes at once where PYTHONUNBUFFERED is set.
+        buffer: Any = raw if stream.write_through else io.BufferedWriter(raw)
         guarded = io.TextIOWrapper(
-            io.BufferedWriter(raw),
+            buffer,
             encoding=stream.encoding,
             errors="backslashreplace",
             line_buffering=stream.line_buffering,
+            write_through=stream.write_through,
         )
         setattr(sys, name, guarded)
         # Taichi takes another one for that of a notebook.
@@ -56,4 +59,5 @@ def output_failure() -> str | None:
 
 def _raw(stream: TextIO) -> IO[bytes] | None:
     """The file below a text stream, if there is one."""
-    return getattr(getattr(stream, "buffer", None), "raw", None)
+    buffer = getattr(stream, "buffer", None)
+    return getattr(buffer, "raw", buffer)
