@@ -58,8 +58,8 @@ class FileClaim:
                 opened = self._part.open("wb")
         if opened is None:
             raise SdcError(
-                f"{path}: another process is writing it; valid is another name, or to wait until "
-                "it has ended"
+                f"{path}: another run is writing it; valid is another name, or to wait until it "
+                "has ended"
             )
         self.file: IO[bytes] = opened
         """The hidden file, empty and open for writing."""

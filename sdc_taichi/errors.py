@@ -43,8 +43,8 @@ class SdcError(ValueError):
     """Base of all errors caused by input; the command line prints them without a traceback.
 
     Args:
-        message: what was found where, and what would be valid; kept as ``one_line`` makes it. An
-            error in its place, as Gymnasium hands one on from a worker process, is its message.
+        message: what was found where, and what would be valid; kept as ``one_line`` makes it. Or
+            an error, whose text is taken: Gymnasium rebuilds errors of worker processes so.
     """
 
     def __init__(self, message: object) -> None:
@@ -60,7 +60,7 @@ class DataError(SdcError):
 
 
 class PhysicalLimitError(SdcError):
-    """A result lies beyond what any data center can reach, as an input of no sense leads to."""
+    """A result is beyond what any data center can reach, which points to a meaningless input."""
 
 
 class RuntimeStateError(SdcError):

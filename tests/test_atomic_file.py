@@ -66,7 +66,7 @@ def test_a_file_is_written_by_one_at_a_time(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     with AtomicFile(path) as first:
         first.file.write(b"first")
-        with pytest.raises(SdcError, match=r"a\.txt: another process is writing it; valid is"):
+        with pytest.raises(SdcError, match=r"a\.txt: another run is writing it; valid is"):
             AtomicFile(path)
         first.commit()
     with AtomicFile(path) as second:

@@ -610,7 +610,7 @@ def test_a_second_run_into_a_folder_is_refused_and_leaves_the_first_alone(tmp_pa
         recorder.begin(sim)
         controller = make_controller("idle", sim.fleet)
         simulate_to_folder(sim, controller, RunRequest("idle", 4), out, on_step=start_another)
-    end = "another process is writing it; valid is another name, or to wait until it has ended"
+    end = "another run is writing it; valid is another name, or to wait until it has ended"
     assert refused == [f"error: {file}: {end}" for file in (out / "metrics.json", recording)]
     assert names_in(out) == FILES | {"config.yaml"}
     assert names_in(tmp_path) == {"run"}

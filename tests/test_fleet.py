@@ -329,7 +329,7 @@ def test_a_drawn_value_that_is_not_valid_is_an_error() -> None:
 
 @pytest.mark.parametrize("count", [0, -3])
 def test_a_fleet_has_at_least_one(count: int) -> None:
-    with pytest.raises(ConfigError, match=f"fleet: {count} data centers; valid is at least 1"):
+    with pytest.raises(ConfigError, match=f"fleet: count {count}: valid is a whole number of 1"):
         make_configs(TINY, count=count)
 
 

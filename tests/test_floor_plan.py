@@ -14,7 +14,7 @@ from sdc_taichi import SdcError, load_config
 from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
 from sdc_taichi.viz.floor_plan_figure import floor_plan_figure
 
-WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[400, 40]"]
+WIDE = ["hall.supply_approach_k=5.15", "hall.return_approach_k=-3.1", "servers.power_w=[250, 25]"]
 HALLS = {
     "tiny": ("tiny", []),
     "paper": ("corrected", ["hvac.crac.units=4", "hall.layout.returns=end_wall"]),

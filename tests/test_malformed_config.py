@@ -197,6 +197,7 @@ def test_what_is_too_long_for_the_name_of_a_file_is_an_override() -> None:
         ("servers.groups=[[]]", ["servers.groups rack 0 is empty"]),
         ("servers.groups.1.1.load_weight=20", ["servers.groups rack 1: load_weight 20"]),
         ("servers.inlet_range_c=[28, 16]", ["servers.inlet_range_c", "low < high"]),
+        ("servers.inlet_range_c=[1, 2]", ["servers.inlet_range_c", "at least 5 K apart"]),
         ("hvac.chiller.model=york", ["hvac.chiller.model", "eir_york", "'york'"]),
         ("hvac.total_of=[chiler]", ["hvac.total_of.0", "'chiller'", "'chiler'"]),
         ("hvac.setpoint.min_c=30", ["hvac.setpoint", "initial_c 18", "min_c 30"]),

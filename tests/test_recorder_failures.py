@@ -363,7 +363,7 @@ def test_viewer_is_served_to_browsers_of_this_machine(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["view", "none.rrd"], "none.rrd: cannot be read"),
+        (["view", "none.rrd"], "none.rrd: no such file"),
         (["view", __file__], "no Rerun recording"),
         (["view", "x.rrd", "--port", "80"], "--port: given without --web"),
         (["view", "rerun+http://127.0.0.1:1/proxy"], "nothing listens there"),

@@ -16,10 +16,10 @@ from pathlib import Path
 from sdc_taichi.errors import RuntimeStateError, SdcWarning
 
 CACHE_VARIABLE = "TI_OFFLINE_CACHE_FILE_PATH"
-"""Variable by which users of Taichi name the folder of compiled kernels, here too."""
+"""Environment variable that names Taichi's folder of compiled kernels; obeyed here too."""
 LOCK_S = 60.0
-"""Age at which a lock of the folder is one that a killed process left; Taichi holds it for
-milliseconds, in s."""
+"""Age, in s, from which a lock of the folder is one that a killed process left; Taichi holds it for
+milliseconds."""
 _LOCK, _INDEX = "ticache.lock", "ticache.tcb"
 _OWN = {"ENABLE_TAICHI_HEADER_PRINT": "False", "TI_SKIP_VERSION_CHECK": "ON"}
 # Layout of the index of Taichi 1.7.4: length of the file, version, sum of sizes and number of
@@ -55,7 +55,7 @@ def taichi_environment() -> Iterator[None]:
 def kernel_folder() -> Path:
     """Folder in which Taichi keeps compiled kernels, fit to be used.
 
-    It is the one of all programs of Taichi, or that of ``CACHE_VARIABLE``. Where none can be
+    On Linux it is that of all programs of Taichi, or that of ``CACHE_VARIABLE``. Where none can be
     written, it is a temporary one, which is deleted at exit, with a ``KernelCacheWarning``.
 
     Raises:

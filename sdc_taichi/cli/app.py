@@ -62,8 +62,8 @@ app.command("simulate")(simulate_command)
 
 def main() -> None:
     """Run the command line of this process, and exit."""
-    guard_streams()
     try:
+        guard_streams()
         app()
     except KeyboardInterrupt:  # commands being put together, or the last line being printed
         sys.exit(EXIT_INTERRUPTED)

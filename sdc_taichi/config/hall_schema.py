@@ -28,6 +28,9 @@ from sdc_taichi.plant.servers import ServerCurves, linear_curve
 
 MOST_RACKS = 10_000_000
 """Largest number of racks of a hall."""
+LEAST_INLET_RANGE_K = 5.0
+"""Least difference of the two inlets between which curves of servers are given, in K: fans run over
+some 10 K, and over 1 K they would do a hundred times their power a few degrees beyond it."""
 RackCount = Annotated[int, Field(ge=1, le=MOST_RACKS)]
 """A number of rows or racks, 1..10,000,000."""
 PowerPair = tuple[ServerW, IdleW]
@@ -226,7 +229,8 @@ class ServerConfig(Section):
     """Addition to the slope of CPU power over full power against the inlet, in 1/K, -1..1: a kelvin
     changes no server's power by more than that at full load."""
     inlet_range_c: tuple[AirC, AirC] = (16.0, 28.0)
-    """Coldest and warmest inlet, between which the curves are given, in C."""
+    """Coldest and warmest inlet, between which the curves are given, in C; at least 5 K apart, as
+    the curves go on as straight lines beyond both."""
     curve_limit_c: AirC | None = 45.0
     """Inlet above which power and airflow no longer rise (upper limit of ASHRAE class A4), in C;
     without a limit, None, a room that cannot be cooled draws ever more power."""
@@ -313,6 +317,15 @@ class ServerConfig(Section):
     @classmethod
     def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
         return check_ordered(value)
+
+    @field_validator("inlet_range_c")
+    @classmethod
+    def _wide_enough(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[1] - value[0] < LEAST_INLET_RANGE_K:
+            raise ValueError(
+                f"({value[0]:g}, {value[1]:g}) must be at least {LEAST_INLET_RANGE_K:g} K apart"
+            )
+        return value
 
     @model_validator(mode="after")
     def _idle_below_full(self) -> Self:

@@ -37,7 +37,7 @@ class SetpointConfig(Section):
     initial_c: AirC = 18.0
     """Setpoint after a reset, in C."""
     step_k: Annotated[float, Field(ge=0.001, le=50)] = 1.0
-    """Change of the setpoint by one action, in K, 0.001..50: from less than any sensor tells to
+    """Change of the setpoint by one action, in K, 0.001..50: from less than any sensor resolves to
     more than any range of setpoints."""
 
     @model_validator(mode="after")
@@ -71,7 +71,7 @@ class CracConfig(Section):
     """Lowest airflow of a running unit over its design airflow, 0.01..1."""
     fan_step: Annotated[float, Field(ge=0.001, le=1)] = 0.05
     """Change of fan speed over design speed by one action, for flow model ``controlled``, 0.001..1:
-    from less than any drive tells to the whole range."""
+    from less than any drive resolves to the whole range."""
     coasting_flow_ratio: WorkingShare = 0.1
     """Airflow through a unit that is down over its design airflow, 0.01..1: as much leaks through
     closed dampers."""
@@ -167,7 +167,7 @@ class WaterConfig(Section):
     """How evaporation, drift and blowdown of the tower are computed."""
     cycles_of_concentration: Annotated[float, Field(ge=1.01, le=1000)] = 5.0
     """Concentration of solids in the tower water over that in the make-up water, 1.01..1,000:
-    blowdown is 100 evaporations at the lower end, and of rain water a thousandth at the upper."""
+    blowdown is 100 times the evaporation at the lower end and a thousandth of it at the upper."""
     drift_share: Annotated[float, Field(ge=0, le=0.01)] = 2e-5
     """Drift over the water flow of the tower, 0..0.01; towers without drift eliminators lose up to
     0.003."""

@@ -31,7 +31,8 @@ def fields_markdown() -> str:
     tables = [_table(name, model) for name, model in _sections("", DataCenterConfig)]
     tables += [_table(f"{path}[]", model) for path, model in LISTED.items()]
     reasons = [f"- {text}" for text in _types().values()]
-    return "\n\n".join([*tables, "## Bounds that fields share", "\n".join(reasons)])
+    found = "\n\n".join([*tables, "## Bounds that fields share", "\n".join(reasons)])
+    return found.replace("``", "`")
 
 
 def _sections(path: str, model: type[BaseModel]) -> Iterator[tuple[str, type[BaseModel]]]:
@@ -61,8 +62,8 @@ def _is_section(entry: dict[str, Any]) -> bool:
 def _default(schema: dict[str, Any], name: str) -> str:
     if name in schema.get("required", ()):
         return "required"
-    value = schema["properties"][name].get("default")
-    return "" if value in ("", []) else f"`{json.dumps(value)}`"
+    value = schema["properties"][name].get("default", [])
+    return "" if value == "" else f"`{json.dumps(value)}`"
 
 
 def _valid(entry: dict[str, Any], schema: dict[str, Any]) -> str:

@@ -51,15 +51,15 @@ class BatteryConfig(Section):
     charge_efficiency: WorkingShare = 0.97
     """Energy stored per energy drawn from the bus, 0.01..1."""
     discharge_factor: Annotated[float, Field(ge=1, le=100)] = 1.04
-    """Energy drawn from the store per energy delivered, 1..100, which is no loss to an efficiency
-    of a hundredth."""
+    """Energy drawn from the store per energy delivered, 1..100: from no loss to an efficiency
+    of 1 %."""
     charge_limit_c_rate: CRate = 3.0
     """Largest rate into the store, in capacities per hour (1/h)."""
     discharge_limit_c_rate: CRate = 3.0
     """Largest rate out of the store, in capacities per hour (1/h)."""
     upper_u_h: Annotated[float, Field(ge=-100, le=0)] = -0.04
     """Slope u of the upper limit of the stored energy, u P + v capacity, against the charge power
-    P, in h, -100..0; it is the time for which what is left out would last."""
+    P, in h, -100..0."""
     upper_v: Share = 1.0
     """Share v of the capacity in the upper limit of the stored energy, 0..1."""
     lower_u_h: Annotated[float, Field(ge=0, le=100)] = 0.01

@@ -68,7 +68,7 @@ def simulate_to_folder(
             or the controller gave actions that are not valid.
     """
     sim.fleet.require_distinct_names()
-    has_former_run = prepare_folder(out, force=force)
+    prepare_folder(out, force=force)
     description = describe_run(sim, request)
     configs = configs_yaml(sim.fleet.configs)
     names = ["config.yaml", "configs.yaml"]
@@ -79,6 +79,8 @@ def simulate_to_folder(
     # Open from the first step to the last file, it keeps a second run out of the folder.
     metrics_file = AtomicFile(out / METRICS_FILE)
     with metrics_file, StepsWriter(out / STEPS_FILE, sim, metadata) as writer:
+        # Asked again, as another run may have ended here before the claim.
+        has_former_run = prepare_folder(out, force=force)
 
         def write_step(result: StepResult) -> None:
             writer.add(result)

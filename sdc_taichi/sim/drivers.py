@@ -120,7 +120,11 @@ class Drivers:
         return len(self.start)
 
     def digest(self) -> bytes:
-        """SHA-256 of all series; equal inputs have equal digests, on whatever processor."""
+        """SHA-256 of all series; equal inputs have equal digests.
+
+        Values that differ in the last bits, as on another processor, count as equal unless they
+        round apart.
+        """
         sha = hashlib.sha256()
         for series in (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh, self.demand):
             sha.update(common_digits(series.values))
@@ -148,7 +152,7 @@ class Drivers:
 class InputReader:
     """Reads the inputs of a fleet: those that its configs name, or other years and traces.
 
-    What was read is kept, up to ``MAX_KEPT_BYTES``, what was used last the longest.
+    Inputs are cached up to ``MAX_KEPT_BYTES``; the least recently used go first.
 
     Args:
         configs: data centers, B.

@@ -581,7 +581,7 @@ class Hall:
             racks = self._places.values_of_racks(racks)
         outlets_c = racks[_OUTLET_MAX_ROW]
         self.hottest_outlet_c = float(np.maximum.reduce(outlets_c))
-        # What is no number anywhere in a hall is none in its outlets.
+        # A NaN anywhere in a hall reaches its outlets.
         if not self.hottest_outlet_c < BEYOND_NUMBERS_C:
             raise no_number_error(outlets_c, self._fleet)
         self._was_transient = transient

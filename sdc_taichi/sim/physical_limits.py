@@ -1,7 +1,8 @@
 """Limits that no result of a step leaves in any data center.
 
-They are no design limits: beyond them a hall has burnt, or an input has no sense that the bounds of
-its field could tell. A run ends there, since what follows would be numbers without a meaning.
+They are no design limits: beyond them a hall has burnt, or an input is meaningless in a way that
+the bounds of its field cannot show. A run ends there, since what follows would be
+numbers without a meaning.
 """
 
 from __future__ import annotations

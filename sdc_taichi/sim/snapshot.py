@@ -28,7 +28,8 @@ VERSION = 3
 def fingerprint(fleet: Fleet, drivers: Drivers, precision: str) -> str:
     """SHA-256 of configs, inputs and precision, which tells simulators apart.
 
-    The same on every processor, so that a state may go on on another one.
+    Equal on all processors, so that a state can be continued on another one, unless a value of the
+    inputs rounds apart there.
     """
     digest = hashlib.sha256(precision.encode())
     # Environments of a batch share their configs.
