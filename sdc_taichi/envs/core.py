@@ -55,7 +55,7 @@ class Transition:
     joint_reward: F64
     """Reward of all learning agents as one, (B,)."""
     costs: dict[str, F64]
-    """Costs that the option ``costs`` names: ``cost``, their weighed sum, and ``cost_NAME`` for
+    """Costs that the option ``costs`` names: ``cost``, their weighted sum, and ``cost_NAME`` for
     each, (B,) each; empty without the option."""
     ended: bool
     """Whether the episodes are over; all have the same length."""

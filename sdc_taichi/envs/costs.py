@@ -94,7 +94,7 @@ class Costs:
             )
 
     def of(self, result: StepResult, view: View) -> dict[str, F64]:
-        """Costs of a step: their weighed sum as ``cost``, each as ``cost_NAME``, (B,) each.
+        """Costs of a step: their weighted sum as ``cost``, each as ``cost_NAME``, (B,) each.
 
         Args:
             result: the step.
