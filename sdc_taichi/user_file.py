@@ -21,15 +21,15 @@ import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
 
-MOST_CONFIG_BYTES = 64 << 20
+MOST_CONFIG_BYTES = 64_000_000
 """Largest YAML or JSON file of a configuration, in bytes: twice that of 8,192 racks with 64 groups
 of servers each."""
-MOST_TABLE_BYTES = 512 << 20
+MOST_TABLE_BYTES = 512_000_000
 """Largest file of weather, carbon intensity or workload, in bytes: an EPW file of four years of
 minutes."""
-MOST_MATRIX_BYTES = 2 << 30
+MOST_MATRIX_BYTES = 2_000_000_000
 """Largest file of a recirculation matrix, in bytes: 8,192 racks, 32 characters per number."""
-MOST_METRICS_BYTES = 1 << 30
+MOST_METRICS_BYTES = 1_000_000_000
 """Largest metrics.json, in bytes: 10 kB for each of 100,000 data centers."""
 _HEADER_BYTES = 1 << 16
 _KINDS = (

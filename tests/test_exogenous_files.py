@@ -104,6 +104,7 @@ def test_hours_before_the_year_wrap_to_its_end(tmp_path: Path) -> None:
     assert series.values[8754] == pytest.approx(100.0)
     assert "6 rows before 1 January 00:00 moved to the end" in series.notes
     east = read_carbon(path, 3.0, "start")
+    assert "3 rows after 31 December 24:00 moved to the start" in east.notes
     assert east.values[3] == pytest.approx(100.0)
     assert east.values[0] == pytest.approx(100 + 0.01 * 8757)
     kept = read_carbon(path, -5.0, pairing="utc_rows")

@@ -375,7 +375,9 @@ def whole_years(
     if late > 1e-9:
         values = (1.0 - late) * values + late * np.roll(values, 1, axis=0)
         notes.append(f"averaged by overlap: rows start {late * minutes:g} min into the interval")
-    if first:
+    if first > len(values) // 2:
+        notes.append(f"{len(values) - first} rows after 31 December 24:00 moved to the start")
+    elif first:
         notes.append(f"{first} rows before 1 January 00:00 moved to the end")
     return values, notes
 
