@@ -108,7 +108,7 @@ def test_a_claim_that_ends_while_another_opens_the_file_is_noticed(
     monkeypatch.setattr(os, "open", open_late)
     second = FileClaim(tmp_path / "a")
     assert os.fstat(second.file.fileno()).st_ino == (tmp_path / ".a.part").stat().st_ino
-    with pytest.raises(SdcError, match="another process"):
+    with pytest.raises(SdcError, match="another run"):
         FileClaim(tmp_path / "a")
     second.release()
     assert names(tmp_path) == (["a"] if end == "renamed" else [])
