@@ -196,10 +196,10 @@ def environments(quick: bool) -> Iterator[Figure]:
     yield Figure("environments", where, ratio, at_most=2.0, absolute=spent_us)
     runs = (
         ("corrected", corrected, some, interpreter, 2.2),
-        ("corrected", corrected, many, roof, 0.8),
-        ("corrected, transient", transient, many, interpreter, 100.0),
-        ("sustaindc", sdc_taichi.load_config("sustaindc"), many, roof, 0.7),
-        ("corrected, each server its own", own, most, interpreter, 25.0),
+        ("corrected", corrected, many, roof, 1.0),
+        ("corrected, transient", transient, many, interpreter, 130.0),
+        ("sustaindc", sdc_taichi.load_config("sustaindc"), many, roof, 0.9),
+        ("corrected, each server its own", own, most, interpreter, 35.0),
     )
     for name, config, count, yardstick, at_most in runs:
         where = f"{name}, N = {count}"

@@ -56,7 +56,7 @@ def _table(path: str, model: type[BaseModel]) -> str:
 
 
 def _is_section(entry: dict[str, Any]) -> bool:
-    return "$ref" in entry
+    return "$ref" in entry or "allOf" in entry  # the latter of pydantic 2.8
 
 
 def _default(schema: dict[str, Any], name: str) -> str:
