@@ -58,7 +58,7 @@ class Figure:
     at_most: float | None = None
     at_least: float | None = None
     absolute: str = ""
-    """What was measured on this machine, where the value is a ratio."""
+    """Time or rate of this machine behind a ratio, with its unit, such as ``259 us/step``."""
     note: str = ""
     """Why there is no value, or how the value was found."""
 

@@ -1,4 +1,4 @@
-"""What this machine does at best: the memory roof and the interpreter yardstick.
+"""Fixed work to compare steps with: the memory roof and the interpreter yardstick.
 
 Times of steps mean nothing without the machine that they were measured on. Their ratio to the time
 of fixed work of the same kind, measured in the same run, is far less tied to it. Steps of large
@@ -70,7 +70,7 @@ class Reading:
     hottest: F64
     """Largest of the inputs, (B,)."""
     late: bool
-    """Whether any data center is over the limit."""
+    """Whether the largest input of any data center exceeds the yardstick's limit."""
 
 
 def interpreter_loop(rounds: int = 12) -> Callable[[], object]:

@@ -137,7 +137,7 @@ class CompiledStage:
         self._results: npt.NDArray[np.float64] = unpadded(self._outputs, self._size)
         source = _source(trace.statements(list(results.values())))
         self._kernel = BoundKernel(_kernel(source), templates=1)
-        # It often is a method of the object that has this one: a cycle of references, which
+        # A function that is a method of the stage's owner would make a cycle of references, which
         # only the garbage collector frees, with all arrays that the object holds.
         self._stage = None
 

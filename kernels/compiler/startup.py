@@ -1,4 +1,4 @@
-"""What Taichi finds around it when it starts: environment variables, and a folder for kernels."""
+"""Environment variables and cache folder of compiled kernels with which Taichi starts."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _make_usable(folder: Path) -> None:
 
 
 def _is_damaged(index: bytes) -> bool:
-    """Whether an index of kernels is one that Taichi could not read without running out of memory.
+    """Whether an index of Taichi's kernel cache is damaged; reading it could exhaust memory.
 
     Taichi notices a wrong length of the file, but trusts the lengths within it.
     """

@@ -13,7 +13,7 @@ class _Stream(io.FileIO):
     """A standard stream that remembers its first failure and drops what it cannot write."""
 
     failure: OSError | None = None
-    """What the system said when it first could not be written."""
+    """Error of the first write that failed; None if all succeeded."""
 
     def write(self, data: object) -> int | None:  # type: ignore[override]
         """Write bytes, or drop them."""
@@ -31,7 +31,7 @@ def guard_streams() -> None:
         if os.name == "nt" and stream.isatty():  # consoles of Windows are no files
             continue
         raw = _Stream(stream.fileno(), "w", closefd=False)
-        # As Python does it, which writes at once where PYTHONUNBUFFERED is set.
+        # With PYTHONUNBUFFERED, Python's own streams write at once, and so do these.
         buffer: Any = raw if stream.write_through else io.BufferedWriter(raw)
         guarded = io.TextIOWrapper(
             buffer,
@@ -46,7 +46,7 @@ def guard_streams() -> None:
 
 
 def output_failure() -> str | None:
-    """What kept standard output from being written, if anything did.
+    """Message of the first failed write to standard output; None if there is none to report.
 
     A reader that wanted no more, such as ``head``, is no failure.
     """

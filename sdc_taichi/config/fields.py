@@ -93,14 +93,14 @@ class Section(BaseModel):
 
 
 def _has_truth(value: Any) -> bool:
-    """Whether a value is true or false, or a list that holds one at any depth."""
+    """Whether a value is a boolean, or a list that contains a boolean at any depth."""
     if isinstance(value, list | tuple):
         return any(map(_has_truth, value))
     return isinstance(value, bool)
 
 
 def _has_odd_number(value: Any) -> bool:
-    """Whether a value is a text that Python alone reads as a number, or a list that holds one."""
+    """Whether a value is, or a list contains, a text like ``1_000``: a number to Python alone."""
     if isinstance(value, list | tuple):
         return any(map(_has_odd_number, value))
     if not isinstance(value, str):
@@ -117,7 +117,7 @@ def _has_odd_number(value: Any) -> bool:
 
 
 def _takes_text(kind: Any) -> bool:
-    """Whether a type is of texts, of names of choices, or has a part that is."""
+    """Whether a field of this type accepts text: a string, a choice, or a union with either."""
     if isinstance(kind, str) or (isinstance(kind, type) and issubclass(kind, str)):
         return True
     return any(map(_takes_text, get_args(kind)))

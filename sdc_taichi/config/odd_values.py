@@ -1,4 +1,4 @@
-"""What is possible in a configuration, but probably not what was meant."""
+"""Warnings of values that are valid in a configuration, but probably a mistake."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LEAST_USUAL_PUMP_EFFICIENCY = 0.2
 
 
 def odd_values(config: DataCenterConfig) -> Iterator[str]:
-    """What is odd about a configuration: field, value and what is usual."""
+    """Messages about unusual values of a configuration: field, value and what is usual."""
     yield from _odd_servers(config)
     chiller, setpoint, pumps = config.hvac.chiller, config.hvac.setpoint, config.hvac.pumps
     if chiller.reference_cop > MOST_USUAL_COP:

@@ -67,7 +67,7 @@ def _default(schema: dict[str, Any], name: str) -> str:
 
 
 def _valid(entry: dict[str, Any], schema: dict[str, Any]) -> str:
-    """What a JSON schema takes, in words as short as they can be."""
+    """Valid values of an entry of a JSON schema, as text for the column ``valid``."""
     if "anyOf" in entry:
         return " or ".join(_valid(one, schema) for one in entry["anyOf"])
     if "enum" in entry:
