@@ -23,6 +23,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from pettingzoo.test.state_test import state_test
 
 import sdc_taichi
+from eventful_hall import EVENTFUL_HALL
 from sdc_taichi import ConfigError, RuntimeStateError, SdcError, load_config
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.agents import AGENTS
@@ -43,18 +44,7 @@ SEEN: dict[str, dict[str, Any]] = {
     "heat_map": {"heat_map": True},
 }
 MODES = ("discrete", "continuous")
-EVENTFUL = load_config(
-    "corrected",
-    [
-        "hall.rows=2",
-        "hall.racks_per_row=2",
-        "hall.supply_approach_k=5",
-        "hall.return_approach_k=-3",
-        "servers.power_w=[300, 40]",
-        "hvac.crac.units=2",
-        "events.sampled=[{kind: crac_down, per_year: 2000, duration_h: [1, 4]}]",
-    ],
-)
+EVENTFUL = load_config("corrected", EVENTFUL_HALL)
 BUSY: dict[str, Any] = {
     "config": EVENTFUL,
     "days": 1,

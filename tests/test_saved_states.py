@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import sdc_taichi
+from eventful_hall import EVENTFUL_HALL
 from sdc_taichi import ForecastError, RuntimeStateError, SdcError, Simulator, load_config
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.errors import PhysicalLimitError
@@ -20,17 +21,11 @@ from sdc_taichi.sim.state_limits import HALL_LIMITS_C
 CONFIG = load_config(
     "corrected",
     [
-        "hall.rows=2",
-        "hall.racks_per_row=2",
-        "hall.supply_approach_k=5",
-        "hall.return_approach_k=-3",
-        "servers.power_w=[300, 40]",
-        "hvac.crac.units=2",
+        *EVENTFUL_HALL,
         "hvac.crac.flow_model=controlled",
         "simulation.thermal=transient",
         "workload.placement=coolest-first",
         "protection.ashrae_class=A1",
-        "events.sampled=[{kind: crac_down, per_year: 2000, duration_h: [1, 4]}]",
     ],
 )
 OPTIONS: dict[str, Any] = {
