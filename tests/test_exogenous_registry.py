@@ -22,6 +22,8 @@ from sdc_taichi.exogenous import (
     read_workload,
     site_from_files,
     site_names,
+    site_pressure_pa,
+    standard_pressure_pa,
     synthetic_site,
     trace_names,
 )
@@ -70,6 +72,23 @@ def run(*arguments: str) -> Result:
 
 
 # Names
+
+
+def test_pressure_of_a_site_follows_from_its_height(sources: Path, user_folder: Path) -> None:
+    assert standard_pressure_pa(0.0) == 101_325.0
+    # Table 1 of the chapter: 1,000 m.
+    assert standard_pressure_pa(1000.0) == pytest.approx(89_875.0, abs=2.0)
+    height_m = read_epw(epw(sources)).elevation_m
+    at_station = pytest.approx(float(standard_pressure_pa(height_m)))
+    assert site_pressure_pa("ny") == pytest.approx(float(standard_pressure_pa(3.4)))
+    assert site_pressure_pa("AZ", epw(sources)) == at_station
+    run("import", epw(sources), "--site", "home")
+    run("import", carbon(sources), "--site", "grid", "--base", "AZ")
+    assert site_pressure_pa("home") == at_station
+    assert site_pressure_pa("grid") == site_pressure_pa("AZ")
+    for bad in ({"name": "nowhere"}, {"name": "NY", "weather_file": carbon(sources)}):
+        with pytest.raises(DataError, match="expected"):
+            site_pressure_pa(**bad)
 
 
 def test_embedded_names(user_folder: Path) -> None:

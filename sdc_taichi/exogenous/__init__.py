@@ -5,12 +5,13 @@ What the data center does with it never is.
 """
 
 from sdc_taichi.exogenous.carbon import read_carbon
-from sdc_taichi.exogenous.psychrometrics import stull_wet_bulb_c, wet_bulb_c
+from sdc_taichi.exogenous.psychrometrics import standard_pressure_pa, stull_wet_bulb_c, wet_bulb_c
 from sdc_taichi.exogenous.registry import (
     load_site,
     load_trace,
     site_from_files,
     site_names,
+    site_pressure_pa,
     trace_names,
 )
 from sdc_taichi.exogenous.series import Series, SiteData, Weather, resample
@@ -31,6 +32,8 @@ __all__ = [
     "resample",
     "site_from_files",
     "site_names",
+    "site_pressure_pa",
+    "standard_pressure_pa",
     "statistics",
     "stull_wet_bulb_c",
     "synthetic_site",

@@ -1,4 +1,4 @@
-"""Moist air: wet bulb of whole years at station pressure.
+"""Air: pressure by height above sea level, and wet bulb of whole years at station pressure.
 
 The equations are those of ASHRAE Handbook - Fundamentals (2017), chapter 1; psychrolib solves the
 same ones for one state at a time, which takes seconds for a year.
@@ -13,7 +13,26 @@ from sdc_taichi.exogenous.series import FloatArray, check_physical
 
 TRIPLE_POINT_C = 0.01
 MIN_HUMIDITY_RATIO = 1e-7
+ELEVATION_LIMITS_M = (-1000.0, 10_000.0)
+"""Limits of heights above sea level, in m."""
 _BISECTIONS = 40  # 180 K / 2**40 < 1e-9 K
+
+
+def standard_pressure_pa(elevation_m: ArrayLike) -> FloatArray:
+    """Pressure of the standard atmosphere, about the mean of the year at that height.
+
+    Args:
+        elevation_m: height above sea level, -1,000..10,000 m, any shape.
+
+    Returns:
+        Same shape, Pa. ASHRAE Fundamentals (2017) ch. 1, eq. 3.
+
+    Raises:
+        DataError: a height outside its range.
+    """
+    check_physical("elevation_m", elevation_m, *ELEVATION_LIMITS_M)
+    ratio = 1.0 - 2.25577e-5 * np.asarray(elevation_m, dtype=np.float64)
+    return np.asarray(101_325.0 * ratio**5.2559, dtype=np.float64)
 
 
 def saturation_pressure_pa(temperature_c: ArrayLike) -> FloatArray:

@@ -16,16 +16,18 @@ from typing import Any
 from sdc_taichi.errors import DataError, shortened, similar_names
 from sdc_taichi.exogenous import series_file
 from sdc_taichi.exogenous.carbon import Pairing, read_carbon
+from sdc_taichi.exogenous.psychrometrics import standard_pressure_pa
 from sdc_taichi.exogenous.series import Series, SiteData, make_site, site_weather
 from sdc_taichi.exogenous.stamps import Stamp
 from sdc_taichi.exogenous.synthetic import (
     DEFAULT_SEED,
+    coefficients,
     synthetic_site,
     synthetic_sites,
     synthetic_trace,
     synthetic_traces,
 )
-from sdc_taichi.exogenous.weather import read_epw
+from sdc_taichi.exogenous.weather import read_elevation_m, read_epw
 from sdc_taichi.exogenous.workload import read_workload
 from sdc_taichi.user_file import list_folder
 
@@ -136,6 +138,33 @@ def load_site(
         synthetic_site(find_name("base", bases.pop(), synthetic_sites()), seed) if bases else None
     )
     return site_from_files(base, parts.get("weather"), parts.get("carbon"), name)
+
+
+def site_pressure_pa(
+    name: str, weather_file: str | Path | None = None, *, data_dir: str | Path | None = None
+) -> float:
+    """Air pressure of the standard atmosphere at the height of a site, in Pa.
+
+    Reads no more than the header of a file, unlike ``load_site``.
+
+    Args:
+        name: embedded or imported, any case.
+        weather_file: EPW or imported Parquet in place of the weather of ``name``.
+        data_dir: folder of imported files instead of the user's.
+
+    Raises:
+        DataError: unknown name, or a file that is damaged.
+    """
+    if weather_file is not None:
+        return float(standard_pressure_pa(read_elevation_m(weather_file)))
+    name = find_name("site", name, site_names(data_dir))
+    if name not in synthetic_sites():
+        parts = imported_sites(data_dir)[name]
+        if "weather" in parts:
+            return site_pressure_pa(name, parts["weather"])
+        name = str(_metadata(parts["carbon"]).get("base", ""))
+        name = find_name("base", name, synthetic_sites())
+    return float(standard_pressure_pa(coefficients()["weather"][name]["elevation_m"]))
 
 
 def load_trace(

@@ -136,11 +136,31 @@ def read_city(path: str | Path) -> str:
     if files.is_parquet(path):
         metadata = series_file.read_metadata(path) or {}
         return str(metadata.get("label", "")).split(", ")[0]
-    with open_input(path, MOST_TABLE_BYTES, DataError) as file:
-        line = _decoded(file.readline(_LONGEST_LINE))
+    line = _first_line(path)
     _location(path, [line])
     city = line.split(",")[1].strip()
     return "" if city == "-" else city
+
+
+def read_elevation_m(path: str | Path) -> float:
+    """Height of the station of a weather file above sea level, in m, by its header.
+
+    Args:
+        path: EPW, or Parquet written by ``data import``.
+
+    Raises:
+        DataError: the file cannot be read, is neither, or names no height.
+    """
+    path = Path(path)
+    if files.is_parquet(path):
+        metadata = series_file.read_metadata(path) or {}
+        return float(series_file.metadata_value(path, metadata, "elevation_m", float))
+    return float(_location(path, [_first_line(path)])["elevation_m"])
+
+
+def _first_line(path: Path) -> str:
+    with open_input(path, MOST_TABLE_BYTES, DataError) as file:
+        return _decoded(file.readline(_LONGEST_LINE))
 
 
 def _decoded(content: bytes) -> str:
