@@ -13,8 +13,9 @@ before (the functions named on the right do each line):
         T_out,j  <- T_in,j + P_j / (rho c_p V_j)
         what j gives to the mixes <- T_out,j, less with failing fans        store_exhaust
     for each CRAC unit k:                                                   run_crac_units
-        V_k      <- V_k,design clip(sum_j V_j / V_design, low, high)
-        f_k      <- min(1, (1 - b_0) V_k / sum_j s_jk (1 - r_j) V_j)
+        need_k   <- sum_j s_jk (1 - r_j) V_j
+        V_k      <- clip(need_k / (1 - b_0), low V_k,design, high V_k,design)
+        f_k      <- min(1, (1 - b_0) V_k / need_k)
     V_crac <- sum_k V_k
     T_ret  <- (sum_j V_j T_out,j - sum_j r'_j V_j T_mix,j + V_bypass T_sup) / V_crac
     T_mix,j  <- sum_i w_ji T_out,i                                          mixes.py
@@ -229,11 +230,11 @@ def is_last_chunk(hall: ti.template(), n, n_chunks):
 @ti.func
 @no_type_check
 def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
-    """CRAC units at the servers' airflow; status of the data center, and its next mixes."""
+    """CRAC units at what the racks need; status of the data center, and its next mixes."""
     dc = hall.dcs[n]
     total, sweep = hall.chunks[dc.first_chunk], dc.sweep
     is_last = sweep + 1 >= hall.sweeps
-    units = run_crac_units(hall, n, total.flow_m3s, is_last)
+    units = run_crac_units(hall, n, is_last)
     air.crac_flow_m3s = units.flow_m3s
     air.supply_c = units.supply_m3k_s / units.flow_m3s
     air.return_c = (total.return_m3k_s + units.bypass_m3k_s) / units.flow_m3s

@@ -133,7 +133,6 @@ DC_DOUBLES = {
     "room_j_per_k": "heat capacity of the room, J/K (transient)",
     "coil_limit_w": "heat that the plant can take, W (transient)",
     "crac_fan_w_per_m3s": "CRAC fan power over airflow at full speed, W/(m3/s)",
-    "design_it_airflow_m3s": "airflow of the servers at the design point, m3/s",
     "table_low_c": "lowest supply air of the table of steady states, C",
     "table_rows_per_k": "supply rows of the table per K",
     "feedback_gain": "share of a common change of the mixes that one sweep gives back to them",
@@ -156,7 +155,7 @@ UNIT_STATE = {
     "flow_m3s": "airflow, in transient halls mean over the substeps so far, m3/s",
     "cubed_speed": "cube of the fan speed over design speed, 0 where coasting, mean likewise",
     "need_m3s": "supply air that the racks ask for, m3/s",
-    "following": "airflow of the servers over that at the design point",
+    "following": "fan speed over design speed that would just cover the need",
 }
 RACK_STATE = {
     "mixed_c": "exhaust mix before the rack; transient: of the room air that it takes in, C",

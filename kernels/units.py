@@ -40,11 +40,12 @@ def unit_need(hall: ti.template(), n, unit):
 
 @ti.func
 @no_type_check
-def run_crac_units(hall: ti.template(), n, it_flow_m3s, is_last):
-    """Airflow of the CRAC units at the servers' airflow, and what share of the need it covers.
+def run_crac_units(hall: ti.template(), n, is_last):
+    """Airflow of the CRAC units for what their racks need, and what share of the need it covers.
 
-    Each unit: V_k = V_k,design clip(V / V_design, low, high), f_k = min(1, (1 - b_0) V_k / need).
-    ``is_last``: no sweep follows, so the state of the units is that at the end of the step.
+    Each unit: V_k = clip(need_k / (1 - b_0), low V_k,design, high V_k,design) and
+    f_k = min(1, (1 - b_0) V_k / need_k). ``is_last``: no sweep follows, so the state of the units
+    is that at the end of the step.
     """
     dc, none = hall.dcs[n], ti.cast(0.0, ti.f64)
     units = ti.Struct(
@@ -58,7 +59,6 @@ def run_crac_units(hall: ti.template(), n, it_flow_m3s, is_last):
         running_m3k_s=none,
         any_running=none,
     )
-    following = it_flow_m3s / dc.design_it_airflow_m3s
     fresh_share = ti.cast(dc.fresh_share, ti.f64)
     at = dc.first_unit
     while at < hall.dcs[n + 1].first_unit:
@@ -68,6 +68,7 @@ def run_crac_units(hall: ti.template(), n, it_flow_m3s, is_last):
         design_m3s = ti.cast(unit.design_m3s, ti.f64)
         is_running = ti.cast(unit.running, ti.f64)
         f_used, supply_c = unit.fresh_ratio, unit.supply_c
+        following = need / ti.max(fresh_share * design_m3s, 1e-30)
         speed = ti.min(ti.max(following, low), high)
         flow = design_m3s * speed
         units.flow_m3s += flow

@@ -152,8 +152,8 @@ class State:
     need_m3s: F64
     """Supply air that the racks ask of each CRAC unit, in m3/s, (U,); for transient halls."""
     following: F64
-    """Airflow of the servers over that at the design point, for each CRAC unit, (U,); for transient
-    halls."""
+    """Fan speed of each CRAC unit over design speed that would just cover the need, (U,); for
+    transient halls."""
 
 
 @dataclass(slots=True)

@@ -164,8 +164,6 @@ class HallTwin:
     unit_design_m3s: F64
     full_m3s: float
     """Airflow of one server at ratio 1."""
-    it_airflow_m3s: float
-    """Of all servers at the design point."""
     air_j_per_m3_k: float
     parcel_j_per_k: float
     """Room air before each rack."""
@@ -297,7 +295,7 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
     supply_c = config.hvac.setpoint.max_c
     twin = HallTwin(
         config, rack, full_w, idle_w, deviation, raw_height, np.zeros((racks, racks)),
-        np.zeros(racks), 1.0, _supply_shares(config), np.zeros(0), 1.0, 1.0, air,
+        np.zeros(racks), 1.0, _supply_shares(config), np.zeros(0), 1.0, air,
         air * _air_m3(hall) / racks,
     )  # fmt: skip
     approach_k = np.broadcast_to(np.asarray(hall.supply_approach_k, np.float64), (racks,)).copy()
@@ -340,20 +338,25 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
         for _ in range(30):
             height, airflow, it_w, rise, full_m3s = design(approach_k)
             approach_k = share * (weights @ rise)
-    if matrix is None:
-        share = share * (1.0 - hall.layout.containment)
     crac_m3s = config.hvac.crac.supply_m3s_per_w * float(it_w.sum())
-    fresh_m3s = (1.0 - share) * airflow
+    bypassed = max(0.0, 1.0 - float(((1.0 - share) * airflow).sum()) / crac_m3s)
+    is_open = 1.0 - hall.layout.containment
+    captured = is_open * share[rack] * height
+    for _ in range(60):
+        inlet_c = supply_c + (weights @ rise)[rack] * captured
+        cpu, fan, ratio = twin.servers(inlet_c, load, on, on)
+        moved = full_m3s * twin.per_rack(ratio)
+        rise = twin.per_rack(full_m3s * ratio * (inlet_c - supply_c) + (cpu + fan) / air) / moved
+    fresh_m3s = twin.per_rack((1.0 - captured) * full_m3s * ratio)
     need = twin.unit_shares.T @ fresh_m3s
     return replace(
         twin,
-        captured=share[rack] * height,
+        captured=captured,
         weights=weights,
-        share=share,
-        fresh_share=min(1.0, float(fresh_m3s.sum()) / crac_m3s),
-        unit_design_m3s=crac_m3s * need / need.sum(),
+        share=is_open * share,
+        fresh_share=1.0 - is_open * bypassed,
+        unit_design_m3s=need / (1.0 - is_open * bypassed),
         full_m3s=full_m3s,
-        it_airflow_m3s=float(airflow.sum()),
     )
 
 
@@ -395,7 +398,7 @@ def flows(
     unit_share = hall.unit_shares[hall.rack]
     fresh_need = (1.0 - hall.captured) * airflow
     need = fresh_need @ unit_share
-    speed = np.clip(airflow.sum() / hall.it_airflow_m3s, low, high)
+    speed = np.clip(wanted_speed(hall, need), low, high)
     unit = hall.unit_design_m3s * speed
     offered = hall.fresh_share * unit
     able = np.where(need > offered, offered / np.where(need > 0, need, 1.0), 1.0)
@@ -406,6 +409,12 @@ def flows(
         unit, speed, need, able, unit - covered * need, from_unit, exhaust,
         hall.per_rack(airflow * exhaust),
     )  # fmt: skip
+
+
+def wanted_speed(hall: HallTwin, need: F64) -> F64:
+    """Fan speed of each unit over design speed that would just cover its racks' need, (U,)."""
+    design = hall.fresh_share * hall.unit_design_m3s
+    return np.where(design > 0, need / np.where(design > 0, design, 1.0), 0.0)
 
 
 def mixing(hall: HallTwin, breath: F64) -> F64:
@@ -523,7 +532,7 @@ class Memory:
     need_m3s: F64
     """Supply air that the racks ask of each unit, (U,)."""
     following: F64
-    """Airflow of the servers over that at the design point, alike for each unit, (U,)."""
+    """Fan speed of each unit that would just cover that need, over design speed, (U,)."""
     room_j: float
 
 
@@ -619,7 +628,7 @@ def advance(
         )  # fmt: skip
         now = Memory(
             warmer, mixed_end, mixed + breath * (outlet_c - mixed), captured, moved.need,
-            np.full(len(ratio), flow.sum() / hall.it_airflow_m3s),
+            wanted_speed(hall, moved.need),
             now.room_j + (load_w - coil_w) * h,
         )  # fmt: skip
     found: dict[str, Any] = {}

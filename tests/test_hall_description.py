@@ -77,7 +77,10 @@ def test_containment_warms_less_and_still_closes(corrected: DesignHall) -> None:
     assert closed.air is not None
     assert np.all(closed.approach_k < 0.3 * corrected.approach_k)
     assert closed.air.shi < 0.3 * corrected.air.shi
-    assert closed.unit_m3s.sum() == pytest.approx(corrected.unit_m3s.sum())
+    # The units make up for the exhaust that the racks no longer breathe.
+    need_m3s = np.sum((1.0 - closed.air.exhaust_share) * closed.airflow_m3s)
+    design_m3s = need_m3s / (1.0 - 0.2 * corrected.air.bypass_share)
+    assert closed.unit_m3s.sum() == pytest.approx(design_m3s)
     heat_closes(closed)
 
 

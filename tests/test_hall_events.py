@@ -16,6 +16,7 @@ from sdc_taichi import (
     SdcError,
     Simulator,
     StepResult,
+    build_fleet,
     drivers_from_arrays,
     load_config,
 )
@@ -72,9 +73,7 @@ def test_a_unit_that_is_down_coasts_and_warms_its_racks_most() -> None:
     running = column(down, "unit_running")
     assert np.array_equal(running[:, 1] == 0, (np.arange(40) >= 4) & (np.arange(40) < 8))
     assert np.all(running[:, 0] == 1)
-    design = column(whole, "unit_flow_m3s")[0] / (
-        whole[0].crac_flow_m3s / (5.663e-5 * full_load_w())
-    )
+    design = build_fleet(load_config("corrected", overrides)).unit_design_m3s
     assert column(down, "unit_flow_m3s")[4, 1] == pytest.approx(0.25 * design[1], rel=1e-9)
     warmer = column(down, "rack_inlet_c") - column(whole, "rack_inlet_c")
     assert np.all(warmer[:4] == 0)
@@ -88,12 +87,6 @@ def test_a_unit_that_is_down_coasts_and_warms_its_racks_most() -> None:
     assert np.all(column(down, "unmet_w")[4:8] > 0)
     assert room[-1] == 0
     np.testing.assert_allclose(warmer[-1], 0, atol=1e-9)
-
-
-def full_load_w() -> float:
-    """IT power at the design point."""
-    with Simulator(load_config("corrected"), drivers=constant(), precision="f64") as sim:
-        return float(sim.sizing.it_w[0])
 
 
 @pytest.mark.parametrize("thermal", THERMAL)

@@ -70,7 +70,7 @@ def random_state(rng: np.random.Generator, fleet: Fleet, precision: Precision) -
         exhaust_c=(fleet.air.mix_weights.strength * rng.uniform(25, 45, fleet.racks)).astype(real),
         captured_m3s=rng.uniform(0, 1, fleet.racks).astype(real),
         need_m3s=fleet.unit_design_m3s * rng.uniform(0.2, 1.2, fleet.units),
-        following=rng.uniform(0.2, 1.1, fleet.size)[fleet.unit_dc],
+        following=rng.uniform(0.2, 1.1, fleet.units),
     )
 
 

@@ -65,8 +65,8 @@ class CracConfig(Section):
     reference_m3s_per_w: FlowM3sPerW = 9.438e-5
     """Airflow per IT power at which a fan draws ``released_fan_w``, in m3/s per W."""
     flow_model: Literal["constant", "follow_servers", "per_watt", "controlled"] = "follow_servers"
-    """Control of the units' airflow: constant, by the airflow of the servers, by IT power, or by
-    the actions of an agent."""
+    """Control of the units' airflow: constant, by the supply air that the servers take in, by IT
+    power, or by the actions of an agent."""
     min_flow_ratio: WorkingShare = 0.6
     """Lowest airflow of a running unit over its design airflow, 0.01..1."""
     fan_step: Annotated[float, Field(ge=0.001, le=1)] = 0.05

@@ -56,21 +56,51 @@ def design_point(
     """
     servers = rack_servers(config) if servers is None else servers
     approach_k = config.hall.rack_approach_k() if approach_k is None else approach_k
-    hall, curves, supply_c = config.hall, config.servers.curves, config.hvac.setpoint.max_c
-    full_load = np.ones(len(servers.count))
+    supply_c = config.hvac.setpoint.max_c
     group_approach_k = servers.per_group(approach_k)
     height_factor = np.ones(len(servers.count))
-    if hall.inlet_model == "recirculation":
+    if config.hall.inlet_model == "recirculation":
+        curves = config.servers.curves
         height_factor = _height_factor(servers, curves, supply_c, group_approach_k)
     inlet_c = _inlet_c(servers, supply_c, group_approach_k, height_factor)
+    return design_point_at(config, servers, inlet_c, height_factor, approach_k=approach_k)
+
+
+def design_point_at(
+    config: DataCenterConfig,
+    servers: RackServers,
+    inlet_c: F64,
+    height_factor: F64,
+    *,
+    approach_k: F64 | None = None,
+    fan_full_airflow_m3s: float | None = None,
+) -> DesignPoint:
+    """Power, airflow and temperatures at full load with given inlets.
+
+    Args:
+        config: The data center.
+        servers: Its ``rack_servers``.
+        inlet_c: Inlet of each server group, C, (G,).
+        height_factor: Height factors of the groups, dimensionless, (G,).
+        approach_k: Inlet over supply air, K, (R,), that the airflow of the servers follows from
+            unless it is given.
+        fan_full_airflow_m3s: Airflow of one server at an airflow ratio of 1, m3/s; None is as
+            configured, or else as follows from ``approach_k``.
+
+    Raises:
+        ConfigError: approach temperatures that leave no room for heating the air.
+    """
+    hall, curves, supply_c = config.hall, config.servers.curves, config.hvac.setpoint.max_c
+    full_load = np.ones(len(servers.count))
     ratio = curves.airflow_ratio(inlet_c, full_load)
     cpu_w = curves.cpu_w(inlet_c, full_load, servers.full_w, servers.idle_w)
     it_w = servers.per_rack(servers.count * (cpu_w + curves.fan_w(ratio)))
     rack_ratio = servers.per_rack(servers.count * ratio)
     air_j_per_m3_k = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
-    full_m3s = config.servers.fan_full_airflow_m3s
+    full_m3s = fan_full_airflow_m3s or config.servers.fan_full_airflow_m3s
     if full_m3s is None:
-        rise_k = _server_rise_k(config, approach_k, air_j_per_m3_k)
+        given_k = config.hall.rack_approach_k() if approach_k is None else approach_k
+        rise_k = _server_rise_k(config, given_k, air_j_per_m3_k)
         full_m3s = float(np.mean(it_w / (air_j_per_m3_k * rack_ratio)) / rise_k)
     airflow_m3s = full_m3s * rack_ratio
     inlet_rise_k = servers.per_rack(servers.count * ratio * (inlet_c - supply_c)) / rack_ratio

@@ -207,8 +207,8 @@ def _design_patterns(states: _SteadyStates, recirculation: Recirculation) -> tup
     """Patterns of the design point, (4, R), and shares of approach and rise over it, (2, m)."""
     scales = np.concatenate([states.inlet_k, states.heat_k])
     shares = (scales / np.maximum(scales[:, -1:], 1e-9))[:, :-1]
-    approach_k = recirculation.approach_k
-    own = np.stack([approach_k, recirculation.design.outlet_rise_k - approach_k])
+    design = recirculation.design
+    own = np.stack([design.approach_k, design.outlet_rise_k - design.approach_k])
     mixes = [recirculation.mix_weights.apply(row) for row in own]
     return np.concatenate([mixes, own]), shares
 

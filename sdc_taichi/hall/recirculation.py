@@ -13,20 +13,24 @@ such that the given approach temperatures come out exactly at the design point.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.hall.design_point import DesignPoint, design_point
+from sdc_taichi.hall.design_point import DesignPoint, design_point, design_point_at
 from sdc_taichi.hall.matrix_file import read_matrix, share_matrix
 from sdc_taichi.hall.mix_weights import MixWeights, dense_weights, layout_weights
 from sdc_taichi.hall.rack_servers import RackServers, rack_servers
 from sdc_taichi.types import F64
 
 _MOST_ITERATIONS = 500
+_WITHIN_K = 1e-12
+"""Change of the approach temperatures, in K, at which they count as found."""
+_CONTAINED_WITHIN_K = 1e-9
+"""The same for the exhaust mixes of contained halls, which may have a hundred thousand racks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +45,10 @@ class Recirculation:
     """Share of each server group's intake that is exhaust air, by its height, 0..1, (G,)."""
     fresh_share: float
     """Share of CRAC air that reaches inlets at the design point; the rest bypasses them."""
-    approach_k: F64
-    """Mean inlet over supply of each rack at the design point, in K, (R,); below
-    ``design.approach_k`` where containment closes paths."""
+    need_m3s: F64
+    """Supply air that each rack takes in at the design point, in m3/s, (R,)."""
     design: DesignPoint
-    """Design point of the hall without containment."""
+    """Design point of the hall, with containment; ``height_factor`` is that of the open hall."""
 
     def matrix(self) -> F64:
         """R, the share of each rack's intake (rows) that is each rack's exhaust, (R, R)."""
@@ -80,21 +83,30 @@ def calibrate(config: DataCenterConfig, servers: RackServers | None = None) -> R
 def _calibrated(
     config: DataCenterConfig, servers: RackServers, design: DesignPoint
 ) -> Recirculation:
-    """Recirculation of a hall that has a design point without it."""
+    """Recirculation of a hall that has a design point without it.
+
+    Containment c closes the share c of the paths both ways: racks take in r (1 - c) of exhaust air,
+    and b (1 - c) of the supply air bypasses them. The units are sized for what that leaves.
+    """
     if config.hall.recirculation.matrix_file is None:
         weights = layout_weights(config.hall, design.airflow_m3s)
-        share = design.approach_k / weights.apply(design.outlet_rise_k)
-        share = share * (1.0 - config.hall.layout.containment)
+        open_share = design.approach_k / weights.apply(design.outlet_rise_k)
     else:
-        weights, share, design = _from_matrix_file(config, servers, design)
+        weights, open_share, design = _from_matrix_file(config, servers, design)
+    open_part = 1.0 - config.hall.layout.containment
+    share = open_share * open_part
     group_share = servers.per_group(share) * design.height_factor
     _check_intakes(config, servers, group_share)
     _check_airflows(config, design, weights, share)
-    fresh = float(np.sum((1.0 - share) * design.airflow_m3s)) / design.crac_flow_m3s
-    fresh, approach_k = min(fresh, 1.0), design.approach_k
-    if config.hall.layout.containment > 0:
-        approach_k = _contained_approach_k(config, servers, design, weights, share, fresh)
-    return Recirculation(weights, share, group_share, fresh, approach_k, design)
+    fresh = _open_fresh_share(config, design, open_share)
+    if open_part < 1.0:
+        fresh = 1.0 - (1.0 - fresh) * open_part
+        design = _contained_design(config, servers, design, weights, group_share)
+    # Inlets are warmed by the exhaust that they take in.
+    need_m3s = design.airflow_m3s * (1.0 - design.approach_k / weights.apply(design.outlet_rise_k))
+    if open_part < 1.0:
+        design = replace(design, crac_flow_m3s=float(need_m3s.sum()) / fresh)
+    return Recirculation(weights, share, group_share, fresh, need_m3s, design)
 
 
 def _from_matrix_file(
@@ -131,7 +143,6 @@ def _solve_design_point(
     config: DataCenterConfig,
     servers: RackServers,
     approach_k: Callable[[DesignPoint], F64],
-    within_k: float = 1e-12,
 ) -> DesignPoint:
     """Design point whose approach temperatures are those that follow from it.
 
@@ -142,7 +153,6 @@ def _solve_design_point(
         config: The data center.
         servers: Its ``rack_servers``.
         approach_k: Inlet over supply air, K, (R,), that follows from a design point.
-        within_k: Change of the approach temperatures at which they count as found, K.
 
     Raises:
         ConfigError: no steady state.
@@ -151,34 +161,52 @@ def _solve_design_point(
     for _ in range(_MOST_ITERATIONS):
         design = design_point(config, servers, before)
         after = approach_k(design)
-        if np.max(np.abs(after - before)) < within_k:
+        if np.max(np.abs(after - before)) < _WITHIN_K:
             return design
         before = after
-    raise ConfigError(
-        f"{config.hall.recirculation.matrix_file or config.name}: the hall finds no steady state "
-        "at full load; valid is less recirculation"
-    )
+    raise _no_steady_state(config)
 
 
-def _contained_approach_k(
+def _contained_design(
     config: DataCenterConfig,
     servers: RackServers,
     design: DesignPoint,
     weights: MixWeights,
-    share: F64,
-    fresh_share: float,
-) -> F64:
-    """Inlet over supply behind containment, in K, (R,), to a thousandth of a kelvin."""
-    full = {"fan_full_airflow_m3s": design.fan_full_airflow_m3s}
-    contained = config.model_copy(update={"servers": config.servers.model_copy(update=full)})
+    group_share: F64,
+) -> DesignPoint:
+    """Design point behind containment, but for the airflow of the CRAC units.
 
-    def approach_k(at: DesignPoint) -> F64:
-        # Air that the units cannot supply comes from the exhaust mix too.
-        need = float(np.sum((1.0 - share) * at.airflow_m3s))
-        covered = min(1.0, fresh_share * design.crac_flow_m3s / need)
-        return (1.0 - (1.0 - share) * covered) * weights.apply(at.outlet_rise_k)
+    Args:
+        config: The data center.
+        servers: Its ``rack_servers``.
+        design: Design point of the open hall.
+        weights: Weights of the exhaust mix before each rack.
+        group_share: Share of each group's intake that is exhaust air, with containment, (G,).
 
-    return _solve_design_point(contained, servers, approach_k, within_k=1e-3).approach_k
+    Raises:
+        ConfigError: no steady state.
+    """
+    mix_k = weights.apply(design.outlet_rise_k)
+    for _ in range(_MOST_ITERATIONS):
+        found = design_point_at(
+            config,
+            servers,
+            design.supply_c + servers.per_group(mix_k) * group_share,
+            design.height_factor,
+            fan_full_airflow_m3s=design.fan_full_airflow_m3s,
+        )
+        before, mix_k = mix_k, weights.apply(found.outlet_rise_k)
+        if np.max(np.abs(mix_k - before)) < _CONTAINED_WITHIN_K:
+            return found
+    raise _no_steady_state(config)
+
+
+def _no_steady_state(config: DataCenterConfig) -> ConfigError:
+    """Error of a hall whose inlets at full load do not settle."""
+    return ConfigError(
+        f"{config.hall.recirculation.matrix_file or config.name}: the hall finds no steady state "
+        "at full load; valid is less recirculation"
+    )
 
 
 def _check_intakes(config: DataCenterConfig, servers: RackServers, group_share: F64) -> None:
@@ -196,7 +224,7 @@ def _check_intakes(config: DataCenterConfig, servers: RackServers, group_share: 
 def _check_airflows(
     config: DataCenterConfig, design: DesignPoint, weights: MixWeights, share: F64
 ) -> None:
-    """Make sure that exhausts and CRAC units give the air that the racks take in."""
+    """Make sure that racks take in no more of an exhaust than there is."""
     left = design.airflow_m3s - weights.apply_transposed(share * design.airflow_m3s)
     worst = int(np.argmin(left))
     if left[worst] < 0:
@@ -205,11 +233,19 @@ def _check_airflows(
             f"{1 - left[worst] / design.airflow_m3s[worst]:.3g} times the air it exhausts; valid "
             "is at most 1 (lower hall.supply_approach_k or raise the rack's airflow)"
         )
-    fresh = float(np.sum((1.0 - share) * design.airflow_m3s))
-    # Containment turns recirculation into demand for supply air, which may then fall short.
-    if fresh > design.crac_flow_m3s * (1 + 1e-9) and config.hall.layout.containment == 0:
+
+
+def _open_fresh_share(config: DataCenterConfig, design: DesignPoint, share: F64) -> float:
+    """Share of the CRAC air that the racks of the open hall take in, at most 1.
+
+    Raises:
+        ConfigError: CRAC units that do not give the air that the racks take in.
+    """
+    need_m3s = float(np.sum((1.0 - share) * design.airflow_m3s))
+    if need_m3s > design.crac_flow_m3s * (1 + 1e-9):
         raise ConfigError(
-            f"{config.name}: servers draw {fresh:.4g} m3/s of supply air at full load, the CRAC "
+            f"{config.name}: servers draw {need_m3s:.4g} m3/s of supply air at full load, the CRAC "
             f"units give {design.crac_flow_m3s:.4g}; lower servers.fan_full_airflow_m3s (null "
             "derives it) or raise hvac.crac.supply_m3s_per_w"
         )
+    return min(need_m3s / design.crac_flow_m3s, 1.0)

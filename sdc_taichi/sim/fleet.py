@@ -98,8 +98,6 @@ class Fleet:
     """Rows DC_COEFFICIENTS of the hall kernels, (18, B)."""
     unit_design_m3s: F64
     """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
-    it_airflow_m3s: F64
-    """Airflow through all servers at the design point, in m3/s, (B,)."""
     air: HallAir | None
     """How air moves in the halls; None with inlet model ``approach``."""
 
@@ -199,8 +197,6 @@ class _HallArrays:
     """Rows DC_COEFFICIENTS of the hall kernels, (18,)."""
     unit_design_m3s: F64
     """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
-    it_airflow_m3s: float
-    """Airflow through all servers at the design point, in m3/s."""
     air: _Air | None
     """How air moves in the hall; None with inlet model ``approach``."""
 
@@ -258,7 +254,6 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
             np.array([len(h.unit_design_m3s) for h in halls]), "CRAC units"
         ),
         unit_design_m3s=np.concatenate([h.unit_design_m3s for h in halls]),
-        it_airflow_m3s=np.array([h.it_airflow_m3s for h in halls]),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
     )
 
@@ -317,14 +312,15 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
     air, approach_k, fresh_share = None, hall.rack_approach_k(), 1.0
     if hall.inlet_model == "recirculation":
         found = calibrate(config, servers)
-        design, approach_k, fresh_share = found.design, found.approach_k, found.fresh_share
+        design, fresh_share = found.design, found.fresh_share
+        approach_k = design.approach_k
         shares = (
             unit_shares(floor_plan(hall), crac.units, crac.supply_length_m)
             if crac.unit_shares is None
             else np.array(crac.unit_shares)
         )
         # Units are sized for the racks they supply.
-        need = shares.T @ ((1.0 - found.exhaust_share) * design.airflow_m3s)
+        need = shares.T @ found.need_m3s
         unit_design_m3s = design.crac_flow_m3s * need / need.sum()
         of_groups = servers.per_rack(found.group_exhaust_share)
         air = _Air(
@@ -351,7 +347,6 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         approach_k=approach_k,
         dc=np.array(in_row_order(DC_COEFFICIENTS, coefficients)),
         unit_design_m3s=unit_design_m3s,
-        it_airflow_m3s=float(design.airflow_m3s.sum()),
         air=air,
     )
 

@@ -88,7 +88,7 @@ class HallState:
     need_m3s: F64
     """Supply air that the racks ask of each CRAC unit, in m3/s, (U,)."""
     following: F64
-    """Airflow of the servers over that at the design point, for each CRAC unit, (U,)."""
+    """Fan speed of each CRAC unit over design speed that would just cover the need, (U,)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -463,7 +463,6 @@ def _build_rack_inputs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -
 
 def _set_data_center_values(fleet: Fleet, dc: dict[str, Array]) -> None:
     """Rows of DC_DOUBLES that stay the same in all steps."""
-    dc["design_it_airflow_m3s"][:] = fleet.it_airflow_m3s
     air = fleet.air
     if air is not None:
         ends_c = np.array([table.supply_c[:2] for table in air.steady_states])

@@ -73,5 +73,5 @@ def state_limits(fleet: Fleet, sizing: Sizing, step: int) -> dict[str, Limits]:
         "exhaust_c": (HALL_LIMITS_C[0] * strength, HALL_LIMITS_C[1] * strength),
         "captured_m3s": (0.0, most_m3s[per_rack]),
         "need_m3s": (0.0, most_m3s[per_unit]),
-        "following": (0.0, AIRFLOW_FACTOR),
+        "following": (0.0, most_m3s[per_unit] / np.maximum(fleet.unit_design_m3s, 1e-30)),
     }
