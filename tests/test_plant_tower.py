@@ -153,11 +153,12 @@ def test_approach_is_evaluated_within_its_bounds() -> None:
     approach = tower.yorkcalc_approach_k
     assert approach(40.0, 6.0, 1.0) == approach(26.7, 6.0, 1.0) != approach(26.5, 6.0, 1.0)
     assert approach(-50.0, 6.0, 1.0) == approach(-34.4, 6.0, 1.0) != approach(-34.0, 6.0, 1.0)
-    assert approach(20.0, 0.1, 1.0) == approach(20.0, 1.1, 1.0) != approach(20.0, 1.105, 1.0)
+    assert approach(20.0, -0.1, 1.0) == approach(20.0, 0.0, 1.0) != approach(20.0, 0.1, 1.0)
     assert approach(20.0, 30.0, 1.0) == approach(20.0, 22.2, 1.0) != approach(20.0, 22.19, 1.0)
     assert approach(20.0, 3.0, 20.0) == approach(20.0, 3.0, 8.0) != approach(20.0, 3.0, 7.9)
-    assert approach(20.0, 1.1, 0.5) == 1.1
-    assert approach(-30.0, 20.0, 4.0) == 40.0
+    assert 0.0 < approach(20.0, 1.1, 0.5) < 1.1
+    assert approach(26.0, 0.0, 0.1) == 0.0
+    assert approach(-30.0, 20.0, 4.0) > 40.0
 
 
 def test_reference_flow_meets_the_design_point_at_full_air() -> None:
@@ -204,12 +205,15 @@ def test_heat_balance_bounds_and_batch(
     assert (result.air_ratio >= 0.0).all()
     if name != "paper":
         assert (result.air_ratio <= 1.0).all()
+    if name == "released":
         np.testing.assert_allclose(result.fan_w, DESIGN_FAN_W * result.air_ratio**3, rtol=1e-12)
     if name == "yorkcalc":
         assert (result.leaving_c >= np.array(setpoint) - 1e-9).all()
         above = result.leaving_c > np.array(setpoint) + 1e-9
         assert (result.air_ratio[above] == 1.0).all()
-        assert (result.approach_k[above] >= 1.1 - 1e-9).all()
+        assert (result.approach_k[above] >= 0.0).all()
+        assert (result.fan_w <= DESIGN_FAN_W * result.air_ratio**3 * (1.0 + 1e-9)).all()
+        assert (result.air_ratio[np.array(heat) > 0.0] >= tower.FREE_CONVECTION_SHARE).all()
 
 
 @given(st.floats(1e4, 3e6), st.floats(-30.0, 30.0))
@@ -255,26 +259,32 @@ def test_full_speed_lets_the_water_rise_above_the_setpoint() -> None:
 def test_fan_is_off_once_free_convection_carries_the_heat() -> None:
     heat_w, wet_bulb_c = 2e5, -10.0
     range_k = heat_w / (4184.0 * WATER_KG_S)
-    full = tower.yorkcalc_approach_k(wet_bulb_c, range_k, WATER_KG_S / REFERENCE_WATER_KG_S)
-    # T_in - T_out = f*(T_in - T_out_full) with f = 1/8.
+    water_ratio = WATER_KG_S / REFERENCE_WATER_KG_S
+    # T_in - T_out = f*(T_in - T_out_full), f = 1/8: at full speed the range is eight times that.
+    full = tower.yorkcalc_approach_k(wet_bulb_c, 8.0 * range_k, water_ratio)
     threshold_c = wet_bulb_c + full + 7.0 * range_k
-    below, above = threshold_c - 1e-6, threshold_c + 1e-6
-    result = run(
-        "yorkcalc", heat_w, wet_bulb_c=wet_bulb_c, condenser_setpoint_c=np.array([below, above])
-    )
-    assert result.air_ratio[0] > 0.1
-    assert result.air_ratio[1] == 0.0
+    setpoint_c = threshold_c + np.array([-1e-3, 1e-3])
+    result = run("yorkcalc", heat_w, wet_bulb_c=wet_bulb_c, condenser_setpoint_c=setpoint_c)
+    assert 0.0 < result.fan_w[0] < 0.01 * 0.2**3 * DESIGN_FAN_W
     assert result.fan_w[1] == 0.0
-    np.testing.assert_allclose(result.leaving_c, [below, above])
+    assert result.air_ratio[1] == tower.FREE_CONVECTION_SHARE
+    np.testing.assert_allclose(result.leaving_c, setpoint_c)
 
 
-def test_least_air_is_the_bound_of_the_correlation() -> None:
-    # 39 K of approach at 20 C and 5.56 K would need less air than a liquid to gas ratio of 8 gives,
-    # yet free convection (44 K) does not reach it.
-    result = run("yorkcalc", HEAT_W, wet_bulb_c=20.0, condenser_setpoint_c=np.array([59.0, 57.0]))
-    assert result.air_ratio[0] == pytest.approx(WATER_KG_S / REFERENCE_WATER_KG_S / 8.0)
-    assert result.air_ratio[1] > result.air_ratio[0]
-    np.testing.assert_allclose(result.leaving_c, [59.0, 57.0])
+def test_fan_goes_on_and_off_below_its_lowest_speed() -> None:
+    """Fan power falls evenly from that of the lowest speed to 0."""
+    heat_w, wet_bulb_c = 4e5, 5.0
+    range_k, water_ratio = heat_w / (4184.0 * WATER_KG_S), WATER_KG_S / REFERENCE_WATER_KG_S
+    slow = tower.yorkcalc_approach_k(wet_bulb_c, range_k, water_ratio / tower.MIN_AIR_RATIO)
+    off = tower.yorkcalc_approach_k(wet_bulb_c, 8.0 * range_k, water_ratio) + 7.0 * range_k
+    approach_k = slow + (off - slow) * np.array([-0.01, 0.0, 0.25, 0.75, 1.0])
+    result = run(
+        "yorkcalc", heat_w, wet_bulb_c=wet_bulb_c, condenser_setpoint_c=wet_bulb_c + approach_k
+    )
+    share = result.fan_w / (0.2**3 * DESIGN_FAN_W)
+    np.testing.assert_allclose(share[1:], [1.0, 0.75, 0.25, 0.0], atol=1e-9)
+    assert share[0] > 1.0
+    np.testing.assert_allclose(result.air_ratio[1:], 0.125 + 0.075 * share[1:])
 
 
 def test_idle_tower_costs_nothing() -> None:
@@ -283,7 +293,7 @@ def test_idle_tower_costs_nothing() -> None:
         assert result.fan_w[0] == 0.0
         assert result.range_k[0] == 0.0
         assert result.leaving_c[0] == 24.0
-    assert run("yorkcalc", [0.0]).air_ratio[0] == 0.0
+    assert run("yorkcalc", [0.0]).air_ratio[0] == 0.0  # With water, and no heat.
 
 
 def test_no_step_at_five_degrees() -> None:

@@ -62,15 +62,20 @@ YORKCALC = np.array(
 and of the wet bulb in C."""
 WET_BULB_BOUNDS_C = (-34.4, 26.7)
 """Wet bulb within which YorkCalc is evaluated, in C."""
-RANGE_BOUNDS_K = (1.1, 22.2)
-"""Range within which YorkCalc is evaluated, in K."""
-APPROACH_BOUNDS_K = (1.1, 40.0)
-"""Approach that YorkCalc gives, in K."""
+MAX_RANGE_K = 22.2
+"""Largest range at which YorkCalc is evaluated, in K."""
 MAX_LIQUID_GAS_RATIO = 8.0
 """Largest liquid to gas ratio at which YorkCalc is evaluated."""
 
 FREE_CONVECTION_SHARE = 0.125
-"""Share of the full-speed cooling that is left when the fan stands still."""
+"""Share of the full-speed cooling, and of the full-speed airflow, that is left when the fan stands
+still (default of EnergyPlus)."""
+MIN_AIR_RATIO = 0.2
+"""Lowest airflow of a running fan over that at full speed; below it the fan goes on and off
+(default of EnergyPlus)."""
+
+_LEAST_K = 1e-9
+"""Least difference of approaches that divides, in K."""
 
 FAN_W_PER_KG_S = 275.0 / 0.15
 """Fan power at full speed per design water flow, in W/(kg/s): 275 W per 0.15 kg/s, the default of
@@ -84,7 +89,8 @@ class TowerResult:
     fan_w: F64
     """Fan power, in W, (B,)."""
     air_ratio: F64
-    """Airflow over its design (reference) value, (B,); 0 when the fan is off."""
+    """Airflow over its design (reference) value, mean over the step, (B,); with the fan off it is
+    that of free convection, or 0 for models that have none."""
     leaving_c: F64
     """Temperature of the water that leaves the tower, in C, (B,)."""
     range_k: F64
@@ -98,11 +104,11 @@ def yorkcalc_approach_k(wet_bulb_c: Values, range_k: Values, liquid_gas_ratio: V
 
     Args:
         wet_bulb_c: Outdoor wet bulb, C; evaluated within -34.4..26.7 C.
-        range_k: Entering minus leaving water, K; evaluated within 1.1..22.2 K.
+        range_k: Entering minus leaving water, K; evaluated within 0..22.2 K.
         liquid_gas_ratio: Water flow ratio over air flow ratio; evaluated at 8 or less.
 
     Returns:
-        Approach within 1.1..40 K.
+        Approach, K, at least 0.
     """
     return _approach_at(liquid_gas_ratio, *_approach_parabola(wet_bulb_c, range_k))
 
@@ -117,7 +123,7 @@ def yorkcalc_liquid_gas_ratio(wet_bulb_c: Values, range_k: Values, approach_k: V
     Args:
         wet_bulb_c: Outdoor wet bulb, C.
         range_k: Entering minus leaving water, K.
-        approach_k: Approach wanted, K; evaluated within 1.1..40 K.
+        approach_k: Approach wanted, K.
 
     Returns:
         The ratio, 0..8. It is 0 where no airflow reaches the approach, and 8, the bound of the
@@ -129,12 +135,12 @@ def yorkcalc_liquid_gas_ratio(wet_bulb_c: Values, range_k: Values, approach_k: V
 def _approach_at(liquid_gas_ratio: Values, a: Values, b: Values, c: Values) -> F64:
     """Approach a + b*x + c*x^2 at the liquid to gas ratio x, in K."""
     x = np.minimum(liquid_gas_ratio, MAX_LIQUID_GAS_RATIO)
-    return as_array(np.clip(a + x * (b + x * c), *APPROACH_BOUNDS_K))
+    return as_array(np.maximum(a + x * (b + x * c), 0.0))
 
 
 def _ratio_at(approach_k: Values, a: Values, b: Values, c: Values) -> F64:
     """Liquid to gas ratio x at which a + b*x + c*x^2 is the approach, 0..8."""
-    above_intercept = np.clip(approach_k, *APPROACH_BOUNDS_K) - a
+    above_intercept = approach_k - a
     discriminant = b**2 + 4.0 * c * above_intercept
     # A negative discriminant has two meanings. The parabola opens downwards and stays below the
     # approach: any airflow will do. It opens upwards and stays above: none will; then the
@@ -219,12 +225,12 @@ def yorkcalc(
 ) -> TowerResult:
     """York tower with a variable-speed fan that holds the condenser water at its setpoint.
 
-    All heat is rejected: the range is heat_w/(c*m). The fan runs at the lowest speed that reaches
-    the setpoint; at full speed the leaving water rises above it. At the lowest airflow the
-    correlation covers (liquid to gas ratio 8), and with the fan off, a bypass keeps the water from
-    falling below the setpoint. With the fan off the tower still gives the free-convection share f
-    of its full-speed cooling (EnergyPlus: T_out = T_in - f*(T_in - T_out_full)), which for a given
-    range makes the approach A_full + range*(1 - f)/f.
+    All heat is rejected: the range is r = heat_w/(c*m). At full speed the leaving water may rise
+    above the setpoint. Else the fan runs as slowly as the setpoint allows, and below
+    ``MIN_AIR_RATIO`` goes on and off at that speed. With the fan off the tower keeps the share f of
+    its full-speed cooling (EnergyPlus: T_out = T_in - f*(T_in - T_out_full)): a tower that rejects
+    r with the fan off has r/f at full speed, and its approach is A_full(r/f) + r*(1 - f)/f. A
+    bypass keeps the water from falling below the setpoint.
 
     Args:
         heat_w: Heat to reject, W.
@@ -246,21 +252,21 @@ def yorkcalc(
     wanted_k = condenser_setpoint_c - wet_bulb_c
     parabola = _approach_parabola(wet_bulb_c, range_k)
     full_speed_k = _approach_at(water_ratio, *parabola)
+    low_speed_k = np.maximum(_approach_at(water_ratio / MIN_AIR_RATIO, *parabola), full_speed_k)
+    fan_off_k = _fan_off_approach_k(wet_bulb_c, range_k, water_ratio)
 
-    free_k = full_speed_k + range_k * (1.0 - FREE_CONVECTION_SHARE) / FREE_CONVECTION_SHARE
-    fan_off = (wanted_k >= free_k) | (range_k <= 0.0)
-    saturated = ~fan_off & (wanted_k <= full_speed_k)
-
-    ratio = _ratio_at(wanted_k, *parabola)
-    modulating = ~fan_off & ~saturated & (ratio > 0.0)
-    part_speed = np.minimum(water_ratio / np.where(modulating, ratio, 1.0), 1.0)
-    air_ratio = np.where(fan_off, 0.0, np.where(modulating, part_speed, 1.0))
-
-    approach_k = np.where(saturated, full_speed_k, wanted_k)
+    # The ratio of the wanted approach is below that of full speed where full speed is not enough.
+    loaded = range_k > 0.0
+    ratio = np.maximum(_ratio_at(wanted_k, *parabola), np.where(loaded, water_ratio, 1.0))
+    speed = np.maximum(water_ratio / ratio, MIN_AIR_RATIO)
+    # Between lowest speed and fan off the approach changes evenly with the share of time it is on.
+    on_share = (fan_off_k - wanted_k) / np.maximum(fan_off_k - low_speed_k, _LEAST_K)
+    on_share = np.where(loaded, np.clip(on_share, 0.0, 1.0), 0.0)
+    air_ratio = on_share * speed + (1.0 - on_share) * FREE_CONVECTION_SHARE
     return _tower(
-        fan_power_w(air_ratio, design_fan_w=design_fan_w),
-        air_ratio,
-        leaving_c=wet_bulb_c + approach_k,
+        on_share * fan_power_w(speed, design_fan_w=design_fan_w),
+        np.where(loaded, air_ratio, 0.0),
+        leaving_c=wet_bulb_c + np.where(loaded, np.maximum(wanted_k, full_speed_k), wanted_k),
         range_k=range_k,
         wet_bulb_c=wet_bulb_c,
     )
@@ -368,10 +374,17 @@ TOWERS: dict[str, Callable[..., TowerResult]] = {
 def _approach_parabola(wet_bulb_c: Values, range_k: Values) -> tuple[Values, Values, Values]:
     """Coefficients of the approach in powers 0, 1, 2 of the liquid to gas ratio."""
     t = np.clip(wet_bulb_c, *WET_BULB_BOUNDS_C)
-    r = np.clip(range_k, *RANGE_BOUNDS_K)
+    r = np.clip(range_k, 0.0, MAX_RANGE_K)
     in_range = [[p + t * (q + t * u) for p, q, u in powers] for powers in YORKCALC]
     a, b, c = (p + r * (q + r * u) for p, q, u in in_range)
     return a, b, c
+
+
+def _fan_off_approach_k(wet_bulb_c: Values, range_k: Values, water_ratio: Values) -> F64:
+    """Approach by free convection alone, in K."""
+    at_full_speed_k = range_k / FREE_CONVECTION_SHARE
+    full_speed_k = _approach_at(water_ratio, *_approach_parabola(wet_bulb_c, at_full_speed_k))
+    return as_array(full_speed_k + at_full_speed_k - range_k)
 
 
 def _range_k(heat_w: Values, water_kg_s: Values) -> F64:

@@ -1,0 +1,126 @@
+"""Components and a facility beside EnergyPlus 25.2, on tables that it wrote.
+
+``SDC_REFERENCE_DIR`` names a folder of such tables in place of ``reference/energyplus``, whose
+README says how each was made. Settings that a table does not hold are those of that README.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sdc_taichi.exogenous import psychrometrics
+from sdc_taichi.plant import tower
+from sdc_taichi.types import F64
+
+FOLDER = Path(
+    os.environ.get("SDC_REFERENCE_DIR") or Path(__file__).parent / "reference" / "energyplus"
+)
+
+
+def tables(pattern: str) -> list[Path]:
+    """Tables of a kind, of all sites and settings."""
+    return sorted(FOLDER.glob(pattern))
+
+
+def columns(path: Path) -> dict[str, F64]:
+    """Columns of a table by their names, (T,) each."""
+    with path.open(newline="") as file:
+        head, *rows = csv.reader(file)
+    return dict(zip(head, np.array(rows, dtype=np.float64).T, strict=True))
+
+
+def by_name(path: Path) -> str:
+    return path.stem
+
+
+# Moist air
+
+
+@pytest.mark.parametrize("path", tables("psychrometrics*.csv"), ids=by_name)
+def test_wet_bulb(path: Path) -> None:
+    table = columns(path)
+    wet_bulb_c = psychrometrics.wet_bulb_c(
+        table["outdoor_c"], table["relative_humidity_pct"], table["pressure_pa"]
+    )
+    apart_k = np.abs(wet_bulb_c - table["wet_bulb_c"])
+    # Just above 0 C two wet bulbs meet the equations, over water and over ice.
+    two_fold = (table["wet_bulb_c"] >= 0.0) & (table["wet_bulb_c"] <= 0.1)
+    assert apart_k[~two_fold].max() < 1e-3
+    assert apart_k[two_fold].max(initial=0.0) < 0.4
+
+
+@pytest.mark.parametrize("path", tables("psychrometrics*.csv"), ids=by_name)
+def test_humidity_ratio(path: Path) -> None:
+    table = columns(path)
+    ratio = psychrometrics.humidity_ratio(
+        table["outdoor_c"], table["relative_humidity_pct"], table["pressure_pa"]
+    )
+    np.testing.assert_allclose(ratio, table["humidity_ratio"], rtol=5e-4)
+
+
+# Tower
+
+TOWERS = tables("tower_yorkcalc_*.csv")
+DRIFT_SHARE = 2e-5
+DESIGN_RANGE_K = 5.56
+DESIGN = {"wet_bulb_c": 25.55, "range_k": DESIGN_RANGE_K, "approach_k": 4.0}
+FAN_W_PER_KG_S = 24_000.0 / 51.584
+
+
+def water_kg_m3(temperature_c: F64 | float) -> F64:
+    """Density of water (Kell 1975, as in Jones and Harris 1992)."""
+    t = np.asarray(temperature_c)
+    falling = (t - 3.9863) ** 2 * (t + 288.9414) / (508_929.2 * (t + 68.12963))
+    return 999.974 * (1.0 - falling)
+
+
+def design_water_kg_s(table: dict[str, F64]) -> float:
+    """Condenser water flow at design; drift is a share of it, of water at the outdoor air."""
+    litres = np.median(table["drift_l"] / table["air_ratio"])
+    return float(litres * 0.998 / 3600.0 / DRIFT_SHARE)
+
+
+def run_tower(table: dict[str, F64]) -> tower.TowerResult:
+    """The tower of a table; EnergyPlus counts flow ratios by the volume of the entering water."""
+    design_kg_s = design_water_kg_s(table)
+    reference_kg_s = tower.yorkcalc_reference_water_kg_s(design_kg_s, **DESIGN)
+    by_volume = water_kg_m3(table["entering_c"]) / water_kg_m3(5.05)
+    return tower.yorkcalc(
+        table["heat_w"],
+        wet_bulb_c=table["wet_bulb_c"],
+        outdoor_c=table["outdoor_c"],
+        condenser_setpoint_c=table["setpoint_c"],
+        supply_setpoint_c=0.0,
+        water_kg_s=table["water_kg_s"],
+        reference_water_kg_s=reference_kg_s * by_volume,
+        reference_air_m3s=0.0,
+        design_fan_w=FAN_W_PER_KG_S * design_kg_s,
+    )
+
+
+@pytest.mark.parametrize("path", TOWERS, ids=by_name)
+def test_tower(path: Path) -> None:
+    table = columns(path)
+    found = run_tower(table)
+    rows = table["consistent"] == 1.0
+    assert np.abs(found.leaving_c - table["leaving_c"])[rows].max() < 0.05
+    np.testing.assert_allclose(found.fan_w[rows], table["fan_w"][rows], rtol=0.01)
+
+
+@pytest.mark.parametrize("path", TOWERS, ids=by_name)
+def test_tower_fan_goes_off_in_the_same_hours(path: Path) -> None:
+    """Regime 1 is a fan that modulates, 0 one that goes on and off, or stands still."""
+    table = columns(path)
+    found = run_tower(table)
+    modulating = (table["regime"] == 1.0) & (table["consistent"] == 1.0)
+    assert (found.air_ratio[modulating] >= tower.MIN_AIR_RATIO).all()
+    cycling = table["regime"] == 0.0
+    same = found.air_ratio[cycling] < tower.MIN_AIR_RATIO
+    assert same.mean() > 0.95
+    apart = np.abs(found.air_ratio - table["air_ratio"])[cycling][same]
+    assert apart.max() < 0.03
