@@ -38,8 +38,9 @@ from sdc_taichi import (
     load_config,
 )
 from sdc_taichi.config import apply_overrides
+from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums, Precision
+from sdc_taichi.sim.hall_solver import Conditions, Hall, HallState, HallSums, Precision
 from sdc_taichi.types import F64
 
 SEEDS = st.integers(0, 2**32 - 1)

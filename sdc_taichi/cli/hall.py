@@ -21,6 +21,7 @@ from sdc_taichi.cli.arguments import (
     out_option,
     read_config,
 )
+from sdc_taichi.cli.hall_why import why_command
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import printable
 from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from sdc_taichi.sim.design_hall import DesignHall
 
 hall_app = typer.Typer(help="Describe a hall, solve its air.", no_args_is_help=True)
+hall_app.command("why")(why_command)
 
 
 @hall_app.command("show")

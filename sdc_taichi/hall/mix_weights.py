@@ -74,6 +74,15 @@ class MixWeights:
             out[rows, sources] += weights
         return np.asarray(out * self.strength * self.norm[:, None])
 
+    def row(self, rack: int) -> tuple[I64, F64]:
+        """Source racks of one rack, (n,), and their weights, which sum to 1, (n,)."""
+        runs = slice(self.run_offsets[rack], self.run_offsets[rack + 1])
+        lengths = self.run_length[runs]
+        within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+        sources = np.repeat(self.run_first_rack[runs], lengths) + within
+        weights = self.weights[np.repeat(self.run_first_weight[runs], lengths) + within]
+        return sources, np.asarray(weights * self.strength[sources] * self.norm[rack])
+
     def _slices(self) -> Iterator[tuple[Any, Any, F64]]:
         """Entries (row, column, weight), one position within the runs at a time."""
         rack = np.repeat(np.arange(len(self.norm)), np.diff(self.run_offsets))

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.facility_stage import FacilityStage
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums
+from sdc_taichi.sim.hall_solver import Conditions, Hall, HallState, HallSums
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.surroundings import Surroundings
 from sdc_taichi.sim.unit_index import UnitIndex

@@ -13,6 +13,7 @@ from sdc_taichi.hall.floor_plan import FloorPlan, floor_plan, unit_places_m
 from sdc_taichi.hall.mix_weights import MixWeights
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
+from sdc_taichi.sim.inlet_parts import Inlets
 from sdc_taichi.types import F64
 
 EXACT_RADIUS_RACKS = 2000
@@ -78,6 +79,8 @@ class DesignHall:
     air: AirFlows | None
     """Recirculation in the hall; None with inlet model ``approach``, whose inlets follow from no
     flows."""
+    inlets: Inlets
+    """Inlets of the racks as sums of parts."""
 
 
 def solve_design_hall(config: DataCenterConfig) -> DesignHall:
@@ -89,7 +92,8 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
     fleet = build_fleet(config)
     supply_c = config.hvac.setpoint.max_c
     hall = Hall(fleet, "f64")
-    sums = hall.solve(Conditions(np.full(fleet.units, supply_c), np.ones(1)))
+    unit_supply_c = np.full(fleet.units, supply_c)
+    sums = hall.solve(Conditions(unit_supply_c, np.ones(1)))
     plan = floor_plan(config.hall)
     inlet_c = np.asarray(sums.rack_inlet_c, dtype=np.float64)
     approach_k = inlet_c - supply_c
@@ -114,6 +118,7 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
         hottest_rack=rack,
         hottest_server=int(fleet.server_offsets[group] - first_server),
         air=_air_flows(fleet, sums, approach_k, supply_c),
+        inlets=Inlets(fleet, 0, hall.intake_air(unit_supply_c)),
     )
 
 

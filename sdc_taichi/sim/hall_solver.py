@@ -27,8 +27,10 @@ from sdc_taichi.kernels.hall_arguments import (
     RUNNING,
     STEP_ARGUMENTS,
 )
+from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_tables import build_hall_tables, build_rows_along_racks, vectors
+from sdc_taichi.sim.intake_air import IntakeAir, read_intake_air
 from sdc_taichi.sim.physical_limits import BEYOND_NUMBERS_C, no_number_error, no_steady_air_error
 from sdc_taichi.types import F64, I32, Reals, ServerLayers
 
@@ -89,22 +91,6 @@ class HallState:
     """Supply air that the racks ask of each CRAC unit, in m3/s, (U,)."""
     following: F64
     """Fan speed of each CRAC unit over design speed that would just cover the need, (U,)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Coil:
-    """Coils and plant of transient halls during one step."""
-
-    setpoint_c: F64
-    """Supply setpoint of each CRAC unit, in C, (U,)."""
-    room_j: F64
-    """Heat held by the room at the start of the step, over the setpoint, in J, (B,)."""
-    room_j_per_k: F64
-    """Heat capacity of the room, in J/K, (B,)."""
-    limit_w: F64
-    """Heat that the plant can take during the step, in W, (B,)."""
-    fan_w_per_m3s: F64
-    """CRAC fan power over airflow at full speed, in W/(m3/s), (B,)."""
 
 
 @dataclass
@@ -388,6 +374,21 @@ class Hall:
         """
         return self.groups().inlet_c.astype(np.float64)
 
+    def intake_air(self, setpoint_c: F64) -> IntakeAir:
+        """Air before the racks after a step, with the setpoint of each CRAC unit, in C, (U,).
+
+        Raises:
+            RuntimeStateError: before the first step.
+        """
+        self._require_step()
+        return read_intake_air(self._tables, self._rack_out, self._exhaust(), setpoint_c)
+
+    def _require_step(self) -> bool:
+        """Whether the last step was transient; an error without one."""
+        if self._was_transient is None:
+            raise RuntimeStateError("no step has been done yet; air and servers exist after one")
+        return self._was_transient
+
     def _set_conditions(self, met: Conditions) -> None:
         """Check conditions and write them to the inputs of the kernels."""
         for name, shape in self._shapes.items():
@@ -501,13 +502,12 @@ class Hall:
 
     def _call_layers_kernel(self, arguments: dict[str, Any], per_group: int) -> None:
         """Values of the last step to servers, or to each group once."""
-        if self._was_transient is None:
-            raise RuntimeStateError("no step has been done yet; server layers exist after one")
+        transient = self._require_step()
         runtime.ensure_started()
         if not self._has_rows_along_racks:
             self._add_rows_along_racks()
         self._layers_kernel(
-            transient=self._was_transient,
+            transient=transient,
             serial=len(arguments["inlet_c"]) <= SERIAL_GROUPS,
             load_level=self._load_level,
             group_load=self._group_load,

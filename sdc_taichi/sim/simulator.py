@@ -23,6 +23,7 @@ from sdc_taichi.sim.facility import Facility
 from sdc_taichi.sim.facility_stage import FacilityStage
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
+from sdc_taichi.sim.intake_air import IntakeAir
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.sim.state_limits import LAST_START, state_limits
@@ -234,6 +235,14 @@ class Simulator:
             RuntimeStateError: Before the first step.
         """
         return self._started().hall.groups()
+
+    def intake_air(self) -> IntakeAir:
+        """Air before the racks in the last step, of which ``Inlets`` tells why they are warm.
+
+        Raises:
+            RuntimeStateError: Before the first step.
+        """
+        return self._started().hall.intake_air(self.state.setpoint_c)
 
     def state_dict(self, state: State | None = None) -> dict[str, Any]:
         """A state as plain arrays, for ``load_state_dict`` or ``numpy.savez``.
