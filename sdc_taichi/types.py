@@ -313,6 +313,8 @@ class StepResult:
     """HVAC energy, in kWh, (B,)."""
     grid_kwh: F64
     """Energy bought from the grid, in kWh, (B,)."""
+    grid_overload_kwh: F64
+    """Energy bought beyond what the grid connection carries, in kWh, (B,); part of ``grid_kwh``."""
     unserved_kwh: F64
     """Energy that facility and battery lack in an outage while there is power (see ``powered``), in
     kWh, (B,)."""

@@ -131,6 +131,7 @@ def test_metrics_are_those_of_the_recorded_steps(two_sites: Path) -> None:
             "rci_lo_pct": rows["rci_lo_pct"].mean(),
             "lost_tasks": total["lost_tasks"],
             "unserved_kwh": total["unserved_kwh"],
+            "grid_overload_kwh": total["grid_overload_kwh"],
             "throttled_rack_h": total["throttled_racks"] * h,
             "tripped_rack_h": total["tripped_racks"] * h,
         }

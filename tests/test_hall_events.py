@@ -219,7 +219,8 @@ def test_a_hardier_class_keeps_running() -> None:
 
 def test_the_battery_carries_an_outage_as_far_as_it_reaches() -> None:
     results = simulate(
-        ["battery.hours_of_design_load=0.5", "battery.initial_soc=1", "battery.lower_v=0",
+        ["battery.hours_of_design_load=0.5", "battery.discharge_limit_c_rate=3",
+         "battery.initial_soc=1", "battery.lower_v=0",
          events("kind: grid_outage, start_h: 1, duration_h: 2")],
         20,
         battery=0.3,

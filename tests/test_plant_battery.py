@@ -317,3 +317,26 @@ def test_released_step_length_scales_with_the_step() -> None:
 def test_released_store_has_eight_decimals_of_a_mwh() -> None:
     stored = run("released", np.linspace(3.0, 1900.0, 40), -1.0).stored_kwh / 1e3
     np.testing.assert_array_equal(stored, np.round(stored, 8))
+
+
+@given(names, shares, commands, shares, st.floats(0.0, 2e4))
+@PROPERTY
+def test_the_grid_limit_is_kept_as_far_as_the_battery_can(
+    name: str, soc: list[float], command: list[float], load: list[float], limit_kw: float
+) -> None:
+    stored, load_kw = np.array(soc) * 2000.0, np.array(load) * 2e4
+    free = run(name, stored, command, load_kw=load_kw)
+    empty = run(name, stored, -1.0, load_kw=load_kw)
+    found = run(name, stored, command, load_kw=load_kw, grid_limit_kw=limit_kw)
+    # Charging gives way to the load; a load above the limit draws on the battery, asked or not.
+    room_kwh = np.maximum(limit_kw - load_kw, 0.0) * 0.25
+    np.testing.assert_array_equal(found.charge_kwh, np.minimum(free.charge_kwh, room_kwh))
+    missing_kwh = np.maximum(load_kw - limit_kw, 0.0) * 0.25
+    expected_kwh = np.maximum(free.discharge_kwh, np.minimum(missing_kwh, empty.discharge_kwh))
+    np.testing.assert_allclose(found.discharge_kwh, expected_kwh, rtol=1e-12, atol=1e-9)
+    over_kwh = found.grid_kwh - limit_kw * 0.25
+    exhausted = np.isclose(found.discharge_kwh, empty.discharge_kwh, rtol=1e-12, atol=1e-9)
+    assert np.all((over_kwh <= 1e-9) | exhausted)
+    np.testing.assert_allclose(
+        found.grid_kwh, load_kw * 0.25 + found.charge_kwh - found.discharge_kwh, rtol=1e-12
+    )

@@ -117,6 +117,13 @@ def _conditions(allowable_max_c: float) -> tuple[_Condition, ...]:
             "ERROR",
         ),
         _Condition(
+            "grid connection overloaded: {value} kWh beyond its limit in the step",
+            "grid connection within its limit again, {total} kWh beyond it in all",
+            "grid_overload_kwh",
+            1e-9,
+            "ERROR",
+        ),
+        _Condition(
             "energy unserved: {value} kWh",
             "no energy unserved any more, {total} kWh in all",
             "unserved_kwh",

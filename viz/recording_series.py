@@ -158,6 +158,7 @@ EVENT_FIELDS = (
     "hottest_server",
     "unmet_w",
     "unserved_kwh",
+    "grid_overload_kwh",
 )
 """Fields that the log of events needs besides those that are plotted."""
 

@@ -31,6 +31,7 @@ METRICS = (
             ("battery_discharge_kwh", "delivered by the battery", "kWh"),
             ("battery_net_kwh", "battery, drawn less delivered", "kWh"),
             ("grid_kwh", "grid energy, facility and battery", "kWh"),
+            ("grid_overload_kwh", "beyond the limit of the grid connection", "kWh"),
             ("unserved_kwh", "unserved in outages", "kWh"),
             ("pue", "PUE", "1"),
             ("pue_with_ups", "PUE with UPS losses", "1"),

@@ -135,6 +135,7 @@ def _work_texts(run: RunFolder) -> list[str]:
         ("throttled_rack_h", "Racks were throttled for {} rack h because of hot inlets."),
         ("tripped_rack_h", "Racks were switched off for {} rack h because of hot inlets."),
         ("unserved_kwh", "In grid outages, {} kWh could not be served."),
+        ("grid_overload_kwh", "The grid connection carried {} kWh beyond its limit."),
         ("unmet_cooling_kwh", "The plant lacked capacity for {} kWh of heat."),
     ):
         if total[key] > 0:

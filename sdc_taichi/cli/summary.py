@@ -38,6 +38,7 @@ _ROWS = (
     ("RCI lo (%)", "rci_lo_pct"),
     ("lost (tasks)", "lost_tasks"),
     ("unserved energy (kWh)", "unserved_kwh"),
+    ("grid overload (kWh)", "grid_overload_kwh"),
     ("battery throughput (kWh)", "battery_throughput_kwh"),
 )
 

@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from pydantic import Field, field_validator, model_validator
 
+from sdc_taichi.config.electrical_schema import ElectricalConfig
 from sdc_taichi.config.event_schema import EventsConfig, ProtectionConfig
 from sdc_taichi.config.fields import (
     CRate,
@@ -53,9 +54,9 @@ class BatteryConfig(Section):
     discharge_factor: Annotated[float, Field(ge=1, le=100)] = 1.04
     """Energy drawn from the store per energy delivered, 1..100: from no loss to an efficiency
     of 1 %."""
-    charge_limit_c_rate: CRate = 3.0
+    charge_limit_c_rate: CRate = 0.5
     """Largest rate into the store, in capacities per hour (1/h)."""
-    discharge_limit_c_rate: CRate = 3.0
+    discharge_limit_c_rate: CRate = 1.0
     """Largest rate out of the store, in capacities per hour (1/h)."""
     upper_u_h: Annotated[float, Field(ge=-100, le=0)] = -0.04
     """Slope u of the upper limit of the stored energy, u P + v capacity, against the charge power
@@ -168,6 +169,8 @@ class DataCenterConfig(Section):
     """Cooling from the CRAC units to the tower."""
     battery: BatteryConfig = BatteryConfig()
     """Battery between grid and facility."""
+    electrical: ElectricalConfig = ElectricalConfig()
+    """Connection to the grid."""
     workload: WorkloadConfig = WorkloadConfig()
     """Work of the servers and its queue."""
     protection: ProtectionConfig = ProtectionConfig()

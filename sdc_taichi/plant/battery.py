@@ -14,6 +14,7 @@ Every model has the same signature, so a caller can look it up in `BATTERIES` an
     discharge_limit_c_rate largest rate out of the store, in capacities per hour
     upper_u_h, upper_v     highest stored energy at charge power P, u*P + v*capacity; u in h
     lower_u_h, lower_v     lowest stored energy at discharge power P, u*P + v*capacity; u in h
+    grid_limit_kw          most power that the grid connection carries, kW; None is no limit
 
 Arguments are float64 arrays of shape (B,), or anything that broadcasts to it; a model reads only
 what its equations need. Energy at the bus: charge_kwh is drawn, discharge_kwh delivered, and
@@ -21,6 +22,10 @@ what its equations need. Energy at the bus: charge_kwh is drawn, discharge_kwh d
     stored' = stored + charge_efficiency*charge_kwh - discharge_factor*discharge_kwh
 
 to rounding; the released model has no losses and rounds its store to 8 decimals of a MWh.
+
+Every battery guards the grid connection: it charges with what the limit leaves beside the load,
+and where the load alone exceeds the limit it discharges to make up the difference, as far as its
+own limits allow and whatever the command says.
 
 Sources: F. Kazhamiaka, C. Rosenberg, S. Keshav, "Tractable lithium-ion storage models for
 optimizing energy systems", Energy Informatics 2 (2019); SustainDC, appendix A.3.4.
@@ -70,6 +75,7 @@ def clc(
     upper_v: Values = 1.0,
     lower_u_h: Values = 0.01,
     lower_v: Values = 0.0,
+    grid_limit_kw: Values | None = None,
 ) -> BatteryResult:
     """C/L/C: constant efficiencies, linear limits of the stored energy, constant rate limits.
 
@@ -91,6 +97,7 @@ def clc(
         upper_v: Highest stored energy v without charge power, over capacity.
         lower_u_h: Rise u' of the lowest stored energy with the discharge power, h, at least 0.
         lower_v: Lowest stored energy v' without discharge power, over capacity.
+        grid_limit_kw: Most power of the grid connection, kW; None is no limit.
 
     Returns:
         The battery's step.
@@ -113,6 +120,7 @@ def clc(
         ),
         charge_efficiency=charge_efficiency,
         discharge_factor=discharge_factor,
+        grid_limit_kw=grid_limit_kw,
     )
 
 
@@ -131,6 +139,7 @@ def released(
     upper_v: Values = 1.0,
     lower_u_h: Values = 0.01,
     lower_v: Values = 0.0,
+    grid_limit_kw: Values | None = None,
 ) -> BatteryResult:
     """The battery of the released SustainDC code, as identified from its recorded runs.
 
@@ -154,6 +163,7 @@ def released(
         upper_v: Not used; the model has 1.
         lower_u_h: Not used; the model has 0.01 h.
         lower_v: Not used; the model has 0.
+        grid_limit_kw: Most power of the grid connection, kW; None is no limit.
 
     Returns:
         The battery's step. Its loss is what the rounding takes or gives, 5e-6 kWh at most.
@@ -168,8 +178,13 @@ def released(
         np.minimum(capacity_kwh, stored_kwh / (discharge_h + 0.01)), 0.25 * load_kw
     )
 
-    charge_kwh = np.maximum(command, 0.0) * charge_kw * charge_h
-    discharge_kwh = np.maximum(-command, 0.0) * discharge_kw * discharge_h
+    charge_kwh, discharge_kwh = _within_grid_limit(
+        np.maximum(command, 0.0) * charge_kw * charge_h,
+        np.maximum(-command, 0.0) * discharge_kw * discharge_h,
+        most_discharge_kwh=discharge_kw * discharge_h,
+        load_kwh=load_kw * dt_h,
+        limit_kwh=None if grid_limit_kw is None else grid_limit_kw * dt_h,
+    )
     change_kwh = charge_kwh - discharge_kwh
     rounded_kwh = np.clip(np.round((stored_kwh + change_kwh) / 1e3, 8) * 1e3, 0.0, capacity_kwh)
     return _battery(
@@ -196,6 +211,7 @@ def paper(
     upper_v: Values = 1.0,
     lower_u_h: Values = 0.01,
     lower_v: Values = 0.0,
+    grid_limit_kw: Values | None = None,
 ) -> BatteryResult:
     """Appendix A.3.4: the rates are limited by the energy that fits and by a largest power.
 
@@ -218,6 +234,7 @@ def paper(
         upper_v: Not used.
         lower_u_h: Not used.
         lower_v: Not used.
+        grid_limit_kw: Most power of the grid connection, kW; None is no limit.
 
     Returns:
         The battery's step.
@@ -237,6 +254,7 @@ def paper(
         ),
         charge_efficiency=charge_efficiency,
         discharge_factor=discharge_factor,
+        grid_limit_kw=grid_limit_kw,
     )
 
 
@@ -259,10 +277,17 @@ def _step(
     discharge_limit_kw: Values,
     charge_efficiency: Values,
     discharge_factor: Values,
+    grid_limit_kw: Values | None,
 ) -> BatteryResult:
     """Charge or discharge at a share of the limit powers; a discharge never exceeds the load."""
-    charge_kwh = np.maximum(command, 0.0) * charge_limit_kw * dt_h
-    discharge_kwh = np.maximum(-command, 0.0) * np.minimum(discharge_limit_kw, load_kw) * dt_h
+    discharge_kw = np.minimum(discharge_limit_kw, load_kw)
+    charge_kwh, discharge_kwh = _within_grid_limit(
+        np.maximum(command, 0.0) * charge_limit_kw * dt_h,
+        np.maximum(-command, 0.0) * discharge_kw * dt_h,
+        most_discharge_kwh=discharge_kw * dt_h,
+        load_kwh=load_kw * dt_h,
+        limit_kwh=None if grid_limit_kw is None else grid_limit_kw * dt_h,
+    )
     after_kwh = stored_kwh + charge_efficiency * charge_kwh - discharge_factor * discharge_kwh
     # Emptying or filling exactly can miss by the last bits, and an empty battery carries nothing.
     after_kwh = np.where(after_kwh > _ROUND_OFF_SHARE * stored_kwh, after_kwh, 0.0)
@@ -272,6 +297,24 @@ def _step(
         charge_kwh=charge_kwh,
         discharge_kwh=discharge_kwh,
         load_kwh=load_kw * dt_h,
+    )
+
+
+def _within_grid_limit(
+    charge_kwh: Values,
+    discharge_kwh: Values,
+    *,
+    most_discharge_kwh: Values,
+    load_kwh: Values,
+    limit_kwh: Values | None,
+) -> tuple[Values, Values]:
+    """Charge and discharge, kWh, that keep the grid connection within its limit if they can."""
+    if limit_kwh is None:
+        return charge_kwh, discharge_kwh
+    missing_kwh = np.maximum(load_kwh - limit_kwh, 0.0)
+    return (
+        np.minimum(charge_kwh, np.maximum(limit_kwh - load_kwh, 0.0)),
+        np.maximum(discharge_kwh, np.minimum(missing_kwh, most_discharge_kwh)),
     )
 
 

@@ -18,6 +18,7 @@ from sdc_taichi.plant.battery import BATTERIES, BatteryResult
 from sdc_taichi.plant.carbon import emitted_g
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.fans_pumps import crac_fan_w
+from sdc_taichi.plant.grid import NO_LIMIT_KW, overload_kwh
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterUse
 from sdc_taichi.plant.water_side import WaterSideResult
@@ -195,6 +196,16 @@ class Facility:
         self._water_model = WATER[models["water"]]
         self._battery_model = BATTERIES[models["battery"]]
         self._battery = {name: v(f"battery.{name}") for name in _BATTERY}
+        self._grid_limited = bool(np.any(sizing.grid_limit_kw < NO_LIMIT_KW))
+        if self._grid_limited:
+            self._battery["grid_limit_kw"] = sizing.grid_limit_kw
+        self._outage_battery = dict(self._battery)
+        if models["battery"] == "clc":
+            # At 1 C a battery of one hour carries the design power: its losses are less than what
+            # the design power exceeds any load by.
+            self._outage_battery["discharge_limit_c_rate"] = v(
+                "battery.discharge_limit_c_rate"
+            ) * v("battery.discharge_factor")
         self._water = {
             "cycles_of_concentration": v("hvac.water.cycles_of_concentration"),
             "drift_share": v("hvac.water.drift_share"),
@@ -256,7 +267,8 @@ class Facility:
         """Share of a step with power, 0..1, (B,).
 
         In an outage power lasts as long as the battery would carry the facility at its design
-        power, which is more than it draws.
+        power, which is more than it draws; a battery that cannot deliver the design power carries
+        it for a part of the time.
 
         Args:
             grid_up: Whether the grid supplies, (B,).
@@ -266,7 +278,9 @@ class Facility:
         if np.all(grid_up):
             return all_step
         design_kw = self._sizing.facility_w / 1e3
-        carried_kwh = self._run_battery(stored_kwh, -all_step, load_kw=design_kw).discharge_kwh
+        carried_kwh = self._run_battery(
+            stored_kwh, -all_step, load_kw=design_kw, limits=self._outage_battery
+        ).discharge_kwh
         lasts = np.minimum(carried_kwh / (design_kw * self._step_h), 1.0)
         return np.where(grid_up, all_step, lasts)
 
@@ -383,16 +397,22 @@ class Facility:
         command = inputs.battery_command
         if not self._event_free:
             command = np.where(inputs.grid_up > 0, command, -1.0)
-        battery = self._run_battery(inputs.stored_kwh, command, load_kw=(it_w + hvac_w) / 1e3)
+        battery = self._run_battery(
+            inputs.stored_kwh, command, load_kw=(it_w + hvac_w) / 1e3, limits=self._battery
+        )
         needed_kwh = battery.grid_kwh
         grid_kwh = needed_kwh if self._event_free else needed_kwh * inputs.grid_up
         battery_kwh = self._sizing.battery_kwh
+        limit_kwh = self._sizing.grid_limit_kw * self._step_h
         return {
             **fields_of(battery),
             "soc": battery.stored_kwh / np.where(battery_kwh > 0, battery_kwh, 1.0),
             "it_kwh": it_w * self._step_h / 1e3,
             "hvac_kwh": hvac_w * self._step_h / 1e3,
             "grid_kwh": grid_kwh,
+            "grid_overload_kwh": (
+                overload_kwh(grid_kwh, limit_kwh) if self._grid_limited else 0.0 * grid_kwh
+            ),
             "unserved_kwh": needed_kwh - grid_kwh,
             "carbon_g": emitted_g(grid_kwh, inputs.ci_g_per_kwh),
         }
@@ -411,7 +431,9 @@ class Facility:
             "rci_lo_pct": air_metrics.rci_lo(inputs.under_18_sum_k, servers, allowable_c=low_c),
         }
 
-    def _run_battery(self, stored_kwh: F64, command: F64, *, load_kw: F64) -> BatteryResult:
+    def _run_battery(
+        self, stored_kwh: F64, command: F64, *, load_kw: F64, limits: dict[str, F64]
+    ) -> BatteryResult:
         """One step of the batteries."""
         return self._battery_model(
             stored_kwh,
@@ -419,7 +441,7 @@ class Facility:
             capacity_kwh=self._sizing.battery_kwh,
             load_kw=load_kw,
             dt_h=self._step_h,
-            **self._battery,
+            **limits,
         )
 
     def _coil_capacity_w(self, inputs: FacilityInputs) -> F64:

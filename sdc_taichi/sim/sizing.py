@@ -10,6 +10,7 @@ import numpy as np
 from sdc_taichi.errors import PhysicalLimitError
 from sdc_taichi.plant import chiller, tower
 from sdc_taichi.plant.fans_pumps import hydraulic_pump_w
+from sdc_taichi.plant.grid import NO_LIMIT_KW
 from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
@@ -41,6 +42,8 @@ class Sizing:
     """IT and HVAC power at the design point, in W, (B,)."""
     battery_kwh: F64
     """Capacity of the battery, in kWh, (B,)."""
+    grid_limit_kw: F64
+    """Most power that the grid connection carries, in kW, (B,); ``NO_LIMIT_KW`` without a limit."""
     room_kwh_per_k: F64
     """Heat that warms the room, and its servers if quasi-steady, by 1 K, in kWh/K, (B,)."""
     water_side: WaterSideDesign
@@ -127,6 +130,7 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
         design_wet_bulb_c=wet_bulb_c,
         facility_w=facility_w,
         battery_kwh=_battery_kwh(fleet, facility_w * hours / 1e3),
+        grid_limit_kw=_grid_limit_kw(fleet, facility_w / 1e3),
         room_kwh_per_k=_room_kwh_per_k(fleet),
         water_side=water_side,
     )
@@ -177,6 +181,7 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
         design_wet_bulb_c=wet_bulb_c,
         facility_w=facility_w,
         battery_kwh=_battery_kwh(fleet, facility_w / 1e3),
+        grid_limit_kw=_grid_limit_kw(fleet, facility_w / 1e3),
         room_kwh_per_k=_room_kwh_per_k(fleet),
         water_side=_water_side(fleet, rated_w, rated_w, rated_w, outdoor_c, wet_bulb_c),
     )
@@ -333,6 +338,14 @@ def _battery_kwh(fleet: Fleet, sized_kwh: F64) -> F64:
     """Capacity of the battery, kWh, (B,): that of the config, or as sized."""
     given = fleet.values("battery.capacity_kwh")
     return np.where(np.isnan(given), sized_kwh, given)
+
+
+def _grid_limit_kw(fleet: Fleet, design_kw: F64) -> F64:
+    """Most power of the grid connection, kW, (B,): as given, or in proportion to the design."""
+    given_kw = fleet.values("electrical.grid_limit_kw")
+    ratio = fleet.values("electrical.grid_limit_ratio")
+    sized_kw = np.where(np.isnan(ratio), NO_LIMIT_KW, ratio * design_kw)
+    return np.minimum(np.where(np.isnan(given_kw), sized_kw, given_kw), NO_LIMIT_KW)
 
 
 def _room_kwh_per_k(fleet: Fleet) -> F64:
