@@ -231,7 +231,7 @@ def assert_agrees(
 
 def at_design(configs: Sequence[DataCenterConfig]) -> HallSums:
     setpoint_c = np.concatenate(
-        [np.full(c.hvac.crac.units, c.hvac.setpoint.max_c) for c in configs]
+        [np.full(c.hvac.crac.units, c.hall.design_supply_c) for c in configs]
     )
     return Hall(fleet_of(*configs), "f64").solve(Conditions(setpoint_c, np.ones(len(configs))))
 

@@ -292,7 +292,7 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
     rack_number, full_w, idle_w, deviation, raw_height = np.concatenate(columns, axis=1)
     rack = rack_number.astype(np.int64)
     air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
-    supply_c = config.hvac.setpoint.max_c
+    supply_c = config.hall.design_supply_c
     twin = HallTwin(
         config, rack, full_w, idle_w, deviation, raw_height, np.zeros((racks, racks)),
         np.zeros(racks), 1.0, _supply_shares(config), np.zeros(0), 1.0, air,

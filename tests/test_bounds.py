@@ -128,6 +128,7 @@ def test_no_rack_in_air_has_more_power_than_air_carries() -> None:
         ("servers.power_w=[400, 40]", "rack 0 has servers of 80 kW"),
         ("hvac.chiller.reference_cop=20", "reference_cop 20"),
         ("hvac.setpoint.max_c=40", "max_c 40: supply air is usually 10..35 C"),
+        ("hall.design_supply_c=40", "design_supply_c 40: supply air is usually 10..35 C"),
         ("hvac.pumps.efficiency=0.1", "efficiency 0.1"),
     ],
 )

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from random_halls import AS_FOUND, SEEDS, fleet_of, random_values
-from sdc_taichi import ConfigError, DataCenterConfig, load_config
+from sdc_taichi import ConfigError, DataCenterConfig, Simulator, load_config
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.sim.crac_units import CracUnits
 from sdc_taichi.sim.design_hall import DesignHall, solve_design_hall
@@ -102,6 +102,28 @@ def test_hottest_inlet_is_continuous_in_load(
     found: F64 = Hall(fleet, "f64").solve(met).inlet_max_c
     # A quarter of a percent of load; without containment inlets rise by 7 K over all of it.
     assert np.max(np.abs(np.diff(found))) < 0.05
+
+
+@pytest.mark.parametrize("highest_c", [19.0, 23.0, 27.0])
+def test_setpoint_limits_move_neither_temperatures_nor_sizes(highest_c: float) -> None:
+    config = load_config("corrected", [f"hvac.setpoint.max_c={highest_c}"])
+    at_18 = simulated(config, 18.0)
+    np.testing.assert_allclose(at_18.rack_inlet_max_c.max(), 26.22, atol=0.01)
+    expected = simulated(load_config("corrected"), 18.0)
+    np.testing.assert_allclose(at_18.rack_inlet_c, expected.rack_inlet_c, rtol=0, atol=1e-9)
+    with Simulator([config, load_config("corrected", ["name=usual"])]) as sim:
+        for name in ("it_w", "crac_flow_m3s", "facility_w", "battery_kwh"):
+            sized = getattr(sim.sizing, name)
+            assert sized[0] == pytest.approx(sized[1], rel=1e-5)
+
+
+def test_design_supply_air_moves_the_design_point() -> None:
+    for supply_c in (18.0, 26.0):
+        config = load_config("corrected", [f"hall.design_supply_c={supply_c}"])
+        shown = solve_design_hall(config)
+        assert shown.supply_c == supply_c
+        assert shown.approach_k.mean() == pytest.approx(5.15)
+        assert_at_design(shown, simulated(config, supply_c))
 
 
 def test_fans_cover_what_their_racks_need_and_no_more() -> None:

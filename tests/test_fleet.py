@@ -179,8 +179,8 @@ def test_approach_temperatures_are_those_that_the_hall_has(tmp_path: Path) -> No
     for changes in ([], ["hall.layout.containment=0.6", "hvac.crac.units=2"], matrix):
         config = load_config("corrected", changes)
         fleet = build_fleet(config)
-        met = Conditions(np.full(fleet.units, config.hvac.setpoint.max_c), np.ones(1))
-        found = Hall(fleet, "f64").solve(met).rack_inlet_c - config.hvac.setpoint.max_c
+        met = Conditions(np.full(fleet.units, config.hall.design_supply_c), np.ones(1))
+        found = Hall(fleet, "f64").solve(met).rack_inlet_c - config.hall.design_supply_c
         np.testing.assert_allclose(fleet.approach_k, found, rtol=0.01)
         given = np.allclose(fleet.approach_k, config.hall.rack_approach_k(), rtol=0.2)
         assert given == (not changes)

@@ -77,7 +77,7 @@ def solve_hall(
     """Solve air and temperatures at the design point, and write the recirculation matrix R.
 
     Potential flow on a grid: racks, floor tiles, returns and containment of hall.layout, full load
-    at the highest setpoint. docs/layout-solver.md says what potential flow cannot tell.
+    at hall.design_supply_c. docs/layout-solver.md says what potential flow cannot tell.
     """
     from sdc_taichi.layout_solver.solve import solve_at_design_point
 

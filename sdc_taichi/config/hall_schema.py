@@ -128,6 +128,10 @@ class HallConfig(Section):
     return_approach_k: DifferenceK | tuple[DifferenceK, ...]
     """CRAC return air above the rack outlet, in K, negative where supply air bypasses the racks:
     one for all racks, or one per rack."""
+    design_supply_c: AirC = 23.0
+    """Supply air at the design point, in C, at which the approach temperatures hold and devices are
+    sized for full load; setpoints limit actions alone. With approach temperatures of 5 K, 23 C
+    brings inlets to 28 C, where the usual server fans reach full speed."""
     layout: LayoutConfig = LayoutConfig()
     """Measures of the hall."""
     recirculation: RecirculationConfig = RecirculationConfig()

@@ -36,6 +36,11 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
         value = getattr(setpoint, name)
         if not low <= value <= high:
             yield f"hvac.setpoint.{name} {value:g}: supply air is usually {low:g}..{high:g} C"
+    if not low <= config.hall.design_supply_c <= high:
+        yield (
+            f"hall.design_supply_c {config.hall.design_supply_c:g}: supply air is usually "
+            f"{low:g}..{high:g} C"
+        )
     if pumps.model == "sized" and pumps.efficiency < LEAST_USUAL_PUMP_EFFICIENCY:
         yield (
             f"hvac.pumps.efficiency {pumps.efficiency:g}: even small pumps reach "

@@ -1,4 +1,4 @@
-"""Power, airflow and temperatures of a hall at its design point: full load, highest setpoint."""
+"""Power, airflow and temperatures of a hall at its design point: full load, design supply air."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _MOST_HEIGHT_ITERATIONS = 100
 
 @dataclass(frozen=True, slots=True)
 class DesignPoint:
-    """A hall of R racks and G server groups at full load and the highest setpoint."""
+    """A hall of R racks and G server groups at full load and design supply air."""
 
     supply_c: float
-    """Supply air, the highest setpoint, in C."""
+    """Supply air, in C."""
     fan_full_airflow_m3s: float
     """Airflow of one server at an airflow ratio of 1, in m3/s: as configured, or else such that the
     approach temperatures close the heat balance of the hall."""
@@ -42,7 +42,7 @@ class DesignPoint:
 def design_point(
     config: DataCenterConfig, servers: RackServers | None = None, approach_k: F64 | None = None
 ) -> DesignPoint:
-    """Power, airflow and temperatures of every rack at full load and the highest setpoint.
+    """Power, airflow and temperatures of every rack at full load and design supply air.
 
     Outlets follow from the heat balance of a rack, T_out = T_in + P/(rho cp V).
 
@@ -56,7 +56,7 @@ def design_point(
     """
     servers = rack_servers(config) if servers is None else servers
     approach_k = config.hall.rack_approach_k() if approach_k is None else approach_k
-    supply_c = config.hvac.setpoint.max_c
+    supply_c = config.hall.design_supply_c
     group_approach_k = servers.per_group(approach_k)
     height_factor = np.ones(len(servers.count))
     if config.hall.inlet_model == "recirculation":
@@ -90,7 +90,7 @@ def design_point_at(
     Raises:
         ConfigError: approach temperatures that leave no room for heating the air.
     """
-    hall, curves, supply_c = config.hall, config.servers.curves, config.hvac.setpoint.max_c
+    hall, curves, supply_c = config.hall, config.servers.curves, config.hall.design_supply_c
     full_load = np.ones(len(servers.count))
     ratio = curves.airflow_ratio(inlet_c, full_load)
     cpu_w = curves.cpu_w(inlet_c, full_load, servers.full_w, servers.idle_w)

@@ -357,7 +357,7 @@ class _SystemSolution:
 def solve_at_design_point(
     config: DataCenterConfig, cell_m: float = DEFAULT_CELL_M
 ) -> LayoutSolution:
-    """Solve the air of a hall at full load and the highest setpoint.
+    """Solve the air of a hall at full load and design supply air.
 
     Args:
         config: The data center.

@@ -46,7 +46,7 @@ class AirFlows:
 
 @dataclass(frozen=True, slots=True)
 class DesignHall:
-    """A hall of R racks and U CRAC units at full load and the highest setpoint."""
+    """A hall of R racks and U CRAC units at full load and design supply air."""
 
     config: DataCenterConfig
     """The data center that the hall belongs to."""
@@ -90,7 +90,7 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
         SdcError: a hall that cannot be laid out or has no steady state.
     """
     fleet = build_fleet(config)
-    supply_c = config.hvac.setpoint.max_c
+    supply_c = config.hall.design_supply_c
     hall = Hall(fleet, "f64")
     unit_supply_c = np.full(fleet.units, supply_c)
     sums = hall.solve(Conditions(unit_supply_c, np.ones(1)))

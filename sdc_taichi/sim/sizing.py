@@ -27,9 +27,9 @@ class Sizing:
     """Sized devices of B data centers."""
 
     it_w: F64
-    """IT power at full load and the highest setpoint, in W, (B,)."""
+    """IT power at full load and design supply air, in W, (B,)."""
     it_airflow_m3s: F64
-    """Airflow through the servers at full load and the highest setpoint, in m3/s, (B,)."""
+    """Airflow through the servers at full load and design supply air, in m3/s, (B,)."""
     crac_flow_m3s: F64
     """Airflow of the CRAC units at full fan speed, in m3/s, (B,)."""
     crac_fan_w: F64
@@ -94,7 +94,7 @@ def _check_sizes(fleet: Fleet, found: Sizing) -> None:
 
 
 def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizing:
-    """Full load, highest setpoint and design wet bulb, with the margin of the config on top.
+    """Full load, design supply air and design wet bulb, with the margin of the config on top.
 
     Args:
         fleet: B data centers.
@@ -103,7 +103,7 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
         wet_bulb_c: Design wet bulb, C, (B,).
     """
     v = fleet.values
-    full = _solve(fleet, hall, v("hvac.setpoint.max_c"), np.ones(fleet.size))
+    full = _solve(fleet, hall, v("hall.design_supply_c"), np.ones(fleet.size))
     it_w = full.cpu_w + full.it_fan_w
     crac_flow_m3s = fleet.unit_sums(fleet.unit_design_m3s)
     crac_fan_w = v("hvac.crac.fan_w_per_m3s") * crac_flow_m3s
