@@ -150,6 +150,18 @@ def test_what_a_fleet_must_share(change: str) -> None:
         build_fleet([TINY, named(TINY, "other", change)])
 
 
+def test_smallest_lift_is_a_field_of_its_own() -> None:
+    base = load_config("corrected")
+    configs = [named(base, str(lift), f"hvac.chiller.min_lift_k={lift}") for lift in (6.0, 30.0)]
+    year = [20.0], [15.0], [300.0], [0.9]
+    with Simulator(configs, drivers=drivers_from_arrays(*year, size=2)) as sim:
+        sim.reset()
+        low, high = sim.step().chiller_w
+        towers = sim.sizing.water_side.rejected_w
+    assert high > 1.1 * low > 0
+    assert towers[1] > towers[0]
+
+
 def test_fleets_that_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match="no data center given"):
         build_fleet([])

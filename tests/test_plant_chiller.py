@@ -19,7 +19,14 @@ CHECKS = [c for c in ALL if c["group"] == "chiller"]
 DC_CHECKS = [c for c in ALL if c["group"] == "dc" and "P_comp" in c["expected"]]
 TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
 FIELDS = ChillerResult.__slots__
-CURVES = ("carnot", "eir_york", "electric_water_cooled", "electric_air_cooled", "released")
+CURVES = (
+    "centrifugal_vsd",
+    "carnot",
+    "eir_york",
+    "electric_water_cooled",
+    "electric_air_cooled",
+    "released",
+)
 
 PROPERTY = settings(max_examples=60, deadline=None, derandomize=True)
 # Shares of a capacity that a float cannot hold are no loads.
@@ -196,12 +203,13 @@ def test_power_rises_with_load(name: str, chilled_c: float, condenser_c: float) 
 
 @given(st.floats(-20.0, 60.0), st.floats(0.0, 30.0), st.floats(0.0, 10.0))
 @PROPERTY
-def test_carnot_power_rises_with_lift(condenser_c: float, chilled_c: float, by_k: float) -> None:
-    base = run("carnot", 6e5, condenser_c=condenser_c, chilled_water_c=chilled_c).power_w
-    hotter = run("carnot", 6e5, condenser_c=condenser_c + by_k, chilled_water_c=chilled_c).power_w
-    colder = run("carnot", 6e5, condenser_c=condenser_c, chilled_water_c=chilled_c - by_k).power_w
-    assert hotter >= base
-    assert colder >= base
+def test_power_rises_with_lift(condenser_c: float, chilled_c: float, by_k: float) -> None:
+    for name in ("centrifugal_vsd", "carnot"):
+        base = run(name, 6e5, condenser_c=condenser_c, chilled_water_c=chilled_c).power_w
+        hotter = run(name, 6e5, condenser_c=condenser_c + by_k, chilled_water_c=chilled_c).power_w
+        colder = run(name, 6e5, condenser_c=condenser_c, chilled_water_c=chilled_c - by_k).power_w
+        assert hotter >= base
+        assert colder >= base
 
 
 @pytest.mark.parametrize("name", sorted(CHILLERS))
@@ -229,9 +237,17 @@ def test_machine_cycles_below_its_least_load(name: str) -> None:
 # -------------------------------------------------------------------------------- single equations
 
 
-def test_carnot_is_calibrated_at_the_york_reference_point() -> None:
-    result = run("carnot", 1e6, reference_cop=np.array([5.96, 4.0]))
+@pytest.mark.parametrize("name", ["centrifugal_vsd", "carnot"])
+def test_cop_is_calibrated_at_the_york_reference_point(name: str) -> None:
+    result = run(name, 1e6, reference_cop=np.array([5.96, 4.0]))
     np.testing.assert_allclose(result.cop, [5.96, 4.0], rtol=1e-12)
+
+
+def test_smallest_lift_limits_the_cop_of_the_default() -> None:
+    at_floor = run("centrifugal_vsd", 1e6, chilled_water_c=10.0, condenser_c=np.array([16.11, 9.0]))
+    np.testing.assert_allclose(at_floor.cop, 5.96 * 283.15 / 279.82 * 44.77 / 28.11, rtol=1e-4)
+    lower = run("centrifugal_vsd", 1e6, chilled_water_c=10.0, condenser_c=9.0, min_lift_k=3.0)
+    np.testing.assert_allclose(lower.cop / at_floor.cop[0], 28.11 / 25.0, rtol=1e-6)
 
 
 def test_carnot_cop_is_proportional_to_evaporator_temperature_over_lift() -> None:
@@ -259,7 +275,10 @@ def test_carnot_lift_has_a_floor() -> None:
     np.testing.assert_allclose(2.0 * lower.power_w, at_floor.power_w, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("name", "low", "high"), [("carnot", 4, 20), ("eir_york", 4.44, 8.89)])
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [("centrifugal_vsd", 4, 20), ("carnot", 4, 20), ("eir_york", 4.44, 8.89)],
+)
 def test_chilled_water_is_held_within_the_curve(name: str, low: float, high: float) -> None:
     assert chiller.CHILLED_WATER_BOUNDS_C[name] == (low, high)
     inside = run(name, 6e5, chilled_water_c=np.array([low, high])).power_w
@@ -319,6 +338,7 @@ def test_condenser_side_each_model_sees() -> None:
         for n in CHILLERS
     }
     assert seen == {
+        "centrifugal_vsd": "water",
         "carnot": "water",
         "eir_york": "water",
         "electric_water_cooled": "water",

@@ -19,7 +19,7 @@ from sdc_taichi.config.fields import (
     WaterRangeK,
     WorkingShare,
 )
-from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C
+from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C, MIN_LIFT_K
 
 Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
 
@@ -86,6 +86,7 @@ class ChillerConfig(Section):
     """Chiller model and its reference point."""
 
     model: Literal[
+        "centrifugal_vsd",
         "carnot",
         "eir_york",
         "electric_water_cooled",
@@ -93,7 +94,7 @@ class ChillerConfig(Section):
         "constant_cop",
         "released",
         "paper",
-    ] = "carnot"
+    ] = "centrifugal_vsd"
     """How power and capacity of the chiller follow from load and temperatures."""
     reference_cop: Annotated[float, Field(ge=0.5, le=50)] = 5.96
     """COP at the reference point, in W of heat per W of power, 0.5..50: from an absorption chiller
@@ -105,6 +106,10 @@ class ChillerConfig(Section):
     min_condenser_c: Annotated[float, Field(ge=0, le=60)] = 12.78
     """Lowest temperature of the condenser water that enters the chiller, in C, 0..60: water that is
     liquid, and below the condensing temperatures of refrigerants."""
+    min_lift_k: Annotated[float, Field(ge=0.1, le=50)] = MIN_LIFT_K
+    """Smallest lift that a compressor works against, entering condenser water over leaving chilled
+    water, in K, for models ``centrifugal_vsd`` and ``carnot``, 0.1..50: towards 0 K the COP of
+    ``carnot`` has no limit, and no plant lifts more in its best hour."""
 
 
 class TowerConfig(Section):
@@ -239,9 +244,10 @@ class HvacConfig(Section):
 
     @model_validator(mode="after")
     def _chilled_water_within_the_model(self) -> Self:
-        if self.chiller.model != "carnot":
+        model = self.chiller.model
+        if model not in ("centrifugal_vsd", "carnot"):
             return self
-        low, high = CHILLED_WATER_BOUNDS_C["carnot"]
+        low, high = CHILLED_WATER_BOUNDS_C[model]
         for name in ("min_c", "max_c"):
             setpoint = getattr(self.setpoint, name)
             water = setpoint - self.chiller.coil_approach_k
@@ -249,6 +255,6 @@ class HvacConfig(Section):
                 raise ValueError(
                     f"setpoint.{name} {setpoint:g} less chiller.coil_approach_k "
                     f"{self.chiller.coil_approach_k:g} makes chilled water of {water:g} C; "
-                    f"model carnot is valid within {low:g}..{high:g} C"
+                    f"model {model} is valid within {low:g}..{high:g} C"
                 )
         return self

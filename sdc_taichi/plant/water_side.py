@@ -51,6 +51,8 @@ class WaterSideDesign:
     """Approach of the economiser, precooled water over tower water, in K, (B,)."""
     min_condenser_c: F64
     """Coldest condenser water that the chiller takes, in C, (B,)."""
+    min_lift_k: F64
+    """Smallest lift of the chiller, condenser water over chilled water, in K, (B,)."""
     economiser: F64
     """1 with a waterside economiser, 0 without, (B,)."""
 
@@ -160,6 +162,7 @@ def operate(
             condenser_c=np.maximum(tower_water_c, design.min_condenser_c),
             outdoor_c=outdoor_c,
             reference_cop=design.reference_cop,
+            min_lift_k=design.min_lift_k,
         )
 
     coldest_c = wet_bulb_c + design.approach_min_k

@@ -247,6 +247,7 @@ def _design_chiller(
         "condenser_c": np.maximum(tower_c, v("hvac.chiller.min_condenser_c")),
         "outdoor_c": outdoor_c,
         "reference_cop": v("hvac.chiller.reference_cop"),
+        "min_lift_k": v("hvac.chiller.min_lift_k"),
     }
     idle, unit_w = np.zeros(fleet.size), np.ones(fleet.size)
     available_w_per_w = model(idle, reference_w=unit_w, **conditions).available_w
@@ -275,6 +276,7 @@ def _water_side(
         approach_min_k=approach_k,
         exchanger_approach_k=v("hvac.tower.economiser_approach_k") - approach_k,
         min_condenser_c=v("hvac.chiller.min_condenser_c"),
+        min_lift_k=v("hvac.chiller.min_lift_k"),
         economiser=v("hvac.tower.economiser"),
         **_tower(fleet, cooling_w, rejected_w, outdoor_c, wet_bulb_c),
         **_pumps(fleet, cooling_w, rejected_w),
