@@ -10,6 +10,7 @@ from .hall_arguments import LANES, RECOMMENDED_C, UNIT_STATE
 from .mixes import store_exhaust
 from .servers import (
     OUTLET_OF_SERVERS,
+    STILL_AIR_SHARE,
     add_group,
     apply_rack_factors,
     compute_group,
@@ -122,7 +123,12 @@ def compute_block(
         terms.return_m3k_s = terms.return_m3k_s + return_m3k_s
         block.captured_m3s = captured_m3s
         block_terms.fresh_m3s = fresh_m3s
-        store_exhaust(hall, block_at, sweep, air.mixed_c, outlet_c, changes)
+        given_c = outlet_c
+        if ti.static(hall.transient):
+            # Past a rack that is off flows air of its inlet, but for the draught.
+            draught_c = mean_c + hall.real(STILL_AIR_SHARE) * (outlet_c - mean_c)
+            given_c = ti.select(racks.powered > hall.real(0.0), outlet_c, draught_c)
+        store_exhaust(hall, block_at, sweep, air.mixed_c, given_c, changes)
     else:
         # SHI and RHI are those of the racks, by whatever model their outlets are.
         sums.inlet_m3k_s = flow_m3s * mean_c

@@ -15,6 +15,9 @@ from .decay import halvings_for, phi1, power_of_half
 from .hall_arguments import LANES, LOADS_PER_GROUP, LOADS_PER_RACK, OUTLETS
 
 OUTLET_OF_SERVERS, OUTLET_OF_RACKS = OUTLETS.index("server"), OUTLETS.index("rack")
+STILL_AIR_SHARE = 0.02
+"""Share of its full airflow by which a rack whose servers are off loses heat, in transient halls:
+draught of warm air and the surface of the rack together, see docs/transients.md."""
 
 
 class _ReleasedOutlet(NamedTuple):
@@ -136,7 +139,13 @@ def rack_model(hall: ti.template(), servers: ti.template(), block_at):
             first_group[i] = hall.places[place].first_group
             last_group[i] = hall.places[place + 1].first_group - 1
     powered = block.powered
-    available_airflow = block.fan_airflow * powered
+    blown_airflow = block.fan_airflow * powered
+    available_airflow, fan_low = blown_airflow, servers.fan_low
+    if ti.static(hall.transient):
+        off = hall.real(1.0) - powered
+        available_airflow = blown_airflow + hall.real(STILL_AIR_SHARE) * off
+        # Draught knows no fan curve.
+        fan_low = ti.select(powered > hall.real(0.0), fan_low, hall.zeros + hall.real(1.0))
     return ti.Struct(
         # A group does u + deviation*u*(1 - u), which conserves the work of its rack and stays
         # within 0..1.
@@ -151,7 +160,8 @@ def rack_model(hall: ti.template(), servers: ti.template(), block_at):
         powered=powered,
         available_airflow=available_airflow,
         full_m3s=available_airflow * servers.full_m3s,
-        full_fan_w=available_airflow * servers.fan_full_w,
+        full_fan_w=blown_airflow * servers.fan_full_w,
+        fan_low=fan_low,
     )
 
 
@@ -192,7 +202,7 @@ def compute_group(
     cpu_ratio = on_curve_c * servers.cpu_slope + (deviation * servers.cpu_shift + racks.cpu_base)
     cpu_w = larger(group.idle_w, group.full_w * cpu_ratio)
     airflow = on_curve_c * servers.fan_slope + (deviation * servers.fan_shift + racks.fan_base)
-    airflow = smaller(larger(airflow, servers.fan_low), servers.fan_high)
+    airflow = smaller(larger(airflow, racks.fan_low), servers.fan_high)
     fan_power = airflow
     if servers.fan_exponent == hall.real(3.0):
         fan_power = airflow * airflow * airflow

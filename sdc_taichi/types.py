@@ -138,6 +138,9 @@ class State:
     (B,)."""
     rack_status: Status
     """Status of each rack: 0 normal, 1 throttled, 2 tripped, (R,)."""
+    restart_wait_min: F64
+    """Time for which each tripped rack has been able to restart, in min, (R,); where racks protect
+    themselves."""
     group_inlet_c: F64
     """Inlet of each server group in the last step, in C, (G,); for placement by temperature."""
     server_c: Reals

@@ -122,6 +122,8 @@ def _rack(
 
 
 POWERS = ("full_w", "idle_w")
+DRAUGHT = 0.02
+"""Share of its full airflow by which a rack that is off loses heat, in transient halls."""
 
 
 def _data_center(racks: list[dict[str, float]]) -> dict[str, float]:
@@ -177,18 +179,26 @@ class HallTwin:
         u = rack_load[self.rack]
         return u + self.deviation * u * (1.0 - u)
 
-    def servers(self, inlet_c: F64, load: F64, powered: F64, breath: F64) -> tuple[F64, F64, F64]:
-        """CPU power, fan power and airflow of every server, (S,) each."""
+    def servers(
+        self, inlet_c: F64, load: F64, powered: F64, breath: F64, draught: float = 0.0
+    ) -> tuple[F64, F64, F64]:
+        """CPU power, fan power and airflow of every server, (S,) each.
+
+        ``draught`` is the share of its full airflow that passes a server which is off.
+        """
         s = self.config.servers
         limit_c = np.inf if s.curve_limit_c is None else s.curve_limit_c
         on_curve_c = np.minimum(inlet_c, limit_c)
         ratio = airflow_ratio(self.config, on_curve_c, load)
         fan = s.fan_reference_w * (ratio / s.fan_reference_ratio) ** s.fan_power_exponent
         on = powered[self.rack]
+        if draught:
+            _, high = s.fan_airflow_ratio_limits or (0.0, np.inf)
+            ratio = np.where(on > 0, ratio, np.clip(ratio, 1.0, high))
         return (
             on * cpu_w(self.config, self.full_w, self.idle_w, on_curve_c, load),
             on * breath[self.rack] * fan,
-            on * breath[self.rack] * self.full_m3s * ratio,
+            (on * breath[self.rack] + (1.0 - on) * draught) * self.full_m3s * ratio,
         )
 
 
@@ -573,7 +583,7 @@ def advance(
         ratio = np.where(asked, offered / np.where(asked, now.need_m3s, 1.0), 1.0)
         covered = (1.0 - hall.captured)[:, None] * hall.unit_shares[hall.rack] * ratio
         inlet_c = (1.0 - covered.sum(axis=1)) * mixed[hall.rack] + covered @ supply_c
-        cpu, fan, flow = hall.servers(inlet_c, load, powered, breath)
+        cpu, fan, flow = hall.servers(inlet_c, load, powered, breath, DRAUGHT)
         moved = flows(hall, flow, low, high, ratio)
         k = s.heat_exchange_effectiveness * air * flow
         blown = k > 0
@@ -598,6 +608,8 @@ def advance(
         inflow = hall.per_rack(flow * inlet_c) / np.where(still, 1.0, rack_flow)
         rack_inlet = np.where(still, plain, inflow)
         captured = hall.per_rack(flow * moved.exhaust)
+        passed_c = rack_inlet + DRAUGHT * (outlet_c - rack_inlet)
+        given_c = np.where(powered > 0, outlet_c, passed_c)
         warm = rack_flow @ outlet_c - captured @ mixed - parcel_w / air
         return_c = float((warm + moved.bypass @ supply_c) / moved.unit.sum())
         taken = air * moved.unit * (return_c - supply_c)
@@ -627,7 +639,7 @@ def advance(
             }
         )  # fmt: skip
         now = Memory(
-            warmer, mixed_end, mixed + breath * (outlet_c - mixed), captured, moved.need,
+            warmer, mixed_end, mixed + breath * (given_c - mixed), captured, moved.need,
             wanted_speed(hall, moved.need),
             now.room_j + (load_w - coil_w) * h,
         )  # fmt: skip

@@ -214,6 +214,77 @@ def test_a_hardier_class_keeps_running() -> None:
     assert unmet["A1"] > unmet["A2"] == unmet["null"] == 0
 
 
+def all_units_down(thermal: str, *more: str) -> list[StepResult]:
+    """Four units down from minute 6 to 36 of 90, at 90 % load and 22 C, steps of a minute."""
+    return simulate(
+        [f"simulation.thermal={thermal}", "hvac.crac.units=4", "hvac.setpoint.initial_c=22",
+         "protection.ashrae_class=A2", "simulation.steps_per_hour=60", "simulation.substep_s=15",
+         "hvac.sizing.design_wet_bulb_c=26",
+         events("kind: crac_down, start_h: 0.1, duration_h: 0.5"), *more],
+        90,
+        constant(0.9, outdoor_c=30.0, wet_bulb_c=22.0),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("thermal", THERMAL)
+def test_racks_restart_in_stages_and_with_cooling_alone(thermal: str) -> None:
+    results = all_units_down(thermal)
+    status, it_w = column(results, "rack_status"), column(results, "it_w")
+    up = np.array([(r.unit_running > 0).any() for r in results])
+    assert np.flatnonzero(~up).tolist() == list(range(6, 36))
+    off = status == TRIPPED
+    starts = (~off[1:] & off[:-1]).sum(axis=1)
+    assert off.sum(axis=1).max() >= 15
+    assert np.all(starts[:35] == 0)
+    # Five minutes of cool inlets, then a tenth of the racks a minute.
+    assert np.all(starts[35:39] == 0)
+    assert starts.max() == 2
+    assert starts.sum() == off.any(axis=0).sum()
+    assert np.all(status[-1] == NORMAL)
+    assert it_w[35] < 0.2 * it_w[0]
+    assert it_w[-1] == pytest.approx(it_w[0], rel=0.01)
+
+
+def test_the_heat_of_tripped_servers_goes_to_the_room() -> None:
+    results = all_units_down("transient")
+    off = slice(25, 34)
+    assert np.all(column(results, "tripped_racks")[off] >= 15)
+    stored_w, load_w = column(results, "thermal_storage_w"), column(results, "cooling_load_w")
+    assert np.all(stored_w[off] < 0), "off servers keep their heat"
+    assert np.all(np.diff(column(results, "room_heat_kwh")[off]) > 0)
+    assert np.all(np.diff(column(results, "supply_c")[off]) > 0)
+    np.testing.assert_allclose(column(results, "it_w")[off] - stored_w[off], load_w[off], rtol=1e-9)
+    # Inlets neither fall to where racks would restart nor pass the servers.
+    inlet_c = column(results, "inlet_mean_c")[off]
+    assert np.all((inlet_c > 29) & (inlet_c < column(results, "outlet_mean_c")[off]))
+
+
+@pytest.mark.parametrize(("thermal", "per_hour"), [("quasi_steady", 4), ("transient", 60)])
+def test_a_rack_with_a_tenth_of_its_air_throttles_trips_and_waits_for_its_fans(
+    thermal: str, per_hour: int
+) -> None:
+    results = simulate(
+        [f"simulation.thermal={thermal}", f"simulation.steps_per_hour={per_hour}",
+         "servers.power_w=[150, 10]", "protection.ashrae_class=A2",
+         events("kind: rack_fan_failure, rack: 7, share: 0.1, start_h: 0.5, duration_h: 3")],
+        5 * per_hour,
+        constant(1.0),
+    )  # fmt: skip
+    status = column(results, "rack_status")
+    others = np.delete(status, 7, axis=1)
+    assert np.all(others == NORMAL)
+    rack, outlet_c = status[:, 7], column(results, "rack_outlet_max_c")[:, 7]
+    first = {code: int(np.argmax(rack == code)) for code in (THROTTLED, TRIPPED)}
+    assert per_hour // 2 <= first[THROTTLED] < first[TRIPPED] < 2.5 * per_hour
+    # It is off to the end of the failure, and back after it.
+    end = int(3.5 * per_hour)
+    assert np.all(rack[first[TRIPPED] : end] == TRIPPED)
+    assert np.all(rack[-per_hour // 2 :] == NORMAL)
+    assert np.all(outlet_c[first[TRIPPED] + 1 :] < 80.0)
+    if thermal == "transient":
+        assert outlet_c.max() < 81.0
+
+
 # --- grid ---------------------------------------------------------------------------------------
 
 
@@ -250,8 +321,13 @@ def test_an_outage_without_battery_stops_everything(thermal: str) -> None:
     )  # fmt: skip
     dark = slice(4, 10)
     for name in ("it_w", "hvac_w", "heat_removed_w", "executed_tasks", "grid_kwh", "lost_tasks",
-                 "it_airflow_m3s", "water_l"):  # fmt: skip
+                 "water_l"):  # fmt: skip
         assert np.all(column(results, name)[dark] == 0), name
+    # Warm servers draw a little air.
+    airflow = column(results, "it_airflow_m3s")
+    draught = 0.1 * airflow[0] if thermal == "transient" else 0.0
+    assert np.all(airflow[dark] <= draught)
+    assert np.all((airflow[dark] > 0) == (thermal == "transient"))
     assert np.all(column(results, "powered")[dark] == 0)
     running = np.array([r.unit_running for r in results])
     assert np.all(running[dark] == 0)

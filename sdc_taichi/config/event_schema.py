@@ -17,6 +17,9 @@ WaveK = Annotated[float, Field(ge=-40, le=40)]
 DurationH = Annotated[float, Field(ge=0.001, le=876_000)]
 """Duration of an event, 0.001..876,000 h: from a few seconds to a century."""
 
+OutletC = Annotated[float, Field(ge=20, le=120)]
+"""Temperature of the air that servers give off, 20..120 C: from inlets to what no board bears."""
+
 LEAST_DRAUGHT_SHARE = 0.01
 """Least share of its airflow that a rack keeps without fans, as warm air rises through it."""
 
@@ -31,21 +34,44 @@ _OPTIONAL: dict[EventKind, tuple[str, ...]] = {"crac_down": ("unit",)}
 
 
 class ProtectionConfig(Section):
-    """Response of servers to inlets above the allowable range of their ASHRAE class.
+    """Response of servers to inlets above the allowable range of their class, and to hot outlets.
 
-    Above the limit a rack throttles; ``trip_margin_k`` above it, it switches off and loses the
-    work of the step, until its inlet is at most ``restart_c``.
+    Above a limit a rack throttles; above a trip temperature it switches off and loses the work of
+    the step. It stays off until cooling has been in order, and its inlet at most ``restart_c``, for
+    ``restart_hold_min``; then racks start again in stages.
     """
 
     ashrae_class: Literal["A1", "A2", "A3", "A4"] | None = None
-    """ASHRAE TC 9.9 (2021) class of the servers, whose allowable range has the limit; None is no
-    protection."""
+    """ASHRAE TC 9.9 (2021) class of the servers, whose allowable range has the limit of the inlets;
+    None is no protection."""
     throttle_share: Share = 0.5
     """Utilisation that a throttled rack may reach, 0..1."""
     trip_margin_k: RiseK = 5.0
     """Inlet above the limit at which a rack switches off, in K."""
-    restart_c: AirC = 27.0
-    """Warmest inlet at which a rack that has switched off starts again, in C."""
+    restart_c: AirC | None = None
+    """Warmest inlet at which a rack that has switched off starts again, in C; None is midway
+    between the recommended 27 C and the limit of the class."""
+    outlet_limit_c: OutletC | None = 70.0
+    """Outlet above which a rack throttles, in C; None leaves outlets out. 70 C is the default limit
+    of the exhaust of Dell PowerEdge servers (``ThermalSettings.AirExhaustTemp`` of iDRAC)."""
+    outlet_trip_c: OutletC = 80.0
+    """Outlet above which a throttled rack switches off, in C. 80 C is the critical threshold of the
+    exhaust sensor of Dell PowerEdge R750 servers."""
+    restart_hold_min: Annotated[float, Field(ge=0, le=1440)] = 5.0
+    """Time for which cooling and inlet have to be in order before a rack starts again, in min,
+    0..1,440: from at once to a day."""
+    restart_share: Annotated[float, Field(ge=0.001, le=1)] = 0.1
+    """Share of the racks of a data center that start again in a minute, at least one rack in a
+    step, 0.001..1: from a day for a thousand racks to all at once."""
+
+    @model_validator(mode="after")
+    def _throttles_before_it_trips(self) -> Self:
+        limit_c = self.outlet_limit_c
+        if limit_c is not None and limit_c > self.outlet_trip_c:
+            raise ValueError(
+                f"outlet_limit_c {limit_c:g} must not exceed outlet_trip_c {self.outlet_trip_c:g}"
+            )
+        return self
 
 
 class ScheduledEvent(Section):

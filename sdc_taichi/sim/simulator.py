@@ -168,6 +168,7 @@ class Simulator:
             stored_kwh=self.fleet.values("battery.initial_soc") * stages.sizing.battery_kwh,
             room_heat_kwh=np.zeros(self.size),
             rack_status=np.zeros(self.fleet.racks, dtype=np.int8),
+            restart_wait_min=stages.allocation.initial_wait_min(),
             **stages.air.initial(supply, drivers.at(0).demand),
         )
 
@@ -200,7 +201,7 @@ class Simulator:
         except PhysicalLimitError as error:
             raise PhysicalLimitError(f"{error} (step {state.step})") from None
         plant = stages.facility.step(state, commands, surroundings, supply, air)
-        racks = stages.allocation.protect(state, work, placement, air.rack_inlet_max_c)
+        racks = stages.allocation.protect(state, surroundings, work, placement, air, plant)
         result = _step_result(
             state.step, self.step_h, commands, surroundings, work, supply, air, racks, plant
         )
@@ -448,6 +449,7 @@ def _next_state(
         stored_kwh=plant["stored_kwh"].copy(),
         room_heat_kwh=plant["room_heat_kwh"].copy(),
         rack_status=racks.rack_status.copy(),
+        restart_wait_min=racks.restart_wait_min,
         **thermal,
     )
 

@@ -66,6 +66,7 @@ def state_limits(fleet: Fleet, sizing: Sizing, step: int) -> dict[str, Limits]:
             (AIR_LIMITS_C[0] - highest_c) * sizing.room_kwh_per_k,
             (AIR_LIMITS_C[1] - lowest_c) * sizing.room_kwh_per_k,
         ),
+        "restart_wait_min": (0.0, 60.0 * step / fleet.steps_per_hour),
         "rack_status": (NORMAL, np.where(is_protected, TRIPPED, NORMAL)[per_rack]),
         "group_inlet_c": HALL_LIMITS_C,
         "server_c": HALL_LIMITS_C,

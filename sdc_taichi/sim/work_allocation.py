@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from sdc_taichi.hall import protection
-from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, allowable_c
+from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, allowable_c
 from sdc_taichi.hall.placement import make_bins, place
-from sdc_taichi.hall.protection import THROTTLED, TRIPPED
+from sdc_taichi.hall.protection import THROTTLED, TRIPPED, Mask
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim.actions import Commands
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import HallSums
 from sdc_taichi.sim.surroundings import Surroundings
 from sdc_taichi.sim.workload import WorkResult
-from sdc_taichi.types import F64, Reals, State, Status
+from sdc_taichi.types import F64, I64, State, Status
+
+UNMET_SHARE = 0.01
+"""Cooling keeps up where no more than this share of the cooling load stays in the room."""
 
 
 @dataclass
@@ -49,6 +55,9 @@ class Placement:
 class RackOutcome:
     """Results of one step of R racks in B data centers, from their work and inlets."""
 
+    restart_wait_min: F64
+    """Time for which tripped racks have been able to restart, in min, (R,); empty where no rack
+    ever trips."""
     rack_status: Status
     """Status at the end of the step: 0 normal, 1 throttled, 2 tripped, (R,)."""
     throttled_racks: F64
@@ -84,14 +93,30 @@ class WorkAllocation:
         limit_c = np.array([np.inf if c is None else allowable_c(c)[1] for c in classes])
         trip_c = limit_c + fleet.values("protection.trip_margin_k")
         self._protected = bool(np.any(np.isfinite(limit_c)))
-        restart_c = fleet.values("protection.restart_c")
-        self._limits = {
-            name: each[fleet.rack_dc] + LEAST_EXCESS_K
-            for name, each in (("limit_c", limit_c), ("trip_c", trip_c), ("restart_c", restart_c))
+        outlet_limit_c = fleet.values("protection.outlet_limit_c")
+        unlimited = np.isnan(outlet_limit_c) | np.isinf(limit_c)
+        outlet_trip_c = np.where(unlimited, np.inf, fleet.values("protection.outlet_trip_c"))
+        limits = {
+            "limit_c": limit_c,
+            "trip_c": trip_c,
+            "outlet_limit_c": np.where(unlimited, np.inf, outlet_limit_c),
+            "outlet_trip_c": outlet_trip_c,
         }
+        self._limits = {name: each[fleet.rack_dc] + LEAST_EXCESS_K for name, each in limits.items()}
+        self._step_min = 60.0 / fleet.steps_per_hour
+        restart_c = fleet.values("protection.restart_c")
+        midway_c = 0.5 * (RECOMMENDED_C[1] + limit_c)
+        restart_c = np.where(np.isnan(restart_c), midway_c, restart_c)
+        self._restart_c = restart_c[fleet.rack_dc] + LEAST_EXCESS_K
+        self._hold_min = fleet.values("protection.restart_hold_min")[fleet.rack_dc]
+        self._most_starts = self._racks_per_step()
         self._unlimited = Capacity(utilisation=1.0, bins=None)
         self._throttle_share = fleet.values("protection.throttle_share")[fleet.rack_dc]
         self._allowable_high_c = np.array([allowable_c(c)[1] for c in classes])
+
+    def initial_wait_min(self) -> F64:
+        """``restart_wait_min`` before the first step, (R,), or empty where no rack ever trips."""
+        return np.zeros(self._fleet.racks if self._protected else 0)
 
     @property
     def watches_inlets(self) -> bool:
@@ -160,30 +185,79 @@ class WorkAllocation:
         return Placement(utilisation, placed_utilisation, rack_load, group_load, rack_powered)
 
     def protect(
-        self, state: State, work: WorkResult, placement: Placement, rack_inlet_max_c: Reals
+        self,
+        state: State,
+        surroundings: Surroundings,
+        work: WorkResult,
+        placement: Placement,
+        air: HallSums,
+        plant: Mapping[str, Any],
     ) -> RackOutcome:
-        """Racks throttle, trip and restart by their hottest inlets.
+        """Racks throttle, trip and restart by their hottest inlets and outlets.
 
         Args:
             state: State at the start of the step, with the status of each rack.
+            surroundings: Which CRAC units run, and what is left of the racks' fans.
             work: Work that starts.
             placement: Where it runs.
-            rack_inlet_max_c: Hottest inlet of each rack, C, (R,).
+            air: Hottest inlet and outlet of each rack.
+            plant: Cooling load, and what of it was not met.
         """
         lost_share = np.maximum(work.utilisation - placement.placed_utilisation, 0.0)
         before, status = state.rack_status, state.rack_status.copy()
+        wait_min = state.restart_wait_min
         if self._protected:
-            inlet_max_c = rack_inlet_max_c.astype(np.float64)
-            status = protection.protect(before, inlet_max_c, **self._limits)
+            inlet_max_c = air.rack_inlet_max_c.astype(np.float64)
+            fans_failed = np.zeros(len(before), np.bool_)
+            if surroundings.rack_airflow is not None:
+                fans_failed = surroundings.rack_airflow < 1.0
+            restarts = np.zeros(len(before), np.bool_)
+            if (before == TRIPPED).any():
+                cooled = self._is_cooled(surroundings, plant)[self._fleet.rack_dc] & ~fans_failed
+                restarts, wait_min = self._restart(before, wait_min, inlet_max_c, cooled)
+            status = protection.protect(
+                before,
+                inlet_max_c,
+                air.rack_outlet_max_c.astype(np.float64),
+                **self._limits,
+                throttle_share=self._throttle_share,
+                fans_failed=fans_failed,
+                restarts=restarts,
+            )
             lost_share = lost_share + self._tripped_work(before, status, placement)
         lost_tasks = TASKS_PER_STEP * lost_share
         return RackOutcome(
+            restart_wait_min=wait_min,
             rack_status=status,
             throttled_racks=self._racks_in(status, THROTTLED),
             tripped_racks=self._racks_in(status, TRIPPED),
             lost_tasks=lost_tasks,
             executed_tasks=work.started_tasks - lost_tasks,
         )
+
+    def _restart(
+        self, before: Status, wait_min: F64, inlet_max_c: F64, cooled: Mask
+    ) -> tuple[Mask, F64]:
+        """Racks that start again in a step, and ``restart_wait_min`` at its end, each (R,)."""
+        wait_min = protection.ready_min(
+            before, wait_min, inlet_max_c, cooled, restart_c=self._restart_c, dt=self._step_min
+        )
+        ready = (wait_min > 0) & (wait_min >= self._hold_min)
+        restarts = protection.first_of_each(ready, self._most_starts, self._fleet.rack_offsets)
+        return restarts, np.where(restarts, 0.0, wait_min)
+
+    def _racks_per_step(self) -> I64:
+        """Racks of each data center that may restart in a step, at least one, (B,)."""
+        racks = np.diff(self._fleet.rack_offsets)
+        share = self._fleet.values("protection.restart_share") * self._step_min
+        # The tolerance keeps what is a whole number of racks one.
+        return np.maximum(np.floor(share * racks + 1e-9), 1.0).astype(np.int64)
+
+    def _is_cooled(self, surroundings: Surroundings, plant: Mapping[str, Any]) -> Mask:
+        """Whether a CRAC unit of each data center runs and the plant keeps up with it, (B,)."""
+        any_runs = self._fleet.unit_sums(surroundings.unit_running) > 0
+        load_w = np.abs(plant["cooling_load_w"])
+        return np.asarray(any_runs & (plant["unmet_w"] <= UNMET_SHARE * load_w))
 
     def _fully_on(self, status: Status, surroundings: Surroundings) -> bool:
         """Whether all racks are in order and on throughout the step."""
