@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from sdc_taichi.exogenous import psychrometrics
-from sdc_taichi.plant import tower
+from sdc_taichi.plant import chiller, tower
 from sdc_taichi.types import F64
 
 FOLDER = Path(
@@ -124,3 +124,59 @@ def test_tower_fan_goes_off_in_the_same_hours(path: Path) -> None:
     assert same.mean() > 0.95
     apart = np.abs(found.air_ratio - table["air_ratio"])[cycling][same]
     assert apart.max() < 0.03
+
+
+# Chillers
+
+
+@pytest.mark.parametrize("path", tables("chiller_eir_york*.csv"), ids=by_name)
+def test_york_chiller(path: Path) -> None:
+    table = columns(path)
+    steady = table["cycling_ratio"] == 1.0
+    reference_w = np.median((table["load_w"] / table["plr"] / table["capacity_factor"])[steady])
+    factors = ("capacity_factor", "eir_factor_t", "eir_factor_plr", "cycling_ratio")
+    full_w = reference_w * np.prod([table[name] for name in factors], axis=0)
+    machine = chiller.eir_york(
+        table["load_w"],
+        reference_w=reference_w,
+        chilled_water_c=table["chilled_water_c"],
+        condenser_c=table["condenser_c"],
+        outdoor_c=0.0,
+        reference_cop=float(np.median(full_w / table["power_w"])),
+    )
+    np.testing.assert_allclose(machine.power_w, table["power_w"], rtol=1e-9)
+    np.testing.assert_allclose(machine.rejected_w, table["rejected_w"], rtol=1e-9)
+    np.testing.assert_allclose(machine.unmet_w, 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("path", tables("chiller_electric_water_cooled*.csv"), ids=by_name)
+def test_water_cooled_electric_chiller(path: Path) -> None:
+    table = columns(path)
+    machine = chiller.electric_water_cooled(
+        table["load_w"],
+        reference_w=1e6,
+        chilled_water_c=table["chilled_water_c"],
+        condenser_c=table["condenser_c"],
+        outdoor_c=0.0,
+        reference_cop=4.75,
+    )
+    np.testing.assert_allclose(machine.power_w, table["power_w"], rtol=1e-9)
+
+
+@pytest.mark.parametrize("path", tables("chiller_electric_air_cooled*.csv"), ids=by_name)
+def test_air_cooled_electric_chiller(path: Path) -> None:
+    table = columns(path)
+    machine = chiller.electric_air_cooled(
+        table["load_w"],
+        reference_w=1e6,
+        chilled_water_c=table["chilled_water_c"],
+        condenser_c=0.0,
+        outdoor_c=table["outdoor_c"],
+        reference_cop=3.0,
+    )
+    delta_k = (table["outdoor_c"] - 35.0) / 2.778 - (table["chilled_water_c"] - 6.67)
+    # EnergyPlus follows its parabola beyond the maximum.
+    beyond = delta_k < chiller.MIN_DELTA_K
+    apart = np.abs(machine.power_w / table["power_w"] - 1.0)
+    assert apart[~beyond].max() < 1e-9
+    assert apart[beyond].max(initial=0.0) < 3e-3
