@@ -19,7 +19,7 @@ from sdc_taichi.config.fields import (
     WaterRangeK,
     WorkingShare,
 )
-from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C, MIN_LIFT_K
+from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C, MIN_LIFT_K, chilled_water_bounds_c
 
 Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
 
@@ -95,12 +95,15 @@ class ChillerConfig(Section):
         "released",
         "paper",
     ] = "centrifugal_vsd"
-    """How power and capacity of the chiller follow from load and temperatures."""
+    """How power and capacity of the chiller follow from load and temperatures. Chilled water is at
+    most as warm as the model is valid for: 8.89 C with ``eir_york``, 20 C with ``centrifugal_vsd``
+    and ``carnot``."""
     reference_cop: Annotated[float, Field(ge=0.5, le=50)] = 5.96
     """COP at the reference point, in W of heat per W of power, 0.5..50: from an absorption chiller
     to Carnot's limit at a lift of 6 K."""
     coil_approach_k: ExchangerK = 8.0
-    """Supply air setpoint above the chilled water that the coils take, in K."""
+    """Supply air setpoint above the chilled water that the coils take, in K; more where the chiller
+    makes no water as warm as that."""
     chilled_water_range_k: WaterRangeK = 6.0
     """Chilled water that returns above chilled water that is supplied, in K."""
     min_condenser_c: Annotated[float, Field(ge=0, le=60)] = 12.78
@@ -244,17 +247,12 @@ class HvacConfig(Section):
 
     @model_validator(mode="after")
     def _chilled_water_within_the_model(self) -> Self:
-        model = self.chiller.model
-        if model not in ("centrifugal_vsd", "carnot"):
-            return self
-        low, high = CHILLED_WATER_BOUNDS_C[model]
-        for name in ("min_c", "max_c"):
-            setpoint = getattr(self.setpoint, name)
-            water = setpoint - self.chiller.coil_approach_k
-            if not low <= water <= high:
-                raise ValueError(
-                    f"setpoint.{name} {setpoint:g} less chiller.coil_approach_k "
-                    f"{self.chiller.coil_approach_k:g} makes chilled water of {water:g} C; "
-                    f"model {model} is valid within {low:g}..{high:g} C"
-                )
+        low, high = chilled_water_bounds_c(self.chiller.model)
+        water = self.setpoint.min_c - self.chiller.coil_approach_k
+        if self.chiller.model in CHILLED_WATER_BOUNDS_C and water < low:
+            raise ValueError(
+                f"setpoint.min_c {self.setpoint.min_c:g} less chiller.coil_approach_k "
+                f"{self.chiller.coil_approach_k:g} asks for chilled water of {water:g} C; "
+                f"model {self.chiller.model} is valid within {low:g}..{high:g} C"
+            )
         return self

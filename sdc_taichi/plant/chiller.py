@@ -14,8 +14,9 @@ Every model has the same signature, so a caller can look it up in `CHILLERS` and
 
 Arguments are float64 arrays of shape (B,), or anything that broadcasts to it. A model reads only
 what its equations need. Temperatures beyond a curve's bounds are evaluated at the nearest bound:
-`CHILLED_WATER_BOUNDS_C` and `CONDENSER_BOUNDS_C` name them, so that a configuration can be held
-against them before a run.
+`CHILLED_WATER_BOUNDS_C` and `CONDENSER_BOUNDS_C` name them. A plant makes no chilled water beyond
+them: colder water is an error of the configuration, and for warmer air the water stays at the
+warmest.
 
 Sources: EnergyPlus Engineering Reference, "Chillers" (Chiller:Electric, Chiller:Electric:EIR,
 Chiller:ConstantCOP); York and Trane data sets as in Modelica Buildings,
@@ -62,7 +63,9 @@ CHILLED_WATER_BOUNDS_C: dict[str, tuple[float, float]] = {
     "carnot": (4.0, 20.0),
     "eir_york": (4.44, 8.89),
 }
-"""Leaving chilled water within which each model is evaluated, in C."""
+"""Leaving chilled water within which each model is evaluated, in C; a plant makes no warmer."""
+ANY_WATER_C = (0.0, 100.0)
+"""Chilled water of models that have no bounds, in C."""
 CONDENSER_BOUNDS_C: dict[str, tuple[float, float]] = {"eir_york": (12.78, 35.0)}
 """Entering condenser water within which each model is evaluated, in C."""
 
@@ -108,6 +111,11 @@ class ChillerResult:
     off."""
     rejected_w: F64
     """Heat that the model hands to the cooling tower, in W, (B,)."""
+
+
+def chilled_water_bounds_c(model: str) -> tuple[float, float]:
+    """Coldest and warmest chilled water of a model, in C."""
+    return CHILLED_WATER_BOUNDS_C.get(model, ANY_WATER_C)
 
 
 def centrifugal_vsd(

@@ -53,6 +53,8 @@ class WaterSideDesign:
     """Coldest condenser water that the chiller takes, in C, (B,)."""
     min_lift_k: F64
     """Smallest lift of the chiller, condenser water over chilled water, in K, (B,)."""
+    warmest_chilled_c: F64
+    """Warmest chilled water that the chiller makes, in C, (B,)."""
     economiser: F64
     """1 with a waterside economiser, 0 without, (B,)."""
 
@@ -133,7 +135,8 @@ def operate(
 ) -> WaterSideResult:
     """Remove up to ``requested_w`` from the chilled water and reject it outside.
 
-    Chilled water follows the air, T_chw = setpoint - coil approach. The integrated economiser
+    Chilled water follows the air, T_chw = setpoint - coil approach, up to the warmest that the
+    chiller makes. The integrated economiser
     precools the return water with tower water as cold as the weather allows; the chiller does the
     rest. Tower and chiller depend on each other: the tower is solved for the chiller's power at
     the tower setpoint, then chiller and economiser at the water that the tower gives.
@@ -152,7 +155,7 @@ def operate(
         The plant's step.
     """
     load_w = np.minimum(requested_w, design.cooling_w) if limited else requested_w
-    chilled_c = setpoint_c - design.coil_approach_k
+    chilled_c = np.minimum(setpoint_c - design.coil_approach_k, design.warmest_chilled_c)
 
     def run_chiller(economiser: F64, tower_water_c: F64) -> ChillerResult:
         return chiller(

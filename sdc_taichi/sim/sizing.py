@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from sdc_taichi.errors import PhysicalLimitError
 from sdc_taichi.plant import chiller, tower
+from sdc_taichi.plant.chiller import ChillerResult
 from sdc_taichi.plant.fans_pumps import hydraulic_pump_w
 from sdc_taichi.plant.grid import NO_LIMIT_KW
 from sdc_taichi.plant.water_side import WaterSideDesign
@@ -20,6 +22,9 @@ WATER_DENSITY_KG_M3 = 1000.0
 """Density of water, in kg/m3."""
 RELEASED_OUTDOOR_C = {"NY": 30.0, "WA": 20.0}
 """Design dry bulbs of the released SustainDC, in C, by the first letters of the site; else 50 C."""
+
+_GRID = np.linspace(0.0, 1.0, 5)
+"""Where within their ranges the temperatures of the water are tried at which a chiller is sized."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,23 +241,45 @@ def mean_return_approach_k(fleet: Fleet) -> F64:
 
 def _design_chiller(
     fleet: Fleet, cooling_w: F64, outdoor_c: F64, wet_bulb_c: F64
-) -> tuple[F64, chiller.ChillerResult]:
-    """Reference capacity, W, (B,), that just cools ``cooling_w``, and the chiller as it does so."""
-    v = fleet.values
-    model = chiller.CHILLERS[fleet.models["chiller"]]
-    tower_c = wet_bulb_c + v("hvac.tower.approach_min_k")
-    conditions = {
-        # The coldest chilled water asks most of the chiller.
-        "chilled_water_c": v("hvac.setpoint.min_c") - v("hvac.chiller.coil_approach_k"),
-        "condenser_c": np.maximum(tower_c, v("hvac.chiller.min_condenser_c")),
-        "outdoor_c": outdoor_c,
-        "reference_cop": v("hvac.chiller.reference_cop"),
-        "min_lift_k": v("hvac.chiller.min_lift_k"),
-    }
-    idle, unit_w = np.zeros(fleet.size), np.ones(fleet.size)
-    available_w_per_w = model(idle, reference_w=unit_w, **conditions).available_w
-    chiller_w = cooling_w / available_w_per_w
-    return chiller_w, model(cooling_w, reference_w=chiller_w, **conditions)
+) -> tuple[F64, ChillerResult]:
+    """Reference capacity of the chiller, W, (B,), and the chiller as it cools at design.
+
+    It cools ``cooling_w`` with any water that the plant meets: chilled water of every setpoint,
+    condenser water from the coldest that the chiller takes to that of the design wet bulb. A
+    machine whose capacity falls in cold condenser water is sized for that.
+    """
+    v, name = fleet.values, fleet.models["chiller"]
+    model = chiller.CHILLERS[name]
+    coldest_c = v("hvac.chiller.min_condenser_c")
+    design_c = np.maximum(wet_bulb_c + v("hvac.tower.approach_min_k"), coldest_c)
+    _, warmest_c = chiller.chilled_water_bounds_c(name)
+    low_c, high_c = (
+        np.minimum(v(f"hvac.setpoint.{end}_c") - v("hvac.chiller.coil_approach_k"), warmest_c)
+        for end in ("min", "max")
+    )
+    unit_w = np.ones(fleet.size)
+
+    def at(chilled_c: F64, condenser_c: F64, load_w: F64, reference_w: F64) -> ChillerResult:
+        return model(
+            load_w,
+            reference_w=reference_w,
+            chilled_water_c=chilled_c,
+            condenser_c=condenser_c,
+            outdoor_c=outdoor_c,
+            reference_cop=v("hvac.chiller.reference_cop"),
+            min_lift_k=v("hvac.chiller.min_lift_k"),
+        )
+
+    least_w_per_w = np.minimum.reduce(
+        [
+            at(low_c + x * (high_c - low_c), coldest_c + y * (design_c - coldest_c), 0.0 * unit_w,
+               unit_w).available_w
+            for x, y in product(_GRID, _GRID)
+        ]
+    )  # fmt: skip
+    chiller_w = cooling_w / least_w_per_w
+    # The coldest chilled water asks most of the chiller.
+    return chiller_w, at(low_c, design_c, cooling_w, chiller_w)
 
 
 def _water_side(
@@ -277,6 +304,9 @@ def _water_side(
         exchanger_approach_k=v("hvac.tower.economiser_approach_k") - approach_k,
         min_condenser_c=v("hvac.chiller.min_condenser_c"),
         min_lift_k=v("hvac.chiller.min_lift_k"),
+        warmest_chilled_c=np.full(
+            fleet.size, chiller.chilled_water_bounds_c(fleet.models["chiller"])[1]
+        ),
         economiser=v("hvac.tower.economiser"),
         **_tower(fleet, cooling_w, rejected_w, outdoor_c, wet_bulb_c),
         **_pumps(fleet, cooling_w, rejected_w),
