@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
+from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
+from rrd import read
 from sdc_taichi import Simulator, load_config
 from sdc_taichi.cli.hall import hall_app
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.control import make_controller
+from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.run.description import RunRequest
+from sdc_taichi.run.folder_reader import RunFolder, read_run, read_steps
+from sdc_taichi.run.folder_writer import simulate_to_folder
+from sdc_taichi.run.inlets_of_run import hottest_inlets, inlets_at_step
+from sdc_taichi.run.steps_file import METADATA_KEY
 from sdc_taichi.sim.design_hall import solve_design_hall
-from sdc_taichi.sim.inlet_parts import InletParts, Inlets, inlet_terms
+from sdc_taichi.sim.fleet_configs import make_configs
+from sdc_taichi.sim.inlet_parts import InletParts, Inlets, inlet_terms, rack_text
 from sdc_taichi.sim.intake_air import intake_air_of
+from sdc_taichi.viz.recorder import Recorder
+from sdc_taichi.viz.report_inlets import hot_racks_section
 
 FAILURES = (
     "hvac.crac.units=4",
@@ -100,6 +114,108 @@ def test_the_nearest_racks_warm_an_inlet_most() -> None:
     assert words[1] == "exhaust of rack 1 (row 0, place 1)"
     assert words[-2:] == ["exhaust of 14 other racks", "its own exhaust"]
     assert sum(k for _, k in inlet_terms(parts, 5)) == pytest.approx(parts.inlet_c, abs=0.02)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A day of two halls with failures, under ``g36``."""
+    out = tmp_path_factory.mktemp("runs") / "run"
+    configs = make_configs(load_config("corrected", FAILURES), sites=["NY", "AZ"])
+    with Simulator(configs) as sim:
+        controller = make_controller("g36", sim.fleet)
+        simulate_to_folder(sim, controller, RunRequest("g36", 96, 3), out)
+    return read_run(out)
+
+
+def test_a_run_keeps_the_air_of_its_hottest_step(run: RunFolder) -> None:
+    for dc, content in enumerate(run.metrics["data_centers"]):
+        metrics = content["metrics"]
+        found = hottest_inlets(run, dc)
+        assert found is not None
+        assert found.step == metrics["hottest_step"]
+        hottest = found.inlets.parts(found.inlets.hottest(1)[0])
+        assert hottest.inlet_c == pytest.approx(metrics["hottest_inlet_c"], abs=1e-4)
+        assert (hottest.rack, hottest.server) == (
+            metrics["hottest_rack"],
+            metrics["hottest_server"],
+        )
+        again = inlets_at_step(run, dc, found.step)
+        assert again.inlets.parts(7).inlet_c == pytest.approx(
+            found.inlets.parts(7).inlet_c, abs=1e-5
+        )
+
+
+def test_any_step_of_a_run_is_simulated_again(run: RunFolder) -> None:
+    (steps,) = read_steps(run, [1], ["inlet_max_c", "setpoint_c"])
+    found = inlets_at_step(run, 1, 30)
+    parts = found.inlets.parts(found.inlets.hottest(1)[0])
+    assert parts.inlet_c == pytest.approx(steps["inlet_max_c"][30], abs=1e-4)
+    assert parts.setpoint_c == pytest.approx(steps["setpoint_c"][30])
+    with pytest.raises(ConfigError, match=r"step 96: valid is 0\.\.95"):
+        inlets_at_step(run, 1, 96)
+
+
+def test_a_run_that_does_not_repeat_is_an_error(run: RunFolder, tmp_path: Path) -> None:
+    folder = shutil.copytree(run.path, tmp_path / "run")
+    path = folder / "metrics.json"
+    path.write_text(path.read_text().replace('"seed": 3', '"seed": 4'))
+    table = pq.read_table(folder / "steps.parquet")
+    metadata = dict(table.schema.metadata)
+    metadata[METADATA_KEY] = metadata[METADATA_KEY].replace(b'"seed": 3', b'"seed": 4')
+    metadata[METADATA_KEY] = metadata[METADATA_KEY].replace(b"g36", b"coldest")
+    path.write_text(path.read_text().replace("g36", "coldest"))
+    pq.write_table(table.replace_schema_metadata(metadata), folder / "steps.parquet")
+    with pytest.raises(SdcError, match="step 30 of az, simulated again alone, has a hottest inlet"):
+        inlets_at_step(read_run(folder), 1, 30)
+
+
+def test_report_explains_the_five_hottest_racks(run: RunFolder) -> None:
+    text = hot_racks_section(run, [0, 1])
+    found = hottest_inlets(run, 1)
+    assert found is not None
+    for rack in found.inlets.hottest(5):
+        assert rack_text(rack, 5) in text
+        assert f"{found.inlets.parts(rack).inlet_c:.2f}" in text
+    assert text.count("<tr>") == 2 * 5 + 2
+
+
+def test_recording_explains_the_five_hottest_racks(tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    path = tmp_path / "hall.rrd"
+    with Simulator(load_config("corrected")) as sim, Recorder(path) as recorder:
+        recorder.begin(sim)
+        sim.reset()
+        recorder.add(sim.step())
+        inlets = Inlets(sim.fleet, 0, sim.intake_air())
+    (name,) = (name for name in read(path) if name.endswith("/hottest"))
+    ((text,),) = read(path)[name]["TextDocument:text"]
+    for rack in inlets.hottest(5):
+        assert f"## {rack_text(rack, 5)}: {inlets.parts(rack).inlet_c:.2f} C" in text
+    assert text.count("its own exhaust") == 5
+
+
+def test_command_explains_a_run(run: RunFolder) -> None:
+    def call(*arguments: object) -> str:
+        done = CliRunner().invoke(hall_app, ["why", str(run.path), *map(str, arguments)])
+        if done.exception is not None:
+            raise done.exception
+        return done.stdout
+
+    hottest = run.metrics["total"]["hottest_dc"]
+    assert call().startswith(f"{hottest}, step {run.metrics['total']['hottest_step']} of ")
+    assert "rack 7 (row 1, place 2)" in call("--rack", 7, "--dc", "az")
+    assert "step 4 of" in call("--rack", 7, "--dc", "az", "--step", 4)
+    for message, arguments in (
+        ("no such data center", ("--dc", "tx")),
+        ("valid is 0..95", ("--step", 96)),
+        ("valid with a preset or file", ("--set", "name=x")),
+        ("valid is it alone", ("name=x",)),
+    ):
+        with pytest.raises(SdcError, match=re.escape(message)):
+            call(*arguments)
+    for option in ("--dc", "--step"):
+        done = CliRunner().invoke(hall_app, ["why", "corrected", option, "1"])
+        assert f"{option}: given without a run" in str(done.exception)
 
 
 def test_command_names_a_rack_by_number_or_by_row_and_place() -> None:

@@ -33,7 +33,7 @@ from sdc_taichi.run import folder_reader
 from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.folder_reader import read_racks, read_run, read_steps
 from sdc_taichi.run.folder_writer import simulate_to_folder
-from sdc_taichi.run.steps_file import METADATA_KEY, RACKS_KEY
+from sdc_taichi.run.steps_file import AIR_KEY, METADATA_KEY, RACKS_KEY
 from sdc_taichi.viz import (
     dashboards,
     report,
@@ -507,13 +507,27 @@ def edit_steps(folder: Path, change: Callable[[Any], Any]) -> None:
     table = pq.read_table(path)
     changed = change(table)
     stored = pq.read_metadata(path).metadata
-    kept = {key: stored[key] for key in (METADATA_KEY, RACKS_KEY)} | dict(changed.schema.metadata)
+    kept = {key: stored[key] for key in (METADATA_KEY, RACKS_KEY, AIR_KEY)} | dict(
+        changed.schema.metadata
+    )
     pq.write_table(changed.replace_schema_metadata(kept), path)
 
 
 def edit_racks(folder: Path, racks: object) -> None:
     """Write other racks into the file's metadata."""
-    stored = {RACKS_KEY: json.dumps(racks).encode()}
+    edit_stored(folder, RACKS_KEY, racks)
+
+
+def edit_air(folder: Path, **values: object) -> None:
+    """Write other values of the air of the first data center into the file's metadata."""
+    air = json.loads(pq.read_metadata(folder / "steps.parquet").metadata[AIR_KEY])
+    air[0].update(values)
+    edit_stored(folder, AIR_KEY, air)
+
+
+def edit_stored(folder: Path, key: bytes, content: object) -> None:
+    """Write other content under a key of the file's metadata."""
+    stored = {key: json.dumps(content).encode()}
     edit_steps(folder, lambda t: t.replace_schema_metadata({**t.schema.metadata, **stored}))
 
 
@@ -691,6 +705,26 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "racks of another hall": (
         lambda f: edit_racks(f, [{"hottest_steps": [1], "inlet_max_c": [20.0]}] * 2),
         r"steps\.parquet: sdc_taichi_racks\[0\]: 1 racks; valid is",
+    ),
+    "air of fewer data centers": (
+        lambda f: edit_stored(f, AIR_KEY, [{}]),
+        r"steps\.parquet: no sdc_taichi_air of 2 data centers",
+    ),
+    "air that is no object": (
+        lambda f: edit_stored(f, AIR_KEY, [1, 2]),
+        r"steps\.parquet: sdc_taichi_air\[0\] is 1; valid is an object",
+    ),
+    "air after the run": (
+        lambda f: edit_air(f, step=STEPS),
+        rf"steps\.parquet: sdc_taichi_air\[0\]: step {STEPS}; valid is 0\.\.{STEPS - 1}",
+    ),
+    "air of another hall": (
+        lambda f: edit_air(f, mixed_c=[20.0]),
+        r"steps\.parquet: sdc_taichi_air\[0\]: mixed_c; valid is a list of \d+ numbers",
+    ),
+    "air without numbers": (
+        lambda f: edit_air(f, supply_c="x"),
+        r"steps\.parquet: sdc_taichi_air\[0\]: supply_c; valid is a list of \d+ numbers",
     ),
     "whole numbers": (
         lambda f: edit_steps(

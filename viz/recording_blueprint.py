@@ -93,7 +93,9 @@ def _focus_tab(tab: FocusTab, whole_run: Any, *, has_rewards: bool) -> Any:
             text_log_columns=["loglevel", "body"],
         ),
     )
-    hall = rrb.Vertical(maps, _hall_view(tab), events, row_shares=[5, 4, 2])
+    hottest = rrb.TextDocumentView(origin=f"{tab.path}/hottest", name="why the hottest are hot")
+    texts = rrb.Tabs(events, hottest, active_tab=0)
+    hall = rrb.Vertical(maps, _hall_view(tab), texts, row_shares=[5, 4, 2])
     return rrb.Horizontal(
         hall,
         _plot_tabs(tab, whole_run, has_rewards=has_rewards),

@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from sdc_taichi.run.hottest_air import AirAtStep
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.inlet_parts import (
+    HOTTEST_RACKS,
+    Inlets,
+    exhaust_terms,
+    inlet_terms,
+    rack_text,
+    state_texts,
+)
 
 from .hall_rasters import ColourScale
 from .recording_cadence import Cadence
@@ -63,6 +72,40 @@ def summary_markdown(
     if fleet.size > len(focus):
         rest = _count_text(fleet.size - len(focus), "other data center")
         lines += ["", f"The {rest} count in the fleet series only."]
+    return "\n".join(lines)
+
+
+def hottest_markdown(fleet: Fleet, dc: int, found: AirAtStep, clock: str) -> str:
+    """Markdown that says why the hottest racks of a data center are as hot as they are.
+
+    Args:
+        fleet: the fleet.
+        dc: index of the data center.
+        found: its air in its hottest step.
+        clock: when the step begins, on the clock of the data center.
+    """
+    per_row = fleet.configs[dc].hall.racks_per_row
+    inlets = Inlets(fleet, dc, found.air)
+    when = clock[5:].replace("T", " ")
+    lines = ["# Why the hottest racks are hot", f"At the hottest inlet, step {found.step}, {when}."]
+    for rack in inlets.hottest(HOTTEST_RACKS):
+        parts = inlets.parts(rack)
+        (first, setpoint_c), *others = inlet_terms(parts, per_row)
+        lines += [
+            "",
+            f"## {rack_text(rack, per_row)}: {parts.inlet_c:.2f} C",
+            "",
+            "| | |",
+            "|---:|---|",
+            f"| {setpoint_c:.2f} C | {first} |",
+            *(f"| {k:+.2f} K | {text} |" for text, k in others),
+            "",
+            f"{100 * parts.exhaust_share:.1f} % of its intake is exhaust air: "
+            + ", ".join(f"{k:+.2f} K {text}" for text, k in exhaust_terms(parts))
+            + ".",
+            "",
+            *(f"- {text}" for text in state_texts(parts)),
+        ]
     return "\n".join(lines)
 
 

@@ -7,6 +7,7 @@ Entities of a recording, NAME being a data center in focus:
     dc/NAME/series/..., crac/...       lines, an entity per unit
     dc/NAME/actions/...                commands, as states
     dc/NAME/events                     log
+    dc/NAME/hottest                    why the hottest racks are hot, at the end of the recording
     fleet/...                          sums and extremes over all data centers
     legend/..., summary                static
 
@@ -26,6 +27,7 @@ import numpy.typing as npt
 
 from sdc_taichi.exogenous.year_clock import step_times
 from sdc_taichi.hall.floor_plan import floor_plan
+from sdc_taichi.run.hottest_air import HottestAir
 from sdc_taichi.types import F64, I64, StepResult
 
 from . import hall_rasters as rasters
@@ -45,7 +47,7 @@ from .recording_series import (
     plot_rows_and_factors,
 )
 from .recording_static import MAX_UNIT_LINES, data_center_entities, fleet_entities
-from .recording_summary import summary_markdown
+from .recording_summary import hottest_markdown, summary_markdown
 from .rerun_columns import TimeColumn, bytes_column, number_column
 
 if TYPE_CHECKING:
@@ -98,6 +100,7 @@ class RecordingWriter:
         self._scales["power"] = rasters.power_scale(fleet)
         self._tile_grids = [rasters.tile_grid(fleet.configs[dc].hall) for dc in focus]
         self._condition_logs = [ConditionLog(fleet, dc) for dc in focus]
+        self._hottest_air = HottestAir(sim, focus)
         self._last_signs: dict[tuple[int, str], int] = {}
         self.steps_added = 0
         """Number of steps added."""
@@ -123,20 +126,36 @@ class RecordingWriter:
         if self.failed:
             return
         self._builder.add(result, rewards)
+        self._hottest_air.add(result)
         self.steps_added += 1
         is_late = time.monotonic() - self._written_at_s > self._block_s
         if is_late or self._builder.steps == self._cadence.block_steps:
             self._write_block()
 
     def flush(self) -> None:
-        """Write the steps that wait for their block to be complete."""
+        """Write the steps that wait for their block to be complete, and why racks are hot."""
         if self._builder.steps and not self.failed:
             self._write_block()
+        if self._output.is_open and not self.failed:
+            self._write_hottest()
 
     def close(self) -> None:
         """Write what is left, and the index."""
         self.flush()
         self._output.close()
+
+    def _write_hottest(self) -> None:
+        """Say why the hottest racks of each data center in focus are hot."""
+        import rerun as rr
+
+        for index, dc in enumerate(self._focus):
+            found = self._hottest_air.of(dc)
+            if found is None:
+                continue
+            clock = self._clock(np.array([found.step]))[0, index]
+            text = hottest_markdown(self._fleet, dc, found, str(clock.astype("datetime64[m]")))
+            document = rr.TextDocument(text, media_type="text/markdown")
+            self._output.send_static(f"{self._path(dc)}/hottest", document)
 
     def _write_block(self) -> None:
         """Write the block under way."""

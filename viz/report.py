@@ -17,6 +17,7 @@ from sdc_taichi.run.folder_reader import RunFolder, is_number
 from sdc_taichi.run.folder_writer import METRICS_FILE, REPORT_FILE
 
 from .report_html import html_page
+from .report_inlets import hot_racks_section
 from .report_metrics import MAX_DC_COLUMNS, METRICS, comparison_section, metrics_section
 from .report_pictures import (
     data_center_section,
@@ -74,6 +75,7 @@ def report_html(run: RunFolder, others: Sequence[RunFolder] = ()) -> str:
         sections["All data centers"] = fleet_section(run)
     for dc in shown:
         sections[f"Data center {run.names[dc.index]}"] = data_center_section(run, dc)
+    sections["Why the hottest racks are hot"] = hot_racks_section(run, [dc.index for dc in shown])
     if run.metrics["steps_done"] > 1:
         sections["Inputs"] = inputs_section(run, shown)
     sections["Provenance"] = provenance_section(run)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from sdc_taichi.cli.arguments import Overrides, Source, json_option, read_config
-from sdc_taichi.config import HallConfig
-from sdc_taichi.errors import ConfigError, printable
+from sdc_taichi.cli.arguments import Overrides, json_option, read_config
+from sdc_taichi.config import DataCenterConfig, HallConfig
+from sdc_taichi.errors import ConfigError, SdcError, printable
 from sdc_taichi.sim.inlet_parts import (
     InletParts,
+    Inlets,
     exhaust_terms,
     inlet_terms,
     inlet_values,
@@ -21,31 +24,100 @@ from sdc_taichi.sim.inlet_parts import (
 
 
 def why_command(
-    source: Source = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[PRESET|FILE|DIR] [A.B=C]...",
+            help="Preset, YAML file or SustainDC dc_config.json, and overrides of its fields; or "
+            "the folder of a run.",
+            show_default=False,
+        ),
+    ] = None,
     rack: Annotated[
         str | None,
         typer.Option(
             metavar="RACK|ROW:PLACE", help="The rack, counted from 0. [default: the hottest]"
         ),
     ] = None,
+    dc: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Data center of a run. [default: the hottest]"),
+    ] = None,
+    step: Annotated[
+        int | None,
+        typer.Option(min=0, help="Step of a run, which is simulated again. [default: the hottest]"),
+    ] = None,
     overrides: Overrides = None,
     as_json: Annotated[bool, json_option("Print all parts as JSON.")] = False,
 ) -> None:
     """Say why the inlet of a rack is as warm as it is: a sum of parts without a remainder.
 
-    At the design point, at full load.
+    At the design point of a config, at full load; or in the hottest step of a run, whose folder
+    holds the air of that step. Any other step is simulated again from the start of the run.
     """
+    run_folder = _run_folder(source)
+    if run_folder is None:
+        name, config, at, inlets = _at_design_point(source, overrides, dc, step)
+    else:
+        name, config, at, inlets = _in_run(run_folder, overrides, dc, step)
+    index = inlets.hottest(1)[0] if rack is None else rack_number(rack, config.hall)
+    parts = inlets.parts(index)
+    if as_json:
+        typer.echo(json.dumps({"name": name, "at": at, **inlet_values(parts)}, indent=2))
+        return
+    typer.echo(f"{printable(name)}, {at}")
+    typer.echo(describe_inlet(parts, config.hall.racks_per_row))
+
+
+_Found = tuple[str, DataCenterConfig, str, Inlets]
+"""Name of a data center, its config, when its inlets are as they are, and the inlets."""
+
+
+def _run_folder(source: list[str] | None) -> Path | None:
+    """The folder of a run, where the arguments name one alone."""
+    folders = [text for text in source or [] if os.path.isdir(text)]
+    if not folders:
+        return None
+    if len(source or []) > 1:
+        raise ConfigError(f"{folders[0]}: is the folder of a run; valid is it alone, without more")
+    return Path(folders[0])
+
+
+def _at_design_point(
+    source: list[str] | None, overrides: list[str] | None, dc: str | None, step: int | None
+) -> _Found:
+    """Inlets at the design point of a config."""
     from sdc_taichi.sim.design_hall import solve_design_hall
 
+    for option, value in (("--dc", dc), ("--step", step)):
+        if value is not None:
+            raise ConfigError(f"{option}: given without a run; valid with the folder of a run")
     config, _ = read_config(source, overrides)
-    index = None if rack is None else rack_number(rack, config.hall)
-    inlets = solve_design_hall(config).inlets
-    parts = inlets.parts(inlets.hottest(1)[0] if index is None else index)
-    if as_json:
-        typer.echo(json.dumps({"name": config.name, **inlet_values(parts)}, indent=2))
-        return
-    typer.echo(f"{printable(config.name)} at its design point")
-    typer.echo(describe_inlet(parts, config.hall.racks_per_row))
+    return config.name, config, "at its design point", solve_design_hall(config).inlets
+
+
+def _in_run(folder: Path, overrides: list[str] | None, dc: str | None, step: int | None) -> _Found:
+    """Inlets in a step of a run."""
+    from sdc_taichi.run.folder_reader import read_run
+    from sdc_taichi.run.inlets_of_run import hottest_inlets, inlets_at_step
+
+    if overrides:
+        raise ConfigError("--set: given with the folder of a run; valid with a preset or file")
+    run = read_run(folder)
+    name = run.metrics["total"].get("hottest_dc") if dc is None else dc
+    if name not in run.names:
+        shown = ", ".join(run.names[:10]) + (", ..." if len(run.names) > 10 else "")
+        raise ConfigError(f"--dc {name!r}: no such data center in {folder}; valid: {shown}")
+    index = run.names.index(name)
+    hottest_step = run.metrics["data_centers"][index]["metrics"].get("hottest_step")
+    wanted = hottest_step if step is None else step
+    if not isinstance(wanted, int):
+        raise SdcError(f"{folder}: no hottest_step of {name}; simulate the run again")
+    found = hottest_inlets(run, index) if wanted == hottest_step else None
+    if found is None:
+        found = inlets_at_step(run, index, wanted)
+    is_hottest = " (its hottest)" if found.step == hottest_step else ""
+    return name, found.config, f"step {found.step} of {folder}{is_hottest}", found.inlets
 
 
 def rack_number(text: str, hall: HallConfig) -> int:

@@ -22,7 +22,7 @@ from sdc_taichi.config import DataCenterConfig, config_from_dict, load_json, loa
 from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.run.description import FORMAT
 from sdc_taichi.run.folder_writer import METRICS_FILE
-from sdc_taichi.run.steps_file import METADATA_KEY, RACKS_KEY, STEPS_FILE
+from sdc_taichi.run.steps_file import AIR_KEY, METADATA_KEY, RACKS_KEY, STEPS_FILE
 from sdc_taichi.types import F64
 from sdc_taichi.user_file import MOST_METRICS_BYTES, decoding, open_input, read_text
 
@@ -252,6 +252,21 @@ def read_racks(run: RunFolder, dcs: Sequence[int]) -> list[pd.DataFrame]:
             )
         out.append(pd.DataFrame({"hottest_h": steps * step_h, "inlet_max_c": highest}))
     return out
+
+
+def read_hottest_air(run: RunFolder, dc: int) -> object:
+    """What steps.parquet holds of the air of a data center in its hottest step; None if nothing.
+
+    Raises:
+        SdcError: steps.parquet is damaged.
+    """
+    stored = _stored_json(run.steps_path, AIR_KEY) or []
+    if not isinstance(stored, list) or len(stored) not in (0, len(run.names)):
+        raise SdcError(
+            f"{run.steps_path}: no sdc_taichi_air of {len(run.names)} data centers; simulate the "
+            "run again"
+        )
+    return cast(object, stored[dc]) if stored else None
 
 
 def _read_metrics(path: Path) -> dict[str, Any]:

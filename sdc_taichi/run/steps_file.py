@@ -13,6 +13,7 @@ import numpy as np
 from sdc_taichi.atomic_file import AtomicFile, naming_errors
 from sdc_taichi.exogenous.year_clock import step_times
 from sdc_taichi.hall.air_metrics import TIE_K
+from sdc_taichi.run.hottest_air import HottestAir, air_values
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
@@ -28,6 +29,12 @@ A list with an object for each data center: ``hottest_steps``, the number of ste
 hottest inlet of each rack was that of the hall, up to ``TIE_K``, and ``inlet_max_c``, the highest
 inlet of each rack over the run, in C.
 """
+AIR_KEY = b"sdc_taichi_air"
+"""Key of the file's metadata under which the air before the racks is told, as JSON: a list with
+what ``hottest_air.air_values`` says of each data center in its hottest step. Empty for runs of more
+than ``MOST_AIR_RACKS`` racks."""
+MOST_AIR_RACKS = 20_000
+"""Most racks of a run whose air is kept."""
 _ROWS_PER_GROUP = 1 << 16
 _RACKS_AT_A_TIME = 1 << 14
 
@@ -57,6 +64,7 @@ class StepsWriter:
         self._first_step = 0
         self._writer: Any = None
         self._racks = _RackCounts(sim.fleet)
+        self._air = HottestAir(sim) if sim.fleet.racks <= MOST_AIR_RACKS else None
         self._output = AtomicFile(path)
 
     def add(self, result: StepResult) -> None:
@@ -74,6 +82,8 @@ class StepsWriter:
             self._first_step = result.step
         self._values[:, self._filled] = self._columns(result)
         self._racks.add(result)
+        if self._air is not None:
+            self._air.add(result)
         self._filled += 1
         if self._filled == self._steps_per_group:
             self._write_row_group()
@@ -85,9 +95,10 @@ class StepsWriter:
             SdcError: the file cannot be written.
         """
         self._write_row_group()
-        racks = json.dumps(self._racks.per_dc(), allow_nan=False)
+        found = {RACKS_KEY: self._racks.per_dc(), AIR_KEY: self._air_per_dc()}
+        texts = {key: json.dumps(value, allow_nan=False) for key, value in found.items()}
         with naming_errors(self._output.path):
-            self._writer.add_key_value_metadata({RACKS_KEY: racks.encode()})
+            self._writer.add_key_value_metadata({k: text.encode() for k, text in texts.items()})
             self._writer.close()
         self._output.commit()
 
@@ -96,6 +107,13 @@ class StepsWriter:
 
     def __exit__(self, *_: object) -> None:
         self._output.discard()
+
+    def _air_per_dc(self) -> list[dict[str, Any]]:
+        """What ``AIR_KEY`` says, of the steps added."""
+        if self._air is None:
+            return []
+        found = map(self._air.of, range(self._fleet.size))
+        return [air_values(each) for each in found if each is not None]
 
     def _write_row_group(self) -> None:
         """Write the steps added since the last row group, if there are any."""

@@ -28,6 +28,8 @@ from sdc_taichi.types import F64, fields_of
 
 LISTED_SOURCES = 5
 """Racks whose exhaust is listed by name; that of the others is summed."""
+HOTTEST_RACKS = 5
+"""Racks whose inlets reports and recordings explain."""
 LISTED_UNITS = 8
 """CRAC units that are described, those that give most."""
 LEAST_K = 0.005
