@@ -180,6 +180,8 @@ class StepResult:
     """Carbon intensity of the grid, in g CO2e/kWh, (B,)."""
     demand: F64
     """Work that arrives as a share of capacity, 0..1, (B,)."""
+    active_events: F64
+    """Number of events that cover the step, (B,)."""
     load_command: F64
     """Share of what could be deferred (below 0) or drained (above 0), -1..1, (B,)."""
     cooling_command: F64

@@ -67,7 +67,9 @@ def met(line: Timeline, low: int, high: int) -> set[ActiveEvent]:
 
 def arrays(line: Timeline, step: int) -> list[np.ndarray]:
     disturbance = line.at(step)
-    return [getattr(disturbance, f.name) for f in fields(disturbance) if f.name != "active"]
+    return [
+        getattr(disturbance, f.name) for f in fields(disturbance) if not f.name.startswith("active")
+    ]
 
 
 def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
@@ -102,6 +104,7 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
             place, values = expected[step]
             wanted[place] = values
         assert line.at(step).active == (step in expected)
+        assert line.at(step).active_events.tolist() == [0.0, float(step in expected)]
         for found, values in zip(arrays(line, step), wanted, strict=True):
             np.testing.assert_array_equal(found, values)
     assert line.active(0) == []

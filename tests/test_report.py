@@ -155,7 +155,7 @@ def test_tables_hold_the_metrics(folder: Path, page: Page) -> None:
     columns = [dc["metrics"] for dc in about["data_centers"]] + [about["total"]]
     for _, group in report_metrics.METRICS:
         for key, label, unit in group:
-            expected = [format_number(column[key]) for column in columns]
+            expected = [report_text.metric_text(column, key) for column in columns]
             assert [label, unit, *expected] in page.rows(label), key
     assert ["metric", "unit", "ny", NASTY, "all"] in page.rows("metric")
 

@@ -98,7 +98,9 @@ def _check_metrics(run: RunFolder) -> None:
     for where, metrics in given:
         for key in (key for _, group in METRICS for key, *_ in group):
             value = metrics.get(key)
-            empty = value is None and key in ratios and metrics.get("it_kwh") == 0
+            may_be_empty = key == "time_to_throttle_min"
+            may_be_empty |= key in ratios and metrics.get("it_kwh") == 0
+            empty = value is None and may_be_empty
             if not (is_number(value) or (key in metrics and empty)):
                 found = f"is {value!r}" if key in metrics else "is missing"
                 raise SdcError(f"{path}: {where}.{key} {found}; valid is a number")

@@ -70,6 +70,7 @@ METRICS = (
             ("unmet_cooling_kwh", "heat beyond the plant's capacity", "kWh"),
             ("throttled_rack_h", "racks throttled", "rack h"),
             ("tripped_rack_h", "racks tripped", "rack h"),
+            ("time_to_throttle_min", "first event to first throttled rack", "min"),
             ("shi", "supply heat index SHI", "1"),
             ("rhi", "return heat index RHI", "1"),
             ("rti_pct", "return temperature index RTI", "%"),

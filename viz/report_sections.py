@@ -132,14 +132,17 @@ def _work_texts(run: RunFolder) -> list[str]:
     else:
         texts.append("The battery was not charged.")
     for key, text in (
-        ("throttled_rack_h", "Racks were throttled for {} rack h because of hot inlets."),
-        ("tripped_rack_h", "Racks were switched off for {} rack h because of hot inlets."),
+        ("throttled_rack_h", "Racks were throttled for {} rack h because of hot air."),
+        ("tripped_rack_h", "Racks were switched off for {} rack h because of hot air."),
         ("unserved_kwh", "In grid outages, {} kWh could not be served."),
         ("grid_overload_kwh", "The grid connection carried {} kWh beyond its limit."),
         ("unmet_cooling_kwh", "The plant lacked capacity for {} kWh of heat."),
     ):
         if total[key] > 0:
             texts.append(text.format(format_number(total[key])))
+    if total["time_to_throttle_min"] is not None:
+        minutes = metric_text(total, "time_to_throttle_min")
+        texts.append(f"The first rack throttled {minutes} min after an event began.")
     return texts
 
 

@@ -17,6 +17,8 @@ Definitions (PUE, CUE and WUE after The Green Grid, white papers 49, 32 and 35):
     over_27_degree_h  inlet temperature in excess of 27 C, summed over time, mean over the servers
     shi, rhi, rti_pct, rci_hi_pct, rci_lo_pct  means over the steps (see ``air_metrics``)
     rci_hi_min_pct   rci_hi_pct of the worst step
+    time_to_throttle_min  from the start of the first event to the end of the first step since then
+                     in which a rack throttles or trips; None without either
 
 A ratio without IT energy is None.
 """
@@ -94,6 +96,11 @@ class Totals:
     """Step of the hottest inlet, counted from 0 at reset, (B,)."""
     rci_hi_min_pct: F64
     """Lowest rack cooling index at the high end, in %, (B,)."""
+    first_event_step: I64
+    """First step that an event covers, -1 without any, (B,)."""
+    first_throttle_step: I64
+    """First step from ``first_event_step`` on with a rack that is throttled or off, -1 without any,
+    (B,)."""
 
 
 def empty_totals(size: int, step_h: float) -> Totals:
@@ -116,6 +123,8 @@ def empty_totals(size: int, step_h: float) -> Totals:
         hottest_server=np.zeros(size, dtype=np.int64),
         hottest_step=np.zeros(size, dtype=np.int64),
         rci_hi_min_pct=np.full(size, np.inf),
+        first_event_step=np.full(size, -1),
+        first_throttle_step=np.full(size, -1),
     )
 
 
@@ -137,11 +146,16 @@ def add_step(totals: Totals, result: StepResult) -> None:
         totals.hottest_rack[hotter] = result.hottest_rack[hotter]
         totals.hottest_server[hotter] = result.hottest_server[hotter]
     np.minimum(totals.rci_hi_min_pct, result.rci_hi_pct, out=totals.rci_hi_min_pct)
+    first_event, first_throttle = totals.first_event_step, totals.first_throttle_step
+    first_event[(first_event < 0) & (result.active_events > 0)] = result.step
+    hot = (result.throttled_racks > 0) | (result.tripped_racks > 0)
+    first_throttle[(first_throttle < 0) & (first_event >= 0) & hot] = result.step
 
 
 def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
     """Metrics of every data center, in the order of the fleet, from totals of at least one step."""
     efficiency = fleet.values("hvac.ups_efficiency")
+    found_min = times_to_throttle_min(totals)
     out = []
     for dc in range(fleet.size):
         sums = {name: float(values[dc]) for name, values in totals.sums.items()}
@@ -161,6 +175,7 @@ def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
                 ),
                 "over_27_degree_h": sums["over_27_mean_k"] * totals.step_h,
                 "rci_hi_min_pct": float(totals.rci_hi_min_pct[dc]),
+                "time_to_throttle_min": found_min[dc],
                 "hottest_step": int(totals.hottest_step[dc]),
             }
         )
@@ -173,11 +188,13 @@ def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
     Energies, carbon, water, tasks and hours are sums over the data centers, ratios are those of
     the sums. ``queue_mean_tasks`` is the mean, ``queue_max_tasks`` and ``overdue_max_tasks`` the
     highest over the data centers, because a task is 1 % of the capacity of its own data center.
+    ``time_to_throttle_min`` is the shortest.
     """
     sums = {name: float(values.sum()) for name, values in totals.sums.items()}
     behind_ups_kwh = float((totals.sums["it_kwh"] / fleet.values("hvac.ups_efficiency")).sum())
     hottest = int(np.argmax(rank(totals.hottest_inlet_c)))
     servers = fleet.per_dc_servers()
+    found_min = times_to_throttle_min(totals)
     return _energy_and_work(sums, behind_ups_kwh, totals.step_h) | {
         "queue_mean_tasks": sums["queue_tasks"] / totals.steps / fleet.size,
         "queue_end_tasks": float(totals.queue_end_tasks.sum()),
@@ -192,8 +209,22 @@ def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
         / servers.sum()
         * totals.step_h,
         "rci_hi_min_pct": float(totals.rci_hi_min_pct.min()),
+        "time_to_throttle_min": min((x for x in found_min if x is not None), default=None),
         "hottest_step": int(totals.hottest_step[hottest]),
     }
+
+
+def times_to_throttle_min(totals: Totals) -> list[float | None]:
+    """Minutes from the first event to the first throttled rack of each data center.
+
+    To the end of the step in which it throttles; None without events or throttled racks.
+    """
+    steps = totals.first_throttle_step + 1 - totals.first_event_step
+    found = totals.first_throttle_step >= 0
+    return [
+        float(n * totals.step_h * 60.0) if is_found else None
+        for n, is_found in zip(steps, found, strict=True)
+    ]
 
 
 def _hottest_place(totals: Totals, dc: int, fleet: Fleet) -> dict[str, Metric]:

@@ -36,6 +36,8 @@ class Disturbance:
 
     active: bool
     """Whether any event covers the step; without one, all is as if there were no events."""
+    active_events: F64
+    """Number of events that cover the step, (B,)."""
     unit_up: Mask
     """Whether each CRAC unit is in order, (U,)."""
     chiller_share: F64
@@ -134,6 +136,7 @@ class Timeline:
         self._normal = _read_only(
             Disturbance(
                 active=False,
+                active_events=np.zeros(size),
                 unit_up=np.ones(unit_offsets[-1], dtype=np.bool_),
                 chiller_share=np.ones(size),
                 rack_airflow=np.ones(rack_offsets[-1]),
@@ -186,6 +189,7 @@ class Timeline:
         return _read_only(
             Disturbance(
                 active=True,
+                active_events=np.bincount(found.dc, minlength=len(grid_up)).astype(np.float64),
                 unit_up=unit_up,
                 chiller_share=chiller,
                 rack_airflow=airflow,

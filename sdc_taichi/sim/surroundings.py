@@ -25,6 +25,8 @@ class Surroundings:
     """Carbon intensity of the grid, in g CO2 per kWh, (B,)."""
     demand: F64
     """Work that arrives as a share of capacity, 0..1, (B,)."""
+    active_events: F64
+    """Number of events that cover the step, (B,)."""
     grid_up: F64
     """1 with grid, 0 in an outage, (B,)."""
     powered: F64
@@ -52,7 +54,8 @@ class SurroundingsModel:
 
     def __init__(self, fleet: Fleet, units: UnitIndex, facility: Facility) -> None:
         self._units, self._facility = units, facility
-        self._ones, self._unit_ones = np.ones(fleet.size), np.ones(fleet.units)
+        self._ones, self._zeros = np.ones(fleet.size), np.zeros(fleet.size)
+        self._unit_ones = np.ones(fleet.units)
 
     def at(self, exogenous: Exogenous, event: Disturbance, stored_kwh: F64) -> Surroundings:
         """Surroundings of one step.
@@ -68,6 +71,7 @@ class SurroundingsModel:
                 wet_bulb_c=exogenous.wet_bulb_c,
                 ci_g_per_kwh=exogenous.ci_g_per_kwh,
                 demand=exogenous.demand,
+                active_events=self._zeros.copy(),
                 grid_up=self._ones.copy(),
                 powered=self._ones.copy(),
                 fully_powered=True,
@@ -83,6 +87,7 @@ class SurroundingsModel:
             wet_bulb_c=exogenous.wet_bulb_c + event.outdoor_offset_k,
             ci_g_per_kwh=exogenous.ci_g_per_kwh,
             demand=exogenous.demand,
+            active_events=event.active_events.copy(),
             grid_up=event.grid_up.astype(np.float64),
             powered=powered,
             fully_powered=bool(np.all(powered == 1.0)),
