@@ -105,6 +105,8 @@ class Exogenous:
     """Carbon intensity of the grid, in g CO2e/kWh, (B,)."""
     demand: F64
     """Work that arrives as a share of capacity, 0..1, (B,)."""
+    price_per_kwh: F64
+    """Price of a kWh from the grid, in the currency of the tariff, (B,); 0 without prices."""
 
 
 @dataclass(slots=True)
@@ -182,6 +184,8 @@ class StepResult:
     """Work that arrives as a share of capacity, 0..1, (B,)."""
     active_events: F64
     """Number of events that cover the step, (B,)."""
+    price_per_kwh: F64
+    """Price of a kWh from the grid, in the currency of the tariff, (B,)."""
     load_command: F64
     """Share of what could be deferred (below 0) or drained (above 0), -1..1, (B,)."""
     cooling_command: F64
@@ -325,6 +329,8 @@ class StepResult:
     kWh, (B,)."""
     carbon_g: F64
     """Emissions of the energy bought, in g CO2e, (B,)."""
+    energy_cost: F64
+    """Price of the energy bought, without demand charges, in the currency of the tariff, (B,)."""
     grid_up: F64
     """1 with grid, 0 in an outage, (B,)."""
     powered: F64

@@ -132,6 +132,11 @@ def test_metrics_are_those_of_the_recorded_steps(two_sites: Path) -> None:
             "lost_tasks": total["lost_tasks"],
             "unserved_kwh": total["unserved_kwh"],
             "grid_overload_kwh": total["grid_overload_kwh"],
+            "peak_kw": rows["grid_kwh"].max() / h,
+            "energy_cost": (rows["grid_kwh"] * rows["price_per_kwh"]).sum(),
+            # Two days of July.
+            "demand_charge": 12 * rows["grid_kwh"].max() / h * 2 / 31,
+            "cost": total["energy_cost"] + 12 * rows["grid_kwh"].max() / h * 2 / 31,
             "throttled_rack_h": total["throttled_racks"] * h,
             "tripped_rack_h": total["tripped_racks"] * h,
         }

@@ -1,12 +1,18 @@
-"""The grid connection: what it carries, what does not fit, and what exceeds it."""
+"""The grid connection and its limit, prices of electricity, and bills."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 
 from sdc_taichi import Actions, Simulator, StepResult, load_config
+from sdc_taichi.config.tariff_schema import TariffConfig
+from sdc_taichi.control import view_maker
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH
+from sdc_taichi.run.bills import add_power, billed_kw_months, no_demand
 from sdc_taichi.types import F64
 
 
@@ -80,5 +86,95 @@ def test_a_battery_of_an_hour_carries_an_outage_at_one_c() -> None:
     ],
 )
 def test_bad_limits_are_named(override: str, named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        load_config("corrected", [override])
+
+
+# --- tariff -------------------------------------------------------------------------------------
+
+
+def prices(values: dict[str, Any]) -> F64:
+    """Prices by day of the year and hour, (365, 24)."""
+    return TariffConfig.model_validate(values).hourly_prices().reshape(365, 24)
+
+
+def test_prices_follow_hour_weekday_and_season() -> None:
+    summer_peak = {
+        "months": [6, 7, 8, 9], "days": "weekdays", "from_h": 16, "to_h": 21, "price_per_kwh": 0.4,
+    }  # fmt: skip
+    night = {"from_h": 22, "to_h": 6, "price_per_kwh": 0.05}
+    weekend = {"days": "weekends", "price_per_kwh": 0.08}
+    found = prices({"price_per_kwh": [0.1], "periods": [summer_peak, night, weekend]})
+    # 1 January is a Monday, so 1 July, day 181, is a Sunday.
+    assert np.all(found[181] == 0.08)
+    monday = [0.05] * 6 + [0.1] * 10 + [0.4] * 5 + [0.1] + [0.05] * 2
+    assert found[182].tolist() == monday
+    assert set(found[0]) == {0.05, 0.1}
+    assert np.all(found[5:7] == 0.08)
+    flat = prices({"price_per_kwh": [0.13]})
+    assert np.all(flat == 0.13)
+
+
+def test_a_data_center_pays_its_own_tariff_from_its_own_day_on() -> None:
+    """Prices of a fleet are those of each alone, whatever the inputs are stored as."""
+    weekend = "tariff.periods=[{days: weekends, price_per_kwh: 0.01}]"
+    configs = [
+        load_config("tiny", ["name=a", "site.start=07-01"]),
+        load_config("tiny", ["name=b", "site.start=07-02", weekend]),
+        load_config("tiny", ["name=c", "site.start=07-01", weekend]),
+        load_config("tiny", ["name=d", "site.location=CA", "site.start=07-02"]),
+    ]
+    with Simulator(configs) as sim:
+        sim.reset()
+        results = [sim.step() for _ in range(40)]
+        ahead = view_maker(sim)(None).forecast(24.0).price_per_kwh
+    for i, config in enumerate(configs):
+        first = 182 if config.site.start == "07-02" else 181
+        hours = first * 24 + np.arange(136) // 4
+        expected = config.tariff.hourly_prices()[hours]
+        paid = [r.price_per_kwh[i] for r in results]
+        np.testing.assert_array_equal(paid, expected[:40])
+        np.testing.assert_array_equal(ahead[i], expected[40:136])
+        cost = [r.energy_cost[i] / r.grid_kwh[i] for r in results]
+        np.testing.assert_allclose(cost, expected[:40], rtol=1e-12)
+
+
+def test_months_pay_their_peaks_by_the_part_that_a_run_covers() -> None:
+    """Three years from 1 January, from 11 January and from the last hours of a year."""
+    rng = np.random.default_rng(1)
+    start = np.array([0, 10 * 24 + 5, 364 * 24 + 20])
+    power_kw = rng.uniform(0, 100, (3 * 365 * 24 - 700, 3))
+    demand = no_demand(start, 1)
+    for step, kw in enumerate(power_kw):
+        add_power(demand, step, kw)
+    found = billed_kw_months(demand, len(power_kw))
+    months = [(year * 365 + first, days)
+              for year in range(5)
+              for first, days in zip(FIRST_DAY_OF_MONTH, DAYS_PER_MONTH, strict=False)]  # fmt: skip
+    for i in range(3):
+        day = (start[i] + np.arange(len(power_kw))) // 24
+        inside = [(day >= first) & (day < first + days) for first, days in months]
+        expected = sum(
+            power_kw[covered, i].max() * covered.sum() / (24 * days)
+            for covered, (_, days) in zip(inside, months, strict=True)
+            if covered.any()
+        )
+        assert found[i] == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_array_equal(demand.peak_kw, power_kw.max(axis=0))
+
+
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("tariff.price_per_kwh=[1,2]", "2 prices; valid is 1, or 24"),
+        ("tariff.price_per_kwh=[-1]", r"tariff\.price_per_kwh"),
+        ("tariff.periods=[{months: [6, 6], price_per_kwh: 1}]", "each once"),
+        ("tariff.periods=[{days: sundays, price_per_kwh: 1}]", "weekdays"),
+        ("tariff.periods=[{from_h: 24, price_per_kwh: 1}]", "from_h"),
+        ("tariff.periods=[{from_h: 3}]", "price_per_kwh"),
+        ("tariff.demand_charge_per_kw=.inf", "demand_charge_per_kw"),
+    ],
+)
+def test_bad_tariffs_are_named(override: str, named: str) -> None:
     with pytest.raises(ConfigError, match=named):
         load_config("corrected", [override])

@@ -17,7 +17,7 @@ import sdc_taichi
 from sdc_taichi import ConfigError, EnvOptions, ForecastError, load_config
 from sdc_taichi.envs.registration import IDS
 from sdc_taichi.envs.single import SdcEnv
-from sdc_taichi.envs.tariff import Tariff
+from sdc_taichi.config.tariff_schema import TariffConfig
 
 STEPS = 96
 TINY = load_config("tiny", ["site.location=CA"])
@@ -41,7 +41,7 @@ GIVEN: dict[str, dict[str, Any]] = {
         "days": 1,
         "months": (6, 7),
         "forecast_error": ForecastError(0.1, 1.0),
-        "tariff": Tariff(price_per_kwh=(0.1,)),
+        "tariff": TariffConfig(price_per_kwh=(0.1,)),
         "rewards": {"agent_bat": {"cost": np.float64(2.0)}},
         "features": {"agent_bat": ("soc", "ci")},
     },

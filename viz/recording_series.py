@@ -73,6 +73,14 @@ PLOTS: dict[str, Plot] = {
         (PlotLine("grid carbon intensity [g/kWh]", "ci_g_per_kwh", RED),),
     ),
     "carbon_kg": Plot("carbon [kg/step]", (PlotLine("carbon [kg/step]", "carbon_g", RED, 1e-3),)),
+    "price": Plot(
+        "price of electricity [currency/kWh]",
+        (PlotLine("price [currency/kWh]", "price_per_kwh", GREEN),),
+    ),
+    "energy_cost": Plot(
+        "cost of energy [currency/step]",
+        (PlotLine("cost of energy [currency/step]", "energy_cost", GREEN),),
+    ),
     "battery": Plot(
         "battery state of charge [-]", (PlotLine("state of charge [-]", "soc", GREEN),), (0.0, 1.0)
     ),

@@ -39,6 +39,15 @@ METRICS = (
         ),
     ),
     (
+        "Money",
+        (
+            ("energy_cost", "energy at the prices of the tariff", "currency"),
+            ("demand_charge", "demand charges", "currency"),
+            ("cost", "cost, energy and demand", "currency"),
+            ("peak_kw", "highest power from the grid, mean over a step", "kW"),
+        ),
+    ),
+    (
         "Carbon and water",
         (
             ("cfp_kg", "carbon footprint", "kg CO₂e"),
@@ -85,6 +94,8 @@ METRICS = (
 COMPARED = (
     *(key for key, *_ in RADAR_METRICS),
     "grid_kwh",
+    "cost",
+    "peak_kw",
     "pue",
     "cue_kg_per_kwh",
     "wue_l_per_kwh",

@@ -25,6 +25,7 @@ from .report_text import (
 KEY_METRICS = (
     ("facility energy", "facility_kwh", "kWh"),
     ("PUE", "pue", ""),
+    ("cost, currency of the tariff", "cost", ""),
     ("carbon footprint", "cfp_kg", "kg CO₂e"),
     ("make-up water", "water_l", "L"),
     ("hottest inlet", "hottest_inlet_c", "°C"),

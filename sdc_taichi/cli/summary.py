@@ -19,6 +19,8 @@ _ROWS = (
     ("HVAC energy (kWh)", "hvac_kwh"),
     ("facility energy (kWh)", "facility_kwh"),
     ("grid energy (kWh)", "grid_kwh"),
+    ("cost (currency of the tariff)", "cost"),
+    ("highest grid power (kW)", "peak_kw"),
     ("PUE", "pue"),
     ("PUE with UPS losses", "pue_with_ups"),
     ("WUE (L/kWh)", "wue_l_per_kwh"),

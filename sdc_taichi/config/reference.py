@@ -17,11 +17,13 @@ from sdc_taichi.config import fields as types
 from sdc_taichi.config.event_schema import SampledEvent, ScheduledEvent
 from sdc_taichi.config.hall_schema import ServerGroup
 from sdc_taichi.config.schema import DataCenterConfig
+from sdc_taichi.config.tariff_schema import TariffPeriod
 
 LISTED: dict[str, type[BaseModel]] = {
     "servers.groups": ServerGroup,
     "events.scheduled": ScheduledEvent,
     "events.sampled": SampledEvent,
+    "tariff.periods": TariffPeriod,
 }
 """Sections that stand in lists, by the path of the list."""
 

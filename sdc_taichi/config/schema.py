@@ -28,6 +28,7 @@ from sdc_taichi.config.fields import (
 )
 from sdc_taichi.config.hall_schema import HallConfig, ServerConfig, ServerGroup
 from sdc_taichi.config.hvac_schema import HvacConfig
+from sdc_taichi.config.tariff_schema import TariffConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import day_of_year
 
@@ -171,6 +172,8 @@ class DataCenterConfig(Section):
     """Battery between grid and facility."""
     electrical: ElectricalConfig = ElectricalConfig()
     """Connection to the grid."""
+    tariff: TariffConfig = TariffConfig()
+    """Prices of electricity."""
     workload: WorkloadConfig = WorkloadConfig()
     """Work of the servers and its queue."""
     protection: ProtectionConfig = ProtectionConfig()

@@ -33,7 +33,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """Weather and carbon intensity of coming steps, exactly as they will be.
+    """Weather, carbon intensity and price of coming steps, exactly as they will be.
 
     Column 0 is the step to come.
     """
@@ -47,6 +47,12 @@ class Forecast:
     def ci_g_per_kwh(self) -> F64:
         """Carbon intensity of the grid, in g CO2e/kWh, (B, n)."""
         return self.drivers.ci_g_per_kwh.at(self.index)
+
+    @property
+    def price_per_kwh(self) -> F64:
+        """Price of a kWh from the grid, in the currency of the tariff, (B, n)."""
+        assert self.drivers.price_per_kwh is not None, "a simulator has filled it in"
+        return self.drivers.price_per_kwh.at(self.index)
 
     @property
     def outdoor_c(self) -> F64:

@@ -122,6 +122,8 @@ class Core:
         self.options = options
         self.agents: tuple[str, ...] = options.agents
         self.num_envs = size
+        if options.tariff is not None:
+            configs = [c.model_copy(update={"tariff": options.tariff}) for c in configs]
         of_each = [configs[i % len(configs)] for i in range(size)]
         self._inputs = DrawnInputs(of_each, options) if draws_inputs(options) else None
         self._draw: Draw | None = None
@@ -140,7 +142,6 @@ class Core:
         self._rewards = Rewards(
             options.rewards,
             options.collaboration,
-            options.tariff,
             agents=self.agents,
             days=options.days,
         )

@@ -18,6 +18,7 @@ from pydantic import (
 )
 
 from sdc_taichi.config import explain
+from sdc_taichi.config.tariff_schema import TariffConfig
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT, Agent
 from sdc_taichi.envs.forecasts import (
     CI_LEADS_H,
@@ -27,7 +28,6 @@ from sdc_taichi.envs.forecasts import (
     LeadH,
 )
 from sdc_taichi.envs.rewards import REWARD_SETS
-from sdc_taichi.envs.tariff import Tariff
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MONTH_OF_DAY
 
@@ -106,8 +106,8 @@ class EnvOptions(BaseModel):
     collaboration: Annotated[float, Field(ge=0, le=1)] = 0.8
     """Share a of an agent's own reward in what it gets, 0..1; those of the other two agents share
     the rest evenly (paper, section 4.5). 1 is no collaboration."""
-    tariff: Tariff = Tariff()
-    """Prices for the reward terms ``cost`` and ``demand_charge``."""
+    tariff: TariffConfig | None = None
+    """Prices of electricity in place of those of the configs; None keeps them."""
     costs: Any = None
     """Costs of each step for ``info["cost"]``: a list of names, functions or import paths
     ``module:name``, or a dict of them to weights; None is none."""

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.envs.tariff import Tariff
 from sdc_taichi.envs.user_functions import is_replacement
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.plant.workload import TASKS_PER_STEP
@@ -45,15 +44,13 @@ class TermContext:
 
     design_kwh: F64
     """Energy of a step at the design point, in kWh, (B,)."""
-    tariff: Tariff
-    """Prices of electricity."""
+    demand_charge_per_kw: F64
+    """Price of each kW of the highest power of a bill, (B,)."""
     peak_kw: F64
     """Highest power of the episode before this step, at least half the design power, in kW,
     (B,)."""
     bills: float
     """Length of the episode over the 30 days of a bill."""
-    price_per_kwh: F64
-    """Price of a kWh in this step, (B,)."""
     end_of_day_weight: F64
     """Weight of queued tasks, 0 before 23:00 and rising to 1 in the last step of the day, (B,)."""
 
@@ -110,8 +107,8 @@ def hvac_energy(r: StepResult, c: TermContext) -> F64:
 
 @reward_term
 def cost(r: StepResult, c: TermContext) -> F64:
-    """Energy by the time-of-use tariff, over the price of the design energy at 0.1 per kWh."""
-    return -r.grid_kwh * c.price_per_kwh / (PRICE_PER_KWH * c.design_kwh)
+    """Energy at the prices of the tariff, over the price of the design energy at 0.1 per kWh."""
+    return -r.energy_cost / (PRICE_PER_KWH * c.design_kwh)
 
 
 @reward_term
@@ -122,7 +119,7 @@ def demand_charge(r: StepResult, c: TermContext) -> F64:
     billed in any case, so it is no part of the reward.
     """
     above_kw = np.maximum(r.grid_kwh / r.step_h - c.peak_kw, 0.0)
-    charge = above_kw * c.tariff.demand_charge_per_kw * c.bills
+    charge = above_kw * c.demand_charge_per_kw * c.bills
     return -charge / (PRICE_PER_KWH * c.design_kwh)
 
 

@@ -16,7 +16,6 @@ from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.released_rewards import ReleasedRewards
 from sdc_taichi.envs.reward_terms import TERMS, TermContext
-from sdc_taichi.envs.tariff import Tariff
 from sdc_taichi.envs.user_functions import (
     checked_values,
     function_named,
@@ -76,7 +75,6 @@ class Rewards:
     Args:
         rewards: the option ``rewards``: a name, agent to term to scale, or a function or its path.
         collaboration: share of an agent's own reward in what it gets, 0..1.
-        tariff: prices for the terms ``cost`` and ``demand_charge``.
         agents: agents that learn.
         days: length of the episodes in days.
 
@@ -93,12 +91,11 @@ class Rewards:
         self,
         rewards: Any,
         collaboration: float,
-        tariff: Tariff,
         *,
         agents: Sequence[str],
         days: float,
     ) -> None:
-        self._collaboration, self._tariff, self._agents = collaboration, tariff, tuple(agents)
+        self._collaboration, self._agents = collaboration, tuple(agents)
         self._bills = days / BILL_DAYS
         self._released = ReleasedRewards() if rewards == "sustaindc" else None
         self._scales: dict[str, dict[str, float]] | None = None
@@ -121,8 +118,9 @@ class Rewards:
         self._design_kwh = np.zeros(0)
         self._step_h = 0.0
         self._first_step_of_day: I64 = np.zeros(0, dtype=np.int64)
+        self._demand_charge_per_kw = np.zeros(0)
         # By step of the day.
-        self._price_per_kwh = self._end_of_day_weight = np.zeros(0)
+        self._end_of_day_weight = np.zeros(0)
 
     def reset(self, view: View) -> None:
         """Start an episode.
@@ -138,8 +136,7 @@ class Rewards:
         self._design_kwh = view.sizing.facility_w * view.step_h / 1e3
         per_hour = view.fleet.steps_per_hour
         step_of_day = np.arange(24 * per_hour)
-        prices = np.array(self._tariff.price_per_kwh)
-        self._price_per_kwh = prices[step_of_day // per_hour % len(prices)]
+        self._demand_charge_per_kw = view.fleet.values("tariff.demand_charge_per_kw")
         self._end_of_day_weight = _end_of_day_weight(step_of_day, view.step_h)
         self._first_step_of_day = view.state.start % len(step_of_day)
         if self._released is not None:
@@ -214,7 +211,7 @@ class Rewards:
         found: dict[str, F64] = self._stage(
             design_kwh=self._design_kwh,
             peak_kw=self._peak_before_kw,
-            price_per_kwh=self._price_per_kwh[now],
+            demand_charge_per_kw=self._demand_charge_per_kw,
             end_of_day_weight=self._end_of_day_weight[now],
             **{name: getattr(result, name) for name in self._quantities_read},
         )
@@ -235,7 +232,7 @@ class Rewards:
         self,
         design_kwh: F64,
         peak_kw: F64,
-        price_per_kwh: F64,
+        demand_charge_per_kw: F64,
         end_of_day_weight: F64,
         **quantities: Any,
     ) -> dict[str, F64]:
@@ -243,10 +240,9 @@ class Rewards:
         assert self._scales is not None
         context = TermContext(
             design_kwh=design_kwh,
-            tariff=self._tariff,
+            demand_charge_per_kw=demand_charge_per_kw,
             peak_kw=peak_kw,
             bills=self._bills,
-            price_per_kwh=price_per_kwh,
             end_of_day_weight=end_of_day_weight,
         )
         result: Any = SimpleNamespace(step_h=self._step_h, **quantities)
@@ -268,10 +264,9 @@ class Rewards:
         now = self._step_of_day(result)
         return TermContext(
             design_kwh=self._design_kwh,
-            tariff=self._tariff,
+            demand_charge_per_kw=self._demand_charge_per_kw,
             peak_kw=self._peak_before_kw,
             bills=self._bills,
-            price_per_kwh=self._price_per_kwh[now],
             end_of_day_weight=self._end_of_day_weight[now],
         )
 

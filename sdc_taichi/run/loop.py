@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from sdc_taichi.control import Controller, view_maker
 from sdc_taichi.errors import whole_number
+from sdc_taichi.run.bills import no_demand
 from sdc_taichi.run.metrics import Totals, add_step, empty_totals
 from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.simulator import Simulator
@@ -50,6 +51,8 @@ def simulate(
     controller.reset(seed)
     view_of = view_maker(sim)
     totals = empty_totals(sim.size, sim.step_h) if totals is None else totals
+    if totals.steps == 0:
+        totals.demand = no_demand(sim.drivers.start, sim.fleet.steps_per_hour)
     last: StepResult | None = None
     for _ in range(steps):
         if stop is not None and stop():

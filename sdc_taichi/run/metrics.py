@@ -19,6 +19,10 @@ Definitions (PUE, CUE and WUE after The Green Grid, white papers 49, 32 and 35):
     rci_hi_min_pct   rci_hi_pct of the worst step
     time_to_throttle_min  from the start of the first event to the end of the first step since then
                      in which a rack throttles or trips; None without either
+    energy_cost      grid energy times the price of the tariff, step by step
+    demand_charge    price of a kW times the highest power of each month, mean over a step; a month
+                     that the run covers in part counts by that part
+    cost             energy_cost + demand_charge, in the currency of the tariff
 
 A ratio without IT energy is None.
 """
@@ -30,6 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, rank
+from sdc_taichi.run.bills import BilledDemand, add_power, billed_kw_months, no_demand
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, StepResult
 
@@ -55,6 +60,7 @@ _SUMMED_FIELDS = (
     "lost_tasks",
     "unserved_kwh",
     "grid_overload_kwh",
+    "energy_cost",
     "over_27_mean_k",
     "throttled_racks",
     "tripped_racks",
@@ -101,15 +107,20 @@ class Totals:
     first_throttle_step: I64
     """First step from ``first_event_step`` on with a rack that is throttled or off, -1 without any,
     (B,)."""
+    demand: BilledDemand
+    """Highest power of each month."""
 
 
-def empty_totals(size: int, step_h: float) -> Totals:
+def empty_totals(size: int, step_h: float, start: I64 | None = None) -> Totals:
     """Totals of no steps.
 
     Args:
         size: number of data centers, B.
         step_h: length of a step, in h.
+        start: first step of each data center, counted from the beginning of the year, (B,); None
+            is 0.
     """
+    first = np.zeros(size, dtype=np.int64) if start is None else start
     return Totals(
         steps=0,
         step_h=step_h,
@@ -125,11 +136,13 @@ def empty_totals(size: int, step_h: float) -> Totals:
         rci_hi_min_pct=np.full(size, np.inf),
         first_event_step=np.full(size, -1),
         first_throttle_step=np.full(size, -1),
+        demand=no_demand(first, round(1.0 / step_h)),
     )
 
 
 def add_step(totals: Totals, result: StepResult) -> None:
     """Add one step to the totals, in place."""
+    add_power(totals.demand, totals.steps, result.grid_kwh / totals.step_h)
     totals.steps += 1
     for name, total in totals.sums.items():
         total += getattr(result, name)
@@ -156,12 +169,14 @@ def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
     """Metrics of every data center, in the order of the fleet, from totals of at least one step."""
     efficiency = fleet.values("hvac.ups_efficiency")
     found_min = times_to_throttle_min(totals)
+    demand_charge = _demand_charge(totals, fleet)
     out = []
     for dc in range(fleet.size):
         sums = {name: float(values[dc]) for name, values in totals.sums.items()}
         behind_ups_kwh = sums["it_kwh"] / float(efficiency[dc])
         out.append(
             _energy_and_work(sums, behind_ups_kwh, totals.step_h)
+            | _cost(sums, float(demand_charge[dc]), float(totals.demand.peak_kw[dc]))
             | {
                 "queue_mean_tasks": sums["queue_tasks"] / totals.steps,
                 "queue_end_tasks": float(totals.queue_end_tasks[dc]),
@@ -187,15 +202,20 @@ def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
 
     Energies, carbon, water, tasks and hours are sums over the data centers, ratios are those of
     the sums. ``queue_mean_tasks`` is the mean, ``queue_max_tasks`` and ``overdue_max_tasks`` the
-    highest over the data centers, because a task is 1 % of the capacity of its own data center.
-    ``time_to_throttle_min`` is the shortest.
+    highest over the data centers, because a task is 1 % of the capacity of its own data center;
+    ``peak_kw`` is the highest as well, ``time_to_throttle_min`` the shortest, and costs are those
+    of each data center's own bill.
     """
     sums = {name: float(values.sum()) for name, values in totals.sums.items()}
     behind_ups_kwh = float((totals.sums["it_kwh"] / fleet.values("hvac.ups_efficiency")).sum())
     hottest = int(np.argmax(rank(totals.hottest_inlet_c)))
     servers = fleet.per_dc_servers()
     found_min = times_to_throttle_min(totals)
+    cost = _cost(
+        sums, float(_demand_charge(totals, fleet).sum()), float(totals.demand.peak_kw.max())
+    )
     return _energy_and_work(sums, behind_ups_kwh, totals.step_h) | {
+        **cost,
         "queue_mean_tasks": sums["queue_tasks"] / totals.steps / fleet.size,
         "queue_end_tasks": float(totals.queue_end_tasks.sum()),
         "queue_max_tasks": float(totals.queue_max_tasks.max()),
@@ -225,6 +245,22 @@ def times_to_throttle_min(totals: Totals) -> list[float | None]:
         float(n * totals.step_h * 60.0) if is_found else None
         for n, is_found in zip(steps, found, strict=True)
     ]
+
+
+def _demand_charge(totals: Totals, fleet: Fleet) -> F64:
+    """Demand charges of a run, in the currency of the tariff, (B,)."""
+    kw_months = billed_kw_months(totals.demand, totals.steps)
+    return np.asarray(kw_months * fleet.values("tariff.demand_charge_per_kw"))
+
+
+def _cost(sums: dict[str, float], demand_charge: float, peak_kw: float) -> dict[str, Metric]:
+    """Metrics of money."""
+    return {
+        "peak_kw": peak_kw,
+        "energy_cost": sums["energy_cost"],
+        "demand_charge": demand_charge,
+        "cost": sums["energy_cost"] + demand_charge,
+    }
 
 
 def _hottest_place(totals: Totals, dc: int, fleet: Fleet) -> dict[str, Metric]:

@@ -113,6 +113,8 @@ class Drivers:
     """Whether any series of a data center is synthetic, B."""
     notes: tuple[str, ...]
     """Repairs and warnings of the loaders, each text once."""
+    price_per_kwh: FleetSeries | None = None
+    """Price of a kWh from the grid; None takes the tariff of the config."""
 
     @property
     def size(self) -> int:
@@ -126,7 +128,8 @@ class Drivers:
         round apart.
         """
         sha = hashlib.sha256()
-        for series in (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh, self.demand):
+        given = (self.outdoor_c, self.wet_bulb_c, self.ci_g_per_kwh, self.demand)
+        for series in (*given, *(() if self.price_per_kwh is None else (self.price_per_kwh,))):
             sha.update(common_digits(series.values))
             for array in (series.offsets, series.lengths):
                 sha.update(array.tobytes())
@@ -146,6 +149,9 @@ class Drivers:
             wet_bulb_c=read(self.wet_bulb_c),
             ci_g_per_kwh=read(self.ci_g_per_kwh),
             demand=read(self.demand),
+            price_per_kwh=(
+                np.zeros(self.size) if self.price_per_kwh is None else read(self.price_per_kwh)
+            ),
         )
 
 
@@ -202,17 +208,17 @@ class InputReader:
         of_traces = {key: resample(x, self._steps_per_hour) for key, x in series.items()}
         if self._design_c is None:
             self._design_c = self._design_temperatures(of_sites)
-        outdoor_c = _fleet_series([of_sites[key].outdoor_c for key in site_keys])
+        outdoor_c = fleet_series([of_sites[key].outdoor_c for key in site_keys])
         inputs = [(sites[s], series[t]) for s, t in zip(site_keys, trace_keys, strict=True)]
         return Drivers(
             outdoor_c=outdoor_c,
-            wet_bulb_c=_fleet_series(
+            wet_bulb_c=fleet_series(
                 [of_sites[key].wet_bulb_c for key in site_keys]
             ).sharing_places(outdoor_c),
-            ci_g_per_kwh=_fleet_series(
+            ci_g_per_kwh=fleet_series(
                 [of_sites[key].ci_g_per_kwh for key in site_keys]
             ).sharing_places(outdoor_c),
-            demand=_fleet_series([of_traces[key] for key in trace_keys]).sharing_places(outdoor_c),
+            demand=fleet_series([of_traces[key] for key in trace_keys]).sharing_places(outdoor_c),
             start=self._days * 24 * self._steps_per_hour,
             design_outdoor_c=self._design_c[0],
             design_wet_bulb_c=self._design_c[1],
@@ -377,7 +383,7 @@ def drivers_from_arrays(
                 f"valid is {valid}"
             )
     return Drivers(
-        **{name: _fleet_series(list(value)) for name, value in rows.items()},
+        **{name: fleet_series(list(value)) for name, value in rows.items()},
         start=np.zeros(size, dtype=np.int64),
         design_outdoor_c=np.quantile(rows["outdoor_c"], DESIGN_QUANTILE, axis=1),
         design_wet_bulb_c=np.quantile(rows["wet_bulb_c"], DESIGN_QUANTILE, axis=1),
@@ -467,7 +473,7 @@ def _notes(site: SiteData, trace: Series) -> tuple[str, ...]:
     return tuple(f"{s.source}: {note}" for s in series for note in s.notes)
 
 
-def _fleet_series(series: Sequence[F64]) -> FleetSeries:
+def fleet_series(series: Sequence[F64]) -> FleetSeries:
     """Join one series per data center; the very same array is stored once."""
     offset_of: dict[int, int] = {}
     stored: list[F64] = []

@@ -49,6 +49,7 @@ _STEP_INPUTS = (
     "outlet_m3k_s",
     "supply_c",
     "ci_g_per_kwh",
+    "price_per_kwh",
     "battery_command",
     "stored_kwh",
     "room_heat_kwh",
@@ -115,6 +116,8 @@ class FacilityInputs:
 
     ci_g_per_kwh: F64 = NOT_USED
     """Carbon intensity of the grid, in g CO2 per kWh, (B,)."""
+    price_per_kwh: F64 = NOT_USED
+    """Price of a kWh from the grid, in the currency of the tariff, (B,)."""
     battery_command: F64 = NOT_USED
     """Share of the battery's power limit, discharged (below 0) or charged, -1..1, (B,)."""
     stored_kwh: F64 = NOT_USED
@@ -415,6 +418,7 @@ class Facility:
             ),
             "unserved_kwh": needed_kwh - grid_kwh,
             "carbon_g": emitted_g(grid_kwh, inputs.ci_g_per_kwh),
+            "energy_cost": grid_kwh * inputs.price_per_kwh,
         }
 
     def _air_indices(self, inputs: FacilityInputs, air: _CracAir) -> dict[str, F64]:

@@ -25,6 +25,7 @@ from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
 from sdc_taichi.sim.intake_air import IntakeAir
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
+from sdc_taichi.sim.prices import with_prices
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.sim.state_limits import LAST_START, state_limits
 from sdc_taichi.sim.surroundings import Surroundings, SurroundingsModel
@@ -291,7 +292,7 @@ class Simulator:
             state: What ``read_state`` returned, or ``state`` was before.
             drivers: Inputs from here on; None keeps those that there are.
         """
-        inputs = self.drivers if drivers is None else drivers
+        inputs = self.drivers if drivers is None else self._checked_drivers(drivers)
         self._started().hall.discard_last_step()
         self._state = state
         if state is not None:
@@ -321,7 +322,9 @@ class Simulator:
             drivers: Inputs; None is the present ones.
         """
         return snapshot.fingerprint(
-            self.fleet, self.drivers if drivers is None else drivers, self.precision
+            self.fleet,
+            self.drivers if drivers is None else self._checked_drivers(drivers),
+            self.precision,
         )
 
     def close(self) -> None:
@@ -350,7 +353,7 @@ class Simulator:
             raise RuntimeStateError("the simulator is closed; create a new one")
 
     def _checked_drivers(self, drivers: Drivers) -> Drivers:
-        """Inputs, of as many data centers as there are.
+        """Inputs, of as many data centers as there are, with prices.
 
         Raises:
             ConfigError: Those of more or fewer.
@@ -359,7 +362,7 @@ class Simulator:
             raise ConfigError(
                 f"drivers of {drivers.size} data centers for a fleet of {self.fleet.size}"
             )
-        return drivers
+        return with_prices(drivers, self.fleet.configs)
 
     def _seeds(self, given: int | Sequence[int] | I64) -> I64:
         """Seeds of the data centers, (B,)."""

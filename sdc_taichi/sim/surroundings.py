@@ -27,6 +27,8 @@ class Surroundings:
     """Work that arrives as a share of capacity, 0..1, (B,)."""
     active_events: F64
     """Number of events that cover the step, (B,)."""
+    price_per_kwh: F64
+    """Price of a kWh from the grid, in the currency of the tariff, (B,)."""
     grid_up: F64
     """1 with grid, 0 in an outage, (B,)."""
     powered: F64
@@ -72,6 +74,7 @@ class SurroundingsModel:
                 ci_g_per_kwh=exogenous.ci_g_per_kwh,
                 demand=exogenous.demand,
                 active_events=self._zeros.copy(),
+                price_per_kwh=exogenous.price_per_kwh,
                 grid_up=self._ones.copy(),
                 powered=self._ones.copy(),
                 fully_powered=True,
@@ -88,6 +91,7 @@ class SurroundingsModel:
             ci_g_per_kwh=exogenous.ci_g_per_kwh,
             demand=exogenous.demand,
             active_events=event.active_events.copy(),
+            price_per_kwh=exogenous.price_per_kwh,
             grid_up=event.grid_up.astype(np.float64),
             powered=powered,
             fully_powered=bool(np.all(powered == 1.0)),
