@@ -172,6 +172,7 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
         "no_unit_down": running,
         "idle_flow_m3s": (1.0 - running) * flow_m3s,
         "idle_setpoint_m3k_s": (1.0 - running) * flow_m3s * setpoint_c,
+        "price_per_kwh": some(0.0, 0.5),
     }
 
 
