@@ -129,7 +129,9 @@ def _plot_tabs(tab: FocusTab, whole_run: Any, *, has_rewards: bool) -> Any:
         name="cooling",
     )
     work = rrb.Grid(
-        *plots("load", "work_tasks", "queue_age_h", "commands", "carbon_kg", "price", "energy_cost"),
+        *plots(
+            "load", "work_tasks", "queue_age_h", "commands", "carbon_kg", "price", "energy_cost"
+        ),
         *(plots(REWARDS_ENTITY) if has_rewards else []),
         grid_columns=2,
         name="work",

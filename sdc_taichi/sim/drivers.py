@@ -212,9 +212,9 @@ class InputReader:
         inputs = [(sites[s], series[t]) for s, t in zip(site_keys, trace_keys, strict=True)]
         return Drivers(
             outdoor_c=outdoor_c,
-            wet_bulb_c=fleet_series(
-                [of_sites[key].wet_bulb_c for key in site_keys]
-            ).sharing_places(outdoor_c),
+            wet_bulb_c=fleet_series([of_sites[key].wet_bulb_c for key in site_keys]).sharing_places(
+                outdoor_c
+            ),
             ci_g_per_kwh=fleet_series(
                 [of_sites[key].ci_g_per_kwh for key in site_keys]
             ).sharing_places(outdoor_c),
