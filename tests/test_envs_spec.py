@@ -15,9 +15,9 @@ from gymnasium.wrappers import TimeAwareObservation
 
 import sdc_taichi
 from sdc_taichi import ConfigError, EnvOptions, ForecastError, load_config
+from sdc_taichi.config.tariff_schema import TariffConfig
 from sdc_taichi.envs.registration import IDS
 from sdc_taichi.envs.single import SdcEnv
-from sdc_taichi.config.tariff_schema import TariffConfig
 
 STEPS = 96
 TINY = load_config("tiny", ["site.location=CA"])
