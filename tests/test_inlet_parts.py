@@ -32,9 +32,11 @@ from sdc_taichi.viz.report_inlets import hot_racks_section
 FAILURES = (
     "hvac.crac.units=4",
     "events.scheduled=[{kind: crac_down, unit: 1, start_h: 0.5, duration_h: 2}, "
+    "{kind: crac_down, unit: 2, start_h: 0.5, duration_h: 2}, "
+    "{kind: crac_down, unit: 3, start_h: 0.5, duration_h: 2}, "
     "{kind: rack_fan_failure, rack: 7, share: 0.3, start_h: 0.5, duration_h: 2}]",
 )
-"""One of four units down and the fans of rack 7 failing, at the fourth step of a quarter hour."""
+"""Three of four units down and the fans of rack 7 failing, at the fourth step of a quarter hour."""
 HALLS = {
     "open": ("corrected",),
     "contained": ("corrected", "hall.layout.containment=0.7", "hvac.crac.units=2"),

@@ -20,7 +20,9 @@ EVENT = "events.scheduled=[{{kind: {}, start_h: 1, duration_h: 1{}}}]"
         ("hall.layout.ceiling_m=1", ["ceiling_m 1 must be above rack_height_m 2.1"]),
         ("hall.layout.containment=1.5", ["hall.layout.containment", "1.5"]),
         ("hall.height_gradient=1", ["hall.height_gradient", "less than 1"]),
-        ("hvac.crac.units=70", ["hvac.crac.units", "64", "70"]),
+        ("hvac.crac.units=20000", ["hvac.crac.units", "10000", "20000"]),
+        ("hvac.crac.spare_units=1", ["spare_units 1 must be below units 1"]),
+        ("hvac.crac.airflow_m3s=[9, 9]", ["airflow_m3s has 2 entries, expected 1 (units)"]),
         ("hvac.crac.unit_shares=[[1]]", ["hvac.crac.unit_shares has 1 entries, expected 20"]),
         (
             f"hvac.crac.unit_shares={[[0.5]] * 20}",

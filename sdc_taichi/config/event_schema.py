@@ -84,7 +84,7 @@ class ScheduledEvent(Section):
     century."""
     duration_h: DurationH
     """Duration of the event, in h."""
-    unit: Annotated[int, Field(ge=0, le=63)] | None = None
+    unit: Annotated[int, Field(ge=0, le=9_999)] | None = None
     """CRAC unit that is down, counted from 0, below their number; None is all of them."""
     rack: Annotated[int, Field(ge=0, le=9_999_999)] | None = None
     """Rack whose fans fail, counted from 0, row by row, below their number."""

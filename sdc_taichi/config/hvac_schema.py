@@ -22,6 +22,10 @@ from sdc_taichi.config.fields import (
 from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C, MIN_LIFT_K, chilled_water_bounds_c
 
 Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
+MOST_CRAC_UNITS = 10_000
+"""Largest number of CRAC units of a hall, one for each fan of the largest fan walls."""
+UnitAirflow = Annotated[float, Field(ge=0.01, le=1000)]
+"""Airflow of a CRAC unit, 0.01..1,000 m3/s: from a desk fan to a fan wall of a large hall."""
 
 
 class SetpointConfig(Section):
@@ -51,10 +55,17 @@ class SetpointConfig(Section):
 
 
 class CracConfig(Section):
-    """CRAC units: airflow per IT watt at design, fan power, who supplies whom."""
+    """CRAC units: number, size, control of their fans, who supplies whom."""
 
-    units: Annotated[int, Field(ge=1, le=64)] = 1
-    """Number of CRAC units, along both end walls in turn and evenly spread over the rows."""
+    units: Annotated[int, Field(ge=1, le=MOST_CRAC_UNITS)] = 1
+    """Number of CRAC units, along both end walls in turn and evenly spread over the rows,
+    1..10,000: more than the fan walls of any hall have fans."""
+    spare_units: Annotated[int, Field(ge=0, lt=MOST_CRAC_UNITS)] = 0
+    """Number of units that may be lost at the design point, below ``units``: 1 for N+1. The others
+    then give the design airflow; while all run, each runs at part speed."""
+    airflow_m3s: UnitAirflow | tuple[UnitAirflow, ...] | None = None
+    """Airflow of a unit at full speed, in m3/s: one for all units, or one per unit; None sizes them
+    for what their racks need at the design point."""
     unit_shares: tuple[tuple[Share, ...], ...] | None = None
     """Share of each unit in the supply air of each rack, 0..1: one row of shares per rack, each row
     summing to 1; None is by distance."""
@@ -64,22 +75,44 @@ class CracConfig(Section):
     """Design airflow of all units per IT power at the design point, in m3/s per W."""
     reference_m3s_per_w: FlowM3sPerW = 9.438e-5
     """Airflow per IT power at which a fan draws ``released_fan_w``, in m3/s per W."""
-    flow_model: Literal["constant", "follow_servers", "per_watt", "controlled"] = "follow_servers"
-    """Control of the units' airflow: constant, by the supply air that the servers take in, by IT
-    power, or by the actions of an agent."""
-    min_flow_ratio: WorkingShare = 0.6
-    """Lowest airflow of a running unit over its design airflow, 0.01..1."""
+    flow_model: Literal["constant", "pressure", "follow_servers", "per_watt", "controlled"] = (
+        "follow_servers"
+    )
+    """Control of the units' fans: at the speed of the design point; by the pressure under a raised
+    floor, which takes the same airflow whatever units run; by the supply air that the servers take
+    in; by IT power; or by the actions of an agent."""
+    min_flow_ratio: WorkingShare = 0.3
+    """Lowest airflow of a running unit over its airflow at full speed, 0.01..1."""
     fan_step: Annotated[float, Field(ge=0.001, le=1)] = 0.05
     """Change of fan speed over design speed by one action, for flow model ``controlled``, 0.001..1:
     from less than any drive resolves to the whole range."""
     coasting_flow_ratio: WorkingShare = 0.1
-    """Airflow through a unit that is down over its design airflow, 0.01..1: as much leaks through
-    closed dampers."""
+    """Airflow through a unit that is down over its airflow at full speed, 0.01..1: as much leaks
+    through closed dampers."""
     fan_w_per_m3s: Annotated[float, Field(ge=0, le=20_000)] = 1000.0
     """Design fan power per design airflow (specific fan power), in W per m3/s, 0..20,000: four
     times the worst class of EN 16798-3."""
     released_fan_w: DeviceW = 150.0
     """CRAC_FAN_REF_P of the SustainDC format: power of one unscaled fan, in W."""
+
+    @model_validator(mode="after")
+    def _units_fit_together(self) -> Self:
+        if self.spare_units >= self.units:
+            raise ValueError(
+                f"spare_units {self.spare_units} must be below units {self.units}, so that one is "
+                "left"
+            )
+        if self.spare_units and self.airflow_m3s is not None:
+            raise ValueError(
+                f"spare_units {self.spare_units} sizes units, and airflow_m3s gives their size; "
+                "valid is one of the two"
+            )
+        if isinstance(self.airflow_m3s, tuple) and len(self.airflow_m3s) != self.units:
+            raise ValueError(
+                f"airflow_m3s has {len(self.airflow_m3s)} entries, expected {self.units} (units), "
+                "or one value for all"
+            )
+        return self
 
 
 class ChillerConfig(Section):

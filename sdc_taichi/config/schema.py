@@ -195,9 +195,11 @@ class DataCenterConfig(Section):
 
     def _check_approach_model(self) -> None:
         kinds = {e.kind for e in self.events.scheduled} | {e.kind for e in self.events.sampled}
-        units = self.hvac.crac.units
+        crac = self.hvac.crac
         given = {
-            f"hvac.crac.units {units}": units > 1,
+            f"hvac.crac.units {crac.units}": crac.units > 1,
+            "hvac.crac.airflow_m3s": crac.airflow_m3s is not None,
+            "hvac.crac.flow_model pressure": crac.flow_model == "pressure",
             "hall.recirculation.matrix_file": self.hall.recirculation.matrix_file is not None,
             "simulation.thermal transient": self.simulation.thermal == "transient",
             "event crac_down": "crac_down" in kinds,

@@ -90,7 +90,7 @@ SETPOINTS: dict[str, SetpointModel] = {
 def constant_flow(
     it_w: F64, airflow_m3s: F64, *, design_flow_m3s: F64, **_: F64
 ) -> tuple[F64, F64]:
-    """CRAC airflow of fixed-speed fans.
+    """CRAC airflow of fans at fixed speed, or of fans that hold the pressure under a floor.
 
     Args:
         it_w: IT power, W, (B,); not used.
@@ -163,6 +163,7 @@ def controlled_flow(
 
 CRAC_FLOWS: dict[str, FlowModel] = {
     "constant": constant_flow,
+    "pressure": constant_flow,
     "follow_servers": following_flow,
     "per_watt": per_watt_flow,
     "controlled": controlled_flow,

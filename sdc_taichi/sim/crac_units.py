@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.plant import cooling
 from sdc_taichi.sim.actions import Commands
@@ -35,7 +36,8 @@ class Supply:
     plant_setpoint_c: F64
     """Supply air setpoint that the chilled water follows, in C, (B,)."""
     coil_share: F64
-    """Design airflow of the units that run over that of all units, (B,)."""
+    """Airflow at full speed of the units that run over that of the design point, at most 1,
+    (B,)."""
 
 
 class CracUnits:
@@ -62,15 +64,18 @@ class CracUnits:
         self._fan_step = of_each("hvac.crac.fan_step")
         self._coasting = of_each("hvac.crac.coasting_flow_ratio")
         self._min_speed = of_each("hvac.crac.min_flow_ratio")
-        self._design_m3s = fleet.unit_design_m3s
+        self._full_m3s, self._design_m3s = fleet.unit_design_m3s, fleet.design_flow_m3s
         self._ones, full_speed = np.ones(fleet.size), np.ones(fleet.units)
+        self._design_speed = fleet.design_speed[units.dc]
         flow_model = fleet.models["crac_flow"]
         self._controlled = flow_model == "controlled"
+        self._holds_pressure = flow_model == "pressure"
         follows = flow_model == "follow_servers"
-        self._free_range = (self._min_speed if follows else full_speed, full_speed)
+        at_design = self._design_speed, self._design_speed
+        self._free_range = (self._min_speed, full_speed) if follows else at_design
 
     def initial_supply(self) -> Supply:
-        """Initial setpoints of units that all run at full speed, before any command."""
+        """Initial setpoints and fan speeds of units that all run, before any command."""
         n_units = len(self._initial_c)
         setpoint_c = self._initial_c.copy()
         low, high = self._free_range
@@ -79,7 +84,7 @@ class CracUnits:
             setpoint_c=self._units.mean(setpoint_c),
             cooling_run=np.zeros(n_units, dtype=np.int64),
             cooling_last=np.full(n_units, np.nan),
-            fan_speed=np.ones(n_units),
+            fan_speed=self._design_speed.copy(),
             unit_low=low,
             unit_high=high,
             plant_setpoint_c=self._units.lowest(setpoint_c),
@@ -133,7 +138,16 @@ class CracUnits:
         if surroundings.all_running:
             return low, high
         runs = surroundings.unit_running > 0
+        if self._holds_pressure:
+            low = high = self._speed_that_holds_pressure(runs)
         return np.where(runs, low, self._coasting), np.where(runs, high, self._coasting)
+
+    def _speed_that_holds_pressure(self, runs: npt.NDArray[np.bool_]) -> F64:
+        """Speed at which the units that run give the design airflow, at most full speed, (U,)."""
+        coasting_m3s = self._units.sum(np.where(runs, 0.0, self._coasting * self._full_m3s))
+        running_m3s = self._units.sum(np.where(runs, self._full_m3s, 0.0))
+        speed = (self._design_m3s - coasting_m3s) / np.maximum(running_m3s, 1e-30)
+        return np.clip(self._units.of_each(speed), self._min_speed, 1.0)
 
     def _served_by_plant(self, unit_setpoint_c: F64, surroundings: Surroundings) -> tuple[F64, F64]:
         """Setpoint that the chilled water follows, and share of the coils in use, each (B,).
@@ -146,5 +160,5 @@ class CracUnits:
         running = surroundings.unit_running
         coldest_c = self._units.lowest(np.where(running > 0, unit_setpoint_c, np.inf))
         coldest_c = np.where(np.isinf(coldest_c), lowest_c, coldest_c)
-        in_use_m3s = self._units.sum(running * self._design_m3s)
-        return coldest_c, in_use_m3s / self._units.sum(self._design_m3s)
+        in_use_m3s = self._units.sum(running * self._full_m3s)
+        return coldest_c, np.minimum(in_use_m3s / self._design_m3s, 1.0)

@@ -69,7 +69,9 @@ class DesignHall:
     outlet_c: F64
     """Airflow-weighted mean outlet temperature of each rack, in C, (R,)."""
     unit_m3s: F64
-    """Design airflow of each CRAC unit, in m3/s, (U,)."""
+    """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
+    design_flow_m3s: float
+    """Airflow of all CRAC units at the design point, in m3/s."""
     unit_places_m: F64
     """Place of each CRAC unit on the floor plan, x and y in m, (U, 2)."""
     hottest_rack: int
@@ -93,7 +95,8 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
     supply_c = config.hall.design_supply_c
     hall = Hall(fleet, "f64")
     unit_supply_c = np.full(fleet.units, supply_c)
-    sums = hall.solve(Conditions(unit_supply_c, np.ones(1)))
+    speed = np.repeat(fleet.design_speed, fleet.units)
+    sums = hall.solve(Conditions(unit_supply_c, np.ones(1), unit_low=speed, unit_high=speed))
     plan = floor_plan(config.hall)
     inlet_c = np.asarray(sums.rack_inlet_c, dtype=np.float64)
     approach_k = inlet_c - supply_c
@@ -114,6 +117,7 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
         inlet_max_c=np.asarray(sums.rack_inlet_max_c, dtype=np.float64),
         outlet_c=np.asarray(sums.rack_outlet_c, dtype=np.float64),
         unit_m3s=fleet.unit_design_m3s,
+        design_flow_m3s=float(sums.crac_flow_m3s[0] or fleet.design_flow_m3s[0]),
         unit_places_m=unit_places_m(plan, fleet.units),
         hottest_rack=rack,
         hottest_server=int(fleet.server_offsets[group] - first_server),
@@ -200,7 +204,7 @@ def design_hall_values(found: DesignHall) -> dict[str, Any]:
         ],
         "supply_c": found.supply_c,
         "it_w": float(found.it_w.sum()),
-        "crac_flow_m3s": float(found.unit_m3s.sum()),
+        "crac_flow_m3s": found.design_flow_m3s,
         "hottest_rack": found.hottest_rack,
         "hottest_server": found.hottest_server,
         "hottest_inlet_c": float(found.inlet_max_c.max()),

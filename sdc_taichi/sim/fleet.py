@@ -18,13 +18,16 @@ from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.hall.mix_weights import MixWeights
 from sdc_taichi.hall.rack_servers import rack_servers
-from sdc_taichi.hall.recirculation import calibrate
+from sdc_taichi.hall.recirculation import Recirculation, calibrate
+from sdc_taichi.hall.unit_supply import full_airflow_m3s, unit_weights, weighted_shares
 from sdc_taichi.kernels.arguments import in_row_order
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
 from sdc_taichi.types import F64, I32
 
 MOST_ENTRIES = int(np.iinfo(np.int32).max)
 """Most racks, servers or other entries of a fleet: what the kernels can index."""
+MOST_UNIT_SHARES = 2**25
+"""Most pairs of rack and CRAC unit in a hall, whose shares of supply air take 12 bytes each."""
 STAGE_MODELS = {
     "inlet": "hall.inlet_model",
     "outlet": "servers.outlet_model",
@@ -55,6 +58,8 @@ class HallAir:
     """Share of each rack's intake that is exhaust air where the height factor is 1, (R,)."""
     unit_shares: F64
     """Share of each CRAC unit of its data center in the supply of each rack, rack by rack."""
+    rack_need_m3s: F64
+    """Supply air that each rack takes in at the design point, in m3/s, (R,)."""
     unit_share_offsets: I32
     """First entry of each data center in ``unit_shares``, and the number of entries, (B + 1,)."""
     steady_states: tuple[SteadyStateTable, ...]
@@ -98,6 +103,8 @@ class Fleet:
     """Rows DC_COEFFICIENTS of the hall kernels, (18, B)."""
     unit_design_m3s: F64
     """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
+    design_flow_m3s: F64
+    """Airflow of all CRAC units at the design point, in m3/s, (B,)."""
     air: HallAir | None
     """How air moves in the halls; None with inlet model ``approach``."""
 
@@ -110,6 +117,13 @@ class Fleet:
     def unit_dc(self) -> I32:
         """Data center of each CRAC unit, (U,)."""
         return np.repeat(np.arange(self.size, dtype=np.int32), np.diff(self.unit_offsets))
+
+    @property
+    def design_speed(self) -> F64:
+        """Speed of the CRAC fans at the design point over full speed, at most 1, (B,)."""
+        speed = self.design_flow_m3s / self.unit_sums(self.unit_design_m3s)
+        # Units that are just large enough run at full speed, whatever the last bits of sums.
+        return np.where(speed > 1.0 - 1e-9, 1.0, speed)
 
     @property
     def size(self) -> int:
@@ -197,6 +211,8 @@ class _HallArrays:
     """Rows DC_COEFFICIENTS of the hall kernels, (18,)."""
     unit_design_m3s: F64
     """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
+    design_flow_m3s: float
+    """Airflow of all CRAC units at the design point, in m3/s."""
     air: _Air | None
     """How air moves in the hall; None with inlet model ``approach``."""
 
@@ -211,6 +227,8 @@ class _Air:
     """Share of each rack's intake that is exhaust air where the height factor is 1, (R,)."""
     unit_shares: F64
     """Share of each CRAC unit in the supply of each rack, (R, U)."""
+    rack_need_m3s: F64
+    """Supply air that each rack takes in at the design point, in m3/s, (R,)."""
     steady_states: SteadyStateTable
     """Steady states, from which sweeps take their first guess."""
 
@@ -254,6 +272,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
             np.array([len(h.unit_design_m3s) for h in halls]), "CRAC units"
         ),
         unit_design_m3s=np.concatenate([h.unit_design_m3s for h in halls]),
+        design_flow_m3s=np.array([h.design_flow_m3s for h in halls]),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
     )
 
@@ -303,7 +322,7 @@ def _shared(configs: Sequence[DataCenterConfig], path: str) -> Any:
 
 def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
     """Arrays of the hall of one data center."""
-    hall, crac, curves = config.hall, config.hvac.crac, config.servers.curves
+    hall, curves = config.hall, config.servers.curves
     servers = rack_servers(config)
     if servers.count.sum() > MOST_ENTRIES:
         raise ConfigError(
@@ -314,19 +333,13 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         found = calibrate(config, servers)
         design, fresh_share = found.design, found.fresh_share
         approach_k = design.approach_k
-        shares = (
-            unit_shares(floor_plan(hall), crac.units, crac.supply_length_m)
-            if crac.unit_shares is None
-            else np.array(crac.unit_shares)
-        )
-        # Units are sized for the racks they supply.
-        need = shares.T @ found.need_m3s
-        unit_design_m3s = design.crac_flow_m3s * need / need.sum()
+        shares, unit_design_m3s = _unit_supply(config, found)
         of_groups = servers.per_rack(found.group_exhaust_share)
         air = _Air(
             mix_weights=found.mix_weights,
             exhaust_share=of_groups / servers.per_rack(servers.height_factor),
             unit_shares=shares,
+            rack_need_m3s=found.need_m3s,
             steady_states=initial_guess(config, servers, found),
         )
     else:
@@ -347,8 +360,30 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         approach_k=approach_k,
         dc=np.array(in_row_order(DC_COEFFICIENTS, coefficients)),
         unit_design_m3s=unit_design_m3s,
+        design_flow_m3s=design.crac_flow_m3s,
         air=air,
     )
+
+
+def _unit_supply(config: DataCenterConfig, found: Recirculation) -> tuple[F64, F64]:
+    """Shares of the CRAC units in the supply of the racks, (R, U), and airflows, in m3/s, (U,)."""
+    crac, racks = config.hvac.crac, config.hall.racks
+    if racks * crac.units > MOST_UNIT_SHARES:
+        raise ConfigError(
+            f"{config.name}: hvac.crac.units {crac.units:,} for {racks:,} racks makes "
+            f"{racks * crac.units:,} shares of supply air; valid is at most "
+            f"{MOST_UNIT_SHARES // racks:,} units"
+        )
+    if crac.unit_shares is not None:
+        shares = np.array(crac.unit_shares)
+        return shares, full_airflow_m3s(crac, shares.T @ found.need_m3s, found.design.crac_flow_m3s)
+    shares = unit_shares(floor_plan(config.hall), crac.units, crac.supply_length_m)
+    airflow_m3s = full_airflow_m3s(crac, shares.T @ found.need_m3s, found.design.crac_flow_m3s)
+    if crac.airflow_m3s is not None:
+        # Large units reach further than small ones.
+        weight = unit_weights(shares, found.need_m3s, airflow_m3s)
+        shares = weighted_shares(shares, weight)
+    return shares, airflow_m3s
 
 
 def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
@@ -361,6 +396,7 @@ def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:
         mix_weights=_joined([air.mix_weights for air in distinct], entry),
         exhaust_share=np.concatenate([air.exhaust_share for air in found]),
         unit_shares=np.concatenate([air.unit_shares.reshape(-1) for air in found]),
+        rack_need_m3s=np.concatenate([air.rack_need_m3s for air in found]),
         unit_share_offsets=offsets_from_counts(
             [air.unit_shares.size for air in found], "unit shares"
         ),

@@ -416,6 +416,7 @@ class Hall:
             elif name in self._overridden_rows:
                 row[:] = self._is_rack
                 self._overridden_rows.remove(name)
+        self._tables.plenum.supply_from(met.unit_running)
         unit = self._unit
         unit["low"][:] = 1.0 if met.unit_low is None else met.unit_low
         unit["high"][:] = 1.0 if met.unit_high is None else met.unit_high

@@ -42,6 +42,7 @@ from sdc_taichi.kernels.hall_arguments import (
     UNIT_STATE,
 )
 from sdc_taichi.sim.fleet import Fleet, offsets_from_counts
+from sdc_taichi.sim.shared_plenum import SharedPlenum, shares_by_block
 from sdc_taichi.types import F64, I32
 
 Array = Any
@@ -97,6 +98,8 @@ class HallTables:
     """Entries of arrays that have one per block and group, such as ``server_c``."""
     slices: int
     """Parts in which threads take on the tasks."""
+    plenum: SharedPlenum
+    """Keeps ``unit_shares`` up while CRAC units are down."""
 
     def rows(self, argument: str) -> dict[str, Array]:
         """Views of the named rows of an array of two dimensions, each flat."""
@@ -166,7 +169,8 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
         "group_values": vectors(dtype, len(GROUP_OUT), slices * int(most_groups)),
         "rack_out": vectors(dtype, len(RACK_OUT), places.count // LANES),
     }
-    tables = HallTables(places, arrays, int(group_places), slices)
+    plenum = SharedPlenum(fleet, unit_shares, dc_ints["first_share"], LANES)
+    tables = HallTables(places, arrays, int(group_places), slices, plenum)
     tables.rows("unit_inputs")["design_m3s"][:] = fleet.unit_design_m3s
     _set_data_center_values(fleet, tables.rows("dc_doubles"))
     return tables
@@ -322,10 +326,11 @@ def _build_air(
         zip(np.diff(fleet.rack_offsets), np.diff(fleet.unit_offsets), strict=True)
     ):
         n_places = int(places.blocks[dc]) * LANES
-        own = np.zeros((n_places, int(units)))
         at = air.unit_share_offsets[dc]
-        own[:racks] = air.unit_shares[at : at + racks * units].reshape(racks, units)
-        shares.append(own.reshape(-1, LANES, int(units)).swapaxes(1, 2).reshape(-1, LANES))
+        own = air.unit_shares[at : at + racks * units].reshape(racks, units)
+        shares.append(shares_by_block(own, LANES))
+        # Sparse halls fill up to whole vectors of RUN_LANES with blocks of padding.
+        shares.append(np.zeros((n_places // LANES * units - len(shares[-1]), LANES)))
         if racks > DENSE_RACKS:
             continue
         entry = int(air.steady_state_of_dc[dc])

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.hall.air_metrics import rank
+from sdc_taichi.hall.unit_supply import weighted_shares
 from sdc_taichi.kernels.hall_arguments import GROUP_INPUTS
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.intake_air import IntakeAir
@@ -147,7 +148,8 @@ class Inlets:
             self._exhaust_share = np.zeros(self._racks)
         else:
             first, end = fleet.air.unit_share_offsets[dc : dc + 2]
-            self._shares = fleet.air.unit_shares[first:end].reshape(self._racks, -1)
+            shares = fleet.air.unit_shares[first:end].reshape(self._racks, -1)
+            self._shares = weighted_shares(shares, air.unit_weight)
             racks = slice(self._first_rack, self._first_rack + self._racks)
             self._exhaust_share = fleet.air.exhaust_share[racks]
         self._group_inlet_c = self._group_inlets()

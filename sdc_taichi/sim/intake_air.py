@@ -44,9 +44,11 @@ class IntakeAir:
     """Share of its racks' need for supply air that each CRAC unit covers, 0..1, (U,)."""
     unit_m3s: F64
     """Airflow of each CRAC unit, in m3/s, (U,)."""
+    unit_weight: F64
+    """Weight of each CRAC unit in the supply of all racks, 0..1, (U,): 1 while all units run."""
 
 
-UNIT_FIELDS = ("setpoint_c", "supply_c", "fresh_ratio", "unit_m3s")
+UNIT_FIELDS = ("setpoint_c", "supply_c", "fresh_ratio", "unit_m3s", "unit_weight")
 """Fields of ``IntakeAir`` with an entry per CRAC unit."""
 RACK_FIELDS = tuple(f.name for f in fields(IntakeAir) if f.name not in UNIT_FIELDS)
 """Fields of ``IntakeAir`` with an entry per rack."""
@@ -80,6 +82,7 @@ def read_intake_air(tables: HallTables, rack_out: Any, exhaust: Any, setpoint_c:
         supply_c=unit["supply_c"].copy(),
         fresh_ratio=unit["fresh_ratio_used"].copy(),
         unit_m3s=unit["flow_m3s"].copy(),
+        unit_weight=tables.plenum.weight.copy(),
     )
 
 

@@ -112,14 +112,16 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     it_w = full.cpu_w + full.it_fan_w
     crac_flow_m3s = fleet.unit_sums(fleet.unit_design_m3s)
     crac_fan_w = v("hvac.crac.fan_w_per_m3s") * crac_flow_m3s
-    cooling_w = (it_w + crac_fan_w) * v("hvac.sizing.margin")
+    # Spare units let all run at part speed.
+    crac_at_design_w = crac_fan_w * fleet.design_speed**3
+    cooling_w = (it_w + crac_at_design_w) * v("hvac.sizing.margin")
     chiller_w, at_design = _design_chiller(fleet, cooling_w, outdoor_c, wet_bulb_c)
     water_side = _water_side(
         fleet, cooling_w, chiller_w, at_design.rejected_w, outdoor_c, wet_bulb_c
     )
     facility_w = (
         it_w
-        + crac_fan_w
+        + crac_at_design_w
         + at_design.power_w
         + water_side.tower_fan_w
         + water_side.chilled_pump_w

@@ -1,0 +1,160 @@
+"""CRAC units as equipment: their sizes, their control, and who takes over for one that is lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sdc_taichi import ConfigError, Simulator, StepResult, drivers_from_arrays, load_config
+from sdc_taichi.hall.unit_supply import unit_weights, weighted_shares
+from sdc_taichi.sim.design_hall import solve_design_hall
+from sdc_taichi.sim.fleet import Fleet, build_fleet
+from sdc_taichi.sim.inlet_parts import Inlets
+
+FOUR = "hvac.crac.units=4"
+N_PLUS_1 = "hvac.crac.spare_units=1"
+MINUTES = (
+    "simulation.thermal=transient",
+    "simulation.steps_per_hour=60",
+    "simulation.substep_s=15",
+    "protection.ashrae_class=A2",
+)
+LOST = "events.scheduled=[{kind: crac_down, unit: 0, start_h: 0.05, duration_h: 100}]"
+
+
+def run_at_full_load(*overrides: str, steps: int = 1) -> tuple[Fleet, list[StepResult]]:
+    """Results of steps of ``corrected`` at full load."""
+    config = load_config("corrected", list(overrides))
+    drivers = drivers_from_arrays(*(np.full((1, 1), x) for x in (20.0, 14.0, 300.0, 1.0)))
+    with Simulator(config, drivers=drivers, precision="f64") as sim:
+        sim.reset()
+        return sim.fleet, [sim.step() for _ in range(steps)]
+
+
+def test_balanced_shares_give_what_units_give() -> None:
+    rng = np.random.default_rng(3)
+    shares, need = rng.dirichlet(np.ones(5), 30), rng.uniform(0.5, 2.0, 30)
+    given = rng.uniform(0.1, 3.0, 5)
+    found = weighted_shares(shares, unit_weights(shares, need, given))
+    np.testing.assert_allclose(found.sum(axis=1), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(need @ found / need.sum(), given / given.sum(), rtol=1e-9)
+    # The ratio of two units is changed alike for all racks.
+    change = found[:, 0] * shares[:, 1] / (found[:, 1] * shares[:, 0])
+    np.testing.assert_allclose(change, change[0], rtol=1e-9)
+
+
+def test_a_rack_with_one_unit_alone_keeps_it() -> None:
+    shares = np.array([[1.0, 0.0], [0.5, 0.5]])
+    found = weighted_shares(shares, unit_weights(shares, np.ones(2), np.array([0.1, 1.0])))
+    assert found[0].tolist() == [1.0, 0.0]
+    assert found[1, 1] > 0.99
+
+
+def test_spare_units_run_at_part_speed_and_take_over_for_one_that_is_lost() -> None:
+    fleet, whole = run_at_full_load(FOUR, N_PLUS_1, *MINUTES, steps=2)
+    _, lost = run_at_full_load(FOUR, N_PLUS_1, *MINUTES, LOST, steps=60)
+    largest = fleet.unit_design_m3s.max()
+    assert fleet.unit_design_m3s.sum() - largest == pytest.approx(fleet.design_flow_m3s[0])
+    before = whole[-1].unit_flow_m3s / fleet.unit_design_m3s
+    after = lost[-1].unit_flow_m3s / fleet.unit_design_m3s
+    np.testing.assert_allclose(before, before[0], rtol=1e-4)
+    np.testing.assert_allclose(after[1:], after[1], rtol=1e-4)
+    assert after[0] == pytest.approx(0.1)
+    # The others give what is missing: of every rack's air, none falls short.
+    total = lost[-1].crac_flow_m3s[0]
+    assert total == pytest.approx(whole[-1].crac_flow_m3s[0], rel=0.01)
+    assert lost[-1].inlet_max_c[0] < whole[-1].inlet_max_c[0] + 0.1
+    assert all(result.throttled_racks[0] == 0 for result in lost)
+
+
+def test_without_spare_units_the_others_go_to_full_speed() -> None:
+    fleet, lost = run_at_full_load(FOUR, *MINUTES, LOST, steps=40)
+    speed = lost[-1].unit_flow_m3s / fleet.unit_design_m3s
+    np.testing.assert_allclose(speed, [0.1, 1.0, 1.0, 1.0], rtol=1e-9)
+    # The plenum is shared, so no rack has less air than the others of its kind.
+    assert lost[4].inlet_max_c[0] > lost[2].inlet_max_c[0] + 1.0
+
+
+@pytest.mark.parametrize(("flow_model", "takes_over"), [("pressure", True), ("constant", False)])
+def test_fans_that_hold_a_pressure_take_over_and_fixed_ones_do_not(
+    flow_model: str, takes_over: bool
+) -> None:
+    model = f"hvac.crac.flow_model={flow_model}"
+    fleet, lost = run_at_full_load(FOUR, N_PLUS_1, model, *MINUTES, LOST, steps=5)
+    design = fleet.design_flow_m3s[0]
+    assert lost[0].crac_flow_m3s[0] == pytest.approx(design)
+    assert bool(lost[-1].crac_flow_m3s[0] == pytest.approx(design)) is takes_over
+    # Less load takes as much air.
+    low = drivers_from_arrays(*(np.full((1, 1), x) for x in (20.0, 14.0, 300.0, 0.2)))
+    with Simulator(load_config("corrected", [FOUR, N_PLUS_1, model]), drivers=low) as sim:
+        sim.reset()
+        assert sim.step().crac_flow_m3s[0] == pytest.approx(design)
+
+
+def test_unlike_units_give_air_by_their_size() -> None:
+    sizes = [15.0, 10.0, 5.0, 10.0]
+    fleet, results = run_at_full_load(FOUR, f"hvac.crac.airflow_m3s={sizes}")
+    assert fleet.unit_design_m3s.tolist() == sizes
+    flow = results[0].unit_flow_m3s
+    np.testing.assert_allclose(flow / sizes, flow.sum() / 40.0, rtol=1e-3)
+    # Units alike in size give as much as those that are sized for their racks.
+    _, sized = run_at_full_load(FOUR)
+    assert flow.sum() == pytest.approx(sized[0].crac_flow_m3s[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("spare_units", [0, 1, 3])
+def test_spare_units_leave_the_design_point_as_it_is(spare_units: int) -> None:
+    plain = solve_design_hall(load_config("corrected", [FOUR]))
+    spare = solve_design_hall(
+        load_config("corrected", [FOUR, f"hvac.crac.spare_units={spare_units}"])
+    )
+    assert spare.design_flow_m3s == pytest.approx(plain.design_flow_m3s)
+    np.testing.assert_allclose(spare.inlet_c, plain.inlet_c, rtol=0, atol=1e-9)
+    assert spare.air is not None
+    assert plain.air is not None
+    assert spare.air.return_c == pytest.approx(plain.air.return_c)
+
+
+def test_shares_come_back_with_the_unit() -> None:
+    event = "events.scheduled=[{kind: crac_down, unit: 0, start_h: 0.5, duration_h: 0.5}]"
+    _, results = run_at_full_load(FOUR, event, steps=12)
+    _, whole = run_at_full_load(FOUR, steps=1)
+    # Heat held by the room is gone by then.
+    assert results[-1].room_heat_kwh[0] < 1e-9
+    np.testing.assert_allclose(results[-1].rack_inlet_c, whole[0].rack_inlet_c, rtol=1e-12)
+
+
+def test_a_large_hall_has_hundreds_of_units() -> None:
+    fleet = build_fleet(load_config("large", ["hvac.crac.units=400"]))
+    assert fleet.units == 400
+    with pytest.raises(ConfigError, match=r"shares of supply air; valid is at most 3,355 units"):
+        build_fleet(load_config("large", ["hall.rows=500", "hvac.crac.units=10000"]))
+
+
+def test_lowest_speed_of_the_fans_costs_a_variable_speed_unit_little() -> None:
+    """Fans with electronically commutated motors follow the load further down than 0.6."""
+    load = np.linspace(0.05, 1.0, 20)[None]
+    outdoor, wet_bulb, carbon = (np.full(load.shape, x) for x in (20.0, 14.0, 300.0))
+    drivers = drivers_from_arrays(outdoor, wet_bulb, carbon, load)
+
+    def fan_w(*overrides: str) -> float:
+        with Simulator(load_config("corrected", list(overrides)), drivers=drivers) as sim:
+            sim.reset()
+            return float(np.mean([sim.step().crac_fan_w[0] for _ in range(20)]))
+
+    free_w = fan_w("hvac.crac.min_flow_ratio=0.01")
+    assert fan_w() == pytest.approx(free_w, rel=0.02)
+    assert fan_w("hvac.crac.min_flow_ratio=0.6") > 1.05 * free_w
+
+
+def test_parts_of_an_inlet_add_up_while_a_unit_is_down() -> None:
+    config = load_config("corrected", [FOUR, *MINUTES, LOST])
+    drivers = drivers_from_arrays(*(np.full((1, 1), x) for x in (20.0, 14.0, 300.0, 1.0)))
+    with Simulator(config, drivers=drivers, precision="f64") as sim:
+        sim.reset()
+        for _ in range(6):
+            sim.step()
+        parts = Inlets(sim.fleet, 0, sim.intake_air()).parts(3)
+        hottest_c = sim.servers().inlet_c[600:800].max()
+    assert parts.unit_share[0] < 0.1
+    assert parts.inlet_c == pytest.approx(hottest_c, abs=1e-9)
