@@ -220,7 +220,7 @@ def test_command_explains_a_run(run: RunFolder) -> None:
         assert f"{option}: given without a run" in str(done.exception)
 
 
-def test_command_names_a_rack_by_number_or_by_row_and_place() -> None:
+def test_command_names_a_rack_by_number_or_by_row_and_place(tmp_path: Path) -> None:
     def call(*arguments: str) -> str:
         done = CliRunner().invoke(hall_app, ["why", *arguments])
         if done.exception is not None:
@@ -234,6 +234,11 @@ def test_command_names_a_rack_by_number_or_by_row_and_place() -> None:
     values = json.loads(call("--rack", "7", "--json"))
     parts_k = values["warming_k"] + sum(values["exhaust_k"])
     assert values["setpoint_c"] + parts_k == pytest.approx(values["inlet_c"], abs=1e-9)
+    picture = tmp_path / "why.png"
+    assert call("--rack", "7", "--out", str(picture)) == f"{text}Floor plan: {picture}\n"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(ConfigError, match="exists; choose another name"):
+        call("--out", str(picture))
     hottest = json.loads(call("--json"))
     assert hottest["inlet_c"] >= values["inlet_c"]
     for bad in ("20", "4:0", "0:5", "-1", "x", "1:", "1:2:3"):

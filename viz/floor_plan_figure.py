@@ -1,8 +1,9 @@
-"""Floor plan of a hall to scale, racks coloured by their inlets at the design point."""
+"""Floor plan of a hall to scale, racks coloured by their inlets or by other values of theirs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,21 +36,50 @@ UNIT_SIZE_M = (0.9, 2.0)
 """Size of the symbol of a CRAC unit, off the wall and along it, in m."""
 
 
-def floor_plan_figure(hall: DataCenterConfig | DesignHall) -> Figure:
+@dataclass(frozen=True, slots=True)
+class RackValues:
+    """What the colours of the R racks of a floor plan tell."""
+
+    values: F64
+    """Value of each rack, (R,)."""
+    label: str
+    """What the values are, with their unit, for the colour bar."""
+    marked: int
+    """The rack that is outlined."""
+    mark_label: str
+    """What the outlined rack is, for the legend."""
+    digits: int = 1
+    """Decimals of the numbers in the racks."""
+
+
+def floor_plan_figure(
+    hall: DataCenterConfig | DesignHall, shown: RackValues | None = None
+) -> Figure:
     """Walls, rows, aisles, floor tiles, returns and CRAC units, to scale.
 
     The longer side of the room runs to the right. Labels that would not fit are left out.
 
     Args:
         hall: a data center, or what ``solve_design_hall`` found of it.
+        shown: what the colours of the racks tell; None is their inlets at the design point.
 
     Raises:
         SdcError: matplotlib is missing, or the hall cannot be solved.
     """
     figure = new_figure(1.0, 1.0)
     found = solve_design_hall(hall) if isinstance(hall, DataCenterConfig) else hall
-    _FloorPlanDrawing(found, figure).draw()
+    _FloorPlanDrawing(found, figure, _inlet_values(found) if shown is None else shown).draw()
     return figure
+
+
+def _inlet_values(found: DesignHall) -> RackValues:
+    """Inlets at the design point."""
+    return RackValues(
+        values=found.inlet_c,
+        label="rack inlet at the design point (°C)",
+        marked=found.hottest_rack,
+        mark_label=f"hottest server, {found.inlet_max_c.max():.1f} °C",
+    )
 
 
 def is_transposed(plan: FloorPlan) -> bool:
@@ -81,10 +111,11 @@ class _FloorPlanDrawing:
     Args:
         hall: the hall with its air at the design point.
         figure: where to draw.
+        shown: what the colours of the racks tell.
     """
 
-    def __init__(self, hall: DesignHall, figure: Figure) -> None:
-        self._found, self._figure = hall, figure
+    def __init__(self, hall: DesignHall, figure: Figure, shown: RackValues) -> None:
+        self._found, self._figure, self._shown = hall, figure, shown
         self._hall, self._size = hall.config.hall, hall.config.hall.layout
         plan = hall.plan
         room = (plan.length_m, plan.width_m)
@@ -223,18 +254,18 @@ class _FloorPlanDrawing:
         )
 
     def _draw_racks(self, axes: Axes) -> None:
-        """Draw racks in the colours of their inlets, with numbers where they fit."""
+        """Draw racks in the colours of their values, with numbers where they fit."""
         from matplotlib.collections import PolyCollection
         from matplotlib.ticker import MaxNLocator
 
-        found, plan, size = self._found, self._found.plan, self._size
+        shown, plan, size = self._shown, self._found.plan, self._size
         deep_m = self._row_gap_m if self._is_coarse else size.rack_depth_m
         boxes = rack_boxes(plan, size.rack_pitch_m, deep_m)
         edged = self._fits(size.rack_pitch_m, size.rack_depth_m, (8.0, 8.0))
-        low, high = colour_range(found.inlet_c)
+        low, high = colour_range(shown.values)
         racks = PolyCollection(
             list(boxes),
-            array=found.inlet_c,
+            array=shown.values,
             cmap="inferno",
             clim=(low, high),
             edgecolor="white" if edged else "face",
@@ -242,26 +273,26 @@ class _FloorPlanDrawing:
         )
         axes.add_collection(racks)
         if self._fits(size.rack_pitch_m, size.rack_depth_m, RACK_LABEL_PX):
-            for rack, value in enumerate(found.inlet_c):
+            for rack, value in enumerate(shown.values):
                 ink = "black" if value > (low + high) / 2 else "white"
                 where = self._place(*plan.centre_m[rack])
-                axes.text(*where, f"{value:.1f}", color=ink, ha="center", va="center", fontsize=9)
-        self._mark_hottest(axes, boxes[found.hottest_rack])
+                text = f"{value:z.{shown.digits}f}"
+                axes.text(*where, text, color=ink, ha="center", va="center", fontsize=9)
+        self._mark_rack(axes, boxes[shown.marked])
         self._figure.colorbar(
             racks,
             ax=axes,
-            label="rack inlet at the design point (°C)",
+            label=shown.label,
             ticks=MaxNLocator(6, steps=[1, 2, 5, 10]),
             shrink=0.85,
             pad=0.01,
         )
 
-    def _mark_hottest(self, axes: Axes, corners: F64) -> None:
-        """Outline the rack with the hottest server, or ring it where it is too small."""
+    def _mark_rack(self, axes: Axes, corners: F64) -> None:
+        """Outline the marked rack, or ring it where it is too small."""
         from matplotlib.patches import Polygon
 
-        found = self._found
-        label = f"hottest server, {found.inlet_max_c.max():.1f} °C"
+        label = self._shown.mark_label
         if self._fits(self._size.rack_pitch_m, self._size.rack_depth_m, (16.0, 16.0)):
             box = 0.92 * corners + 0.08 * corners.mean(axis=0)
             axes.add_patch(

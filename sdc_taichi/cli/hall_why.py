@@ -9,7 +9,14 @@ from typing import Annotated
 
 import typer
 
-from sdc_taichi.cli.arguments import Overrides, json_option, read_config
+from sdc_taichi.cli.arguments import (
+    Overrides,
+    check_out_file,
+    force_option,
+    json_option,
+    out_option,
+    read_config,
+)
 from sdc_taichi.config import DataCenterConfig, HallConfig
 from sdc_taichi.errors import ConfigError, SdcError, printable
 from sdc_taichi.sim.inlet_parts import (
@@ -47,7 +54,12 @@ def why_command(
         int | None,
         typer.Option(min=0, help="Step of a run, which is simulated again. [default: the hottest]"),
     ] = None,
+    out: Annotated[
+        Path | None,
+        out_option("Draw what each rack adds to the inlet on the floor plan.", "FILE.png"),
+    ] = None,
     overrides: Overrides = None,
+    force: Annotated[bool, force_option()] = False,
     as_json: Annotated[bool, json_option("Print all parts as JSON.")] = False,
 ) -> None:
     """Say why the inlet of a rack is as warm as it is: a sum of parts without a remainder.
@@ -55,6 +67,7 @@ def why_command(
     At the design point of a config, at full load; or in the hottest step of a run, whose folder
     holds the air of that step. Any other step is simulated again from the start of the run.
     """
+    check_out_file(out, ".png", force=force)
     run_folder = _run_folder(source)
     if run_folder is None:
         name, config, at, inlets = _at_design_point(source, overrides, dc, step)
@@ -62,11 +75,15 @@ def why_command(
         name, config, at, inlets = _in_run(run_folder, overrides, dc, step)
     index = inlets.hottest(1)[0] if rack is None else rack_number(rack, config.hall)
     parts = inlets.parts(index)
+    if out is not None:
+        _draw(out, config, parts)
     if as_json:
         typer.echo(json.dumps({"name": name, "at": at, **inlet_values(parts)}, indent=2))
         return
     typer.echo(f"{printable(name)}, {at}")
     typer.echo(describe_inlet(parts, config.hall.racks_per_row))
+    if out is not None:
+        typer.echo(f"Floor plan: {printable(out)}")
 
 
 _Found = tuple[str, DataCenterConfig, str, Inlets]
@@ -118,6 +135,21 @@ def _in_run(folder: Path, overrides: list[str] | None, dc: str | None, step: int
         found = inlets_at_step(run, index, wanted)
     is_hottest = " (its hottest)" if found.step == hottest_step else ""
     return name, found.config, f"step {found.step} of {folder}{is_hottest}", found.inlets
+
+
+def _draw(out: Path, config: DataCenterConfig, parts: InletParts) -> None:
+    """Draw the floor plan, racks coloured by what their exhaust adds to the inlet."""
+    from sdc_taichi.viz.floor_plan_figure import RackValues, floor_plan_figure
+    from sdc_taichi.viz.plotting import save_picture
+
+    shown = RackValues(
+        values=parts.exhaust_k,
+        label=f"added to the inlet of rack {parts.rack} (K)",
+        marked=parts.rack,
+        mark_label=f"rack {parts.rack}, inlet {parts.inlet_c:.1f} °C",
+        digits=2,
+    )
+    save_picture(floor_plan_figure(config, shown), out, parents=True)
 
 
 def rack_number(text: str, hall: HallConfig) -> int:
