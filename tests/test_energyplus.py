@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from sdc_taichi.exogenous import psychrometrics
-from sdc_taichi.plant import chiller, tower
+from sdc_taichi.plant import chiller, tower, water
 from sdc_taichi.types import F64
 
 FOLDER = Path(
@@ -124,6 +124,41 @@ def test_tower_fan_goes_off_in_the_same_hours(path: Path) -> None:
     assert same.mean() > 0.95
     apart = np.abs(found.air_ratio - table["air_ratio"])[cycling][same]
     assert apart.max() < 0.03
+
+
+# Water of the tower
+
+DESIGN_AIR_M3S_PER_KG_S = 32.0 / 51.584
+CYCLES = 5.0
+
+
+@pytest.mark.parametrize("path", TOWERS, ids=by_name)
+def test_evaporation(path: Path) -> None:
+    """Heat, air and weather give the litres of the year, and those of every 5 K of weather."""
+    table = columns(path)
+    used = water.saturated_exit(
+        rejected_w=table["heat_w"],
+        range_k=table["entering_c"] - table["leaving_c"],
+        water_kg_s=table["water_kg_s"],
+        tower_airflow_m3s=run_tower(table).air_ratio
+        * (DESIGN_AIR_M3S_PER_KG_S * design_water_kg_s(table)),
+        outdoor_c=table["outdoor_c"],
+        wet_bulb_c=table["wet_bulb_c"],
+        pressure_pa=float(np.mean(table["pressure_pa"])),
+        return_c=0.0,
+        supply_setpoint_c=0.0,
+        cycles_of_concentration=CYCLES,
+        drift_share=DRIFT_SHARE,
+        dt_s=3600.0,
+    )
+    for name in ("evaporation_l", "water_l"):
+        expected_l = table["makeup_l" if name == "water_l" else name]
+        found_l = getattr(used, name)
+        assert found_l.sum() == pytest.approx(expected_l.sum(), rel=0.05)
+        bins = np.floor(table["outdoor_c"] / 5.0)
+        for warmth in np.unique(bins):
+            hours = bins == warmth
+            assert found_l[hours].sum() == pytest.approx(expected_l[hours].sum(), rel=0.1)
 
 
 # Chillers

@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sdc_taichi.exogenous import psychrometrics
+from sdc_taichi.plant import moist_air
 from sdc_taichi.plant.water import WATER, WaterUse
 
 REFERENCE = Path(__file__).parent / "reference"
@@ -34,7 +36,10 @@ def run(name: str, **changes: Any) -> WaterUse:
         "rejected_w": 1e6,
         "range_k": 5.56,
         "water_kg_s": 1e6 / (4184.0 * 5.56),
+        "tower_airflow_m3s": 26.67,
+        "outdoor_c": 20.0,
         "wet_bulb_c": 15.0,
+        "pressure_pa": 101_325.0,
         "return_c": 30.0,
         "supply_setpoint_c": 18.0,
         "cycles_of_concentration": 5.0,
@@ -119,6 +124,7 @@ def test_balance_and_batch(
     changes = {
         "rejected_w": np.array(heat),
         "range_k": np.array(range_k),
+        "outdoor_c": np.array(wet) + 3.0,
         "wet_bulb_c": np.array(wet),
         "return_c": 18.0 + np.array(range_k),
         "cycles_of_concentration": np.array(cycles),
@@ -172,10 +178,53 @@ def test_drift_beyond_the_blowdown_needs_no_blowdown() -> None:
     assert result.water_l[1] == result.evaporation_l[1] + result.drift_l[1]
 
 
-def test_idle_tower_only_drifts() -> None:
-    result = run("mass_balance", rejected_w=np.array([0.0, -1e5]), water_kg_s=50.0)
+@pytest.mark.parametrize("name", ["mass_balance", "saturated_exit"])
+def test_idle_tower_only_drifts(name: str) -> None:
+    result = run(name, rejected_w=np.array([0.0, -1e5]), water_kg_s=50.0)
     np.testing.assert_allclose(result.water_l, 50.0 * 2e-5 * 900.0)
     np.testing.assert_array_equal(result.evaporation_l, 0.0)
+
+
+def test_evaporation_follows_the_climate() -> None:
+    """Litres per kWh rejected: in frost much heat leaves as warmth, in the desert none."""
+    weather = {
+        "outdoor_c": np.array([-15.0, 0.0, 15.0, 30.0, 40.0]),
+        "wet_bulb_c": np.array([-16.0, -2.0, 12.0, 24.0, 20.0]),
+    }
+    litres = run("saturated_exit", dt_s=3600.0, **weather).evaporation_l / 1e3
+    assert (np.diff(litres) > 0.05).all()
+    assert 0.5 < litres[0] < 0.8
+    assert 1.3 < litres[3] < 1.6
+    assert litres[4] > 3.6e6 / 2.45e6  # Warm dry air gives heat of its own.
+
+
+def test_evaporation_of_half_the_step_is_half() -> None:
+    """As in a step of which the plant ran a half: heat and air are means of the step."""
+    whole = run("saturated_exit")
+    half = run("saturated_exit", rejected_w=5e5, tower_airflow_m3s=26.67 / 2.0)
+    assert half.evaporation_l == pytest.approx(whole.evaporation_l / 2.0, rel=1e-12)
+
+
+@pytest.mark.parametrize("pressure_pa", [70_000.0, 85_000.0, 101_325.0])
+def test_polynomials_of_moist_air(pressure_pa: float) -> None:
+    """Against the equations of whole years, from frost to the tropics."""
+    outdoor_c, humidity = np.meshgrid(np.linspace(-30.0, 34.0, 33), np.linspace(20.0, 100.0, 9))
+    wet_bulb_c = psychrometrics.wet_bulb_c(outdoor_c, humidity, pressure_pa)
+    ratio = psychrometrics.humidity_ratio(outdoor_c, humidity, pressure_pa)
+    at_wet_bulb = moist_air.saturated_ratio(wet_bulb_c, pressure_pa)
+    # The wet bulb just above 0 C has two meanings.
+    sure = (wet_bulb_c < -0.5) | (wet_bulb_c > 0.5)
+    found = np.asarray(moist_air.humidity_ratio(outdoor_c, wet_bulb_c, at_wet_bulb))
+    np.testing.assert_allclose(found[sure], ratio[sure], atol=8e-5)
+
+    saturated_c = np.linspace(-15.0, 50.0, 66)
+    expected = psychrometrics.humidity_ratio(saturated_c, 100.0, pressure_pa)
+    enthalpy = np.asarray(moist_air.enthalpy_j_per_kg(saturated_c, expected))
+    bounded = enthalpy <= 260e3
+    found = np.asarray(moist_air.saturated_ratio_by_enthalpy(enthalpy, pressure_pa))
+    np.testing.assert_allclose(found[bounded], expected[bounded], atol=1e-4)
+    density = moist_air.dry_air_kg_m3(20.0, 0.0, pressure_pa)
+    assert density == pytest.approx(1.2041 * pressure_pa / 101_325.0, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", sorted(WATER))

@@ -160,6 +160,10 @@ class TowerConfig(Section):
     fan_w_per_w_rejected: Annotated[float, Field(ge=0, le=1)] = 0.02
     """Design fan power per heat rejected at the design point, in W per W, 0..1: at 1 the fan alone
     would warm the air as much as the heat does."""
+    airflow_m3s_per_w_rejected: Annotated[float, Field(ge=5e-6, le=2e-4)] = 2.667e-5
+    """Airflow at full fan speed per heat rejected at the design point, in m3/s per W, 5e-6..2e-4:
+    from seven kilograms of water per kilogram of air, at a range of 5.56 K, to a fifth of one; the
+    default makes 1.4."""
     paper_fan_w: DeviceW = 1000.0
     """CT_FAN_REF_P of the SustainDC format: fan power of the paper's tower at its reference
     airflow, in W."""
@@ -204,8 +208,10 @@ class PumpConfig(Section):
 class WaterConfig(Section):
     """Make-up water of the cooling tower."""
 
-    model: Literal["mass_balance", "released", "paper"] = "mass_balance"
-    """How evaporation, drift and blowdown of the tower are computed."""
+    model: Literal["saturated_exit", "mass_balance", "released", "paper"] = "saturated_exit"
+    """How evaporation, drift and blowdown of the tower are computed: from air that leaves the tower
+    saturated, from heat that leaves as vapour alone, or by the fits of the released SustainDC and
+    of its paper."""
     cycles_of_concentration: Annotated[float, Field(ge=1.01, le=1000)] = 5.0
     """Concentration of solids in the tower water over that in the make-up water, 1.01..1,000:
     blowdown is 100 times the evaporation at the lower end and a thousandth of it at the upper."""

@@ -5,7 +5,10 @@ Every model has the same signature, so a caller can look it up in `WATER` and pa
     rejected_w              heat rejected by the tower, W
     range_k                 entering minus leaving tower water, K
     water_kg_s              tower water flow, kg/s
+    tower_airflow_m3s       airflow into the tower, m3/s
+    outdoor_c               outdoor dry bulb, C
     wet_bulb_c              outdoor wet bulb, C
+    pressure_pa             air pressure of the site, Pa
     return_c                CRAC return air, C
     supply_setpoint_c       CRAC supply setpoint, C
     cycles_of_concentration of the tower water, above 1
@@ -23,6 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sdc_taichi.plant import moist_air
 from sdc_taichi.types import F64, Values
 
 EVAPORATION_HEAT_J_PER_KG = 2.45e6
@@ -53,7 +57,10 @@ def mass_balance(
     rejected_w: Values,
     range_k: Values,
     water_kg_s: Values,
+    tower_airflow_m3s: Values,
+    outdoor_c: Values,
     wet_bulb_c: Values,
+    pressure_pa: Values,
     return_c: Values,
     supply_setpoint_c: Values,
     cycles_of_concentration: Values,
@@ -70,7 +77,10 @@ def mass_balance(
         rejected_w: Heat rejected, W.
         range_k: Tower range, K.
         water_kg_s: Tower water flow, kg/s.
+        tower_airflow_m3s: Not used.
+        outdoor_c: Not used.
         wet_bulb_c: Not used.
+        pressure_pa: Not used.
         return_c: Not used.
         supply_setpoint_c: Not used.
         cycles_of_concentration: Concentration of solids in the tower over that in the make-up.
@@ -82,9 +92,60 @@ def mass_balance(
     """
     latent_kg_s = np.maximum(rejected_w, 0.0) / EVAPORATION_HEAT_J_PER_KG
     evaporation_l = np.minimum(latent_kg_s, MAX_EVAPORATION_PER_K * range_k * water_kg_s) * dt_s
+    return _with_blowdown(evaporation_l, drift_share * water_kg_s * dt_s, cycles_of_concentration)
+
+
+def saturated_exit(
+    *,
+    rejected_w: Values,
+    range_k: Values,
+    water_kg_s: Values,
+    tower_airflow_m3s: Values,
+    outdoor_c: Values,
+    wet_bulb_c: Values,
+    pressure_pa: Values,
+    return_c: Values,
+    supply_setpoint_c: Values,
+    cycles_of_concentration: Values,
+    drift_share: Values,
+    dt_s: Values,
+) -> WaterUse:
+    """Evaporation into air that leaves the tower saturated, drift and blowdown.
+
+    The heat raises the enthalpy of the tower's air from that of saturated air at the wet bulb, and
+    air leaves saturated: evaporation = m*(w_sat,out - w_in) with m the dry air (EnergyPlus
+    Engineering Reference, cooling tower make-up water, "saturated exit"). So little water
+    evaporates in frost, when the air carries heat as warmth, and much in dry heat. Drift and
+    blowdown as in ``mass_balance``.
+
+    Args:
+        rejected_w: Heat rejected, W.
+        range_k: Not used.
+        water_kg_s: Tower water flow, kg/s.
+        tower_airflow_m3s: Airflow into the tower, m3/s, above 0 wherever there is heat.
+        outdoor_c: Outdoor dry bulb, C.
+        wet_bulb_c: Outdoor wet bulb, C.
+        pressure_pa: Air pressure, Pa.
+        return_c: Not used.
+        supply_setpoint_c: Not used.
+        cycles_of_concentration: Concentration of solids in the tower over that in the make-up.
+        drift_share: Drift over water flow.
+        dt_s: Length of the step, s.
+
+    Returns:
+        The water used in the step.
+    """
+    at_wet_bulb = moist_air.saturated_ratio(wet_bulb_c, pressure_pa)
+    entering = moist_air.humidity_ratio(outdoor_c, wet_bulb_c, at_wet_bulb)
+    dry_air_kg_s = tower_airflow_m3s * moist_air.dry_air_kg_m3(outdoor_c, entering, pressure_pa)
+    working = np.greater(rejected_w, 0.0) & (dry_air_kg_s > 0.0)
+    gain_j_per_kg = rejected_w / np.where(working, dry_air_kg_s, 1.0)
+    leaving = moist_air.saturated_ratio_by_enthalpy(
+        moist_air.enthalpy_j_per_kg(wet_bulb_c, at_wet_bulb) + gain_j_per_kg, pressure_pa
+    )
+    taken_up_kg_s = np.where(working, dry_air_kg_s * np.maximum(leaving - entering, 0.0), 0.0)
     drift_l = drift_share * water_kg_s * dt_s
-    blowdown_l = np.maximum(evaporation_l / (cycles_of_concentration - 1.0) - drift_l, 0.0)
-    return _water(evaporation_l, drift_l, blowdown_l, evaporation_l + drift_l + blowdown_l)
+    return _with_blowdown(taken_up_kg_s * dt_s, drift_l, cycles_of_concentration)
 
 
 def released(
@@ -92,7 +153,10 @@ def released(
     rejected_w: Values,
     range_k: Values,
     water_kg_s: Values,
+    tower_airflow_m3s: Values,
+    outdoor_c: Values,
     wet_bulb_c: Values,
+    pressure_pa: Values,
     return_c: Values,
     supply_setpoint_c: Values,
     cycles_of_concentration: Values,
@@ -109,7 +173,10 @@ def released(
         rejected_w: Not used.
         range_k: Not used.
         water_kg_s: Not used.
+        tower_airflow_m3s: Not used.
+        outdoor_c: Not used.
         wet_bulb_c: Outdoor wet bulb, C.
+        pressure_pa: Not used.
         return_c: CRAC return air, C.
         supply_setpoint_c: CRAC supply setpoint, C.
         cycles_of_concentration: Not used.
@@ -131,7 +198,10 @@ def paper(
     rejected_w: Values,
     range_k: Values,
     water_kg_s: Values,
+    tower_airflow_m3s: Values,
+    outdoor_c: Values,
     wet_bulb_c: Values,
+    pressure_pa: Values,
     return_c: Values,
     supply_setpoint_c: Values,
     cycles_of_concentration: Values,
@@ -146,7 +216,10 @@ def paper(
         rejected_w: Not used.
         range_k: Not used.
         water_kg_s: Not used.
+        tower_airflow_m3s: Not used.
+        outdoor_c: Not used.
         wet_bulb_c: Outdoor wet bulb, C.
+        pressure_pa: Not used.
         return_c: CRAC return air, C; the paper's hot_water_temp.
         supply_setpoint_c: CRAC supply setpoint, C; the paper's cold_water_temp.
         cycles_of_concentration: Not used.
@@ -164,10 +237,19 @@ def paper(
 
 WATER: dict[str, Callable[..., WaterUse]] = {
     "mass_balance": mass_balance,
+    "saturated_exit": saturated_exit,
     "released": released,
     "paper": paper,
 }
 """Water models by the names that ``hvac.water.model`` takes."""
+
+
+def _with_blowdown(
+    evaporation_l: Values, drift_l: Values, cycles_of_concentration: Values
+) -> WaterUse:
+    """Water of a step whose blowdown holds the concentration of solids."""
+    blowdown_l = np.maximum(evaporation_l / (cycles_of_concentration - 1.0) - drift_l, 0.0)
+    return _water(evaporation_l, drift_l, blowdown_l, evaporation_l + drift_l + blowdown_l)
 
 
 def _litres_per_m3h(dt_s: Values) -> Values:

@@ -81,6 +81,8 @@ class WaterSideResult:
     """Entering less leaving water temperature of the tower, in K, (B,)."""
     tower_water_kg_s: F64
     """Condenser water flow, in kg/s, (B,)."""
+    tower_airflow_m3s: F64
+    """Airflow of the tower, in m3/s, (B,)."""
     tower_fan_w: F64
     """Power of the tower fan, in W, (B,)."""
     chilled_pump_w: F64
@@ -93,7 +95,7 @@ class WaterSideResult:
 
         Powers and flows are multiplied with the share; temperatures stay those while it ran.
         """
-        flows = [f.name for f in fields(self) if f.name.endswith(("_w", "_kg_s"))]
+        flows = [f.name for f in fields(self) if f.name.endswith(("_w", "_kg_s", "_m3s"))]
         return replace(self, **{name: getattr(self, name) * share for name in flows})
 
 
@@ -201,6 +203,7 @@ def operate(
         condenser_water_c=cooled.leaving_c,
         tower_range_k=cooled.range_k,
         tower_water_kg_s=tower_water_kg_s,
+        tower_airflow_m3s=cooled.air_ratio * design.tower_air_m3s,
         tower_fan_w=cooled.fan_w,
         chilled_pump_w=chilled_pump_w,
         condenser_pump_w=condenser_pump_w,

@@ -23,7 +23,7 @@ from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterUse
 from sdc_taichi.plant.water_side import WaterSideResult
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k
+from sdc_taichi.sim.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k, sites_pressure_pa
 from sdc_taichi.types import F64, StepResult, fields_of
 
 NOT_USED = cast(F64, None)
@@ -212,6 +212,7 @@ class Facility:
         self._water = {
             "cycles_of_concentration": v("hvac.water.cycles_of_concentration"),
             "drift_share": v("hvac.water.drift_share"),
+            "pressure_pa": sites_pressure_pa(fleet),
         }
         self._flow_limits = {
             "design_flow_m3s": sizing.crac_flow_m3s,
@@ -382,6 +383,8 @@ class Facility:
             rejected_w=plant.rejected_w,
             range_k=plant.tower_range_k,
             water_kg_s=plant.tower_water_kg_s,
+            tower_airflow_m3s=plant.tower_airflow_m3s,
+            outdoor_c=inputs.outdoor_c,
             wet_bulb_c=inputs.wet_bulb_c,
             return_c=air.return_c,
             supply_setpoint_c=inputs.plant_setpoint_c,

@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 
 from sdc_taichi.errors import PhysicalLimitError
+from sdc_taichi.exogenous import site_pressure_pa
 from sdc_taichi.plant import chiller, tower
 from sdc_taichi.plant.chiller import ChillerResult
 from sdc_taichi.plant.fans_pumps import hydraulic_pump_w
@@ -236,6 +237,13 @@ def air_j_per_m3_k(fleet: Fleet) -> F64:
     )
 
 
+def sites_pressure_pa(fleet: Fleet) -> F64:
+    """Air pressure of the standard atmosphere at the height of each site, Pa, (B,)."""
+    places = [(c.site.location, c.site.weather_file) for c in fleet.configs]
+    pressure_pa = {place: site_pressure_pa(*place) for place in dict.fromkeys(places)}
+    return np.array([pressure_pa[place] for place in places])
+
+
 def mean_return_approach_k(fleet: Fleet) -> F64:
     """Return approach temperature, mean over the racks, K, (B,)."""
     return np.array([np.mean(np.asarray(c.hall.return_approach_k)) for c in fleet.configs])
@@ -337,6 +345,7 @@ def _tower(
     }
     if model == "yorkcalc":
         sized["tower_fan_w"] = v("hvac.tower.fan_w_per_w_rejected") * rejected_w
+        sized["tower_air_m3s"] = v("hvac.tower.airflow_m3s_per_w_rejected") * rejected_w
         sized["tower_reference_kg_s"] = tower.yorkcalc_reference_water_kg_s(
             water_kg_s, wet_bulb_c=wet_bulb_c, range_k=range_k, approach_k=approach_k
         )

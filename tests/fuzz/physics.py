@@ -36,7 +36,7 @@ def closing(config: DataCenterConfig) -> Iterable[str]:
         open_ones |= {"server air"}
     if config.battery.model == "released":
         open_ones |= {"battery", "battery loss"}
-    if hvac.water.model != "mass_balance":
+    if hvac.water.model in paper:
         open_ones |= {"water", "blowdown"}
     if len(hvac.total_of) < 5:
         open_ones |= {"hvac"}
