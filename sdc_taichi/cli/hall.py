@@ -21,6 +21,7 @@ from sdc_taichi.cli.arguments import (
     out_option,
     read_config,
 )
+from sdc_taichi.cli.hall_failover import failover_command
 from sdc_taichi.cli.hall_why import why_command
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import printable
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 hall_app = typer.Typer(help="Describe a hall, solve its air.", no_args_is_help=True)
 hall_app.command("why")(why_command)
+hall_app.command("failover")(failover_command)
 
 
 @hall_app.command("show")
