@@ -204,9 +204,11 @@ def test_command_explains_a_run(run: RunFolder) -> None:
         return done.stdout
 
     hottest = run.metrics["total"]["hottest_dc"]
-    assert call().startswith(f"{hottest}, step {run.metrics['total']['hottest_step']} of ")
+    step = run.metrics["total"]["hottest_step"]
+    assert call().startswith(f"{hottest}, at the end of its hottest step {step} of ")
+    assert f"{run.metrics['total']['hottest_inlet_c']:.2f} C" in call()
     assert "rack 7 (row 1, place 2)" in call("--rack", 7, "--dc", "az")
-    assert "step 4 of" in call("--rack", 7, "--dc", "az", "--step", 4)
+    assert "at the end of step 4 of" in call("--rack", 7, "--dc", "az", "--step", 4)
     for message, arguments in (
         ("no such data center", ("--dc", "tx")),
         ("valid is 0..95", ("--step", 96)),

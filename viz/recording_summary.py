@@ -87,7 +87,7 @@ def hottest_markdown(fleet: Fleet, dc: int, found: AirAtStep, clock: str) -> str
     per_row = fleet.configs[dc].hall.racks_per_row
     inlets = Inlets(fleet, dc, found.air)
     when = clock[5:].replace("T", " ")
-    lines = ["# Why the hottest racks are hot", f"At the hottest inlet, step {found.step}, {when}."]
+    lines = ["# Why the hottest racks are hot", f"At the end of step {found.step}, {when}."]
     for rack in inlets.hottest(HOTTEST_RACKS):
         parts = inlets.parts(rack)
         (first, setpoint_c), *others = inlet_terms(parts, per_row)

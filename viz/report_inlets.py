@@ -67,7 +67,10 @@ def _data_center(run: RunFolder, dc: int, found: InletsAtStep) -> str:
     when = time_text(run, local_time(run, dc, found.step))
     rows = [_row(parts, per_row) for parts in all_parts]
     heads = [Cell(text, 0 < i < len(HEADS) - 1) for i, text in enumerate(HEADS)]
-    caption = f"Hottest racks of {run.names[dc]} at its hottest inlet, {when}"
+    caption = (
+        f"Hottest racks of {run.names[dc]} at the end of the step of its hottest inlet, "
+        f"{found.hottest_c:.2f} °C on {when}"
+    )
     lines = [
         f"Of the intake of the hottest, {100 * all_parts[0].exhaust_share:.1f} % is exhaust air.",
         *(f"{text[0].upper()}{text[1:]}." for text in state_texts(all_parts[0])),

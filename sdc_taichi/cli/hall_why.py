@@ -115,7 +115,7 @@ def _at_design_point(
 
 def _in_run(folder: Path, overrides: list[str] | None, dc: str | None, step: int | None) -> _Found:
     """Inlets in a step of a run."""
-    from sdc_taichi.run.folder_reader import read_run
+    from sdc_taichi.run.folder_reader import is_number, read_run
     from sdc_taichi.run.inlets_of_run import hottest_inlets, inlets_at_step
 
     if overrides:
@@ -126,15 +126,17 @@ def _in_run(folder: Path, overrides: list[str] | None, dc: str | None, step: int
         shown = ", ".join(run.names[:10]) + (", ..." if len(run.names) > 10 else "")
         raise ConfigError(f"--dc {name!r}: no such data center in {folder}; valid: {shown}")
     index = run.names.index(name)
-    hottest_step = run.metrics["data_centers"][index]["metrics"].get("hottest_step")
+    metrics = run.metrics["data_centers"][index]["metrics"]
+    hottest_step = metrics.get("hottest_step")
     wanted = hottest_step if step is None else step
-    if not isinstance(wanted, int):
-        raise SdcError(f"{folder}: no hottest_step of {name}; simulate the run again")
+    if not (isinstance(wanted, int) and is_number(metrics.get("hottest_inlet_c"))):
+        raise SdcError(f"{folder}: no hottest inlet of {name}; simulate the run again")
     found = hottest_inlets(run, index) if wanted == hottest_step else None
     if found is None:
         found = inlets_at_step(run, index, wanted)
-    is_hottest = " (its hottest)" if found.step == hottest_step else ""
-    return name, found.config, f"step {found.step} of {folder}{is_hottest}", found.inlets
+    at = "at the end of its hottest step" if found.step == hottest_step else "at the end of step"
+    at = f"{at} {found.step} of {folder}, whose hottest inlet is {found.hottest_c:.2f} C"
+    return name, found.config, at, found.inlets
 
 
 def _draw(out: Path, config: DataCenterConfig, parts: InletParts) -> None:

@@ -26,6 +26,9 @@ class InletsAtStep:
 
     step: int
     """The step, counted from 0 at reset."""
+    hottest_c: float
+    """Hottest server inlet of the step, in C; in transient halls of any substep, while ``inlets``
+    are those at the end of the step."""
     config: DataCenterConfig
     """Config of the data center."""
     inlets: Inlets
@@ -58,7 +61,8 @@ def hottest_inlets(run: RunFolder, dc: int) -> InletsAtStep | None:
         )
     except ValueError as error:
         raise SdcError(f"{place}: {error}") from None
-    return InletsAtStep(found.step, fleet.configs[0], Inlets(fleet, 0, found.air))
+    hottest_c = float(run.metrics["data_centers"][dc]["metrics"]["hottest_inlet_c"])
+    return InletsAtStep(found.step, hottest_c, fleet.configs[0], Inlets(fleet, 0, found.air))
 
 
 def inlets_at_step(run: RunFolder, dc: int, step: int) -> InletsAtStep:
@@ -100,7 +104,7 @@ def inlets_at_step(run: RunFolder, dc: int, step: int) -> InletsAtStep:
             "and versions are those of today, under a controller that treats a data center alike "
             "in any batch"
         )
-    return InletsAtStep(step, fleet.configs[0], Inlets(fleet, 0, air))
+    return InletsAtStep(step, again_c, fleet.configs[0], Inlets(fleet, 0, air))
 
 
 def _fleet_of(run: RunFolder, dc: int) -> Fleet:

@@ -299,6 +299,9 @@ def state_texts(parts: InletParts) -> list[str]:
         for i in units
         if parts.exhaust_share > 0 and parts.unit_share[i] >= LEAST_SHARE
     ]
+    rest = 1.0 - float(parts.unit_share[units].sum())
+    if parts.exhaust_share > 0 and rest >= LEAST_SHARE:
+        texts.append(f"the other CRAC units give {100 * rest:.1f} %")
     fans = f"the rack draws {parts.power_w / 1e3:.1f} kW, its fans move {parts.airflow_m3s:.3f} "
     fans += f"m3/s, its outlet is {parts.outlet_c:.1f} C"
     if parts.fan_airflow < 1.0:
