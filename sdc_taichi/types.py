@@ -296,6 +296,13 @@ class StepResult:
     """Electric power of the CRAC fans, in W, (B,)."""
     hvac_w: F64
     """Electric power of the devices that ``hvac.total_of`` names, in W, (B,)."""
+    ups_loss_w: F64
+    """Power that the UPS loses, in W, (B,)."""
+    distribution_loss_w: F64
+    """Power that transformers, PDUs and wiring lose behind the UPS, in W, (B,)."""
+    overhead_w: F64
+    """Power of the facility beside IT that the energy bought covers, in W, (B,): ``hvac_w``, and
+    with ``electrical.losses: counted`` the losses of UPS and distribution."""
 
     evaporation_l: F64
     """Water that the tower evaporates, in l, (B,)."""
@@ -369,8 +376,8 @@ class StepResult:
 
     @property
     def facility_kwh(self) -> F64:
-        """IT and HVAC energy, without the battery, in kWh, (B,)."""
-        return self.it_kwh + self.hvac_kwh
+        """Energy of IT and ``overhead_w``, without the battery, in kWh, (B,)."""
+        return self.it_kwh + self.overhead_w * self.step_h / 1e3
 
     @property
     def rhi(self) -> F64:
@@ -379,9 +386,9 @@ class StepResult:
 
     @property
     def pue(self) -> F64:
-        """(IT + HVAC) / IT, dimensionless, (B,); inf without IT power."""
+        """(IT + overhead) / IT, dimensionless, (B,); inf without IT power."""
         some = self.it_w > 0
-        return np.where(some, 1.0 + self.hvac_w / np.where(some, self.it_w, 1.0), np.inf)
+        return np.where(some, 1.0 + self.overhead_w / np.where(some, self.it_w, 1.0), np.inf)
 
     def per_dc(self) -> dict[str, F64]:
         """All (B,) quantities by name, in the order of the fields."""

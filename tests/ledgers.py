@@ -20,6 +20,7 @@ class Run:
     start: dict[str, F64]
     fleet_values: Callable[[str], F64]
     step_h: float
+    counts_losses: bool
     flow_balance: F64
     """Of every watched step, (n, B)."""
 
@@ -127,7 +128,7 @@ LEDGERS: dict[str, Ledger] = {
         r["grid_kwh"],
         r["unserved_kwh"],
         -r.kwh("it_w"),
-        -r.kwh("hvac_w"),
+        -r.kwh("overhead_w"),
         -r["charge_kwh"],
         r["discharge_kwh"],
     ],
@@ -139,6 +140,13 @@ LEDGERS: dict[str, Ledger] = {
         -r["condenser_pump_w"],
         -r["crac_fan_w"],
     ],
+    "overhead": lambda r: [
+        r["overhead_w"],
+        -r["hvac_w"],
+        -r["ups_loss_w"] * r.counts_losses,
+        -r["distribution_loss_w"] * r.counts_losses,
+    ],
+    "cost": lambda r: [r["energy_cost"], -r["grid_kwh"] * r["price_per_kwh"]],
     "water": lambda r: [r["water_l"], -r["evaporation_l"], -r["drift_l"], -r["blowdown_l"]],
     "blowdown": lambda r: [
         concentrating_l(r),

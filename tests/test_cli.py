@@ -97,7 +97,10 @@ def test_metrics_are_those_of_the_recorded_steps(two_sites: Path) -> None:
             "battery_net_kwh": total["charge_kwh"] - total["discharge_kwh"],
             "grid_kwh": total["grid_kwh"],
             "pue": (it + total["hvac_kwh"]) / it,
-            "pue_with_ups": (it / 0.96 + total["hvac_kwh"]) / it,
+            "ups_loss_kwh": total["ups_loss_w"] * h / 1e3,
+            "distribution_loss_kwh": total["distribution_loss_w"] * h / 1e3,
+            "pue_with_losses": 1
+            + (total["hvac_w"] + total["ups_loss_w"] + total["distribution_loss_w"]) * h / 1e3 / it,
             "partial_pue": 1 + (total["chiller_w"] + total["tower_fan_w"]) * h / 1e3 / it,
             "wue_l_per_kwh": total["water_l"] / it,
             "cue_kg_per_kwh": (rows["grid_kwh"] * rows["ci_g_per_kwh"]).sum() / 1e3 / it,

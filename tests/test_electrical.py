@@ -12,6 +12,7 @@ from sdc_taichi.config.tariff_schema import TariffConfig
 from sdc_taichi.control import view_maker
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH
+from sdc_taichi.plant.electrical import loss_w
 from sdc_taichi.run.bills import add_power, billed_kw_months, no_demand
 from sdc_taichi.types import F64
 
@@ -178,3 +179,57 @@ def test_months_pay_their_peaks_by_the_part_that_a_run_covers() -> None:
 def test_bad_tariffs_are_named(override: str, named: str) -> None:
     with pytest.raises(ConfigError, match=named):
         load_config("corrected", [override])
+
+
+# --- losses -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("device", "load_shares", "efficiencies"),
+    [
+        ("ups", [0.25, 0.5, 1.0], [0.941, 0.963, 0.970]),
+        # 99.02 % at 35 % of the load by regulation, less 0.35 % in the wiring.
+        ("distribution", [0.35, 1.0], [0.9902 - 0.0034, 0.975]),
+    ],
+)
+def test_efficiencies_are_the_published_ones(
+    device: str, load_shares: list[float], efficiencies: list[float]
+) -> None:
+    config = getattr(load_config("corrected").electrical, device)
+    load_w = 2e5 * np.array(load_shares)
+    lost_w = loss_w(load_w, 2e5, **config.model_dump())
+    np.testing.assert_allclose(load_w / (load_w + lost_w), efficiencies, atol=6e-4)
+
+
+def test_reported_losses_change_nothing_else_and_counted_ones_are_paid_for() -> None:
+    told, paid = charged([], command=0.0), charged(["electrical.losses=counted"], command=0.0)
+    for name in ("it_w", "hvac_w", "ups_loss_w", "distribution_loss_w"):
+        np.testing.assert_array_equal(column(told, name), column(paid, name))
+    lost_kwh = (column(told, "ups_loss_w") + column(told, "distribution_loss_w")) / 4e3
+    share = lost_kwh / column(told, "it_kwh")
+    assert np.all((share > 0.04) & (share < 0.12)), share
+    np.testing.assert_allclose(
+        column(paid, "grid_kwh") - column(told, "grid_kwh"), lost_kwh, rtol=1e-9
+    )
+    np.testing.assert_allclose(column(paid, "pue") - column(told, "pue"), share, rtol=1e-9)
+    np.testing.assert_array_equal(column(told, "overhead_w"), column(told, "hvac_w"))
+    carbon = column(paid, "carbon_g") / column(told, "carbon_g")
+    cost = column(paid, "energy_cost") / column(told, "energy_cost")
+    np.testing.assert_allclose(carbon, cost, rtol=1e-12)
+    assert design_kw(["electrical.losses=counted"]) > 1.03 * design_kw([])
+
+
+def test_a_constant_efficiency_is_a_proportional_loss() -> None:
+    """As the presets of the paper have it: 96 % at any load."""
+    with Simulator(load_config("paper")) as sim:
+        result = (sim.reset(), sim.step())[1]
+    assert result.ups_loss_w == pytest.approx(result.it_w / 0.96 - result.it_w, rel=1e-12)
+    assert result.distribution_loss_w == 0
+
+
+def test_nothing_is_lost_without_power() -> None:
+    outage = "events.scheduled=[{kind: grid_outage, start_h: 0.25, duration_h: 0.5}]"
+    found = charged([outage, "electrical.losses=counted", "battery.capacity_kwh=0"], 0.0, 4)
+    for name in ("ups_loss_w", "distribution_loss_w", "overhead_w", "grid_kwh"):
+        lost = column(found, name)
+        assert lost[0] > 0 == lost[1] == lost[2] < lost[3], name

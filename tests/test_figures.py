@@ -352,7 +352,7 @@ def test_hot_racks_shows_hours_and_ties() -> None:
 
 def fleet_of(steps: pd.DataFrame) -> pd.DataFrame:
     inlets = {f"inlet_{part}_c": steps["inlet_max_c"] for part in ("low", "mid", "high", "max")}
-    return steps[["time", "it_w", "hvac_w", "carbon_g"]].assign(**inlets)
+    return steps[["time", "it_w", "overhead_w", "carbon_g"]].assign(**inlets)
 
 
 def series_of(steps: pd.DataFrame) -> dict[str, pd.Series]:
@@ -391,13 +391,13 @@ def test_every_axis_has_a_unit(
 @pytest.mark.parametrize(("factor", "power"), [(1.0, "kW"), (1e4, "MW")])
 def test_fleet_overview_fits_the_size(steps: pd.DataFrame, factor: float, power: str) -> None:
     given = fleet_of(steps)
-    given[["it_w", "hvac_w", "carbon_g"]] *= factor
+    given[["it_w", "overhead_w", "carbon_g"]] *= factor
     figure: Any = fleet_figures.fleet_overview(given)
     axes, pue, carbon, inlets = figure.axes
     assert axes.get_ylabel() == f"power ({power})"
     unit = 1e3 if power == "kW" else 1e6
     highest = max(area.get_paths()[0].vertices[:, 1].max() for area in axes.collections)
-    assert highest == pytest.approx((given["it_w"] + given["hvac_w"]).max() / unit)
+    assert highest == pytest.approx((given["it_w"] + given["overhead_w"]).max() / unit)
     np.testing.assert_allclose(pue.lines[0].get_ydata()[:-1], 1 + steps["hvac_w"] / steps["it_w"])
     assert carbon.get_ylabel() == f"emitted ({'kg' if power == 'kW' else 't'} CO₂e/h)"
     assert clock(inlets.get_xlim()[1]) == "03-02 00:00"

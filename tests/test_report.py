@@ -450,7 +450,7 @@ def test_fleet_sums_and_maxima(fleet: Path) -> None:
     found = folder_reader.read_fleet_steps(run)
     steps = pd.read_parquet(fleet / "steps.parquet")
     by_step = steps.groupby("step")
-    for name in ("it_w", "hvac_w", "carbon_g"):
+    for name in ("it_w", "overhead_w", "carbon_g"):
         np.testing.assert_allclose(found.series[name], by_step[name].sum())
     np.testing.assert_array_equal(found.series["inlet_max_c"], by_step["inlet_max_c"].max())
     np.testing.assert_allclose(found.series["inlet_high_c"], by_step["inlet_max_c"].quantile(0.9))

@@ -106,7 +106,7 @@ def fleet_overview(steps: pd.DataFrame) -> Figure:
 
     Args:
         steps: two rows or more: ``time`` on the clock of the first data center; ``it_w``,
-            ``hvac_w`` and ``carbon_g``, sums over the data centers; ``inlet_low_c``,
+            ``overhead_w`` and ``carbon_g``, sums over the data centers; ``inlet_low_c``,
             ``inlet_mid_c``, ``inlet_high_c`` and ``inlet_max_c``, 10 %, median, 90 % and the
             highest of their hottest inlets.
 
@@ -118,9 +118,12 @@ def fleet_overview(steps: pd.DataFrame) -> Figure:
     panels = figure.subplots(4, 1, sharex=True, height_ratios=[3, 2, 2, 3])
     power, pue, carbon, inlets = panels
     tops, unit = scale_thousands(
-        np.cumsum([steps["it_w"], steps["hvac_w"]], axis=0) / 1e3, "kW", "MW"
+        np.cumsum([steps["it_w"], steps["overhead_w"]], axis=0) / 1e3, "kW", "MW"
     )
-    for low, high, colour, label in ((0 * tops[0], tops[0], BLUE, "IT"), (*tops, ORANGE, "HVAC")):
+    for low, high, colour, label in (
+        (0 * tops[0], tops[0], BLUE, "IT"),
+        (*tops, ORANGE, "HVAC and counted losses"),
+    ):
         power.fill_between(edges, repeat_last(low), repeat_last(high), color=colour, label=label,
                            linewidth=0, step="post")  # fmt: skip
     power.set_ylabel(f"power ({unit})")

@@ -63,6 +63,8 @@ PLOTS: dict[str, Plot] = {
         (
             PlotLine("IT [kW]", "it_w", BLUE, 1e-3),
             PlotLine("HVAC [kW]", "hvac_w", SKY, 1e-3),
+            PlotLine("UPS loss [kW]", "ups_loss_w", PINK, 1e-3),
+            PlotLine("distribution loss [kW]", "distribution_loss_w", GREY, 1e-3),
             PlotLine("grid [kW]", "grid_kwh", ORANGE, per_hour=True),
             PlotLine("battery charge [kW]", "charge_kwh", GREEN, per_hour=True),
             PlotLine("battery discharge [kW]", "discharge_kwh", RED, per_hour=True),
@@ -172,7 +174,7 @@ EVENT_FIELDS = (
 
 FLEET_SUMS = (
     "it_w",
-    "hvac_w",
+    "overhead_w",
     "carbon_g",
     "water_l",
     "queue_tasks",
@@ -209,10 +211,10 @@ class FleetPlot(NamedTuple):
     """From the sums of ``FLEET_SUMS`` and the highest ``inlet_max_c`` to the line, all (T,)."""
 
 
-def _pue(it_w: F64, hvac_w: F64) -> F64:
-    """(IT + HVAC) / IT, nan without IT power, which a plot shows as a gap."""
+def _pue(it_w: F64, overhead_w: F64) -> F64:
+    """(IT + overhead) / IT, nan without IT power, which a plot shows as a gap."""
     some = it_w > 0
-    return np.where(some, 1.0 + hvac_w / np.where(some, it_w, 1.0), np.nan)
+    return np.where(some, 1.0 + overhead_w / np.where(some, it_w, 1.0), np.nan)
 
 
 def _sum_of(*fields: str, factor: float = 1.0) -> Callable[[Mapping[str, F64]], F64]:
@@ -224,7 +226,7 @@ FLEET_PLOTS: dict[str, FleetPlot] = {
     "pue": FleetPlot(
         "PUE of all [-]",
         BLUE,
-        lambda total: _pue(total["it_w"], total["hvac_w"]),
+        lambda total: _pue(total["it_w"], total["overhead_w"]),
     ),
     "hottest_inlet_c": FleetPlot(
         "hottest inlet of all [C]", ORANGE, lambda total: total["inlet_max_c"]
@@ -245,7 +247,7 @@ FLEET_PLOTS: dict[str, FleetPlot] = {
 
 def append_pue(values: F64) -> F64:
     """Values of ``FIELDS``, (T, F, n), followed by the PUE, (T, F + 1, n)."""
-    pue = _pue(values[:, FIELD_ROWS["it_w"]], values[:, FIELD_ROWS["hvac_w"]])
+    pue = _pue(values[:, FIELD_ROWS["it_w"]], values[:, FIELD_ROWS["overhead_w"]])
     return np.concatenate([values, pue[:, None]], axis=1)
 
 

@@ -92,7 +92,7 @@ def _check_metrics(run: RunFolder) -> None:
     # Rows, racks of a hall and servers of a rack are far fewer.
     places = dict.fromkeys(("hottest_row", "hottest_rack", "hottest_server"), 10**9)
     places["hottest_step"] = run.metrics["steps_done"] - 1
-    ratios = {"pue", "pue_with_ups", "partial_pue", "cue_kg_per_kwh", "wue_l_per_kwh"}
+    ratios = {"pue", "pue_with_losses", "partial_pue", "cue_kg_per_kwh", "wue_l_per_kwh"}
     given = [("total", run.metrics["total"])]
     given += [(f"data_centers[{i}].metrics", dc["metrics"]) for i, dc in enumerate(dcs)]
     for where, metrics in given:

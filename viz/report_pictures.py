@@ -54,7 +54,7 @@ def fleet_section(run: RunFolder) -> str:
     """All data centers together, and which halls ran hot when."""
     fleet = read_fleet_steps(run)
     count = len(run.names)
-    powers_kw = (fleet.series["it_w"] + fleet.series["hvac_w"]).to_numpy() / 1e3
+    powers_kw = (fleet.series["it_w"] + fleet.series["overhead_w"]).to_numpy() / 1e3
     power, unit = scale_thousands(powers_kw, "kW", "MW")
     out = picture_element(
         fleet_figures.fleet_overview(fleet.series),

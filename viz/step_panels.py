@@ -42,7 +42,7 @@ COLUMNS = (
     "wet_bulb_c",
     "setpoint_c",
     *POWERS,
-    "hvac_w",
+    "overhead_w",
     "ci_g_per_kwh",
     "carbon_g",
     "queue_tasks",
@@ -74,7 +74,7 @@ def draw_power(axes: Axes, steps: pd.DataFrame) -> None:
         linewidth=0,
         step="post",
     )
-    counted = (steps["it_w"] + steps["hvac_w"]) / 1e3
+    counted = (steps["it_w"] + steps["overhead_w"]) / 1e3
     # Presets may leave devices out of the HVAC total.
     if not np.allclose(counted, sum(powers), rtol=1e-6):
         draw_steps(axes, steps, counted, color="black", linewidth=1.2, label="counted in total")

@@ -22,7 +22,7 @@ _ROWS = (
     ("cost (currency of the tariff)", "cost"),
     ("highest grid power (kW)", "peak_kw"),
     ("PUE", "pue"),
-    ("PUE with UPS losses", "pue_with_ups"),
+    ("PUE with losses of UPS and distribution", "pue_with_losses"),
     ("WUE (L/kWh)", "wue_l_per_kwh"),
     ("CUE (kg/kWh)", "cue_kg_per_kwh"),
     ("CFP (kg CO2e)", "cfp_kg"),

@@ -273,9 +273,6 @@ class HvacConfig(Section):
         "crac_fan",
     )
     """Devices whose power counts in the HVAC total."""
-    ups_efficiency: WorkingShare = 0.96
-    """Efficiency of the UPS, 0.01..1, for the PUE with UPS losses alone; the grid balance is IT +
-    HVAC + battery."""
 
     @field_validator("total_of")
     @classmethod

@@ -171,7 +171,7 @@ class DataCenterConfig(Section):
     battery: BatteryConfig = BatteryConfig()
     """Battery between grid and facility."""
     electrical: ElectricalConfig = ElectricalConfig()
-    """Connection to the grid."""
+    """Grid connection, UPS and distribution."""
     tariff: TariffConfig = TariffConfig()
     """Prices of electricity."""
     workload: WorkloadConfig = WorkloadConfig()

@@ -140,7 +140,7 @@ def measured_features(units: int = 1, fans: int = 0, racks: int = 0) -> tuple[Fe
         Feature("setpoint", "C", 10.0, 30.0, f"supply setpoint {setpoint}", units),
         Feature("it_energy", "share", 0.0, 1.2, "IT energy of the last step over design"),
         Feature("hvac_energy", "share", 0.0, 1.2, "HVAC energy of the last step over design"),
-        Feature("dc_load", "share", 0.0, 1.2, "IT and HVAC power of the last step over design"),
+        Feature("dc_load", "share", 0.0, 1.2, "facility power of the last step over design"),
         Feature("soc", "share", 0.0, 1.0, "state of charge; 0 without a battery"),
         Feature("fan_speed", "share", 0.0, 1.0, "speed of each CRAC fan over design", fans),
         Feature("rack_inlets", "C", 10.0, 50.0, "hottest inlet of each rack, last step", racks),

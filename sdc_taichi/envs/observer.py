@@ -211,7 +211,7 @@ class Observer:
         if last is None:
             # A hall at rest at the setpoint.
             at_c, none = mean_setpoint_c(view), np.zeros(len(state.stored_kwh))
-            of_last_step = (none, none, at_c, at_c, none, none)
+            of_last_step = (none, none, at_c, at_c, none, none, none)
         else:
             of_last_step = _read_last_step(last)
         given |= zip(_LAST_STEP_QUANTITIES, of_last_step, strict=True)
@@ -235,7 +235,7 @@ class Observer:
 
         kwh = step_h / 1e3
         per_it_kwh = _inverse(sizing.it_w * kwh)
-        per_hvac_kwh = _inverse((sizing.facility_w - sizing.it_w) * kwh)
+        per_hvac_kwh = _inverse((sizing.facility_w - sizing.counted_loss_w - sizing.it_w) * kwh)
         per_facility_kwh = _inverse(sizing.facility_w * kwh)
         per_battery_kwh = _inverse(sizing.battery_kwh)
         edges, units = range(len(self._age_columns)), range(self._units)
@@ -256,7 +256,7 @@ class Observer:
                 "setpoint": [x[f"setpoint_{i}"] for i in units],
                 "it_energy": [x["it_kwh"] * per_it_kwh],
                 "hvac_energy": [x["hvac_kwh"] * per_hvac_kwh],
-                "dc_load": [(x["it_kwh"] + x["hvac_kwh"]) * per_facility_kwh],
+                "dc_load": [x["facility_kwh"] * per_facility_kwh],
                 "soc": [x["stored_kwh"] * per_battery_kwh],
                 "fan_speed": [x[f"fan_{i}"] for i in range(self._fans)],
             }
@@ -276,6 +276,7 @@ _LAST_STEP_QUANTITIES = (
     "inlet_max_c",
     "it_kwh",
     "hvac_kwh",
+    "facility_kwh",
 )
 """Fields of ``StepResult`` that are observed."""
 _read_last_step = attrgetter(*_LAST_STEP_QUANTITIES)

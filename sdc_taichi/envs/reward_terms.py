@@ -89,7 +89,7 @@ def total_energy(r: StepResult, c: TermContext) -> F64:
 
 @reward_term
 def facility_energy(r: StepResult, c: TermContext) -> F64:
-    """IT and HVAC energy (paper, 4.5: r_DC)."""
+    """Energy of IT, HVAC and counted losses (paper, 4.5: r_DC)."""
     return -r.facility_kwh / c.design_kwh
 
 
@@ -132,8 +132,8 @@ def fossil_share(r: StepResult, c: TermContext) -> F64:
 
 @reward_term
 def pue(r: StepResult, c: TermContext) -> F64:
-    """HVAC power over IT power, PUE - 1; 0 without IT power."""
-    return np.where(r.it_w > 0.0, -r.hvac_w / np.where(r.it_w > 0.0, r.it_w, 1.0), 0.0)
+    """Power beside IT over IT power, PUE - 1; 0 without IT power."""
+    return np.where(r.it_w > 0.0, -r.overhead_w / np.where(r.it_w > 0.0, r.it_w, 1.0), 0.0)
 
 
 @reward_term

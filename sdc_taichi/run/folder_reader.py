@@ -97,8 +97,8 @@ class FleetSteps:
 
     series: pd.DataFrame
     """One row per step: ``time`` on the clock of the first data center, sums over the data centers
-    of ``it_w``, ``hvac_w`` (W) and ``carbon_g`` (g), and of their hottest inlets the 10 %, 50 % and
-    90 % quantile and the maximum, ``inlet_low_c``, ``inlet_mid_c``, ``inlet_high_c`` and
+    of ``it_w``, ``overhead_w`` (W) and ``carbon_g`` (g), and of their hottest inlets the 10 %, 50 %
+    and 90 % quantile and the maximum, ``inlet_low_c``, ``inlet_mid_c``, ``inlet_high_c`` and
     ``inlet_max_c`` (C)."""
     edge_times: npt.NDArray[np.datetime64]
     """Beginnings of m intervals, equal but for the last, and the end of the run, (m + 1,)."""
@@ -158,7 +158,7 @@ def read_fleet_steps(run: RunFolder) -> FleetSteps:
     """
     import pandas as pd
 
-    summed = ("it_w", "hvac_w", "carbon_g")
+    summed = ("it_w", "overhead_w", "carbon_g")
     steps, size = run.metrics["steps_done"], len(run.names)
     step_h = float(run.metrics["step_h"])
     interval = next(

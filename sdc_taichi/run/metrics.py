@@ -6,10 +6,11 @@ in f64, so a data center has the same metrics whatever the batch it is in.
 
 Definitions (PUE, CUE and WUE after The Green Grid, white papers 49, 32 and 35):
 
-    facility_kwh     IT + HVAC (the devices of ``hvac.total_of``), without the battery
+    facility_kwh     IT + HVAC (the devices of ``hvac.total_of``), without the battery; with
+                     ``electrical.losses: counted`` also the losses of UPS and distribution
     battery_net_kwh  charged - discharged; grid_kwh = facility_kwh + battery_net_kwh
     pue              facility / IT
-    pue_with_ups     (IT / ``hvac.ups_efficiency`` + HVAC) / IT
+    pue_with_losses  (IT + HVAC + losses of UPS and distribution) / IT, counted or not
     partial_pue      (IT + chiller + tower fan) / IT
     wue_l_per_kwh    make-up water / IT
     cue_kg_per_kwh   cfp_kg / IT, cfp_kg being grid energy times carbon intensity, step by step
@@ -44,6 +45,9 @@ Metric = float | int | str | None
 _SUMMED_FIELDS = (
     "it_kwh",
     "hvac_kwh",
+    "overhead_w",
+    "ups_loss_w",
+    "distribution_loss_w",
     "grid_kwh",
     "charge_kwh",
     "discharge_kwh",
@@ -167,15 +171,13 @@ def add_step(totals: Totals, result: StepResult) -> None:
 
 def metrics_per_dc(totals: Totals, fleet: Fleet) -> list[dict[str, Metric]]:
     """Metrics of every data center, in the order of the fleet, from totals of at least one step."""
-    efficiency = fleet.values("hvac.ups_efficiency")
     found_min = times_to_throttle_min(totals)
     demand_charge = _demand_charge(totals, fleet)
     out = []
     for dc in range(fleet.size):
         sums = {name: float(values[dc]) for name, values in totals.sums.items()}
-        behind_ups_kwh = sums["it_kwh"] / float(efficiency[dc])
         out.append(
-            _energy_and_work(sums, behind_ups_kwh, totals.step_h)
+            _energy_and_work(sums, totals.step_h)
             | _cost(sums, float(demand_charge[dc]), float(totals.demand.peak_kw[dc]))
             | {
                 "queue_mean_tasks": sums["queue_tasks"] / totals.steps,
@@ -207,14 +209,13 @@ def metrics_of_fleet(totals: Totals, fleet: Fleet) -> dict[str, Metric]:
     of each data center's own bill.
     """
     sums = {name: float(values.sum()) for name, values in totals.sums.items()}
-    behind_ups_kwh = float((totals.sums["it_kwh"] / fleet.values("hvac.ups_efficiency")).sum())
     hottest = int(np.argmax(rank(totals.hottest_inlet_c)))
     servers = fleet.per_dc_servers()
     found_min = times_to_throttle_min(totals)
     cost = _cost(
         sums, float(_demand_charge(totals, fleet).sum()), float(totals.demand.peak_kw.max())
     )
-    return _energy_and_work(sums, behind_ups_kwh, totals.step_h) | {
+    return _energy_and_work(sums, totals.step_h) | {
         **cost,
         "queue_mean_tasks": sums["queue_tasks"] / totals.steps / fleet.size,
         "queue_end_tasks": float(totals.queue_end_tasks.sum()),
@@ -279,18 +280,24 @@ def _mean_metrics(totals: Totals, sums: dict[str, float]) -> dict[str, Metric]:
     return {**means, "rhi": 1.0 - means["shi"]}
 
 
-def _energy_and_work(
-    sums: dict[str, float], behind_ups_kwh: float, step_h: float
-) -> dict[str, Metric]:
+def _energy_and_work(sums: dict[str, float], step_h: float) -> dict[str, Metric]:
     """Metrics of energy, carbon, water and work.
 
     Args:
         sums: sum over the steps of each summed field of ``StepResult``, by name.
-        behind_ups_kwh: IT energy with the losses of the UPS.
         step_h: length of a step, in h.
     """
     it_kwh, hvac_kwh = sums["it_kwh"], sums["hvac_kwh"]
-    compression_kwh = (sums["chiller_w"] + sums["tower_fan_w"]) * step_h / 1e3
+    overhead_kwh, ups_kwh, distribution_kwh, compression_kwh = (
+        power_w * step_h / 1e3
+        for power_w in (
+            sums["overhead_w"],
+            sums["ups_loss_w"],
+            sums["distribution_loss_w"],
+            sums["chiller_w"] + sums["tower_fan_w"],
+        )
+    )
+    facility_kwh = it_kwh + overhead_kwh
     cfp_kg = sums["carbon_g"] / 1e3
 
     def per_it(value: float) -> float | None:
@@ -299,11 +306,13 @@ def _energy_and_work(
     return {
         "it_kwh": it_kwh,
         "hvac_kwh": hvac_kwh,
-        "facility_kwh": it_kwh + hvac_kwh,
+        "ups_loss_kwh": ups_kwh,
+        "distribution_loss_kwh": distribution_kwh,
+        "facility_kwh": facility_kwh,
         "battery_net_kwh": sums["charge_kwh"] - sums["discharge_kwh"],
         "grid_kwh": sums["grid_kwh"],
-        "pue": per_it(it_kwh + hvac_kwh),
-        "pue_with_ups": per_it(behind_ups_kwh + hvac_kwh),
+        "pue": per_it(facility_kwh),
+        "pue_with_losses": per_it(it_kwh + hvac_kwh + ups_kwh + distribution_kwh),
         "partial_pue": per_it(it_kwh + compression_kwh),
         "wue_l_per_kwh": per_it(sums["water_l"]),
         "cue_kg_per_kwh": per_it(cfp_kg),

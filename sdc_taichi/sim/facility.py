@@ -17,14 +17,14 @@ from sdc_taichi.plant import cooling, water_side
 from sdc_taichi.plant.battery import BATTERIES, BatteryResult
 from sdc_taichi.plant.carbon import emitted_g
 from sdc_taichi.plant.chiller import CHILLERS
+from sdc_taichi.plant.electrical import NO_LIMIT_KW, overload_kwh, power_path_loss_w
 from sdc_taichi.plant.fans_pumps import crac_fan_w
-from sdc_taichi.plant.grid import NO_LIMIT_KW, overload_kwh
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterUse
 from sdc_taichi.plant.water_side import WaterSideResult
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k, sites_pressure_pa
-from sdc_taichi.types import F64, StepResult, fields_of
+from sdc_taichi.types import F64, StepResult, as_array, fields_of
 
 NOT_USED = cast(F64, None)
 _BATTERY = (
@@ -189,6 +189,7 @@ class Facility:
         classes = [air_metrics.allowable_c(c.protection.ashrae_class) for c in fleet.configs]
         self._allowable_c = np.array(classes).T.copy()
         self._hvac_devices = fleet.configs[0].hvac.total_of
+        self._counts_losses = fleet.configs[0].electrical.losses == "counted"
         self._recirculates = models["inlet"] == "recirculation"
         self._transient = models["thermal"] == "transient"
         self._stores_heat = models["cooling_load"] in cooling.STORES_UNMET_HEAT
@@ -398,13 +399,28 @@ class Facility:
         first, *rest = (power_w[f"{device}_w"] for device in self._hvac_devices)
         return cast(F64, sum(rest, first))
 
+    def _power_path_loss_w(self, inputs: FacilityInputs, it_w: F64) -> tuple[F64, F64]:
+        """Losses of UPS and distribution, which have no power while the data center has none."""
+        path = self._sizing.power_path
+        if self._event_free:
+            ups_w, distribution_w = power_path_loss_w(it_w, path)
+        else:
+            on = np.where(inputs.powered > 0, inputs.powered, 1.0)
+            ups_w, distribution_w = power_path_loss_w(it_w / on, path)
+        return (
+            self._while_powered(as_array(ups_w), inputs),
+            self._while_powered(as_array(distribution_w), inputs),
+        )
+
     def _energy(self, inputs: FacilityInputs, it_w: F64, hvac_w: F64) -> dict[str, F64]:
-        """Battery, grid and emissions; without grid the battery gives what it can."""
+        """Losses, battery, grid and emissions; without grid the battery gives what it can."""
+        ups_w, distribution_w = self._power_path_loss_w(inputs, it_w)
+        overhead_w = hvac_w + (ups_w + distribution_w) if self._counts_losses else hvac_w
         command = inputs.battery_command
         if not self._event_free:
             command = np.where(inputs.grid_up > 0, command, -1.0)
         battery = self._run_battery(
-            inputs.stored_kwh, command, load_kw=(it_w + hvac_w) / 1e3, limits=self._battery
+            inputs.stored_kwh, command, load_kw=(it_w + overhead_w) / 1e3, limits=self._battery
         )
         needed_kwh = battery.grid_kwh
         grid_kwh = needed_kwh if self._event_free else needed_kwh * inputs.grid_up
@@ -412,6 +428,9 @@ class Facility:
         limit_kwh = self._sizing.grid_limit_kw * self._step_h
         return {
             **fields_of(battery),
+            "ups_loss_w": ups_w,
+            "distribution_loss_w": distribution_w,
+            "overhead_w": overhead_w,
             "soc": battery.stored_kwh / np.where(battery_kwh > 0, battery_kwh, 1.0),
             "it_kwh": it_w * self._step_h / 1e3,
             "hvac_kwh": hvac_w * self._step_h / 1e3,

@@ -250,6 +250,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     models = {stage: _shared(listed, path) for stage, path in STAGE_MODELS.items()}
     steps_per_hour = _shared(listed, "simulation.steps_per_hour")
     _shared(listed, "hvac.total_of")
+    _shared(listed, "electrical.losses")
     _shared(listed, "simulation.substep_s")
     # One queue array serves the fleet; ages are read off its length.
     _shared(listed, "workload.age_horizon_h")

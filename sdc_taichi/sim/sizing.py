@@ -12,8 +12,8 @@ from sdc_taichi.errors import PhysicalLimitError
 from sdc_taichi.exogenous import site_pressure_pa
 from sdc_taichi.plant import chiller, tower
 from sdc_taichi.plant.chiller import ChillerResult
+from sdc_taichi.plant.electrical import NO_LIMIT_KW, PowerPath, loss_w, power_path_loss_w
 from sdc_taichi.plant.fans_pumps import hydraulic_pump_w
-from sdc_taichi.plant.grid import NO_LIMIT_KW
 from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
@@ -45,7 +45,10 @@ class Sizing:
     design_wet_bulb_c: F64
     """Design wet bulb of the site, in C, (B,)."""
     facility_w: F64
-    """IT and HVAC power at the design point, in W, (B,)."""
+    """IT and HVAC power at the design point, and ``counted_loss_w``, in W, (B,)."""
+    counted_loss_w: F64
+    """Losses of UPS and distribution at the design point, in W, (B,); 0 where they are only
+    reported."""
     battery_kwh: F64
     """Capacity of the battery, in kWh, (B,)."""
     grid_limit_kw: F64
@@ -54,6 +57,8 @@ class Sizing:
     """Heat that warms the room, and its servers if quasi-steady, by 1 K, in kWh/K, (B,)."""
     water_side: WaterSideDesign
     """Sized chiller, tower, pumps and economiser."""
+    power_path: PowerPath
+    """Sized UPS and distribution."""
 
 
 def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64) -> Sizing:
@@ -85,9 +90,9 @@ def size(fleet: Fleet, hall: Hall, design_outdoor_c: F64, design_wet_bulb_c: F64
 
 def _check_sizes(fleet: Fleet, found: Sizing) -> None:
     """Make sure that devices can be built: capacities, flows and powers are finite and positive."""
-    sizes = fields_of(found) | fields_of(found.water_side)
+    sizes = fields_of(found) | fields_of(found.water_side) | fields_of(found.power_path)
     for name, values in sizes.items():
-        if name == "water_side" or name.endswith("_c"):
+        if name in ("water_side", "power_path") or name.endswith("_c"):
             continue
         wrong = ~(np.isfinite(values) & (values >= 0))
         if wrong.any():
@@ -120,8 +125,10 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     water_side = _water_side(
         fleet, cooling_w, chiller_w, at_design.rejected_w, outdoor_c, wet_bulb_c
     )
+    power_path, counted_loss_w = _power_path(fleet, it_w)
     facility_w = (
         it_w
+        + counted_loss_w
         + crac_at_design_w
         + at_design.power_w
         + water_side.tower_fan_w
@@ -137,10 +144,12 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
         design_outdoor_c=outdoor_c,
         design_wet_bulb_c=wet_bulb_c,
         facility_w=facility_w,
+        counted_loss_w=counted_loss_w,
         battery_kwh=_battery_kwh(fleet, facility_w * hours / 1e3),
         grid_limit_kw=_grid_limit_kw(fleet, facility_w / 1e3),
         room_kwh_per_k=_room_kwh_per_k(fleet),
         water_side=water_side,
+        power_path=power_path,
     )
 
 
@@ -178,7 +187,8 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
         outdoor_c=outdoor_c,
         reference_cop=v("hvac.chiller.reference_cop"),
     )
-    facility_w = 1.1 * (highest_w + rated_w + machine.power_w)
+    power_path, counted_loss_w = _power_path(fleet, it_w)
+    facility_w = 1.1 * (highest_w + rated_w + machine.power_w) + counted_loss_w
     flow_ratio = supply_m3s_per_w / v("hvac.crac.reference_m3s_per_w")
     return Sizing(
         it_w=it_w,
@@ -188,10 +198,12 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
         design_outdoor_c=outdoor_c,
         design_wet_bulb_c=wet_bulb_c,
         facility_w=facility_w,
+        counted_loss_w=counted_loss_w,
         battery_kwh=_battery_kwh(fleet, facility_w / 1e3),
         grid_limit_kw=_grid_limit_kw(fleet, facility_w / 1e3),
         room_kwh_per_k=_room_kwh_per_k(fleet),
         water_side=_water_side(fleet, rated_w, rated_w, rated_w, outdoor_c, wet_bulb_c),
+        power_path=power_path,
     )
 
 
@@ -381,6 +393,30 @@ def _battery_kwh(fleet: Fleet, sized_kwh: F64) -> F64:
     """Capacity of the battery, kWh, (B,): that of the config, or as sized."""
     given = fleet.values("battery.capacity_kwh")
     return np.where(np.isnan(given), sized_kwh, given)
+
+
+def _power_path(fleet: Fleet, it_w: F64) -> tuple[PowerPath, F64]:
+    """UPS and distribution for an IT power, W, (B,), and the losses there that count, W, (B,)."""
+    v = fleet.values
+    ratio = v("electrical.capacity_ratio")
+    shares = {
+        f"{device}_{name}": v(f"electrical.{device}.{name}")
+        for device in ("ups", "distribution")
+        for name in ("no_load_share", "proportional_share", "square_share")
+    }
+    distribution_w = ratio * it_w
+    behind_ups_w = it_w + loss_w(
+        it_w,
+        distribution_w,
+        no_load_share=shares["distribution_no_load_share"],
+        proportional_share=shares["distribution_proportional_share"],
+        square_share=shares["distribution_square_share"],
+    )
+    path = PowerPath(
+        ups_rated_w=np.asarray(ratio * behind_ups_w), distribution_rated_w=distribution_w, **shares
+    )
+    counted = fleet.configs[0].electrical.losses == "counted"
+    return path, np.asarray(sum(power_path_loss_w(it_w, path)) if counted else 0.0 * it_w)
 
 
 def _grid_limit_kw(fleet: Fleet, design_kw: F64) -> F64:
