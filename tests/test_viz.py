@@ -179,7 +179,7 @@ def test_overview_marks_devices_left_out_of_the_total(
     run: tuple[Simulator, list[StepResult]],
 ) -> None:
     steps = frame(run[1])
-    steps["hvac_w"] = steps["chiller_w"]
+    steps["overhead_w"] = steps["chiller_w"]
     line: Any
     (line,) = figures.overview(steps).axes[1].lines
     assert line.get_label() == "counted in total"
