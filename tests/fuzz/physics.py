@@ -104,7 +104,10 @@ def check(sim: Simulator, start: State, results: list[StepResult]) -> None:
     if config.workload.model == "tasks":
         # Whole tasks that find the queue full count as dropped, and run.
         values["dropped_tasks"] = np.zeros_like(values["dropped_tasks"])
-    recorded = Run(values, stocks(start), sim.fleet.values, sim.step_h, np.empty((0, sim.size)))
+    counts_losses = config.electrical.losses == "counted"
+    recorded = Run(
+        values, stocks(start), sim.fleet.values, sim.step_h, counts_losses, np.empty((0, sim.size))
+    )
     for name in closing(config):
         left = residual(LEDGERS[name](recorded), 1e-6)
         if left.max() > TOLERANCE[sim.precision]:
