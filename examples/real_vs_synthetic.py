@@ -3,7 +3,8 @@
     SDC_REAL_DATA=FOLDER python examples/real_vs_synthetic.py > docs/real-vs-synthetic.md
 
 FOLDER holds weather/*.epw, carbon/XX_NG_&_avgCI.csv and workload/Alibaba_CPU_Data_Hourly_1.csv.
-Idle controller, preset corrected; the measured and the synthetic year of a site run side by side.
+Idle controller, preset corrected; the measured and the synthetic year of a site run side by side,
+in plants of the same sizes.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi import DataCenterConfig, Simulator, load_config
+from sdc_taichi.config.hvac_schema import HvacConfig
+from sdc_taichi.exogenous import read_epw
+from sdc_taichi.exogenous.series import DesignConditions
 from sdc_taichi.exogenous.synthetic import synthetic_sites
 
 QUANTITIES = ("it_kwh", "hvac_kwh", "grid_kwh", "carbon_g", "water_l")
@@ -40,10 +44,21 @@ def pairs_of_configs(folder: Path, steps_per_hour: int) -> list[DataCenterConfig
     base = load_config("corrected", [f"simulation.steps_per_hour={steps_per_hour}"])
     configs = []
     for site in synthetic_sites():
-        for name, files in (("measured", real_files(folder, site)), ("synthetic", {})):
+        measured = real_files(folder, site)
+        hvac = _sized_for(base.hvac, read_epw(measured["weather_file"]).design)
+        for name, files in (("measured", measured), ("synthetic", {})):
             where = base.site.model_copy(update={"location": site, **files})
-            configs.append(base.model_copy(update={"name": f"{site}-{name}", "site": where}))
+            update = {"name": f"{site}-{name}", "site": where, "hvac": hvac}
+            configs.append(base.model_copy(update=update))
     return configs
+
+
+def _sized_for(hvac: HvacConfig, design: DesignConditions | None) -> HvacConfig:
+    """Section ``hvac`` with the design conditions of a weather file."""
+    if design is None:
+        return hvac
+    weather = {"design_outdoor_c": design.outdoor_c, "design_wet_bulb_c": design.wet_bulb_c}
+    return hvac.model_copy(update={"sizing": hvac.sizing.model_copy(update=weather)})
 
 
 def year(configs: list[DataCenterConfig], steps: int) -> dict[str, npt.NDArray[np.float64]]:

@@ -21,6 +21,16 @@ CARBON_HEADER = "timestamp,WND,SUN,WAT,OIL,NG,COL,NUC,OTH,avg_CI"
 FACTORS = {"SUN": 41.0, "NG": 490.0, "NUC": 12.0}
 
 
+DESIGN_LINE = (
+    "DESIGN CONDITIONS,1,2021 ASHRAE Handbook -- Fundamentals - Chapter 14 Climatic Design "
+    "Information,,Heating,1,-18.7,-16.0,-24.1,0.4,-18.0,-21.6,0.6,-15.2,11.9,-0.8,11.0,-1.4,4.7,"
+    "270,0.565,Cooling,7,9.8,32.9,23.4,31.4,22.7,30.0,21.9,25.2,30.7,24.2,29.2,23.3,28.0,5.1,220,"
+    "23.5,18.8,28.6,22.6,17.7,27.4,21.7,16.7,26.3,78.0,30.5,73.8,29.5,70.1,28.2,28.5,Extremes,"
+    "10.9,9.3,8.4,-22.3,35.2,3.8,2.0,-25.1,36.7,-27.3,37.9,-29.5,39.0,-32.3,40.5"
+)
+"""Design conditions of Chicago: dry bulb 32.9 C, wet bulb 25.2 C, 39.0 C once in 20 years."""
+
+
 def days(start: str, stop: str) -> np.ndarray:
     """Every day from start up to, not including, stop."""
     return np.arange(np.datetime64(start, "D"), np.datetime64(stop, "D"))

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sdc_taichi import DataError, drivers_from_arrays, load_config, load_drivers, make_configs
+import exogenous_builders as build
+from sdc_taichi import (
+    DataError,
+    Drivers,
+    drivers_from_arrays,
+    load_config,
+    load_drivers,
+    make_configs,
+)
 
 
 def test_seasons_start_where_the_config_says() -> None:
@@ -37,6 +46,22 @@ def test_copies_store_a_series_once() -> None:
     world = drivers.at(1000)
     assert len(np.unique(world.outdoor_c)) == 2
     np.testing.assert_array_equal(world.outdoor_c[0::2], world.outdoor_c[0])
+
+
+def test_design_conditions_of_a_file_size_the_plant(tmp_path: Path) -> None:
+    """The 99.6 % quantile of the year stays where a file has none."""
+    lines = list(build.epw_lines())
+    found: list[Drivers] = []
+    for line in (lines[1], build.DESIGN_LINE):
+        lines[1] = line
+        path = tmp_path / f"{len(found)}.epw"
+        path.write_text("\n".join(lines))
+        found.append(load_drivers([load_config("tiny", [f"site.weather_file={path}"])]))
+    without, given = found
+    assert given.design_outdoor_c == 32.9
+    assert given.design_wet_bulb_c == 25.2
+    assert without.design_outdoor_c == np.quantile(without.outdoor_c.values, 0.996)
+    assert without.design_wet_bulb_c == np.quantile(without.wet_bulb_c.values, 0.996)
 
 
 def test_series_of_different_length_repeat_on_their_own() -> None:

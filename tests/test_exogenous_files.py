@@ -10,6 +10,7 @@ import pytest
 import exogenous_builders as build
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import read_carbon, read_epw, read_workload, statistics, wet_bulb_c
+from sdc_taichi.exogenous.series import DesignConditions
 from sdc_taichi.exogenous.series_file import read_metadata, write_parquet
 from sdc_taichi.exogenous.stamps import Stamp
 from sdc_taichi.exogenous.year_clock import MONTH_OF_DAY
@@ -383,6 +384,36 @@ def epw_of(real_data: Path, state: str) -> Path:
 
 def carbon_of(real_data: Path, state: str) -> Path:
     return real_data / "carbon" / f"{state}_NG_&_avgCI.csv"
+
+
+def test_design_conditions_are_those_of_the_header(tmp_path: Path) -> None:
+    lines = list(build.epw_lines())
+    assert read_epw(write(tmp_path / "none.epw", lines)).design is None
+    lines[1] = build.DESIGN_LINE
+    weather = read_epw(write(tmp_path / "some.epw", lines))
+    assert weather.design == DesignConditions(32.9, 25.2, 39.0)
+    assert not weather.outdoor_c.notes
+    for good, bad in (("25.2,30.7", "x,30.7"), (",32.9,", ",22.9,")):
+        lines[1] = build.DESIGN_LINE.replace(good, bad)
+        weather = read_epw(write(tmp_path / "damaged.epw", lines))
+        assert weather.design is None
+        assert "design conditions of the header are not usable" in weather.outdoor_c.notes[0]
+
+
+def test_a_pressure_that_does_not_fit_the_elevation_is_told(tmp_path: Path) -> None:
+    """Tucson's file: 101 kPa at 809 m from May to September."""
+    lines = list(build.epw_lines())
+    lines[0] = lines[0].replace(",10.0", ",809.0")
+    summer = {"5", "6", "7", "8", "9"}
+    for at, line in enumerate(lines[8:], 8):
+        cells = line.split(",")
+        cells[9] = "101000" if cells[1] in summer else "92000"
+        lines[at] = ",".join(cells)
+    (note,) = read_epw(write(tmp_path / "tucson.epw", lines)).outdoor_c.notes
+    assert note == (
+        "warning: station pressure of 101.0 kPa in May, Jun, Jul, Aug, Sep does not fit the "
+        "elevation of 809 m, which has about 92.0 kPa"
+    )
 
 
 @pytest.mark.parametrize("state", STATES)

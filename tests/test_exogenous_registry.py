@@ -310,6 +310,22 @@ def test_show_a_site_and_a_trace(user_folder: Path) -> None:
         run("show", "vaa")
 
 
+def test_design_conditions_are_imported_and_shown(
+    tmp_path: Path, user_folder: Path, sources: Path
+) -> None:
+    lines = list(build.epw_lines())
+    lines[1] = build.DESIGN_LINE
+    path = tmp_path / "chicago.epw"
+    path.write_text("\n".join(lines))
+    run("import", str(path), "--site", "ohare", "--base", "IL")
+    assert load_site("ohare").design == read_epw(path).design
+    output = run("show", "ohare").output
+    assert "dry bulb 32.9 C, wet bulb 25.2 C (exceeded for 0.4 % of the year), 39 C once" in output
+    run("import", epw(sources), "--site", "home", "--base", "NY")
+    assert load_site("home").design is None
+    assert "Design conditions" not in run("show", "home").output
+
+
 def test_show_draws_a_picture(tmp_path: Path, user_folder: Path) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is the extra plot")
     out = tmp_path / "va.png"

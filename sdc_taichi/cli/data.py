@@ -26,7 +26,7 @@ from sdc_taichi.exogenous.registry import (
     trace_names,
     user_data_dir,
 )
-from sdc_taichi.exogenous.series import Series
+from sdc_taichi.exogenous.series import DesignConditions, Series
 from sdc_taichi.exogenous.statistics import statistics
 from sdc_taichi.exogenous.synthetic import (
     DEFAULT_SEED,
@@ -104,8 +104,9 @@ def show_data(
         site = load_site(found, seed=seed)
         title = f"{found}: {site.label}, UTC{site.utc_offset_h:+g} h, {site.elevation_m:g} m"
         series = site.series
+        design = _design_text(site.design)
     else:
-        series, title = (load_trace(found, seed=seed),), found
+        series, title, design = (load_trace(found, seed=seed),), found, ""
     table = Table("", title=title)
     for s in series:
         table.add_column(f"{s.name.replace('_', ' ')}\n{s.unit}", justify="right")
@@ -116,6 +117,8 @@ def show_data(
     table.add_row("resolution", *(f"{s.minutes:g} min" for s in series))
     table.add_row("days", *(f"{s.days:g}" for s in series))
     console.print(table)
+    if design:
+        console.print(design, soft_wrap=True)
     for source in dict.fromkeys(s.source for s in series):
         console.print(f"Source: {source}", soft_wrap=True)
     for note in dict.fromkeys(note for s in series for note in s.notes):
@@ -123,6 +126,18 @@ def show_data(
     if out is not None:
         _write_picture(series, title, out)
         console.print(f"Picture: {out}", soft_wrap=True)
+
+
+def _design_text(design: DesignConditions | None) -> str:
+    """Design conditions of a site in words; empty where it has none."""
+    if design is None:
+        return ""
+    extreme = design.extreme_outdoor_c
+    highest = "" if extreme is None else f", {extreme:g} C once in 20 years"
+    return (
+        f"Design conditions: dry bulb {design.outdoor_c:g} C, wet bulb {design.wet_bulb_c:g} C "
+        f"(exceeded for 0.4 % of the year){highest}"
+    )
 
 
 def _write_picture(series: tuple[Series, ...], title: str, out: Path) -> None:

@@ -230,10 +230,12 @@ class SizingConfig(Section):
     """Sized cooling power over the cooling load at the design point, 1..10; redundancy of 2N is
     2."""
     design_wet_bulb_c: OutdoorC | None = None
-    """Design wet bulb of the site, in C; None takes the 99.6 % quantile of its weather."""
+    """Design wet bulb of the site, in C; None takes that of the design conditions of its weather
+    file, else the 99.6 % quantile of its weather."""
     design_outdoor_c: OutdoorC | None = None
-    """Design dry bulb of the site, in C; None takes the 99.6 % quantile of its weather, or with
-    sizing model ``released`` 30 in NY, 20 in WA and else 50."""
+    """Design dry bulb of the site, in C; None takes that of the design conditions of its weather
+    file, else the 99.6 % quantile of its weather, or with sizing model ``released`` 30 in NY, 20 in
+    WA and else 50."""
 
     @model_validator(mode="after")
     def _wet_bulb_below_dry_bulb(self) -> Self:

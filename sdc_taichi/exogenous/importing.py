@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -19,7 +19,7 @@ from sdc_taichi.exogenous.registry import (
     new_name,
     user_data_dir,
 )
-from sdc_taichi.exogenous.series import Series
+from sdc_taichi.exogenous.series import DesignConditions, Series
 from sdc_taichi.exogenous.stamps import Stamp
 from sdc_taichi.exogenous.synthetic import (
     coefficients,
@@ -102,10 +102,18 @@ def import_weather(
         "longitude_deg": weather.longitude_deg,
         "elevation_m": weather.elevation_m,
         "utc_offset_h": weather.utc_offset_h,
+        "design": _design_metadata(weather.design),
         "base": base,
     }
     target = user_data_dir(data_dir) / "sites" / name / "weather.parquet"
     return _store(path, name, target, [s for s in series if s is not None], metadata)
+
+
+def _design_metadata(design: DesignConditions | None) -> dict[str, float] | None:
+    """Design conditions as numbers by name, without what is not known."""
+    if design is None:
+        return None
+    return {name: value for name, value in asdict(design).items() if value is not None}
 
 
 def import_carbon(

@@ -72,6 +72,27 @@ class Series:
         return self.values.size * self.minutes / MINUTES_PER_DAY
 
 
+@dataclass(frozen=True)
+class DesignConditions:
+    """Climatic design conditions of a station (ASHRAE Handbook - Fundamentals 2021, chapter 14)."""
+
+    outdoor_c: float
+    """Dry bulb that is exceeded for 0.4 % of the year, in C."""
+    wet_bulb_c: float
+    """Wet bulb that is exceeded for 0.4 % of the year, for evaporation, in C."""
+    extreme_outdoor_c: float | None = None
+    """Highest dry bulb in 20 years, in C; None if it is not known."""
+
+    def __post_init__(self) -> None:
+        """Check that the values are those of a place on Earth.
+
+        Raises:
+            DataError: a value out of range, or a wet bulb above the dry bulb.
+        """
+        check_physical("design dry bulb", self.outdoor_c, *OUTDOOR_LIMITS_C)
+        check_physical("design wet bulb", self.wet_bulb_c, -90.0, self.outdoor_c)
+
+
 @dataclass(frozen=True, eq=False)
 class Weather:
     """Weather of a station on the simulator's clock, and where the station is."""
@@ -94,6 +115,8 @@ class Weather:
     """Relative humidity, in %; None if it is not known."""
     pressure_pa: Series | None = None
     """Air pressure at the station, in Pa; None if it is not known."""
+    design: DesignConditions | None = None
+    """Design conditions of the station; None if its file has none."""
 
     def __post_init__(self) -> None:
         """Check that the year is one of a place on Earth.
@@ -147,6 +170,8 @@ class SiteData:
     """Relative humidity, in %; None if it is not known."""
     pressure_pa: Series | None = None
     """Air pressure at the station, in Pa; None if it is not known."""
+    design: DesignConditions | None = None
+    """Design conditions of the station; None if its file has none."""
 
     @property
     def series(self) -> tuple[Series, ...]:
@@ -180,6 +205,7 @@ def make_site(name: str, weather: Weather, ci_g_per_kwh: Series) -> SiteData:
         ci_g_per_kwh=ci_g_per_kwh,
         relative_humidity_pct=weather.relative_humidity_pct,
         pressure_pa=weather.pressure_pa,
+        design=weather.design,
     )
 
 
@@ -195,6 +221,7 @@ def site_weather(site: SiteData) -> Weather:
         wet_bulb_c=site.wet_bulb_c,
         relative_humidity_pct=site.relative_humidity_pct,
         pressure_pa=site.pressure_pa,
+        design=site.design,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,9 +12,21 @@ from numpy.typing import NDArray
 
 from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous import files, series_file
-from sdc_taichi.exogenous.psychrometrics import wet_bulb_c
-from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C, FloatArray, Series, Weather
-from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH, HOURS_PER_YEAR
+from sdc_taichi.exogenous.psychrometrics import standard_pressure_pa, wet_bulb_c
+from sdc_taichi.exogenous.series import (
+    OUTDOOR_LIMITS_C,
+    DesignConditions,
+    FloatArray,
+    Series,
+    Weather,
+)
+from sdc_taichi.exogenous.year_clock import (
+    DAYS_PER_MONTH,
+    DAYS_PER_YEAR,
+    FIRST_DAY_OF_MONTH,
+    HOURS_PER_YEAR,
+    MINUTES_PER_DAY,
+)
 from sdc_taichi.number_text import parse_number, parse_whole
 from sdc_taichi.user_file import MOST_TABLE_BYTES, open_input, read_bytes
 
@@ -52,6 +65,14 @@ _USED = (_DRY_BULB, _HUMIDITY, _PRESSURE)
 """Columns that give the weather; the dew point is only checked."""
 _DEW_POINT_SLACK_K = 0.2
 """By this much a dew point may exceed the dry bulb, as both are rounded."""
+MOST_PRESSURE_SHARE = 0.05
+"""Largest difference of a month's mean pressure from the standard atmosphere, as a share of it;
+weather and climate make up to 0.03 at the heights where people live."""
+_COOLING_CELLS = {"outdoor_c": 3, "wet_bulb_c": 9}
+"""Cells of the design conditions, counted from the word ``Cooling``."""
+_EXTREME_OUTDOOR_CELL = -3
+"""Cell of the highest dry bulb in 20 years: before lowest and highest of 50 years, the last."""
+_MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 _LONGEST_LINE = 4096
 _DAYS_PER_MONTH = np.array(DAYS_PER_MONTH)
 _FIRST_DAY_OF_MONTH = np.array(FIRST_DAY_OF_MONTH)
@@ -109,6 +130,9 @@ def read_epw(path: str | Path) -> Weather:
     values, year_notes = files.whole_years(path, values, float(hours[0]) * 60.0, minutes)
     notes += year_notes
     outdoor, humidity, pressure = values.T
+    notes += _pressure_notes(pressure, minutes, location["elevation_m"])
+    design, design_notes = _design_conditions(lines)
+    notes += design_notes
     wet_bulb = wet_bulb_c(outdoor, humidity, pressure)
 
     def series(name: str, unit: str, x: FloatArray) -> Series:
@@ -120,6 +144,7 @@ def read_epw(path: str | Path) -> Weather:
         wet_bulb_c=series("wet_bulb_c", "C", wet_bulb),
         relative_humidity_pct=series("relative_humidity_pct", "%", humidity),
         pressure_pa=series("pressure_pa", "Pa", pressure),
+        design=design,
     )
 
 
@@ -196,6 +221,41 @@ def _location(path: Path, lines: list[str]) -> dict[str, Any]:
             raise files.fault(path, 1, name, fields[at], f"a number from {low:g} to {high:g}")
         location[field] = value
     return location
+
+
+def _design_conditions(lines: list[str]) -> tuple[DesignConditions | None, list[str]]:
+    """Design conditions of the header, and notes; None where it has none."""
+    for line in lines[1:HEADER_LINES]:
+        cells = [x.strip() for x in line.split(",")]
+        if cells[0].upper() != "DESIGN CONDITIONS" or "Cooling" not in cells:
+            continue
+        cooling = cells.index("Cooling")
+        found: dict[str, Any] = {}
+        try:
+            for name, at in _COOLING_CELLS.items():
+                found[name] = parse_number(cells[cooling + at])
+            if "Extremes" in cells[cooling:]:
+                found["extreme_outdoor_c"] = parse_number(cells[_EXTREME_OUTDOOR_CELL])
+            return DesignConditions(**found), []
+        except (ValueError, IndexError, DataError) as error:
+            note = f"warning: design conditions of the header are not usable ({error})"
+            return None, [note]
+    return None, []
+
+
+def _pressure_notes(pressure: FloatArray, minutes: float, elevation_m: float) -> list[str]:
+    """Warning of months whose pressure is not that of the height of the station."""
+    standard_pa = float(standard_pressure_pa(elevation_m))
+    days = pressure.reshape(-1, DAYS_PER_YEAR, round(MINUTES_PER_DAY / minutes))
+    means_pa = np.array([days[:, a:b].mean() for a, b in pairwise(FIRST_DAY_OF_MONTH)])
+    odd = np.abs(means_pa / standard_pa - 1.0) > MOST_PRESSURE_SHARE
+    if not odd.any():
+        return []
+    months = ", ".join(name for name, is_odd in zip(_MONTHS, odd, strict=True) if is_odd)
+    return [
+        f"warning: station pressure of {means_pa[odd].mean() / 1e3:.1f} kPa in {months} does not "
+        f"fit the elevation of {elevation_m:g} m, which has about {standard_pa / 1e3:.1f} kPa"
+    ]
 
 
 def _records_per_hour(path: Path, lines: list[str]) -> int:
@@ -366,4 +426,19 @@ def _read_imported(path: Path, metadata: dict[str, Any]) -> Weather:
         elevation_m=series_file.metadata_value(path, metadata, "elevation_m", float),
         utc_offset_h=series_file.metadata_value(path, metadata, "utc_offset_h", float),
         **series,
+        design=_imported_design(path, metadata),
     )
+
+
+def _imported_design(path: Path, metadata: dict[str, Any]) -> DesignConditions | None:
+    """Design conditions that ``data import`` kept; None where the file that it read had none."""
+    if metadata.get("design") is None:
+        return None
+    stored = series_file.metadata_value(path, metadata, "design", dict)
+    try:
+        return DesignConditions(**{name: float(value) for name, value in stored.items()})
+    except (TypeError, ValueError, DataError) as error:
+        raise DataError(
+            f"{path}: metadata design: {shortened(stored)}, expected design conditions as written "
+            f"by `data import` ({error})"
+        ) from None

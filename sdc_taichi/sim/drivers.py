@@ -104,9 +104,11 @@ class Drivers:
     start: I64
     """First simulated step, counted from the beginning of the year, (B,)."""
     design_outdoor_c: F64
-    """Dry bulb that the year exceeds for 0.4 % of its steps, in C, (B,)."""
+    """Dry bulb of the design conditions of the weather file, else what the year exceeds for 0.4 %
+    of its steps, in C, (B,)."""
     design_wet_bulb_c: F64
-    """Wet bulb that the year exceeds for 0.4 % of its steps, in C, (B,)."""
+    """Wet bulb of the design conditions of the weather file, else what the year exceeds for 0.4 %
+    of its steps, in C, (B,)."""
     sources: tuple[dict[str, str], ...]
     """Source of weather, carbon and workload of each data center; synthetic ones say so, B."""
     synthetic: tuple[bool, ...]
@@ -274,6 +276,10 @@ class InputReader:
         """Design dry bulb and wet bulb of the years that the configs name, in C, (B,) each."""
         design = {}
         for key in dict.fromkeys(self._sites):
+            station = self._site(key).design
+            if station is not None:
+                design[key] = [station.outdoor_c, station.wet_bulb_c]
+                continue
             arrays = of_sites.get(key) or self._site_arrays(key, self._site(key))
             design[key] = [
                 float(np.quantile(values, DESIGN_QUANTILE))
