@@ -267,9 +267,10 @@ class StepResult:
     chilled_water_c: F64
     """Temperature of the chilled water supply, in C, (B,)."""
     condenser_water_c: F64
-    """Temperature of the water that leaves the tower, in C, (B,)."""
+    """Temperature of the water that leaves the tower, or of the outdoor air that cools the
+    condenser, in C, (B,)."""
     economiser_w: F64
-    """Heat that the economiser takes off the chilled water, in W, (B,)."""
+    """Heat that economiser, dry cooler or outdoor air takes past the chiller, in W, (B,)."""
     chiller_load_w: F64
     """Heat that the chiller takes off the chilled water, in W, (B,)."""
     unmet_w: F64
@@ -279,7 +280,7 @@ class StepResult:
     heat_removed_w: F64
     """Heat that the plant takes from the CRAC units, in W, (B,)."""
     rejected_w: F64
-    """Heat that the tower gives to the outside, in W, (B,)."""
+    """Heat that goes to the outside, in W, (B,)."""
     room_heat_kwh: F64
     """Heat held by the room over that at the setpoint at the end of the step, in kWh, (B,)."""
     thermal_storage_w: F64
@@ -287,11 +288,11 @@ class StepResult:
     chiller_w: F64
     """Electric power of the chiller, in W, (B,)."""
     tower_fan_w: F64
-    """Electric power of the tower fan, in W, (B,)."""
+    """Electric power of the fans of tower, dry cooler or outdoor air, in W, (B,)."""
     chilled_pump_w: F64
     """Electric power of the chilled-water pumps, in W, (B,)."""
     condenser_pump_w: F64
-    """Electric power of the condenser-water pumps, in W, (B,)."""
+    """Electric power of the pumps of condenser water, or of the dry cooler's loop, in W, (B,)."""
     crac_fan_w: F64
     """Electric power of the CRAC fans, in W, (B,)."""
     hvac_w: F64
@@ -305,7 +306,7 @@ class StepResult:
     with ``electrical.losses: counted`` the losses of UPS and distribution."""
 
     evaporation_l: F64
-    """Water that the tower evaporates, in l, (B,)."""
+    """Water that tower, or humidifier of outdoor air, evaporates, in l, (B,)."""
     drift_l: F64
     """Water that leaves the tower as drops, in l, (B,)."""
     blowdown_l: F64

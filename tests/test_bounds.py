@@ -264,7 +264,7 @@ def test_the_docs_show_every_field_with_its_bounds() -> None:
     text = (Path(__file__).parents[1] / "docs" / "configuration.md").read_text("utf-8")
     made = fields_markdown()
     assert made in text, "docs/configuration.md: append what fields_markdown() makes"
-    assert "| `reference_cop` | `5.96` | 0.5..50 |" in made
+    assert "| `min_condenser_c` | `12.78` | 0..60 |" in made
 
 
 @pytest.mark.parametrize("bad", [-1, 2.5, True, "3", 10**18])

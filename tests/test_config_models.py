@@ -15,7 +15,7 @@ from sdc_taichi.control.registry import controller_names
 from sdc_taichi.exogenous import carbon
 from sdc_taichi.hall import air_metrics, placement
 from sdc_taichi.kernels import hall_arguments
-from sdc_taichi.plant import battery, chiller, cooling, tower, water, workload
+from sdc_taichi.plant import battery, chiller, cooling, plants, tower, water, workload
 from sdc_taichi.sim import sizing
 from sdc_taichi.sim.events import schedule
 from sdc_taichi.sim.fleet import STAGE_MODELS
@@ -25,6 +25,7 @@ REGISTRIES: dict[str, tuple[str, Collection[str]]] = {
     "hvac.setpoint.model": ("plant.cooling.SETPOINTS", cooling.SETPOINTS),
     "hvac.crac.flow_model": ("plant.cooling.CRAC_FLOWS", cooling.CRAC_FLOWS),
     "hvac.cooling_load_model": ("plant.cooling.COOLING_LOADS", cooling.COOLING_LOADS),
+    "hvac.plant": ("plant.plants.PLANTS", plants.PLANTS),
     "hvac.chiller.model": ("plant.chiller.CHILLERS", chiller.CHILLERS),
     "hvac.tower.model": ("plant.tower.TOWERS", tower.TOWERS),
     "hvac.water.model": ("plant.water.WATER", water.WATER),
@@ -44,6 +45,10 @@ BRANCHES = {"hall.inlet_model", "hvac.pumps.model", "simulation.thermal"}
 EVENTS: dict[EventKind, dict[str, Any]] = {
     "crac_down": {"unit": 1},
     "chiller_derate": {"share": 0.3},
+    "pump_down": {"share": 0.5},
+    "tower_cell_down": {"share": 0.5},
+    "dry_cooler_down": {"share": 0.5},
+    "outdoor_air_closed": {"share": 0.0},
     "rack_fan_failure": {"rack": 2, "share": 0.7},
     "heat_wave": {"offset_k": 4.5},
     "grid_outage": {},
@@ -135,7 +140,7 @@ def test_every_kind_of_event_disturbs_a_step() -> None:
         changed = [
             field.name
             for field in fields(before)
-            if field.name != "active"
+            if field.name not in ("active", "active_events")
             and not np.array_equal(getattr(before, field.name), getattr(during, field.name))
         ]
         assert len(changed) == 1, f"event {kind} has no effect in sim/events.py: implement it there"

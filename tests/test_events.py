@@ -80,6 +80,8 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         scheduled("heat_wave", 4.0, 1.0, offset_k=6.0),
         scheduled("grid_outage", 5.0, 1.0),
         scheduled("crac_down", 6.0, 1.0),
+        scheduled("pump_down", 7.0, 1.0, share=0.5),
+        scheduled("tower_cell_down", 8.0, 1.0, share=0.75),
     )
     line = timeline(
         data_center("a"),
@@ -89,7 +91,7 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         steps_per_hour=1,
     )
     assert not line.event_free
-    normal = [[True] * 5, [1.0, 1.0], [1.0] * 6, [0.0, 0.0], [True, True]]
+    normal = [[True] * 5, [1.0, 1.0], [1.0] * 6, [0.0, 0.0], [True, True], [1.0, 1.0], [1.0, 1.0]]
     expected = {
         1: (0, [True, True, True, True, False]),
         2: (1, [1.0, 0.4]),
@@ -97,8 +99,10 @@ def test_each_kind_does_what_it_says_to_its_own_data_center() -> None:
         4: (3, [0.0, 6.0]),
         5: (4, [True, False]),
         6: (0, [True, True, True, False, False]),
+        7: (5, [1.0, 0.5]),
+        8: (6, [1.0, 0.75]),
     }
-    for step in range(9):
+    for step in range(11):
         wanted = list(normal)
         if step in expected:
             place, values = expected[step]

@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sdc_taichi import Simulator, drivers_from_arrays, load_config
+from ledgers import LEDGERS, TRANSIENT_LEDGERS, residual
+from sdc_taichi import ConfigError, Simulator, StepResult, drivers_from_arrays, load_config
 from sdc_taichi.config import apply_overrides
+from sdc_taichi.errors import OddInputWarning
 from sdc_taichi.plant.chiller import CHILLERS
+from sdc_taichi.plant.water_side import WaterSideDesign
+from test_ledgers import assert_closes, record, sites_and_seasons
 
 WATER_COOLED = ["centrifugal_vsd", "carnot", "eir_york", "electric_water_cooled", "constant_cop"]
 
@@ -66,3 +70,183 @@ def test_plant_makes_no_warmer_water_than_its_chiller_is_valid_for(
         result = sim.step()
     expected_c = np.minimum([8.0, 15.0, 22.0], warmest_c)
     np.testing.assert_allclose(result.chilled_water_c, expected_c, rtol=1e-12)
+
+
+# Plants without a tower
+
+DRY = {
+    "air_cooled": ["hvac.chiller.model=electric_air_cooled"],
+    "air_side": ["hvac.chiller.model=electric_air_cooled", "hvac.plant=air_side"],
+}
+TUCSON = ["hvac.sizing.design_outdoor_c=40.5", "hvac.sizing.design_wet_bulb_c=23"]
+
+
+def steady(
+    overrides: list[str], outdoor_c: list[float], wet_bulb_c: list[float], load: float = 1.0
+) -> tuple[StepResult, WaterSideDesign]:
+    """A step of data centers that differ in their weather alone, and their sizes."""
+    config = load_config("corrected", ["workload.max_utilisation=1", *TUCSON, *overrides])
+    dry, wet = (np.array(values)[:, None] for values in (outdoor_c, wet_bulb_c))
+    same = np.ones_like(dry)
+    drivers = drivers_from_arrays(dry, wet, 300.0 * same, load * same)
+    with Simulator([config] * len(outdoor_c), drivers=drivers, precision="f64") as sim:
+        sim.reset()
+        return sim.step(), sim.sizing.water_side
+
+
+def test_air_cooled_chiller_in_a_desert_july_sees_the_air_and_uses_no_water() -> None:
+    result, design = steady(DRY["air_cooled"], [24.0, 32.0, 40.0], [19.0, 21.0, 23.0])
+    cop = result.chiller_load_w / result.chiller_w
+    assert np.all((cop > 3.0) & (cop < 4.5))
+    assert np.all(np.diff(cop) < 0)
+    for name in ("water_l", "evaporation_l", "drift_l", "blowdown_l", "economiser_w",
+                 "tower_fan_w", "condenser_pump_w", "unmet_w"):  # fmt: skip
+        np.testing.assert_array_equal(getattr(result, name), 0.0, err_msg=name)
+    np.testing.assert_array_equal(result.condenser_water_c, result.outdoor_c)
+    assert np.all(design.tower_water_kg_s == 0)
+
+
+def test_dry_cooler_does_in_frost_what_the_chiller_does_in_summer() -> None:
+    # At 18 C of supply air: chilled water of 10 C that returns at 16 C, and an approach of 8 K.
+    result, design = steady(DRY["air_cooled"], [-20.0, 2.0, 9.0, 16.0], [-21.0, 0.0, 5.0, 10.0])
+    share = result.economiser_w / result.heat_removed_w
+    np.testing.assert_allclose(share, [1.0, 1.0, 0.5, 0.0], atol=1e-9)
+    np.testing.assert_allclose(result.chiller_w[:2], 0.0)
+    full_w = design.tower_fan_w * (result.heat_removed_w / design.cooling_w) ** 4
+    np.testing.assert_allclose(result.tower_fan_w[1:3], full_w[1:3], rtol=1e-9)
+    assert 0 < result.tower_fan_w[0] < 0.1 * result.tower_fan_w[1]
+    without, _ = steady([*DRY["air_cooled"], "hvac.dry_cooler.free_cooling=false"], [2.0], [0.0])
+    assert without.economiser_w == without.tower_fan_w == without.condenser_pump_w == 0
+    assert without.chiller_load_w == without.heat_removed_w
+
+
+def test_outdoor_air_cools_while_it_is_cool_and_neither_dry_nor_humid() -> None:
+    weather = {
+        "cool": (12.0, 8.0),
+        "warm and dry": (24.0, 13.0),
+        "warm and humid": (24.0, 20.0),
+        "hot and dry": (40.0, 18.0),
+        "cool and humid": (16.5, 16.3),
+    }
+    outdoor_c, wet_bulb_c = (list(x) for x in zip(*weather.values(), strict=True))
+    result, design = steady(DRY["air_side"], outdoor_c, wet_bulb_c)
+    share = dict(zip(weather, result.economiser_w / result.heat_removed_w, strict=True))
+    assert share["cool"] == pytest.approx(1.0)
+    assert 0.5 < share["warm and dry"] < 0.8
+    assert share["warm and humid"] == share["hot and dry"] == share["cool and humid"] == 0
+    # All of the air comes from outdoors in the warm: rho cp V (T_return - T_outdoor).
+    warm = design.air_j_per_m3_k[1] * result.crac_flow_m3s[1] * (result.return_c[1] - 24.0)
+    assert result.economiser_w[1] == pytest.approx(warm, rel=1e-12)
+    fan_w = design.tower_fan_w[1] * (result.crac_flow_m3s[1] / design.tower_air_m3s[1]) ** 3
+    assert result.tower_fan_w[1] == pytest.approx(fan_w, rel=1e-12)
+    assert 0 < result.tower_fan_w[0] < fan_w
+    np.testing.assert_array_equal(result.water_l, 0.0)
+    np.testing.assert_array_equal(result.unmet_w, 0.0)
+
+
+def test_outdoor_air_that_is_too_dry_is_wetted_or_left_outside() -> None:
+    frost = [-15.0], [-16.2]
+    wetted, _ = steady(DRY["air_side"], *frost)
+    assert wetted.economiser_w == wetted.heat_removed_w
+    # Dew points of -24 and -9 C are 0.0004 and 0.0018 kg/kg; a third of the air is from outdoors.
+    assert 3.0 < wetted.evaporation_l < 15.0
+    assert wetted.water_l == pytest.approx(1.25 * wetted.evaporation_l)
+    left, _ = steady([*DRY["air_side"], "hvac.outdoor_air.humidifier=false"], *frost)
+    assert left.economiser_w == left.water_l == 0
+    assert left.chiller_load_w == left.heat_removed_w
+
+
+@pytest.mark.parametrize(
+    ("plant", "kind"),
+    [
+        ("water_cooled", "tower_cell_down"),
+        ("air_cooled", "dry_cooler_down"),
+        ("air_side", "outdoor_air_closed"),
+        *((plant, "pump_down") for plant in ("water_cooled", *DRY)),
+    ],
+)
+def test_plants_do_with_the_devices_that_are_left(plant: str, kind: str) -> None:
+    event = "[{kind: %s, start_h: 0, duration_h: 1, share: %g}]"
+    weather = [26.0, 5.0], [22.0, 2.0]
+    runs = {
+        share: steady([*DRY.get(plant, []), "events.scheduled=" + event % (kind, share)], *weather)
+        for share in (1.0, 0.5, 0.0)
+    }
+    design = runs[1.0][1]
+    unmet, free = (
+        {share: getattr(result, name) for share, (result, _) in runs.items()}
+        for name in ("unmet_w", "economiser_w")
+    )
+    np.testing.assert_array_equal(unmet[1.0], 0.0)
+    for share, (result, _) in runs.items():
+        np.testing.assert_allclose(result.heat_removed_w + result.unmet_w, result.cooling_load_w)
+        assert np.all(result.rejected_w >= result.heat_removed_w), share
+    if kind == "pump_down":
+        load_w = runs[0.5][0].cooling_load_w
+        hot = load_w[0] - 0.5 * design.cooling_w[0]
+        assert unmet[0.5][0] == pytest.approx(hot, rel=1e-9)
+        # Outdoor air needs no water.
+        assert unmet[0.0][1] == pytest.approx(0.0 if plant == "air_side" else load_w[1])
+    elif kind == "tower_cell_down":
+        at_half = runs[0.5][0]
+        np.testing.assert_allclose(at_half.heat_removed_w, 0.5 * design.cooling_w)
+        np.testing.assert_allclose(runs[0.0][0].unmet_w, runs[0.0][0].cooling_load_w)
+        assert at_half.condenser_water_c[0] < runs[1.0][0].condenser_water_c[0] + 5.0
+    else:
+        # Free cooling falls, and the chiller makes up for it.
+        np.testing.assert_array_equal([*unmet[0.5], *unmet[0.0]], 0.0)
+        assert free[1.0][1] > 0
+        assert free[0.5][1] <= free[1.0][1]
+        assert free[0.0][1] == 0
+
+
+@pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
+@pytest.mark.parametrize("plant", DRY)
+def test_ledgers_of_dry_plants_close_on_every_step(plant: str, thermal: str) -> None:
+    overrides = [*DRY[plant], f"simulation.thermal={thermal}", "events.sampled=[{kind: pump_down, "
+                 "per_year: 200, duration_h: [1, 6], share: 0.3}]"]  # fmt: skip
+    configs = sites_and_seasons(overrides, ("AZ", "IL", "WA"), ("01-10", "04-20", "07-15"))
+    run = record(configs, 4 * 96, None, "f64")
+    for name in LEDGERS if thermal == "quasi_steady" else TRANSIENT_LEDGERS:
+        assert_closes(name, run, 1e-12, floor=1e-6)
+    assert run["economiser_w"].max() > 0
+    assert run["unmet_w"].max() > 0
+    without_free = [run["heat_removed_w"], -run["chiller_load_w"]]
+    assert np.max(residual(without_free)) > 0.1
+    assert np.all(run["water_l"] >= run["evaporation_l"])
+    assert (run["water_l"].max() > 0) == (plant == "air_side")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "parts"),
+    [
+        (["hvac.plant=air_cooled"], ["plant air_cooled", "chiller.model centrifugal_vsd",
+                                     "constant_cop, electric_air_cooled"]),
+        (["hvac.plant=water_cooled", *DRY["air_cooled"]],
+         ["plant water_cooled", "chiller.model electric_air_cooled"]),
+        (["hvac.outdoor_air.max_dew_point_c=-20"], ["min_dew_point_c -9", "max_dew_point_c -20"]),
+        ([*DRY["air_cooled"], "events.scheduled=[{kind: tower_cell_down, start_h: 0, "
+          "duration_h: 1, share: 0.5}]"],
+         ["events.scheduled.0.kind tower_cell_down", "hvac.plant water_cooled, not air_cooled"]),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_together_is_an_error(overrides: list[str], parts: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config("corrected", overrides)
+    assert all(part in str(caught.value) for part in parts), caught.value
+
+
+def test_reference_cop_is_that_of_the_machine_unless_it_is_given() -> None:
+    cops = {
+        model: steady([f"hvac.chiller.model={model}"], [30.0], [20.0])[1].reference_cop[0]
+        for model in ("centrifugal_vsd", "electric_water_cooled", "electric_air_cooled")
+    }
+    assert cops == {
+        "centrifugal_vsd": 5.96,
+        "electric_water_cooled": 4.75,
+        "electric_air_cooled": 3.0,
+    }
+    given = ["hvac.chiller.model=electric_air_cooled", "hvac.chiller.reference_cop=3.4"]
+    assert steady(given, [30.0], [20.0])[1].reference_cop == 3.4
+    with pytest.warns(OddInputWarning, match="air-cooled chillers reach about 4"):
+        steady([given[0], "hvac.chiller.reference_cop=5.96"], [30.0], [20.0])

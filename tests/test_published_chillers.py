@@ -16,7 +16,7 @@ from sdc_taichi.exogenous import site_names
 from sdc_taichi.plant import chiller
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.tower import TOWERS
-from sdc_taichi.plant.water_side import WaterSideDesign, WaterSideResult, operate
+from sdc_taichi.plant.water_side import WaterSideDesign, WaterSideResult, water_cooled
 from sdc_taichi.types import F64, fields_of
 
 TRANE_CAPACITY = (4.007341e-01, 1.148568e-03, 1.049504e-04, 5.574667e-02, -1.646131e-03,
@@ -75,9 +75,11 @@ def test_default_needs_the_energy_of_published_curves_in_every_climate() -> None
         )
         own = WaterSideDesign(**{name: values[dc] for name, values in design.items()})
         for setpoint_c, load in ((18.0, 0.5), (18.0, 0.9), (22.0, 0.5)):
-            plant = operate(
+            plant = water_cooled(
                 np.full(len(hours), load * it_w[dc]),
                 setpoint_c=np.full(len(hours), setpoint_c),
+                return_c=np.full(len(hours), setpoint_c + 12.0),
+                airflow_m3s=own.tower_air_m3s,
                 outdoor_c=outdoor_c,
                 wet_bulb_c=wet_bulb_c,
                 design=own,

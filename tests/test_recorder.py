@@ -376,7 +376,7 @@ def test_recording_explains_itself(run: Run) -> None:
     (((text,),)) = run.recorded["/summary"]["TextDocument:text"]
     about = describe_run(run.sim, RunRequest("wild", STEPS))
     for expected in (
-        ODD_NAME, "site CA", "**synthetic**", "synthetic year, seed 10", "carnot", "wild",
+        ODD_NAME, "site CA", "**synthetic**", "synthetic year, seed 10", "centrifugal_vsd", "wild",
         about["fingerprint"], f"taichi {about['versions']['taichi']}", "inlet 10 to 45 C",
         run.sim.fleet.configs[0].description, "every 2 steps",
     ):  # fmt: skip

@@ -81,6 +81,10 @@ MAX_NAMED_BARS = 13
 EVENT_SHADES = {
     "crac_down": (BLUE, "//"),
     "chiller_derate": (GREEN, "\\\\"),
+    "pump_down": (GREEN, "||"),
+    "tower_cell_down": (GREEN, "xx"),
+    "dry_cooler_down": (GREEN, "++"),
+    "outdoor_air_closed": (GREEN, "oo"),
     "rack_fan_failure": (GREY, ".."),
     "heat_wave": ("#B8A800", "--"),
 }

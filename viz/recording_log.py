@@ -283,12 +283,22 @@ def failure_entries(
             yield LogEntry(step, event.dc, "INFO", f"over: {_event_text(event, fleet)}")
 
 
+_SHARE_LEFT: dict[str, str] = {
+    "chiller_derate": "chiller at {} of its capacity",
+    "pump_down": "{} of the chilled-water pumps left",
+    "tower_cell_down": "{} of the tower cells left",
+    "dry_cooler_down": "{} of the dry coolers left",
+    "outdoor_air_closed": "{} of the openings for outdoor air left",
+}
+"""Words for events that leave a share of a device of the plant, by their kind."""
+
+
 def _event_text(event: ActiveEvent, fleet: Fleet) -> str:
     """Words for an event."""
     if event.kind == "crac_down":
         return "all CRAC units down" if event.target is None else f"CRAC unit {event.target} down"
-    if event.kind == "chiller_derate":
-        return f"chiller at {event.share:.0%} of its capacity"
+    if event.kind in _SHARE_LEFT:
+        return _SHARE_LEFT[event.kind].format(f"{event.share:.0%}")
     if event.kind == "rack_fan_failure":
         assert event.target is not None
         place = rack_place(event.target, fleet.configs[event.dc].hall.racks_per_row)

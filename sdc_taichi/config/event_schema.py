@@ -6,9 +6,19 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sdc_taichi.config.fields import AirC, RiseK, Section, Share
+from sdc_taichi.config.fields import AirC, Plant, RiseK, Section, Share
 
-EventKind = Literal["crac_down", "chiller_derate", "rack_fan_failure", "heat_wave", "grid_outage"]
+EventKind = Literal[
+    "crac_down",
+    "chiller_derate",
+    "pump_down",
+    "tower_cell_down",
+    "dry_cooler_down",
+    "outdoor_air_closed",
+    "rack_fan_failure",
+    "heat_wave",
+    "grid_outage",
+]
 
 WaveK = Annotated[float, Field(ge=-40, le=40)]
 """Addition to temperatures outdoors, -40..40 K: the largest departure from the climate on record is
@@ -26,11 +36,21 @@ LEAST_DRAUGHT_SHARE = 0.01
 _REQUIRED: dict[EventKind, tuple[str, ...]] = {
     "crac_down": (),
     "chiller_derate": ("share",),
+    "pump_down": ("share",),
+    "tower_cell_down": ("share",),
+    "dry_cooler_down": ("share",),
+    "outdoor_air_closed": ("share",),
     "rack_fan_failure": ("rack", "share"),
     "heat_wave": ("offset_k",),
     "grid_outage": (),
 }
 _OPTIONAL: dict[EventKind, tuple[str, ...]] = {"crac_down": ("unit",)}
+PLANT_OF_EVENT: dict[EventKind, Plant] = {
+    "tower_cell_down": "water_cooled",
+    "dry_cooler_down": "air_cooled",
+    "outdoor_air_closed": "air_side",
+}
+"""Plant that has the device of an event; the other kinds happen with every plant."""
 
 
 class ProtectionConfig(Section):
@@ -89,7 +109,8 @@ class ScheduledEvent(Section):
     rack: Annotated[int, Field(ge=0, le=9_999_999)] | None = None
     """Rack whose fans fail, counted from 0, row by row, below their number."""
     share: Share | None = None
-    """Chiller capacity or rack airflow that remains, as a share of the full value, 0..1."""
+    """Chiller capacity, pumps, tower cells, dry coolers, openings for outdoor air or rack airflow
+    that remain, as a share of all, 0..1."""
     offset_k: WaveK | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
 
@@ -112,7 +133,8 @@ class SampledEvent(Section):
     duration_h: tuple[DurationH, DurationH]
     """Shortest and longest duration of an event, in h."""
     share: Share | None = None
-    """Chiller capacity or rack airflow that remains, as a share of the full value, 0..1."""
+    """Chiller capacity, pumps, tower cells, dry coolers, openings for outdoor air or rack airflow
+    that remain, as a share of all, 0..1."""
     offset_k: WaveK | None = None
     """Addition of a heat wave to the dry bulb and the wet bulb alike, in K."""
 

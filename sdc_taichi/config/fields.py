@@ -7,7 +7,7 @@ is taken. A type below says why; a field with bounds of its own says so in its d
 
 from __future__ import annotations
 
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
@@ -25,6 +25,8 @@ ASHRAE class of servers (A4: 45 C) comes near the upper end."""
 OutdoorC = Annotated[float, Field(ge=OUTDOOR_LIMITS_C[0], le=OUTDOOR_LIMITS_C[1])]
 """Temperature outdoors, -90..60 C: the extremes on record (WMO) are -89.2 C (Vostok 1983) and 56.7
 C (Furnace Creek 1913)."""
+DewPointC = Annotated[float, Field(ge=-40, le=35)]
+"""Dew point of outdoor air, -40..35 C: from polar air to the highest on record (Dhahran, 2003)."""
 DifferenceK = Annotated[float, Field(ge=-50, le=50)]
 """Difference of two temperatures of a hall or plant, -50..50 K: as much as lies between its coldest
 water and its hottest air."""
@@ -68,6 +70,10 @@ Name = Annotated[str, Field(min_length=1, max_length=10_000, pattern=r"\S")]
 """Name of 1 to 10,000 characters, not blank, all of which a file can hold."""
 FileName = Annotated[str, Field(min_length=1)]
 """Path of a file."""
+
+
+Plant = Literal["water_cooled", "air_cooled", "air_side"]
+"""A plant, see ``plant.plants``."""
 
 
 class Section(BaseModel):

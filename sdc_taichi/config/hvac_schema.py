@@ -9,17 +9,25 @@ from pydantic import Field, field_validator, model_validator
 from sdc_taichi.config.fields import (
     AirC,
     DeviceW,
+    DewPointC,
     ExchangerK,
     FlowM3sPerW,
     LengthM,
     OutdoorC,
+    Plant,
     RiseK,
     Section,
     Share,
     WaterRangeK,
     WorkingShare,
 )
-from sdc_taichi.plant.chiller import CHILLED_WATER_BOUNDS_C, MIN_LIFT_K, chilled_water_bounds_c
+from sdc_taichi.plant.chiller import (
+    AIR_COOLED,
+    CHILLED_WATER_BOUNDS_C,
+    MIN_LIFT_K,
+    chilled_water_bounds_c,
+)
+from sdc_taichi.plant.plants import DRY_PLANTS
 
 Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
 MOST_CRAC_UNITS = 10_000
@@ -131,9 +139,10 @@ class ChillerConfig(Section):
     """How power and capacity of the chiller follow from load and temperatures. Chilled water is at
     most as warm as the model is valid for: 8.89 C with ``eir_york``, 20 C with ``centrifugal_vsd``
     and ``carnot``."""
-    reference_cop: Annotated[float, Field(ge=0.5, le=50)] = 5.96
+    reference_cop: Annotated[float, Field(ge=0.5, le=50)] | None = None
     """COP at the reference point, in W of heat per W of power, 0.5..50: from an absorption chiller
-    to Carnot's limit at a lift of 6 K."""
+    to Carnot's limit at a lift of 6 K; None is that of the model's machine: 3 air-cooled, 4.75 with
+    ``electric_water_cooled``, else 5.96."""
     coil_approach_k: ExchangerK = 8.0
     """Supply air setpoint above the chilled water that the coils take, in K; more where the chiller
     makes no water as warm as that."""
@@ -182,6 +191,52 @@ class TowerConfig(Section):
             raise ValueError(
                 f"economiser_approach_k {self.economiser_approach_k:g} must not be below "
                 f"approach_min_k {self.approach_min_k:g}, which it contains"
+            )
+        return self
+
+
+class DryCoolerConfig(Section):
+    """Dry cooler of plant ``air_cooled``, with the heat exchanger to the chilled water."""
+
+    free_cooling: bool = True
+    """Whether a dry cooler cools the return water before the chiller."""
+    approach_k: ExchangerK = 8.0
+    """Chilled water over outdoor air where the dry cooler does all of the work at full load, in K:
+    7 K of the cooler and 1 K of the heat exchanger."""
+    fan_w_per_w_cooled: Annotated[float, Field(ge=0, le=1)] = 0.03
+    """Design fan power per cooling load at the design point, in W per W, 0..1; coolers on the
+    market need 0.02 to 0.04."""
+
+
+class OutdoorAirConfig(Section):
+    """Outdoor air of plant ``air_side``: when it is let in, and its fans.
+
+    The default limits of moisture are those that ASHRAE TC 9.9 recommends (Thermal Guidelines for
+    Data Processing Environments, 5th edition, 2021). Its allowable range of class A1 is -12..17 C
+    of dew point and up to 80 %.
+    """
+
+    min_dew_point_c: DewPointC = -9.0
+    """Lowest dew point of outdoor air that is let in, in C."""
+    humidifier: bool = True
+    """Whether an adiabatic humidifier wets drier air up to the lowest dew point; without one such
+    air is left outside."""
+    max_dew_point_c: DewPointC = 15.0
+    """Highest dew point of outdoor air that is let in, in C."""
+    max_humidity_pct: Annotated[float, Field(ge=1, le=100)] = 70.0
+    """Highest relative humidity of outdoor air at the supply setpoint, in %, 1..100: from the
+    driest air of a desert to fog."""
+    fan_w_per_m3s: Annotated[float, Field(ge=0, le=20_000)] = 500.0
+    """Power of the fans that draw outdoor air through filters and push return air out, at the
+    design airflow of the CRAC units, in W per m3/s, 0..20,000: class SFP 1 of EN 16798-3 ends at
+    500."""
+
+    @model_validator(mode="after")
+    def _dew_points_in_order(self) -> Self:
+        if self.min_dew_point_c >= self.max_dew_point_c:
+            raise ValueError(
+                f"min_dew_point_c {self.min_dew_point_c:g} must be below "
+                f"max_dew_point_c {self.max_dew_point_c:g}"
             )
         return self
 
@@ -254,6 +309,11 @@ class HvacConfig(Section):
     """Supply setpoint of the CRAC units."""
     crac: CracConfig = CracConfig()
     """CRAC units and their fans."""
+    plant: Plant | None = None
+    """How the heat of the hall gets outdoors: by chilled water with a cooling tower and waterside
+    economiser, by an air-cooled chiller with a dry cooler, or by outdoor air in the hall with an
+    air-cooled chiller for the rest. None is ``air_cooled`` with chiller ``electric_air_cooled``,
+    else ``water_cooled``."""
     cooling_load_model: Literal["heat_balance", "released", "paper"] = "heat_balance"
     """How return air and cooling load follow from the hall: a heat balance, or the formulas of the
     released SustainDC or of its paper."""
@@ -261,6 +321,10 @@ class HvacConfig(Section):
     """Chiller and chilled water."""
     tower: TowerConfig = TowerConfig()
     """Cooling tower, condenser water and economiser."""
+    dry_cooler: DryCoolerConfig = DryCoolerConfig()
+    """Dry cooler of plant ``air_cooled``."""
+    outdoor_air: OutdoorAirConfig = OutdoorAirConfig()
+    """Outdoor air of plant ``air_side``."""
     pumps: PumpConfig = PumpConfig()
     """Pumps of chilled water and condenser water."""
     water: WaterConfig = WaterConfig()
@@ -282,6 +346,25 @@ class HvacConfig(Section):
         if not value or len(set(value)) < len(value):
             raise ValueError(f"{list(value)} must name at least one device and each one once")
         return value
+
+    @property
+    def plant_in_use(self) -> Plant:
+        """The plant, that of the chiller if the config names none."""
+        if self.plant is not None:
+            return self.plant
+        return "air_cooled" if self.chiller.model == "electric_air_cooled" else "water_cooled"
+
+    @model_validator(mode="after")
+    def _chiller_fits_the_plant(self) -> Self:
+        model, plant = self.chiller.model, self.plant
+        dry = self.plant_in_use in DRY_PLANTS
+        if (dry and model not in AIR_COOLED) or (not dry and model == "electric_air_cooled"):
+            fit = ", ".join(sorted(AIR_COOLED)) if dry else "any but electric_air_cooled"
+            raise ValueError(
+                f"plant {plant} and chiller.model {model} do not fit together; valid with this "
+                f"plant is {fit}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _chilled_water_within_the_model(self) -> Self:

@@ -9,6 +9,7 @@ import numpy as np
 
 from sdc_taichi.config.schema import DataCenterConfig
 from sdc_taichi.errors import OddInputWarning
+from sdc_taichi.plant.plants import DRY_PLANTS
 
 LEAST_USUAL_SERVER_W = 20.0
 """Servers of less power at full load are rare, while 1..20 is the power of large ones in kW."""
@@ -16,6 +17,8 @@ MOST_USUAL_RACK_W = 60e3
 """Racks of more power are rarely cooled by air alone: about 3 m3/s pass their doors at 15 K."""
 MOST_USUAL_COP = 15.0
 """Chillers with magnetic bearings reach about 12 at their reference point."""
+MOST_USUAL_AIR_COOLED_COP = 4.5
+"""Air-cooled chillers reach about 4 at 35 C outdoors."""
 USUAL_SETPOINTS_C = (10.0, 35.0)
 """Supply air that is colder condenses water on every surface; ASHRAE class A2 ends at 35 C."""
 LEAST_USUAL_PUMP_EFFICIENCY = 0.2
@@ -26,10 +29,12 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
     """Messages about unusual values of a configuration: field, value and what is usual."""
     yield from _odd_servers(config)
     chiller, setpoint, pumps = config.hvac.chiller, config.hvac.setpoint, config.hvac.pumps
-    if chiller.reference_cop > MOST_USUAL_COP:
+    dry = config.hvac.plant_in_use in DRY_PLANTS
+    most, reached = (MOST_USUAL_AIR_COOLED_COP, 4) if dry else (MOST_USUAL_COP, 12)
+    if chiller.reference_cop is not None and chiller.reference_cop > most:
         yield (
-            f"hvac.chiller.reference_cop {chiller.reference_cop:g}: the best chillers reach about "
-            f"12"
+            f"hvac.chiller.reference_cop {chiller.reference_cop:g}: the best "
+            f"{'air-cooled ' if dry else ''}chillers reach about {reached}"
         )
     low, high = USUAL_SETPOINTS_C
     for name in ("min_c", "max_c"):

@@ -13,7 +13,7 @@ import yaml
 from pydantic import Field, field_validator, model_validator
 
 from sdc_taichi.config.electrical_schema import ElectricalConfig
-from sdc_taichi.config.event_schema import EventsConfig, ProtectionConfig
+from sdc_taichi.config.event_schema import PLANT_OF_EVENT, EventsConfig, ProtectionConfig
 from sdc_taichi.config.fields import (
     CRate,
     FileName,
@@ -224,6 +224,19 @@ class DataCenterConfig(Section):
         for what, is_so in holds.items():
             if not is_so:
                 raise ValueError(f"hall.inlet_model recirculation needs {what}")
+
+    @model_validator(mode="after")
+    def _events_fit_the_plant(self) -> Self:
+        plant = self.hvac.plant_in_use
+        for name in ("scheduled", "sampled"):
+            for index, event in enumerate(getattr(self.events, name)):
+                needed = PLANT_OF_EVENT.get(event.kind, plant)
+                if needed != plant:
+                    raise ValueError(
+                        f"events.{name}.{index}.kind {event.kind} needs hvac.plant {needed}, "
+                        f"not {plant}"
+                    )
+        return self
 
     @model_validator(mode="after")
     def _names_existing_places(self) -> Self:

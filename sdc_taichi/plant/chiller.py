@@ -446,6 +446,12 @@ CHILLERS: dict[str, Callable[..., ChillerResult]] = {
     "paper": paper,
 }
 """Chiller models by the names that ``hvac.chiller.model`` takes."""
+REFERENCE_COPS = {"electric_water_cooled": 4.75, "electric_air_cooled": 3.0, "released": 3.0}
+"""COP at the reference point of machines other than the default, in W/W, by their models."""
+DEFAULT_REFERENCE_COP = 5.96
+"""COP at the reference point of the York machine, and of the Trane machine, in W/W."""
+AIR_COOLED = frozenset({"electric_air_cooled", "constant_cop"})
+"""Models of chillers that reject their heat to outdoor air."""
 
 
 def _electric(

@@ -1,4 +1,4 @@
-"""Water side of the plant: chilled water, economiser, chiller, tower and pumps together."""
+"""Water-cooled plant: chilled water, economiser, chiller, tower and pumps together."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from sdc_taichi.plant.fans_pumps import pump_w
 from sdc_taichi.plant.tower import TowerResult
 from sdc_taichi.types import F64, Values, as_array
 
+LEAST_OUTDOOR_UNITS = 0.01
+"""Least share of a tower with which its equations are evaluated; without a cell no heat is left."""
+
 
 @dataclass(frozen=True, slots=True)
 class WaterSideDesign:
@@ -24,21 +27,22 @@ class WaterSideDesign:
     reference_cop: F64
     """Coefficient of performance of the chiller at its reference point, in W/W, (B,)."""
     rejected_w: F64
-    """Heat that the tower rejects at design, in W, (B,)."""
+    """Heat that the plant rejects at design, in W, (B,)."""
     tower_water_kg_s: F64
     """Condenser water flow at design, in kg/s, (B,)."""
     tower_reference_kg_s: F64
     """Water flow at which the water flow ratio of the tower is 1, in kg/s, (B,)."""
     tower_air_m3s: F64
-    """Airflow of the tower at full fan speed, in m3/s, (B,)."""
+    """Airflow of the tower, or outdoor air let in, at full fan speed, in m3/s, (B,)."""
     tower_fan_w: F64
-    """Power of the tower fan at full speed, in W, (B,)."""
+    """Power of the fans of tower, dry cooler or outdoor air at full speed, in W, (B,)."""
     air_j_per_m3_k: F64
     """Heat capacity of air per volume, in J/(m3 K), (B,)."""
     chilled_pump_w: F64
     """Power of the chilled-water pumps at design flow, in W, (B,)."""
     condenser_pump_w: F64
-    """Power of the condenser-water pumps at design flow, in W, (B,)."""
+    """Power of the pumps of condenser water, or of the dry cooler's loop, at design flow, in W,
+    (B,)."""
     pump_min_ratio: F64
     """Lowest flow of the pumps over design flow, (B,); 1 is constant flow."""
     coil_approach_k: F64
@@ -56,7 +60,24 @@ class WaterSideDesign:
     warmest_chilled_c: F64
     """Warmest chilled water that the chiller makes, in C, (B,)."""
     economiser: F64
-    """1 with a waterside economiser, 0 without, (B,)."""
+    """1 with a waterside economiser or free cooling by a dry cooler, 0 without, (B,)."""
+    pumped_w: F64
+    """Heat that the chilled-water pumps in order carry, in W, (B,); ``cooling_w`` with all."""
+    outdoor_units: F64
+    """Share of tower cells, dry coolers or openings for outdoor air that is in order, 0..1,
+    (B,)."""
+    dry_cooler_approach_k: F64
+    """Approach of dry cooler and heat exchanger, chilled water over outdoor air, in K, (B,)."""
+    pressure_pa: F64
+    """Air pressure of the site, in Pa, (B,)."""
+    least_vapour_pa: F64
+    """Least vapour pressure of outdoor air that is let in, in Pa, (B,)."""
+    most_vapour_pa: F64
+    """Largest vapour pressure of outdoor air that is let in, in Pa, (B,)."""
+    humidifier: F64
+    """1 if outdoor air that is too dry is wetted, 0 if it is left outside, (B,)."""
+    most_humidity: F64
+    """Largest relative humidity of outdoor air at the supply setpoint, 0..1, (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,31 +85,34 @@ class WaterSideResult:
     """One step of the plants of B data centers."""
 
     heat_removed_w: F64
-    """Heat taken from the chilled water, in W, (B,)."""
+    """Heat taken from the room, in W, (B,)."""
     economiser_w: F64
-    """Heat that the economiser takes off the chilled water, in W, (B,)."""
+    """Heat that economiser, dry cooler or outdoor air takes past the chiller, in W, (B,)."""
     chiller_load_w: F64
     """Heat that the chiller takes off the chilled water, in W, (B,)."""
     chiller_w: F64
     """Electric power of the chiller, in W, (B,)."""
     rejected_w: F64
-    """Heat that the tower gives to the outside, in W, (B,)."""
+    """Heat that goes to the outside, in W, (B,)."""
     chilled_water_c: F64
     """Temperature of the chilled water supply, in C, (B,)."""
     condenser_water_c: F64
-    """Temperature of the water that leaves the tower, in C, (B,)."""
+    """Temperature of the water that leaves the tower, or of the outdoor air that cools an
+    air-cooled condenser, in C, (B,)."""
     tower_range_k: F64
     """Entering less leaving water temperature of the tower, in K, (B,)."""
     tower_water_kg_s: F64
     """Condenser water flow, in kg/s, (B,)."""
     tower_airflow_m3s: F64
     """Airflow of the tower, in m3/s, (B,)."""
+    humidifier_kg_s: F64
+    """Water that evaporates into outdoor air on its way into the hall, in kg/s, (B,)."""
     tower_fan_w: F64
-    """Power of the tower fan, in W, (B,)."""
+    """Power of the fans of tower, dry cooler or outdoor air, in W, (B,)."""
     chilled_pump_w: F64
     """Power of the chilled-water pumps, in W, (B,)."""
     condenser_pump_w: F64
-    """Power of the condenser-water pumps, in W, (B,)."""
+    """Power of the pumps of condenser water, or of the dry cooler's loop, in W, (B,)."""
 
     def scaled(self, share: F64) -> WaterSideResult:
         """Means over a step during a share of which, (B,), the plant ran.
@@ -97,6 +121,16 @@ class WaterSideResult:
         """
         flows = [f.name for f in fields(self) if f.name.endswith(("_w", "_kg_s", "_m3s"))]
         return replace(self, **{name: getattr(self, name) * share for name in flows})
+
+
+def chilled_water_c(setpoint_c: F64, design: WaterSideDesign) -> F64:
+    """Chilled water that the coils take, up to the warmest that the chiller makes, in C, (B,).
+
+    Args:
+        setpoint_c: CRAC supply setpoint, C, (B,).
+        design: Sized devices.
+    """
+    return np.minimum(setpoint_c - design.coil_approach_k, design.warmest_chilled_c)
 
 
 def economiser_share(
@@ -124,10 +158,12 @@ def economiser_share(
     )
 
 
-def operate(
+def water_cooled(
     requested_w: F64,
     *,
     setpoint_c: F64,
+    return_c: F64,
+    airflow_m3s: F64,
     outdoor_c: F64,
     wet_bulb_c: F64,
     design: WaterSideDesign,
@@ -135,7 +171,7 @@ def operate(
     tower: Callable[..., TowerResult],
     limited: bool,
 ) -> WaterSideResult:
-    """Remove up to ``requested_w`` from the chilled water and reject it outside.
+    """Remove up to ``requested_w`` from the chilled water and reject it by a cooling tower.
 
     Chilled water follows the air, T_chw = setpoint - coil approach, up to the warmest that the
     chiller makes. The integrated economiser
@@ -146,6 +182,8 @@ def operate(
     Args:
         requested_w: Heat to remove, W, (B,).
         setpoint_c: CRAC supply setpoint, C, (B,).
+        return_c: Not used.
+        airflow_m3s: Not used.
         outdoor_c: Outdoor dry bulb, C, (B,).
         wet_bulb_c: Outdoor wet bulb, C, (B,).
         design: Sized devices.
@@ -156,8 +194,10 @@ def operate(
     Returns:
         The plant's step.
     """
-    load_w = np.minimum(requested_w, design.cooling_w) if limited else requested_w
-    chilled_c = np.minimum(setpoint_c - design.coil_approach_k, design.warmest_chilled_c)
+    # The cells that run take the water of those that are down, but no more than at design.
+    most_w = np.minimum(design.pumped_w, design.cooling_w * design.outdoor_units)
+    load_w = np.minimum(requested_w, most_w) if limited else requested_w
+    chilled_c = chilled_water_c(setpoint_c, design)
 
     def run_chiller(economiser: F64, tower_water_c: F64) -> ChillerResult:
         return chiller(
@@ -176,6 +216,7 @@ def operate(
     heat_w = load_w * share + run_chiller(share, tower_setpoint_c).rejected_w
     flow_ratio = np.maximum(heat_w / design.rejected_w, design.pump_min_ratio)
     tower_water_kg_s = design.tower_water_kg_s * flow_ratio
+    units = np.maximum(design.outdoor_units, LEAST_OUTDOOR_UNITS)
     cooled = tower(
         heat_w,
         wet_bulb_c=wet_bulb_c,
@@ -183,9 +224,9 @@ def operate(
         condenser_setpoint_c=tower_setpoint_c,
         supply_setpoint_c=setpoint_c,
         water_kg_s=tower_water_kg_s,
-        reference_water_kg_s=design.tower_reference_kg_s,
-        reference_air_m3s=design.tower_air_m3s,
-        design_fan_w=design.tower_fan_w,
+        reference_water_kg_s=design.tower_reference_kg_s * units,
+        reference_air_m3s=design.tower_air_m3s * units,
+        design_fan_w=design.tower_fan_w * units,
         air_j_per_m3_k=design.air_j_per_m3_k,
     )
     share = _economiser_share_at(cooled.leaving_c, chilled_c, design)
@@ -203,6 +244,7 @@ def operate(
         condenser_water_c=cooled.leaving_c,
         tower_range_k=cooled.range_k,
         tower_water_kg_s=tower_water_kg_s,
+        humidifier_kg_s=0.0 * heat_w,
         tower_airflow_m3s=cooled.air_ratio * design.tower_air_m3s,
         tower_fan_w=cooled.fan_w,
         chilled_pump_w=chilled_pump_w,

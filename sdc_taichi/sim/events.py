@@ -24,6 +24,13 @@ HOURS_PER_BLOCK = 8760
 """Sampled events are drawn in blocks of 365 days, each from a stream of its own."""
 _HOURS_PER_WINDOW = 120  # Divides a block. Events are looked up once per window.
 _KINDS: tuple[EventKind, ...] = get_args(EventKind)
+_PLANT_SHARES: dict[str, tuple[EventKind, ...]] = {
+    "chiller_share": ("chiller_derate",),
+    "pump_share": ("pump_down",),
+    "outdoor_units": ("tower_cell_down", "dry_cooler_down", "outdoor_air_closed"),
+}
+"""Kinds of events that leave a share of devices of the plant, by the field of ``Disturbance``."""
+_KINDS_WITH_SHARE = {"rack_fan_failure"}.union(*_PLANT_SHARES.values())
 _NO_TARGET = -1
 """Target of events of all CRAC units, or of none to name."""
 
@@ -48,6 +55,11 @@ class Disturbance:
     """Offset of dry bulb and wet bulb alike, so that their order is kept, in K, (B,)."""
     grid_up: Mask
     """Whether the grid supplies the data center, (B,)."""
+    pump_share: F64
+    """Chilled-water pumps that are in order, as a share of all, 0..1, (B,)."""
+    outdoor_units: F64
+    """Tower cells, dry coolers or openings for outdoor air in order, as a share of all, 0..1,
+    (B,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +151,8 @@ class Timeline:
                 active_events=np.zeros(size),
                 unit_up=np.ones(unit_offsets[-1], dtype=np.bool_),
                 chiller_share=np.ones(size),
+                pump_share=np.ones(size),
+                outdoor_units=np.ones(size),
                 rack_airflow=np.ones(rack_offsets[-1]),
                 outdoor_offset_k=np.zeros(size),
                 grid_up=np.ones(size, dtype=np.bool_),
@@ -170,7 +184,7 @@ class Timeline:
             return self._normal
         normal = self._normal
         unit_up, grid_up = normal.unit_up.copy(), normal.grid_up.copy()
-        chiller, airflow = normal.chiller_share.copy(), normal.rack_airflow.copy()
+        airflow = normal.rack_airflow.copy()
         offset_k = normal.outdoor_offset_k.copy()
         is_kind = {kind: found.kind == code for code, kind in enumerate(_KINDS)}
         down = found.where(is_kind["crac_down"])
@@ -179,8 +193,11 @@ class Timeline:
         without = np.zeros(len(grid_up), dtype=np.bool_)
         without[down.dc[~one]] = True
         unit_up &= ~np.repeat(without, np.diff(self._unit_offsets))
-        derated = found.where(is_kind["chiller_derate"])
-        np.multiply.at(chiller, derated.dc, derated.value)
+        shares = {}
+        for name, kinds in _PLANT_SHARES.items():
+            shares[name] = getattr(normal, name).copy()
+            left = found.where(np.logical_or.reduce([is_kind[kind] for kind in kinds]))
+            np.multiply.at(shares[name], left.dc, left.value)
         failed = found.where(is_kind["rack_fan_failure"])
         np.multiply.at(airflow, self._rack_offsets[failed.dc] + failed.target, failed.value)
         wave = found.where(is_kind["heat_wave"])
@@ -191,7 +208,7 @@ class Timeline:
                 active=True,
                 active_events=np.bincount(found.dc, minlength=len(grid_up)).astype(np.float64),
                 unit_up=unit_up,
-                chiller_share=chiller,
+                **shares,
                 rack_airflow=airflow,
                 outdoor_offset_k=offset_k,
                 grid_up=grid_up,
@@ -210,7 +227,7 @@ class Timeline:
                     kind=kind,
                     dc=int(found.dc[i]),
                     target=None if target == _NO_TARGET else target,
-                    share=value if kind in ("chiller_derate", "rack_fan_failure") else None,
+                    share=value if kind in _KINDS_WITH_SHARE else None,
                     offset_k=value if kind == "heat_wave" else None,
                     start_step=int(found.first_step[i]),
                     end_step=int(found.end_step[i]),

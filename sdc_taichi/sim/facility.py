@@ -13,12 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.hall import air_metrics
-from sdc_taichi.plant import cooling, water_side
+from sdc_taichi.plant import cooling
 from sdc_taichi.plant.battery import BATTERIES, BatteryResult
 from sdc_taichi.plant.carbon import emitted_g
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.electrical import NO_LIMIT_KW, overload_kwh, power_path_loss_w
 from sdc_taichi.plant.fans_pumps import crac_fan_w
+from sdc_taichi.plant.plants import DRY_PLANTS, PLANTS
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterUse
 from sdc_taichi.plant.water_side import WaterSideResult
@@ -38,7 +39,7 @@ _BATTERY = (
     "lower_v",
 )
 _PLANT_INPUTS = ("plant_setpoint_c", "outdoor_c", "wet_bulb_c")
-_PLANT_EVENT_INPUTS = ("powered", "chiller_share", "coil_share")
+_PLANT_EVENT_INPUTS = ("powered", "chiller_share", "pump_share", "outdoor_units", "coil_share")
 _STEP_INPUTS = (
     "cpu_w",
     "it_fan_w",
@@ -131,6 +132,11 @@ class FacilityInputs:
     """1 with grid, 0 in an outage, (B,); for fleets with events."""
     chiller_share: F64 = NOT_USED
     """Share of the chiller's capacity that is available, 0..1, (B,); for fleets with events."""
+    pump_share: F64 = NOT_USED
+    """Share of the chilled-water pumps that are in order, 0..1, (B,); for fleets with events."""
+    outdoor_units: F64 = NOT_USED
+    """Share of tower cells, dry coolers or openings for outdoor air that are in order, 0..1, (B,);
+    for fleets with events."""
     coil_share: F64 = NOT_USED
     """Design airflow of the CRAC units that run over that of all, (B,); for fleets with events."""
     no_unit_down: F64 = NOT_USED
@@ -195,6 +201,8 @@ class Facility:
         self._stores_heat = models["cooling_load"] in cooling.STORES_UNMET_HEAT
         self._flow = cooling.CRAC_FLOWS[models["crac_flow"]]
         self._load = cooling.COOLING_LOADS[models["cooling_load"]]
+        self._plant = PLANTS[models["plant"]]
+        self._dry = models["plant"] in DRY_PLANTS
         self._chiller = CHILLERS[models["chiller"]]
         self._tower = TOWERS[models["tower"]]
         self._water_model = WATER[models["water"]]
@@ -237,7 +245,9 @@ class Facility:
 
     def removable_w(self, inputs: FacilityInputs) -> dict[str, F64]:
         """Heat that the plant can take with the coils in use, W, as ``heat_removed_w``, (B,)."""
-        plant = self._operate(self._coil_capacity_w(inputs), inputs)
+        capacity_w, flow_m3s = self._coil_capacity_w(inputs), self._sizing.crac_flow_m3s
+        rise_k = self._sizing.water_side.cooling_w / (self._air_j_per_m3_k * flow_m3s)
+        plant = self._operate(capacity_w, inputs, inputs.plant_setpoint_c + rise_k, flow_m3s)
         return {"heat_removed_w": plant.heat_removed_w}
 
     def step(self, inputs: FacilityInputs) -> dict[str, F64]:
@@ -252,7 +262,8 @@ class Facility:
         """
         it_w = inputs.cpu_w + inputs.it_fan_w
         air = self._crac_air(inputs, it_w)
-        plant = self._operate(self._requested_w(inputs, air), inputs)
+        requested_w = self._requested_w(inputs, air)
+        plant = self._operate(requested_w, inputs, air.return_c, air.crac_flow_m3s)
         heat = self._balance_heat(inputs, air, plant)
         water = self._use_water(inputs, air, plant)
         hvac_w = self._hvac_w(air, plant)
@@ -340,16 +351,25 @@ class Facility:
         reached_w = np.clip(wanted_w - passing_w, 0.0, self._coil_capacity_w(inputs))
         return np.where(inputs.no_unit_down > 0, wanted_w, reached_w)
 
-    def _operate(self, requested_w: F64, inputs: FacilityInputs) -> WaterSideResult:
+    def _operate(
+        self, requested_w: F64, inputs: FacilityInputs, return_c: F64, airflow_m3s: F64
+    ) -> WaterSideResult:
         """The plant, which stands still while there is no power."""
         design = self._sizing.water_side
         if not self._event_free:
             on = np.where(inputs.powered > 0, inputs.powered, 1.0)
             requested_w = np.where(inputs.powered > 0, requested_w / on, 0.0)
-            design = replace(design, chiller_w=design.chiller_w * inputs.chiller_share)
-        found = water_side.operate(
+            design = replace(
+                design,
+                chiller_w=design.chiller_w * inputs.chiller_share,
+                pumped_w=design.pumped_w * inputs.pump_share,
+                outdoor_units=inputs.outdoor_units,
+            )
+        found = self._plant(
             requested_w,
             setpoint_c=inputs.plant_setpoint_c,
+            return_c=return_c,
+            airflow_m3s=airflow_m3s,
             outdoor_c=inputs.outdoor_c,
             wet_bulb_c=inputs.wet_bulb_c,
             design=design,
@@ -379,7 +399,12 @@ class Facility:
         return _HeatBalance(unmet_w, recovered_w, room_heat_kwh)
 
     def _use_water(self, inputs: FacilityInputs, air: _CracAir, plant: WaterSideResult) -> WaterUse:
-        """Water that the tower evaporates, loses and gets."""
+        """Water that the tower evaporates, loses and gets; else that of the humidifier."""
+        if self._dry:
+            nothing = 0.0 * plant.rejected_w
+            evaporation_l = plant.humidifier_kg_s * (self._step_h * 3600.0)
+            blowdown_l = evaporation_l / (self._water["cycles_of_concentration"] - 1.0)
+            return WaterUse(evaporation_l, nothing, blowdown_l, evaporation_l + blowdown_l)
         return self._water_model(
             rejected_w=plant.rejected_w,
             range_k=plant.tower_range_k,

@@ -34,6 +34,7 @@ STAGE_MODELS = {
     "setpoint": "hvac.setpoint.model",
     "crac_flow": "hvac.crac.flow_model",
     "cooling_load": "hvac.cooling_load_model",
+    "plant": "hvac.plant",
     "chiller": "hvac.chiller.model",
     "tower": "hvac.tower.model",
     "pumps": "hvac.pumps.model",
@@ -248,6 +249,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     listed = _listed(configs)
     warn_of_odd_values(listed)
     models = {stage: _shared(listed, path) for stage, path in STAGE_MODELS.items()}
+    models["plant"] = listed[0].hvac.plant_in_use
     steps_per_hour = _shared(listed, "simulation.steps_per_hour")
     _shared(listed, "hvac.total_of")
     _shared(listed, "electrical.losses")

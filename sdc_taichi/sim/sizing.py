@@ -10,10 +10,11 @@ import numpy as np
 
 from sdc_taichi.errors import PhysicalLimitError
 from sdc_taichi.exogenous import site_pressure_pa
-from sdc_taichi.plant import chiller, tower
+from sdc_taichi.plant import chiller, moist_air, tower
 from sdc_taichi.plant.chiller import ChillerResult
 from sdc_taichi.plant.electrical import NO_LIMIT_KW, PowerPath, loss_w, power_path_loss_w
 from sdc_taichi.plant.fans_pumps import hydraulic_pump_w
+from sdc_taichi.plant.plants import DRY_PLANTS
 from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
@@ -123,7 +124,7 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     cooling_w = (it_w + crac_at_design_w) * v("hvac.sizing.margin")
     chiller_w, at_design = _design_chiller(fleet, cooling_w, outdoor_c, wet_bulb_c)
     water_side = _water_side(
-        fleet, cooling_w, chiller_w, at_design.rejected_w, outdoor_c, wet_bulb_c
+        fleet, cooling_w, chiller_w, at_design.rejected_w, crac_flow_m3s, outdoor_c, wet_bulb_c
     )
     power_path, counted_loss_w = _power_path(fleet, it_w)
     facility_w = (
@@ -185,7 +186,7 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
         chilled_water_c=low_c,
         condenser_c=outdoor_c,
         outdoor_c=outdoor_c,
-        reference_cop=v("hvac.chiller.reference_cop"),
+        reference_cop=_reference_cop(fleet),
     )
     power_path, counted_loss_w = _power_path(fleet, it_w)
     facility_w = 1.1 * (highest_w + rated_w + machine.power_w) + counted_loss_w
@@ -202,7 +203,9 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
         battery_kwh=_battery_kwh(fleet, facility_w / 1e3),
         grid_limit_kw=_grid_limit_kw(fleet, facility_w / 1e3),
         room_kwh_per_k=_room_kwh_per_k(fleet),
-        water_side=_water_side(fleet, rated_w, rated_w, rated_w, outdoor_c, wet_bulb_c),
+        water_side=_water_side(
+            fleet, rated_w, rated_w, rated_w, crac_flow_m3s, outdoor_c, wet_bulb_c
+        ),
         power_path=power_path,
     )
 
@@ -261,6 +264,13 @@ def mean_return_approach_k(fleet: Fleet) -> F64:
     return np.array([np.mean(np.asarray(c.hall.return_approach_k)) for c in fleet.configs])
 
 
+def _reference_cop(fleet: Fleet) -> F64:
+    """COP of the chillers at their reference point, (B,): that of the config, or of the model."""
+    given = fleet.values("hvac.chiller.reference_cop")
+    usual = chiller.REFERENCE_COPS.get(fleet.models["chiller"], chiller.DEFAULT_REFERENCE_COP)
+    return np.where(np.isnan(given), usual, given)
+
+
 def _design_chiller(
     fleet: Fleet, cooling_w: F64, outdoor_c: F64, wet_bulb_c: F64
 ) -> tuple[F64, ChillerResult]:
@@ -288,7 +298,7 @@ def _design_chiller(
             chilled_water_c=chilled_c,
             condenser_c=condenser_c,
             outdoor_c=outdoor_c,
-            reference_cop=v("hvac.chiller.reference_cop"),
+            reference_cop=_reference_cop(fleet),
             min_lift_k=v("hvac.chiller.min_lift_k"),
         )
 
@@ -309,16 +319,22 @@ def _water_side(
     cooling_w: F64,
     chiller_w: F64,
     rejected_w: F64,
+    crac_flow_m3s: F64,
     outdoor_c: F64,
     wet_bulb_c: F64,
 ) -> WaterSideDesign:
-    """Chiller, tower, pumps and economiser for the given heat, each (B,)."""
+    """Chiller, tower, pumps and economiser for the given heat and CRAC airflow, each (B,)."""
     v = fleet.values
     approach_k = v("hvac.tower.approach_min_k")
+    _, warmest_c = chiller.chilled_water_bounds_c(fleet.models["chiller"])
+    if fleet.models["plant"] in DRY_PLANTS:
+        outdoor = _dry_units(fleet, cooling_w, crac_flow_m3s)
+    else:
+        outdoor = _tower(fleet, cooling_w, rejected_w, outdoor_c, wet_bulb_c)
     return WaterSideDesign(
         cooling_w=cooling_w,
         chiller_w=chiller_w,
-        reference_cop=v("hvac.chiller.reference_cop"),
+        reference_cop=_reference_cop(fleet),
         rejected_w=rejected_w,
         coil_approach_k=v("hvac.chiller.coil_approach_k"),
         chilled_water_range_k=v("hvac.chiller.chilled_water_range_k"),
@@ -326,13 +342,47 @@ def _water_side(
         exchanger_approach_k=v("hvac.tower.economiser_approach_k") - approach_k,
         min_condenser_c=v("hvac.chiller.min_condenser_c"),
         min_lift_k=v("hvac.chiller.min_lift_k"),
-        warmest_chilled_c=np.full(
-            fleet.size, chiller.chilled_water_bounds_c(fleet.models["chiller"])[1]
-        ),
-        economiser=v("hvac.tower.economiser"),
-        **_tower(fleet, cooling_w, rejected_w, outdoor_c, wet_bulb_c),
+        warmest_chilled_c=np.full(fleet.size, warmest_c),
+        pumped_w=cooling_w,
+        outdoor_units=np.ones(fleet.size),
+        dry_cooler_approach_k=v("hvac.dry_cooler.approach_k"),
+        **_outdoor_air_limits(fleet),
+        **outdoor,
         **_pumps(fleet, cooling_w, rejected_w),
     )
+
+
+def _outdoor_air_limits(fleet: Fleet) -> dict[str, F64]:
+    """Vapour pressures, Pa, and relative humidity within which outdoor air is let in, (B,)."""
+    v = fleet.values
+    least_pa, most_pa = (
+        np.asarray(moist_air.saturation_pa(v(f"hvac.outdoor_air.{end}_dew_point_c")))
+        for end in ("min", "max")
+    )
+    return {
+        "pressure_pa": sites_pressure_pa(fleet),
+        "least_vapour_pa": least_pa,
+        "most_vapour_pa": most_pa,
+        "humidifier": v("hvac.outdoor_air.humidifier"),
+        "most_humidity": v("hvac.outdoor_air.max_humidity_pct") / 100.0,
+    }
+
+
+def _dry_units(fleet: Fleet, cooling_w: F64, crac_flow_m3s: F64) -> dict[str, F64]:
+    """Fans of a dry cooler or of outdoor air, in the fields of a tower, which has no water."""
+    v = fleet.values
+    sized = {
+        "economiser": v("hvac.dry_cooler.free_cooling"),
+        "tower_water_kg_s": np.zeros(fleet.size),
+        "tower_reference_kg_s": np.zeros(fleet.size),
+        "tower_air_m3s": np.zeros(fleet.size),
+        "tower_fan_w": v("hvac.dry_cooler.fan_w_per_w_cooled") * cooling_w,
+        "air_j_per_m3_k": air_j_per_m3_k(fleet),
+    }
+    if fleet.models["plant"] == "air_side":
+        sized["tower_air_m3s"] = crac_flow_m3s
+        sized["tower_fan_w"] = v("hvac.outdoor_air.fan_w_per_m3s") * crac_flow_m3s
+    return sized
 
 
 def _tower(
@@ -349,6 +399,7 @@ def _tower(
     water_kg_s = np.asarray(tower.design_water_kg_s(rejected_w, range_k=range_k))
     rise_k = np.maximum(50.0 - (outdoor_c - v("hvac.setpoint.min_c")), 1.0)
     sized = {
+        "economiser": v("hvac.tower.economiser"),
         "tower_water_kg_s": water_kg_s,
         "tower_reference_kg_s": water_kg_s,
         "tower_air_m3s": cooling_w / (air * rise_k),
@@ -368,7 +419,7 @@ def _tower(
 
 
 def _pumps(fleet: Fleet, cooling_w: F64, rejected_w: F64) -> dict[str, F64]:
-    """Chilled- and condenser-water pumps: sized for their flow, or one unscaled pump each."""
+    """Pumps of chilled water and of the loop outdoors: sized for their flow, or unscaled."""
     v = fleet.values
     if fleet.models["pumps"] == "released":
         return {
@@ -382,9 +433,15 @@ def _pumps(fleet: Fleet, cooling_w: F64, rejected_w: F64) -> dict[str, F64]:
         efficiency = v("hvac.pumps.efficiency")
         return hydraulic_pump_w(v("hvac.pumps.pressure_drop_pa"), flow, efficiency=efficiency)
 
+    chilled_range_k = v("hvac.chiller.chilled_water_range_k")
+    second_loop_w = {
+        "water_cooled": design_w(rejected_w, v("hvac.tower.water_range_k")),
+        "air_cooled": design_w(cooling_w, chilled_range_k) * v("hvac.dry_cooler.free_cooling"),
+        "air_side": np.zeros(fleet.size),
+    }
     return {
-        "chilled_pump_w": design_w(cooling_w, v("hvac.chiller.chilled_water_range_k")),
-        "condenser_pump_w": design_w(rejected_w, v("hvac.tower.water_range_k")),
+        "chilled_pump_w": design_w(cooling_w, chilled_range_k),
+        "condenser_pump_w": second_loop_w[fleet.models["plant"]],
         "pump_min_ratio": v("hvac.pumps.min_flow_ratio"),
     }
 

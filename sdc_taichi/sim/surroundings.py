@@ -37,6 +37,11 @@ class Surroundings:
     """Whether all data centers have power throughout the step."""
     chiller_share: F64
     """Chiller capacity that is available, as a share of its full capacity, 0..1, (B,)."""
+    pump_share: F64
+    """Chilled-water pumps that are in order, as a share of all, 0..1, (B,)."""
+    outdoor_units: F64
+    """Tower cells, dry coolers or openings for outdoor air in order, as a share of all, 0..1,
+    (B,)."""
     unit_running: F64
     """1 for CRAC units that run, 0 for those that are down or without power, (U,)."""
     all_running: bool
@@ -79,6 +84,8 @@ class SurroundingsModel:
                 powered=self._ones.copy(),
                 fully_powered=True,
                 chiller_share=self._ones,
+                pump_share=self._ones,
+                outdoor_units=self._ones,
                 unit_running=self._unit_ones.copy(),
                 all_running=True,
                 rack_airflow=None,
@@ -96,6 +103,8 @@ class SurroundingsModel:
             powered=powered,
             fully_powered=bool(np.all(powered == 1.0)),
             chiller_share=event.chiller_share,
+            pump_share=event.pump_share,
+            outdoor_units=event.outdoor_units,
             unit_running=running.astype(np.float64),
             all_running=bool(np.all(running)),
             rack_airflow=event.rack_airflow,
