@@ -99,13 +99,13 @@ def numba_step(given: Arguments, threads: int) -> Step:
     prange = numba.prange
 
     @numba.njit(fastmath=True, inline="always")  # type: ignore[untyped-decorator]
-    def operate(dc: Any, inlet_c: Any, load: Any, full_w: Any, idle_w: Any) -> Any:
+    def operate(dc: Any, inlet_c: Any, load: Any, groups: Any, g: Any) -> Any:
         t = min(inlet_c, dc[13])
         y = min(max(dc[3] * t + dc[4] + dc[5] * load, dc[6]), dc[7])
         speed = y / dc[8]
-        cpu_w = max(idle_w, full_w * (dc[0] * t + dc[1] + dc[2] * load))
-        fan_w = dc[10] * speed * speed * speed
-        flow = dc[11] * y
+        cpu_w = max(groups[2, g], groups[1, g] * (dc[0] * t + dc[1] + dc[2] * load))
+        fan_w = groups[8, g] * dc[10] * speed * speed * speed
+        flow = dc[11] * y * (groups[6, g] - groups[7, g] * t)
         return cpu_w, fan_w, flow, inlet_c + (cpu_w + fan_w) / (dc[12] * flow)
 
     @numba.njit(parallel=True, fastmath=True)  # type: ignore[untyped-decorator]
@@ -139,7 +139,7 @@ def numba_step(given: Arguments, threads: int) -> Step:
                 for g in range(group_offsets[r], group_offsets[r + 1]):
                     t = air_c + groups[3, g]
                     load = u + groups[4, g] * spread
-                    cpu_w, fan_w, m3s, out_c = operate(dc, t, load, groups[1, g], groups[2, g])
+                    cpu_w, fan_w, m3s, out_c = operate(dc, t, load, groups, g)
                     inlet_c[g] = t
                     outlet_c[g] = out_c
                     power_w[g] = cpu_w + fan_w
@@ -153,7 +153,7 @@ def numba_step(given: Arguments, threads: int) -> Step:
                 for g in range(group_offsets[r], group_offsets[r + 1]):
                     t = air_c + groups[3, g]
                     load = u + groups[4, g] * spread
-                    cpu_w, fan_w, m3s, out_c = operate(dc, t, load, groups[1, g], groups[2, g])
+                    cpu_w, fan_w, m3s, out_c = operate(dc, t, load, groups, g)
                     drawn_w = cpu_w + fan_w
                     inlet_c[server_offsets[g] : server_offsets[g + 1]] = t
                     outlet_c[server_offsets[g] : server_offsets[g + 1]] = out_c

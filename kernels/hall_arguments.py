@@ -104,6 +104,9 @@ GROUP_INPUTS = {
     "inlet_offset_k": "inlet over that of the rack, K (inlet model approach)",
     "load_deviation": "load over that of the rack as a share of u (1 - u), u the rack's load",
     "height_factor": "exhaust share over that of the rack, g of docs/hall.md",
+    "full_airflow": "airflow of a server at ratio 1 and an inlet of 0 C, over fan_full_m3s",
+    "airflow_fall_per_k": "fall of that with the inlet, by the density of air, 1/K",
+    "full_fan_power": "fan power of a server at the reference ratio, over fan_reference_w",
 }
 """Where a rack has fewer groups than its block, or in padding, all but ``count`` repeat its last
 group, as do loads and server temperatures: no lane computes with numbers out of reach."""
@@ -118,8 +121,8 @@ DC_COEFFICIENTS = {
     "fan_high": "highest airflow ratio",
     "fan_reference_ratio": "airflow ratio at which fans draw fan_reference_w",
     "fan_exponent": "exponent of fan power over the airflow ratio, 1..3",
-    "fan_reference_w": "fan power at the reference ratio, W per server",
-    "fan_full_m3s": "airflow of a server at ratio 1, m3/s",
+    "fan_reference_w": "most fan power of a server at the reference ratio, W",
+    "fan_full_m3s": "most airflow of a server at ratio 1, m3/s",
     "air_j_per_m3_k": "heat capacity of air by volume, rho*cp, J/(m3 K)",
     "curve_limit_c": "inlet above which power and airflow no longer rise, C",
     "fresh_share": "supply air that does not bypass the racks at the design point, 1 - b_0",

@@ -3,7 +3,9 @@
 Curves of a server with inlet T, at most the curve limit, and utilisation u (Sun et al. 2021;
 EnergyPlus ElectricEquipment:ITE:AirCooled): power without fans max(idle, full (slope T + offset +
 shift u)), airflow ratio y = clip(slope T + offset + shift u), fan power
-reference (y / reference ratio)^exponent. ``sdc_taichi/plant/servers.py`` has them in NumPy.
+reference (y / reference ratio)^exponent. ``sdc_taichi/plant/servers.py`` has them in NumPy. Fans
+move the volume y; airflows are volumes at a reference temperature, so y is taken times the density
+at the inlet over that at the reference (``sdc_taichi/plant/air.py``).
 """
 
 from typing import NamedTuple, no_type_check
@@ -187,8 +189,9 @@ def compute_group(
 ):
     """Inlet in C, power without fans in W, and airflow and fan power ratios of a server.
 
-    Of group z of each rack of a block. Powers and airflows are those of a rack that is on for the
-    whole step and whose fans are in order.
+    Of group z of each rack of a block; ratios are to the full airflow and full fan power of the
+    data center. Powers and airflows are those of a rack that is on for the whole step and whose
+    fans are in order.
     """
     inlet_c = group_inlet(hall, air, group)
     # Utilisation over that of the rack, or utilisation itself where given per group.
@@ -210,6 +213,8 @@ def compute_group(
         # x^p as x exp((p - 1) log x), which is 0 where x is.
         excess = servers.fan_exponent - hall.real(1.0)
         fan_power = airflow * hall.exp_of(hall.log_of(airflow) * excess)
+    airflow *= group.full_airflow - on_curve_c * group.airflow_fall_per_k
+    fan_power *= group.full_fan_power
     return inlet_c, cpu_w, airflow, fan_power
 
 
@@ -345,7 +350,9 @@ def warming_model(hall: ti.template(), n, servers: ti.template()):
     server_j_per_k = dc.server_j_per_k
     k_per_w, halvings = step_s / server_j_per_k, 0
     if ti.static(hall.transient):
-        most = dc.fan_high * servers.full_m3s * servers.uptake_j_per_m3_k * k_per_w
+        # Air at 0 C is 7 % denser than at the reference.
+        most = hall.real(1.07) * dc.fan_high * servers.full_m3s
+        most *= servers.uptake_j_per_m3_k * k_per_w
         halvings = halvings_for(hall, most)
         k_per_w *= power_of_half(hall, halvings)
     return ti.Struct(

@@ -9,6 +9,7 @@ import numpy as np
 
 from sdc_taichi import State, StepResult
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 
 
@@ -19,6 +20,8 @@ class Run:
     values: dict[str, F64]
     start: dict[str, F64]
     fleet_values: Callable[[str], F64]
+    air_j_per_m3_k: F64
+    """Heat capacity of the air, (B,)."""
     step_h: float
     counts_losses: bool
     flow_balance: F64
@@ -46,8 +49,8 @@ def stocks(state: State) -> dict[str, F64]:
 
 def quantities(fleet: Fleet, result: StepResult) -> dict[str, F64]:
     """All quantities of a step, and sums over the racks, (B,)."""
-    first, v = fleet.rack_offsets[:-1], fleet.values
-    air = (v("hall.air_density_kg_m3") * v("hall.air_heat_capacity_j_per_kg_k"))[fleet.rack_dc]
+    first = fleet.rack_offsets[:-1]
+    air = air_j_per_m3_k(fleet)[fleet.rack_dc]
     rack_cpu, rack_fan, rack_flow, rack_in, rack_out = (
         getattr(result, f"rack_{name}").astype(np.float64)
         for name in ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "outlet_c")
@@ -89,10 +92,7 @@ LEDGERS: dict[str, Ledger] = {
     "server air": lambda r: [r["it_w"], -r["racks_air_w"]],
     "room air": lambda r: [
         r["it_w"],
-        -r.fleet_values("hall.air_density_kg_m3")
-        * r.fleet_values("hall.air_heat_capacity_j_per_kg_k")
-        * r["crac_flow_m3s"]
-        * (r["return_c"] - r["supply_c"]),
+        -r.air_j_per_m3_k * r["crac_flow_m3s"] * (r["return_c"] - r["supply_c"]),
     ],
     "cooling": lambda r: [r["heat_removed_w"], -r["economiser_w"], -r["chiller_load_w"]],
     "rejected heat": lambda r: [r["rejected_w"], -r["heat_removed_w"], -r["chiller_w"]],

@@ -59,6 +59,7 @@ def random_values(
     }
     hall["supply_approach_k"] = rng.uniform(1.5, 5.0, racks).tolist()
     hall["return_approach_k"] = rng.uniform(-5.0, 0.0, racks).tolist()
+    hall["air_density_kg_m3"] = 1.2 if rng.integers(3) == 0 else None
     hall["height_zones"] = int(rng.integers(1, 8))
     hall["height_gradient"] = float(rng.uniform(0.0, 0.6))
     crac["units"] = int(rng.integers(1, 5))
@@ -78,6 +79,9 @@ def random_values(
                     "full_w": float(full_w),
                     "idle_w": float(rng.uniform(0.0, 0.4) * full_w),
                     "load_weight": float(rng.uniform(0.8, 1.2)),
+                    "height_u": float(rng.choice([1.0, 1.0, 4.5])),
+                    "fan_w": float(rng.uniform(5, 30)) if rng.integers(2) else None,
+                    "design_rise_k": float(rng.uniform(9, 16)) if rng.integers(3) == 0 else None,
                 }
                 for full_w in rng.uniform(150, 300, rng.integers(2, 4))
             ]
@@ -215,7 +219,8 @@ def assert_agrees(
         for field, expected in twin.dcs.items():
             where = part.units if field.startswith("unit_") else slice(i, i + 1)
             # Sums over what exceeds a limit inherit the absolute error of each inlet.
-            scale = float(len(part.load)) if field in ("over_27_sum_k", "under_18_sum_k") else 0.0
+            limit_c = {"over_27_sum_k": 27.0, "under_18_sum_k": 18.0}.get(field, 0.0)
+            scale = limit_c * len(part.load)
             assert_close(getattr(sums, field)[where], expected, rel, (name, field), scale)
         for field, expected in twin.racks.items():
             found = getattr(sums, f"rack_{field}")[part.racks]

@@ -15,6 +15,8 @@ import numpy as np
 
 from sdc_taichi import DataCenterConfig
 from sdc_taichi.config import HallConfig
+from sdc_taichi.config.hall_schema import ServerGroup
+from sdc_taichi.exogenous import site_pressure_pa
 from sdc_taichi.types import F64, I64
 
 
@@ -58,6 +60,34 @@ def airflow_ratio(config: DataCenterConfig, inlet_c: F64, load: F64) -> F64:
     return np.asarray(np.clip(ratio, low, high))
 
 
+def air_of(config: DataCenterConfig) -> tuple[float, float, float]:
+    """rho cp of a site's air at 20 C, and its density at 0 C and its fall per K over that at 20 C.
+
+    A line through the density of an ideal gas at 18 C and 32 C.
+    """
+    hall = config.hall
+    if hall.air_density_kg_m3 is not None:
+        return hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k, 1.0, 0.0
+    pressure = site_pressure_pa(config.site.location, config.site.weather_file)
+    at = {t: 293.15 / (t + 273.15) for t in (18.0, 32.0)}
+    fall = (at[18.0] - at[32.0]) / 14.0
+    rho = pressure / (287.05 * 293.15)
+    return rho * hall.air_heat_capacity_j_per_kg_k, at[18.0] + 18.0 * fall, fall
+
+
+def reference_fan_w(config: DataCenterConfig, groups: Sequence[ServerGroup]) -> list[float]:
+    """Fan power of a server of each group at the reference airflow ratio, W."""
+    s = config.servers
+    return [
+        g.fan_w
+        if g.fan_w is not None
+        else s.fan_reference_w
+        if s.fan_reference_w is not None
+        else (s.fan_reference_share or 0.0) * g.full_w
+        for g in groups
+    ]
+
+
 def evaluate(configs: Sequence[DataCenterConfig], supply_c: F64, utilisation: F64) -> Twin:
     """Temperatures and power of every server at the given supply air and load."""
     servers: list[dict[str, F64]] = []
@@ -93,10 +123,12 @@ def _rack(
     on_curve_c = np.minimum(inlet_c, np.inf if s.curve_limit_c is None else s.curve_limit_c)
     cpu = cpu_w(config, full_w, idle_w, on_curve_c, load)
     ratio = airflow_ratio(config, on_curve_c, load)
-    fan = s.fan_reference_w * (ratio / s.fan_reference_ratio) ** s.fan_power_exponent
-    assert s.fan_full_airflow_m3s is not None, "this twin derives no airflow"
-    flow = s.fan_full_airflow_m3s * ratio
-    heat = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
+    fan_w = np.repeat(reference_fan_w(config, groups), count)
+    fan = fan_w * (ratio / s.fan_reference_ratio) ** s.fan_power_exponent
+    full_m3s = [g.full_airflow_m3s or s.fan_full_airflow_m3s for g in groups]
+    assert None not in full_m3s, "this twin derives no airflow"
+    heat, base, fall = air_of(config)
+    flow = np.repeat(np.array(full_m3s, np.float64), count) * ratio * (base - fall * on_curve_c)
     power, total_flow, mean_inlet = np.sum(cpu + fan), np.sum(flow), np.mean(inlet_c)
     if s.outlet_model == "server":
         outlet_c = inlet_c + (cpu + fan) / (heat * flow)
@@ -164,8 +196,10 @@ class HallTwin:
     unit_shares: F64
     """(R, U)."""
     unit_design_m3s: F64
-    full_m3s: float
-    """Airflow of one server at ratio 1."""
+    full_m3s: F64
+    """Airflow of each server at ratio 1, as volume at its inlet, (S,)."""
+    fan_w: F64
+    """Fan power of each server at the reference ratio, (S,)."""
     air_j_per_m3_k: float
     parcel_j_per_k: float
     """Room air before each rack."""
@@ -192,15 +226,16 @@ class HallTwin:
         limit_c = np.inf if s.curve_limit_c is None else s.curve_limit_c
         on_curve_c = np.minimum(inlet_c, limit_c)
         ratio = airflow_ratio(self.config, on_curve_c, load)
-        fan = s.fan_reference_w * (ratio / s.fan_reference_ratio) ** s.fan_power_exponent
-        on = powered[self.rack]
+        fan = self.fan_w * (ratio / s.fan_reference_ratio) ** s.fan_power_exponent
+        on, (_, base, fall) = powered[self.rack], air_of(self.config)
         if draught:
             _, high = s.fan_airflow_ratio_limits or (0.0, np.inf)
             ratio = np.where(on > 0, ratio, np.clip(ratio, 1.0, high))
+        moved = ratio * (base - fall * on_curve_c)
         return (
             on * cpu_w(self.config, self.full_w, self.idle_w, on_curve_c, load),
             on * breath[self.rack] * fan,
-            (on * breath[self.rack] + (1.0 - on) * draught) * self.full_m3s * ratio,
+            (on * breath[self.rack] + (1.0 - on) * draught) * self.full_m3s * moved,
         )
 
 
@@ -286,7 +321,13 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
         weight = np.repeat([g.load_weight for g in groups], count)
         servers = len(weight)
         zones = min(hall.height_zones, servers)
-        ends = [round(servers * (z + 1) / zones) for z in range(zones)]
+        heights_u = np.repeat([g.height_u or 1.0 for g in groups], count)
+        tops = np.concatenate([[0.0], np.cumsum(heights_u)])
+        # Servers below the upper end of each zone, the last of them in part.
+        ends = [
+            round(float(np.interp(tops[-1] * (z + 1) / zones, tops, np.arange(servers + 1))))
+            for z in range(zones)
+        ]
         zone = np.array([next(z for z in range(zones) if n < ends[z]) for n in range(servers)])
         level = (2 * zone + 1) / zones - 1.0
         full_w, idle_w = (np.repeat([float(getattr(g, n)) for g in groups], count) for n in POWERS)
@@ -298,40 +339,60 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
                     idle_w,
                     weight / weight.mean() - 1.0,
                     1.0 + hall.height_gradient * level,
+                    *(
+                        np.repeat(values, count)
+                        for values in (
+                            [g.full_airflow_m3s or np.nan for g in groups],
+                            [g.design_rise_k or np.nan for g in groups],
+                            reference_fan_w(config, groups),
+                        )
+                    ),
                 ]
             )
         )
-    rack_number, full_w, idle_w, deviation, raw_height = np.concatenate(columns, axis=1)
+    rows = np.concatenate(columns, axis=1)
+    rack_number, full_w, idle_w, deviation, raw_height, given_m3s, rise_k, fan_w = rows
     rack = rack_number.astype(np.int64)
-    air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
+    air = air_of(config)[0]
     supply_c = config.hall.design_supply_c
     twin = HallTwin(
         config, rack, full_w, idle_w, deviation, raw_height, np.zeros((racks, racks)),
-        np.zeros(racks), 1.0, _supply_shares(config), np.zeros(0), 1.0, air,
+        np.zeros(racks), 1.0, _supply_shares(config), np.zeros(0), np.ones(len(rack)), fan_w, air,
         air * _air_m3(hall) / racks,
     )  # fmt: skip
     approach_k = np.broadcast_to(np.asarray(hall.supply_approach_k, np.float64), (racks,)).copy()
     load, on = np.ones(len(rack)), np.ones(racks)
 
-    def design(approach_k: F64) -> tuple[F64, F64, F64, F64, float]:
-        """Height factor (S,), and airflow, IT power, outlet rise (R,), and full airflow."""
+    def full_airflow(inlet_c: F64, approach_k: F64) -> F64:
+        """Airflow of every server at ratio 1, as volume at its inlet, (S,)."""
+        cpu, fan, ratio = twin.servers(inlet_c, load, on, on)
+        by_rise = (cpu + fan) / (air * rise_k * ratio)
+        one_for_all = np.nan if s.fan_full_airflow_m3s is None else s.fan_full_airflow_m3s
+        full = np.where(np.isnan(given_m3s), one_for_all, given_m3s)
+        full = np.where(np.isnan(rise_k), full, by_rise)
+        left = np.isnan(full)
+        if left.any():
+            crac_rise_k = 1.0 / (air * config.hvac.crac.supply_m3s_per_w)
+            back_k = np.broadcast_to(np.asarray(hall.return_approach_k, np.float64), (racks,))
+            mean_k = crac_rise_k - approach_k.mean() - back_k.mean()
+            heat = twin.per_rack(left * (cpu + fan))
+            moved = twin.per_rack(left * full_w * ratio)
+            full[left] = np.mean(heat[heat > 0] / moved[heat > 0]) / (air * mean_k) * full_w[left]
+        return full
+
+    def design(approach_k: F64) -> tuple[F64, F64, F64, F64, F64]:
+        """Height factor (S,), and airflow, IT power, outlet rise (R,), and full airflow (S,)."""
         height = raw_height
         for _ in range(60):
             inlet_c = supply_c + approach_k[rack] * height
-            ratio = twin.servers(inlet_c, load, on, on)[2]
-            mean = twin.per_rack(ratio * raw_height) / twin.per_rack(ratio)
+            flow = full_airflow(inlet_c, approach_k) * twin.servers(inlet_c, load, on, on)[2]
+            mean = twin.per_rack(flow * raw_height) / twin.per_rack(flow)
             height = raw_height / mean[rack]
         inlet_c = supply_c + approach_k[rack] * height
         cpu, fan, ratio = twin.servers(inlet_c, load, on, on)
-        it_w, moved = twin.per_rack(cpu + fan), twin.per_rack(ratio)
-        full_m3s = s.fan_full_airflow_m3s
-        if full_m3s is None:
-            crac_rise_k = 1.0 / (air * config.hvac.crac.supply_m3s_per_w)
-            back_k = np.broadcast_to(np.asarray(hall.return_approach_k, np.float64), (racks,))
-            rise_k = crac_rise_k - approach_k.mean() - back_k.mean()
-            full_m3s = float(np.mean(it_w / moved)) / (air * rise_k)
-        airflow = full_m3s * moved
-        mean_in_k = twin.per_rack(ratio * (inlet_c - supply_c)) / moved
+        full_m3s = full_airflow(inlet_c, approach_k)
+        it_w, airflow = twin.per_rack(cpu + fan), twin.per_rack(full_m3s * ratio)
+        mean_in_k = twin.per_rack(full_m3s * ratio * (inlet_c - supply_c)) / airflow
         return height, airflow, it_w, mean_in_k + it_w / (air * airflow), full_m3s
 
     if matrix is None:
@@ -357,7 +418,7 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
     for _ in range(60):
         inlet_c = supply_c + (weights @ rise)[rack] * captured
         cpu, fan, ratio = twin.servers(inlet_c, load, on, on)
-        moved = full_m3s * twin.per_rack(ratio)
+        moved = twin.per_rack(full_m3s * ratio)
         rise = twin.per_rack(full_m3s * ratio * (inlet_c - supply_c) + (cpu + fan) / air) / moved
     fresh_m3s = twin.per_rack((1.0 - captured) * full_m3s * ratio)
     need = twin.unit_shares.T @ fresh_m3s

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from sdc_taichi import DataCenterConfig, load_config
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.hall.air_properties import air_properties
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.kernels.compiler import runtime
@@ -20,7 +21,6 @@ from sdc_taichi.layout_solver.grid import MOST_CELLS, Grid, build_grid
 from sdc_taichi.layout_solver.solve import LayoutSolution, solve
 from sdc_taichi.types import F64
 
-AIR_J_PER_M3_K = 1.225 * 1006.0
 COARSE_M = 0.6
 
 
@@ -51,7 +51,7 @@ def solved(
     return solve(
         config,
         airflow_m3s=flow,
-        power_w=AIR_J_PER_M3_K * flow * rise_k,
+        power_w=air_properties(config).j_per_m3_k * flow * rise_k,
         supply_m3s=supply * float(flow.sum()),
         supply_c=20.0,
         cell_m=cell_m,

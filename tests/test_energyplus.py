@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sdc_taichi import build_fleet, load_config, make_configs
 from sdc_taichi.exogenous import psychrometrics
 from sdc_taichi.plant import chiller, tower, water
+from sdc_taichi.sim.hall_solver import Conditions, Hall
 from sdc_taichi.types import F64
 
 FOLDER = Path(
@@ -61,6 +63,78 @@ def test_humidity_ratio(path: Path) -> None:
         table["outdoor_c"], table["relative_humidity_pct"], table["pressure_pa"]
     )
     np.testing.assert_allclose(ratio, table["humidity_ratio"], rtol=5e-4)
+
+
+# Servers
+
+SERVERS = 4000
+RACKS = 100
+SERVER_W = 130.0, 10.0
+FAN_W = 10.0
+ITE = [
+    *("hall.rows=1", "hall.racks_per_row=1", f"hall.servers_per_rack={SERVERS // RACKS}"),
+    *("hall.inlet_model=approach", "hall.supply_approach_k=5.15"),
+    "hall.return_approach_k=-3.1",
+    *(f"servers.power_w={list(SERVER_W)}", f"servers.fan_reference_w={FAN_W}"),
+    *("servers.fan_reference_ratio=1", "servers.fan_power_exponent=3"),
+    *("servers.cpu_power_ratio_lb=[0.01, 1]", "servers.cpu_power_ratio_ub=[0.03, 1.02]"),
+    *("servers.fan_airflow_ratio_lb=[0.01, 0.225]", "servers.fan_airflow_ratio_ub=[0.225, 1]"),
+    *("servers.fan_airflow_ratio_limits=[0.2, 1]", "hvac.sizing.model=design_day"),
+]
+
+
+@pytest.mark.parametrize("path", tables("ite_*.csv"), ids=by_name)
+def test_servers(path: Path) -> None:
+    table = columns(path)
+    inlet_c, load = table["inlet_c"], table["utilisation"]
+    curves = load_config("corrected", ITE).servers.curves
+    ratio = curves.airflow_ratio(inlet_c, load)
+    full_w, idle_w = (np.full(len(load), w) for w in SERVER_W)
+    cpu_w = SERVERS * curves.cpu_w(inlet_c, load, full_w, idle_w)
+    np.testing.assert_allclose(cpu_w, table["cpu_w"], rtol=1e-5)
+    np.testing.assert_allclose(SERVERS * curves.fan_w(ratio, FAN_W), table["fan_w"], rtol=1e-4)
+    full_m3s = np.median(table["airflow_m3s"] / ratio)
+    np.testing.assert_allclose(full_m3s * ratio, table["airflow_m3s"], rtol=5e-5)
+
+
+def elevation_m(table: dict[str, F64]) -> float:
+    """Height above sea level of the standard atmosphere whose dry air is as dense as the table's.
+
+    Air of 2 g of water per kg is 0.3 % lighter than dry air.
+    """
+    density_kg_m3 = table["air_kg_s"] / table["airflow_m3s"]
+    pressure_pa = 1.003 * np.median(density_kg_m3 * 287.05 * (table["inlet_c"] + 273.15))
+    return float((1.0 - (pressure_pa / 101_325.0) ** (1.0 / 5.2559)) / 2.25577e-5)
+
+
+@pytest.mark.parametrize("path", tables("ite_*.csv"), ids=by_name)
+def test_outlets_of_servers(path: Path, tmp_path: Path) -> None:
+    """All rows at once, as copies of one rack at a site as high as that of the table."""
+    table = columns(path)
+    weather = tmp_path / "site.epw"
+    weather.write_text(f"LOCATION,Site,-,-,-,0,0.0,0.0,0.0,{elevation_m(table):.1f}\n")
+    ratio = load_config("corrected", ITE).servers.curves.airflow_ratio(
+        table["inlet_c"], table["utilisation"]
+    )
+    full_m3s = np.median(table["airflow_m3s"] / ratio) / SERVERS
+    approach_k = np.median(table["inlet_c"] - table["supply_c"])
+    own = [
+        f"servers.fan_full_airflow_m3s={full_m3s:.12g}",
+        f"hall.supply_approach_k={approach_k:.12g}",
+        f"site.weather_file={weather}",
+    ]
+    fleet = build_fleet(make_configs(load_config("corrected", [*ITE, *own]), count=len(ratio)))
+    met = Conditions(table["inlet_c"] - approach_k, table["utilisation"])
+    sums = Hall(fleet, "f64").solve(met)
+    np.testing.assert_allclose(RACKS * sums.cpu_w, table["cpu_w"], rtol=1e-5)
+    np.testing.assert_allclose(RACKS * sums.it_fan_w, table["fan_w"], rtol=1e-4)
+    at_inlet_m3s = RACKS * sums.it_airflow_m3s * (table["inlet_c"] + 273.15) / 293.15
+    np.testing.assert_allclose(at_inlet_m3s, table["airflow_m3s"], rtol=1e-3)
+    apart_k = sums.rack_outlet_c - table["outlet_c"]
+    assert np.abs(apart_k).max() < 0.1
+    if path.stem == "ite_chicago":
+        # O'Hare is 201.8 m high.
+        assert elevation_m(table) == pytest.approx(201.8, abs=5.0)
 
 
 # Tower

@@ -19,6 +19,7 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.config import apply_overrides, config_from_dict
+from sdc_taichi.exogenous import standard_pressure_pa
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS, GROUP_INPUTS
 from sdc_taichi.plant.water_side import WaterSideDesign
@@ -90,7 +91,8 @@ def test_parameters_of_each_data_center_reach_the_kernel() -> None:
     assert row["fan_exponent"].tolist() == [3.0, 2.5]
     assert row["fan_reference_w"].tolist() == [10.0, 7.0]
     assert row["fan_full_m3s"].tolist() == [0.0212, 0.04]
-    np.testing.assert_allclose(row["air_j_per_m3_k"], [1.225 * 1006, 1.1 * 1006])
+    rho = float(standard_pressure_pa(3.4)) / (287.05 * 293.15)
+    np.testing.assert_allclose(row["air_j_per_m3_k"], [rho * 1006, 1.1 * 1006])
 
 
 def test_values_of_a_field() -> None:
@@ -185,7 +187,7 @@ def test_sums_of_a_ragged_fleet() -> None:
 
 
 def test_approach_temperatures_are_those_that_the_hall_has(tmp_path: Path) -> None:
-    np.savez(tmp_path / "r.npz", R=np.full((20, 20), 0.012))
+    np.savez(tmp_path / "r.npz", R=np.full((20, 20), 0.01))
     matrix = [f"hall.recirculation.matrix_file={tmp_path / 'r.npz'}",
               "hall.recirculation.calibrate=false"]  # fmt: skip
     for changes in ([], ["hall.layout.containment=0.6", "hvac.crac.units=2"], matrix):

@@ -52,7 +52,7 @@ def test_report_and_file_agree(tmp_path: Path) -> None:
     assert list(out.parent.iterdir()) == [out]
 
     design = design_point(load_config("corrected"))
-    rise_k = design.it_w / (1.225 * 1006 * design.airflow_m3s)
+    rise_k = design.it_w / (design.air_j_per_m3_k * design.airflow_m3s)
     inlet_k = np.array(report["approach_k"])
     np.testing.assert_allclose(inlet_k, R @ (inlet_k + rise_k), rtol=1e-9)
     rows = inlet_k.reshape(4, 5)

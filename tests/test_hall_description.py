@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from sdc_taichi import DataCenterConfig, SdcError, load_config
 from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.cli.hall_text import LISTED_ROWS, describe_hall
+from sdc_taichi.hall.air_properties import air_properties
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.sim.design_hall import (
     EXACT_RADIUS_RACKS,
@@ -34,9 +35,8 @@ def corrected() -> DesignHall:
 
 def heat_closes(found: DesignHall) -> None:
     assert found.air is not None
-    hall = found.config.hall
-    air = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
-    carried_w = air * found.unit_m3s.sum() * (found.air.return_c - found.supply_c)
+    air = air_properties(found.config)
+    carried_w = air.j_per_m3_k * found.unit_m3s.sum() * (found.air.return_c - found.supply_c)
     assert carried_w == pytest.approx(found.it_w.sum(), rel=1e-10)
 
 
@@ -52,10 +52,14 @@ def test_the_papers_hall_comes_out(corrected: DesignHall) -> None:
     # Racks alike: shares, bypass and RTI have a closed form.
     alike = solve_design_hall(load_config("corrected", WIDE)).air
     assert alike is not None
-    np.testing.assert_allclose(alike.exhaust_share, 0.29548, atol=1e-5)
-    assert alike.bypass_share == pytest.approx(0.17786, abs=1e-5)
-    assert alike.rti_pct == pytest.approx(116.695, abs=1e-3)
-    assert alike.shi == pytest.approx(0.29548, abs=1e-5)
+    crac_rise_k = 1.0 / (air_properties(config).j_per_m3_k * 5.663e-5)
+    rise_k = crac_rise_k - 5.15 + 3.10
+    assert rise_k == pytest.approx(12.53, abs=0.01)
+    share, ratio = 5.15 / (5.15 + rise_k), crac_rise_k / rise_k
+    np.testing.assert_allclose(alike.exhaust_share, share, rtol=1e-9)
+    assert alike.bypass_share == pytest.approx(1.0 - (1.0 - share) * ratio, abs=1e-9)
+    assert alike.rti_pct == pytest.approx(100.0 * ratio, abs=1e-6)
+    assert alike.shi == pytest.approx(share, abs=1e-9)
 
 
 def test_spectral_radius_is_that_of_the_matrix(corrected: DesignHall) -> None:

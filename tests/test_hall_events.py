@@ -25,6 +25,7 @@ from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
 from sdc_taichi.run.metrics import add_step, empty_totals, metrics_of_fleet, metrics_per_dc
 from sdc_taichi.sim.events import seeds_of_fleet
 from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 from test_transients import assert_same, part_of, run
 
@@ -84,7 +85,7 @@ def test_a_unit_that_is_down_coasts_and_warms_the_hall() -> None:
     room = column(down, "room_heat_kwh")
     assert np.all(np.diff(room[3:8]) > 0)
     assert np.all(column(down, "unmet_w")[4:8] > 0)
-    assert room[-1] == 0
+    assert room[-1] == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose(warmer[-1], 0, atol=1e-9)
 
 
@@ -134,7 +135,9 @@ def test_fan_speed_is_a_control_of_its_own() -> None:
     np.testing.assert_allclose(column(results, "crac_fan_w"), expected, rtol=1e-12)
     assert np.all(np.diff(column(results, "inlet_mean_c")[:5]) >= 0)
     assert np.ptp(column(results, "inlet_mean_c")) > 0.5
-    rise_k = column(results, "it_w") / (1225 * 1.006 * column(results, "crac_flow_m3s"))
+    rise_k = column(results, "it_w") / (
+        air_j_per_m3_k(sim.fleet) * column(results, "crac_flow_m3s")
+    )
     np.testing.assert_allclose(column(results, "return_c") - 18.0, rise_k, rtol=1e-10)
 
 
@@ -201,7 +204,7 @@ def test_a_hardier_class_keeps_running() -> None:
     throttled, unmet = {}, {}
     for name in ("A1", "A2", "A3", "A4", "null"):
         results = simulate(
-            [f"protection.ashrae_class={name}", "hvac.crac.units=2",
+            [f"protection.ashrae_class={name}", "hvac.crac.units=2", "hvac.setpoint.initial_c=19",
              "simulation.thermal=transient", "workload.queue_limit_h=0.01",
              events("kind: crac_down, unit: 0, start_h: 1, duration_h: 3")],
             20,
@@ -279,7 +282,7 @@ def test_the_heat_of_tripped_servers_goes_to_the_room() -> None:
     np.testing.assert_allclose(column(results, "it_w")[off] - stored_w[off], load_w[off], rtol=1e-9)
     # Inlets neither fall to where racks would restart nor pass the servers.
     inlet_c = column(results, "inlet_mean_c")[off]
-    assert np.all((inlet_c > 29) & (inlet_c < column(results, "outlet_mean_c")[off]))
+    assert np.all((inlet_c > 27) & (inlet_c < column(results, "outlet_mean_c")[off]))
 
 
 @pytest.mark.parametrize(("thermal", "per_hour"), [("quasi_steady", 4), ("transient", 60)])

@@ -53,6 +53,9 @@ def random_rack(rng: np.random.Generator) -> list[dict[str, float]]:
                 "inlet_offset_k": float(rng.uniform(-0.5, 1.5)),
             }
         )
+        if rng.integers(2):
+            groups[-1] |= {"full_airflow_m3s": float(rng.uniform(0.02, 0.2))}
+            groups[-1] |= {"fan_w": float(rng.uniform(0, 40))}
     return groups
 
 
@@ -70,7 +73,8 @@ def random_config(
     racks = hall["rows"] * hall["racks_per_row"]
     hall["supply_approach_k"] = rng.uniform(1, 7, racks).tolist()
     hall["return_approach_k"] = rng.uniform(-5, 0, racks).tolist()
-    hall["air_density_kg_m3"] = float(rng.uniform(1.0, 1.25))
+    hall["air_density_kg_m3"] = float(rng.uniform(1.0, 1.25)) if rng.integers(2) else None
+    values["site"]["location"] = str(rng.choice(["NY", "AZ", "GA"]))
     servers["outlet_model"], servers["fan_power_exponent"] = outlet_model, exponent
     servers["fan_reference_ratio"] = float(rng.uniform(0.5, 1.5))
     servers["fan_full_airflow_m3s"] = float(rng.uniform(0.02, 0.06))
@@ -229,7 +233,8 @@ def test_load_weights_conserve_the_work_of_a_rack(seed: int, load: float) -> Non
         "cpu_power_ratio_ub": [0.0, 1.0],
         "fan_reference_w": 0.0,
         "groups": [
-            [{**g, "full_w": 100.0, "idle_w": 0.0} for g in random_rack(rng)] for _ in range(4)
+            [{**g, "full_w": 100.0, "idle_w": 0.0, "fan_w": None} for g in random_rack(rng)]
+            for _ in range(4)
         ],
     }
     config = config_from_dict(values)

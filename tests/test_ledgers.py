@@ -24,6 +24,7 @@ from sdc_taichi import (
 from sdc_taichi.exogenous import site_names
 from sdc_taichi.run.metrics import metrics_of_fleet
 from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 
 MONTHS = tuple(f"{month:02d}-01" for month in range(1, 13))
@@ -89,7 +90,9 @@ def record(
     load, battery = (held(rng, steps, size, lambda n: rng.uniform(-1, 1, n).round(1)) for _ in "ab")
     cooling = rng.integers(-1, 2, (steps, size)).astype(np.float64)
     values: dict[str, F64] = {}
-    twins = [reference_twin.calibrated(configs[0])] * size if watch_flows_every else []
+    # Halls of a site are alike.
+    of_site = {config.site.location: config for config in configs if watch_flows_every}
+    twins = [reference_twin.calibrated(of_site[c.site.location]) for c in configs if of_site]
     flows = []
     with Simulator(configs, precision=precision, drivers=drivers) as sim:
         state = sim.reset()
@@ -103,8 +106,9 @@ def record(
                 if t == 0:
                     values[name] = np.empty((steps, size))
                 values[name][t] = value
+    air = air_j_per_m3_k(sim.fleet)
     counts_losses = configs[0].electrical.losses == "counted"
-    return Run(values, start, sim.fleet.values, sim.step_h, counts_losses, np.array(flows))
+    return Run(values, start, sim.fleet.values, air, sim.step_h, counts_losses, np.array(flows))
 
 
 def sites_and_seasons(

@@ -33,9 +33,9 @@ def heat_matrix(matrix: F64, overrides: list[str], scaled: bool, folder: Path) -
     given = [f"hall.recirculation.matrix_file={json.dumps(str(path))}",
              f"hall.recirculation.calibrate={str(scaled).lower()}"]  # fmt: skip
     config = load_config("corrected", [*overrides, *given])
-    per_k = config.hall.air_density_kg_m3 * config.hall.air_heat_capacity_j_per_kg_k
-    airflow_m3s = calibrate(config).design.airflow_m3s
-    return np.asarray(matrix @ np.linalg.inv(np.eye(len(matrix)) - matrix) / (per_k * airflow_m3s))
+    design = calibrate(config).design
+    w_per_k = design.air_j_per_m3_k * design.airflow_m3s
+    return np.asarray(matrix @ np.linalg.inv(np.eye(len(matrix)) - matrix) / w_per_k)
 
 
 @pytest.mark.parametrize("kind", ["R.npz", "D.npz", "R.csv", "D.csv"])

@@ -6,7 +6,19 @@ import numpy as np
 import pytest
 
 from sdc_taichi import Simulator, drivers_from_arrays, load_config
+from sdc_taichi.plant.air import CONSTANT, EXACT_AT_C, OF_IDEAL_GAS, density_kg_m3
 from sdc_taichi.plant.servers import linear_curve
+
+
+def test_density_of_air() -> None:
+    assert density_kg_m3(101_325.0, 20.0) == pytest.approx(1.2041, abs=1e-4)
+    ideal = {t: 293.15 / (t + 273.15) for t in (10.0, 15.0, *EXACT_AT_C, 25.0, 35.0, 45.0)}
+    error = {t: float(OF_IDEAL_GAS.at(np.array(t))) / ratio - 1.0 for t, ratio in ideal.items()}
+    assert [error[t] for t in EXACT_AT_C] == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert max(abs(error[t]) for t in (15.0, 25.0, 35.0)) < 6e-4
+    assert abs(error[10.0]) < 2e-3
+    assert abs(error[45.0]) < 4e-3
+    assert CONSTANT.at(np.array([-40.0, 60.0])).tolist() == [1.0, 1.0]
 
 
 def test_curve_coefficients_by_hand() -> None:
@@ -36,7 +48,7 @@ def test_fans_never_blow_backwards_and_curves_end_at_the_limit() -> None:
     assert curves.airflow_ratio(beyond, idle) == curves.airflow_ratio(at_limit, idle)
     watts = np.array([150.0]), np.array([10.0])
     assert curves.cpu_w(beyond, idle, *watts) == curves.cpu_w(at_limit, idle, *watts)
-    assert curves.fan_w(np.array([0.5])) == pytest.approx(10.0 * 0.5**3)
+    assert curves.fan_w(np.array([0.5]), 10.0) == pytest.approx(10.0 * 0.5**3)
 
 
 @pytest.mark.parametrize(
@@ -60,6 +72,7 @@ def test_kernel_computes_the_same_curves(changes: list[str]) -> None:
     inlet_c = result.rack_inlet_c[racks].astype(np.float64)
     ratio = curves.airflow_ratio(inlet_c, load)
     cpu_w = curves.cpu_w(inlet_c, load, full_w, idle_w)
-    np.testing.assert_allclose(result.rack_airflow_m3s[racks], 3 * 0.0212 * ratio, rtol=1e-12)
+    moved = curves.moved_ratio(ratio, inlet_c, OF_IDEAL_GAS)
+    np.testing.assert_allclose(result.rack_airflow_m3s[racks], 3 * 0.0212 * moved, rtol=1e-12)
     np.testing.assert_allclose(result.rack_cpu_w[racks], 3 * cpu_w, rtol=1e-12)
-    np.testing.assert_allclose(result.rack_fan_w[racks], 3 * curves.fan_w(ratio), rtol=1e-12)
+    np.testing.assert_allclose(result.rack_fan_w[racks], 3 * curves.fan_w(ratio, 10.0), rtol=1e-12)

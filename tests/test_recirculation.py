@@ -206,8 +206,9 @@ def test_any_design_point_comes_out(seed: int) -> None:
     sums = at_design([config.model_copy(update={"hall": hall})])
     found = sums.rack_inlet_c - config.hall.design_supply_c
     np.testing.assert_allclose(found, hall.supply_approach_k, rtol=0, atol=1e-9)
-    mean_return_k = sums.return_c[0] - np.mean(sums.rack_outlet_c)
-    assert mean_return_k == pytest.approx(np.mean(hall.return_approach_k), abs=1e-9)
+    if all(g.design_rise_k is None for rack in config.rack_groups() for g in rack):
+        mean_return_k = sums.return_c[0] - np.mean(sums.rack_outlet_c)
+        assert mean_return_k == pytest.approx(np.mean(hall.return_approach_k), abs=1e-9)
 
 
 def test_containment_takes_its_share_of_the_paths() -> None:
@@ -289,7 +290,7 @@ def test_racks_with_failing_fans_give_no_more_heat_than_they_have(
     if len(failed) == 1:
         # Most of what it gives off goes back to the units and not to its neighbours.
         others = np.delete(sums.rack_inlet_c - before.rack_inlet_c, failed)
-        assert np.all(np.abs(others) < 0.6)
+        assert np.all(np.abs(others) < 0.8)
 
 
 @settings(phases=AS_FOUND, max_examples=15)

@@ -744,6 +744,7 @@ def even_hall(given: dict[str, Any]) -> DataCenterConfig:
         "hall.return_approach_k": given.get("d", [-3.7] * 5 + [-2.5] * 10 + [-3.7] * 5),
         "hall.recirculation.decay_m": given.get("lambda_m", 3.0),
         "hall.layout.rack_height_m": given.get("H_rack", 2.1),
+        "hall.air_density_kg_m3": 1.225,
         "hvac.crac.supply_m3s_per_w": given.get("V_crac_per_W", 5.663e-5),
     }
     return load_config(

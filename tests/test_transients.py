@@ -41,6 +41,7 @@ from sdc_taichi.config import apply_overrides
 from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallState, HallSums, Precision
+from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -479,13 +480,13 @@ def test_server_layers_are_those_of_the_end_of_the_step() -> None:
             if before is not None:
                 layers = sim.servers()
                 # Power leaves the servers later than it enters them.
-                air = 1.225 * 1006.0
+                air = float(air_j_per_m3_k(sim.fleet)[0])
                 warming = layers.outlet_c - layers.inlet_c
                 share = air * result.rack_airflow_m3s.sum() * np.mean(warming) / result.it_w[0]
                 assert share < 0.9
         layers = sim.servers()
         warming = layers.outlet_c - layers.inlet_c
-        flow = layers.power_w / (1.225 * 1006.0 * warming)
+        flow = layers.power_w / (air_j_per_m3_k(sim.fleet)[0] * warming)
         moved = np.bincount(rack, flow)
         np.testing.assert_allclose(moved, result.rack_airflow_m3s, rtol=1e-6)
         for name in ("inlet_c", "outlet_c"):

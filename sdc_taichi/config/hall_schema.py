@@ -35,6 +35,10 @@ RackCount = Annotated[int, Field(ge=1, le=MOST_RACKS)]
 """A number of rows or racks, 1..10,000,000."""
 PowerPair = tuple[ServerW, IdleW]
 """CPU power of a server at full load and idle, in W."""
+FullAirflow = Annotated[float, Field(ge=1e-4, le=100)]
+"""Airflow of a server at full speed, in m3/s, 1e-4..100."""
+DesignRiseK = Annotated[float, Field(ge=2, le=40)]
+"""Temperature rise of the air through a server at the design point, in K, 2..40."""
 RackLength = Annotated[float, Field(ge=0.1, le=5)]
 """A measure of a rack, in m, 0.1..5; racks are 0.6 m wide, 1.2 m deep and 2.1 m high or near."""
 
@@ -145,9 +149,10 @@ class HallConfig(Section):
     room_heat_capacity_kj_per_k_per_server: Annotated[float, Field(ge=0.01, le=1e5)] = 2.0
     """Heat capacity of room, coils and all else that follows the supply air, in kJ/K per server,
     0.01..1e5: from 10 l of air to 100 t of concrete."""
-    air_density_kg_m3: Annotated[float, Field(ge=0.4, le=1.6)] = 1.225
-    """Density of the air, in kg/m3, 0.4..1.6: from the summit of Mount Everest to sea level at
-    -50 C."""
+    air_density_kg_m3: Annotated[float, Field(ge=0.4, le=1.6)] | None = None
+    """Density of the air at all temperatures, in kg/m3, 0.4..1.6: from the summit of Mount Everest
+    to sea level at -50 C; None lets it follow from the height of the site above sea level and the
+    temperature of the air."""
     air_heat_capacity_j_per_kg_k: Annotated[float, Field(ge=990, le=1200)] = 1006.0
     """Specific heat capacity of the air, in J/(kg K), 990..1,200: from dry air to air of 100 g of
     water per kg."""
@@ -206,11 +211,27 @@ class ServerGroup(Section):
     that mean."""
     inlet_offset_k: DifferenceK = 0.0
     """Inlet of a server above the inlet of its rack, by its height in the rack, in K."""
+    full_airflow_m3s: FullAirflow | None = None
+    """Airflow through one server at airflow ratio 1, in m3/s, 1e-4..100: from the fan of a laptop
+    to ten racks in one; None is that of ``servers.fan_full_airflow_m3s``."""
+    design_rise_k: DesignRiseK | None = None
+    """Temperature rise of the air through the server at the design point, in K, 2..40, in place of
+    ``full_airflow_m3s``: less takes a storm, and more no server bears."""
+    fan_w: IdleW | None = None
+    """Fan power of one server at ``servers.fan_reference_ratio``, in W; None is by ``servers``."""
+    height_u: Annotated[float, Field(ge=0.1, le=58)] | None = None
+    """Height of one server in units of 44.45 mm, 0.1..58: from a card in a chassis to the tallest
+    racks; None is as high as a server of one unit."""
 
     @model_validator(mode="after")
-    def _idle_below_full(self) -> Self:
+    def _fits_together(self) -> Self:
         if self.idle_w > self.full_w:
             raise ValueError(f"idle_w {self.idle_w:g} must not exceed full_w {self.full_w:g}")
+        if self.full_airflow_m3s is not None and self.design_rise_k is not None:
+            raise ValueError(
+                "full_airflow_m3s and design_rise_k are both given; valid is one, null for the "
+                "other"
+            )
         return self
 
 
@@ -252,15 +273,19 @@ class ServerConfig(Section):
     backwards."""
     fan_power_exponent: Annotated[float, Field(ge=1, le=3)] = 3.0
     """Exponent of fan power over the airflow ratio, 1..3."""
-    fan_full_airflow_m3s: Annotated[float, Field(ge=1e-4, le=100)] | None = 0.051
+    fan_full_airflow_m3s: FullAirflow | None = 0.051
     """Airflow through one server at airflow ratio 1, in m3/s, 1e-4..100: from the fan of a laptop
-    to ten racks in one; None takes the airflow on which the supply and return approach temperatures
-    close at the design point."""
+    to ten racks in one; None is in proportion to the power of a server, as much as the supply and
+    return approach temperatures close on at the design point."""
     fan_reference_ratio: Annotated[float, Field(ge=0.01, le=10)] = 1.0
     """Airflow ratio at which the fans of a server draw ``fan_reference_w``, 0.01..10: from fans
     that hardly turn to ten times full airflow."""
-    fan_reference_w: IdleW = 10.0
-    """Fan power of one server at the reference airflow ratio, in W."""
+    fan_reference_w: IdleW | None = 10.0
+    """Fan power of one server at the reference airflow ratio, in W; None is in proportion to its
+    power, by ``fan_reference_share``."""
+    fan_reference_share: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Fan power of a server at the reference airflow ratio over its CPU power at full load, 0..1,
+    in place of ``fan_reference_w``: at 1, fans draw as much as all that they cool."""
     outlet_model: Literal["server", "rack", "released"] = "server"
     """Outlet temperature from a heat balance per server, from one per rack, or from the fit of the
     released SustainDC."""
@@ -303,7 +328,6 @@ class ServerConfig(Section):
             fan_high=fan_high,
             fan_reference_ratio=self.fan_reference_ratio,
             fan_exponent=self.fan_power_exponent,
-            fan_reference_w=self.fan_reference_w,
             curve_limit_c=np.inf if self.curve_limit_c is None else self.curve_limit_c,
         )
 
@@ -335,6 +359,12 @@ class ServerConfig(Section):
     def _idle_below_full(self) -> Self:
         if self.power_w is not None and self.groups is not None:
             raise ValueError("power_w and groups are both given; valid is one, null for the other")
+        if (self.fan_reference_w is None) == (self.fan_reference_share is None):
+            given = "neither" if self.fan_reference_w is None else "both"
+            raise ValueError(
+                f"fan_reference_w and fan_reference_share: {given} given; valid is one, null for "
+                "the other"
+            )
         for rack, (full_w, idle_w) in enumerate(self.power_pairs):
             if idle_w > full_w:
                 raise ValueError(

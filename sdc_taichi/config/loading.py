@@ -23,6 +23,8 @@ from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 
 DEFAULT_PRESET = "corrected"
 """Preset that is read where none is named."""
+_EITHER_OF_SERVERS = (("groups", "power_w"), ("fan_reference_w", "fan_reference_share"))
+"""Fields of ``servers`` of which one is given, and the other null."""
 
 
 def preset_names() -> list[str]:
@@ -164,10 +166,11 @@ def _with_base(label: str, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _replace_other_servers(servers: dict[str, Any], given: Mapping[str, Any]) -> None:
-    """Let groups take the place of inherited power pairs, and the other way round."""
-    for new, old in (("groups", "power_w"), ("power_w", "groups")):
-        if given.get(new) is not None and old not in given:
-            servers[old] = None
+    """Let groups take the place of inherited power pairs and so on, and the other way round."""
+    for one, other in _EITHER_OF_SERVERS:
+        for new, old in ((one, other), (other, one)):
+            if given.get(new) is not None and old not in given:
+                servers[old] = None
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.rack_servers import RackServers, rack_servers
-from sdc_taichi.plant.servers import ServerCurves
 from sdc_taichi.types import F64
 
 _MOST_HEIGHT_ITERATIONS = 100
@@ -21,15 +20,19 @@ class DesignPoint:
 
     supply_c: float
     """Supply air, in C."""
-    fan_full_airflow_m3s: float
-    """Airflow of one server at an airflow ratio of 1, in m3/s: as configured, or else such that the
-    approach temperatures close the heat balance of the hall."""
+    full_airflow_m3s: F64
+    """Airflow of one server of each group at an airflow ratio of 1, as volume at its inlet, in
+    m3/s, (G,): as configured, or else such that the approach temperatures close the heat balance of
+    the hall."""
+    air_j_per_m3_k: float
+    """Heat capacity of the air by volume at the reference temperature, rho cp, in J/(m3 K)."""
     crac_flow_m3s: float
     """Airflow of all CRAC units together, in m3/s."""
     it_w: F64
     """IT power of each rack, fans included, in W, (R,)."""
     airflow_m3s: F64
-    """Airflow through the servers of each rack, in m3/s, (R,)."""
+    """Airflow through the servers of each rack, as volume at the reference temperature of
+    ``plant.air``, in m3/s, (R,)."""
     approach_k: F64
     """Airflow-weighted mean inlet of each rack over supply air, in K, (R,)."""
     outlet_rise_k: F64
@@ -60,8 +63,7 @@ def design_point(
     group_approach_k = servers.per_group(approach_k)
     height_factor = np.ones(len(servers.count))
     if config.hall.inlet_model == "recirculation":
-        curves = config.servers.curves
-        height_factor = _height_factor(servers, curves, supply_c, group_approach_k)
+        height_factor = _height_factor(config, servers, approach_k)
     inlet_c = _inlet_c(servers, supply_c, group_approach_k, height_factor)
     return design_point_at(config, servers, inlet_c, height_factor, approach_k=approach_k)
 
@@ -73,7 +75,7 @@ def design_point_at(
     height_factor: F64,
     *,
     approach_k: F64 | None = None,
-    fan_full_airflow_m3s: float | None = None,
+    full_airflow_m3s: F64 | None = None,
 ) -> DesignPoint:
     """Power, airflow and temperatures at full load with given inlets.
 
@@ -84,29 +86,28 @@ def design_point_at(
         height_factor: Height factors of the groups, dimensionless, (G,).
         approach_k: Inlet over supply air, K, (R,), that the airflow of the servers follows from
             unless it is given.
-        fan_full_airflow_m3s: Airflow of one server at an airflow ratio of 1, m3/s; None is as
-            configured, or else as follows from ``approach_k``.
+        full_airflow_m3s: Airflow of one server of each group at an airflow ratio of 1, m3/s, (G,);
+            None is as configured, or else as follows from ``approach_k``.
 
     Raises:
         ConfigError: approach temperatures that leave no room for heating the air.
     """
-    hall, curves, supply_c = config.hall, config.servers.curves, config.hall.design_supply_c
-    full_load = np.ones(len(servers.count))
-    ratio = curves.airflow_ratio(inlet_c, full_load)
-    cpu_w = curves.cpu_w(inlet_c, full_load, servers.full_w, servers.idle_w)
-    it_w = servers.per_rack(servers.count * (cpu_w + curves.fan_w(ratio)))
-    rack_ratio = servers.per_rack(servers.count * ratio)
-    air_j_per_m3_k = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
-    full_m3s = fan_full_airflow_m3s or config.servers.fan_full_airflow_m3s
-    if full_m3s is None:
+    supply_c, air_j_per_m3_k = config.hall.design_supply_c, servers.air.j_per_m3_k
+    if full_airflow_m3s is None:
         given_k = config.hall.rack_approach_k() if approach_k is None else approach_k
-        rise_k = _server_rise_k(config, given_k, air_j_per_m3_k)
-        full_m3s = float(np.mean(it_w / (air_j_per_m3_k * rack_ratio)) / rise_k)
-    airflow_m3s = full_m3s * rack_ratio
-    inlet_rise_k = servers.per_rack(servers.count * ratio * (inlet_c - supply_c)) / rack_ratio
+        full_airflow_m3s = _full_airflow_m3s(config, servers, inlet_c, given_k)
+    server_w, moved = _at_full_load(config, servers, inlet_c)
+    it_w = servers.per_rack(servers.count * server_w)
+    most_m3s = float(full_airflow_m3s.max())
+    # Servers that are alike have a share of 1, which keeps the digits of their sums.
+    moved = servers.count * (full_airflow_m3s / most_m3s) * moved
+    rack_moved = servers.per_rack(moved)
+    airflow_m3s = most_m3s * rack_moved
+    inlet_rise_k = servers.per_rack(moved * (inlet_c - supply_c)) / rack_moved
     return DesignPoint(
         supply_c=supply_c,
-        fan_full_airflow_m3s=full_m3s,
+        full_airflow_m3s=full_airflow_m3s,
+        air_j_per_m3_k=air_j_per_m3_k,
         crac_flow_m3s=config.hvac.crac.supply_m3s_per_w * float(it_w.sum()),
         it_w=it_w,
         airflow_m3s=airflow_m3s,
@@ -121,19 +122,30 @@ def _inlet_c(servers: RackServers, supply_c: float, approach_k: F64, height_fact
     return np.asarray(supply_c + approach_k * height_factor + servers.inlet_offset_k)
 
 
-def _height_factor(
-    servers: RackServers, curves: ServerCurves, supply_c: float, approach_k: F64
-) -> F64:
+def _at_full_load(config: DataCenterConfig, servers: RackServers, inlet_c: F64) -> tuple[F64, F64]:
+    """Power of a server of each group with its fans, in W, and its airflow over full airflow, (G,).
+
+    The airflow is the volume at the reference temperature over the volume at the inlet.
+    """
+    curves, full_load = config.servers.curves, np.ones(len(servers.count))
+    ratio = curves.airflow_ratio(inlet_c, full_load)
+    cpu_w = curves.cpu_w(inlet_c, full_load, servers.full_w, servers.idle_w)
+    server_w = cpu_w + curves.fan_w(ratio, servers.fan_reference_w)
+    return server_w, curves.moved_ratio(ratio, inlet_c, servers.air.density_ratio)
+
+
+def _height_factor(config: DataCenterConfig, servers: RackServers, approach_k: F64) -> F64:
     """Height factors of the groups, scaled to average 1 over the airflow of each rack, (G,).
 
     Airflow depends on the inlet, which depends on the factors that airflow weights: the fixed point
     is found by repeated substitution.
     """
-    full_load = np.ones(len(servers.count))
+    supply_c, group_approach_k = config.hall.design_supply_c, servers.per_group(approach_k)
     factor = np.ones(len(servers.count))
     for _ in range(_MOST_HEIGHT_ITERATIONS):
-        inlet_c = _inlet_c(servers, supply_c, approach_k, factor)
-        airflow = servers.count * curves.airflow_ratio(inlet_c, full_load)
+        inlet_c = _inlet_c(servers, supply_c, group_approach_k, factor)
+        full_m3s = _full_airflow_m3s(config, servers, inlet_c, approach_k)
+        airflow = servers.count * full_m3s * _at_full_load(config, servers, inlet_c)[1]
         mean = servers.per_rack(airflow * servers.height_factor) / servers.per_rack(airflow)
         before, factor = factor, servers.height_factor / servers.per_group(mean)
         if np.max(np.abs(factor - before)) < 1e-15:
@@ -141,8 +153,34 @@ def _height_factor(
     return factor
 
 
+def _full_airflow_m3s(
+    config: DataCenterConfig, servers: RackServers, inlet_c: F64, approach_k: F64
+) -> F64:
+    """Airflow of a server of each group at an airflow ratio of 1, in m3/s, (G,).
+
+    As configured, or by the design rise of the group. Servers for which neither is given move air
+    in proportion to their power, by as much as leaves the mean rise of their racks that the
+    approach temperatures close on.
+    """
+    full_m3s = servers.full_airflow_m3s
+    if not np.isnan(full_m3s).any():
+        return full_m3s
+    server_w, moved = _at_full_load(config, servers, inlet_c)
+    per_rise_m3s = server_w / (servers.air.j_per_m3_k * moved)
+    full_m3s = np.where(np.isnan(full_m3s), per_rise_m3s / servers.design_rise_k, full_m3s)
+    open_count = servers.count * np.isnan(full_m3s)
+    if open_count.any():
+        heat_w = servers.per_rack(open_count * server_w)
+        w_moved = servers.per_rack(open_count * servers.full_w * moved)
+        racks = w_moved > 0
+        rise_k = _server_rise_k(config, approach_k, servers.air.j_per_m3_k)
+        m3s_per_w = np.mean(heat_w[racks] / (servers.air.j_per_m3_k * w_moved[racks])) / rise_k
+        full_m3s = np.where(open_count > 0, m3s_per_w * servers.full_w, full_m3s)
+    return np.asarray(full_m3s)
+
+
 def _server_rise_k(config: DataCenterConfig, approach_k: F64, air_j_per_m3_k: float) -> float:
-    """Mean temperature rise through the servers that the approach temperatures leave, in K."""
+    """Mean temperature rise through the racks that the approach temperatures leave, in K."""
     crac_rise_k = 1.0 / (air_j_per_m3_k * config.hvac.crac.supply_m3s_per_w)
     supply_k = np.mean(approach_k)
     return_k = np.mean(np.asarray(config.hall.return_approach_k))

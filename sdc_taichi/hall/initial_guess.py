@@ -18,6 +18,7 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.hall.mix_weights import DENSE_RACKS
 from sdc_taichi.hall.rack_servers import RackServers
 from sdc_taichi.hall.recirculation import Recirculation
+from sdc_taichi.plant.air import DensityRatio
 from sdc_taichi.plant.servers import ServerCurves
 from sdc_taichi.types import F32, F64, I32
 
@@ -91,7 +92,7 @@ def initial_guess(
     supply_c = _table_supplies_c(config)
     dense = config.hall.racks <= DENSE_RACKS
     part = (_whole_hall if dense else _sampled_racks)(servers, recirculation)
-    states = _steady_states(config, part, recirculation, supply_c)
+    states = _steady_states(config, servers, part, recirculation, supply_c)
     if dense:
         patterns, shares = _strongest_patterns(states.mix_k[:, :-1])
     else:
@@ -121,8 +122,8 @@ class _HallPart(NamedTuple):
     group_offsets: I32
     """First server group of each rack, (R + 1,)."""
     columns: F64
-    """Rows count, full power, idle power, load deviation and exhaust share of the server groups,
-    (5, G)."""
+    """Rows count, full power, idle power, load deviation, full airflow over that of the largest
+    server, fan power at the reference ratio and exhaust share of the server groups, (7, G)."""
     weights: F64
     """Weights of the exhaust mix, (R, R)."""
     design_mix_k: F64
@@ -155,29 +156,36 @@ def _sampled_racks(servers: RackServers, recirculation: Recirculation) -> _HallP
 
 
 def _columns(servers: RackServers, recirculation: Recirculation) -> F64:
-    """Values of the server groups that the steady states need, see ``_HallPart``, (5, G)."""
+    """Values of the server groups that the steady states need, see ``_HallPart``, (7, G)."""
+    full_m3s = recirculation.design.full_airflow_m3s
     return np.stack(
         [
             servers.count,
             servers.full_w,
             servers.idle_w,
             servers.load_deviation,
+            full_m3s / full_m3s.max(),
+            servers.fan_reference_w,
             recirculation.group_exhaust_share,
         ]
     )
 
 
 def _steady_states(
-    config: DataCenterConfig, part: _HallPart, recirculation: Recirculation, supply_c: F64
+    config: DataCenterConfig,
+    servers: RackServers,
+    part: _HallPart,
+    recirculation: Recirculation,
+    supply_c: F64,
 ) -> _SteadyStates:
     """Steady states of the whole table and, as the last entry, of the design point."""
-    design, hall = recirculation.design, config.hall
-    air_j_per_m3_k = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
+    design = recirculation.design
     shape = len(part.design_mix_k), len(supply_c) * len(TABLE_LOADS) + 1
     states = _SteadyStates(
         curves=config.servers.curves,
         weights=part.weights,
-        k_per_w=1.0 / (design.fan_full_airflow_m3s * air_j_per_m3_k),
+        density_ratio=servers.air.density_ratio,
+        k_per_w=1.0 / (float(design.full_airflow_m3s.max()) * design.air_j_per_m3_k),
         supply_c=np.append(np.repeat(supply_c, len(TABLE_LOADS)), design.supply_c),
         load=np.append(np.tile(TABLE_LOADS, len(supply_c)), 1.0),
         mix_k=np.broadcast_to(part.design_mix_k[:, None], shape),
@@ -221,8 +229,11 @@ class _SteadyStates:
     """Curves of the servers."""
     weights: F64
     """Weights of the exhaust mix, (R, R)."""
+    density_ratio: DensityRatio
+    """Density of the air over that at the reference temperature."""
     k_per_w: float
-    """Temperature rise of the air of one server per power at an airflow ratio of 1, in K/W."""
+    """Temperature rise of the air of the largest server per power at an airflow ratio of 1, in
+    K/W."""
     supply_c: F64
     """Supply temperature of each pair, in C, (m,)."""
     load: F64
@@ -244,7 +255,7 @@ class _SteadyStates:
         secants over the step before.
 
         Args:
-            groups: Server groups by rack, see ``_by_rack``, (5, R, most groups of a rack).
+            groups: Server groups by rack, see ``_by_rack``, (7, R, most groups of a rack).
             passes: Most steps.
         """
         before: tuple[F64, F64] | None = None
@@ -276,7 +287,8 @@ class _SteadyStates:
 
         Keeps ``inlet_k`` and ``heat_k``, of which outlets are the sum.
         """
-        count, full_w, idle_w, deviation, exhaust_share = (row[..., None] for row in groups)
+        rows = (row[..., None] for row in groups)
+        count, full_w, idle_w, deviation, full_airflow, fan_w, exhaust_share = rows
         self.inlet_k, self.heat_k = np.empty_like(self.mix_k), np.empty_like(self.mix_k)
         batch = max(_LEAST_BATCH, _BATCH_VALUES // count.size)
         for first in range(0, len(self.load), batch):
@@ -286,8 +298,10 @@ class _SteadyStates:
             load = load + deviation * (load * (1.0 - load))
             inlet_c = self.supply_c[at] + inlet_k
             ratio = self.curves.airflow_ratio(inlet_c, load)
-            power_w = self.curves.cpu_w(inlet_c, load, full_w, idle_w) + self.curves.fan_w(ratio)
-            ratio = ratio * count
+            power_w = self.curves.cpu_w(inlet_c, load, full_w, idle_w)
+            power_w += self.curves.fan_w(ratio, fan_w)
+            ratio = self.curves.moved_ratio(ratio, inlet_c, self.density_ratio)
+            ratio = ratio * (count * full_airflow)
             flow = np.maximum(np.sum(ratio, axis=1), 1e-9)
             heat_k = np.sum(power_w * count, axis=1) / flow * self.k_per_w
             self.heat_k[:, at] = np.minimum(heat_k, _MOST_HEAT_K)
@@ -296,7 +310,7 @@ class _SteadyStates:
 
 
 def _by_rack(group_offsets: I32, columns: F64) -> F64:
-    """Columns of server groups, (5, G), as (5, R, most groups of a rack), filled up with none."""
+    """Columns of server groups, (7, G), as (7, R, most groups of a rack), filled up with none."""
     sizes = np.diff(group_offsets)
     place = np.arange(int(sizes.max()))
     out = columns[:, group_offsets[:-1, None] + np.minimum(place, sizes[:, None] - 1)]

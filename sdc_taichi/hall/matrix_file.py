@@ -92,9 +92,7 @@ def _shares_of_heat(config: DataCenterConfig, path: Path, matrix: F64, design: D
     j, i = np.unravel_index(np.argmin(matrix), matrix.shape)
     if matrix[j, i] < -_ROUND_OFF * np.max(np.abs(matrix)):
         raise ConfigError(f"{path}: D[{j}, {i}] is {matrix[j, i]:.3g} K/W; valid is at least 0")
-    hall = config.hall
-    air_j_per_m3_k = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
-    rise = matrix * (air_j_per_m3_k * design.airflow_m3s)
+    rise = matrix * (design.air_j_per_m3_k * design.airflow_m3s)
     try:
         shares = np.linalg.solve(np.eye(len(rise)) + rise.T, rise.T).T
     except np.linalg.LinAlgError:

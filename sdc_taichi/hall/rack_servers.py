@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.config.hall_schema import ServerConfig, ServerGroup
+from sdc_taichi.hall.air_properties import AirProperties, air_properties
 from sdc_taichi.types import F64, I32
 
 
 @dataclass(frozen=True, slots=True)
 class RackServers:
-    """Server groups of a hall of R racks and G groups, cut at the height zones.
+    """Server groups of a hall of R racks and G groups, cut at the height zones, and their air.
 
     The servers of a group are alike and meet the same air.
     """
@@ -30,9 +32,19 @@ class RackServers:
     """Inlet of each group over the inlet of its rack, in K, (G,)."""
     load_deviation: F64
     """Load weight of each group over the mean of its rack, less 1, (G,)."""
+    full_airflow_m3s: F64
+    """Airflow of one server at airflow ratio 1 as configured, in m3/s; nan where it follows from
+    the design point, (G,)."""
+    design_rise_k: F64
+    """Temperature rise of the air through one server at the design point as configured, in K; nan
+    where none is, (G,)."""
+    fan_reference_w: F64
+    """Fan power of one server at the reference airflow ratio, in W, (G,)."""
     height_factor: F64
     """Exhaust share of the intake of each group over that of its rack, by height, (G,). Its mean
     over the airflow of a rack is near 1."""
+    air: AirProperties
+    """Air that the servers take in."""
 
     def per_rack(self, values: F64) -> F64:
         """Sum of group values, (G,), over each rack, (R,)."""
@@ -48,17 +60,22 @@ def rack_servers(config: DataCenterConfig) -> RackServers:
 
     Servers fill a rack from the floor in the order in which its groups are listed. With inlet model
     ``recirculation`` groups are cut at the height zones.
+
+    Raises:
+        ConfigError: a capacity that leaves racks without servers.
+        DataError: a site or weather file that names no height above sea level.
     """
     hall = config.hall
     zones = hall.height_zones if hall.inlet_model == "recirculation" else 1
     columns: dict[Any, F64] = {}
     racks = []
     for rack in config.rack_groups():
-        key = tuple((g.count, g.full_w, g.idle_w, g.load_weight, g.inlet_offset_k) for g in rack)
+        key = tuple(_values(group, config.servers) for group in rack)
         if key not in columns:
             columns[key] = _rack_columns(np.array(key, dtype=np.float64), zones)
         racks.append(columns[key])
-    count, full_w, idle_w, deviation, offset_k, level = np.concatenate(racks, axis=1)
+    rows = np.concatenate(racks, axis=1)
+    count, full_w, idle_w, deviation, offset_k, airflow_m3s, rise_k, fan_w, level = rows
     return RackServers(
         group_offsets=np.concatenate([[0], np.cumsum([r.shape[1] for r in racks])]).astype(
             np.int32
@@ -68,31 +85,54 @@ def rack_servers(config: DataCenterConfig) -> RackServers:
         idle_w=idle_w,
         inlet_offset_k=offset_k,
         load_deviation=deviation,
+        full_airflow_m3s=airflow_m3s,
+        design_rise_k=rise_k,
+        fan_reference_w=fan_w,
         height_factor=1.0 + hall.height_gradient * level,
+        air=air_properties(config),
+    )
+
+
+def _values(group: ServerGroup, servers: ServerConfig) -> tuple[float | None, ...]:
+    """Numbers of a group as ``_rack_columns`` takes them; None becomes nan."""
+    airflow_m3s = group.full_airflow_m3s
+    if airflow_m3s is None and group.design_rise_k is None:
+        airflow_m3s = servers.fan_full_airflow_m3s
+    fan_w = group.fan_w
+    if fan_w is None:
+        share = servers.fan_reference_share
+        fan_w = servers.fan_reference_w if share is None else share * group.full_w
+    return (
+        *(group.count, group.full_w, group.idle_w, group.load_weight, group.inlet_offset_k),
+        *(airflow_m3s, group.design_rise_k, fan_w, group.height_u or 1.0),
     )
 
 
 def _rack_columns(groups: F64, zones: int) -> F64:
-    """Groups of one rack, cut at its height zones, (6, cut groups).
+    """Groups of one rack, cut at its height zones, (9, cut groups).
 
     Args:
-        groups: count, full power, idle power, load weight and inlet offset, (groups, 5).
+        groups: count, full power, idle power, load weight, inlet offset, full airflow, design rise,
+            fan power and height of a server, (groups, 9).
         zones: height zones of the rack.
 
     Returns:
-        Rows count, full power, idle power, load deviation, inlet offset, and level from -1 at the
-        floor to 1 at the top.
+        Rows count, full power, idle power, load deviation, inlet offset, full airflow, design rise,
+        fan power, and level from -1 at the floor to 1 at the top.
     """
-    count, full_w, idle_w, weight, offset_k = groups.T
-    deviation = weight / (np.sum(count * weight) / np.sum(count)) - 1.0
+    count, weight, height_u = groups[:, 0], groups[:, 3], groups[:, 8]
+    listed = groups.T[:8].copy()
+    listed[3] = weight / (np.sum(count * weight) / np.sum(count)) - 1.0
     servers = int(count.sum())
     zones = min(zones, servers)
-    zone_ends = np.rint(np.arange(1, zones + 1) * servers / zones)
-    ends = np.unique(np.concatenate([zone_ends, np.cumsum(count)]))
+    # The servers below the upper end of each zone.
+    tops_u = np.concatenate([[0.0], np.cumsum(count * height_u)])
+    numbers = np.concatenate([[0.0], np.cumsum(count)])
+    zone_ends = np.rint(np.interp(np.arange(1, zones + 1) * tops_u[-1] / zones, tops_u, numbers))
+    ends = np.unique(np.concatenate([zone_ends, numbers[1:]]))
+    ends = ends[ends > 0.0]
     begins = np.concatenate([[0.0], ends[:-1]])
-    group = np.searchsorted(np.cumsum(count), begins, side="right")
+    group = np.searchsorted(numbers[1:], begins, side="right")
     zone = np.searchsorted(zone_ends, begins, side="right")
     level = (2.0 * zone + 1.0) / zones - 1.0
-    return np.stack(
-        [ends - begins, full_w[group], idle_w[group], deviation[group], offset_k[group], level]
-    )
+    return np.stack([ends - begins, *listed[1:, group], level])

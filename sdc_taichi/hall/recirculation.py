@@ -193,7 +193,7 @@ def _contained_design(
             servers,
             design.supply_c + servers.per_group(mix_k) * group_share,
             design.height_factor,
-            fan_full_airflow_m3s=design.fan_full_airflow_m3s,
+            full_airflow_m3s=design.full_airflow_m3s,
         )
         before, mix_k = mix_k, weights.apply(found.outlet_rise_k)
         if np.max(np.abs(mix_k - before)) < _CONTAINED_WITHIN_K:

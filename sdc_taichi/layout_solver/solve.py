@@ -17,6 +17,7 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.hall import air_metrics
+from sdc_taichi.hall.air_properties import air_properties
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.matrix_file import MOST_MATRIX_RACKS
 from sdc_taichi.kernels.compiler import runtime
@@ -111,8 +112,7 @@ def solve(
     mass_residual = air.find_flow() / supply_m3s
     R, supply_share, returned_m3s = air.exhaust_shares()
 
-    air_j_per_m3_k = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
-    rise_k = power_w / (air_j_per_m3_k * airflow_m3s)
+    rise_k = power_w / (air_properties(config).j_per_m3_k * airflow_m3s)
     approach_k: F64 = np.asarray(np.linalg.solve(np.eye(hall.racks) - R, R @ rise_k), np.float64)
     returned_m3k_s = float(returned_m3s @ (approach_k + rise_k))
     direct_k, direct_m3k_s = air.temperatures(rise_k)

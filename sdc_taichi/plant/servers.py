@@ -1,9 +1,9 @@
 """Power and airflow of servers against inlet temperature and load, as pure functions.
 
-CPU power and airflow ratio (airflow over full airflow) are linear in the inlet temperature and
-shift with the load; fan power is a power of the airflow ratio (Sun et al. 2021, *Prototype energy
-models for data centers*, Energy and Buildings 231; EnergyPlus Engineering Reference,
-ElectricEquipment:ITE:AirCooled). ``kernels/servers.py`` holds the same curves compiled.
+CPU power and airflow ratio (volume at the inlet over that at full speed) are linear in the inlet
+temperature and shift with the load; fan power is a power of the airflow ratio (Sun et al. 2021,
+*Prototype energy models for data centers*, Energy and Buildings 231; EnergyPlus Engineering
+Reference, ElectricEquipment:ITE:AirCooled). ``kernels/servers.py`` holds the same curves compiled.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sdc_taichi.plant.air import DensityRatio
 from sdc_taichi.types import F64
 
 
@@ -21,8 +22,8 @@ class ServerCurves:
 
     With x = min(inlet_c, curve_limit_c) and the utilisation u of the server, CPU power is
     max(idle, full*(cpu_slope*x + cpu_offset + cpu_shift*u)), the airflow ratio is
-    y = clip(fan_slope*x + fan_offset + fan_shift*u, fan_low, fan_high), and fan power is
-    fan_reference_w*(y/fan_reference_ratio)^fan_exponent.
+    y = clip(fan_slope*x + fan_offset + fan_shift*u, fan_low, fan_high), and fan power over that at
+    the reference is (y/fan_reference_ratio)^fan_exponent.
     """
 
     cpu_slope_per_k: float
@@ -42,11 +43,9 @@ class ServerCurves:
     fan_high: float
     """Highest airflow ratio, inf for none."""
     fan_reference_ratio: float
-    """Airflow ratio at which the fans of a server draw ``fan_reference_w``."""
+    """Airflow ratio at which the fans of a server draw their reference power."""
     fan_exponent: float
     """Exponent of fan power over the airflow ratio, 1..3."""
-    fan_reference_w: float
-    """Fan power of one server at the reference airflow ratio, in W."""
     curve_limit_c: float
     """Inlet temperature above which power and airflow no longer rise, in C, inf for none."""
 
@@ -61,6 +60,17 @@ class ServerCurves:
         ratio = self.fan_slope_per_k * on_curve_c + self.fan_offset + self.fan_shift * utilisation
         return np.asarray(np.clip(ratio, self.fan_low, self.fan_high))
 
+    def moved_ratio(self, airflow_ratio: F64, inlet_c: F64, density_ratio: DensityRatio) -> F64:
+        """Airflow over full airflow as volume at the reference temperature of ``plant.air``.
+
+        Args:
+            airflow_ratio: airflow ratio of each server, any shape.
+            inlet_c: inlet temperature of each server in C, of the same shape.
+            density_ratio: density of the air over that at the reference temperature.
+        """
+        on_curve_c = np.minimum(inlet_c, self.curve_limit_c)
+        return np.asarray(airflow_ratio * density_ratio.at(on_curve_c))
+
     def cpu_w(self, inlet_c: F64, utilisation: F64, full_w: F64, idle_w: F64) -> F64:
         """Power of servers without their fans, in W.
 
@@ -74,10 +84,15 @@ class ServerCurves:
         ratio = self.cpu_slope_per_k * on_curve_c + self.cpu_offset + self.cpu_shift * utilisation
         return np.asarray(np.maximum(idle_w, full_w * ratio))
 
-    def fan_w(self, airflow_ratio: F64) -> F64:
-        """Fan power of servers, in W, at airflow ratios of any shape."""
+    def fan_w(self, airflow_ratio: F64, reference_w: F64 | float) -> F64:
+        """Power of the fans of servers, in W.
+
+        Args:
+            airflow_ratio: airflow ratio of each server, any shape.
+            reference_w: fan power of each server at the reference airflow ratio, in W.
+        """
         speed = airflow_ratio / self.fan_reference_ratio
-        return np.asarray(self.fan_reference_w * speed**self.fan_exponent)
+        return np.asarray(reference_w * speed**self.fan_exponent)
 
 
 def linear_curve(

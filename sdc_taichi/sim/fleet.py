@@ -13,11 +13,11 @@ import numpy.typing as npt
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.config.odd_values import warn_of_odd_values
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.hall.design_point import design_point
+from sdc_taichi.hall.design_point import DesignPoint, design_point
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.hall.mix_weights import MixWeights
-from sdc_taichi.hall.rack_servers import rack_servers
+from sdc_taichi.hall.rack_servers import RackServers, rack_servers
 from sdc_taichi.hall.recirculation import Recirculation, calibrate
 from sdc_taichi.hall.unit_supply import full_airflow_m3s, unit_weights, weighted_shares
 from sdc_taichi.kernels.arguments import in_row_order
@@ -98,7 +98,7 @@ class Fleet:
     """Mean inlet over supply of each rack, in K, (R,): as given, within the limits of the config;
     with recirculation what the hall has at its design point."""
     group_rows: tuple[F64, ...]
-    """Rows GROUP_INPUTS of the hall kernels by data center, (6, its groups); equal halls share one
+    """Rows GROUP_INPUTS of the hall kernels by data center, (9, its groups); equal halls share one
     array."""
     dcs: F64
     """Rows DC_COEFFICIENTS of the hall kernels, (18, B)."""
@@ -205,7 +205,7 @@ class _HallArrays:
     groups_per_rack: I32
     """Server groups of each rack, (R,)."""
     groups: F64
-    """Rows GROUP_INPUTS of the hall kernels, (6, G)."""
+    """Rows GROUP_INPUTS of the hall kernels, (9, G)."""
     approach_k: F64
     """Mean inlet over supply of each rack at the design point, in K, (R,)."""
     dc: F64
@@ -300,10 +300,15 @@ def _distinct_halls(configs: Sequence[DataCenterConfig]) -> list[_HallArrays]:
     known: dict[Any, _HallArrays] = {}
     halls = []
     for config in configs:
-        same = tuple(map(id, (config.hall, config.servers, config.hvac)))
+        # The density of the air belongs to the site.
+        place = None
+        if config.hall.air_density_kg_m3 is None:
+            place = config.site.location, config.site.weather_file
+        same = (*map(id, (config.hall, config.servers, config.hvac)), place)
         if same not in known:
             setpoint = config.hvac.setpoint
-            made_of = config.hall, config.servers, config.hvac.crac, setpoint.min_c, setpoint.max_c
+            range_c = setpoint.min_c, setpoint.max_c
+            made_of = config.hall, config.servers, config.hvac.crac, range_c, place
             if made_of not in cache:
                 cache[made_of] = _hall_arrays(config)
             known[same] = cache[made_of]
@@ -348,9 +353,11 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
     else:
         design = design_point(config, servers)
         unit_design_m3s = np.array([design.crac_flow_m3s])
-    air_j_per_m3_k = hall.air_density_kg_m3 * hall.air_heat_capacity_j_per_kg_k
+    air_j_per_m3_k = servers.air.j_per_m3_k
+    groups = _group_inputs(servers, design)
     coefficients = asdict(curves) | {
-        "fan_full_m3s": design.fan_full_airflow_m3s,
+        "fan_full_m3s": float(design.full_airflow_m3s.max()),
+        "fan_reference_w": float(servers.fan_reference_w.max()),
         "air_j_per_m3_k": air_j_per_m3_k,
         "fresh_share": fresh_share,
         "server_j_per_k": config.servers.heat_capacity_kj_per_k * 1e3,
@@ -359,7 +366,7 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
     }
     return _HallArrays(
         groups_per_rack=np.diff(servers.group_offsets),
-        groups=np.stack([getattr(servers, name) for name in GROUP_INPUTS]),
+        groups=np.stack(in_row_order(GROUP_INPUTS, groups)),
         approach_k=approach_k,
         dc=np.array(in_row_order(DC_COEFFICIENTS, coefficients)),
         unit_design_m3s=unit_design_m3s,
@@ -387,6 +394,18 @@ def _unit_supply(config: DataCenterConfig, found: Recirculation) -> tuple[F64, F
         weight = unit_weights(shares, found.need_m3s, airflow_m3s)
         shares = weighted_shares(shares, weight)
     return shares, airflow_m3s
+
+
+def _group_inputs(servers: RackServers, design: DesignPoint) -> dict[str, F64]:
+    """Rows GROUP_INPUTS of the hall kernels by name, (G,) each."""
+    names = ("count", "full_w", "idle_w", "inlet_offset_k", "load_deviation", "height_factor")
+    full_airflow = design.full_airflow_m3s / design.full_airflow_m3s.max()
+    fan_w = servers.fan_reference_w
+    return {name: getattr(servers, name) for name in names} | {
+        "full_airflow": full_airflow * servers.air.density_ratio.base,
+        "airflow_fall_per_k": full_airflow * servers.air.density_ratio.fall_per_k,
+        "full_fan_power": fan_w / fan_w.max() if fan_w.max() > 0 else np.ones(len(fan_w)),
+    }
 
 
 def _hall_air(halls: Sequence[_HallArrays]) -> HallAir:

@@ -10,6 +10,8 @@ import numpy as np
 
 from sdc_taichi.errors import PhysicalLimitError
 from sdc_taichi.exogenous import site_pressure_pa
+from sdc_taichi.kernels.arguments import row_index
+from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS
 from sdc_taichi.plant import chiller, moist_air, tower
 from sdc_taichi.plant.chiller import ChillerResult
 from sdc_taichi.plant.electrical import NO_LIMIT_KW, PowerPath, loss_w, power_path_loss_w
@@ -247,9 +249,7 @@ def _solve(fleet: Fleet, hall: Hall, supply_c: F64, utilisation: F64) -> HallSum
 
 def air_j_per_m3_k(fleet: Fleet) -> F64:
     """Heat capacity of air per volume, J/(m3 K), (B,)."""
-    return fleet.values("hall.air_density_kg_m3") * fleet.values(
-        "hall.air_heat_capacity_j_per_kg_k"
-    )
+    return np.asarray(fleet.dcs[row_index(DC_COEFFICIENTS, "air_j_per_m3_k")])
 
 
 def sites_pressure_pa(fleet: Fleet) -> F64:

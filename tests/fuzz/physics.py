@@ -9,6 +9,7 @@ import numpy as np
 from fuzz.case import DefectError, Scratch
 from ledgers import LEDGERS, TRANSIENT_LEDGERS, Run, quantities, residual, stocks
 from sdc_taichi import Actions, DataCenterConfig, Simulator, State, StepResult
+from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 
 STEPS = 5
@@ -104,9 +105,14 @@ def check(sim: Simulator, start: State, results: list[StepResult]) -> None:
     if config.workload.model == "tasks":
         # Whole tasks that find the queue full count as dropped, and run.
         values["dropped_tasks"] = np.zeros_like(values["dropped_tasks"])
-    counts_losses = config.electrical.losses == "counted"
     recorded = Run(
-        values, stocks(start), sim.fleet.values, sim.step_h, counts_losses, np.empty((0, sim.size))
+        values,
+        stocks(start),
+        sim.fleet.values,
+        air_j_per_m3_k(sim.fleet),
+        sim.step_h,
+        config.electrical.losses == "counted",
+        np.empty((0, sim.size)),
     )
     for name in closing(config):
         left = residual(LEDGERS[name](recorded), 1e-6)
