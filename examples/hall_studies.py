@@ -159,7 +159,8 @@ class SideBySide:
         for i, controller in enumerate(self._controllers):
             given = controller.act(view)
             for row, value in enumerate((given.load, given.cooling, given.battery)):
-                numbers = np.asarray(getattr(value, "value", value), dtype=np.float64)
+                held = 0.0 if value is None else value
+                numbers = np.asarray(getattr(held, "value", held), dtype=np.float64)
                 commands[row] = np.where(chosen == i, numbers, commands[row])
         return Actions(*commands)
 

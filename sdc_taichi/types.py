@@ -80,9 +80,9 @@ class Actions:
 
     load: LoadAction | float | F64 | Sequence[LoadAction] = LoadAction.NEUTRAL
     """Share of what can be deferred (below 0) or drained (above 0), -1..1, () or (B,)."""
-    cooling: CoolAction | float | F64 | Sequence[CoolAction] = CoolAction.HOLD
+    cooling: CoolAction | float | F64 | Sequence[CoolAction] | None = None
     """Steps of ``hvac.setpoint.step_k`` by which setpoints move, a number within -1e6..1e6, (),
-    (B,) or (U,)."""
+    (B,) or (U,); None follows ``hvac.setpoint.schedule_c``, and holds where there is none."""
     battery: BatteryAction | float | F64 | Sequence[BatteryAction] = BatteryAction.IDLE
     """Share of the battery's power limit, discharged (below 0) or charged, -1..1, () or (B,)."""
     fan: FanAction | float | F64 | Sequence[FanAction] = FanAction.HOLD
@@ -189,7 +189,8 @@ class StepResult:
     load_command: F64
     """Share of what could be deferred (below 0) or drained (above 0), -1..1, (B,)."""
     cooling_command: F64
-    """Steps by which the setpoints were to move, mean over the CRAC units, (B,)."""
+    """Steps by which the setpoints were to move, mean over the CRAC units, (B,); 0 where they
+    follow their schedule."""
     battery_command: F64
     """Share of the battery's power limit, discharged (below 0) or charged, -1..1, (B,)."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from sdc_taichi.config.fields import (
@@ -21,6 +22,7 @@ from sdc_taichi.config.fields import (
     WaterRangeK,
     WorkingShare,
 )
+from sdc_taichi.exogenous.year_clock import MONTH_OF_DAY
 from sdc_taichi.plant.chiller import (
     AIR_COOLED,
     CHILLED_WATER_BOUNDS_C,
@@ -28,6 +30,7 @@ from sdc_taichi.plant.chiller import (
     chilled_water_bounds_c,
 )
 from sdc_taichi.plant.plants import DRY_PLANTS
+from sdc_taichi.types import F64
 
 Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
 MOST_CRAC_UNITS = 10_000
@@ -48,9 +51,43 @@ class SetpointConfig(Section):
     """Highest setpoint, in C."""
     initial_c: AirC = 18.0
     """Setpoint after a reset, in C."""
+    schedule_c: tuple[AirC, ...] | tuple[tuple[AirC, ...], ...] | None = None
+    """Setpoint of each month (12 values, January first), of each local hour of the day (24 values,
+    midnight first) or of both (12 lists of 24), in C, which steps without a cooling command follow;
+    None is no schedule."""
     step_k: Annotated[float, Field(ge=0.001, le=50)] = 1.0
     """Change of the setpoint by one action, in K, 0.001..50: from less than any sensor resolves to
     more than any range of setpoints."""
+
+    @model_validator(mode="after")
+    def _schedule_inside(self) -> Self:
+        schedule = self.schedule_c
+        if schedule is None:
+            return self
+        rows = [row if isinstance(row, tuple) else (row,) for row in schedule]
+        lengths = {len(row) for row in rows}
+        whole = isinstance(schedule[0], tuple) if schedule else False
+        if (len(schedule), lengths) not in ([(12, {24})] if whole else [(12, {1}), (24, {1})]):
+            raise ValueError(
+                f"schedule_c has {len(schedule)} entries; valid is 12, one for each month, 24, one "
+                "for each hour of the day, or 12 lists of 24"
+            )
+        for value in (value for row in rows for value in row):
+            if not self.min_c <= value <= self.max_c:
+                raise ValueError(
+                    f"schedule_c {value:g} must lie within min_c {self.min_c:g} and max_c "
+                    f"{self.max_c:g}"
+                )
+        return self
+
+    def hourly_c(self) -> F64 | None:
+        """Scheduled setpoint of each hour of the year, in C, (8760,); None without a schedule."""
+        if self.schedule_c is None:
+            return None
+        table = np.array(self.schedule_c)
+        by_month = table[:, None] if table.shape == (12,) else np.broadcast_to(table, (12, 24))
+        by_day = np.broadcast_to(by_month, (12, 24))[np.array(MONTH_OF_DAY) - 1]
+        return by_day.reshape(-1)
 
     @model_validator(mode="after")
     def _inside(self) -> Self:

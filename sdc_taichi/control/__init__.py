@@ -8,6 +8,7 @@ from sdc_taichi.control.registry import (
     CONTROLLABLE,
     controlled_by,
     controller_names,
+    given_by,
     make_controller,
 )
 from sdc_taichi.control.rules import (
@@ -38,6 +39,7 @@ __all__ = [
     "View",
     "controlled_by",
     "controller_names",
+    "given_by",
     "make_controller",
     "trim_and_respond",
     "view_maker",

@@ -91,6 +91,14 @@ def controlled_by(spec: str) -> tuple[str, ...]:
     return ("cooling",) if entry is None else entry.commands
 
 
+def given_by(spec: str) -> tuple[str, ...]:
+    """Commands that the controllers of a valid spec give themselves; ``idle`` gives none."""
+    if "=" in spec:
+        parts = (part.split("=") for part in spec.split(","))
+        return tuple(agent.strip() for agent, name in parts if name.strip() != "idle")
+    return () if spec.strip() == "idle" else controlled_by(spec)
+
+
 def _make(name: str, fleet: Fleet, agents: tuple[str, ...]) -> Controller:
     """Look a name up, for use on any of ``agents``."""
     kind, colon, text = name.partition(":")

@@ -1,7 +1,7 @@
 """Controllers that are not learned; each acts on a whole fleet at once.
 
 A controller has ``reset(seed)`` and ``act(view) -> Actions``. What it does not control it leaves
-neutral: work neither deferred nor drained, setpoint held, battery idle.
+neutral: work neither deferred nor drained, setpoint held or on its schedule, battery idle.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Controller(Protocol):
 
 
 class Idle:
-    """Neutral commands: moves no work, holds the setpoint, leaves the battery alone."""
+    """Neutral commands: moves no work, holds the setpoint or its schedule, leaves the battery alone."""
 
     def reset(self, seed: int | I64) -> None:
         """Do nothing: no memory."""

@@ -18,9 +18,9 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.control import Idle, View, controlled_by, make_controller, view_maker
+from sdc_taichi.control import View, controlled_by, given_by, make_controller, view_maker
 from sdc_taichi.envs.actions import ActionDecoder
-from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT
+from sdc_taichi.envs.agents import COMMAND_OF_AGENT
 from sdc_taichi.envs.costs import Costs
 from sdc_taichi.envs.drawn_inputs import Draw, DrawnInputs, draw_info, draws_inputs
 from sdc_taichi.envs.episode_reset import Seed, chosen_start_days, seeded_generators
@@ -133,12 +133,15 @@ class Core:
         require_events_start_before(24.0 * options.days, fleet.configs, "the episode")
         self._others = make_controller(options.others, fleet)
         _check_others(options)
-        self._others_act = set(self.agents) != set(AGENTS) and not isinstance(self._others, Idle)
+        given = given_by(options.others)
         self._commands_of_others = [
-            command for agent, command in COMMAND_OF_AGENT.items() if agent not in self.agents
+            command
+            for agent, command in COMMAND_OF_AGENT.items()
+            if agent not in self.agents and command in given
         ]
+        self._others_act = bool(self._commands_of_others)
         learned = [name for agent in self.agents for name in options.commands_of(agent)]
-        self._command_names = learned + (self._commands_of_others if self._others_act else [])
+        self._command_names = learned + self._commands_of_others
         self._rewards = Rewards(
             options.rewards,
             options.collaboration,

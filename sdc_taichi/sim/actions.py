@@ -29,6 +29,8 @@ class Commands:
     """Steps by which the setpoints move, mean over the CRAC units, (B,)."""
     unit_cooling_command: F64
     """Steps by which the setpoint of each CRAC unit moves, (U,)."""
+    follows_schedule: bool
+    """Whether setpoints that have a schedule follow it, as no cooling command is given."""
     unit_fan_command: F64 | None
     """Steps by which the speed of each CRAC fan moves, (U,); None holds all of them."""
     group_weights: F64 | None
@@ -63,12 +65,14 @@ class ActionDecoder:
         given = actions or Actions()
         load_command = self._command("load", given.load, LoadAction, limit=1.0)
         battery_command = self._command("battery", given.battery, BatteryAction, limit=1.0)
-        unit_cooling_command = self._unit_command("cooling", given.cooling, CoolAction)
+        cooling = CoolAction.HOLD if given.cooling is None else given.cooling
+        unit_cooling_command = self._unit_command("cooling", cooling, CoolAction)
         return Commands(
             load_command=load_command,
             battery_command=battery_command,
             cooling_command=self._units.mean(unit_cooling_command),
             unit_cooling_command=unit_cooling_command,
+            follows_schedule=given.cooling is None,
             unit_fan_command=self._fan_command(given.fan),
             group_weights=self._group_weights(given.placement),
         )

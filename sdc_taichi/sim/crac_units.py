@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.config.hvac_schema import SetpointConfig
 from sdc_taichi.plant import cooling
 from sdc_taichi.sim.actions import Commands
+from sdc_taichi.sim.drivers import FleetSeries, fleet_series
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.surroundings import Surroundings
 from sdc_taichi.sim.unit_index import UnitIndex
@@ -61,6 +63,7 @@ class CracUnits:
             "high_c": of_each("hvac.setpoint.max_c"),
         }
         self._initial_c = of_each("hvac.setpoint.initial_c")
+        self._schedule_c = _schedules_c(fleet)
         self._fan_step = of_each("hvac.crac.fan_step")
         self._coasting = of_each("hvac.crac.coasting_flow_ratio")
         self._min_speed = of_each("hvac.crac.min_flow_ratio")
@@ -106,6 +109,9 @@ class CracUnits:
             state.cooling_last,
             **self._setpoint_limits,
         )
+        if commands.follows_schedule and self._schedule_c is not None:
+            scheduled_c = self._units.of_each(self._schedule_c.at(state.start + state.step))
+            unit_setpoint_c = np.where(np.isnan(scheduled_c), unit_setpoint_c, scheduled_c)
         fan_speed = self._moved_fans(state.fan_speed, commands.unit_fan_command)
         unit_low, unit_high = self._speed_range(fan_speed, surroundings)
         plant_setpoint_c, coil_share = self._served_by_plant(unit_setpoint_c, surroundings)
@@ -162,3 +168,15 @@ class CracUnits:
         coldest_c = np.where(np.isinf(coldest_c), lowest_c, coldest_c)
         in_use_m3s = self._units.sum(running * self._full_m3s)
         return coldest_c, np.minimum(in_use_m3s / self._design_m3s, 1.0)
+
+
+def _schedules_c(fleet: Fleet) -> FleetSeries | None:
+    """Scheduled setpoints over the steps of a year, in C, nan without; None if nobody has any."""
+    hourly_c: dict[SetpointConfig, F64] = {}
+    none_c = np.array([np.nan])
+    for setpoint in (config.hvac.setpoint for config in fleet.configs):
+        if setpoint not in hourly_c:
+            found = setpoint.hourly_c()
+            hourly_c[setpoint] = none_c if found is None else np.repeat(found, fleet.steps_per_hour)
+    schedules = [hourly_c[config.hvac.setpoint] for config in fleet.configs]
+    return None if all(x is none_c for x in schedules) else fleet_series(schedules)
