@@ -46,7 +46,7 @@ class Controller(Protocol):
 
 
 class Idle:
-    """Neutral commands: moves no work, holds the setpoint or its schedule, leaves the battery alone."""
+    """Neutral commands: no work moves, the battery rests, setpoints hold or follow a schedule."""
 
     def reset(self, seed: int | I64) -> None:
         """Do nothing: no memory."""

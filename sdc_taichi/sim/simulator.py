@@ -177,7 +177,7 @@ class Simulator:
         """Advance all data centers by one step.
 
         Args:
-            actions: Named commands; None is neutral load, held or scheduled setpoint and idle battery.
+            actions: Named commands; None is neutral load, held or scheduled setpoint, idle battery.
 
         Raises:
             PhysicalLimitError: A result that no data center can reach; the state is as before.
