@@ -87,7 +87,7 @@ class SetpointConfig(Section):
         table = np.array(self.schedule_c)
         by_month = table[:, None] if table.shape == (12,) else np.broadcast_to(table, (12, 24))
         by_day = np.broadcast_to(by_month, (12, 24))[np.array(MONTH_OF_DAY) - 1]
-        return by_day.reshape(-1)
+        return np.asarray(by_day.reshape(-1), dtype=np.float64)
 
     @model_validator(mode="after")
     def _inside(self) -> Self:
