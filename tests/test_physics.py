@@ -39,7 +39,7 @@ def test_best_setpoint_of_corrected_moves_with_weather_and_load(study: ModuleTyp
     assert len(np.unique(best)) >= 4
     assert len(np.unique(best[interior])) >= 3
     # In summer a chiller saves 3 % of its power per kelvin, about what fans and servers cost.
-    assert interior.mean() > 0.25
+    assert interior.mean() > 0.2
     assert any(len(np.unique(column)) > 2 for column in best.T), "moves with weather"
     assert any(len(np.unique(row)) > 2 for row in best), "moves with load"
 

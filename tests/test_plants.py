@@ -55,7 +55,19 @@ def test_york_machine_is_sized_for_cold_condenser_water() -> None:
                 outdoor_c=0.0,
                 reference_cop=5.96,
             )
-            assert machine.unmet_w <= 1e-9 * design.cooling_w
+            # The margin of 1.15 counts at the design wet bulb, 5 % of it at any other.
+            need_w = design.cooling_w * (1.0 if condenser_c == 30.0 else 1.05 / 1.15)
+            assert machine.available_w >= need_w * (1.0 - 1e-9)
+
+
+def test_chiller_with_a_large_margin_is_sized_by_the_design_wet_bulb_alone() -> None:
+    drivers = drivers_from_arrays([20.0], [15.0], [300.0], [0.5])
+    overrides = ["hvac.chiller.model=eir_york", "hvac.sizing.margin=1.35",
+                 "hvac.sizing.design_wet_bulb_c=25.5"]  # fmt: skip
+    with Simulator(load_config("corrected", overrides), drivers=drivers) as sim:
+        design = sim.sizing.water_side
+    # As EnergyPlus was given it: 761.7 kW of cooling, 684.4 kW at the reference point.
+    assert design.chiller_w / design.cooling_w == pytest.approx(684.437 / 761.725, rel=1e-3)
 
 
 @pytest.mark.parametrize(("model", "warmest_c"), [("eir_york", 8.89), ("centrifugal_vsd", 20.0)])

@@ -27,6 +27,9 @@ WATER_DENSITY_KG_M3 = 1000.0
 RELEASED_OUTDOOR_C = {"NY": 30.0, "WA": 20.0}
 """Design dry bulbs of the released SustainDC, in C, by the first letters of the site; else 50 C."""
 
+OFF_DESIGN_MARGIN = 1.05
+"""Largest margin of the chiller's capacity over the design load at other than the design water;
+power and airflow of a hall grow by a few percent with its setpoint."""
 _GRID = np.linspace(0.0, 1.0, 5)
 """Where within their ranges the temperatures of the water are tried at which a chiller is sized."""
 
@@ -276,9 +279,9 @@ def _design_chiller(
 ) -> tuple[F64, ChillerResult]:
     """Reference capacity of the chiller, W, (B,), and the chiller as it cools at design.
 
-    It cools ``cooling_w`` with any water that the plant meets: chilled water of every setpoint,
-    condenser water from the coldest that the chiller takes to that of the design wet bulb. A
-    machine whose capacity falls in cold condenser water is sized for that.
+    It cools ``cooling_w`` at the design wet bulb, and the load within, with a margin of up to 5 %,
+    with any other water that the plant meets: chilled water of every setpoint, condenser water from
+    the coldest that the chiller takes. Capacity may fall in cold condenser water.
     """
     v, name = fleet.values, fleet.models["chiller"]
     model = chiller.CHILLERS[name]
@@ -309,8 +312,11 @@ def _design_chiller(
             for x, y in product(_GRID, _GRID)
         ]
     )  # fmt: skip
-    chiller_w = cooling_w / least_w_per_w
     # The coldest chilled water asks most of the chiller.
+    design_w_per_w = at(low_c, design_c, 0.0 * unit_w, unit_w).available_w
+    margin = v("hvac.sizing.margin")
+    share = np.minimum(margin, OFF_DESIGN_MARGIN) / margin
+    chiller_w = cooling_w * np.maximum(1.0 / design_w_per_w, share / least_w_per_w)
     return chiller_w, at(low_c, design_c, cooling_w, chiller_w)
 
 
