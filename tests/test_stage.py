@@ -189,7 +189,7 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
         ["hvac.chiller.model=electric_air_cooled", "hvac.tower.economiser=false"],
         ["hvac.chiller.model=electric_air_cooled", "hvac.plant=air_side"],
         ["hvac.chiller.model=carnot"],
-        ["hvac.water.model=mass_balance"],
+        ["hvac.water.model=mass_balance", "hvac.chiller.coil_valves=false"],
         ["hvac.chiller.model=constant_cop", "hvac.total_of=[chiller,crac_fan]"],
         ["hall.inlet_model=approach"],
         ["hall.inlet_model=approach", "hvac.crac.flow_model=controlled"],

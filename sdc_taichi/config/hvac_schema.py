@@ -184,7 +184,10 @@ class ChillerConfig(Section):
     """Supply air setpoint above the chilled water that the coils take, in K; more where the chiller
     makes no water as warm as that."""
     chilled_water_range_k: WaterRangeK = 6.0
-    """Chilled water that returns above chilled water that is supplied, in K."""
+    """Chilled water that returns above chilled water that is supplied, at design, in K."""
+    coil_valves: bool = True
+    """Whether valves let coils take no more water than they need, so that it returns warmer at part
+    load; else it returns ``chilled_water_range_k`` above the supply at any load."""
     min_condenser_c: Annotated[float, Field(ge=0, le=60)] = 12.78
     """Lowest temperature of the condenser water that enters the chiller, in C, 0..60: water that is
     liquid, and below the condensing temperatures of refrigerants."""

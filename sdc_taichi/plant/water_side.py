@@ -12,6 +12,8 @@ from sdc_taichi.plant.fans_pumps import pump_w
 from sdc_taichi.plant.tower import TowerResult
 from sdc_taichi.types import F64, Values, as_array
 
+LEAST_COIL_LOAD = 0.1
+"""Least load of the coils over that at design below which the range of their water stays."""
 LEAST_OUTDOOR_UNITS = 0.01
 """Least share of a tower with which its equations are evaluated; without a cell no heat is left."""
 
@@ -48,7 +50,9 @@ class WaterSideDesign:
     coil_approach_k: F64
     """Coil approach: supply air temperature less that of the chilled water, in K, (B,)."""
     chilled_water_range_k: F64
-    """Return less supply temperature of the chilled water, in K, (B,)."""
+    """Return less supply temperature of the chilled water at design, in K, (B,)."""
+    coil_valves: F64
+    """1 if valves let coils take the water that they need, 0 with a fixed range of it, (B,)."""
     approach_min_k: F64
     """Lowest approach of the tower, leaving water over wet bulb, in K, (B,)."""
     exchanger_approach_k: F64
@@ -133,6 +137,23 @@ def chilled_water_c(setpoint_c: F64, design: WaterSideDesign) -> F64:
     return np.minimum(setpoint_c - design.coil_approach_k, design.warmest_chilled_c)
 
 
+def coil_range_ratio(load_w: Values, design: WaterSideDesign) -> F64:
+    """Range of the chilled water at the coils over that at design, (B,); 1 with a fixed range.
+
+    A coil that is larger than its load needs little water, which leaves it warmer: the range rises
+    as the load to the power -1/4. That is within 3 % of a counterflow coil whose airflow follows
+    its load, from full load down to a fifth, with resistances alike on both sides at design that go
+    with the airflow to the power -0.8 and with the water flow to the power -0.85 (Wetter 1999,
+    "Simulation model: finned water-air-coil without condensation", LBNL).
+
+    Args:
+        load_w: Heat that the coils take, W, (B,).
+        design: Sized devices.
+    """
+    share = np.clip(load_w / design.cooling_w, LEAST_COIL_LOAD, 1.0)
+    return as_array(1.0 + design.coil_valves * (1.0 / np.sqrt(np.sqrt(share)) - 1.0))
+
+
 def economiser_share(
     return_water_c: Values, *, chilled_water_c: Values, tower_water_c: Values
 ) -> F64:
@@ -174,10 +195,10 @@ def water_cooled(
     """Remove up to ``requested_w`` from the chilled water and reject it by a cooling tower.
 
     Chilled water follows the air, T_chw = setpoint - coil approach, up to the warmest that the
-    chiller makes. The integrated economiser
-    precools the return water with tower water as cold as the weather allows; the chiller does the
-    rest. Tower and chiller depend on each other: the tower is solved for the chiller's power at
-    the tower setpoint, then chiller and economiser at the water that the tower gives.
+    chiller makes, and returns as warm as the coils let it. The integrated economiser precools the
+    return water with tower water as cold as the weather allows; the chiller does the rest. Tower
+    and chiller depend on each other: the tower is solved for the chiller's power at the tower
+    setpoint, then chiller and economiser at the water that the tower gives.
 
     Args:
         requested_w: Heat to remove, W, (B,).
@@ -210,8 +231,10 @@ def water_cooled(
             min_lift_k=design.min_lift_k,
         )
 
+    range_ratio = coil_range_ratio(load_w, design)
+    return_water_c = chilled_c + design.chilled_water_range_k * range_ratio
     coldest_c = wet_bulb_c + design.approach_min_k
-    share = _economiser_share_at(coldest_c, chilled_c, design)
+    share = _economiser_share_at(coldest_c, chilled_c, return_water_c, design)
     tower_setpoint_c = _tower_setpoint_c(coldest_c, share, chilled_c, design)
     heat_w = load_w * share + run_chiller(share, tower_setpoint_c).rejected_w
     flow_ratio = np.maximum(heat_w / design.rejected_w, design.pump_min_ratio)
@@ -229,11 +252,12 @@ def water_cooled(
         design_fan_w=design.tower_fan_w * units,
         air_j_per_m3_k=design.air_j_per_m3_k,
     )
-    share = _economiser_share_at(cooled.leaving_c, chilled_c, design)
+    share = _economiser_share_at(cooled.leaving_c, chilled_c, return_water_c, design)
     machine = run_chiller(share, cooled.leaving_c)
     economiser_w = load_w * share
     heat_removed_w = load_w - machine.unmet_w if limited else load_w
-    chilled_pump_w, condenser_pump_w = _pumps_w(heat_removed_w, heat_w, design)
+    # The exchanger stands in the return of the coils, ahead of the bypass of pumps and chiller.
+    chilled_pump_w, condenser_pump_w = _pumps_w(heat_removed_w / range_ratio, heat_w, design)
     return WaterSideResult(
         heat_removed_w=heat_removed_w,
         economiser_w=economiser_w,
@@ -245,17 +269,19 @@ def water_cooled(
         tower_range_k=cooled.range_k,
         tower_water_kg_s=tower_water_kg_s,
         humidifier_kg_s=0.0 * heat_w,
-        tower_airflow_m3s=cooled.air_ratio * design.tower_air_m3s,
+        tower_airflow_m3s=cooled.air_ratio * design.tower_air_m3s * units,
         tower_fan_w=cooled.fan_w,
         chilled_pump_w=chilled_pump_w,
         condenser_pump_w=condenser_pump_w,
     )
 
 
-def _economiser_share_at(tower_water_c: F64, chilled_water_c: F64, design: WaterSideDesign) -> F64:
-    """Share of the cooling load that the economiser takes with tower water, both in C, (B,)."""
+def _economiser_share_at(
+    tower_water_c: F64, chilled_water_c: F64, return_water_c: F64, design: WaterSideDesign
+) -> F64:
+    """Share of the cooling load that the economiser takes with tower water, all in C, (B,)."""
     return design.economiser * economiser_share(
-        chilled_water_c + design.chilled_water_range_k,
+        return_water_c,
         chilled_water_c=chilled_water_c,
         tower_water_c=tower_water_c + design.exchanger_approach_k,
     )
@@ -273,10 +299,13 @@ def _tower_setpoint_c(
     return np.maximum(coldest_c, useful_c)
 
 
-def _pumps_w(heat_removed_w: F64, rejected_w: F64, design: WaterSideDesign) -> tuple[F64, F64]:
-    """Power of chilled- and condenser-water pumps, in W, whose flows follow the heat, (B,)."""
+def _pumps_w(chilled_w: F64, rejected_w: F64, design: WaterSideDesign) -> tuple[F64, F64]:
+    """Power of chilled- and condenser-water pumps, in W, (B,).
+
+    Flows are in proportion to the heat, in W, that they carry with their ranges at design.
+    """
     chilled_pump_w = pump_w(
-        heat_removed_w,
+        chilled_w,
         design_flow=design.cooling_w,
         design_w=design.chilled_pump_w,
         min_flow_ratio=design.pump_min_ratio,

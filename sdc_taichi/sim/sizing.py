@@ -344,6 +344,7 @@ def _water_side(
         rejected_w=rejected_w,
         coil_approach_k=v("hvac.chiller.coil_approach_k"),
         chilled_water_range_k=v("hvac.chiller.chilled_water_range_k"),
+        coil_valves=v("hvac.chiller.coil_valves"),
         approach_min_k=approach_k,
         exchanger_approach_k=v("hvac.tower.economiser_approach_k") - approach_k,
         min_condenser_c=v("hvac.chiller.min_condenser_c"),
