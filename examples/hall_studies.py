@@ -141,6 +141,35 @@ def failing_units(
         return sim, [sim.step() for _ in range(steps)]
 
 
+def uncooled(rack_kw: float, event: str, minutes: int = 15) -> list[float]:
+    """Mean inlet at the end of each minute in C, beginning with the one before cooling is lost.
+
+    Full load, four CRAC units at 22 C, no protection.
+
+    Args:
+        rack_kw: IT nameplate of a rack, in kW.
+        event: kind and share of the event from the start on, as in a config.
+        minutes: length of the run.
+    """
+    config = load_config(
+        "corrected",
+        [
+            "hvac.crac.units=4",
+            "hvac.setpoint.initial_c=22",
+            "hvac.sizing.design_wet_bulb_c=26",
+            "servers.power_w=[150, 10]",
+            f"hall.servers_per_rack={round(rack_kw * 1e3 / 150)}",
+            "simulation.thermal=transient",
+            "simulation.substep_s=5",
+            "simulation.steps_per_hour=60",
+            f"events.scheduled=[{{{event}, start_h: {1 / 60}, duration_h: 9}}]",
+        ],
+    )
+    with Simulator(config, drivers=steady_weather(1.0, minutes + 1)) as sim:
+        sim.reset()
+        return [float(sim.step().inlet_mean_c[0]) for _ in range(minutes + 1)]
+
+
 class SideBySide:
     """Several controllers in one fleet: data center i is driven by controller i % n."""
 
@@ -297,6 +326,22 @@ def print_failures(hours: float) -> None:
                 )
 
 
+def print_warm_up() -> None:
+    """How fast halls of several densities warm without cooling."""
+    print(
+        "lost            kW per rack   mean inlet before, after 1, 3, 5, 10 min (C)   then (K/min)"
+    )
+    for label, event in (
+        ("all CRAC units", "kind: crac_down"),
+        ("chiller", "kind: chiller_derate, share: 0"),
+    ):
+        for rack_kw in (5, 10, 28):
+            inlet_c = uncooled(rack_kw, event)
+            shown = "  ".join(f"{inlet_c[minute]:.1f}" for minute in (0, 1, 3, 5, 10))
+            rate = (inlet_c[15] - inlet_c[5]) / 10
+            print(f"{label:15} {rack_kw:11d}   {shown:43}   {rate:.1f}")
+
+
 def print_failing_substeps() -> None:
     """What the substep changes when units fail, at steps of 15 min."""
     print(
@@ -434,6 +479,7 @@ def main(folder: Path, quick: bool) -> None:
         one[0].fleet,
     ).savefig(folder / "crac_failure.png")
     print_failures(hours)
+    print_warm_up()
     print_failing_substeps()
 
     steps = 24 if quick else DAYS * 96

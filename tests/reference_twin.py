@@ -647,7 +647,7 @@ def advance(
 ) -> tuple[dict[str, Any], Memory]:
     """Means over a step and the memory at its end; arguments as in ``steady``."""
     h, air, s = step_s / substeps, hall.air_j_per_m3_k, hall.config.servers
-    capacity = s.heat_capacity_kj_per_k * 1e3
+    capacity = hall.config.server_heat_capacity_kj_per_k * 1e3
     now, parts = memory, []
     for _ in range(substeps):
         supply_c = setpoint_c + now.room_j / room_j_per_k

@@ -84,7 +84,7 @@ def test_without_a_chiller_racks_throttle_and_then_trip() -> None:
     lost = rows["chiller"]
     assert 0 < lost["time_to_throttle_min"] < lost["time_to_trip_min"] <= 60
     assert lost["racks_off"] > 0
-    half = rows["half the chiller"]["time_to_throttle_min"]
+    half = rows["half of chiller"]["time_to_throttle_min"]
     assert half is None or half > lost["time_to_throttle_min"]
 
 

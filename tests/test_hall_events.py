@@ -151,7 +151,7 @@ def test_fan_commands_need_the_flow_model_that_obeys_them() -> None:
 # --- protection ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("thermal", "margin_k"), [("quasi_steady", 6.0), ("transient", 3.0)])
+@pytest.mark.parametrize(("thermal", "margin_k"), [("quasi_steady", 6.0), ("transient", 6.0)])
 def test_hot_racks_throttle_and_then_trip_with_their_work_counted(
     thermal: str, margin_k: float
 ) -> None:
@@ -208,13 +208,13 @@ def test_a_hardier_class_keeps_running() -> None:
              "simulation.thermal=transient", "workload.queue_limit_h=0.01",
              events("kind: crac_down, unit: 0, start_h: 1, duration_h: 3")],
             20,
-            constant(0.62),
+            constant(0.6),
         )  # fmt: skip
         throttled[name] = float(np.sum(column(results, "throttled_racks")))
         unmet[name] = float(np.sum(column(results, "dropped_tasks")))
-    assert throttled["A1"] > throttled["A2"] > 0
-    assert throttled["A3"] == throttled["A4"] == throttled["null"] == 0
-    assert unmet["A1"] > unmet["A2"] > unmet["null"] == 0
+    for found in (throttled, unmet):
+        assert [*found.values()] == sorted(found.values(), reverse=True)
+        assert found["A1"] > found["A4"] >= found["null"] == 0
 
 
 def all_units_down(thermal: str, *more: str) -> list[StepResult]:
@@ -280,9 +280,11 @@ def test_the_heat_of_tripped_servers_goes_to_the_room() -> None:
     assert np.all(np.diff(column(results, "room_heat_kwh")[off]) > 0)
     assert np.all(np.diff(column(results, "supply_c")[off]) > 0)
     np.testing.assert_allclose(column(results, "it_w")[off] - stored_w[off], load_w[off], rtol=1e-9)
-    # Inlets neither fall to where racks would restart nor pass the servers.
-    inlet_c = column(results, "inlet_mean_c")[off]
-    assert np.all((inlet_c > 27) & (inlet_c < column(results, "outlet_mean_c")[off]))
+    # The hall warms as the servers cool.
+    inlet_c, outlet_c = (column(results, f"{name}_mean_c")[off] for name in ("inlet", "outlet"))
+    assert np.all(np.diff(inlet_c) > 0)
+    assert np.all(np.diff(outlet_c) < 0)
+    assert np.all(inlet_c < outlet_c)
 
 
 @pytest.mark.parametrize(("thermal", "per_hour"), [("quasi_steady", 4), ("transient", 60)])

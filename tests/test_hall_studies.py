@@ -57,7 +57,7 @@ def test_moved_load_changes_inlets_by_an_amount_that_falls_with_distance(moved: 
 
 def test_failed_unit_is_felt_near_it_first_and_recovers(study: ModuleType) -> None:
     sim, results = study.failing_units(0, steps_per_hour=12, hours=4.0)
-    before, first, last, after = (results[i] for i in (11, 12, 23, -1))
+    before, first, after = (results[i] for i in (11, 12, -1))
     assert before.unit_running.tolist() == [1.0] * 4
     assert first.unit_running.tolist() == [0.0, 1.0, 1.0, 1.0]
     rise = (first.rack_inlet_c - before.rack_inlet_c).astype(np.float64)
@@ -65,8 +65,9 @@ def test_failed_unit_is_felt_near_it_first_and_recovers(study: ModuleType) -> No
     plan_front = study.floor_plan(sim.fleet.configs[0].hall).front_m
     distance = np.hypot(*(plan_front - [0.0, 2.7]).T)
     assert np.corrcoef(distance, rise)[0, 1] < -0.8
-    # It goes on while the servers warm, and comes back.
-    assert np.all(last.rack_inlet_c > first.rack_inlet_c + 1.0)
+    # It goes on while the servers warm, until they throttle, and comes back.
+    warmest_c = np.max([r.rack_inlet_c for r in results[12:24]], axis=0)
+    assert np.all(warmest_c > first.rack_inlet_c + 1.0)
     np.testing.assert_allclose(after.rack_inlet_c, before.rack_inlet_c, atol=0.05)
     assert after.tripped_racks[0] == 0.0
 
@@ -84,6 +85,18 @@ def test_loss_of_all_units_trips_servers_in_time_only_with_memory(study: ModuleT
     assert down[-1] == 0.0
     assert float(moving[-1].executed_tasks[0]) == pytest.approx(90.0)
     assert sum(float(r.lost_tasks[0]) for r in moving) > 0.0
+
+
+@pytest.mark.parametrize("rack_kw", [5, 28])
+def test_halls_without_cooling_warm_as_fast_as_published(study: ModuleType, rack_kw: int) -> None:
+    # Opengate Data Systems: servers shut down 3 min 9 s after the loss, at 5 kW per rack.
+    inlet_c = study.uncooled(rack_kw, "kind: crac_down", 12)
+    assert inlet_c[0] < 28.0
+    assert 42.0 < inlet_c[3] < 46.0
+    # Then servers of 30 J/(K W), coils and floor of 15 and some air warm by the power alone.
+    assert 1 / 48 < (inlet_c[12] - inlet_c[10]) / 120 < 1 / 30
+    slower = study.uncooled(rack_kw, "kind: chiller_derate, share: 0", 12)
+    assert 34.0 < slower[3] < 38.0
 
 
 def test_side_by_side_gives_each_its_own_controller(study: ModuleType) -> None:

@@ -326,9 +326,9 @@ def test_heat_wave_stores_heat_and_gives_it_back(heat_wave: tuple[Precision, Run
     assert np.all(run["room_heat_kwh"].max(axis=0) > 0), "nothing stored"
     assert np.all(run["recovered_w"].max(axis=0) > 0), "nothing recovered"
     assert np.all(run["room_heat_kwh"][-1] < 1e-9), "not recovered by the end"
-    kj_per_k = run.fleet_values("hall.room_heat_capacity_kj_per_k_per_server")
+    kj_per_k = run.fleet_values("room_heat_capacity_kj_per_k")
     # Servers in steady state warm with the room.
-    kwh_per_k = (kj_per_k + run.fleet_values("servers.heat_capacity_kj_per_k")) * 4000 / 3600
+    kwh_per_k = (kj_per_k + run.fleet_values("server_heat_capacity_kj_per_k")) * 4000 / 3600
     warmed = run["supply_c"] - run["setpoint_c"]
     np.testing.assert_allclose(warmed, run.before("room_heat_kwh") / kwh_per_k, atol=1e-12)
     assert not np.any((run["unmet_w"] > 0) & (run["recovered_w"] > 0))

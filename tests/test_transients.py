@@ -194,7 +194,7 @@ def test_substeps_converge_to_the_differential_equations(low: float) -> None:
     hall = Hall(fleet, "f64")
     settled = hall.steady_state(before)
     part = parts([config], after)[0]
-    capacity = config.servers.heat_capacity_kj_per_k * 1e3
+    capacity = config.server_heat_capacity_kj_per_k * 1e3
     counts = np.diff(fleet.server_offsets)
     state = np.concatenate([np.repeat(settled.server_c, counts), settled.mixed_c])
     change, _ = rates(parts([config], before)[0], state, supply_c, capacity)
@@ -246,7 +246,9 @@ def test_servers_follow_the_exact_exponential_in_any_number_of_substeps(
     per_k = config.servers.heat_exchange_effectiveness * twin.air_j_per_m3_k * flow
     start = np.repeat(np.asarray(settled.server_c, np.float64), np.diff(fleet.server_offsets))
     final = 20.0 + cpu / per_k
-    expected = final + (start - final) * np.exp(-900.0 * per_k / 9750.0)
+    expected = final + (start - final) * np.exp(
+        -900.0 * per_k / (1e3 * config.server_heat_capacity_kj_per_k)
+    )
     found = np.repeat(ends[0], np.diff(fleet.server_offsets))
     np.testing.assert_allclose(found, expected, rtol=rel)
     assert np.all((expected > start + 1) & (expected < final - 1))
@@ -260,7 +262,7 @@ def held_j(fleet: Fleet, state: HallState, room_j: F64) -> F64:
     per_group = fleet.per_group_servers() * np.asarray(state.server_c, np.float64)
     servers = np.add.reduceat(per_group, fleet.group_offsets[fleet.rack_offsets[:-1]])
     parcels = np.add.reduceat(np.asarray(state.mixed_c, np.float64), fleet.rack_offsets[:-1])
-    capacity = fleet.values("servers.heat_capacity_kj_per_k") * 1e3
+    capacity = fleet.values("server_heat_capacity_kj_per_k") * 1e3
     twins = [reference_twin.calibrated(c) for c in fleet.configs]
     per_parcel = np.array([t.parcel_j_per_k for t in twins])
     return np.asarray(servers * capacity + parcels * per_parcel + room_j, dtype=np.float64)
@@ -348,7 +350,7 @@ def test_an_uncooled_hall_warms_by_its_power_over_its_heat_capacity(precision: P
         assert sums.coil_w[0] == 0.0
         means.append((sums.inlet_mean_c[0], sums.outlet_mean_c[0], sums.supply_c[0]))
     parcels = reference_twin.calibrated(config).parcel_j_per_k * fleet.racks
-    capacity = servers * (9750.0 + 2000.0) + parcels
+    capacity = servers * (1e3 * config.server_heat_capacity_kj_per_k + 2000.0) + parcels
     expected = 900.0 * (sums.cpu_w + sums.it_fan_w) / capacity
     rel = {"f64": 1e-6, "f32": 1e-3}[precision]
     np.testing.assert_allclose(np.diff(means, axis=0)[-1], np.full(3, expected[0]), rtol=rel)

@@ -28,6 +28,13 @@ from sdc_taichi.plant.servers import ServerCurves, linear_curve
 
 MOST_RACKS = 10_000_000
 """Largest number of racks of a hall."""
+SERVER_J_PER_K_W = 30.0
+"""Heat capacity of servers over their power at full load, in J/(K W): 12 kJ/K were measured of a
+server of two units (Ibrahim, Shrivastava, Sammakia, Ghose 2012, "Thermal mass characterization of a
+server at different fan speeds", ITherm), which draws some 400 W."""
+ROOM_J_PER_K_W = 15.0
+"""Heat capacity of what follows the supply air over the servers' power at full load, in J/(K W):
+coils with their water, and raised floor."""
 LEAST_INLET_RANGE_K = 5.0
 """Least difference of the two inlets between which curves of servers are given, in K: fans run over
 some 10 K, and over 1 K they would do a hundred times their power a few degrees beyond it."""
@@ -146,9 +153,10 @@ class HallConfig(Section):
     height_gradient: Annotated[float, Field(ge=0, lt=1)] = 0.4
     """Relative rise of the recirculated share of the intake from the middle of a rack to its top,
     and its fall to the floor, 0..1."""
-    room_heat_capacity_kj_per_k_per_server: Annotated[float, Field(ge=0.01, le=1e5)] = 2.0
-    """Heat capacity of room, coils and all else that follows the supply air, in kJ/K per server,
-    0.01..1e5: from 10 l of air to 100 t of concrete."""
+    room_heat_capacity_kj_per_k_per_server: Annotated[float, Field(ge=0.01, le=1e5)] | None = None
+    """Heat capacity of coils, floor and all else that follows the supply air, in kJ/K per server,
+    0.01..1e5: from 10 l of air to 100 t of concrete; None is 15 J/K per W of the servers' power at
+    full load."""
     air_density_kg_m3: Annotated[float, Field(ge=0.4, le=1.6)] | None = None
     """Density of the air at all temperatures, in kg/m3, 0.4..1.6: from the summit of Mount Everest
     to sea level at -50 C; None lets it follow from the height of the site above sea level and the
@@ -289,8 +297,9 @@ class ServerConfig(Section):
     outlet_model: Literal["server", "rack", "released"] = "server"
     """Outlet temperature from a heat balance per server, from one per rack, or from the fit of the
     released SustainDC."""
-    heat_capacity_kj_per_k: Annotated[float, Field(ge=0.01, le=1e4)] = 9.75
-    """Heat capacity of one server, in kJ/K, 0.01..10,000: from 10 g to 10 t of metal."""
+    heat_capacity_kj_per_k: Annotated[float, Field(ge=0.01, le=1e4)] | None = None
+    """Heat capacity of one server, in kJ/K, 0.01..10,000: from 10 g to 10 t of metal; None is 30
+    J/K per W of its power at full load, mean over the servers of the hall."""
     heat_exchange_effectiveness: WorkingShare = 0.95
     """Effectiveness of the heat exchange between the mass of a server and the air that passes it,
     0.01..1."""

@@ -26,7 +26,13 @@ from sdc_taichi.config.fields import (
     WorkingShare,
     check_one_per_rack,
 )
-from sdc_taichi.config.hall_schema import HallConfig, ServerConfig, ServerGroup
+from sdc_taichi.config.hall_schema import (
+    ROOM_J_PER_K_W,
+    SERVER_J_PER_K_W,
+    HallConfig,
+    ServerConfig,
+    ServerGroup,
+)
 from sdc_taichi.config.hvac_schema import HvacConfig
 from sdc_taichi.config.tariff_schema import TariffConfig
 from sdc_taichi.errors import ConfigError
@@ -303,6 +309,27 @@ class DataCenterConfig(Section):
                 f"coldest inlet of rack {worst}, and no load; it must be positive (raise "
                 "fan_airflow_ratio_lb or set fan_airflow_ratio_limits)"
             )
+
+    @property
+    def server_heat_capacity_kj_per_k(self) -> float:
+        """Heat capacity of one server, in kJ/K."""
+        given = self.servers.heat_capacity_kj_per_k
+        return SERVER_J_PER_K_W * self._mean_server_w() / 1e3 if given is None else given
+
+    @property
+    def room_heat_capacity_kj_per_k(self) -> float:
+        """Heat capacity of what follows the supply air, in kJ/K per server."""
+        given = self.hall.room_heat_capacity_kj_per_k_per_server
+        return ROOM_J_PER_K_W * self._mean_server_w() / 1e3 if given is None else given
+
+    def _mean_server_w(self) -> float:
+        """Power of a server at full load without its fans, mean over the hall, in W."""
+        if self.servers.groups is None:
+            count = np.asarray(self.hall.servers_per_rack, dtype=np.float64)
+            full_w = np.array([full for full, _ in self.servers.power_pairs])
+            return float((count * full_w).mean() / count.mean())
+        groups = [group for rack in self.servers.groups for group in rack]
+        return sum(g.count * g.full_w for g in groups) / sum(g.count for g in groups)
 
     def rack_nameplate_w(self) -> np.ndarray:
         """Power at full load of the servers of every rack, without their fans, in W, (R,)."""

@@ -12,7 +12,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sdc_taichi.config import DataCenterConfig, EventsConfig, ScheduledEvent, with_values
+from sdc_taichi.config import (
+    DataCenterConfig,
+    EventKind,
+    EventsConfig,
+    ScheduledEvent,
+    with_values,
+)
+from sdc_taichi.config.event_schema import PLANT_OF_EVENT
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
 from sdc_taichi.sim.drivers import drivers_from_arrays, load_drivers
@@ -33,6 +40,14 @@ MOST_LOSSES = 200
 """Most losses of a study; of more CRAC units than that, evenly spread ones are lost."""
 SHOWN_AFTER_MIN = (15, 60)
 """Minutes after which the hottest inlet is told."""
+DEVICES: dict[EventKind, str] = {
+    "chiller_derate": "chiller",
+    "pump_down": "chilled-water pumps",
+    "tower_cell_down": "tower cells",
+    "dry_cooler_down": "dry cooler",
+    "outdoor_air_closed": "outdoor air",
+}
+"""Devices of plants by the event that takes them, in words."""
 CLASS = "A2"
 """Class of the servers, whose limits they throttle and trip at, where the config names none."""
 
@@ -105,7 +120,7 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
         ConfigError: Inlet model ``approach``, which knows no CRAC units and no room.
     """
     base, supply_c = _studied(config)
-    losses, note = unit_losses(base) if lost == "units" else (plant_losses(), "")
+    losses, note = unit_losses(base) if lost == "units" else (plant_losses(base), "")
     copies = [
         base.model_copy(
             update={
@@ -176,12 +191,17 @@ def unit_losses(config: DataCenterConfig) -> tuple[tuple[Loss, ...], str]:
     ), note
 
 
-def plant_losses() -> tuple[Loss, ...]:
-    """No loss, and each device of the plant that an event can take."""
+def plant_losses(config: DataCenterConfig) -> tuple[Loss, ...]:
+    """No loss, and half and all of each device that the plant of a config has."""
+    plant = config.hvac.plant_in_use
     return (
         Loss("no loss", (), ()),
-        Loss("half the chiller", (), (_event("chiller_derate", share=0.5),)),
-        Loss("chiller", (), (_event("chiller_derate", share=0.0),)),
+        *(
+            Loss(name, (), (_event(kind, share=share),))
+            for kind, device in DEVICES.items()
+            if PLANT_OF_EVENT.get(kind, plant) == plant
+            for name, share in ((f"half of {device}", 0.5), (device, 0.0))
+        ),
     )
 
 

@@ -360,7 +360,7 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         "fan_reference_w": float(servers.fan_reference_w.max()),
         "air_j_per_m3_k": air_j_per_m3_k,
         "fresh_share": fresh_share,
-        "server_j_per_k": config.servers.heat_capacity_kj_per_k * 1e3,
+        "server_j_per_k": config.server_heat_capacity_kj_per_k * 1e3,
         "effectiveness": config.servers.heat_exchange_effectiveness,
         "parcel_j_per_k": air_j_per_m3_k * floor_plan(hall).air_m3 / hall.racks,
     }

@@ -497,7 +497,7 @@ def _room_kwh_per_k(fleet: Fleet) -> F64:
     Quasi-steady halls: with the servers. Transient ones: servers and the air before the racks,
     which is that of the room, have temperatures of their own.
     """
-    per_server = fleet.values("hall.room_heat_capacity_kj_per_k_per_server")
+    per_server = fleet.values("room_heat_capacity_kj_per_k")
     if fleet.models["thermal"] == "quasi_steady":
-        per_server = per_server + fleet.values("servers.heat_capacity_kj_per_k")
+        per_server = per_server + fleet.values("server_heat_capacity_kj_per_k")
     return np.asarray(per_server * fleet.per_dc_servers() / 3600.0)
