@@ -50,6 +50,7 @@ def test_costs_are_what_their_names_say() -> None:
             "hot_inlets": infos["over_27_mean_k"] / 4,
             "throttled_racks": (infos["throttled_racks"] + infos["tripped_racks"]) / 4,
             "overdue_work": tasks,
+            "grid_overload": infos["grid_overload_kwh"],
         }
         for name, values in expected.items():
             np.testing.assert_array_equal(infos[f"cost_{name}"], values, name)
@@ -174,6 +175,8 @@ def test_costs_that_are_not_valid(costs: Any, message: str) -> None:
 def test_a_cost_that_is_always_zero_is_refused() -> None:
     with pytest.raises(ConfigError, match="throttled_racks is always 0 without protection"):
         sdc_taichi.parallel_env("corrected", costs=["throttled_racks"])
+    with pytest.raises(ConfigError, match="grid_overload is always 0 without a limit"):
+        sdc_taichi.parallel_env("paper", costs=["grid_overload"])
 
 
 @pytest.mark.parametrize(

@@ -167,6 +167,8 @@ def by_hand(view: View, dc: int, work: list[list[float]]) -> dict[str, list[floa
         "wet_bulb": [at(drivers.wet_bulb_c, dc, index)],
         "wet_bulb_forecast": ahead(drivers.wet_bulb_c, WEATHER_LEADS_H),
         "workload": [at(drivers.demand, dc, index)],
+        "price": [at(drivers.price_per_kwh, dc, index) / 0.125],
+        "price_forecast": [p / 0.125 for p in ahead(drivers.price_per_kwh, CI_LEADS_H)],
         "queue": [total / (limit_h * per_hour * 100.0)],
         "oldest_age": [ages[0][0] if ages else 0.0],
         "mean_age": [sum(age * tasks for age, tasks in ages) / total if ages else 0.0],

@@ -45,8 +45,14 @@ def overdue_work(result: StepResult, view: View) -> F64:
     return result.overdue_tasks + result.dropped_tasks + result.lost_tasks
 
 
+def grid_overload(result: StepResult, view: View) -> F64:
+    """Energy drawn beyond the limit of the grid connection, kWh."""
+    return result.grid_overload_kwh
+
+
 COSTS: dict[str, CostFunction] = {
-    function.__name__: function for function in (hot_inlets, throttled_racks, overdue_work)
+    function.__name__: function
+    for function in (hot_inlets, throttled_racks, overdue_work, grid_overload)
 }
 """Costs by name that need no registration."""
 _registered: dict[str, CostFunction] = {}
@@ -91,6 +97,14 @@ class Costs:
             raise ConfigError(
                 "costs: throttled_racks is always 0 without protection; valid with "
                 "protection.ashrae_class"
+            )
+
+        limits = [c.electrical for c in fleet.configs]
+        unlimited = all(x.grid_limit_kw is x.grid_limit_ratio is None for x in limits)
+        if self._functions.get("grid_overload") is grid_overload and unlimited:
+            raise ConfigError(
+                "costs: grid_overload is always 0 without a limit; valid with "
+                "electrical.grid_limit_kw or grid_limit_ratio"
             )
 
     def of(self, result: StepResult, view: View) -> dict[str, F64]:

@@ -95,10 +95,10 @@ FEATURE_OF_COMMAND = {"fan": "fan_speed", "placement": "rack_inlets"}
 def time_features(
     ci_leads_h: Sequence[float] = CI_LEADS_H, weather_leads_h: Sequence[float] = WEATHER_LEADS_H
 ) -> tuple[Feature, ...]:
-    """Features that depend on time alone: clock, carbon intensity, weather and arriving work.
+    """Features that depend on time alone: clock, carbon intensity, weather, work and price.
 
     Args:
-        ci_leads_h: leads of the carbon-intensity forecast, in h.
+        ci_leads_h: leads of the forecasts of carbon intensity and price, in h.
         weather_leads_h: leads of the weather forecasts, in h.
     """
     ci, weather = (", ".join(f"{h:g}" for h in leads) for leads in (ci_leads_h, weather_leads_h))
@@ -114,6 +114,8 @@ def time_features(
         Feature("wet_bulb", "C", -30.0, 40.0, "wet bulb of the step to come"),
         Feature("wet_bulb_forecast", "C", -30.0, 40.0, f"wet bulb in {weather} h", k),
         Feature("workload", "share", 0.0, 1.0, "work that arrives in the step to come"),
+        Feature("price", "1", 0.0, 3.0, "price of the step to come over its mean"),
+        Feature("price_forecast", "1", 0.0, 3.0, f"price in {ci} h over its mean", n),
     )
     return tuple(feature for feature in features if feature.size)
 
@@ -158,7 +160,7 @@ def all_features(
     """All features in the order of the shared state.
 
     Args:
-        ci_leads_h: leads of the carbon-intensity forecast, in h.
+        ci_leads_h: leads of the forecasts of carbon intensity and price, in h.
         weather_leads_h: leads of the weather forecasts, in h.
         units: number of CRAC units whose setpoints stand side by side.
         fans: number of CRAC fans whose speeds are decided; 0 if none are.

@@ -109,6 +109,9 @@ class Forecasts:
         weather_leads_h: leads of both temperatures in h, rising multiples of the step.
         error: how forecasts err.
 
+    Attributes:
+        ci_leads: 0 for the present, then the leads of the carbon intensity, in steps, (1 + k,).
+
     Raises:
         ConfigError: leads that are not valid.
     """
@@ -122,7 +125,7 @@ class Forecasts:
         error: ForecastError = PERFECT,
     ) -> None:
         now = np.zeros(1, dtype=np.int64)
-        self._ci_leads = np.append(now, lead_steps("ci_leads_h", ci_leads_h, steps_per_hour))
+        self.ci_leads = np.append(now, lead_steps("ci_leads_h", ci_leads_h, steps_per_hour))
         self._weather_leads = np.append(
             now, lead_steps("weather_leads_h", weather_leads_h, steps_per_hour)
         )
@@ -152,12 +155,12 @@ class Forecasts:
         new = not all(map(operator.is_, tables, self._tables)) or not self._tables
         if new:
             self._tables = tables
-            self._ci = _ExtendedSeries(tables[0], self._ci_leads)
-            self._outdoor = _ExtendedSeries(tables[1], self._weather_leads)
-            self._wet_bulb = _ExtendedSeries(tables[2], self._weather_leads)
+            self._ci = ExtendedSeries(tables[0], self.ci_leads)
+            self._outdoor = ExtendedSeries(tables[1], self._weather_leads)
+            self._wet_bulb = ExtendedSeries(tables[2], self._weather_leads)
         self._walks = None
         if not self.perfect:
-            ahead = int(max(self._ci_leads[-1], self._weather_leads[-1]))
+            ahead = int(max(self.ci_leads[-1], self._weather_leads[-1]))
             self._walks = _RandomWalks(keys, self._step_h, ahead)
         return new
 
@@ -203,9 +206,7 @@ class Forecasts:
             return ci, outdoor, wet_bulb
         self._walks.extend(step)
         if self._error.ci_share > 0:
-            ci *= 1.0 + float(self._error.ci_share) * self._walks.increments(
-                0, step, self._ci_leads
-            )
+            ci *= 1.0 + float(self._error.ci_share) * self._walks.increments(0, step, self.ci_leads)
             np.maximum(ci, 0.0, out=ci)
         if self._error.temperature_k > 0:
             error = float(self._error.temperature_k) * self._walks.increments(
@@ -216,7 +217,7 @@ class Forecasts:
         return ci, outdoor, wet_bulb
 
 
-class _ExtendedSeries:
+class ExtendedSeries:
     """A series of each data center in f32, repeated past its end by the longest lead.
 
     Args:

@@ -23,7 +23,14 @@ from sdc_taichi.envs.features import (
     scale,
     time_features,
 )
-from sdc_taichi.envs.forecasts import CI_LEADS_H, PERFECT, WEATHER_LEADS_H, ForecastError, Forecasts
+from sdc_taichi.envs.forecasts import (
+    CI_LEADS_H,
+    PERFECT,
+    WEATHER_LEADS_H,
+    ExtendedSeries,
+    ForecastError,
+    Forecasts,
+)
 from sdc_taichi.envs.time_rows import EntryOrder, RowStretches, TimeRows, time_rows
 from sdc_taichi.errors import RuntimeStateError
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
@@ -325,6 +332,8 @@ class _TimeEntries:
         self.width = sum(f.size for f in features)
         self._row_bytes = 4 * self.width
         self._forecasts = forecasts
+        self._price_leads = forecasts.ci_leads
+        self._price: ExtendedSeries | None = None
         self._time_of_day = _sine_and_cosine(24 * steps_per_hour)
         self._time_of_year = _sine_and_cosine(HOURS_PER_YEAR * steps_per_hour)
         self._series: tuple[FleetSeries, ...] = ()
@@ -349,7 +358,11 @@ class _TimeEntries:
         changed = changed or not self._series or demand is not self._series[-1]
         self._stretch = range(0)
         if changed:
-            self._series = (drivers.ci_g_per_kwh, drivers.outdoor_c, drivers.wet_bulb_c, demand)
+            price = drivers.price_per_kwh
+            assert price is not None, "a simulator has filled it in"
+            self._price = ExtendedSeries(_over_mean(price), self._price_leads)
+            weather = drivers.outdoor_c, drivers.wet_bulb_c
+            self._series = (drivers.ci_g_per_kwh, *weather, price, demand)
             self._row_bytes = 4 * (self.width + arranged_width)
             self.rows = self._stretches = None
             if self._forecasts.perfect and not self._new_inputs:
@@ -385,14 +398,20 @@ class _TimeEntries:
         """Entries of data centers ``dc`` at steps of the year, (n, width)."""
         demand = self._series[-1]
         now = demand.values[demand.offsets[dc] + index % demand.lengths[dc]]
-        return self._scaled(index, now, self._forecasts.truth(index, dc))
+        return self._scaled(index, now, self._forecasts.truth(index, dc), dc)
 
     def compute(self, index: I64, step: int) -> F32:
         """Entries of all data centers, (B, n), at steps of the year, (B,), ``step`` after reset."""
         demand = self._series[-1].at(index)
         return self._scaled(index, demand, self._forecasts.forecast(index, step))
 
-    def _scaled(self, index: I64, demand: F64, forecasts: tuple[F32, F32, F32]) -> F32:
+    def _scaled(
+        self,
+        index: I64,
+        demand: F64,
+        forecasts: tuple[F32, F32, F32],
+        dc: I64 | slice = slice(None),
+    ) -> F32:
         """Scaled entries, (n, width).
 
         Args:
@@ -400,7 +419,10 @@ class _TimeEntries:
             demand: arriving work as a share of capacity, (n,).
             forecasts: carbon intensity, dry bulb and wet bulb, (1 + leads, n) each, the present
                 first.
+            dc: data center of each step, (n,); one step for each by default.
         """
+        assert self._price is not None
+        price = self._price.at(index, dc)
         ci, outdoor, wet_bulb = forecasts
         out = np.empty((len(index), self.width), dtype=np.float32)
         day, year = self._time_of_day, self._time_of_year
@@ -415,6 +437,8 @@ class _TimeEntries:
             "wet_bulb": wet_bulb[:1],
             "wet_bulb_forecast": wet_bulb[1:],
             "workload": demand[None].astype(np.float32),
+            "price": price[:1],
+            "price_forecast": price[1:],
         }
         for name, of_feature in values.items():
             if name in self._features:
@@ -426,6 +450,16 @@ def mean_setpoint_c(view: View) -> F64:
     """Mean setpoint over the CRAC units of each data center, in C, (B,)."""
     fleet = view.fleet
     return np.asarray(fleet.unit_sums(view.state.setpoint_c) / np.diff(fleet.unit_offsets))
+
+
+def _over_mean(series: FleetSeries) -> FleetSeries:
+    """Values of each series over their mean; those of a series of zeros stay."""
+    values = series.values.copy()
+    for first, length in {*zip(series.offsets.tolist(), series.lengths.tolist(), strict=True)}:
+        own = values[first : first + length]
+        mean = own.mean()
+        own /= mean if mean > 0 else 1.0
+    return FleetSeries(values, series.offsets, series.lengths)
 
 
 def _inverse(values: F64) -> F64:
