@@ -149,6 +149,8 @@ def by_hand(view: View, dc: int, work: list[list[float]]) -> dict[str, list[floa
     def ahead(table: FleetSeries, leads_h: tuple[float, ...]) -> list[float]:
         return [at(table, dc, index + round(h * per_hour)) for h in leads_h]
 
+    price = drivers.price_per_kwh
+    assert price is not None
     ci = at(drivers.ci_g_per_kwh, dc, index)
     ci_ahead = ahead(drivers.ci_g_per_kwh, CI_LEADS_H)
     last = view.last
@@ -167,8 +169,8 @@ def by_hand(view: View, dc: int, work: list[list[float]]) -> dict[str, list[floa
         "wet_bulb": [at(drivers.wet_bulb_c, dc, index)],
         "wet_bulb_forecast": ahead(drivers.wet_bulb_c, WEATHER_LEADS_H),
         "workload": [at(drivers.demand, dc, index)],
-        "price": [at(drivers.price_per_kwh, dc, index) / 0.125],
-        "price_forecast": [p / 0.125 for p in ahead(drivers.price_per_kwh, CI_LEADS_H)],
+        "price": [at(price, dc, index) / 0.125],
+        "price_forecast": [p / 0.125 for p in ahead(price, CI_LEADS_H)],
         "queue": [total / (limit_h * per_hour * 100.0)],
         "oldest_age": [ages[0][0] if ages else 0.0],
         "mean_age": [sum(age * tasks for age, tasks in ages) / total if ages else 0.0],
