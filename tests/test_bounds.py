@@ -175,9 +175,10 @@ def test_environments_end_at_a_limit_too(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_servers_without_air_end_the_run() -> None:
-    still = [f"servers.fan_airflow_ratio_{end}=[1e-6, 1e-6]" for end in ("lb", "ub")]
+    still = [f"servers.fan_airflow_ratio_{end}=[1e-6, 1]" for end in ("lb", "ub")]
     still += ["name=still", "servers.fan_airflow_ratio_limits=null"]
-    with Simulator([load_config("tiny"), load_config("tiny", still)]) as sim:
+    idle = drivers_from_arrays([20.0], [15.0], [300.0], [0.0], size=2)
+    with Simulator([load_config("tiny"), load_config("tiny", still)], drivers=idle) as sim:
         sim.reset()
         with pytest.raises(PhysicalLimitError, match=r"^still: outlet_mean_c is .* in step 0; "):
             sim.step()

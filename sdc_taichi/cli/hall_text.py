@@ -33,11 +33,34 @@ def _room_lines(found: DesignHall) -> list[str]:
         f"{plan.air_m3:,.4g} m3 of air",
         f"racks         {size.rack_pitch_m:g} m wide, {size.rack_depth_m:g} m deep, "
         f"{size.rack_height_m:g} m high",
+        *_type_lines(found),
         f"aisles        {cold} cold of {size.cold_aisle_m:g} m and {hot} hot of "
         f"{size.hot_aisle_m:g} m between rows; {size.side_margin_m:g} m beside the outer rows, "
         f"{size.end_margin_m:g} m at the row ends",
         f"containment   {100 * size.containment:g} %; returns {grilles}",
     ]
+
+
+def _type_lines(found: DesignHall) -> list[str]:
+    """A line for each type of racks: how many, and what one of them draws at the design point."""
+    hall = found.config.hall
+    named = np.array(hall.rack_type_names())
+    rise_k = found.outlet_c - found.inlet_c
+    lines = []
+    for name in hall.rack_types:
+        of_type = named == name
+        if not of_type.any():
+            lines.append(f"  type {printable(name)}: no racks")
+            continue
+        groups = found.config.rack_groups()[int(np.argmax(of_type))]
+        servers = " + ".join(f"{g.count:,} x {g.full_w:,.6g} W" for g in groups)
+        lines.append(
+            f"  type {printable(name)}: {_count(int(of_type.sum()), 'rack')} of {servers}, "
+            f"{_span(found.it_w[of_type] / 1e3, 1)} kW, "
+            f"{_span(found.airflow_m3s[of_type], 3)} m3/s, "
+            f"{_span(rise_k[of_type], 1)} K of rise"
+        )
+    return lines
 
 
 def _unit_lines(found: DesignHall) -> list[str]:

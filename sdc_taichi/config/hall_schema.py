@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -15,15 +16,18 @@ from sdc_taichi.config.fields import (
     FlowRatio,
     IdleW,
     LengthM,
+    Name,
     PowerRatio,
     RiseK,
     Section,
     ServerW,
     Share,
+    Text,
     WorkingShare,
     check_one_per_rack,
     check_ordered,
 )
+from sdc_taichi.errors import shortened, suggestion_or_valid
 from sdc_taichi.plant.servers import ServerCurves, linear_curve
 
 MOST_RACKS = 10_000_000
@@ -35,6 +39,8 @@ server at different fan speeds", ITherm), which draws some 400 W."""
 ROOM_J_PER_K_W = 15.0
 """Heat capacity of what follows the supply air over the servers' power at full load, in J/(K W):
 coils with their water, and raised floor."""
+MOST_RACK_U = 58.0
+"""Height of the tallest racks, in units of 44.45 mm."""
 LEAST_INLET_RANGE_K = 5.0
 """Least difference of the two inlets between which curves of servers are given, in K: fans run over
 some 10 K, and over 1 K they would do a hundred times their power a few degrees beyond it."""
@@ -116,6 +122,106 @@ class RecirculationConfig(Section):
         return self
 
 
+class ServerGroup(Section):
+    """Servers of a rack that are alike: computed once, expanded to servers on request."""
+
+    count: Count
+    """Number of servers."""
+    full_w: ServerW
+    """CPU power of one server at full load and a power ratio of 1, in W."""
+    idle_w: IdleW
+    """Least CPU power of one server, in W."""
+    load_weight: Annotated[float, Field(ge=0, le=1000)] = 1.0
+    """Load of a server relative to the mean of its rack, by count, at little load; at most twice
+    that mean."""
+    inlet_offset_k: DifferenceK = 0.0
+    """Inlet of a server above the inlet of its rack, by its height in the rack, in K."""
+    full_airflow_m3s: FullAirflow | None = None
+    """Airflow through one server at airflow ratio 1, in m3/s, 1e-4..100: from the fan of a laptop
+    to ten racks in one; None is that of ``servers.fan_full_airflow_m3s``."""
+    design_rise_k: DesignRiseK | None = None
+    """Temperature rise of the air through the server at the design point, in K, 2..40, in place of
+    ``full_airflow_m3s``: less takes a storm, and more no server bears."""
+    fan_w: IdleW | None = None
+    """Fan power of one server at ``servers.fan_reference_ratio``, in W; None is by ``servers``."""
+    height_u: Annotated[float, Field(ge=0.1, le=58)] | None = None
+    """Height of one server in units of 44.45 mm, 0.1..58: from a card in a chassis to the tallest
+    racks; None is as high as a server of one unit."""
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if self.idle_w > self.full_w:
+            raise ValueError(f"idle_w {self.idle_w:g} must not exceed full_w {self.full_w:g}")
+        if self.full_airflow_m3s is not None and self.design_rise_k is not None:
+            raise ValueError(
+                "full_airflow_m3s and design_rise_k are both given; valid is one, null for the "
+                "other"
+            )
+        return self
+
+
+class RackType(Section):
+    """A rack with all that stands in it."""
+
+    servers: Annotated[tuple[ServerGroup, ...], Field(min_length=1)]
+    """Servers of the rack from the floor up: one group, or several."""
+
+    @field_validator("servers", mode="before")
+    @classmethod
+    def _one_group_is_a_list_of_one(cls, value: Any) -> Any:
+        return [value] if isinstance(value, dict | ServerGroup) else value
+
+
+class RackRange(Section):
+    """Places of the hall whose racks are of one type."""
+
+    type: Name
+    """Name of the type, one of ``rack_types``."""
+    rows: Text | None = None
+    """Rows, counted from 0, such as 3, 0-5 or "0-2, 6"; None is all."""
+    racks: Text | None = None
+    """Places in these rows, counted from 0, likewise; None is all."""
+
+    @field_validator("rows", "racks", mode="before")
+    @classmethod
+    def _numbers_as_text(cls, value: Any) -> Any:
+        if isinstance(value, list | tuple):
+            return ", ".join(map(str, value))
+        return str(value) if isinstance(value, int) else value
+
+    @field_validator("rows", "racks")
+    @classmethod
+    def _numbers_and_ranges(cls, value: str | None) -> str | None:
+        if value is not None and not re.fullmatch(r"\d+(-\d+)?( *, *\d+(-\d+)?)*", value):
+            raise ValueError("valid are numbers and ranges, such as 3, 0-5 or 0-2, 6")
+        return value
+
+
+def _is_in(shape: tuple[int, ...], part: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Whether each place of a grid belongs to a part of it."""
+    out = np.zeros(shape, bool)
+    out[part] = True
+    return out
+
+
+def _listed(what: str, text: str | None, count: int) -> list[int]:
+    """Numbers of a text such as "0-2, 6", or all of ``count``.
+
+    Raises:
+        ValueError: naming ``what`` and numbers that are not in 0..count - 1.
+    """
+    found: list[int] = []
+    for part in (text or f"0-{count - 1}").split(","):
+        first, _, last = part.partition("-")
+        low, high = int(first), int(last or first)
+        if not low <= high < count:
+            raise ValueError(
+                f"{what} {part.strip()}: valid are 0..{count - 1}, the lower number first"
+            )
+        found += range(low, high + 1)
+    return found
+
+
 class HallConfig(Section):
     """Rows of racks, their approach temperatures, and how many servers they hold."""
 
@@ -124,7 +230,12 @@ class HallConfig(Section):
     racks_per_row: RackCount
     """Number of racks of each row."""
     servers_per_rack: Count | tuple[Count, ...] = 200
-    """Number of servers of a rack: one for all racks, or one per rack."""
+    """Number of servers of a rack: one for all racks, or one per rack. Racks of ``rack_types`` and
+    of ``servers.groups`` have their own."""
+    rack_types: dict[Name, RackType] = Field(default={})
+    """Types of racks by their names, in place of ``servers.power_w`` and ``servers.groups``."""
+    rack_plan: tuple[RackRange, ...] = ()
+    """Which type stands where; none is needed for a single type."""
     capacity_mw: Annotated[float, Field(ge=1e-6, le=1e5)] | None = None
     """IT nameplate power that the number of servers is scaled to, in MW, from a server of 1 W to
     1e5, more than all data centers of the world draw; None keeps ``servers_per_rack``."""
@@ -170,6 +281,47 @@ class HallConfig(Section):
         """Number of racks, rows x racks per row."""
         return self.rows * self.racks_per_row
 
+    def __hash__(self) -> int:
+        """Hash of all fields, of ``rack_types`` by their names and types."""
+        values = {**self.__dict__, "rack_types": tuple(self.rack_types.items())}
+        return hash(tuple(values.items()))
+
+    def rack_type_names(self) -> tuple[str, ...]:
+        """Name of the type of every rack, (R,); none without ``rack_types``.
+
+        Raises:
+            ValueError: a type that is not known, or racks of two types or of none.
+        """
+        names, plan = list(self.rack_types), self.rack_plan
+        if len(names) == 1 and not plan:
+            plan = (RackRange(type=names[0]),)
+        at = np.full((self.rows, self.racks_per_row), -1)
+        for index, entry in enumerate(plan):
+            where = f"rack_plan.{index}"
+            if entry.type not in self.rack_types:
+                raise ValueError(
+                    f"{where}.type: {shortened(entry.type)} is not in rack_types"
+                    f"{suggestion_or_valid(entry.type, names)}"
+                )
+            part = np.ix_(
+                _listed(f"{where}.rows", entry.rows, self.rows),
+                _listed(f"{where}.racks", entry.racks, self.racks_per_row),
+            )
+            if np.any(at[part] >= 0):
+                row, rack = np.argwhere((at >= 0) & _is_in(at.shape, part))[0]
+                raise ValueError(
+                    f"{where}: rack {rack} of row {row} has a type already, "
+                    f"{names[at[row, rack]]}; valid is one"
+                )
+            at[part] = names.index(entry.type)
+        if names and np.any(at < 0):
+            row, rack = np.argwhere(at < 0)[0]
+            raise ValueError(
+                f"rack_plan: rack {rack} of row {row} has no type, as {np.sum(at < 0):,} of "
+                f"{at.size:,} racks; valid is one for each"
+            )
+        return tuple(names[i] for i in at.reshape(-1)) if names else ()
+
     def rack_approach_k(self) -> np.ndarray:
         """Supply approach temperature of every rack within its limits, in K, (R,)."""
         given = np.broadcast_to(np.asarray(self.supply_approach_k, np.float64), (self.racks,))
@@ -190,6 +342,11 @@ class HallConfig(Section):
         return check_ordered(value)
 
     @model_validator(mode="after")
+    def _every_rack_has_one_type(self) -> Self:
+        self.rack_type_names()
+        return self
+
+    @model_validator(mode="after")
     def _containment_acts_once(self) -> Self:
         if self.layout.containment > 0 and self.recirculation.matrix_file is not None:
             raise ValueError(
@@ -205,44 +362,6 @@ class HallConfig(Section):
         return self
 
 
-class ServerGroup(Section):
-    """Servers of a rack that are alike: computed once, expanded to servers on request."""
-
-    count: Count
-    """Number of servers."""
-    full_w: ServerW
-    """CPU power of one server at full load and a power ratio of 1, in W."""
-    idle_w: IdleW
-    """Least CPU power of one server, in W."""
-    load_weight: Annotated[float, Field(ge=0, le=1000)] = 1.0
-    """Load of a server relative to the mean of its rack, by count, at little load; at most twice
-    that mean."""
-    inlet_offset_k: DifferenceK = 0.0
-    """Inlet of a server above the inlet of its rack, by its height in the rack, in K."""
-    full_airflow_m3s: FullAirflow | None = None
-    """Airflow through one server at airflow ratio 1, in m3/s, 1e-4..100: from the fan of a laptop
-    to ten racks in one; None is that of ``servers.fan_full_airflow_m3s``."""
-    design_rise_k: DesignRiseK | None = None
-    """Temperature rise of the air through the server at the design point, in K, 2..40, in place of
-    ``full_airflow_m3s``: less takes a storm, and more no server bears."""
-    fan_w: IdleW | None = None
-    """Fan power of one server at ``servers.fan_reference_ratio``, in W; None is by ``servers``."""
-    height_u: Annotated[float, Field(ge=0.1, le=58)] | None = None
-    """Height of one server in units of 44.45 mm, 0.1..58: from a card in a chassis to the tallest
-    racks; None is as high as a server of one unit."""
-
-    @model_validator(mode="after")
-    def _fits_together(self) -> Self:
-        if self.idle_w > self.full_w:
-            raise ValueError(f"idle_w {self.idle_w:g} must not exceed full_w {self.full_w:g}")
-        if self.full_airflow_m3s is not None and self.design_rise_k is not None:
-            raise ValueError(
-                "full_airflow_m3s and design_rise_k are both given; valid is one, null for the "
-                "other"
-            )
-        return self
-
-
 class ServerConfig(Section):
     """Power and airflow of the servers (ITE:AirCooled form of EnergyPlus, curves of Sun 2021)."""
 
@@ -250,8 +369,8 @@ class ServerConfig(Section):
     """(full, idle) CPU power of one server, in W: one pair for all racks, or one per rack. Without
     it and without groups a server draws 150 W at full load and 10 W idle."""
     groups: tuple[tuple[ServerGroup, ...], ...] | None = None
-    """Server groups, in place of ``power_w`` and ``servers_per_rack``: one entry for all racks, or
-    one per rack."""
+    """Server groups, in place of ``power_w`` and ``hall.servers_per_rack``: one entry for all
+    racks, or one per rack. ``hall.rack_types`` name them."""
     cpu_power_ratio_lb: tuple[PowerRatio, PowerRatio] = (0.01, 1.00)
     """CPU power over full power at the coldest inlet of ``inlet_range_c``: at no load, and at full
     load."""

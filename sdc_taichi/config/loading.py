@@ -162,7 +162,20 @@ def _with_base(label: str, values: dict[str, Any]) -> dict[str, Any]:
     given = values.get("servers")
     if isinstance(given, dict):
         _replace_other_servers(merged["servers"], given)
+    _replace_by_rack_types(merged, values)
     return merged
+
+
+def _replace_by_rack_types(merged: dict[str, Any], values: Mapping[str, Any]) -> None:
+    """Let types of racks take the place of inherited servers, and the other way round."""
+    hall, servers = values.get("hall"), values.get("servers")
+    own = {k for k in ("power_w", "groups") if isinstance(servers, dict) and servers.get(k)}
+    if isinstance(hall, dict) and hall.get("rack_types"):
+        for name in {"power_w", "groups"} - own:
+            merged["servers"][name] = None
+    elif own:
+        merged["hall"].pop("rack_types", None)
+        merged["hall"].pop("rack_plan", None)
 
 
 def _replace_other_servers(servers: dict[str, Any], given: Mapping[str, Any]) -> None:
@@ -238,6 +251,8 @@ def _assign(values: dict[str, Any], path: str, value: Any, override: str) -> Non
         node[last] = value
         if sections == ["servers"]:
             _replace_other_servers(node, {last: value})
+        if sections in (["servers"], ["hall"]):
+            _replace_by_rack_types(values, {sections[0]: {last: value}})
 
 
 def _list_index(node: list[Any], key: str, override: str) -> int:

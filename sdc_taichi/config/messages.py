@@ -56,7 +56,8 @@ def _keys_of(model: type[BaseModel], path: Sequence[str | int]) -> list[str]:
     """Valid keys of the section at ``path`` in ``model``; entries of lists are skipped."""
     section = model
     for key in path:
-        if isinstance(key, str):
+        # Names of a mapping are the user's.
+        if isinstance(key, str) and key in section.model_fields:
             section = _section_in(section.model_fields[key].annotation) or section
     return list(section.model_fields)
 

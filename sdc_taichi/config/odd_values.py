@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -54,33 +54,49 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
 
 
 def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
-    """Warn of what is odd about data centers, once for all that have it in common.
+    """Warn of odd values of data centers, once for all that have them in common.
 
     Warns:
         OddInputWarning: for each odd value.
     """
-    names: dict[str, list[str]] = {}
     known: dict[tuple[int, ...], list[str]] = {}
+    found: list[tuple[str, list[str]]] = []
     for config in configs:
         # Copies share the sections themselves.
         same = tuple(map(id, (config.hall, config.servers, config.hvac)))
         if same not in known:
             known[same] = [*odd_values(config)]
-        for text in known[same]:
-            names.setdefault(text, []).append(config.name)
+        found.append((config.name, known[same]))
+    warn_of(found)
+
+
+def warn_of(found: Iterable[tuple[str, Sequence[str]]]) -> None:
+    """Warn of what is odd about data centers, once for all that have it in common.
+
+    Args:
+        found: name of each data center, and messages about it.
+
+    Warns:
+        OddInputWarning: for each message.
+    """
+    names: dict[str, list[str]] = {}
+    for name, texts in found:
+        for text in texts:
+            names.setdefault(text, []).append(name)
     for text, listed in names.items():
         others = f" and {len(listed) - 1} more" if len(listed) > 1 else ""
-        warnings.warn(f"{listed[0]}{others}: {text}", OddInputWarning, stacklevel=3)
+        warnings.warn(f"{listed[0]}{others}: {text}", OddInputWarning, stacklevel=4)
 
 
 def _odd_servers(config: DataCenterConfig) -> Iterator[str]:
-    servers = config.servers
-    listed_w = (
-        [full_w for full_w, _ in servers.power_pairs]
-        if servers.groups is None
-        else [group.full_w for rack in servers.groups for group in rack]
-    )
-    field = "servers.power_w" if servers.groups is None else "servers.groups"
+    servers, types = config.servers, config.hall.rack_types
+    listed_w, field = [full_w for full_w, _ in servers.power_pairs], "servers.power_w"
+    if types:
+        listed_w = [group.full_w for rack in types.values() for group in rack.servers]
+        field = "hall.rack_types"
+    elif servers.groups is not None:
+        listed_w = [group.full_w for rack in servers.groups for group in rack]
+        field = "servers.groups"
     least_w = min(listed_w)
     if least_w < LEAST_USUAL_SERVER_W:
         yield f"{field}: a server of {least_w:g} W at full load; power is in W, not in kW"

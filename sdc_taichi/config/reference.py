@@ -15,12 +15,14 @@ from pydantic import BaseModel
 
 from sdc_taichi.config import fields as types
 from sdc_taichi.config.event_schema import SampledEvent, ScheduledEvent
-from sdc_taichi.config.hall_schema import ServerGroup
+from sdc_taichi.config.hall_schema import RackRange, RackType, ServerGroup
 from sdc_taichi.config.schema import DataCenterConfig
 from sdc_taichi.config.tariff_schema import TariffPeriod
 
 LISTED: dict[str, type[BaseModel]] = {
     "servers.groups": ServerGroup,
+    "hall.rack_types": RackType,
+    "hall.rack_plan": RackRange,
     "events.scheduled": ScheduledEvent,
     "events.sampled": SampledEvent,
     "tariff.periods": TariffPeriod,
@@ -87,6 +89,8 @@ def _valid(entry: dict[str, Any], schema: dict[str, Any]) -> str:
             return f"[{', '.join(_valid(one, schema) for one in entry['prefixItems'])}]"
         items = _valid(entry["items"], schema)
         return f"list of {items.replace('list', 'lists', 1) if items[:4] == 'list' else items}"
+    if kind == "object":
+        return "names, each with a section as below"
     if "$ref" in entry:
         return "sections as below"
     return {"boolean": "true, false", "null": "null"}.get(str(kind), "text")

@@ -27,6 +27,7 @@ from sdc_taichi.config.fields import (
     check_one_per_rack,
 )
 from sdc_taichi.config.hall_schema import (
+    MOST_RACK_U,
     ROOM_J_PER_K_W,
     SERVER_J_PER_K_W,
     HallConfig,
@@ -216,14 +217,13 @@ class DataCenterConfig(Section):
                 raise ValueError(f"{what} needs hall.inlet_model recirculation")
 
     def _check_recirculation_model(self) -> None:
-        groups = self.servers.groups or ()
-        hvac = self.hvac
+        groups, hvac = self._given_groups().values(), self.hvac
         holds = {
             "servers.outlet_model server": self.servers.outlet_model == "server",
             "hvac.cooling_load_model heat_balance": hvac.cooling_load_model == "heat_balance",
             "another hvac.crac.flow_model than per_watt": hvac.crac.flow_model != "per_watt",
             "hall.supply_approach_limits_k null": self.hall.supply_approach_limits_k is None,
-            "inlet_offset_k 0 in servers.groups (hall.height_zones takes its place)": not any(
+            "inlet_offset_k 0 of all groups (hall.height_zones takes its place)": not any(
                 g.inlet_offset_k for rack in groups for g in rack
             ),
         }
@@ -278,12 +278,19 @@ class DataCenterConfig(Section):
     @model_validator(mode="after")
     def _servers_fit_the_racks(self) -> Self:
         racks, groups = self.hall.racks, self.servers.groups
-        if groups is None:
+        if self.hall.rack_types:
+            for name in ("power_w", "groups"):
+                if getattr(self.servers, name) is not None:
+                    raise ValueError(
+                        f"hall.rack_types and servers.{name} are both given; valid is one, "
+                        f"servers.{name} null for rack_types"
+                    )
+        elif groups is None:
             check_one_per_rack("servers.power_w", self.servers.power_pairs, racks, one_for_all=True)
         else:
             check_one_per_rack("servers.groups", groups, racks, one_for_all=True)
-            for index, rack in enumerate(groups):
-                _check_load_weights(index, rack)
+        for where, rack in self._given_groups().items():
+            _check_rack(where, rack)
         self._check_airflow()
         rack_w = self.rack_nameplate_w()
         most = int(np.argmax(rack_w))
@@ -296,7 +303,7 @@ class DataCenterConfig(Section):
 
     def _check_airflow(self) -> None:
         """Check that servers move air at their coldest inlets, where the airflow ratio is least."""
-        racks, groups = self.hall.racks, self.servers.groups
+        racks, groups = self.hall.racks, self._listed_groups()
         lowest_k = np.array([min(g.inlet_offset_k for g in r) for r in groups] if groups else [0.0])
         given = self.hall.inlet_model == "approach"
         approach_k = self.hall.rack_approach_k() if given else np.zeros(racks)
@@ -333,15 +340,27 @@ class DataCenterConfig(Section):
 
     def rack_nameplate_w(self) -> np.ndarray:
         """Power at full load of the servers of every rack, without their fans, in W, (R,)."""
-        if self.servers.groups is None:
+        groups = self._listed_groups()
+        if groups is None:
             full_w = np.array([full for full, _ in self.servers.power_pairs])
             rack_w = full_w * np.asarray(self.hall.servers_per_rack, dtype=np.float64)
         else:
-            rack_w = np.array([sum(g.count * g.full_w for g in r) for r in self.servers.groups])
+            rack_w = np.array([sum(g.count * g.full_w for g in r) for r in groups])
         rack_w = np.broadcast_to(rack_w, (self.hall.racks,))
         if self.hall.capacity_mw is None:
             return rack_w
         return np.asarray(rack_w * (self.hall.capacity_mw * 1e6 / rack_w.sum()))
+
+    def _given_groups(self) -> dict[str, tuple[ServerGroup, ...]]:
+        """Server groups of types of racks and of racks, by where they are given."""
+        types = {f"hall.rack_types.{k}": v.servers for k, v in self.hall.rack_types.items()}
+        racks = {f"servers.groups rack {i}": r for i, r in enumerate(self.servers.groups or ())}
+        return types | racks
+
+    def _listed_groups(self) -> tuple[tuple[ServerGroup, ...], ...] | None:
+        """Server groups of every rack, or of all at once, where they are given."""
+        types = self.hall.rack_types
+        return tuple(types[n].servers for n in self.hall.rack_type_names()) or self.servers.groups
 
     def rack_groups(self) -> tuple[tuple[ServerGroup, ...], ...]:
         """Server groups of every rack, with ``hall.capacity_mw`` applied to the counts.
@@ -349,9 +368,8 @@ class DataCenterConfig(Section):
         Raises:
             ConfigError: the capacity leaves racks without servers.
         """
-        racks = self.hall.racks
-        if self.servers.groups is not None:
-            found = self.servers.groups
+        racks, found = self.hall.racks, self._listed_groups()
+        if found is not None:
             per_rack = found * racks if len(found) == 1 else found
         else:
             pairs = self.servers.power_pairs
@@ -394,15 +412,22 @@ class DataCenterConfig(Section):
         return yaml.safe_dump(values, sort_keys=False)
 
 
-def _check_load_weights(index: int, rack: tuple[ServerGroup, ...]) -> None:
+def _check_rack(where: str, rack: tuple[ServerGroup, ...]) -> None:
+    """Check that the servers of a rack fit into it, and that none has more work than it can do."""
     if not rack:
-        raise ValueError(f"servers.groups rack {index} is empty; valid is at least one group")
+        raise ValueError(f"{where} is empty; valid is at least one group")
+    height_u = sum(g.count * g.height_u for g in rack if g.height_u is not None)
+    if height_u > MOST_RACK_U:
+        raise ValueError(
+            f"{where}: servers of {height_u:g} units of height; the tallest racks have "
+            f"{MOST_RACK_U:g}"
+        )
     mean = sum(g.count * g.load_weight for g in rack) / sum(g.count for g in rack)
     if mean <= 0:
-        raise ValueError(f"servers.groups rack {index}: at least one load_weight must be positive")
+        raise ValueError(f"{where}: at least one load_weight must be positive")
     highest = max(g.load_weight for g in rack)
     if highest > 2 * mean:
         raise ValueError(
-            f"servers.groups rack {index}: load_weight {highest:g} exceeds twice the rack's mean "
-            f"{mean:.3g}, which would overload the server at partial load"
+            f"{where}: load_weight {highest:g} exceeds twice the rack's mean {mean:.3g}, which "
+            "would overload the server at partial load"
         )

@@ -33,6 +33,8 @@ class DesignPoint:
     airflow_m3s: F64
     """Airflow through the servers of each rack, as volume at the reference temperature of
     ``plant.air``, in m3/s, (R,)."""
+    server_rise_k: F64
+    """Temperature rise of the air through the servers of each group, in K, (G,)."""
     approach_k: F64
     """Airflow-weighted mean inlet of each rack over supply air, in K, (R,)."""
     outlet_rise_k: F64
@@ -99,6 +101,7 @@ def design_point_at(
     server_w, moved = _at_full_load(config, servers, inlet_c)
     it_w = servers.per_rack(servers.count * server_w)
     most_m3s = float(full_airflow_m3s.max())
+    server_rise_k = server_w / (air_j_per_m3_k * full_airflow_m3s * moved)
     # Servers that are alike have a share of 1, which keeps the digits of their sums.
     moved = servers.count * (full_airflow_m3s / most_m3s) * moved
     rack_moved = servers.per_rack(moved)
@@ -111,6 +114,7 @@ def design_point_at(
         crac_flow_m3s=config.hvac.crac.supply_m3s_per_w * float(it_w.sum()),
         it_w=it_w,
         airflow_m3s=airflow_m3s,
+        server_rise_k=server_rise_k,
         approach_k=inlet_rise_k,
         outlet_rise_k=inlet_rise_k + it_w / (air_j_per_m3_k * airflow_m3s),
         height_factor=height_factor,

@@ -209,6 +209,7 @@ def design_hall_values(found: DesignHall) -> dict[str, Any]:
         "hottest_server": found.hottest_server,
         "hottest_inlet_c": float(found.inlet_max_c.max()),
         **flows,
+        **({"rack_types": list(types)} if (types := hall.rack_type_names()) else {}),
         "rack_it_w": found.it_w.tolist(),
         "rack_airflow_m3s": found.airflow_m3s.tolist(),
         "approach_k": found.approach_k.tolist(),

@@ -11,12 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.config.odd_values import warn_of_odd_values
+from sdc_taichi.config.odd_values import warn_of, warn_of_odd_values
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import DesignPoint, design_point
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.hall.mix_weights import MixWeights
+from sdc_taichi.hall.odd_airflow import odd_airflow
 from sdc_taichi.hall.rack_servers import RackServers, rack_servers
 from sdc_taichi.hall.recirculation import Recirculation, calibrate
 from sdc_taichi.hall.unit_supply import full_airflow_m3s, unit_weights, weighted_shares
@@ -216,6 +217,8 @@ class _HallArrays:
     """Airflow of all CRAC units at the design point, in m3/s."""
     air: _Air | None
     """How air moves in the hall; None with inlet model ``approach``."""
+    odd: tuple[str, ...]
+    """Messages about what is odd about the airflows of the hall."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,6 +260,7 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     # One queue array serves the fleet; ages are read off its length.
     _shared(listed, "workload.age_horizon_h")
     halls = _distinct_halls(listed)
+    warn_of([(config.name, hall.odd) for config, hall in zip(listed, halls, strict=True)])
     racks = np.array([len(h.groups_per_rack) for h in halls])
     return Fleet(
         configs=listed,
@@ -365,6 +369,7 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         "parcel_j_per_k": air_j_per_m3_k * floor_plan(hall).air_m3 / hall.racks,
     }
     return _HallArrays(
+        odd=odd_airflow(config, servers, design),
         groups_per_rack=np.diff(servers.group_offsets),
         groups=np.stack(in_row_order(GROUP_INPUTS, groups)),
         approach_k=approach_k,

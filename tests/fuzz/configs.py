@@ -57,6 +57,9 @@ def valid_value(rng: np.random.Generator, part: Schema) -> Any:
     if "enum" in part:
         return part["enum"][int(rng.integers(len(part["enum"])))]
     kind = part.get("type")
+    if kind == "object" and "properties" not in part:
+        names = rng.choice(["cpu", "gpu", "2", "ü"], int(rng.integers(3)), replace=False)
+        return {str(name): valid_value(rng, part["additionalProperties"]) for name in names}
     if kind == "object":
         needed = part.get("required", ())
         return {
