@@ -10,7 +10,7 @@ import pytest
 from sdc_taichi import Actions, Simulator, StepResult, load_config
 from sdc_taichi.config.tariff_schema import TariffConfig
 from sdc_taichi.control import view_maker
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, OddInputWarning
 from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH
 from sdc_taichi.plant.electrical import loss_w
 from sdc_taichi.run.bills import add_power, billed_kw_months, no_demand
@@ -64,6 +64,11 @@ def test_a_load_above_the_limit_empties_the_battery_and_then_overloads_the_conne
     np.testing.assert_allclose(over_kwh, np.maximum(grid_kwh - 37.5, 0), atol=1e-6)
 
 
+def test_a_connection_for_less_than_half_is_odd() -> None:
+    with pytest.warns(OddInputWarning, match=r"electrical\.grid_limit_ratio 0\.4"):
+        Simulator(load_config("tiny", ["electrical.grid_limit_ratio=0.4"])).close()
+
+
 def test_presets_of_the_paper_have_no_limit() -> None:
     for preset in ("paper", "sustaindc"):
         config = load_config(preset)
@@ -112,8 +117,8 @@ def test_prices_follow_hour_weekday_and_season() -> None:
     assert found[182].tolist() == monday
     assert set(found[0]) == {0.05, 0.1}
     assert np.all(found[5:7] == 0.08)
-    flat = prices({"price_per_kwh": [0.13]})
-    assert np.all(flat == 0.13)
+    for flat in (0.13, [0.13], [0.13] * 24):
+        assert np.all(prices({"price_per_kwh": flat}) == 0.13)
 
 
 def test_a_data_center_pays_its_own_tariff_from_its_own_day_on() -> None:
@@ -233,3 +238,25 @@ def test_nothing_is_lost_without_power() -> None:
     for name in ("ups_loss_w", "distribution_loss_w", "overhead_w", "grid_kwh"):
         lost = column(found, name)
         assert lost[0] > 0 == lost[1] == lost[2] < lost[3], name
+
+
+def test_a_data_center_with_a_limit_is_the_same_alone_and_beside_others() -> None:
+    limits = ["electrical.grid_limit_kw=0.5", "electrical.grid_limit_ratio=null"]
+    configs = [load_config("tiny", [f"name=dc-{i}", limits[i % 2], f"battery.initial_soc={i / 3}"])
+               for i in range(3)]  # fmt: skip
+    command = np.array([1.0, -1.0, 0.4])
+
+    def run(which: list[int]) -> dict[str, F64]:
+        found: dict[str, list[F64]] = {}
+        with Simulator([configs[i] for i in which], precision="f64") as sim:
+            sim.reset()
+            for step in range(12):
+                result = sim.step(Actions(battery=(-1) ** (step // 3) * command[which]))
+                for name, values in result.per_dc().items():
+                    found.setdefault(name, []).append(values.copy())
+        return {name: np.array(values) for name, values in found.items()}
+
+    together = run([0, 1, 2])
+    for i in range(3):
+        for name, values in run([i]).items():
+            np.testing.assert_array_equal(values[:, 0], together[name][:, i], name)

@@ -23,6 +23,8 @@ USUAL_SETPOINTS_C = (10.0, 35.0)
 """Supply air that is colder condenses water on every surface; ASHRAE class A2 ends at 35 C."""
 LEAST_USUAL_PUMP_EFFICIENCY = 0.2
 """Even small circulators reach a fifth."""
+LEAST_USUAL_GRID_RATIO = 0.5
+"""A connection for less than half of the design power is overloaded in most hours."""
 
 
 def odd_values(config: DataCenterConfig) -> Iterator[str]:
@@ -51,6 +53,12 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
             f"hvac.pumps.efficiency {pumps.efficiency:g}: even small pumps reach "
             f"{LEAST_USUAL_PUMP_EFFICIENCY:g}"
         )
+    ratio = config.electrical.grid_limit_ratio
+    if config.electrical.grid_limit_kw is None and (ratio or 1.0) < LEAST_USUAL_GRID_RATIO:
+        yield (
+            f"electrical.grid_limit_ratio {ratio:g}: less than half of the design power overloads "
+            "the connection in most hours"
+        )
 
 
 def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
@@ -63,7 +71,7 @@ def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
     found: list[tuple[str, list[str]]] = []
     for config in configs:
         # Copies share the sections themselves.
-        same = tuple(map(id, (config.hall, config.servers, config.hvac)))
+        same = tuple(map(id, (config.hall, config.servers, config.hvac, config.electrical)))
         if same not in known:
             known[same] = [*odd_values(config)]
         found.append((config.name, known[same]))

@@ -61,11 +61,11 @@ class TariffConfig(Section):
     included (EIA, Electric Power Monthly, table 5.3).
     """
 
-    price_per_kwh: tuple[Price, ...] = (
+    price_per_kwh: Price | tuple[Price, ...] = (
         *(0.08,) * 7, *(0.12,) * 9, *(0.20,) * 5, *(0.12,) * 3,
     )  # fmt: skip
-    """Price of a kWh: one for all hours, or 24, one for each local hour of the day from midnight
-    on."""
+    """Price of a kWh: one for all hours, or a list of 24, one for each local hour of the day from
+    midnight on."""
     periods: tuple[TariffPeriod, ...] = ()
     """Prices of some months, days of the week and hours, of which later ones go first."""
     demand_charge_per_kw: Price = 12.0
@@ -73,8 +73,8 @@ class TariffConfig(Section):
 
     @field_validator("price_per_kwh")
     @classmethod
-    def _one_or_each_hour(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        if len(value) not in (1, 24):
+    def _one_or_each_hour(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        if isinstance(value, tuple) and len(value) not in (1, 24):
             raise ValueError(f"{len(value)} prices; valid is 1, or 24 from midnight on")
         return value
 
