@@ -16,6 +16,7 @@ before (the functions named on the right do each line):
         need_k   <- sum_j s_jk (1 - r_j) V_j
         V_k      <- clip(need_k / (1 - b_0), low V_k,design, high V_k,design)
         f_k      <- min(1, (1 - b_0) V_k / need_k)
+        T_sup,k  <- setpoint, warmer for coils at their limit and return control  set_supply
     V_crac <- sum_k V_k
     T_ret  <- (sum_j V_j T_out,j - sum_j r'_j V_j T_mix,j + V_bypass T_sup) / V_crac
     T_mix,j  <- sum_i w_ji T_out,i                                          mixes.py
@@ -72,7 +73,7 @@ from .sums import (
     store_change_range,
     sum_chunk,
 )
-from .units import run_coils, run_crac_units, sum_unit_needs
+from .units import keep_supply, run_coils, run_crac_units, set_supply, sum_unit_needs
 
 END_OF_TERMS_TRANSIENT = row_index(SUMS, "outlet_sum_c")
 """Row behind the last sum of transient halls, which do not ask for the sum of the outlets."""
@@ -255,7 +256,15 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
             dc.status = DONE
         air.cooling_load_w, air.coil_w = run_coils(hall, n, units, air.return_c)
     else:
-        dc.status = status_after_sweep(hall, n, air.supply_c, units.most_f_change, is_last)
+        moved_k = ti.cast(0.0, ti.f64)
+        if dc.adjusts_supply > 0.0:
+            load_w = air.return_c * units.flow_m3s - units.supply_m3k_s
+            load_w *= ti.cast(dc.air_j_per_m3_k, ti.f64)
+            load_w += units.fan_m3s * dc.crac_fan_w_per_m3s
+            moved_k = set_supply(hall, n, units, air.return_c, 0.0, load_w)
+        dc.status = status_after_sweep(hall, n, air.supply_c, units.most_f_change, moved_k, is_last)
+        if dc.adjusts_supply > 0.0 and dc.status != RUNNING:
+            keep_supply(hall, n)
         if dc.first_mix_weight < 0:
             dc.exchanges_before = ti.cast(exchanges, ti.i32)
             update_shift(hall, n, sweep, has_exchanged, change_k, exchanges)

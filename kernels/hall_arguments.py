@@ -136,6 +136,9 @@ DC_DOUBLES = {
     "room_j_per_k": "heat capacity of the room, J/K (transient)",
     "coil_limit_w": "heat that the plant can take, W (transient)",
     "crac_fan_w_per_m3s": "CRAC fan power over airflow at full speed, W/(m3/s)",
+    "adjusts_supply": "1 where supply air may differ from the setpoint of its unit, see set_supply",
+    "return_rise_k": "rise of air from supply to return at the design point, K (return control)",
+    "return_gain": "rise of the supply air per K that the air rises less, 0 with supply control",
     "table_low_c": "lowest supply air of the table of steady states, C",
     "table_rows_per_k": "supply rows of the table per K",
     "feedback_gain": "share of a common change of the mixes that one sweep gives back to them",
@@ -145,11 +148,12 @@ DC_DOUBLES = {
     "last_shift_k": "what the last sweep added to shift_k, K",
 }
 UNIT_INPUTS = {
-    "setpoint_c": "supply setpoint, C (transient)",
+    "setpoint_c": "supply setpoint; in steady air with what the room is warmed by, C",
     "low": "lowest fan speed over design speed",
     "high": "highest fan speed over design speed",
-    "design_m3s": "airflow at design speed, m3/s",
+    "design_m3s": "airflow at full speed, m3/s",
     "running": "1 for a unit that runs, 0 for one that coasts without cooling",
+    "capacity_w": "most heat that the coil takes out, W",
 }
 UNIT_STATE = {
     "supply_c": "supply air, C",
@@ -159,6 +163,9 @@ UNIT_STATE = {
     "cubed_speed": "cube of the fan speed over design speed, 0 where coasting, mean likewise",
     "need_m3s": "supply air that the racks ask for, m3/s",
     "following": "fan speed over design speed that would just cover the need",
+    "speed": "fan speed over full speed in the present sweep",
+    "excess_k": "supply air over setpoint and warmth of the room in the next sweep, K",
+    "mean_supply_c": "supply air, in transient halls mean over the substeps so far, C",
 }
 RACK_STATE = {
     "mixed_c": "exhaust mix before the rack; transient: of the room air that it takes in, C",

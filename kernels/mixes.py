@@ -357,8 +357,11 @@ def advance_parcels(
 
 @ti.func
 @no_type_check
-def status_after_sweep(hall: ti.template(), n, supply_c, most_f_change, is_last):
-    """Status of a data center in steady air: DONE where another sweep would move no mix."""
+def status_after_sweep(hall: ti.template(), n, supply_c, most_f_change, moved_k, is_last):
+    """Status of a data center in steady air: DONE where another sweep would move no mix.
+
+    ``moved_k``: largest change of the supply air of a unit for the next sweep, in K.
+    """
     dc, total = hall.dcs[n], hall.chunks[hall.dcs[n].first_chunk]
     least_k, most_k, shift_k = total.least_change_k, total.most_change_k, dc.shift_k
     left_k = ti.max(most_k - shift_k, shift_k - least_k)
@@ -366,6 +369,7 @@ def status_after_sweep(hall: ti.template(), n, supply_c, most_f_change, is_last)
     # lie above supply air.
     above_k = ti.abs(total.outlet_sum_c / ti.cast(dc.racks, ti.f64) - supply_c)
     left_k = ti.max(left_k, most_f_change * above_k)
+    left_k = ti.max(left_k, moved_k)
     status = DONE
     # Written as a negation, a NaN goes on.
     if not left_k <= hall.tolerance_k:

@@ -8,6 +8,9 @@ from .hall_arguments import N_BLOCK_TERMS
 from .servers import first_share_at
 from .sums import sum_lanes
 
+MOST_PASSES = 100
+"""Most passes over the coils of a data center; as many as saturate one after the other."""
+
 
 @ti.func
 @no_type_check
@@ -68,6 +71,7 @@ def run_crac_units(hall: ti.template(), n, is_last):
         design_m3s = ti.cast(unit.design_m3s, ti.f64)
         is_running = ti.cast(unit.running, ti.f64)
         f_used, supply_c = unit.fresh_ratio, unit.supply_c
+        mean_supply_c = supply_c
         following = need / ti.max(fresh_share * design_m3s, 1e-30)
         speed = ti.min(ti.max(following, low), high)
         flow = design_m3s * speed
@@ -78,17 +82,19 @@ def run_crac_units(hall: ti.template(), n, is_last):
         units.most_f_change = ti.max(units.most_f_change, ti.abs(f - f_used))
         unit.fresh_ratio = f
         cubed = speed * speed * speed * is_running
+        units.fan_m3s += cubed * design_m3s
+        units.running_m3s += is_running * flow
+        units.running_m3k_s += is_running * flow * supply_c
+        if is_running > 0.0:
+            units.any_running = ti.cast(1.0, ti.f64)
         if ti.static(hall.transient):
-            units.fan_m3s += cubed * design_m3s
-            units.running_m3s += is_running * flow
-            units.running_m3k_s += is_running * flow * supply_c
-            if is_running > 0.0:
-                units.any_running = ti.cast(1.0, ti.f64)
             flow *= hall.weight
             cubed *= hall.weight
+            mean_supply_c *= hall.weight
             if dc.sweep > 0:
                 flow += unit.flow_m3s
                 cubed += unit.cubed_speed
+                mean_supply_c += unit.mean_supply_c
         if is_last:
             unit.need_m3s = need
             unit.following = following
@@ -96,8 +102,108 @@ def run_crac_units(hall: ti.template(), n, is_last):
             unit.fresh_ratio_used = f_used
         unit.flow_m3s = flow
         unit.cubed_speed = cubed
+        unit.speed = speed
+        unit.mean_supply_c = mean_supply_c
         at += hall.one
     return units
+
+
+@ti.func
+@no_type_check
+def coil_spare_w(hall: ti.template(), n, at, scale):
+    """Capacity of a coil, times ``scale``, less the heat of its fan, in W; 0 where it is down."""
+    dc, unit = hall.dcs[n], hall.units[at]
+    speed, is_running = unit.speed, ti.cast(unit.running, ti.f64)
+    fan_w = dc.crac_fan_w_per_m3s * ti.cast(unit.design_m3s, ti.f64) * speed * speed * speed
+    return is_running * (scale * ti.cast(unit.capacity_w, ti.f64) - fan_w)
+
+
+@ti.func
+@no_type_check
+def spread_load(hall: ti.template(), n, base_k, air_load_w, scale, return_c):
+    """Return air with which the coils take a given load of air, none above its capacity, in C.
+
+    Solves sum_k min(C_k, g_k (theta - b_k)) = load for theta by Newton's method, g_k the heat
+    capacity flow of unit k and b_k its supply air without a limit. The sum rises with theta ever
+    less steeply, so steps from below never go too far, and each saturates a coil or is the last.
+    """
+    dc = hall.dcs[n]
+    air = ti.cast(dc.air_j_per_m3_k, ti.f64)
+    theta, passes, change_k = return_c, 0, ti.cast(1.0, ti.f64)
+    while passes < MOST_PASSES and change_k > 1e-9:
+        taken_w, slope = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        at = dc.first_unit
+        while at < hall.dcs[n + 1].first_unit:
+            unit = hall.units[at]
+            g = air * ti.cast(unit.design_m3s, ti.f64) * unit.speed * ti.cast(unit.running, ti.f64)
+            wanted_w = g * (theta - ti.cast(unit.setpoint_c, ti.f64) - base_k)
+            most_w = coil_spare_w(hall, n, at, scale)
+            # The first pass has no limits, and finds where to begin.
+            if passes > 0 and wanted_w > most_w:
+                taken_w += most_w
+            else:
+                taken_w += wanted_w
+                slope += g
+            at += hall.one
+        change_k = 0.0
+        if slope > 0.0:
+            change_k = (air_load_w - taken_w) / slope
+            theta += change_k
+        if passes == 0:
+            change_k = ti.cast(1.0, ti.f64)
+        passes += 1
+    return theta
+
+
+@ti.func
+@no_type_check
+def set_supply(hall: ti.template(), n, units: ti.template(), return_c, warmed_k, wanted_w):
+    """Supply air of the units in the next sweep; return the largest change, in K.
+
+    A unit gives its setpoint plus what the room is warmed by. With return-air control it gives more
+    the less the air warms on its way: b_k = setpoint + gain max(0, rise at design - rise). A coil
+    that would take more than its capacity C_k gives warmer air, theta - C_k / (rho cp V_k), and a
+    unit that is down gives theta, the return air. Where all coils together fall short, all fall
+    short by the same share, which the room keeps.
+
+    Args:
+        hall: the hall kernel's arguments.
+        n: data center.
+        units: sums over its units in this sweep.
+        return_c: return air of this sweep, in C.
+        warmed_k: what the room is warmed by, beyond what setpoints hold, in K.
+        wanted_w: heat that the running coils are asked to take, in W.
+    """
+    dc = hall.dcs[n]
+    air = ti.cast(dc.air_j_per_m3_k, ti.f64)
+    rise_k = return_c - units.running_m3k_s / ti.max(units.running_m3s, 1e-30)
+    base_k = warmed_k + dc.return_gain * ti.max(dc.return_rise_k - rise_k, 0.0)
+    capacity_w, at = ti.cast(0.0, ti.f64), dc.first_unit
+    while at < hall.dcs[n + 1].first_unit:
+        unit = hall.units[at]
+        capacity_w += ti.cast(unit.running, ti.f64) * ti.cast(unit.capacity_w, ti.f64)
+        at += hall.one
+    scale = ti.max(wanted_w / ti.max(capacity_w, 1.0), 1.0)
+    theta = return_c
+    if ti.static(not hall.transient):
+        load_w = air * (return_c * units.flow_m3s - units.supply_m3k_s)
+        theta = spread_load(hall, n, base_k, load_w, scale, return_c)
+    most_change_k, at = ti.cast(0.0, ti.f64), dc.first_unit
+    while at < hall.dcs[n + 1].first_unit:
+        unit = hall.units[at]
+        setpoint_c = ti.cast(unit.setpoint_c, ti.f64)
+        supply_c = setpoint_c + base_k
+        if units.any_running > 0.0:
+            if unit.running > hall.real(0.0):
+                g = air * ti.max(ti.cast(unit.design_m3s, ti.f64) * unit.speed, 1e-30)
+                supply_c = ti.max(supply_c, theta - coil_spare_w(hall, n, at, scale) / g)
+            else:
+                supply_c = theta
+        most_change_k = ti.max(most_change_k, ti.abs(supply_c - unit.supply_c))
+        unit.excess_k = supply_c - setpoint_c - warmed_k
+        unit.supply_c = supply_c
+        at += hall.one
+    return most_change_k
 
 
 @ti.func
@@ -118,9 +224,23 @@ def run_coils(hall: ti.template(), n, units: ti.template(), return_c):
     room_j = dc.room_j + (load_w - coil_w) * hall.substep_s
     dc.room_j = room_j
     warmed_k = room_j / dc.room_j_per_k
-    at = dc.first_unit
-    while at < hall.dcs[n + 1].first_unit:
-        unit = hall.units[at]
-        unit.supply_c = ti.cast(unit.setpoint_c, ti.f64) + warmed_k
-        at += hall.one
+    if dc.adjusts_supply > 0.0:
+        set_supply(hall, n, units, return_c, warmed_k, wanted_w)
+    else:
+        at = dc.first_unit
+        while at < hall.dcs[n + 1].first_unit:
+            unit = hall.units[at]
+            unit.excess_k = 0.0
+            unit.supply_c = ti.cast(unit.setpoint_c, ti.f64) + warmed_k
+            at += hall.one
     return load_w, coil_w
+
+
+@ti.func
+@no_type_check
+def keep_supply(hall: ti.template(), n):
+    """Supply air of the units back to that of the last sweep, which results belong to."""
+    at = hall.dcs[n].first_unit
+    while at < hall.dcs[n + 1].first_unit:
+        hall.units[at].supply_c = hall.units[at].mean_supply_c
+        at += hall.one

@@ -123,7 +123,7 @@ class State:
     start: I64
     """Index of the first step in the year, (B,)."""
     setpoint_c: F64
-    """Supply air setpoint of each CRAC unit, in C, (U,)."""
+    """Setpoint of each CRAC unit, in C, (U,)."""
     cooling_run: I64
     """Equal cooling commands in a row that each CRAC unit has had, (U,)."""
     cooling_last: F64
@@ -159,6 +159,9 @@ class State:
     following: F64
     """Fan speed of each CRAC unit over design speed that would just cover the need, (U,); for
     transient halls."""
+    supply_excess_k: F64
+    """Supply air of each CRAC unit over its setpoint and what the room is warmed by, in K, (U,);
+    for transient halls."""
 
 
 @dataclass(slots=True)

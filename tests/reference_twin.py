@@ -545,6 +545,7 @@ def steady(
     racks, rack, air = len(hall.share), hall.rack, hall.air_j_per_m3_k
     count, mix = np.bincount(rack), mixing(hall, breath)
     inlet_c = np.full(len(rack), unit_supply_c.mean() + 4.0)
+    setpoint_c, return_c = unit_supply_c, float(unit_supply_c.mean())
     for _ in range(20000):
         cpu, fan, flow = hall.servers(inlet_c, load, powered, breath)
         moved = flows(hall, flow, low, high)
@@ -555,10 +556,13 @@ def steady(
         power = hall.per_rack(cpu + fan)
         rise = np.where(still, 0.0, power / (air * np.where(still, 1.0, rack_flow)))
         matrix = hall.per_rack(part * moved.exhaust)[:, None] * mix
+        unit_supply_c = supply_by_unit(setpoint_c, running, return_c)
         supplied = moved.from_unit @ unit_supply_c
         outlet_c = np.linalg.solve(np.eye(racks) - matrix, hall.per_rack(part * supplied) + rise)
         before = inlet_c
         inlet_c = moved.exhaust * (mix @ outlet_c)[rack] + supplied
+        outlets: F64 = np.asarray(outlet_c, dtype=np.float64)
+        return_c, _ = return_air(hall, moved, rack_flow, outlets, unit_supply_c, breath)
         if np.max(np.abs(inlet_c - before)) < 1e-13 * np.max(np.abs(inlet_c)):
             break
     else:
@@ -566,7 +570,6 @@ def steady(
     heat = cpu + fan
     blown = flow > 0
     server_outlet_c = inlet_c + np.where(blown, heat / (air * np.where(blown, flow, 1.0)), 0.0)
-    outlets: F64 = np.asarray(outlet_c, dtype=np.float64)
     return_c, _ = return_air(hall, moved, rack_flow, outlets, unit_supply_c, breath)
     supply_c = float(moved.unit @ unit_supply_c / moved.unit.sum())
     found = {
@@ -593,6 +596,13 @@ def steady(
         {name: np.array([value]) for name, value in dcs.items()}
         | {"unit_flow_m3s": moved.unit, "unit_cubed_speed": running * moved.speed**3},
     )
+
+
+def supply_by_unit(setpoint_c: F64, running: F64, return_c: float) -> F64:
+    """Supply air of each unit: units that are down pass on what returns, while any runs."""
+    if not running.any():
+        return setpoint_c
+    return np.where(running > 0, setpoint_c, return_c)
 
 
 def return_air(
@@ -626,6 +636,8 @@ class Memory:
     following: F64
     """Fan speed of each unit that would just cover that need, over design speed, (U,)."""
     room_j: float
+    excess_k: F64
+    """Supply air of each unit over its setpoint and the warmth of the room, (U,)."""
 
 
 def advance(
@@ -650,7 +662,7 @@ def advance(
     capacity = hall.config.server_heat_capacity_kj_per_k * 1e3
     now, parts = memory, []
     for _ in range(substeps):
-        supply_c = setpoint_c + now.room_j / room_j_per_k
+        supply_c = setpoint_c + now.room_j / room_j_per_k + now.excess_k
         target = hall.weights @ now.given_c
         # A still parcel is stirred by its part of the CRAC air.
         units_m3s = hall.unit_design_m3s * np.clip(now.following, low, high)
@@ -720,10 +732,12 @@ def advance(
                 "inlet_max_c": inlet_c.max(), "rack_outlet_max_c": hottest_c,
             }
         )  # fmt: skip
+        room_j = now.room_j + (load_w - coil_w) * h
+        base_c = setpoint_c + room_j / room_j_per_k
         now = Memory(
             warmer, mixed_end, mixed + breath * (given_c - mixed), captured, moved.need,
             wanted_speed(hall, moved.need),
-            now.room_j + (load_w - coil_w) * h,
+            room_j, supply_by_unit(base_c, running, return_c) - base_c,
         )  # fmt: skip
     found: dict[str, Any] = {}
     for name in parts[0]:

@@ -7,9 +7,13 @@ import pytest
 
 from sdc_taichi import ConfigError, Simulator, StepResult, drivers_from_arrays, load_config
 from sdc_taichi.hall.unit_supply import unit_weights, weighted_shares
+from sdc_taichi.sim.crac_units import CracUnits
 from sdc_taichi.sim.design_hall import solve_design_hall
 from sdc_taichi.sim.fleet import Fleet, build_fleet
+from sdc_taichi.sim.hall_solver import Conditions, Hall
 from sdc_taichi.sim.inlet_parts import Inlets
+from sdc_taichi.sim.sizing import air_j_per_m3_k
+from sdc_taichi.sim.unit_index import UnitIndex
 
 FOUR = "hvac.crac.units=4"
 N_PLUS_1 = "hvac.crac.spare_units=1"
@@ -17,8 +21,8 @@ MINUTES = (
     "simulation.thermal=transient",
     "simulation.steps_per_hour=60",
     "simulation.substep_s=15",
-    "protection.ashrae_class=A2",
 )
+PROTECTED = "protection.ashrae_class=A2"
 LOST = "events.scheduled=[{kind: crac_down, unit: 0, start_h: 0.05, duration_h: 100}]"
 
 
@@ -52,18 +56,18 @@ def test_a_rack_with_one_unit_alone_keeps_it() -> None:
 
 def test_spare_units_run_at_part_speed_and_take_over_for_one_that_is_lost() -> None:
     fleet, whole = run_at_full_load(FOUR, N_PLUS_1, *MINUTES, steps=2)
-    _, lost = run_at_full_load(FOUR, N_PLUS_1, *MINUTES, LOST, steps=60)
+    _, lost = run_at_full_load(FOUR, N_PLUS_1, PROTECTED, *MINUTES, LOST, steps=60)
     largest = fleet.unit_design_m3s.max()
     assert fleet.unit_design_m3s.sum() - largest == pytest.approx(fleet.design_flow_m3s[0])
     before = whole[-1].unit_flow_m3s / fleet.unit_design_m3s
     after = lost[-1].unit_flow_m3s / fleet.unit_design_m3s
     np.testing.assert_allclose(before, before[0], rtol=1e-4)
-    np.testing.assert_allclose(after[1:], after[1], rtol=1e-4)
+    np.testing.assert_allclose(after[1:], after[1], rtol=0.01)
     assert after[0] == pytest.approx(0.1)
     # The others give what is missing: of every rack's air, none falls short.
     total = lost[-1].crac_flow_m3s[0]
-    assert total == pytest.approx(whole[-1].crac_flow_m3s[0], rel=0.01)
-    assert lost[-1].inlet_max_c[0] < whole[-1].inlet_max_c[0] + 0.1
+    assert total == pytest.approx(whole[-1].crac_flow_m3s[0], rel=0.03)
+    assert lost[-1].inlet_max_c[0] < whole[-1].inlet_max_c[0] + 1.0
     assert all(result.throttled_racks[0] == 0 for result in lost)
 
 
@@ -158,3 +162,122 @@ def test_parts_of_an_inlet_add_up_while_a_unit_is_down() -> None:
         hottest_c = sim.servers().inlet_c[600:800].max()
     assert parts.unit_share[0] < 0.1
     assert parts.inlet_c == pytest.approx(hottest_c, abs=1e-9)
+
+
+HEAT_UNITS = {
+    "down": [N_PLUS_1, LOST],
+    "one coil small": ["hvac.crac.capacity_kw=[60, 200, 200, 200]"],
+    "three coils at their limit": ["hvac.crac.capacity_kw=[60, 120, 200, 250]"],
+    "coils too small": ["hvac.crac.capacity_kw=100"],
+    "return air": [
+        "hvac.crac.temperature_control=return",
+        "hvac.setpoint={min_c: 28, max_c: 38, initial_c: 33}",
+        "hall.design_supply_c=18",
+    ],
+}
+THERMAL = {"quasi_steady": (), "transient": MINUTES}
+
+
+@pytest.mark.parametrize("thermal", THERMAL)
+@pytest.mark.parametrize("case", HEAT_UNITS)
+def test_heat_closes_over_the_units(case: str, thermal: str) -> None:
+    fleet, results = run_at_full_load(FOUR, *THERMAL[thermal], *HEAT_UNITS[case], steps=12)
+    held = 0.0
+    for r in results:
+        taken_w = air_j_per_m3_k(fleet) * r.unit_flow_m3s * (r.return_c - r.unit_supply_c)
+        if thermal == "quasi_steady":
+            # What servers give to the air is what units take out of it.
+            assert taken_w.sum() == pytest.approx(r.it_w[0], rel=1e-9)
+        left_kwh = (r.cooling_load_w[0] - r.heat_removed_w[0]) * r.step_h / 1e3
+        assert r.room_heat_kwh[0] - held == pytest.approx(left_kwh, abs=1e-9 * r.it_w[0])
+        held = float(r.room_heat_kwh[0])
+
+
+def coil_w(fleet: Fleet, result: StepResult) -> np.ndarray:
+    """Heat that each coil takes out, that of its fan included."""
+    speed = result.unit_flow_m3s / fleet.unit_design_m3s
+    fan_w = 1000.0 * fleet.unit_design_m3s * speed**3
+    rise_k = result.return_c - result.unit_supply_c
+    return np.asarray(air_j_per_m3_k(fleet) * result.unit_flow_m3s * rise_k + fan_w)
+
+
+def test_a_coil_takes_no_more_than_its_capacity_and_the_others_take_the_rest() -> None:
+    limit_w = np.array([60e3, 120e3, 200e3, 250e3])
+    fleet, results = run_at_full_load(FOUR, *HEAT_UNITS["three coils at their limit"])
+    taken_w = coil_w(fleet, results[0])
+    np.testing.assert_allclose(taken_w[:3], limit_w[:3], rtol=1e-9)
+    assert limit_w[2] < taken_w[3] < limit_w[3]
+    assert results[0].unit_supply_c[3] == 18.0
+    assert results[0].unmet_w[0] == 0.0
+    # In the end a transient hall is the same.
+    limits = HEAT_UNITS["three coils at their limit"]
+    _, slowly = run_at_full_load(FOUR, *MINUTES, *limits, steps=90)
+    np.testing.assert_allclose(slowly[-1].unit_supply_c, results[0].unit_supply_c, atol=0.05)
+
+
+def test_capacity_that_suffices_changes_nothing() -> None:
+    _, plain = run_at_full_load(FOUR)
+    _, large = run_at_full_load(FOUR, "hvac.crac.capacity_kw=200")
+    np.testing.assert_allclose(large[0].rack_inlet_c, plain[0].rack_inlet_c, rtol=1e-12)
+
+
+def test_coils_that_are_too_small_leave_the_rest_to_the_room() -> None:
+    _, results = run_at_full_load(FOUR, *MINUTES, "hvac.crac.capacity_kw=100", steps=30)
+    for r in results:
+        assert r.heat_removed_w[0] <= 400e3 * (1 + 1e-12)
+    assert results[-1].room_heat_kwh[0] > results[-2].room_heat_kwh[0] > 1.0
+
+
+def test_air_of_a_unit_that_is_down_passes_uncooled_to_the_racks_near_it() -> None:
+    _, results = run_at_full_load(FOUR, N_PLUS_1, *MINUTES, LOST, steps=6)
+    down = results[-1]
+    assert down.unit_supply_c[0] == pytest.approx(down.return_c[0], abs=0.1)
+    warmer = (down.rack_inlet_c - results[1].rack_inlet_c).reshape(4, 5)
+    # Unit 0 stands at the low end of the rows.
+    assert np.all(warmer[:2, 0] > warmer[:2, 4] + 0.1)
+
+
+@pytest.mark.parametrize(("load", "supply_c"), [(1.0, (18.0, 19.0)), (0.5, (24.0, 27.0))])
+def test_return_air_control_warms_the_supply_air_at_part_load(
+    load: float, supply_c: tuple[float, float]
+) -> None:
+    """STULZ: 33 C return air, 15 K at full load: 18 C supply, at 40 to 60 % load 27 to 24 C."""
+    overrides = [*HEAT_UNITS["return air"], "hvac.crac.flow_model=constant"]
+    drivers = drivers_from_arrays(*(np.full((1, 1), x) for x in (20.0, 14.0, 300.0, load)))
+    found = []
+    for thermal in THERMAL.values():
+        with Simulator(load_config("corrected", [*overrides, *thermal]), drivers=drivers) as sim:
+            sim.reset()
+            found.append([sim.step() for _ in range(20)][-1])
+    for r in found:
+        assert supply_c[0] < r.supply_c[0] < supply_c[1]
+        assert 33.0 - 2.0 < r.return_c[0] < 33.0 + 0.1
+    assert found[0].supply_c[0] == pytest.approx(found[1].supply_c[0], abs=0.02)
+
+
+def test_return_air_control_is_continuous_in_load() -> None:
+    config = load_config("corrected", HEAT_UNITS["return air"])
+    loads = np.linspace(0.0, 1.0, 201)
+    fleet = build_fleet([config] * len(loads))
+    supply = CracUnits(fleet, UnitIndex(fleet)).initial_supply()
+    met = Conditions(
+        supply.coldest_supply_c, loads, unit_low=supply.unit_low, unit_high=supply.unit_high
+    )
+    found = Hall(fleet, "f64").solve(met)
+    assert np.max(np.abs(np.diff(found.supply_c))) < 0.1
+    assert np.max(np.abs(np.diff(found.inlet_max_c))) < 0.1
+
+
+@pytest.mark.parametrize("case", ["down", "three coils at their limit", "return air"])
+def test_substeps_down_to_five_seconds_converge(case: str) -> None:
+    hottest, supply = {}, {}
+    for substep_s in (5, 10, 20, 60):
+        overrides = [FOUR, *HEAT_UNITS[case], *MINUTES, f"simulation.substep_s={substep_s}"]
+        _, results = run_at_full_load(*overrides, steps=12)
+        hottest[substep_s] = np.array([r.inlet_max_c[0] for r in results])
+        supply[substep_s] = np.array([r.supply_c[0] for r in results])
+    for found in (hottest, supply):
+        error = {s: np.max(np.abs(found[s] - found[5])) for s in (10, 20, 60)}
+        assert error[10] < error[60] + 1e-9
+        assert error[10] < 0.1
+        assert error[60] < 0.8

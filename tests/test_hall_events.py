@@ -151,7 +151,7 @@ def test_fan_commands_need_the_flow_model_that_obeys_them() -> None:
 # --- protection ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("thermal", "margin_k"), [("quasi_steady", 6.0), ("transient", 6.0)])
+@pytest.mark.parametrize(("thermal", "margin_k"), [("quasi_steady", 9.0), ("transient", 6.0)])
 def test_hot_racks_throttle_and_then_trip_with_their_work_counted(
     thermal: str, margin_k: float
 ) -> None:

@@ -22,6 +22,11 @@ EVENT = "events.scheduled=[{{kind: {}, start_h: 1, duration_h: 1{}}}]"
         ("hall.height_gradient=1", ["hall.height_gradient", "less than 1"]),
         ("hvac.crac.units=20000", ["hvac.crac.units", "10000", "20000"]),
         ("hvac.crac.spare_units=1", ["spare_units 1 must be below units 1"]),
+        ("hvac.crac.capacity_kw=[9, 9]", ["capacity_kw has 2 entries, expected 1 (units)"]),
+        (
+            "hvac.crac.temperature_control=return",
+            ["setpoint.min_c 16", "the rise of the air of 14.7 K", "chilled water of -6.7"],
+        ),
         ("hvac.crac.airflow_m3s=[9, 9]", ["airflow_m3s has 2 entries, expected 1 (units)"]),
         ("hvac.crac.unit_shares=[[1]]", ["hvac.crac.unit_shares has 1 entries, expected 20"]),
         (

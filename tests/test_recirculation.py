@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -252,6 +252,7 @@ def test_all_power_leaves_with_the_air(precision: Precision, seed: int) -> None:
     hall = Hall(fleet_of(*configs), precision)
     sums, layers = hall.solve(met), hall.servers()
     for i, part in enumerate(parts(configs, met)):
+        part = replace(part, supply_c=sums.unit_supply_c[part.units])
         heat_w, power_w, left_over = leaving(part, sums, layers)
         it_w = sums.cpu_w[i] + sums.it_fan_w[i]
         assert power_w == pytest.approx(it_w, rel=TOLERANCE[precision])

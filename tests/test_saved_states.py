@@ -248,7 +248,7 @@ LIMITS: list[tuple[str, float, str]] = [
     ("stored_kwh", -1.0, "stored_kwh of entry 0 is -1"),
     ("queue", 1e4, "queue of entry 0, 0 is 10000; valid is 0..500"),
     ("setpoint_c", 60.0, "setpoint_c of entry 0 is 60; valid is 16..23"),
-    ("fan_speed", 0.1, r"fan_speed of entry 0 is 0.1; valid is 0\.6\.\.1"),
+    ("fan_speed", 0.1, r"fan_speed of entry 0 is 0.1; valid is 0\.3\.\.1"),
     ("rack_status", 3, r"rack_status of entry 0 is 3; valid is 0\.\.2"),
     ("cooling_run", 6, "cooling_run of entry 0 is 6; valid is 0..5"),
     ("cooling_last", np.nan, "cooling_last is .* after 5 steps"),

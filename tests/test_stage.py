@@ -139,7 +139,6 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
     supply_c = setpoint_c + some(0.0, 3.0) * (rng.random(n) < 0.3)
     it_w = sized.it_w * some(0.0, 1.1)
     inlet_m3k_s = flow_m3s * some(0.0, 5.0)
-    running = (rng.random(n) < 0.8).astype(np.float64)
     return {
         "plant_setpoint_c": setpoint_c,
         "outdoor_c": some(-25.0, 45.0),
@@ -157,7 +156,6 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
         "crac_flow_m3s": flow_m3s,
         "return_c": supply_c + some(0.0, 20.0),
         "cubed_flow_m3s": flow_m3s * some(0.1, 1.0),
-        "setpoint_m3k_s": flow_m3s * setpoint_c,
         "cooling_load_w": it_w * some(0.8, 1.2),
         "coil_w": it_w * some(0.8, 1.2),
         "room_j": some(-1e6, 1e8),
@@ -171,9 +169,8 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
         "outdoor_units": rng.choice([0.0, 0.5, 1.0], n),
         "chiller_share": rng.choice([0.0, 0.5, 1.0], n),
         "coil_share": some(0.3, 1.0),
-        "no_unit_down": running,
-        "idle_flow_m3s": (1.0 - running) * flow_m3s,
-        "idle_setpoint_m3k_s": (1.0 - running) * flow_m3s * setpoint_c,
+        "coil_limit_w": it_w * some(0.5, 1.5),
+        "no_unit_down": (rng.random(n) < 0.8).astype(np.float64),
         "price_per_kwh": some(0.0, 0.5),
     }
 
@@ -184,6 +181,7 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
     [
         [],
         ["simulation.thermal=transient"],
+        ["hvac.crac.capacity_kw=500"],
         ["hvac.chiller.model=eir_york", "hvac.water.model=paper"],
         ["hvac.chiller.model=electric_water_cooled", "battery.model=paper"],
         ["hvac.chiller.model=electric_air_cooled", "hvac.tower.economiser=false"],

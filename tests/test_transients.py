@@ -40,7 +40,8 @@ from sdc_taichi import (
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall, HallState, HallSums, Precision
+from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums, Precision
+from sdc_taichi.sim.hall_state import HallState
 from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 
@@ -73,6 +74,7 @@ def random_state(rng: np.random.Generator, fleet: Fleet, precision: Precision) -
         captured_m3s=rng.uniform(0, 1, fleet.racks).astype(real),
         need_m3s=fleet.unit_design_m3s * rng.uniform(0.2, 1.2, fleet.units),
         following=rng.uniform(0.2, 1.1, fleet.units),
+        supply_excess_k=rng.uniform(0.0, 3.0, fleet.units),
     )
 
 
@@ -89,6 +91,7 @@ def twin_memory(fleet: Fleet, part: Part, state: HallState, room_j: float) -> re
         need_m3s=state.need_m3s[part.units],
         following=state.following[part.units],
         room_j=room_j,
+        excess_k=state.supply_excess_k[part.units],
     )
 
 
@@ -514,7 +517,8 @@ def test_a_transient_hall_of_a_batch_equals_itself_alone(precision: Precision, s
     layers = batch.servers()
     for i, (config, part) in enumerate(zip(configs, parts(configs, met), strict=True)):
         alone = Hall(fleet_of(config), precision)
-        where = {"server_c": part.groups, "need_m3s": part.units, "following": part.units}
+        of_units = "need_m3s", "following", "supply_excess_k"
+        where = {"server_c": part.groups} | dict.fromkeys(of_units, part.units)
         own = own_conditions(met, configs, i)
         start = alone.steady_state(replace(own, powered=None))
         one = slice(i, i + 1)

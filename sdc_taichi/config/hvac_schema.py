@@ -33,14 +33,22 @@ from sdc_taichi.plant.plants import DRY_PLANTS
 from sdc_taichi.types import F64
 
 Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
+USUAL_AIR_J_PER_M3_K = 1.2e3
+"""Heat capacity of air by volume near sea level, in J/(m3 K), for checks alone."""
 MOST_CRAC_UNITS = 10_000
 """Largest number of CRAC units of a hall, one for each fan of the largest fan walls."""
 UnitAirflow = Annotated[float, Field(ge=0.01, le=1000)]
 """Airflow of a CRAC unit, 0.01..1,000 m3/s: from a desk fan to a fan wall of a large hall."""
 
+UnitCapacity = Annotated[float, Field(ge=0.1, le=1e5)]
+"""Cooling capacity of a CRAC unit, 0.1..100,000 kW: from a small wall unit to a fan wall."""
+
 
 class SetpointConfig(Section):
-    """CRAC supply setpoint: range, first value and how actions move it."""
+    """Setpoint of the CRAC units: range, first value and how actions move it.
+
+    It is of the supply air, or of the return air where ``crac.temperature_control`` says so.
+    """
 
     model: Literal["symmetric", "accelerating"] = "symmetric"
     """How a command moves the setpoint: by one step, or by a step that grows with equal commands
@@ -116,6 +124,13 @@ class CracConfig(Section):
     summing to 1; None is by distance."""
     supply_length_m: LengthM = 6.0
     """Length over which a unit loses weight in the supply of a rack by a factor of e, in m."""
+    capacity_kw: UnitCapacity | tuple[UnitCapacity, ...] | None = None
+    """Most heat that the coil of a unit takes out, that of its fan included, in kW: one for all
+    units, or one per unit; None is no limit but that of the plant."""
+    temperature_control: Literal["supply", "return"] = "supply"
+    """Air that the setpoint is of: what a unit supplies, or what returns to it. With ``return`` the
+    supply air is colder the more heat there is to remove, down to the setpoint less the rise of the
+    air at the design point."""
     supply_m3s_per_w: FlowM3sPerW = 5.663e-5
     """Design airflow of all units per IT power at the design point, in m3/s per W."""
     reference_m3s_per_w: FlowM3sPerW = 9.438e-5
@@ -152,11 +167,13 @@ class CracConfig(Section):
                 f"spare_units {self.spare_units} sizes units, and airflow_m3s gives their size; "
                 "valid is one of the two"
             )
-        if isinstance(self.airflow_m3s, tuple) and len(self.airflow_m3s) != self.units:
-            raise ValueError(
-                f"airflow_m3s has {len(self.airflow_m3s)} entries, expected {self.units} (units), "
-                "or one value for all"
-            )
+        for name in ("airflow_m3s", "capacity_kw"):
+            given = getattr(self, name)
+            if isinstance(given, tuple) and len(given) != self.units:
+                raise ValueError(
+                    f"{name} has {len(given)} entries, expected {self.units} (units), or one "
+                    "value for all"
+                )
         return self
 
 
@@ -409,11 +426,14 @@ class HvacConfig(Section):
     @model_validator(mode="after")
     def _chilled_water_within_the_model(self) -> Self:
         low, high = chilled_water_bounds_c(self.chiller.model)
-        water = self.setpoint.min_c - self.chiller.coil_approach_k
+        water, rise = self.setpoint.min_c - self.chiller.coil_approach_k, ""
+        if self.crac.temperature_control == "return":
+            rise_k = 1.0 / (USUAL_AIR_J_PER_M3_K * self.crac.supply_m3s_per_w)
+            water, rise = water - rise_k, f" and the rise of the air of {rise_k:.3g} K"
         if self.chiller.model in CHILLED_WATER_BOUNDS_C and water < low:
             raise ValueError(
                 f"setpoint.min_c {self.setpoint.min_c:g} less chiller.coil_approach_k "
-                f"{self.chiller.coil_approach_k:g} asks for chilled water of {water:g} C; "
+                f"{self.chiller.coil_approach_k:g}{rise} asks for chilled water of {water:.4g} C; "
                 f"model {self.chiller.model} is valid within {low:g}..{high:g} C"
             )
         return self

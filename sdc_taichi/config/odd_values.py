@@ -19,8 +19,9 @@ MOST_USUAL_COP = 15.0
 """Chillers with magnetic bearings reach about 12 at their reference point."""
 MOST_USUAL_AIR_COOLED_COP = 4.5
 """Air-cooled chillers reach about 4 at 35 C outdoors."""
-USUAL_SETPOINTS_C = (10.0, 35.0)
-"""Supply air that is colder condenses water on every surface; ASHRAE class A2 ends at 35 C."""
+USUAL_SETPOINTS_C = {"supply": (10.0, 35.0), "return": (18.0, 50.0)}
+"""Supply air that is colder condenses water on every surface; ASHRAE class A2 ends at 35 C. Return
+air is some 10 to 15 K warmer."""
 LEAST_USUAL_PUMP_EFFICIENCY = 0.2
 """Even small circulators reach a fifth."""
 LEAST_USUAL_GRID_RATIO = 0.5
@@ -38,11 +39,14 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
             f"hvac.chiller.reference_cop {chiller.reference_cop:g}: the best "
             f"{'air-cooled ' if dry else ''}chillers reach about {reached}"
         )
-    low, high = USUAL_SETPOINTS_C
+    controlled = config.hvac.crac.temperature_control
+    low, high = USUAL_SETPOINTS_C[controlled]
     for name in ("min_c", "max_c"):
         value = getattr(setpoint, name)
         if not low <= value <= high:
-            yield f"hvac.setpoint.{name} {value:g}: supply air is usually {low:g}..{high:g} C"
+            yield (
+                f"hvac.setpoint.{name} {value:g}: {controlled} air is usually {low:g}..{high:g} C"
+            )
     if not low <= config.hall.design_supply_c <= high:
         yield (
             f"hall.design_supply_c {config.hall.design_supply_c:g}: supply air is usually "

@@ -206,6 +206,8 @@ class DataCenterConfig(Section):
         given = {
             f"hvac.crac.units {crac.units}": crac.units > 1,
             "hvac.crac.airflow_m3s": crac.airflow_m3s is not None,
+            "hvac.crac.capacity_kw": crac.capacity_kw is not None,
+            "hvac.crac.temperature_control return": crac.temperature_control == "return",
             "hvac.crac.flow_model pressure": crac.flow_model == "pressure",
             "hall.recirculation.matrix_file": self.hall.recirculation.matrix_file is not None,
             "simulation.thermal transient": self.simulation.thermal == "transient",

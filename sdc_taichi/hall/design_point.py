@@ -43,6 +43,19 @@ class DesignPoint:
     """Exhaust share of the intake of each group over that of its rack, by height, (G,). Its mean
     over the airflow of a rack is 1."""
 
+    def setpoint_over_supply_k(self, config: DataCenterConfig) -> float:
+        """Setpoint of the CRAC units less their coldest supply air, in K.
+
+        With control of the return air it is the rise from supply to return air at this point,
+        P/(rho cp V_crac), else 0.
+
+        Args:
+            config: The data center.
+        """
+        if config.hvac.crac.temperature_control == "supply":
+            return 0.0
+        return float(self.it_w.sum()) / (self.air_j_per_m3_k * self.crac_flow_m3s)
+
 
 def design_point(
     config: DataCenterConfig, servers: RackServers | None = None, approach_k: F64 | None = None

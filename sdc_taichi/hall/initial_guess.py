@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.hall.design_point import DesignPoint
 from sdc_taichi.hall.mix_weights import DENSE_RACKS
 from sdc_taichi.hall.rack_servers import RackServers
 from sdc_taichi.hall.recirculation import Recirculation
@@ -89,7 +90,7 @@ def initial_guess(
         servers: Its ``rack_servers``.
         recirculation: Its calibrated recirculation.
     """
-    supply_c = _table_supplies_c(config)
+    supply_c = _table_supplies_c(config, recirculation.design)
     dense = config.hall.racks <= DENSE_RACKS
     part = (_whole_hall if dense else _sampled_racks)(servers, recirculation)
     states = _steady_states(config, servers, part, recirculation, supply_c)
@@ -107,13 +108,14 @@ def initial_guess(
     )
 
 
-def _table_supplies_c(config: DataCenterConfig) -> F64:
+def _table_supplies_c(config: DataCenterConfig, design: DesignPoint) -> F64:
     """Supply temperatures of the table, which cover the range of setpoints, in C, (n,)."""
     setpoint = config.hvac.setpoint
-    span_k = setpoint.max_c - setpoint.min_c
+    over_k = design.setpoint_over_supply_k(config)
+    low_c, span_k = setpoint.min_c - over_k, setpoint.max_c - setpoint.min_c + over_k
     step_k = max(SUPPLY_STEP_K, span_k / (MOST_SUPPLIES - 1))
     count = 1 + max(1, int(np.ceil(span_k / step_k - 1e-9)))
-    return np.asarray(setpoint.min_c + step_k * np.arange(count), dtype=np.float64)
+    return np.asarray(low_c + step_k * np.arange(count), dtype=np.float64)
 
 
 class _HallPart(NamedTuple):

@@ -15,7 +15,8 @@ from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.facility_stage import FacilityStage
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall, HallState, HallSums
+from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
+from sdc_taichi.sim.hall_state import HallState
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.surroundings import Surroundings
 from sdc_taichi.sim.unit_index import UnitIndex
@@ -73,7 +74,7 @@ class SteadyAir:
             PhysicalLimitError: No steady state, or temperatures or power beyond any number.
         """
         warmed_k = self._units.of_each(state.room_heat_kwh / self._room_kwh_per_k)
-        unit_supply_c = supply.unit_setpoint_c + warmed_k
+        unit_supply_c = supply.coldest_supply_c + warmed_k
         air = self._hall.solve(_conditions(unit_supply_c, placement, supply, surroundings))
         return air, {**self._no_memory, "group_inlet_c": self._inlets.last()}
 
@@ -109,7 +110,7 @@ class TransientAir:
         """Steady temperatures under the given load; arguments as in ``SteadyAir.initial``."""
         steady = self._hall.steady_state(
             Conditions(
-                unit_supply_c=supply.unit_setpoint_c,
+                unit_supply_c=supply.coldest_supply_c,
                 utilisation=demand,
                 unit_low=supply.unit_low,
                 unit_high=supply.unit_high,
@@ -126,7 +127,7 @@ class TransientAir:
             PhysicalLimitError: Temperatures or power beyond any number.
         """
         coil = Coil(
-            setpoint_c=supply.unit_setpoint_c,
+            setpoint_c=supply.coldest_supply_c,
             room_j=state.room_heat_kwh * J_PER_KWH,
             room_j_per_k=self._room_j_per_k,
             limit_w=self._facility.removable_w(supply, surroundings),
@@ -134,7 +135,7 @@ class TransientAir:
         )
         air, after = self._hall.advance(
             # The supply air of each substep follows from the coil.
-            _conditions(supply.unit_setpoint_c, placement, supply, surroundings),
+            _conditions(supply.coldest_supply_c, placement, supply, surroundings),
             HallState(**{name: getattr(state, name) for name in _HALL_FIELDS}),
             coil,
             self._step_s,
@@ -154,8 +155,9 @@ class _GroupInlets:
         if not self._keep:
             return _EMPTY
         fleet = self._fleet
-        setpoint_c = fleet.values("hvac.setpoint.initial_c")[fleet.rack_dc]
-        return np.repeat(setpoint_c + fleet.approach_k, np.diff(fleet.group_offsets))
+        supply_c = fleet.values("hvac.setpoint.initial_c") - fleet.setpoint_over_supply_k
+        inlet_c = supply_c[fleet.rack_dc] + fleet.approach_k
+        return np.repeat(inlet_c, np.diff(fleet.group_offsets))
 
     def last(self) -> F64:
         """Inlets of the last step, in C, (G,); empty if nothing needs them."""

@@ -22,9 +22,12 @@ class Supply:
     """How the CRAC units run during one step: B data centers, U units."""
 
     unit_setpoint_c: F64
-    """Supply air setpoint of each unit, in C, (U,)."""
+    """Setpoint of each unit, in C, (U,)."""
+    coldest_supply_c: F64
+    """Coldest supply air of each unit, in C, (U,): its setpoint, less the design rise of the air
+    where that is of the return air."""
     setpoint_c: F64
-    """Supply air setpoint, mean over the units, in C, (B,)."""
+    """Setpoint, mean over the units, in C, (B,)."""
     cooling_run: I64
     """Equal cooling commands in a row that each unit has had, (U,)."""
     cooling_last: F64
@@ -36,7 +39,9 @@ class Supply:
     unit_high: F64
     """Highest speed of each fan over design speed in this step, (U,)."""
     plant_setpoint_c: F64
-    """Supply air setpoint that the chilled water follows, in C, (B,)."""
+    """Coldest supply air, which the chilled water follows, in C, (B,)."""
+    coil_limit_w: F64
+    """Capacity of the coils of the units that run, in W, (B,)."""
     coil_share: F64
     """Airflow at full speed of the units that run over that of the design point, at most 1,
     (B,)."""
@@ -67,6 +72,8 @@ class CracUnits:
         self._fan_step = of_each("hvac.crac.fan_step")
         self._coasting = of_each("hvac.crac.coasting_flow_ratio")
         self._min_speed = of_each("hvac.crac.min_flow_ratio")
+        self._setpoint_over_supply_k = fleet.setpoint_over_supply_k[units.dc]
+        self._capacity_w = fleet.unit_capacity_w
         self._full_m3s, self._design_m3s = fleet.unit_design_m3s, fleet.design_flow_m3s
         self._ones, full_speed = np.ones(fleet.size), np.ones(fleet.units)
         self._design_speed = fleet.design_speed[units.dc]
@@ -84,15 +91,21 @@ class CracUnits:
         low, high = self._free_range
         return Supply(
             unit_setpoint_c=setpoint_c,
+            coldest_supply_c=self.coldest_supply_c(setpoint_c),
             setpoint_c=self._units.mean(setpoint_c),
             cooling_run=np.zeros(n_units, dtype=np.int64),
             cooling_last=np.full(n_units, np.nan),
             fan_speed=self._design_speed.copy(),
             unit_low=low,
             unit_high=high,
-            plant_setpoint_c=self._units.lowest(setpoint_c),
+            plant_setpoint_c=self._units.lowest(self.coldest_supply_c(setpoint_c)),
+            coil_limit_w=self._units.sum(self._capacity_w),
             coil_share=self._ones,
         )
+
+    def coldest_supply_c(self, unit_setpoint_c: F64) -> F64:
+        """Coldest supply air of each unit by its setpoint, each in C, (U,)."""
+        return unit_setpoint_c - self._setpoint_over_supply_k
 
     def supply(self, state: State, commands: Commands, surroundings: Surroundings) -> Supply:
         """Setpoints and fan speeds of a step.
@@ -114,9 +127,11 @@ class CracUnits:
             unit_setpoint_c = np.where(np.isnan(scheduled_c), unit_setpoint_c, scheduled_c)
         fan_speed = self._moved_fans(state.fan_speed, commands.unit_fan_command)
         unit_low, unit_high = self._speed_range(fan_speed, surroundings)
-        plant_setpoint_c, coil_share = self._served_by_plant(unit_setpoint_c, surroundings)
+        coldest_c = self.coldest_supply_c(unit_setpoint_c)
+        plant_setpoint_c, coil_limit_w, coil_share = self._served_by_plant(coldest_c, surroundings)
         return Supply(
             unit_setpoint_c=unit_setpoint_c,
+            coldest_supply_c=coldest_c,
             setpoint_c=self._units.mean(unit_setpoint_c),
             cooling_run=cooling_run,
             cooling_last=cooling_last,
@@ -124,6 +139,7 @@ class CracUnits:
             unit_low=unit_low,
             unit_high=unit_high,
             plant_setpoint_c=plant_setpoint_c,
+            coil_limit_w=coil_limit_w,
             coil_share=coil_share,
         )
 
@@ -155,19 +171,24 @@ class CracUnits:
         speed = (self._design_m3s - coasting_m3s) / np.maximum(running_m3s, 1e-30)
         return np.clip(self._units.of_each(speed), self._min_speed, 1.0)
 
-    def _served_by_plant(self, unit_setpoint_c: F64, surroundings: Surroundings) -> tuple[F64, F64]:
-        """Setpoint that the chilled water follows, and share of the coils in use, each (B,).
+    def _served_by_plant(
+        self, coldest_supply_c: F64, surroundings: Surroundings
+    ) -> tuple[F64, F64, F64]:
+        """What the plant sees of the coils in use, each (B,).
 
-        The coldest unit that runs decides; without any, the coldest of all.
+        Returns:
+            Coldest supply air, in C, which the chilled water follows, of the units that run, or
+            without any of all; capacity of the coils, in W; and their share of the airflow.
         """
-        lowest_c = self._units.lowest(unit_setpoint_c)
+        lowest_c = self._units.lowest(coldest_supply_c)
         if surroundings.all_running:
-            return lowest_c, self._ones
+            return lowest_c, self._units.sum(self._capacity_w), self._ones
         running = surroundings.unit_running
-        coldest_c = self._units.lowest(np.where(running > 0, unit_setpoint_c, np.inf))
+        coldest_c = self._units.lowest(np.where(running > 0, coldest_supply_c, np.inf))
         coldest_c = np.where(np.isinf(coldest_c), lowest_c, coldest_c)
         in_use_m3s = self._units.sum(running * self._full_m3s)
-        return coldest_c, np.minimum(in_use_m3s / self._design_m3s, 1.0)
+        share = np.minimum(in_use_m3s / self._design_m3s, 1.0)
+        return coldest_c, self._units.sum(running * self._capacity_w), share
 
 
 def _schedules_c(fleet: Fleet) -> FleetSeries | None:

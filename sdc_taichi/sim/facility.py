@@ -23,7 +23,7 @@ from sdc_taichi.plant.plants import DRY_PLANTS, PLANTS
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterUse
 from sdc_taichi.plant.water_side import WaterSideResult
-from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
 from sdc_taichi.sim.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k, sites_pressure_pa
 from sdc_taichi.types import F64, StepResult, as_array, fields_of
 
@@ -55,11 +55,11 @@ _STEP_INPUTS = (
     "stored_kwh",
     "room_heat_kwh",
 )
-_RECIRCULATION_INPUTS = ("crac_flow_m3s", "return_c", "cubed_flow_m3s", "setpoint_m3k_s")
+_RECIRCULATION_INPUTS = ("crac_flow_m3s", "return_c", "cubed_flow_m3s")
 _APPROACH_INPUTS = ("outlet_mean_c", "fan_speed")
 _TRANSIENT_INPUTS = ("cooling_load_w", "coil_w", "room_j")
-_EVENT_INPUTS = ("grid_up", "no_unit_down", "idle_flow_m3s", "idle_setpoint_m3k_s")
-_RESULTS = {f.name for f in fields(StepResult)} | {"supply_warming_k"}
+_EVENT_INPUTS = ("grid_up", "no_unit_down")
+_RESULTS = {f.name for f in fields(StepResult)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +104,6 @@ class FacilityInputs:
     cubed_flow_m3s: F64 = NOT_USED
     """Sum over the CRAC units of design airflow times the mean cube of the fan speed over design
     speed, in m3/s, (B,); for halls that recirculate."""
-    setpoint_m3k_s: F64 = NOT_USED
-    """Sum over the CRAC units of airflow times setpoint, in m3 C/s, (B,); for halls that
-    recirculate."""
     cooling_load_w: F64 = NOT_USED
     """Heat of air and fans that reaches the CRAC units, in W, (B,); for transient halls."""
     coil_w: F64 = NOT_USED
@@ -138,14 +135,12 @@ class FacilityInputs:
     """Share of tower cells, dry coolers or openings for outdoor air that are in order, 0..1, (B,);
     for fleets with events."""
     coil_share: F64 = NOT_USED
-    """Design airflow of the CRAC units that run over that of all, (B,); for fleets with events."""
+    """Airflow at full speed of the CRAC units that run over that of the design point, at most 1,
+    (B,); for fleets with events."""
     no_unit_down: F64 = NOT_USED
     """1 if all CRAC units run, 0 if one is down, (B,); for fleets with events."""
-    idle_flow_m3s: F64 = NOT_USED
-    """Airflow of the CRAC units that are down, in m3/s, (B,); for fleets with events."""
-    idle_setpoint_m3k_s: F64 = NOT_USED
-    """Sum over the CRAC units that are down of airflow times setpoint, in m3 C/s, (B,); for fleets
-    with events."""
+    coil_limit_w: F64 = NOT_USED
+    """Capacity of the coils of the CRAC units that run, in W, (B,); for fleets with such limits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +153,6 @@ class _CracAir:
     """Power of the CRAC fans, in W, (B,)."""
     supply_c: F64
     """Supply air temperature, mean over the CRAC airflow, in C, (B,)."""
-    supply_warming_k: F64
-    """Supply air temperature over the setpoint, in K, (B,)."""
     return_c: F64
     """Temperature of the air that returns to the CRAC units, in C, (B,)."""
     cooling_load_w: F64
@@ -232,7 +225,12 @@ class Facility:
         self._air_j_per_m3_k = air_j_per_m3_k(fleet)
         self._return_approach_k = mean_return_approach_k(fleet)
         self._fan_w_per_m3s = sizing.crac_fan_w / sizing.crac_flow_m3s
-        self.plant_input_names = _PLANT_INPUTS + (() if event_free else _PLANT_EVENT_INPUTS)
+        self._limits_coils = bool(np.any(fleet.unit_capacity_w < NO_LIMIT_W))
+        self.plant_input_names = (
+            *_PLANT_INPUTS,
+            *(() if event_free else _PLANT_EVENT_INPUTS),
+            *(("coil_limit_w",) if self._limits_coils else ()),
+        )
         """Names of the inputs that ``removable_w`` reads."""
         self.input_names = (
             *self.plant_input_names,
@@ -257,8 +255,7 @@ class Facility:
             inputs: What the step starts from.
 
         Returns:
-            Quantities of ``StepResult`` by their names there, and ``supply_warming_k``, supply air
-            over the setpoint, K, each (B,).
+            Quantities of ``StepResult`` by their names there, each (B,).
         """
         it_w = inputs.cpu_w + inputs.it_fan_w
         air = self._crac_air(inputs, it_w)
@@ -308,8 +305,6 @@ class Facility:
                 crac_flow_m3s=inputs.crac_flow_m3s,
                 crac_fan_w=fan_w,
                 supply_c=inputs.supply_c,
-                # Units differ by their setpoints alone; the room warms the air of all alike.
-                supply_warming_k=inputs.supply_c - inputs.setpoint_m3k_s / inputs.crac_flow_m3s,
                 return_c=inputs.return_c,
                 cooling_load_w=inputs.cooling_load_w if self._transient else it_w + fan_w,
             )
@@ -332,7 +327,6 @@ class Facility:
             crac_flow_m3s=flow,
             crac_fan_w=fan_w,
             supply_c=inputs.supply_c,
-            supply_warming_k=inputs.supply_c - inputs.plant_setpoint_c,
             return_c=return_c,
             cooling_load_w=load_w,
         )
@@ -342,13 +336,11 @@ class Facility:
         if self._transient:
             return inputs.coil_w
         wanted_w = air.cooling_load_w + inputs.room_heat_kwh * 1e3 / self._step_h
+        if self._limits_coils:
+            wanted_w = np.minimum(wanted_w, self._coil_limit_w(inputs))
         if self._event_free:
             return wanted_w
-        # Heat of the air that passes units that are down stays in the room.
-        unwarmed_return_c = air.return_c - air.supply_warming_k
-        idle_rise_m3k_s = unwarmed_return_c * inputs.idle_flow_m3s - inputs.idle_setpoint_m3k_s
-        passing_w = self._air_j_per_m3_k * idle_rise_m3k_s
-        reached_w = np.clip(wanted_w - passing_w, 0.0, self._coil_capacity_w(inputs))
+        reached_w = np.clip(wanted_w, 0.0, self._coil_capacity_w(inputs))
         return np.where(inputs.no_unit_down > 0, wanted_w, reached_w)
 
     def _operate(
@@ -498,7 +490,15 @@ class Facility:
     def _coil_capacity_w(self, inputs: FacilityInputs) -> F64:
         """Heat that the coils in use can take, mean over the step."""
         cooling_w = self._sizing.water_side.cooling_w
-        return cooling_w if self._event_free else cooling_w * inputs.coil_share * inputs.powered
+        if not self._event_free:
+            cooling_w = cooling_w * inputs.coil_share * inputs.powered
+        return (
+            np.minimum(cooling_w, self._coil_limit_w(inputs)) if self._limits_coils else cooling_w
+        )
+
+    def _coil_limit_w(self, inputs: FacilityInputs) -> F64:
+        """Capacity of the coils of the units that run, mean over the step."""
+        return self._while_powered(inputs.coil_limit_w, inputs)
 
     def _while_powered(self, power_w: F64, inputs: FacilityInputs) -> F64:
         """Mean over the step of a power that is drawn while there is power."""

@@ -71,32 +71,24 @@ class FacilityStage:
             **vars(surroundings),
             **vars(supply),
             **vars(air),
-            **self._unit_sums(surroundings, supply, air),
+            **self._unit_sums(surroundings, air),
             "battery_command": commands.battery_command,
             "stored_kwh": state.stored_kwh,
             "room_heat_kwh": state.room_heat_kwh,
         }
         found = self._step.select(known)
-        warming_k = self._units.of_each(found.pop("supply_warming_k"))
-        found["unit_supply_c"] = supply.unit_setpoint_c + warming_k
+        found["unit_supply_c"] = air.unit_supply_c if self._recirculates else found["supply_c"]
         found["unit_flow_m3s"] = air.unit_flow_m3s if self._recirculates else found["crac_flow_m3s"]
         return found
 
-    def _unit_sums(
-        self, surroundings: Surroundings, supply: Supply, air: HallSums
-    ) -> dict[str, F64]:
+    def _unit_sums(self, surroundings: Surroundings, air: HallSums) -> dict[str, F64]:
         """Sums over the CRAC units that the facility reads, see ``FacilityInputs``."""
-        units, flow_m3s, sums = self._units, air.unit_flow_m3s, {}
+        units, sums = self._units, {}
         if self._recirculates:
             cubed_m3s = self._unit_design_m3s * air.unit_cubed_speed
             sums["cubed_flow_m3s"] = units.sum(cubed_m3s)
-            sums["setpoint_m3k_s"] = units.sum(flow_m3s * supply.unit_setpoint_c)
         if not self._event_free:
-            running = surroundings.unit_running
-            idle_m3s = (1.0 - running) * flow_m3s
-            sums["no_unit_down"] = units.lowest(running)
-            sums["idle_flow_m3s"] = units.sum(idle_m3s)
-            sums["idle_setpoint_m3k_s"] = units.sum(idle_m3s * supply.unit_setpoint_c)
+            sums["no_unit_down"] = units.lowest(surroundings.unit_running)
         return sums
 
 

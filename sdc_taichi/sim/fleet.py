@@ -27,6 +27,8 @@ from sdc_taichi.types import F64, I32
 
 MOST_ENTRIES = int(np.iinfo(np.int32).max)
 """Most racks, servers or other entries of a fleet: what the kernels can index."""
+NO_LIMIT_W = 1e30
+"""Capacity of a coil without a limit of its own, in W: a number whose sums are numbers in f32."""
 MOST_UNIT_SHARES = 2**25
 """Most pairs of rack and CRAC unit in a hall, whose shares of supply air take 12 bytes each."""
 STAGE_MODELS = {
@@ -107,6 +109,11 @@ class Fleet:
     """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
     design_flow_m3s: F64
     """Airflow of all CRAC units at the design point, in m3/s, (B,)."""
+    unit_capacity_w: F64
+    """Most heat that the coil of each CRAC unit takes out, in W, (U,); ``NO_LIMIT_W`` without."""
+    setpoint_over_supply_k: F64
+    """Setpoint of the CRAC units over their coldest supply air, in K, (B,): the rise to the return
+    air at the design point with control of return air, else 0."""
     air: HallAir | None
     """How air moves in the halls; None with inlet model ``approach``."""
 
@@ -215,6 +222,8 @@ class _HallArrays:
     """Airflow of each CRAC unit at full speed, in m3/s, (U,)."""
     design_flow_m3s: float
     """Airflow of all CRAC units at the design point, in m3/s."""
+    setpoint_over_supply_k: float
+    """Setpoint of the CRAC units over their coldest supply air, in K."""
     air: _Air | None
     """How air moves in the hall; None with inlet model ``approach``."""
     odd: tuple[str, ...]
@@ -280,6 +289,8 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         ),
         unit_design_m3s=np.concatenate([h.unit_design_m3s for h in halls]),
         design_flow_m3s=np.array([h.design_flow_m3s for h in halls]),
+        unit_capacity_w=np.concatenate([_capacity_w(config) for config in listed]),
+        setpoint_over_supply_k=np.array([h.setpoint_over_supply_k for h in halls]),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
     )
 
@@ -376,8 +387,16 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         dc=np.array(in_row_order(DC_COEFFICIENTS, coefficients)),
         unit_design_m3s=unit_design_m3s,
         design_flow_m3s=design.crac_flow_m3s,
+        setpoint_over_supply_k=design.setpoint_over_supply_k(config),
         air=air,
     )
+
+
+def _capacity_w(config: DataCenterConfig) -> F64:
+    """Most heat that the coil of each CRAC unit of a data center takes out, in W, (U,)."""
+    crac = config.hvac.crac
+    given_w = NO_LIMIT_W if crac.capacity_kw is None else 1e3 * np.asarray(crac.capacity_kw)
+    return np.broadcast_to(np.asarray(given_w, np.float64), (crac.units,))
 
 
 def _unit_supply(config: DataCenterConfig, found: Recirculation) -> tuple[F64, F64]:

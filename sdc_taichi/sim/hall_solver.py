@@ -29,6 +29,7 @@ from sdc_taichi.kernels.hall_arguments import (
 )
 from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_state import HallState
 from sdc_taichi.sim.hall_tables import build_hall_tables, build_rows_along_racks, vectors
 from sdc_taichi.sim.intake_air import IntakeAir, read_intake_air
 from sdc_taichi.sim.physical_limits import BEYOND_NUMBERS_C, no_number_error, no_steady_air_error
@@ -74,25 +75,6 @@ class Conditions:
     all."""
 
 
-@dataclass(frozen=True, slots=True)
-class HallState:
-    """Thermal memory of transient halls; quasi-steady halls have none."""
-
-    server_c: Reals
-    """Temperature of the servers of each group, in C, (G,)."""
-    mixed_c: Reals
-    """Temperature of the recirculated air before each rack, in C, (R,)."""
-    exhaust_c: Reals
-    """Temperature that each rack gives to the exhaust mixes, times its strength, in C, (R,): its
-    outlet, and for the share of its air that failing fans do not move the mix before it."""
-    captured_m3s: Reals
-    """Recirculated air that each rack takes in, in m3/s, (R,)."""
-    need_m3s: F64
-    """Supply air that the racks ask of each CRAC unit, in m3/s, (U,)."""
-    following: F64
-    """Fan speed of each CRAC unit over design speed that would just cover the need, (U,)."""
-
-
 @dataclass
 class HallSums:
     """Results of one step: sums and means of each data center, and values of each rack."""
@@ -133,6 +115,8 @@ class HallSums:
     """Heat of air and CRAC fans that reaches the CRAC units, in W, (B,); 0 in steady air."""
     coil_w: F64
     """Heat that the coils take out, in W, (B,); 0 in steady air."""
+    unit_supply_c: F64
+    """Supply air of each CRAC unit, in C, (U,)."""
     unit_flow_m3s: F64
     """Airflow of each CRAC unit, in m3/s, (U,)."""
     unit_cubed_speed: F64
@@ -269,7 +253,7 @@ class Hall:
         """
         self._set_conditions(met)
         self._set_state(state)
-        self._set_coil(coil)
+        self._set_coil(coil, state.supply_excess_k)
         substeps = int(np.ceil(step_s / substep_s - 1e-9))
         dc_out = self._new_results()
         self._begin_step(exchanges_before=1)
@@ -295,7 +279,7 @@ class Hall:
         # A substep that lasts for ever brings servers to their steady temperatures; what it makes
         # of the air is put back.
         air = [self._memory["mixed_c"]]
-        air += [self._unit_state[name] for name in ("fresh_ratio", "supply_c")]
+        air += [self._unit_state[name] for name in ("fresh_ratio", "supply_c", "excess_k")]
         steady = [row.copy() for row in air]
         self._memory["exhaust_c"][:] = self._exhaust()
         self._begin_step(exchanges_before=1)
@@ -421,7 +405,9 @@ class Hall:
         unit["low"][:] = 1.0 if met.unit_low is None else met.unit_low
         unit["high"][:] = 1.0 if met.unit_high is None else met.unit_high
         unit["running"][:] = 1.0 if met.unit_running is None else met.unit_running
+        unit["setpoint_c"][:] = met.unit_supply_c
         self._unit_state["supply_c"][:] = met.unit_supply_c
+        self._unit_state["excess_k"][:] = 0.0
 
     def _set_state(self, state: HallState) -> None:
         """Thermal memory and CRAC airflow at the start of a transient step."""
@@ -434,7 +420,7 @@ class Hall:
         flow_m3s = fleet.unit_sums(fleet.unit_design_m3s * speed)
         self._dc["crac_m3s_per_rack"][:] = flow_m3s / np.diff(fleet.rack_offsets)
 
-    def _set_coil(self, coil: Coil) -> None:
+    def _set_coil(self, coil: Coil, excess_k: F64) -> None:
         """Setpoints, room and plant of a transient step, and the supply air it begins with."""
         self._unit["setpoint_c"][:] = coil.setpoint_c
         for name, values in (
@@ -445,7 +431,7 @@ class Hall:
         ):
             self._dc[name][:] = values
         warmed_k = (coil.room_j / coil.room_j_per_k)[self._fleet.unit_dc]
-        self._unit_state["supply_c"][:] = coil.setpoint_c + warmed_k
+        self._unit_state["supply_c"][:] = coil.setpoint_c + warmed_k + excess_k
 
     def _begin_step(self, exchanges_before: int) -> None:
         """The first sweep exchanges what ``exhaust_c`` holds, or looks up its first guess."""
@@ -561,6 +547,7 @@ class Hall:
             captured_m3s=self._places.values_of_racks(self._memory["captured_m3s"][None])[0],
             need_m3s=self._unit_state["need_m3s"].copy(),
             following=self._unit_state["following"].copy(),
+            supply_excess_k=self._unit_state["excess_k"].copy(),
         )
 
     def _aligned(self, shape: tuple[int, ...]) -> Any:
@@ -587,6 +574,7 @@ class Hall:
             raise no_number_error(outlets_c, self._fleet)
         self._was_transient = transient
         return HallSums(
+            unit_supply_c=self._unit_state["mean_supply_c"].copy(),
             unit_flow_m3s=self._unit_state["flow_m3s"].copy(),
             unit_cubed_speed=self._unit_state["cubed_speed"].copy(),
             room_j=self._dc["room_j"].copy(),

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.hall.mix_weights import DENSE_RACKS
-from sdc_taichi.kernels.arguments import in_row_order
+from sdc_taichi.kernels.arguments import in_row_order, row_index
 from sdc_taichi.kernels.hall_arguments import (
     ARGUMENTS,
     BLOCK_INTS,
@@ -45,6 +45,9 @@ from sdc_taichi.sim.fleet import Fleet, offsets_from_counts
 from sdc_taichi.sim.shared_plenum import SharedPlenum, shares_by_block
 from sdc_taichi.types import F64, I32
 
+RETURN_BAND_K = 2.0
+"""Proportional band of return-air control, in K: how much colder than the setpoint the return air
+is without load."""
 Array = Any
 """NumPy array of any type; arrays of vectors have an axis more than in the kernel."""
 
@@ -169,9 +172,12 @@ def build_hall_tables(fleet: Fleet, dtype: npt.DTypeLike, most_slices: int) -> H
         "group_values": vectors(dtype, len(GROUP_OUT), slices * int(most_groups)),
         "rack_out": vectors(dtype, len(RACK_OUT), places.count // LANES),
     }
-    plenum = SharedPlenum(fleet, unit_shares, dc_ints["first_share"], LANES)
+    doubles = arrays["dc_doubles"]
+    adjusts_supply = doubles[row_index(DC_DOUBLES, "adjusts_supply")]
+    plenum = SharedPlenum(fleet, unit_shares, dc_ints["first_share"], LANES, adjusts_supply)
     tables = HallTables(places, arrays, int(group_places), slices, plenum)
     tables.rows("unit_inputs")["design_m3s"][:] = fleet.unit_design_m3s
+    tables.rows("unit_inputs")["capacity_w"][:] = fleet.unit_capacity_w
     _set_data_center_values(fleet, tables.rows("dc_doubles"))
     return tables
 
@@ -467,7 +473,11 @@ def _build_rack_inputs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -
 
 
 def _set_data_center_values(fleet: Fleet, dc: dict[str, Array]) -> None:
-    """Rows of DC_DOUBLES that stay the same in all steps."""
+    """Rows of DC_DOUBLES that stay the same in all steps, but for the fans of transient halls."""
+    dc["crac_fan_w_per_m3s"][:] = fleet.values("hvac.crac.fan_w_per_m3s")
+    rise_k = fleet.setpoint_over_supply_k
+    dc["return_rise_k"][:] = rise_k
+    dc["return_gain"][:] = np.maximum(1.0 - RETURN_BAND_K / np.maximum(rise_k, 1e-9), 0.0)
     air = fleet.air
     if air is not None:
         ends_c = np.array([table.supply_c[:2] for table in air.steady_states])

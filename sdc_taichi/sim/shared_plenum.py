@@ -1,4 +1,4 @@
-"""Whose air reaches which racks while CRAC units are down: the kernels' unit shares kept up."""
+"""CRAC units that are down: whose air reaches which racks then, kept up in the kernels' arrays."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.hall.unit_supply import airflow_with_losses_m3s, unit_weights, weighted_shares
-from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
 from sdc_taichi.types import F64
 
 _MOST_KEPT = 4096
@@ -25,12 +25,19 @@ class SharedPlenum:
         kernel_shares: The kernels' array of shares, which holds those of all units running.
         first_share: First vector of each data center in it.
         lanes: Racks in a vector.
+        adjusts_supply: The kernels' row of whether supply air may differ from setpoints, (B,).
     """
 
-    def __init__(self, fleet: Fleet, kernel_shares: Any, first_share: Any, lanes: int) -> None:
+    def __init__(
+        self, fleet: Fleet, kernel_shares: Any, first_share: Any, lanes: int, adjusts_supply: F64
+    ) -> None:
         self._fleet, self._kernel_shares = fleet, kernel_shares
         self._first_share, self._lanes = first_share, lanes
         self._coasting_ratio = fleet.values("hvac.crac.coasting_flow_ratio")
+        limited = fleet.unit_sums(fleet.unit_capacity_w < NO_LIMIT_W) > 0
+        self._always_adjusts = limited | (fleet.setpoint_over_supply_k > 0)
+        self._adjusts_supply = adjusts_supply
+        adjusts_supply[:] = self._always_adjusts
         self.weight = np.ones(fleet.units)
         """Weight of each CRAC unit in the shares of all racks, (U,); 1 where all units run."""
         self._whole = np.ones(fleet.units)
@@ -62,6 +69,8 @@ class SharedPlenum:
                 self._kept.clear()
             self._kept[key] = self._weights(dc, shares, own)
         self.weight[units] = self._kept[key]
+        some_down = bool(np.any(own > 0) and np.any(own == 0))
+        self._adjusts_supply[dc] = some_down or self._always_adjusts[dc]
         by_block = shares_by_block(weighted_shares(shares, self._kept[key]), self._lanes)
         first = int(self._first_share[dc])
         self._kernel_shares[first : first + len(by_block)] = by_block

@@ -244,7 +244,8 @@ class Simulator:
         Raises:
             RuntimeStateError: Before the first step.
         """
-        return self._started().hall.intake_air(self.state.setpoint_c)
+        stages = self._started()
+        return stages.hall.intake_air(stages.crac_units.coldest_supply_c(self.state.setpoint_c))
 
     def state_dict(self, state: State | None = None) -> dict[str, Any]:
         """A state as plain arrays, for ``load_state_dict`` or ``numpy.savez``.

@@ -246,8 +246,10 @@ def released_ranges(fleet: Fleet, hall: Hall) -> dict[str, tuple[F64, F64]]:
 
 
 def _solve(fleet: Fleet, hall: Hall, supply_c: F64, utilisation: F64) -> HallSums:
-    """The hall in order, at one supply temperature and full CRAC airflow."""
-    return hall.solve(Conditions(supply_c[fleet.unit_dc], utilisation))
+    """The hall in order, at one supply temperature and the CRAC airflow of the design point."""
+    speed = fleet.design_speed[fleet.unit_dc]
+    supply_c = supply_c[fleet.unit_dc]
+    return hall.solve(Conditions(supply_c, utilisation, unit_low=speed, unit_high=speed))
 
 
 def air_j_per_m3_k(fleet: Fleet) -> F64:
@@ -288,9 +290,9 @@ def _design_chiller(
     coldest_c = v("hvac.chiller.min_condenser_c")
     design_c = np.maximum(wet_bulb_c + v("hvac.tower.approach_min_k"), coldest_c)
     _, warmest_c = chiller.chilled_water_bounds_c(name)
+    water_below_k = fleet.setpoint_over_supply_k + v("hvac.chiller.coil_approach_k")
     low_c, high_c = (
-        np.minimum(v(f"hvac.setpoint.{end}_c") - v("hvac.chiller.coil_approach_k"), warmest_c)
-        for end in ("min", "max")
+        np.minimum(v(f"hvac.setpoint.{end}_c") - water_below_k, warmest_c) for end in ("min", "max")
     )
     unit_w = np.ones(fleet.size)
 

@@ -75,4 +75,5 @@ def state_limits(fleet: Fleet, sizing: Sizing, step: int) -> dict[str, Limits]:
         "captured_m3s": (0.0, most_m3s[per_rack]),
         "need_m3s": (0.0, most_m3s[per_unit]),
         "following": (0.0, most_m3s[per_unit] / np.maximum(fleet.unit_design_m3s, 1e-30)),
+        "supply_excess_k": (AIR_LIMITS_C[0] - AIR_LIMITS_C[1], AIR_LIMITS_C[1] - AIR_LIMITS_C[0]),
     }
