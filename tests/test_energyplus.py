@@ -115,15 +115,26 @@ def elevation_m(table: dict[str, F64]) -> float:
     """
     density_kg_m3 = table["air_kg_s"] / table["airflow_m3s"]
     pressure_pa = 1.003 * np.median(density_kg_m3 * 287.05 * (table["inlet_c"] + 273.15))
+    return height_m(float(pressure_pa))
+
+
+def height_m(pressure_pa: float) -> float:
+    """Height above sea level of a pressure of the standard atmosphere, m."""
     return float((1.0 - (pressure_pa / 101_325.0) ** (1.0 / 5.2559)) / 2.25577e-5)
+
+
+def header_at(folder: Path, elevation_m: float) -> Path:
+    """A weather file of which the height above sea level is read, and nothing else."""
+    path = folder / "site.epw"
+    path.write_text(f"LOCATION,Site,-,-,-,0,0.0,0.0,0.0,{elevation_m:.1f}\n")
+    return path
 
 
 @pytest.mark.parametrize("path", tables("ite_*.csv"), ids=by_name)
 def test_outlets_of_servers(path: Path, tmp_path: Path) -> None:
     """All rows at once, as copies of one rack at a site as high as that of the table."""
     table = columns(path)
-    weather = tmp_path / "site.epw"
-    weather.write_text(f"LOCATION,Site,-,-,-,0,0.0,0.0,0.0,{elevation_m(table):.1f}\n")
+    weather = header_at(tmp_path, elevation_m(table))
     ratio = load_config("corrected", ITE).servers.curves.airflow_ratio(
         table["inlet_c"], table["utilisation"]
     )
@@ -203,12 +214,11 @@ def test_tower_fan_goes_off_in_the_same_hours(path: Path) -> None:
     table = columns(path)
     found = run_tower(table)
     modulating = (table["regime"] == 1.0) & (table["consistent"] == 1.0)
-    assert (found.air_ratio[modulating] >= tower.MIN_AIR_RATIO).all()
+    assert (found.fan_w[modulating] > 0.0).all()
     cycling = table["regime"] == 0.0
-    same = found.air_ratio[cycling] < tower.MIN_AIR_RATIO
-    assert same.mean() > 0.95
-    apart = np.abs(found.air_ratio - table["air_ratio"])[cycling][same]
-    assert apart.max() < 0.03
+    same = cycling & (found.air_ratio < tower.MIN_AIR_RATIO)
+    assert same.sum() >= 0.95 * cycling.sum()
+    assert np.abs(found.air_ratio - table["air_ratio"])[same].max(initial=0.0) < 0.03
 
 
 # Water of the tower
@@ -229,7 +239,7 @@ def test_evaporation(path: Path) -> None:
         * (DESIGN_AIR_M3S_PER_KG_S * design_water_kg_s(table)),
         outdoor_c=table["outdoor_c"],
         wet_bulb_c=table["wet_bulb_c"],
-        pressure_pa=float(np.mean(table["pressure_pa"])),
+        pressure_pa=table["pressure_pa"],
         return_c=0.0,
         supply_setpoint_c=0.0,
         cycles_of_concentration=CYCLES,
@@ -305,22 +315,15 @@ def test_air_cooled_electric_chiller(path: Path) -> None:
 # One facility
 
 CONFIG = [
-    "hall.inlet_model=approach",
-    "hall.supply_approach_k=5.15",
-    "hall.return_approach_k=-3.1",
-    "hall.air_density_kg_m3=1.225",
-    "servers.power_w=[130,10]",
-    "servers.fan_reference_w=10",
-    "hvac.setpoint.initial_c=18",
-    "hvac.chiller.model=eir_york",
-    "hvac.tower.economiser=false",
+    *ITE,
+    *("hall.rows=4", "hall.racks_per_row=5", "hall.servers_per_rack=200"),
+    *("hall.air_density_kg_m3=1.225", "simulation.steps_per_hour=1"),
+    *("hvac.setpoint.initial_c=18", "hvac.crac.flow_model=follow_servers"),
+    *("hvac.chiller.model=eir_york", "hvac.tower.economiser=false"),
+    *("hvac.sizing.margin=1.35", "hvac.sizing.design_wet_bulb_c=25.5"),
     "hvac.pumps.min_flow_ratio=1",
-    "hvac.sizing.margin=1.35",
-    "hvac.sizing.design_wet_bulb_c=25.5",
-    "simulation.steps_per_hour=1",
-    "site.location=IL",
 ]
-"""The hall and plant of the README; units, coils and tower are those of ``corrected``."""
+"""Hall and plant of the README; CRAC units, coils and tower are those of ``corrected``."""
 AIR_M3S_PER_W_REJECTED = 32.0 / 1.2e6
 
 
@@ -351,15 +354,26 @@ def resized(found: Sizing, given: dict[str, float]) -> Sizing:
     )
 
 
-def year(path: Path, given: dict[str, float], patch: pytest.MonkeyPatch) -> dict[str, F64]:
+def elevation_of_site_m(path: Path) -> float:
+    """Height of the site of a facility, by the pressure of its tower's table; else of O'Hare."""
+    site = path.stem.removeprefix("facility_").removesuffix("_hourly")
+    of_tower = [columns(x)["pressure_pa"] for x in tables(f"tower_yorkcalc_{site}.csv")]
+    return height_m(float(np.mean(of_tower[0]))) if of_tower else 201.8
+
+
+def year(
+    path: Path, given: dict[str, float], folder: Path, patch: pytest.MonkeyPatch
+) -> dict[str, F64]:
     """Quantities of every hour of a table, (T,) each."""
     table = columns(path)
+    weather = header_at(folder, elevation_of_site_m(path))
     patch.setattr(simulator, "size", lambda *of: resized(size(*of), given))
     wet_bulb_c = np.minimum(table["wb_c"], table["out_c"])
     drivers = drivers_from_arrays(
         table["out_c"], wet_bulb_c, np.full(len(wet_bulb_c), 300.0), table["utilisation"]
     )
-    overrides = [*CONFIG, f"servers.fan_full_airflow_m3s={given['vfull']}"]
+    own = [f"servers.fan_full_airflow_m3s={given['vfull']}", f"site.weather_file={weather}"]
+    overrides = [*CONFIG, *own]
     with Simulator(load_config("corrected", overrides), drivers=drivers) as sim:
         sim.reset()
         steps = [sim.step() for _ in wet_bulb_c]
@@ -372,12 +386,12 @@ def year(path: Path, given: dict[str, float], patch: pytest.MonkeyPatch) -> dict
 
 
 @pytest.mark.parametrize("path", tables("facility_*_hourly.csv"), ids=by_name)
-def test_facility(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_facility(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     summary: dict[str, Any] = json.loads(
         path.with_name(path.name.replace("_hourly.csv", "_monthly.json")).read_text()
     )
     table = columns(path)
-    found = year(path, summary["sizing"], monkeypatch)
+    found = year(path, summary["sizing"], tmp_path, monkeypatch)
     assert found["unmet_w"].max() == 0.0
 
     def over(*names: str) -> float:
