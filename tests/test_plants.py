@@ -8,7 +8,7 @@ import pytest
 from ledgers import LEDGERS, TRANSIENT_LEDGERS, residual
 from sdc_taichi import ConfigError, Simulator, StepResult, drivers_from_arrays, load_config
 from sdc_taichi.config import apply_overrides
-from sdc_taichi.errors import OddInputWarning
+from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.water_side import WaterSideDesign
 from test_ledgers import assert_closes, record, sites_and_seasons
@@ -246,6 +246,13 @@ def test_what_does_not_fit_together_is_an_error(overrides: list[str], parts: lis
     with pytest.raises(ConfigError) as caught:
         load_config("corrected", overrides)
     assert all(part in str(caught.value) for part in parts), caught.value
+
+
+def test_chiller_without_capacity_is_an_error() -> None:
+    hot = ["hvac.chiller.model=electric_water_cooled", "hvac.chiller.min_condenser_c=60",
+           "hvac.chiller.coil_approach_k=11"]  # fmt: skip
+    with pytest.raises(PhysicalLimitError, match="no capacity at its design weather, 60 C of cond"):
+        steady(hot, [20.0], [15.0])
 
 
 def test_reference_cop_is_that_of_the_machine_unless_it_is_given() -> None:

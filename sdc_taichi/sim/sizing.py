@@ -284,6 +284,9 @@ def _design_chiller(
     It cools ``cooling_w`` at the design wet bulb, and the load within, with a margin of up to 5 %,
     with any other water that the plant meets: chilled water of every setpoint, condenser water from
     the coldest that the chiller takes. Capacity may fall in cold condenser water.
+
+    Raises:
+        PhysicalLimitError: The chiller has no capacity in such weather.
     """
     v, name = fleet.values, fleet.models["chiller"]
     model = chiller.CHILLERS[name]
@@ -316,6 +319,14 @@ def _design_chiller(
     )  # fmt: skip
     # The coldest chilled water asks most of the chiller.
     design_w_per_w = at(low_c, design_c, 0.0 * unit_w, unit_w).available_w
+    without = np.minimum(design_w_per_w, least_w_per_w) <= 0
+    if without.any():
+        dc = int(np.argmax(without))
+        raise PhysicalLimitError(
+            f"{fleet.names[dc]}: hvac.chiller.model {name} has no capacity at its design weather, "
+            f"{design_c[dc]:g} C of condenser water and {outdoor_c[dc]:g} C outdoors; valid are a "
+            "lower hvac.chiller.min_condenser_c, tower approach or design temperature"
+        )
     margin = v("hvac.sizing.margin")
     share = np.minimum(margin, OFF_DESIGN_MARGIN) / margin
     chiller_w = cooling_w * np.maximum(1.0 / design_w_per_w, share / least_w_per_w)
