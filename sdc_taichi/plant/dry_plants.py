@@ -14,7 +14,12 @@ from sdc_taichi.plant import moist_air
 from sdc_taichi.plant.chiller import ChillerResult
 from sdc_taichi.plant.fans_pumps import pump_w
 from sdc_taichi.plant.tower import TowerResult
-from sdc_taichi.plant.water_side import WaterSideDesign, WaterSideResult, chilled_water_c
+from sdc_taichi.plant.water_side import (
+    WaterSideDesign,
+    WaterSideResult,
+    chilled_water_c,
+    coil_range_ratio,
+)
 from sdc_taichi.types import F64, Values, as_array
 
 _WETTING_K = moist_air.VAPOUR_J_PER_KG / moist_air.DRY_AIR_J_PER_KG_K
@@ -37,10 +42,12 @@ def air_cooled(
     """Remove up to ``requested_w`` from the chilled water with a dry cooler and a chiller.
 
     The dry cooler, with a heat exchanger in series ahead of the chiller, precools the return water.
-    Its effectiveness at full fan speed is constant, so the water comes within the design approach
-    of the outdoor air when the cooler does all of the work:
+    At full load and full fan speed the water comes within the design approach of the outdoor air
+    when the cooler does all of the work, and with constant effectiveness
 
         share = clip((T_return - T_outdoor)/(range + approach), 0, 1)
+
+    with the design range, so that the effectiveness grows a little as the water flow falls.
 
     The heat of a cooler that needs less grows with the airflow to the power 3/4, as that of a film
     does, and the fan power with its cube, so the fans draw the fourth power of the heat over that
@@ -63,7 +70,9 @@ def air_cooled(
     """
     load_w = np.minimum(requested_w, design.pumped_w) if limited else requested_w
     chilled_c = chilled_water_c(setpoint_c, design)
-    over_k = np.maximum(chilled_c + design.chilled_water_range_k - outdoor_c, 0.0)
+    range_ratio = coil_range_ratio(load_w, design)
+    return_water_c = chilled_c + design.chilled_water_range_k * range_ratio
+    over_k = np.maximum(return_water_c - outdoor_c, 0.0)
     reach = over_k / (design.chilled_water_range_k + design.dry_cooler_approach_k)
     full_speed_w = design.economiser * design.outdoor_units * design.cooling_w * reach
     free_w = np.minimum(load_w * np.minimum(reach, 1.0), full_speed_w)
@@ -77,7 +86,7 @@ def air_cooled(
         chilled_c=chilled_c,
         outdoor_c=outdoor_c,
         fan_w=design.tower_fan_w * design.outdoor_units * speed_share**4,
-        chilled_pump_w=_pump_w(removed_w, design.chilled_pump_w, design),
+        chilled_pump_w=_pump_w(removed_w / range_ratio, design.chilled_pump_w, design),
         condenser_pump_w=_pump_w(free_w, design.condenser_pump_w, design),
     )
 
@@ -153,7 +162,11 @@ def air_side(
         outdoor_c=outdoor_c,
         fan_w=design.tower_fan_w * (outdoor_m3s / design.tower_air_m3s) ** 3,
         humidifier_kg_s=lack * outdoor_m3s * design.air_j_per_m3_k / moist_air.DRY_AIR_J_PER_KG_K,
-        chilled_pump_w=_pump_w(machine.evaporator_w, design.chilled_pump_w, design),
+        chilled_pump_w=_pump_w(
+            machine.evaporator_w / coil_range_ratio(machine.evaporator_w, design),
+            design.chilled_pump_w,
+            design,
+        ),
         condenser_pump_w=0.0 * load_w,
     )
 

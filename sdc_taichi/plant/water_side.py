@@ -59,6 +59,8 @@ class WaterSideDesign:
     """Approach of the economiser, precooled water over tower water, in K, (B,)."""
     min_condenser_c: F64
     """Coldest condenser water that the chiller takes, in C, (B,)."""
+    fullest_condenser_c: F64
+    """Condenser water at which the chiller has most capacity, in C, (B,)."""
     min_lift_k: F64
     """Smallest lift of the chiller, condenser water over chilled water, in K, (B,)."""
     warmest_chilled_c: F64
@@ -220,12 +222,12 @@ def water_cooled(
     load_w = np.minimum(requested_w, most_w) if limited else requested_w
     chilled_c = chilled_water_c(setpoint_c, design)
 
-    def run_chiller(economiser: F64, tower_water_c: F64) -> ChillerResult:
+    def run_chiller(economiser: F64, condenser_c: F64) -> ChillerResult:
         return chiller(
             load_w * (1.0 - economiser),
             reference_w=design.chiller_w,
             chilled_water_c=chilled_c,
-            condenser_c=np.maximum(tower_water_c, design.min_condenser_c),
+            condenser_c=condenser_c,
             outdoor_c=outdoor_c,
             reference_cop=design.reference_cop,
             min_lift_k=design.min_lift_k,
@@ -236,7 +238,8 @@ def water_cooled(
     coldest_c = wet_bulb_c + design.approach_min_k
     share = _economiser_share_at(coldest_c, chilled_c, return_water_c, design)
     tower_setpoint_c = _tower_setpoint_c(coldest_c, share, chilled_c, design)
-    heat_w = load_w * share + run_chiller(share, tower_setpoint_c).rejected_w
+    foreseen = run_chiller(share, np.maximum(tower_setpoint_c, design.min_condenser_c))
+    heat_w = load_w * share + foreseen.rejected_w
     flow_ratio = np.maximum(heat_w / design.rejected_w, design.pump_min_ratio)
     tower_water_kg_s = design.tower_water_kg_s * flow_ratio
     units = np.maximum(design.outdoor_units, LEAST_OUTDOOR_UNITS)
@@ -253,7 +256,10 @@ def water_cooled(
         air_j_per_m3_k=design.air_j_per_m3_k,
     )
     share = _economiser_share_at(cooled.leaving_c, chilled_c, return_water_c, design)
-    machine = run_chiller(share, cooled.leaving_c)
+    # Head pressure control: a bypass keeps the chiller's water as warm as its capacity needs.
+    short = foreseen.unmet_w > 0.0
+    warm_c = np.where(short, design.fullest_condenser_c, design.min_condenser_c)
+    machine = run_chiller(share, np.maximum(cooled.leaving_c, warm_c))
     economiser_w = load_w * share
     heat_removed_w = load_w - machine.unmet_w if limited else load_w
     # The exchanger stands in the return of the coils, ahead of the bypass of pumps and chiller.

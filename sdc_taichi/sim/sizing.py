@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import product
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -127,10 +126,11 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     # Spare units let all run at part speed.
     crac_at_design_w = crac_fan_w * fleet.design_speed**3
     cooling_w = (it_w + crac_at_design_w) * v("hvac.sizing.margin")
-    chiller_w, at_design = _design_chiller(fleet, cooling_w, outdoor_c, wet_bulb_c)
+    chiller_w, at_design, fullest_c = _design_chiller(fleet, cooling_w, outdoor_c, wet_bulb_c)
     water_side = _water_side(
         fleet, cooling_w, chiller_w, at_design.rejected_w, crac_flow_m3s, outdoor_c, wet_bulb_c
     )
+    water_side = replace(water_side, fullest_condenser_c=fullest_c)
     power_path, counted_loss_w = _power_path(fleet, it_w)
     facility_w = (
         it_w
@@ -276,28 +276,10 @@ def _reference_cop(fleet: Fleet) -> F64:
     return np.where(np.isnan(given), usual, given)
 
 
-def _design_chiller(
-    fleet: Fleet, cooling_w: F64, outdoor_c: F64, wet_bulb_c: F64
-) -> tuple[F64, ChillerResult]:
-    """Reference capacity of the chiller, W, (B,), and the chiller as it cools at design.
-
-    It cools ``cooling_w`` at the design wet bulb, and the load within, with a margin of up to 5 %,
-    with any other water that the plant meets: chilled water of every setpoint, condenser water from
-    the coldest that the chiller takes. Capacity may fall in cold condenser water.
-
-    Raises:
-        PhysicalLimitError: The chiller has no capacity in such weather.
-    """
-    v, name = fleet.values, fleet.models["chiller"]
-    model = chiller.CHILLERS[name]
-    coldest_c = v("hvac.chiller.min_condenser_c")
-    design_c = np.maximum(wet_bulb_c + v("hvac.tower.approach_min_k"), coldest_c)
-    _, warmest_c = chiller.chilled_water_bounds_c(name)
-    water_below_k = fleet.setpoint_over_supply_k + v("hvac.chiller.coil_approach_k")
-    low_c, high_c = (
-        np.minimum(v(f"hvac.setpoint.{end}_c") - water_below_k, warmest_c) for end in ("min", "max")
-    )
-    unit_w = np.ones(fleet.size)
+def _chiller_at(fleet: Fleet, outdoor_c: F64) -> Callable[[F64, F64, F64, F64], ChillerResult]:
+    """The chillers as a function of chilled and condenser water, C, load and capacity, W, (B,)."""
+    v, model = fleet.values, chiller.CHILLERS[fleet.models["chiller"]]
+    reference_cop, min_lift_k = _reference_cop(fleet), v("hvac.chiller.min_lift_k")
 
     def at(chilled_c: F64, condenser_c: F64, load_w: F64, reference_w: F64) -> ChillerResult:
         return model(
@@ -306,22 +288,47 @@ def _design_chiller(
             chilled_water_c=chilled_c,
             condenser_c=condenser_c,
             outdoor_c=outdoor_c,
-            reference_cop=_reference_cop(fleet),
-            min_lift_k=v("hvac.chiller.min_lift_k"),
+            reference_cop=reference_cop,
+            min_lift_k=min_lift_k,
         )
 
-    least_w_per_w = np.minimum.reduce(
-        [
-            at(low_c + x * (high_c - low_c), coldest_c + y * (design_c - coldest_c), 0.0 * unit_w,
-               unit_w).available_w
-            for x, y in product(_GRID, _GRID)
-        ]
-    )  # fmt: skip
-    # The coldest chilled water asks most of the chiller.
-    design_w_per_w = at(low_c, design_c, 0.0 * unit_w, unit_w).available_w
-    without = np.minimum(design_w_per_w, least_w_per_w) <= 0
-    if without.any():
-        dc = int(np.argmax(without))
+    return at
+
+
+def _design_chiller(
+    fleet: Fleet, cooling_w: F64, outdoor_c: F64, wet_bulb_c: F64
+) -> tuple[F64, ChillerResult, F64]:
+    """Size of the chiller.
+
+    It cools ``cooling_w`` at the design wet bulb, and the load within, with a margin of up to 5 %,
+    with any other water that the plant meets: chilled water of every setpoint, condenser water from
+    the coldest that the chiller takes. Capacity may fall in cold condenser water.
+
+    Returns:
+        Reference capacity, W, the chiller as it cools at design, and the condenser water at which
+        it has most capacity, C, each (B,).
+
+    Raises:
+        PhysicalLimitError: The chiller has no capacity in such weather.
+    """
+    v, name = fleet.values, fleet.models["chiller"]
+    at, zero_w, unit_w = _chiller_at(fleet, outdoor_c), np.zeros(fleet.size), np.ones(fleet.size)
+    coldest_c = v("hvac.chiller.min_condenser_c")
+    design_c = np.maximum(wet_bulb_c + v("hvac.tower.approach_min_k"), coldest_c)
+    _, warmest_c = chiller.chilled_water_bounds_c(name)
+    water_below_k = fleet.setpoint_over_supply_k + v("hvac.chiller.coil_approach_k")
+    low_c, high_c = (
+        np.minimum(v(f"hvac.setpoint.{end}_c") - water_below_k, warmest_c) for end in ("min", "max")
+    )
+    chilled_c = [low_c + x * (high_c - low_c) for x in _GRID]
+    condenser_c = [coldest_c + x * (design_c - coldest_c) for x in _GRID]
+    w_per_w = np.array(
+        [[at(c, t, zero_w, unit_w).available_w for c in chilled_c] for t in condenser_c]
+    ).min(axis=1)
+    design_w_per_w = at(low_c, design_c, zero_w, unit_w).available_w
+    least_w_per_w = np.minimum(w_per_w.min(axis=0), design_w_per_w)
+    if np.any(least_w_per_w <= 0):
+        dc = int(np.argmin(least_w_per_w))
         raise PhysicalLimitError(
             f"{fleet.names[dc]}: hvac.chiller.model {name} has no capacity at its design weather, "
             f"{design_c[dc]:g} C of condenser water and {outdoor_c[dc]:g} C outdoors; valid are a "
@@ -330,7 +337,9 @@ def _design_chiller(
     margin = v("hvac.sizing.margin")
     share = np.minimum(margin, OFF_DESIGN_MARGIN) / margin
     chiller_w = cooling_w * np.maximum(1.0 / design_w_per_w, share / least_w_per_w)
-    return chiller_w, at(low_c, design_c, cooling_w, chiller_w)
+    # The coldest chilled water asks most of the chiller.
+    at_design = at(low_c, design_c, cooling_w, chiller_w)
+    return chiller_w, at_design, np.choose(w_per_w.argmax(axis=0), condenser_c)
 
 
 def _water_side(
@@ -361,6 +370,7 @@ def _water_side(
         approach_min_k=approach_k,
         exchanger_approach_k=v("hvac.tower.economiser_approach_k") - approach_k,
         min_condenser_c=v("hvac.chiller.min_condenser_c"),
+        fullest_condenser_c=v("hvac.chiller.min_condenser_c"),
         min_lift_k=v("hvac.chiller.min_lift_k"),
         warmest_chilled_c=np.full(fleet.size, warmest_c),
         pumped_w=cooling_w,
