@@ -107,6 +107,7 @@ GROUP_INPUTS = {
     "full_airflow": "airflow of a server at ratio 1 and an inlet of 0 C, over fan_full_m3s",
     "airflow_fall_per_k": "fall of that with the inlet, by the density of air, 1/K",
     "full_fan_power": "fan power of a server at the reference ratio, over fan_reference_w",
+    "heat_capacity": "heat capacity of a server over server_j_per_k, at least full_airflow",
 }
 """Where a rack has fewer groups than its block, or in padding, all but ``count`` repeat its last
 group, as do loads and server temperatures: no lane computes with numbers out of reach."""
@@ -126,7 +127,7 @@ DC_COEFFICIENTS = {
     "air_j_per_m3_k": "heat capacity of air by volume, rho*cp, J/(m3 K)",
     "curve_limit_c": "inlet above which power and airflow no longer rise, C",
     "fresh_share": "supply air that does not bypass the racks at the design point, 1 - b_0",
-    "server_j_per_k": "heat capacity of a server, J/K (transient)",
+    "server_j_per_k": "least heat capacity of a server over its full_airflow, J/K (transient)",
     "effectiveness": "share of server over inlet temperature that the air takes up (transient)",
     "parcel_j_per_k": "heat capacity of the room air of a rack, J/K (transient)",
 }

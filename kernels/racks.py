@@ -54,8 +54,9 @@ def compute_groups(
         server_c = hall.zeros
         if ti.static(hall.transient):
             at = first_place + z
-            change_k = warm_servers(hall, warming, racks, at, inlet_c, cpu_w, airflow)
-            thermal_storage_w += count * change_k
+            capacity = group.heat_capacity
+            change_k = warm_servers(hall, warming, racks, at, capacity, inlet_c, cpu_w, airflow)
+            thermal_storage_w += count * capacity * change_k
             server_c = hall.server_c[at]
             if sweep.is_last:
                 store_server_temperatures(hall, block_at, z, count, server_c)

@@ -367,13 +367,21 @@ def warming_model(hall: ti.template(), n, servers: ti.template()):
 @ti.func
 @no_type_check
 def warm_servers(
-    hall: ti.template(), warming: ti.template(), racks: ti.template(), at, inlet_c, cpu_w, airflow
+    hall: ti.template(),
+    warming: ti.template(),
+    racks: ti.template(),
+    at,
+    capacity,
+    inlet_c,
+    cpu_w,
+    airflow,
 ):
     """Warm the servers of a group by a substep; return the change of their temperature, in K."""
     before_c = hall.server_c[at]
     # Without air a server keeps all of its power.
-    x = airflow * (racks.available_airflow * warming.per_airflow)
-    change_k = cpu_w * (racks.powered * warming.k_per_w) - (before_c - inlet_c) * x
+    per_capacity = hall.real(1.0) / capacity
+    x = airflow * (racks.available_airflow * warming.per_airflow) * per_capacity
+    change_k = cpu_w * (racks.powered * warming.k_per_w) * per_capacity - (before_c - inlet_c) * x
     change_k *= phi1(hall, x, warming.halvings)
     hall.server_c[at] = before_c + change_k
     return change_k

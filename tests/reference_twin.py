@@ -239,6 +239,12 @@ class HallTwin:
         )
 
 
+def heat_capacity_j_per_k(hall: HallTwin) -> F64:
+    """Heat capacity of every server, (S,)."""
+    given = hall.config.servers.heat_capacity_kj_per_k
+    return 30.0 * hall.full_w if given is None else np.full(len(hall.full_w), 1e3 * given)
+
+
 def path_lengths_m(hall: HallConfig) -> F64:
     """Shortest way from the exhaust of rack i to the inlet of rack j, (R, R) as [j, i]."""
     m = hall.layout
@@ -659,7 +665,7 @@ def advance(
 ) -> tuple[dict[str, Any], Memory]:
     """Means over a step and the memory at its end; arguments as in ``steady``."""
     h, air, s = step_s / substeps, hall.air_j_per_m3_k, hall.config.servers
-    capacity = hall.config.server_heat_capacity_kj_per_k * 1e3
+    capacity = heat_capacity_j_per_k(hall)
     now, parts = memory, []
     for _ in range(substeps):
         supply_c = setpoint_c + now.room_j / room_j_per_k + now.excess_k
@@ -721,7 +727,7 @@ def advance(
                 "over_27_sum_k": np.maximum(inlet_c - 27, 0).sum(),
                 "under_18_sum_k": np.maximum(18 - inlet_c, 0).sum(),
                 "outlet_m3k_s": carried.sum() - rack_flow.sum() * warmth,
-                "thermal_storage_w": capacity * np.sum(warmer - now.server_c) / h + parcel_w,
+                "thermal_storage_w": np.sum(capacity * (warmer - now.server_c)) / h + parcel_w,
                 "crac_flow_m3s": moved.unit.sum(),
                 "supply_c": warmth, "return_c": return_c,
                 "cooling_load_w": load_w, "coil_w": coil_w,

@@ -154,9 +154,7 @@ def test_transient_halls_agree_with_the_twin(
 # --- against the differential equations ---------------------------------------------------------
 
 
-def rates(
-    part: Part, state: F64, supply_c: F64, capacity: float
-) -> tuple[F64, reference_twin.Flows]:
+def rates(part: Part, state: F64, supply_c: F64, capacity: F64) -> tuple[F64, reference_twin.Flows]:
     """Time derivatives of server and mix temperatures, every flow at its present temperature."""
     twin, air = part.twin, part.twin.air_j_per_m3_k
     server_c, mixed_c = np.split(state, [len(twin.rack)])
@@ -197,7 +195,7 @@ def test_substeps_converge_to_the_differential_equations(low: float) -> None:
     hall = Hall(fleet, "f64")
     settled = hall.steady_state(before)
     part = parts([config], after)[0]
-    capacity = config.server_heat_capacity_kj_per_k * 1e3
+    capacity = reference_twin.heat_capacity_j_per_k(part.twin)
     counts = np.diff(fleet.server_offsets)
     state = np.concatenate([np.repeat(settled.server_c, counts), settled.mixed_c])
     change, _ = rates(parts([config], before)[0], state, supply_c, capacity)
@@ -250,7 +248,7 @@ def test_servers_follow_the_exact_exponential_in_any_number_of_substeps(
     start = np.repeat(np.asarray(settled.server_c, np.float64), np.diff(fleet.server_offsets))
     final = 20.0 + cpu / per_k
     expected = final + (start - final) * np.exp(
-        -900.0 * per_k / (1e3 * config.server_heat_capacity_kj_per_k)
+        -900.0 * per_k / reference_twin.heat_capacity_j_per_k(twin)
     )
     found = np.repeat(ends[0], np.diff(fleet.server_offsets))
     np.testing.assert_allclose(found, expected, rtol=rel)
@@ -262,13 +260,14 @@ def test_servers_follow_the_exact_exponential_in_any_number_of_substeps(
 
 def held_j(fleet: Fleet, state: HallState, room_j: F64) -> F64:
     """Heat in servers, recirculated air and room, from temperatures, (B,)."""
-    per_group = fleet.per_group_servers() * np.asarray(state.server_c, np.float64)
+    twins = [reference_twin.calibrated(c) for c in fleet.configs]
+    of_servers = np.concatenate([reference_twin.heat_capacity_j_per_k(t) for t in twins])
+    capacity = np.add.reduceat(of_servers, fleet.server_offsets[:-1])
+    per_group = capacity * np.asarray(state.server_c, np.float64)
     servers = np.add.reduceat(per_group, fleet.group_offsets[fleet.rack_offsets[:-1]])
     parcels = np.add.reduceat(np.asarray(state.mixed_c, np.float64), fleet.rack_offsets[:-1])
-    capacity = fleet.values("server_heat_capacity_kj_per_k") * 1e3
-    twins = [reference_twin.calibrated(c) for c in fleet.configs]
     per_parcel = np.array([t.parcel_j_per_k for t in twins])
-    return np.asarray(servers * capacity + parcels * per_parcel + room_j, dtype=np.float64)
+    return np.asarray(servers + parcels * per_parcel + room_j, dtype=np.float64)
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

@@ -418,7 +418,7 @@ class ServerConfig(Section):
     released SustainDC."""
     heat_capacity_kj_per_k: Annotated[float, Field(ge=0.01, le=1e4)] | None = None
     """Heat capacity of one server, in kJ/K, 0.01..10,000: from 10 g to 10 t of metal; None is 30
-    J/K per W of its power at full load, mean over the servers of the hall."""
+    J/K per W of its power at full load."""
     heat_exchange_effectiveness: WorkingShare = 0.95
     """Effectiveness of the heat exchange between the mass of a server and the air that passes it,
     0.01..1."""

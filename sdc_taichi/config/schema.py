@@ -321,7 +321,7 @@ class DataCenterConfig(Section):
 
     @property
     def server_heat_capacity_kj_per_k(self) -> float:
-        """Heat capacity of one server, in kJ/K."""
+        """Heat capacity of one server, mean over the hall, in kJ/K."""
         given = self.servers.heat_capacity_kj_per_k
         return SERVER_J_PER_K_W * self._mean_server_w() / 1e3 if given is None else given
 

@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.config.hall_schema import SERVER_J_PER_K_W
 from sdc_taichi.config.odd_values import warn_of, warn_of_odd_values
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.hall.design_point import DesignPoint, design_point
+from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.hall.mix_weights import MixWeights
@@ -369,13 +370,18 @@ def _hall_arrays(config: DataCenterConfig) -> _HallArrays:
         design = design_point(config, servers)
         unit_design_m3s = np.array([design.crac_flow_m3s])
     air_j_per_m3_k = servers.air.j_per_m3_k
-    groups = _group_inputs(servers, design)
+    server_j_per_k = _server_heat_capacity_j_per_k(config, servers)
+    full_airflow = design.full_airflow_m3s / design.full_airflow_m3s.max()
+    least_j_per_k = float((server_j_per_k / full_airflow).min())
+    groups = _group_inputs(servers, full_airflow) | {
+        "heat_capacity": server_j_per_k / least_j_per_k
+    }
     coefficients = asdict(curves) | {
         "fan_full_m3s": float(design.full_airflow_m3s.max()),
         "fan_reference_w": float(servers.fan_reference_w.max()),
         "air_j_per_m3_k": air_j_per_m3_k,
         "fresh_share": fresh_share,
-        "server_j_per_k": config.server_heat_capacity_kj_per_k * 1e3,
+        "server_j_per_k": least_j_per_k,
         "effectiveness": config.servers.heat_exchange_effectiveness,
         "parcel_j_per_k": air_j_per_m3_k * floor_plan(hall).air_m3 / hall.racks,
     }
@@ -420,10 +426,17 @@ def _unit_supply(config: DataCenterConfig, found: Recirculation) -> tuple[F64, F
     return shares, airflow_m3s
 
 
-def _group_inputs(servers: RackServers, design: DesignPoint) -> dict[str, F64]:
-    """Rows GROUP_INPUTS of the hall kernels by name, (G,) each."""
+def _server_heat_capacity_j_per_k(config: DataCenterConfig, servers: RackServers) -> F64:
+    """Heat capacity of one server of each group, in J/K, (G,)."""
+    given = config.servers.heat_capacity_kj_per_k
+    if given is None:
+        return SERVER_J_PER_K_W * servers.full_w
+    return np.full(len(servers.full_w), 1e3 * given)
+
+
+def _group_inputs(servers: RackServers, full_airflow: F64) -> dict[str, F64]:
+    """Rows GROUP_INPUTS of the hall kernels that follow from servers and their air, (G,) each."""
     names = ("count", "full_w", "idle_w", "inlet_offset_k", "load_deviation", "height_factor")
-    full_airflow = design.full_airflow_m3s / design.full_airflow_m3s.max()
     fan_w = servers.fan_reference_w
     return {name: getattr(servers, name) for name in names} | {
         "full_airflow": full_airflow * servers.air.density_ratio.base,
