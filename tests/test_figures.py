@@ -195,14 +195,16 @@ def test_day_of_hottest_inlet(steps: pd.DataFrame) -> None:
 
 
 def test_day_of_the_second_year(steps: pd.DataFrame) -> None:
-    hot = steps[:96].assign(time=steps["time"][:96] + pd.Timedelta(days=365), inlet_max_c=60.0)
+    hottest_c = steps["inlet_max_c"].max() + 10.0
+    later = steps["time"][:96] + pd.Timedelta(days=365)
+    hot = steps[:96].assign(time=later, inlet_max_c=hottest_c)
     both = pd.concat([steps, hot])
     assert dashboards.hottest_day(both) == "2002-02-27"
     first: Any = dashboards.day(both, "02-27")
     second: Any = dashboards.day(both, dashboards.hottest_day(both))
     assert first.axes[4].get_xlabel() == "local standard time on 27 February (year 1)"
     assert second.axes[4].get_xlabel() == "local standard time on 27 February (year 2)"
-    assert second.axes[0].lines[2].get_ydata().max() == 60.0
+    assert second.axes[0].lines[2].get_ydata().max() == hottest_c
 
 
 @pytest.mark.parametrize("date", ["02-26", "03-02", "2-28", "x"])
