@@ -71,9 +71,17 @@ from .sums import (
     combine_chunks,
     find_hottest_rack,
     store_change_range,
+    store_present_inlet,
     sum_chunk,
 )
-from .units import keep_supply, run_coils, run_crac_units, set_supply, sum_unit_needs
+from .units import (
+    follow_hottest_inlet,
+    keep_supply,
+    run_coils,
+    run_crac_units,
+    set_supply,
+    sum_unit_needs,
+)
 
 END_OF_TERMS_TRANSIENT = row_index(SUMS, "outlet_sum_c")
 """Row behind the last sum of transient halls, which do not ask for the sum of the outlets."""
@@ -194,7 +202,11 @@ def compute_chunk(
     block_terms_0 = terms_at + N_TERMS
     begin_terms(hall, terms_at, sweep, is_one_chunk, hottest)
     update_mixes(hall, n, chunk_at, block_terms_0, sweep, servers, amounts)
-    changes = ti.Struct(least_k=hall.zeros + hall.real(1e30), most_k=hall.zeros - hall.real(1e30))
+    changes = ti.Struct(
+        least_k=hall.zeros + hall.real(1e30),
+        most_k=hall.zeros - hall.real(1e30),
+        inlet_max_c=hall.zeros - hall.real(1e30),
+    )
     block_0 = hall.chunks[chunk_at].first_block
     for b in range(hall.chunks[chunk_at + 1].first_block - block_0):
         block_terms_at = block_terms_0 + b * N_BLOCK_TERMS
@@ -214,6 +226,8 @@ def compute_chunk(
         sum_unit_needs(hall, n, chunk_at, block_terms_0)
     store_chunk(hall, chunk_at, terms_at, sweep, is_one_chunk, hottest)
     store_change_range(hall, chunk_at, changes.least_k, changes.most_k)
+    if hall.dcs[n].inlet_target_c > 0.0:
+        store_present_inlet(hall, chunk_at, changes.inlet_max_c)
 
 
 @ti.func
@@ -235,6 +249,9 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
     dc = hall.dcs[n]
     total, sweep = hall.chunks[dc.first_chunk], dc.sweep
     is_last = sweep + 1 >= hall.sweeps
+    moved_k = ti.cast(0.0, ti.f64)
+    if dc.inlet_target_c > 0.0:
+        moved_k = follow_hottest_inlet(hall, n, total.present_inlet_max_c)
     units = run_crac_units(hall, n, is_last)
     air.crac_flow_m3s = units.flow_m3s
     air.supply_c = units.supply_m3k_s / units.flow_m3s
@@ -256,12 +273,11 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
             dc.status = DONE
         air.cooling_load_w, air.coil_w = run_coils(hall, n, units, air.return_c)
     else:
-        moved_k = ti.cast(0.0, ti.f64)
         if dc.adjusts_supply > 0.0:
             load_w = air.return_c * units.flow_m3s - units.supply_m3k_s
             load_w *= ti.cast(dc.air_j_per_m3_k, ti.f64)
             load_w += units.fan_m3s * dc.crac_fan_w_per_m3s
-            moved_k = set_supply(hall, n, units, air.return_c, 0.0, load_w)
+            moved_k = ti.max(moved_k, set_supply(hall, n, units, air.return_c, 0.0, load_w))
         dc.status = status_after_sweep(hall, n, air.supply_c, units.most_f_change, moved_k, is_last)
         if dc.adjusts_supply > 0.0 and dc.status != RUNNING:
             keep_supply(hall, n)

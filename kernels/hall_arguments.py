@@ -140,6 +140,10 @@ DC_DOUBLES = {
     "adjusts_supply": "1 where supply air may differ from the setpoint of its unit, see set_supply",
     "return_rise_k": "rise of air from supply to return at the design point, K (return control)",
     "return_gain": "rise of the supply air per K that the air rises less, 0 with supply control",
+    "inlet_target_c": "hottest inlet at which fans run at full speed, C; 0 where others lead them",
+    "inlet_band_k": "how far below that they run at their lowest speed, K",
+    "least_speed": "lowest speed of the fans over full speed",
+    "fan_speed": "speed of the fans that follow the hottest inlet, over full speed",
     "table_low_c": "lowest supply air of the table of steady states, C",
     "table_rows_per_k": "supply rows of the table per K",
     "feedback_gain": "share of a common change of the mixes that one sweep gives back to them",
@@ -225,6 +229,7 @@ SUMS = (
         "hottest_block": "block of the rack with the hottest inlet",
         "hottest_lane": "lane of the rack with the hottest inlet",
         "hottest_group": "group with the hottest inlet, from 0 in its rack",
+        "present_inlet_max_c": "hottest inlet in the present sweep, C; where fans follow it",
         "least_change_k": "lower bound of the exhaust mixes less unshifted_mix_c, K",
         "most_change_k": "upper bound of the exhaust mixes less unshifted_mix_c, K",
     }

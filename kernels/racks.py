@@ -143,13 +143,15 @@ def compute_block(
     else:
         terms.outlet_sum_c = terms.outlet_sum_c + outlet_c
 
+    inlet_max_c = update_hottest(hall, block_at, racks, extremes, hottest)
+    changes.inlet_max_c = larger(inlet_max_c, changes.inlet_max_c)
     results = ti.Struct(
         cpu_w=sums.cpu_w,
         fan_w=sums.fan_w,
         airflow_m3s=flow_m3s,
         inlet_c=mean_c,
         outlet_c=outlet_c,
-        inlet_max_c=update_hottest(hall, block_at, racks, extremes, hottest),
+        inlet_max_c=inlet_max_c,
         outlet_max_c=outlet_max_c,
     )
     store_racks(hall, block_at, sweep, results)

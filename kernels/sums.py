@@ -116,6 +116,16 @@ def store_change_range(hall: ti.template(), chunk_at, least_k, most_k):
 
 @ti.func
 @no_type_check
+def store_present_inlet(hall: ti.template(), chunk_at, inlet_max_c):
+    """Hottest of the hottest inlets of each lane of a chunk in this sweep."""
+    most_c = hall.real(-1e30)
+    for i in range(LANES):
+        most_c = ti.select(inlet_max_c[i] > most_c, inlet_max_c[i], most_c)
+    hall.chunks[chunk_at].present_inlet_max_c = ti.cast(most_c, ti.f64)
+
+
+@ti.func
+@no_type_check
 def add_chunks(hall: ti.template(), n, first_row, end_row):
     """Rows of SUMS of all chunks of a data center, added up in those of its first chunk."""
     first = hall.dcs[n].first_chunk
@@ -143,6 +153,7 @@ def combine_chunks(hall: ti.template(), n):
             total.hottest_lane = chunk.hottest_lane
             total.hottest_group = chunk.hottest_group
         total.inlet_max_c = ti.max(total.inlet_max_c, chunk.inlet_max_c)
+        total.present_inlet_max_c = ti.max(total.present_inlet_max_c, chunk.present_inlet_max_c)
         total.least_change_k = ti.min(total.least_change_k, chunk.least_change_k)
         total.most_change_k = ti.max(total.most_change_k, chunk.most_change_k)
         chunk_at += hall.one

@@ -8,6 +8,10 @@ from .hall_arguments import N_BLOCK_TERMS
 from .servers import first_share_at
 from .sums import sum_lanes
 
+USUAL_RISE_K = 15.0
+"""Rise of the air through servers, in K, by which fans judge how much their speed matters."""
+FAN_RAMP_S = 30.0
+"""Time in which fans follow the hottest inlet, in s, in transient halls."""
 MOST_PASSES = 100
 """Most passes over the coils of a data center; as many as saturate one after the other."""
 
@@ -73,6 +77,8 @@ def run_crac_units(hall: ti.template(), n, is_last):
         f_used, supply_c = unit.fresh_ratio, unit.supply_c
         mean_supply_c = supply_c
         following = need / ti.max(fresh_share * design_m3s, 1e-30)
+        if dc.inlet_target_c > 0.0:
+            following = dc.fan_speed
         speed = ti.min(ti.max(following, low), high)
         flow = design_m3s * speed
         units.flow_m3s += flow
@@ -106,6 +112,28 @@ def run_crac_units(hall: ti.template(), n, is_last):
         unit.mean_supply_c = mean_supply_c
         at += hall.one
     return units
+
+
+@ti.func
+@no_type_check
+def follow_hottest_inlet(hall: ti.template(), n, inlet_c):
+    """Speed of the fans after a sweep with the given hottest inlet; return how far off it is, K.
+
+    Proportional control: lowest speed at ``inlet_band_k`` below the target, full speed at the
+    target. Inlets answer to the speed s by some -(inlet - supply + rise)/s, so that a step of the
+    difference over 1 plus the gain of the loop neither swings nor stalls.
+    """
+    dc = hall.dcs[n]
+    s, low, band_k = dc.fan_speed, dc.least_speed, dc.inlet_band_k
+    wanted = 1.0 + (1.0 - low) * (inlet_c - dc.inlet_target_c) / band_k
+    wanted = ti.min(ti.max(wanted, low), 1.0)
+    over_supply_k = ti.max(inlet_c - hall.units[dc.first_unit].supply_c, 0.0)
+    gain = (1.0 - low) * (over_supply_k + USUAL_RISE_K) / (ti.max(s, low) * band_k)
+    step = (wanted - s) / (1.0 + gain)
+    if ti.static(hall.transient):
+        step *= ti.min(hall.substep_s / FAN_RAMP_S, 1.0)
+    dc.fan_speed = s + step
+    return ti.abs(wanted - s) * band_k
 
 
 @ti.func

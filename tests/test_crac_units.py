@@ -281,3 +281,45 @@ def test_substeps_down_to_five_seconds_converge(case: str) -> None:
         assert error[10] < error[60] + 1e-9
         assert error[10] < 0.1
         assert error[60] < 0.8
+
+
+@pytest.mark.parametrize("containment", [0.0, 0.8])
+@pytest.mark.parametrize("target_c", [24.0, 26.0, 30.0])
+def test_fans_follow_the_hottest_inlet_between_their_limits(
+    target_c: float, containment: float
+) -> None:
+    config = load_config(
+        "corrected",
+        [
+            "hvac.crac.flow_model=hottest_inlet",
+            f"hvac.crac.inlet_target_c={target_c}",
+            f"hall.layout.containment={containment}",
+        ],
+    )
+    loads = np.linspace(0.0, 1.0, 101)
+    fleet = build_fleet([config] * len(loads))
+    supply = CracUnits(fleet, UnitIndex(fleet)).initial_supply()
+    met = Conditions(
+        supply.coldest_supply_c, loads, unit_low=supply.unit_low, unit_high=supply.unit_high
+    )
+    hall = Hall(fleet, "f32")
+    found = hall.solve(met)
+    speed = found.unit_flow_m3s / fleet.unit_design_m3s
+    wanted = np.clip(1.0 + 0.7 * (found.inlet_max_c - target_c) / 4.0, 0.3, 1.0)
+    np.testing.assert_allclose(speed, wanted, atol=1e-4)
+    assert np.max(np.abs(np.diff(speed))) < 0.05
+    assert hall.sweeps.max() < 500
+
+
+def test_fans_that_follow_inlets_settle_where_steady_air_is() -> None:
+    model = ["hvac.crac.flow_model=hottest_inlet", "hvac.crac.inlet_target_c=29"]
+    _, steady = run_at_full_load(FOUR, *model)
+    for substep_s in (5, 30):
+        overrides = [FOUR, *model, *MINUTES, f"simulation.substep_s={substep_s}"]
+        _, slowly = run_at_full_load(*overrides, steps=60)
+        assert slowly[-1].inlet_max_c[0] == pytest.approx(steady[0].inlet_max_c[0], abs=0.05)
+    # A unit that is lost warms inlets, and the others speed up.
+    event = "events.scheduled=[{kind: crac_down, unit: 0, start_h: 1, duration_h: 100}]"
+    fleet, lost = run_at_full_load(FOUR, N_PLUS_1, *model, *MINUTES, event, steps=90)
+    speed = [r.unit_flow_m3s[1:] / fleet.unit_design_m3s[1:] for r in (lost[55], lost[-1])]
+    assert np.all(speed[1] > speed[0] + 0.05)

@@ -135,12 +135,16 @@ class CracConfig(Section):
     """Design airflow of all units per IT power at the design point, in m3/s per W."""
     reference_m3s_per_w: FlowM3sPerW = 9.438e-5
     """Airflow per IT power at which a fan draws ``released_fan_w``, in m3/s per W."""
-    flow_model: Literal["constant", "pressure", "follow_servers", "per_watt", "controlled"] = (
-        "follow_servers"
-    )
+    flow_model: Literal[
+        "constant", "pressure", "follow_servers", "hottest_inlet", "per_watt", "controlled"
+    ] = "follow_servers"
     """Control of the units' fans: at the speed of the design point; by the pressure under a raised
     floor, which takes the same airflow whatever units run; by the supply air that the servers take
-    in; by IT power; or by the actions of an agent."""
+    in; by the hottest inlet of the servers; by IT power; or by the actions of an agent."""
+    inlet_target_c: Annotated[float, Field(ge=1, le=60)] = 25.0
+    """Hottest inlet at which fans of flow model ``hottest_inlet`` reach full speed, in C, 1..60."""
+    inlet_band_k: ExchangerK = 4.0
+    """How far the hottest inlet is below that where they reach their lowest speed, in K."""
     min_flow_ratio: WorkingShare = 0.3
     """Lowest airflow of a running unit over its airflow at full speed, 0.01..1."""
     fan_step: Annotated[float, Field(ge=0.001, le=1)] = 0.05

@@ -208,7 +208,8 @@ class DataCenterConfig(Section):
             "hvac.crac.airflow_m3s": crac.airflow_m3s is not None,
             "hvac.crac.capacity_kw": crac.capacity_kw is not None,
             "hvac.crac.temperature_control return": crac.temperature_control == "return",
-            "hvac.crac.flow_model pressure": crac.flow_model == "pressure",
+            f"hvac.crac.flow_model {crac.flow_model}": crac.flow_model
+            in ("pressure", "hottest_inlet"),
             "hall.recirculation.matrix_file": self.hall.recirculation.matrix_file is not None,
             "simulation.thermal transient": self.simulation.thermal == "transient",
             "event crac_down": "crac_down" in kinds,

@@ -12,7 +12,10 @@ import numpy as np
 from sdc_taichi.config.hvac_schema import CracConfig
 from sdc_taichi.types import F64
 
-_MOST_PASSES = 200
+_MOST_PASSES, _LEAST_PASSES = 200, 20
+_MOST_PRODUCTS = 2e8
+"""Most products of share and weight in all passes, but for the least number of passes: about a
+second."""
 _WITHIN = 1e-13
 """Relative difference of what units give and what is asked of them at which both agree."""
 _LEAST_WEIGHT = 1e-12
@@ -54,7 +57,8 @@ def unit_weights(shares: F64, rack_need_m3s: F64, given_m3s: F64) -> F64:
     """
     wanted_m3s = given_m3s * (rack_need_m3s.sum() / given_m3s.sum())
     weight = np.ones(len(given_m3s))
-    for _ in range(_MOST_PASSES):
+    passes = int(np.clip(_MOST_PRODUCTS / shares.size, _LEAST_PASSES, _MOST_PASSES))
+    for _ in range(passes):
         taken_m3s = weight * ((rack_need_m3s / (shares @ weight)) @ shares)
         ratio = wanted_m3s / np.maximum(taken_m3s, 1e-30)
         if np.max(np.abs(ratio - 1.0)) < _WITHIN:

@@ -165,6 +165,7 @@ CRAC_FLOWS: dict[str, FlowModel] = {
     "constant": constant_flow,
     "pressure": constant_flow,
     "follow_servers": following_flow,
+    "hottest_inlet": following_flow,
     "per_watt": per_watt_flow,
     "controlled": controlled_flow,
 }

@@ -80,7 +80,7 @@ class CracUnits:
         flow_model = fleet.models["crac_flow"]
         self._controlled = flow_model == "controlled"
         self._holds_pressure = flow_model == "pressure"
-        follows = flow_model == "follow_servers"
+        follows = flow_model in ("follow_servers", "hottest_inlet")
         at_design = self._design_speed, self._design_speed
         self._free_range = (self._min_speed, full_speed) if follows else at_design
 

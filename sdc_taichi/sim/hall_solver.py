@@ -225,6 +225,7 @@ class Hall:
         """
         self._set_conditions(met)
         self._unit_state["fresh_ratio"][:] = 1.0
+        self._dc["fan_speed"][:] = 1.0
         self._begin_step(exchanges_before=0)
         dc_out = self._new_results()
         if not self._recirculates:
@@ -417,6 +418,7 @@ class Hall:
         speed = np.clip(state.following, self._unit["low"], self._unit["high"])
         covers = self._fresh_m3s * speed / np.maximum(state.need_m3s, 1e-30)
         self._unit_state["fresh_ratio"][:] = np.minimum(1.0, covers)
+        self._dc["fan_speed"][:] = state.following[fleet.unit_offsets[:-1]]
         flow_m3s = fleet.unit_sums(fleet.unit_design_m3s * speed)
         self._dc["crac_m3s_per_rack"][:] = flow_m3s / np.diff(fleet.rack_offsets)
 

@@ -475,6 +475,10 @@ def _build_rack_inputs(fleet: Fleet, places: RackPlaces, dtype: npt.DTypeLike) -
 def _set_data_center_values(fleet: Fleet, dc: dict[str, Array]) -> None:
     """Rows of DC_DOUBLES that stay the same in all steps, but for the fans of transient halls."""
     dc["crac_fan_w_per_m3s"][:] = fleet.values("hvac.crac.fan_w_per_m3s")
+    follows = fleet.models["crac_flow"] == "hottest_inlet"
+    dc["inlet_target_c"][:] = fleet.values("hvac.crac.inlet_target_c") * follows
+    dc["inlet_band_k"][:] = fleet.values("hvac.crac.inlet_band_k")
+    dc["least_speed"][:] = fleet.values("hvac.crac.min_flow_ratio")
     rise_k = fleet.setpoint_over_supply_k
     dc["return_rise_k"][:] = rise_k
     dc["return_gain"][:] = np.maximum(1.0 - RETURN_BAND_K / np.maximum(rise_k, 1e-9), 0.0)
