@@ -1,4 +1,4 @@
-"""A week of July in New York: what the hall and the plant do, as pictures.
+"""A week of July in New York: what hall and plant of preset hall_of_2026 do, as pictures.
 
     python examples/plot_hall.py FOLDER
 
@@ -82,7 +82,7 @@ def readme_picture(result: StepResult, fleet: Fleet, steps: pd.DataFrame, dc: in
 
 def main(folder: Path) -> None:
     """Write the pictures."""
-    config = load_config("corrected", ["site.location=NY", "site.start=07-01"])
+    config = load_config("hall_of_2026", ["site.location=NY", "site.start=07-01"])
     with Simulator(config) as sim:
         results = run(sim)
         fleet = sim.fleet
