@@ -100,7 +100,7 @@ def test_measured_years_agree_with_synthetic_years(real_data: Path) -> None:
 def test_a_room_that_overheats_recovers_when_load_falls() -> None:
     small = ["hvac.sizing.margin=1", "hvac.sizing.design_wet_bulb_c=10"]
     config = load_config("corrected", ["hvac.chiller.model=electric_water_cooled", *small])
-    demand = [1.0] * 100 + [0.1] * 400
+    demand = [1.0] * 60 + [0.1] * 440
     drivers = drivers_from_arrays([36.0] * 500, [30.0] * 500, [300.0] * 500, demand)
     with Simulator(config, drivers=drivers) as sim:
         sim.reset()
