@@ -222,6 +222,21 @@ def test_command_explains_a_run(run: RunFolder) -> None:
         assert f"{option}: given without a run" in str(done.exception)
 
 
+def test_setpoints_of_return_air_are_named_so() -> None:
+    control = ["hvac.crac.temperature_control=return", "hvac.setpoint.min_c=28"]
+    limits = ["hvac.setpoint.max_c=38", "hvac.setpoint.initial_c=34"]
+    with Simulator(load_config("corrected", [*control, *limits]), precision="f64") as sim:
+        sim.reset()
+        sim.step()
+        parts = Inlets(sim.fleet, 0, sim.intake_air()).parts(3)
+    (text, setpoint_c), (over, warming_k) = inlet_terms(parts, 5)[:2]
+    assert text == "coldest supply air that its setpoint of return air admits"
+    assert over == "supply air over that temperature"
+    assert setpoint_c < 34.0
+    assert warming_k > 1.0
+    assert total_c(parts) == pytest.approx(parts.inlet_c, abs=1e-9)
+
+
 def test_command_names_a_rack_by_number_or_by_row_and_place(tmp_path: Path) -> None:
     def call(*arguments: str) -> str:
         done = CliRunner().invoke(hall_app, ["why", *arguments])

@@ -59,7 +59,9 @@ class InletParts:
     """Inlet temperature of the server, in C."""
     setpoint_c: float
     """Setpoint of the supply air that reaches the rack, mean over its units by what they give, in
-    C."""
+    C; with control of the return air the coldest supply air that its setpoint admits."""
+    controls_return: bool
+    """Whether the CRAC units control the return air."""
     warming_k: float
     """Temperature of that supply air over its setpoint, in K: what the coils do not cool."""
     approach_k: float
@@ -180,6 +182,7 @@ class Inlets:
             servers=int(ends[2] - ends[0]),
             inlet_c=float(self._group_inlet_c[group]),
             setpoint_c=setpoint_c,
+            controls_return=fleet.configs[self._dc].hvac.crac.temperature_control == "return",
             warming_k=supply_c - setpoint_c,
             approach_k=0.0,
             exhaust_k=np.zeros(self._racks),
@@ -264,7 +267,7 @@ def inlet_terms(parts: InletParts, racks_per_row: int) -> list[tuple[str, float]
     others_k = float(parts.exhaust_k.sum()) - parts.own_exhaust_k - sum(k for _, k in listed)
     others = len(parts.exhaust_k) - 1 - len(listed)
     terms = [
-        ("supply air over its setpoint", parts.warming_k),
+        ("supply air over that temperature", parts.warming_k),
         ("approach temperature of the config", parts.approach_k),
         *((f"exhaust of {rack_text(i, racks_per_row)}", k) for i, k in listed),
         (f"exhaust of {others:,} other rack{'' if others == 1 else 's'}", others_k),
@@ -272,7 +275,9 @@ def inlet_terms(parts: InletParts, racks_per_row: int) -> list[tuple[str, float]
         ("room air that is warmer than the exhausts of the moment", parts.lag_k),
     ]
     kept = [(text, k) for text, k in terms if abs(k) >= LEAST_K]
-    return [("setpoint of its supply air", parts.setpoint_c), *kept]
+    first = "coldest supply air that its setpoint of return air admits"
+    first = first if parts.controls_return else "setpoint of its supply air"
+    return [(first, parts.setpoint_c), *kept]
 
 
 def exhaust_terms(parts: InletParts) -> list[tuple[str, float]]:
