@@ -45,7 +45,7 @@ def test_all_inlets_are_recommended_at_the_design_point(hall: DesignHall) -> Non
     assert hall.air is not None
     assert 95.0 < hall.air.rti_pct < 110.0
     rise_k = hall.outlet_c - hall.inlet_c
-    assert 10.0 < rise_k.min() < rise_k.max() < 20.0
+    assert 10.0 < rise_k.min() < rise_k.max() < 22.0
 
 
 def test_the_block_with_accelerators_is_hottest(hall: DesignHall) -> None:
@@ -65,7 +65,7 @@ def test_any_unit_may_be_lost(config: DataCenterConfig) -> None:
     with Simulator(configs, drivers=inputs) as sim:
         sim.reset()
         result = sim.step()
-    assert result.inlet_max_c[:6].max() < ALLOWABLE_C["A2"][1] - 5.0
+    assert result.inlet_max_c[:6].max() < ALLOWABLE_C["A1"][1]
     assert np.all(result.throttled_racks[:6] == 0)
     assert result.inlet_max_c[6] > result.inlet_max_c[:6].max() + 3.0
 
