@@ -95,8 +95,9 @@ def random_hall(
 ) -> DataCenterConfig:
     """A hall that closes: some draws breathe more air than their neighbours exhaust."""
     for _ in range(50):
-        config = config_from_dict(random_values(rng, name, shape, even=even))
+        values = random_values(rng, name, shape, even=even)
         with suppress(ConfigError):
+            config = config_from_dict(values)
             calibrate(config)
             return config
     raise AssertionError(f"no hall of {shape} closes")
