@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
@@ -13,7 +14,7 @@ from hypothesis import Phase
 from hypothesis import strategies as st
 
 import reference_twin
-from sdc_taichi import ConfigError, DataCenterConfig, build_fleet, load_config
+from sdc_taichi import ConfigError, DataCenterConfig, OddInputWarning, build_fleet, load_config
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.hall.air_metrics import rank
 from sdc_taichi.hall.recirculation import calibrate
@@ -79,7 +80,7 @@ def random_values(
                     "full_w": float(full_w),
                     "idle_w": float(rng.uniform(0.0, 0.4) * full_w),
                     "load_weight": float(rng.uniform(0.8, 1.2)),
-                    "height_u": float(rng.choice([1.0, 1.0, 4.5])),
+                    "height_u": float(rng.choice([1.0, 1.0, 1.5])),
                     "fan_w": float(rng.uniform(5, 30)) if rng.integers(2) else None,
                     "design_rise_k": float(rng.uniform(9, 16)) if rng.integers(3) == 0 else None,
                 }
@@ -106,7 +107,10 @@ def random_hall(
 @lru_cache(maxsize=128)
 def fleet_of(*configs: DataCenterConfig) -> Fleet:
     """The fleet of these data centers, which tests of both precisions share."""
-    return build_fleet(configs)
+    with warnings.catch_warnings():
+        # Halls of any make-up move odd amounts of air.
+        warnings.simplefilter("ignore", OddInputWarning)
+        return build_fleet(configs)
 
 
 @lru_cache(maxsize=32)

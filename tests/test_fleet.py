@@ -87,7 +87,7 @@ def test_parameters_of_each_data_center_reach_the_kernel() -> None:
     np.testing.assert_allclose(row["fan_offset"], 0.225 - 28 * 0.215 / 12)
     np.testing.assert_allclose(row["fan_shift"], 0.215)
     assert row["fan_low"].tolist() == [0.2, 0.0]
-    assert row["fan_high"].tolist() == [1.0, np.inf]
+    assert row["fan_high"].tolist() == [0.62, np.inf]
     assert row["fan_exponent"].tolist() == [3.0, 2.5]
     assert row["fan_reference_w"].tolist() == [10.0, 7.0]
     assert row["fan_full_m3s"].tolist() == [0.03, 0.04]

@@ -48,7 +48,7 @@ def test_fans_never_blow_backwards_and_curves_end_at_the_limit() -> None:
     assert curves.airflow_ratio(beyond, idle) == curves.airflow_ratio(at_limit, idle)
     watts = np.array([150.0]), np.array([10.0])
     assert curves.cpu_w(beyond, idle, *watts) == curves.cpu_w(at_limit, idle, *watts)
-    assert curves.fan_w(np.array([0.5]), 10.0) == pytest.approx(10.0 * 0.5**3)
+    assert curves.fan_w(np.array([0.5]), 10.0) == pytest.approx(10.0 * (0.5 / 0.44) ** 3)
 
 
 @pytest.mark.parametrize(

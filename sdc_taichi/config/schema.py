@@ -334,11 +334,12 @@ class DataCenterConfig(Section):
 
     def _mean_server_w(self) -> float:
         """Power of a server at full load without its fans, mean over the hall, in W."""
-        if self.servers.groups is None:
+        listed = self._listed_groups()
+        if listed is None:
             count = np.asarray(self.hall.servers_per_rack, dtype=np.float64)
             full_w = np.array([full for full, _ in self.servers.power_pairs])
             return float((count * full_w).mean() / count.mean())
-        groups = [group for rack in self.servers.groups for group in rack]
+        groups = [group for rack in listed for group in rack]
         return sum(g.count * g.full_w for g in groups) / sum(g.count for g in groups)
 
     def rack_nameplate_w(self) -> np.ndarray:
