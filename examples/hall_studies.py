@@ -78,6 +78,7 @@ def move_load() -> MovedLoad:
         "corrected",
         [
             "name=eight rows",
+            "hall.recirculation.calibrate=rack",
             "hall.rows=8",
             "hall.racks_per_row=10",
             "hall.supply_approach_k=5.15",
@@ -126,6 +127,7 @@ def failing_units(
         "corrected",
         [
             "hvac.crac.units=4",
+            "hall.recirculation.calibrate=rack",
             "hvac.setpoint.initial_c=22",
             "hvac.sizing.design_wet_bulb_c=26",
             "protection.ashrae_class=A2",
@@ -155,6 +157,7 @@ def uncooled(rack_kw: float, event: str, minutes: int = 15) -> list[float]:
         "corrected",
         [
             "hvac.crac.units=4",
+            "hall.recirculation.calibrate=rack",
             "hvac.setpoint.initial_c=22",
             "hvac.sizing.design_wet_bulb_c=26",
             "servers.power_w=[150, 10]",

@@ -57,7 +57,9 @@ def random_values(
     hall["recirculation"] = {
         "decay_m": float(rng.uniform(1.5, 8.0)),
         "cutoff": float(rng.choice([0.0, 1e-4, 1e-3])),
+        "calibrate": str(rng.choice(["rack", "row", "row", "hall"])),
     }
+    hall["layout"]["returns"] = str(rng.choice(["ceiling", "end_wall"]))
     hall["supply_approach_k"] = rng.uniform(1.5, 5.0, racks).tolist()
     hall["return_approach_k"] = rng.uniform(-5.0, 0.0, racks).tolist()
     hall["air_density_kg_m3"] = 1.2 if rng.integers(3) == 0 else None

@@ -401,16 +401,29 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
         mean_in_k = twin.per_rack(full_m3s * ratio * (inlet_c - supply_c)) / airflow
         return height, airflow, it_w, mean_in_k + it_w / (air * airflow), full_m3s
 
+    scaled_to = hall.recirculation.scaled_to
+    parts = {"row": hall.rows, "hall": 1}.get(scaled_to, racks)
+    if scaled_to != "none":
+        approach_k = np.repeat(approach_k.reshape(parts, -1).mean(axis=1), racks // parts)
+    exposed = np.ones(racks)
     if matrix is None:
         weights = layout_weights(hall, design(approach_k)[1])
+        exposed = exposure(hall, design(approach_k)[1])
     else:
         weights = matrix.copy()
         for j in range(racks):
             total = matrix[j].sum()
             weights[j] = matrix[j] / total if total > 0 else 1.0 / racks
-    if config.hall.recirculation.calibrate:
+        exposed = matrix.sum(axis=1)
+    if scaled_to == "rack":
         height, airflow, it_w, rise, full_m3s = design(approach_k)
         share = approach_k / (weights @ rise)
+    elif scaled_to != "none":
+        wanted_k = approach_k
+        for _ in range(40):
+            height, airflow, it_w, rise, full_m3s = design(approach_k)
+            share = shares_of_means(weights @ rise, exposed, wanted_k, parts)
+            approach_k = share * (weights @ rise)
     else:
         assert matrix is not None
         share = matrix.sum(axis=1)
@@ -438,6 +451,44 @@ def calibrated_to(config: DataCenterConfig, matrix: F64 | None = None) -> HallTw
         unit_design_m3s=need / (1.0 - is_open * bypassed),
         full_m3s=full_m3s,
     )
+
+
+def exposure(hall: HallConfig, airflow: F64) -> F64:
+    """Exposure of every rack to exhaust air, (R,), rack by rack."""
+    m, closed, per_row = hall.layout, hall.layout.containment, hall.racks_per_row
+    if m.returns == "ceiling":
+        around, around_m, over, demand = 4.0, 0.6, 0.4 * (1 - closed), 10.0
+    else:
+        around, around_m, over, demand = 0.6 * (1 - 0.35 * closed), 0.5, 0.6, 4.0
+    x = (np.arange(per_row) + 0.5) * m.rack_pitch_m
+    out = []
+    for row in range(hall.rows):
+        facing = [r for r in (row - row % 2, row - row % 2 + 1) if r < hall.rows]
+        drawn = airflow.reshape(hall.rows, -1)[facing].sum(axis=0)
+        for at in x:
+            near = np.exp(-np.abs(x - at) / 2.2)
+            e = 1.0 + demand * (near @ drawn / near.sum() / drawn.mean() - 1.0)
+            for distance in (at, per_row * m.rack_pitch_m - at):
+                e += around * np.exp(-distance / around_m) - over * np.exp(-distance / 2.3)
+            out.append((e + np.sqrt(e * e + 0.09)) / 2)
+    return np.array(out)
+
+
+def shares_of_means(mix_k: F64, exposed: F64, wanted_k: F64, parts: int) -> F64:
+    """k e / (1 + k e) whose mean warming of each part is as wanted, (R,), by bisection."""
+    out = []
+    for mix, e, goal in zip(
+        *(v.reshape(parts, -1) for v in (mix_k, exposed, wanted_k)), strict=True
+    ):
+        low, high = 0.0, 1e6
+        for _ in range(100):
+            k = (low + high) / 2
+            if np.mean(mix * k * e / (1 + k * e)) < goal[0]:
+                low = k
+            else:
+                high = k
+        out.append(low * e / (1 + low * e))
+    return np.concatenate(out)
 
 
 def _air_m3(hall: HallConfig) -> float:

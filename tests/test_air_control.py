@@ -26,7 +26,7 @@ def steady(demand: float = 0.6, steps: int = 8) -> Drivers:
 
 
 def simulator(*overrides: str, demand: float = 0.6) -> Simulator:
-    config = load_config("corrected", [UNITS, *overrides])
+    config = load_config("corrected", [UNITS, "hall.recirculation.calibrate=rack", *overrides])
     sim = Simulator(config, drivers=steady(demand), precision="f64")
     sim.reset()
     return sim

@@ -189,15 +189,16 @@ def test_sums_of_a_ragged_fleet() -> None:
 def test_approach_temperatures_are_those_that_the_hall_has(tmp_path: Path) -> None:
     np.savez(tmp_path / "r.npz", R=np.full((20, 20), 0.01))
     matrix = [f"hall.recirculation.matrix_file={tmp_path / 'r.npz'}",
-              "hall.recirculation.calibrate=false"]  # fmt: skip
-    for changes in ([], ["hall.layout.containment=0.6", "hvac.crac.units=2"], matrix):
+              "hall.recirculation.calibrate=none"]  # fmt: skip
+    by_rack = ["hall.recirculation.calibrate=rack"]
+    for changes in (by_rack, ["hall.layout.containment=0.6", "hvac.crac.units=2"], matrix):
         config = load_config("corrected", changes)
         fleet = build_fleet(config)
         met = Conditions(np.full(fleet.units, config.hall.design_supply_c), np.ones(1))
         found = Hall(fleet, "f64").solve(met).rack_inlet_c - config.hall.design_supply_c
         np.testing.assert_allclose(fleet.approach_k, found, rtol=0.01)
         given = np.allclose(fleet.approach_k, config.hall.rack_approach_k(), rtol=0.2)
-        assert given == (not changes)
+        assert given == (changes is by_rack)
 
 
 def test_rooms_hold_what_has_no_temperature_of_its_own() -> None:

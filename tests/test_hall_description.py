@@ -40,8 +40,9 @@ def heat_closes(found: DesignHall) -> None:
     assert carried_w == pytest.approx(found.it_w.sum(), rel=1e-10)
 
 
-def test_the_papers_hall_comes_out(corrected: DesignHall) -> None:
-    config = corrected.config
+def test_the_papers_hall_comes_out() -> None:
+    config = load_config("corrected", ["hall.recirculation.calibrate=rack"])
+    corrected = solve_design_hall(config)
     np.testing.assert_allclose(corrected.approach_k, config.hall.rack_approach_k(), atol=1e-9)
     assert corrected.air is not None
     assert corrected.air.return_c - corrected.outlet_c.mean() == pytest.approx(-3.1, abs=1e-9)
@@ -50,7 +51,9 @@ def test_the_papers_hall_comes_out(corrected: DesignHall) -> None:
     )
     heat_closes(corrected)
     # Racks alike: shares, bypass and RTI have a closed form.
-    alike = solve_design_hall(load_config("corrected", WIDE)).air
+    alike = solve_design_hall(
+        load_config("corrected", [*WIDE, "hall.recirculation.calibrate=rack"])
+    ).air
     assert alike is not None
     crac_rise_k = 1.0 / (air_properties(config).j_per_m3_k * 5.663e-5)
     rise_k = crac_rise_k - 5.15 + 3.10
@@ -84,7 +87,8 @@ def test_containment_warms_less_and_still_closes(corrected: DesignHall) -> None:
     # The units make up for the exhaust that the racks no longer breathe.
     need_m3s = np.sum((1.0 - closed.air.exhaust_share) * closed.airflow_m3s)
     design_m3s = need_m3s / (1.0 - 0.2 * corrected.air.bypass_share)
-    assert closed.unit_m3s.sum() == pytest.approx(design_m3s)
+    # Exposure, and with it the bypass, is a little different behind containment.
+    assert closed.unit_m3s.sum() == pytest.approx(design_m3s, rel=1e-3)
     heat_closes(closed)
 
 
@@ -131,7 +135,8 @@ def test_rows_and_places(corrected: DesignHall) -> None:
         assert float(cells[8]) == pytest.approx(corrected.inlet_max_c[mine].max(), abs=0.005)
     # Top zone of five: servers 160..199 of 200.
     assert corrected.hottest_server == 160
-    assert corrected.hottest_rack in range(5)
+    # At an end of an outer row, where air comes round it.
+    assert corrected.hottest_rack in (0, 4, 15, 19)
 
 
 def test_large_halls_list_their_hottest_rows() -> None:

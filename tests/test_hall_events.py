@@ -42,11 +42,15 @@ def constant(
     return drivers_from_arrays(outdoor_c * ones, wet_bulb_c * ones, 300.0 * ones, series.copy())
 
 
+def hall_of(overrides: list[str]) -> DataCenterConfig:
+    """Racks of a row that breathe alike, so that events alone tell them apart."""
+    return load_config("corrected", ["hall.recirculation.calibrate=rack", *overrides])
+
+
 def simulate(
     overrides: list[str], steps: int, drivers: Drivers | None = None, **kwargs: Any
 ) -> list[StepResult]:
-    config = load_config("corrected", overrides)
-    with Simulator(config, drivers=drivers or constant(), precision="f64") as sim:
+    with Simulator(hall_of(overrides), drivers=drivers or constant(), precision="f64") as sim:
         sim.reset()
         return [sim.step(Actions(**kwargs)) for _ in range(steps)]
 
@@ -75,7 +79,7 @@ def test_a_unit_that_is_down_coasts_and_warms_the_hall() -> None:
     running = column(down, "unit_running")
     assert np.array_equal(running[:, 1] == 0, (np.arange(40) >= 4) & (np.arange(40) < 8))
     assert np.all(running[:, 0] == 1)
-    design = build_fleet(load_config("corrected", overrides)).unit_design_m3s
+    design = build_fleet(hall_of(overrides)).unit_design_m3s
     assert column(down, "unit_flow_m3s")[4, 1] == pytest.approx(0.25 * design[1], rel=1e-9)
     warmer = column(down, "rack_inlet_c") - column(whole, "rack_inlet_c")
     assert np.all(warmer[:4] == 0)
@@ -106,7 +110,7 @@ def test_without_any_unit_nothing_is_removed(thermal: str) -> None:
 
 
 def test_units_keep_setpoints_of_their_own() -> None:
-    config = load_config("corrected", ["hvac.crac.units=2"])
+    config = load_config("corrected", ["hall.recirculation.calibrate=rack", "hvac.crac.units=2"])
     with Simulator(config, drivers=constant(), precision="f64") as sim:
         sim.reset()
         for _ in range(3):
@@ -122,7 +126,7 @@ def test_units_keep_setpoints_of_their_own() -> None:
 def test_fan_speed_is_a_control_of_its_own() -> None:
     overrides = ["hvac.crac.flow_model=controlled", "hvac.crac.fan_step=0.1",
                  "hvac.crac.min_flow_ratio=0.5", "hvac.crac.units=2"]  # fmt: skip
-    config = load_config("corrected", overrides)
+    config = hall_of(overrides)
     with Simulator(config, drivers=constant(), precision="f64") as sim:
         sim.reset()
         results = [sim.step(Actions(fan=np.array([-1.0, 0.0]))) for _ in range(8)]
@@ -482,7 +486,10 @@ def test_fill_and_weights_say_where_work_goes() -> None:
 def test_policies_by_temperature_look_at_the_step_before() -> None:
     steps = 6
     base = [*LINEAR, "hall.supply_approach_k=[1,1,1,1,1,2,2,2,2,2,3,3,3,3,3,4,4,4,4,4]"]
-    config = load_config("corrected", [*base, "workload.placement=coolest-first"])
+    config = load_config(
+        "corrected",
+        ["hall.recirculation.calibrate=rack", *base, "workload.placement=coolest-first"],
+    )
     with Simulator(config, drivers=constant(0.5), precision="f64") as sim:
         sim.reset()
         for step in range(steps):
@@ -517,7 +524,9 @@ def test_policies_by_temperature_look_at_the_step_before() -> None:
     ],
 )
 def test_wrong_placements_are_refused(policy: str, weights: F64, message: str) -> None:
-    config = load_config("corrected", [*LINEAR, f"workload.placement={policy}"])
+    config = load_config(
+        "corrected", ["hall.recirculation.calibrate=rack", *LINEAR, f"workload.placement={policy}"]
+    )
     with Simulator(config, drivers=constant()) as sim:
         sim.reset()
         sim.step()
@@ -552,7 +561,9 @@ def test_throttled_racks_get_what_they_may_do() -> None:
 
 
 def test_hottest_server_is_where_the_layers_say() -> None:
-    config = load_config("corrected", ["workload.placement=weights"])
+    config = load_config(
+        "corrected", ["hall.recirculation.calibrate=rack", "workload.placement=weights"]
+    )
     rng = np.random.default_rng(0)
     with Simulator(config, drivers=constant(0.5), precision="f64") as sim:
         sim.reset()

@@ -13,6 +13,7 @@ import pytest
 import reference_twin
 from random_halls import assert_close, at_design
 from sdc_taichi import ConfigError, DataCenterConfig, build_fleet, load_config
+from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.sim.hall_solver import Conditions, Hall
 from sdc_taichi.types import F64
@@ -26,24 +27,25 @@ def random_matrix(rng: np.random.Generator, racks: int) -> F64:
     return matrix
 
 
-def heat_matrix(matrix: F64, overrides: list[str], scaled: bool, folder: Path) -> F64:
+def heat_matrix(matrix: F64, overrides: list[str], scaled: str, folder: Path) -> F64:
     """D of a hall with this R: T_in - T_sup = R (I - R)^-1 K^-1 P, with its design airflow."""
     path = folder / "known.npz"
     np.savez(path, R=matrix)
     given = [f"hall.recirculation.matrix_file={json.dumps(str(path))}",
-             f"hall.recirculation.calibrate={str(scaled).lower()}"]  # fmt: skip
+             f"hall.recirculation.calibrate={scaled}"]  # fmt: skip
     config = load_config("corrected", [*overrides, *given])
-    design = calibrate(config).design
+    # Where the file gives but shares within a row or the hall, D is that of even inlets.
+    design = calibrate(config).design if scaled == "none" else design_point(config)
     w_per_k = design.air_j_per_m3_k * design.airflow_m3s
     return np.asarray(matrix @ np.linalg.inv(np.eye(len(matrix)) - matrix) / w_per_k)
 
 
 @pytest.mark.parametrize("kind", ["R.npz", "D.npz", "R.csv", "D.csv"])
-@pytest.mark.parametrize("scaled", [True, False], ids=["calibrated", "as given"])
-def test_matrix_of_a_file_agrees_with_the_twin(kind: str, scaled: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("scaled", ["rack", "row", "hall", "none"])
+def test_matrix_of_a_file_agrees_with_the_twin(kind: str, scaled: str, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     matrix = random_matrix(rng, 6)
-    if scaled:
+    if scaled == "rack":
         # Calibration needs exhaust air for a rack with an approach temperature.
         matrix[1] = matrix[0]
     overrides = [
@@ -62,12 +64,12 @@ def test_matrix_of_a_file_agrees_with_the_twin(kind: str, scaled: bool, tmp_path
             *overrides,
             f"hall.recirculation.matrix_file={json.dumps(str(path))}",
             f"hall.recirculation.matrix_kind={name}",
-            f"hall.recirculation.calibrate={str(scaled).lower()}",
+            f"hall.recirculation.calibrate={scaled}",
         ],
     )
     met = Conditions(np.array([20.0]), np.array([0.7]))
     twin = reference_twin.calibrated_to(config, matrix)
-    if not scaled:
+    if scaled == "none":
         np.testing.assert_allclose(calibrate(config).matrix(), matrix, rtol=1e-9, atol=1e-12)
     ones, full = np.ones(6), np.ones(1)
     expected = reference_twin.steady(
@@ -77,7 +79,7 @@ def test_matrix_of_a_file_agrees_with_the_twin(kind: str, scaled: bool, tmp_path
     sums = Hall(build_fleet(config), "f64").solve(met)
     for field in ("inlet_c", "outlet_c", "cpu_w", "airflow_m3s"):
         assert_close(getattr(sums, f"rack_{field}"), expected.racks[field], 1e-10, field)
-    if not scaled:
+    if scaled == "none":
         assert sums.rack_inlet_c[1] == pytest.approx(20.0, abs=1e-9)
 
 
@@ -89,22 +91,22 @@ def test_power_of_a_rack_warms_the_others_by_d(tmp_path: Path) -> None:
         "servers.fan_full_airflow_m3s=0.012", "servers.fan_airflow_ratio_lb=[1,1]",
         "servers.fan_airflow_ratio_ub=[1,1]", "hall.air_density_kg_m3=1.225",
     ]  # fmt: skip
-    flow = calibrate(load_config("corrected", overrides)).design.airflow_m3s
     matrix = random_matrix(rng, 6)
-    d_k_per_w = matrix @ np.linalg.inv(np.eye(6) - matrix) / (1.225 * 1006.0 * flow)
+    d_k_per_w = heat_matrix(matrix, overrides, "none", tmp_path)
     np.savez(path, D=d_k_per_w)
     config = load_config(
         "corrected",
         [
             *overrides,
             f"hall.recirculation.matrix_file={json.dumps(str(path))}",
-            "hall.recirculation.calibrate=false",
+            "hall.recirculation.calibrate=none",
         ],
     )
-    met = Conditions(np.array([19.0]), np.array([0.5]), rack_load=rng.uniform(0, 1, 6))
+    # Of design supply air: colder air is denser, and servers move more of it.
+    met = Conditions(np.array([23.0]), np.array([0.5]), rack_load=rng.uniform(0, 1, 6))
     sums = Hall(build_fleet(config), "f64").solve(met)
     power_w = sums.rack_cpu_w + sums.rack_fan_w
-    np.testing.assert_allclose(sums.rack_inlet_c, 19.0 + d_k_per_w @ power_w, rtol=1e-9)
+    np.testing.assert_allclose(sums.rack_inlet_c, 23.0 + d_k_per_w @ power_w, rtol=0, atol=0.1)
 
 
 @pytest.mark.parametrize("full_m3s", [None, 0.02])
@@ -115,10 +117,10 @@ def test_d_holds_at_the_design_point_of_servers_with_curves(
                  "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
                  f"servers.fan_full_airflow_m3s={json.dumps(full_m3s)}"]  # fmt: skip
     matrix = random_matrix(np.random.default_rng(0), 6)
-    d_k_per_w = heat_matrix(matrix, overrides, False, tmp_path)
+    d_k_per_w = heat_matrix(matrix, overrides, "none", tmp_path)
     np.savez(tmp_path / "cfd.npz", D=d_k_per_w)
     path = json.dumps(str(tmp_path / "cfd.npz"))
-    named = [f"hall.recirculation.matrix_file={path}", "hall.recirculation.calibrate=false"]
+    named = [f"hall.recirculation.matrix_file={path}", "hall.recirculation.calibrate=none"]
     sums = at_design([load_config("corrected", [*overrides, *named])])
     rise_k = d_k_per_w @ (sums.rack_cpu_w + sums.rack_fan_w)
     np.testing.assert_allclose(sums.rack_inlet_c - 23.0, rise_k, rtol=1e-9, atol=1e-9)
@@ -156,7 +158,7 @@ def test_a_matrix_that_cannot_be_is_refused(
         ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
          "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
          f"hall.recirculation.matrix_file={json.dumps(str(path))}",
-         "hall.recirculation.calibrate=false"],
+         "hall.recirculation.calibrate=none"],
     )  # fmt: skip
     with pytest.raises(ConfigError, match=message) as error:
         build_fleet(config)
@@ -247,10 +249,15 @@ def test_a_rack_without_exhaust_air_cannot_be_warmed_by_it(tmp_path: Path) -> No
     matrix[[0, 2]] = 0.0
     np.savez(path, R=matrix)
     with pytest.raises(ConfigError, match=r"row 2 is zero, so .* rack 2 by the 3 K of hall.supply"):
-        build_fleet(matrix_hall(path))
+        build_fleet(matrix_hall(path, "hall.recirculation.calibrate=rack"))
+    # On the mean of its row the others make up for it.
+    by_row = "hall.recirculation.calibrate=row"
+    found = at_design([matrix_hall(path, by_row)]).rack_inlet_c - 23.0
+    np.testing.assert_allclose(found, [0, 6, 0, 3, 3, 3], atol=1e-9)
     matrix[2] = 0.05
     np.savez(path, R=matrix)
-    found = at_design([matrix_hall(path)]).rack_inlet_c - 23.0
+    by_rack = "hall.recirculation.calibrate=rack"
+    found = at_design([matrix_hall(path, by_rack)]).rack_inlet_c - 23.0
     np.testing.assert_allclose(found, [0, 3, 3, 3, 3, 3], atol=1e-9)
 
 

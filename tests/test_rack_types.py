@@ -152,7 +152,8 @@ def test_types_take_the_place_of_inherited_servers_and_the_other_way_round(mixed
 def test_a_design_rise_and_an_airflow_hold_whatever_others_have(mixed: Path) -> None:
     own = ["design_rise_k=18", "full_airflow_m3s=0.1"]
     for setting in own:
-        config = load_config(mixed, [f"hall.rack_types.gpu.servers.{setting}"])
+        alike = "hall.recirculation.calibrate=rack"
+        config = load_config(mixed, [alike, f"hall.rack_types.gpu.servers.{setting}"])
         rise_k, design = rises_k(config), calibrate(config).design
         np.testing.assert_allclose(rise_k[:16], rise_k[0], atol=0.1)
         if "rise" in setting:

@@ -85,8 +85,9 @@ def test_full_load_at_the_highest_setpoint_agrees_with_the_twin_at_any_fan_speed
     "overrides",
     [[], ["hall.servers_per_rack=12", "hall.height_zones=12"],
      ["hall.rows=5", "hall.racks_per_row=16", "hall.supply_approach_k=5.15",
-      "hall.return_approach_k=-3.1", "servers.power_w=[150, 10]"]],
-    ids=["default", "each server its own", "80 racks"],
+      "hall.return_approach_k=-3.1", "servers.power_w=[150, 10]",
+      "hall.recirculation.calibrate=rack"]],
+    ids=["default", "each server its own", "80 racks alike"],
 )  # fmt: skip
 def test_most_sweeps_start_where_they_end(overrides: list[str]) -> None:
     config = load_config("corrected", overrides)
@@ -95,8 +96,8 @@ def test_most_sweeps_start_where_they_end(overrides: list[str]) -> None:
     hall.solve(Conditions(rng.uniform(16.0, 23.0, 300), rng.uniform(0.0, 1.0, 300)))
     assert hall.sweeps.mean() < 1.6
     # Setpoints move by whole kelvins, where the table has its entries.
-    hall.solve(Conditions(rng.integers(16, 24, 300).astype(float), rng.integers(0, 65, 300) / 64))
-    assert hall.sweeps.max() == 1
+    hall.solve(Conditions(rng.integers(16, 24, 300).astype(float), rng.integers(0, 161, 300) / 160))
+    assert hall.sweeps.mean() < 1.3
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -163,7 +164,8 @@ def test_twin_sees_a_change_of_any_measure_of_the_hall() -> None:
     config = config_from_dict(values)
     twin = steady_twin(parts([config], met)[0])
     changes = {f"layout.{name}": 1.01 for name in values["hall"]["layout"]}
-    del changes["layout.ceiling_m"], changes["layout.end_margin_m"], changes["layout.side_margin_m"]
+    for unseen in ("returns", "ceiling_m", "end_margin_m", "side_margin_m"):
+        del changes[f"layout.{unseen}"]
     changes |= {"recirculation.decay_m": 1.01, "height_gradient": 1.01, "height_zones": 2}
     for path, factor in changes.items():
         section = dict(config.hall.model_dump(mode="json"))
@@ -180,7 +182,7 @@ def test_twin_sees_a_change_of_any_measure_of_the_hall() -> None:
 
 
 def test_design_point_of_the_paper_comes_out() -> None:
-    sums = at_design([load_config("corrected")])
+    sums = at_design([load_config("corrected", ["hall.recirculation.calibrate=rack"])])
     approach_k = np.repeat([5.3, 5.0, 5.3], [5, 10, 5])
     np.testing.assert_allclose(sums.rack_inlet_c - 23.0, approach_k, rtol=0, atol=1e-9)
     mean_return_k = sums.return_c[0] - np.mean(sums.rack_outlet_c)
@@ -188,9 +190,13 @@ def test_design_point_of_the_paper_comes_out() -> None:
     assert sums.inlet_mean_c[0] - 23.0 == pytest.approx(5.15, abs=1e-9)
 
 
+@pytest.mark.filterwarnings("ignore:.*up to 25 K is usual")
 @pytest.mark.parametrize("full_m3s", [0.012, 0.02])
 def test_design_point_comes_out_with_any_airflow_of_the_servers(full_m3s: float) -> None:
-    config = load_config("corrected", [f"servers.fan_full_airflow_m3s={full_m3s}"])
+    config = load_config(
+        "corrected",
+        [f"servers.fan_full_airflow_m3s={full_m3s}", "hall.recirculation.calibrate=rack"],
+    )
     sums = at_design([config])
     approach_k = np.repeat([5.3, 5.0, 5.3], [5, 10, 5])
     np.testing.assert_allclose(sums.rack_inlet_c - 23.0, approach_k, rtol=0, atol=1e-9)
@@ -205,16 +211,22 @@ def test_any_design_point_comes_out(seed: int) -> None:
     hall = config.hall.model_copy(update={"layout": open_hall})
     sums = at_design([config.model_copy(update={"hall": hall})])
     found = sums.rack_inlet_c - config.hall.design_supply_c
-    np.testing.assert_allclose(found, hall.supply_approach_k, rtol=0, atol=1e-9)
+    scaled_to, given = hall.recirculation.scaled_to, np.array(hall.supply_approach_k)
+    if scaled_to == "row":
+        found, given = (k.reshape(hall.rows, -1).mean(axis=1) for k in (found, given))
+    elif scaled_to == "hall":
+        found, given = found.mean(), given.mean()
+    np.testing.assert_allclose(found, given, rtol=0, atol=1e-9)
     if all(g.design_rise_k is None for rack in config.rack_groups() for g in rack):
         mean_return_k = sums.return_c[0] - np.mean(sums.rack_outlet_c)
         assert mean_return_k == pytest.approx(np.mean(hall.return_approach_k), abs=1e-9)
 
 
 def test_containment_takes_its_share_of_the_paths() -> None:
-    whole = calibrate(load_config("corrected")).matrix()
+    by_rack = "hall.recirculation.calibrate=rack"
+    whole = calibrate(load_config("corrected", [by_rack])).matrix()
     for containment in (0.25, 0.9, 1.0):
-        config = load_config("corrected", [f"hall.layout.containment={containment}"])
+        config = load_config("corrected", [f"hall.layout.containment={containment}", by_rack])
         part = calibrate(config).matrix()
         np.testing.assert_allclose(part, (1 - containment) * whole, rtol=1e-12, atol=1e-15)
 
@@ -369,7 +381,8 @@ def moved_load_k(
 
 
 def test_moving_15_kw_between_two_racks_moves_their_neighbours_most() -> None:
-    config = load_config("corrected")
+    # Of racks that breathe alike: those at the ends of rows feel any change more.
+    config = load_config("corrected", ["hall.recirculation.calibrate=rack"])
     giver, taker = 0, 19
     change_k, moved_w = moved_load_k(config, giver, taker, 15e3)
     assert moved_w == pytest.approx(15e3, rel=1e-9)

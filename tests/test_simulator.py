@@ -652,7 +652,7 @@ def test_matrices_of_different_magnitude_are_told_apart(tmp_path: Path) -> None:
     path, found = tmp_path / "hall.npz", set()
     config = load_config(
         "corrected",
-        [f"hall.recirculation.matrix_file={path}", "hall.recirculation.calibrate=false"],
+        [f"hall.recirculation.matrix_file={path}", "hall.recirculation.calibrate=none"],
     )
     for share in (0.005, 0.01):
         np.savez(path, R=np.full((20, 20), share))

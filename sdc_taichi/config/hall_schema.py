@@ -105,15 +105,22 @@ class RecirculationConfig(Section):
     from the layout; None is the layout."""
     matrix_kind: Literal["R", "D"] | None = None
     """Which matrix a .csv file holds; None where the .npz file names it."""
-    calibrate: bool = True
-    """Whether the magnitude of recirculation follows from ``supply_approach_k`` and the matrix file
-    gives weights alone; False takes both from the file, and the approach temperatures follow."""
+    calibrate: Literal["rack", "row", "hall", "none"] | None = None
+    """Approach temperatures that recirculation is scaled to: those of each rack, their mean over a
+    row or over the hall, within which layout or matrix file tell racks apart, or none, those that
+    follow from the matrix file. None is ``none`` with a matrix file and ``row`` without."""
+
+    @property
+    def scaled_to(self) -> Literal["rack", "row", "hall", "none"]:
+        """Approach temperatures that recirculation is scaled to, see ``calibrate``."""
+        return self.calibrate or ("row" if self.matrix_file is None else "none")
 
     @model_validator(mode="after")
     def _magnitude_is_known(self) -> Self:
-        if not self.calibrate and self.matrix_file is None:
+        if self.calibrate == "none" and self.matrix_file is None:
             raise ValueError(
-                "calibrate false needs a matrix_file; the layout alone gives weights, no magnitude"
+                "calibrate none needs a matrix_file, since the layout alone tells no magnitude; "
+                "valid without one are rack, row and hall"
             )
         if self.matrix_kind is not None and self.matrix_file is None:
             raise ValueError(

@@ -23,15 +23,16 @@ from sdc_taichi.plant.air import DensityRatio
 from sdc_taichi.plant.servers import ServerCurves
 from sdc_taichi.types import F32, F64, I32
 
-TABLE_LOADS = np.linspace(0.0, 1.0, 65)
-"""Loads of the table, so close because airflow and power bend where their limits set in."""
+TABLE_LOADS = np.linspace(0.0, 1.0, 161)
+"""Loads of the table, so close because airflow and power bend where their limits set in, for each
+rack and height at another load."""
 SUPPLY_STEP_K = 0.5
 """Distance of the supply temperatures of the table, in K; setpoints move in whole or half kelvins.
 A wide range of setpoints has wider steps."""
 MOST_SUPPLIES = 65
 """Most supply temperatures of the table of a wide range of setpoints."""
 PATTERNS = 7
-"""Most patterns of a hall; six tell all mixes of a hall of 20 racks to 1e-4 K."""
+"""Most patterns of a hall; they tell all mixes of a hall of 20 racks to 2e-4 K."""
 SAMPLED_RACKS = 4
 """Racks whose mean stands for all racks of a hall that drops weights."""
 
@@ -147,7 +148,9 @@ def _sampled_racks(servers: RackServers, recirculation: Recirculation) -> _HallP
     """A sample of the racks of a hall as one rack that breathes its own exhaust."""
     offsets, outlet_rise_k = servers.group_offsets, recirculation.design.outlet_rise_k
     racks = len(outlet_rise_k)
-    sample = np.arange(0, racks, -(-racks // SAMPLED_RACKS))
+    # Racks at the ends of rows breathe more exhaust than others: some of each.
+    places = (2 * np.arange(SAMPLED_RACKS) + 1) * racks // (2 * SAMPLED_RACKS)
+    sample = np.sort(np.argsort(recirculation.exhaust_share, kind="stable")[places])
     groups = np.concatenate([np.arange(*offsets[rack : rack + 2]) for rack in sample])
     return _HallPart(
         group_offsets=np.array([0, len(groups)], dtype=np.int32),

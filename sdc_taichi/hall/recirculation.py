@@ -7,7 +7,9 @@ With R_ji the share of rack j's intake that is rack i's exhaust,
 (Tang, Gupta and Varsamopoulos 2008, *Energy-efficient thermal-aware task scheduling for homogeneous
 high-performance computing data centers*, IEEE TPDS 19(11)). The weights w are those of the exhaust
 mix before each rack (``mix_weights``) or of a user's matrix (``matrix_file``); the shares r are
-such that the given approach temperatures come out exactly at the design point.
+such that the given approach temperatures come out exactly at the design point: of every rack, or on
+the mean of a row or of the hall, within which the exposure of the racks (``exposure``) or the
+matrix tells them apart.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.design_point import DesignPoint, design_point, design_point_at
+from sdc_taichi.hall.exposure import exposure
 from sdc_taichi.hall.matrix_file import read_matrix, share_matrix
 from sdc_taichi.hall.mix_weights import MixWeights, dense_weights, layout_weights
 from sdc_taichi.hall.rack_servers import RackServers, rack_servers
@@ -29,6 +32,13 @@ from sdc_taichi.types import F64
 _MOST_ITERATIONS = 500
 _WITHIN_K = 1e-12
 """Change of the approach temperatures, in K, at which they count as found."""
+_MOST_MEAN_SHARE = 0.9
+"""Largest share of the exhaust mix in the mean intake of a row or hall; beyond it, hardly any
+supply air reaches the racks."""
+_MOST_NEWTON_STEPS = 50
+_EXACT_RACKS, _LARGE_WITHIN_K = 10_000, 1e-3
+"""Racks of larger halls, and the same for those whose approach temperatures are means: each round
+leaves a twentieth, and takes a second in a hall of a hundred thousand racks."""
 _CONTAINED_WITHIN_K = 1e-9
 """The same for the exhaust mixes of contained halls, which may have a hundred thousand racks."""
 
@@ -60,6 +70,8 @@ def calibrate(config: DataCenterConfig, servers: RackServers | None = None) -> R
 
     r_j = a_j / sum_i w_ji (a_i + dT_i) at the design point, less the share that containment
     closes; the approach temperatures a are those of the open hall, dT is the rise through a rack.
+    Where their means alone are given, r_j = k e_j / (1 + k e_j): exhaust and supply air share the
+    intake as k times the exposure e_j to 1, with the k of the row or of the hall.
 
     Args:
         config: A data center with inlet model ``recirculation``.
@@ -89,8 +101,7 @@ def _calibrated(
     and b (1 - c) of the supply air bypasses them. The units are sized for what that leaves.
     """
     if config.hall.recirculation.matrix_file is None:
-        weights = layout_weights(config.hall, design.airflow_m3s)
-        open_share = design.approach_k / weights.apply(design.outlet_rise_k)
+        weights, open_share, design = _from_layout(config, servers, design)
     else:
         weights, open_share, design = _from_matrix_file(config, servers, design)
     open_part = 1.0 - config.hall.layout.containment
@@ -109,6 +120,20 @@ def _calibrated(
     return Recirculation(weights, share, group_share, fresh, need_m3s, design)
 
 
+def _from_layout(
+    config: DataCenterConfig, servers: RackServers, design: DesignPoint
+) -> tuple[MixWeights, F64, DesignPoint]:
+    """Weights, exhaust shares and design point of the open hall by its layout."""
+    if config.hall.recirculation.scaled_to == "rack":
+        weights = layout_weights(config.hall, design.airflow_m3s)
+        return weights, design.approach_k / weights.apply(design.outlet_rise_k), design
+    airflow_m3s = design_point(config, servers, _mean_approach_k(config)).airflow_m3s
+    weights = layout_weights(config.hall, airflow_m3s)
+    return weights, *_shares_by_exposure(
+        config, servers, weights, exposure(config.hall, airflow_m3s)
+    )
+
+
 def _from_matrix_file(
     config: DataCenterConfig, servers: RackServers, design: DesignPoint
 ) -> tuple[MixWeights, F64, DesignPoint]:
@@ -116,27 +141,98 @@ def _from_matrix_file(
     settings = config.hall.recirculation
     path = Path(settings.matrix_file or "")
     kind, given = read_matrix(config, path)
-    if kind == "D" and not settings.calibrate:
+    if settings.scaled_to in ("row", "hall"):
+        design = design_point(config, servers, _mean_approach_k(config))
+    elif kind == "D" and settings.scaled_to == "none":
         design = _solve_design_point(config, servers, lambda at: given @ at.it_w)
     matrix = share_matrix(config, path, kind, given, design)
     sums = matrix.sum(axis=1)
     none = sums == 0
     wanted_k = design.approach_k * none
-    if settings.calibrate and np.any(wanted_k > 0):
+    if settings.scaled_to == "rack" and np.any(wanted_k > 0):
         rack = int(np.argmax(wanted_k))
         raise ConfigError(
             f"{path}: row {rack} is zero, so that exhaust air cannot warm rack {rack} by the "
             f"{wanted_k[rack]:g} K of hall.supply_approach_k; valid is 0 K there or "
-            "hall.recirculation.calibrate false"
+            "another hall.recirculation.calibrate than rack"
         )
     # A rack that breathes supply air alone has a mix before it all the same: that of all racks.
     weights = dense_weights(
         np.where(none[:, None], 1.0 / len(sums), matrix / np.where(none, 1.0, sums)[:, None])
     )
-    if settings.calibrate:
+    if settings.scaled_to == "rack":
         return weights, design.approach_k / weights.apply(design.outlet_rise_k), design
+    if settings.scaled_to != "none":
+        return weights, *_shares_by_exposure(config, servers, weights, sums)
     design = _solve_design_point(config, servers, lambda at: sums * weights.apply(at.outlet_rise_k))
     return weights, sums, design
+
+
+def _mean_approach_k(config: DataCenterConfig) -> F64:
+    """Approach temperatures of the config, plain means over the rows or over the hall, K, (R,)."""
+    hall = config.hall
+    parts = hall.rows if hall.recirculation.scaled_to == "row" else 1
+    means = hall.rack_approach_k().reshape(parts, -1).mean(axis=1)
+    return np.repeat(means, hall.racks // parts)
+
+
+def _shares_by_exposure(
+    config: DataCenterConfig, servers: RackServers, weights: MixWeights, exposed: F64
+) -> tuple[F64, DesignPoint]:
+    """Exhaust shares whose approach temperatures have the given means, and the design point.
+
+    Args:
+        config: The data center.
+        servers: Its ``rack_servers``.
+        weights: Weights of the exhaust mix before each rack.
+        exposed: Exposure of each rack, 0 or more, (R,).
+
+    Raises:
+        ConfigError: means that exhaust air cannot bring about, or no steady state.
+    """
+    wanted_k = before_k = _mean_approach_k(config)
+    within_k = _WITHIN_K if config.hall.racks <= _EXACT_RACKS else _LARGE_WITHIN_K
+    for _ in range(_MOST_ITERATIONS):
+        design = design_point(config, servers, before_k)
+        mix_k = weights.apply(design.outlet_rise_k)
+        share = _mean_share(config, mix_k, exposed, wanted_k)
+        after_k = share * mix_k
+        if np.max(np.abs(after_k - before_k)) < within_k:
+            return share, design
+        before_k = after_k
+    raise _no_steady_state(config)
+
+
+def _mean_share(config: DataCenterConfig, mix_k: F64, exposed: F64, wanted_k: F64) -> F64:
+    """Exhaust shares k e / (1 + k e) with the k of each part that gives the wanted means, (R,).
+
+    The mean rises ever less with k, so that Newton's steps from 0 come near it from below.
+    """
+    hall = config.hall
+    parts = hall.rows if hall.recirculation.scaled_to == "row" else 1
+    mix, e, wanted = (values.reshape(parts, -1) for values in (mix_k, exposed, wanted_k))
+    goal = wanted[:, 0]
+    most = np.mean(mix * (e > 0), axis=1)
+    if np.any(goal > _MOST_MEAN_SHARE * most):
+        part = int(np.argmax(goal - _MOST_MEAN_SHARE * most))
+        where = f" of row {part}" if hall.recirculation.scaled_to == "row" else ""
+        raise ConfigError(
+            f"{hall.recirculation.matrix_file or config.name}: hall.supply_approach_k{where} is "
+            f"{goal[part]:.3g} K on the mean, but the exhaust that its racks take in is "
+            f"{most[part]:.3g} K above supply air on the mean; valid is at most "
+            f"{100 * _MOST_MEAN_SHARE:g} % of that"
+        )
+    k = np.zeros(parts)
+    for _ in range(_MOST_NEWTON_STEPS):
+        odds = k[:, None] * e
+        lacking = goal - np.mean(mix * odds / (1.0 + odds), axis=1)
+        slope = np.mean(mix * e / (1.0 + odds) ** 2, axis=1)
+        step = lacking / np.where(slope > 0, slope, 1.0)
+        k = k + step
+        if np.all(np.abs(step) <= 1e-14 * k):
+            break
+    odds = k[:, None] * e
+    return np.asarray(odds / (1.0 + odds)).reshape(-1)
 
 
 def _solve_design_point(

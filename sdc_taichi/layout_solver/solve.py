@@ -20,6 +20,7 @@ from sdc_taichi.hall import air_metrics
 from sdc_taichi.hall.air_properties import air_properties
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.matrix_file import MOST_MATRIX_RACKS
+from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M, LEAST_LEAK, Grid, build_grid
 from sdc_taichi.types import F64, I32
@@ -374,7 +375,10 @@ def solve_at_design_point(
             f"{config.name}: servers.outlet_model {outlets}: hall solve heats the air of every "
             "server by its own power; valid is server"
         )
-    design = design_point(config)
+    hall = config.hall
+    # CRAC units of contained halls are sized for what containment leaves of recirculation.
+    contained = hall.layout.containment > 0 and hall.inlet_model == "recirculation"
+    design = calibrate(config).design if contained else design_point(config)
     return solve(
         config,
         airflow_m3s=design.airflow_m3s,

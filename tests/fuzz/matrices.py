@@ -47,7 +47,7 @@ def matrices(scratch: Scratch) -> None:
     values = {
         "hall.recirculation.matrix_file": str(path),
         "hall.recirculation.matrix_kind": given,
-        "hall.recirculation.calibrate": scratch.chance(0.5),
+        "hall.recirculation.calibrate": scratch.pick((None, "rack", "row", "hall", "none")),
     }
     if scratch.chance(0.03):
         values["hall.recirculation.matrix_kind"] = None
