@@ -198,6 +198,15 @@ def test_every_ledger_closes_in_a_mixed_hall(thermal: str, mixed: Path) -> None:
         assert residual(LEDGERS[name](run), 1e-6).max() < 1e-11, name
 
 
+def test_heat_capacities_are_those_of_the_servers_of_the_types(mixed: Path) -> None:
+    config = load_config(mixed)
+    servers = [group for rack in config.rack_groups() for group in rack]
+    mean_w = config.rack_nameplate_w().sum() / sum(group.count for group in servers)
+    assert mean_w > 200.0
+    assert config.server_heat_capacity_kj_per_k == pytest.approx(0.030 * mean_w)
+    assert config.room_heat_capacity_kj_per_k == pytest.approx(0.015 * mean_w)
+
+
 def test_servers_without_air_are_refused() -> None:
     still = [f"servers.fan_airflow_ratio_{end}=[1e-6, 1e-6]" for end in ("lb", "ub")]
     still += ["servers.fan_airflow_ratio_limits=null"]
