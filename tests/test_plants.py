@@ -135,6 +135,33 @@ def test_dry_cooler_does_in_frost_what_the_chiller_does_in_summer() -> None:
     assert without.chiller_load_w == without.heat_removed_w
 
 
+def test_dry_cooler_makes_no_water_colder_than_the_air() -> None:
+    # A close approach and a wide range at little load: water that returns at 10 + 17 K or so.
+    wide = ["hvac.dry_cooler.approach_k=1", "hvac.chiller.chilled_water_range_k=12",
+            "hvac.crac.supply_m3s_per_w=4e-5"]  # fmt: skip
+    outdoor_c = [9.0, 12.0, 15.0, 18.0]
+    result, design = steady(
+        [*DRY["air_cooled"], *wide], outdoor_c, [c - 6.0 for c in outdoor_c], load=0.01
+    )
+    load_share = np.clip(result.heat_removed_w / design.cooling_w, 0.1, 1.0)
+    range_k = 12.0 * load_share**-0.25
+    assert np.all(range_k > 13.0)
+    water_c = result.chilled_water_c + range_k * (1.0 - result.economiser_w / result.heat_removed_w)
+    assert np.all(water_c >= result.outdoor_c - 1e-9)
+    assert result.economiser_w[0] == result.heat_removed_w[0]
+
+
+def test_openings_that_are_left_have_a_share_of_the_fans() -> None:
+    event = "events.scheduled=[{kind: outdoor_air_closed, start_h: 0, duration_h: 1, share: 0.5}]"
+    result, design = steady([*DRY["air_side"], event], [22.0], [12.0])
+    # In the warm all the air that is left comes in, at full speed.
+    outdoor_m3s = result.economiser_w / (
+        design.air_j_per_m3_k * (result.return_c - result.outdoor_c)
+    )
+    assert outdoor_m3s == pytest.approx(0.5 * design.tower_air_m3s, rel=1e-9)
+    assert result.tower_fan_w == pytest.approx(0.5 * design.tower_fan_w, rel=1e-9)
+
+
 def test_outdoor_air_cools_while_it_is_cool_and_neither_dry_nor_humid() -> None:
     weather = {
         "cool": (12.0, 8.0),

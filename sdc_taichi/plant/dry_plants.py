@@ -15,6 +15,7 @@ from sdc_taichi.plant.chiller import ChillerResult
 from sdc_taichi.plant.fans_pumps import pump_w
 from sdc_taichi.plant.tower import TowerResult
 from sdc_taichi.plant.water_side import (
+    LEAST_OUTDOOR_UNITS,
     WaterSideDesign,
     WaterSideResult,
     chilled_water_c,
@@ -47,7 +48,8 @@ def air_cooled(
 
         share = clip((T_return - T_outdoor)/(range + approach), 0, 1)
 
-    with the design range, so that the effectiveness grows a little as the water flow falls.
+    with the design range, so that the effectiveness grows as the water flow falls. It never exceeds
+    1: no water leaves colder than the outdoor air.
 
     The heat of a cooler that needs less grows with the airflow to the power 3/4, as that of a film
     does, and the fan power with its cube, so the fans draw the fourth power of the heat over that
@@ -71,11 +73,14 @@ def air_cooled(
     load_w = np.minimum(requested_w, design.pumped_w) if limited else requested_w
     chilled_c = chilled_water_c(setpoint_c, design)
     range_ratio = coil_range_ratio(load_w, design)
-    return_water_c = chilled_c + design.chilled_water_range_k * range_ratio
-    over_k = np.maximum(return_water_c - outdoor_c, 0.0)
-    reach = over_k / (design.chilled_water_range_k + design.dry_cooler_approach_k)
-    full_speed_w = design.economiser * design.outdoor_units * design.cooling_w * reach
-    free_w = np.minimum(load_w * np.minimum(reach, 1.0), full_speed_w)
+    range_k = design.chilled_water_range_k * range_ratio
+    over_k = np.maximum(chilled_c + range_k - outdoor_c, 0.0)
+    full_range_k = design.chilled_water_range_k + design.dry_cooler_approach_k
+    full_speed_w = (
+        design.economiser * design.outdoor_units * design.cooling_w * over_k / full_range_k
+    )
+    share = np.minimum(over_k / np.maximum(full_range_k, range_k), 1.0)
+    free_w = np.minimum(load_w * share, full_speed_w)
     speed_share = free_w / np.maximum(full_speed_w, 1.0)
     machine = _air_cooled_chiller(load_w - free_w, chilled_c, outdoor_c, design, chiller)
     removed_w = load_w - machine.unmet_w if limited else load_w
@@ -140,6 +145,7 @@ def air_side(
     over_k = np.maximum(return_c - outdoor_c, 0.0)
     over_w_s_m3 = design.air_j_per_m3_k * (over_k + lack * _WETTING_K)
     most_m3s = np.minimum(airflow_m3s, design.tower_air_m3s * design.outdoor_units)
+    units = np.maximum(design.outdoor_units, LEAST_OUTDOOR_UNITS)
     reachable_w = np.where(over_k > 0.0, most_m3s * over_w_s_m3, 0.0)
     within = (
         ((vapour_pa >= design.least_vapour_pa) | (design.humidifier > 0.0))
@@ -160,7 +166,7 @@ def air_side(
         machine=machine,
         chilled_c=chilled_c,
         outdoor_c=outdoor_c,
-        fan_w=design.tower_fan_w * (outdoor_m3s / design.tower_air_m3s) ** 3,
+        fan_w=design.tower_fan_w * units * (outdoor_m3s / (design.tower_air_m3s * units)) ** 3,
         humidifier_kg_s=lack * outdoor_m3s * design.air_j_per_m3_k / moist_air.DRY_AIR_J_PER_KG_K,
         chilled_pump_w=_pump_w(
             machine.evaporator_w / coil_range_ratio(machine.evaporator_w, design),

@@ -15,7 +15,7 @@ from sdc_taichi.types import F64, Values, as_array
 LEAST_COIL_LOAD = 0.1
 """Least load of the coils over that at design below which the range of their water stays."""
 LEAST_OUTDOOR_UNITS = 0.01
-"""Least share of a tower with which its equations are evaluated; without a cell no heat is left."""
+"""Least share of outdoor units with which equations are evaluated; without any they do nothing."""
 
 
 @dataclass(frozen=True, slots=True)
