@@ -31,6 +31,7 @@ from sdc_taichi import (
     vector_env,
 )
 from sdc_taichi.cli.app import app
+from sdc_taichi.config.odd_values import odd_values
 from sdc_taichi.config.reference import fields_markdown
 from sdc_taichi.control import make_controller, view_maker
 from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
@@ -142,6 +143,16 @@ def test_what_is_odd_is_warned_of_once(override: str, part: str) -> None:
     assert [w.category for w in caught] == [OddInputWarning]
     assert str(caught[0].message).startswith("corrected and 2 more: ")
     assert part in str(caught[0].message)
+
+
+@pytest.mark.parametrize(("design_c", "odd"), [(17, False), (40, True)])
+def test_design_air_is_of_the_supply_where_setpoints_are_of_the_return(
+    design_c: float, odd: bool
+) -> None:
+    given = ["hvac.crac.temperature_control=return", f"hall.design_supply_c={design_c}",
+             "hvac.setpoint={min_c: 28, max_c: 38, initial_c: 33}"]  # fmt: skip
+    found = [*odd_values(load_config("corrected", given))]
+    assert any("design_supply_c" in text for text in found) == odd
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30, -1e30])

@@ -47,6 +47,7 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
             yield (
                 f"hvac.setpoint.{name} {value:g}: {controlled} air is usually {low:g}..{high:g} C"
             )
+    low, high = USUAL_SETPOINTS_C["supply"]
     if not low <= config.hall.design_supply_c <= high:
         yield (
             f"hall.design_supply_c {config.hall.design_supply_c:g}: supply air is usually "
