@@ -88,6 +88,24 @@ def test_without_a_chiller_racks_throttle_and_then_trip() -> None:
     assert half is None or half > lost["time_to_throttle_min"]
 
 
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["hvac.crac.temperature_control=return",
+         "hvac.setpoint={min_c: 28, max_c: 45, initial_c: 30}"],
+        [f"hvac.setpoint.schedule_c={[20.0] * 24}"],
+    ],
+)  # fmt: skip
+def test_air_is_that_of_the_design_point_whatever_the_setpoint_is(overrides: list[str]) -> None:
+    config = load_config("corrected", [*SMALL, *overrides])
+    base, supply_c = failover._studied(config)
+    assert supply_c == pytest.approx(23.0)
+    ones = np.ones(2)
+    with Simulator(base, drivers=drivers_from_arrays(35 * ones, 26 * ones, 0 * ones, ones)) as sim:
+        sim.reset()
+        assert sim.step().supply_c == pytest.approx(23.0, abs=0.2)
+
+
 def test_the_command_prints_and_writes_all_losses(tmp_path: Path) -> None:
     out = tmp_path / "new" / "failover.png"
     runner, command = CliRunner(), ["hall", "failover", "corrected", *SMALL, "--out", str(out)]

@@ -21,6 +21,7 @@ from sdc_taichi.config import (
 )
 from sdc_taichi.config.event_schema import PLANT_OF_EVENT
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
 from sdc_taichi.sim.drivers import drivers_from_arrays, load_drivers
 from sdc_taichi.sim.fleet import build_fleet
@@ -78,7 +79,7 @@ class Failover:
     note: str
     """Which losses were left out, as a sentence; empty for none."""
     supply_c: float
-    """Supply setpoint, in C."""
+    """Supply air at full load without a loss, in C."""
     outdoor_c: float
     """Dry bulb outside, in C."""
     wet_bulb_c: float
@@ -222,23 +223,26 @@ def _neighbours(config: DataCenterConfig) -> list[tuple[int, ...]]:
 
 
 def _studied(config: DataCenterConfig) -> tuple[DataCenterConfig, float]:
-    """A data center as it is studied, without events, and its supply setpoint in C."""
+    """A data center as it is studied, without events, and its supply air in C."""
     if config.hall.inlet_model != "recirculation":
         raise ConfigError(
             f"{config.name}: hall.inlet_model {config.hall.inlet_model} has no air that a loss of "
             "cooling would warm; valid is recirculation"
         )
-    setpoint = config.hvac.setpoint
-    supply_c = float(np.clip(config.hall.design_supply_c, setpoint.min_c, setpoint.max_c))
+    limits = config.hvac.setpoint
+    over_supply_k = design_point(config).setpoint_over_supply_k(config)
+    wanted_c = config.hall.design_supply_c + over_supply_k
+    setpoint_c = float(np.clip(wanted_c, limits.min_c, limits.max_c))
     values = {
         "simulation.thermal": "transient",
         "simulation.steps_per_hour": 60,
         "simulation.substep_s": SUBSTEP_S,
-        "hvac.setpoint.initial_c": supply_c,
+        "hvac.setpoint.initial_c": setpoint_c,
+        "hvac.setpoint.schedule_c": None,
         "protection.ashrae_class": config.protection.ashrae_class or CLASS,
         "events": {},
     }
-    return with_values(config, values), supply_c
+    return with_values(config, values), setpoint_c - over_supply_k
 
 
 def _kept(result: StepResult, step: int) -> dict[str, Any]:
