@@ -115,16 +115,13 @@ class Totals:
     """Highest power of each month."""
 
 
-def empty_totals(size: int, step_h: float, start: I64 | None = None) -> Totals:
+def empty_totals(size: int, step_h: float) -> Totals:
     """Totals of no steps.
 
     Args:
         size: number of data centers, B.
         step_h: length of a step, in h.
-        start: first step of each data center, counted from the beginning of the year, (B,); None
-            is 0.
     """
-    first = np.zeros(size, dtype=np.int64) if start is None else start
     return Totals(
         steps=0,
         step_h=step_h,
@@ -140,7 +137,8 @@ def empty_totals(size: int, step_h: float, start: I64 | None = None) -> Totals:
         rci_hi_min_pct=np.full(size, np.inf),
         first_event_step=np.full(size, -1),
         first_throttle_step=np.full(size, -1),
-        demand=no_demand(first, round(1.0 / step_h)),
+        # Runs begin on a day of their own, which ``loop.simulate`` knows.
+        demand=no_demand(np.zeros(size, dtype=np.int64), round(1.0 / step_h)),
     )
 
 
