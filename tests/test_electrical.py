@@ -98,7 +98,7 @@ def test_bad_limits_are_named(override: str, named: str) -> None:
         load_config("corrected", [override])
 
 
-# --- tariff -------------------------------------------------------------------------------------
+# Tariff
 
 
 def prices(values: dict[str, Any]) -> F64:
@@ -188,7 +188,7 @@ def test_bad_tariffs_are_named(override: str, named: str) -> None:
         load_config("corrected", [override])
 
 
-# --- losses -------------------------------------------------------------------------------------
+# Losses
 
 
 @pytest.mark.parametrize(

@@ -57,8 +57,9 @@ class TariffPeriod(Section):
 class TariffConfig(Section):
     """Prices of electricity in any one currency, local standard time.
 
-    The default is about what commercial customers in the USA pay: 0.127 $/kWh in 2024, all charges
-    included (EIA, Electric Power Monthly, table 5.3).
+    The default prices of a kWh have a mean of 0.125, beside the 0.127 $/kWh that commercial
+    customers in the USA paid in 2024 with all charges included (EIA, Electric Power Monthly, table
+    5.3); the default demand charge comes on top.
     """
 
     price_per_kwh: Price | tuple[Price, ...] = (
