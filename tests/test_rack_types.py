@@ -68,13 +68,14 @@ def test_a_plan_places_types(mixed: Path, tmp_path: Path) -> None:
 
 
 def test_racks_of_8_and_30_kw_warm_their_air_alike(mixed: Path) -> None:
-    rise_k = rises_k(load_config(mixed))
+    alike = "hall.recirculation.calibrate=rack"
+    rise_k = rises_k(load_config(mixed, [alike]))
     assert np.ptp(rise_k) < 0.1
     assert rise_k.mean() == pytest.approx(12.65, abs=0.1)
     # One airflow per server, on which the racks of 8 kW warm their air by 13 K.
     equal = ["servers.fan_full_airflow_m3s=0.035", "hvac.crac.supply_m3s_per_w=6e-5"]
     with pytest.raises(ConfigError, match=r"racks 16, 17 warm the air by 4[78]\.\d K .* 40 K"):
-        build_fleet(load_config(mixed, equal))
+        build_fleet(load_config(mixed, [alike, *equal]))
 
 
 def test_gpu_servers_leave_the_air_of_other_racks_alone() -> None:
@@ -85,7 +86,8 @@ def test_gpu_servers_leave_the_air_of_other_racks_alone() -> None:
     plan = "[{rows: 0-1, type: cpu}, {rows: 2, racks: 0-2, type: cpu},"
     plan += " {rows: 2, racks: 3-4, type: gpu}, {rows: 3, type: cpu}]"
     changes = [f"hall.rack_types={types}", f"hall.rack_plan={plan}"]
-    config = load_config("corrected", [*SETTINGS, *changes])
+    alike = "hall.recirculation.calibrate=rack"
+    config = load_config("corrected", [*SETTINGS, *changes, alike])
     with pytest.warns(OddInputWarning, match="rack 13 has servers of 100 kW"):
         build_fleet(config)
     with warnings.catch_warnings():
@@ -105,7 +107,7 @@ def test_odd_airflow_is_told(mixed: Path) -> None:
         build_fleet(warm)
     # Approach temperatures of an open hall without order.
     stirred = load_config("corrected", ["hall.supply_approach_k=11", "hall.return_approach_k=-3"])
-    with pytest.warns(OddInputWarning, match=r"through rack 0 .* RTI 22\d %; up to 200 % is us"):
+    with pytest.warns(OddInputWarning, match=r"through rack \d+ .* RTI 22\d %; up to 200 % is us"):
         build_fleet(stirred)
 
 
