@@ -14,7 +14,7 @@ before (the functions named on the right do each line):
         what j gives to the mixes <- T_out,j, less with failing fans        store_exhaust
     for each CRAC unit k:                                                   run_crac_units
         need_k   <- sum_j s_jk (1 - r_j) V_j
-        V_k      <- clip(need_k / (1 - b_0), low V_k,design, high V_k,design)
+        V_k      <- clip(need_k / (1 - b_0), low V_k,full, high V_k,full)
         f_k      <- min(1, (1 - b_0) V_k / need_k)
         T_sup,k  <- setpoint, warmer for coils at their limit and return control  set_supply
     V_crac <- sum_k V_k

@@ -154,8 +154,8 @@ DC_DOUBLES = {
 }
 UNIT_INPUTS = {
     "setpoint_c": "supply setpoint; in steady air with what the room is warmed by, C",
-    "low": "lowest fan speed over design speed",
-    "high": "highest fan speed over design speed",
+    "low": "lowest fan speed over full speed",
+    "high": "highest fan speed over full speed",
     "design_m3s": "airflow at full speed, m3/s",
     "running": "1 for a unit that runs, 0 for one that coasts without cooling",
     "capacity_w": "most heat that the coil takes out, W",
@@ -165,9 +165,9 @@ UNIT_STATE = {
     "fresh_ratio": "share of the racks' need for its air that the unit covers, f of docs/hall.md",
     "fresh_ratio_used": "fresh_ratio that the last sweep computed the racks with",
     "flow_m3s": "airflow, in transient halls mean over the substeps so far, m3/s",
-    "cubed_speed": "cube of the fan speed over design speed, 0 where coasting, mean likewise",
+    "cubed_speed": "cube of the fan speed over full speed, 0 where coasting, mean likewise",
     "need_m3s": "supply air that the racks ask for, m3/s",
-    "following": "fan speed over design speed that would just cover the need",
+    "following": "fan speed over full speed that would just cover the need",
     "speed": "fan speed over full speed in the present sweep",
     "excess_k": "supply air over setpoint and warmth of the room in the next sweep, K",
     "mean_supply_c": "supply air, in transient halls mean over the substeps so far, C",

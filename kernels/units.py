@@ -50,7 +50,7 @@ def unit_need(hall: ti.template(), n, unit):
 def run_crac_units(hall: ti.template(), n, is_last):
     """Airflow of the CRAC units for what their racks need, and what share of the need it covers.
 
-    Each unit: V_k = clip(need_k / (1 - b_0), low V_k,design, high V_k,design) and
+    Each unit: V_k = clip(need_k / (1 - b_0), low V_k,full, high V_k,full) and
     f_k = min(1, (1 - b_0) V_k / need_k). ``is_last``: no sweep follows, so the state of the units
     is that at the end of the step.
     """

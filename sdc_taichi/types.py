@@ -129,7 +129,7 @@ class State:
     cooling_last: F64
     """Last cooling command of each CRAC unit, in steps, nan before the first, (U,)."""
     fan_speed: F64
-    """Controlled speed of each CRAC fan over design speed, 0..1, (U,)."""
+    """Controlled speed of each CRAC fan over full speed, 0..1, (U,)."""
     queue: F64
     """Tasks in the queue by the step that put them in, oldest first, accumulated, (B, L) with L
     the steps that a queue tells apart; read-only."""
@@ -157,7 +157,7 @@ class State:
     need_m3s: F64
     """Supply air that the racks ask of each CRAC unit, in m3/s, (U,); for transient halls."""
     following: F64
-    """Fan speed of each CRAC unit over design speed that would just cover the need, (U,); for
+    """Fan speed of each CRAC unit over full speed that would just cover the need, (U,); for
     transient halls."""
     supply_excess_k: F64
     """Supply air of each CRAC unit over its setpoint and what the room is warmed by, in K, (U,);

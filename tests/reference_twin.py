@@ -525,7 +525,7 @@ class Flows:
     unit: F64
     """Through each CRAC unit, (U,)."""
     speed: F64
-    """Of its fan over design speed, (U,)."""
+    """Of its fan over full speed, (U,)."""
     need: F64
     """Supply air that the racks ask of each unit, (U,)."""
     fresh_ratio: F64
@@ -561,7 +561,7 @@ def flows(
 
 
 def wanted_speed(hall: HallTwin, need: F64) -> F64:
-    """Fan speed of each unit over design speed that would just cover its racks' need, (U,)."""
+    """Fan speed of each unit over full speed that would just cover its racks' need, (U,)."""
     design = hall.fresh_share * hall.unit_design_m3s
     return np.where(design > 0, need / np.where(design > 0, design, 1.0), 0.0)
 
@@ -691,7 +691,7 @@ class Memory:
     need_m3s: F64
     """Supply air that the racks ask of each unit, (U,)."""
     following: F64
-    """Fan speed of each unit that would just cover that need, over design speed, (U,)."""
+    """Fan speed of each unit that would just cover that need, over full speed, (U,)."""
     room_j: float
     excess_k: F64
     """Supply air of each unit over its setpoint and the warmth of the room, (U,)."""

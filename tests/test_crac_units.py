@@ -61,7 +61,7 @@ def test_spare_units_run_at_part_speed_and_take_over_for_one_that_is_lost() -> N
     assert fleet.unit_design_m3s.sum() - largest == pytest.approx(fleet.design_flow_m3s[0])
     before = whole[-1].unit_flow_m3s / fleet.unit_design_m3s
     after = lost[-1].unit_flow_m3s / fleet.unit_design_m3s
-    np.testing.assert_allclose(before, before[0], rtol=1e-4)
+    np.testing.assert_allclose(before, before[0], rtol=2e-3)
     np.testing.assert_allclose(after[1:], after[1], rtol=0.01)
     assert after[0] == pytest.approx(0.1)
     # The others give what is missing: of every rack's air, none falls short.
@@ -106,7 +106,7 @@ def test_unlike_units_give_air_by_their_size() -> None:
     assert flow.sum() == pytest.approx(sized[0].crac_flow_m3s[0], rel=1e-6)
 
 
-@pytest.mark.parametrize("spare_units", [0, 1, 3])
+@pytest.mark.parametrize("spare_units", [0, 1, 2])
 def test_spare_units_leave_the_design_point_as_it_is(spare_units: int) -> None:
     plain = solve_design_hall(load_config("corrected", [FOUR]))
     spare = solve_design_hall(
@@ -117,6 +117,22 @@ def test_spare_units_leave_the_design_point_as_it_is(spare_units: int) -> None:
     assert spare.air is not None
     assert plain.air is not None
     assert spare.air.return_c == pytest.approx(plain.air.return_c)
+
+
+@pytest.mark.parametrize("flow_model", ["follow_servers", "constant", "controlled"])
+def test_units_that_are_far_too_large_run_at_their_lowest_speed(flow_model: str) -> None:
+    overrides = [FOUR, "hvac.crac.spare_units=3", f"hvac.crac.flow_model={flow_model}"]
+    config = load_config("corrected", [*overrides, "hvac.setpoint.initial_c=23"])
+    shown = solve_design_hall(config)
+    drivers = drivers_from_arrays(*(np.full((1, 1), x) for x in (20.0, 14.0, 300.0, 1.0)))
+    with Simulator(config, drivers=drivers, precision="f64") as sim:
+        sim.reset()
+        found = sim.step()
+        sim.load_state_dict(sim.state_dict())
+    # A quarter of full speed would do.
+    np.testing.assert_allclose(found.unit_flow_m3s, 0.3 * shown.unit_m3s, rtol=1e-9)
+    assert shown.design_flow_m3s == pytest.approx(found.crac_flow_m3s[0])
+    np.testing.assert_allclose(found.rack_inlet_c, shown.inlet_c, rtol=0, atol=1e-6)
 
 
 def test_shares_come_back_with_the_unit() -> None:
@@ -167,12 +183,12 @@ def test_parts_of_an_inlet_add_up_while_a_unit_is_down() -> None:
 HEAT_UNITS = {
     "down": [N_PLUS_1, LOST],
     "one coil small": ["hvac.crac.capacity_kw=[60, 200, 200, 200]"],
-    "three coils at their limit": ["hvac.crac.capacity_kw=[60, 120, 200, 250]"],
+    "three coils at their limit": ["hvac.crac.capacity_kw=[80, 140, 200, 300]"],
     "coils too small": ["hvac.crac.capacity_kw=100"],
     "return air": [
         "hvac.crac.temperature_control=return",
         "hvac.setpoint={min_c: 28, max_c: 38, initial_c: 33}",
-        "hall.design_supply_c=18",
+        "hall.design_supply_c=18.5",
     ],
 }
 THERMAL = {"quasi_steady": (), "transient": MINUTES}
@@ -202,7 +218,7 @@ def coil_w(fleet: Fleet, result: StepResult) -> np.ndarray:
 
 
 def test_a_coil_takes_no_more_than_its_capacity_and_the_others_take_the_rest() -> None:
-    limit_w = np.array([60e3, 120e3, 200e3, 250e3])
+    limit_w = np.array([80e3, 140e3, 200e3, 300e3])
     fleet, results = run_at_full_load(FOUR, *HEAT_UNITS["three coils at their limit"])
     taken_w = coil_w(fleet, results[0])
     np.testing.assert_allclose(taken_w[:3], limit_w[:3], rtol=1e-9)
@@ -312,7 +328,7 @@ def test_fans_follow_the_hottest_inlet_between_their_limits(
 
 
 def test_fans_that_follow_inlets_settle_where_steady_air_is() -> None:
-    model = ["hvac.crac.flow_model=hottest_inlet", "hvac.crac.inlet_target_c=29"]
+    model = ["hvac.crac.flow_model=hottest_inlet", "hvac.crac.inlet_target_c=31"]
     _, steady = run_at_full_load(FOUR, *model)
     for substep_s in (5, 30):
         overrides = [FOUR, *model, *MINUTES, f"simulation.substep_s={substep_s}"]

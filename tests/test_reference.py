@@ -745,6 +745,7 @@ def even_hall(given: dict[str, Any]) -> DataCenterConfig:
         "hall.recirculation.decay_m": given.get("lambda_m", 3.0),
         "hall.layout.rack_height_m": given.get("H_rack", 2.1),
         "hall.air_density_kg_m3": 1.225,
+        "hall.recirculation.calibrate": "rack",
         "hvac.crac.supply_m3s_per_w": given.get("V_crac_per_W", 5.663e-5),
     }
     return load_config(

@@ -148,7 +148,7 @@ class CracConfig(Section):
     min_flow_ratio: WorkingShare = 0.3
     """Lowest airflow of a running unit over its airflow at full speed, 0.01..1."""
     fan_step: Annotated[float, Field(ge=0.001, le=1)] = 0.05
-    """Change of fan speed over design speed by one action, for flow model ``controlled``, 0.001..1:
+    """Change of fan speed over full speed by one action, for flow model ``controlled``, 0.001..1:
     from less than any drive resolves to the whole range."""
     coasting_flow_ratio: WorkingShare = 0.1
     """Airflow through a unit that is down over its airflow at full speed, 0.01..1: as much leaks

@@ -73,7 +73,7 @@ class EnvOptions(BaseModel):
     setpoint_change_k: Annotated[float, Field(gt=0, le=20)] = 2.0
     """Change of the setpoint in one step by a continuous action of 1, the largest, in K."""
     fan_change: Annotated[float, Field(ge=0.001, le=1)] = 0.2
-    """Change of the CRAC fan speed over design speed in one step by a continuous action of 1, the
+    """Change of the CRAC fan speed over full speed in one step by a continuous action of 1, the
     largest, 0.001..1; fans hold no smaller steps, and the whole range is 1."""
     days: Annotated[int, Field(strict=True, ge=1, le=365), PLAIN_INT] = 7
     """Length of an episode, in days."""

@@ -33,11 +33,11 @@ class Supply:
     cooling_last: F64
     """Cooling command of each unit, in steps, (U,)."""
     fan_speed: F64
-    """Controlled speed of each fan over design speed, (U,)."""
+    """Controlled speed of each fan over full speed, (U,)."""
     unit_low: F64
-    """Lowest speed of each fan over design speed in this step, (U,)."""
+    """Lowest speed of each fan over full speed in this step, (U,)."""
     unit_high: F64
-    """Highest speed of each fan over design speed in this step, (U,)."""
+    """Highest speed of each fan over full speed in this step, (U,)."""
     plant_setpoint_c: F64
     """Coldest supply air, which the chilled water follows, in C, (B,)."""
     coil_limit_w: F64

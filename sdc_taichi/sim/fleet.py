@@ -130,10 +130,15 @@ class Fleet:
 
     @property
     def design_speed(self) -> F64:
-        """Speed of the CRAC fans at the design point over full speed, at most 1, (B,)."""
+        """Speed of the CRAC fans at the design point over full speed, (B,).
+
+        At most 1, and at least the lowest speed of the fans: units that are far too large give more
+        than the design airflow.
+        """
         speed = self.design_flow_m3s / self.unit_sums(self.unit_design_m3s)
         # Units that are just large enough run at full speed, whatever the last bits of sums.
-        return np.where(speed > 1.0 - 1e-9, 1.0, speed)
+        speed = np.where(speed > 1.0 - 1e-9, 1.0, speed)
+        return np.maximum(speed, self.values("hvac.crac.min_flow_ratio"))
 
     @property
     def size(self) -> int:

@@ -67,9 +67,9 @@ class Conditions:
     rack_airflow: F64 | None = None
     """Share of their airflow left to the fans of each rack, 0..1, (R,); None is all of it."""
     unit_low: F64 | None = None
-    """Lowest fan speed of each CRAC unit over design speed, (U,); None is design speed."""
+    """Lowest fan speed of each CRAC unit over full speed, (U,); None is full speed."""
     unit_high: F64 | None = None
-    """Highest fan speed of each CRAC unit over design speed, (U,); None is design speed."""
+    """Highest fan speed of each CRAC unit over full speed, (U,); None is full speed."""
     unit_running: F64 | None = None
     """1 for CRAC units that run, 0 for those whose fan coasts without cooling, (U,); None runs
     all."""
@@ -120,7 +120,7 @@ class HallSums:
     unit_flow_m3s: F64
     """Airflow of each CRAC unit, in m3/s, (U,)."""
     unit_cubed_speed: F64
-    """Mean cube of the fan speed of each CRAC unit over design speed, 0 for units that are down,
+    """Mean cube of the fan speed of each CRAC unit over full speed, 0 for units that are down,
     (U,)."""
     room_j: F64
     """Heat held by the room at the end of the step, over the setpoint, in J, (B,)."""

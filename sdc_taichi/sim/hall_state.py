@@ -23,6 +23,6 @@ class HallState:
     need_m3s: F64
     """Supply air that the racks ask of each CRAC unit, in m3/s, (U,)."""
     following: F64
-    """Fan speed of each CRAC unit over design speed that would just cover the need, (U,)."""
+    """Fan speed of each CRAC unit over full speed that would just cover the need, (U,)."""
     supply_excess_k: F64
     """Supply air of each CRAC unit over its setpoint and what the room is warmed by, in K, (U,)."""
