@@ -20,6 +20,7 @@ from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.run.description import RunRequest
 from sdc_taichi.run.folder_reader import RunFolder, read_run, read_steps
 from sdc_taichi.run.folder_writer import simulate_to_folder
+from sdc_taichi.run.hottest_air import AirAtStep
 from sdc_taichi.run.inlets_of_run import hottest_inlets, inlets_at_step
 from sdc_taichi.run.steps_file import METADATA_KEY
 from sdc_taichi.sim.design_hall import solve_design_hall
@@ -27,6 +28,7 @@ from sdc_taichi.sim.fleet_configs import make_configs
 from sdc_taichi.sim.inlet_parts import InletParts, Inlets, inlet_terms, rack_text
 from sdc_taichi.sim.intake_air import intake_air_of
 from sdc_taichi.viz.recorder import Recorder
+from sdc_taichi.viz.recording_summary import hottest_markdown
 from sdc_taichi.viz.report_inlets import hot_racks_section
 
 FAILURES = (
@@ -109,7 +111,7 @@ def test_containment_keeps_out_what_the_open_hall_lets_in() -> None:
 def test_the_nearest_racks_warm_an_inlet_most() -> None:
     hall = solve_design_hall(load_config("corrected"))
     parts = hall.inlets.parts(0)
-    assert [rack for rack, _ in parts.sources(2)] == [1, 2]
+    assert [rack for rack, _ in parts.sources(2)] == [1, 5]
     assert len(parts.sources()) == 5
     words = [text for text, _ in inlet_terms(parts, 5)]
     assert words[0] == "setpoint of its supply air"
@@ -194,6 +196,20 @@ def test_recording_explains_the_five_hottest_racks(tmp_path: Path) -> None:
     for rack in inlets.hottest(5):
         assert f"## {rack_text(rack, 5)}: {inlets.parts(rack).inlet_c:.2f} C" in text
     assert text.count("its own exhaust") == 5
+
+
+def test_given_inlets_are_explained_by_their_approach_temperatures(tmp_path: Path) -> None:
+    with Simulator(load_config("tiny")) as sim:
+        controller = make_controller("idle", sim.fleet)
+        simulate_to_folder(sim, controller, RunRequest("idle", 2, 1), tmp_path / "run")
+        air = AirAtStep(1, intake_air_of(sim.fleet, sim.intake_air(), 0))
+        document = hottest_markdown(sim.fleet, 0, air, "2021-01-01T00:15")
+    report = hot_racks_section(read_run(tmp_path / "run"), [0])
+    assert "approach temperature (K)" in report
+    assert "exhaust of other racks" not in report
+    assert "+5.40 K | approach temperature of the config" in document
+    for text in (report, document):
+        assert "is exhaust air" not in text
 
 
 def test_command_explains_a_run(run: RunFolder) -> None:

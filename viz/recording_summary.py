@@ -100,12 +100,11 @@ def hottest_markdown(fleet: Fleet, dc: int, found: AirAtStep, clock: str) -> str
             f"| {setpoint_c:.2f} C | {first} |",
             *(f"| {k:+.2f} K | {text} |" for text, k in others),
             "",
-            f"{100 * parts.exhaust_share:.1f} % of its intake is exhaust air: "
-            + ", ".join(f"{k:+.2f} K {text}" for text, k in exhaust_terms(parts))
-            + ".",
-            "",
-            *(f"- {text}" for text in state_texts(parts)),
         ]
+        why = ", ".join(f"{k:+.2f} K {text}" for text, k in exhaust_terms(parts))
+        if why:
+            lines += [f"{100 * parts.exhaust_share:.1f} % of its intake is exhaust air: {why}.", ""]
+        lines += [f"- {text}" for text in state_texts(parts)]
     return "\n".join(lines)
 
 

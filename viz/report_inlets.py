@@ -26,7 +26,11 @@ HEADS = (
     "CRAC air that falls short (K)",
     "most from (K)",
 )
-"""Heads of the table. The inlet is the sum of the four numbers that follow it."""
+"""Heads of the table of a hall with recirculation. The inlet is the sum of the four numbers that
+follow it."""
+APPROACH_HEADS = (*HEADS[:4], "approach temperature (K)")
+"""Heads of the table of a hall whose inlets are given. The inlet is the sum of the three numbers
+that follow it."""
 
 
 def hot_racks_section(run: RunFolder, dcs: Sequence[int]) -> str:
@@ -40,8 +44,9 @@ def hot_racks_section(run: RunFolder, dcs: Sequence[int]) -> str:
         SdcError: steps.parquet is damaged.
     """
     out = [
-        "<p>Each inlet is the sum of setpoint, supply air over its setpoint and exhausts. Height "
-        "and missing CRAC air are why a part of the exhausts reaches it.</p>\n"
+        "<p>Each inlet is the sum of setpoint, supply air over its setpoint, and exhausts or the "
+        "approach temperature of the config. Height and missing CRAC air are why a part of the "
+        "exhausts reaches it.</p>\n"
     ]
     for dc in dcs:
         name = run.names[dc]
@@ -65,35 +70,35 @@ def _data_center(run: RunFolder, dc: int, found: InletsAtStep) -> str:
     per_row = found.config.hall.racks_per_row
     all_parts = [found.inlets.parts(rack) for rack in found.inlets.hottest(HOTTEST_RACKS)]
     when = time_text(run, local_time(run, dc, found.step))
-    rows = [_row(parts, per_row) for parts in all_parts]
-    heads = [Cell(text, 0 < i < len(HEADS) - 1) for i, text in enumerate(HEADS)]
+    recirculates = found.config.hall.inlet_model == "recirculation"
+    rows = [_row(parts, per_row, recirculates=recirculates) for parts in all_parts]
+    heads = [
+        Cell(text, text not in (HEADS[0], HEADS[-1]))
+        for text in (HEADS if recirculates else APPROACH_HEADS)
+    ]
     caption = (
         f"Hottest racks of {run.names[dc]} at the end of the step of its hottest inlet, "
         f"{found.hottest_c:.2f} °C on {when}"
     )
-    lines = [
-        f"Of the intake of the hottest, {100 * all_parts[0].exhaust_share:.1f} % is exhaust air.",
-        *(f"{text[0].upper()}{text[1:]}." for text in state_texts(all_parts[0])),
-    ]
+    lines = [f"{text[0].upper()}{text[1:]}." for text in state_texts(all_parts[0])]
+    if recirculates:
+        share = f"{100 * all_parts[0].exhaust_share:.1f} %"
+        lines.insert(0, f"Of the intake of the hottest, {share} is exhaust air.")
     items = "".join(f"<li>{escape(line)}</li>\n" for line in lines)
     return html_table(caption, heads, rows) + f"<ul>{items}</ul>\n"
 
 
-def _row(parts: InletParts, racks_per_row: int) -> list[Cell]:
+def _row(parts: InletParts, racks_per_row: int, *, recirculates: bool) -> list[Cell]:
     """Cells of one rack."""
-    others_k = float(parts.exhaust_k.sum()) - parts.own_exhaust_k + parts.lag_k + parts.approach_k
-    numbers = (
-        parts.inlet_c,
-        parts.setpoint_c,
-        parts.warming_k,
-        others_k,
-        parts.own_exhaust_k,
-        parts.height_k,
-        parts.shortfall_k,
-    )
-    sources = ", ".join(f"rack {rack} {k:.2f}" for rack, k in parts.sources(NAMED_SOURCES))
-    return [
-        Cell(rack_text(parts.rack, racks_per_row)),
-        *(Cell(f"{number:z.2f}", True) for number in numbers),
-        Cell(sources or "–"),
-    ]
+    numbers = [parts.inlet_c, parts.setpoint_c, parts.warming_k]
+    if recirculates:
+        others_k = float(parts.exhaust_k.sum()) - parts.own_exhaust_k + parts.lag_k
+        numbers += [others_k, parts.own_exhaust_k, parts.height_k, parts.shortfall_k]
+    else:
+        numbers.append(parts.approach_k)
+    cells = [Cell(rack_text(parts.rack, racks_per_row))]
+    cells += [Cell(f"{number:z.2f}", True) for number in numbers]
+    if recirculates:
+        sources = ", ".join(f"rack {rack} {k:.2f}" for rack, k in parts.sources(NAMED_SOURCES))
+        cells.append(Cell(sources or "–"))
+    return cells

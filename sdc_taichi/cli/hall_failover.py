@@ -104,8 +104,8 @@ def _print_study(study: Failover) -> None:
     if study.note:
         typer.echo(study.note)
     typer.echo(
-        f"Hottest inlet of the hall; minutes to the end of the step of a minute, - for not within "
-        f"{MINUTES} min; racks off at the end."
+        "C is the hottest inlet of the hall; times count to the end of a whole minute, - is not "
+        f"within {MINUTES} min; racks off are those after {MINUTES} min."
     )
 
 

@@ -299,7 +299,7 @@ def state_texts(parts: InletParts) -> list[str]:
     units = np.argsort(-parts.unit_share, kind="stable")[:LISTED_UNITS]
     texts += [
         f"CRAC unit {i} gives {100 * parts.unit_share[i]:.1f} % of its supply air, at "
-        f"{parts.unit_supply_c[i]:.2f} C; of {parts.unit_m3s[i]:.4g} m3/s it covers "
+        f"{parts.unit_supply_c[i]:.2f} C; its {parts.unit_m3s[i]:.4g} m3/s cover "
         f"{100 * parts.unit_fresh_ratio[i]:.1f} % of what its racks ask for"
         for i in units
         if parts.exhaust_share > 0 and parts.unit_share[i] >= LEAST_SHARE
