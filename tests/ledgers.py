@@ -67,6 +67,13 @@ Ledger = Callable[[Run], list[F64]]
 """The terms of a balance with their signs, each (T, B); they add up to zero."""
 
 
+def pump_heat_w(run: Run) -> F64:
+    """Heat of the chilled-water pumps that economiser and chiller take, (T, B); where they take
+    less than that, nothing is left for the hall."""
+    heat_w = run.fleet_values("hvac.pumps.heat_to_water_share") * run["chilled_pump_w"]
+    return np.asarray(np.minimum(heat_w, run["economiser_w"] + run["chiller_load_w"]))
+
+
 def concentrating_l(run: Run) -> F64:
     """Water that has to leave for the concentration to hold, drift included, (T, B)."""
     cycles = run.fleet_values("hvac.water.cycles_of_concentration")
@@ -94,8 +101,18 @@ LEDGERS: dict[str, Ledger] = {
         r["it_w"],
         -r.air_j_per_m3_k * r["crac_flow_m3s"] * (r["return_c"] - r["supply_c"]),
     ],
-    "cooling": lambda r: [r["heat_removed_w"], -r["economiser_w"], -r["chiller_load_w"]],
-    "rejected heat": lambda r: [r["rejected_w"], -r["heat_removed_w"], -r["chiller_w"]],
+    "cooling": lambda r: [
+        r["heat_removed_w"],
+        pump_heat_w(r),
+        -r["economiser_w"],
+        -r["chiller_load_w"],
+    ],
+    "rejected heat": lambda r: [
+        r["rejected_w"],
+        -r["heat_removed_w"],
+        -pump_heat_w(r),
+        -r["chiller_w"],
+    ],
     "work": lambda r: [
         r["arrived_tasks"],
         -r["executed_tasks"],

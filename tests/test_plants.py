@@ -11,6 +11,7 @@ from sdc_taichi.config import apply_overrides
 from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.water_side import WaterSideDesign
+from sdc_taichi.types import F64
 from test_ledgers import assert_closes, record, sites_and_seasons
 
 WATER_COOLED = ["centrifugal_vsd", "carnot", "eir_york", "electric_water_cooled", "constant_cop"]
@@ -67,7 +68,8 @@ def test_chiller_with_a_large_margin_is_sized_by_the_design_wet_bulb_alone() -> 
     with Simulator(load_config("corrected", overrides), drivers=drivers) as sim:
         design = sim.sizing.water_side
     # As EnergyPlus was given it: 761.7 kW of cooling, 684.4 kW at the reference point.
-    assert design.chiller_w / design.cooling_w == pytest.approx(684.437 / 761.725, rel=1e-3)
+    taken_w = design.cooling_w + design.pump_heat_share * design.chilled_pump_w
+    assert design.chiller_w / taken_w == pytest.approx(684.437 / 761.725, rel=1e-3)
 
 
 @pytest.mark.parametrize(("model", "warmest_c"), [("eir_york", 8.89), ("centrifugal_vsd", 20.0)])
@@ -106,6 +108,40 @@ def steady(
         return sim.step(), sim.sizing.water_side
 
 
+def pump_heat_w(result: StepResult) -> F64:
+    """Heat that the chilled-water pumps give the water, W, (B,)."""
+    return 0.9 * result.chilled_pump_w
+
+
+@pytest.mark.parametrize("plant", ["water_cooled", *DRY])
+def test_plants_take_the_heat_of_the_chilled_water_pumps(plant: str) -> None:
+    chosen = [*DRY.get(plant, []), "hvac.pumps.min_flow_ratio=1"]
+    hot, cold = [30.0, 2.0], [22.0, 0.0]
+    warmed, design = steady(chosen, hot, cold)
+    pinned, smaller = steady([*chosen, "hvac.pumps.heat_to_water_share=0"], hot, cold)
+    taken_w, removed_w = (
+        of.economiser_w + of.chiller_load_w - of.heat_removed_w for of in (warmed, pinned)
+    )
+    np.testing.assert_allclose(taken_w, pump_heat_w(warmed), rtol=1e-9)
+    np.testing.assert_allclose(removed_w, 0.0, atol=1e-6)
+    np.testing.assert_array_equal(warmed.heat_removed_w, pinned.heat_removed_w)
+    # In the heat, 300 kPa at 6 K and an efficiency of 0.75 are 1.4 % of the design load.
+    assert warmed.chiller_load_w[0] / pinned.chiller_load_w[0] == pytest.approx(1.017, abs=0.003)
+    assert warmed.chiller_w[0] > pinned.chiller_w[0]
+    more = design.chiller_w / smaller.chiller_w - 1.0
+    np.testing.assert_allclose(more, 0.9 * design.chilled_pump_w / design.cooling_w, rtol=1e-9)
+    assert np.all(design.rejected_w / smaller.rejected_w - 1.0 > 0.9 * more)
+
+
+@pytest.mark.parametrize("plant", ["water_cooled", *DRY])
+def test_pumps_without_cooling_do_not_heat_the_hall(plant: str) -> None:
+    lost = "events.scheduled=[{kind: %s, start_h: 0, duration_h: 1, share: 0}]"
+    for kind in ("chiller_derate", "pump_down"):
+        result, _ = steady([*DRY.get(plant, []), lost % kind], [38.0], [22.0])
+        assert result.heat_removed_w == result.chiller_load_w == 0
+        assert (result.chilled_pump_w == 0) == (kind == "pump_down")
+
+
 def test_air_cooled_chiller_in_a_desert_july_sees_the_air_and_uses_no_water() -> None:
     result, design = steady(DRY["air_cooled"], [24.0, 32.0, 40.0], [19.0, 21.0, 23.0])
     cop = result.chiller_load_w / result.chiller_w
@@ -122,17 +158,19 @@ def test_dry_cooler_does_in_frost_what_the_chiller_does_in_summer() -> None:
     # At 18 C of supply air: chilled water of 10 C that returns at 16 C and a little more at less
     # than the sized load, and an approach of 8 K.
     result, design = steady(DRY["air_cooled"], [-20.0, 2.0, 9.0, 16.0], [-21.0, 0.0, 5.0, 10.0])
-    share = result.economiser_w / result.heat_removed_w
-    np.testing.assert_allclose(share, [1.0, 1.0, 0.5, 0.0], atol=0.02)
+    taken_w = result.heat_removed_w + pump_heat_w(result)
+    share = result.economiser_w / taken_w
+    np.testing.assert_allclose(share, [1.0, 1.0, 0.5, 0.0], atol=0.025)
     assert share[0] == share[1] == 1
     np.testing.assert_allclose(result.chiller_w[:2], 0.0)
-    full_w = design.tower_fan_w * (result.heat_removed_w / design.cooling_w) ** 4
+    cooler_w = design.cooling_w + design.pump_heat_share * design.chilled_pump_w
+    full_w = design.tower_fan_w * (taken_w / cooler_w) ** 4
     assert result.tower_fan_w[2] == pytest.approx(full_w[2], rel=1e-9)
     assert 0.9 * full_w[1] < result.tower_fan_w[1] < full_w[1]
     assert 0 < result.tower_fan_w[0] < 0.1 * result.tower_fan_w[1]
     without, _ = steady([*DRY["air_cooled"], "hvac.dry_cooler.free_cooling=false"], [2.0], [0.0])
     assert without.economiser_w == without.tower_fan_w == without.condenser_pump_w == 0
-    assert without.chiller_load_w == without.heat_removed_w
+    assert without.chiller_load_w == without.heat_removed_w + pump_heat_w(without)
 
 
 def test_dry_cooler_makes_no_water_colder_than_the_air() -> None:
@@ -146,9 +184,9 @@ def test_dry_cooler_makes_no_water_colder_than_the_air() -> None:
     load_share = np.clip(result.heat_removed_w / design.cooling_w, 0.1, 1.0)
     range_k = 12.0 * load_share**-0.25
     assert np.all(range_k > 13.0)
-    water_c = result.chilled_water_c + range_k * (1.0 - result.economiser_w / result.heat_removed_w)
-    assert np.all(water_c >= result.outdoor_c - 1e-9)
-    assert result.economiser_w[0] == result.heat_removed_w[0]
+    left_k = range_k * result.chiller_load_w / result.heat_removed_w
+    assert np.all(result.chilled_water_c + left_k >= result.outdoor_c - 1e-9)
+    assert result.chiller_load_w[0] == 0
 
 
 def test_openings_that_are_left_have_a_share_of_the_fans() -> None:
@@ -195,7 +233,7 @@ def test_outdoor_air_that_is_too_dry_is_wetted_or_left_outside() -> None:
     assert wetted.water_l == pytest.approx(1.25 * wetted.evaporation_l)
     left, _ = steady([*DRY["air_side"], "hvac.outdoor_air.humidifier=false"], *frost)
     assert left.economiser_w == left.water_l == 0
-    assert left.chiller_load_w == left.heat_removed_w
+    assert left.chiller_load_w == left.heat_removed_w + pump_heat_w(left)
 
 
 @pytest.mark.parametrize(

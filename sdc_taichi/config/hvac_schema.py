@@ -313,6 +313,10 @@ class PumpConfig(Section):
     times what flanges of class PN 10 hold."""
     efficiency: WorkingShare = 0.75
     """Hydraulic power over electric power of a pump, 0.01..1."""
+    heat_to_water_share: Share = 0.9
+    """Share of the power of the chilled-water pumps that warms the chilled water, 0..1: the
+    efficiency of motor and drive, whose losses stay with the air beside them; 1 is a motor that
+    stands in the water."""
     min_flow_ratio: WorkingShare = 0.6
     """Lowest flow of a running pump over its design flow, 0.01..1."""
     released_chilled_w: DeviceW = 0.0

@@ -12,14 +12,14 @@ import numpy as np
 
 from sdc_taichi.plant import moist_air
 from sdc_taichi.plant.chiller import ChillerResult
-from sdc_taichi.plant.fans_pumps import pump_w
 from sdc_taichi.plant.tower import TowerResult
 from sdc_taichi.plant.water_side import (
     LEAST_OUTDOOR_UNITS,
     WaterSideDesign,
     WaterSideResult,
     chilled_water_c,
-    coil_range_ratio,
+    chilled_water_load_w,
+    loop_pump_w,
 )
 from sdc_taichi.types import F64, Values, as_array
 
@@ -72,27 +72,26 @@ def air_cooled(
     """
     load_w = np.minimum(requested_w, design.pumped_w) if limited else requested_w
     chilled_c = chilled_water_c(setpoint_c, design)
-    range_ratio = coil_range_ratio(load_w, design)
+    taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(load_w, design)
     range_k = design.chilled_water_range_k * range_ratio
     over_k = np.maximum(chilled_c + range_k - outdoor_c, 0.0)
     full_range_k = design.chilled_water_range_k + design.dry_cooler_approach_k
-    full_speed_w = (
-        design.economiser * design.outdoor_units * design.cooling_w * over_k / full_range_k
-    )
+    cooler_w = design.cooling_w + design.pump_heat_share * design.chilled_pump_w
+    full_speed_w = design.economiser * design.outdoor_units * cooler_w * over_k / full_range_k
     share = np.minimum(over_k / np.maximum(full_range_k, range_k), 1.0)
-    free_w = np.minimum(load_w * share, full_speed_w)
+    free_w = np.minimum(taken_w * share, full_speed_w)
     speed_share = free_w / np.maximum(full_speed_w, 1.0)
-    machine = _air_cooled_chiller(load_w - free_w, chilled_c, outdoor_c, design, chiller)
-    removed_w = load_w - machine.unmet_w if limited else load_w
+    machine = _air_cooled_chiller(taken_w - free_w, chilled_c, outdoor_c, design, chiller)
     return _dry(
-        removed_w,
+        np.maximum(load_w - machine.unmet_w, 0.0) if limited else load_w,
         free_w=free_w,
+        chiller_load_w=machine.evaporator_w if limited else taken_w - free_w,
         machine=machine,
         chilled_c=chilled_c,
         outdoor_c=outdoor_c,
         fan_w=design.tower_fan_w * design.outdoor_units * speed_share**4,
-        chilled_pump_w=_pump_w(removed_w / range_ratio, design.chilled_pump_w, design),
-        condenser_pump_w=_pump_w(free_w, design.condenser_pump_w, design),
+        chilled_pump_w=chilled_pump_w,
+        condenser_pump_w=loop_pump_w(free_w, cooler_w, design.condenser_pump_w, design),
     )
 
 
@@ -157,22 +156,20 @@ def air_side(
     free_w = np.where(let_in, np.minimum(np.maximum(load_w, 0.0), reachable_w), 0.0)
     outdoor_m3s = free_w / np.maximum(over_w_s_m3, design.air_j_per_m3_k * 1e-3)
     coil_w = load_w - free_w
-    chiller_load_w = np.minimum(coil_w, design.pumped_w) if limited else coil_w
-    machine = _air_cooled_chiller(chiller_load_w, chilled_c, outdoor_c, design, chiller)
-    removed_w = free_w + (chiller_load_w - machine.unmet_w if limited else coil_w)
+    if limited:
+        coil_w = np.minimum(coil_w, design.pumped_w)
+    taken_w, chilled_pump_w, _ = chilled_water_load_w(coil_w, design)
+    machine = _air_cooled_chiller(taken_w, chilled_c, outdoor_c, design, chiller)
     return _dry(
-        removed_w,
+        free_w + (np.maximum(coil_w - machine.unmet_w, 0.0) if limited else coil_w),
         free_w=free_w,
+        chiller_load_w=machine.evaporator_w if limited else taken_w,
         machine=machine,
         chilled_c=chilled_c,
         outdoor_c=outdoor_c,
         fan_w=design.tower_fan_w * units * (outdoor_m3s / (design.tower_air_m3s * units)) ** 3,
         humidifier_kg_s=lack * outdoor_m3s * design.air_j_per_m3_k / moist_air.DRY_AIR_J_PER_KG_K,
-        chilled_pump_w=_pump_w(
-            machine.evaporator_w / coil_range_ratio(machine.evaporator_w, design),
-            design.chilled_pump_w,
-            design,
-        ),
+        chilled_pump_w=chilled_pump_w,
         condenser_pump_w=0.0 * load_w,
     )
 
@@ -196,20 +193,11 @@ def _air_cooled_chiller(
     )
 
 
-def _pump_w(heat_w: F64, design_w: F64, design: WaterSideDesign) -> F64:
-    """Power of pumps whose flow follows the heat, W, (B,)."""
-    return pump_w(
-        heat_w,
-        design_flow=design.cooling_w,
-        design_w=design_w,
-        min_flow_ratio=design.pump_min_ratio,
-    )
-
-
 def _dry(
     removed_w: F64,
     *,
     free_w: F64,
+    chiller_load_w: F64,
     machine: ChillerResult,
     chilled_c: F64,
     outdoor_c: F64,
@@ -223,7 +211,7 @@ def _dry(
     return WaterSideResult(
         heat_removed_w=removed_w,
         economiser_w=free_w,
-        chiller_load_w=removed_w - free_w,
+        chiller_load_w=chiller_load_w,
         chiller_w=machine.power_w,
         rejected_w=free_w + machine.rejected_w,
         chilled_water_c=chilled_c,

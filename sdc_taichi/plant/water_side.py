@@ -47,6 +47,8 @@ class WaterSideDesign:
     (B,)."""
     pump_min_ratio: F64
     """Lowest flow of the pumps over design flow, (B,); 1 is constant flow."""
+    pump_heat_share: F64
+    """Share of the power of the chilled-water pumps that warms the chilled water, 0..1, (B,)."""
     coil_approach_k: F64
     """Coil approach: supply air temperature less that of the chilled water, in K, (B,)."""
     chilled_water_range_k: F64
@@ -91,7 +93,8 @@ class WaterSideResult:
     """One step of the plants of B data centers."""
 
     heat_removed_w: F64
-    """Heat taken from the room, in W, (B,)."""
+    """Heat taken from the room, in W, (B,): that of economiser and chiller less that of the
+    chilled-water pumps."""
     economiser_w: F64
     """Heat that economiser, dry cooler or outdoor air takes past the chiller, in W, (B,)."""
     chiller_load_w: F64
@@ -198,8 +201,9 @@ def water_cooled(
 
     Chilled water follows the air, T_chw = setpoint - coil approach, up to the warmest that the
     chiller makes, and returns as warm as the coils let it. The integrated economiser precools the
-    return water with tower water as cold as the weather allows; the chiller does the rest. Tower
-    and chiller depend on each other: the tower is solved for the chiller's power at the tower
+    return water with tower water as cold as the weather allows; the chiller does the rest. Both
+    take the heat of the chilled-water pumps as well, so the hall gets the capacity less that heat.
+    Tower and chiller depend on each other: the tower is solved for the chiller's power at the tower
     setpoint, then chiller and economiser at the water that the tower gives.
 
     Args:
@@ -224,7 +228,7 @@ def water_cooled(
 
     def run_chiller(economiser: F64, condenser_c: F64) -> ChillerResult:
         return chiller(
-            load_w * (1.0 - economiser),
+            taken_w * (1.0 - economiser),
             reference_w=design.chiller_w,
             chilled_water_c=chilled_c,
             condenser_c=condenser_c,
@@ -233,13 +237,14 @@ def water_cooled(
             min_lift_k=design.min_lift_k,
         )
 
-    range_ratio = coil_range_ratio(load_w, design)
+    # The exchanger stands in the return of the coils, ahead of the bypass of pumps and chiller.
+    taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(load_w, design)
     return_water_c = chilled_c + design.chilled_water_range_k * range_ratio
     coldest_c = wet_bulb_c + design.approach_min_k
     share = _economiser_share_at(coldest_c, chilled_c, return_water_c, design)
     tower_setpoint_c = _tower_setpoint_c(coldest_c, share, chilled_c, design)
     foreseen = run_chiller(share, np.maximum(tower_setpoint_c, design.min_condenser_c))
-    heat_w = load_w * share + foreseen.rejected_w
+    heat_w = taken_w * share + foreseen.rejected_w
     flow_ratio = np.maximum(heat_w / design.rejected_w, design.pump_min_ratio)
     tower_water_kg_s = design.tower_water_kg_s * flow_ratio
     units = np.maximum(design.outdoor_units, LEAST_OUTDOOR_UNITS)
@@ -260,14 +265,11 @@ def water_cooled(
     short = foreseen.unmet_w > 0.0
     warm_c = np.where(short, design.fullest_condenser_c, design.min_condenser_c)
     machine = run_chiller(share, np.maximum(cooled.leaving_c, warm_c))
-    economiser_w = load_w * share
-    heat_removed_w = load_w - machine.unmet_w if limited else load_w
-    # The exchanger stands in the return of the coils, ahead of the bypass of pumps and chiller.
-    chilled_pump_w, condenser_pump_w = _pumps_w(heat_removed_w / range_ratio, heat_w, design)
+    economiser_w = taken_w * share
     return WaterSideResult(
-        heat_removed_w=heat_removed_w,
+        heat_removed_w=np.maximum(load_w - machine.unmet_w, 0.0) if limited else load_w,
         economiser_w=economiser_w,
-        chiller_load_w=heat_removed_w - economiser_w,
+        chiller_load_w=machine.evaporator_w if limited else taken_w - economiser_w,
         chiller_w=machine.power_w,
         rejected_w=economiser_w + machine.rejected_w,
         chilled_water_c=chilled_c,
@@ -278,7 +280,7 @@ def water_cooled(
         tower_airflow_m3s=cooled.air_ratio * design.tower_air_m3s * units,
         tower_fan_w=cooled.fan_w,
         chilled_pump_w=chilled_pump_w,
-        condenser_pump_w=condenser_pump_w,
+        condenser_pump_w=loop_pump_w(heat_w, design.rejected_w, design.condenser_pump_w, design),
     )
 
 
@@ -305,21 +307,39 @@ def _tower_setpoint_c(
     return np.maximum(coldest_c, useful_c)
 
 
-def _pumps_w(chilled_w: F64, rejected_w: F64, design: WaterSideDesign) -> tuple[F64, F64]:
-    """Power of chilled- and condenser-water pumps, in W, (B,).
+def loop_pump_w(heat_w: F64, design_heat_w: F64, design_w: F64, design: WaterSideDesign) -> F64:
+    """Power of the pumps of a loop, W, (B,), whose flow follows the heat that it carries.
 
-    Flows are in proportion to the heat, in W, that they carry with their ranges at design.
+    Args:
+        heat_w: Heat that the loop would carry with its range at design, W, (B,); without any its
+            pumps stand still.
+        design_heat_w: Heat that it carries at design flow, W, (B,).
+        design_w: Power of the pumps at design flow, W, (B,).
+        design: Sized devices.
     """
-    chilled_pump_w = pump_w(
-        chilled_w,
-        design_flow=design.cooling_w,
-        design_w=design.chilled_pump_w,
+    return pump_w(
+        heat_w,
+        design_flow=design_heat_w,
+        design_w=design_w,
         min_flow_ratio=design.pump_min_ratio,
     )
-    condenser_pump_w = pump_w(
-        rejected_w,
-        design_flow=design.rejected_w,
-        design_w=design.condenser_pump_w,
-        min_flow_ratio=design.pump_min_ratio,
-    )
-    return chilled_pump_w, condenser_pump_w
+
+
+def chilled_water_load_w(load_w: F64, design: WaterSideDesign) -> tuple[F64, F64, F64]:
+    """What coils ask of the chilled water, and what its pumps add.
+
+    All that reaches the shaft of a pump ends as heat of the water, the losses of its motor do not
+    (EnergyPlus Engineering Reference, "Pumps").
+
+    Args:
+        load_w: Heat that the coils take, W, (B,).
+        design: Sized devices.
+
+    Returns:
+        Heat to take off the chilled water, W, (B,); power of its pumps, W, (B,); and the range of
+        the water at the coils over that at design, (B,).
+    """
+    range_ratio = coil_range_ratio(load_w, design)
+    flow_w = load_w / range_ratio
+    power_w = loop_pump_w(flow_w, design.cooling_w, design.chilled_pump_w, design)
+    return load_w + design.pump_heat_share * power_w, power_w, range_ratio

@@ -126,7 +126,10 @@ def design_day(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Siz
     # Spare units let all run at part speed.
     crac_at_design_w = crac_fan_w * fleet.design_speed**3
     cooling_w = (it_w + crac_at_design_w) * v("hvac.sizing.margin")
-    chiller_w, at_design, fullest_c = _design_chiller(fleet, cooling_w, outdoor_c, wet_bulb_c)
+    pump_heat_w = v("hvac.pumps.heat_to_water_share") * _chilled_pump_w(fleet, cooling_w)
+    chiller_w, at_design, fullest_c = _design_chiller(
+        fleet, cooling_w + pump_heat_w, outdoor_c, wet_bulb_c
+    )
     water_side = _water_side(
         fleet, cooling_w, chiller_w, at_design.rejected_w, crac_flow_m3s, outdoor_c, wet_bulb_c
     )
@@ -451,29 +454,42 @@ def _tower(
 def _pumps(fleet: Fleet, cooling_w: F64, rejected_w: F64) -> dict[str, F64]:
     """Pumps of chilled water and of the loop outdoors: sized for their flow, or unscaled."""
     v = fleet.values
+    chilled = {
+        "chilled_pump_w": _chilled_pump_w(fleet, cooling_w),
+        "pump_heat_share": v("hvac.pumps.heat_to_water_share"),
+    }
     if fleet.models["pumps"] == "released":
         return {
-            "chilled_pump_w": v("hvac.pumps.released_chilled_w"),
+            **chilled,
             "condenser_pump_w": v("hvac.pumps.released_condenser_w"),
             "pump_min_ratio": np.ones(fleet.size),
         }
-
-    def design_w(heat_w: F64, range_k: F64) -> F64:
-        flow = np.asarray(tower.design_water_kg_s(heat_w, range_k=range_k)) / WATER_DENSITY_KG_M3
-        efficiency = v("hvac.pumps.efficiency")
-        return hydraulic_pump_w(v("hvac.pumps.pressure_drop_pa"), flow, efficiency=efficiency)
-
-    chilled_range_k = v("hvac.chiller.chilled_water_range_k")
     second_loop_w = {
-        "water_cooled": design_w(rejected_w, v("hvac.tower.water_range_k")),
-        "air_cooled": design_w(cooling_w, chilled_range_k) * v("hvac.dry_cooler.free_cooling"),
+        "water_cooled": _sized_pump_w(fleet, rejected_w, v("hvac.tower.water_range_k")),
+        "air_cooled": chilled["chilled_pump_w"] * v("hvac.dry_cooler.free_cooling"),
         "air_side": np.zeros(fleet.size),
     }
     return {
-        "chilled_pump_w": design_w(cooling_w, chilled_range_k),
+        **chilled,
         "condenser_pump_w": second_loop_w[fleet.models["plant"]],
         "pump_min_ratio": v("hvac.pumps.min_flow_ratio"),
     }
+
+
+def _chilled_pump_w(fleet: Fleet, cooling_w: F64) -> F64:
+    """Power of the chilled-water pumps at design, W, (B,)."""
+    if fleet.models["pumps"] == "released":
+        return fleet.values("hvac.pumps.released_chilled_w")
+    return _sized_pump_w(fleet, cooling_w, fleet.values("hvac.chiller.chilled_water_range_k"))
+
+
+def _sized_pump_w(fleet: Fleet, heat_w: F64, range_k: F64) -> F64:
+    """Power of pumps whose water carries a heat, W, with a range, K, each (B,)."""
+    v = fleet.values
+    flow = np.asarray(tower.design_water_kg_s(heat_w, range_k=range_k)) / WATER_DENSITY_KG_M3
+    return hydraulic_pump_w(
+        v("hvac.pumps.pressure_drop_pa"), flow, efficiency=v("hvac.pumps.efficiency")
+    )
 
 
 def _battery_kwh(fleet: Fleet, sized_kwh: F64) -> F64:
