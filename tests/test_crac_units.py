@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sdc_taichi import ConfigError, Simulator, StepResult, drivers_from_arrays, load_config
+from sdc_taichi import (
+    ConfigError,
+    OddInputWarning,
+    Simulator,
+    StepResult,
+    drivers_from_arrays,
+    load_config,
+)
 from sdc_taichi.hall.unit_supply import unit_weights, weighted_shares
 from sdc_taichi.sim.crac_units import CracUnits
 from sdc_taichi.sim.design_hall import solve_design_hall
@@ -194,6 +201,7 @@ HEAT_UNITS = {
 THERMAL = {"quasi_steady": (), "transient": MINUTES}
 
 
+@pytest.mark.filterwarnings("ignore:.*the coils take out:sdc_taichi.OddInputWarning")
 @pytest.mark.parametrize("thermal", THERMAL)
 @pytest.mark.parametrize("case", HEAT_UNITS)
 def test_heat_closes_over_the_units(case: str, thermal: str) -> None:
@@ -237,6 +245,7 @@ def test_capacity_that_suffices_changes_nothing() -> None:
     np.testing.assert_allclose(large[0].rack_inlet_c, plain[0].rack_inlet_c, rtol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:.*the coils take out:sdc_taichi.OddInputWarning")
 def test_coils_that_are_too_small_leave_the_rest_to_the_room() -> None:
     _, results = run_at_full_load(FOUR, *MINUTES, "hvac.crac.capacity_kw=100", steps=30)
     for r in results:
@@ -339,3 +348,18 @@ def test_fans_that_follow_inlets_settle_where_steady_air_is() -> None:
     fleet, lost = run_at_full_load(FOUR, N_PLUS_1, *model, *MINUTES, event, steps=90)
     speed = [r.unit_flow_m3s[1:] / fleet.unit_design_m3s[1:] for r in (lost[55], lost[-1])]
     assert np.all(speed[1] > speed[0] + 0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("hvac.crac.airflow_m3s=5", r"airflow_m3s: the units give 5 m3/s .* takes 34\.28 m3/s"),
+        (
+            "hvac.crac.capacity_kw=300",
+            r"capacity_kw: the coils take out 300 kW, .* give 605\.\d kW",
+        ),
+    ],
+)
+def test_units_too_small_for_the_hall_are_told(change: str, said: str) -> None:
+    with pytest.warns(OddInputWarning, match=said):
+        build_fleet(load_config("corrected", [change]))

@@ -19,6 +19,9 @@ MOST_USUAL_RISE_K = 25.0
 """Servers in air warm it by 10 to 20 K at full load, the densest by 25 K."""
 MOST_USUAL_RTI_PCT = 200.0
 """Open halls without order in their aisles reach a return temperature index of about 150 %."""
+LEAST_USUAL_UNIT_SHARE = 0.9
+"""CRAC units smaller than the design airflow make up for it with exhaust air at full load; a tenth
+is bearable in halls that never reach full load."""
 _MOST_LISTED = 3
 
 
@@ -64,6 +67,26 @@ def _messages(config: DataCenterConfig, design: DesignPoint, rack_rise_k: F64) -
             f"{design.crac_flow_m3s:.4g} m3/s: RTI {rti_pct:.0f} %; up to "
             f"{MOST_USUAL_RTI_PCT:g} % is usual"
         )
+    yield from _small_units(config, design)
+
+
+def _small_units(config: DataCenterConfig, design: DesignPoint) -> Iterator[str]:
+    crac = config.hvac.crac
+    if crac.airflow_m3s is not None:
+        given_m3s = float(np.broadcast_to(crac.airflow_m3s, crac.units).sum())
+        if given_m3s < LEAST_USUAL_UNIT_SHARE * design.crac_flow_m3s:
+            yield (
+                f"hvac.crac.airflow_m3s: the units give {given_m3s:.4g} m3/s at full speed, the "
+                f"design point takes {design.crac_flow_m3s:.4g} m3/s"
+            )
+    if crac.capacity_kw is not None:
+        coils_kw = float(np.broadcast_to(crac.capacity_kw, crac.units).sum())
+        servers_kw = float(design.it_w.sum()) / 1e3
+        if coils_kw < servers_kw:
+            yield (
+                f"hvac.crac.capacity_kw: the coils take out {coils_kw:.4g} kW, the servers give "
+                f"{servers_kw:.4g} kW at full load"
+            )
 
 
 def _racks(rack_rise_k: F64, limit_k: float) -> str:
