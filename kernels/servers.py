@@ -18,8 +18,8 @@ from .hall_arguments import LANES, LOADS_PER_GROUP, LOADS_PER_RACK, OUTLETS
 
 OUTLET_OF_SERVERS, OUTLET_OF_RACKS = OUTLETS.index("server"), OUTLETS.index("rack")
 STILL_AIR_SHARE = 0.02
-"""Share of its full airflow by which a rack whose servers are off loses heat, in transient halls:
-draught of warm air and the surface of the rack together, see docs/transients.md."""
+"""Share of its airflow at full fan speed by which a rack whose servers are off loses heat, in
+transient halls: draught of warm air and the surface of the rack, see docs/transients.md."""
 
 
 class _ReleasedOutlet(NamedTuple):
@@ -146,7 +146,7 @@ def rack_model(hall: ti.template(), servers: ti.template(), block_at):
     if ti.static(hall.transient):
         off = hall.real(1.0) - powered
         available_airflow = blown_airflow + hall.real(STILL_AIR_SHARE) * off
-        # Draught knows no fan curve.
+        # Draught is a share of the airflow at full speed, whatever inlet and load are.
         fan_low = ti.select(powered > hall.real(0.0), fan_low, hall.zeros + hall.real(1.0))
     return ti.Struct(
         # A group does u + deviation*u*(1 - u), which conserves the work of its rack and stays

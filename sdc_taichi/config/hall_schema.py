@@ -259,8 +259,8 @@ class HallConfig(Section):
     one for all racks, or one per rack."""
     design_supply_c: AirC = 23.0
     """Supply air at the design point, in C, at which the approach temperatures hold and devices are
-    sized for full load; setpoints limit actions alone. With approach temperatures of 5 K, 23 C
-    brings inlets to 28 C, where the usual server fans reach full speed."""
+    sized for full load; limits of the setpoint bound actions alone. With approach temperatures of
+    5 K, 23 C brings inlets to 28 C, the warm end of ``servers.inlet_range_c``."""
     layout: LayoutConfig = LayoutConfig()
     """Measures of the hall."""
     recirculation: RecirculationConfig = RecirculationConfig()

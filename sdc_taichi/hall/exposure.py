@@ -26,8 +26,7 @@ OVER_M = 2.3
 NEIGHBOURS_M = 2.2
 """Length over which racks of an aisle share its supply air."""
 LEAST = 0.15
-"""Exposure of racks that the floor gives just what they draw, over the mean of a hall of alike
-racks."""
+"""Exposure of a rack for which the sum of the terms is 0; a rack of the mean has about 1."""
 _REACH = 40.0
 """Distance of neighbours that still count, in lengths: their weight is that of a rounding."""
 
@@ -39,13 +38,13 @@ class _Coefficients:
     around: float
     """Exposure at the very end of a row by what comes round it."""
     around_length_m: float
-    """Length over which that fades, in m."""
+    """Length over which air that comes round the end of a row fades, in m."""
     around_closed: float
-    """Share of it that full containment takes away beyond what it takes from all paths."""
+    """Share of ``around`` that full containment takes away beyond what it takes from all paths."""
     over: float
     """Exposure that a rack at the very end of a row lacks of what comes over the racks."""
     over_closed: float
-    """The same share of it."""
+    """Share of ``over`` that full containment takes away beyond what it takes from all paths."""
     demand: float
     """Change of the exposure over that of the demand for air, relative to its mean."""
 

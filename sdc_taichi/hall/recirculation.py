@@ -37,10 +37,11 @@ _MOST_MEAN_SHARE = 0.9
 supply air reaches the racks."""
 _MOST_NEWTON_STEPS = 50
 _EXACT_RACKS, _LARGE_WITHIN_K = 10_000, 1e-3
-"""Racks of larger halls, and the same for those whose approach temperatures are means: each round
-leaves a twentieth, and takes a second in a hall of a hundred thousand racks."""
+"""Most racks of a hall whose approach temperatures are found to ``_WITHIN_K`` where their means are
+given, and the change in K that counts as found in larger halls: each round leaves a twentieth of
+the change, and takes a second in a hall of a hundred thousand racks."""
 _CONTAINED_WITHIN_K = 1e-9
-"""The same for the exhaust mixes of contained halls, which may have a hundred thousand racks."""
+"""Change of the exhaust mixes of a contained hall, in K, at which they count as found."""
 
 
 @dataclass(frozen=True, slots=True)
