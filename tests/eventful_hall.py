@@ -7,5 +7,5 @@ EVENTFUL_HALL = [
     "hall.return_approach_k=-3",
     "servers.power_w=[300, 40]",
     "hvac.crac.units=2",
-    "events.sampled=[{kind: crac_down, per_year: 2000, duration_h: [1, 4]}]",
+    "events.sampled=[{kind: crac_down, per_year: 2000, duration_h: [0.5, 1]}]",
 ]

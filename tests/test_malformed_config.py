@@ -89,7 +89,7 @@ def fails(arguments: list[str], parts: list[str]) -> None:
         ("? [a]\n: 1\n? [a]\n: 2\n", ["not valid YAML"]),
         ("a: 1\n---\nb: 2\n", ["not valid YAML", "single document"]),
         ("!!python/object:os.system {}", ["not valid YAML", "python/object"]),
-        ("extends: corected", ["extends: 'corected'", "corrected, large, paper"]),
+        ("extends: corected", ["extends: 'corected'", "corrected, hall_of_2026, large, paper"]),
         ("hall: {rows: 2}", ["hall.racks_per_row: missing", "hall.supply_approach_k: missing"]),
         ("extends: tiny\nhvca: {}", ["hvca: unknown key", "did you mean 'hvac'?"]),
         (

@@ -476,6 +476,7 @@ def test_values_are_clamped_to_the_range() -> None:
 @pytest.mark.parametrize("full_w", [25.0, 150.0, 1400.0])
 def test_power_range_covers_the_largest_rack(full_w: float) -> None:
     power = ["servers.groups=null", f"servers.power_w=[{full_w}, 1]"]
+    power.append("servers.fan_full_airflow_m3s=null")
     fleet = build_fleet(load_config("tiny", [*power, "hall.servers_per_rack=40"]))
     scale = hall_rasters.power_scale(fleet)
     count, full_w = np.concatenate(fleet.group_rows, axis=1)[:2]
