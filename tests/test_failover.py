@@ -38,6 +38,14 @@ def test_each_unit_and_each_pair_is_lost(study: Failover) -> None:
     assert {unit for pair in pairs for unit in pair} == set(range(20))
 
 
+def test_losses_of_a_large_hall_fit_into_memory() -> None:
+    big = load_config("large", ["hall.rows=100", "hall.racks_per_row=100", "hvac.crac.units=1000"])
+    losses, note = unit_losses(big)
+    assert [loss.units for loss in losses[:3]] == [(), (0,), (125,)]
+    assert losses[-1].units == (999,)
+    assert note == "Of 1,000 CRAC units, 9 are lost, one at a time."
+
+
 def test_so_many_units_that_some_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(failover, "MOST_LOSSES", 11)
     config = with_values(load_config("corrected", SMALL), {"hvac.crac.units": 30})

@@ -39,6 +39,8 @@ MOST_UNITS_PAIRED = 12
 """Most CRAC units of which all pairs are lost; of more, each with its nearest neighbour."""
 MOST_LOSSES = 200
 """Most losses of a study; of more CRAC units than that, evenly spread ones are lost."""
+MOST_UNIT_SHARES = 100_000_000
+"""Most shares of units in the supply of racks, over all losses of a study: some 2 GB."""
 SHOWN_AFTER_MIN = (15, 60)
 """Minutes after which the hottest inlet is told."""
 DEVICES: dict[EventKind, str] = {
@@ -168,15 +170,16 @@ def study_failover(config: DataCenterConfig, lost: Lost = "units") -> Failover:
 def unit_losses(config: DataCenterConfig) -> tuple[tuple[Loss, ...], str]:
     """No loss, each CRAC unit and each pair of them, and which of them are left out."""
     units = config.hvac.crac.units
+    most = min(MOST_LOSSES, max(2, MOST_UNIT_SHARES // (config.hall.racks * units)))
     singles: list[tuple[int, ...]] = [(unit,) for unit in range(units)]
     pairs: list[tuple[int, ...]]
     if units <= MOST_UNITS_PAIRED:
         pairs, note = [*combinations(range(units), 2)], ""
-    elif 2 * units < MOST_LOSSES:
+    elif 2 * units < most:
         pairs = sorted(set(_neighbours(config)))
         note = f"Of {units} CRAC units, each is paired with its nearest neighbour alone."
     else:
-        chosen = np.linspace(0, units - 1, min(units, MOST_LOSSES - 1)).round().astype(int)
+        chosen = np.linspace(0, units - 1, min(units, most - 1)).round().astype(int)
         singles, pairs = [(int(unit),) for unit in chosen], []
         note = f"Of {units:,} CRAC units, {len(singles)} are lost, one at a time."
     return (
