@@ -88,7 +88,7 @@ def test_power_of_a_rack_warms_the_others_by_d(tmp_path: Path) -> None:
     overrides = [
         "hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
         "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
-        "servers.fan_full_airflow_m3s=0.012", "servers.fan_airflow_ratio_lb=[1,1]",
+        "servers.fan_full_airflow_m3s=0.019", "servers.fan_airflow_ratio_lb=[1,1]",
         "servers.fan_airflow_ratio_ub=[1,1]", "hall.air_density_kg_m3=1.225",
     ]  # fmt: skip
     matrix = random_matrix(rng, 6)
