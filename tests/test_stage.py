@@ -181,7 +181,7 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
     [
         [],
         ["simulation.thermal=transient"],
-        ["hvac.crac.capacity_kw=500"],
+        ["hvac.crac.capacity_kw=650"],
         ["hvac.chiller.model=eir_york", "hvac.water.model=paper"],
         ["hvac.chiller.model=electric_water_cooled", "battery.model=paper"],
         ["hvac.chiller.model=electric_air_cooled", "hvac.tower.economiser=false"],

@@ -124,7 +124,13 @@ def test_hall_map_of_a_large_hall(run: tuple[Simulator, list[StepResult]]) -> No
     approach = np.random.default_rng(0).uniform(3.0, 6.0, 200).tolist()
     values = ["hall.rows=10", "hall.racks_per_row=20", f"hall.supply_approach_k={approach}"]
     config = load_config(
-        "corrected", [*values, "hall.return_approach_k=-3", "servers.power_w=[150, 10]"]
+        "corrected",
+        [
+            *values,
+            "hall.return_approach_k=-3",
+            "servers.power_w=[150, 10]",
+            "hall.recirculation.calibrate=rack",
+        ],
     )
     with Simulator(config) as sim:
         sim.reset()
