@@ -1,6 +1,6 @@
 """Components and a facility beside EnergyPlus 25.2, on tables that it wrote.
 
-``SDC_REFERENCE_DIR`` names a folder of such tables in place of ``reference/energyplus``, whose
+``SDC_REFERENCE_DIR`` names folders of such tables in place of ``reference/energyplus``, whose
 README says how each was made. Settings that a table does not hold are those of that README.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from reference_folders import energyplus_tables
 from sdc_taichi import (
     Simulator,
     build_fleet,
@@ -29,15 +29,6 @@ from sdc_taichi.sim import simulator
 from sdc_taichi.sim.hall_solver import Conditions, Hall
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.types import F64
-
-FOLDER = Path(
-    os.environ.get("SDC_REFERENCE_DIR") or Path(__file__).parent / "reference" / "energyplus"
-)
-
-
-def tables(pattern: str) -> list[Path]:
-    """Tables of a kind, of all sites and settings."""
-    return sorted(FOLDER.glob(pattern))
 
 
 def columns(path: Path) -> dict[str, F64]:
@@ -54,7 +45,7 @@ def by_name(path: Path) -> str:
 # Moist air
 
 
-@pytest.mark.parametrize("path", tables("psychrometrics*.csv"), ids=by_name)
+@pytest.mark.parametrize("path", energyplus_tables("psychrometrics*.csv"), ids=by_name)
 def test_wet_bulb(path: Path) -> None:
     table = columns(path)
     wet_bulb_c = psychrometrics.wet_bulb_c(
@@ -67,7 +58,7 @@ def test_wet_bulb(path: Path) -> None:
     assert apart_k[two_fold].max(initial=0.0) < 0.4
 
 
-@pytest.mark.parametrize("path", tables("psychrometrics*.csv"), ids=by_name)
+@pytest.mark.parametrize("path", energyplus_tables("psychrometrics*.csv"), ids=by_name)
 def test_humidity_ratio(path: Path) -> None:
     table = columns(path)
     ratio = psychrometrics.humidity_ratio(
@@ -94,7 +85,7 @@ ITE = [
 ]
 
 
-@pytest.mark.parametrize("path", tables("ite_*.csv"), ids=by_name)
+@pytest.mark.parametrize("path", energyplus_tables("ite_*.csv"), ids=by_name)
 def test_servers(path: Path) -> None:
     table = columns(path)
     inlet_c, load = table["inlet_c"], table["utilisation"]
@@ -130,7 +121,7 @@ def header_at(folder: Path, elevation_m: float) -> Path:
     return path
 
 
-@pytest.mark.parametrize("path", tables("ite_*.csv"), ids=by_name)
+@pytest.mark.parametrize("path", energyplus_tables("ite_*.csv"), ids=by_name)
 def test_outlets_of_servers(path: Path, tmp_path: Path) -> None:
     """All rows at once, as copies of one rack at a site as high as that of the table."""
     table = columns(path)
@@ -161,7 +152,7 @@ def test_outlets_of_servers(path: Path, tmp_path: Path) -> None:
 
 # Tower
 
-TOWERS = tables("tower_yorkcalc_*.csv")
+TOWERS = energyplus_tables("tower_yorkcalc_*.csv")
 DRIFT_SHARE = 2e-5
 DESIGN_RANGE_K = 5.56
 DESIGN = {"wet_bulb_c": 25.55, "range_k": DESIGN_RANGE_K, "approach_k": 4.0}
@@ -259,7 +250,7 @@ def test_evaporation(path: Path) -> None:
 # Chillers
 
 
-@pytest.mark.parametrize("path", tables("chiller_eir_york*.csv"), ids=by_name)
+@pytest.mark.parametrize("path", energyplus_tables("chiller_eir_york*.csv"), ids=by_name)
 def test_york_chiller(path: Path) -> None:
     table = columns(path)
     steady = table["cycling_ratio"] == 1.0
@@ -279,7 +270,9 @@ def test_york_chiller(path: Path) -> None:
     np.testing.assert_allclose(machine.unmet_w, 0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("path", tables("chiller_electric_water_cooled*.csv"), ids=by_name)
+@pytest.mark.parametrize(
+    "path", energyplus_tables("chiller_electric_water_cooled*.csv"), ids=by_name
+)
 def test_water_cooled_electric_chiller(path: Path) -> None:
     table = columns(path)
     machine = chiller.electric_water_cooled(
@@ -293,7 +286,7 @@ def test_water_cooled_electric_chiller(path: Path) -> None:
     np.testing.assert_allclose(machine.power_w, table["power_w"], rtol=1e-9)
 
 
-@pytest.mark.parametrize("path", tables("chiller_electric_air_cooled*.csv"), ids=by_name)
+@pytest.mark.parametrize("path", energyplus_tables("chiller_electric_air_cooled*.csv"), ids=by_name)
 def test_air_cooled_electric_chiller(path: Path) -> None:
     table = columns(path)
     machine = chiller.electric_air_cooled(
@@ -357,7 +350,7 @@ def resized(found: Sizing, given: dict[str, float]) -> Sizing:
 def elevation_of_site_m(path: Path) -> float:
     """Height of the site of a facility, by the pressure of its tower's table; else of O'Hare."""
     site = path.stem.removeprefix("facility_").removesuffix("_hourly")
-    of_tower = [columns(x)["pressure_pa"] for x in tables(f"tower_yorkcalc_{site}.csv")]
+    of_tower = [columns(x)["pressure_pa"] for x in energyplus_tables(f"tower_yorkcalc_{site}.csv")]
     return height_m(float(np.mean(of_tower[0]))) if of_tower else 201.8
 
 
@@ -385,7 +378,7 @@ def year(
     }
 
 
-@pytest.mark.parametrize("path", tables("facility_*_hourly.csv"), ids=by_name)
+@pytest.mark.parametrize("path", energyplus_tables("facility_*_hourly.csv"), ids=by_name)
 def test_facility(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     summary: dict[str, Any] = json.loads(
         path.with_name(path.name.replace("_hourly.csv", "_monthly.json")).read_text()

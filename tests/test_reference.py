@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from reference_folders import reference_folders
 from sdc_taichi import (
     Actions,
     BatteryAction,
@@ -63,15 +63,7 @@ COOLING = (CoolAction.LOWER, CoolAction.HOLD, CoolAction.RAISE)
 BATTERY = (BatteryAction.CHARGE, BatteryAction.DISCHARGE, BatteryAction.IDLE)
 
 
-def folders() -> list[Path]:
-    """The folders of recorded numbers."""
-    named = os.environ.get("SDC_REFERENCE_DIR", "").strip()
-    if not named:
-        return [Path(__file__).parent / "reference"]
-    return [Path(part).resolve() for part in named.split(os.pathsep) if part]
-
-
-FOLDERS = folders()
+FOLDERS = reference_folders()
 
 
 def _label(folder: Path, name: str) -> str:
@@ -98,8 +90,9 @@ CHECKS = list(read_checks())
 def test_folders_hold_recorded_numbers() -> None:
     for folder in FOLDERS:
         assert folder.is_dir(), f"{folder}: no such folder (SDC_REFERENCE_DIR)"
-        found = [*folder.glob("trajectories/*.csv"), *folder.glob("physics_checks.json")]
-        assert found, f"{folder}: neither trajectories/*.csv nor physics_checks.json"
+        kinds = ("trajectories/*.csv", "physics_checks.json", "*_*.csv", "energyplus/*.csv")
+        found = [path for kind in kinds for path in folder.glob(kind)]
+        assert found, f"{folder}: none of {', '.join(kinds)}"
     for _, path in TRAJECTORIES:
         assert path.with_suffix(".json").is_file(), f"{path}: no .json beside it"
 
