@@ -46,6 +46,13 @@ CONTROLLERS = ("idle", "random", "g36", "coldest", "warmest", "lookahead-24h", "
 DAYS = 28
 SUBSTEPS_S = (15, 30, 60, 120)
 REFERENCE_SUBSTEP_S = 5
+FOUR_UNITS = (
+    "hvac.crac.units=4",
+    "hall.recirculation.calibrate=rack",
+    "hvac.setpoint.initial_c=22",
+    "hvac.sizing.design_wet_bulb_c=26",
+)
+"""Four CRAC units and the same air at each rack, which the studies of failures start from."""
 
 
 @dataclass(frozen=True)
@@ -126,10 +133,7 @@ def failing_units(
     config = load_config(
         "corrected",
         [
-            "hvac.crac.units=4",
-            "hall.recirculation.calibrate=rack",
-            "hvac.setpoint.initial_c=22",
-            "hvac.sizing.design_wet_bulb_c=26",
+            *FOUR_UNITS,
             "protection.ashrae_class=A2",
             f"simulation.thermal={thermal}",
             f"simulation.substep_s={substep_s}",
@@ -156,10 +160,7 @@ def uncooled(rack_kw: float, event: str, minutes: int = 15) -> list[float]:
     config = load_config(
         "corrected",
         [
-            "hvac.crac.units=4",
-            "hall.recirculation.calibrate=rack",
-            "hvac.setpoint.initial_c=22",
-            "hvac.sizing.design_wet_bulb_c=26",
+            *FOUR_UNITS,
             "servers.power_w=[150, 10]",
             f"hall.servers_per_rack={round(rack_kw * 1e3 / 150)}",
             "simulation.thermal=transient",

@@ -33,7 +33,7 @@ LISTED = 30
 
 
 class LostParts(StrEnum):
-    """What is lost: CRAC units, or devices of the plant."""
+    """Kinds of equipment that a failover study takes out of service."""
 
     units = "units"
     plant = "plant"

@@ -45,8 +45,8 @@ class ElectricalConfig(Section):
     """Grid connection, UPS and distribution of a data center."""
 
     losses: Literal["reported", "counted"] = "reported"
-    """Whether losses of UPS and distribution are told beside the energy bought, or part of it, and
-    of PUE, carbon and cost."""
+    """Treatment of the losses of UPS and distribution: ``counted`` in grid energy, PUE, carbon and
+    cost, or only ``reported`` beside them."""
     capacity_ratio: Annotated[float, Field(ge=1, le=10)] = 1.25
     """Rated power of UPS and distribution over what they carry at the design point, 1..10: five
     modules where four suffice are 1.25, two paths of which each suffices are 2."""

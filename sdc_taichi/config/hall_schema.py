@@ -205,7 +205,7 @@ class RackRange(Section):
 
 
 def _is_in(shape: tuple[int, ...], part: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Whether each place of a grid belongs to a part of it."""
+    """Mask of the places of racks, of a shape, that an index selects."""
     out = np.zeros(shape, bool)
     out[part] = True
     return out

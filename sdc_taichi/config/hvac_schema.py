@@ -207,8 +207,9 @@ class ChillerConfig(Section):
     chilled_water_range_k: WaterRangeK = 6.0
     """Chilled water that returns above chilled water that is supplied, at design, in K."""
     coil_valves: bool = True
-    """Whether valves let coils take no more water than they need, so that it returns warmer at part
-    load; else it returns ``chilled_water_range_k`` above the supply at any load."""
+    """Whether control valves match the water flow of the coils to their load: the water then
+    returns warmer at part load. Without valves it returns ``chilled_water_range_k`` above the
+    supply at any load."""
     min_condenser_c: Annotated[float, Field(ge=0, le=60)] = 12.78
     """Lowest temperature of the condenser water that enters the chiller, in C, 0..60: water that is
     liquid, and below the condensing temperatures of refrigerants."""
@@ -260,7 +261,8 @@ class DryCoolerConfig(Section):
     """Dry cooler of plant ``air_cooled``, with the heat exchanger to the chilled water."""
 
     free_cooling: bool = True
-    """Whether a dry cooler cools the return water before the chiller."""
+    """Whether the chilled water that returns from the coils passes the dry cooler before the
+    chiller."""
     approach_k: ExchangerK = 8.0
     """Chilled water over outdoor air where the dry cooler does all of the work at full load, in K:
     7 K of the cooler and 1 K of the heat exchanger."""
@@ -280,8 +282,8 @@ class OutdoorAirConfig(Section):
     min_dew_point_c: DewPointC = -9.0
     """Lowest dew point of outdoor air that is let in, in C."""
     humidifier: bool = True
-    """Whether an adiabatic humidifier wets drier air up to the lowest dew point; without one such
-    air is left outside."""
+    """Whether an adiabatic humidifier raises the dew point of drier outdoor air to
+    ``min_dew_point_c``; air that is drier is left outside without one."""
     max_dew_point_c: DewPointC = 15.0
     """Highest dew point of outdoor air that is let in, in C."""
     max_humidity_pct: Annotated[float, Field(ge=1, le=100)] = 70.0

@@ -42,7 +42,7 @@ class TariffPeriod(Section):
         return value
 
     def hours(self) -> np.ndarray:
-        """Whether each hour of the year belongs to the period, (8760,)."""
+        """Mask of the hours of a year in which the period applies, (8760,)."""
         hour = np.arange(24)
         if self.to_h > self.from_h:
             of_day = (hour >= self.from_h) & (hour < self.to_h)

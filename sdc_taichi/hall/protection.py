@@ -83,7 +83,7 @@ def ready_min(
 
 
 def first_of_each(wanted: Mask, most: I64, offsets: npt.NDArray[np.integer]) -> Mask:
-    """Of the racks that are wanted, the first so many of each data center, (R,).
+    """Mask of the racks to restart: the first wanted ones of each data center, (R,).
 
     Args:
         wanted: Racks to choose from, (R,).

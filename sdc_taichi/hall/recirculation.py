@@ -169,10 +169,14 @@ def _from_matrix_file(
     return weights, sums, design
 
 
+def _parts(config: DataCenterConfig) -> int:
+    """Number of equal parts of a hall whose mean approach temperatures hold: its rows, or 1."""
+    return config.hall.rows if config.hall.recirculation.scaled_to == "row" else 1
+
+
 def _mean_approach_k(config: DataCenterConfig) -> F64:
     """Approach temperatures of the config, plain means over the rows or over the hall, K, (R,)."""
-    hall = config.hall
-    parts = hall.rows if hall.recirculation.scaled_to == "row" else 1
+    hall, parts = config.hall, _parts(config)
     means = hall.rack_approach_k().reshape(parts, -1).mean(axis=1)
     return np.repeat(means, hall.racks // parts)
 
@@ -209,8 +213,7 @@ def _mean_share(config: DataCenterConfig, mix_k: F64, exposed: F64, wanted_k: F6
 
     The mean rises ever less with k, so that Newton's steps from 0 come near it from below.
     """
-    hall = config.hall
-    parts = hall.rows if hall.recirculation.scaled_to == "row" else 1
+    hall, parts = config.hall, _parts(config)
     mix, e, wanted = (values.reshape(parts, -1) for values in (mix_k, exposed, wanted_k))
     goal = wanted[:, 0]
     most = np.mean(mix * (e > 0), axis=1)

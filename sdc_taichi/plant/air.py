@@ -46,7 +46,7 @@ OF_IDEAL_GAS = _line()
 """The density of an ideal gas falls as 1/T; the line errs by at most 0.06 % within 15..35 C, 0.2 %
 at 10 C and 0.4 % at 45 C."""
 CONSTANT = DensityRatio(1.0, 0.0)
-"""The same density at all temperatures."""
+"""Ratio of an air whose density does not depend on its temperature."""
 
 
 def density_kg_m3(pressure_pa: float, temperature_c: float) -> float:

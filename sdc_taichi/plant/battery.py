@@ -182,8 +182,9 @@ def released(
         np.maximum(command, 0.0) * charge_kw * charge_h,
         np.maximum(-command, 0.0) * discharge_kw * discharge_h,
         most_discharge_kwh=discharge_kw * discharge_h,
-        load_kwh=load_kw * dt_h,
-        limit_kwh=None if grid_limit_kw is None else grid_limit_kw * dt_h,
+        load_kw=load_kw,
+        grid_limit_kw=grid_limit_kw,
+        dt_h=dt_h,
     )
     change_kwh = charge_kwh - discharge_kwh
     rounded_kwh = np.clip(np.round((stored_kwh + change_kwh) / 1e3, 8) * 1e3, 0.0, capacity_kwh)
@@ -285,8 +286,9 @@ def _step(
         np.maximum(command, 0.0) * charge_limit_kw * dt_h,
         np.maximum(-command, 0.0) * discharge_kw * dt_h,
         most_discharge_kwh=discharge_kw * dt_h,
-        load_kwh=load_kw * dt_h,
-        limit_kwh=None if grid_limit_kw is None else grid_limit_kw * dt_h,
+        load_kw=load_kw,
+        grid_limit_kw=grid_limit_kw,
+        dt_h=dt_h,
     )
     after_kwh = stored_kwh + charge_efficiency * charge_kwh - discharge_factor * discharge_kwh
     # Emptying or filling exactly can miss by the last bits, and an empty battery carries nothing.
@@ -305,12 +307,14 @@ def _within_grid_limit(
     discharge_kwh: Values,
     *,
     most_discharge_kwh: Values,
-    load_kwh: Values,
-    limit_kwh: Values | None,
+    load_kw: Values,
+    grid_limit_kw: Values | None,
+    dt_h: Values,
 ) -> tuple[Values, Values]:
     """Charge and discharge, kWh, that keep the grid connection within its limit if they can."""
-    if limit_kwh is None:
+    if grid_limit_kw is None:
         return charge_kwh, discharge_kwh
+    load_kwh, limit_kwh = load_kw * dt_h, grid_limit_kw * dt_h
     missing_kwh = np.maximum(load_kwh - limit_kwh, 0.0)
     return (
         np.minimum(charge_kwh, np.maximum(limit_kwh - load_kwh, 0.0)),

@@ -326,7 +326,7 @@ def loop_pump_w(heat_w: F64, design_heat_w: F64, design_w: F64, design: WaterSid
 
 
 def chilled_water_load_w(load_w: F64, design: WaterSideDesign) -> tuple[F64, F64, F64]:
-    """What coils ask of the chilled water, and what its pumps add.
+    """Heat that economiser and chiller have to take off the chilled water: of coils and pumps.
 
     All that reaches the shaft of a pump ends as heat of the water, the losses of its motor do not
     (EnergyPlus Engineering Reference, "Pumps").

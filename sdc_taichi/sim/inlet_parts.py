@@ -243,11 +243,11 @@ class Inlets:
     def _group_inlets(self) -> F64:
         """Inlet of every server group of the data center, in C, (G,)."""
         air, counts = self._air, np.diff(self._group_offsets)
-        given = self._shares * air.fresh_ratio
         if self._fleet.air is None:
             first = self._first_rack
             rack_c = air.supply_c[0] + self._fleet.approach_k[first : first + self._racks]
             return np.asarray(np.repeat(rack_c, counts) + self._group_rows[_OFFSET_ROW])
+        given = self._shares * air.fresh_ratio
         fresh_k = given @ air.supply_c - given.sum(axis=1) * air.mixed_c
         taken = np.repeat(self._exhaust_share, counts) * self._group_rows[_HEIGHT_ROW]
         mixed_c, fresh_k = np.repeat(air.mixed_c, counts), np.repeat(fresh_k, counts)

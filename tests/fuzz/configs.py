@@ -59,7 +59,8 @@ def valid_value(rng: np.random.Generator, part: Schema) -> Any:
     kind = part.get("type")
     if kind == "object" and "properties" not in part:
         names = rng.choice(["cpu", "gpu", "2", "ü"], int(rng.integers(3)), replace=False)
-        return {str(name): valid_value(rng, part["additionalProperties"]) for name in names}
+        (inner,) = part.get("patternProperties", {"": part.get("additionalProperties")}).values()
+        return {str(name): valid_value(rng, inner) for name in names}
     if kind == "object":
         needed = part.get("required", ())
         return {
