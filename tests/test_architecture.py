@@ -26,6 +26,7 @@ ROOMS = (
     "hall",
     "layout_solver",
     "sim",
+    "optimum",
     "control",
     "run",
     "viz",

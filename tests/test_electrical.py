@@ -13,7 +13,7 @@ from sdc_taichi.control import view_maker
 from sdc_taichi.errors import ConfigError, OddInputWarning
 from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH
 from sdc_taichi.plant.electrical import loss_w
-from sdc_taichi.run.bills import add_power, billed_kw_months, no_demand
+from sdc_taichi.sim.bills import add_power, billed_kw_months, no_demand
 from sdc_taichi.types import F64
 from sdc_taichi.viz.recording_log import ConditionLog
 from sdc_taichi.viz.recording_series import FIELD_ROWS, FIELDS

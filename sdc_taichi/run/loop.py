@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 from sdc_taichi.control import Controller, view_maker
 from sdc_taichi.errors import whole_number
-from sdc_taichi.run.bills import no_demand
 from sdc_taichi.run.metrics import Totals, add_step, empty_totals
+from sdc_taichi.sim.bills import no_demand
 from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import StepResult

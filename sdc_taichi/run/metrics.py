@@ -35,7 +35,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, rank
-from sdc_taichi.run.bills import BilledDemand, add_power, billed_kw_months, no_demand
+from sdc_taichi.sim.bills import BilledDemand, add_power, billed_kw_months, no_demand
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64, StepResult
 
