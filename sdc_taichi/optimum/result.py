@@ -38,7 +38,7 @@ class Optimum:
     idle: F64
     """Figure under idle commands, (B,)."""
     bound: F64
-    """Figure that no controller comes below that ends as it began, (B,); nan where none is known."""
+    """No controller that ends as it began comes below this figure, (B,); nan if none is known."""
     achieved: F64
     """Lowest figure that the simulator reached and that keeps the constraints, (B,)."""
     alone: Mapping[str, F64]
