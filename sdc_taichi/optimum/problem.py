@@ -40,6 +40,8 @@ class FlexibleWork:
 
     arrived_tasks: F64
     """Work that arrives, (T,)."""
+    idle_tasks: F64
+    """Work that is done under idle commands, (T,)."""
     most_deferred_tasks: F64
     """Most of it that can be deferred, (T,)."""
     most_executed_tasks: F64
@@ -50,6 +52,8 @@ class FlexibleWork:
     """Steps after which deferred work has to run; None is never."""
     model: str
     """Name of the model of work: ``fluid`` or ``tasks``."""
+    most_dropped_tasks: float = 0.0
+    """Most work that may be dropped over the scored steps, as under idle commands."""
 
 
 @dataclass(frozen=True, slots=True)
