@@ -85,6 +85,12 @@ class Objective:
             if weight
         )
 
+    @property
+    def unit(self) -> str:
+        """Unit of the figure; of a sum, the text of the objective."""
+        units = {"carbon": "kg CO2e", "energy": "kWh", "cost": "currency of the tariff"}
+        return {**units, "water": "L"}.get(str(self), str(self))
+
     def kwh_weight(self, drivers: Drivers, index: I64) -> F64:
         """Weight of a kWh bought in each step, without demand charges, (B, T).
 

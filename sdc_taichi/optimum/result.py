@@ -7,9 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sdc_taichi.errors import SdcError
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import Agent, Ends
 from sdc_taichi.types import F64, I64
+
+
+class StoppedError(SdcError):
+    """Solving was stopped before its end; the message says what is kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +42,8 @@ class Optimum:
     """Highest inlet that plans may cause where they have a choice, in C, (B,); inf without."""
     idle: F64
     """Figure under idle commands, (B,)."""
+    idle_dropped_tasks: F64
+    """Work that finds the queue full under idle commands, in tasks, (B,)."""
     bound: F64
     """No controller that ends as it began comes below this figure, (B,); nan if none is known."""
     achieved: F64
