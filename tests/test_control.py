@@ -33,7 +33,8 @@ from sdc_taichi.control import (
     trim_and_respond,
     view_maker,
 )
-from sdc_taichi.control.rules import avoid_repeats, quartile_command, slots_in_step
+from sdc_taichi.control.rules import quartile_command, slots_in_step
+from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.run.loop import simulate
 
 CHECKS = json.loads((Path(__file__).parent / "reference" / "physics_checks.json").read_text())

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from sdc_taichi.control.view import View
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K
+from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.types import F64, I64, Actions
 
 SLOT_MIN = 5.0
@@ -272,19 +273,6 @@ def setpoint_command(target_c: F64, view: View) -> F64:
     """Cooling command, in steps, (B,), that moves the setpoint to ``target_c``, in C, (B,)."""
     command = (target_c - view.setpoint_c) / view.limits.setpoint_step_k
     return avoid_repeats(command, view.cooling_last)
-
-
-def avoid_repeats(command: F64, last: F64) -> F64:
-    """Cooling commands that differ from those of the step before, if only in the last bit.
-
-    Setpoint model ``accelerating`` takes equal commands in a row for a wish to go faster and
-    multiplies them; a command that is computed means what it says.
-
-    Args:
-        command: setpoint changes, in steps, (n,).
-        last: those of the step before, in steps, (n,); not a number before the first step.
-    """
-    return np.where(command == last, np.nextafter(command, 0.0), command)
 
 
 def quartile_command(ci_g_per_kwh: F64) -> F64:

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sdc_taichi.control.rules import avoid_repeats
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.sim.fleet import STAGE_MODELS, Fleet
 from sdc_taichi.types import F64, State
 

@@ -87,6 +87,19 @@ SETPOINTS: dict[str, SetpointModel] = {
 """Setpoint models by the names that ``hvac.setpoint.model`` takes."""
 
 
+def avoid_repeats(command: F64, last: F64) -> F64:
+    """Cooling commands that differ from those of the step before, if only in the last bit.
+
+    Setpoint model ``accelerating`` takes equal commands in a row for a wish to go faster and
+    multiplies them; a command that is computed means what it says.
+
+    Args:
+        command: setpoint changes, in steps, (n,).
+        last: those of the step before, in steps, (n,); not a number before the first step.
+    """
+    return np.where(command == last, np.nextafter(command, 0.0), command)
+
+
 def constant_flow(
     it_w: F64, airflow_m3s: F64, *, design_flow_m3s: F64, **_: F64
 ) -> tuple[F64, F64]:

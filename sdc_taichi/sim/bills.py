@@ -43,7 +43,7 @@ def no_demand(start: I64, steps_per_hour: int) -> BilledDemand:
         start: first step of each data center, counted from the beginning of the year, (B,).
         steps_per_hour: number of steps in an hour.
     """
-    begin, end = _month_around(start, 24 * steps_per_hour)
+    begin, end = month_around(start, 24 * steps_per_hour)
     return BilledDemand(
         start=start.copy(),
         steps_per_day=24 * steps_per_hour,
@@ -68,7 +68,7 @@ def add_power(demand: BilledDemand, step: int, power_kw: F64) -> None:
         ended = step >= demand.month_end
         demand.billed_kw_months[ended] = billed_kw_months(demand, step)[ended]
         demand.month_peak_kw[ended] = 0.0
-        begin, end = _month_around(demand.start + step, demand.steps_per_day)
+        begin, end = month_around(demand.start + step, demand.steps_per_day)
         demand.month_begin, demand.month_end = begin - demand.start, end - demand.start
         demand.next_end = int(demand.month_end.min())
     np.maximum(demand.month_peak_kw, power_kw, out=demand.month_peak_kw)
@@ -87,7 +87,7 @@ def billed_kw_months(demand: BilledDemand, steps: int) -> F64:
     return np.asarray(demand.billed_kw_months + demand.month_peak_kw * share)
 
 
-def _month_around(step: I64, steps_per_day: int) -> tuple[I64, I64]:
+def month_around(step: I64, steps_per_day: int) -> tuple[I64, I64]:
     """First step of the month with a step of the year, and of the month after it, (B,) each."""
     firsts = np.array(FIRST_DAY_OF_MONTH)
     years, day = np.divmod(step // steps_per_day, DAYS_PER_YEAR)

@@ -68,7 +68,7 @@ class CracUnits:
             "high_c": of_each("hvac.setpoint.max_c"),
         }
         self._initial_c = of_each("hvac.setpoint.initial_c")
-        self._schedule_c = _schedules_c(fleet)
+        self._schedule_c = schedules_c(fleet)
         self._fan_step = of_each("hvac.crac.fan_step")
         self._coasting = of_each("hvac.crac.coasting_flow_ratio")
         self._min_speed = of_each("hvac.crac.min_flow_ratio")
@@ -191,7 +191,7 @@ class CracUnits:
         return coldest_c, self._units.sum(running * self._capacity_w), share
 
 
-def _schedules_c(fleet: Fleet) -> FleetSeries | None:
+def schedules_c(fleet: Fleet) -> FleetSeries | None:
     """Scheduled setpoints over the steps of a year, in C, nan without; None if nobody has any."""
     hourly_c: dict[SetpointConfig, F64] = {}
     none_c = np.array([np.nan])

@@ -28,7 +28,7 @@ from sdc_taichi.sim.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k
 from sdc_taichi.types import F64, StepResult, as_array, fields_of
 
 NOT_USED = cast(F64, None)
-_BATTERY = (
+BATTERY_PARAMETERS = (
     "charge_efficiency",
     "discharge_factor",
     "charge_limit_c_rate",
@@ -38,6 +38,7 @@ _BATTERY = (
     "lower_u_h",
     "lower_v",
 )
+"""Parameters of the battery models, by their names as arguments and in section ``battery``."""
 _PLANT_INPUTS = ("plant_setpoint_c", "outdoor_c", "wet_bulb_c")
 _PLANT_EVENT_INPUTS = ("powered", "chiller_share", "pump_share", "outdoor_units", "coil_share")
 _STEP_INPUTS = (
@@ -200,7 +201,7 @@ class Facility:
         self._tower = TOWERS[models["tower"]]
         self._water_model = WATER[models["water"]]
         self._battery_model = BATTERIES[models["battery"]]
-        self._battery = {name: v(f"battery.{name}") for name in _BATTERY}
+        self._battery = {name: v(f"battery.{name}") for name in BATTERY_PARAMETERS}
         self._grid_limited = bool(np.any(sizing.grid_limit_kw < NO_LIMIT_KW))
         if self._grid_limited:
             self._battery["grid_limit_kw"] = sizing.grid_limit_kw

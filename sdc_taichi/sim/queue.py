@@ -16,7 +16,7 @@ import numpy as np
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.kernels.compiler.arrays import unpadded, vector_rows
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, I32
 
 if TYPE_CHECKING:
     from sdc_taichi.kernels.compiler.launch import BoundKernel
@@ -38,6 +38,30 @@ class QueueState:
     """Mean age of the work that waits, in steps, (B,)."""
 
 
+def due_entries(length: int, due_steps: F64) -> I32:
+    """Entry of each queue that holds the work that is due when a step begins, (B,).
+
+    It is ``length``, beyond the last entry, where work is never due.
+
+    Args:
+        length: steps that a queue tells apart, L.
+        due_steps: age at which work is due, in steps, inf for never, (B,).
+    """
+    due_at = length - np.minimum(due_steps, length + 1.0).astype(np.int64)
+    return np.where(due_at < 0, length, due_at).astype(np.int32)
+
+
+def due_work(queue: F64, entries: I32) -> F64:
+    """Work that is due when a step begins, in tasks, (B,).
+
+    Args:
+        queue: work still queued by the step that put it in, oldest first, (B, L).
+        entries: what ``due_entries`` returned, (B,).
+    """
+    never = np.zeros((1, len(entries)))
+    return np.asarray(np.concatenate([queue.T, never])[entries, np.arange(len(entries))])
+
+
 class Queue:
     """The queues of a fleet.
 
@@ -47,9 +71,8 @@ class Queue:
     """
 
     def __init__(self, length: int, due_steps: F64) -> None:
-        due_at = length - np.minimum(due_steps, length + 1.0).astype(np.int64)
         self._size, self._length = len(due_steps), length
-        self._due_row = np.where(due_at < 0, length, due_at).astype(np.int32)
+        self._due_row = due_entries(length, due_steps)
         self._kernel: BoundKernel | None = None
         self._rows: Any = None
         """The queue that the last step left, as ``vector_rows``."""
@@ -66,8 +89,7 @@ class Queue:
                 read-only, since what is known of it would not follow a change.
         """
         if queue is not self._last:
-            never = np.zeros((1, self._size))
-            due = np.concatenate([queue.T, never])[self._due_row, np.arange(self._size)]
+            due = due_work(queue, self._due_row)
             self._load(queue)
             self._begin = queue[:, -1].copy(), due
         return self._begin

@@ -44,6 +44,21 @@ class WorkResult:
     """Mean age of the work in the queue, in h, (B,)."""
 
 
+def queue_limit_tasks(fleet: Fleet) -> F64:
+    """Longest queue of each data center, in tasks, (B,); ``UNLIMITED_TASKS`` without a limit."""
+    limit_h = fleet.values("workload.queue_limit_h")
+    limit_tasks = limit_h * (workload.TASKS_PER_STEP * fleet.steps_per_hour)
+    return np.where(np.isnan(limit_h), workload.UNLIMITED_TASKS, limit_tasks)
+
+
+def due_steps(fleet: Fleet) -> F64:
+    """Age at which the work of each data center is due, in steps, inf for never, (B,)."""
+    deadline_h = fleet.values("workload.deadline_h")
+    deadline_steps = np.rint(deadline_h * fleet.steps_per_hour)
+    deadline_steps = np.where(np.isnan(deadline_h), np.inf, deadline_steps)
+    return deadline_steps + workload.DUE_AFTER_STEPS[fleet.models["workload"]]
+
+
 class Workload:
     """The workload model of a fleet and its queues.
 
@@ -56,20 +71,16 @@ class Workload:
 
         v, name = fleet.values, fleet.models["workload"]
         model, per_hour = workload.MODELS[name], fleet.steps_per_hour
-        limit_h, deadline_h = v("workload.queue_limit_h"), v("workload.deadline_h")
-        limit_tasks = limit_h * (workload.TASKS_PER_STEP * per_hour)
         limits = {
             "flexible_share": v("workload.flexible_share"),
-            "queue_limit": np.where(np.isnan(limit_h), workload.UNLIMITED_TASKS, limit_tasks),
+            "queue_limit": queue_limit_tasks(fleet),
         }
         self._size, self._step_h = fleet.size, 1.0 / per_hour
         self._decide = CompiledStage(lambda **x: fields_of(model(**x, **limits)), fleet.size)
         self._max_utilisation = v("workload.max_utilisation")
-        deadline_steps = np.where(np.isnan(deadline_h), np.inf, np.rint(deadline_h * per_hour))
-        due_steps = deadline_steps + workload.DUE_AFTER_STEPS[name]
         # One step for work that enters, one for all that is older than the horizon.
         self._length = int(np.max(np.rint(v("workload.age_horizon_h") * per_hour))) + 2
-        self._queue = Queue(self._length, due_steps)
+        self._queue = Queue(self._length, due_steps(fleet))
 
     def empty_queue(self) -> F64:
         """Queues without work, (B, L)."""

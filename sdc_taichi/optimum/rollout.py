@@ -1,0 +1,283 @@
+"""Plans run by the simulator itself: what it did, and what that comes to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from sdc_taichi.optimum.commands import (
+    battery_command,
+    bus_energy_kwh,
+    load_command,
+    setpoint_command,
+)
+from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.score import Score
+from sdc_taichi.plant.workload import MODELS as WORK_MODELS
+from sdc_taichi.sim.drivers import Drivers, FleetSeries
+from sdc_taichi.sim.facility import BATTERY_PARAMETERS
+from sdc_taichi.sim.fleet import Fleet, build_fleet
+from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.queue import due_entries, due_work
+from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.sim.workload import due_steps, queue_limit_tasks
+from sdc_taichi.types import F64, I64, Actions, StepResult
+
+Stop = Callable[[], bool]
+"""Asked now and then; true ends the work."""
+OnStep = Callable[[], None]
+"""Called after every step that a simulator has done."""
+
+
+@dataclass(frozen=True, slots=True)
+class Targets:
+    """What B data centers are to do in T steps, told by the states that they are to reach.
+
+    A step that falls short of its target is made up for by the steps after it.
+    """
+
+    queue_tasks: F64
+    """Work in the queue after each step, in tasks, (T, B); nan leaves the load command neutral."""
+    setpoint_c: F64
+    """Setpoint of each step, in C, (T, B)."""
+    stored_kwh: F64
+    """Energy stored after each step, in kWh, (T, B); nan leaves the battery idle."""
+    facility_kwh: F64
+    """Energy that the facility is expected to need in each step, in kWh, (T, B)."""
+
+
+@dataclass(frozen=True, slots=True)
+class RollOut:
+    """What the simulator did in T steps of B data centers."""
+
+    facility_kwh: F64
+    """Energy of the facility without its battery, in kWh, (T, B)."""
+    grid_kwh: F64
+    """Energy bought, in kWh, (T, B)."""
+    carbon_g: F64
+    """Emissions of the energy bought, in g CO2e, (T, B)."""
+    energy_cost: F64
+    """Price of the energy bought, in the currency of the tariff, (T, B)."""
+    water_l: F64
+    """Make-up water, in l, (T, B)."""
+    executed_tasks: F64
+    """Work done, in tasks, (T, B)."""
+    queue_tasks: F64
+    """Work in the queue after each step, in tasks, (T, B)."""
+    stored_kwh: F64
+    """Energy stored after each step, in kWh, (T, B)."""
+    charge_kwh: F64
+    """Energy drawn into the battery, in kWh, (T, B)."""
+    discharge_kwh: F64
+    """Energy delivered by the battery, in kWh, (T, B)."""
+    setpoint_c: F64
+    """Setpoint, mean over the CRAC units, in C, (T, B)."""
+    inlet_max_c: F64
+    """Hottest inlet of a server, in C, (T, B)."""
+    unmet_w: F64
+    """Cooling load that stays in the room, in W, (T, B)."""
+    dropped_tasks: F64
+    """Work that found the queue full, in tasks, (T, B)."""
+    overdue_tasks: F64
+    """Due work that did not fit into its step, in tasks, (T, B)."""
+    utilisation: F64
+    """Work that was started, as a share of capacity, (T, B)."""
+    load_command: F64
+    """Load command, -1..1, (T, B)."""
+    cooling_command: F64
+    """Cooling command, in steps of the setpoint, (T, B)."""
+    battery_command: F64
+    """Battery command, -1..1, (T, B)."""
+
+    def of(self, where: I64 | slice) -> RollOut:
+        """Copy with some of the data centers.
+
+        Args:
+            where: their numbers.
+        """
+        return RollOut(*(getattr(self, f.name)[:, where] for f in fields(self)))
+
+
+def roll_out(
+    fleet: Fleet,
+    drivers: Drivers,
+    targets: Targets,
+    *,
+    start: I64,
+    objective: Objective,
+    scored_from: int = 0,
+    seed: int | I64 = 0,
+    precision: Precision = "f32",
+    on_step: OnStep | None = None,
+    stop: Stop | None = None,
+) -> tuple[RollOut, Score] | None:
+    """Run plans in the simulator: commands are computed at the true state of every step.
+
+    All CRAC units of a data center move alike.
+
+    Args:
+        fleet: B data centers.
+        drivers: Their inputs.
+        targets: What they are to do.
+        start: First step of each, counted from the beginning of the year, (B,).
+        objective: What is minimised.
+        scored_from: First step that is scored.
+        seed: Of the sampled events, one for all or for each data center, (B,).
+        precision: Of the hall kernels.
+        on_step: Called after every step.
+        stop: Asked before every step.
+
+    Returns:
+        What they did, and its score; None where ``stop`` ended the work.
+
+    Raises:
+        PhysicalLimitError: A result that no data center can reach.
+    """
+    steps = len(targets.setpoint_c)
+    with Simulator(fleet, drivers=drivers, precision=precision) as sim:
+        sim.reset(seed, start=start)
+        follow = _Follower(sim, targets)
+        score = Score(objective, sim, scored_from)
+        done = {f.name: np.empty((steps, fleet.size)) for f in fields(RollOut)}
+        for t in range(steps):
+            if stop is not None and stop():
+                return None
+            result: StepResult = sim.step(follow.actions(t))
+            score.add(result)
+            for name, values in done.items():
+                values[t] = getattr(result, name)
+            if on_step is not None:
+                on_step()
+    return RollOut(**done), score
+
+
+class _Follower:
+    """Commands that take the data centers of a simulator to their targets.
+
+    Args:
+        sim: The simulator, reset.
+        targets: What they are to do.
+    """
+
+    def __init__(self, sim: Simulator, targets: Targets) -> None:
+        fleet = sim.fleet
+        v, models = fleet.values, fleet.models
+        self._sim, self._targets = sim, targets
+        self._work = {
+            "flexible_share": v("workload.flexible_share"),
+            "max_utilisation": v("workload.max_utilisation"),
+            "queue_limit_tasks": queue_limit_tasks(fleet),
+        }
+        self._work_model, self._battery_model = models["workload"], models["battery"]
+        self._due = due_entries(sim.state.queue.shape[1], due_steps(fleet))
+        self._battery = {name: v(f"battery.{name}") for name in BATTERY_PARAMETERS}
+        loses = self._battery_model != "released"
+        one = np.ones(fleet.size)
+        self._efficiency = {
+            name: self._battery[name] if loses else one
+            for name in ("charge_efficiency", "discharge_factor")
+        }
+        self._capacity_kwh = sim.sizing.battery_kwh
+        self._step_k = v("hvac.setpoint.step_k")[fleet.unit_dc]
+        self._unit_dc = fleet.unit_dc
+
+    def actions(self, t: int) -> Actions:
+        """Commands of step ``t``."""
+        return Actions(load=self._load(t), cooling=self._cooling(t), battery=self._battery_(t))
+
+    def _load(self, t: int) -> F64:
+        target = self._targets.queue_tasks[t]
+        moves = ~np.isnan(target)
+        if not moves.any():
+            return np.zeros(len(target))
+        queue, demand = self._sim.state.queue, self._sim.drivers.at(t).demand
+        arrived = arrived_tasks(self._work_model, demand, self._work["flexible_share"])
+        command = load_command(
+            queue[:, -1] + arrived - np.where(moves, target, 0.0),
+            model=self._work_model,
+            demand=demand,
+            waiting_tasks=queue[:, -1],
+            due_tasks=due_work(queue, self._due),
+            **self._work,
+        )
+        return np.where(moves, command, 0.0)
+
+    def _cooling(self, t: int) -> F64:
+        state = self._sim.state
+        return setpoint_command(
+            self._targets.setpoint_c[t][self._unit_dc],
+            setpoint_c=state.setpoint_c,
+            step_k=self._step_k,
+            last=state.cooling_last,
+        )
+
+    def _battery_(self, t: int) -> F64:
+        target, stored = self._targets.stored_kwh[t], self._sim.state.stored_kwh
+        moves = ~np.isnan(target)
+        bus_kwh = bus_energy_kwh(np.where(moves, target, stored), stored, **self._efficiency)
+        return battery_command(
+            bus_kwh,
+            model=self._battery_model,
+            stored_kwh=stored,
+            load_kw=self._targets.facility_kwh[t] / self._sim.step_h,
+            step_h=self._sim.step_h,
+            capacity_kwh=self._capacity_kwh,
+            parameters=self._battery,
+        )
+
+
+def arrived_tasks(model: str, demand: F64, flexible_share: F64 | float) -> F64:
+    """Work that arrives as a model of work counts it, in tasks.
+
+    Args:
+        model: name of the model of work.
+        demand: work that arrives, as a share of capacity, 0..1.
+        flexible_share: share of it that may wait, 0..1.
+    """
+    nothing = np.zeros(np.shape(demand))
+    work = WORK_MODELS[model](
+        demand,
+        nothing,
+        nothing,
+        nothing,
+        flexible_share=flexible_share,
+        max_utilisation=1.0,
+        queue_limit=0.0,
+    )
+    return np.asarray(work.arrived_tasks)
+
+
+def repeated(fleet: Fleet, drivers: Drivers, start: I64, times: int) -> tuple[Fleet, Drivers, I64]:
+    """Copies of a fleet in one: data center b of copy k is number k*B + b.
+
+    Args:
+        fleet: B data centers.
+        drivers: Their inputs.
+        start: First step of each, (B,).
+        times: Number of copies.
+
+    Returns:
+        Fleet, drivers and first steps of all copies.
+    """
+
+    def series(of: FleetSeries) -> FleetSeries:
+        return replace(of, offsets=np.tile(of.offsets, times), lengths=np.tile(of.lengths, times))
+
+    price = drivers.price_per_kwh
+    shared = series(drivers.outdoor_c)
+    copies = replace(
+        drivers,
+        outdoor_c=shared,
+        wet_bulb_c=series(drivers.wet_bulb_c).sharing_places(shared),
+        ci_g_per_kwh=series(drivers.ci_g_per_kwh).sharing_places(shared),
+        demand=series(drivers.demand).sharing_places(shared),
+        price_per_kwh=None if price is None else series(price).sharing_places(shared),
+        start=np.tile(drivers.start, times),
+        design_outdoor_c=np.tile(drivers.design_outdoor_c, times),
+        design_wet_bulb_c=np.tile(drivers.design_wet_bulb_c, times),
+        sources=drivers.sources * times,
+        synthetic=drivers.synthetic * times,
+    )
+    return build_fleet(fleet.configs * times), copies, np.tile(start, times)
