@@ -32,9 +32,8 @@ from sdc_taichi.types import (
 )
 
 if TYPE_CHECKING:
-    from sdc_taichi.control import View, make_controller
+    from sdc_taichi.control import ForecastError, View, make_controller
     from sdc_taichi.envs.costs import register_cost
-    from sdc_taichi.envs.forecasts import ForecastError
     from sdc_taichi.envs.options import EnvOptions
     from sdc_taichi.envs.parallel import aec_env, parallel_env
     from sdc_taichi.envs.recording import EpisodeRecorder, RecordEpisodes
@@ -98,7 +97,7 @@ __all__ = [
 _LAZY = {
     "EnvOptions": "sdc_taichi.envs.options",
     "EpisodeRecorder": "sdc_taichi.envs.recording",
-    "ForecastError": "sdc_taichi.envs.forecasts",
+    "ForecastError": "sdc_taichi.control",
     "RecordEpisodes": "sdc_taichi.envs.recording",
     "Recorder": "sdc_taichi.viz.recorder",
     "RunRequest": "sdc_taichi.run.description",

@@ -25,9 +25,9 @@ from pettingzoo.test.state_test import state_test
 import sdc_taichi
 from eventful_hall import EVENTFUL_HALL
 from sdc_taichi import ConfigError, RuntimeStateError, SdcError, load_config
+from sdc_taichi.control.forecast_error import ForecastError
 from sdc_taichi.envs import rendering
 from sdc_taichi.envs.agents import AGENTS
-from sdc_taichi.envs.forecasts import ForecastError
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.parallel import SdcParallelEnv
 from sdc_taichi.envs.registration import IDS

@@ -24,7 +24,7 @@ from sdc_taichi import (
     load_config,
     make_configs,
 )
-from sdc_taichi.control import View, view_maker
+from sdc_taichi.control import ForecastError, View, view_maker
 from sdc_taichi.envs import time_rows
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.features import (
@@ -36,7 +36,6 @@ from sdc_taichi.envs.features import (
 from sdc_taichi.envs.forecasts import (
     CI_LEADS_H,
     WEATHER_LEADS_H,
-    ForecastError,
     Forecasts,
     lead_steps,
 )

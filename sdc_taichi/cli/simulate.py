@@ -69,9 +69,18 @@ def simulate_command(
     seed: Annotated[
         int,
         typer.Option(
-            min=0, max=2**63 - 1, help="Of controller and --sample (not of the synthetic year)."
+            min=0,
+            max=2**63 - 1,
+            help="Of controller, forecast errors and --sample (not of the synthetic year).",
         ),
     ] = 0,
+    forecast_error: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ci=SHARE,temperature=K",
+            help="Errors of the controller's forecasts at 24 h, such as ci=0.1,temperature=1.",
+        ),
+    ] = None,
     precision: Precision = "f32",
     overrides: Overrides = None,
     sample: Annotated[
@@ -123,7 +132,7 @@ def simulate_command(
     run and leaves whole files of the steps done. Without weather, carbon or workload files the
     inputs are synthetic years.
     """
-    from sdc_taichi.control import make_controller
+    from sdc_taichi.control import PERFECT, ForecastError, make_controller
     from sdc_taichi.run.description import RunRequest
     from sdc_taichi.run.folder_writer import metrics_json, prepare_folder, simulate_to_folder
     from sdc_taichi.sim.events import require_events_start_before
@@ -143,7 +152,8 @@ def simulate_command(
         seed=seed,
     )
     fleet = build_fleet(configs)
-    request = RunRequest(controller, whole_steps(days, fleet.steps_per_hour), seed)
+    error = PERFECT if forecast_error is None else ForecastError.parse(forecast_error)
+    request = RunRequest(controller, whole_steps(days, fleet.steps_per_hour), seed, error)
     require_events_start_before(24.0 * days, fleet.configs)
     driver = make_controller(controller, fleet)
     recorder = make_recorder(record, focus, every, serve, serve_port)

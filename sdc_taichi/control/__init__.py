@@ -4,6 +4,7 @@ A controller turns a view of the data centers into actions, and knows them by no
 Learning algorithms and physics never live here.
 """
 
+from sdc_taichi.control.forecast_error import PERFECT, ForecastError
 from sdc_taichi.control.registry import (
     CONTROLLABLE,
     controlled_by,
@@ -26,9 +27,11 @@ from sdc_taichi.control.view import Forecast, Limits, View, view_maker
 
 __all__ = [
     "CONTROLLABLE",
+    "PERFECT",
     "Controller",
     "FixedSetpoint",
     "Forecast",
+    "ForecastError",
     "GreedyCarbon",
     "Idle",
     "Limits",

@@ -7,9 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sdc_taichi.control.forecast_error import (
+    CI_WALK,
+    PERFECT,
+    TEMPERATURE_WALK,
+    ForecastError,
+    RandomWalks,
+    walk_keys,
+)
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
-from sdc_taichi.sim.drivers import Drivers
+from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
@@ -33,20 +41,25 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """Weather, carbon intensity and price of coming steps, exactly as they will be.
+    """Weather, carbon intensity and price of coming steps as they are forecast.
 
-    Column 0 is the step to come.
+    Column 0 is the step to come, which is known exactly, as prices are for all steps.
     """
 
     drivers: Drivers
     """Inputs of all steps."""
     index: I64
     """Coming steps, counted from the beginning of the year, (B, n)."""
+    ci_error: F64 | None = None
+    """Error of the carbon intensity as a share of its true value, (B, n); None is exact."""
+    temperature_error_k: F64 | None = None
+    """Error of both temperatures, in K, (B, n); None is exact."""
 
     @property
     def ci_g_per_kwh(self) -> F64:
         """Carbon intensity of the grid, in g CO2e/kWh, (B, n)."""
-        return self.drivers.ci_g_per_kwh.at(self.index)
+        true = self.drivers.ci_g_per_kwh.at(self.index)
+        return true if self.ci_error is None else np.maximum(true * (1.0 + self.ci_error), 0.0)
 
     @property
     def price_per_kwh(self) -> F64:
@@ -57,12 +70,16 @@ class Forecast:
     @property
     def outdoor_c(self) -> F64:
         """Outdoor dry bulb, in C, (B, n)."""
-        return self.drivers.outdoor_c.at(self.index)
+        return self._temperature_c(self.drivers.outdoor_c)
 
     @property
     def wet_bulb_c(self) -> F64:
         """Outdoor wet bulb, in C, (B, n)."""
-        return self.drivers.wet_bulb_c.at(self.index)
+        return self._temperature_c(self.drivers.wet_bulb_c)
+
+    def _temperature_c(self, series: FleetSeries) -> F64:
+        true = series.at(self.index)
+        return true if self.temperature_error_k is None else true + self.temperature_error_k
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +102,11 @@ class View:
     """Length of a step, in h."""
     precision: Precision
     """Floating-point precision of the hall kernels: ``f32`` or ``f64``."""
+    forecast_error: ForecastError = PERFECT
+    """How forecasts err."""
+    walks: RandomWalks | None = None
+    """Walks that the errors are made of, shared by the views of an episode; None for perfect
+    forecasts."""
 
     @property
     def now(self) -> Exogenous:
@@ -92,21 +114,30 @@ class View:
         return self.drivers.at(self.state.step)
 
     def forecast(self, hours: float) -> Forecast:
-        """Inputs of the coming hours, known exactly in advance.
+        """Inputs of the coming hours, exact unless the run or the environment has forecasts err.
 
         Args:
             hours: length of the forecast, rounded to whole steps.
 
         Raises:
             ConfigError: the forecast is shorter than a step, or longer than a year.
+            RuntimeStateError: forecasts err, and those of a later step have been asked for.
         """
         if not self.step_h / 2 < hours <= HOURS_PER_YEAR:
             raise ConfigError(
                 f"forecast of {hours:g} h: valid is {self.step_h:g}..{HOURS_PER_YEAR:,} h"
             )
         steps = round(hours / self.step_h)
-        first = self.drivers.start + self.state.step
-        return Forecast(self.drivers, first[:, None] + np.arange(steps))
+        first, leads = self.drivers.start + self.state.step, np.arange(steps)
+        ci_error = self._error(CI_WALK, self.forecast_error.ci_share, leads)
+        error_k = self._error(TEMPERATURE_WALK, self.forecast_error.temperature_k, leads)
+        return Forecast(self.drivers, first[:, None] + leads, ci_error, error_k)
+
+    def _error(self, walk: int, deviation: float, leads: I64) -> F64 | None:
+        """Errors of a forecast at each lead, (B, n); None without any."""
+        if self.walks is None or deviation == 0.0:
+            return None
+        return float(deviation) * self.walks.increments(walk, self.state.step, leads).T
 
     @property
     def setpoint_c(self) -> F64:
@@ -138,20 +169,40 @@ def limits_of(fleet: Fleet) -> Limits:
     )
 
 
-def view_maker(sim: Simulator) -> Callable[[StepResult | None], View]:
-    """A function that makes the view before each step.
+def view_maker(
+    sim: Simulator, forecast_error: ForecastError = PERFECT, keys: I64 | None = None
+) -> Callable[[StepResult | None], View]:
+    """A function that makes the view before each step of an episode.
 
     Args:
         sim: a simulator that has been reset.
+        forecast_error: how forecasts err.
+        keys: seeds of the errors, (B,); None takes them from the seeds that the simulator was reset
+            with, and from the names of its data centers.
 
     Returns:
         Function of the last step's result, or of None before the first step.
     """
     step_h = sim.step_h
     limits, sizing = limits_of(sim.fleet), sim.sizing
+    walks: RandomWalks | None = None
+    if forecast_error != PERFECT:
+        seeds = walk_keys(sim.state.seed, sim.fleet.names) if keys is None else keys
+        walks = RandomWalks(seeds, step_h)
 
     def view_after(last: StepResult | None) -> View:
-        return View(last, sim.state, sim.drivers, sim.fleet, sizing, limits, step_h, sim.precision)
+        return View(
+            last,
+            sim.state,
+            sim.drivers,
+            sim.fleet,
+            sizing,
+            limits,
+            step_h,
+            sim.precision,
+            forecast_error,
+            walks,
+        )
 
     return view_after
 

@@ -18,7 +18,14 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.control import View, controlled_by, given_by, make_controller, view_maker
+from sdc_taichi.control import (
+    PERFECT,
+    View,
+    controlled_by,
+    given_by,
+    make_controller,
+    view_maker,
+)
 from sdc_taichi.envs.actions import ActionDecoder
 from sdc_taichi.envs.agents import COMMAND_OF_AGENT
 from sdc_taichi.envs.costs import Costs
@@ -233,8 +240,9 @@ class Core:
         """Start what goes along with the simulator, which has been reset."""
         self._final_terms = {}
         self._others.reset(self.sim.state.seed)
-        if self._view_after is None:
-            self._view_after = view_maker(self.sim)
+        error = self.options.forecast_error
+        if self._view_after is None or error != PERFECT:
+            self._view_after = view_maker(self.sim, error, self._keys)
         self._last = None
         self._view = view = self._view_after(None)
         self._observer.reset(view, self._keys)

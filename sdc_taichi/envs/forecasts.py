@@ -1,26 +1,25 @@
-"""Carbon intensity and weather, now and some hours ahead: known exactly, or with errors.
-
-The error of the forecast that is issued at time t for t + h is ``s (W(t + h) - W(t))`` with a
-standard deviation s at 24 h and a random walk W of unit variance per 24 h. It is zero for the
-present, grows with the square root of the lead, and a later forecast of the same hour differs from
-an earlier one by what the walk has done in between. W is a realisation of each environment: it
-depends on the key given at reset and on the step alone.
-"""
+"""Carbon intensity and weather, now and some hours ahead: known exactly, or with errors."""
 
 from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
+from sdc_taichi.control.forecast_error import (
+    CI_WALK,
+    PERFECT,
+    TEMPERATURE_WALK,
+    ForecastError,
+    RandomWalks,
+)
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.sim.drivers import Drivers, FleetSeries
-from sdc_taichi.types import F32, F64, I64
+from sdc_taichi.types import F32, I64
 
 CI_LEADS_H = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0)
 """Leads of the carbon-intensity forecast unless told otherwise, in h."""
@@ -28,44 +27,9 @@ WEATHER_LEADS_H = (3.0, 6.0, 12.0, 24.0)
 """Leads of the weather forecasts unless told otherwise, in h."""
 LONGEST_LEAD_H = float(HOURS_PER_YEAR)
 """Longest valid lead, in h."""
-MOST_CI_SHARE = 10.0
-"""Largest error of carbon intensity, ten times its value: no forecast is that poor."""
-MOST_TEMPERATURE_K = 40.0
-"""Largest error of temperatures, in K: the largest departure from the climate on record is 39 K."""
 LeadH = Annotated[float, Field(gt=0, le=LONGEST_LEAD_H, allow_inf_nan=False)]
 """Lead of a forecast, above 0 and at most a year of 8,760 h."""
-_DRAWN_STEPS = 128
-"""Steps of the random walks that are drawn at once."""
 _ALL = slice(None)
-
-
-@dataclass(frozen=True, slots=True)
-class ForecastError:
-    """How forecasts err: standard deviations at a lead of 24 h. Zero is perfect foresight.
-
-    Raises:
-        ConfigError: a value that is no number or out of bounds.
-    """
-
-    ci_share: Annotated[float, Field(ge=0, le=MOST_CI_SHARE)] = 0.0
-    """Standard deviation of the carbon intensity at 24 h, as a share of its true value, 0..10;
-    forecasts are cut at zero."""
-    temperature_k: Annotated[float, Field(ge=0, le=MOST_TEMPERATURE_K)] = 0.0
-    """Standard deviation of dry bulb and wet bulb at 24 h, in K, 0..40. Both err alike, so that the
-    wet bulb stays below the dry bulb."""
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        for name, most in (("ci_share", MOST_CI_SHARE), ("temperature_k", MOST_TEMPERATURE_K)):
-            value: Any = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-                raise ConfigError(f"forecast error {name}: {value!r} is no number")
-            if not 0.0 <= value <= most:
-                raise ConfigError(f"forecast error {name}: {value:g}; valid is 0..{most:g}")
-
-
-PERFECT = ForecastError()
-"""Perfect foresight."""
 
 
 def lead_steps(name: str, leads_h: Sequence[float], steps_per_hour: int) -> I64:
@@ -132,7 +96,7 @@ class Forecasts:
         self._error = error
         self._step_h = 1.0 / steps_per_hour
         self._tables: tuple[FleetSeries, ...] = ()
-        self._walks: _RandomWalks | None = None
+        self._walks: RandomWalks | None = None
 
     def reset(self, drivers: Drivers, keys: Sequence[int] | I64 = ()) -> bool:
         """Start an episode.
@@ -160,8 +124,7 @@ class Forecasts:
             self._wet_bulb = ExtendedSeries(tables[2], self._weather_leads)
         self._walks = None
         if not self.perfect:
-            ahead = int(max(self.ci_leads[-1], self._weather_leads[-1]))
-            self._walks = _RandomWalks(keys, self._step_h, ahead)
+            self._walks = RandomWalks(keys, self._step_h)
         return new
 
     @property
@@ -204,14 +167,14 @@ class Forecasts:
         ci, outdoor, wet_bulb = self.truth(index)
         if self._walks is None:
             return ci, outdoor, wet_bulb
-        self._walks.extend(step)
         if self._error.ci_share > 0:
-            ci *= 1.0 + float(self._error.ci_share) * self._walks.increments(0, step, self.ci_leads)
+            walked = self._walks.increments(CI_WALK, step, self.ci_leads).astype(np.float32)
+            ci *= 1.0 + float(self._error.ci_share) * walked
             np.maximum(ci, 0.0, out=ci)
         if self._error.temperature_k > 0:
-            error = float(self._error.temperature_k) * self._walks.increments(
-                1, step, self._weather_leads
-            )
+            leads = self._weather_leads
+            walked = self._walks.increments(TEMPERATURE_WALK, step, leads).astype(np.float32)
+            error = float(self._error.temperature_k) * walked
             outdoor += error
             wet_bulb += error
         return ci, outdoor, wet_bulb
@@ -239,45 +202,3 @@ class ExtendedSeries:
         """Values of data centers ``dc`` at steps ``index`` and at each lead, (1 + k, n)."""
         first = self._first_entries[dc] + index % self._lengths[dc]
         return np.asarray(self._values.take(first + self._leads))
-
-
-class _RandomWalks:
-    """Two random walks per environment, of unit variance per 24 h, from reset on.
-
-    Args:
-        keys: seed of each environment, (B,).
-        step_h: time step, in h.
-        ahead: longest lead, in steps.
-    """
-
-    def __init__(self, keys: Sequence[int] | I64, step_h: float, ahead: int) -> None:
-        self._generators = [np.random.Generator(np.random.PCG64(int(key))) for key in keys]
-        self._scale = np.sqrt(step_h / 24.0)
-        self._ahead = ahead
-        self._first = 0
-        self._walk: F64 = np.zeros((2, 1, len(keys)))
-
-    def extend(self, step: int) -> None:
-        """Draw as far as the longest lead of ``step`` needs, and drop what lies before it.
-
-        Raises:
-            RuntimeStateError: ``step`` lies before one that was asked for already.
-        """
-        if step < self._first:
-            raise RuntimeStateError(
-                f"forecasts of step {step} after those of a later one; reset starts again"
-            )
-        while self._first + self._walk.shape[1] <= step + self._ahead:
-            keep = min(step - self._first, self._walk.shape[1] - 1)
-            drawn = np.stack(
-                [rng.standard_normal((2, _DRAWN_STEPS)) for rng in self._generators], axis=2
-            )
-            more = self._walk[:, -1:] + np.cumsum(drawn * self._scale, axis=1)
-            self._walk = np.concatenate([self._walk[:, keep:], more], axis=1)
-            self._first += keep
-
-    def increments(self, which: int, step: int, leads: I64) -> F32:
-        """Increments of walk ``which`` between ``step`` and each lead, (1 + k, B)."""
-        now = step - self._first
-        walk = self._walk[which]
-        return np.asarray(walk[now + leads] - walk[now], dtype=np.float32)

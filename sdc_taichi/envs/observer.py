@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sdc_taichi.control.forecast_error import PERFECT, ForecastError
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.features import (
@@ -25,10 +26,8 @@ from sdc_taichi.envs.features import (
 )
 from sdc_taichi.envs.forecasts import (
     CI_LEADS_H,
-    PERFECT,
     WEATHER_LEADS_H,
     ExtendedSeries,
-    ForecastError,
     Forecasts,
 )
 from sdc_taichi.envs.time_rows import EntryOrder, RowStretches, TimeRows, time_rows

@@ -19,12 +19,11 @@ from pydantic import (
 
 from sdc_taichi.config import explain
 from sdc_taichi.config.tariff_schema import TariffConfig
+from sdc_taichi.control.forecast_error import PERFECT, ForecastError
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT, Agent
 from sdc_taichi.envs.forecasts import (
     CI_LEADS_H,
-    PERFECT,
     WEATHER_LEADS_H,
-    ForecastError,
     LeadH,
 )
 from sdc_taichi.envs.rewards import REWARD_SETS

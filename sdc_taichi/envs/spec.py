@@ -14,8 +14,8 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from pydantic import BaseModel
 
+from sdc_taichi.control.forecast_error import ForecastError
 from sdc_taichi.envs.core import Core
-from sdc_taichi.envs.forecasts import ForecastError
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.user_functions import import_path
 from sdc_taichi.errors import ConfigError

@@ -6,12 +6,13 @@ import functools
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.control import PERFECT, ForecastError
 from sdc_taichi.exogenous.files import sha256
 from sdc_taichi.run.processor import processor_features
 from sdc_taichi.sim.fleet_configs import locations
@@ -30,7 +31,9 @@ class RunRequest:
     steps: int
     """Number of steps to simulate."""
     seed: int = 0
-    """Seed of the simulator's events and of the controller."""
+    """Seed of the simulator's events, of the controller and of errors of forecasts."""
+    forecast_error: ForecastError = PERFECT
+    """How the forecasts err that the controller sees."""
 
 
 def describe_run(sim: Simulator, request: RunRequest) -> dict[str, Any]:
@@ -48,6 +51,7 @@ def describe_run(sim: Simulator, request: RunRequest) -> dict[str, Any]:
         "fingerprint": sim.fingerprint(),
         "controller": request.controller,
         "seed": request.seed,
+        "forecast_error": asdict(request.forecast_error),
         "precision": sim.precision,
         "step_h": sim.step_h,
         "steps_asked": request.steps,

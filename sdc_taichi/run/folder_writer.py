@@ -52,7 +52,7 @@ def simulate_to_folder(
     Args:
         sim: the simulator; its data centers have distinct names.
         controller: gives the actions of every step.
-        request: steps, seed and the controller's name.
+        request: steps, seed, errors of forecasts and the controller's name.
         out: folder, created if need be; files of a former run there are replaced.
         force: also write into a folder with other files.
         on_step: called with the result of every step.
@@ -96,6 +96,7 @@ def simulate_to_folder(
                 controller,
                 request.steps,
                 request.seed,
+                forecast_error=request.forecast_error,
                 on_step=write_step,
                 stop=stop,
                 totals=totals,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sdc_taichi.control import Controller, view_maker
+from sdc_taichi.control import PERFECT, Controller, ForecastError, view_maker
 from sdc_taichi.errors import whole_number
 from sdc_taichi.run.metrics import Totals, add_step, empty_totals
 from sdc_taichi.sim.bills import no_demand
@@ -22,6 +22,7 @@ def simulate(
     steps: int,
     seed: int = 0,
     *,
+    forecast_error: ForecastError = PERFECT,
     on_step: Callable[[StepResult], None] | None = None,
     stop: Callable[[], bool] | None = None,
     totals: Totals | None = None,
@@ -32,7 +33,8 @@ def simulate(
         sim: the simulator.
         controller: gives the actions of every step.
         steps: number of steps, at most ``MOST_STEPS``.
-        seed: of the simulator's events and of the controller.
+        seed: of the simulator's events, of the controller and of errors of forecasts.
+        forecast_error: how the forecasts err that the controller sees.
         on_step: called with the result of every step.
         stop: asked before every step; true ends the run.
         totals: totals that each step is added to as it is done; None makes new ones.
@@ -49,7 +51,7 @@ def simulate(
     require_events_start_before(steps * sim.step_h, sim.fleet.configs)
     sim.reset(seed)
     controller.reset(seed)
-    view_of = view_maker(sim)
+    view_of = view_maker(sim, forecast_error)
     totals = empty_totals(sim.size, sim.step_h) if totals is None else totals
     if totals.steps == 0:
         totals.demand = no_demand(sim.drivers.start, sim.fleet.steps_per_hour)
