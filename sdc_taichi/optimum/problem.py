@@ -31,7 +31,8 @@ class FacilityTable:
     inlet_max_c: F64
     """Hottest inlet of a server, in C, (T, I, J)."""
     unmet_w: F64
-    """Cooling load that stays in the room, in W, (T, I, J)."""
+    """Cooling load that stays in the room, in W, (T, I, J); inf where racks would throttle or
+    results are beyond what is physical."""
 
 
 @dataclass(frozen=True, slots=True)

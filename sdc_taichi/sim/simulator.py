@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from operator import itemgetter
 from typing import Any, Self
 
@@ -14,24 +14,21 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, PhysicalLimitError, RuntimeStateError
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim import snapshot
-from sdc_taichi.sim.actions import ActionDecoder, Commands
-from sdc_taichi.sim.air import SteadyAir, TransientAir
-from sdc_taichi.sim.crac_units import CracUnits, Supply
+from sdc_taichi.sim.actions import Commands
+from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.drivers import Drivers, load_drivers
 from sdc_taichi.sim.events import ActiveEvent, schedule, seeds_of_fleet
-from sdc_taichi.sim.facility import Facility
-from sdc_taichi.sim.facility_stage import FacilityStage
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
+from sdc_taichi.sim.hall_solver import HallSums, Precision
 from sdc_taichi.sim.intake_air import IntakeAir
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
 from sdc_taichi.sim.prices import with_prices
-from sdc_taichi.sim.sizing import Sizing, size
+from sdc_taichi.sim.sizing import Sizing
+from sdc_taichi.sim.stages import Stages, make_stages
 from sdc_taichi.sim.state_limits import LAST_START, state_limits
-from sdc_taichi.sim.surroundings import Surroundings, SurroundingsModel
-from sdc_taichi.sim.unit_index import UnitIndex
-from sdc_taichi.sim.work_allocation import RackOutcome, WorkAllocation
-from sdc_taichi.sim.workload import Workload, WorkResult
+from sdc_taichi.sim.surroundings import Surroundings
+from sdc_taichi.sim.work_allocation import RackOutcome
+from sdc_taichi.sim.workload import WorkResult
 from sdc_taichi.types import I64, Actions, ServerLayers, State, StepResult
 
 
@@ -70,7 +67,7 @@ class Simulator:
             steps_per_hour=self.fleet.steps_per_hour,
             seed=0,
         )
-        self._stages: _Stages | None = None
+        self._stages: Stages | None = None
         self._state: State | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -155,23 +152,7 @@ class Simulator:
 
     def _initial_state(self, seeds: I64, drivers: Drivers) -> State:
         """The state before the first step; see ``reset``."""
-        stages = self._started()
-        supply = stages.crac_units.initial_supply()
-        return State(
-            step=0,
-            seed=seeds,
-            start=drivers.start,
-            setpoint_c=supply.unit_setpoint_c,
-            cooling_run=supply.cooling_run,
-            cooling_last=supply.cooling_last,
-            fan_speed=supply.fan_speed,
-            queue=stages.workload.empty_queue(),
-            stored_kwh=self.fleet.values("battery.initial_soc") * stages.sizing.battery_kwh,
-            room_heat_kwh=np.zeros(self.size),
-            rack_status=np.zeros(self.fleet.racks, dtype=np.int8),
-            restart_wait_min=stages.allocation.initial_wait_min(),
-            **stages.air.initial(supply, drivers.at(0).demand),
-        )
+        return self._started().initial_state(self.fleet, seeds, drivers)
 
     def step(self, actions: Actions | None = None) -> StepResult:
         """Advance all data centers by one step.
@@ -340,11 +321,11 @@ class Simulator:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _started(self) -> _Stages:
+    def _started(self) -> Stages:
         """The stages, made on first use: they size all devices and need the Taichi runtime."""
         self._check_open()
         if self._stages is None:
-            self._stages = _make_stages(
+            self._stages = make_stages(
                 self.fleet, self.drivers, self.precision, event_free=self._timeline.event_free
             )
         return self._stages
@@ -378,58 +359,6 @@ class Simulator:
         if not np.ndim(given):
             return seeds_of_fleet(int(listed[0]), self.fleet.names)
         return np.array(listed, dtype=np.int64)
-
-
-@dataclass(frozen=True, slots=True)
-class _Stages:
-    """Stages of a step, and the objects that they share."""
-
-    hall: Hall
-    """Temperatures and power of servers and air."""
-    sizing: Sizing
-    """Sized devices."""
-    decoder: ActionDecoder
-    """From actions to commands."""
-    surroundings: SurroundingsModel
-    """Weather, demand, and what is out of order."""
-    workload: Workload
-    """Work that runs, waits, is due or dropped."""
-    allocation: WorkAllocation
-    """Which racks work, and what they protect themselves from."""
-    crac_units: CracUnits
-    """Setpoints and fan speeds."""
-    air: SteadyAir | TransientAir
-    """Air of the halls, quasi-steady or transient."""
-    facility: FacilityStage
-    """Plant, water, battery, grid and carbon."""
-
-
-def _make_stages(
-    fleet: Fleet, drivers: Drivers, precision: Precision, *, event_free: bool
-) -> _Stages:
-    hall, units = Hall(fleet, precision), UnitIndex(fleet)
-    sizing = size(fleet, hall, drivers.design_outdoor_c, drivers.design_wet_bulb_c)
-    hall.discard_last_step()
-    allocation = WorkAllocation(fleet)
-    models = Facility(fleet, sizing, event_free=event_free)
-    facility = FacilityStage(fleet, units, models, event_free=event_free)
-    keep = allocation.watches_inlets
-    air: SteadyAir | TransientAir = (
-        TransientAir(fleet, hall, sizing, facility, keep_inlets=keep)
-        if fleet.models["thermal"] == "transient"
-        else SteadyAir(fleet, hall, sizing, units, keep_inlets=keep)
-    )
-    return _Stages(
-        hall=hall,
-        sizing=sizing,
-        decoder=ActionDecoder(fleet, units),
-        surroundings=SurroundingsModel(fleet, units, models),
-        workload=Workload(fleet),
-        allocation=allocation,
-        crac_units=CracUnits(fleet, units),
-        air=air,
-        facility=facility,
-    )
 
 
 def _next_state(

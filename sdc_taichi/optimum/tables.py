@@ -1,0 +1,270 @@
+"""What a step costs by utilisation and setpoint, from batches of the simulator itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.errors import ConfigError, whole_number
+from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, allowable_c
+from sdc_taichi.hall.protection import Mask
+from sdc_taichi.optimum.problem import FacilityTable
+from sdc_taichi.sim.drivers import Drivers, FleetSeries
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.steady_facility import SteadyFacility
+from sdc_taichi.types import F64, I64
+
+MOST_COPIES = 4096
+"""Copies of data centers in a batch, beyond which its arrays leave the caches."""
+MOST_RACKS = 2**18
+"""Racks of the copies in a batch, which take some 1 kB each."""
+
+OnStep = Callable[[int, int], None]
+"""Is told how many steps of data centers are done, and of how many."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableGrid:
+    """Where tables have their nodes."""
+
+    utilisations: int = 41
+    """Number of utilisations, evenly from 0 to 1, 2..1,001."""
+    setpoint_step_k: float = 1.0
+    """Largest distance of setpoints, in K, 0.01..50."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ConfigError: One that is out of bounds.
+        """
+        whole_number("table: utilisations", self.utilisations, 2, 1001)
+        if not 0.01 <= self.setpoint_step_k <= 50.0:
+            raise ConfigError(f"table: setpoint_step_k {self.setpoint_step_k:g}; valid is 0.01..50")
+
+    def utilisation(self) -> F64:
+        """Utilisations, rising from 0 to 1, (I,)."""
+        return np.linspace(0.0, 1.0, self.utilisations)
+
+    def setpoint_c(self, config: DataCenterConfig) -> F64:
+        """Setpoints from the lowest to the highest of a data center, in C, (J,)."""
+        setpoint = config.hvac.setpoint
+        intervals = int(np.ceil((setpoint.max_c - setpoint.min_c) / self.setpoint_step_k - 1e-9))
+        return np.linspace(setpoint.min_c, setpoint.max_c, intervals + 1)
+
+
+def facility_tables(
+    fleet: Fleet,
+    drivers: Drivers,
+    *,
+    start: I64,
+    steps: int,
+    grid: TableGrid = TableGrid(),
+    precision: Precision = "f32",
+    on_step: OnStep | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> list[FacilityTable]:
+    """Tables of data centers over the steps of a run.
+
+    Utilisation and setpoint are constant in each entry, and the room holds no heat from earlier
+    steps. Entries in which racks would throttle, or results are not physical, have an unmet load of
+    inf. Data centers that are alike share one table.
+
+    Args:
+        fleet: B data centers. Events, thermal mass and protection are left out.
+        drivers: Their inputs, whose design temperatures size the devices.
+        start: First step of each data center, counted from the beginning of the year, (B,).
+        steps: Number of steps, T.
+        grid: Where the tables have their nodes.
+        precision: Of the server kernels.
+        on_step: Called after every step of a batch of data centers.
+        stop: Asked before every step; true ends with no table.
+
+    Returns:
+        A table for each data center, B; none where ``stop`` was true.
+
+    Raises:
+        PhysicalLimitError: A hall that finds no steady air at some utilisation and setpoint.
+    """
+    known: dict[Hashable, int] = {}
+    table_of = [
+        known.setdefault(_what_decides(fleet, drivers, start, dc), dc) for dc in range(fleet.size)
+    ]
+    distinct = list(known.values())
+    tables: dict[int, FacilityTable] = {}
+    for batch in batches(fleet, distinct, grid):
+        outdoor_c, wet_bulb_c = (
+            _series_of(series, batch, start, steps)
+            for series in (drivers.outdoor_c, drivers.wet_bulb_c)
+        )
+        done = len(tables) * steps
+
+        def tell(step: int, before: int = done, size: int = len(batch)) -> None:
+            if on_step is not None:
+                on_step(before + size * step, len(distinct) * steps)
+
+        found = tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, grid, precision, tell, stop)
+        if found is None:
+            return []
+        tables |= dict(zip(batch, found, strict=True))
+    return [tables[dc] for dc in table_of]
+
+
+def tabulate(
+    fleet: Fleet,
+    drivers: Drivers,
+    batch: Sequence[int],
+    outdoor_c: F64,
+    wet_bulb_c: F64,
+    grid: TableGrid,
+    precision: Precision,
+    on_step: Callable[[int], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> list[FacilityTable] | None:
+    """Tables of some data centers over given weather.
+
+    Args:
+        fleet: B data centers.
+        drivers: Their inputs, of which the design temperatures are read.
+        batch: Which of them, n.
+        outdoor_c: Dry bulb of each step, in C, (n, T).
+        wet_bulb_c: Wet bulb of each step, in C, (n, T).
+        grid: Where the tables have their nodes.
+        precision: Of the server kernels.
+        on_step: Called after every step with the number of those done.
+        stop: Asked before every step.
+
+    Returns:
+        A table for each, n; None where ``stop`` was true.
+    """
+    levels = grid.utilisation()
+    setpoints = [grid.setpoint_c(fleet.configs[dc]) for dc in batch]
+    counts = np.array([len(levels) * len(each) for each in setpoints])
+    place = np.repeat(np.arange(len(batch)), counts)
+    facility = SteadyFacility(
+        fleet.configs,
+        drivers,
+        of=np.asarray(batch)[place],
+        utilisation=np.concatenate([np.repeat(levels, len(each)) for each in setpoints]),
+        setpoint_c=np.concatenate([np.tile(each, len(levels)) for each in setpoints]),
+        precision=precision,
+    )
+    barred = _throttles(fleet, facility, np.asarray(batch)[place])
+    steps = outdoor_c.shape[1]
+    facility_kwh, water_l = (np.empty((steps, len(place))) for _ in range(2))
+    unmet_w: F64 | None = None
+    for step in range(steps):
+        if stop is not None and stop():
+            facility.close()
+            return None
+        found = facility.at(outdoor_c[place, step], wet_bulb_c[place, step])
+        facility_kwh[step], water_l[step] = found.facility_kwh, found.water_l
+        short_w = np.where(barred, np.inf, found.unmet_w)
+        if unmet_w is None and short_w.any():
+            unmet_w = np.zeros((steps, len(place)))
+        if unmet_w is not None:
+            unmet_w[step] = short_w
+        if on_step is not None:
+            on_step(step + 1)
+    facility.close()
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    return [
+        FacilityTable(
+            utilisation=levels,
+            setpoint_c=setpoint_c,
+            **{
+                name: _of_one(values, first, steps, len(levels), len(setpoint_c))
+                for name, values in (
+                    ("facility_kwh", facility_kwh),
+                    ("water_l", water_l),
+                    ("inlet_max_c", facility.inlet_max_c[None]),
+                    ("unmet_w", np.zeros((1, len(place))) if unmet_w is None else unmet_w),
+                )
+            },
+        )
+        for first, setpoint_c in zip(ends, setpoints, strict=False)
+    ]
+
+
+def batches(fleet: Fleet, which: Sequence[int], grid: TableGrid) -> Iterator[list[int]]:
+    """Parts of a list of data centers whose copies at all nodes make one batch.
+
+    Args:
+        fleet: B data centers.
+        which: Some of them.
+        grid: Nodes of each.
+    """
+    racks = np.diff(fleet.rack_offsets)
+    part: list[int] = []
+    part_copies = part_racks = 0
+    for dc in which:
+        copies = grid.utilisations * len(grid.setpoint_c(fleet.configs[dc]))
+        of_copies = copies * int(racks[dc])
+        if part and (part_copies + copies > MOST_COPIES or part_racks + of_copies > MOST_RACKS):
+            yield part
+            part, part_copies, part_racks = [], 0, 0
+        part.append(dc)
+        part_copies, part_racks = part_copies + copies, part_racks + of_copies
+    if part:
+        yield part
+
+
+def what_decides_facility(fleet: Fleet, drivers: Drivers, dc: int) -> Hashable:
+    """What the energy of a facility follows from beside weather, load and setpoint.
+
+    Args:
+        fleet: B data centers.
+        drivers: Their inputs.
+        dc: One of them.
+    """
+    config = fleet.configs[dc]
+    setpoint = config.hvac.setpoint
+    first_c = setpoint.model_copy(update={"initial_c": setpoint.min_c, "schedule_c": None})
+    return (
+        config.hall,
+        config.servers,
+        config.hvac.model_copy(update={"setpoint": first_c}),
+        config.electrical,
+        config.protection,
+        config.site.location,
+        config.site.weather_file,
+        float(drivers.design_outdoor_c[dc]),
+        float(drivers.design_wet_bulb_c[dc]),
+    )
+
+
+def _what_decides(fleet: Fleet, drivers: Drivers, start: I64, dc: int) -> Hashable:
+    """What a table follows from beside its number of steps: facility, weather and first step."""
+    series = drivers.outdoor_c, drivers.wet_bulb_c
+    weather = tuple((int(each.offsets[dc]), int(each.lengths[dc])) for each in series)
+    return what_decides_facility(fleet, drivers, dc), weather, int(start[dc])
+
+
+def _series_of(series: FleetSeries, batch: Sequence[int], start: I64, steps: int) -> F64:
+    """Values of some data centers over the steps of a run, (n, T)."""
+    index = np.asarray(start)[:, None] + np.arange(steps)
+    return series.at(index)[list(batch)]
+
+
+def _throttles(fleet: Fleet, facility: SteadyFacility, of: I64) -> Mask:
+    """Whether racks of each copy would throttle by their hottest inlet or outlet, (B,)."""
+    limits = [fleet.configs[dc].protection for dc in of]
+    inlet_c, outlet_c = (np.full(len(of), np.inf) for _ in range(2))
+    for copy, protection in enumerate(limits):
+        if protection.ashrae_class is not None:
+            inlet_c[copy] = allowable_c(protection.ashrae_class)[1]
+            if protection.outlet_limit_c is not None:
+                outlet_c[copy] = protection.outlet_limit_c
+    return (facility.inlet_max_c > inlet_c + LEAST_EXCESS_K) | (
+        facility.outlet_max_c > outlet_c + LEAST_EXCESS_K
+    )
+
+
+def _of_one(values: F64, first: int, steps: int, levels: int, setpoints: int) -> F64:
+    """Values of one data center, (T, I, J), from those of all copies, (T, B) or (1, B)."""
+    own = np.ascontiguousarray(values[:, first : first + levels * setpoints])
+    return np.broadcast_to(own.reshape(-1, levels, setpoints), (steps, levels, setpoints))
