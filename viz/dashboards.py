@@ -113,7 +113,7 @@ def day(
     figure = new_figure(12.0, 12.0)
     check_steps(steps, COLUMNS)
     check_steps(steps, ("time", *DAY_COLUMNS))
-    first, after = _rows_of_day(steps, date)
+    first, after = rows_of_day(steps, date)
     shown = steps.iloc[first:after]
     check_steps(shown, COLUMNS)
     panels = figure.subplots(5, 1, sharex=True, height_ratios=[4, 4, 3, 2, 3])
@@ -127,7 +127,7 @@ def day(
     panels[-1].xaxis.set_major_formatter(DateFormatter("%H:%M"))  # type: ignore[no-untyped-call]
     begin = shown["time"].iloc[0].normalize()
     panels[-1].set_xlim(begin, begin + _DAY)
-    name = date_text(begin, over_a_year=_is_over_a_year(steps))
+    name = date_text(begin, over_a_year=is_over_a_year(steps))
     panels[-1].set_xlabel(f"local standard time on {name}")
     add_title(figure, short_name(title))
     return figure
@@ -299,12 +299,12 @@ def hot_racks(racks: pd.DataFrame, hall: HallConfig, title: str = "") -> Figure:
     return figure
 
 
-def _is_over_a_year(steps: pd.DataFrame) -> bool:
+def is_over_a_year(steps: pd.DataFrame) -> bool:
     """Whether a run is longer than a year, so that its days occur more than once."""
     return bool(steps["time"].iloc[-1] - steps["time"].iloc[0] >= 365 * _DAY)
 
 
-def _rows_of_day(steps: pd.DataFrame, date: str) -> tuple[int, int]:
+def rows_of_day(steps: pd.DataFrame, date: str) -> tuple[int, int]:
     """First row of a day, and the first row after it.
 
     Args:
@@ -458,7 +458,7 @@ def _draw_totals(both: npt.NDArray[np.object_], steps: pd.DataFrame) -> None:
     carbon.set_ylabel(f"emitted ({unit} CO₂e/{per})")
     style_axes(carbon)
     every = -(-len(sums) // MAX_NAMED_BARS)
-    over = _is_over_a_year(steps)
+    over = is_over_a_year(steps)
     span = " to ".join(date_text(times.iloc[i], over_a_year=over) for i in (0, -1))
     for axes in (energy, carbon):
         axes.set_axisbelow(True)

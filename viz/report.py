@@ -19,6 +19,7 @@ from sdc_taichi.run.folder_writer import METRICS_FILE, REPORT_FILE
 from .report_html import html_page
 from .report_inlets import hot_racks_section
 from .report_metrics import MAX_DC_COLUMNS, METRICS, comparison_section, metrics_section
+from .report_optimum import known_optimum, optimum_section, shares_of
 from .report_pictures import (
     data_center_section,
     fleet_section,
@@ -67,10 +68,14 @@ def report_html(run: RunFolder, others: Sequence[RunFolder] = ()) -> str:
         "Summary": summary_section(run),
         "Metrics": metrics_section(run),
     }
+    optimum = known_optimum([run, *others])
     if others:
-        sections["Comparison"] = comparison_section([run, *others])
+        shares = None if optimum is None else shares_of([run, *others], optimum)
+        sections["Comparison"] = comparison_section([run, *others], shares)
     sections["Events"] = events_section(run)
     shown = shown_data_centers(run)
+    if optimum is not None:
+        sections["Known optimum"] = optimum_section(run, optimum, shown)
     if len(run.names) > 1 and run.metrics["steps_done"] > 1:
         sections["All data centers"] = fleet_section(run)
     for dc in shown:

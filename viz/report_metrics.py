@@ -188,8 +188,15 @@ def _low_mean_high(dcs: Sequence[dict[str, Any]], key: str) -> list[str]:
     return [f"{format_number(low[0])} {low[1]}", mean, f"{format_number(high[0])} {high[1]}"]
 
 
-def comparison_section(runs: Sequence[RunFolder]) -> str:
+def comparison_section(
+    runs: Sequence[RunFolder], shares: Sequence[float | None] | None = None
+) -> str:
     """Runs against the first one: metrics, their changes, and a radar of five.
+
+    Args:
+        runs: the runs.
+        shares: share of the achievable of each, None where it is not known; None without a known
+            optimum.
 
     Raises:
         SdcError: runs of other length than the first one, or too many.
@@ -219,7 +226,10 @@ def comparison_section(runs: Sequence[RunFolder]) -> str:
         )
     for start in range(1, len(runs), COMPARED_PER_TABLE):
         columns = [0, *range(start, min(start + COMPARED_PER_TABLE, len(runs)))]
-        out.append(_comparison_table([labels[i] for i in columns], [totals[i] for i in columns]))
+        own = None if shares is None else [shares[i] for i in columns]
+        out.append(
+            _comparison_table([labels[i] for i in columns], [totals[i] for i in columns], own)
+        )
     worst = "; ".join(
         f"{label} {format_number(max(total[key] for total in totals))} {unit}"
         for key, label, unit in RADAR_METRICS
@@ -235,7 +245,11 @@ def comparison_section(runs: Sequence[RunFolder]) -> str:
     return "".join(out)
 
 
-def _comparison_table(labels: Sequence[str], totals: Sequence[Mapping[str, Any]]) -> str:
+def _comparison_table(
+    labels: Sequence[str],
+    totals: Sequence[Mapping[str, Any]],
+    shares: Sequence[float | None] | None = None,
+) -> str:
     """Metrics of some runs, and their changes against the first one."""
     known = {key: (label, unit) for _, group in METRICS for key, label, unit in group}
     rows = []
@@ -249,6 +263,10 @@ def _comparison_table(labels: Sequence[str], totals: Sequence[Mapping[str, Any]]
                 text += f" ({100 * (total[key] / base - 1):+z.2f} %)"
             cells.append(Cell(text, True))
         rows.append(cells)
+    if shares is not None:
+        texts = ["–" if share is None else f"{100 * share:z.1f}" for share in shares]
+        own = [Cell("share of the achievable"), Cell("%"), *(Cell(text, True) for text in texts)]
+        rows.append(own)
     heads = [Cell("metric"), Cell("unit"), *(Cell(label, True) for label in labels)]
     caption = f"All data centers of each run; changes are against {labels[0]}"
     return html_table(caption, heads, rows)

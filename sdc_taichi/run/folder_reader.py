@@ -374,7 +374,7 @@ def _check_steps_file(run: RunFolder) -> None:
 
 def _flat_description(content: Mapping[str, Any]) -> dict[str, Any]:
     """Fields that steps.parquet and metrics.json both hold, by their paths."""
-    others = ("data_centers", "steps_done", "total", "configs_yaml")
+    others = ("data_centers", "steps_done", "total", "configs_yaml", "optimum")
     out = {name: value for name, value in content.items() if name not in others}
     for index, dc in enumerate(content.get("data_centers", ())):
         own = {name: value for name, value in dc.items() if name not in ("metrics", "events")}

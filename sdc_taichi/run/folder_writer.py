@@ -20,6 +20,8 @@ from sdc_taichi.atomic_file import AtomicFile, atomic_write, naming_errors
 from sdc_taichi.config import DataCenterConfig, load_json
 from sdc_taichi.control import Controller
 from sdc_taichi.errors import ConfigError, PhysicalLimitError
+from sdc_taichi.optimum.result import Optimum
+from sdc_taichi.run.achievable import achievement, begin_score, put_beside
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import Totals, empty_totals, metrics_of_fleet, metrics_per_dc
@@ -34,6 +36,8 @@ METRICS_FILE = "metrics.json"
 """Written last, so that its presence marks the folder of a whole run."""
 REPORT_FILE = "report.html"
 """Written by ``sdc-taichi report`` from the other files of a run folder."""
+OPTIMUM_FILE = "optimum.json"
+"""Written beside the run of a known optimum, by ``optimum_folder.write_optimum``."""
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
@@ -44,6 +48,7 @@ def simulate_to_folder(
     out: Path,
     *,
     force: bool = False,
+    optimum: Optimum | None = None,
     on_step: Callable[[StepResult], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> dict[str, Any] | None:
@@ -55,6 +60,8 @@ def simulate_to_folder(
         request: steps, seed, errors of forecasts and the controller's name.
         out: folder, created if need be; files of a former run there are replaced.
         force: also write into a folder with other files.
+        optimum: known optimum of the same configs, inputs and steps, beside which metrics.json is
+            to put the run; a run that ends early is put beside none.
         on_step: called with the result of every step.
         stop: asked before every step; true ends the run with files of the steps done.
 
@@ -82,8 +89,12 @@ def simulate_to_folder(
         # Asked again, as another run may have ended here before the claim.
         has_former_run = prepare_folder(out, force=force)
 
+        score = None if optimum is None else begin_score(optimum, sim, request.seed)
+
         def write_step(result: StepResult) -> None:
             writer.add(result)
+            if score is not None:
+                score.add(result)
             events.update(dict.fromkeys(sim.active_events(result.step)))
             if on_step is not None:
                 on_step(result)
@@ -111,10 +122,12 @@ def simulate_to_folder(
         writer.commit()
         write_text(out / config_name, configs)
         if has_former_run:
-            for name in (other_name, REPORT_FILE):
+            for name in (other_name, REPORT_FILE, OPTIMUM_FILE):
                 with naming_errors(out / name):
                     (out / name).unlink(missing_ok=True)
         content = _metrics_content(description, totals, sim.fleet, events)
+        if optimum is not None and score is not None and totals.steps == optimum.steps:
+            put_beside(content, optimum, achievement(optimum, request.controller, score))
         with naming_errors(metrics_file.path):
             metrics_file.file.write(f"{metrics_json(content)}\n".encode())
         metrics_file.commit()
@@ -207,7 +220,8 @@ def _events_by_dc(events: Iterable[ActiveEvent], size: int) -> list[list[dict[st
 
 def _is_left_by_broken_run(path: Path) -> bool:
     """Whether a file is one that a run may leave when it ends before metrics.json is written."""
-    return path.name in (STEPS_FILE, REPORT_FILE) or path.suffix in (".part", ".rrd")
+    names = (STEPS_FILE, REPORT_FILE, OPTIMUM_FILE)
+    return path.name in names or path.suffix in (".part", ".rrd")
 
 
 def _is_run_folder(out: Path) -> bool:

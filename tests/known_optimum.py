@@ -1,0 +1,66 @@
+"""A made-up optimum of a simulator, for tests of what is told of optima: no search is behind it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sdc_taichi import Actions, Simulator
+from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.problem import AGENTS, Ends
+from sdc_taichi.optimum.result import Optimum
+from sdc_taichi.optimum.score import Score
+from sdc_taichi.types import F64
+
+KWH_VALUE = 0.05
+"""Value of a kWh that is stored at the end."""
+TASK_VALUE = 1e-4
+"""Value of a task that does not wait at the end."""
+
+
+def made_up_optimum(sim: Simulator, steps: int, objective: str = "carbon") -> Optimum:
+    """An optimum whose achieved path lowers the setpoint by 2 K and uses the battery once."""
+    aim = Objective.parse(objective)
+    shape = (steps, sim.size)
+    cooling, battery = np.zeros(shape), np.zeros(shape)
+    cooling[0] = -2.0
+    battery[:8] = 1.0
+    battery[60:] = -1.0
+    idle = run_commands(sim, aim, np.zeros(shape), np.zeros(shape))
+    best = run_commands(sim, aim, cooling, battery)
+
+    def bound_of_ends(dc: int, ends: Ends) -> float:
+        stored, waiting = ends.end_kwh - ends.start_kwh, ends.end_tasks - ends.start_tasks
+        return float(0.9 * best.figure[dc] + KWH_VALUE * stored - TASK_VALUE * waiting)
+
+    kinds = ("bound", *["estimate: made up"] * (sim.size - 1))
+    return Optimum(
+        names=tuple(sim.fleet.names),
+        fingerprint=sim.fingerprint(),
+        objective=aim,
+        agents=AGENTS,
+        start=sim.drivers.start.copy(),
+        steps=steps,
+        scored_from=0,
+        inlet_limit_c=np.full(sim.size, np.inf),
+        idle=idle.figure,
+        idle_dropped_tasks=idle.dropped_tasks,
+        bound=0.9 * best.figure,
+        achieved=best.figure,
+        alone={"cooling": 0.5 * (idle.figure + best.figure)},
+        bound_kinds=kinds,
+        failures=((), *[("facility energy off by 1e-3",)] * (sim.size - 1)),
+        certificates=({"facility_error": 1e-9},) * sim.size,
+        load=np.zeros(shape),
+        cooling=cooling,
+        battery=battery,
+        bound_of_ends=bound_of_ends,
+    )
+
+
+def run_commands(sim: Simulator, objective: Objective, cooling: F64, battery: F64) -> Score:
+    """Score of a run with given commands, (T, B) each."""
+    sim.reset(0)
+    score = Score(objective, sim)
+    for cool, store in zip(cooling, battery, strict=True):
+        score.add(sim.step(Actions(cooling=cool, battery=store)))
+    return score

@@ -1,0 +1,202 @@
+"""Section of a report about a known optimum of the run's inputs, and shares in comparisons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+from sdc_taichi.errors import SdcError
+from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.run.achievable import OPTIMUM
+from sdc_taichi.run.folder_reader import RunFolder, is_number, read_run, read_steps
+from sdc_taichi.run.folder_writer import METRICS_FILE
+from sdc_taichi.run.optimum_folder import find_optimum, optimum_remarks
+
+from .optimum_figure import COLUMNS, day_of_most_saved, optimum_day
+from .plotting import format_number
+from .report_html import Cell, html_table, picture_element
+from .report_pictures import ShownDataCenter
+from .report_text import MAX_ROWS, first_texts
+
+_SAVED = {
+    "carbon": "carbon_g",
+    "energy": "grid_kwh",
+    "cost": "energy_cost",
+    "water": "water_l",
+}
+_DASH = "–"
+
+
+@dataclass(frozen=True, slots=True)
+class KnownOptimum:
+    """An optimum of the inputs of a run."""
+
+    run: RunFolder
+    """Run folder of the achieved path."""
+    content: Mapping[str, Any]
+    """Content of optimum.json."""
+
+
+def known_optimum(runs: Sequence[RunFolder]) -> KnownOptimum | None:
+    """An optimum of the inputs and steps of the first of some runs, in the folder of any of them.
+
+    Raises:
+        SdcError: an optimum that is damaged.
+    """
+    first = runs[0].metrics
+    for run in runs:
+        found = find_optimum(run.path, first["fingerprint"], first["steps_done"])
+        if found is not None:
+            place, content = found
+            path = run if place == run.path else read_run(place)
+            names = [dc.get("name") for dc in content["data_centers"]]
+            if names != runs[0].names or path.metrics["steps_done"] != first["steps_done"]:
+                raise SdcError(f"{place}: optimum of other data centers; solve it again")
+            return KnownOptimum(path, content)
+    return None
+
+
+def optimum_section(run: RunFolder, optimum: KnownOptimum, shown: Sequence[ShownDataCenter]) -> str:
+    """Figures of an optimum, and its day beside that of the run.
+
+    Args:
+        run: the run.
+        optimum: an optimum of its inputs.
+        shown: data centers with pictures.
+    """
+    content = optimum.content
+    remarks = first_texts(optimum_remarks(content))
+    out = ["".join(f"<p>{escape(text)}</p>\n" for text in remarks), _table(run, content)]
+    for dc in shown:
+        if run.metrics["steps_done"] > 1:
+            out.append(_day_picture(run, optimum, dc))
+    return "".join(out)
+
+
+def shares_of(runs: Sequence[RunFolder], optimum: KnownOptimum) -> list[float | None]:
+    """Share of the achievable of each run; None where its files do not tell it.
+
+    Where metrics.json does not hold it, a run that ends with no work waiting and has not used the
+    battery ends as it began, and its figure tells its share.
+
+    Args:
+        runs: the runs.
+        optimum: an optimum of the inputs of the first.
+    """
+    return [_share_of(run, optimum.content) for run in runs]
+
+
+def _share_of(run: RunFolder, content: Mapping[str, Any]) -> float | None:
+    """Share of the achievable of a run."""
+    if run.metrics["fingerprint"] != content["fingerprint"]:
+        return None
+    if run.metrics["controller"] == OPTIMUM and find_optimum(
+        run.path, content["fingerprint"], content["steps"]
+    ):
+        return 1.0
+    if _own(run, content) is not None:
+        share = run.metrics["total"].get("achievable_share")
+        return float(share) if is_number(share) else None
+    total, best = run.metrics["total"], content["total"]
+    used = ("queue_end_tasks", "battery_charge_kwh", "battery_discharge_kwh")
+    idle, achieved = best["idle"], best["achieved"]
+    ends_differ = any(total[name] != 0 for name in used)
+    if ends_differ or content["scored_from"] or not idle > achieved:
+        return None
+    figure = Objective.parse(content["objective"]).figure(
+        **{name: total[name] for name in ("cfp_kg", "grid_kwh", "cost", "water_l")}
+    )
+    return float((idle - figure) / (idle - achieved))
+
+
+def _own(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """What metrics.json says of an optimum of this objective; None if nothing.
+
+    Raises:
+        SdcError: it is damaged.
+    """
+    own = run.metrics.get("optimum")
+    if own is None:
+        return None
+    if not isinstance(own, dict) or not isinstance(own.get("objective"), str):
+        raise SdcError(f"{run.path / METRICS_FILE}: optimum is damaged; simulate the run again")
+    return own if own["objective"] == content["objective"] else None
+
+
+def _table(run: RunFolder, content: Mapping[str, Any]) -> str:
+    """Figures of each data center and of all."""
+    has_own = _own(run, content) is not None
+    names = [each["controller"] for each in content["controllers"]]
+    heads = ["idle", "bound", "achieved", "gap (points)"]
+    heads += [f"{name} alone" for name in content["total"]["alone"]]
+    heads += ["this run, ends valued", "share (%)"] if has_own else []
+    heads += [f"{name}, share (%)" for name in names]
+    shown = content["data_centers"][:MAX_ROWS]
+    rows = []
+    for i, dc in enumerate(shown):
+        shares = [each["data_centers"][i].get("share") for each in content["controllers"]]
+        rows.append(
+            _row(dc["name"], dc, run.metrics["data_centers"][i]["metrics"], has_own, shares)
+        )
+    shares = [each.get("share") for each in content["controllers"]]
+    if len(content["data_centers"]) > 1:
+        rows.append(_row("all", content["total"], run.metrics["total"], has_own, shares))
+    caption = (
+        f"Objective {content['objective']}: figures in {content['unit']}, less is better; the gap "
+        "between bound and achieved in % of idle; shares of the achievable, 0 as good as idle "
+        "commands and 100 as good as the achieved path"
+    )
+    if len(content["data_centers"]) > len(shown):
+        caption += f"; the first {MAX_ROWS} data centers, and all together"
+    return html_table(caption, [Cell("data center"), *(Cell(h, True) for h in heads)], rows)
+
+
+def _row(
+    name: str,
+    figures: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    has_own: bool,
+    shares: Sequence[object],
+) -> list[Cell]:
+    """Row of a data center, or of all."""
+    values = [figures[key] for key in ("idle", "bound", "achieved", "gap_points")]
+    values += list(figures["alone"].values())
+    if has_own:
+        values += [metrics.get("valued_figure"), _percent(metrics.get("achievable_share"))]
+    values += [_percent(share) for share in shares]
+    return [Cell(name), *(Cell(_text(value), True) for value in values)]
+
+
+def _percent(share: object) -> float | None:
+    """A share in %."""
+    return 100.0 * float(share) if is_number(share) else None  # type: ignore[arg-type]
+
+
+def _text(value: object) -> str:
+    """A figure as text, a dash where there is none."""
+    return format_number(float(value)) if is_number(value) else _DASH  # type: ignore[arg-type]
+
+
+def _day_picture(run: RunFolder, optimum: KnownOptimum, dc: ShownDataCenter) -> str:
+    """The day on which the optimum saves most against the run, of one data center."""
+    name = run.names[dc.index]
+    objective = str(optimum.content["objective"])
+    column = _SAVED.get(objective, "carbon_g")
+    if optimum.run is run:
+        steps_of = {OPTIMUM: dc.steps}
+        saved = (dc.steps["charge_kwh"] + dc.steps["discharge_kwh"]).to_numpy()
+        caption = "The day on which the battery moves most energy, on the achieved path."
+    else:
+        (best,) = read_steps(optimum.run, [dc.index], [*COLUMNS[1:], column])
+        steps_of = {run.metrics["controller"]: dc.steps, OPTIMUM: best}
+        saved = (dc.steps[column] - best[column]).to_numpy()
+        caption = "The day on which the achieved path saves most against this run."
+    date = day_of_most_saved(saved, dc.steps["time"])
+    return picture_element(
+        optimum_day(steps_of, date, name, by_price=objective == "cost"),
+        f"Grid, utilisation, setpoint and battery charge of {name} on a day under "
+        f"{' and '.join(steps_of)}.",
+        caption,
+    )
