@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from sdc_taichi import Actions, Simulator, build_fleet, load_config
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, OddInputWarning
 from sdc_taichi.optimum import tables
+from sdc_taichi.optimum.facility_map import FacilityMap, facility_map
 from sdc_taichi.optimum.tables import TableGrid, facility_tables
 from sdc_taichi.sim.drivers import Drivers, FleetSeries, load_drivers
 
@@ -154,3 +156,96 @@ def test_heat_that_the_plant_leaves_is_in_the_table() -> None:
 def test_a_grid_without_nodes_is_an_error(values: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match="table: "):
         TableGrid(**values)  # type: ignore[arg-type]
+
+
+def a_map(configs: list[DataCenterConfig], **options: Any) -> tuple[FacilityMap, Drivers]:
+    fleet, drivers = build_fleet(configs), load_drivers(configs)
+    options = {"inlet_limit_c": np.full(len(configs), np.inf)} | options
+    return facility_map(fleet, drivers, grid=GRID, weather_step_k=10.0, **options), drivers
+
+
+@pytest.mark.parametrize("plant", ["water_cooled", "air_side"])
+def test_a_map_has_the_simulators_figures_at_its_nodes(plant: str) -> None:
+    chiller = {"water_cooled": "centrifugal_vsd", "air_side": "electric_air_cooled"}[plant]
+    config = load_config("tiny", [f"hvac.plant={plant}", f"hvac.chiller.model={chiller}"])
+    found, drivers = a_map([config], precision="f64")
+    lead_c = found.first_c[0] + 10.0 * np.arange(found.facility_kwh.shape[1])
+    below_k = 2 * found.depression_step_k[0]
+    outdoor_c = lead_c + below_k if plant == "water_cooled" else lead_c
+    still = np.zeros(1, np.int64)
+    for node, outside_c in enumerate(outdoor_c):
+        outdoor, wet_bulb = (
+            FleetSeries(np.array([value_c]), still, still + 1)
+            for value_c in (outside_c, outside_c - below_k)
+        )
+        (table,) = facility_tables(
+            build_fleet(config),
+            replace(drivers, outdoor_c=outdoor, wet_bulb_c=wet_bulb),
+            start=still,
+            steps=1,
+            grid=GRID,
+            precision="f64",
+        )
+        for setpoint_c, expected in zip(table.setpoint_c, table.facility_kwh[0].T, strict=True):
+            at = np.array([[outside_c]]), np.array([[outside_c - below_k]])
+            kwh = found.kwh_at(np.array([[setpoint_c]]), *at)
+            assert kwh[0, 0] == pytest.approx(expected, rel=1e-9)
+            assert found.water_l[0, node, 2] == pytest.approx(table.water_l[0], rel=1e-9)
+
+
+def test_a_map_is_linear_between_its_nodes() -> None:
+    found, _ = a_map([load_config("tiny", []), load_config("tiny", ["site.location=AZ"])])
+    wet_bulb_c = np.array([[7.0, 8.0, 9.0], [4.5, 5.0, 5.5]])
+    outdoor_c = wet_bulb_c + np.array([[1.0, 2.0, 3.0], [6.0, 5.0, 4.0]])
+    found = replace(found, first_c=np.array([3.0, -1.0]))
+    kwh = found.lowest_kwh(outdoor_c, wet_bulb_c)
+    assert kwh.shape == (2, 3, 3)
+    assert kwh[:, 1] == pytest.approx((kwh[:, 0] + kwh[:, 2]) / 2, rel=1e-12)
+    level = np.array([[0.25], [0.75]])
+    setpoint_c = np.array([[17.0], [21.0]])
+    at = outdoor_c[:, :1], wet_bulb_c[:, :1]
+    middle = found.energy_kwh(level, setpoint_c, at[1], at[0])
+    corners = [
+        found.energy_kwh(level + above, setpoint_c + warmer, at[1], at[0])
+        for above in (-0.25, 0.25)
+        for warmer in (-1.0, 1.0)
+    ]
+    assert middle == pytest.approx(np.mean(corners, axis=0), rel=1e-12)
+
+
+def test_the_best_setpoint_of_a_map_is_that_of_least_cost() -> None:
+    found, drivers = a_map([load_config("corrected", []), load_config("corrected", [JULY])])
+    index = drivers.start[:, None] + 8 * np.arange(6)
+    at = drivers.outdoor_c.at(index), drivers.wet_bulb_c.at(index)
+    level, ones = np.full(index.shape, 0.5), np.ones(index.shape)
+    for litre_weight in (0.0, 0.3):
+        cost, kwh = found.lowest_cost(*at, ones, litre_weight)
+        best_c = found.best_setpoint_c(level, *at, ones, litre_weight)
+        assert np.all((best_c >= 16) & (best_c <= 23))
+        for setpoint_c in found.setpoint_c[0]:
+            other = np.full(index.shape, setpoint_c)
+            litres = replace(found, facility_kwh=found.water_l)
+            figure = found.energy_kwh(level, other, at[1], at[0])
+            figure += litre_weight * litres.energy_kwh(level, other, at[1], at[0])
+            assert np.all(cost[..., 1] <= figure + 1e-9)
+            assert figure[best_c == setpoint_c] == pytest.approx(
+                cost[..., 1][best_c == setpoint_c], rel=1e-12
+            )
+        assert kwh == pytest.approx(cost) if litre_weight == 0 else np.all(kwh < cost)
+
+
+def test_a_map_keeps_inlets_within_the_limit_where_it_can() -> None:
+    config = load_config("tiny", [])
+    limit_c = 23.0
+    found, _ = a_map([config], inlet_limit_c=np.array([limit_c]))
+    drivers = load_drivers([config])
+    (table,) = facility_tables(
+        build_fleet(config), drivers, start=drivers.start, steps=1, grid=GRID
+    )
+    within = table.inlet_max_c[0] <= limit_c
+    assert np.array_equal(found.allowed[0, 0, 0], within)
+    assert 0 < within.sum() < within.size
+    none, _ = a_map([config], inlet_limit_c=np.array([10.0]))
+    coolest = np.argmin(table.inlet_max_c[0], axis=-1)
+    assert np.array_equal(np.argmax(none.allowed[0, 0, 0], axis=-1), coolest)
+    assert np.all(none.allowed.sum(axis=-1) == 1)

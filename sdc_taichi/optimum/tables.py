@@ -23,6 +23,24 @@ MOST_COPIES = 4096
 MOST_RACKS = 2**18
 """Racks of the copies in a batch, which take some 1 kB each."""
 
+
+@dataclass(frozen=True, slots=True)
+class Nodes:
+    """Where the table of one data center has its nodes."""
+
+    dc: int
+    """Number of the data center in its fleet."""
+    utilisation: F64
+    """Utilisations, rising, 0..1, (I,)."""
+    setpoint_c: F64
+    """Setpoints, rising, in C, (J,)."""
+
+    @property
+    def copies(self) -> int:
+        """Number of copies of the data center, one for each node."""
+        return len(self.utilisation) * len(self.setpoint_c)
+
+
 OnStep = Callable[[int, int], None]
 """Is told how many steps of data centers are done, and of how many."""
 
@@ -96,7 +114,8 @@ def facility_tables(
     ]
     distinct = list(known.values())
     tables: dict[int, FacilityTable] = {}
-    for batch in batches(fleet, distinct, grid):
+    nodes = [Nodes(dc, grid.utilisation(), grid.setpoint_c(fleet.configs[dc])) for dc in distinct]
+    for batch in batches(fleet, nodes):
         outdoor_c, wet_bulb_c = (
             _series_of(series, batch, start, steps)
             for series in (drivers.outdoor_c, drivers.wet_bulb_c)
@@ -107,33 +126,31 @@ def facility_tables(
             if on_step is not None:
                 on_step(before + size * step, len(distinct) * steps)
 
-        found = tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, grid, precision, tell, stop)
+        found = tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, precision, tell, stop)
         if found is None:
             return []
-        tables |= dict(zip(batch, found, strict=True))
+        tables |= {own.dc: table for own, table in zip(batch, found, strict=True)}
     return [tables[dc] for dc in table_of]
 
 
 def tabulate(
     fleet: Fleet,
     drivers: Drivers,
-    batch: Sequence[int],
+    nodes: Sequence[Nodes],
     outdoor_c: F64,
     wet_bulb_c: F64,
-    grid: TableGrid,
     precision: Precision,
     on_step: Callable[[int], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> list[FacilityTable] | None:
-    """Tables of some data centers over given weather.
+    """Tables of some data centers over given weather, in one batch.
 
     Args:
         fleet: B data centers.
         drivers: Their inputs, of which the design temperatures are read.
-        batch: Which of them, n.
+        nodes: Nodes of n of them.
         outdoor_c: Dry bulb of each step, in C, (n, T).
         wet_bulb_c: Wet bulb of each step, in C, (n, T).
-        grid: Where the tables have their nodes.
         precision: Of the server kernels.
         on_step: Called after every step with the number of those done.
         stop: Asked before every step.
@@ -141,19 +158,17 @@ def tabulate(
     Returns:
         A table for each, n; None where ``stop`` was true.
     """
-    levels = grid.utilisation()
-    setpoints = [grid.setpoint_c(fleet.configs[dc]) for dc in batch]
-    counts = np.array([len(levels) * len(each) for each in setpoints])
-    place = np.repeat(np.arange(len(batch)), counts)
+    place = np.repeat(np.arange(len(nodes)), [each.copies for each in nodes])
+    of = np.array([each.dc for each in nodes])[place]
     facility = SteadyFacility(
         fleet.configs,
         drivers,
-        of=np.asarray(batch)[place],
-        utilisation=np.concatenate([np.repeat(levels, len(each)) for each in setpoints]),
-        setpoint_c=np.concatenate([np.tile(each, len(levels)) for each in setpoints]),
+        of=of,
+        utilisation=np.concatenate([np.repeat(x.utilisation, len(x.setpoint_c)) for x in nodes]),
+        setpoint_c=np.concatenate([np.tile(x.setpoint_c, len(x.utilisation)) for x in nodes]),
         precision=precision,
     )
-    barred = _throttles(fleet, facility, np.asarray(batch)[place])
+    barred = _throttles(fleet, facility, of)
     steps = outdoor_c.shape[1]
     facility_kwh, water_l = (np.empty((steps, len(place))) for _ in range(2))
     unmet_w: F64 | None = None
@@ -171,44 +186,41 @@ def tabulate(
         if on_step is not None:
             on_step(step + 1)
     facility.close()
-    ends = np.concatenate([[0], np.cumsum(counts)])
+    values = {
+        "facility_kwh": facility_kwh,
+        "water_l": water_l,
+        "inlet_max_c": facility.inlet_max_c[None],
+        "unmet_w": np.zeros((1, len(place))) if unmet_w is None else unmet_w,
+    }
+    firsts = np.cumsum([0, *(each.copies for each in nodes)])
     return [
         FacilityTable(
-            utilisation=levels,
-            setpoint_c=setpoint_c,
-            **{
-                name: _of_one(values, first, steps, len(levels), len(setpoint_c))
-                for name, values in (
-                    ("facility_kwh", facility_kwh),
-                    ("water_l", water_l),
-                    ("inlet_max_c", facility.inlet_max_c[None]),
-                    ("unmet_w", np.zeros((1, len(place))) if unmet_w is None else unmet_w),
-                )
-            },
+            utilisation=each.utilisation,
+            setpoint_c=each.setpoint_c,
+            **{name: _of_one(x, int(first), steps, each) for name, x in values.items()},
         )
-        for first, setpoint_c in zip(ends, setpoints, strict=False)
+        for first, each in zip(firsts, nodes, strict=False)
     ]
 
 
-def batches(fleet: Fleet, which: Sequence[int], grid: TableGrid) -> Iterator[list[int]]:
-    """Parts of a list of data centers whose copies at all nodes make one batch.
+def batches(fleet: Fleet, nodes: Sequence[Nodes]) -> Iterator[list[Nodes]]:
+    """Parts of a list of nodes whose copies make one batch.
 
     Args:
         fleet: B data centers.
-        which: Some of them.
-        grid: Nodes of each.
+        nodes: Nodes of some of them.
     """
     racks = np.diff(fleet.rack_offsets)
-    part: list[int] = []
+    part: list[Nodes] = []
     part_copies = part_racks = 0
-    for dc in which:
-        copies = grid.utilisations * len(grid.setpoint_c(fleet.configs[dc]))
-        of_copies = copies * int(racks[dc])
-        if part and (part_copies + copies > MOST_COPIES or part_racks + of_copies > MOST_RACKS):
+    for each in nodes:
+        its_racks = each.copies * int(racks[each.dc])
+        full = part_copies + each.copies > MOST_COPIES or part_racks + its_racks > MOST_RACKS
+        if part and full:
             yield part
             part, part_copies, part_racks = [], 0, 0
-        part.append(dc)
-        part_copies, part_racks = part_copies + copies, part_racks + of_copies
+        part.append(each)
+        part_copies, part_racks = part_copies + each.copies, part_racks + its_racks
     if part:
         yield part
 
@@ -244,10 +256,11 @@ def _what_decides(fleet: Fleet, drivers: Drivers, start: I64, dc: int) -> Hashab
     return what_decides_facility(fleet, drivers, dc), weather, int(start[dc])
 
 
-def _series_of(series: FleetSeries, batch: Sequence[int], start: I64, steps: int) -> F64:
+def _series_of(series: FleetSeries, nodes: Sequence[Nodes], start: I64, steps: int) -> F64:
     """Values of some data centers over the steps of a run, (n, T)."""
-    index = np.asarray(start)[:, None] + np.arange(steps)
-    return series.at(index)[list(batch)]
+    which = np.array([each.dc for each in nodes])
+    index = np.asarray(start)[which, None] + np.arange(steps)
+    return series.values.take(series.offsets[which, None] + index % series.lengths[which, None])
 
 
 def _throttles(fleet: Fleet, facility: SteadyFacility, of: I64) -> Mask:
@@ -264,7 +277,8 @@ def _throttles(fleet: Fleet, facility: SteadyFacility, of: I64) -> Mask:
     )
 
 
-def _of_one(values: F64, first: int, steps: int, levels: int, setpoints: int) -> F64:
+def _of_one(values: F64, first: int, steps: int, nodes: Nodes) -> F64:
     """Values of one data center, (T, I, J), from those of all copies, (T, B) or (1, B)."""
-    own = np.ascontiguousarray(values[:, first : first + levels * setpoints])
-    return np.broadcast_to(own.reshape(-1, levels, setpoints), (steps, levels, setpoints))
+    own = np.ascontiguousarray(values[:, first : first + nodes.copies])
+    shape = len(nodes.utilisation), len(nodes.setpoint_c)
+    return np.broadcast_to(own.reshape(-1, *shape), (steps, *shape))

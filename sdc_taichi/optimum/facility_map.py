@@ -1,0 +1,323 @@
+"""What a step costs by weather, utilisation and setpoint, for plans on weather that is foreseen.
+
+A table has the weather of each step; a forecast may be wrong, so a map has nodes over the weather
+of the year. Between nodes it is read linearly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.optimum.problem import FacilityTable
+from sdc_taichi.optimum.tables import (
+    Nodes,
+    TableGrid,
+    batches,
+    tabulate,
+    what_decides_facility,
+)
+from sdc_taichi.plant.plants import DRY_PLANTS
+from sdc_taichi.sim.drivers import Drivers, FleetSeries
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.types import F64, I64
+
+MARGIN_K = 5.0
+"""How far a map reaches beyond the weather of the year, for forecasts that err."""
+_FEW = 4
+"""Nodes of dry bulb less wet bulb. Towers and dry coolers hardly feel it; plants that let outdoor
+air in open and close by its humidity, and have nodes as close as those of the dry bulb."""
+_GRID = TableGrid(utilisations=21, setpoint_step_k=1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FacilityMap:
+    """What a step costs in B data centers, M of which differ, by weather, load and setpoint.
+
+    The first axis of the weather is the wet bulb where heat goes to a tower, else the dry bulb; the
+    second is the dry bulb less the wet bulb. Weather beyond the nodes is read at the last ones.
+    """
+
+    which: I64
+    """Entry of each data center among those that differ, (B,)."""
+    by_wet_bulb: bool
+    """Whether the first axis of the weather is the wet bulb."""
+    first_c: F64
+    """First node of the first axis, in C, (M,)."""
+    step_k: float
+    """Distance of its nodes, in K."""
+    depression_step_k: F64
+    """Distance of the nodes of dry bulb less wet bulb, the first of which is 0, in K, (M,)."""
+    utilisation: F64
+    """Utilisations, evenly from 0 to 1, (I,)."""
+    setpoint_c: F64
+    """Setpoints, rising in equal steps, in C, (M, J)."""
+    facility_kwh: F64
+    """Energy of the facility without its battery, in kWh, (M, W, P, I, J)."""
+    water_l: F64
+    """Make-up water, in l, (M, W, P, I, J)."""
+    allowed: npt.NDArray[np.bool_]
+    """Whether a plan may choose a setpoint: its hottest inlet is within the limit and it leaves no
+    heat in the room, or no setpoint does better, (M, W, P, I, J)."""
+    least_kwh: F64 = field(init=False)
+    """Least energy among the setpoints that are allowed, in kWh, (M, W, P, I)."""
+
+    def __post_init__(self) -> None:
+        """Find the least energy among setpoints."""
+        least_kwh = np.where(self.allowed, self.facility_kwh, np.inf).min(axis=-1)
+        object.__setattr__(self, "least_kwh", least_kwh)
+
+    def lowest_kwh(self, outdoor_c: F64, wet_bulb_c: F64) -> F64:
+        """Energy of the facility at the best setpoint, by utilisation.
+
+        Args:
+            outdoor_c: Dry bulb, in C, (B, H).
+            wet_bulb_c: Wet bulb, in C, (B, H).
+
+        Returns:
+            kWh, (B, H, I).
+        """
+        return self._in_weather(self.least_kwh, outdoor_c, wet_bulb_c)
+
+    def lowest_cost(
+        self, outdoor_c: F64, wet_bulb_c: F64, kwh_weight: F64, litre_weight: float
+    ) -> tuple[F64, F64]:
+        """Cost at the best setpoint, by utilisation, and the energy that belongs to it.
+
+        Args:
+            outdoor_c: Dry bulb, in C, (B, H).
+            wet_bulb_c: Wet bulb, in C, (B, H).
+            kwh_weight: Cost of a kWh, (B, H).
+            litre_weight: Cost of a litre of water.
+
+        Returns:
+            Cost, and kWh, each (B, H, I).
+        """
+        if litre_weight == 0.0:
+            kwh = self.lowest_kwh(outdoor_c, wet_bulb_c)
+            return np.asarray(kwh_weight[..., None] * kwh), kwh
+        kwh, cost = self._by_setpoint(outdoor_c, wet_bulb_c, kwh_weight, litre_weight)
+        best = cost.argmin(axis=-1)[..., None]
+        return (
+            np.take_along_axis(cost, best, axis=-1)[..., 0],
+            np.take_along_axis(kwh, best, axis=-1)[..., 0],
+        )
+
+    def kwh_at(self, setpoint_c: F64, outdoor_c: F64, wet_bulb_c: F64) -> F64:
+        """Energy of the facility at given setpoints, by utilisation, in kWh, (B, H, I).
+
+        Args:
+            setpoint_c: Setpoint, in C, (B, H).
+            outdoor_c: Dry bulb, in C, (B, H).
+            wet_bulb_c: Wet bulb, in C, (B, H).
+        """
+        by_setpoint = self._in_weather(self.facility_kwh, outdoor_c, wet_bulb_c)
+        place, share = self._places_of_setpoints(setpoint_c)
+        low, high = (
+            np.take_along_axis(by_setpoint, at[..., None, None], axis=-1)[..., 0]
+            for at in (place, np.minimum(place + 1, self.setpoint_c.shape[1] - 1))
+        )
+        return low + share[..., None] * (high - low)
+
+    def energy_kwh(self, utilisation: F64, setpoint_c: F64, wet_bulb_c: F64, outdoor_c: F64) -> F64:
+        """Energy of the facility, in kWh, (B, H).
+
+        Args:
+            utilisation: Utilisation, 0..1, (B, H).
+            setpoint_c: Setpoint, in C, (B, H).
+            wet_bulb_c: Wet bulb, in C, (B, H).
+            outdoor_c: Dry bulb, in C, (B, H).
+        """
+        return self.at_utilisation(self.kwh_at(setpoint_c, outdoor_c, wet_bulb_c), utilisation)
+
+    def at_utilisation(self, values: F64, utilisation: F64) -> F64:
+        """Values at some utilisation, (B, H), from those at the nodes, (B, H, I)."""
+        intervals = len(self.utilisation) - 1
+        place = np.clip(utilisation * intervals, 0.0, intervals)
+        low = np.minimum(place.astype(np.int64), intervals - 1)
+        at_low, at_high = (
+            np.take_along_axis(values, at[..., None], axis=-1)[..., 0] for at in (low, low + 1)
+        )
+        return at_low + (place - low) * (at_high - at_low)
+
+    def best_setpoint_c(
+        self,
+        utilisation: F64,
+        outdoor_c: F64,
+        wet_bulb_c: F64,
+        kwh_weight: F64,
+        litre_weight: float,
+    ) -> F64:
+        """The setpoint of least cost among the nodes that are allowed, in C, (B, H).
+
+        Args:
+            utilisation: Utilisation, 0..1, (B, H).
+            outdoor_c: Dry bulb, in C, (B, H).
+            wet_bulb_c: Wet bulb, in C, (B, H).
+            kwh_weight: Cost of a kWh, (B, H).
+            litre_weight: Cost of a litre of water.
+        """
+        _, cost = self._by_setpoint(outdoor_c, wet_bulb_c, kwh_weight, litre_weight)
+        each = [self.at_utilisation(cost[..., j], utilisation) for j in range(cost.shape[-1])]
+        best = np.argmin(each, axis=0)
+        return np.asarray(np.take_along_axis(self.setpoint_c[self.which], best, axis=1))
+
+    def _by_setpoint(
+        self, outdoor_c: F64, wet_bulb_c: F64, kwh_weight: F64, litre_weight: float
+    ) -> tuple[F64, F64]:
+        """Energy, and cost that is large where a setpoint is barred, each (B, H, I, J)."""
+        kwh = self._in_weather(self.facility_kwh, outdoor_c, wet_bulb_c)
+        cost = kwh_weight[..., None, None] * kwh
+        if litre_weight:
+            cost = cost + litre_weight * self._in_weather(self.water_l, outdoor_c, wet_bulb_c)
+        barred = self._in_weather(np.where(self.allowed, 0.0, 1.0), outdoor_c, wet_bulb_c)
+        # A number, so that shares of nodes can be taken of it.
+        return kwh, cost + _BARRED * (1.0 + cost.max(axis=-1, keepdims=True)) * (barred > 0.0)
+
+    def _in_weather(self, values: F64, outdoor_c: F64, wet_bulb_c: F64) -> F64:
+        """Values in some weather, (B, H, ...), from those at the nodes, (M, W, P, ...)."""
+        wet, dry = values.shape[1:3]
+        which = self.which[:, None]
+        lead_c = wet_bulb_c if self.by_wet_bulb else outdoor_c
+        low, share = _place((lead_c - self.first_c[which]) / self.step_k, wet)
+        low_k, share_k = _place((outdoor_c - wet_bulb_c) / self.depression_step_k[which], dry)
+        flat = values.reshape(-1, *values.shape[3:])
+        at = (which * wet + low) * dry + low_k
+        added = (1,) * (values.ndim - 3)
+        share, share_k = (x.reshape(*x.shape, *added) for x in (share, share_k))
+        found: F64 = flat[at] * ((1.0 - share) * (1.0 - share_k))
+        found += flat[at + dry] * (share * (1.0 - share_k))
+        found += flat[at + 1] * ((1.0 - share) * share_k)
+        found += flat[at + dry + 1] * (share * share_k)
+        return found
+
+    def _places_of_setpoints(self, setpoint_c: F64) -> tuple[I64, F64]:
+        """Node below each setpoint, and its share of the way to the next, each (B, H)."""
+        low_c, high_c = self.setpoint_c[self.which, :1], self.setpoint_c[self.which, -1:]
+        intervals = self.setpoint_c.shape[1] - 1
+        range_k = np.where(high_c > low_c, high_c - low_c, 1.0)
+        return _place((setpoint_c - low_c) / range_k * intervals, intervals + 1)
+
+
+_BARRED = 1e6
+"""Cost of a barred setpoint over that of the dearest, a number so that it can be interpolated."""
+
+
+def facility_map(
+    fleet: Fleet,
+    drivers: Drivers,
+    *,
+    inlet_limit_c: F64,
+    weather_step_k: float = 1.0,
+    margin_k: float = MARGIN_K,
+    grid: TableGrid = _GRID,
+    precision: Precision = "f32",
+) -> FacilityMap:
+    """Map of the data centers of a fleet over the weather of their year.
+
+    Args:
+        fleet: B data centers. Events, thermal mass and protection are left out.
+        drivers: Their inputs, whose design temperatures size the devices.
+        inlet_limit_c: Highest inlet that a plan may cause where it has a choice, in C, (B,); inf
+            without a limit.
+        weather_step_k: Distance of the nodes of the first axis of the weather, in K.
+        margin_k: How far the map reaches beyond the weather of the year, in K.
+        grid: Nodes of utilisation and setpoint; setpoints of all data centers are as many.
+        precision: Of the server kernels.
+
+    Raises:
+        PhysicalLimitError: A hall that finds no steady air at some utilisation and setpoint.
+    """
+    by_wet_bulb = fleet.models["plant"] not in DRY_PLANTS
+    entries: dict[Hashable, int] = {}
+    keys = [_what_decides(fleet, drivers, dc, inlet_limit_c) for dc in range(fleet.size)]
+    for key in keys:
+        entries.setdefault(key, len(entries))
+    which = np.array([entries[key] for key in keys])
+    dcs = [keys.index(key) for key in entries]
+    low_c, high_c, most_k = _ranges(fleet, drivers, which, by_wet_bulb, margin_k)
+    wet = max(int(np.ceil(np.max(high_c - low_c) / weather_step_k)) + 1, 2)
+    lead_c = low_c[:, None] + weather_step_k * np.arange(wet)
+    depressions = _FEW
+    if fleet.models["plant"] == "air_side":
+        depressions = max(int(np.ceil(np.max(most_k) / weather_step_k)) + 1, _FEW)
+    depression_k = np.linspace(np.zeros_like(most_k), most_k, depressions, axis=1)
+    first, second = np.broadcast_arrays(lead_c[:, :, None], depression_k[:, None, :])
+    outdoor_c = (first + second if by_wet_bulb else first).reshape(len(dcs), -1)
+    wet_bulb_c = (first if by_wet_bulb else first - second).reshape(len(dcs), -1)
+    setpoints = max(len(grid.setpoint_c(fleet.configs[dc])) for dc in dcs)
+    nodes = [Nodes(dc, grid.utilisation(), _setpoint_c(fleet, dc, setpoints)) for dc in dcs]
+    tables: list[FacilityTable] = []
+    for part in batches(fleet, nodes):
+        own = slice(len(tables), len(tables) + len(part))
+        tables += tabulate(fleet, drivers, part, outdoor_c[own], wet_bulb_c[own], precision) or ()
+    shape = len(dcs), wet, depressions, grid.utilisations, setpoints
+    return FacilityMap(
+        which=which,
+        by_wet_bulb=by_wet_bulb,
+        first_c=low_c,
+        step_k=weather_step_k,
+        depression_step_k=depression_k[:, 1],
+        utilisation=grid.utilisation(),
+        setpoint_c=np.array([each.setpoint_c for each in nodes]),
+        facility_kwh=np.stack([t.facility_kwh for t in tables]).reshape(shape),
+        water_l=np.stack([t.water_l for t in tables]).reshape(shape),
+        allowed=np.stack(
+            [_allowed(t, inlet_limit_c[dc]) for t, dc in zip(tables, dcs, strict=True)]
+        ).reshape(shape),
+    )
+
+
+def _what_decides(fleet: Fleet, drivers: Drivers, dc: int, inlet_limit_c: F64) -> Hashable:
+    """What the map of a data center follows from."""
+    series = drivers.outdoor_c, drivers.wet_bulb_c
+    weather = tuple((int(each.offsets[dc]), int(each.lengths[dc])) for each in series)
+    return what_decides_facility(fleet, drivers, dc), weather, float(inlet_limit_c[dc])
+
+
+def _setpoint_c(fleet: Fleet, dc: int, number: int) -> F64:
+    """As many setpoints over the range of a data center, in C, (J,)."""
+    setpoint = fleet.configs[dc].hvac.setpoint
+    return np.linspace(setpoint.min_c, setpoint.max_c, number)
+
+
+def _ranges(
+    fleet: Fleet, drivers: Drivers, which: I64, by_wet_bulb: bool, margin_k: float
+) -> tuple[F64, F64, F64]:
+    """Weather of the year: least and most of the first axis, C, most depression, K, each (M,)."""
+    found: dict[int, tuple[float, float, float]] = {}
+    for dc, entry in enumerate(which.tolist()):
+        if entry not in found:
+            both = drivers.outdoor_c, drivers.wet_bulb_c
+            length = max(int(series.lengths[dc]) for series in both)
+            outdoor_c, wet_bulb_c = (_year_of(series, dc, length) for series in both)
+            lead_c = wet_bulb_c if by_wet_bulb else outdoor_c
+            most_k = float(np.max(outdoor_c - wet_bulb_c)) + margin_k
+            found[entry] = float(lead_c.min()) - margin_k, float(lead_c.max()) + margin_k, most_k
+    low_c, high_c, most_k = np.array([found[entry] for entry in range(len(found))]).T
+    return low_c, high_c, most_k
+
+
+def _year_of(series: FleetSeries, dc: int, length: int) -> F64:
+    """The first values of one data center, (T,)."""
+    places = int(series.offsets[dc]) + np.arange(length) % int(series.lengths[dc])
+    return series.values.take(places)
+
+
+def _allowed(table: FacilityTable, inlet_limit_c: float) -> npt.NDArray[np.bool_]:
+    """Whether a plan may choose a setpoint, (T, I, J): the best of them always."""
+    over_k = np.maximum(table.inlet_max_c - inlet_limit_c, 0.0)
+    fit = over_k <= over_k.min(axis=-1, keepdims=True)
+    unmet_w = np.where(fit, table.unmet_w, np.inf)
+    return np.asarray(fit & (unmet_w <= unmet_w.min(axis=-1, keepdims=True)))
+
+
+def _place(position: F64, nodes: int) -> tuple[I64, F64]:
+    """Node below a position, counted in nodes, and its share of the way to the next."""
+    within = np.clip(position, 0.0, nodes - 1)
+    low = np.minimum(within.astype(np.int64), max(nodes - 2, 0))
+    return low, within - low
