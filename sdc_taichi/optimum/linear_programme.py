@@ -1,0 +1,213 @@
+"""The bound of a planning problem, and a plan that queue and battery can carry out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.optimum.dispatch import DEFER, DRAIN, DUE, Dispatch, DispatchProgramme, Span
+from sdc_taichi.optimum.problem import Ends, Plan, Problem
+from sdc_taichi.optimum.programme import InfeasibleError
+from sdc_taichi.optimum.stage_cost import (
+    LoadCurves,
+    StageCost,
+    at_tasks,
+    given_curves,
+    load_curves,
+    stage_cost,
+    step_weights,
+)
+from sdc_taichi.types import F64
+
+_WARM_UP_SHARE = 0.05
+"""Weight of steps that are not scored, so that plans do nothing odd in them."""
+_DEFERRAL_WEIGHT = 0.01
+"""Weight of a task that enters the queue, over the mean cost of a task: hardly any, but enough that
+work leaves the queue no earlier than it has to."""
+_ROUNDS = 2
+"""How often the modes of a plan are found anew from the plan that they led to."""
+_NEGLIGIBLE_TASKS = 1e-7
+"""Work that a solver may leave for nothing."""
+
+Modes = np.ndarray[tuple[int], np.dtype[np.int64]]
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """A figure below which no controller can come, and what state is worth."""
+
+    figure: float
+    """Weighed cost of the scored steps and their peaks, in the unit of the objective."""
+    task_price: F64
+    """What one task more that waits at the end of each step adds to the figure, (T,)."""
+    kwh_price: F64
+    """What one kWh more stored at the end of each step takes off the figure, (T,)."""
+    executed_tasks: F64
+    """Work that is done where the bound is reached, in tasks, (T,); no queue may be able to."""
+
+
+def bound(problem: Problem, ends: Ends | None = None) -> Bound:
+    """The least figure of a problem with what only helps a controller taken as granted.
+
+    Ramps of the setpoint are dropped, the cost of each step is the convex curve below its table,
+    and the queue and the battery are those of ``dispatch``.
+
+    Args:
+        problem: What is to be planned.
+        ends: State at the first scored step and at the end. By default the state before the first
+            step is that of the problem, and the end keeps at least the stored energy and at most
+            the queue of the first scored step.
+
+    Raises:
+        ConfigError: no plan keeps the limits.
+    """
+    curves_of = load_curves if "load" in problem.agents else given_curves
+    stage = stage_cost(problem)
+    curves = curves_of(problem, stage)
+    span = _span(problem, ends)
+    found = _solve(problem, DispatchProgramme(problem, stage, curves, span))
+    before = np.zeros(span.first)
+    return Bound(
+        figure=found.figure,
+        task_price=np.concatenate([before, found.task_price]),
+        kwh_price=np.concatenate([before, found.kwh_price]),
+        executed_tasks=np.concatenate([before, found.executed_tasks]),
+    )
+
+
+def plan(problem: Problem) -> Plan:
+    """A plan of low cost that a first-in-first-out queue and the battery can carry out.
+
+    In each step of the plan work only enters the queue, or only leaves it, or what leaves is what
+    is due. Which of these is found from the bound's linear programme, and then anew from the plan
+    that it led to; the best plan is kept. Setpoints are the cheapest of each step, without a ramp.
+
+    Args:
+        problem: What is to be planned.
+
+    Raises:
+        ConfigError: no plan keeps the limits.
+    """
+    stage = stage_cost(problem, warm_up_share=_WARM_UP_SHARE)
+    curves_of = load_curves if "load" in problem.agents else given_curves
+    curves = curves_of(problem, stage)
+    weighed = replace(problem, kwh_weight=step_weights(problem, _WARM_UP_SHARE)[0])
+    span = _span(weighed, None)
+    if problem.work.deadline_steps is not None:
+        span = replace(span, deferred_before=np.zeros(problem.work.deadline_steps))
+    found = _plan_of_span(weighed, stage, curves, span)
+    return Plan(
+        executed_tasks=found.executed_tasks,
+        setpoint_c=at_tasks(stage.executed_tasks, stage.setpoint_c, found.executed_tasks),
+        charge_kwh=found.charge_kwh,
+        discharge_kwh=found.discharge_kwh,
+    )
+
+
+def _plan_of_span(problem: Problem, stage: StageCost, curves: LoadCurves, span: Span) -> Dispatch:
+    """The best dispatch found of those that the queue can carry out."""
+
+    def programme() -> DispatchProgramme:
+        return DispatchProgramme(problem, stage, curves, span)
+
+    relaxed = programme()
+    if "load" not in problem.agents or problem.work.deadline_steps is None:
+        return _solve(problem, relaxed)
+    steps = span.end - span.first
+    of_task = float(np.abs(curves.slope_cost).mean()) if len(curves.slope_cost) else 0.0
+    late = 2.0 - np.arange(steps) / steps
+    relaxed.add_deferral_weight(_DEFERRAL_WEIGHT * of_task * late)
+    first = _solve(problem, relaxed)
+    best: Dispatch | None = None
+    for start in (_modes(problem, span, first), _queue_modes(problem, span, first)):
+        modes = start
+        for _ in range(_ROUNDS):
+            restricted = programme()
+            restricted.keep_modes(modes)
+            found = _solve(problem, restricted)
+            if best is None or found.figure < best.figure:
+                best = found
+            modes = _modes(problem, span, found)
+    assert best is not None
+    return best
+
+
+def _span(problem: Problem, ends: Ends | None) -> Span:
+    """All steps of a problem with the ends that it asks for, or the scored ones with given ends."""
+    if ends is not None:
+        return Span(
+            problem.scored_from,
+            problem.steps,
+            start_kwh=ends.start_kwh,
+            start_tasks=ends.start_tasks,
+            end_kwh=ends.end_kwh,
+            end_tasks=ends.end_tasks,
+        )
+    stored = problem.storage.stored_kwh
+    if problem.scored_from:
+        return Span(
+            0, problem.steps, start_kwh=stored, start_tasks=0.0, as_after=problem.scored_from - 1
+        )
+    return Span(0, problem.steps, start_kwh=stored, start_tasks=0.0, end_kwh=stored, end_tasks=0.0)
+
+
+def _modes(problem: Problem, span: Span, found: Dispatch) -> Modes:
+    """Modes that allow about what a dispatch does in each step."""
+    steps = problem.work.deadline_steps
+    assert steps is not None
+    entered, waiting = found.deferred_tasks, found.waiting_tasks
+    start = span.start_tasks or 0.0
+    left = entered - np.diff(waiting, prepend=start)
+    before = np.zeros(steps) if span.deferred_before is None else span.deferred_before
+    total = np.cumsum(np.concatenate([before, entered]))
+    within = total[steps:] - total[:-steps]
+    due = (within - waiting < _NEGLIGIBLE_TASKS) & (waiting > _NEGLIGIBLE_TASKS)
+    modes = np.where(waiting > _NEGLIGIBLE_TASKS, DRAIN, DEFER)
+    modes = np.where(left > entered + _NEGLIGIBLE_TASKS, DRAIN, modes)
+    modes = np.where(entered > left + _NEGLIGIBLE_TASKS, DEFER, modes)
+    return np.where(due & (entered > _NEGLIGIBLE_TASKS), DUE, modes)
+
+
+def _queue_modes(problem: Problem, span: Span, found: Dispatch) -> Modes:
+    """Modes of a queue that is asked to do the work of a dispatch, as far as it can."""
+    work, steps = problem.work, problem.work.deadline_steps
+    assert steps is not None
+    arrived = work.arrived_tasks[span.first : span.end]
+    most = work.most_deferred_tasks[span.first : span.end]
+    before = np.zeros(steps) if span.deferred_before is None else span.deferred_before
+    entered = np.concatenate([before, np.zeros(len(arrived))])
+    total_in = np.cumsum(entered)
+    total_out = total_in[steps - 1] - (span.start_tasks or 0.0)
+    modes = np.empty(len(arrived), np.int64)
+    total = total_in[steps - 1]
+    for t in range(len(arrived)):
+        waiting = total - total_out
+        due = max(total_in[t] - total_out, 0.0)
+        change = found.executed_tasks[t] - arrived[t]
+        out = min(max(due, change), waiting)
+        into = min(max(out - change, 0.0), most[t])
+        if into > _NEGLIGIBLE_TASKS:
+            modes[t] = DUE if out > _NEGLIGIBLE_TASKS else DEFER
+        else:
+            modes[t] = DRAIN if waiting > _NEGLIGIBLE_TASKS else DEFER
+        total, total_out = total + into, total_out + out
+        total_in[t + steps] = total
+    return modes
+
+
+def _solve(problem: Problem, programme: DispatchProgramme) -> Dispatch:
+    """Solve a programme.
+
+    Raises:
+        ConfigError: no plan keeps the limits.
+    """
+    try:
+        return programme.solve()
+    except InfeasibleError:
+        raise ConfigError(
+            f"optimum of {problem.name}: no plan does all work within its deadline and ends with "
+            f"at least the stored energy and at most the queue that are asked for; valid are data "
+            f"centers that can, see workload.max_utilisation and workload.deadline_h"
+        ) from None
