@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,9 @@ from sdc_taichi import Actions, Simulator, build_fleet, load_config
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, OddInputWarning
 from sdc_taichi.optimum import tables
+from sdc_taichi.optimum.eligibility import no_table_reasons, uncooled_reason
 from sdc_taichi.optimum.facility_map import FacilityMap, facility_map
+from sdc_taichi.optimum.problem import FacilityTable
 from sdc_taichi.optimum.tables import TableGrid, facility_tables
 from sdc_taichi.sim.drivers import Drivers, FleetSeries, load_drivers
 
@@ -49,6 +52,9 @@ CASES = {
         "hvac.setpoint.initial_c=34",
     ),
     "fill": ("tiny", "workload.placement=fill"),
+    "pressure": ("corrected", "hvac.crac.flow_model=pressure", "hvac.crac.units=2"),
+    "hottest_inlet": ("corrected", "hvac.crac.flow_model=hottest_inlet"),
+    "constant": ("corrected", "hvac.crac.flow_model=constant"),
 }
 
 
@@ -156,6 +162,59 @@ def test_heat_that_the_plant_leaves_is_in_the_table() -> None:
 def test_a_grid_without_nodes_is_an_error(values: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match="table: "):
         TableGrid(**values)  # type: ignore[arg-type]
+
+
+TABLELESS = {
+    "transient": (["simulation.thermal=transient"], "remember their temperatures"),
+    "scheduled": (
+        ["events.scheduled=[{kind: heat_wave, start_h: 1, duration_h: 2, offset_k: 5}]"],
+        "scheduled events .* (heat_wave)",
+    ),
+    "sampled": (
+        ["events.sampled=[{kind: grid_outage, per_year: 2, duration_h: [1, 2]}]"],
+        "not known in advance (grid_outage)",
+    ),
+    "coolest-first": (["workload.placement=coolest-first"], "inlets of the step before"),
+    "inlet-aware": (["workload.placement=inlet-aware"], "inlets of the step before"),
+    "weights": (["workload.placement=weights"], "actions move work"),
+    "controlled": (["hvac.crac.flow_model=controlled"], "actions move the fans"),
+}
+
+
+@pytest.mark.parametrize("case", TABLELESS)
+def test_what_a_table_leaves_out_is_a_reason_in_words(case: str) -> None:
+    overrides, reason = TABLELESS[case]
+    (found,) = no_table_reasons(build_fleet(load_config("corrected", overrides)))
+    assert found is not None
+    assert re.search(reason.replace("(", r"\(").replace(")", r"\)"), found)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_exact_tables_have_no_reason(case: str) -> None:
+    assert no_table_reasons(build_fleet(config_of(case))) == (None,)
+
+
+def test_all_reasons_are_told_for_each_data_center() -> None:
+    plain = load_config("corrected", [])
+    controlled = "hvac.crac.flow_model=controlled"
+    both = load_config("corrected", [controlled, "simulation.thermal=transient"])
+    first, second = (no_table_reasons(build_fleet(config))[0] for config in (plain, both))
+    assert first is None
+    assert second is not None
+    assert second.count("; ") == 1
+
+
+def test_loads_that_no_setpoint_cools_are_told() -> None:
+    utilisation = np.array([0.0, 0.5, 1.0])
+    unmet_w = np.zeros((3, 3, 2))
+    unmet_w[:, 2] = 5.0
+    unmet_w[2, 1] = 5.0, 0.0
+    ones = np.ones_like(unmet_w)
+    table = FacilityTable(utilisation, np.array([16.0, 20.0]), ones, ones, ones, unmet_w)
+    assert uncooled_reason(table, np.array([0.1, 0.4, 0.5])) is None
+    told = uncooled_reason(table, np.array([0.1, 0.9, 0.6]))
+    assert told is not None
+    assert "2 of 3 steps" in told
 
 
 def a_map(configs: list[DataCenterConfig], **options: Any) -> tuple[FacilityMap, Drivers]:

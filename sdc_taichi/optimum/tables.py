@@ -51,7 +51,7 @@ class TableGrid:
 
     utilisations: int = 41
     """Number of utilisations, evenly from 0 to 1, 2..1,001."""
-    setpoint_step_k: float = 1.0
+    setpoint_step_k: float = 0.5
     """Largest distance of setpoints, in K, 0.01..50."""
 
     def __post_init__(self) -> None:
