@@ -4,3 +4,9 @@ A table of what each step costs, made by the simulator itself, turns the control
 into linear programmes and dynamic programmes. Their optimum bounds the figure of every controller
 that knows the inputs in advance; the plan behind it is then run to see what can be achieved.
 """
+
+from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.result import Optimum, StoppedError
+from sdc_taichi.optimum.solve import solve
+
+__all__ = ["Objective", "Optimum", "StoppedError", "solve"]

@@ -270,7 +270,7 @@ class DispatchProgramme:
             # Of the work deferred earlier, what is within the deadline of each of the first steps.
             within = np.cumsum(before[::-1])[::-1][1:]
             right[: steps - 1] = within[:n]
-        earlier = sparse.eye_array(n, k=-steps, format="csr")
+        earlier = sparse.eye_array(n, k=-steps, format="csr") if steps < n else 0.0 * self._now
         return {"queue": self._now, "deferred": earlier - self._now}, right
 
     def _add_battery(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -49,6 +49,18 @@ class Targets:
 
 
 @dataclass(frozen=True, slots=True)
+class CommandPath:
+    """Commands of B data centers in T steps."""
+
+    load: F64
+    """Load commands, -1..1, (T, B)."""
+    cooling: F64
+    """Cooling commands, in steps of the setpoint, (T, B)."""
+    battery: F64
+    """Battery commands, -1..1, (T, B)."""
+
+
+@dataclass(frozen=True, slots=True)
 class RollOut:
     """What the simulator did in T steps of B data centers."""
 
@@ -91,19 +103,19 @@ class RollOut:
     battery_command: F64
     """Battery command, -1..1, (T, B)."""
 
-    def of(self, where: I64 | slice) -> RollOut:
+    def of(self, where: Sequence[int]) -> RollOut:
         """Copy with some of the data centers.
 
         Args:
             where: their numbers.
         """
-        return RollOut(*(getattr(self, f.name)[:, where] for f in fields(self)))
+        return RollOut(*(getattr(self, f.name)[:, list(where)] for f in fields(self)))
 
 
 def roll_out(
     fleet: Fleet,
     drivers: Drivers,
-    targets: Targets,
+    plans: Targets | CommandPath,
     *,
     start: I64,
     objective: Objective,
@@ -113,14 +125,14 @@ def roll_out(
     on_step: OnStep | None = None,
     stop: Stop | None = None,
 ) -> tuple[RollOut, Score] | None:
-    """Run plans in the simulator: commands are computed at the true state of every step.
+    """Run plans in the simulator: commands for targets are computed at the true state of each step.
 
     All CRAC units of a data center move alike.
 
     Args:
         fleet: B data centers.
         drivers: Their inputs.
-        targets: What they are to do.
+        plans: What they are to do, as states to reach or as commands.
         start: First step of each, counted from the beginning of the year, (B,).
         objective: What is minimised.
         scored_from: First step that is scored.
@@ -135,22 +147,29 @@ def roll_out(
     Raises:
         PhysicalLimitError: A result that no data center can reach.
     """
-    steps = len(targets.setpoint_c)
+    steps = len(plans.cooling if isinstance(plans, CommandPath) else plans.setpoint_c)
     with Simulator(fleet, drivers=drivers, precision=precision) as sim:
         sim.reset(seed, start=start)
-        follow = _Follower(sim, targets)
+        actions = _given(plans) if isinstance(plans, CommandPath) else _Follower(sim, plans).actions
         score = Score(objective, sim, scored_from)
         done = {f.name: np.empty((steps, fleet.size)) for f in fields(RollOut)}
         for t in range(steps):
             if stop is not None and stop():
                 return None
-            result: StepResult = sim.step(follow.actions(t))
+            result: StepResult = sim.step(actions(t))
             score.add(result)
             for name, values in done.items():
                 values[t] = getattr(result, name)
             if on_step is not None:
                 on_step()
     return RollOut(**done), score
+
+
+def _given(commands: CommandPath) -> Callable[[int], Actions]:
+    """Actions of a step from commands of all steps."""
+    return lambda t: Actions(
+        load=commands.load[t], cooling=commands.cooling[t], battery=commands.battery[t]
+    )
 
 
 class _Follower:

@@ -1,0 +1,118 @@
+"""What the simulator measured along a path, and whether it keeps what a plan has to keep."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sdc_taichi.optimum.problem import Problem
+from sdc_taichi.optimum.rollout import RollOut, Targets
+from sdc_taichi.optimum.table_lookup import at_utilisation, barred
+from sdc_taichi.types import F64
+
+LARGEST_TABLE_ERROR = 1e-4
+"""Largest error of a table, as a share of the energy, with which a bound still is one."""
+LEAST_TASKS = 1e-6
+"""Work that rounding may leave, in tasks."""
+LEAST_K = 1e-3
+"""Temperature by which the precision of the kernels may exceed a limit, in K."""
+_LEAST_STORED_SHARE = 1e-6
+"""Share of the capacity that may be missing from the battery at the end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """What the simulator measured in the scored steps along a path of one data center."""
+
+    figure: float
+    """Figure of the scored steps, in the unit of the objective."""
+    table_error: float
+    """Difference of the facility's energy in each step from its table, without its sign, summed
+    over the steps and over their energy."""
+    start_kwh: float
+    """Energy stored at the first scored step, in kWh."""
+    end_kwh: float
+    """Energy stored at the end, in kWh."""
+    start_tasks: float
+    """Work that waits at the first scored step, in tasks."""
+    end_tasks: float
+    """Work that waits at the end, in tasks."""
+    dropped_tasks: float
+    """Work that finds the queue full, in tasks."""
+    overdue_tasks: float
+    """Most due work that does not fit into a step, in tasks."""
+    hottest_inlet_c: float
+    """Hottest inlet, in C."""
+    over_limit_k: float
+    """Most by which an inlet exceeds the limit in a step that has a setpoint within it, in K."""
+    unmet_kwh: float
+    """Cooling load that stays in the room, in kWh."""
+
+    def failures(self, idle: Certificate, capacity_kwh: float) -> tuple[str, ...]:
+        """What the path breaks, in words; nothing where it may count as achieved.
+
+        Args:
+            idle: Certificate of idle commands.
+            capacity_kwh: Capacity of the battery, in kWh.
+        """
+        missing_kwh = self.start_kwh - self.end_kwh
+        more_tasks = self.end_tasks - self.start_tasks
+        dropped = self.dropped_tasks - idle.dropped_tasks
+        texts = []
+        if missing_kwh > _LEAST_STORED_SHARE * capacity_kwh:
+            texts.append(f"ends with {missing_kwh:.4g} kWh less in the battery")
+        if more_tasks > LEAST_TASKS:
+            texts.append(f"ends with {more_tasks:.4g} tasks more in the queue")
+        if dropped > LEAST_TASKS:
+            texts.append(f"drops {dropped:.4g} tasks more than idle commands")
+        if self.overdue_tasks > idle.overdue_tasks + LEAST_TASKS:
+            texts.append(f"leaves up to {self.overdue_tasks:.4g} tasks overdue")
+        if self.over_limit_k > LEAST_K:
+            texts.append(f"has inlets up to {self.over_limit_k:.3g} K over the limit")
+        if self.unmet_kwh > idle.unmet_kwh * (1.0 + 1e-6) + 1e-6:
+            texts.append(f"leaves {self.unmet_kwh - idle.unmet_kwh:.4g} kWh of heat in the room")
+        return tuple(texts)
+
+
+def certificate(problem: Problem, path: Targets, done: RollOut, figure: float) -> Certificate:
+    """What the simulator measured along a path.
+
+    Args:
+        problem: Planning problem of the data center.
+        path: Path of one data center, with the energy that tables expect.
+        done: What the simulator did along it.
+        figure: Figure of the scored steps.
+    """
+    first, step_h = problem.scored_from, problem.step_h
+    scored = slice(first, None)
+    begin = first - 1
+    inlet_c, facility = done.inlet_max_c[scored, 0], done.facility_kwh[scored, 0]
+    difference = np.abs(path.facility_kwh[scored, 0] - facility)
+    return Certificate(
+        figure=figure,
+        table_error=float(difference.sum() / facility.sum()),
+        start_kwh=float(done.stored_kwh[begin, 0]) if first else problem.storage.stored_kwh,
+        end_kwh=float(done.stored_kwh[-1, 0]),
+        start_tasks=float(done.queue_tasks[begin, 0]) if first else 0.0,
+        end_tasks=float(done.queue_tasks[-1, 0]),
+        dropped_tasks=float(done.dropped_tasks[scored].sum()),
+        overdue_tasks=float(done.overdue_tasks[scored].max()),
+        hottest_inlet_c=float(inlet_c.max()),
+        over_limit_k=float(_over_limit_k(problem, done)[scored].max()),
+        unmet_kwh=float(done.unmet_w[scored].sum() * step_h / 1e3),
+    )
+
+
+def _over_limit_k(problem: Problem, done: RollOut) -> F64:
+    """By how much the hottest inlet of each step exceeds what it has to keep, in K, (T,)."""
+    if np.isinf(problem.inlet_limit_c):
+        return np.zeros(problem.steps)
+    table = problem.table
+    inlet_c, unmet_w = (
+        at_utilisation(values, table.utilisation, done.utilisation[:, 0])
+        for values in (table.inlet_max_c, table.unmet_w)
+    )
+    not_permitted = barred(inlet_c, unmet_w, problem.inlet_limit_c)
+    warmest_c = np.where(not_permitted, -np.inf, inlet_c).max(axis=1)
+    return np.asarray(done.inlet_max_c[:, 0] - np.maximum(problem.inlet_limit_c, warmest_c))

@@ -1,0 +1,230 @@
+"""Paths of one data center that its planning problem suggests, to be run by the simulator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sdc_taichi.optimum.battery_path import battery_path
+from sdc_taichi.optimum.linear_programme import plan
+from sdc_taichi.optimum.problem import Agent, FacilityTable, Problem
+from sdc_taichi.optimum.rollout import Targets
+from sdc_taichi.optimum.setpoint_path import setpoint_path
+from sdc_taichi.optimum.table_lookup import (
+    at_setpoint,
+    at_utilisation,
+    barred,
+    energy_at_utilisation,
+)
+from sdc_taichi.plant.workload import TASKS_PER_STEP
+from sdc_taichi.types import F64
+
+IDLE = "idle"
+"""Name of the path under idle commands."""
+JOINT = "joint"
+"""Name of the path that moves all agents of a problem together."""
+_UNSCORED_SHARE = 1e-3
+"""Weight of a kWh in steps that are not scored, over the mean of the others: it decides between
+paths that are otherwise alike."""
+_PEAK_SHARES = (np.inf, 1.0, 0.97, 0.94, 0.9, 0.86, 0.82, 0.78)
+"""Highest power bought over that of the facility, among which paths with peaks choose."""
+_STORED_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""States of charge at the first scored step among which paths choose."""
+
+
+def paths_of(problem: Problem) -> dict[str, Targets]:
+    """Paths of a data center, by name, one data center each.
+
+    There is that of idle commands, one for each agent alone, and one for all of them together.
+
+    Args:
+        problem: The planning problem.
+
+    Raises:
+        ConfigError: No plan keeps the limits.
+    """
+    return {name: path_of(problem, agents) for name, agents in _agents_of(problem).items()}
+
+
+def idle_paths(problem: Problem) -> dict[str, Targets]:
+    """Paths under idle commands, by the names of ``paths_of``.
+
+    Args:
+        problem: The planning problem.
+    """
+    return dict.fromkeys(_agents_of(problem), path_of(problem, ()))
+
+
+def _agents_of(problem: Problem) -> dict[str, tuple[Agent, ...]]:
+    """What each path moves, by its name."""
+    named: dict[str, tuple[Agent, ...]] = {IDLE: ()}
+    named |= {agent: (agent,) for agent in problem.agents}
+    return named | ({JOINT: problem.agents} if len(problem.agents) > 1 else {})
+
+
+def path_of(problem: Problem, agents: tuple[Agent, ...]) -> Targets:
+    """A good path that moves some agents and leaves the others idle.
+
+    Work comes from the linear programme, setpoints from the dynamic programme for that work, and
+    the battery's path is that for the energy which the facility then needs.
+
+    Args:
+        problem: The planning problem.
+        agents: What the path may move.
+    """
+    executed = problem.work.idle_tasks
+    if "load" in agents:
+        executed = plan(replace(problem, agents=agents)).executed_tasks
+    return _path(problem, agents, executed)
+
+
+def with_battery_for(problem: Problem, path: Targets, facility_kwh: F64) -> Targets:
+    """A path whose battery follows an energy of the facility that is known better.
+
+    Args:
+        problem: The planning problem.
+        path: The path, which moves the battery.
+        facility_kwh: Energy of the facility along it, in kWh, (T,).
+    """
+    stored = _stored_kwh(problem, facility_kwh)
+    return replace(path, stored_kwh=stored[:, None], facility_kwh=facility_kwh[:, None])
+
+
+def weight_of_kwh(problem: Problem) -> F64:
+    """Weight of a kWh of the facility in each step, with a share of the peaks, (T,).
+
+    A demand charge is spread over its month. Steps that are not scored have a little weight.
+    """
+    weight = problem.kwh_weight.copy()
+    for month in problem.months:
+        hours = (month.end - month.first) * problem.step_h
+        weight[month.first : month.end] += month.weight_per_kw / hours
+    scored = weight[problem.scored_from :]
+    weight[: problem.scored_from] = _UNSCORED_SHARE * (scored.mean() or 1.0)
+    return weight
+
+
+def _path(problem: Problem, agents: tuple[Agent, ...], executed_tasks: F64) -> Targets:
+    """The path that does some work, with the setpoints and the battery that suit it."""
+    setpoint_c = problem.idle_setpoint_c
+    utilisation = np.minimum(executed_tasks / TASKS_PER_STEP, 1.0)
+    if "cooling" in agents:
+        setpoint_c = _setpoints_c(problem, utilisation)
+    facility = facility_kwh(problem.table, utilisation, setpoint_c)
+    nothing = np.full(problem.steps, np.nan)
+    queue = _queue_tasks(problem, executed_tasks) if "load" in agents else nothing
+    stored = _stored_kwh(problem, facility) if "battery" in agents else nothing
+    return Targets(*(x[:, None] for x in (queue, setpoint_c, stored, facility)))
+
+
+def facility_kwh(table: FacilityTable, utilisation: F64, setpoint_c: F64) -> F64:
+    """Energy of the facility in each step, in kWh, (T,).
+
+    Args:
+        table: What steps cost.
+        utilisation: Utilisation of each step, (T,).
+        setpoint_c: Setpoint of each step, in C, (T,).
+    """
+    by_setpoint = energy_at_utilisation(table.facility_kwh, table.utilisation, utilisation)
+    return at_setpoint(by_setpoint, table.setpoint_c, setpoint_c)
+
+
+def _queue_tasks(problem: Problem, executed_tasks: F64) -> F64:
+    """Work in the queue after each step, in tasks, (T,); what finds it full is dropped."""
+    rise = problem.work.arrived_tasks - executed_tasks
+    limit = problem.work.queue_limit_tasks
+    if problem.work.most_dropped_tasks == 0.0:
+        return np.clip(np.cumsum(rise), 0.0, limit)
+    queue, waiting = np.empty(len(rise)), 0.0
+    for t, more in enumerate(rise.tolist()):
+        queue[t] = waiting = min(max(waiting + more, 0.0), limit)
+    return queue
+
+
+def _setpoints_c(problem: Problem, utilisation: F64) -> F64:
+    """Setpoints of least cost for the utilisation of each step, in C, (T,)."""
+    table = problem.table
+    energy = energy_at_utilisation(table.facility_kwh, table.utilisation, utilisation)
+    water, inlet_c, unmet_w = (
+        at_utilisation(values, table.utilisation, utilisation)
+        for values in (table.water_l, table.inlet_max_c, table.unmet_w)
+    )
+    cost = weight_of_kwh(problem)[:, None] * energy + problem.litre_weight * water
+    cost[barred(inlet_c, unmet_w, problem.inlet_limit_c)] = np.inf
+    return setpoint_path(cost, table.setpoint_c, ramp_k=problem.ramp_k, start_c=problem.setpoint_c)
+
+
+def _stored_kwh(problem: Problem, facility_kwh: F64) -> F64:
+    """Energy stored after each step for a known energy of the facility, in kWh, (T,)."""
+    storage = problem.storage
+    if storage.model == "released":
+        return _released_kwh(problem, facility_kwh)
+    found = plan(replace(problem, agents=("battery",), table=_known_facility(facility_kwh)))
+    rise_kwh = (
+        storage.charge_efficiency * found.charge_kwh
+        - storage.discharge_factor * found.discharge_kwh
+    )
+    return np.clip(storage.stored_kwh + np.cumsum(rise_kwh), 0.0, storage.capacity_kwh)
+
+
+def _known_facility(facility_kwh: F64) -> FacilityTable:
+    """Table of a facility whose energy is the same at all utilisations and setpoints."""
+    values = np.broadcast_to(facility_kwh[:, None, None], (len(facility_kwh), 2, 1))
+    nothing = np.zeros(values.shape)
+    return FacilityTable(np.array([0.0, 1.0]), np.array([20.0]), values, nothing, nothing, nothing)
+
+
+def _released_kwh(problem: Problem, facility_kwh: F64) -> F64:
+    """Path of a battery of model ``released``, (T,): the cheapest of several peaks and starts."""
+    peaks = _PEAK_SHARES if problem.months else _PEAK_SHARES[:1]
+    starts = _STORED_SHARES if problem.scored_from else (None,)
+    best, least = np.full(problem.steps, problem.storage.stored_kwh), np.inf
+    highest_kw = float(facility_kwh.max()) / problem.step_h
+    for start in starts:
+        for peak in peaks:
+            path = _released_once(problem, facility_kwh, start, peak * highest_kw)
+            cost = _battery_cost(problem, facility_kwh, path)
+            if cost < least:
+                best, least = path, cost
+    return best
+
+
+def _released_once(
+    problem: Problem, facility_kwh: F64, start_share: float | None, most_grid_kw: float
+) -> F64:
+    """Path of a battery of model ``released``, from a state of charge at the first scored step."""
+    weight, split = weight_of_kwh(problem), problem.scored_from
+    storage, before = problem.storage, np.empty(0)
+    limits = {
+        "step_h": problem.step_h,
+        "grid_limit_kw": problem.grid_limit_kw,
+        "most_grid_kw": most_grid_kw,
+    }
+    if start_share is not None:
+        before = battery_path(
+            storage,
+            facility_kwh[:split],
+            weight[:split],
+            end_kwh=start_share * storage.capacity_kwh,
+            **limits,
+        )
+        storage = replace(storage, stored_kwh=float(before[-1]))
+    after = battery_path(
+        storage, facility_kwh[split:], weight[split:], end_kwh=storage.stored_kwh, **limits
+    )
+    return np.concatenate([before, after])
+
+
+def _battery_cost(problem: Problem, facility_kwh: F64, stored_kwh: F64) -> float:
+    """Cost of a path of a battery without losses; inf where it ends lower than it began."""
+    grid_kwh = facility_kwh + np.diff(stored_kwh, prepend=problem.storage.stored_kwh)
+    split = problem.scored_from
+    begin = stored_kwh[split - 1] if split else problem.storage.stored_kwh
+    if stored_kwh[-1] < begin - 1e-6 * problem.storage.capacity_kwh:
+        return np.inf
+    cost = float((problem.kwh_weight * grid_kwh).sum())
+    for month in problem.months:
+        highest_kw = grid_kwh[month.first : month.end].max() / problem.step_h
+        cost += month.weight_per_kw * float(highest_kw)
+    return cost

@@ -1,0 +1,422 @@
+"""Bound and achieved figure of data centers: tables, programmes, and runs of the simulator."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.kernels.compiler import runtime
+from sdc_taichi.optimum.certificates import LARGEST_TABLE_ERROR, Certificate, certificate
+from sdc_taichi.optimum.eligibility import no_table_reasons, uncooled_reason
+from sdc_taichi.optimum.entry import Cache, Entry
+from sdc_taichi.optimum.linear_programme import bound
+from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.paths import IDLE, JOINT, idle_paths, paths_of, with_battery_for
+from sdc_taichi.optimum.problem import AGENTS, Agent, Ends, Problem
+from sdc_taichi.optimum.result import Optimum, StoppedError
+from sdc_taichi.optimum.rollout import RollOut, Targets, repeated, roll_out
+from sdc_taichi.optimum.task import Task, checked_task
+from sdc_taichi.plant.workload import TASKS_PER_STEP
+from sdc_taichi.sim import snapshot
+from sdc_taichi.sim.drivers import Drivers
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.types import F64, I64
+
+_EXACT_TABLE_ERROR = 1e-6
+"""Error of a table, as a share of the energy, below which no battery is planned again."""
+_AGAIN = "again"
+"""Name of the path whose battery is planned for the energy that the simulator measured."""
+_POLL_S = 0.2
+"""Time between two questions whether to stop, in s."""
+
+_X = TypeVar("_X")
+_Y = TypeVar("_Y")
+Progress = Callable[[str, int, int], None]
+"""Is told the name of a stage, how much of it is done, and how much there is."""
+
+
+def solve(
+    configs: Fleet | DataCenterConfig | Iterable[DataCenterConfig],
+    *,
+    steps: int,
+    start: I64 | Sequence[int] | None = None,
+    drivers: Drivers | None = None,
+    objective: Objective | str = "carbon",
+    agents: Sequence[Agent] = AGENTS,
+    scored_from: int = 0,
+    inlet_limit_c: float | None = None,
+    discrete: bool = False,
+    precision: Precision = "f32",
+    cache: bool | str | os.PathLike[str] = True,
+    progress: Progress | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Optimum:
+    """Find what the best controllers of data centers can reach when all inputs are known.
+
+    The bound is that of ``linear_programme.bound``; the achieved figure is the best of several
+    plans that the simulator has run and that keep the constraints.
+
+    Args:
+        configs: A fleet, one config or several, B.
+        steps: Number of steps, T.
+        start: First step of each, counted from the beginning of the year, (B,); None is that of
+            the drivers.
+        drivers: Inputs; None reads what the configs name.
+        objective: What is minimised, or its text.
+        agents: What plans may move.
+        scored_from: First step that is scored; where it is not 0, plans end in the state that they
+            have there.
+        inlet_limit_c: Highest inlet that plans may cause where they have a choice, in C; None is
+            the limit of ``protection.ashrae_class``, and none where that is not set.
+        discrete: Whether to look for the best path of discrete actions as well.
+        precision: Floating-point precision of the hall kernels.
+        cache: Whether to read and keep results among the user's caches, or a folder for them.
+        progress: Is told of the stages of the work.
+        stop: Asked now and then; true ends the work, and what has been solved is kept.
+
+    Raises:
+        ConfigError: An argument that is not valid.
+        StoppedError: ``stop`` was true.
+        PhysicalLimitError: A result that no data center can reach.
+    """
+    task = checked_task(
+        configs,
+        steps=steps,
+        start=start,
+        drivers=drivers,
+        objective=objective,
+        agents=agents,
+        scored_from=scored_from,
+        inlet_limit_c=inlet_limit_c,
+        precision=precision,
+    )
+    kept = None if cache is False else Cache(None if cache is True else Path(cache))
+    work = _Work(progress or (lambda _stage, _done, _total: None), stop or (lambda: False))
+    return _optimum(task, work.entries(task, kept))
+
+
+def _optimum(task: Task, entries: Sequence[Entry]) -> Optimum:
+    """The optimum of a task, from what is known of each data center."""
+
+    def each(name: str) -> F64:
+        return np.array([getattr(entry, name) for entry in entries], dtype=np.float64)
+
+    def paths(name: str) -> F64:
+        return np.stack([getattr(entry, name) for entry in entries], axis=1)
+
+    limits = [entry.certificate["inlet_limit_c"] for entry in entries]
+    return Optimum(
+        names=task.fleet.names,
+        fingerprint=snapshot.fingerprint(task.fleet, task.drivers, task.precision),
+        objective=task.objective,
+        agents=task.agents,
+        start=task.start,
+        steps=task.steps,
+        scored_from=task.scored_from,
+        inlet_limit_c=np.array(limits),
+        idle=each("idle"),
+        idle_dropped_tasks=each("idle_dropped_tasks"),
+        bound=each("bound"),
+        achieved=each("achieved"),
+        alone={agent: np.array([entry.alone[agent] for entry in entries]) for agent in task.agents},
+        bound_kinds=tuple(entry.kind for entry in entries),
+        failures=tuple(entry.failures for entry in entries),
+        certificates=tuple(entry.certificate for entry in entries),
+        load=paths("load"),
+        cooling=paths("cooling"),
+        battery=paths("battery"),
+        bound_of_ends=_BoundOfEnds(task, [entry.kind for entry in entries]),
+    )
+
+
+class _BoundOfEnds:
+    """Bounds of data centers with given ends, computed when they are first asked for.
+
+    Args:
+        task: What was solved.
+        kinds: What the bound of each data center is, B.
+    """
+
+    def __init__(self, task: Task, kinds: Sequence[str]) -> None:
+        self._task, self._kinds = task, kinds
+        self._problem: tuple[int, Problem] | None = None
+        self._known: dict[tuple[int, Ends], float] = {}
+
+    def __call__(self, dc: int, ends: Ends) -> float:
+        """Bound of a data center, by its number, with given ends; nan where there is none."""
+        if self._kinds[dc].startswith("none"):
+            return float("nan")
+        if (dc, ends) not in self._known:
+            self._known[dc, ends] = bound(self._problem_of(dc), ends).figure
+        return self._known[dc, ends]
+
+    def _problem_of(self, dc: int) -> Problem:
+        """Planning problem of a data center; that of the last call is kept."""
+        if self._problem is None or self._problem[0] != dc:
+            part = self._task.part([dc])
+            self._problem = dc, part.problems(part.tables())[0]
+        return self._problem[1]
+
+
+@dataclass(frozen=True, slots=True)
+class _Suggestion:
+    """What the programmes say of one data center."""
+
+    bound: float
+    """Bound of the figure; nan without one."""
+    no_bound: str | None
+    """Why there is no bound, in words; None where there is one."""
+    paths: dict[str, Targets]
+    """Paths to run, by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """A path of one data center that the simulator has run."""
+
+    path: Targets
+    """What it was to do."""
+    done: RollOut
+    """What it did."""
+    figure: float
+    """Figure of the scored steps."""
+
+
+def _suggestion(problem: Problem, reason: str | None) -> _Suggestion:
+    """Bound and paths of a data center.
+
+    Args:
+        problem: Its planning problem.
+        reason: Why its table does not hold all that a step costs; None where it does.
+    """
+    try:
+        figure = float("nan") if reason else bound(problem).figure
+        return _Suggestion(figure, reason, paths_of(problem))
+    except ConfigError as error:
+        return _Suggestion(float("nan"), str(error), idle_paths(problem))
+
+
+def _battery_again(problem: Problem, run: _Run) -> Targets:
+    """The path of a run with a battery that suits the energy that the simulator measured."""
+    return with_battery_for(problem, run.path, run.done.facility_kwh[:, 0])
+
+
+def _beside(paths: Sequence[Targets]) -> Targets:
+    """Paths of several data centers in one."""
+    return Targets(
+        *(
+            np.concatenate([getattr(path, f.name) for path in paths], axis=1)
+            for f in fields(Targets)
+        )
+    )
+
+
+def _certificate(problem: Problem, run: _Run) -> Certificate:
+    return certificate(problem, run.path, run.done, run.figure)
+
+
+def _entry(problem: Problem, suggestion: _Suggestion, runs: Mapping[str, _Run]) -> Entry:
+    """What is known of a data center, from all its runs."""
+    certificates = {name: _certificate(problem, run) for name, run in runs.items()}
+    idle = certificates[IDLE]
+    failures = {
+        name: found.failures(idle, problem.storage.capacity_kwh)
+        for name, found in certificates.items()
+    }
+    valid = [name for name, texts in failures.items() if not texts] or [IDLE]
+    best = min(valid, key=lambda name: certificates[name].figure)
+    error = max(found.table_error for found in certificates.values())
+    done = runs[best].done
+    return Entry(
+        idle=idle.figure,
+        idle_dropped_tasks=idle.dropped_tasks,
+        # By as much as tables were found to differ from the simulator.
+        bound=suggestion.bound - error * abs(suggestion.bound),
+        achieved=certificates[best].figure,
+        alone={
+            agent: certificates[agent if agent in valid else IDLE].figure
+            for agent in problem.agents
+        },
+        kind=_kind(suggestion.no_bound, error),
+        failures=tuple(
+            f"the path of {name} {text}" for name, texts in failures.items() for text in texts
+        ),
+        certificate=asdict(certificates[best])
+        | {"table_error": error, "inlet_limit_c": problem.inlet_limit_c},
+        load=done.load_command[:, 0],
+        cooling=done.cooling_command[:, 0],
+        battery=done.battery_command[:, 0],
+    )
+
+
+def _kind(reason: str | None, error: float) -> str:
+    """What a bound is, in words."""
+    if reason is not None:
+        return f"none: {reason}"
+    if error > LARGEST_TABLE_ERROR:
+        return (
+            f"estimate: the simulator differs from its tables by {100.0 * error:.3g} % of the "
+            "energy"
+        )
+    return "bound"
+
+
+class _Work:
+    """The work of solving a task, stage by stage.
+
+    Args:
+        progress: Is told of the stages.
+        stop: Asked now and then; true ends the work.
+    """
+
+    def __init__(self, progress: Progress, stop: Callable[[], bool]) -> None:
+        self._progress, self._stop = progress, stop
+        self._kept, self._missing, self._solved = 0, 0, 0
+
+    def entries(self, task: Task, cache: Cache | None) -> list[Entry]:
+        """What is known of each data center, B.
+
+        Args:
+            task: What is to be solved.
+            cache: Where entries are kept; None keeps none.
+
+        Raises:
+            StoppedError: The work was stopped.
+        """
+        keys = [""] * task.fleet.size if cache is None else task.keys()
+        found: dict[int, Entry] = {}
+        if cache is not None:
+            known = {i: cache.find(key, task.steps) for i, key in enumerate(keys)}
+            found = {i: entry for i, entry in known.items() if entry is not None}
+        missing = [i for i in range(task.fleet.size) if i not in found]
+        self._kept, self._missing = len(found), len(missing)
+        for part in task.parts(missing):
+            for i, entry in zip(part, self._solve(task.part(part)), strict=True):
+                found[i] = entry
+                if cache is not None:
+                    cache.keep(keys[i], entry)
+            self._solved += len(part)
+            self._kept += len(part) if cache is not None else 0
+        return [found[i] for i in range(task.fleet.size)]
+
+    def _solve(self, task: Task) -> list[Entry]:
+        """Entries of data centers whose tables fit into memory together, B."""
+        steps = task.steps
+        tables = task.tables(
+            lambda done, total: self._tell("tables", done * task.fleet.size / total, steps),
+            self._stop,
+        )
+        if not tables:
+            raise self._stopped()
+        problems = task.problems(tables)
+        reasons = [
+            of_config or uncooled_reason(problem.table, problem.work.idle_tasks / TASKS_PER_STEP)
+            for of_config, problem in zip(no_table_reasons(task.fleet), problems, strict=True)
+        ]
+        found = self._side_by_side(_suggestion, problems, reasons)
+        runs = self._run(task, [suggestion.paths for suggestion in found])
+        self._plan_batteries_again(task, problems, runs)
+        return [
+            _entry(problem, suggestion, of)
+            for problem, suggestion, of in zip(problems, found, runs, strict=True)
+        ]
+
+    def _plan_batteries_again(
+        self, task: Task, problems: Sequence[Problem], runs: Sequence[dict[str, _Run]]
+    ) -> None:
+        """Where tables are not exact, add a run whose battery suits the energy measured."""
+        chosen = {}
+        for i, problem in enumerate(problems):
+            name = JOINT if JOINT in runs[i] else problem.agents[0]
+            error = _certificate(problem, runs[i][name]).table_error
+            if "battery" in problem.agents and error > _EXACT_TABLE_ERROR:
+                chosen[i] = runs[i][name]
+        if not chosen:
+            return
+        plans = self._side_by_side(
+            _battery_again, [problems[i] for i in chosen], list(chosen.values())
+        )
+        again = self._run(task.part(list(chosen)), [{_AGAIN: path} for path in plans])
+        for i, of in zip(chosen, again, strict=True):
+            runs[i].update(of)
+
+    def _side_by_side(
+        self, plan: Callable[[Problem, _X], _Y], problems: Sequence[Problem], given: Sequence[_X]
+    ) -> list[_Y]:
+        """What programmes find for each data center, B, several of them at a time.
+
+        Args:
+            plan: Solves the programmes of one data center.
+            problems: Their planning problems, B.
+            given: What else is known of each, B.
+        """
+        pool = ThreadPoolExecutor(runtime.ensure_started())
+        try:
+            futures = [pool.submit(plan, *each) for each in zip(problems, given, strict=True)]
+            waiting = set(futures)
+            while waiting:
+                if self._stop():
+                    raise self._stopped()
+                _, waiting = wait(waiting, timeout=_POLL_S)
+                self._tell("programmes", len(problems) - len(waiting), 1)
+            return [future.result() for future in futures]
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    def _tell(self, stage: str, data_centers: float, steps: int) -> None:
+        """Tell how much of a stage is done, counted in steps of data centers."""
+        done = self._solved + data_centers
+        self._progress(stage, round(done * steps), self._missing * steps)
+
+    def _stopped(self) -> StoppedError:
+        size = self._kept + self._missing - self._solved
+        return StoppedError(f"optima of {self._kept} of {size} data centers are kept")
+
+    def _run(self, task: Task, paths: Sequence[Mapping[str, Targets]]) -> list[dict[str, _Run]]:
+        """What the simulator does along the paths of each data center, by name, B.
+
+        Args:
+            task: The data centers, B.
+            paths: Paths of each, of the same names, B.
+        """
+        names, steps = list(paths[0]), 0
+        fleet, drivers, start = repeated(task.fleet, task.drivers, task.start, len(names))
+        stacked = _beside([of[name] for name in names for of in paths])
+
+        def on_step() -> None:
+            nonlocal steps
+            steps += 1
+            self._tell("runs", task.fleet.size * steps / task.steps, task.steps)
+
+        found = roll_out(
+            fleet,
+            drivers,
+            stacked,
+            start=start,
+            objective=task.objective,
+            scored_from=task.scored_from,
+            seed=np.tile(task.seed, len(names)),
+            precision=task.precision,
+            on_step=on_step,
+            stop=self._stop,
+        )
+        if found is None:
+            raise self._stopped()
+        done, score = found
+        figure = score.figure.reshape(len(names), len(paths))
+        return [
+            {
+                name: _Run(of[name], done.of([k * len(paths) + i]), float(figure[k, i]))
+                for k, name in enumerate(names)
+            }
+            for i, of in enumerate(paths)
+        ]

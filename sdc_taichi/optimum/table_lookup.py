@@ -1,0 +1,80 @@
+"""Reading tables of a facility between their nodes."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.optimum.stage_cost import at_tasks
+from sdc_taichi.types import F64, I64
+
+Mask = npt.NDArray[np.bool_]
+
+
+def at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:
+    """Values of a table at a utilisation of each step, linear between the nodes, (T, J).
+
+    Args:
+        values: Values by step, utilisation and setpoint, (T, I, J).
+        nodes: Utilisations of the table, rising, (I,).
+        utilisation: Utilisation of each step, (T,); beyond the nodes that of the last node counts.
+    """
+    low, share = _place(nodes, utilisation)
+    step = np.arange(len(utilisation))
+    below, above = values[step, low], values[step, low + 1]
+    # A share of 0 must not read a neighbour that cannot be cooled.
+    weighed = np.where(share[:, None] > 0.0, above, 0.0) * share[:, None]
+    return np.asarray(below * (1.0 - share)[:, None] + weighed)
+
+
+def energy_at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:
+    """Energy of a table at a utilisation of each step, cubic between the nodes, (T, J).
+
+    Args:
+        values: Energy by step, utilisation and setpoint, in kWh, (T, I, J).
+        nodes: Utilisations of the table, rising, (I,).
+        utilisation: Utilisation of each step, (T,); beyond the nodes that of the last node counts.
+    """
+    columns = [at_tasks(nodes, values[:, :, j], utilisation) for j in range(values.shape[2])]
+    return np.stack(columns, axis=1)
+
+
+def at_setpoint(values: F64, nodes: F64, setpoint_c: F64) -> F64:
+    """Values at a setpoint of each step, linear between the nodes, (T,).
+
+    Args:
+        values: Values by step and setpoint, (T, J).
+        nodes: Setpoints of the table, rising, in C, (J,).
+        setpoint_c: Setpoint of each step, in C, (T,); beyond the nodes that of the last node
+            counts.
+    """
+    if len(nodes) == 1:
+        return values[:, 0].copy()
+    low, share = _place(nodes, setpoint_c)
+    step = np.arange(len(setpoint_c))
+    return np.asarray(values[step, low] * (1.0 - share) + values[step, low + 1] * share)
+
+
+def barred(inlet_max_c: F64, unmet_w: F64, limit_c: float) -> Mask:
+    """Whether a plan may not use a setpoint, at the utilisation of each step, (T, J).
+
+    Where no setpoint keeps inlets within the limit, those with the coolest inlets may be used, and
+    where none meets the cooling load, those that miss the least of it.
+
+    Args:
+        inlet_max_c: Hottest inlet by step and setpoint, in C, (T, J).
+        unmet_w: Cooling load that stays in the room by step and setpoint, in W, (T, J).
+        limit_c: Highest inlet, in C; inf without a limit.
+    """
+    least_w = unmet_w.min(axis=1, keepdims=True)
+    meets = unmet_w <= least_w
+    coolest_c = np.where(meets, inlet_max_c, np.inf).min(axis=1, keepdims=True)
+    within = inlet_max_c <= np.maximum(limit_c, coolest_c)
+    return np.asarray(~(meets & within))
+
+
+def _place(nodes: F64, at: F64) -> tuple[I64, F64]:
+    """Node below each place, and how far it is to the node above, 0..1."""
+    low = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
+    share = (at - nodes[low]) / (nodes[low + 1] - nodes[low])
+    return low, np.clip(share, 0.0, 1.0)

@@ -1,0 +1,264 @@
+"""What is to be solved: data centers with inputs and options, and parts of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.errors import ConfigError, whole_number
+from sdc_taichi.optimum.entry import key_of
+from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.problem import AGENTS, Agent, FacilityTable, Problem
+from sdc_taichi.optimum.problems import problems_of
+from sdc_taichi.optimum.tables import TableGrid, facility_tables
+from sdc_taichi.sim import snapshot
+from sdc_taichi.sim.drivers import Drivers, FleetSeries, load_drivers
+from sdc_taichi.sim.events import seeds_of_fleet
+from sdc_taichi.sim.fleet import Fleet, build_fleet
+from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.prices import with_prices
+from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.sim.state_limits import LAST_START
+from sdc_taichi.types import I64
+
+MOST_STEPS = 100 * 8760
+"""Most steps of a plan."""
+MOST_TABLE_BYTES = 2**28
+"""Most memory of the tables of data centers that are solved together, in bytes."""
+_INLET_LIMITS_C = -50.0, 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is to be solved: B data centers with inputs and options."""
+
+    fleet: Fleet
+    """The data centers, B."""
+    drivers: Drivers
+    """Their inputs, with prices."""
+    start: I64
+    """First step of each, counted from the beginning of the year, (B,)."""
+    seed: I64
+    """Seed of the sampled events of each, (B,)."""
+    steps: int
+    """Number of steps, T."""
+    objective: Objective
+    """What is minimised."""
+    agents: tuple[Agent, ...]
+    """What plans may move."""
+    scored_from: int
+    """First step that is scored."""
+    inlet_limit_c: float | None
+    """Highest inlet where there is a choice, in C; None is that of the protection."""
+    precision: Precision
+    """Floating-point precision of the hall kernels."""
+
+    def part(self, where: Sequence[int]) -> Task:
+        """The task of some of the data centers.
+
+        Args:
+            where: their numbers.
+        """
+        chosen = list(where)
+        return replace(
+            self,
+            fleet=build_fleet([self.fleet.configs[i] for i in chosen]),
+            drivers=_part_of_drivers(self.drivers, chosen),
+            start=self.start[chosen],
+            seed=self.seed[chosen],
+        )
+
+    def parts(self, where: Sequence[int]) -> Iterator[list[int]]:
+        """Numbers of data centers whose tables fit into memory together.
+
+        Args:
+            where: numbers of the data centers to divide.
+        """
+        grid, part, size = TableGrid(), list[int](), 0.0
+        for i in where:
+            nodes = len(grid.utilisation()) * len(grid.setpoint_c(self.fleet.configs[i]))
+            own = 4.0 * 8.0 * self.steps * nodes
+            if part and size + own > MOST_TABLE_BYTES:
+                yield part
+                part, size = [], 0.0
+            part.append(i)
+            size += own
+        if part:
+            yield part
+
+    def keys(self) -> list[str]:
+        """SHA-256 of everything that decides what is found of each data center, B."""
+        options = {
+            "steps": self.steps,
+            "objective": str(self.objective),
+            "agents": self.agents,
+            "scored_from": self.scored_from,
+            "inlet_limit_c": self.inlet_limit_c,
+        }
+        halls: dict[Hashable, Fleet] = {}
+        keys = []
+        for i, config in enumerate(self.fleet.configs):
+            site = config.site
+            same = config.hall, config.servers, config.hvac, site.location, site.weather_file
+            if same not in halls:
+                halls[same] = build_fleet(config)
+            fingerprint = snapshot.fingerprint(
+                replace(halls[same], configs=(config,)),
+                _part_of_drivers(self.drivers, [i]),
+                self.precision,
+            )
+            own = {"start": int(self.start[i]), "seed": int(self.seed[i])}
+            keys.append(key_of(fingerprint, options | own))
+        return keys
+
+    def tables(
+        self,
+        on_step: Callable[[int, int], None] | None = None,
+        stop: Callable[[], bool] | None = None,
+    ) -> list[FacilityTable]:
+        """Tables of each data center, B; none where ``stop`` ended the work.
+
+        Args:
+            on_step: is told how many steps of data centers are done, and of how many.
+            stop: asked now and then; true ends the work.
+        """
+        return facility_tables(
+            self.fleet,
+            self.drivers,
+            start=self.start,
+            steps=self.steps,
+            precision=self.precision,
+            on_step=on_step,
+            stop=stop,
+        )
+
+    def problems(self, tables: Sequence[FacilityTable]) -> list[Problem]:
+        """The planning problem of each data center, B.
+
+        Args:
+            tables: what their steps cost, B.
+        """
+        with Simulator(self.fleet, drivers=self.drivers, precision=self.precision) as sim:
+            return problems_of(
+                self.fleet,
+                self.drivers,
+                sim.sizing,
+                tables,
+                start=self.start,
+                objective=self.objective,
+                agents=self.agents,
+                scored_from=self.scored_from,
+                inlet_limit_c=self.inlet_limit_c,
+            )
+
+
+def checked_task(
+    configs: Fleet | DataCenterConfig | Iterable[DataCenterConfig],
+    *,
+    steps: int,
+    start: I64 | Sequence[int] | None,
+    drivers: Drivers | None,
+    objective: Objective | str,
+    agents: Sequence[Agent],
+    scored_from: int,
+    inlet_limit_c: float | None,
+    precision: Precision,
+) -> Task:
+    """The task that arguments of ``solve`` mean.
+
+    Raises:
+        ConfigError: an argument that is not valid.
+    """
+    fleet = configs if isinstance(configs, Fleet) else build_fleet(configs)
+    steps = whole_number("steps", steps, 1, MOST_STEPS)
+    scored_from = whole_number("scored_from", scored_from, 0, steps - 1)
+    if inlet_limit_c is not None:
+        low_c, high_c = _INLET_LIMITS_C
+        if not low_c <= inlet_limit_c <= high_c:
+            raise ConfigError(
+                f"inlet_limit_c {inlet_limit_c:g}: valid is {low_c:g}..{high_c:g} C, or None"
+            )
+    if precision not in ("f32", "f64"):
+        raise ConfigError(f"precision {precision!r}: valid are f32 and f64")
+    given = load_drivers(fleet.configs) if drivers is None else drivers
+    if given.size != fleet.size:
+        raise ConfigError(f"drivers of {given.size} data centers for a fleet of {fleet.size}")
+    return Task(
+        fleet=fleet,
+        drivers=with_prices(given, fleet.configs),
+        start=_checked_start(given.start if start is None else start, fleet.size),
+        seed=seeds_of_fleet(0, fleet.names),
+        steps=steps,
+        objective=Objective.parse(objective) if isinstance(objective, str) else objective,
+        agents=_checked_agents(agents),
+        scored_from=scored_from,
+        inlet_limit_c=inlet_limit_c,
+        precision=precision,
+    )
+
+
+def _checked_start(start: I64 | Sequence[int], size: int) -> I64:
+    """First steps, (B,).
+
+    Raises:
+        ConfigError: they are not valid.
+    """
+    first = np.asarray(start)
+    whole = first.shape == (size,) and first.dtype.kind in "iu"
+    if not whole or np.any((first < 0) | (first > LAST_START)):
+        raise ConfigError(
+            f"start {start!r}: valid is one integer of 0..{LAST_START:,} for each of {size} data "
+            "centers"
+        )
+    return first.astype(np.int64)
+
+
+def _checked_agents(agents: Sequence[Agent]) -> tuple[Agent, ...]:
+    """Agents in the order of ``AGENTS``.
+
+    Raises:
+        ConfigError: none, one that is unknown, or one that is named twice.
+    """
+    named = (agents,) if isinstance(agents, str) else tuple(agents)
+    if not named or len(set(named)) < len(named) or not set(named) <= set(AGENTS):
+        raise ConfigError(
+            f"agents {list(named)!r}: valid is one or more of {', '.join(AGENTS)}, each once"
+        )
+    return tuple(agent for agent in AGENTS if agent in named)
+
+
+def _part_of_drivers(drivers: Drivers, where: Sequence[int]) -> Drivers:
+    """Inputs of some data centers, with no other series than theirs."""
+    chosen = list(where)
+
+    def part(series: FleetSeries) -> FleetSeries:
+        stored: dict[tuple[int, int], int] = {}
+        pieces, offsets, end = [], [], 0
+        for offset, length in zip(
+            series.offsets[chosen].tolist(), series.lengths[chosen].tolist(), strict=True
+        ):
+            if (offset, length) not in stored:
+                stored[offset, length] = end
+                pieces.append(series.values[offset : offset + length])
+                end += length
+            offsets.append(stored[offset, length])
+        return FleetSeries(np.concatenate(pieces), np.array(offsets), series.lengths[chosen])
+
+    price = drivers.price_per_kwh
+    first = part(drivers.outdoor_c)
+    return replace(
+        drivers,
+        outdoor_c=first,
+        wet_bulb_c=part(drivers.wet_bulb_c).sharing_places(first),
+        ci_g_per_kwh=part(drivers.ci_g_per_kwh).sharing_places(first),
+        demand=part(drivers.demand).sharing_places(first),
+        price_per_kwh=None if price is None else part(price).sharing_places(first),
+        start=drivers.start[chosen],
+        design_outdoor_c=drivers.design_outdoor_c[chosen],
+        design_wet_bulb_c=drivers.design_wet_bulb_c[chosen],
+        sources=tuple(drivers.sources[i] for i in chosen),
+        synthetic=tuple(drivers.synthetic[i] for i in chosen),
+    )

@@ -1,0 +1,235 @@
+"""Known optima: bound, achieved figure and certificates, and the files that keep them."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sdc_taichi import ConfigError, DataCenterConfig, Simulator, load_config, preset_names
+from sdc_taichi.control import make_controller
+from sdc_taichi.optimum import Objective, Optimum, StoppedError, solve
+from sdc_taichi.optimum.entry import OptimumCacheWarning
+from sdc_taichi.optimum.problem import AGENTS, FacilityTable
+from sdc_taichi.optimum.tables import facility_tables
+from sdc_taichi.run.achievable import AchievedPath, achievement, begin_score
+from sdc_taichi.run.loop import simulate
+
+DAY = 96
+
+
+def config_of(site: str = "CA", *changes: str, preset: str = "tiny") -> DataCenterConfig:
+    named = [f"name={site}", f"site.location={site}", "site.start=07-01"]
+    return load_config(preset, [*named, *changes])
+
+
+def solved(configs: Any, steps: int = DAY, **arguments: Any) -> Optimum:
+    return solve(configs, steps=steps, **{"cache": False, **arguments})
+
+
+@pytest.fixture(scope="module")
+def joint() -> Optimum:
+    return solved([config_of("CA"), config_of("NY")])
+
+
+def test_what_is_achieved_lies_between_bound_and_idle(joint: Optimum) -> None:
+    assert np.all(joint.bound <= joint.achieved)
+    assert np.all(joint.achieved < joint.idle)
+    assert np.all(joint.gap_points < 1.0)
+    for agent in AGENTS:
+        assert np.all(joint.achieved <= joint.alone[agent])
+        assert np.all(joint.alone[agent] <= joint.idle)
+    assert joint.failures == ((), ())
+
+
+def test_the_commands_are_what_the_figure_is_of(joint: Optimum) -> None:
+    with Simulator([config_of("CA"), config_of("NY")]) as sim:
+        score = begin_score(joint, sim, 0)
+        simulate(sim, AchievedPath(joint), joint.steps, on_step=score.add)
+        np.testing.assert_array_equal(score.figure, joint.achieved)
+        assert np.all(score.dropped_tasks == 0.0)
+        assert np.all(score.end_kwh >= score.start_kwh - 1e-9)
+        assert np.all(score.end_tasks <= 1e-6)
+        reached = achievement(joint, "optimum", score)
+    np.testing.assert_allclose(reached.share, 1.0, atol=1e-6)
+
+
+def test_no_controller_is_better_once_its_ends_are_valued(joint: Optimum) -> None:
+    with Simulator([config_of("CA"), config_of("NY")]) as sim:
+        for name in ("idle", "greedy-ci", "lookahead-24h", "random"):
+            score = begin_score(joint, sim, 0)
+            simulate(sim, make_controller(name, sim.fleet), joint.steps, on_step=score.add)
+            reached = achievement(joint, name, score)
+            assert np.all(joint.bound <= reached.valued_figure * (1.0 + 1e-9)), name
+            if name == "idle":
+                np.testing.assert_allclose(reached.share, 0.0, atol=1e-9)
+
+
+def test_a_batch_equals_each_data_center_alone(joint: Optimum) -> None:
+    alone = solved(config_of("NY"))
+    for name in ("idle", "bound", "achieved"):
+        assert getattr(alone, name)[0] == getattr(joint, name)[1]
+    for name in ("load", "cooling", "battery"):
+        np.testing.assert_array_equal(getattr(alone, name)[:, 0], getattr(joint, name)[:, 1])
+
+
+@pytest.mark.parametrize("agents", [("load",), ("cooling",), ("battery",), ("load", "battery")])
+def test_fewer_agents_achieve_no_more(joint: Optimum, agents: tuple[Any, ...]) -> None:
+    found = solved(config_of("CA"), agents=agents)
+    assert found.agents == agents
+    assert set(found.alone) == set(agents)
+    assert found.bound[0] <= found.achieved[0] <= found.idle[0]
+    assert found.bound[0] >= joint.bound[0] * (1.0 - 1e-6)
+    moved = {"load": found.load, "cooling": found.cooling, "battery": found.battery}
+    for agent in set(AGENTS) - set(agents):
+        assert not moved[agent].any(), agent
+
+
+@pytest.mark.parametrize("objective", ["energy", "cost", "water", "carbon+0.002*water"])
+def test_objectives_are_all_bounded(objective: str) -> None:
+    found = solved(config_of("CA"), objective=objective)
+    assert found.objective == Objective.parse(objective)
+    assert found.bound[0] <= found.achieved[0] <= found.idle[0]
+    assert found.failures == ((),)
+
+
+def test_a_warm_up_leaves_the_state_of_the_first_scored_step_free() -> None:
+    found = solved(config_of("CA"), steps=2 * DAY, scored_from=DAY)
+    of = found.certificates[0]
+    assert of["end_kwh"] >= of["start_kwh"] - 1e-6
+    assert of["end_tasks"] <= of["start_tasks"] + 1e-6
+    assert found.bound[0] <= found.achieved[0] < found.idle[0]
+    with Simulator(config_of("CA")) as sim:
+        score = begin_score(found, sim, 0)
+        simulate(sim, AchievedPath(found), found.steps, on_step=score.add)
+    assert score.figure[0] == found.achieved[0]
+
+
+def test_inlets_stay_within_a_limit() -> None:
+    free = solved(config_of("CA"))
+    hottest_c = free.certificates[0]["hottest_inlet_c"]
+    limit_c = hottest_c - 1.0
+    found = solved(config_of("CA"), inlet_limit_c=limit_c)
+    assert found.certificates[0]["hottest_inlet_c"] <= limit_c + 1e-3
+    assert found.achieved[0] >= free.achieved[0]
+    assert found.bound[0] >= free.bound[0] * (1.0 - 1e-9)
+    np.testing.assert_array_equal(found.inlet_limit_c, [limit_c])
+
+
+@pytest.mark.parametrize("preset", preset_names())
+def test_every_preset_has_an_optimum(preset: str) -> None:
+    if preset == "large":
+        pytest.skip("of the same models as corrected")
+    found = solved(config_of("CA", preset=preset), steps=24)
+    assert found.achieved[0] <= found.idle[0]
+    assert not found.bound[0] > found.achieved[0]
+    assert found.failures == ((),)
+
+
+def test_halls_without_a_table_have_no_bound_and_say_so() -> None:
+    found = solved(config_of("CA", "simulation.thermal=transient", preset="corrected"), steps=8)
+    assert found.bound_kinds[0].startswith("none: ")
+    assert np.isnan(found.bound[0])
+    assert found.achieved[0] <= found.idle[0]
+    assert np.isnan(found.bound_of_ends(0, None))  # type: ignore[arg-type]
+
+
+def test_tables_that_are_off_make_the_bound_an_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    right = facility_tables
+
+    def off(*arguments: Any, **named: Any) -> list[FacilityTable]:
+        return [
+            dataclasses.replace(table, facility_kwh=1.01 * table.facility_kwh)
+            for table in right(*arguments, **named)
+        ]
+
+    monkeypatch.setattr("sdc_taichi.optimum.task.facility_tables", off)
+    found = solved(config_of("CA"), steps=24)
+    assert found.bound_kinds[0].startswith("estimate: ")
+    assert found.certificates[0]["table_error"] == pytest.approx(0.01, rel=0.1)
+
+
+def test_what_is_kept_is_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = solved(config_of("CA"), steps=24, cache=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 1
+
+    def fails(*_: Any, **__: Any) -> Any:
+        raise AssertionError("solved again")
+
+    monkeypatch.setattr("sdc_taichi.optimum.task.facility_tables", fails)
+    again = solved(config_of("CA"), steps=24, cache=tmp_path)
+    for name in ("idle", "bound", "achieved", "load", "cooling", "battery"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+    assert first.certificates == again.certificates
+    assert first.alone.keys() == again.alone.keys()
+    with pytest.raises(AssertionError, match="solved again"):
+        solved(config_of("CA"), steps=25, cache=tmp_path)
+    with pytest.raises(AssertionError, match="solved again"):
+        solved(config_of("CA"), steps=24, cache=tmp_path, objective="energy")
+    with pytest.raises(AssertionError, match="solved again"):
+        solved(config_of("NY"), steps=24, cache=tmp_path)
+
+
+def test_files_that_are_damaged_or_swapped_are_solved_anew(tmp_path: Path) -> None:
+    configs = [config_of("CA"), config_of("NY")]
+    first = solved(configs, steps=24, cache=tmp_path)
+    one, other = sorted(tmp_path.iterdir())
+    one_bytes, other_bytes = one.read_bytes(), other.read_bytes()
+    one.write_bytes(other_bytes)
+    other.write_bytes(one_bytes)
+    with pytest.warns(OptimumCacheWarning, match="other configs"):
+        swapped = solved(configs, steps=24, cache=tmp_path)
+    np.testing.assert_array_equal(swapped.achieved, first.achieved)
+    one.write_bytes(one_bytes[: len(one_bytes) // 2])
+    with pytest.warns(OptimumCacheWarning, match=r"solved anew"):
+        damaged = solved(configs, steps=24, cache=tmp_path)
+    np.testing.assert_array_equal(damaged.achieved, first.achieved)
+    assert solved(configs, steps=24, cache=tmp_path).names == ("CA", "NY")
+
+
+def test_a_folder_that_cannot_be_written_keeps_nothing(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.warns(OptimumCacheWarning, match="not kept"):
+        found = solved(config_of("CA"), steps=24, cache=blocked / "folder")
+    assert found.achieved[0] <= found.idle[0]
+
+
+def test_progress_is_told_and_work_can_be_stopped() -> None:
+    told: list[tuple[str, int, int]] = []
+    solved(config_of("CA"), steps=24, progress=lambda *each: told.append(each))
+    stages = [stage for stage, _ in itertools.groupby(stage for stage, _, _ in told)]
+    assert stages[:3] == ["tables", "programmes", "runs"]
+    assert all(done <= total for _, done, total in told)
+    assert {done == total for stage, done, total in told if stage == "runs"} == {False, True}
+    for stage in ("tables", "programmes", "runs"):
+        told.clear()
+
+        def stop(stage: str = stage) -> bool:
+            return any(name == stage for name, _, _ in told)
+
+        with pytest.raises(StoppedError, match="0 of 1 data centers are kept"):
+            solved(config_of("CA"), steps=24, progress=lambda *each: told.append(each), stop=stop)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"steps": 0}, "steps 0"),
+        ({"scored_from": DAY}, "scored_from 96"),
+        ({"agents": ()}, "agents"),
+        ({"agents": ("load", "load")}, "agents"),
+        ({"agents": ("fan",)}, "fan"),
+        ({"objective": "coal"}, "coal"),
+        ({"inlet_limit_c": 1000.0}, "inlet_limit_c"),
+        ({"start": [1, 2]}, "start"),
+        ({"precision": "f16"}, "precision"),
+    ],
+)
+def test_arguments_that_mean_nothing_are_refused(arguments: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        solved(config_of("CA"), **arguments)
