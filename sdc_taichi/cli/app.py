@@ -16,6 +16,7 @@ from sdc_taichi.cli.arguments import Debug
 from sdc_taichi.cli.config import config_app
 from sdc_taichi.cli.data import data_app
 from sdc_taichi.cli.hall import hall_app
+from sdc_taichi.cli.optimum import optimum_command
 from sdc_taichi.cli.report import report_command
 from sdc_taichi.cli.session import warnings_in_lines
 from sdc_taichi.cli.simulate import simulate_command
@@ -58,6 +59,7 @@ app.add_typer(hall_app, name="hall")
 app.command("report")(report_command)
 app.command("view")(view_command)
 app.command("simulate")(simulate_command)
+app.command("optimum")(optimum_command)
 
 
 def main() -> None:

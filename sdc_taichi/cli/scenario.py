@@ -24,6 +24,22 @@ Site = Annotated[
 ]
 Days = Annotated[float, typer.Option(help="Length, in days; may exceed a year.")]
 Start = Annotated[str | None, typer.Option(metavar="MM-DD", help="First day, local standard time.")]
+Seed = Annotated[
+    int,
+    typer.Option(
+        min=0,
+        max=2**63 - 1,
+        help="Of controllers, forecast errors and samples (not of the synthetic year).",
+    ),
+]
+ErrorOfForecasts = Annotated[
+    str | None,
+    typer.Option(
+        "--forecast-error",
+        metavar="ci=SHARE,temperature=K",
+        help="Errors of controllers' forecasts at 24 h, such as ci=0.1,temperature=1.",
+    ),
+]
 Precision = Annotated[Literal["f32", "f64"], typer.Option(help="Of the per-server kernels.")]
 Weather = Annotated[
     list[str] | None,

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, TextIO
 from sdc_taichi.errors import ConfigError, SdcWarning, one_line, printable
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
     from sdc_taichi.run.description import RunRequest
     from sdc_taichi.sim.simulator import Simulator
     from sdc_taichi.types import StepResult
@@ -169,6 +171,43 @@ def progress_bar(steps: int, *, shown: bool) -> Iterator[Callable[[StepResult], 
     if not shown or not sys.stderr.isatty():
         yield lambda _: None
         return
+    every = max(1, steps // 1000)
+    with _progress() as progress:
+        task = progress.add_task("simulating", total=steps)
+
+        def advance(result: StepResult) -> None:
+            if result.step % every == 0:
+                progress.update(task, completed=result.step + 1)
+
+        yield advance
+
+
+@contextlib.contextmanager
+def stage_bars(*, shown: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """Show a progress bar for each stage of a piece of work on stderr, if that is a terminal.
+
+    Args:
+        shown: whether to show them at all.
+
+    Yields:
+        A function to call with the name of a stage, how much of it is done, and how much there is.
+    """
+    if not shown or not sys.stderr.isatty():
+        yield lambda _stage, _done, _total: None
+        return
+    with _progress() as progress:
+        tasks: dict[str, TaskID] = {}
+
+        def advance(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage, total=total)
+            progress.update(tasks[stage], completed=done, total=total)
+
+        yield advance
+
+
+def _progress() -> Progress:
+    """Progress bars on stderr that go when they are done."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -178,13 +217,6 @@ def progress_bar(steps: int, *, shown: bool) -> Iterator[Callable[[StepResult], 
         TimeRemainingColumn,
     )
 
-    every = max(1, steps // 1000)
-    columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("", total=steps)
-
-        def advance(result: StepResult) -> None:
-            if result.step % every == 0:
-                progress.update(task, completed=result.step + 1)
-
-        yield advance
+    text = TextColumn("{task.description}")
+    columns = (text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=Console(stderr=True), transient=True)

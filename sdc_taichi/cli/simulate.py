@@ -17,11 +17,14 @@ from sdc_taichi.cli.arguments import (
     out_option,
     read_config,
 )
+from sdc_taichi.cli.optimum import solve_beside
 from sdc_taichi.cli.scenario import (
     EXIT_INTERRUPTED,
     Carbon,
     Days,
+    ErrorOfForecasts,
     Precision,
+    Seed,
     Site,
     Start,
     Weather,
@@ -66,19 +69,14 @@ def simulate_command(
             "greedy-ci; or per agent, such as load=greedy-ci,cooling=g36,battery=lookahead-24h.",
         ),
     ] = "idle",
-    seed: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=2**63 - 1,
-            help="Of controller, forecast errors and --sample (not of the synthetic year).",
-        ),
-    ] = 0,
-    forecast_error: Annotated[
+    seed: Seed = 0,
+    forecast_error: ErrorOfForecasts = None,
+    optimum: Annotated[
         str | None,
         typer.Option(
-            metavar="ci=SHARE,temperature=K",
-            help="Errors of the controller's forecasts at 24 h, such as ci=0.1,temperature=1.",
+            metavar="TERMS",
+            help="Also solve for the optimum of carbon, energy, cost, water or a sum such as "
+            "carbon+0.002*water, and tell the run's share of the achievable.",
         ),
     ] = None,
     precision: Precision = "f32",
@@ -133,8 +131,10 @@ def simulate_command(
     inputs are synthetic years.
     """
     from sdc_taichi.control import PERFECT, ForecastError, make_controller
+    from sdc_taichi.optimum.objective import Objective
     from sdc_taichi.run.description import RunRequest
     from sdc_taichi.run.folder_writer import metrics_json, prepare_folder, simulate_to_folder
+    from sdc_taichi.run.optimum_folder import FOLDER, write_optimum
     from sdc_taichi.sim.events import require_events_start_before
     from sdc_taichi.sim.fleet import build_fleet
     from sdc_taichi.sim.simulator import Simulator
@@ -156,12 +156,18 @@ def simulate_command(
     request = RunRequest(controller, whole_steps(days, fleet.steps_per_hour), seed, error)
     require_events_start_before(24.0 * days, fleet.configs)
     driver = make_controller(controller, fleet)
+    aim = None if optimum is None else Objective.parse(optimum)
     recorder = make_recorder(record, focus, every, serve, serve_port)
     folder = out if out is not None else default_folder(label, configs)
     with Simulator(fleet, precision=precision) as sim:
         print_notes(sim.drivers.notes)
         with interruptible() as interrupted, recording(recorder, sim, request) as record_step:
             prepare_folder(folder, force=force)
+            best = (
+                None
+                if aim is None
+                else solve_beside(sim, aim, request.steps, quiet=quiet, stop=interrupted)
+            )
             with progress_bar(request.steps, shown=not quiet) as advance:
 
                 def after_step(result: StepResult) -> None:
@@ -169,11 +175,20 @@ def simulate_command(
                     advance(result)
 
                 metrics = simulate_to_folder(
-                    sim, driver, request, folder, force=force, on_step=after_step, stop=interrupted
+                    sim,
+                    driver,
+                    request,
+                    folder,
+                    force=force,
+                    optimum=best,
+                    on_step=after_step,
+                    stop=interrupted,
                 )
             if metrics is None:
                 print("interrupted before the first step; nothing written", file=sys.stderr)
                 raise typer.Exit(EXIT_INTERRUPTED)
+            if best is not None and metrics["steps_done"] == request.steps:
+                write_optimum(sim, best, folder / FOLDER, seed=seed, stop=interrupted)
             if as_json:
                 print(metrics_json(metrics))
             elif not quiet:

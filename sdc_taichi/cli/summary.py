@@ -71,6 +71,8 @@ def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_h
         table = _aggregate_table(metrics)
     console.print(table)
     console.print(_hottest_line(metrics))
+    if "optimum" in metrics:
+        console.print(_optimum_line(metrics))
     for line in _event_lines(metrics):
         console.print(line)
     if metrics["synthetic"]:
@@ -93,6 +95,18 @@ def _hottest_line(metrics: dict[str, Any]) -> str:
         f"Hottest inlet: {total['hottest_inlet_c']:.1f} C at {where}row {total['hottest_row']}, "
         f"rack {total['hottest_rack']}, server {total['hottest_server']} from the floor, step "
         f"{total['hottest_step']}"
+    )
+
+
+def _optimum_line(metrics: dict[str, Any]) -> str:
+    total, of = metrics["total"], metrics["optimum"]
+    names = ("idle_figure", "bound_figure", "achieved_figure")
+    idle, bound, achieved = (_figure(total[name]) for name in names)
+    share = total["achievable_share"]
+    reached = "-" if share is None else f"{100 * share:z.1f} %"
+    return (
+        f"Share of the achievable ({of['objective']}): {reached}; idle {idle}, achieved {achieved},"
+        f" bound {bound} {of['unit']}"
     )
 
 

@@ -1,0 +1,285 @@
+"""``sdc-taichi optimum``: a bound on what controllers can reach, and what has been reached."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sdc_taichi.cli.arguments import (
+    Debug,
+    Overrides,
+    Source,
+    force_option,
+    json_option,
+    out_option,
+    read_config,
+)
+from sdc_taichi.cli.optimum_text import print_optimum
+from sdc_taichi.cli.scenario import (
+    EXIT_INTERRUPTED,
+    Carbon,
+    Days,
+    ErrorOfForecasts,
+    Precision,
+    Seed,
+    Site,
+    Start,
+    Weather,
+    Workload,
+    data_centers,
+    whole_steps,
+)
+from sdc_taichi.cli.session import interruptible, print_notes, progress_bar, stage_bars
+from sdc_taichi.errors import ConfigError, one_line, printable, suggestion
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sdc_taichi.control import Controller, ForecastError
+    from sdc_taichi.optimum.objective import Objective
+    from sdc_taichi.optimum.problem import Agent
+    from sdc_taichi.optimum.result import Optimum
+    from sdc_taichi.run.achievable import Achievement
+    from sdc_taichi.sim.simulator import Simulator
+
+
+def optimum_command(
+    source: Source = None,
+    site: Site = None,
+    days: Days = 31.0,
+    start: Start = None,
+    objective: Annotated[
+        str,
+        typer.Option(
+            metavar="TERMS",
+            help="What is minimised: carbon, energy, cost, water, or a sum such as "
+            "carbon+0.002*water.",
+        ),
+    ] = "carbon",
+    controller: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Controller to compare, as of simulate; repeatable."),
+    ] = None,
+    agents: Annotated[
+        str,
+        typer.Option(metavar="NAME[,NAME]", help="What may be moved: load, cooling, battery."),
+    ] = "load,cooling,battery",
+    warm_up: Annotated[
+        float,
+        typer.Option(
+            metavar="DAYS", help="Days before the figures count; the run ends as it is after them."
+        ),
+    ] = 0.0,
+    max_inlet: Annotated[
+        float | None,
+        typer.Option(
+            metavar="C", help="Hottest inlet to allow. [default: of protection.ashrae_class]"
+        ),
+    ] = None,
+    seed: Seed = 0,
+    forecast_error: ErrorOfForecasts = None,
+    discrete: Annotated[
+        bool, typer.Option("--discrete", help="Also solve for discrete actions.")
+    ] = False,
+    no_cache: Annotated[
+        bool, typer.Option("--no-cache", help="Solve anew, and keep nothing for later.")
+    ] = False,
+    precision: Precision = "f32",
+    overrides: Overrides = None,
+    weather: Weather = None,
+    carbon: Carbon = None,
+    workload: Workload = None,
+    out: Annotated[
+        Path | None, out_option("Run folder to write the achieved path to. [default: none]", "DIR")
+    ] = None,
+    force: Annotated[bool, force_option("Write into a folder with other files.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
+    as_json: Annotated[bool, json_option("Print optimum.json instead of the table.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Find out how low carbon, energy, cost or water of data centers can come.
+
+    Prints a bound that no controller comes below, a figure that the simulator has reached, and
+    where named controllers stand between idle commands and that. All inputs are known in advance.
+    """
+    from sdc_taichi.control import PERFECT, ForecastError, make_controller
+    from sdc_taichi.optimum.objective import Objective
+    from sdc_taichi.run.folder_writer import metrics_json, prepare_folder
+    from sdc_taichi.run.optimum_folder import optimum_content, write_optimum
+    from sdc_taichi.sim.events import require_events_start_before
+    from sdc_taichi.sim.fleet import build_fleet
+    from sdc_taichi.sim.simulator import Simulator
+
+    aim, movable = Objective.parse(objective), _agents(agents)
+    base, _ = read_config(source, overrides)
+    fleet = build_fleet(
+        data_centers(base, site, start=start, weather=weather, carbon=carbon, workload=workload)
+    )
+    steps = whole_steps(days, fleet.steps_per_hour)
+    scored_from = _warm_up_steps(warm_up, steps, fleet.steps_per_hour)
+    limit_c = _inlet_limit(max_inlet)
+    require_events_start_before(24.0 * days, fleet.configs)
+    fleet.require_distinct_names()
+    error = PERFECT if forecast_error is None else ForecastError.parse(forecast_error)
+    named = {name: make_controller(name, fleet) for name in controller or ()}
+    if out is not None:
+        prepare_folder(out, force=force)
+    with Simulator(fleet, precision=precision) as sim, interruptible() as interrupted:
+        print_notes(sim.drivers.notes)
+        found = solve_beside(
+            sim,
+            aim,
+            steps,
+            agents=movable,
+            scored_from=scored_from,
+            inlet_limit_c=limit_c,
+            discrete=discrete,
+            cache=not no_cache,
+            quiet=quiet,
+            stop=interrupted,
+        )
+        reached = _run_controllers(sim, found, named, seed, error, quiet, interrupted)
+        if as_json:
+            print(metrics_json(optimum_content(found, reached)))
+        elif not quiet:
+            print_optimum(optimum_content(found, reached), fleet.steps_per_hour)
+        is_written = False
+        if out is not None and not interrupted():
+            with progress_bar(steps, shown=not quiet) as advance:
+                is_written = write_optimum(
+                    sim, found, out, reached=reached, force=force, on_step=advance, stop=interrupted
+                )
+        if is_written and not (quiet or as_json):
+            print(f"Files in {printable(out)}: optimum.json, and the run of the achieved path")
+        if interrupted():
+            missing = [name for name in named if name not in {r.controller for r in reached}]
+            _print_interruption(missing, out if not is_written else None)
+            raise typer.Exit(EXIT_INTERRUPTED)
+
+
+def solve_beside(
+    sim: Simulator,
+    objective: Objective,
+    steps: int,
+    *,
+    agents: tuple[Agent, ...] | None = None,
+    scored_from: int = 0,
+    inlet_limit_c: float | None = None,
+    discrete: bool = False,
+    cache: bool = True,
+    quiet: bool,
+    stop: Callable[[], bool],
+) -> Optimum:
+    """Solve for the optimum of a simulator's data centers and inputs, with progress bars.
+
+    Args:
+        sim: the simulator.
+        objective: what to minimise.
+        steps: number of steps.
+        agents: what may be moved; None is all.
+        scored_from: first step that counts.
+        inlet_limit_c: hottest inlet to allow, in C; None is that of ``protection.ashrae_class``.
+        discrete: whether to solve for discrete actions as well.
+        cache: whether to read and keep results.
+        quiet: whether to show no progress.
+        stop: asked now and then; true ends the work.
+
+    Raises:
+        typer.Exit: it was stopped; what is kept has been printed.
+        SdcError: there is no optimum of these.
+    """
+    from sdc_taichi.optimum import solve
+    from sdc_taichi.optimum.problem import AGENTS
+    from sdc_taichi.optimum.result import StoppedError
+
+    try:
+        with stage_bars(shown=not quiet) as progress:
+            return solve(
+                sim.fleet,
+                steps=steps,
+                drivers=sim.drivers,
+                objective=objective,
+                agents=AGENTS if agents is None else agents,
+                scored_from=scored_from,
+                inlet_limit_c=inlet_limit_c,
+                discrete=discrete,
+                precision=sim.precision,
+                cache=cache,
+                progress=progress,
+                stop=stop,
+            )
+    except StoppedError as error:
+        print(f"interrupted: {one_line(str(error))}", file=sys.stderr)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def _run_controllers(
+    sim: Simulator,
+    optimum: Optimum,
+    named: dict[str, Controller],
+    seed: int,
+    error: ForecastError,
+    quiet: bool,
+    stop: Callable[[], bool],
+) -> list[Achievement]:
+    """What each controller reaches, of those that were not stopped."""
+    from sdc_taichi.run.achievable import run_beside
+
+    reached = []
+    for name, controller in named.items():
+        with progress_bar(optimum.steps, shown=not quiet) as advance:
+            found = run_beside(
+                optimum,
+                sim,
+                controller,
+                name,
+                seed,
+                forecast_error=error,
+                on_step=advance,
+                stop=stop,
+            )
+        if found is not None:
+            reached.append(found)
+    return reached
+
+
+def _print_interruption(missing: list[str], out: Path | None) -> None:
+    """Say on stderr what an interrupted command did not do; what it printed is whole."""
+    left = [f"controllers {', '.join(missing)}"] if missing else []
+    left += [f"files in {printable(out)}"] if out is not None else []
+    text = f"; without {' and '.join(left)}" if left else ""
+    print(f"interrupted{text}; the figures above are whole", file=sys.stderr)
+
+
+def _agents(text: str) -> tuple[Agent, ...]:
+    """What ``--agents`` names, in the order of ``AGENTS``."""
+    from sdc_taichi.optimum.problem import AGENTS
+
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in AGENTS:
+            meant = suggestion(name, AGENTS, " (did you mean {!r}?)")
+            raise ConfigError(f"--agents {text!r}: {name!r}; valid are {', '.join(AGENTS)}{meant}")
+        if names.count(name) > 1:
+            raise ConfigError(f"--agents {text!r}: {name} is given twice")
+    return tuple(agent for agent in AGENTS if agent in names)
+
+
+def _warm_up_steps(days: float, steps: int, steps_per_hour: int) -> int:
+    """Number of steps of ``--warm-up``."""
+    if days == 0.0:
+        return 0
+    found = whole_steps(days, steps_per_hour, "--warm-up")
+    if found >= steps:
+        raise ConfigError(f"--warm-up {days:g}: valid is less than --days")
+    return found
+
+
+def _inlet_limit(limit_c: float | None) -> float | None:
+    """Limit of ``--max-inlet``."""
+    if limit_c is not None and not 10.0 <= limit_c <= 60.0:
+        raise ConfigError(f"--max-inlet {limit_c:g}: valid is 10..60 C")
+    return limit_c
