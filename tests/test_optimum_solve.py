@@ -130,6 +130,17 @@ def test_every_preset_has_an_optimum(preset: str) -> None:
     assert found.failures == ((),)
 
 
+def test_discrete_actions_reach_a_figure_of_their_own(tmp_path: Path) -> None:
+    found = solved(config_of("CA"), steps=8, discrete=True, cache=tmp_path)
+    assert found.discrete is not None
+    assert found.bound[0] <= found.discrete[0] <= found.idle[0]
+    assert len(found.discrete_complete) == 1
+    again = solved(config_of("CA"), steps=8, discrete=True, cache=tmp_path)
+    np.testing.assert_array_equal(again.discrete, found.discrete)
+    assert again.discrete_complete == found.discrete_complete
+    assert solved(config_of("CA"), steps=8, cache=tmp_path).discrete is None
+
+
 def test_halls_without_a_table_have_no_bound_and_say_so() -> None:
     found = solved(config_of("CA", "simulation.thermal=transient", preset="corrected"), steps=8)
     assert found.bound_kinds[0].startswith("none: ")

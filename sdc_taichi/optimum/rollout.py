@@ -49,18 +49,6 @@ class Targets:
 
 
 @dataclass(frozen=True, slots=True)
-class CommandPath:
-    """Commands of B data centers in T steps."""
-
-    load: F64
-    """Load commands, -1..1, (T, B)."""
-    cooling: F64
-    """Cooling commands, in steps of the setpoint, (T, B)."""
-    battery: F64
-    """Battery commands, -1..1, (T, B)."""
-
-
-@dataclass(frozen=True, slots=True)
 class RollOut:
     """What the simulator did in T steps of B data centers."""
 
@@ -115,7 +103,7 @@ class RollOut:
 def roll_out(
     fleet: Fleet,
     drivers: Drivers,
-    plans: Targets | CommandPath,
+    targets: Targets,
     *,
     start: I64,
     objective: Objective,
@@ -125,14 +113,14 @@ def roll_out(
     on_step: OnStep | None = None,
     stop: Stop | None = None,
 ) -> tuple[RollOut, Score] | None:
-    """Run plans in the simulator: commands for targets are computed at the true state of each step.
+    """Run plans in the simulator: commands are computed at the true state of every step.
 
     All CRAC units of a data center move alike.
 
     Args:
         fleet: B data centers.
         drivers: Their inputs.
-        plans: What they are to do, as states to reach or as commands.
+        targets: What they are to do.
         start: First step of each, counted from the beginning of the year, (B,).
         objective: What is minimised.
         scored_from: First step that is scored.
@@ -147,29 +135,22 @@ def roll_out(
     Raises:
         PhysicalLimitError: A result that no data center can reach.
     """
-    steps = len(plans.cooling if isinstance(plans, CommandPath) else plans.setpoint_c)
+    steps = len(targets.setpoint_c)
     with Simulator(fleet, drivers=drivers, precision=precision) as sim:
         sim.reset(seed, start=start)
-        actions = _given(plans) if isinstance(plans, CommandPath) else _Follower(sim, plans).actions
+        follow = _Follower(sim, targets)
         score = Score(objective, sim, scored_from)
         done = {f.name: np.empty((steps, fleet.size)) for f in fields(RollOut)}
         for t in range(steps):
             if stop is not None and stop():
                 return None
-            result: StepResult = sim.step(actions(t))
+            result: StepResult = sim.step(follow.actions(t))
             score.add(result)
             for name, values in done.items():
                 values[t] = getattr(result, name)
             if on_step is not None:
                 on_step()
     return RollOut(**done), score
-
-
-def _given(commands: CommandPath) -> Callable[[int], Actions]:
-    """Actions of a step from commands of all steps."""
-    return lambda t: Actions(
-        load=commands.load[t], cooling=commands.cooling[t], battery=commands.battery[t]
-    )
 
 
 class _Follower:

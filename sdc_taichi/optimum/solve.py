@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,12 +15,14 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.optimum.certificates import LARGEST_TABLE_ERROR, Certificate, certificate
+from sdc_taichi.optimum.discrete import DiscretePlans, discrete_plans
+from sdc_taichi.optimum.discrete_run import run_discrete
 from sdc_taichi.optimum.eligibility import no_table_reasons, uncooled_reason
 from sdc_taichi.optimum.entry import Cache, Entry
 from sdc_taichi.optimum.linear_programme import bound
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.paths import IDLE, JOINT, idle_paths, paths_of, with_battery_for
-from sdc_taichi.optimum.problem import AGENTS, Agent, Ends, Problem
+from sdc_taichi.optimum.problem import AGENTS, Agent, Ends, Plan, Problem
 from sdc_taichi.optimum.result import Optimum, StoppedError
 from sdc_taichi.optimum.rollout import RollOut, Targets, repeated, roll_out
 from sdc_taichi.optimum.task import Task, checked_task
@@ -98,6 +100,7 @@ def solve(
         scored_from=scored_from,
         inlet_limit_c=inlet_limit_c,
         precision=precision,
+        discrete=discrete,
     )
     kept = None if cache is False else Cache(None if cache is True else Path(cache))
     work = _Work(progress or (lambda _stage, _done, _total: None), stop or (lambda: False))
@@ -135,6 +138,8 @@ def _optimum(task: Task, entries: Sequence[Entry]) -> Optimum:
         cooling=paths("cooling"),
         battery=paths("battery"),
         bound_of_ends=_BoundOfEnds(task, [entry.kind for entry in entries]),
+        discrete=each("discrete") if task.discrete else None,
+        discrete_complete=tuple(entry.discrete_complete for entry in entries if task.discrete),
     )
 
 
@@ -203,6 +208,25 @@ def _suggestion(problem: Problem, reason: str | None) -> _Suggestion:
         return _Suggestion(figure, reason, paths_of(problem))
     except ConfigError as error:
         return _Suggestion(float("nan"), str(error), idle_paths(problem))
+
+
+def _joint(problem: Problem, runs: Mapping[str, _Run]) -> _Run:
+    """The run that moves all agents."""
+    return runs[JOINT if JOINT in runs else problem.agents[0]]
+
+
+def _discrete(problem: Problem, given: tuple[DataCenterConfig, F64, _Run]) -> DiscretePlans:
+    """Sequences of discrete actions, guided by a run of continuous ones.
+
+    Args:
+        problem: The planning problem.
+        given: Config of the data center, work that arrives as a share of capacity, (T,), and the
+            run.
+    """
+    config, demand, run = given
+    done = run.done
+    paths = (done.executed_tasks, done.setpoint_c, done.charge_kwh, done.discharge_kwh)
+    return discrete_plans(problem, config, demand, guide=Plan(*(path[:, 0] for path in paths)))
 
 
 def _battery_again(problem: Problem, run: _Run) -> Targets:
@@ -325,9 +349,43 @@ class _Work:
         found = self._side_by_side(_suggestion, problems, reasons)
         runs = self._run(task, [suggestion.paths for suggestion in found])
         self._plan_batteries_again(task, problems, runs)
-        return [
+        entries = [
             _entry(problem, suggestion, of)
             for problem, suggestion, of in zip(problems, found, runs, strict=True)
+        ]
+        return self._with_discrete(task, problems, runs, entries) if task.discrete else entries
+
+    def _with_discrete(
+        self,
+        task: Task,
+        problems: Sequence[Problem],
+        runs: Sequence[Mapping[str, _Run]],
+        entries: Sequence[Entry],
+    ) -> list[Entry]:
+        """Entries with the best paths of discrete actions, B."""
+        demand = task.drivers.demand.at(task.start[:, None] + np.arange(task.steps))
+        given = [
+            (config, demand[i], _joint(problems[i], runs[i]))
+            for i, config in enumerate(task.fleet.configs)
+        ]
+        plans = self._side_by_side(_discrete, problems, given, "discrete actions")
+        found = run_discrete(
+            task.fleet,
+            task.drivers,
+            plans,
+            agents=task.agents,
+            start=task.start,
+            objective=task.objective,
+            scored_from=task.scored_from,
+            seed=task.seed,
+            precision=task.precision,
+            stop=self._stop,
+        )
+        if found is None:
+            raise self._stopped()
+        return [
+            replace(entry, discrete=path.figure, discrete_complete=path.is_complete)
+            for entry, path in zip(entries, found, strict=True)
         ]
 
     def _plan_batteries_again(
@@ -336,10 +394,10 @@ class _Work:
         """Where tables are not exact, add a run whose battery suits the energy measured."""
         chosen = {}
         for i, problem in enumerate(problems):
-            name = JOINT if JOINT in runs[i] else problem.agents[0]
-            error = _certificate(problem, runs[i][name]).table_error
+            run = _joint(problem, runs[i])
+            error = _certificate(problem, run).table_error
             if "battery" in problem.agents and error > _EXACT_TABLE_ERROR:
-                chosen[i] = runs[i][name]
+                chosen[i] = run
         if not chosen:
             return
         plans = self._side_by_side(
@@ -350,7 +408,11 @@ class _Work:
             runs[i].update(of)
 
     def _side_by_side(
-        self, plan: Callable[[Problem, _X], _Y], problems: Sequence[Problem], given: Sequence[_X]
+        self,
+        plan: Callable[[Problem, _X], _Y],
+        problems: Sequence[Problem],
+        given: Sequence[_X],
+        stage: str = "programmes",
     ) -> list[_Y]:
         """What programmes find for each data center, B, several of them at a time.
 
@@ -358,6 +420,7 @@ class _Work:
             plan: Solves the programmes of one data center.
             problems: Their planning problems, B.
             given: What else is known of each, B.
+            stage: Name of the stage.
         """
         pool = ThreadPoolExecutor(runtime.ensure_started())
         try:
@@ -367,7 +430,7 @@ class _Work:
                 if self._stop():
                     raise self._stopped()
                 _, waiting = wait(waiting, timeout=_POLL_S)
-                self._tell("programmes", len(problems) - len(waiting), 1)
+                self._tell(stage, len(problems) - len(waiting), 1)
             return [future.result() for future in futures]
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
