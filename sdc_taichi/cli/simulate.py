@@ -66,7 +66,8 @@ def simulate_command(
         typer.Option(
             metavar="NAME",
             help="idle, random, g36, coldest, warmest, constant:C, lookahead-3h, lookahead-24h, "
-            "greedy-ci; or per agent, such as load=greedy-ci,cooling=g36,battery=lookahead-24h.",
+            "greedy-ci, mpc-24h; or per agent, such as "
+            "load=greedy-ci,cooling=g36,battery=lookahead-24h.",
         ),
     ] = "idle",
     seed: Seed = 0,

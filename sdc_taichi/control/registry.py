@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sdc_taichi.control.mpc import is_mpc, model_predictive
 from sdc_taichi.control.rules import (
     Controller,
     FixedSetpoint,
@@ -21,9 +22,10 @@ from sdc_taichi.control.rules import (
 from sdc_taichi.control.view import limits_of
 from sdc_taichi.errors import ConfigError, suggestion
 from sdc_taichi.number_text import parse_number
+from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.sim.fleet import Fleet
 
-CONTROLLABLE = ("load", "cooling", "battery")
+CONTROLLABLE = AGENTS
 """Names of the commands that a controller may give, as specs and ``Actions`` name them."""
 
 
@@ -47,12 +49,17 @@ _CONTROLLERS: dict[str, _NamedController] = {
     "greedy-ci": _NamedController(GreedyCarbon, ("load", "battery")),
 }
 _CONSTANT = "constant:C"
+_MPC = "mpc-24h"
 _SUGGESTION = " (did you mean {!r}?)"
 
 
 def controller_names() -> tuple[str, ...]:
-    """Valid names; ``constant:C`` stands for a setpoint in C, such as ``constant:20``."""
-    return (*_CONTROLLERS, _CONSTANT)
+    """Valid names.
+
+    ``constant:C`` stands for a setpoint in C, such as ``constant:20``, and ``mpc-24h`` for any
+    horizon, with or without an objective, such as ``mpc-72h:cost``.
+    """
+    return (*_CONTROLLERS, _CONSTANT, _MPC)
 
 
 def make_controller(spec: str, fleet: Fleet) -> Controller:
@@ -69,7 +76,7 @@ def make_controller(spec: str, fleet: Fleet) -> Controller:
     """
     if "=" not in spec:
         return _make(spec.strip(), fleet, CONTROLLABLE)
-    chosen: dict[str, Controller] = {}
+    named: dict[str, str] = {}
     for part in spec.split(","):
         agent, sign, name = (text.strip() for text in part.partition("="))
         if not sign or agent not in CONTROLLABLE:
@@ -77,9 +84,18 @@ def make_controller(spec: str, fleet: Fleet) -> Controller:
                 f"controller {spec!r}: {part.strip()!r}: valid is agent=name with one of the "
                 f"agents {', '.join(CONTROLLABLE)}{suggestion(agent, CONTROLLABLE, _SUGGESTION)}"
             )
-        if agent in chosen:
+        if agent in named:
             raise ConfigError(f"controller {spec!r}: {agent} is given twice")
-        chosen[agent] = _make(name, fleet, (agent,))
+        named[agent] = name
+    made: dict[str, Controller] = {}
+    chosen: dict[str, Controller] = {}
+    for agent, name in named.items():
+        if is_mpc(name):
+            # One plan for all agents that it is named for.
+            own = tuple(a for a in CONTROLLABLE if named.get(a) == name)
+            chosen[agent] = made[name] = made.get(name) or model_predictive(name, own)
+        else:
+            chosen[agent] = _make(name, fleet, (agent,))
     return PerAgent(*(chosen.get(agent, Idle()) for agent in CONTROLLABLE))
 
 
@@ -87,6 +103,8 @@ def controlled_by(spec: str) -> tuple[str, ...]:
     """Commands that a valid spec of ``make_controller`` gives; all for ``idle`` and ``random``."""
     if "=" in spec:
         return tuple(part.partition("=")[0].strip() for part in spec.split(","))
+    if is_mpc(spec.strip()):
+        return CONTROLLABLE
     entry = _CONTROLLERS.get(spec.strip())
     return ("cooling",) if entry is None else entry.commands
 
@@ -101,6 +119,8 @@ def given_by(spec: str) -> tuple[str, ...]:
 
 def _make(name: str, fleet: Fleet, agents: tuple[str, ...]) -> Controller:
     """Look a name up, for use on any of ``agents``."""
+    if is_mpc(name):
+        return model_predictive(name, CONTROLLABLE)
     kind, colon, text = name.partition(":")
     if kind == "constant":
         entry = _NamedController(lambda: _constant(text if colon else "", fleet), ("cooling",))
@@ -113,7 +133,7 @@ def _make(name: str, fleet: Fleet, agents: tuple[str, ...]) -> Controller:
     if not set(agents) & set(entry.commands):
         (agent,) = agents
         able = [n for n, e in _CONTROLLERS.items() if agent in e.commands]
-        able += [_CONSTANT] if agent == "cooling" else []
+        able += [_CONSTANT, _MPC] if agent == "cooling" else [_MPC]
         raise ConfigError(
             f"controller {name!r}: does not act on {agent}; valid for {agent}: {', '.join(able)}"
         )

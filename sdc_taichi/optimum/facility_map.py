@@ -48,6 +48,8 @@ class FacilityMap:
     """Whether the first axis of the weather is the wet bulb."""
     first_c: F64
     """First node of the first axis, in C, (M,)."""
+    last_c: F64
+    """Last node of the first axis that is a data center's own, in C, (M,)."""
     step_k: float
     """Distance of its nodes, in K."""
     depression_step_k: F64
@@ -55,7 +57,7 @@ class FacilityMap:
     utilisation: F64
     """Utilisations, evenly from 0 to 1, (I,)."""
     setpoint_c: F64
-    """Setpoints, rising in equal steps, in C, (M, J)."""
+    """Setpoints, rising in equal steps to the highest, which fills what is left, in C, (M, J)."""
     facility_kwh: F64
     """Energy of the facility without its battery, in kWh, (M, W, P, I, J)."""
     water_l: F64
@@ -116,7 +118,7 @@ class FacilityMap:
             wet_bulb_c: Wet bulb, in C, (B, H).
         """
         by_setpoint = self._in_weather(self.facility_kwh, outdoor_c, wet_bulb_c)
-        place, share = self._places_of_setpoints(setpoint_c)
+        place, share = self.places_of_setpoints(setpoint_c)
         low, high = (
             np.take_along_axis(by_setpoint, at[..., None, None], axis=-1)[..., 0]
             for at in (place, np.minimum(place + 1, self.setpoint_c.shape[1] - 1))
@@ -183,6 +185,7 @@ class FacilityMap:
         wet, dry = values.shape[1:3]
         which = self.which[:, None]
         lead_c = wet_bulb_c if self.by_wet_bulb else outdoor_c
+        lead_c = np.minimum(lead_c, self.last_c[which])
         low, share = _place((lead_c - self.first_c[which]) / self.step_k, wet)
         low_k, share_k = _place((outdoor_c - wet_bulb_c) / self.depression_step_k[which], dry)
         flat = values.reshape(-1, *values.shape[3:])
@@ -195,12 +198,13 @@ class FacilityMap:
         found += flat[at + dry + 1] * (share * share_k)
         return found
 
-    def _places_of_setpoints(self, setpoint_c: F64) -> tuple[I64, F64]:
+    def places_of_setpoints(self, setpoint_c: F64) -> tuple[I64, F64]:
         """Node below each setpoint, and its share of the way to the next, each (B, H)."""
-        low_c, high_c = self.setpoint_c[self.which, :1], self.setpoint_c[self.which, -1:]
-        intervals = self.setpoint_c.shape[1] - 1
-        range_k = np.where(high_c > low_c, high_c - low_c, 1.0)
-        return _place((setpoint_c - low_c) / range_k * intervals, intervals + 1)
+        nodes_c = self.setpoint_c[self.which]
+        step_k = nodes_c[:, 1:2] - nodes_c[:, :1] if nodes_c.shape[1] > 1 else np.zeros(1)
+        within_c = np.clip(setpoint_c, nodes_c[:, :1], nodes_c[:, -1:])
+        place = (within_c - nodes_c[:, :1]) / np.where(step_k > 0, step_k, 1.0)
+        return _place(place, nodes_c.shape[1])
 
 
 _BARRED = 1e6
@@ -226,7 +230,7 @@ def facility_map(
             without a limit.
         weather_step_k: Distance of the nodes of the first axis of the weather, in K.
         margin_k: How far the map reaches beyond the weather of the year, in K.
-        grid: Nodes of utilisation and setpoint; setpoints of all data centers are as many.
+        grid: Nodes of utilisation and setpoint.
         precision: Of the server kernels.
 
     Raises:
@@ -240,7 +244,8 @@ def facility_map(
     which = np.array([entries[key] for key in keys])
     dcs = [keys.index(key) for key in entries]
     low_c, high_c, most_k = _ranges(fleet, drivers, which, by_wet_bulb, margin_k)
-    wet = max(int(np.ceil(np.max(high_c - low_c) / weather_step_k)) + 1, 2)
+    steps = np.maximum(np.ceil((high_c - low_c) / weather_step_k), 1.0)
+    wet = int(steps.max()) + 1
     lead_c = low_c[:, None] + weather_step_k * np.arange(wet)
     depressions = _FEW
     if fleet.models["plant"] == "air_side":
@@ -250,7 +255,7 @@ def facility_map(
     outdoor_c = (first + second if by_wet_bulb else first).reshape(len(dcs), -1)
     wet_bulb_c = (first if by_wet_bulb else first - second).reshape(len(dcs), -1)
     setpoints = max(len(grid.setpoint_c(fleet.configs[dc])) for dc in dcs)
-    nodes = [Nodes(dc, grid.utilisation(), _setpoint_c(fleet, dc, setpoints)) for dc in dcs]
+    nodes = [Nodes(dc, grid.utilisation(), _setpoint_c(fleet, dc, grid, setpoints)) for dc in dcs]
     tables: list[FacilityTable] = []
     for part in batches(fleet, nodes):
         own = slice(len(tables), len(tables) + len(part))
@@ -260,6 +265,7 @@ def facility_map(
         which=which,
         by_wet_bulb=by_wet_bulb,
         first_c=low_c,
+        last_c=low_c + weather_step_k * steps,
         step_k=weather_step_k,
         depression_step_k=depression_k[:, 1],
         utilisation=grid.utilisation(),
@@ -279,10 +285,10 @@ def _what_decides(fleet: Fleet, drivers: Drivers, dc: int, inlet_limit_c: F64) -
     return what_decides_facility(fleet, drivers, dc), weather, float(inlet_limit_c[dc])
 
 
-def _setpoint_c(fleet: Fleet, dc: int, number: int) -> F64:
-    """As many setpoints over the range of a data center, in C, (J,)."""
-    setpoint = fleet.configs[dc].hvac.setpoint
-    return np.linspace(setpoint.min_c, setpoint.max_c, number)
+def _setpoint_c(fleet: Fleet, dc: int, grid: TableGrid, number: int) -> F64:
+    """Setpoints of a data center, the highest as often as makes up the number, in C, (J,)."""
+    own = grid.setpoint_c(fleet.configs[dc])
+    return np.pad(own, (0, number - len(own)), mode="edge")
 
 
 def _ranges(

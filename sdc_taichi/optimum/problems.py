@@ -69,7 +69,7 @@ def problems_of(
     work, storage = _work(fleet, demand, scored_from), _storage(fleet, sizing)
     per_kw = objective.kw_month_weight(fleet)
     limit_kw = np.where(sizing.grid_limit_kw < NO_LIMIT_KW, sizing.grid_limit_kw, np.inf)
-    inlet_c = _inlet_limit_c(fleet, inlet_limit_c)
+    inlet_c = inlet_limits_c(fleet, inlet_limit_c)
     initial_c = fleet.values("hvac.setpoint.initial_c")
     return [
         Problem(
@@ -93,8 +93,13 @@ def problems_of(
     ]
 
 
-def _inlet_limit_c(fleet: Fleet, given_c: float | None) -> F64:
-    """Highest inlet that plans may cause, in C, (B,); inf without a limit."""
+def inlet_limits_c(fleet: Fleet, given_c: float | None = None) -> F64:
+    """Highest inlet that plans may cause, in C, (B,); inf without a limit.
+
+    Args:
+        fleet: B data centers.
+        given_c: The limit, in C; None is that of ``protection.ashrae_class``, if it is set.
+    """
     if given_c is not None:
         return np.full(fleet.size, given_c)
     classes = [config.protection.ashrae_class for config in fleet.configs]

@@ -1,0 +1,312 @@
+"""Dynamic programmes of model-predictive control: work that waits, and energy that is stored.
+
+Both go backwards through the coming steps, over levels of what is carried on, and keep the least
+cost from each level to the end. Between levels costs are read linearly:
+
+    V(H, x) <- value of what is left                               end of the forecast
+    for k = H - 1, ..., 1:  V(k, x) <- min over commands of cost(k, x, command) + V(k + 1, x')
+    first command: the candidate with the least cost(0) + V(1, x')
+
+and then forwards, from the first command on, for the energy that the facility will need. With a
+demand charge the programme is done for several peaks: a kWh beyond a peak costs what the charge
+makes of it, and the peak that is dearer than the one of the month to date is charged for.
+``control/mpc.py`` makes the inputs.
+"""
+
+from functools import cache
+from typing import Any, no_type_check
+
+import taichi as ti
+
+from .compiler.functions import part_of
+from .compiler.named_kernel import define_kernel
+from .planning_arguments import (
+    LOWEST_PEAK_SHARE,
+    NEGLIGIBLE_SHARE,
+    NO_PEAK_KWH,
+    QUEUE_ARGUMENTS,
+    SECANT_TASKS,
+    STORE_ARGUMENTS,
+)
+
+
+@cache
+def queue_kernel() -> Any:
+    """Kernel that plans the work of each data center; QUEUE_ARGUMENTS are its arguments."""
+    return _defined("plan_queues", QUEUE_ARGUMENTS, _queues_of_slice)
+
+
+@cache
+def store_kernel() -> Any:
+    """Kernel that plans the battery of each data center; STORE_ARGUMENTS are its arguments."""
+    return _defined("plan_stores", STORE_ARGUMENTS, _stores_of_slice)
+
+
+def _defined(name: str, arguments: Any, run_slice: Any) -> Any:
+    return define_kernel(
+        name, arguments, run_slice, precision="f64", lanes=1, constants={}, views={}
+    )
+
+
+@ti.func
+@no_type_check
+def _cost_between(plan: ti.template(), dc, side, place):
+    """Cost to the end from a place between levels."""
+    low = ti.max(ti.min(ti.cast(place, ti.i32), plan.levels - 2), 0)
+    share = place - low
+    return (1.0 - share) * plan.cost[dc, side, low] + share * plan.cost[dc, side, low + 1]
+
+
+@ti.func
+@no_type_check
+def _tried_peak(plan: ti.template(), dc, top_kwh, number):
+    """Peak of the month that is tried, in kWh of a step."""
+    peak = ti.cast(NO_PEAK_KWH, ti.f64)
+    if plan.peaks > 1:
+        own = plan.dcs[dc].peak_kwh
+        lowest = ti.max(own, LOWEST_PEAK_SHARE * top_kwh)
+        top = ti.max(top_kwh, lowest)
+        # Closer to each other near the top, from which work and batteries take little.
+        below = ti.cast(plan.peaks - 1 - number, ti.f64) / (plan.peaks - 1)
+        peak = top - (top - lowest) * below * below
+    return peak
+
+
+@ti.func
+@no_type_check
+def _energy_cost(plan: ti.template(), dc, weight, kwh, peak_kwh):
+    """Cost of the energy of a step, with that of exceeding the peak that is tried."""
+    return weight * kwh + plan.dcs[dc].peak_cost * ti.max(kwh - peak_kwh, 0.0)
+
+
+@ti.func
+@no_type_check
+def _charge_for_peak(plan: ti.template(), dc, peak_kwh):
+    """Cost of a peak beyond the one of the month to date."""
+    cost = ti.cast(0.0, ti.f64)
+    if plan.peaks > 1:
+        cost = plan.dcs[dc].peak_cost * ti.max(peak_kwh - plan.dcs[dc].peak_kwh, 0.0)
+    return cost
+
+
+@ti.func
+@no_type_check
+def _queues_of_slice(plan: ti.template(), number):
+    """Plan the work of the data centers of a slice."""
+    first, end = part_of(number, plan.slices, plan.size)
+    for dc in range(first, end):
+        top_kwh = ti.cast(0.0, ti.f64)
+        for k in range(plan.horizon):
+            _read_map(plan, dc, k)
+            step = plan.steps[dc * plan.horizon + k]
+            neutral = ti.min(step.arrived, step.capacity)
+            top_kwh = ti.max(top_kwh, _kwh_of(plan, dc, neutral))
+        best, best_peak = ti.cast(ti.math.inf, ti.f64), ti.cast(NO_PEAK_KWH, ti.f64)
+        for number_of_peak in range(plan.peaks):
+            peak_kwh = _tried_peak(plan, dc, top_kwh, number_of_peak)
+            _plan_queue(plan, dc, peak_kwh)
+            _read_map(plan, dc, 0)
+            found = _charge_for_peak(plan, dc, peak_kwh)
+            least = ti.cast(ti.math.inf, ti.f64)
+            at = 0
+            for c in range(plan.first_executed.shape[1]):
+                cost = _first_queue_cost(plan, dc, c, peak_kwh)
+                if c == 0 or cost < least - NEGLIGIBLE_SHARE * ti.abs(least):
+                    least, at = cost, c
+            if number_of_peak == 0 or found + least < best:
+                best, best_peak = found + least, peak_kwh
+                plan.chosen[dc] = at
+        if plan.peaks > 1:
+            _plan_queue(plan, dc, best_peak)
+        _follow_queue(plan, dc)
+
+
+@ti.func
+@no_type_check
+def _first_queue_cost(plan: ti.template(), dc, c, peak_kwh):
+    """Cost of a candidate of the first step, and of what follows."""
+    of_dc = plan.dcs[dc]
+    kwh = _kwh_of(plan, dc, plan.first_executed[dc, c])
+    now = _energy_cost(plan, dc, plan.steps[dc * plan.horizon].weight, kwh, peak_kwh)
+    late = plan.first_late[dc, c] * of_dc.late_cost
+    place = plan.first_waiting[dc, c] / plan.steps[dc * plan.horizon].spacing
+    return now + late + _cost_between(plan, dc, 1, place)
+
+
+@ti.func
+@no_type_check
+def _plan_queue(plan: ti.template(), dc, peak_kwh):
+    """Least cost from each level and step on, V(1) being in side 1 of the work space."""
+    of_dc = plan.dcs[dc]
+    _read_map(plan, dc, plan.horizon - 1)
+    slope = _kwh_of(plan, dc, of_dc.mean_tasks + SECANT_TASKS)
+    slope = (slope - _kwh_of(plan, dc, of_dc.mean_tasks - SECANT_TASKS)) / (2.0 * SECANT_TASKS)
+    end_price = of_dc.end_weight * slope
+    end = dc * plan.horizon + plan.horizon - 1
+    for level in range(plan.levels):
+        plan.cost[dc, plan.horizon % 2, level] = end_price * level * plan.steps[end].spacing
+    for back in range(1, plan.horizon):
+        k = plan.horizon - back
+        _read_map(plan, dc, k)
+        at = dc * plan.horizon + k
+        for level in range(plan.levels):
+            least, best = ti.cast(ti.math.inf, ti.f64), 0
+            for c in range(plan.commands.shape[0]):
+                executed, waiting, late = _work_step(
+                    plan, dc, at, plan.commands[c], level * plan.steps[at - 1].spacing
+                )
+                cost = _energy_cost(
+                    plan, dc, plan.steps[at].weight, _kwh_of(plan, dc, executed), peak_kwh
+                )
+                cost += late * of_dc.late_cost
+                place = waiting / plan.steps[at].spacing
+                cost += _cost_between(plan, dc, (k + 1) % 2, place)
+                if cost < least:
+                    least, best = cost, c
+            plan.cost[dc, k % 2, level] = least
+            plan.policy[dc, k, level] = best
+
+
+@ti.func
+@no_type_check
+def _follow_queue(plan: ti.template(), dc):
+    """Energy of the facility in each step under the commands that were found."""
+    chosen = plan.chosen[dc]
+    waiting = plan.first_waiting[dc, chosen]
+    _read_map(plan, dc, 0)
+    plan.facility_kwh[dc, 0] = _kwh_of(plan, dc, plan.first_executed[dc, chosen])
+    for k in range(1, plan.horizon):
+        _read_map(plan, dc, k)
+        at = dc * plan.horizon + k
+        place = ti.cast(waiting / plan.steps[at - 1].spacing + 0.5, ti.i32)
+        command = plan.commands[plan.policy[dc, k, ti.min(place, plan.levels - 1)]]
+        executed, left, _ = _work_step(plan, dc, at, command, waiting)
+        waiting = left
+        plan.facility_kwh[dc, k] = _kwh_of(plan, dc, executed)
+
+
+@ti.func
+@no_type_check
+def _work_step(plan: ti.template(), dc, at, command, waiting):
+    """Work that a step does, leaves waiting, and is late with or drops, in tasks."""
+    step = plan.steps[at]
+    capacity = step.capacity
+    now = ti.min(step.arrived - ti.max(-command, 0.0) * step.flexible, capacity)
+    held_back = step.arrived - now
+    deferred = ti.min(held_back, ti.max(plan.dcs[dc].limit - waiting, 0.0))
+    most = ti.min(waiting, step.most_drained)
+    drained = ti.min(most, ti.max(command, 0.0) * (capacity - now))
+    left = waiting + deferred - drained
+    due = ti.max(left - step.most_waiting, 0.0)
+    forced = ti.min(due, capacity - now - drained)
+    late = held_back - deferred + due - forced
+    return now + drained + forced, left - forced, late
+
+
+@ti.func
+@no_type_check
+def _kwh_of(plan: ti.template(), dc, executed):
+    """Energy of the facility of a step that does some work, from the energies of its map."""
+    last = plan.kwh.shape[1] - 1
+    place = ti.max(executed, 0.0) * 0.01 * last
+    low = ti.min(ti.cast(place, ti.i32), last - 1)
+    share = place - low
+    return (1.0 - share) * plan.kwh[dc, low] + share * plan.kwh[dc, low + 1]
+
+
+@ti.func
+@no_type_check
+def _read_map(plan: ti.template(), dc, k):
+    """Energy of step ``k`` at each utilisation of the map, into the work space."""
+    of_dc, step = plan.dcs[dc], plan.steps[dc * plan.horizon + k]
+    number = ti.cast(of_dc.map, ti.i32)
+    w, lead = _node(step.weather, plan.table.shape[1])
+    d, dry = _node(step.depression, plan.table.shape[2])
+    s, setpoint = _node(of_dc.setpoint, plan.table.shape[3])
+    for i in range(plan.table.shape[4]):
+        total = ti.cast(0.0, ti.f64)
+        for x in ti.static(range(2)):
+            for y in ti.static(range(2)):
+                for z in ti.static(range(2)):
+                    share = (
+                        (1 - x + (2 * x - 1) * lead)
+                        * (1 - y + (2 * y - 1) * dry)
+                        * (1 - z + (2 * z - 1) * setpoint)
+                    )
+                    total += share * plan.table[number, w + x, d + y, s + z, i]
+        plan.kwh[dc, i] = total
+
+
+@ti.func
+@no_type_check
+def _node(place, count):
+    """Node below a place, and the share of the next node."""
+    low = ti.max(ti.min(ti.cast(place, ti.i32), count - 2), 0)
+    return low, place - low
+
+
+@ti.func
+@no_type_check
+def _stores_of_slice(plan: ti.template(), number):
+    """Plan the batteries of a slice."""
+    first, end = part_of(number, plan.slices, plan.size)
+    for dc in range(first, end):
+        top_kwh = ti.cast(0.0, ti.f64)
+        for k in range(plan.horizon):
+            top_kwh = ti.max(top_kwh, plan.facility_kwh[dc, k])
+        best = ti.cast(ti.math.inf, ti.f64)
+        for number_of_peak in range(plan.peaks):
+            peak_kwh = _tried_peak(plan, dc, top_kwh, number_of_peak)
+            _plan_store(plan, dc, peak_kwh)
+            charge = _charge_for_peak(plan, dc, peak_kwh)
+            for c in range(plan.first_grid.shape[1]):
+                now = _energy_cost(plan, dc, plan.weight[dc, 0], plan.first_grid[dc, c], peak_kwh)
+                place = plan.first_stored[dc, c] / plan.dcs[dc].spacing
+                cost = charge + now + _cost_between(plan, dc, 1, place)
+                first_of_all = number_of_peak == 0 and c == 0
+                if first_of_all or cost < best - NEGLIGIBLE_SHARE * ti.abs(best):
+                    best = cost
+                    plan.chosen[dc] = c
+
+
+@ti.func
+@no_type_check
+def _plan_store(plan: ti.template(), dc, peak_kwh):
+    """Least cost from each level and step on, V(1) being in side 1 of the work space."""
+    of_dc = plan.dcs[dc]
+    side = plan.horizon % 2
+    for level in range(plan.levels):
+        plan.cost[dc, side, level] = -of_dc.end_value * level * of_dc.spacing
+    for back in range(1, plan.horizon):
+        k = plan.horizon - back
+        load_kwh = plan.facility_kwh[dc, k]
+        for level in range(plan.levels):
+            least = ti.cast(ti.math.inf, ti.f64)
+            for c in range(plan.commands.shape[0]):
+                drawn, delivered = _battery_step(
+                    plan, dc, level, plan.commands[c], load_kwh, peak_kwh
+                )
+                rise = of_dc.charge_efficiency * drawn - of_dc.discharge_factor * delivered
+                cost = _energy_cost(
+                    plan, dc, plan.weight[dc, k], load_kwh + drawn - delivered, peak_kwh
+                )
+                cost += _cost_between(plan, dc, (k + 1) % 2, level + rise / of_dc.spacing)
+                if cost < least:
+                    least = cost
+            plan.cost[dc, k % 2, level] = least
+
+
+@ti.func
+@no_type_check
+def _battery_step(plan: ti.template(), dc, level, command, load_kwh, peak_kwh):
+    """Energy that a battery draws and delivers, in kWh, to keep to the grid connection and a peak.
+
+    No share of the full power would follow the load down to a peak.
+    """
+    limit_kwh = ti.min(plan.dcs[dc].grid_limit, peak_kwh)
+    most = ti.min(plan.most_discharge[dc, level], plan.load_share[dc, level] * load_kwh)
+    missing = ti.max(load_kwh - limit_kwh, 0.0)
+    drawn = ti.min(
+        ti.max(command, 0.0) * plan.most_charge[dc, level], ti.max(limit_kwh - load_kwh, 0.0)
+    )
+    return drawn, ti.max(ti.max(-command, 0.0) * most, ti.min(missing, most))

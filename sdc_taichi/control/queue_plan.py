@@ -1,0 +1,227 @@
+"""Plans of when work runs: inputs of the programme over queues in ``kernels/planning.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sdc_taichi.control.planning_kernel import PlanningKernel, first_commands
+from sdc_taichi.kernels.arguments import in_row_order
+from sdc_taichi.kernels.planning_arguments import QUEUE_ARGUMENTS, QUEUE_ROWS, STEP_ROWS
+from sdc_taichi.optimum.facility_map import FacilityMap
+from sdc_taichi.plant import workload
+from sdc_taichi.plant.workload import TASKS_PER_STEP, UNLIMITED_TASKS
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.workload import due_steps, queue_limit_tasks
+from sdc_taichi.types import F64
+
+LEVELS = 51
+"""Levels of the queue."""
+COMMANDS = (0.0, -0.5, 0.5, -1.0, 1.0)
+"""Commands of steps after the first; of equal ones the first counts."""
+
+
+class Weather(NamedTuple):
+    """Weather of the coming steps as it is forecast."""
+
+    outdoor_c: F64
+    """Dry bulb, in C, (B, H)."""
+    wet_bulb_c: F64
+    """Wet bulb, in C, (B, H)."""
+
+
+class EnergyCost(NamedTuple):
+    """What energy costs in the coming steps, in the unit of the objective."""
+
+    weight: F64
+    """Cost of a kWh in each step, (B, H)."""
+    peak_kwh: F64
+    """Energy of a step that the month is charged for already, (B,)."""
+    peak_cost: F64
+    """Cost of each kWh of the month's peak beyond it, (B,); 0 without a demand charge."""
+
+
+class QueuePlan(NamedTuple):
+    """What to do with the work of the step to come, and what follows from it."""
+
+    load: F64
+    """Load command, (B,)."""
+    executed_tasks: F64
+    """Work that the step will do, in tasks, (B,)."""
+    facility_kwh: F64
+    """Energy of the facility in each step of the plan, in kWh, (B, H)."""
+
+
+class QueuePlanner:
+    """Plans the work of B data centers.
+
+    Args:
+        fleet: the data centers.
+        facility: what their steps cost.
+        moves: whether the plan may move work; else it only says what neutral commands need.
+    """
+
+    def __init__(self, fleet: Fleet, facility: FacilityMap, *, moves: bool) -> None:
+        from sdc_taichi.kernels.planning import queue_kernel
+
+        self._facility, self._moves = facility, moves
+        self._model = fleet.models["workload"]
+        self._share = fleet.values("workload.flexible_share")[:, None]
+        self._cap = fleet.values("workload.max_utilisation")[:, None]
+        self._limit = queue_limit_tasks(fleet)
+        self._due_steps = due_steps(fleet)
+        self._kernel = PlanningKernel(queue_kernel(), QUEUE_ARGUMENTS, LEVELS)
+        self._first = first_commands() if moves else np.zeros(1)
+        self._later = np.array(COMMANDS if moves else (0.0,))
+
+    def plan(
+        self,
+        queue: F64,
+        demand: F64,
+        weather: Weather,
+        cost: EnergyCost,
+        *,
+        setpoint_c: F64 | None,
+        peaks: int,
+    ) -> QueuePlan:
+        """The plan of the coming steps.
+
+        Args:
+            queue: work in the queue by the step that put it in, oldest first, accumulated, (B, L).
+            demand: work that arrives, as a share of capacity, the step to come first, (B, H).
+            weather: weather of the coming steps.
+            cost: what energy costs.
+            setpoint_c: setpoint that is held, in C, (B,); None takes the best in each step.
+            peaks: peaks of the month that are tried; 1 without a demand charge.
+        """
+        size, horizon = demand.shape
+        waiting, due = queue[:, -1], _due_by(queue, self._due_steps, horizon)
+        now = self._first_step(demand[:, :1], waiting[:, None], due[:, :1])
+        coming = self._coming(demand, weather, cost.weight, waiting, due)
+        table, setpoint = self._table(setpoint_c, size)
+        dearest = cost.weight.max(axis=1) + cost.peak_cost
+        of_dc = {
+            "map": self._facility.which.astype(np.float64),
+            "setpoint": setpoint,
+            "limit": self._limit,
+            "end_weight": cost.weight.mean(axis=1),
+            "mean_tasks": np.ascontiguousarray(coming["arrived"]).mean(axis=1),
+            "late_cost": dearest * table[self._facility.which].max(axis=(1, 2, 3, 4)),
+            "peak_kwh": cost.peak_kwh,
+            "peak_cost": cost.peak_cost,
+        }
+        chosen, facility_kwh = self._kernel.run(
+            size,
+            horizon,
+            commands=self._later,
+            peaks=peaks,
+            table=table,
+            of_dc=np.stack(in_row_order(QUEUE_ROWS, of_dc), axis=1),
+            coming=np.stack(in_row_order(STEP_ROWS, coming), axis=2),
+            first_executed=now.started_tasks,
+            first_waiting=waiting[:, None] + now.deferred_tasks - now.dequeued_tasks,
+            first_late=now.dropped_tasks,
+        )
+        return QueuePlan(
+            load=self._first[chosen],
+            executed_tasks=now.started_tasks[np.arange(size), chosen],
+            facility_kwh=facility_kwh,
+        )
+
+    def _first_step(self, demand: F64, waiting: F64, due: F64) -> workload.Work:
+        """What each first command does with the work of the step to come, (B, C)."""
+        shape = len(demand), len(self._first)
+        each = [np.broadcast_to(x, shape) for x in (demand, self._first, waiting, due)]
+        return workload.MODELS[self._model](
+            *each,
+            flexible_share=self._share,
+            max_utilisation=self._cap,
+            queue_limit=self._limit[:, None],
+        )
+
+    def _coming(
+        self, demand: F64, weather: Weather, weight: F64, waiting: F64, due: F64
+    ) -> dict[str, F64]:
+        """Inputs of each coming step by the names of ``STEP_ROWS``, (B, H) each."""
+        arrived = demand * TASKS_PER_STEP
+        flexible = arrived * self._share
+        capacity = np.broadcast_to(self._cap * TASKS_PER_STEP, demand.shape)
+        most_drained = np.full(demand.shape, UNLIMITED_TASKS)
+        if self._model == "tasks":
+            # Whole tasks; work beyond the capacity runs all the same.
+            flexible = np.floor(flexible)
+            arrived = np.ceil(arrived * (1.0 - self._share)) + flexible
+            capacity, most_drained = np.maximum(np.floor(capacity), arrived), flexible
+        held_back = np.maximum(flexible, arrived - capacity)
+        lead, depression = self._places(weather)
+        most_waiting = (waiting[:, None] - due) + self._not_due(held_back)
+        reached = np.minimum(waiting[:, None] + np.cumsum(held_back, axis=1), most_waiting)
+        reached = np.minimum(reached, self._limit[:, None])
+        return {
+            "weight": weight,
+            "weather": lead,
+            "depression": depression,
+            "arrived": arrived,
+            "flexible": flexible,
+            "capacity": capacity,
+            "most_drained": most_drained,
+            "most_waiting": most_waiting,
+            "spacing": np.where(reached > 0, reached, 1.0) / (LEVELS - 1),
+        }
+
+    def _not_due(self, held_back: F64) -> F64:
+        """Most work of the coming steps that may wait after each of them, (B, H)."""
+        total = np.cumsum(held_back, axis=1)
+        horizon = held_back.shape[1]
+        before = np.arange(horizon) - np.minimum(self._due_steps, horizon)[:, None].astype(np.int64)
+        gone = np.take_along_axis(total, np.maximum(before, 0), axis=1)
+        return total - np.where(before >= 0, gone, 0.0)
+
+    def _places(self, weather: Weather) -> Sequence[F64]:
+        """Places of the weather between the nodes of the map, (B, H) each."""
+        facility = self._facility
+        which, nodes = facility.which[:, None], facility.facility_kwh.shape[1:3]
+        lead_c = weather.wet_bulb_c if facility.by_wet_bulb else weather.outdoor_c
+        lead_c = np.minimum(lead_c, facility.last_c[which])
+        lead = (lead_c - facility.first_c[which]) / facility.step_k
+        depression = (weather.outdoor_c - weather.wet_bulb_c) / facility.depression_step_k[which]
+        return [
+            np.clip(place, 0.0, count - 1)
+            for place, count in zip((lead, depression), nodes, strict=True)
+        ]
+
+    def _table(self, setpoint_c: F64 | None, size: int) -> tuple[F64, F64]:
+        """Energy by map, weather, setpoint and utilisation, and the place of the setpoint, (B,)."""
+        facility = self._facility
+        if setpoint_c is None:
+            return self._kernel.kept(
+                "least", lambda: np.stack([facility.least_kwh] * 2, axis=3)
+            ), np.zeros(size)
+        low, share = facility.places_of_setpoints(setpoint_c[:, None])
+        table = self._kernel.kept(
+            "each", lambda: np.ascontiguousarray(np.moveaxis(_two_at_least(facility), 4, 3))
+        )
+        return table, (low + share)[:, 0]
+
+
+def _two_at_least(facility: FacilityMap) -> F64:
+    """Energies of the map; those of a single setpoint twice."""
+    kwh = facility.facility_kwh
+    return np.concatenate([kwh, kwh], axis=4) if kwh.shape[4] == 1 else kwh
+
+
+def _due_by(queue: F64, due_after_steps: F64, horizon: int) -> F64:
+    """Work in the queue that is due by each coming step, in tasks, (B, H).
+
+    Args:
+        queue: work in the queue by the step that put it in, oldest first, accumulated, (B, L).
+        due_after_steps: age at which work is due, in steps, inf for never, (B,).
+        horizon: number of coming steps.
+    """
+    length = queue.shape[1]
+    first = length - np.minimum(due_after_steps, length + horizon).astype(np.int64)
+    row = np.minimum(first[:, None] + np.arange(horizon), length - 1)
+    due = np.take_along_axis(queue, np.maximum(row, 0), axis=1)
+    return np.where((row < 0) | np.isinf(due_after_steps)[:, None], 0.0, due)
