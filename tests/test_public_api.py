@@ -59,3 +59,12 @@ def test_a_run_by_public_names_alone() -> None:
         assert totals.steps == len(mine.seen) == 4
         assert mine.seen[0].setpoint_c == 20.0
         assert simulate(sim, make_controller("g36", sim.fleet), 2).steps == 2
+
+
+def test_the_optimum_is_solved_by_public_names() -> None:
+    import sdc_taichi.optimum.solve  # noqa: F401 - the module of that name must not hide it
+    from sdc_taichi.optimum import Objective, Optimum, solve
+
+    found = solve(load_config("tiny"), steps=4, objective=Objective(energy=1.0), cache=False)
+    assert isinstance(found, Optimum)
+    assert found.bound[0] <= found.achieved[0] <= found.idle[0]
