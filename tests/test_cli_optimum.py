@@ -51,7 +51,8 @@ def test_table_tells_figures_gaps_and_shares(asked: dict[str, Any]) -> None:
     assert done.stdout.startswith("Optimum of carbon: 2 data centers, 1 day\n")
     rows = rows_of(done.stdout)
     assert list(rows) == ["idle (kg CO2e)", "bound (% against idle)", "achieved (% against idle)",
-                          "gap (points)", "cooling alone (%)", "g36 (% of the achievable)",
+                          "gap (points)", "cooling alone (%)", "discrete actions (%)",
+                          "g36 (% of the achievable)",
                           "battery=lookahead-3h (% of the achievable)"]  # fmt: skip
     bound, achieved, gap = ([float(x) for x in rows[title]] for title in list(rows)[1:4])
     assert [a - b for a, b in zip(achieved, bound, strict=True)] == pytest.approx(gap, abs=0.011)

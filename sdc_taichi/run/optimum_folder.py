@@ -38,6 +38,12 @@ def optimum_content(optimum: Optimum, reached: Sequence[Achievement] = ()) -> di
         reached: what controllers reached beside it.
     """
     dcs = range(len(optimum.names))
+    total = _figures(
+        {name: float(getattr(optimum, name).sum()) for name in _FIGURES},
+        {name: float(values.sum()) for name, values in optimum.alone.items()},
+    )
+    if optimum.discrete is not None:
+        total["discrete"] = _or_none(optimum.discrete.sum())
     return {
         "format": FORMAT,
         "fingerprint": optimum.fingerprint,
@@ -47,10 +53,7 @@ def optimum_content(optimum: Optimum, reached: Sequence[Achievement] = ()) -> di
         "steps": optimum.steps,
         "scored_from": optimum.scored_from,
         "data_centers": [_data_center(optimum, dc) for dc in dcs],
-        "total": _figures(
-            {name: float(getattr(optimum, name).sum()) for name in _FIGURES},
-            {name: float(values.sum()) for name, values in optimum.alone.items()},
-        ),
+        "total": total,
         "controllers": [
             {
                 "controller": each.controller,
@@ -159,12 +162,16 @@ def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
 def _data_center(optimum: Optimum, dc: int) -> dict[str, Any]:
     """What optimum.json says of a data center."""
     limit_c = float(optimum.inlet_limit_c[dc])
+    figures = _figures(
+        {name: float(getattr(optimum, name)[dc]) for name in _FIGURES},
+        {name: float(values[dc]) for name, values in optimum.alone.items()},
+    )
+    if optimum.discrete is not None:
+        figures["discrete"] = _or_none(optimum.discrete[dc])
+        figures["discrete_complete"] = optimum.discrete_complete[dc]
     return {
         "name": optimum.names[dc],
-        **_figures(
-            {name: float(getattr(optimum, name)[dc]) for name in _FIGURES},
-            {name: float(values[dc]) for name, values in optimum.alone.items()},
-        ),
+        **figures,
         "bound_kind": optimum.bound_kinds[dc],
         "inlet_limit_c": limit_c if math.isfinite(limit_c) else None,
         "certificates": {k: _or_none(v) for k, v in optimum.certificates[dc].items()},
