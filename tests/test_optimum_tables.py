@@ -16,7 +16,7 @@ from sdc_taichi.optimum import tables
 from sdc_taichi.optimum.eligibility import no_table_reasons, uncooled_reason
 from sdc_taichi.optimum.facility_map import FacilityMap, facility_map
 from sdc_taichi.optimum.problem import FacilityTable
-from sdc_taichi.optimum.tables import TableGrid, facility_tables
+from sdc_taichi.optimum.tables import Nodes, TableGrid, facility_tables
 from sdc_taichi.sim.drivers import Drivers, FleetSeries, load_drivers
 
 JULY = "site.start=07-01"
@@ -127,6 +127,34 @@ def test_batches_of_any_size_give_the_same_tables(monkeypatch: pytest.MonkeyPatc
         assert np.array_equal(one.facility_kwh, other.facility_kwh)
 
 
+def test_tables_are_fine_enough_between_their_nodes() -> None:
+    counts = []
+    for preset in ("corrected", "hall_of_2026"):
+        config = load_config(preset, [])
+        fleet, drivers = build_fleet(config), load_drivers([config])
+        start = drivers.start
+        (table,) = facility_tables(
+            fleet, drivers, start=start, steps=2, grid=TableGrid(setpoint_step_k=10.0)
+        )
+        counts.append(len(table.utilisation))
+        spacing = table.utilisation[1]
+        midway = np.arange(0.2, 0.9, 0.1) // spacing * spacing + spacing / 2
+        outdoor_c, wet_bulb_c = (
+            series.at(start[:, None] + np.arange(2))
+            for series in (drivers.outdoor_c, drivers.wet_bulb_c)
+        )
+        found = tables.tabulate(
+            fleet, drivers, [Nodes(0, midway, table.setpoint_c)], outdoor_c, wet_bulb_c, "f32"
+        )
+        assert found is not None
+        (exact,) = found
+        for kwh, expected in zip(table.facility_kwh[0].T, exact.facility_kwh[0].T, strict=True):
+            read = np.interp(midway, table.utilisation, kwh)
+            assert read == pytest.approx(expected, rel=2e-3)
+            assert read.mean() == pytest.approx(expected.mean(), rel=2e-4)
+    assert counts[0] < counts[1]
+
+
 def test_a_table_is_given_up_when_it_is_told_to() -> None:
     config = load_config("tiny", [])
     drivers = load_drivers([config])
@@ -220,7 +248,9 @@ def test_loads_that_no_setpoint_cools_are_told() -> None:
 def a_map(configs: list[DataCenterConfig], **options: Any) -> tuple[FacilityMap, Drivers]:
     fleet, drivers = build_fleet(configs), load_drivers(configs)
     options = {"inlet_limit_c": np.full(len(configs), np.inf)} | options
-    return facility_map(fleet, drivers, grid=GRID, weather_step_k=10.0, **options), drivers
+    return facility_map(
+        fleet, drivers, utilisations=3, setpoint_step_k=4.0, weather_step_k=10.0, **options
+    ), drivers
 
 
 @pytest.mark.parametrize("plant", ["water_cooled", "air_side"])
@@ -270,6 +300,28 @@ def test_a_map_is_linear_between_its_nodes() -> None:
         for warmer in (-1.0, 1.0)
     ]
     assert middle == pytest.approx(np.mean(corners, axis=0), rel=1e-12)
+
+
+@pytest.mark.parametrize("plant", ["water_cooled", "air_side"])
+def test_a_data_center_has_the_same_map_alone_and_beside_others(plant: str) -> None:
+    chiller = {"water_cooled": "centrifugal_vsd", "air_side": "electric_air_cooled"}[plant]
+    shared = [f"hvac.plant={plant}", f"hvac.chiller.model={chiller}"]
+    configs = [
+        load_config("tiny", [*shared, *own])
+        for own in (["site.location=WA"], ["site.location=AZ", "hvac.setpoint.max_c=30"])
+    ]
+    together, _ = a_map(configs)
+    outdoor_c = np.array([[-40.0, -3.0, 12.0, 33.0, 60.0]] * 2)
+    wet_bulb_c = outdoor_c - np.array([0.0, 1.5, 7.0, 18.0, 50.0])
+    setpoint_c = np.array([[16.0, 17.0, 19.5, 21.0, 23.0]] * 2)
+    for dc, config in enumerate(configs):
+        alone, _ = a_map([config])
+        own = slice(dc, dc + 1)
+        at = outdoor_c[own], wet_bulb_c[own]
+        lowest = together.lowest_kwh(outdoor_c, wet_bulb_c)[own]
+        assert np.array_equal(alone.lowest_kwh(*at), lowest)
+        given = together.kwh_at(setpoint_c, outdoor_c, wet_bulb_c)[own]
+        assert np.array_equal(alone.kwh_at(setpoint_c[own], *at), given)
 
 
 def test_the_best_setpoint_of_a_map_is_that_of_least_cost() -> None:

@@ -31,7 +31,6 @@ MARGIN_K = 5.0
 _FEW = 4
 """Nodes of dry bulb less wet bulb. Towers and dry coolers hardly feel it; plants that let outdoor
 air in open and close by its humidity, and have nodes as close as those of the dry bulb."""
-_GRID = TableGrid(utilisations=21, setpoint_step_k=1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +53,8 @@ class FacilityMap:
     """Distance of its nodes, in K."""
     depression_step_k: F64
     """Distance of the nodes of dry bulb less wet bulb, the first of which is 0, in K, (M,)."""
+    last_depression_k: F64
+    """Last of these nodes that is a data center's own, in K, (M,)."""
     utilisation: F64
     """Utilisations, evenly from 0 to 1, (I,)."""
     setpoint_c: F64
@@ -187,7 +188,8 @@ class FacilityMap:
         lead_c = wet_bulb_c if self.by_wet_bulb else outdoor_c
         lead_c = np.minimum(lead_c, self.last_c[which])
         low, share = _place((lead_c - self.first_c[which]) / self.step_k, wet)
-        low_k, share_k = _place((outdoor_c - wet_bulb_c) / self.depression_step_k[which], dry)
+        below_k = np.minimum(outdoor_c - wet_bulb_c, self.last_depression_k[which])
+        low_k, share_k = _place(below_k / self.depression_step_k[which], dry)
         flat = values.reshape(-1, *values.shape[3:])
         at = (which * wet + low) * dry + low_k
         added = (1,) * (values.ndim - 3)
@@ -218,7 +220,8 @@ def facility_map(
     inlet_limit_c: F64,
     weather_step_k: float = 1.0,
     margin_k: float = MARGIN_K,
-    grid: TableGrid = _GRID,
+    utilisations: int = 21,
+    setpoint_step_k: float = 1.0,
     precision: Precision = "f32",
 ) -> FacilityMap:
     """Map of the data centers of a fleet over the weather of their year.
@@ -230,7 +233,8 @@ def facility_map(
             without a limit.
         weather_step_k: Distance of the nodes of the first axis of the weather, in K.
         margin_k: How far the map reaches beyond the weather of the year, in K.
-        grid: Nodes of utilisation and setpoint.
+        utilisations: Number of utilisations, evenly from 0 to 1.
+        setpoint_step_k: Largest distance of setpoints, in K.
         precision: Of the server kernels.
 
     Raises:
@@ -247,28 +251,33 @@ def facility_map(
     steps = np.maximum(np.ceil((high_c - low_c) / weather_step_k), 1.0)
     wet = int(steps.max()) + 1
     lead_c = low_c[:, None] + weather_step_k * np.arange(wet)
-    depressions = _FEW
+    intervals = np.full(len(dcs), float(_FEW - 1))
     if fleet.models["plant"] == "air_side":
-        depressions = max(int(np.ceil(np.max(most_k) / weather_step_k)) + 1, _FEW)
-    depression_k = np.linspace(np.zeros_like(most_k), most_k, depressions, axis=1)
+        intervals = np.maximum(np.ceil(most_k / weather_step_k), _FEW - 1)
+    depression_step_k = most_k / intervals
+    depressions = int(intervals.max()) + 1
+    depression_k = depression_step_k[:, None] * np.arange(depressions)
     first, second = np.broadcast_arrays(lead_c[:, :, None], depression_k[:, None, :])
     outdoor_c = (first + second if by_wet_bulb else first).reshape(len(dcs), -1)
     wet_bulb_c = (first if by_wet_bulb else first - second).reshape(len(dcs), -1)
+    grid = TableGrid(utilisations, setpoint_step_k)
+    levels = np.linspace(0.0, 1.0, utilisations)
     setpoints = max(len(grid.setpoint_c(fleet.configs[dc])) for dc in dcs)
-    nodes = [Nodes(dc, grid.utilisation(), _setpoint_c(fleet, dc, grid, setpoints)) for dc in dcs]
+    nodes = [Nodes(dc, levels, _setpoint_c(fleet, dc, grid, setpoints)) for dc in dcs]
     tables: list[FacilityTable] = []
     for part in batches(fleet, nodes):
         own = slice(len(tables), len(tables) + len(part))
         tables += tabulate(fleet, drivers, part, outdoor_c[own], wet_bulb_c[own], precision) or ()
-    shape = len(dcs), wet, depressions, grid.utilisations, setpoints
+    shape = len(dcs), wet, depressions, utilisations, setpoints
     return FacilityMap(
         which=which,
         by_wet_bulb=by_wet_bulb,
         first_c=low_c,
         last_c=low_c + weather_step_k * steps,
         step_k=weather_step_k,
-        depression_step_k=depression_k[:, 1],
-        utilisation=grid.utilisation(),
+        depression_step_k=depression_step_k,
+        last_depression_k=most_k,
+        utilisation=levels,
         setpoint_c=np.array([each.setpoint_c for each in nodes]),
         facility_kwh=np.stack([t.facility_kwh for t in tables]).reshape(shape),
         water_l=np.stack([t.water_l for t in tables]).reshape(shape),

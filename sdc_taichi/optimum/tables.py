@@ -22,6 +22,16 @@ MOST_COPIES = 4096
 """Copies of data centers in a batch, beyond which its arrays leave the caches."""
 MOST_RACKS = 2**18
 """Racks of the copies in a batch, which take some 1 kB each."""
+UTILISATIONS = (41, 81, 161)
+"""Numbers of utilisations that a table may have where none is given; each halves the spacing."""
+MOST_ERROR = 1e-4
+"""Mean error of the energy midway between utilisations, over the energy, up to which a table counts
+as fine enough."""
+_LEAST_USUAL = 0.15
+"""Utilisation below which errors are not counted: work rarely falls so low, and power bends most
+where fans leave their lowest speed."""
+_SAMPLES = 6
+"""Steps of a run whose weather is tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +59,9 @@ OnStep = Callable[[int, int], None]
 class TableGrid:
     """Where tables have their nodes."""
 
-    utilisations: int = 41
-    """Number of utilisations, evenly from 0 to 1, 2..1,001."""
+    utilisations: int | None = None
+    """Number of utilisations, evenly from 0 to 1, 2..1,001; None is the least of ``UTILISATIONS``
+    that is fine enough for the hall, see ``MOST_ERROR``."""
     setpoint_step_k: float = 0.5
     """Largest distance of setpoints, in K, 0.01..50."""
 
@@ -60,13 +71,10 @@ class TableGrid:
         Raises:
             ConfigError: One that is out of bounds.
         """
-        whole_number("table: utilisations", self.utilisations, 2, 1001)
+        if self.utilisations is not None:
+            whole_number("table: utilisations", self.utilisations, 2, 1001)
         if not 0.01 <= self.setpoint_step_k <= 50.0:
             raise ConfigError(f"table: setpoint_step_k {self.setpoint_step_k:g}; valid is 0.01..50")
-
-    def utilisation(self) -> F64:
-        """Utilisations, rising from 0 to 1, (I,)."""
-        return np.linspace(0.0, 1.0, self.utilisations)
 
     def setpoint_c(self, config: DataCenterConfig) -> F64:
         """Setpoints from the lowest to the highest of a data center, in C, (J,)."""
@@ -114,7 +122,14 @@ def facility_tables(
     ]
     distinct = list(known.values())
     tables: dict[int, FacilityTable] = {}
-    nodes = [Nodes(dc, grid.utilisation(), grid.setpoint_c(fleet.configs[dc])) for dc in distinct]
+    if grid.utilisations is None:
+        counts = _fine_enough(fleet, drivers, distinct, start, steps, precision)
+    else:
+        counts = [grid.utilisations] * len(distinct)
+    nodes = [
+        Nodes(dc, np.linspace(0.0, 1.0, count), grid.setpoint_c(fleet.configs[dc]))
+        for dc, count in zip(distinct, counts, strict=True)
+    ]
     for batch in batches(fleet, nodes):
         outdoor_c, wet_bulb_c = (
             _series_of(series, batch, start, steps)
@@ -254,6 +269,58 @@ def _what_decides(fleet: Fleet, drivers: Drivers, start: I64, dc: int) -> Hashab
     series = drivers.outdoor_c, drivers.wet_bulb_c
     weather = tuple((int(each.offsets[dc]), int(each.lengths[dc])) for each in series)
     return what_decides_facility(fleet, drivers, dc), weather, int(start[dc])
+
+
+def _fine_enough(
+    fleet: Fleet,
+    drivers: Drivers,
+    which: Sequence[int],
+    start: I64,
+    steps: int,
+    precision: Precision,
+) -> list[int]:
+    """Numbers of utilisations at which the tables of some data centers are fine enough.
+
+    What lies midway between nodes is read by the cubic through four of them, and held against the
+    simulator at the lowest and the highest setpoint, in a few steps of the run.
+    """
+    finest = np.linspace(0.0, 1.0, UTILISATIONS[-1])
+    nodes = [
+        Nodes(dc, finest, np.unique([setpoint.min_c, setpoint.max_c]))
+        for dc, setpoint in ((dc, fleet.configs[dc].hvac.setpoint) for dc in which)
+    ]
+    sampled = np.linspace(0, steps - 1, min(_SAMPLES, steps)).astype(np.int64)
+    counts = []
+    for batch in batches(fleet, nodes):
+        outdoor_c, wet_bulb_c = (
+            _series_of(series, batch, start, steps)[:, sampled]
+            for series in (drivers.outdoor_c, drivers.wet_bulb_c)
+        )
+        for table in tabulate(fleet, drivers, batch, outdoor_c, wet_bulb_c, precision) or ():
+            errors = (
+                _error_midway(finest, table.facility_kwh, (len(finest) - 1) // (count - 1))
+                for count in UTILISATIONS[:-1]
+            )
+            fine = (
+                n for n, error in zip(UTILISATIONS, errors, strict=False) if error <= MOST_ERROR
+            )
+            counts.append(next(fine, UTILISATIONS[-1]))
+    return counts
+
+
+def _error_midway(utilisation: F64, kwh: F64, spacing: int) -> float:
+    """Mean error midway between nodes, over the energy.
+
+    Args:
+        utilisation: Utilisations, (I,).
+        kwh: Energy, (T, I, J).
+        spacing: Every so many utilisations there is a node, an even number.
+    """
+    node = kwh[:, ::spacing]
+    midway = (9.0 * (node[:, 1:-2] + node[:, 2:-1]) - node[:, :-3] - node[:, 3:]) / 16.0
+    middle = slice(3 * spacing // 2, len(utilisation) - spacing, spacing)
+    error = np.abs(midway / kwh[:, middle] - 1.0)
+    return float(error[:, utilisation[middle] >= _LEAST_USUAL].mean())
 
 
 def _series_of(series: FleetSeries, nodes: Sequence[Nodes], start: I64, steps: int) -> F64:

@@ -13,7 +13,7 @@ from sdc_taichi.optimum.entry import key_of
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS, Agent, FacilityTable, Problem
 from sdc_taichi.optimum.problems import problems_of
-from sdc_taichi.optimum.tables import TableGrid, facility_tables
+from sdc_taichi.optimum.tables import UTILISATIONS, TableGrid, facility_tables
 from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.drivers import Drivers, FleetSeries, load_drivers
 from sdc_taichi.sim.events import seeds_of_fleet
@@ -81,7 +81,7 @@ class Task:
         """
         grid, part, size = TableGrid(), list[int](), 0.0
         for i in where:
-            nodes = len(grid.utilisation()) * len(grid.setpoint_c(self.fleet.configs[i]))
+            nodes = UTILISATIONS[0] * len(grid.setpoint_c(self.fleet.configs[i]))
             own = 4.0 * 8.0 * self.steps * nodes
             if part and size + own > MOST_TABLE_BYTES:
                 yield part
