@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdc_taichi.optimum.problem import Problem
-from sdc_taichi.optimum.rollout import RollOut, Targets
-from sdc_taichi.optimum.table_lookup import at_utilisation, barred
+from sdc_taichi.optimum.rollout import RollOut
+from sdc_taichi.optimum.table_lookup import at_utilisation, barred, facility_kwh
 from sdc_taichi.types import F64
 
 LARGEST_TABLE_ERROR = 1e-4
@@ -28,8 +28,8 @@ class Certificate:
     figure: float
     """Figure of the scored steps, in the unit of the objective."""
     table_error: float
-    """Difference of the facility's energy in each step from its table, without its sign, summed
-    over the steps and over their energy."""
+    """Difference of the facility's energy in each step from the table at the utilisation and
+    setpoint of the step, without its sign, summed over the steps and over their energy."""
     start_kwh: float
     """Energy stored at the first scored step, in kWh."""
     end_kwh: float
@@ -75,20 +75,20 @@ class Certificate:
         return tuple(texts)
 
 
-def certificate(problem: Problem, path: Targets, done: RollOut, figure: float) -> Certificate:
+def certificate(problem: Problem, done: RollOut, figure: float) -> Certificate:
     """What the simulator measured along a path.
 
     Args:
         problem: Planning problem of the data center.
-        path: Path of one data center, with the energy that tables expect.
-        done: What the simulator did along it.
+        done: What the simulator did, of one data center.
         figure: Figure of the scored steps.
     """
     first, step_h = problem.scored_from, problem.step_h
     scored = slice(first, None)
     begin = first - 1
     inlet_c, facility = done.inlet_max_c[scored, 0], done.facility_kwh[scored, 0]
-    difference = np.abs(path.facility_kwh[scored, 0] - facility)
+    expected = facility_kwh(problem.table, done.utilisation[:, 0], done.setpoint_c[:, 0])
+    difference = np.abs(expected[scored] - facility)
     return Certificate(
         figure=figure,
         table_error=float(difference.sum() / facility.sum()),

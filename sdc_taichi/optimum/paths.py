@@ -12,10 +12,10 @@ from sdc_taichi.optimum.problem import Agent, FacilityTable, Problem
 from sdc_taichi.optimum.rollout import Targets
 from sdc_taichi.optimum.setpoint_path import setpoint_path
 from sdc_taichi.optimum.table_lookup import (
-    at_setpoint,
     at_utilisation,
     barred,
     energy_at_utilisation,
+    facility_kwh,
 )
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64
@@ -116,18 +116,6 @@ def _path(problem: Problem, agents: tuple[Agent, ...], executed_tasks: F64) -> T
     queue = _queue_tasks(problem, executed_tasks) if "load" in agents else nothing
     stored = _stored_kwh(problem, facility) if "battery" in agents else nothing
     return Targets(*(x[:, None] for x in (queue, setpoint_c, stored, facility)))
-
-
-def facility_kwh(table: FacilityTable, utilisation: F64, setpoint_c: F64) -> F64:
-    """Energy of the facility in each step, in kWh, (T,).
-
-    Args:
-        table: What steps cost.
-        utilisation: Utilisation of each step, (T,).
-        setpoint_c: Setpoint of each step, in C, (T,).
-    """
-    by_setpoint = energy_at_utilisation(table.facility_kwh, table.utilisation, utilisation)
-    return at_setpoint(by_setpoint, table.setpoint_c, setpoint_c)
 
 
 def _queue_tasks(problem: Problem, executed_tasks: F64) -> F64:

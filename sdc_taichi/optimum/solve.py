@@ -14,7 +14,7 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.kernels.compiler import runtime
-from sdc_taichi.optimum.certificates import LARGEST_TABLE_ERROR, Certificate, certificate
+from sdc_taichi.optimum.certificates import LARGEST_TABLE_ERROR, certificate
 from sdc_taichi.optimum.discrete import DiscretePlans, discrete_plans
 from sdc_taichi.optimum.discrete_run import run_discrete
 from sdc_taichi.optimum.eligibility import no_table_reasons, uncooled_reason
@@ -33,8 +33,9 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64, I64
 
-_EXACT_TABLE_ERROR = 1e-6
-"""Error of a table, as a share of the energy, below which no battery is planned again."""
+_LEAST_ENERGY_ERROR = 1e-6
+"""Difference of the energy from what was planned for, as a share, below which no battery is planned
+again."""
 _AGAIN = "again"
 """Name of the path whose battery is planned for the energy that the simulator measured."""
 _POLL_S = 0.2
@@ -244,13 +245,15 @@ def _beside(paths: Sequence[Targets]) -> Targets:
     )
 
 
-def _certificate(problem: Problem, run: _Run) -> Certificate:
-    return certificate(problem, run.path, run.done, run.figure)
+def _energy_error(run: _Run) -> float:
+    """Difference of the facility's energy from what was expected, as a share of all of it."""
+    found_kwh = run.done.facility_kwh
+    return float(np.abs(run.path.facility_kwh - found_kwh).sum() / found_kwh.sum())
 
 
 def _entry(problem: Problem, suggestion: _Suggestion, runs: Mapping[str, _Run]) -> Entry:
     """What is known of a data center, from all its runs."""
-    certificates = {name: _certificate(problem, run) for name, run in runs.items()}
+    certificates = {n: certificate(problem, run.done, run.figure) for n, run in runs.items()}
     idle = certificates[IDLE]
     failures = {
         name: found.failures(idle, problem.storage.capacity_kwh)
@@ -391,12 +394,11 @@ class _Work:
     def _plan_batteries_again(
         self, task: Task, problems: Sequence[Problem], runs: Sequence[dict[str, _Run]]
     ) -> None:
-        """Where tables are not exact, add a run whose battery suits the energy measured."""
+        """Where the energy is not what was planned for, add a run whose battery suits it."""
         chosen = {}
         for i, problem in enumerate(problems):
             run = _joint(problem, runs[i])
-            error = _certificate(problem, run).table_error
-            if "battery" in problem.agents and error > _EXACT_TABLE_ERROR:
+            if "battery" in problem.agents and _energy_error(run) > _LEAST_ENERGY_ERROR:
                 chosen[i] = run
         if not chosen:
             return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from sdc_taichi.optimum.problem import FacilityTable
 from sdc_taichi.optimum.stage_cost import at_tasks
 from sdc_taichi.types import F64, I64
 
@@ -53,6 +54,18 @@ def at_setpoint(values: F64, nodes: F64, setpoint_c: F64) -> F64:
     low, share = _place(nodes, setpoint_c)
     step = np.arange(len(setpoint_c))
     return np.asarray(values[step, low] * (1.0 - share) + values[step, low + 1] * share)
+
+
+def facility_kwh(table: FacilityTable, utilisation: F64, setpoint_c: F64) -> F64:
+    """Energy of the facility in each step, in kWh, (T,).
+
+    Args:
+        table: What steps cost.
+        utilisation: Utilisation of each step, (T,).
+        setpoint_c: Setpoint of each step, in C, (T,).
+    """
+    by_setpoint = energy_at_utilisation(table.facility_kwh, table.utilisation, utilisation)
+    return at_setpoint(by_setpoint, table.setpoint_c, setpoint_c)
 
 
 def barred(inlet_max_c: F64, unmet_w: F64, limit_c: float) -> Mask:
