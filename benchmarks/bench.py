@@ -231,6 +231,18 @@ def breakdown(
         yield Figure("environments", f"{name}: {part} of the step", share)
 
 
+def planned(quick: bool) -> Iterator[Figure]:
+    """Steps of a simulator under model-predictive control over the interpreter yardstick."""
+    count, rounds = (2, 1) if quick else (104, 10)
+    for name, at_most in (("mpc-24h", 350.0), ("mpc-72h", 700.0)):
+        with env.controlled_step("corrected", name, count) as step:
+            ratio = core_ratios({"step": step}, interpreter_loop(), rounds)["step"]
+            per_s = env.rate(step, count, 0.005 if quick else 1.0)
+        where = f"{name}, {count} data centers, over the interpreter yardstick"
+        beside = f"{number(per_s)} steps/s"
+        yield Figure("planned", where, ratio, at_most=at_most, absolute=beside)
+
+
 def calls(quick: bool) -> Iterator[Figure]:
     """Calls of a step, which are to be few, and as many in a batch as alone."""
     many = 8 if quick else 96
@@ -566,7 +578,7 @@ def main() -> None:
     print(json.dumps(facts, indent=1))
     figures: list[Figure] = []
     # Environments first: steps of a process that has held gigabytes take a tenth longer.
-    for part in (environments, kernel_and_peers, calls, scaling, starting, recording):
+    for part in (environments, planned, kernel_and_peers, calls, scaling, starting, recording):
         for figure in part(quick):
             show(figure, figures[-1].part if figures else "", quick)
             figures.append(figure)

@@ -18,6 +18,8 @@ import gymnasium as gym
 import numpy as np
 
 import sdc_taichi
+from sdc_taichi.control import view_maker
+from sdc_taichi.types import StepResult
 
 SIZES = (1, 64, 1024, 4096, 16384)
 QUICK_SIZES = (2,)
@@ -50,6 +52,26 @@ def single_step(config: sdc_taichi.DataCenterConfig) -> Callable[[], object]:
         one.step(actions)
 
     return step
+
+
+@contextlib.contextmanager
+def controlled_step(preset: str, controller: str, count: int) -> Iterator[Callable[[], object]]:
+    """A step of some data centers of eight sites under a named controller."""
+    sites = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
+    base = sdc_taichi.load_config(preset)
+    configs = sdc_taichi.make_configs(base, count=count, sites=sites[:count])
+    with sdc_taichi.Simulator(configs) as sim:
+        sim.reset()
+        acting = sdc_taichi.make_controller(controller, sim.fleet)
+        acting.reset(0)
+        view_of = view_maker(sim)
+        last: list[StepResult | None] = [None]
+
+        def step() -> None:
+            last[0] = sim.step(acting.act(view_of(last[0])))
+
+        step()
+        yield step
 
 
 @contextlib.contextmanager

@@ -137,7 +137,9 @@ class View:
         """Errors of a forecast at each lead, (B, n); None without any."""
         if self.walks is None or deviation == 0.0:
             return None
-        return float(deviation) * self.walks.increments(walk, self.state.step, leads).T
+        walked = self.walks.increments(walk, self.state.step, leads)
+        # In the order of series, on which the last bit of a mean over the steps depends.
+        return float(deviation) * np.ascontiguousarray(walked.T)
 
     @property
     def setpoint_c(self) -> F64:
