@@ -144,8 +144,9 @@ def _table(run: RunFolder, content: Mapping[str, Any]) -> str:
     shares = [each.get("share") for each in content["controllers"]]
     if len(content["data_centers"]) > 1:
         rows.append(_row("all", content["total"], run.metrics["total"], has_own, shares))
+    unit = str(content["unit"]).replace("CO2", "CO₂")
     caption = (
-        f"Objective {content['objective']}: figures in {content['unit']}, less is better; the gap "
+        f"Objective {content['objective']}: figures in {unit}, less is better; the gap "
         "between bound and achieved in % of idle; shares of the achievable, 0 as good as idle "
         "commands and 100 as good as the achieved path"
     )

@@ -142,11 +142,10 @@ def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
         content: content of optimum.json.
     """
     dcs = content["data_centers"]
-    remarks = []
+    remarks = ["Achieved: what the simulator reached with all inputs known in advance."]
     if any(dc["bound_kind"] == _BOUND for dc in dcs):
-        remarks.append(
-            "Bound: with these inputs, no controller that ends as it began comes below it. "
-            "Achieved: what the simulator reached with all inputs known in advance."
+        remarks.insert(
+            0, "Bound: with these inputs, no controller that ends as it began comes below it."
         )
     remarks += [f"{dc['name']}: {dc['bound_kind']}" for dc in dcs if dc["bound_kind"] != _BOUND]
     remarks += [f"{dc['name']}: does not hold: {text}" for dc in dcs for text in dc["failures"]]
