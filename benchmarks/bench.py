@@ -43,6 +43,8 @@ HERE = Path(__file__).parent
 LIBRARIES = ("numpy", "taichi", "gymnasium", "pettingzoo", "numba")
 CURVE = (3, 25, 250, 2500, 25_000)
 """Data centers of 4,000 servers of the curve of cost against size: 1e4 to 1e8 servers."""
+ALL_SITES = "az,ca,ga,il,ny,tx,va,wa"
+"""Sites with a synthetic year."""
 BYTES_PER_SERVER_AT_WORK = 30
 """Of the largest size: layers, and what its build takes at the most."""
 
@@ -408,6 +410,19 @@ def starting(quick: bool) -> Iterator[Figure]:
                 yield Figure("start", name, ratio, at_most=at_most, absolute=beside)
 
 
+def optima(quick: bool) -> Iterator[Figure]:
+    """Known optima, from the import to the last run, in processes of their own."""
+    cases = [("ny,ca", 2, None)] if quick else [(ALL_SITES, 31, 500.0), ("ny", 365, 1000.0)]
+    for sites, days, at_most in cases:
+        found = child("optimum", sites, days)
+        name = f"{sites.count(',') + 1} sites, {days} days"
+        ratio = found["core_s"] / (1000.0 * found["yardstick_s"])
+        beside = f"{number(found['wall_s'])} s, {number(found['core_s'])} core s"
+        over = f"{name}, over 1,000 interpreter yardsticks"
+        yield Figure("optima", over, ratio, at_most=at_most, absolute=beside)
+        yield Figure("optima", f"{name}, memory", found["most_mb"], "MB", at_most=2000.0)
+
+
 def recording(quick: bool) -> Iterator[Figure]:
     """A month of simulators and environments with a recorder and without."""
     days, repeats = (1, 1) if quick else (31, 7)
@@ -578,7 +593,8 @@ def main() -> None:
     print(json.dumps(facts, indent=1))
     figures: list[Figure] = []
     # Environments first: steps of a process that has held gigabytes take a tenth longer.
-    for part in (environments, planned, kernel_and_peers, calls, scaling, starting, recording):
+    parts = environments, planned, kernel_and_peers, calls, scaling, starting, optima, recording
+    for part in parts:
         for figure in part(quick):
             show(figure, figures[-1].part if figures else "", quick)
             figures.append(figure)

@@ -86,6 +86,32 @@ def first_step(what: str) -> dict[str, float]:
     }
 
 
+def optimum(sites: str, days: int) -> dict[str, float]:
+    """Core time, time and memory of solving for the optimum of some sites from 1 July on.
+
+    Returns:
+        Time and core time of the process until the end and core time of the interpreter yardstick
+        right after it, all in s, and the most memory, in MB.
+    """
+    from recording import most_mb
+
+    from sdc_taichi.optimum import solve
+
+    base = sdc_taichi.load_config("corrected", ["site.start=07-01"])
+    names = sites.split(",")
+    configs = sdc_taichi.make_configs(base, count=len(names), sites=names)
+    begin = time.time()
+    solve(configs, steps=96 * days, cache=False)
+    spent_s, wall_s = time.process_time(), time.time() - begin
+    yardstick = {"yardstick": interpreter_loop()}
+    return {
+        "wall_s": wall_s,
+        "core_s": spent_s,
+        "yardstick_s": float(np.median(core_s(yardstick, 100)["yardstick"])),
+        "most_mb": most_mb(),
+    }
+
+
 def resident() -> int:
     """Memory of this process, bytes; Linux only."""
     import resource
@@ -152,7 +178,9 @@ def rate(what: str, size: list[int], seconds: float) -> float:
     return env.rate(call, 1, seconds)
 
 
-PARTS: dict[str, Callable[..., Any]] = {f.__name__: f for f in (first_step, memory, cycles, rate)}
+PARTS: dict[str, Callable[..., Any]] = {
+    f.__name__: f for f in (first_step, optimum, memory, cycles, rate)
+}
 
 if __name__ == "__main__":
     print(json.dumps(PARTS[sys.argv[1]](*json.loads(sys.argv[2]))))
