@@ -142,3 +142,49 @@ def test_one_peak_is_shared_by_load_and_battery() -> None:
     apart = [bound(problem(months=months, agents=(agent,))).figure for agent in AGENTS]
     assert bound(p).figure < min(apart)
     assert figure_of(p, plan(p)) == pytest.approx(bound(p).figure, rel=0.01)
+
+
+def in_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Solve windows of three to five times the deadline."""
+    for name, steps in (("LONGEST_BOUND", 40), ("LONGEST_PLAN", 24), ("AROUND", 16), ("AHEAD", 16)):
+        monkeypatch.setattr(f"sdc_taichi.optimum.linear_programme._{name}", steps)
+
+
+def weights_of_days(steps: int, first: int = 0) -> F64:
+    """Weights that vary within days of 24 steps and between them, 0 before the first scored."""
+    t = np.arange(steps)
+    return np.where(t < first, 0.0, 0.3 + 0.15 * np.sin(2 * np.pi * t / 24) + 0.02 * np.sin(t / 50))
+
+
+@pytest.mark.parametrize("first", [0, 10])
+def test_windows_bound_what_one_programme_bounds(
+    monkeypatch: pytest.MonkeyPatch, first: int
+) -> None:
+    weight = weights_of_days(200, first)
+    months = (BilledMonth(max(first, 0), 90, 4.0), BilledMonth(90, 200, 6.0))
+    # Work that crosses a border loses its age, of which there are four; months end at the other.
+    for billed, longest, share in ((), 40, 0.01), (months, 110, 0.03):
+        p = problem(200, kwh_weight=weight, scored_from=first, months=billed)
+        whole = bound(p).figure
+        with monkeypatch.context() as patch:
+            in_windows(patch)
+            patch.setattr("sdc_taichi.optimum.linear_programme._LONGEST_BOUND", longest)
+            parts = bound(p).figure
+        assert whole * (1 - share) < parts <= whole * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("first", [0, 10])
+def test_plans_of_windows_keep_queue_battery_and_ends(
+    monkeypatch: pytest.MonkeyPatch, first: int
+) -> None:
+    in_windows(monkeypatch)
+    p = problem(200, kwh_weight=weights_of_days(200, first), scored_from=first)
+    found = plan(p)
+    done, rest = run_queue(p, found.executed_tasks)
+    waiting = np.cumsum(p.work.arrived_tasks - done)
+    stored = np.cumsum(0.97 * found.charge_kwh - 1.04 * found.discharge_kwh)
+    np.testing.assert_allclose(done, found.executed_tasks, atol=1e-6)
+    assert rest <= (waiting[first - 1] if first else 0.0) + 1e-6
+    assert stored[-1] >= (stored[first - 1] if first else 0.0) - 1e-6
+    low = bound(p).figure
+    assert low <= figure_of(p, found) < low * 1.01

@@ -60,12 +60,13 @@ class Span:
     """Least energy stored after the last, in kWh; None is any."""
     end_tasks: float | None = None
     """Most work that waits after the last, in tasks; None is any."""
+    least_peaks_kw: tuple[float, ...] = ()
+    """Least power of each month that is charged for, in kW; 0 of all where it is empty."""
     as_after: int | None = None
     """Step, of all T, whose state at its end the last has to keep; None is none."""
-    kwh_values: tuple[tuple[int, float], ...] = ()
-    """Steps, of all T, and what a kWh stored at their end costs; ``first - 1`` is the start."""
-    task_values: tuple[tuple[int, float], ...] = ()
-    """Steps, of all T, and what a task waiting at their end costs; ``first - 1`` is the start."""
+    state_values: tuple[tuple[int, float, float], ...] = ()
+    """Steps, of all T, and what each task that waits and each kWh stored at their end costs;
+    ``first - 1`` is the start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +91,12 @@ class Dispatch:
     """What one task more that waits at the end of each step adds to the figure, (n,)."""
     kwh_price: F64
     """What one kWh more stored at the end of each step takes off the figure, (n,)."""
+    end_task_price: float
+    """What one task fewer to leave at the end adds, where that follows an earlier step."""
+    end_kwh_price: float
+    """What one kWh more to leave at the end adds, where that follows an earlier step."""
+    peaks_kw: tuple[float, ...]
+    """Power of each month that is charged for, in kW."""
 
 
 class DispatchProgramme:
@@ -155,12 +162,12 @@ class DispatchProgramme:
             return
         defer, drain, due = (np.flatnonzero(modes == m) for m in (DEFER, DRAIN, DUE))
         change, p = self._change, self._programme
-        leaves = {"deferred": change, "queue": -change}
         start = self._start_column("start_tasks")
+        leaves = {"deferred": change, "queue": -change, "start_tasks": -start}
         none = np.zeros(self._size)
-        p.equal("defer", none[defer], **_rows(leaves | {"start_tasks": start}, defer))
+        p.equal("defer", none[defer], **_rows(leaves, defer))
         p.equal("drain", none[drain], **_rows({"deferred": change}, drain))
-        both = {name: -m for name, m in (leaves | {"start_tasks": start}).items()}
+        both = {name: -m for name, m in leaves.items()}
         for name, rows in (("drained", drain), ("run", due)):
             p.at_most(name, none[rows], **_rows(both, rows))
         matrices, right = self._deadline()
@@ -195,6 +202,12 @@ class DispatchProgramme:
             stored_kwh=stored,
             task_price=found.prices.get("work", none),
             kwh_price=-found.prices.get("energy", none),
+            end_task_price=float(-found.prices.get("end_work", np.zeros(1))[0]),
+            end_kwh_price=float(-found.prices.get("end_energy", np.zeros(1))[0]),
+            peaks_kw=tuple(
+                float(values[f"peak_{k}"][0]) if f"peak_{k}" in values else 0.0
+                for k in range(len(self.problem.months))
+            ),
         )
 
     def _add_segments(self, curves: LoadCurves) -> None:
@@ -225,7 +238,7 @@ class DispatchProgramme:
         upper = np.full(n, limit)
         if span.end_tasks is not None:
             upper[-1] = min(limit, span.end_tasks)
-        p.variables("queue", n, upper=upper, cost=self._values(span.task_values))
+        p.variables("queue", n, upper=upper, cost=self._values(tasks=True))
         rows = {"queue": self._change, **self._of_tasks}
         if span.start_tasks != 0.0:
             given = span.start_tasks
@@ -234,7 +247,7 @@ class DispatchProgramme:
                 1,
                 lower=0.0 if given is None else given,
                 upper=limit if given is None else given,
-                cost=self._start_value(span.task_values),
+                cost=self._start_value(tasks=True),
             )
             rows["start_tasks"] = self._start_column("start_tasks")
         if work.most_dropped_tasks > 0:
@@ -290,7 +303,7 @@ class DispatchProgramme:
             n,
             lower=lower,
             upper=storage.capacity_kwh,
-            cost=self._values(span.kwh_values),
+            cost=self._values(tasks=False),
         )
         given = span.start_kwh
         p.variables(
@@ -298,7 +311,7 @@ class DispatchProgramme:
             1,
             lower=0.0 if given is None else given,
             upper=storage.capacity_kwh if given is None else given,
-            cost=self._start_value(span.kwh_values),
+            cost=self._start_value(tasks=False),
         )
         now, start_column = self._now, self._start_column("start_kwh")
         p.equal(
@@ -341,7 +354,8 @@ class DispatchProgramme:
             if first >= end or month.weight_per_kw == 0.0:
                 continue
             name = f"peak_{k}"
-            p.variables(name, 1, cost=month.weight_per_kw)
+            least = span.least_peaks_kw[k] if span.least_peaks_kw else 0.0
+            p.variables(name, 1, lower=least, cost=month.weight_per_kw)
             rows = np.arange(first, end) - span.first
             column = sparse.csr_array(np.full((len(rows), 1), -step_h))
             p.at_most(name, -self._base_kwh[rows], **_rows(bought, rows), **{name: column})
@@ -356,17 +370,19 @@ class DispatchProgramme:
         gain = eta_c * found.values["charge"] - eta_d * found.values["discharge"]
         return np.maximum(gain, 0.0) / eta_c, np.maximum(-gain, 0.0) / eta_d
 
-    def _values(self, values: tuple[tuple[int, float], ...]) -> F64:
-        """Cost of a unit of the state at the end of each step, (n,)."""
+    def _values(self, *, tasks: bool) -> F64:
+        """Cost of a task that waits, or of a kWh stored, at the end of each step, (n,)."""
         cost = np.zeros(self._size)
-        for step, value in values:
-            if self.span.first <= step < self.span.end:
-                cost[step - self.span.first] += value
+        for step, task, kwh in self.span.state_values:
+            if step >= self.span.first:
+                cost[step - self.span.first] += task if tasks else kwh
         return cost
 
-    def _start_value(self, values: tuple[tuple[int, float], ...]) -> float:
-        """Cost of a unit of the state before the first step."""
-        return sum(value for step, value in values if step == self.span.first - 1)
+    def _start_value(self, *, tasks: bool) -> float:
+        """Cost of a task that waits, or of a kWh stored, before the first step."""
+        before = self.span.first - 1
+        values = self.span.state_values
+        return sum(task if tasks else kwh for step, task, kwh in values if step == before)
 
     def _start_column(self, name: str) -> Matrix:
         """The state before the first step in the rows of changes, (n, 1)."""

@@ -19,6 +19,7 @@ from sdc_taichi.optimum.stage_cost import (
     stage_cost,
     step_weights,
 )
+from sdc_taichi.optimum.windows import bound_in_windows, plan_in_windows, window_ends
 from sdc_taichi.types import F64
 
 _WARM_UP_SHARE = 0.05
@@ -26,8 +27,14 @@ _WARM_UP_SHARE = 0.05
 _DEFERRAL_WEIGHT = 0.01
 """Weight of a task that enters the queue, over the mean cost of a task: hardly any, but enough that
 work leaves the queue no earlier than it has to."""
-_ROUNDS = 2
-"""How often the modes of a plan are found anew from the plan that they led to."""
+_LONGEST_BOUND = 3072
+"""Most steps of a bound's programme: a month of quarter hours. Time rises with their square."""
+_LONGEST_PLAN = 672
+"""Most steps of a plan's programme: a week of quarter hours."""
+_AROUND = 480
+"""Fewest steps on both sides of a border that tell its prices."""
+_AHEAD = 192
+"""Fewest steps that the plan of a window looks ahead."""
 _NEGLIGIBLE_TASKS = 1e-7
 """Work that a solver may leave for nothing."""
 
@@ -46,6 +53,12 @@ class Bound:
     """What one kWh more stored at the end of each step takes off the figure, (T,)."""
     executed_tasks: F64
     """Work that is done where the bound is reached, in tasks, (T,); no queue may be able to."""
+    kept_task_price: float
+    """What one task fewer to leave at the end adds, where the end keeps the state of a step."""
+    kept_kwh_price: float
+    """What one kWh more to leave at the end adds, where the end keeps the state of a step."""
+    peaks_kw: tuple[float, ...]
+    """Power of each month with a demand charge where the bound is reached, in kW."""
 
 
 def bound(problem: Problem, ends: Ends | None = None) -> Bound:
@@ -63,17 +76,28 @@ def bound(problem: Problem, ends: Ends | None = None) -> Bound:
     Raises:
         ConfigError: no plan keeps the limits.
     """
-    curves_of = load_curves if "load" in problem.agents else given_curves
     stage = stage_cost(problem)
-    curves = curves_of(problem, stage)
+    curves = _curves(problem, stage)
     span = _span(problem, ends)
-    found = _solve(problem, DispatchProgramme(problem, stage, curves, span))
+
+    def solve(part: Problem, cost: StageCost, of: Span) -> Dispatch:
+        known = curves if cost is stage else _curves(part, cost)
+        return _solve(part, DispatchProgramme(part, cost, known, of))
+
+    if span.end - span.first <= _LONGEST_BOUND:
+        found = solve(problem, stage, span)
+    else:
+        borders = window_ends(problem, span.first, _LONGEST_BOUND)
+        found = bound_in_windows(problem, stage, span, borders, _ahead(problem, _AROUND), solve)
     before = np.zeros(span.first)
     return Bound(
         figure=found.figure,
         task_price=np.concatenate([before, found.task_price]),
         kwh_price=np.concatenate([before, found.kwh_price]),
         executed_tasks=np.concatenate([before, found.executed_tasks]),
+        kept_task_price=found.end_task_price,
+        kept_kwh_price=found.end_kwh_price,
+        peaks_kw=found.peaks_kw,
     )
 
 
@@ -83,6 +107,8 @@ def plan(problem: Problem) -> Plan:
     In each step of the plan work only enters the queue, or only leaves it, or what leaves is what
     is due. Which of these is found from the bound's linear programme, and then anew from the plan
     that it led to; the best plan is kept. Setpoints are the cheapest of each step, without a ramp.
+    Plans of many steps are made window by window, with the peaks of the bound where there is a
+    demand charge.
 
     Args:
         problem: What is to be planned.
@@ -91,13 +117,27 @@ def plan(problem: Problem) -> Plan:
         ConfigError: no plan keeps the limits.
     """
     stage = stage_cost(problem, warm_up_share=_WARM_UP_SHARE)
-    curves_of = load_curves if "load" in problem.agents else given_curves
-    curves = curves_of(problem, stage)
+    curves = _curves(problem, stage)
     weighed = replace(problem, kwh_weight=step_weights(problem, _WARM_UP_SHARE)[0])
     span = _span(weighed, None)
     if problem.work.deadline_steps is not None:
         span = replace(span, deferred_before=np.zeros(problem.work.deadline_steps))
-    found = _plan_of_span(weighed, stage, curves, span)
+
+    def solve(part: Problem, cost: StageCost, of: Span) -> Dispatch:
+        return _plan_of_span(part, cost, curves, of)
+
+    in_one = "load" not in problem.agents or problem.work.deadline_steps is None
+    # An end that keeps the state of an earlier step is planned better with it.
+    in_one |= span.as_after is not None
+    longest = _LONGEST_BOUND if in_one else _LONGEST_PLAN
+    ahead = _ahead(problem, _AHEAD)
+    if problem.steps <= longest + ahead:
+        found = solve(weighed, stage, span)
+    else:
+        if span.as_after is not None or problem.months:
+            span = _with_prices(weighed, stage, curves, span)
+        borders = window_ends(problem, 0, longest)
+        found = plan_in_windows(weighed, stage, span, borders, ahead, solve)
     return Plan(
         executed_tasks=found.executed_tasks,
         setpoint_c=at_tasks(stage.executed_tasks, stage.setpoint_c, found.executed_tasks),
@@ -106,13 +146,38 @@ def plan(problem: Problem) -> Plan:
     )
 
 
+def _curves(problem: Problem, stage: StageCost) -> LoadCurves:
+    """Cost and energy by the work done, where load is planned, or at the work of idle commands."""
+    return load_curves(problem, stage) if "load" in problem.agents else given_curves(problem, stage)
+
+
+def _ahead(problem: Problem, least: int) -> int:
+    """Steps over which the state at one step matters to another: those of two deadlines."""
+    return max(least, 2 * (problem.work.deadline_steps or 0))
+
+
+def _with_prices(problem: Problem, stage: StageCost, curves: LoadCurves, span: Span) -> Span:
+    """A span with the peaks of its bound, and prices of the state that its end has to keep."""
+    relaxed = bound(problem)
+    span = replace(span, least_peaks_kw=relaxed.peaks_kw)
+    if span.as_after is None:
+        return span
+    held = (span.as_after, -relaxed.kept_task_price, relaxed.kept_kwh_price)
+    return replace(span, state_values=(held,))
+
+
 def _plan_of_span(problem: Problem, stage: StageCost, curves: LoadCurves, span: Span) -> Dispatch:
     """The best dispatch found of those that the queue can carry out."""
 
-    def programme() -> DispatchProgramme:
-        return DispatchProgramme(problem, stage, curves, span)
+    def restricted(modes: Modes) -> Dispatch | None:
+        programme = DispatchProgramme(problem, stage, curves, span)
+        programme.keep_modes(modes)
+        try:
+            return programme.solve()
+        except InfeasibleError:
+            return None
 
-    relaxed = programme()
+    relaxed = DispatchProgramme(problem, stage, curves, span)
     if "load" not in problem.agents or problem.work.deadline_steps is None:
         return _solve(problem, relaxed)
     steps = span.end - span.first
@@ -120,18 +185,18 @@ def _plan_of_span(problem: Problem, stage: StageCost, curves: LoadCurves, span: 
     late = 2.0 - np.arange(steps) / steps
     relaxed.add_deferral_weight(_DEFERRAL_WEIGHT * of_task * late)
     first = _solve(problem, relaxed)
-    best: Dispatch | None = None
-    for start in (_modes(problem, span, first), _queue_modes(problem, span, first)):
-        modes = start
-        for _ in range(_ROUNDS):
-            restricted = programme()
-            restricted.keep_modes(modes)
-            found = _solve(problem, restricted)
-            if best is None or found.figure < best.figure:
-                best = found
-            modes = _modes(problem, span, found)
-    assert best is not None
-    return best
+    found = [
+        restricted(_modes(problem, span, first)),
+        restricted(_queue_modes(problem, span, first)),
+    ]
+    plans = [each for each in found if each is not None]
+    if not plans:
+        # Work that waits already may be due in a step that was to defer; draining always goes.
+        drained = restricted(np.full(steps, DRAIN))
+        plans = [first if drained is None else drained]
+    best = min(plans, key=lambda each: each.figure)
+    again = restricted(_modes(problem, span, best))
+    return best if again is None or again.figure > best.figure else again
 
 
 def _span(problem: Problem, ends: Ends | None) -> Span:
