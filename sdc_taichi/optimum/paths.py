@@ -33,31 +33,14 @@ _STORED_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 """States of charge at the first scored step among which paths choose."""
 
 
-def paths_of(problem: Problem) -> dict[str, Targets]:
-    """Paths of a data center, by name, one data center each.
+def agents_of(problem: Problem) -> dict[str, tuple[Agent, ...]]:
+    """What each path of a data center moves, by its name.
 
     There is that of idle commands, one for each agent alone, and one for all of them together.
 
     Args:
         problem: The planning problem.
-
-    Raises:
-        ConfigError: No plan keeps the limits.
     """
-    return {name: path_of(problem, agents) for name, agents in _agents_of(problem).items()}
-
-
-def idle_paths(problem: Problem) -> dict[str, Targets]:
-    """Paths under idle commands, by the names of ``paths_of``.
-
-    Args:
-        problem: The planning problem.
-    """
-    return dict.fromkeys(_agents_of(problem), path_of(problem, ()))
-
-
-def _agents_of(problem: Problem) -> dict[str, tuple[Agent, ...]]:
-    """What each path moves, by its name."""
     named: dict[str, tuple[Agent, ...]] = {IDLE: ()}
     named |= {agent: (agent,) for agent in problem.agents}
     return named | ({JOINT: problem.agents} if len(problem.agents) > 1 else {})

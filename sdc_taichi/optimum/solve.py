@@ -18,11 +18,12 @@ from sdc_taichi.optimum.certificates import LARGEST_TABLE_ERROR, certificate
 from sdc_taichi.optimum.discrete import DiscretePlans, discrete_plans
 from sdc_taichi.optimum.discrete_run import run_discrete
 from sdc_taichi.optimum.eligibility import no_table_reasons, uncooled_reason
+from sdc_taichi.optimum.end_values import BoundOfEnds
 from sdc_taichi.optimum.entry import Cache, Entry
 from sdc_taichi.optimum.linear_programme import bound
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.paths import IDLE, JOINT, idle_paths, paths_of, with_battery_for
-from sdc_taichi.optimum.problem import AGENTS, Agent, Ends, Plan, Problem
+from sdc_taichi.optimum.paths import IDLE, JOINT, agents_of, path_of, with_battery_for
+from sdc_taichi.optimum.problem import AGENTS, Agent, Plan, Problem
 from sdc_taichi.optimum.result import Optimum, StoppedError
 from sdc_taichi.optimum.rollout import RollOut, Targets, repeated, roll_out
 from sdc_taichi.optimum.task import Task, checked_task
@@ -36,6 +37,8 @@ from sdc_taichi.types import F64, I64
 _LEAST_ENERGY_ERROR = 1e-6
 """Difference of the energy from what was planned for, as a share, below which no battery is planned
 again."""
+_BOUND = "bound"
+"""Name of the bound beside those of paths."""
 _AGAIN = "again"
 """Name of the path whose battery is planned for the energy that the simulator measured."""
 _POLL_S = 0.2
@@ -138,39 +141,10 @@ def _optimum(task: Task, entries: Sequence[Entry]) -> Optimum:
         load=paths("load"),
         cooling=paths("cooling"),
         battery=paths("battery"),
-        bound_of_ends=_BoundOfEnds(task, [entry.kind for entry in entries]),
+        bound_of_ends=BoundOfEnds(task, [entry.kind for entry in entries]),
         discrete=each("discrete") if task.discrete else None,
         discrete_complete=tuple(entry.discrete_complete for entry in entries if task.discrete),
     )
-
-
-class _BoundOfEnds:
-    """Bounds of data centers with given ends, computed when they are first asked for.
-
-    Args:
-        task: What was solved.
-        kinds: What the bound of each data center is, B.
-    """
-
-    def __init__(self, task: Task, kinds: Sequence[str]) -> None:
-        self._task, self._kinds = task, kinds
-        self._problem: tuple[int, Problem] | None = None
-        self._known: dict[tuple[int, Ends], float] = {}
-
-    def __call__(self, dc: int, ends: Ends) -> float:
-        """Bound of a data center, by its number, with given ends; nan where there is none."""
-        if self._kinds[dc].startswith("none"):
-            return float("nan")
-        if (dc, ends) not in self._known:
-            self._known[dc, ends] = bound(self._problem_of(dc), ends).figure
-        return self._known[dc, ends]
-
-    def _problem_of(self, dc: int) -> Problem:
-        """Planning problem of a data center; that of the last call is kept."""
-        if self._problem is None or self._problem[0] != dc:
-            part = self._task.part([dc])
-            self._problem = dc, part.problems(part.tables())[0]
-        return self._problem[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,18 +171,36 @@ class _Run:
     """Figure of the scored steps."""
 
 
-def _suggestion(problem: Problem, reason: str | None) -> _Suggestion:
-    """Bound and paths of a data center.
+def _suggested(given: tuple[Problem, str | None, str]) -> float | Targets | ConfigError:
+    """Bound or path of a data center; an error where no plan keeps the limits.
 
     Args:
-        problem: Its planning problem.
-        reason: Why its table does not hold all that a step costs; None where it does.
+        given: Its planning problem, why its table does not hold all that a step costs, and
+            ``_BOUND`` or the name of a path.
     """
+    problem, reason, name = given
     try:
-        figure = float("nan") if reason else bound(problem).figure
-        return _Suggestion(figure, reason, paths_of(problem))
+        if name != _BOUND:
+            return path_of(problem, agents_of(problem)[name])
+        return float("nan") if reason else bound(problem).figure
     except ConfigError as error:
-        return _Suggestion(float("nan"), str(error), idle_paths(problem))
+        return error
+
+
+def _suggestion(
+    problem: Problem, reason: str | None, found: Mapping[str, float | Targets | ConfigError]
+) -> _Suggestion:
+    """What is known of a data center, from its bound and its paths by name."""
+    errors = [each for each in found.values() if isinstance(each, ConfigError)]
+    if errors:
+        idle = path_of(problem, ())
+        return _Suggestion(
+            float("nan"), reason or str(errors[0]), dict.fromkeys(agents_of(problem), idle)
+        )
+    figure = found[_BOUND]
+    assert isinstance(figure, float)
+    paths = {name: path for name, path in found.items() if isinstance(path, Targets)}
+    return _Suggestion(figure, reason, paths)
 
 
 def _joint(problem: Problem, runs: Mapping[str, _Run]) -> _Run:
@@ -216,22 +208,22 @@ def _joint(problem: Problem, runs: Mapping[str, _Run]) -> _Run:
     return runs[JOINT if JOINT in runs else problem.agents[0]]
 
 
-def _discrete(problem: Problem, given: tuple[DataCenterConfig, F64, _Run]) -> DiscretePlans:
+def _discrete(given: tuple[Problem, DataCenterConfig, F64, _Run]) -> DiscretePlans:
     """Sequences of discrete actions, guided by a run of continuous ones.
 
     Args:
-        problem: The planning problem.
-        given: Config of the data center, work that arrives as a share of capacity, (T,), and the
-            run.
+        given: The planning problem, the config, work that arrives as a share of capacity, (T,), and
+            the run.
     """
-    config, demand, run = given
+    problem, config, demand, run = given
     done = run.done
     paths = (done.executed_tasks, done.setpoint_c, done.charge_kwh, done.discharge_kwh)
     return discrete_plans(problem, config, demand, guide=Plan(*(path[:, 0] for path in paths)))
 
 
-def _battery_again(problem: Problem, run: _Run) -> Targets:
+def _battery_again(given: tuple[Problem, _Run]) -> Targets:
     """The path of a run with a battery that suits the energy that the simulator measured."""
+    problem, run = given
     return with_battery_for(problem, run.path, run.done.facility_kwh[:, 0])
 
 
@@ -307,7 +299,7 @@ class _Work:
 
     def __init__(self, progress: Progress, stop: Callable[[], bool]) -> None:
         self._progress, self._stop = progress, stop
-        self._kept, self._missing, self._solved = 0, 0, 0
+        self._all = self._kept = self._missing = self._solved = self._size = 0
 
     def entries(self, task: Task, cache: Cache | None) -> list[Entry]:
         """What is known of each data center, B.
@@ -325,8 +317,9 @@ class _Work:
             known = {i: cache.find(key, task.steps) for i, key in enumerate(keys)}
             found = {i: entry for i, entry in known.items() if entry is not None}
         missing = [i for i in range(task.fleet.size) if i not in found]
-        self._kept, self._missing = len(found), len(missing)
+        self._all, self._kept, self._missing = len(keys), len(found), len(missing)
         for part in task.parts(missing):
+            self._size = len(part)
             for i, entry in zip(part, self._solve(task.part(part)), strict=True):
                 found[i] = entry
                 if cache is not None:
@@ -339,7 +332,7 @@ class _Work:
         """Entries of data centers whose tables fit into memory together, B."""
         steps = task.steps
         tables = task.tables(
-            lambda done, total: self._tell("tables", done * task.fleet.size / total, steps),
+            lambda done, total: self._tell("tables", done / total, steps),
             self._stop,
         )
         if not tables:
@@ -349,7 +342,7 @@ class _Work:
             of_config or uncooled_reason(problem.table, problem.work.idle_tasks / TASKS_PER_STEP)
             for of_config, problem in zip(no_table_reasons(task.fleet), problems, strict=True)
         ]
-        found = self._side_by_side(_suggestion, problems, reasons)
+        found = self._suggestions(problems, reasons)
         runs = self._run(task, [suggestion.paths for suggestion in found])
         self._plan_batteries_again(task, problems, runs)
         entries = [
@@ -368,10 +361,10 @@ class _Work:
         """Entries with the best paths of discrete actions, B."""
         demand = task.drivers.demand.at(task.start[:, None] + np.arange(task.steps))
         given = [
-            (config, demand[i], _joint(problems[i], runs[i]))
+            (problems[i], config, demand[i], _joint(problems[i], runs[i]))
             for i, config in enumerate(task.fleet.configs)
         ]
-        plans = self._side_by_side(_discrete, problems, given, "discrete actions")
+        plans = self._side_by_side(_discrete, given, "discrete actions")
         found = run_discrete(
             task.fleet,
             task.drivers,
@@ -403,48 +396,54 @@ class _Work:
         if not chosen:
             return
         plans = self._side_by_side(
-            _battery_again, [problems[i] for i in chosen], list(chosen.values())
+            _battery_again, [(problems[i], run) for i, run in chosen.items()], "programmes"
         )
         again = self._run(task.part(list(chosen)), [{_AGAIN: path} for path in plans])
         for i, of in zip(chosen, again, strict=True):
             runs[i].update(of)
 
-    def _side_by_side(
-        self,
-        plan: Callable[[Problem, _X], _Y],
-        problems: Sequence[Problem],
-        given: Sequence[_X],
-        stage: str = "programmes",
-    ) -> list[_Y]:
-        """What programmes find for each data center, B, several of them at a time.
+    def _suggestions(
+        self, problems: Sequence[Problem], reasons: Sequence[str | None]
+    ) -> list[_Suggestion]:
+        """Bounds and paths of data centers, B."""
+        names = [*reversed(agents_of(problems[0])), _BOUND]
+        known = list(zip(problems, reasons, strict=True))
+        given = [(*each, name) for each in known for name in names]
+        found = self._side_by_side(_suggested, given, "programmes")
+        return [
+            _suggestion(*each, dict(zip(names, found[i * len(names) :], strict=False)))
+            for i, each in enumerate(known)
+        ]
+
+    def _side_by_side(self, find: Callable[[_X], _Y], given: Sequence[_X], stage: str) -> list[_Y]:
+        """What a function finds, several calls at a time.
 
         Args:
-            plan: Solves the programmes of one data center.
-            problems: Their planning problems, B.
-            given: What else is known of each, B.
+            find: A function that leaves the interpreter to others for most of its time.
+            given: Argument of each call.
             stage: Name of the stage.
         """
         pool = ThreadPoolExecutor(runtime.ensure_started())
         try:
-            futures = [pool.submit(plan, *each) for each in zip(problems, given, strict=True)]
+            futures = [pool.submit(find, each) for each in given]
             waiting = set(futures)
             while waiting:
                 if self._stop():
                     raise self._stopped()
                 _, waiting = wait(waiting, timeout=_POLL_S)
-                self._tell(stage, len(problems) - len(waiting), 1)
+                share = 1.0 - len(waiting) / len(given)
+                self._progress(stage, self._solved + round(share * self._size), self._missing)
             return [future.result() for future in futures]
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 
-    def _tell(self, stage: str, data_centers: float, steps: int) -> None:
-        """Tell how much of a stage is done, counted in steps of data centers."""
-        done = self._solved + data_centers
+    def _tell(self, stage: str, share: float, steps: int) -> None:
+        """Tell how much of a stage of the present part is done, in steps of data centers."""
+        done = self._solved + share * self._size
         self._progress(stage, round(done * steps), self._missing * steps)
 
     def _stopped(self) -> StoppedError:
-        size = self._kept + self._missing - self._solved
-        return StoppedError(f"optima of {self._kept} of {size} data centers are kept")
+        return StoppedError(f"optima of {self._kept} of {self._all} data centers are kept")
 
     def _run(self, task: Task, paths: Sequence[Mapping[str, Targets]]) -> list[dict[str, _Run]]:
         """What the simulator does along the paths of each data center, by name, B.
@@ -460,7 +459,7 @@ class _Work:
         def on_step() -> None:
             nonlocal steps
             steps += 1
-            self._tell("runs", task.fleet.size * steps / task.steps, task.steps)
+            self._tell("runs", steps / task.steps, task.steps)
 
         found = roll_out(
             fleet,
