@@ -247,19 +247,8 @@ def facility_map(
         entries.setdefault(key, len(entries))
     which = np.array([entries[key] for key in keys])
     dcs = [keys.index(key) for key in entries]
-    low_c, high_c, most_k = _ranges(fleet, drivers, which, by_wet_bulb, margin_k)
-    steps = np.maximum(np.ceil((high_c - low_c) / weather_step_k), 1.0)
-    wet = int(steps.max()) + 1
-    lead_c = low_c[:, None] + weather_step_k * np.arange(wet)
-    intervals = np.full(len(dcs), float(_FEW - 1))
-    if fleet.models["plant"] == "air_side":
-        intervals = np.maximum(np.ceil(most_k / weather_step_k), _FEW - 1)
-    depression_step_k = most_k / intervals
-    depressions = int(intervals.max()) + 1
-    depression_k = depression_step_k[:, None] * np.arange(depressions)
-    first, second = np.broadcast_arrays(lead_c[:, :, None], depression_k[:, None, :])
-    outdoor_c = (first + second if by_wet_bulb else first).reshape(len(dcs), -1)
-    wet_bulb_c = (first if by_wet_bulb else first - second).reshape(len(dcs), -1)
+    reach = _ranges(fleet, drivers, which, by_wet_bulb, margin_k)
+    weather = _weather_nodes(*reach, weather_step_k, fleet.models["plant"])
     grid = TableGrid(utilisations, setpoint_step_k)
     levels = np.linspace(0.0, 1.0, utilisations)
     setpoints = max(len(grid.setpoint_c(fleet.configs[dc])) for dc in dcs)
@@ -267,16 +256,17 @@ def facility_map(
     tables: list[FacilityTable] = []
     for part in batches(fleet, nodes):
         own = slice(len(tables), len(tables) + len(part))
-        tables += tabulate(fleet, drivers, part, outdoor_c[own], wet_bulb_c[own], precision) or ()
-    shape = len(dcs), wet, depressions, utilisations, setpoints
+        at = weather.outdoor_c[own], weather.wet_bulb_c[own]
+        tables += tabulate(fleet, drivers, part, *at, precision) or ()
+    shape = len(dcs), *weather.shape, utilisations, setpoints
     return FacilityMap(
         which=which,
         by_wet_bulb=by_wet_bulb,
-        first_c=low_c,
-        last_c=low_c + weather_step_k * steps,
+        first_c=weather.first_c,
+        last_c=weather.last_c,
         step_k=weather_step_k,
-        depression_step_k=depression_step_k,
-        last_depression_k=most_k,
+        depression_step_k=weather.depression_step_k,
+        last_depression_k=weather.last_depression_k,
         utilisation=levels,
         setpoint_c=np.array([each.setpoint_c for each in nodes]),
         facility_kwh=np.stack([t.facility_kwh for t in tables]).reshape(shape),
@@ -284,6 +274,51 @@ def facility_map(
         allowed=np.stack(
             [_allowed(t, inlet_limit_c[dc]) for t, dc in zip(tables, dcs, strict=True)]
         ).reshape(shape),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _WeatherNodes:
+    """Nodes of the weather of M data centers, W of the first axis and P of the second."""
+
+    first_c: F64
+    """First node of the first axis, in C, (M,)."""
+    last_c: F64
+    """Last node of the first axis that is a data center's own, in C, (M,)."""
+    depression_step_k: F64
+    """Distance of the nodes of the second axis, in K, (M,)."""
+    last_depression_k: F64
+    """Last node of the second axis that is a data center's own, in K, (M,)."""
+    shape: tuple[int, int]
+    """Numbers of nodes of the two axes, W and P."""
+    outdoor_c: F64
+    """Dry bulb of all pairs of nodes, in C, (M, W P)."""
+    wet_bulb_c: F64
+    """Wet bulb of all pairs of nodes, in C, (M, W P)."""
+
+
+def _weather_nodes(
+    low_c: F64, high_c: F64, most_k: F64, step_k: float, plant: str
+) -> _WeatherNodes:
+    """Nodes from the lowest to the highest of the first axis, C, and to a depression, K, (M,)."""
+    steps = np.maximum(np.ceil((high_c - low_c) / step_k), 1.0)
+    few = np.full(len(low_c), _FEW - 1.0)
+    depressions = np.maximum(np.ceil(most_k / step_k), few) if plant == "air_side" else few
+    wet, dry = int(steps.max()) + 1, int(depressions.max()) + 1
+    depression_step_k = most_k / depressions
+    first, second = np.broadcast_arrays(
+        (low_c[:, None] + step_k * np.arange(wet))[:, :, None],
+        (depression_step_k[:, None] * np.arange(dry))[:, None, :],
+    )
+    towers = plant not in DRY_PLANTS
+    return _WeatherNodes(
+        first_c=low_c,
+        last_c=low_c + step_k * steps,
+        depression_step_k=depression_step_k,
+        last_depression_k=most_k,
+        shape=(wet, dry),
+        outdoor_c=(first + second if towers else first).reshape(len(low_c), -1),
+        wet_bulb_c=(first if towers else first - second).reshape(len(low_c), -1),
     )
 
 

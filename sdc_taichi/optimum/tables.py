@@ -122,14 +122,7 @@ def facility_tables(
     ]
     distinct = list(known.values())
     tables: dict[int, FacilityTable] = {}
-    if grid.utilisations is None:
-        counts = _fine_enough(fleet, drivers, distinct, start, steps, precision)
-    else:
-        counts = [grid.utilisations] * len(distinct)
-    nodes = [
-        Nodes(dc, np.linspace(0.0, 1.0, count), grid.setpoint_c(fleet.configs[dc]))
-        for dc, count in zip(distinct, counts, strict=True)
-    ]
+    nodes = _nodes(fleet, drivers, distinct, start, steps, grid, precision)
     for batch in batches(fleet, nodes):
         outdoor_c, wet_bulb_c = (
             _series_of(series, batch, start, steps)
@@ -183,36 +176,28 @@ def tabulate(
         setpoint_c=np.concatenate([np.tile(x.setpoint_c, len(x.utilisation)) for x in nodes]),
         precision=precision,
     )
-    barred = _throttles(fleet, facility, of)
-    steps = outdoor_c.shape[1]
-    facility_kwh, water_l = (np.empty((steps, len(place))) for _ in range(2))
-    unmet_w: F64 | None = None
-    for step in range(steps):
-        if stop is not None and stop():
-            facility.close()
-            return None
-        found = facility.at(outdoor_c[place, step], wet_bulb_c[place, step])
-        facility_kwh[step], water_l[step] = found.facility_kwh, found.water_l
-        short_w = np.where(barred, np.inf, found.unmet_w)
-        if unmet_w is None and short_w.any():
-            unmet_w = np.zeros((steps, len(place)))
-        if unmet_w is not None:
-            unmet_w[step] = short_w
-        if on_step is not None:
-            on_step(step + 1)
-    facility.close()
-    values = {
-        "facility_kwh": facility_kwh,
-        "water_l": water_l,
-        "inlet_max_c": facility.inlet_max_c[None],
-        "unmet_w": np.zeros((1, len(place))) if unmet_w is None else unmet_w,
-    }
+    try:
+        found = _through_weather(
+            facility,
+            place,
+            outdoor_c,
+            wet_bulb_c,
+            _throttles(fleet, facility, of),
+            on_step,
+            stop,
+        )
+    finally:
+        facility.close()
+    if found is None:
+        return None
+    found["inlet_max_c"] = facility.inlet_max_c[None]
     firsts = np.cumsum([0, *(each.copies for each in nodes)])
+    steps = outdoor_c.shape[1]
     return [
         FacilityTable(
             utilisation=each.utilisation,
             setpoint_c=each.setpoint_c,
-            **{name: _of_one(x, int(first), steps, each) for name, x in values.items()},
+            **{name: _of_one(x, int(first), steps, each) for name, x in found.items()},
         )
         for first, each in zip(firsts, nodes, strict=False)
     ]
@@ -269,6 +254,26 @@ def _what_decides(fleet: Fleet, drivers: Drivers, start: I64, dc: int) -> Hashab
     series = drivers.outdoor_c, drivers.wet_bulb_c
     weather = tuple((int(each.offsets[dc]), int(each.lengths[dc])) for each in series)
     return what_decides_facility(fleet, drivers, dc), weather, int(start[dc])
+
+
+def _nodes(
+    fleet: Fleet,
+    drivers: Drivers,
+    which: Sequence[int],
+    start: I64,
+    steps: int,
+    grid: TableGrid,
+    precision: Precision,
+) -> list[Nodes]:
+    """Nodes of some data centers; arguments as of ``facility_tables``."""
+    if grid.utilisations is None:
+        counts = _fine_enough(fleet, drivers, which, start, steps, precision)
+    else:
+        counts = [grid.utilisations] * len(which)
+    return [
+        Nodes(dc, np.linspace(0.0, 1.0, count), grid.setpoint_c(fleet.configs[dc]))
+        for dc, count in zip(which, counts, strict=True)
+    ]
 
 
 def _fine_enough(
@@ -328,6 +333,45 @@ def _series_of(series: FleetSeries, nodes: Sequence[Nodes], start: I64, steps: i
     which = np.array([each.dc for each in nodes])
     index = np.asarray(start)[which, None] + np.arange(steps)
     return series.values.take(series.offsets[which, None] + index % series.lengths[which, None])
+
+
+def _through_weather(
+    facility: SteadyFacility,
+    place: I64,
+    outdoor_c: F64,
+    wet_bulb_c: F64,
+    barred: Mask,
+    on_step: Callable[[int], None] | None,
+    stop: Callable[[], bool] | None,
+) -> dict[str, F64] | None:
+    """Energy, water and unmet load of copies, (T, B) each or (1, B), by their names in a table.
+
+    Args:
+        facility: B copies of data centers.
+        place: Row of the weather that each copy has, (B,).
+        outdoor_c: Dry bulb of each step, in C, (n, T).
+        wet_bulb_c: Wet bulb of each step, in C, (n, T).
+        barred: Whether racks of each copy would throttle, (B,).
+        on_step: Called after every step with the number of those done.
+        stop: Asked before every step; true ends with None.
+    """
+    copies, steps = len(place), outdoor_c.shape[1]
+    facility_kwh, water_l = (np.empty((steps, copies)) for _ in range(2))
+    # Mostly all heat is removed, and one row stands for all steps.
+    unmet_w = np.zeros((1, copies))
+    for step in range(steps):
+        if stop is not None and stop():
+            return None
+        found = facility.at(outdoor_c[place, step], wet_bulb_c[place, step])
+        facility_kwh[step], water_l[step] = found.facility_kwh, found.water_l
+        short_w = np.where(barred, np.inf, found.unmet_w)
+        if len(unmet_w) < steps and short_w.any():
+            unmet_w = np.zeros((steps, copies))
+        if short_w.any():
+            unmet_w[step] = short_w
+        if on_step is not None:
+            on_step(step + 1)
+    return {"facility_kwh": facility_kwh, "water_l": water_l, "unmet_w": unmet_w}
 
 
 def _throttles(fleet: Fleet, facility: SteadyFacility, of: I64) -> Mask:
