@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.optimum.battery_limits import battery_limits
 from sdc_taichi.optimum.linear_programme import bound, plan
 from sdc_taichi.optimum.problem import (
     AGENTS,
@@ -19,6 +20,8 @@ from sdc_taichi.optimum.problem import (
     Storage,
 )
 from sdc_taichi.optimum.stage_cost import stage_cost
+from sdc_taichi.plant.battery import BATTERIES
+from sdc_taichi.sim.facility import BATTERY_PARAMETERS
 from sdc_taichi.types import F64
 
 CLC = Storage("clc", 100.0, 0.0, 0.97, 1.04, 0.5, 1.0, -0.04, 1.0, 0.01, 0.0)
@@ -188,3 +191,190 @@ def test_plans_of_windows_keep_queue_battery_and_ends(
     assert stored[-1] >= (stored[first - 1] if first else 0.0) - 1e-6
     low = bound(p).figure
     assert low <= figure_of(p, found) < low * 1.01
+
+
+def battery_by_states(p: Problem, states: int) -> float:
+    """Least cost of a ``clc`` battery by a dynamic programme over stored energy."""
+    s, h = p.storage, p.step_h
+    grid = np.linspace(0.0, s.capacity_kwh, states)
+    rise = grid[None] - grid[:, None]
+    charge, discharge = np.maximum(rise, 0) / s.charge_efficiency, np.maximum(-rise, 0) / 1.04
+    most_in = np.minimum(0.5 * s.capacity_kwh / 0.97 * h, (s.capacity_kwh - grid) * h / 0.2825)
+    most_out = np.minimum(s.capacity_kwh / 1.04 * h, grid * h / 0.27)
+    allowed = (charge <= most_in[:, None] + 1e-9) & (discharge <= most_out[:, None] + 1e-9)
+    load = energy_kwh(p, p.work.idle_tasks)
+    rest = np.where(grid >= s.stored_kwh - 1e-9, 0.0, np.inf)
+    for weight, kwh in zip(p.kwh_weight[::-1], load[::-1], strict=True):
+        ok = allowed & (discharge <= kwh + 1e-9)
+        cost = np.where(ok, weight * (kwh + charge - discharge) + rest[None], np.inf)
+        rest = cost.min(axis=1)
+    return float(rest[np.abs(grid - s.stored_kwh).argmin()])
+
+
+def test_the_battery_agrees_with_a_dynamic_programme_over_stored_energy() -> None:
+    p = problem(agents=("battery", "cooling"), storage=replace(CLC, stored_kwh=40.0))
+    low, by_states = bound(p).figure, battery_by_states(p, 501)
+    # The grid cannot do all that the battery can.
+    assert low - 0.01 <= by_states <= low * 1.002
+
+
+def test_the_queue_without_deadline_agrees_with_a_dynamic_programme_over_its_length() -> None:
+    p = problem(agents=("load", "cooling"), storage=NO_BATTERY)
+    p = replace(p, work=replace(p.work, deadline_steps=None, queue_limit_tasks=40.0))
+    grid = np.linspace(0.0, 40.0, 161)
+    rest = np.where(grid > 0.0, np.inf, 0.0)
+    for t in range(p.steps)[::-1]:
+        done = p.work.arrived_tasks[t] + grid[:, None] - grid[None]
+        most = p.work.most_deferred_tasks[t]
+        ok = (done <= 100.0) & (done >= p.work.arrived_tasks[t] - most)
+        kwh = np.interp(done, p.table.utilisation * 100, p.table.facility_kwh[t, :, -1])
+        rest = np.where(ok, p.kwh_weight[t] * kwh + rest[None], np.inf).min(axis=1)
+    # Below the lines between nodes by the sag of the curve, and finer than the grid.
+    assert bound(p).figure == pytest.approx(rest[0], rel=2e-3)
+    assert bound(p).figure <= rest[0]
+
+
+@pytest.mark.parametrize(
+    "fewer_limits",
+    [
+        {"work": {"deadline_steps": None}},
+        {"work": {"deadline_steps": 12}},
+        {"work": {"queue_limit_tasks": 16.0}},
+        {"work": {"most_deferred_tasks": np.full(24, 60.0)}},
+        {"storage": {"capacity_kwh": 200.0}},
+        {"storage": {"charge_limit_c_rate": 3.0}},
+        {"storage": {"charge_efficiency": 1.0}},
+        {"storage": {"discharge_factor": 1.0}},
+        {"grid_limit_kw": np.inf},
+        {"inlet_limit_c": np.inf},
+        {"months": (BilledMonth(0, 24, 0.0),)},
+    ],
+    ids=str,
+)
+def test_a_limit_less_never_raises_the_bound(fewer_limits: dict[str, Any]) -> None:
+    p = problem(months=(BilledMonth(0, 24, 0.01),), grid_limit_kw=160.0, inlet_limit_c=22.5)
+    p = replace(p, work=replace(p.work, queue_limit_tasks=12.0, deadline_steps=1))
+    p = replace(p, storage=replace(CLC, charge_limit_c_rate=1.0))
+    freed = p
+    for name, value in fewer_limits.items():
+        inner = replace(getattr(p, name), **value) if isinstance(value, dict) else value
+        freed = replace(freed, **{name: inner})
+    assert bound(freed).figure < bound(p).figure * (1 - 1e-7)
+
+
+def test_prices_are_what_a_little_more_in_queue_and_store_changes() -> None:
+    p = problem()
+    p = replace(p, work=replace(p.work, deadline_steps=None))
+
+    def cost(tasks: float, kwh: float) -> float:
+        return bound(p, Ends(kwh, tasks, 50.0, 0.0)).figure
+
+    found = bound(p, Ends(50.0, 20.0, 50.0, 0.0))
+    # One task or kWh more at the end of the first step is one more at its beginning, where neither
+    # limits what the first step does.
+    assert found.task_price[0] > 0.0
+    assert found.kwh_price[0] > 0.0
+    per_task = [(cost(20.0 + d, 50.0) - cost(20.0, 50.0)) / d for d in (-1e-3, 1e-3)]
+    per_kwh = [(cost(20.0, 50.0) - cost(20.0, 50.0 + d)) / d for d in (-1e-3, 1e-3)]
+    assert per_task[0] - 1e-6 <= found.task_price[0] <= per_task[1] + 1e-6
+    assert per_kwh[1] - 1e-6 <= found.kwh_price[0] <= per_kwh[0] + 1e-6
+
+
+def test_ends_that_ask_for_more_cost_more() -> None:
+    p = problem(steps=48, scored_from=10, kwh_weight=weights_of_days(48, 10))
+    own = bound(p).figure
+    same = bound(p, Ends(30.0, 10.0, 30.0, 10.0)).figure
+    assert own <= same * (1 + 1e-9)
+    assert bound(p, Ends(30.0, 10.0, 60.0, 10.0)).figure > same
+    assert bound(p, Ends(30.0, 10.0, 30.0, 0.0)).figure > same
+    assert bound(p, Ends(30.0, 30.0, 30.0, 10.0)).figure > same
+
+
+def test_nothing_to_move_costs_what_idle_commands_cost() -> None:
+    p = problem(storage=NO_BATTERY)
+    idle = (p.kwh_weight * energy_kwh(p, p.work.arrived_tasks)).sum()
+    for still in (
+        replace(p.work, most_deferred_tasks=np.zeros(24)),
+        replace(p.work, queue_limit_tasks=0.0),
+    ):
+        fixed = replace(p, work=still)
+        assert bound(fixed).figure == pytest.approx(idle, rel=2e-3)
+        np.testing.assert_allclose(plan(fixed).executed_tasks, p.work.arrived_tasks, atol=1e-9)
+
+
+def test_constant_weights_leave_a_battery_with_losses_at_rest() -> None:
+    p = problem(kwh_weight=np.full(24, 0.3))
+    found = plan(p)
+    np.testing.assert_allclose(found.charge_kwh + found.discharge_kwh, 0.0, atol=1e-9)
+
+
+def test_one_step_can_only_do_what_arrives() -> None:
+    p = problem(steps=1)
+    np.testing.assert_allclose(plan(p).executed_tasks, p.work.arrived_tasks)
+    assert bound(p).figure == pytest.approx(
+        float((p.kwh_weight * energy_kwh(p, p.work.arrived_tasks)).sum()), rel=2e-3
+    )
+
+
+@pytest.mark.parametrize("model", ["clc", "paper", "released"])
+@pytest.mark.parametrize("start_share", [0.0, 0.4, 1.0])
+def test_a_model_never_beats_the_limits_of_its_battery(model: str, start_share: float) -> None:
+    rng = np.random.default_rng(5)
+    storage = replace(CLC, model=model, upper_v=0.9, lower_v=0.1)
+    limits = battery_limits(storage, 0.25, start_share * 100.0)
+    stored, load = np.full(50, start_share * 100.0), 120.0
+    parameters = {name: getattr(storage, name) for name in BATTERY_PARAMETERS}
+    for _ in range(40):
+        command = rng.choice([-1.0, 1.0, 0.3, -0.5], 50)
+        step = BATTERIES[model](
+            stored, command, capacity_kwh=100.0, load_kw=load, dt_h=0.25, **parameters
+        )
+        for done, lines, most in (
+            (step.charge_kwh, limits.charge, limits.most_charge_kwh),
+            (step.discharge_kwh, limits.discharge, limits.most_discharge_kwh),
+        ):
+            assert np.all(done <= most + 1e-9)
+            for line, slope in lines:
+                assert np.all(done <= np.maximum(line + slope * stored, 0.0) + 1e-9)
+        assert np.all(step.discharge_kwh <= limits.discharge_load_share * load * 0.25 + 1e-9)
+        gain = limits.charge_efficiency * step.charge_kwh
+        gain = gain - limits.discharge_factor * step.discharge_kwh
+        assert np.all(step.stored_kwh - stored <= gain + limits.rounding_kwh + 1e-9)
+        stored = step.stored_kwh
+
+
+def test_water_has_a_weight_of_its_own() -> None:
+    p = problem(storage=NO_BATTERY)
+    wet = replace(p.table, water_l=np.broadcast_to(100.0 - 10.0 * np.arange(8.0), (24, 11, 8)))
+    dry = replace(p.table, water_l=np.broadcast_to(30.0 + 10.0 * np.arange(8.0), (24, 11, 8)))
+    # Each kelvin saves 0.2 kWh, at 0.1 to 0.5, and takes or saves 10 l at 0.1.
+    assert np.all(stage_cost(replace(p, table=wet, litre_weight=0.1)).setpoint_c == 23.0)
+    assert np.all(stage_cost(replace(p, table=dry, litre_weight=0.1)).setpoint_c == 16.0)
+    free = bound(replace(p, table=wet)).figure
+    weighed = bound(replace(p, table=wet, litre_weight=0.1)).figure
+    assert weighed == pytest.approx(free + 24 * 30.0 * 0.1, rel=1e-6)
+
+
+def test_the_least_energy_between_setpoints_is_found() -> None:
+    p = problem()
+    kwh = 20.0 + 30.0 * p.table.utilisation[:, None] + 0.3 * (p.table.setpoint_c - 20.3) ** 2
+    p = replace(p, table=replace(p.table, facility_kwh=np.broadcast_to(kwh, (24, 11, 8))))
+    stage = stage_cost(p)
+    np.testing.assert_allclose(stage.setpoint_c, 20.3)
+    np.testing.assert_allclose(
+        stage.facility_kwh, np.broadcast_to(20.0 + 30.0 * p.table.utilisation, (24, 11))
+    )
+
+
+def test_work_beyond_what_can_be_cooled_is_not_planned() -> None:
+    p = problem()
+    unmet = np.where(p.table.utilisation[:, None] > 0.75, 1e3, np.zeros((24, 11, 8)))
+    p = replace(p, table=replace(p.table, unmet_w=unmet))
+    assert bound(p).executed_tasks.max() <= 80.0 + 1e-9
+
+
+def test_a_hall_that_nothing_cools_is_told_with_its_name() -> None:
+    p = problem()
+    p = replace(p, table=replace(p.table, unmet_w=np.full((24, 11, 8), np.inf)))
+    with pytest.raises(ConfigError, match="optimum of hall: in step 0"):
+        bound(p)
