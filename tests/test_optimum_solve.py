@@ -141,6 +141,16 @@ def test_discrete_actions_reach_a_figure_of_their_own(tmp_path: Path) -> None:
     assert solved(config_of("CA"), steps=8, cache=tmp_path).discrete is None
 
 
+def test_idle_setpoints_follow_their_schedule() -> None:
+    hours = ",".join(str(17 + hour % 3) for hour in range(24))
+    config = config_of("CA", f"hvac.setpoint.schedule_c=[{hours}]")
+    found = solved(config, steps=24, agents=("load",))
+    with Simulator(config) as sim:
+        score = begin_score(found, sim, 0)
+        simulate(sim, make_controller("idle", sim.fleet), found.steps, on_step=score.add)
+    np.testing.assert_allclose(found.idle, score.figure, rtol=1e-6)
+
+
 def test_halls_without_a_table_have_no_bound_and_say_so() -> None:
     found = solved(config_of("CA", "simulation.thermal=transient", preset="corrected"), steps=8)
     assert found.bound_kinds[0].startswith("none: ")

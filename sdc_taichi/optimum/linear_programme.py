@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.dispatch import DEFER, DRAIN, DUE, Dispatch, DispatchProgramme, Span
 from sdc_taichi.optimum.problem import Ends, Plan, Problem
 from sdc_taichi.optimum.programme import InfeasibleError
+from sdc_taichi.optimum.result import StoppedError
 from sdc_taichi.optimum.stage_cost import (
     LoadCurves,
     StageCost,
@@ -61,7 +63,9 @@ class Bound:
     """Power of each month with a demand charge where the bound is reached, in kW."""
 
 
-def bound(problem: Problem, ends: Ends | None = None) -> Bound:
+def bound(
+    problem: Problem, ends: Ends | None = None, *, stop: Callable[[], bool] | None = None
+) -> Bound:
     """The least figure of a problem with what only helps a controller taken as granted.
 
     Ramps of the setpoint are dropped, the cost of each step is the convex curve below its table,
@@ -72,15 +76,18 @@ def bound(problem: Problem, ends: Ends | None = None) -> Bound:
         ends: State at the first scored step and at the end. By default the state before the first
             step is that of the problem, and the end keeps at least the stored energy and at most
             the queue of the first scored step.
+        stop: Asked before every window; true ends the work.
 
     Raises:
         ConfigError: no plan keeps the limits.
+        StoppedError: ``stop`` was true.
     """
     stage = stage_cost(problem)
     curves = _curves(problem, stage)
     span = _span(problem, ends)
 
     def solve(part: Problem, cost: StageCost, of: Span) -> Dispatch:
+        _ask(stop)
         known = curves if cost is stage else _curves(part, cost)
         return _solve(part, DispatchProgramme(part, cost, known, of))
 
@@ -101,7 +108,7 @@ def bound(problem: Problem, ends: Ends | None = None) -> Bound:
     )
 
 
-def plan(problem: Problem) -> Plan:
+def plan(problem: Problem, *, stop: Callable[[], bool] | None = None) -> Plan:
     """A plan of low cost that a first-in-first-out queue and the battery can carry out.
 
     In each step of the plan work only enters the queue, or only leaves it, or what leaves is what
@@ -112,9 +119,11 @@ def plan(problem: Problem) -> Plan:
 
     Args:
         problem: What is to be planned.
+        stop: Asked before every window; true ends the work.
 
     Raises:
         ConfigError: no plan keeps the limits.
+        StoppedError: ``stop`` was true.
     """
     stage = stage_cost(problem, warm_up_share=_WARM_UP_SHARE)
     curves = _curves(problem, stage)
@@ -124,6 +133,7 @@ def plan(problem: Problem) -> Plan:
         span = replace(span, deferred_before=np.zeros(problem.work.deadline_steps))
 
     def solve(part: Problem, cost: StageCost, of: Span) -> Dispatch:
+        _ask(stop)
         return _plan_of_span(part, cost, curves, of)
 
     in_one = "load" not in problem.agents or problem.work.deadline_steps is None
@@ -135,7 +145,7 @@ def plan(problem: Problem) -> Plan:
         found = solve(weighed, stage, span)
     else:
         if span.as_after is not None or problem.months:
-            span = _with_prices(weighed, stage, curves, span)
+            span = _with_prices(weighed, span, stop)
         borders = window_ends(problem, 0, longest)
         found = plan_in_windows(weighed, stage, span, borders, ahead, solve)
     return Plan(
@@ -156,9 +166,19 @@ def _ahead(problem: Problem, least: int) -> int:
     return max(least, 2 * (problem.work.deadline_steps or 0))
 
 
-def _with_prices(problem: Problem, stage: StageCost, curves: LoadCurves, span: Span) -> Span:
+def _ask(stop: Callable[[], bool] | None) -> None:
+    """Go on unless the work is to end.
+
+    Raises:
+        StoppedError: ``stop`` was true.
+    """
+    if stop is not None and stop():
+        raise StoppedError("linear programmes were stopped")
+
+
+def _with_prices(problem: Problem, span: Span, stop: Callable[[], bool] | None) -> Span:
     """A span with the peaks of its bound, and prices of the state that its end has to keep."""
-    relaxed = bound(problem)
+    relaxed = bound(problem, stop=stop)
     span = replace(span, least_peaks_kw=relaxed.peaks_kw)
     if span.as_after is None:
         return span

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -46,7 +47,9 @@ def agents_of(problem: Problem) -> dict[str, tuple[Agent, ...]]:
     return named | ({JOINT: problem.agents} if len(problem.agents) > 1 else {})
 
 
-def path_of(problem: Problem, agents: tuple[Agent, ...]) -> Targets:
+def path_of(
+    problem: Problem, agents: tuple[Agent, ...], stop: Callable[[], bool] | None = None
+) -> Targets:
     """A good path that moves some agents and leaves the others idle.
 
     Work comes from the linear programme, setpoints from the dynamic programme for that work, and
@@ -55,10 +58,15 @@ def path_of(problem: Problem, agents: tuple[Agent, ...]) -> Targets:
     Args:
         problem: The planning problem.
         agents: What the path may move.
+        stop: Asked now and then; true ends the work.
+
+    Raises:
+        ConfigError: No plan keeps the limits.
+        StoppedError: ``stop`` was true.
     """
     executed = problem.work.idle_tasks
     if "load" in agents:
-        executed = plan(replace(problem, agents=agents)).executed_tasks
+        executed = plan(replace(problem, agents=agents), stop=stop).executed_tasks
     return _path(problem, agents, executed)
 
 

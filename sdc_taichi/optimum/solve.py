@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from threading import Event
 from typing import TypeVar
 
 import numpy as np
@@ -171,18 +172,24 @@ class _Run:
     """Figure of the scored steps."""
 
 
-def _suggested(given: tuple[Problem, str | None, str]) -> float | Targets | ConfigError:
+def _suggested(
+    given: tuple[Problem, str | None, str], stop: Callable[[], bool]
+) -> float | Targets | ConfigError:
     """Bound or path of a data center; an error where no plan keeps the limits.
 
     Args:
         given: Its planning problem, why its table does not hold all that a step costs, and
             ``_BOUND`` or the name of a path.
+        stop: Asked now and then; true ends the work.
+
+    Raises:
+        StoppedError: ``stop`` was true.
     """
     problem, reason, name = given
     try:
         if name != _BOUND:
-            return path_of(problem, agents_of(problem)[name])
-        return float("nan") if reason else bound(problem).figure
+            return path_of(problem, agents_of(problem)[name], stop)
+        return float("nan") if reason else bound(problem, stop=stop).figure
     except ConfigError as error:
         return error
 
@@ -208,7 +215,9 @@ def _joint(problem: Problem, runs: Mapping[str, _Run]) -> _Run:
     return runs[JOINT if JOINT in runs else problem.agents[0]]
 
 
-def _discrete(given: tuple[Problem, DataCenterConfig, F64, _Run]) -> DiscretePlans:
+def _discrete(
+    given: tuple[Problem, DataCenterConfig, F64, _Run], _stop: Callable[[], bool]
+) -> DiscretePlans:
     """Sequences of discrete actions, guided by a run of continuous ones.
 
     Args:
@@ -221,7 +230,7 @@ def _discrete(given: tuple[Problem, DataCenterConfig, F64, _Run]) -> DiscretePla
     return discrete_plans(problem, config, demand, guide=Plan(*(path[:, 0] for path in paths)))
 
 
-def _battery_again(given: tuple[Problem, _Run]) -> Targets:
+def _battery_again(given: tuple[Problem, _Run], _stop: Callable[[], bool]) -> Targets:
     """The path of a run with a battery that suits the energy that the simulator measured."""
     problem, run = given
     return with_battery_for(problem, run.path, run.done.facility_kwh[:, 0])
@@ -415,17 +424,20 @@ class _Work:
             for i, each in enumerate(known)
         ]
 
-    def _side_by_side(self, find: Callable[[_X], _Y], given: Sequence[_X], stage: str) -> list[_Y]:
+    def _side_by_side(
+        self, find: Callable[[_X, Callable[[], bool]], _Y], given: Sequence[_X], stage: str
+    ) -> list[_Y]:
         """What a function finds, several calls at a time.
 
         Args:
-            find: A function that leaves the interpreter to others for most of its time.
+            find: A function of its argument and of what to ask whether to stop, which leaves the
+                interpreter to others for most of its time.
             given: Argument of each call.
             stage: Name of the stage.
         """
-        pool = ThreadPoolExecutor(runtime.ensure_started())
+        pool, ends = ThreadPoolExecutor(runtime.ensure_started()), Event()
         try:
-            futures = [pool.submit(find, each) for each in given]
+            futures = [pool.submit(find, each, ends.is_set) for each in given]
             waiting = set(futures)
             while waiting:
                 if self._stop():
@@ -435,6 +447,7 @@ class _Work:
                 self._progress(stage, self._solved + round(share * self._size), self._missing)
             return [future.result() for future in futures]
         finally:
+            ends.set()
             pool.shutdown(wait=False, cancel_futures=True)
 
     def _tell(self, stage: str, share: float, steps: int) -> None:
