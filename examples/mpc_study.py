@@ -10,7 +10,7 @@ a week is run and not scored. All inputs are synthetic years.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from optimum_study import HELD_OUT, RULES, SITES, STEPS_PER_DAY, data_centers, week_starts
 
@@ -40,8 +40,8 @@ HEAD = (
 )
 
 
-def study(sites: Sequence[str], weeks: Sequence[int], days: int, objective: str) -> list[str]:
-    """Lines of the table.
+def study(sites: Sequence[str], weeks: Sequence[int], days: int, objective: str) -> Iterator[str]:
+    """Lines of the table, each as soon as it is known.
 
     Args:
         sites: the sites.
@@ -62,7 +62,7 @@ def study(sites: Sequence[str], weeks: Sequence[int], days: int, objective: str)
         )
         idle = found.idle.sum()
         best, bound = (100.0 * (x.sum() / idle - 1.0) for x in (found.achieved, found.bound))
-        lines = [f"achieved {best:.2f} %, bound {bound:.2f} %", "", HEAD, "|---" * 8 + "|"]
+        yield from (f"achieved {best:.2f} %, bound {bound:.2f} %", "", HEAD, "|---" * 8 + "|")
         for name, error in CONTROLLERS:
             spec = f"{name}{suffix}" if "mpc" in name else name
             controller = make_controller(spec, sim.fleet)
@@ -75,12 +75,11 @@ def study(sites: Sequence[str], weeks: Sequence[int], days: int, objective: str)
             )
             broken = sum(bool(each) for each in reached.broken)
             known = "perfect" if error == PERFECT else "10 %, 1 K"
-            lines.append(
+            yield (
                 f"| {spec.replace(',', ', ')} | {known} | {plain:.2f} | {valued:.2f} "
                 f"| {100.0 * reached.total_share:.1f} | {stored:.0f} | {waiting:.0f} "
                 f"| {broken} |"
             )
-    return lines
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -92,7 +91,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--days", type=int, default=7)
     parser.add_argument("--objective", default="carbon")
     given = parser.parse_args(arguments)
-    print("\n".join(study(given.sites, given.weeks, given.days, given.objective)))
+    for line in study(given.sites, given.weeks, given.days, given.objective):
+        print(line, flush=True)
 
 
 if __name__ == "__main__":

@@ -190,17 +190,16 @@ def _follow_queue(plan: ti.template(), dc):
 def _work_step(plan: ti.template(), dc, at, command, waiting):
     """Work that a step does, leaves waiting, and is late with or drops, in tasks."""
     step = plan.steps[at]
-    capacity = step.capacity
+    due = ti.max(waiting - step.not_due, 0.0)
+    forced = ti.min(due, step.most_due)
+    capacity, waiting_still = step.capacity - forced, waiting - forced
     now = ti.min(step.arrived - ti.max(-command, 0.0) * step.flexible, capacity)
     held_back = step.arrived - now
-    deferred = ti.min(held_back, ti.max(plan.dcs[dc].limit - waiting, 0.0))
-    most = ti.min(waiting, step.most_drained)
+    deferred = ti.min(held_back, ti.max(plan.dcs[dc].limit - waiting_still, 0.0))
+    most = ti.min(waiting_still, step.most_drained)
     drained = ti.min(most, ti.max(command, 0.0) * (capacity - now))
-    left = waiting + deferred - drained
-    due = ti.max(left - step.most_waiting, 0.0)
-    forced = ti.min(due, capacity - now - drained)
     late = held_back - deferred + due - forced
-    return now + drained + forced, left - forced, late
+    return now + drained + forced, waiting_still + deferred - drained, late
 
 
 @ti.func

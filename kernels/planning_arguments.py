@@ -19,7 +19,8 @@ STEP_ROWS = {
     "flexible": "work that may be deferred, in tasks",
     "capacity": "work that the step can do, in tasks",
     "most_drained": "work that a command can take out of the queue, in tasks",
-    "most_waiting": "work that may wait at the end of the step without being late, in tasks",
+    "most_due": "due work that the step can do, in tasks",
+    "not_due": "most work in the queue before the step that need not run in it, in tasks",
     "spacing": "distance of levels of the queue at the end of the step, in tasks",
 }
 """Inputs of each coming step of a data center."""

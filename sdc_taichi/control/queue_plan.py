@@ -148,12 +148,13 @@ class QueuePlanner:
         arrived = demand * TASKS_PER_STEP
         flexible = arrived * self._share
         capacity = np.broadcast_to(self._cap * TASKS_PER_STEP, demand.shape)
-        most_drained = np.full(demand.shape, UNLIMITED_TASKS)
+        most_drained, most_due = np.full(demand.shape, UNLIMITED_TASKS), capacity
         if self._model == "tasks":
             # Whole tasks; work beyond the capacity runs all the same.
             flexible = np.floor(flexible)
             arrived = np.ceil(arrived * (1.0 - self._share)) + flexible
             capacity, most_drained = np.maximum(np.floor(capacity), arrived), flexible
+            most_due = capacity - arrived
         held_back = np.maximum(flexible, arrived - capacity)
         lead, depression = self._places(weather)
         most_waiting = (waiting[:, None] - due) + self._not_due(held_back)
@@ -167,7 +168,8 @@ class QueuePlanner:
             "flexible": flexible,
             "capacity": capacity,
             "most_drained": most_drained,
-            "most_waiting": most_waiting,
+            "most_due": most_due,
+            "not_due": most_waiting - held_back,
             "spacing": np.where(reached > 0, reached, 1.0) / (LEVELS - 1),
         }
 
