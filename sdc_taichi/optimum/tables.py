@@ -12,6 +12,7 @@ from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, allowable_c
 from sdc_taichi.hall.protection import Mask
 from sdc_taichi.optimum.problem import FacilityTable
+from sdc_taichi.plant.plants import DRY_PLANTS
 from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
@@ -62,8 +63,9 @@ class TableGrid:
     utilisations: int | None = None
     """Number of utilisations, evenly from 0 to 1, 2..1,001; None is the least of ``UTILISATIONS``
     that is fine enough for the hall, see ``MOST_ERROR``."""
-    setpoint_step_k: float = 0.5
-    """Largest distance of setpoints, in K, 0.01..50."""
+    setpoint_step_k: float | None = None
+    """Largest distance of setpoints, in K, 0.01..50; None is 0.5 K with a tower, and half of that
+    for plants without, whose energy bends more along the setpoint."""
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -73,13 +75,16 @@ class TableGrid:
         """
         if self.utilisations is not None:
             whole_number("table: utilisations", self.utilisations, 2, 1001)
-        if not 0.01 <= self.setpoint_step_k <= 50.0:
-            raise ConfigError(f"table: setpoint_step_k {self.setpoint_step_k:g}; valid is 0.01..50")
+        step_k = self.setpoint_step_k
+        if step_k is not None and not 0.01 <= step_k <= 50.0:
+            raise ConfigError(f"table: setpoint_step_k {step_k:g}; valid is 0.01..50")
 
     def setpoint_c(self, config: DataCenterConfig) -> F64:
         """Setpoints from the lowest to the highest of a data center, in C, (J,)."""
-        setpoint = config.hvac.setpoint
-        intervals = int(np.ceil((setpoint.max_c - setpoint.min_c) / self.setpoint_step_k - 1e-9))
+        setpoint, step_k = config.hvac.setpoint, self.setpoint_step_k
+        if step_k is None:
+            step_k = 0.25 if config.hvac.plant_in_use in DRY_PLANTS else 0.5
+        intervals = int(np.ceil((setpoint.max_c - setpoint.min_c) / step_k - 1e-9))
         return np.linspace(setpoint.min_c, setpoint.max_c, intervals + 1)
 
 
