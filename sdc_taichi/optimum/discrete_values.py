@@ -25,6 +25,8 @@ from sdc_taichi.types import F64
 
 TARGETS = 10
 """Parts of queue and store that are tried as what there is at the first scored step."""
+FULL_SHARE = 0.9
+"""Share of the capacity up to which the energy at the first scored step is chosen."""
 QUEUE_LEVELS = 201
 """Levels of the queue at which the rest of a run is costed."""
 STORE_LEVELS = 121
@@ -225,27 +227,26 @@ def _of_queue(
         return np.array([0.0]), np.zeros((problem.steps + 1, 1)), 0.0
     levels = np.linspace(0.0, most, QUEUE_LEVELS)
     command, nothing = model.commands["load"], np.zeros(1)
+    # Energy of a task, at most what a full step takes per task.
+    price = costs.shortage * float(problem.table.facility_kwh.max()) / TASKS_PER_STEP
     nodes = problem.table.utilisation
 
     def step(t: int) -> tuple[F64, F64]:
-        started, deferred, dequeued, _ = model.move_work(levels[:, None], nothing, command, t)
+        started, deferred, dequeued, dropped = model.move_work(levels[:, None], nothing, command, t)
         of_nodes = costs.of_nodes(t, guide.bus_kwh[t])
         if "cooling" in problem.agents:
             best = of_nodes.min(axis=1)
         else:
             at = table_place(problem, nodes, np.asarray(problem.idle_setpoint_c[t]))
             best = read_table(of_nodes, at)
-        cost = np.interp(started / TASKS_PER_STEP, nodes, best)
+        cost = np.interp(started / TASKS_PER_STEP, nodes, best) + price * dropped
         return cost, levels[:, None] + deferred - dequeued
 
-    # Energy of a task, at most what a full step takes per task.
-    price = costs.shortage * float(problem.table.facility_kwh.max()) / TASKS_PER_STEP
-
     def left_over(targets: F64) -> F64:
-        return np.asarray(price * np.maximum(levels - targets[:, None], 0.0))
+        return _penalty(price, levels[-1], levels - targets[:, None])
 
     end_tasks = None if ends is None else ends.end_tasks
-    return levels, *_back(problem, levels, 0.0, end_tasks, left_over, step)
+    return levels, *_back(problem, levels, 0.0, end_tasks, most, left_over, step)
 
 
 def _of_store(
@@ -263,10 +264,23 @@ def _of_store(
         return costs.of_grid(t, grid_kwh), after
 
     def missing(targets: F64) -> F64:
-        return np.asarray(costs.shortage * np.maximum(targets[:, None] - levels, 0.0))
+        return _penalty(costs.shortage, levels[-1], targets[:, None] - levels)
 
     end_kwh = None if ends is None else ends.end_kwh
-    return levels, *_back(problem, levels, storage.stored_kwh, end_kwh, missing, step)
+    # The last part of a battery takes ever longer to fill, so that no run begins and ends there.
+    most_kwh = FULL_SHARE * storage.capacity_kwh
+    return levels, *_back(problem, levels, storage.stored_kwh, end_kwh, most_kwh, missing, step)
+
+
+def _penalty(price: float, most: float, short: F64) -> F64:
+    """Cost of what is short at the end, (K, levels): anything at all costs more than all the rest.
+
+    Args:
+        price: Price that is higher than that of any step.
+        most: Most that can be short.
+        short: What is short by target and level, below 0 where there is more, (K, levels).
+    """
+    return np.where(short > 0.0, price * (most + short), 0.0)
 
 
 def _back(
@@ -274,6 +288,7 @@ def _back(
     levels: F64,
     start: float,
     end: float | None,
+    most: float,
     terminal: Callable[[F64], F64],
     step: _Step,
 ) -> tuple[F64, float]:
@@ -288,22 +303,30 @@ def _back(
         levels: Levels of the quantity.
         start: Level before the first step.
         end: Level to be left at the end; None is the target.
+        most: Highest target that is chosen.
         terminal: Cost of levels at the end, (K, levels), by what is to be left, (K,).
         step: Costs of commands in a step and the levels that they lead to, (levels, commands) each.
     """
     begin, last = problem.scored_from, problem.steps
     if begin == 0 or end is not None:
-        left = start if end is None else end
+        left = _nearest(levels, start) if end is None else end
         found = _recursion(terminal(np.array([left])), levels, step, 0, last)
         return found[:, 0], left
-    targets = levels[:: len(levels) // TARGETS]
+    targets = levels[levels <= most]
+    targets = targets[:: max(len(targets) // TARGETS, 1)]
     of_target = _recursion(terminal(targets), levels, step, begin, last)[0]
     cyclic = [np.interp(x, levels, row) for x, row in zip(targets, of_target, strict=True)]
-    value = np.interp(levels, targets, cyclic)
+    beyond = np.maximum(levels - targets[-1], 0.0)
+    value = np.interp(levels, targets, cyclic) + terminal(targets[-1:]).max() * beyond / levels[-1]
     before = _recursion(value[None], levels, step, 0, begin)[:, 0]
-    target = _follow(before, levels, start, step)
+    target = _nearest(levels, _follow(before, levels, start, step))
     found = _recursion(terminal(np.array([target])), levels, step, begin, last)[1:, 0]
     return np.concatenate([before, found]), target
+
+
+def _nearest(levels: F64, value: float) -> float:
+    """Level that is nearest to a value: what is short of a level is told apart from what is not."""
+    return float(levels[np.abs(levels - value).argmin()])
 
 
 def _follow(values: F64, levels: F64, start: float, step: _Step) -> float:

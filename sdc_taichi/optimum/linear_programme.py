@@ -24,8 +24,9 @@ from sdc_taichi.optimum.stage_cost import (
 from sdc_taichi.optimum.windows import bound_in_windows, plan_in_windows, window_ends
 from sdc_taichi.types import F64
 
-_WARM_UP_SHARE = 0.05
-"""Weight of steps that are not scored, so that plans do nothing odd in them."""
+_WARM_UP_SHARE = 1e-3
+"""Weight of steps that are not scored, so that plans do nothing odd in them; with much more of it,
+plans would not fill batteries before the steps that are scored."""
 _DEFERRAL_WEIGHT = 0.01
 """Weight of a task that enters the queue, over the mean cost of a task: hardly any, but enough that
 work leaves the queue no earlier than it has to."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,12 @@ _ATTEMPTS: tuple[tuple[str, dict[str, Any]], ...] = (
 
 The dual simplex method takes a third less with Devex pricing; presolve now and then takes fifty
 times as long as all the rest. The interior point method takes several times as long.
+"""
+_RELIEFS = (0.0, 1e-7, 1e-6)
+"""By how much right-hand sides are raised for the attempts, over the largest of them.
+
+Rows that hold by rounding alone, as those of a battery that is full at the beginning, may keep the
+solver from telling that it has found an optimum. Raised, they allow more, so that a bound is one.
 """
 _INFEASIBLE = 2
 """Status of ``scipy.optimize.linprog`` for rows that contradict each other."""
@@ -126,11 +133,12 @@ class Programme:
         bounds = np.stack([np.concatenate(self._lower), np.concatenate(self._upper)], axis=1)
         if np.any(bounds[:, 0] > bounds[:, 1]):
             raise InfeasibleError
-        for method, options in _ATTEMPTS:
+        room = 0.0 if upper_right is None else max(1.0, float(np.abs(upper_right).max()))
+        for relief, (method, options) in product(_RELIEFS, _ATTEMPTS):
             found = linprog(
                 np.concatenate(list(self._cost.values())),
                 A_ub=upper,
-                b_ub=upper_right,
+                b_ub=None if upper_right is None else upper_right + relief * room,
                 A_eq=equal,
                 b_eq=equal_right,
                 bounds=bounds,

@@ -40,6 +40,8 @@ _LEAST_ENERGY_ERROR = 1e-6
 again."""
 _BOUND = "bound"
 """Name of the bound beside those of paths."""
+_SOLVER_ERROR = 1e-6
+"""Error of programmes and of what paths leave at the end, as a share of the bound."""
 _AGAIN = "again"
 """Name of the path whose battery is planned for the energy that the simulator measured."""
 _POLL_S = 0.2
@@ -267,8 +269,8 @@ def _entry(problem: Problem, suggestion: _Suggestion, runs: Mapping[str, _Run]) 
     return Entry(
         idle=idle.figure,
         idle_dropped_tasks=idle.dropped_tasks,
-        # By as much as tables were found to differ from the simulator.
-        bound=suggestion.bound - error * abs(suggestion.bound),
+        # By as much as tables were found to differ from the simulator, and solvers may err.
+        bound=suggestion.bound - (error + _SOLVER_ERROR) * abs(suggestion.bound),
         achieved=certificates[best].figure,
         alone={
             agent: certificates[agent if agent in valid else IDLE].figure
