@@ -378,3 +378,11 @@ def test_a_hall_that_nothing_cools_is_told_with_its_name() -> None:
     p = replace(p, table=replace(p.table, unmet_w=np.full((24, 11, 8), np.inf)))
     with pytest.raises(ConfigError, match="optimum of hall: in step 0"):
         bound(p)
+
+
+def test_whole_tasks_are_drained_no_faster_than_the_flexible_work_of_a_step() -> None:
+    p = problem(steps=48, agents=("load", "cooling"))
+    p = replace(p, work=replace(p.work, model="tasks"))
+    drained = plan(p).executed_tasks - p.work.arrived_tasks
+    assert drained.max() > 5.0
+    assert np.all(drained <= p.work.most_deferred_tasks + 1e-9)

@@ -170,6 +170,10 @@ class DispatchProgramme:
         both = {name: -m for name, m in leaves.items()}
         for name, rows in (("drained", drain), ("run", due)):
             p.at_most(name, none[rows], **_rows(both, rows))
+        if self.problem.work.model == "tasks":
+            # A drain takes no more than the flexible work of its step.
+            most = self.problem.work.most_deferred_tasks[self.span.first : self.span.end]
+            p.at_most("drain_limit", most[drain], **_rows(leaves, drain))
         matrices, right = self._deadline()
         p.equal("due", right[due], **_rows(matrices, due))
 
