@@ -88,7 +88,7 @@ def test_work_of_dear_hours_runs_in_cheap_ones() -> None:
 
 def test_setpoint_is_the_one_of_least_energy() -> None:
     kept = results("cooling=mpc-24h", tiny(), 12, drivers=inputs())
-    setpoints = np.arange(16.0, 23.1, 1.0)
+    setpoints = np.arange(16.0, 23.1, 0.5)
     held = [results(f"constant:{c:g}", tiny(), 1, drivers=inputs())[0] for c in setpoints]
     best_c = setpoints[np.argmin([r.facility_kwh[0] for r in held])]
     assert kept[-1].setpoint_c[0] == pytest.approx(best_c)

@@ -38,6 +38,8 @@ CARBON = Objective(carbon=1.0)
 """The objective of a name without one."""
 RAMP_K = 2.0
 """Largest change of the setpoint in a step, in K, as of agents with continuous actions."""
+SETPOINT_STEP_K = 0.5
+"""Largest distance of the setpoints to choose from, in K."""
 PEAKS = 8
 """Peaks of the month that are tried where there is a demand charge."""
 _NAME = re.compile(r"mpc-(?P<hours>[^:]*)h(?::(?P<objective>.*))?")
@@ -188,6 +190,7 @@ class _Planners:
             view.fleet,
             view.drivers,
             inlet_limit_c=inlet_limits_c(view.fleet),
+            setpoint_step_k=SETPOINT_STEP_K,
             precision=view.precision,
         )
         self.queue = QueuePlanner(view.fleet, self.facility, moves="load" in agents)

@@ -19,7 +19,7 @@ from sdc_taichi.types import F64
 
 LEVELS = 51
 """Levels of the queue."""
-COMMANDS = (0.0, -0.5, 0.5, -1.0, 1.0)
+COMMANDS = (0.0, -0.25, 0.25, -0.5, 0.5, -0.75, 0.75, -1.0, 1.0)
 """Commands of steps after the first; of equal ones the first counts."""
 
 

@@ -16,7 +16,7 @@ from sdc_taichi.types import F64
 
 LEVELS = 41
 """Levels of the stored energy."""
-COMMANDS = (0.0, -0.5, 0.5, -1.0, 1.0)
+COMMANDS = (0.0, -0.25, 0.25, -0.5, 0.5, -0.75, 0.75, -1.0, 1.0)
 """Commands of steps after the first; of equal ones the first counts."""
 _AMPLE_KW, _SLIGHT_KW = 1e9, 1e-3
 """Powers of a facility that never limit, and always limit, what a battery delivers."""
