@@ -174,25 +174,32 @@ def test_tables_that_are_off_make_the_bound_an_estimate(monkeypatch: pytest.Monk
     assert found.certificates[0]["table_error"] == pytest.approx(0.01, rel=0.1)
 
 
+@pytest.mark.parametrize("weight", [0.1234567890123, 1e-7, 2.0, 1e20, 1 / 3])
+def test_the_text_of_an_objective_says_its_weights_exactly(weight: float) -> None:
+    objective = Objective(carbon=weight, water=1.0)
+    assert Objective.parse(str(objective)) == objective
+
+
 def test_what_is_kept_is_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = solved(config_of("CA"), steps=24, cache=tmp_path)
-    assert len(list(tmp_path.iterdir())) == 1
+    monkeypatch.chdir(tmp_path)
+    first = solved(config_of("CA"), steps=24, cache="kept")
+    assert len(list((tmp_path / "kept").iterdir())) == 1
 
     def fails(*_: Any, **__: Any) -> Any:
         raise AssertionError("solved again")
 
     monkeypatch.setattr("sdc_taichi.optimum.task.facility_tables", fails)
-    again = solved(config_of("CA"), steps=24, cache=tmp_path)
+    again = solved(config_of("CA"), steps=24, cache="kept")
     for name in ("idle", "bound", "achieved", "load", "cooling", "battery"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
     assert first.certificates == again.certificates
     assert first.alone.keys() == again.alone.keys()
     with pytest.raises(AssertionError, match="solved again"):
-        solved(config_of("CA"), steps=25, cache=tmp_path)
+        solved(config_of("CA"), steps=25, cache="kept")
     with pytest.raises(AssertionError, match="solved again"):
-        solved(config_of("CA"), steps=24, cache=tmp_path, objective="energy")
+        solved(config_of("CA"), steps=24, cache="kept", objective="energy")
     with pytest.raises(AssertionError, match="solved again"):
-        solved(config_of("NY"), steps=24, cache=tmp_path)
+        solved(config_of("NY"), steps=24, cache="kept")
 
 
 def test_files_that_are_damaged_or_swapped_are_solved_anew(tmp_path: Path) -> None:

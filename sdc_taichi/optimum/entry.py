@@ -79,7 +79,7 @@ class Cache:
     """
 
     def __init__(self, folder: Path | None = None) -> None:
-        self._folder = usual_folder() if folder is None else folder
+        self._folder = usual_folder() if folder is None else folder.absolute()
 
     def find(self, key: str, steps: int) -> Entry | None:
         """The entry of a key; None where there is none that can be used.

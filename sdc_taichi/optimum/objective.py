@@ -13,6 +13,8 @@ from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64, I64
 
+_UNITS = {"carbon": "kg CO2e", "energy": "kWh", "cost": "currency of the tariff", "water": "L"}
+"""Units of the objectives of one term with weight 1."""
 _TERM = re.compile(r"(?:(?P<weight>[^*]+)\*)?(?P<name>[^*]+)")
 
 
@@ -80,7 +82,7 @@ class Objective:
         """The text that ``parse`` reads."""
         weights = {f.name: getattr(self, f.name) for f in fields(self)}
         return "+".join(
-            name if weight == 1.0 else f"{weight:g}*{name}"
+            name if weight == 1.0 else f"{_shortest(weight)}*{name}"
             for name, weight in weights.items()
             if weight
         )
@@ -88,8 +90,7 @@ class Objective:
     @property
     def unit(self) -> str:
         """Unit of the figure; of a sum, the text of the objective."""
-        units = {"carbon": "kg CO2e", "energy": "kWh", "cost": "currency of the tariff"}
-        return {**units, "water": "L"}.get(str(self), str(self))
+        return _UNITS.get(str(self), str(self))
 
     def kwh_weight(self, drivers: Drivers, index: I64) -> F64:
         """Weight of a kWh bought in each step, without demand charges, (B, T).
@@ -122,3 +123,8 @@ class Objective:
         return (
             self.carbon * cfp_kg + self.energy * grid_kwh + self.cost * cost + self.water * water_l
         )
+
+
+def _shortest(weight: float) -> str:
+    """The shortest text that is read as this very number, without a plus sign."""
+    return repr(float(weight)).removesuffix(".0").replace("e+", "e")

@@ -263,7 +263,11 @@ def _entry(problem: Problem, suggestion: _Suggestion, runs: Mapping[str, _Run]) 
         for name, found in certificates.items()
     }
     valid = [name for name, texts in failures.items() if not texts] or [IDLE]
-    best = min(valid, key=lambda name: certificates[name].figure)
+
+    def best_of(names: Iterable[str]) -> str:
+        return min(names, key=lambda name: certificates[name].figure)
+
+    best = best_of(valid)
     error = max(found.table_error for found in certificates.values())
     done = runs[best].done
     return Entry(
@@ -273,7 +277,7 @@ def _entry(problem: Problem, suggestion: _Suggestion, runs: Mapping[str, _Run]) 
         bound=suggestion.bound - (error + _SOLVER_ERROR) * abs(suggestion.bound),
         achieved=certificates[best].figure,
         alone={
-            agent: certificates[agent if agent in valid else IDLE].figure
+            agent: certificates[best_of({agent, IDLE}.intersection(valid) or {IDLE})].figure
             for agent in problem.agents
         },
         kind=_kind(suggestion.no_bound, error),
