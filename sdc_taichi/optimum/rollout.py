@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from sdc_taichi.optimum.commands import (
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.score import Score
 from sdc_taichi.plant.workload import MODELS as WORK_MODELS
-from sdc_taichi.sim.drivers import Drivers, FleetSeries
+from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.facility import BATTERY_PARAMETERS
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Precision
@@ -261,23 +261,5 @@ def repeated(fleet: Fleet, drivers: Drivers, start: I64, times: int) -> tuple[Fl
     Returns:
         Fleet, drivers and first steps of all copies.
     """
-
-    def series(of: FleetSeries) -> FleetSeries:
-        return replace(of, offsets=np.tile(of.offsets, times), lengths=np.tile(of.lengths, times))
-
-    price = drivers.price_per_kwh
-    shared = series(drivers.outdoor_c)
-    copies = replace(
-        drivers,
-        outdoor_c=shared,
-        wet_bulb_c=series(drivers.wet_bulb_c).sharing_places(shared),
-        ci_g_per_kwh=series(drivers.ci_g_per_kwh).sharing_places(shared),
-        demand=series(drivers.demand).sharing_places(shared),
-        price_per_kwh=None if price is None else series(price).sharing_places(shared),
-        start=np.tile(drivers.start, times),
-        design_outdoor_c=np.tile(drivers.design_outdoor_c, times),
-        design_wet_bulb_c=np.tile(drivers.design_wet_bulb_c, times),
-        sources=drivers.sources * times,
-        synthetic=drivers.synthetic * times,
-    )
+    copies = drivers.take(list(range(fleet.size)) * times)
     return build_fleet(fleet.configs * times), copies, np.tile(start, times)

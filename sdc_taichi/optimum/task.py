@@ -15,7 +15,7 @@ from sdc_taichi.optimum.problem import AGENTS, Agent, FacilityTable, Problem
 from sdc_taichi.optimum.problems import problems_of
 from sdc_taichi.optimum.tables import UTILISATIONS, TableGrid, facility_tables
 from sdc_taichi.sim import snapshot
-from sdc_taichi.sim.drivers import Drivers, FleetSeries, load_drivers
+from sdc_taichi.sim.drivers import Drivers, load_drivers
 from sdc_taichi.sim.events import seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Precision
@@ -68,7 +68,7 @@ class Task:
         return replace(
             self,
             fleet=build_fleet([self.fleet.configs[i] for i in chosen]),
-            drivers=_part_of_drivers(self.drivers, chosen),
+            drivers=self.drivers.take(chosen),
             start=self.start[chosen],
             seed=self.seed[chosen],
         )
@@ -110,7 +110,7 @@ class Task:
                 halls[same] = build_fleet(config)
             fingerprint = snapshot.fingerprint(
                 replace(halls[same], configs=(config,)),
-                _part_of_drivers(self.drivers, [i]),
+                self.drivers.take([i]),
                 self.precision,
             )
             own = {"start": int(self.start[i]), "seed": int(self.seed[i])}
@@ -233,37 +233,3 @@ def _checked_agents(agents: Sequence[Agent]) -> tuple[Agent, ...]:
             f"agents {list(named)!r}: valid is one or more of {', '.join(AGENTS)}, each once"
         )
     return tuple(agent for agent in AGENTS if agent in named)
-
-
-def _part_of_drivers(drivers: Drivers, where: Sequence[int]) -> Drivers:
-    """Inputs of some data centers, with no other series than theirs."""
-    chosen = list(where)
-
-    def part(series: FleetSeries) -> FleetSeries:
-        stored: dict[tuple[int, int], int] = {}
-        pieces, offsets, end = [], [], 0
-        for offset, length in zip(
-            series.offsets[chosen].tolist(), series.lengths[chosen].tolist(), strict=True
-        ):
-            if (offset, length) not in stored:
-                stored[offset, length] = end
-                pieces.append(series.values[offset : offset + length])
-                end += length
-            offsets.append(stored[offset, length])
-        return FleetSeries(np.concatenate(pieces), np.array(offsets), series.lengths[chosen])
-
-    price = drivers.price_per_kwh
-    first = part(drivers.outdoor_c)
-    return replace(
-        drivers,
-        outdoor_c=first,
-        wet_bulb_c=part(drivers.wet_bulb_c).sharing_places(first),
-        ci_g_per_kwh=part(drivers.ci_g_per_kwh).sharing_places(first),
-        demand=part(drivers.demand).sharing_places(first),
-        price_per_kwh=None if price is None else part(price).sharing_places(first),
-        start=drivers.start[chosen],
-        design_outdoor_c=drivers.design_outdoor_c[chosen],
-        design_wet_bulb_c=drivers.design_wet_bulb_c[chosen],
-        sources=tuple(drivers.sources[i] for i in chosen),
-        synthetic=tuple(drivers.synthetic[i] for i in chosen),
-    )

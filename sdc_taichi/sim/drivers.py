@@ -81,6 +81,24 @@ class FleetSeries:
         )
         return FleetSeries(self.values, offsets, lengths)
 
+    def take(self, where: Sequence[int]) -> FleetSeries:
+        """Series of some data centers, with no other values than theirs.
+
+        Args:
+            where: their numbers, n; a number may stand more than once.
+        """
+        chosen = list(where)
+        first_places: dict[tuple[int, int], int] = {}
+        pieces, offsets, end = [], [], 0
+        for part in zip(self.offsets[chosen].tolist(), self.lengths[chosen].tolist(), strict=True):
+            if part not in first_places:
+                offset, length = part
+                first_places[part] = end
+                pieces.append(self.values[offset : offset + length])
+                end += length
+            offsets.append(first_places[part])
+        return FleetSeries(np.concatenate(pieces), np.array(offsets), self.lengths[chosen])
+
     def distinct(self) -> tuple[list[F64], I64]:
         """The distinct series, and the number of the one that each data center reads, (B,)."""
         parts, which = np.unique(
@@ -122,6 +140,28 @@ class Drivers:
     def size(self) -> int:
         """Number of data centers."""
         return len(self.start)
+
+    def take(self, where: Sequence[int]) -> Drivers:
+        """Inputs of some data centers, with no other series than theirs.
+
+        Args:
+            where: their numbers, n; a number may stand more than once.
+        """
+        chosen, price = list(where), self.price_per_kwh
+        first = self.outdoor_c.take(chosen)
+        return replace(
+            self,
+            outdoor_c=first,
+            wet_bulb_c=self.wet_bulb_c.take(chosen).sharing_places(first),
+            ci_g_per_kwh=self.ci_g_per_kwh.take(chosen).sharing_places(first),
+            demand=self.demand.take(chosen).sharing_places(first),
+            price_per_kwh=None if price is None else price.take(chosen).sharing_places(first),
+            start=self.start[chosen],
+            design_outdoor_c=self.design_outdoor_c[chosen],
+            design_wet_bulb_c=self.design_wet_bulb_c[chosen],
+            sources=tuple(self.sources[i] for i in chosen),
+            synthetic=tuple(self.synthetic[i] for i in chosen),
+        )
 
     def digest(self) -> bytes:
         """SHA-256 of all series; equal inputs have equal digests.
