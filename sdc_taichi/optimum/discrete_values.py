@@ -20,6 +20,7 @@ from sdc_taichi.optimum.discrete_labels import (
     table_place,
 )
 from sdc_taichi.optimum.problem import Ends, Plan, Problem
+from sdc_taichi.optimum.table_lookup import barred
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64
 
@@ -186,10 +187,8 @@ class _StepCosts:
         cost = self.of_grid(t, table.facility_kwh[t] + bus_kwh)
         if t >= problem.scored_from:
             cost = cost + problem.litre_weight * table.water_l[t]
-        coolest_c = table.inlet_max_c[t].min(axis=1, keepdims=True)
-        most_c = np.maximum(problem.inlet_limit_c, coolest_c)
-        barred = (table.inlet_max_c[t] > most_c) | (table.unmet_w[t] > 0)
-        return np.where(barred, cost + self.shortage * table.facility_kwh[t].max(), cost)
+        bars = barred(table.inlet_max_c[t], table.unmet_w[t], problem.inlet_limit_c)
+        return np.where(bars, cost + self.shortage * table.facility_kwh[t].max(), cost)
 
     @property
     def shortage(self) -> float:

@@ -10,9 +10,10 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from sdc_taichi.hall.protection import Mask
 from sdc_taichi.optimum.problem import FacilityTable
+from sdc_taichi.optimum.table_lookup import barred
 from sdc_taichi.optimum.tables import (
     Nodes,
     TableGrid,
@@ -63,7 +64,7 @@ class FacilityMap:
     """Energy of the facility without its battery, in kWh, (M, W, P, I, J)."""
     water_l: F64
     """Make-up water, in l, (M, W, P, I, J)."""
-    allowed: npt.NDArray[np.bool_]
+    allowed: Mask
     """Whether a plan may choose a setpoint: its hottest inlet is within the limit and it leaves no
     heat in the room, or no setpoint does better, (M, W, P, I, J)."""
     least_kwh: F64 = field(init=False)
@@ -177,9 +178,9 @@ class FacilityMap:
         cost = kwh_weight[..., None, None] * kwh
         if litre_weight:
             cost = cost + litre_weight * self._in_weather(self.water_l, outdoor_c, wet_bulb_c)
-        barred = self._in_weather(np.where(self.allowed, 0.0, 1.0), outdoor_c, wet_bulb_c)
+        bars = self._in_weather(np.where(self.allowed, 0.0, 1.0), outdoor_c, wet_bulb_c)
         # A number, so that shares of nodes can be taken of it.
-        return kwh, cost + _BARRED * (1.0 + cost.max(axis=-1, keepdims=True)) * (barred > 0.0)
+        return kwh, cost + _BARRED * (1.0 + cost.max(axis=-1, keepdims=True)) * (bars > 0.0)
 
     def _in_weather(self, values: F64, outdoor_c: F64, wet_bulb_c: F64) -> F64:
         """Values in some weather, (B, H, ...), from those at the nodes, (M, W, P, ...)."""
@@ -272,7 +273,10 @@ def facility_map(
         facility_kwh=np.stack([t.facility_kwh for t in tables]).reshape(shape),
         water_l=np.stack([t.water_l for t in tables]).reshape(shape),
         allowed=np.stack(
-            [_allowed(t, inlet_limit_c[dc]) for t, dc in zip(tables, dcs, strict=True)]
+            [
+                ~barred(table.inlet_max_c, table.unmet_w, inlet_limit_c[dc])
+                for table, dc in zip(tables, dcs, strict=True)
+            ]
         ).reshape(shape),
     )
 
@@ -356,14 +360,6 @@ def _year_of(series: FleetSeries, dc: int, length: int) -> F64:
     """The first values of one data center, (T,)."""
     places = int(series.offsets[dc]) + np.arange(length) % int(series.lengths[dc])
     return series.values.take(places)
-
-
-def _allowed(table: FacilityTable, inlet_limit_c: float) -> npt.NDArray[np.bool_]:
-    """Whether a plan may choose a setpoint, (T, I, J): the best of them always."""
-    over_k = np.maximum(table.inlet_max_c - inlet_limit_c, 0.0)
-    fit = over_k <= over_k.min(axis=-1, keepdims=True)
-    unmet_w = np.where(fit, table.unmet_w, np.inf)
-    return np.asarray(fit & (unmet_w <= unmet_w.min(axis=-1, keepdims=True)))
 
 
 def _place(position: F64, nodes: int) -> tuple[I64, F64]:

@@ -16,11 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.hall.protection import Mask
 from sdc_taichi.optimum.problem import FacilityTable, Problem
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64
-
-Mask = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
 _STEPS_AT_ONCE = 512
 """Steps whose tables are searched at once, so that a year takes little memory."""

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from sdc_taichi.hall.protection import Mask
 from sdc_taichi.optimum.problem import FacilityTable
 from sdc_taichi.optimum.stage_cost import at_tasks
 from sdc_taichi.types import F64, I64
-
-Mask = npt.NDArray[np.bool_]
 
 
 def at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:
@@ -69,19 +67,18 @@ def facility_kwh(table: FacilityTable, utilisation: F64, setpoint_c: F64) -> F64
 
 
 def barred(inlet_max_c: F64, unmet_w: F64, limit_c: float) -> Mask:
-    """Whether a plan may not use a setpoint, at the utilisation of each step, (T, J).
+    """Whether a plan may not use a setpoint, (..., J).
 
     Where no setpoint keeps inlets within the limit, those with the coolest inlets may be used, and
     where none meets the cooling load, those that miss the least of it.
 
     Args:
-        inlet_max_c: Hottest inlet by step and setpoint, in C, (T, J).
-        unmet_w: Cooling load that stays in the room by step and setpoint, in W, (T, J).
+        inlet_max_c: Hottest inlet by setpoint, in C, (..., J).
+        unmet_w: Cooling load that stays in the room by setpoint, in W, (..., J).
         limit_c: Highest inlet, in C; inf without a limit.
     """
-    least_w = unmet_w.min(axis=1, keepdims=True)
-    meets = unmet_w <= least_w
-    coolest_c = np.where(meets, inlet_max_c, np.inf).min(axis=1, keepdims=True)
+    meets = unmet_w <= unmet_w.min(axis=-1, keepdims=True)
+    coolest_c = np.where(meets, inlet_max_c, np.inf).min(axis=-1, keepdims=True)
     within = inlet_max_c <= np.maximum(limit_c, coolest_c)
     return np.asarray(~(meets & within))
 
