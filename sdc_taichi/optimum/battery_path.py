@@ -16,6 +16,8 @@ LEVELS = 201
 """Levels of stored energy at which the value of what is stored is computed."""
 COMMANDS = np.linspace(-1.0, 1.0, 21)
 """Battery commands among which a step chooses."""
+BatteryModel = Callable[[F64, F64, F64 | float], BatteryResult]
+"""What a step does, from the energy stored, a command, and the energy of the facility, in kWh."""
 _SHORTAGE_FACTOR = 10.0
 """Price of a kWh that is missing at the end, over the highest price of a kWh delivered."""
 
@@ -48,7 +50,7 @@ def battery_path(
     steps, capacity = len(facility_kwh), storage.capacity_kwh
     if capacity <= 0:
         return np.full(steps, storage.stored_kwh)
-    run = _model(storage, step_h, grid_limit_kw)
+    run = battery_model(storage, step_h, grid_limit_kw)
     price = float(kwh_weight.max()) or 1.0
     over_price = _SHORTAGE_FACTOR * steps * price
 
@@ -73,14 +75,17 @@ def storage_parameters(storage: Storage) -> dict[str, float]:
     return {f.name: getattr(storage, f.name) for f in fields(storage) if f.name not in beside}
 
 
-_Run = Callable[[F64, F64, float], BatteryResult]
+def battery_model(storage: Storage, step_h: float, grid_limit_kw: float) -> BatteryModel:
+    """The model of a battery as a function of stored energy, command and energy of the facility.
 
-
-def _model(storage: Storage, step_h: float, grid_limit_kw: float) -> _Run:
-    """The battery's model as a function of stored energy, command and energy of the facility."""
+    Args:
+        storage: The battery.
+        step_h: Length of a step, in h.
+        grid_limit_kw: Power beyond which the battery does not charge, in kW; inf without a limit.
+    """
     model, parameters = BATTERIES[storage.model], storage_parameters(storage)
 
-    def run(stored_kwh: F64, command: F64, facility_kwh: float) -> BatteryResult:
+    def run(stored_kwh: F64, command: F64, facility_kwh: F64 | float) -> BatteryResult:
         return model(
             stored_kwh,
             command,
@@ -99,7 +104,7 @@ def _follow(
     facility_kwh: F64,
     values: F64,
     levels: F64,
-    run: _Run,
+    run: BatteryModel,
     cost: Callable[[int, F64], F64],
     step_h: float,
     end_kwh: float,

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.optimum.problem import Problem, Storage
-from sdc_taichi.plant.battery import BATTERIES
+from sdc_taichi.optimum.battery_path import battery_model
+from sdc_taichi.optimum.problem import Problem
 from sdc_taichi.plant.cooling import SETPOINTS
 from sdc_taichi.plant.workload import MODELS, TASKS_PER_STEP, UNLIMITED_TASKS
 from sdc_taichi.types import F64, I64
@@ -148,8 +148,7 @@ class DiscreteModel:
         draws = np.random.Generator(np.random.PCG64(0))
         self._age_weights = draws.uniform(1.0, 2.0, self._window)
         self._factors = draws.integers(1, 2**63, 16, dtype=np.uint64) | np.uint64(1)
-        self._battery = BATTERIES[problem.storage.model]
-        self._battery_limits = battery_parameters(problem.storage, problem.grid_limit_kw)
+        self._battery = battery_model(problem.storage, problem.step_h, problem.grid_limit_kw)
 
     @property
     def setpoint_step_k(self) -> float:
@@ -275,14 +274,7 @@ class DiscreteModel:
         if self.problem.storage.capacity_kwh <= 0:
             shape = np.broadcast_shapes(stored_kwh.shape, command.shape, facility_kwh.shape)
             return np.broadcast_to(stored_kwh, shape), np.broadcast_to(facility_kwh, shape)
-        step_h = self.problem.step_h
-        found = self._battery(
-            stored_kwh,
-            command,
-            load_kw=facility_kwh / step_h,
-            dt_h=step_h,
-            **self._battery_limits,
-        )
+        found = self._battery(stored_kwh, command, facility_kwh)
         return found.stored_kwh, found.grid_kwh
 
     def _move_work(self, labels: Labels, t: int) -> tuple[dict[str, F64], F64]:
@@ -426,15 +418,3 @@ def read_table(values: F64, at: _Place) -> F64:
     low = values[i, j] * (1.0 - along) + values[i, j_next] * along
     high = values[i_next, j] * (1.0 - along) + values[i_next, j_next] * along
     return np.asarray(low * (1.0 - rise) + high * rise)
-
-
-def battery_parameters(storage: Storage, grid_limit_kw: float) -> dict[str, F64 | None]:
-    """Constants of a battery by the names of the arguments of the battery models."""
-    beside = ("model", "stored_kwh")
-    found: dict[str, F64 | None] = {
-        f.name: np.asarray(getattr(storage, f.name))
-        for f in fields(storage)
-        if f.name not in beside
-    }
-    found["grid_limit_kw"] = None if np.isinf(grid_limit_kw) else np.asarray(grid_limit_kw)
-    return found

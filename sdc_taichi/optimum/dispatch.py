@@ -146,7 +146,7 @@ class DispatchProgramme:
             none,
             deferred=-self._change,
             queue=self._change,
-            start_tasks=self._start_column("start_tasks"),
+            start_tasks=self._start_column,
         )
 
     def keep_modes(self, modes: np.ndarray) -> None:
@@ -162,7 +162,7 @@ class DispatchProgramme:
             return
         defer, drain, due = (np.flatnonzero(modes == m) for m in (DEFER, DRAIN, DUE))
         change, p = self._change, self._programme
-        start = self._start_column("start_tasks")
+        start = self._start_column
         leaves = {"deferred": change, "queue": -change, "start_tasks": -start}
         none = np.zeros(self._size)
         p.equal("defer", none[defer], **_rows(leaves, defer))
@@ -253,7 +253,7 @@ class DispatchProgramme:
                 upper=limit if given is None else given,
                 cost=self._start_value(tasks=True),
             )
-            rows["start_tasks"] = self._start_column("start_tasks")
+            rows["start_tasks"] = self._start_column
         if work.most_dropped_tasks > 0:
             p.variables("dropped", n, upper=arrived)
             rows["dropped"] = self._now
@@ -317,7 +317,7 @@ class DispatchProgramme:
             upper=storage.capacity_kwh if given is None else given,
             cost=self._start_value(tasks=False),
         )
-        now, start_column = self._now, self._start_column("start_kwh")
+        now, start_column = self._now, self._start_column
         p.equal(
             "energy",
             np.full(n, limits.rounding_kwh),
@@ -388,7 +388,8 @@ class DispatchProgramme:
         values = self.span.state_values
         return sum(task if tasks else kwh for step, task, kwh in values if step == before)
 
-    def _start_column(self, name: str) -> Matrix:
+    @property
+    def _start_column(self) -> Matrix:
         """The state before the first step in the rows of changes, (n, 1)."""
         from scipy import sparse
 
