@@ -39,6 +39,7 @@ def made_up_optimum(sim: Simulator, steps: int, objective: str = "carbon") -> Op
         objective=aim,
         agents=AGENTS,
         start=sim.drivers.start.copy(),
+        seed=np.zeros(sim.size, dtype=np.int64),
         steps=steps,
         scored_from=0,
         inlet_limit_c=np.full(sim.size, np.inf),

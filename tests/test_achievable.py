@@ -165,10 +165,21 @@ def test_constraints_that_break_are_told(sim: Simulator, optimum: Optimum) -> No
 
 def test_optima_of_other_inputs_are_refused(sim: Simulator, optimum: Optimum) -> None:
     idle = make_controller("idle", sim.fleet)
-    with pytest.raises(SdcError, match="of other configs, inputs, precision or first day"):
+    with pytest.raises(SdcError, match="of other configs, inputs, precision, sampled"):
         run_beside(replace(optimum, fingerprint="0" * 64), sim, idle, "idle")
     with pytest.raises(SdcError, match="first day"):
         run_beside(replace(optimum, start=optimum.start + 96), sim, idle, "idle")
+
+
+def test_optima_of_other_sampled_events_are_refused() -> None:
+    outages = "events.sampled=[{kind: grid_outage, per_year: 50, duration_h: [1, 2]}]"
+    config = load_config("tiny", [outages])
+    with Simulator(config) as sim:
+        optimum = made_up_optimum(sim, 4)
+        idle = make_controller("idle", sim.fleet)
+        assert run_beside(optimum, sim, idle, "idle", seed=0) is not None
+        with pytest.raises(SdcError, match="sampled events"):
+            run_beside(optimum, sim, idle, "idle", seed=1)
 
 
 def test_metrics_tell_the_share(folders: Path, optimum: Optimum) -> None:

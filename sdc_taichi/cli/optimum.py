@@ -133,6 +133,7 @@ def optimum_command(
             sim,
             aim,
             steps,
+            seed=seed,
             agents=movable,
             scored_from=scored_from,
             inlet_limit_c=limit_c,
@@ -150,7 +151,14 @@ def optimum_command(
         if out is not None and not interrupted():
             with progress_bar(steps, shown=not quiet) as advance:
                 is_written = write_optimum(
-                    sim, found, out, reached=reached, force=force, on_step=advance, stop=interrupted
+                    sim,
+                    found,
+                    out,
+                    reached=reached,
+                    seed=seed,
+                    force=force,
+                    on_step=advance,
+                    stop=interrupted,
                 )
         if is_written and not (quiet or as_json):
             print(f"Files in {printable(out)}: optimum.json, and the run of the achieved path")
@@ -165,6 +173,7 @@ def solve_beside(
     objective: Objective,
     steps: int,
     *,
+    seed: int,
     agents: tuple[Agent, ...] | None = None,
     scored_from: int = 0,
     inlet_limit_c: float | None = None,
@@ -179,6 +188,7 @@ def solve_beside(
         sim: the simulator.
         objective: what to minimise.
         steps: number of steps.
+        seed: of the sampled events.
         agents: what may be moved; None is all.
         scored_from: first step that counts.
         inlet_limit_c: hottest inlet to allow, in C; None is that of ``protection.ashrae_class``.
@@ -200,6 +210,7 @@ def solve_beside(
             return solve(
                 sim.fleet,
                 steps=steps,
+                seed=seed,
                 drivers=sim.drivers,
                 objective=objective,
                 agents=AGENTS if agents is None else agents,

@@ -29,7 +29,8 @@ Seed = Annotated[
     typer.Option(
         min=0,
         max=2**63 - 1,
-        help="Of controllers, forecast errors and samples (not of the synthetic year).",
+        help="Of controllers, forecast errors, sampled events and samples (not of the synthetic "
+        "year).",
     ),
 ]
 ErrorOfForecasts = Annotated[

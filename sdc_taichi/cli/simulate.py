@@ -167,7 +167,7 @@ def simulate_command(
             best = (
                 None
                 if aim is None
-                else solve_beside(sim, aim, request.steps, quiet=quiet, stop=interrupted)
+                else solve_beside(sim, aim, request.steps, seed=seed, quiet=quiet, stop=interrupted)
             )
             with progress_bar(request.steps, shown=not quiet) as advance:
 

@@ -34,6 +34,8 @@ class Optimum:
     """What the plans may move."""
     start: I64
     """First step of each data center, counted from the beginning of the year, (B,)."""
+    seed: I64
+    """Seed of the sampled events of each data center, (B,); 0 where none are sampled."""
     steps: int
     """Number of steps, T."""
     scored_from: int
@@ -98,26 +100,3 @@ class Optimum:
             own, cyclic = Ends(kwh, tasks, end_kwh[i], end_tasks[i]), Ends(kwh, tasks, kwh, tasks)
             value[i] = self.bound_of_ends(i, own) - self.bound_of_ends(i, cyclic)
         return value
-
-    def share(
-        self, figure: F64, start_kwh: F64, start_tasks: F64, end_kwh: F64, end_tasks: F64
-    ) -> F64:
-        """Share of the achievable: 0 as good as idle commands, 1 as good as the achieved path.
-
-        It is (idle - x) / (idle - achieved) with x the figure less ``end_value``.
-
-        Args:
-            figure: Figure of the scored steps, in the unit of the objective, (B,).
-            start_kwh: Energy stored at the first scored step, in kWh, (B,).
-            start_tasks: Work that waits at the first scored step, in tasks, (B,).
-            end_kwh: Energy stored at the end, in kWh, (B,).
-            end_tasks: Work that waits at the end, in tasks, (B,).
-
-        Returns:
-            The share, (B,); nan where nothing can be achieved, or ends cannot be valued.
-        """
-        valued = figure - self.end_value(start_kwh, start_tasks, end_kwh, end_tasks)
-        room = self.idle - self.achieved
-        out = np.full(len(self.names), np.nan)
-        np.divide(self.idle - valued, room, out=out, where=room > 0)
-        return out

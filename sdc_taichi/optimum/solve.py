@@ -58,6 +58,7 @@ def solve(
     *,
     steps: int,
     start: I64 | Sequence[int] | None = None,
+    seed: int = 0,
     drivers: Drivers | None = None,
     objective: Objective | str = "carbon",
     agents: Sequence[Agent] = AGENTS,
@@ -79,6 +80,7 @@ def solve(
         steps: Number of steps, T.
         start: First step of each, counted from the beginning of the year, (B,); None is that of
             the drivers.
+        seed: Of the sampled events.
         drivers: Inputs; None reads what the configs name.
         objective: What is minimised, or its text.
         agents: What plans may move.
@@ -101,6 +103,7 @@ def solve(
         configs,
         steps=steps,
         start=start,
+        seed=seed,
         drivers=drivers,
         objective=objective,
         agents=agents,
@@ -130,6 +133,7 @@ def _optimum(task: Task, entries: Sequence[Entry]) -> Optimum:
         objective=task.objective,
         agents=task.agents,
         start=task.start,
+        seed=task.seed,
         steps=task.steps,
         scored_from=task.scored_from,
         inlet_limit_c=np.array(limits),

@@ -42,7 +42,7 @@ class Task:
     start: I64
     """First step of each, counted from the beginning of the year, (B,)."""
     seed: I64
-    """Seed of the sampled events of each, (B,)."""
+    """Seed of the sampled events of each, (B,); 0 where none are sampled."""
     steps: int
     """Number of steps, T."""
     objective: Objective
@@ -163,6 +163,7 @@ def checked_task(
     *,
     steps: int,
     start: I64 | Sequence[int] | None,
+    seed: int,
     drivers: Drivers | None,
     objective: Objective | str,
     agents: Sequence[Agent],
@@ -179,6 +180,7 @@ def checked_task(
     fleet = configs if isinstance(configs, Fleet) else build_fleet(configs)
     steps = whole_number("steps", steps, 1, MOST_STEPS)
     scored_from = whole_number("scored_from", scored_from, 0, steps - 1)
+    seed = whole_number("seed", seed, 0, 2**63 - 1)
     if inlet_limit_c is not None:
         low_c, high_c = _INLET_LIMITS_C
         if not low_c <= inlet_limit_c <= high_c:
@@ -194,7 +196,7 @@ def checked_task(
         fleet=fleet,
         drivers=with_prices(given, fleet.configs),
         start=_checked_start(given.start if start is None else start, fleet.size),
-        seed=seeds_of_fleet(0, fleet.names),
+        seed=seeds_of_sampled_events(seeds_of_fleet(seed, fleet.names), fleet),
         steps=steps,
         objective=Objective.parse(objective) if isinstance(objective, str) else objective,
         agents=_checked_agents(agents),
@@ -203,6 +205,16 @@ def checked_task(
         precision=precision,
         discrete=discrete,
     )
+
+
+def seeds_of_sampled_events(seed: I64, fleet: Fleet) -> I64:
+    """Seeds of the data centers that sample events, and 0 for the others, (B,).
+
+    Args:
+        seed: seed of each data center, (B,).
+        fleet: the data centers.
+    """
+    return np.where([bool(config.events.sampled) for config in fleet.configs], seed, 0)
 
 
 def _checked_start(start: I64 | Sequence[int], size: int) -> I64:

@@ -17,6 +17,7 @@ from sdc_taichi.control import PERFECT, Controller, ForecastError, View
 from sdc_taichi.errors import SdcError
 from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.optimum.score import Score
+from sdc_taichi.optimum.task import seeds_of_sampled_events
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, I64, Actions, StepResult
@@ -148,12 +149,12 @@ def begin_score(optimum: Optimum, sim: Simulator, seed: int) -> Score:
         SdcError: the optimum is of other configs or inputs.
     """
     sim.reset(seed)
-    if sim.fingerprint() != optimum.fingerprint or not np.array_equal(
-        sim.drivers.start, optimum.start
-    ):
+    seeds = seeds_of_sampled_events(sim.state.seed, sim.fleet)
+    same = np.array_equal(sim.drivers.start, optimum.start) and np.array_equal(seeds, optimum.seed)
+    if sim.fingerprint() != optimum.fingerprint or not same:
         raise SdcError(
-            f"optimum of {', '.join(optimum.names[:3])}: of other configs, inputs, precision or "
-            "first day than the run; solve that of the run"
+            f"optimum of {', '.join(optimum.names[:3])}: of other configs, inputs, precision, "
+            "sampled events or first day than the run; solve that of the run"
         )
     return Score(optimum.objective, sim, optimum.scored_from)
 
