@@ -386,3 +386,14 @@ def test_whole_tasks_are_drained_no_faster_than_the_flexible_work_of_a_step() ->
     drained = plan(p).executed_tasks - p.work.arrived_tasks
     assert drained.max() > 5.0
     assert np.all(drained <= p.work.most_deferred_tasks + 1e-9)
+
+
+def test_one_step_that_costs_very_much_at_high_load_does_not_hold_all_work_back() -> None:
+    p = problem(steps=48, agents=("load", "cooling"), storage=NO_BATTERY)
+    kwh = p.table.facility_kwh.copy()
+    kwh[5, -1] += 1e9
+    dear = replace(p, table=replace(p.table, facility_kwh=kwh))
+    shifted, expected = (
+        np.abs(plan(of).executed_tasks - of.work.arrived_tasks).sum() for of in (dear, p)
+    )
+    assert shifted > 0.8 * expected > 0.0

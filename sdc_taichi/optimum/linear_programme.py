@@ -28,8 +28,8 @@ _WARM_UP_SHARE = 1e-3
 """Weight of steps that are not scored, so that plans do nothing odd in them; with much more of it,
 plans would not fill batteries before the steps that are scored."""
 _DEFERRAL_WEIGHT = 0.01
-"""Weight of a task that enters the queue, over the mean cost of a task: hardly any, but enough that
-work leaves the queue no earlier than it has to."""
+"""Weight of a task that enters the queue, over the median cost of a task: hardly any, but enough
+that work leaves the queue no earlier than it has to."""
 _LONGEST_BOUND = 3072
 """Most steps of a bound's programme: a month of quarter hours. Time rises with their square."""
 _LONGEST_PLAN = 672
@@ -202,7 +202,7 @@ def _plan_of_span(problem: Problem, stage: StageCost, curves: LoadCurves, span: 
     if "load" not in problem.agents or problem.work.deadline_steps is None:
         return _solve(problem, relaxed)
     steps = span.end - span.first
-    of_task = float(np.abs(curves.slope_cost).mean()) if len(curves.slope_cost) else 0.0
+    of_task = float(np.median(np.abs(curves.slope_cost))) if len(curves.slope_cost) else 0.0
     late = 2.0 - np.arange(steps) / steps
     relaxed.add_deferral_weight(_DEFERRAL_WEIGHT * of_task * late)
     first = _solve(problem, relaxed)
