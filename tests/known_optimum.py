@@ -50,7 +50,9 @@ def made_up_optimum(sim: Simulator, steps: int, objective: str = "carbon") -> Op
         alone={"cooling": 0.5 * (idle.figure + best.figure)},
         bound_kinds=kinds,
         failures=((), *[("facility energy off by 1e-3",)] * (sim.size - 1)),
-        certificates=({"facility_error": 1e-9},) * sim.size,
+        certificates=tuple(
+            {"table_error": 1e-9, "hottest_inlet_c": float(c)} for c in best.hottest_inlet_c
+        ),
         load=np.zeros(shape),
         cooling=cooling,
         battery=battery,

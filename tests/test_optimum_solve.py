@@ -120,6 +120,19 @@ def test_inlets_stay_within_a_limit() -> None:
     np.testing.assert_array_equal(found.inlet_limit_c, [limit_c])
 
 
+def test_a_path_that_is_as_cool_as_can_be_counts_where_no_setpoint_keeps_the_limit() -> None:
+    config = config_of("NY", preset="corrected")
+    found = solved(config, steps=6, agents=("cooling",), inlet_limit_c=20.0)
+    texts = found.failures[0]
+    assert any("path of idle" in text and "over the limit" in text for text in texts)
+    assert not any("path of cooling" in text for text in texts)
+    assert found.certificates[0]["hottest_inlet_c"] > 20.0
+    with Simulator(config) as sim:
+        score = begin_score(found, sim, 0)
+        simulate(sim, AchievedPath(found), found.steps, on_step=score.add)
+        assert achievement(found, "optimum", score).broken == ((),)
+
+
 @pytest.mark.parametrize("preset", preset_names())
 def test_every_preset_has_an_optimum(preset: str) -> None:
     if preset == "large":

@@ -8,7 +8,12 @@ import numpy as np
 
 from sdc_taichi.optimum.problem import Problem
 from sdc_taichi.optimum.rollout import RollOut
-from sdc_taichi.optimum.table_lookup import at_utilisation, barred, facility_kwh
+from sdc_taichi.optimum.table_lookup import (
+    INLET_MARGIN_K,
+    at_utilisation,
+    coolest_inlet_c,
+    facility_kwh,
+)
 from sdc_taichi.types import F64
 
 LARGEST_TABLE_ERROR = 1e-4
@@ -45,7 +50,8 @@ class Certificate:
     hottest_inlet_c: float
     """Hottest inlet, in C."""
     over_limit_k: float
-    """Most by which an inlet exceeds the limit in a step that has a setpoint within it, in K."""
+    """Most by which an inlet exceeds the limit, or the coolest of all setpoints where none keeps
+    it, in K."""
     unmet_kwh: float
     """Cooling load that stays in the room, in kWh."""
 
@@ -106,13 +112,15 @@ def certificate(problem: Problem, done: RollOut, figure: float) -> Certificate:
 
 def _over_limit_k(problem: Problem, done: RollOut) -> F64:
     """By how much the hottest inlet of each step exceeds what it has to keep, in K, (T,)."""
-    if np.isinf(problem.inlet_limit_c):
+    table, limit_c = problem.table, problem.inlet_limit_c
+    if np.isinf(limit_c):
         return np.zeros(problem.steps)
-    table = problem.table
     inlet_c, unmet_w = (
         at_utilisation(values, table.utilisation, done.utilisation[:, 0])
         for values in (table.inlet_max_c, table.unmet_w)
     )
-    not_permitted = barred(inlet_c, unmet_w, problem.inlet_limit_c)
-    warmest_c = np.where(not_permitted, -np.inf, inlet_c).max(axis=1)
-    return np.asarray(done.inlet_max_c[:, 0] - np.maximum(problem.inlet_limit_c, warmest_c))
+    coolest_c = coolest_inlet_c(inlet_c, unmet_w)[:, 0]
+    within = coolest_c <= limit_c - INLET_MARGIN_K
+    return np.asarray(
+        done.inlet_max_c[:, 0] - np.where(within, limit_c, coolest_c + INLET_MARGIN_K)
+    )

@@ -13,6 +13,7 @@ from sdc_taichi.optimum.problem import Agent, FacilityTable, Problem
 from sdc_taichi.optimum.rollout import Targets
 from sdc_taichi.optimum.setpoint_path import setpoint_path
 from sdc_taichi.optimum.table_lookup import (
+    INLET_MARGIN_K,
     at_utilisation,
     barred,
     energy_at_utilisation,
@@ -130,7 +131,7 @@ def _setpoints_c(problem: Problem, utilisation: F64) -> F64:
         for values in (table.water_l, table.inlet_max_c, table.unmet_w)
     )
     cost = weight_of_kwh(problem)[:, None] * energy + problem.litre_weight * water
-    cost[barred(inlet_c, unmet_w, problem.inlet_limit_c)] = np.inf
+    cost[barred(inlet_c, unmet_w, problem.inlet_limit_c - INLET_MARGIN_K)] = np.inf
     return setpoint_path(cost, table.setpoint_c, ramp_k=problem.ramp_k, start_c=problem.setpoint_c)
 
 

@@ -9,6 +9,10 @@ from sdc_taichi.optimum.problem import FacilityTable
 from sdc_taichi.optimum.stage_cost import at_tasks
 from sdc_taichi.types import F64, I64
 
+INLET_MARGIN_K = 0.02
+"""By how much paths stay below the limit of inlets, in K: inlets are not quite linear between the
+utilisations of a table."""
+
 
 def at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:
     """Values of a table at a utilisation of each step, linear between the nodes, (T, J).
@@ -77,10 +81,23 @@ def barred(inlet_max_c: F64, unmet_w: F64, limit_c: float) -> Mask:
         unmet_w: Cooling load that stays in the room by setpoint, in W, (..., J).
         limit_c: Highest inlet, in C; inf without a limit.
     """
-    meets = unmet_w <= unmet_w.min(axis=-1, keepdims=True)
-    coolest_c = np.where(meets, inlet_max_c, np.inf).min(axis=-1, keepdims=True)
-    within = inlet_max_c <= np.maximum(limit_c, coolest_c)
-    return np.asarray(~(meets & within))
+    within = inlet_max_c <= np.maximum(limit_c, coolest_inlet_c(inlet_max_c, unmet_w))
+    return np.asarray(~(_meets(unmet_w) & within))
+
+
+def coolest_inlet_c(inlet_max_c: F64, unmet_w: F64) -> F64:
+    """Least of the hottest inlets over setpoints that miss the least of the cooling load, (..., 1).
+
+    Args:
+        inlet_max_c: Hottest inlet by setpoint, in C, (..., J).
+        unmet_w: Cooling load that stays in the room by setpoint, in W, (..., J).
+    """
+    return np.asarray(np.where(_meets(unmet_w), inlet_max_c, np.inf).min(axis=-1, keepdims=True))
+
+
+def _meets(unmet_w: F64) -> Mask:
+    """Setpoints that miss the least of the cooling load, (..., J)."""
+    return np.asarray(unmet_w <= unmet_w.min(axis=-1, keepdims=True))
 
 
 def _place(nodes: F64, at: F64) -> tuple[I64, F64]:

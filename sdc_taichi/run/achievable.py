@@ -201,6 +201,8 @@ def _broken(optimum: Optimum, score: Score, dc: int) -> list[str]:
     if overdue > _LEAST_TASKS:
         texts.append(f"leaves up to {overdue:.4g} tasks overdue")
     limit, hottest = optimum.inlet_limit_c[dc], score.hottest_inlet_c[dc]
-    if hottest > limit + _LEAST_K:
+    # Where no setpoint keeps the limit, the achieved path exceeds it as well.
+    reached = optimum.certificates[dc]["hottest_inlet_c"]
+    if hottest > max(limit, reached) + _LEAST_K:
         texts.append(f"has an inlet of {hottest:.2f} C, over the limit of {limit:g} C")
     return texts

@@ -14,6 +14,7 @@ from typing import Any
 
 from sdc_taichi.config import load_json
 from sdc_taichi.errors import SdcError
+from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.run.achievable import OPTIMUM, AchievedPath, Achievement
 from sdc_taichi.run.description import RunRequest
@@ -144,8 +145,10 @@ def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
     dcs = content["data_centers"]
     remarks = ["Achieved: what the simulator reached with all inputs known in advance."]
     if any(dc["bound_kind"] == _BOUND for dc in dcs):
+        moved = content["agents"]
+        of = "" if len(moved) == len(AGENTS) else f" of {' and '.join(moved)} alone"
         remarks.insert(
-            0, "Bound: with these inputs, no controller that ends as it began comes below it."
+            0, f"Bound: with these inputs, no controller{of} that ends as it began comes below it."
         )
     remarks += [f"{dc['name']}: {dc['bound_kind']}" for dc in dcs if dc["bound_kind"] != _BOUND]
     remarks += [f"{dc['name']}: does not hold: {text}" for dc in dcs for text in dc["failures"]]
