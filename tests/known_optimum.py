@@ -51,7 +51,8 @@ def made_up_optimum(sim: Simulator, steps: int, objective: str = "carbon") -> Op
         bound_kinds=kinds,
         failures=((), *[("facility energy off by 1e-3",)] * (sim.size - 1)),
         certificates=tuple(
-            {"table_error": 1e-9, "hottest_inlet_c": float(c)} for c in best.hottest_inlet_c
+            {"overdue_tasks": 0.0, "hottest_inlet_c": float(inlet_c), "unmet_kwh": 0.0}
+            for inlet_c in best.hottest_inlet_c
         ),
         load=np.zeros(shape),
         cooling=cooling,

@@ -155,12 +155,20 @@ def test_without_a_bound_ends_that_differ_have_no_share(sim: Simulator, optimum:
 
 
 def test_constraints_that_break_are_told(sim: Simulator, optimum: Optimum) -> None:
-    cold = replace(optimum, inlet_limit_c=np.array([np.inf, 15.0]))
+    hot = {**optimum.certificates[0], "hottest_inlet_c": 40.0}
+    kept = {**optimum.certificates[1], "hottest_inlet_c": 14.0, "unmet_kwh": -1.0}
+    cold = replace(
+        optimum,
+        inlet_limit_c=np.array([15.0, 15.0]),
+        certificates=(hot, kept),
+    )
     found = run_beside(cold, sim, make_controller("idle", sim.fleet), "idle")
     assert found is not None
+    # At the first data center, no path keeps the limit.
     assert found.broken[0] == ()
-    (text,) = found.broken[1]
-    assert text.endswith("over the limit of 15 C")
+    inlet, heat = found.broken[1]
+    assert inlet.endswith("over the limit of 15 C")
+    assert heat == "leaves 0 kWh of heat in the room"
 
 
 def test_optima_of_other_inputs_are_refused(sim: Simulator, optimum: Optimum) -> None:
