@@ -26,8 +26,7 @@ from sdc_taichi import Simulator, load_config
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import make_controller
 from sdc_taichi.errors import OddInputWarning
-from sdc_taichi.optimum.problem import AGENTS, Agent
-from sdc_taichi.optimum.problems import RAMP_K
+from sdc_taichi.optimum.problem import AGENTS, RAMP_K, Agent
 from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.optimum.solve import solve
 from sdc_taichi.run.achievable import run_beside

@@ -322,6 +322,7 @@ def test_a_data_center_has_the_same_map_alone_and_beside_others(plant: str) -> N
         assert np.array_equal(alone.lowest_kwh(*at), lowest)
         given = together.kwh_at(setpoint_c, outdoor_c, wet_bulb_c)[own]
         assert np.array_equal(alone.kwh_at(setpoint_c[own], *at), given)
+        assert np.array_equal(alone.least_kwh[0], together.at_own_nodes(together.least_kwh)[dc])
 
 
 def test_the_best_setpoint_of_a_map_is_that_of_least_cost() -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,23 +20,18 @@ from sdc_taichi.errors import ConfigError
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.optimum.commands import setpoint_command
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.problem import AGENTS, Agent
+from sdc_taichi.optimum.problem import AGENTS, RAMP_K, Agent
 from sdc_taichi.sim.bills import BilledDemand, add_power, no_demand
-from sdc_taichi.sim.drivers import Drivers
-from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.types import F64, I64, Actions
 
 if TYPE_CHECKING:
-    from sdc_taichi.control.queue_plan import QueuePlan, QueuePlanner, Weather
+    from sdc_taichi.control.queue_plan import QueuePlan, Weather
     from sdc_taichi.control.store_plan import StorePlanner
-    from sdc_taichi.optimum.facility_map import FacilityMap
 
 HORIZON_H = (1.0, 168.0)
 """Shortest and longest horizon, in h."""
 CARBON = Objective(carbon=1.0)
 """The objective of a name without one."""
-RAMP_K = 2.0
-"""Largest change of the setpoint in a step, in K, as of agents with continuous actions."""
 SETPOINT_STEP_K = 0.5
 """Largest distance of the setpoints to choose from, in K."""
 PEAKS = 8
@@ -128,9 +122,7 @@ class ModelPredictive:
         peak_cost = self._objective.kw_month_weight(view.fleet) / view.step_h
         cost = EnergyCost(
             weight=np.ascontiguousarray(
-                self._objective.energy
-                + self._objective.carbon * coming.ci_g_per_kwh / 1e3
-                + self._objective.cost * coming.price_per_kwh
+                self._objective.kwh_weight(coming.ci_g_per_kwh, coming.price_per_kwh)
             ),
             peak_kwh=self._month_peak_kw(view) * view.step_h,
             peak_cost=peak_cost,
@@ -142,14 +134,14 @@ class ModelPredictive:
             expected_demand(view, coming.index),
             weather,
             cost,
-            setpoint_c=None if "cooling" in self._agents else view.setpoint_c,
+            view.setpoint_c,
             peaks=peaks,
         )
         found: dict[str, F64] = {}
         if "load" in self._agents:
             found["load"] = work.load
         if "cooling" in self._agents:
-            found["cooling"] = _cooling_command(view, planners.facility, weather, work)
+            found["cooling"] = _cooling_command(view, planners, weather, work)
         if planners.store is not None:
             found["battery"] = planners.store.plan(
                 view.state.stored_kwh, work.facility_kwh, cost, peaks=peaks
@@ -166,18 +158,8 @@ class ModelPredictive:
         return np.where(step >= self._bill.month_end, 0.0, self._bill.month_peak_kw)
 
 
-@dataclass(slots=True)
 class _Planners:
     """What plans are made with, which lasts as long as data centers and weather stay the same."""
-
-    facility: FacilityMap
-    """What steps cost by weather, load and setpoint."""
-    queue: QueuePlanner
-    """Plans work."""
-    store: StorePlanner | None
-    """Plans batteries; None where there are none to plan."""
-    _sizing: Sizing
-    _drivers: Drivers
 
     def __init__(self, view: View, agents: tuple[Agent, ...]) -> None:
         from sdc_taichi.control.queue_plan import QueuePlanner
@@ -193,20 +175,26 @@ class _Planners:
             setpoint_step_k=SETPOINT_STEP_K,
             precision=view.precision,
         )
-        self.queue = QueuePlanner(view.fleet, self.facility, moves="load" in agents)
-        self.store = None
+        bars = [not allowed.all() for allowed in self.facility.at_own_nodes(self.facility.allowed)]
+        self.is_limited = np.array(bars)[self.facility.which]
+        """Whether some setpoint is barred in some weather, (B,)."""
+        self.queue = QueuePlanner(
+            view.fleet,
+            self.facility,
+            moves_work="load" in agents,
+            moves_setpoint="cooling" in agents,
+        )
+        self.store: StorePlanner | None = None
         if "battery" in agents and np.any(view.sizing.battery_kwh > 0):
             self.store = StorePlanner(view.fleet, view.sizing, view.step_h)
 
     def suit(self, view: View) -> bool:
         """Whether they were made for the data centers and the weather of a view."""
         own, given = self._drivers, view.drivers
-        return view.sizing is self._sizing and all(
-            mine is theirs
-            for mine, theirs in (
-                (own.outdoor_c, given.outdoor_c),
-                (own.wet_bulb_c, given.wet_bulb_c),
-            )
+        return (
+            view.sizing is self._sizing
+            and given.outdoor_c is own.outdoor_c
+            and given.wet_bulb_c is own.wet_bulb_c
         )
 
 
@@ -225,10 +213,10 @@ def expected_demand(view: View, index: I64) -> F64:
     return view.drivers.demand.at(index - day * -(-lead // day))
 
 
-def _cooling_command(view: View, facility: FacilityMap, weather: Weather, work: QueuePlan) -> F64:
+def _cooling_command(view: View, planners: _Planners, weather: Weather, work: QueuePlan) -> F64:
     """Command towards the setpoint of least energy at the load and weather of the step, (B,)."""
     now = slice(0, 1)
-    best_c = facility.best_setpoint_c(
+    best_c = planners.facility.best_setpoint_c(
         (work.executed_tasks / 100.0)[:, None],
         weather.outdoor_c[:, now],
         weather.wet_bulb_c[:, now],
@@ -237,8 +225,8 @@ def _cooling_command(view: View, facility: FacilityMap, weather: Weather, work: 
     )[:, 0]
     target_c = np.minimum(best_c, view.setpoint_c + RAMP_K)
     # Downwards there is no waiting where a hot inlet may be the reason.
-    limited = ~facility.allowed[facility.which].all(axis=(1, 2, 3, 4))
-    target_c = np.where(limited, target_c, np.maximum(target_c, view.setpoint_c - RAMP_K))
+    slowly_c = np.maximum(target_c, view.setpoint_c - RAMP_K)
+    target_c = np.where(planners.is_limited, target_c, slowly_c)
     return setpoint_command(
         target_c,
         setpoint_c=view.setpoint_c,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -37,13 +37,6 @@ class PlanningKernel:
         self._kernel = NamedKernel(kernel, arguments)
         self._kernel.bind(serial=False, levels=levels)
         self._arguments, self._levels = arguments, levels
-        self._kept: dict[str, F64] = {}
-
-    def kept(self, name: str, make: Callable[[], F64]) -> F64:
-        """An array that is made once."""
-        if name not in self._kept:
-            self._kept[name] = make()
-        return self._kept[name]
 
     def run(
         self,

@@ -60,21 +60,27 @@ class QueuePlanner:
     Args:
         fleet: the data centers.
         facility: what their steps cost.
-        moves: whether the plan may move work; else it only says what neutral commands need.
+        moves_work: whether plans may move work; else they only say what neutral commands need.
+        moves_setpoint: whether each step is to have the best setpoint; else the present one holds.
     """
 
-    def __init__(self, fleet: Fleet, facility: FacilityMap, *, moves: bool) -> None:
+    def __init__(
+        self, fleet: Fleet, facility: FacilityMap, *, moves_work: bool, moves_setpoint: bool
+    ) -> None:
         from sdc_taichi.kernels.planning import queue_kernel
 
-        self._facility, self._moves = facility, moves
+        self._facility, self._moves_setpoint = facility, moves_setpoint
+        self._table = _kwh_of_best_setpoint(facility) if moves_setpoint else _kwh(facility)
         self._model = fleet.models["workload"]
         self._share = fleet.values("workload.flexible_share")[:, None]
         self._cap = fleet.values("workload.max_utilisation")[:, None]
         self._limit = queue_limit_tasks(fleet)
         self._due_steps = due_steps(fleet)
         self._kernel = PlanningKernel(queue_kernel(), QUEUE_ARGUMENTS, LEVELS)
-        self._first = first_commands() if moves else np.zeros(1)
-        self._later = np.array(COMMANDS if moves else (0.0,))
+        most_kwh = [kwh.max() for kwh in facility.at_own_nodes(self._table)]
+        self._most_kwh = np.array(most_kwh)[facility.which]
+        self._first = first_commands() if moves_work else np.zeros(1)
+        self._later = np.array(COMMANDS if moves_work else (0.0,))
 
     def plan(
         self,
@@ -82,8 +88,8 @@ class QueuePlanner:
         demand: F64,
         weather: Weather,
         cost: EnergyCost,
+        setpoint_c: F64,
         *,
-        setpoint_c: F64 | None,
         peaks: int,
     ) -> QueuePlan:
         """The plan of the coming steps.
@@ -93,22 +99,21 @@ class QueuePlanner:
             demand: work that arrives, as a share of capacity, the step to come first, (B, H).
             weather: weather of the coming steps.
             cost: what energy costs.
-            setpoint_c: setpoint that is held, in C, (B,); None takes the best in each step.
+            setpoint_c: present setpoint, in C, (B,).
             peaks: peaks of the month that are tried; 1 without a demand charge.
         """
         size, horizon = demand.shape
         waiting, due = queue[:, -1], _due_by(queue, self._due_steps, horizon)
         now = self._first_step(demand[:, :1], waiting[:, None], due[:, :1])
         coming = self._coming(demand, weather, cost.weight, waiting, due)
-        table, setpoint = self._table(setpoint_c, size)
         dearest = cost.weight.max(axis=1) + cost.peak_cost
         of_dc = {
             "map": self._facility.which.astype(np.float64),
-            "setpoint": setpoint,
+            "setpoint": np.zeros(size) if self._moves_setpoint else self._place_of(setpoint_c),
             "limit": self._limit,
             "end_weight": cost.weight.mean(axis=1),
             "mean_tasks": np.ascontiguousarray(coming["arrived"]).mean(axis=1),
-            "late_cost": dearest * table[self._facility.which].max(axis=(1, 2, 3, 4)),
+            "late_cost": dearest * self._most_kwh,
             "peak_kwh": cost.peak_kwh,
             "peak_cost": cost.peak_cost,
         }
@@ -117,7 +122,7 @@ class QueuePlanner:
             horizon,
             commands=self._later,
             peaks=peaks,
-            table=table,
+            table=self._table,
             of_dc=np.stack(in_row_order(QUEUE_ROWS, of_dc), axis=1),
             coming=np.stack(in_row_order(STEP_ROWS, coming), axis=2),
             first_executed=now.started_tasks,
@@ -194,24 +199,21 @@ class QueuePlanner:
             for place, count in zip((lead, depression), nodes, strict=True)
         ]
 
-    def _table(self, setpoint_c: F64 | None, size: int) -> tuple[F64, F64]:
-        """Energy by map, weather, setpoint and utilisation, and the place of the setpoint, (B,)."""
-        facility = self._facility
-        if setpoint_c is None:
-            return self._kernel.kept(
-                "least", lambda: np.stack([facility.least_kwh] * 2, axis=3)
-            ), np.zeros(size)
-        low, share = facility.places_of_setpoints(setpoint_c[:, None])
-        table = self._kernel.kept(
-            "each", lambda: np.ascontiguousarray(np.moveaxis(_two_at_least(facility), 4, 3))
-        )
-        return table, (low + share)[:, 0]
+    def _place_of(self, setpoint_c: F64) -> F64:
+        """Place of setpoints between the nodes of the map, (B,)."""
+        low, share = self._facility.places_of_setpoints(setpoint_c[:, None])
+        return (low + share)[:, 0]
 
 
-def _two_at_least(facility: FacilityMap) -> F64:
-    """Energies of the map; those of a single setpoint twice."""
-    kwh = facility.facility_kwh
-    return np.concatenate([kwh, kwh], axis=4) if kwh.shape[4] == 1 else kwh
+def _kwh(facility: FacilityMap) -> F64:
+    """Energy by map, weather, setpoint and utilisation; that of a single setpoint twice."""
+    kwh = np.ascontiguousarray(np.moveaxis(facility.facility_kwh, 4, 3))
+    return kwh if kwh.shape[3] > 1 else np.repeat(kwh, 2, axis=3)
+
+
+def _kwh_of_best_setpoint(facility: FacilityMap) -> F64:
+    """Energy at the best setpoint, which stands for two, as the kernel reads between setpoints."""
+    return np.stack([facility.least_kwh] * 2, axis=3)
 
 
 def _due_by(queue: F64, due_after_steps: F64, horizon: int) -> F64:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sdc_taichi.hall.protection import Mask
 from sdc_taichi.optimum.problem import FacilityTable
@@ -200,6 +202,16 @@ class FacilityMap:
         found += flat[at + 1] * ((1.0 - share) * share_k)
         found += flat[at + dry + 1] * (share * share_k)
         return found
+
+    def at_own_nodes(self, values: NDArray[Any]) -> list[NDArray[Any]]:
+        """Values of each entry without nodes of weather that only other entries need, M of them.
+
+        Args:
+            values: Values at all nodes, (M, W, P, ...).
+        """
+        wet = np.rint((self.last_c - self.first_c) / self.step_k).astype(np.int64) + 1
+        dry = np.rint(self.last_depression_k / self.depression_step_k).astype(np.int64) + 1
+        return [each[:w, :d] for each, w, d in zip(values, wet, dry, strict=True)]
 
     def places_of_setpoints(self, setpoint_c: F64) -> tuple[I64, F64]:
         """Node below each setpoint, and its share of the way to the next, each (B, H)."""

@@ -9,9 +9,8 @@ import numpy as np
 
 from sdc_taichi.errors import ConfigError, suggestion
 from sdc_taichi.number_text import parse_number
-from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import F64, I64
+from sdc_taichi.types import F64
 
 _UNITS = {"carbon": "kg CO2e", "energy": "kWh", "cost": "currency of the tariff", "water": "L"}
 """Units of the objectives of one term with weight 1."""
@@ -92,20 +91,14 @@ class Objective:
         """Unit of the figure; of a sum, the text of the objective."""
         return _UNITS.get(str(self), str(self))
 
-    def kwh_weight(self, drivers: Drivers, index: I64) -> F64:
+    def kwh_weight(self, ci_g_per_kwh: F64, price_per_kwh: F64) -> F64:
         """Weight of a kWh bought in each step, without demand charges, (B, T).
 
         Args:
-            drivers: Inputs with prices.
-            index: Steps, counted from the beginning of the year, (B, T).
+            ci_g_per_kwh: Carbon intensity, in g CO2e/kWh, (B, T).
+            price_per_kwh: Price, in the currency of the tariff, (B, T).
         """
-        weight = np.full(index.shape, self.energy)
-        if self.carbon:
-            weight += self.carbon * drivers.ci_g_per_kwh.at(index) / 1e3
-        if self.cost:
-            assert drivers.price_per_kwh is not None, "a simulator has filled it in"
-            weight += self.cost * drivers.price_per_kwh.at(index)
-        return weight
+        return self.energy + self.carbon * ci_g_per_kwh / 1e3 + self.cost * price_per_kwh
 
     def kw_month_weight(self, fleet: Fleet) -> F64:
         """Weight of each kW of the highest power of a month, (B,)."""

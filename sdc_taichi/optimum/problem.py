@@ -10,6 +10,8 @@ from sdc_taichi.types import F64
 Agent = Literal["load", "cooling", "battery"]
 AGENTS: tuple[Agent, ...] = ("load", "cooling", "battery")
 """What a plan may move, by the names of the fields of ``Actions``."""
+RAMP_K = 2.0
+"""Largest change of the setpoint in a step, in K, as that of environments by default."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from sdc_taichi.hall.air_metrics import allowable_c
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import (
     AGENTS,
+    RAMP_K,
     Agent,
     BilledMonth,
     FacilityTable,
@@ -28,9 +29,6 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.workload import Workload, due_steps, queue_limit_tasks
 from sdc_taichi.types import F64, I64
-
-RAMP_K = 2.0
-"""Largest change of the setpoint in a step, in K, as that of environments by default."""
 
 
 def problems_of(
@@ -63,7 +61,8 @@ def problems_of(
     """
     steps = len(tables[0].facility_kwh)
     index = start[:, None] + np.arange(steps)
-    weight = objective.kwh_weight(drivers, index)
+    assert drivers.price_per_kwh is not None, "a simulator has filled it in"
+    weight = objective.kwh_weight(drivers.ci_g_per_kwh.at(index), drivers.price_per_kwh.at(index))
     weight[:, :scored_from] = 0.0
     demand, idle_c = drivers.demand.at(index), _idle_setpoint_c(fleet, index)
     work, storage = _work(fleet, demand, scored_from), _storage(fleet, sizing)
