@@ -13,7 +13,7 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.optimum.discrete_labels import DiscreteModel, Labels, Successors
-from sdc_taichi.optimum.discrete_values import CostsToGo, costs_to_go, guide_of, neutral_labels
+from sdc_taichi.optimum.discrete_values import CostsToGo, costs_to_go, guide_of
 from sdc_taichi.optimum.problem import Ends, Plan, Problem
 from sdc_taichi.types import F64, I64
 
@@ -78,9 +78,9 @@ def discrete_plans(
     """
     model = DiscreteModel(problem, config, demand)
     values = costs_to_go(model, guide_of(model, guide), ends)
-    neutral = neutral_labels(model)
-    most_dropped = float(neutral[-1].dropped_tasks[0]) + _SLACK_TASKS
-    most_overdue = float(neutral[-1].overdue_tasks[0]) + _SLACK_TASKS
+    idle = _after_idle_commands(model)
+    most_dropped = float(idle.dropped_tasks[0]) + _SLACK_TASKS
+    most_overdue = float(idle.overdue_tasks[0]) + _SLACK_TASKS
     labels, trail, is_complete, still = model.first(), _Trail(model.shape), True, 0
     steps = problem.steps
     for t in range(steps):
@@ -96,6 +96,14 @@ def discrete_plans(
         trail.add(kept)
     load, cooling, battery = trail.commands(model)
     return DiscretePlans(load, cooling, battery, labels.cost, is_complete)
+
+
+def _after_idle_commands(model: DiscreteModel) -> Labels:
+    """The state after the last step of commands that are all 0, one label."""
+    labels = model.first()
+    for t in range(model.problem.steps):
+        labels = model.pick(model.successors(labels, t), np.array([model.neutral]), t)
+    return labels
 
 
 class _Trail:

@@ -1,12 +1,12 @@
-"""Sequences of discrete actions run by the simulator, and the best of them for each data center."""
+"""Sequences of discrete actions run by the simulator, and the figure of the best of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from sdc_taichi.optimum.certificates import Certificate
 from sdc_taichi.optimum.discrete import DiscretePlans
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import Agent
@@ -17,23 +17,6 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, I64, Actions
-
-
-@dataclass(frozen=True, slots=True)
-class DiscretePath:
-    """The best sequence of discrete actions of a data center that the simulator has run."""
-
-    figure: float
-    """Figure of the scored steps, in the unit of the objective; nan where no sequence was found
-    that keeps the constraints."""
-    is_complete: bool
-    """Whether the search left no state out, so that no sequence is better by the table."""
-    load: F64
-    """Load commands, (T,)."""
-    cooling: F64
-    """Cooling commands, (T,)."""
-    battery: F64
-    """Battery commands, (T,)."""
 
 
 def run_discrete(
@@ -48,8 +31,11 @@ def run_discrete(
     seed: int | I64 = 0,
     precision: Precision = "f32",
     stop: Callable[[], bool] | None = None,
-) -> list[DiscretePath] | None:
-    """Run all plans of B data centers in one batch, and take the best of each.
+) -> F64 | None:
+    """Run all plans of B data centers in one batch, and take the least figure of each.
+
+    A sequence counts if the simulator shows that it keeps what a plan has to keep; of inlets, which
+    a limit bars by step, the table has been asked.
 
     Args:
         fleet: B data centers.
@@ -64,9 +50,11 @@ def run_discrete(
         stop: Asked before every step.
 
     Returns:
-        The best path of each data center, B; None where ``stop`` ended the work.
+        Figure of the best sequence of each data center, in the unit of the objective, (B,), nan
+        where none counts; None where ``stop`` ended the work.
     """
-    most = max(max(len(of.figure) for of in plans), 1)
+    # Idle commands fill up what is missing, and are the last sequence of all.
+    most = 1 + max(len(of.figure) for of in plans)
     steps = plans[0].load.shape[1]
     load, cooling, battery = (
         np.stack([_filled(getattr(of, name), most) for of in plans], axis=1).reshape(-1, steps)
@@ -82,30 +70,36 @@ def run_discrete(
                 return None
             setpoints = cooling[:, t] if "cooling" in agents else None
             score.add(sim.step(Actions(load[:, t], setpoints, battery[:, t])))
-        figure = score.figure.reshape(most, fleet.size)
-    return [_best(of, figure[:, i]) for i, of in enumerate(plans)]
+        capacity_kwh = sim.sizing.battery_kwh
+    found = [_certificate(score, i) for i in range(copies.size)]
+    idle = found[-fleet.size :]
+    least = np.full(fleet.size, np.nan)
+    for i, of in enumerate(plans):
+        own = found[i :: fleet.size][: len(of.figure)]
+        kept = [each.figure for each in own if not each.failures(idle[i], capacity_kwh[i])]
+        least[i] = min(kept, default=np.nan)
+    return least
 
 
 def _filled(commands: F64, most: int) -> F64:
-    """Commands of so many sequences, (most, T), where the first stands for those that lack."""
+    """Commands of so many sequences, (most, T), of which those that lack are 0."""
     found = np.zeros((most, commands.shape[1]))
     found[: len(commands)] = commands
-    if len(commands):
-        found[len(commands) :] = commands[0]
     return found
 
 
-def _best(plans: DiscretePlans, figure: F64) -> DiscretePath:
-    """The best of some plans by the figures that the simulator reached, (K,) and more."""
-    count, steps = plans.load.shape
-    if not count:
-        still = np.zeros(steps)
-        return DiscretePath(float("nan"), plans.is_complete, still, still, still)
-    best = int(figure[:count].argmin())
-    return DiscretePath(
-        figure=float(figure[best]),
-        is_complete=plans.is_complete,
-        load=plans.load[best],
-        cooling=plans.cooling[best],
-        battery=plans.battery[best],
+def _certificate(score: Score, i: int) -> Certificate:
+    """What the simulator measured of one sequence, by its number, without tables."""
+    return Certificate(
+        figure=float(score.figure[i]),
+        table_error=0.0,
+        start_kwh=float(score.start_kwh[i]),
+        end_kwh=float(score.end_kwh[i]),
+        start_tasks=float(score.start_tasks[i]),
+        end_tasks=float(score.end_tasks[i]),
+        dropped_tasks=float(score.dropped_tasks[i]),
+        overdue_tasks=float(score.most_overdue_tasks[i]),
+        hottest_inlet_c=float(score.hottest_inlet_c[i]),
+        over_limit_k=0.0,
+        unmet_kwh=float(score.unmet_kwh[i]),
     )

@@ -14,7 +14,6 @@ import numpy as np
 from sdc_taichi.hall.protection import Mask
 from sdc_taichi.optimum.discrete_labels import (
     DiscreteModel,
-    Labels,
     Successors,
     read_table,
     table_place,
@@ -362,12 +361,3 @@ def _longest_queue(problem: Problem) -> float:
     if waits is None or waits >= problem.steps:
         return float(deferred[-1])
     return float(max(deferred[waits - 1], (deferred[waits:] - deferred[:-waits]).max()))
-
-
-def neutral_labels(model: DiscreteModel) -> list[Labels]:
-    """The state after each step of commands that are all 0, T labels of one each."""
-    labels, found = model.first(), []
-    for t in range(model.problem.steps):
-        labels = model.pick(model.successors(labels, t), np.array([model.neutral]), t)
-        found.append(labels)
-    return found

@@ -399,8 +399,8 @@ class _Work:
         if found is None:
             raise self._stopped()
         return [
-            replace(entry, discrete=path.figure, discrete_complete=path.is_complete)
-            for entry, path in zip(entries, found, strict=True)
+            replace(entry, discrete=float(figure), discrete_complete=of.is_complete)
+            for entry, figure, of in zip(entries, found, plans, strict=True)
         ]
 
     def _plan_batteries_again(
