@@ -16,6 +16,7 @@ from sdc_taichi.optimum import tables
 from sdc_taichi.optimum.eligibility import no_table_reasons, uncooled_reason
 from sdc_taichi.optimum.facility_map import FacilityMap, facility_map
 from sdc_taichi.optimum.problem import FacilityTable
+from sdc_taichi.optimum.table_lookup import at_setpoint, at_utilisation
 from sdc_taichi.optimum.tables import Nodes, TableGrid, facility_tables
 from sdc_taichi.sim.drivers import Drivers, FleetSeries, load_drivers
 
@@ -230,6 +231,16 @@ def test_all_reasons_are_told_for_each_data_center() -> None:
     assert first is None
     assert second is not None
     assert second.count("; ") == 1
+
+
+def test_a_node_that_is_not_reached_is_not_read() -> None:
+    unmet_w = np.array([[[np.inf, 0.0], [np.inf, 0.0], [np.inf, 0.0]]] * 3)
+    utilisation, setpoint_c = np.array([0.0, 0.5, 1.0]), np.array([16.0, 20.0])
+    read = at_utilisation(unmet_w, utilisation, np.array([0.0, 0.7, 1.0]))
+    assert np.array_equal(read, unmet_w[:, 0])
+    assert np.array_equal(
+        at_setpoint(read, setpoint_c, np.array([20.0, 20.0, 19.0])), [0, 0, np.inf]
+    )
 
 
 def test_loads_that_no_setpoint_cools_are_told() -> None:

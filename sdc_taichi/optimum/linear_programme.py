@@ -15,12 +15,12 @@ from sdc_taichi.optimum.result import StoppedError
 from sdc_taichi.optimum.stage_cost import (
     LoadCurves,
     StageCost,
-    at_tasks,
     given_curves,
     load_curves,
     stage_cost,
     step_weights,
 )
+from sdc_taichi.optimum.table_lookup import cubic
 from sdc_taichi.optimum.windows import bound_in_windows, plan_in_windows, window_ends
 from sdc_taichi.types import F64
 
@@ -151,7 +151,7 @@ def plan(problem: Problem, *, stop: Callable[[], bool] | None = None) -> Plan:
         found = plan_in_windows(weighed, stage, span, borders, ahead, solve)
     return Plan(
         executed_tasks=found.executed_tasks,
-        setpoint_c=at_tasks(stage.executed_tasks, stage.setpoint_c, found.executed_tasks),
+        setpoint_c=cubic(stage.executed_tasks, stage.setpoint_c, found.executed_tasks),
         charge_kwh=found.charge_kwh,
         discharge_kwh=found.discharge_kwh,
     )

@@ -17,7 +17,8 @@ import numpy as np
 
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.protection import Mask
-from sdc_taichi.optimum.problem import FacilityTable, Problem
+from sdc_taichi.optimum.problem import Problem
+from sdc_taichi.optimum.table_lookup import at_setpoint, cubic
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64
 
@@ -110,27 +111,6 @@ def step_weights(problem: Problem, warm_up_share: float = 0.0) -> tuple[F64, F64
     return weight, litre
 
 
-def at_tasks(nodes: F64, values: F64, tasks: F64) -> F64:
-    """Values at an amount of work in each step, from the cubic through four nodes, (T,).
-
-    Args:
-        nodes: Amounts of work, rising, in tasks, (I,).
-        values: Values of each step at them, (T, I).
-        tasks: Amount of work of each step, in tasks, (T,), taken as the last node beyond it.
-    """
-    tasks = np.clip(tasks, nodes[0], nodes[-1])
-    points = min(4, len(nodes))
-    first = np.clip(np.searchsorted(nodes, tasks) - points // 2, 0, len(nodes) - points)
-    x = nodes[first[:, None] + np.arange(points)]
-    y = np.take_along_axis(values, first[:, None] + np.arange(points), axis=1)
-    found = np.zeros(len(tasks))
-    for k in range(points):
-        others = np.delete(x, k, axis=1)
-        share = (tasks[:, None] - others) / (x[:, k : k + 1] - others)
-        found += y[:, k] * share.prod(axis=1)
-    return found
-
-
 def load_curves(problem: Problem, stage: StageCost) -> LoadCurves:
     """The largest convex curves below cost and least energy, from the least to the most work.
 
@@ -179,8 +159,8 @@ def given_curves(problem: Problem, stage: StageCost) -> LoadCurves:
     tasks, none = problem.work.idle_tasks, np.zeros(0)
     return LoadCurves(
         least_tasks=tasks,
-        base_cost=at_tasks(stage.executed_tasks, stage.cost, tasks),
-        base_kwh=at_tasks(stage.executed_tasks, stage.least_facility_kwh, tasks),
+        base_cost=cubic(stage.executed_tasks, stage.cost, tasks),
+        base_kwh=cubic(stage.executed_tasks, stage.least_facility_kwh, tasks),
         step=np.zeros(0, np.int64),
         width_tasks=none,
         slope_cost=none,
@@ -216,10 +196,10 @@ def _of_steps(
     weight, litre = weight[steps, None], litre[steps, None]
     if "cooling" not in problem.agents:
         idle_c = problem.idle_setpoint_c[steps]
-        energy = _at_setpoint(table, np.where(cooled, kwh, np.inf), idle_c)
+        energy = at_setpoint(np.where(cooled, kwh, np.inf), table.setpoint_c, idle_c[:, None])
         cost = weight * energy
         if problem.litre_weight:
-            cost = cost + litre * _at_setpoint(table, water_l, idle_c)
+            cost = cost + litre * at_setpoint(water_l, table.setpoint_c, idle_c[:, None])
         cost = np.where(np.isfinite(energy), cost, np.inf)
         return cost, energy, energy, energy, np.broadcast_to(idle_c[:, None], cost.shape)
     permitted, inlet_c = cooled, table.inlet_max_c[steps]
@@ -235,7 +215,7 @@ def _of_steps(
     cost, cost_c = _least(weighed, permitted, edge, table.setpoint_c)
     free = (weight == 0.0) & (litre == 0.0)
     cost_c = np.where(free, least_c, cost_c)
-    return cost, _along_setpoints(table, kwh, cost_c), least, most, cost_c
+    return cost, at_setpoint(kwh, table.setpoint_c, cost_c), least, most, cost_c
 
 
 def _edges(permitted: Mask, cooled: Mask, inlet_c: F64, limit_c: float) -> F64:
@@ -286,24 +266,6 @@ def _least(values: F64, permitted: Mask, edge: F64, setpoint_c: F64) -> tuple[F6
     return least, found_c
 
 
-def _at_setpoint(table: FacilityTable, values: F64, setpoint_c: F64) -> F64:
-    """Values of a table at one setpoint in each step, (t, I)."""
-    return _along_setpoints(table, values, np.broadcast_to(setpoint_c[:, None], values.shape[:2]))
-
-
-def _along_setpoints(table: FacilityTable, values: F64, setpoint_c: F64) -> F64:
-    """Values of a table at a setpoint for each step and utilisation, read linearly, (t, I)."""
-    nodes = table.setpoint_c
-    k = np.clip(np.searchsorted(nodes, setpoint_c, side="right") - 1, 0, max(len(nodes) - 2, 0))
-    low = np.take_along_axis(values, k[..., None], axis=2)[..., 0]
-    if len(nodes) < 2:
-        return low
-    high = np.take_along_axis(values, k[..., None] + 1, axis=2)[..., 0]
-    share = np.clip((setpoint_c - nodes[k]) / (nodes[1] - nodes[0]), 0.0, 1.0)
-    # A share of 0 must not read a neighbour that cannot be cooled.
-    return np.where(share == 0.0, low, low + np.where(share == 0.0, 0.0, share) * (high - low))
-
-
 def _extend(problem: Problem, tasks: F64, t: int, rows: tuple[F64, ...]) -> float:
     """Continue the values of a step beyond what can be cooled, in place.
 
@@ -350,7 +312,7 @@ def _lowered(nodes: F64, values: F64, least: F64, most: F64) -> F64:
     ends = []
     for tasks in (least, most):
         k = np.clip(np.searchsorted(nodes, tasks, side="right") - 1, 0, len(gap) - 1)
-        ends.append(at_tasks(nodes, values, tasks) - np.take_along_axis(sag, k[:, None], 1)[:, 0])
+        ends.append(cubic(nodes, values, tasks) - np.take_along_axis(sag, k[:, None], 1)[:, 0])
     first, last = ends[0][:, None], ends[1][:, None]
     middle = np.where(nodes <= least[:, None], first, values - beside)
     return np.concatenate([first, np.where(nodes >= most[:, None], last, middle), last], axis=1)

@@ -6,7 +6,6 @@ import numpy as np
 
 from sdc_taichi.hall.protection import Mask
 from sdc_taichi.optimum.problem import FacilityTable
-from sdc_taichi.optimum.stage_cost import at_tasks
 from sdc_taichi.types import F64, I64
 
 INLET_MARGIN_K = 0.02
@@ -24,10 +23,7 @@ def at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:
     """
     low, share = _place(nodes, utilisation)
     step = np.arange(len(utilisation))
-    below, above = values[step, low], values[step, low + 1]
-    # A share of 0 must not read a neighbour that cannot be cooled.
-    weighed = np.where(share[:, None] > 0.0, above, 0.0) * share[:, None]
-    return np.asarray(below * (1.0 - share)[:, None] + weighed)
+    return _between(values[step, low], values[step, low + 1], share[:, None])
 
 
 def energy_at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:
@@ -38,24 +34,47 @@ def energy_at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:
         nodes: Utilisations of the table, rising, (I,).
         utilisation: Utilisation of each step, (T,); beyond the nodes that of the last node counts.
     """
-    columns = [at_tasks(nodes, values[:, :, j], utilisation) for j in range(values.shape[2])]
+    columns = [cubic(nodes, values[:, :, j], utilisation) for j in range(values.shape[2])]
     return np.stack(columns, axis=1)
 
 
-def at_setpoint(values: F64, nodes: F64, setpoint_c: F64) -> F64:
-    """Values at a setpoint of each step, linear between the nodes, (T,).
+def cubic(nodes: F64, values: F64, at: F64) -> F64:
+    """Values of each step from the cubic through four nodes, (T,).
 
     Args:
-        values: Values by step and setpoint, (T, J).
+        nodes: Places of the nodes, rising, (I,).
+        values: Values of each step at them, (T, I).
+        at: Place of each step, (T,); beyond the nodes that of the last node counts.
+    """
+    at = np.clip(at, nodes[0], nodes[-1])
+    points = min(4, len(nodes))
+    first = np.clip(np.searchsorted(nodes, at) - points // 2, 0, len(nodes) - points)
+    x = nodes[first[:, None] + np.arange(points)]
+    y = np.take_along_axis(values, first[:, None] + np.arange(points), axis=1)
+    found = np.zeros(len(at))
+    for k in range(points):
+        others = np.delete(x, k, axis=1)
+        share = (at[:, None] - others) / (x[:, k : k + 1] - others)
+        found += y[:, k] * share.prod(axis=1)
+    return found
+
+
+def at_setpoint(values: F64, nodes: F64, setpoint_c: F64) -> F64:
+    """Values at setpoints, linear between the nodes, (...).
+
+    Args:
+        values: Values by setpoint, (..., J).
         nodes: Setpoints of the table, rising, in C, (J,).
-        setpoint_c: Setpoint of each step, in C, (T,); beyond the nodes that of the last node
-            counts.
+        setpoint_c: Setpoints, in C, of a shape that broadcasts to (...); beyond the nodes that of
+            the last node counts.
     """
     if len(nodes) == 1:
-        return values[:, 0].copy()
+        return values[..., 0].copy()
     low, share = _place(nodes, setpoint_c)
-    step = np.arange(len(setpoint_c))
-    return np.asarray(values[step, low] * (1.0 - share) + values[step, low + 1] * share)
+    below, above = (
+        np.take_along_axis(values, k[..., None], axis=-1)[..., 0] for k in (low, low + 1)
+    )
+    return _between(below, above, share)
 
 
 def facility_kwh(table: FacilityTable, utilisation: F64, setpoint_c: F64) -> F64:
@@ -98,6 +117,12 @@ def coolest_inlet_c(inlet_max_c: F64, unmet_w: F64) -> F64:
 def _meets(unmet_w: F64) -> Mask:
     """Setpoints that miss the least of the cooling load, (..., J)."""
     return np.asarray(unmet_w <= unmet_w.min(axis=-1, keepdims=True))
+
+
+def _between(low: F64, high: F64, share: F64) -> F64:
+    """Values part of the way from low to high ones, of which one that is not reached may be inf."""
+    below, above = np.where(share < 1.0, low, 0.0), np.where(share > 0.0, high, 0.0)
+    return np.asarray(below * (1.0 - share) + above * share)
 
 
 def _place(nodes: F64, at: F64) -> tuple[I64, F64]:
