@@ -145,12 +145,14 @@ def test_sequences_that_take_from_the_store_do_not_count() -> None:
     with Simulator(fleet) as sim:
         drivers = sim.drivers
 
-    def least(battery: F64) -> F64 | None:
+    def least(battery: F64) -> float:
         still = np.zeros((len(battery), 8))
         plans = DiscretePlans(still, still, battery, np.zeros(len(battery)), False)
-        return run_discrete(
+        found = run_discrete(
             fleet, drivers, [plans], agents=AGENTS, start=drivers.start, objective=CARBON
         )
+        assert found is not None
+        return float(found[0])
 
     empties, rests = np.full((1, 8), -1.0), np.zeros((1, 8))
     assert np.isnan(least(empties))

@@ -286,31 +286,19 @@ def test_a_map_has_the_simulators_figures_at_its_nodes(plant: str) -> None:
             grid=GRID,
             precision="f64",
         )
-        for setpoint_c, expected in zip(table.setpoint_c, table.facility_kwh[0].T, strict=True):
-            at = np.array([[outside_c]]), np.array([[outside_c - below_k]])
-            kwh = found.kwh_at(np.array([[setpoint_c]]), *at)
-            assert kwh[0, 0] == pytest.approx(expected, rel=1e-9)
-            assert found.water_l[0, node, 2] == pytest.approx(table.water_l[0], rel=1e-9)
+        assert found.facility_kwh[0, node, 2] == pytest.approx(table.facility_kwh[0], rel=1e-9)
 
 
-def test_a_map_is_linear_between_its_nodes() -> None:
+def test_weather_has_its_place_between_the_nodes_of_a_map() -> None:
     found, _ = a_map([load_config("tiny", []), load_config("tiny", ["site.location=AZ"])])
-    wet_bulb_c = np.array([[7.0, 8.0, 9.0], [4.5, 5.0, 5.5]])
-    outdoor_c = wet_bulb_c + np.array([[1.0, 2.0, 3.0], [6.0, 5.0, 4.0]])
-    found = replace(found, first_c=np.array([3.0, -1.0]))
-    kwh = found.lowest_kwh(outdoor_c, wet_bulb_c)
-    assert kwh.shape == (2, 3, 3)
-    assert kwh[:, 1] == pytest.approx((kwh[:, 0] + kwh[:, 2]) / 2, rel=1e-12)
-    level = np.array([[0.25], [0.75]])
-    setpoint_c = np.array([[17.0], [21.0]])
-    at = outdoor_c[:, :1], wet_bulb_c[:, :1]
-    middle = found.energy_kwh(level, setpoint_c, at[1], at[0])
-    corners = [
-        found.energy_kwh(level + above, setpoint_c + warmer, at[1], at[0])
-        for above in (-0.25, 0.25)
-        for warmer in (-1.0, 1.0)
-    ]
-    assert middle == pytest.approx(np.mean(corners, axis=0), rel=1e-12)
+    last_lead, last_depression = (n - 1 for n in found.facility_kwh.shape[1:3])
+    wet_bulb_c = found.first_c[:, None] + 10.0 * np.array([0.0, 1.25, 100.0])
+    below_k = found.depression_step_k[:, None] * np.array([0.0, 1.5, 100.0])
+    lead, depression = found.places_of_weather(wet_bulb_c + below_k, wet_bulb_c)
+    own_last = (found.last_c - found.first_c) / 10.0
+    assert lead == pytest.approx(np.stack([[0.0, 1.25, last] for last in own_last]))
+    assert own_last.max() == pytest.approx(last_lead)
+    assert depression == pytest.approx(np.stack([[0.0, 1.5, last_depression]] * 2))
 
 
 @pytest.mark.parametrize("plant", ["water_cooled", "air_side"])
@@ -324,37 +312,30 @@ def test_a_data_center_has_the_same_map_alone_and_beside_others(plant: str) -> N
     together, _ = a_map(configs)
     outdoor_c = np.array([[-40.0, -3.0, 12.0, 33.0, 60.0]] * 2)
     wet_bulb_c = outdoor_c - np.array([0.0, 1.5, 7.0, 18.0, 50.0])
-    setpoint_c = np.array([[16.0, 17.0, 19.5, 21.0, 23.0]] * 2)
+    level = np.full(outdoor_c.shape, 0.3)
+    best_c = together.best_setpoint_c(level, outdoor_c, wet_bulb_c)
+    places = together.places_of_weather(outdoor_c, wet_bulb_c)
     for dc, config in enumerate(configs):
         alone, _ = a_map([config])
         own = slice(dc, dc + 1)
         at = outdoor_c[own], wet_bulb_c[own]
-        lowest = together.lowest_kwh(outdoor_c, wet_bulb_c)[own]
-        assert np.array_equal(alone.lowest_kwh(*at), lowest)
-        given = together.kwh_at(setpoint_c, outdoor_c, wet_bulb_c)[own]
-        assert np.array_equal(alone.kwh_at(setpoint_c[own], *at), given)
+        assert np.array_equal(alone.best_setpoint_c(level[own], *at), best_c[own])
+        for one, of_all in zip(alone.places_of_weather(*at), places, strict=True):
+            assert np.array_equal(one, of_all[own])
         assert np.array_equal(alone.least_kwh[0], together.at_own_nodes(together.least_kwh)[dc])
 
 
-def test_the_best_setpoint_of_a_map_is_that_of_least_cost() -> None:
-    found, drivers = a_map([load_config("corrected", []), load_config("corrected", [JULY])])
-    index = drivers.start[:, None] + 8 * np.arange(6)
-    at = drivers.outdoor_c.at(index), drivers.wet_bulb_c.at(index)
-    level, ones = np.full(index.shape, 0.5), np.ones(index.shape)
-    for litre_weight in (0.0, 0.3):
-        cost, kwh = found.lowest_cost(*at, ones, litre_weight)
-        best_c = found.best_setpoint_c(level, *at, ones, litre_weight)
-        assert np.all((best_c >= 16) & (best_c <= 23))
-        for setpoint_c in found.setpoint_c[0]:
-            other = np.full(index.shape, setpoint_c)
-            litres = replace(found, facility_kwh=found.water_l)
-            figure = found.energy_kwh(level, other, at[1], at[0])
-            figure += litre_weight * litres.energy_kwh(level, other, at[1], at[0])
-            assert np.all(cost[..., 1] <= figure + 1e-9)
-            assert figure[best_c == setpoint_c] == pytest.approx(
-                cost[..., 1][best_c == setpoint_c], rel=1e-12
-            )
-        assert kwh == pytest.approx(cost) if litre_weight == 0 else np.all(kwh < cost)
+def test_the_best_setpoint_of_a_map_is_that_of_least_energy() -> None:
+    found_c = []
+    for limit_c in (np.inf, 23.0):
+        found, _ = a_map([load_config("corrected", [])], inlet_limit_c=np.array([limit_c]))
+        wet_bulb_c = found.first_c[0] + 10.0 * np.arange(found.facility_kwh.shape[1])[None]
+        best_c = found.best_setpoint_c(np.full(wet_bulb_c.shape, 0.5), wet_bulb_c, wet_bulb_c)
+        kwh = np.where(found.allowed, found.facility_kwh, np.inf)[0, :, 0, 1]
+        assert np.array_equal(best_c[0], found.setpoint_c[0, kwh.argmin(axis=-1)])
+        found_c.append(best_c)
+    free_c, limited_c = found_c
+    assert np.any(limited_c < free_c)
 
 
 def test_a_map_keeps_inlets_within_the_limit_where_it_can() -> None:

@@ -220,8 +220,6 @@ def _cooling_command(view: View, planners: _Planners, weather: Weather, work: Qu
         (work.executed_tasks / 100.0)[:, None],
         weather.outdoor_c[:, now],
         weather.wet_bulb_c[:, now],
-        np.ones((view.size, 1)),
-        0.0,
     )[:, 0]
     target_c = np.minimum(best_c, view.setpoint_c + RAMP_K)
     # Downwards there is no waiting where a hot inlet may be the reason.

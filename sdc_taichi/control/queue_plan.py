@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -161,7 +160,7 @@ class QueuePlanner:
             capacity, most_drained = np.maximum(np.floor(capacity), arrived), flexible
             most_due = capacity - arrived
         held_back = np.maximum(flexible, arrived - capacity)
-        lead, depression = self._places(weather)
+        lead, depression = self._facility.places_of_weather(weather.outdoor_c, weather.wet_bulb_c)
         most_waiting = (waiting[:, None] - due) + self._not_due(held_back)
         reached = np.minimum(waiting[:, None] + np.cumsum(held_back, axis=1), most_waiting)
         reached = np.minimum(reached, self._limit[:, None])
@@ -185,19 +184,6 @@ class QueuePlanner:
         before = np.arange(horizon) - np.minimum(self._due_steps, horizon)[:, None].astype(np.int64)
         gone = np.take_along_axis(total, np.maximum(before, 0), axis=1)
         return total - np.where(before >= 0, gone, 0.0)
-
-    def _places(self, weather: Weather) -> Sequence[F64]:
-        """Places of the weather between the nodes of the map, (B, H) each."""
-        facility = self._facility
-        which, nodes = facility.which[:, None], facility.facility_kwh.shape[1:3]
-        lead_c = weather.wet_bulb_c if facility.by_wet_bulb else weather.outdoor_c
-        lead_c = np.minimum(lead_c, facility.last_c[which])
-        lead = (lead_c - facility.first_c[which]) / facility.step_k
-        depression = (weather.outdoor_c - weather.wet_bulb_c) / facility.depression_step_k[which]
-        return [
-            np.clip(place, 0.0, count - 1)
-            for place, count in zip((lead, depression), nodes, strict=True)
-        ]
 
     def _place_of(self, setpoint_c: F64) -> F64:
         """Place of setpoints between the nodes of the map, (B,)."""

@@ -36,6 +36,10 @@ _FEW = 4
 air in open and close by its humidity, and have nodes as close as those of the dry bulb."""
 
 
+_BARRED = 1e6
+"""Energy at which a barred setpoint is taken, over that of the dearest."""
+
+
 @dataclass(frozen=True, slots=True)
 class FacilityMap:
     """What a step costs in B data centers, M of which differ, by weather, load and setpoint.
@@ -64,8 +68,6 @@ class FacilityMap:
     """Setpoints, rising in equal steps to the highest, which fills what is left, in C, (M, J)."""
     facility_kwh: F64
     """Energy of the facility without its battery, in kWh, (M, W, P, I, J)."""
-    water_l: F64
-    """Make-up water, in l, (M, W, P, I, J)."""
     allowed: Mask
     """Whether a plan may choose a setpoint: its hottest inlet is within the limit and it leaves no
     heat in the room, or no setpoint does better, (M, W, P, I, J)."""
@@ -77,124 +79,50 @@ class FacilityMap:
         least_kwh = np.where(self.allowed, self.facility_kwh, np.inf).min(axis=-1)
         object.__setattr__(self, "least_kwh", least_kwh)
 
-    def lowest_kwh(self, outdoor_c: F64, wet_bulb_c: F64) -> F64:
-        """Energy of the facility at the best setpoint, by utilisation.
-
-        Args:
-            outdoor_c: Dry bulb, in C, (B, H).
-            wet_bulb_c: Wet bulb, in C, (B, H).
-
-        Returns:
-            kWh, (B, H, I).
-        """
-        return self._in_weather(self.least_kwh, outdoor_c, wet_bulb_c)
-
-    def lowest_cost(
-        self, outdoor_c: F64, wet_bulb_c: F64, kwh_weight: F64, litre_weight: float
-    ) -> tuple[F64, F64]:
-        """Cost at the best setpoint, by utilisation, and the energy that belongs to it.
-
-        Args:
-            outdoor_c: Dry bulb, in C, (B, H).
-            wet_bulb_c: Wet bulb, in C, (B, H).
-            kwh_weight: Cost of a kWh, (B, H).
-            litre_weight: Cost of a litre of water.
-
-        Returns:
-            Cost, and kWh, each (B, H, I).
-        """
-        if litre_weight == 0.0:
-            kwh = self.lowest_kwh(outdoor_c, wet_bulb_c)
-            return np.asarray(kwh_weight[..., None] * kwh), kwh
-        kwh, cost = self._by_setpoint(outdoor_c, wet_bulb_c, kwh_weight, litre_weight)
-        best = cost.argmin(axis=-1)[..., None]
-        return (
-            np.take_along_axis(cost, best, axis=-1)[..., 0],
-            np.take_along_axis(kwh, best, axis=-1)[..., 0],
-        )
-
-    def kwh_at(self, setpoint_c: F64, outdoor_c: F64, wet_bulb_c: F64) -> F64:
-        """Energy of the facility at given setpoints, by utilisation, in kWh, (B, H, I).
-
-        Args:
-            setpoint_c: Setpoint, in C, (B, H).
-            outdoor_c: Dry bulb, in C, (B, H).
-            wet_bulb_c: Wet bulb, in C, (B, H).
-        """
-        by_setpoint = self._in_weather(self.facility_kwh, outdoor_c, wet_bulb_c)
-        place, share = self.places_of_setpoints(setpoint_c)
-        low, high = (
-            np.take_along_axis(by_setpoint, at[..., None, None], axis=-1)[..., 0]
-            for at in (place, np.minimum(place + 1, self.setpoint_c.shape[1] - 1))
-        )
-        return low + share[..., None] * (high - low)
-
-    def energy_kwh(self, utilisation: F64, setpoint_c: F64, wet_bulb_c: F64, outdoor_c: F64) -> F64:
-        """Energy of the facility, in kWh, (B, H).
+    def best_setpoint_c(self, utilisation: F64, outdoor_c: F64, wet_bulb_c: F64) -> F64:
+        """The setpoint of least energy among the nodes that are allowed, in C, (B, H).
 
         Args:
             utilisation: Utilisation, 0..1, (B, H).
-            setpoint_c: Setpoint, in C, (B, H).
-            wet_bulb_c: Wet bulb, in C, (B, H).
             outdoor_c: Dry bulb, in C, (B, H).
+            wet_bulb_c: Wet bulb, in C, (B, H).
         """
-        return self.at_utilisation(self.kwh_at(setpoint_c, outdoor_c, wet_bulb_c), utilisation)
-
-    def at_utilisation(self, values: F64, utilisation: F64) -> F64:
-        """Values at some utilisation, (B, H), from those at the nodes, (B, H, I)."""
+        places = self.places_of_weather(outdoor_c, wet_bulb_c)
+        kwh = self._in_weather(self.facility_kwh, *places)
+        bars = self._in_weather(np.where(self.allowed, 0.0, 1.0), *places)
+        # A number, so that shares of nodes can be taken of it.
+        kwh += _BARRED * (1.0 + kwh.max(axis=-1, keepdims=True)) * (bars > 0.0)
         intervals = len(self.utilisation) - 1
-        place = np.clip(utilisation * intervals, 0.0, intervals)
-        low = np.minimum(place.astype(np.int64), intervals - 1)
-        at_low, at_high = (
-            np.take_along_axis(values, at[..., None], axis=-1)[..., 0] for at in (low, low + 1)
+        low, share = _place(utilisation * intervals, intervals + 1)
+        below, above = (
+            np.take_along_axis(kwh, at[..., None, None], axis=2)[:, :, 0] for at in (low, low + 1)
         )
-        return at_low + (place - low) * (at_high - at_low)
-
-    def best_setpoint_c(
-        self,
-        utilisation: F64,
-        outdoor_c: F64,
-        wet_bulb_c: F64,
-        kwh_weight: F64,
-        litre_weight: float,
-    ) -> F64:
-        """The setpoint of least cost among the nodes that are allowed, in C, (B, H).
-
-        Args:
-            utilisation: Utilisation, 0..1, (B, H).
-            outdoor_c: Dry bulb, in C, (B, H).
-            wet_bulb_c: Wet bulb, in C, (B, H).
-            kwh_weight: Cost of a kWh, (B, H).
-            litre_weight: Cost of a litre of water.
-        """
-        _, cost = self._by_setpoint(outdoor_c, wet_bulb_c, kwh_weight, litre_weight)
-        each = [self.at_utilisation(cost[..., j], utilisation) for j in range(cost.shape[-1])]
-        best = np.argmin(each, axis=0)
+        best = (below + share[..., None] * (above - below)).argmin(axis=-1)
         return np.asarray(np.take_along_axis(self.setpoint_c[self.which], best, axis=1))
 
-    def _by_setpoint(
-        self, outdoor_c: F64, wet_bulb_c: F64, kwh_weight: F64, litre_weight: float
-    ) -> tuple[F64, F64]:
-        """Energy, and cost that is large where a setpoint is barred, each (B, H, I, J)."""
-        kwh = self._in_weather(self.facility_kwh, outdoor_c, wet_bulb_c)
-        cost = kwh_weight[..., None, None] * kwh
-        if litre_weight:
-            cost = cost + litre_weight * self._in_weather(self.water_l, outdoor_c, wet_bulb_c)
-        bars = self._in_weather(np.where(self.allowed, 0.0, 1.0), outdoor_c, wet_bulb_c)
-        # A number, so that shares of nodes can be taken of it.
-        return kwh, cost + _BARRED * (1.0 + cost.max(axis=-1, keepdims=True)) * (bars > 0.0)
+    def places_of_weather(self, outdoor_c: F64, wet_bulb_c: F64) -> tuple[F64, F64]:
+        """Places of the weather on the two axes, counted in nodes, each (B, H).
 
-    def _in_weather(self, values: F64, outdoor_c: F64, wet_bulb_c: F64) -> F64:
-        """Values in some weather, (B, H, ...), from those at the nodes, (M, W, P, ...)."""
-        wet, dry = values.shape[1:3]
-        which = self.which[:, None]
+        Args:
+            outdoor_c: Dry bulb, in C, (B, H).
+            wet_bulb_c: Wet bulb, in C, (B, H).
+        """
+        which, (lead_nodes, depression_nodes) = self.which[:, None], self.facility_kwh.shape[1:3]
         lead_c = wet_bulb_c if self.by_wet_bulb else outdoor_c
         lead_c = np.minimum(lead_c, self.last_c[which])
-        low, share = _place((lead_c - self.first_c[which]) / self.step_k, wet)
         below_k = np.minimum(outdoor_c - wet_bulb_c, self.last_depression_k[which])
-        low_k, share_k = _place(below_k / self.depression_step_k[which], dry)
+        return (
+            np.clip((lead_c - self.first_c[which]) / self.step_k, 0.0, lead_nodes - 1),
+            np.clip(below_k / self.depression_step_k[which], 0.0, depression_nodes - 1),
+        )
+
+    def _in_weather(self, values: F64, lead: F64, depression: F64) -> F64:
+        """Values at places of the weather, (B, H, ...), from those at nodes, (M, W, P, ...)."""
+        wet, dry = values.shape[1:3]
+        low, share = _place(lead, wet)
+        low_k, share_k = _place(depression, dry)
         flat = values.reshape(-1, *values.shape[3:])
-        at = (which * wet + low) * dry + low_k
+        at = (self.which[:, None] * wet + low) * dry + low_k
         added = (1,) * (values.ndim - 3)
         share, share_k = (x.reshape(*x.shape, *added) for x in (share, share_k))
         found: F64 = flat[at] * ((1.0 - share) * (1.0 - share_k))
@@ -220,10 +148,6 @@ class FacilityMap:
         within_c = np.clip(setpoint_c, nodes_c[:, :1], nodes_c[:, -1:])
         place = (within_c - nodes_c[:, :1]) / np.where(step_k > 0, step_k, 1.0)
         return _place(place, nodes_c.shape[1])
-
-
-_BARRED = 1e6
-"""Cost of a barred setpoint over that of the dearest, a number so that it can be interpolated."""
 
 
 def facility_map(
@@ -283,7 +207,6 @@ def facility_map(
         utilisation=levels,
         setpoint_c=np.array([each.setpoint_c for each in nodes]),
         facility_kwh=np.stack([t.facility_kwh for t in tables]).reshape(shape),
-        water_l=np.stack([t.water_l for t in tables]).reshape(shape),
         allowed=np.stack(
             [
                 ~barred(table.inlet_max_c, table.unmet_w, inlet_limit_c[dc])
