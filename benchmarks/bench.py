@@ -43,8 +43,6 @@ HERE = Path(__file__).parent
 LIBRARIES = ("numpy", "taichi", "gymnasium", "pettingzoo", "numba")
 CURVE = (3, 25, 250, 2500, 25_000)
 """Data centers of 4,000 servers of the curve of cost against size: 1e4 to 1e8 servers."""
-ALL_SITES = "az,ca,ga,il,ny,tx,va,wa"
-"""Sites with a synthetic year."""
 BYTES_PER_SERVER_AT_WORK = 30
 """Of the largest size: layers, and what its build takes at the most."""
 
@@ -412,7 +410,8 @@ def starting(quick: bool) -> Iterator[Figure]:
 
 def optima(quick: bool) -> Iterator[Figure]:
     """Known optima, from the import to the last run, in processes of their own."""
-    cases = [("ny,ca", 2, None)] if quick else [(ALL_SITES, 31, 500.0), ("ny", 365, 1000.0)]
+    every = ",".join(env.ALL_SITES)
+    cases = [("ny,ca", 2, None)] if quick else [(every, 31, 500.0), ("ny", 365, 1000.0)]
     for sites, days, at_most in cases:
         found = child("optimum", sites, days)
         name = f"{sites.count(',') + 1} sites, {days} days"

@@ -23,6 +23,8 @@ from sdc_taichi.types import StepResult
 
 SIZES = (1, 64, 1024, 4096, 16384)
 QUICK_SIZES = (2,)
+ALL_SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
+"""Sites with a synthetic year."""
 SYNC_MOST = 64
 
 
@@ -57,9 +59,8 @@ def single_step(config: sdc_taichi.DataCenterConfig) -> Callable[[], object]:
 @contextlib.contextmanager
 def controlled_step(preset: str, controller: str, count: int) -> Iterator[Callable[[], object]]:
     """A step of some data centers of eight sites under a named controller."""
-    sites = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
     base = sdc_taichi.load_config(preset)
-    configs = sdc_taichi.make_configs(base, count=count, sites=sites[:count])
+    configs = sdc_taichi.make_configs(base, count=count, sites=ALL_SITES[:count])
     with sdc_taichi.Simulator(configs) as sim:
         sim.reset()
         acting = sdc_taichi.make_controller(controller, sim.fleet)

@@ -193,6 +193,7 @@ def test_optima_of_other_sampled_events_are_refused() -> None:
 def test_metrics_tell_the_share(folders: Path, optimum: Optimum) -> None:
     metrics = read_run(folders / "greedy").metrics
     assert metrics["optimum"]["objective"] == "carbon"
+    assert metrics["optimum"]["agents"] == list(optimum.agents)
     assert metrics["optimum"]["bound_kinds"] == list(optimum.bound_kinds)
     own = [dc["metrics"] for dc in metrics["data_centers"]]
     total = metrics["total"]

@@ -58,7 +58,7 @@ def test_table_tells_figures_gaps_and_shares(asked: dict[str, Any]) -> None:
     assert [a - b for a, b in zip(achieved, bound, strict=True)] == pytest.approx(gap, abs=0.011)
     assert "ca: estimate: made up" in done.stdout
     assert "ca: does not hold: facility energy off by 1e-3" in done.stdout
-    assert "Bound: with these inputs, no controller that ends as it began" in done.stdout
+    assert "no controller that keeps the constraints and ends as it began comes" in done.stdout
     assert asked["agents"] == ("load", "cooling", "battery")
     assert asked["cache"] is True
     assert asked["inlet_limit_c"] is None

@@ -92,7 +92,7 @@ def optimum_day(
 
 
 def day_of_most_saved(saved: F64, times: pd.Series) -> str:
-    """Day on which most is saved, as ``optimum_day`` takes it, the first if several are equal.
+    """Day on which most is saved, YYYY-MM-DD, the first if several are equal.
 
     Args:
         saved: what is saved in each step.

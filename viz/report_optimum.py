@@ -26,6 +26,7 @@ _SAVED = {
     "cost": "energy_cost",
     "water": "water_l",
 }
+"""Columns of steps.parquet by the objectives of which days are told."""
 _DASH = "–"
 
 
@@ -50,11 +51,11 @@ def known_optimum(runs: Sequence[RunFolder]) -> KnownOptimum | None:
         found = find_optimum(run.path, first["fingerprint"], first["steps_done"])
         if found is not None:
             place, content = found
-            path = run if place == run.path else read_run(place)
+            best = run if place == run.path else read_run(place)
             names = [dc.get("name") for dc in content["data_centers"]]
-            if names != runs[0].names or path.metrics["steps_done"] != first["steps_done"]:
+            if names != runs[0].names or best.metrics["steps_done"] != first["steps_done"]:
                 raise SdcError(f"{place}: optimum of other data centers; solve it again")
-            return KnownOptimum(path, content)
+            return KnownOptimum(best, content)
     return None
 
 
@@ -112,7 +113,7 @@ def _share_of(run: RunFolder, content: Mapping[str, Any]) -> float | None:
 
 
 def _own(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """What metrics.json says of an optimum of this objective; None if nothing.
+    """What metrics.json says of an optimum of this objective, agents and steps; None if nothing.
 
     Raises:
         SdcError: it is damaged.
@@ -122,7 +123,8 @@ def _own(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, Any] | None
         return None
     if not isinstance(own, dict) or not isinstance(own.get("objective"), str):
         raise SdcError(f"{run.path / METRICS_FILE}: optimum is damaged; simulate the run again")
-    return own if own["objective"] == content["objective"] else None
+    decisive = ("objective", "agents", "scored_from")
+    return own if all(own.get(name) == content[name] for name in decisive) else None
 
 
 def _table(run: RunFolder, content: Mapping[str, Any]) -> str:
@@ -186,16 +188,16 @@ def _day_picture(run: RunFolder, optimum: KnownOptimum, dc: ShownDataCenter) -> 
     """The day on which the optimum saves most against the run, of one data center."""
     name = run.names[dc.index]
     objective = str(optimum.content["objective"])
-    column = _SAVED.get(objective, "carbon_g")
+    saving = objective if objective in _SAVED else "carbon"
     if optimum.run is run:
         steps_of = {OPTIMUM: dc.steps}
         saved = (dc.steps["charge_kwh"] + dc.steps["discharge_kwh"]).to_numpy()
         caption = "The day on which the battery moves most energy, on the achieved path."
     else:
-        (best,) = read_steps(optimum.run, [dc.index], [*COLUMNS[1:], column])
+        (best,) = read_steps(optimum.run, [dc.index], [*COLUMNS[1:], _SAVED[saving]])
         steps_of = {run.metrics["controller"]: dc.steps, OPTIMUM: best}
-        saved = (dc.steps[column] - best[column]).to_numpy()
-        caption = "The day on which the achieved path saves most against this run."
+        saved = (dc.steps[_SAVED[saving]] - best[_SAVED[saving]]).to_numpy()
+        caption = f"The day on which the achieved path saves most {saving} against this run."
     date = day_of_most_saved(saved, dc.steps["time"])
     return picture_element(
         optimum_day(steps_of, date, name, by_price=objective == "cost"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
     warm_up = content["scored_from"] / steps_per_hour / 24
     after = f" after a warm-up of {_days(warm_up)}" if warm_up else ""
     console.print(f"Optimum of {content['objective']}: {count}, {_days(days)}{after}")
-    table = _table(content, dcs, [each["data_centers"] for each in content["controllers"]])
+    table = _table(content)
     if len(dcs) > TABLE_DCS or console.measure(table).maximum > console.width:
         table = _spread(content)
     console.print(table)
@@ -72,44 +72,45 @@ def _values(figures: Mapping[str, Any], shares: Sequence[float | None]) -> list[
     return [idle, *both, figures["gap_points"], *alone, *own]
 
 
-def _table(
-    content: Mapping[str, Any],
-    dcs: Sequence[Mapping[str, Any]],
-    controllers: Sequence[Sequence[Mapping[str, Any]]],
-) -> Table:
-    """A column for each data center, and one for all of several."""
-    from rich.table import Table
+def _columns(content: Mapping[str, Any]) -> list[list[float | None]]:
+    """Values of the rows of each data center."""
+    shares = [each["data_centers"] for each in content["controllers"]]
+    return [
+        _values(dc, [own[i]["share"] for own in shares])
+        for i, dc in enumerate(content["data_centers"])
+    ]
 
-    table = Table("")
-    columns = []
-    for i, dc in enumerate(dcs):
-        table.add_column(dc["name"], justify="right", no_wrap=True)
-        columns.append(_values(dc, [own[i]["share"] for own in controllers]))
-    if len(dcs) > 1:
-        table.add_column("all", justify="right", no_wrap=True)
-        columns.append(_total(content))
-    for title, *values in zip(_titles(content), *columns, strict=True):
-        table.add_row(title, *map(_figure, values))
-    return table
+
+def _table(content: Mapping[str, Any]) -> Table:
+    """A column for each data center, and one for all of several."""
+    names, columns = [dc["name"] for dc in content["data_centers"]], _columns(content)
+    if len(names) > 1:
+        names, columns = [*names, "all"], [*columns, _total(content)]
+    rows = zip(_titles(content), *columns, strict=True)
+    return _of_rows(names, rows)
 
 
 def _spread(content: Mapping[str, Any]) -> Table:
     """Lowest, mean and highest value of the data centers, and that of all."""
+    rows = []
+    for title, total, *values in zip(
+        _titles(content), _total(content), *_columns(content), strict=True
+    ):
+        known = [value for value in values if value is not None]
+        spread = [min(known), sum(known) / len(known), max(known)] if known else [None] * 3
+        rows.append([title, *spread, total])
+    return _of_rows(["lowest", "mean", "highest", "all"], rows)
+
+
+def _of_rows(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> Table:
+    """A table of rows, each a title and its values."""
     from rich.table import Table
 
     table = Table("")
-    for column in ("lowest", "mean", "highest", "all"):
-        table.add_column(column, justify="right", no_wrap=True)
-    shares = [each["data_centers"] for each in content["controllers"]]
-    columns = [
-        _values(dc, [own[i]["share"] for own in shares])
-        for i, dc in enumerate(content["data_centers"])
-    ]
-    rows = zip(_titles(content), _total(content), *columns, strict=True)
-    for title, total, *values in rows:
-        known = [value for value in values if value is not None]
-        spread = [min(known), sum(known) / len(known), max(known)] if known else [None] * 3
-        table.add_row(title, *map(_figure, [*spread, total]))
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=True)
+    for title, *values in rows:
+        table.add_row(title, *map(_figure, values))
     return table
 
 

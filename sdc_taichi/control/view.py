@@ -114,7 +114,7 @@ class View:
         return self.drivers.at(self.state.step)
 
     def forecast(self, hours: float) -> Forecast:
-        """Inputs of the coming hours, exact unless the run or the environment has forecasts err.
+        """Inputs of the coming hours, exact unless those of the run or environment err.
 
         Args:
             hours: length of the forecast, rounded to whole steps.

@@ -47,7 +47,8 @@ class Optimum:
     idle_dropped_tasks: F64
     """Work that finds the queue full under idle commands, in tasks, (B,)."""
     bound: F64
-    """No controller that ends as it began comes below this figure, (B,); nan if none is known."""
+    """No controller that keeps the constraints and ends as it began comes below this figure, (B,);
+    nan if none is known."""
     achieved: F64
     """Lowest figure that the simulator reached and that keeps the constraints, (B,)."""
     alone: Mapping[str, F64]

@@ -176,6 +176,7 @@ def put_beside(content: dict[str, Any], optimum: Optimum, reached: Achievement) 
     content["optimum"] = {
         "objective": str(optimum.objective),
         "unit": optimum.objective.unit,
+        "agents": list(optimum.agents),
         "scored_from": optimum.scored_from,
         "bound_kinds": list(optimum.bound_kinds),
     }

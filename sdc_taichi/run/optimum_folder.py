@@ -148,7 +148,9 @@ def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
         moved = content["agents"]
         of = "" if len(moved) == len(AGENTS) else f" of {' and '.join(moved)} alone"
         remarks.insert(
-            0, f"Bound: with these inputs, no controller{of} that ends as it began comes below it."
+            0,
+            f"Bound: with these inputs, no controller{of} that keeps the constraints and ends as "
+            "it began comes below it.",
         )
     remarks += [f"{dc['name']}: {dc['bound_kind']}" for dc in dcs if dc["bound_kind"] != _BOUND]
     remarks += [f"{dc['name']}: does not hold: {text}" for dc in dcs for text in dc["failures"]]
@@ -208,8 +210,9 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         found = content.get("format") if isinstance(content, dict) else type(content).__name__
         raise SdcError(f"{path}: format {found!r}; valid is {FORMAT!r}, solve the optimum again")
-    kinds: dict[str, Any] = {"fingerprint": str, "objective": str, "unit": str, "steps": int}
-    kinds |= {"data_centers": list, "total": dict, "controllers": list}
+    kinds: dict[str, Any] = dict.fromkeys(("fingerprint", "objective", "unit"), str)
+    kinds |= dict.fromkeys(("steps", "scored_from"), int) | {"total": dict}
+    kinds |= dict.fromkeys(("agents", "data_centers", "controllers"), list)
     wrong = [name for name, kind in kinds.items() if not isinstance(content.get(name), kind)]
     dcs = [] if wrong else [*content["data_centers"], content["total"]]
     whole = {"idle", "bound", "achieved", "gap_points", "alone"}
