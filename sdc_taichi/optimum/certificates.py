@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sdc_taichi.optimum.problem import Problem
 from sdc_taichi.optimum.rollout import RollOut
+from sdc_taichi.optimum.score import Score
 from sdc_taichi.optimum.table_lookup import (
     INLET_MARGIN_K,
     at_utilisation,
@@ -81,32 +82,45 @@ class Certificate:
         return tuple(texts)
 
 
-def certificate(problem: Problem, done: RollOut, figure: float) -> Certificate:
-    """What the simulator measured along a path.
+def measured(score: Score, i: int) -> Certificate:
+    """What the simulator measured of one path.
+
+    ``table_error`` and ``over_limit_k`` are 0 until ``against_table`` has found them.
+
+    Args:
+        score: Of several paths.
+        i: Number of the path.
+    """
+    return Certificate(
+        figure=float(score.figure[i]),
+        table_error=0.0,
+        start_kwh=float(score.start_kwh[i]),
+        end_kwh=float(score.end_kwh[i]),
+        start_tasks=float(score.start_tasks[i]),
+        end_tasks=float(score.end_tasks[i]),
+        dropped_tasks=float(score.dropped_tasks[i]),
+        overdue_tasks=float(score.most_overdue_tasks[i]),
+        hottest_inlet_c=float(score.hottest_inlet_c[i]),
+        over_limit_k=0.0,
+        unmet_kwh=float(score.unmet_kwh[i]),
+    )
+
+
+def against_table(problem: Problem, done: RollOut, found: Certificate) -> Certificate:
+    """A certificate with its differences from the table of the data center.
 
     Args:
         problem: Planning problem of the data center.
         done: What the simulator did, of one data center.
-        figure: Figure of the scored steps.
+        found: What was measured of it.
     """
-    first, step_h = problem.scored_from, problem.step_h
-    scored = slice(first, None)
-    begin = first - 1
-    inlet_c, facility = done.inlet_max_c[scored, 0], done.facility_kwh[scored, 0]
+    scored = slice(problem.scored_from, None)
+    facility = done.facility_kwh[scored, 0]
     expected = facility_kwh(problem.table, done.utilisation[:, 0], done.setpoint_c[:, 0])
-    difference = np.abs(expected[scored] - facility)
-    return Certificate(
-        figure=figure,
-        table_error=float(difference.sum() / facility.sum()),
-        start_kwh=float(done.stored_kwh[begin, 0]) if first else problem.storage.stored_kwh,
-        end_kwh=float(done.stored_kwh[-1, 0]),
-        start_tasks=float(done.queue_tasks[begin, 0]) if first else 0.0,
-        end_tasks=float(done.queue_tasks[-1, 0]),
-        dropped_tasks=float(done.dropped_tasks[scored].sum()),
-        overdue_tasks=float(done.overdue_tasks[scored].max()),
-        hottest_inlet_c=float(inlet_c.max()),
+    return replace(
+        found,
+        table_error=float(np.abs(expected[scored] - facility).sum() / facility.sum()),
         over_limit_k=float(_over_limit_k(problem, done)[scored].max()),
-        unmet_kwh=float(done.unmet_w[scored].sum() * step_h / 1e3),
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sdc_taichi.optimum.certificates import Certificate
+from sdc_taichi.optimum.certificates import measured
 from sdc_taichi.optimum.discrete import DiscretePlans
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import Agent
@@ -71,7 +71,7 @@ def run_discrete(
             setpoints = cooling[:, t] if "cooling" in agents else None
             score.add(sim.step(Actions(load[:, t], setpoints, battery[:, t])))
         capacity_kwh = sim.sizing.battery_kwh
-    found = [_certificate(score, i) for i in range(copies.size)]
+    found = [measured(score, i) for i in range(copies.size)]
     idle = found[-fleet.size :]
     least = np.full(fleet.size, np.nan)
     for i, of in enumerate(plans):
@@ -86,20 +86,3 @@ def _filled(commands: F64, most: int) -> F64:
     found = np.zeros((most, commands.shape[1]))
     found[: len(commands)] = commands
     return found
-
-
-def _certificate(score: Score, i: int) -> Certificate:
-    """What the simulator measured of one sequence, by its number, without tables."""
-    return Certificate(
-        figure=float(score.figure[i]),
-        table_error=0.0,
-        start_kwh=float(score.start_kwh[i]),
-        end_kwh=float(score.end_kwh[i]),
-        start_tasks=float(score.start_tasks[i]),
-        end_tasks=float(score.end_tasks[i]),
-        dropped_tasks=float(score.dropped_tasks[i]),
-        overdue_tasks=float(score.most_overdue_tasks[i]),
-        hottest_inlet_c=float(score.hottest_inlet_c[i]),
-        over_limit_k=0.0,
-        unmet_kwh=float(score.unmet_kwh[i]),
-    )

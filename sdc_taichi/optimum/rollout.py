@@ -60,8 +60,6 @@ class RollOut:
     """Emissions of the energy bought, in g CO2e, (T, B)."""
     energy_cost: F64
     """Price of the energy bought, in the currency of the tariff, (T, B)."""
-    water_l: F64
-    """Make-up water, in l, (T, B)."""
     executed_tasks: F64
     """Work done, in tasks, (T, B)."""
     queue_tasks: F64
@@ -76,12 +74,8 @@ class RollOut:
     """Setpoint, mean over the CRAC units, in C, (T, B)."""
     inlet_max_c: F64
     """Hottest inlet of a server, in C, (T, B)."""
-    unmet_w: F64
-    """Cooling load that stays in the room, in W, (T, B)."""
     dropped_tasks: F64
     """Work that found the queue full, in tasks, (T, B)."""
-    overdue_tasks: F64
-    """Due work that did not fit into its step, in tasks, (T, B)."""
     utilisation: F64
     """Work that was started, as a share of capacity, (T, B)."""
     load_command: F64

@@ -15,7 +15,12 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.kernels.compiler import runtime
-from sdc_taichi.optimum.certificates import LARGEST_TABLE_ERROR, certificate
+from sdc_taichi.optimum.certificates import (
+    LARGEST_TABLE_ERROR,
+    Certificate,
+    against_table,
+    measured,
+)
 from sdc_taichi.optimum.discrete import DiscretePlans, discrete_plans
 from sdc_taichi.optimum.discrete_run import run_discrete
 from sdc_taichi.optimum.eligibility import no_table_reasons, uncooled_reason
@@ -174,8 +179,8 @@ class _Run:
     """What it was to do."""
     done: RollOut
     """What it did."""
-    figure: float
-    """Figure of the scored steps."""
+    found: Certificate
+    """What was measured in the scored steps, before it is held against the table."""
 
 
 def _suggested(
@@ -260,7 +265,7 @@ def _energy_error(run: _Run) -> float:
 
 def _entry(problem: Problem, suggestion: _Suggestion, runs: Mapping[str, _Run]) -> Entry:
     """What is known of a data center, from all its runs."""
-    certificates = {n: certificate(problem, run.done, run.figure) for n, run in runs.items()}
+    certificates = {n: against_table(problem, run.done, run.found) for n, run in runs.items()}
     idle = certificates[IDLE]
     failures = {
         name: found.failures(idle, problem.storage.capacity_kwh)
@@ -499,11 +504,10 @@ class _Work:
         if found is None:
             raise self._stopped()
         done, score = found
-        figure = score.figure.reshape(len(names), len(paths))
         return [
             {
-                name: _Run(of[name], done.of([k * len(paths) + i]), float(figure[k, i]))
-                for k, name in enumerate(names)
+                name: _Run(of[name], done.of([at]), measured(score, at))
+                for name, at in zip(names, range(i, fleet.size, len(paths)), strict=True)
             }
             for i, of in enumerate(paths)
         ]
