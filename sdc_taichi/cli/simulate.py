@@ -188,19 +188,19 @@ def simulate_command(
             if metrics is None:
                 print("interrupted before the first step; nothing written", file=sys.stderr)
                 raise typer.Exit(EXIT_INTERRUPTED)
-            if best is not None and metrics["steps_done"] == request.steps:
-                write_optimum(sim, best, folder / FOLDER, seed=seed, stop=interrupted)
+            is_whole = metrics["steps_done"] == request.steps
+            if best is not None and is_whole:
+                is_whole = write_optimum(sim, best, folder / FOLDER, seed=seed, stop=interrupted)
             if as_json:
                 print(metrics_json(metrics))
             elif not quiet:
                 print_summary(metrics, label, folder, fleet.steps_per_hour)
                 print_recording(recorder)
             serve_until_interrupted(recorder, interrupted)
-    if metrics["steps_done"] < request.steps:
-        print(
-            f"interrupted after {metrics['steps_done']} of {request.steps} steps; "
-            f"{printable(folder)} holds "
-            "the steps done",
-            file=sys.stderr,
-        )
+    if not is_whole:
+        done = metrics["steps_done"]
+        where = f"after {done} of {request.steps} steps; {printable(folder)} holds the steps done"
+        if done == request.steps:
+            where = f"after the run; {printable(folder)} holds it without the path of the optimum"
+        print(f"interrupted {where}", file=sys.stderr)
         raise typer.Exit(EXIT_INTERRUPTED)
