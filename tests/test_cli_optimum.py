@@ -106,6 +106,7 @@ def test_simulate_tells_its_share(asked: dict[str, Any], tmp_path: Path) -> None
     run = read_run(out)
     share = run.metrics["total"]["achievable_share"]
     assert f"Share of the achievable (carbon): {100 * share:.1f} %" in done.stdout
+    assert "work and energy left at the end are valued" in " ".join(done.stdout.split())
     assert read_run(out / "optimum").metrics["fingerprint"] == run.metrics["fingerprint"]
     again = call("simulate", *CASE, "--out", out, "--quiet")
     assert again.exit_code == 0, again.output

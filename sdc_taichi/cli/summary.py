@@ -106,7 +106,7 @@ def _optimum_line(metrics: dict[str, Any]) -> str:
     reached = "-" if share is None else f"{100 * share:z.1f} %"
     return (
         f"Share of the achievable ({of['objective']}): {reached}; idle {idle}, achieved {achieved},"
-        f" bound {bound} {of['unit']}"
+        f" bound {bound} {of['unit']}; work and energy left at the end are valued"
     )
 
 
