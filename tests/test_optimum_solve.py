@@ -172,6 +172,15 @@ def test_halls_without_a_table_have_no_bound_and_say_so() -> None:
     assert np.isnan(found.bound_of_ends(0, None))  # type: ignore[arg-type]
 
 
+def test_a_battery_that_the_grid_makes_move_leaves_no_bound_to_other_agents() -> None:
+    changes = "battery.initial_soc=1", "electrical.grid_limit_ratio=0.55"
+    config = config_of("CA", *changes)
+    agents: tuple[Any, ...]
+    for agents, kind in ((("load",), "none: the facility may need"), (("battery",), "bound")):
+        assert solved(config, steps=4, agents=agents).bound_kinds[0].startswith(kind)
+    assert solved(config_of("CA", changes[0]), steps=4, agents=("load",)).bound_kinds == ("bound",)
+
+
 def test_tables_that_are_off_make_the_bound_an_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     right = facility_tables
 

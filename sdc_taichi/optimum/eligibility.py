@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.optimum.problem import FacilityTable
+from sdc_taichi.optimum.problem import FacilityTable, Problem
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.types import F64
 
@@ -50,6 +50,25 @@ def uncooled_reason(table: FacilityTable, utilisation: F64) -> str | None:
     return (
         f"in {np.count_nonzero(~kept)} of {len(kept)} steps no setpoint cools the hall without "
         "heat that stays in the room or racks that throttle"
+    )
+
+
+def forced_discharge_reason(problem: Problem) -> str | None:
+    """Why a battery that no plan moves may move: it delivers what the grid does not carry.
+
+    Args:
+        problem: Planning problem of the data center.
+
+    Returns:
+        The reason in words; None where the battery stays at rest.
+    """
+    table, limit_kw = problem.table, problem.grid_limit_kw
+    most_kw = float(np.where(table.unmet_w == 0.0, table.facility_kwh, 0.0).max()) / problem.step_h
+    if "battery" in problem.agents or problem.storage.stored_kwh <= 0 or most_kw <= limit_kw:
+        return None
+    return (
+        f"the facility may need {most_kw:.4g} kW where the grid connection carries {limit_kw:.4g}, "
+        "and a battery that plans do not move then delivers the difference"
     )
 
 

@@ -23,7 +23,11 @@ from sdc_taichi.optimum.certificates import (
 )
 from sdc_taichi.optimum.discrete import DiscretePlans, discrete_plans
 from sdc_taichi.optimum.discrete_run import run_discrete
-from sdc_taichi.optimum.eligibility import no_table_reasons, uncooled_reason
+from sdc_taichi.optimum.eligibility import (
+    forced_discharge_reason,
+    no_table_reasons,
+    uncooled_reason,
+)
 from sdc_taichi.optimum.end_values import BoundOfEnds
 from sdc_taichi.optimum.entry import Cache, Entry
 from sdc_taichi.optimum.linear_programme import bound
@@ -363,7 +367,9 @@ class _Work:
             raise self._stopped()
         problems = task.problems(tables)
         reasons = [
-            of_config or uncooled_reason(problem.table, problem.work.idle_tasks / TASKS_PER_STEP)
+            of_config
+            or uncooled_reason(problem.table, problem.work.idle_tasks / TASKS_PER_STEP)
+            or forced_discharge_reason(problem)
             for of_config, problem in zip(no_table_reasons(task.fleet), problems, strict=True)
         ]
         found = self._suggestions(problems, reasons)
