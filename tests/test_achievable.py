@@ -32,7 +32,7 @@ from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.optimum.score import Score
 from sdc_taichi.run.achievable import AchievedPath, run_beside
 from sdc_taichi.run.folder_reader import read_run
-from sdc_taichi.run.optimum_folder import FOLDER, find_optimum, write_optimum
+from sdc_taichi.run.optimum_folder import FOLDER, find_optimum, remarks_beside, write_optimum
 from sdc_taichi.viz import report
 from sdc_taichi.viz.report_optimum import known_optimum, optimum_section
 
@@ -198,6 +198,11 @@ def test_metrics_tell_the_share(folders: Path, optimum: Optimum) -> None:
     assert metrics["optimum"]["objective"] == "carbon"
     assert metrics["optimum"]["agents"] == list(optimum.agents)
     assert metrics["optimum"]["bound_kinds"] == list(optimum.bound_kinds)
+    metrics["optimum"]["broken"] = [["drops 3 tasks"], []]
+    assert remarks_beside(metrics) == [
+        f"{optimum.names[1]}: estimate: made up",
+        f"{optimum.names[0]}: this run drops 3 tasks, which the achieved path does not",
+    ]
     own = [dc["metrics"] for dc in metrics["data_centers"]]
     total = metrics["total"]
     for name in ("idle_figure", "bound_figure", "achieved_figure", "valued_figure"):

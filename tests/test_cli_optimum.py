@@ -107,6 +107,7 @@ def test_simulate_tells_its_share(asked: dict[str, Any], tmp_path: Path) -> None
     share = run.metrics["total"]["achievable_share"]
     assert f"Share of the achievable (carbon): {100 * share:.1f} %" in done.stdout
     assert "work and energy left at the end are valued" in " ".join(done.stdout.split())
+    assert "\nca: estimate: made up\n" in done.stdout
     assert read_run(out / "optimum").metrics["fingerprint"] == run.metrics["fingerprint"]
     again = call("simulate", *CASE, "--out", out, "--quiet")
     assert again.exit_code == 0, again.output
@@ -124,6 +125,10 @@ def test_simulate_tells_its_share(asked: dict[str, Any], tmp_path: Path) -> None
         (["--warm-up", "0.001"], "--warm-up 0.001: valid is a positive number of days"),
         (["--max-inlet", "400"], "--max-inlet 400: valid is 10..60 C"),
         (["--controller", "g37"], "controller 'g37'"),
+        (
+            ["--agents", "load,cooling", "--controller", "greedy-ci"],
+            "--controller greedy-ci: moves battery, which --agents load,cooling leaves idle",
+        ),
         (["--forecast-error", "ci=x"], "ci"),
         (["--site", "ny,ny"], "is given twice"),
         (["--days", "0"], "--days 0"),

@@ -12,7 +12,7 @@ from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.run.achievable import OPTIMUM
 from sdc_taichi.run.folder_reader import RunFolder, is_number, read_run, read_steps
 from sdc_taichi.run.folder_writer import METRICS_FILE
-from sdc_taichi.run.optimum_folder import find_optimum, optimum_remarks
+from sdc_taichi.run.optimum_folder import find_optimum, optimum_remarks, remarks_beside
 
 from .optimum_figure import COLUMNS, day_of_most_saved, optimum_day
 from .plotting import format_number
@@ -68,7 +68,8 @@ def optimum_section(run: RunFolder, optimum: KnownOptimum, shown: Sequence[Shown
         shown: data centers with pictures.
     """
     content = optimum.content
-    remarks = first_texts(optimum_remarks(content))
+    own = remarks_beside(run.metrics) if _own(run, content) is not None else []
+    remarks = first_texts(list(dict.fromkeys([*optimum_remarks(content), *own])))
     out = ["".join(f"<p>{escape(text)}</p>\n" for text in remarks), _table(run, content)]
     for dc in shown:
         if run.metrics["steps_done"] > 1:
@@ -121,7 +122,11 @@ def _own(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, Any] | None
     own = run.metrics.get("optimum")
     if own is None:
         return None
-    if not isinstance(own, dict) or not isinstance(own.get("objective"), str):
+    lists = ("bound_kinds", "broken")
+    size = len(run.names)
+    if not isinstance(own, dict) or any(
+        not isinstance(own.get(name), list) or len(own[name]) != size for name in lists
+    ):
         raise SdcError(f"{run.path / METRICS_FILE}: optimum is damaged; simulate the run again")
     decisive = ("objective", "agents", "scored_from")
     return own if all(own.get(name) == content[name] for name in decisive) else None

@@ -125,6 +125,8 @@ def optimum_command(
     fleet.require_distinct_names()
     error = PERFECT if forecast_error is None else ForecastError.parse(forecast_error)
     named = {name: make_controller(name, fleet) for name in controller or ()}
+    for name in named:
+        _require_movable(name, movable)
     if out is not None:
         prepare_folder(out, force=force)
     with Simulator(fleet, precision=precision) as sim, interruptible() as interrupted:
@@ -277,6 +279,18 @@ def _agents(text: str) -> tuple[Agent, ...]:
         if names.count(name) > 1:
             raise ConfigError(f"--agents {text!r}: {name} is given twice")
     return tuple(agent for agent in AGENTS if agent in names)
+
+
+def _require_movable(controller: str, movable: tuple[Agent, ...]) -> None:
+    """Refuse a controller that moves more than the optimum that it is compared with."""
+    from sdc_taichi.control import given_by
+
+    more = [agent for agent in given_by(controller) if agent not in movable]
+    if more:
+        raise ConfigError(
+            f"--controller {controller}: moves {' and '.join(more)}, which --agents "
+            f"{','.join(movable)} leaves idle"
+        )
 
 
 def _warm_up_steps(days: float, steps: int, steps_per_hour: int) -> int:

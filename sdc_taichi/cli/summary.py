@@ -72,7 +72,8 @@ def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_h
     console.print(table)
     console.print(_hottest_line(metrics))
     if "optimum" in metrics:
-        console.print(_optimum_line(metrics))
+        for line in _optimum_lines(metrics):
+            console.print(line)
     for line in _event_lines(metrics):
         console.print(line)
     if metrics["synthetic"]:
@@ -85,7 +86,8 @@ def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_h
     if len(sources) > TABLE_DCS:
         console.print(f"  and {len(sources) - TABLE_DCS} more, see metrics.json")
     config_file = "config.yaml" if len(dcs) == 1 else "configs.yaml"
-    console.print(f"Files in {folder}: steps.parquet, metrics.json, {config_file}")
+    more = ", optimum/" if "optimum" in metrics else ""
+    console.print(f"Files in {folder}: steps.parquet, metrics.json, {config_file}{more}")
 
 
 def _hottest_line(metrics: dict[str, Any]) -> str:
@@ -98,16 +100,23 @@ def _hottest_line(metrics: dict[str, Any]) -> str:
     )
 
 
-def _optimum_line(metrics: dict[str, Any]) -> str:
+def _optimum_lines(metrics: dict[str, Any]) -> list[str]:
+    from sdc_taichi.run.optimum_folder import remarks_beside
+
     total, of = metrics["total"], metrics["optimum"]
     names = ("idle_figure", "bound_figure", "achieved_figure")
     idle, bound, achieved = (_figure(total[name]) for name in names)
     share = total["achievable_share"]
     reached = "-" if share is None else f"{100 * share:z.1f} %"
-    return (
+    remarks = remarks_beside(metrics)
+    shown = remarks[:TABLE_DCS]
+    if len(remarks) > TABLE_DCS:
+        shown.append(f"and {len(remarks) - TABLE_DCS} more, see metrics.json")
+    return [
         f"Share of the achievable ({of['objective']}): {reached}; idle {idle}, achieved {achieved},"
-        f" bound {bound} {of['unit']}; work and energy left at the end are valued"
-    )
+        f" bound {bound} {of['unit']}; work and energy left at the end are valued",
+        *shown,
+    ]
 
 
 def _event_lines(metrics: dict[str, Any]) -> list[str]:

@@ -179,6 +179,7 @@ def put_beside(content: dict[str, Any], optimum: Optimum, reached: Achievement) 
         "agents": list(optimum.agents),
         "scored_from": optimum.scored_from,
         "bound_kinds": list(optimum.bound_kinds),
+        "broken": [list(texts) for texts in reached.broken],
     }
     for i, dc in enumerate(content["data_centers"]):
         own = {name: values[i] for name, values in figures.items()}

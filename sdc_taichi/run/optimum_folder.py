@@ -163,6 +163,22 @@ def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
     return remarks
 
 
+def remarks_beside(metrics: Mapping[str, Any]) -> list[str]:
+    """What is to be known of the share of a run, in words: bounds that are none, limits it breaks.
+
+    Args:
+        metrics: content of metrics.json of a run beside an optimum.
+    """
+    names, own = [dc["name"] for dc in metrics["data_centers"]], metrics["optimum"]
+    kinds = zip(names, own["bound_kinds"], strict=True)
+    remarks = [f"{name}: {kind}" for name, kind in kinds if kind != _BOUND]
+    return remarks + [
+        f"{name}: this run {text}, which the achieved path does not"
+        for name, texts in zip(names, own["broken"], strict=True)
+        for text in texts
+    ]
+
+
 def _data_center(optimum: Optimum, dc: int) -> dict[str, Any]:
     """What optimum.json says of a data center."""
     limit_c = float(optimum.inlet_limit_c[dc])
