@@ -120,6 +120,12 @@ def test_inlets_stay_within_a_limit() -> None:
     np.testing.assert_array_equal(found.inlet_limit_c, [limit_c])
 
 
+def test_queues_of_whole_tasks_are_empty_at_the_end() -> None:
+    found = solved(config_of("CA", "workload.model=tasks"), steps=2 * DAY, agents=("load",))
+    assert found.failures == ((),)
+    assert found.bound[0] <= found.achieved[0] < 0.99 * found.idle[0]
+
+
 def test_a_path_that_is_as_cool_as_can_be_counts_where_no_setpoint_keeps_the_limit() -> None:
     config = config_of("NY", preset="corrected")
     found = solved(config, steps=6, agents=("cooling",), inlet_limit_c=20.0)

@@ -171,9 +171,12 @@ class DispatchProgramme:
         for name, rows in (("drained", drain), ("run", due)):
             p.at_most(name, none[rows], **_rows(both, rows))
         if self.problem.work.model == "tasks":
-            # A drain takes no more than the flexible work of its step.
+            # But for due work, a queue falls by no more than the flexible work of its step, and
+            # none that was deferred is taken back in a step with due work.
             most = self.problem.work.most_deferred_tasks[self.span.first : self.span.end]
-            p.at_most("drain_limit", most[drain], **_rows(leaves, drain))
+            falls, others = {"queue": -change, "start_tasks": -start}, np.flatnonzero(modes != DUE)
+            p.at_most("drain_limit", most[others], **_rows(falls, others))
+            p.at_most("entered_due", none[due], **_rows({"deferred": -change}, due))
         matrices, right = self._deadline()
         p.equal("due", right[due], **_rows(matrices, due))
 
