@@ -18,7 +18,7 @@ import numpy as np
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.protection import Mask
 from sdc_taichi.optimum.problem import Problem
-from sdc_taichi.optimum.table_lookup import at_setpoint, cubic
+from sdc_taichi.optimum.table_lookup import INLET_MARGIN_K, at_setpoint, cubic
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64
 
@@ -74,8 +74,8 @@ def stage_cost(problem: Problem, *, warm_up_share: float = 0.0) -> StageCost:
     """The least cost of each step at each utilisation of the table.
 
     A setpoint is permitted where it leaves no heat in the room, and where the hottest inlet is
-    within its limit if any setpoint keeps it within. Without the agent of cooling the setpoint is
-    that of idle commands.
+    within its limit if any setpoint keeps it within, give or take ``INLET_MARGIN_K``. Without the
+    agent of cooling the setpoint is that of idle commands.
 
     Args:
         problem: What is to be planned.
@@ -203,10 +203,13 @@ def _of_steps(
         cost = np.where(np.isfinite(energy), cost, np.inf)
         return cost, energy, energy, energy, np.broadcast_to(idle_c[:, None], cost.shape)
     permitted, inlet_c = cooled, table.inlet_max_c[steps]
-    if np.isfinite(problem.inlet_limit_c):
-        within = cooled & (inlet_c <= problem.inlet_limit_c)
-        permitted = np.where(within.any(axis=2, keepdims=True), within, cooled)
-    edge = _edges(permitted, cooled, inlet_c, problem.inlet_limit_c)
+    # No run that counts as keeping the limit has a setpoint that is not permitted here.
+    limit_c = problem.inlet_limit_c + INLET_MARGIN_K
+    if np.isfinite(limit_c):
+        surely = cooled & (inlet_c <= problem.inlet_limit_c - INLET_MARGIN_K)
+        within = cooled & (inlet_c <= limit_c)
+        permitted = np.where(surely.any(axis=2, keepdims=True), within, cooled)
+    edge = _edges(permitted, cooled, inlet_c, limit_c)
     most = np.where(permitted, kwh, -np.inf).max(axis=2)
     least, least_c = _least(kwh, permitted, edge, table.setpoint_c)
     if not problem.litre_weight:

@@ -9,8 +9,8 @@ from sdc_taichi.optimum.problem import FacilityTable
 from sdc_taichi.types import F64, I64
 
 INLET_MARGIN_K = 0.02
-"""By how much paths stay below the limit of inlets, in K: inlets are not quite linear between the
-utilisations of a table."""
+"""By how much paths stay below the limit of inlets and bounds go beyond it, in K: inlets are not
+quite linear between the utilisations of a table."""
 
 
 def at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:
