@@ -22,9 +22,9 @@ from sdc_taichi.optimum.table_lookup import (
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64
 
-IDLE = "idle"
+IDLE = "idle commands"
 """Name of the path under idle commands."""
-JOINT = "joint"
+JOINT = "all agents"
 """Name of the path that moves all agents of a problem together."""
 _UNSCORED_SHARE = 1e-3
 """Weight of a kWh in steps that are not scored, over the mean of the others: it decides between

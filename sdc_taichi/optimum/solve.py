@@ -51,7 +51,7 @@ _BOUND = "bound"
 """Name of the bound beside those of paths."""
 _SOLVER_ERROR = 1e-6
 """Error of programmes and of what paths leave at the end, as a share of the bound."""
-_AGAIN = "again"
+_AGAIN = "all agents with the battery planned again"
 """Name of the path whose battery is planned for the energy that the simulator measured."""
 _POLL_S = 0.2
 """Time between two questions whether to stop, in s."""
