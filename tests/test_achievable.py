@@ -30,9 +30,16 @@ from sdc_taichi.cli.app import app
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.optimum.score import Score
-from sdc_taichi.run.achievable import AchievedPath, run_beside
+from sdc_taichi.run.achievable import AchievedPath, Achievement, run_beside
 from sdc_taichi.run.folder_reader import read_run
-from sdc_taichi.run.optimum_folder import FOLDER, find_optimum, remarks_beside, write_optimum
+from sdc_taichi.run.optimum_folder import (
+    FOLDER,
+    find_optimum,
+    optimum_content,
+    optimum_remarks,
+    remarks_beside,
+    write_optimum,
+)
 from sdc_taichi.viz import report
 from sdc_taichi.viz.report_optimum import known_optimum, optimum_section
 
@@ -230,6 +237,17 @@ def test_the_achieved_path_is_a_run_as_any_other(folders: Path, optimum: Optimum
     assert inside is not None
     assert inside[0] == folders / "greedy" / FOLDER
     assert find_optimum(folders / "greedy", "0" * 64, STEPS) is None
+
+
+def test_controllers_that_beat_the_achieved_path_are_named(optimum: Optimum) -> None:
+    two = np.zeros(2)
+    shares = np.array([1.01, 1.01])
+    reached = Achievement("better", two, two, shares, 1.01, ((), ("drops 3 tasks",)))
+    told = [line for line in optimum_remarks(optimum_content(optimum, [reached])) if "more" in line]
+    assert told == [
+        f"{optimum.names[0]}: better reaches 101.00 % of the achievable, more than the achieved "
+        "path: the best is between it and the bound"
+    ]
 
 
 def test_report_shows_the_optimum_beside_the_run(

@@ -2,8 +2,8 @@
 
 Before each step it plans work, setpoint and battery over a horizon and gives the first commands of
 the plan. It knows what a controller may know: forecasts of weather and carbon intensity, prices,
-the work of the step to come, and for later steps the work of the same time a day before. What a
-step costs it reads from a ``FacilityMap``, tables of the simulator at constant load and setpoint:
+the work of the step to come, and for later steps the work of the same time on the last days. What
+a step costs it reads from a ``FacilityMap``, tables of the simulator at constant load and setpoint:
 halls that are transient, events and racks that protect themselves are not foreseen.
 """
 
@@ -34,6 +34,10 @@ CARBON = Objective(carbon=1.0)
 """The objective of a name without one."""
 SETPOINT_STEP_K = 0.5
 """Largest distance of the setpoints to choose from, in K."""
+KNOWN_DAYS = 7
+"""Days whose mean work is expected to come again."""
+FADES_IN_H = 3.0
+"""Time in which the departure of the present work from that mean falls to 1/e, in h."""
 PEAKS = 8
 """Peaks of the month that are tried where there is a demand charge."""
 _NAME = re.compile(r"mpc-(?P<hours>[^:]*)h(?::(?P<objective>.*))?")
@@ -201,16 +205,22 @@ class _Planners:
 def expected_demand(view: View, index: I64) -> F64:
     """Work that is expected to arrive, as a share of capacity, (B, H).
 
-    That of the step to come is known; later steps take that of the same time on the last day whose
-    work is known.
+    That of the step to come is known. Later steps take the mean work of the same time on the last
+    days, and the departure of the present work from that mean, which fades.
 
     Args:
         view: the situation before the step.
         index: coming steps, counted from the beginning of the year, (B, H).
     """
-    day = 24 * view.fleet.steps_per_hour
-    lead = np.arange(index.shape[1])
-    return view.drivers.demand.at(index - day * -(-lead // day))
+    demand, per_hour = view.drivers.demand, view.fleet.steps_per_hour
+    day, lead = 24 * per_hour, np.arange(index.shape[1])
+    last = index - day * -(-lead // day)
+    usual = np.mean([demand.at(last - day * back) for back in range(KNOWN_DAYS)], axis=0)
+    before = index[:, :1] - day * np.arange(1, KNOWN_DAYS + 1)
+    departure = demand.at(index[:, :1]) - demand.at(before).mean(axis=1, keepdims=True)
+    expected = usual + departure * np.exp(-lead / (FADES_IN_H * per_hour))
+    expected[:, :1] = demand.at(index[:, :1])
+    return np.clip(expected, 0.0, 1.0)
 
 
 def _cooling_command(view: View, planners: _Planners, weather: Weather, work: QueuePlan) -> F64:

@@ -29,6 +29,8 @@ FOLDER = "optimum"
 """Name of the folder of an optimum inside that of the run beside which it was solved."""
 _BOUND = "bound"
 _FIGURES = ("idle", "bound", "achieved")
+_ALL_OF_IT = 1.0 + 1e-6
+"""Share of the achievable beyond which a controller does better than the achieved path."""
 
 
 def optimum_content(optimum: Optimum, reached: Sequence[Achievement] = ()) -> dict[str, Any]:
@@ -159,6 +161,12 @@ def optimum_remarks(content: Mapping[str, Any]) -> list[str]:
             f"{dc['name']}: {each['controller']} {text}, which the achieved path does not"
             for dc, own in zip(dcs, each["data_centers"], strict=True)
             for text in own["broken"]
+        ]
+        remarks += [
+            f"{dc['name']}: {each['controller']} reaches {100.0 * own['share']:.2f} % of the "
+            "achievable, more than the achieved path: the best is between it and the bound"
+            for dc, own in zip(dcs, each["data_centers"], strict=True)
+            if own["share"] is not None and own["share"] > _ALL_OF_IT and not own["broken"]
         ]
     return remarks
 
