@@ -61,6 +61,7 @@ def test_every_part_has_figures_that_are_numbers_or_say_why_not(written: dict[st
         "kernel",
         "calls",
         "environments",
+        "optima",
         "planned",
         "scaling",
         "start",

@@ -25,7 +25,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.exogenous import psychrometrics
 from sdc_taichi.plant import chiller, tower, water
-from sdc_taichi.sim import simulator
+from sdc_taichi.sim import stages
 from sdc_taichi.sim.hall_solver import Conditions, Hall
 from sdc_taichi.sim.sizing import Sizing, size
 from sdc_taichi.types import F64
@@ -360,7 +360,7 @@ def year(
     """Quantities of every hour of a table, (T,) each."""
     table = columns(path)
     weather = header_at(folder, elevation_of_site_m(path))
-    patch.setattr(simulator, "size", lambda *of: resized(size(*of), given))
+    patch.setattr(stages, "size", lambda *of: resized(size(*of), given))
     wet_bulb_c = np.minimum(table["wb_c"], table["out_c"])
     drivers = drivers_from_arrays(
         table["out_c"], wet_bulb_c, np.full(len(wet_bulb_c), 300.0), table["utilisation"]

@@ -202,18 +202,27 @@ def test_erring_forecasts_are_reproducible_and_matter() -> None:
     assert np.any(runs[0] != runs[2])
 
 
-def test_work_of_later_steps_is_that_of_the_day_before() -> None:
-    demand = np.random.default_rng(0).uniform(0.1, 0.9, 4 * DAY)
-    drivers = inputs(demand=demand)
+def expected(demand: np.ndarray, now: int, hours: float) -> np.ndarray:
+    drivers = inputs(ci=np.full(len(demand), 300.0), demand=demand)
     with Simulator(tiny(), drivers=drivers) as sim:
-        sim.reset(0, start=np.array([DAY + 7]))
+        sim.reset(0, start=np.array([now]))
         view = view_maker(sim)(None)
-        found = expected_demand(view, view.forecast(30.0).index)[0]
-    now = DAY + 7
-    np.testing.assert_array_equal(found[0], demand[now])
-    np.testing.assert_array_equal(found[1:DAY], demand[now - DAY + 1 : now])
-    np.testing.assert_array_equal(found[DAY : DAY + 1], demand[now])
-    np.testing.assert_array_equal(found[DAY + 1 :], demand[now - DAY + 1 : now - DAY + 24])
+        return expected_demand(view, view.forecast(hours).index)[0]
+
+
+def test_later_work_is_expected_as_on_the_last_days() -> None:
+    of_day = np.random.default_rng(0).uniform(0.1, 0.8, DAY)
+    days = np.tile(of_day, 9)
+    now = 8 * DAY + 7
+    np.testing.assert_allclose(expected(days, now, 30.0), np.resize(np.roll(of_day, -7), 120))
+    level = np.repeat(np.linspace(-0.06, 0.06, 7), DAY)
+    days[DAY : 8 * DAY] += level - level.mean()
+    days[now - 8 * DAY :][: 7 * DAY] = days[DAY + 7 : now]
+    usual = np.mean([days[now - k * DAY :][:DAY] for k in range(1, 8)], axis=0)
+    days[now] += 0.1
+    found = expected(days, now, 24.0)
+    fading = (days[now] - usual[0]) * np.exp(-np.arange(DAY) / 12.0)
+    np.testing.assert_allclose(found, usual + fading, rtol=1e-12)
 
 
 def test_later_work_is_not_foreseen() -> None:
