@@ -207,7 +207,7 @@ def expected(demand: np.ndarray, now: int, hours: float) -> np.ndarray:
     with Simulator(tiny(), drivers=drivers) as sim:
         sim.reset(0, start=np.array([now]))
         view = view_maker(sim)(None)
-        return expected_demand(view, view.forecast(hours).index)[0]
+        return np.asarray(expected_demand(view, view.forecast(hours).index)[0])
 
 
 def test_later_work_is_expected_as_on_the_last_days() -> None:

@@ -220,7 +220,7 @@ def expected_demand(view: View, index: I64) -> F64:
     departure = demand.at(index[:, :1]) - demand.at(before).mean(axis=1, keepdims=True)
     expected = usual + departure * np.exp(-lead / (FADES_IN_H * per_hour))
     expected[:, :1] = demand.at(index[:, :1])
-    return np.clip(expected, 0.0, 1.0)
+    return np.asarray(np.clip(expected, 0.0, 1.0))
 
 
 def _cooling_command(view: View, planners: _Planners, weather: Weather, work: QueuePlan) -> F64:
