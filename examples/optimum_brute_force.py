@@ -107,7 +107,7 @@ SCENARIOS: dict[str, Scenario] = {
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What all sequences of commands come to, N of them."""
+    """Figures and constraints of all N sequences of commands that the simulator ran."""
 
     figure: F64
     end_kwh: F64
@@ -172,7 +172,7 @@ def commands_of(agents: tuple[Agent, ...]) -> F64:
 def permitted(
     outcomes: Outcomes, scenario: Scenario, ends: Ends | None, start_kwh: float
 ) -> npt.NDArray[np.bool_]:
-    """Whether each sequence keeps the constraints, (N,)."""
+    """Mask of the sequences that keep all constraints, (N,)."""
     neutral = len(outcomes.figure) // 2
     kept = outcomes.dropped_tasks <= outcomes.dropped_tasks[neutral] + ANY_TASKS
     kept &= outcomes.overdue_tasks <= outcomes.overdue_tasks[neutral] + ANY_TASKS

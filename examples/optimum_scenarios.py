@@ -66,7 +66,7 @@ class Group:
     inlet_limit_c: float | None
 
     def __str__(self) -> str:
-        """What the data centers share."""
+        """Objective, agents and limits that all data centers of the group share, in one line."""
         limit = "" if self.inlet_limit_c is None else f", inlets to {self.inlet_limit_c:.1f} C"
         return (
             f"{self.objective} by {'+'.join(self.agents)}, steps {self.scored_from}..{self.steps}"
@@ -88,7 +88,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Checked:
-    """What a group of scenarios came to."""
+    """Result of comparing bound, achieved figure and controllers in one group of scenarios."""
 
     size: int
     bounded: int
@@ -234,14 +234,14 @@ def check(group: Group, controllers: Sequence[str] = CONTROLLERS) -> Checked:
 
 
 def acts_on(name: str) -> tuple[Agent, ...]:
-    """What a controller may move, so that an optimum of fewer agents is no match for it."""
+    """Agents that a controller may move; an optimum of fewer agents cannot be compared with it."""
     from sdc_taichi.control.registry import given_by
 
     return tuple(agent for agent in AGENTS if agent in given_by(name))
 
 
 def keeps_ramp(configs: Sequence[DataCenterConfig], name: str) -> npt.NDArray[np.bool_]:
-    """Whether the setpoint of each data center moves no faster than plans may move it, (B,).
+    """Mask of data centers whose setpoints a controller moves no faster than plans may, (B,).
 
     Setpoints that are held from the first step on get there at once.
     """
@@ -287,7 +287,7 @@ class _Findings:
 
 
 def described(config: DataCenterConfig) -> str:
-    """What of a configuration is not as in preset ``tiny``, in one line."""
+    """Fields of a configuration that differ from preset ``tiny``, in one line."""
     found = []
 
     def walk(prefix: str, here: Any, there: Any) -> None:

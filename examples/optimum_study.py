@@ -52,9 +52,9 @@ class Case:
     """A table of held-out weeks."""
 
     title: str
-    """What is solved, in words."""
+    """Title of the table."""
     objective: str
-    """What is minimised."""
+    """Objective, as ``sdc-taichi optimum --objective`` takes it."""
     overrides: tuple[str, ...]
     """Overrides of preset ``corrected``."""
     sites: Sequence[str]

@@ -238,7 +238,7 @@ def _run_controllers(
     quiet: bool,
     stop: Callable[[], bool],
 ) -> list[Achievement]:
-    """What each controller reaches, of those that were not stopped."""
+    """Figure and share of each controller whose run was not stopped."""
     from sdc_taichi.run.achievable import run_beside
 
     reached = []
@@ -268,7 +268,7 @@ def _print_interruption(missing: list[str], out: Path | None) -> None:
 
 
 def _agents(text: str) -> tuple[Agent, ...]:
-    """What ``--agents`` names, in the order of ``AGENTS``."""
+    """Agents that option ``--agents`` names, in the order of ``AGENTS``."""
     from sdc_taichi.optimum.problem import AGENTS
 
     names = [name.strip() for name in text.split(",")]

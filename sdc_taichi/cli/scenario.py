@@ -1,4 +1,4 @@
-"""What a command simulates: sites, days, files, and the configs that follow from the options."""
+"""Options that name sites, days and files, and the data centers that follow from them."""
 
 from __future__ import annotations
 

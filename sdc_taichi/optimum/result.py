@@ -29,7 +29,7 @@ class Optimum:
     fingerprint: str
     """Fingerprint of configs, inputs and precision (``Simulator.fingerprint``)."""
     objective: Objective
-    """What is minimised."""
+    """Objective that plans minimise."""
     agents: tuple[Agent, ...]
     """What the plans may move."""
     start: I64

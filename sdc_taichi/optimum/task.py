@@ -46,7 +46,7 @@ class Task:
     steps: int
     """Number of steps, T."""
     objective: Objective
-    """What is minimised."""
+    """Objective that plans minimise."""
     agents: tuple[Agent, ...]
     """What plans may move."""
     scored_from: int
