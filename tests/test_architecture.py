@@ -31,6 +31,7 @@ ROOMS = (
     "run",
     "viz",
     "envs",
+    "learning",
     "cli",
     "__init__",
 )

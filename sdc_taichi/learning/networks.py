@@ -1,0 +1,139 @@
+"""Networks of policies and critics, and distributions of actions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from sdc_taichi.learning.settings import OnPolicySettings
+from sdc_taichi.learning.stream import CHOICES, LearnerSpaces
+from sdc_taichi.types import F32
+
+ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU}
+FIRST_STD = 0.5
+"""Standard deviation of continuous actions before training."""
+
+
+def perceptron(
+    width: int,
+    hidden: Sequence[int],
+    out: int,
+    *,
+    activation: str,
+    last_gain: float,
+    generator: torch.Generator,
+) -> nn.Sequential:
+    """Layers with orthogonal weights (Saxe et al. 2014) and biases of 0.
+
+    Args:
+        width: number of inputs.
+        hidden: units of each hidden layer.
+        out: number of outputs.
+        activation: ``tanh`` or ``relu``, after all layers but the last.
+        last_gain: gain of the weights of the last layer.
+        generator: source of the weights.
+    """
+    layers: list[nn.Module] = []
+    for units in hidden:
+        layers += [_linear(width, units, math.sqrt(2.0), generator), ACTIVATIONS[activation]()]
+        width = units
+    return nn.Sequential(*layers, _linear(width, out, last_gain, generator))
+
+
+def _linear(width: int, out: int, gain: float, generator: torch.Generator) -> nn.Linear:
+    layer = nn.utils.skip_init(nn.Linear, width, out)
+    nn.init.orthogonal_(layer.weight, gain, generator=generator)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def layers_of(net: nn.Sequential) -> tuple[tuple[F32, F32], ...]:
+    """Weight, (out, in), and bias, (out,), of each layer, as arrays of their own."""
+    return tuple(
+        (layer.weight.detach().float().numpy().copy(), layer.bias.detach().float().numpy().copy())
+        for layer in net
+        if isinstance(layer, nn.Linear)
+    )
+
+
+class Actor(nn.Module):
+    """Policy of a learner: a distribution of its actions for each observation.
+
+    Discrete actions are k independent choices of three, continuous ones k independent normal
+    distributions whose standard deviations do not depend on the observation.
+
+    Args:
+        spaces: what the learner sees and does.
+        settings: hidden layers and activation.
+        generator: source of the weights.
+    """
+
+    def __init__(
+        self, spaces: LearnerSpaces, settings: OnPolicySettings, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.discrete = spaces.discrete
+        outputs = spaces.action_width * (CHOICES if spaces.discrete else 1)
+        self.net = perceptron(
+            spaces.observation_width,
+            settings.hidden,
+            outputs,
+            activation=settings.activation,
+            last_gain=0.01,
+            generator=generator,
+        )
+        if not spaces.discrete:
+            self.log_std = nn.Parameter(torch.full((outputs,), math.log(FIRST_STD)))
+
+    def sample(self, observations: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw actions.
+
+        Args:
+            observations: normalised observations, (B, n).
+            generator: source of the draws.
+
+        Returns:
+            Actions, (B, k), and logarithms of their probabilities, (B,). Continuous ones may lie
+            beyond -1..1.
+        """
+        out = self.net(observations)
+        if self.discrete:
+            log_p = self._log_probabilities(out)
+            noise = torch.empty_like(log_p).exponential_(generator=generator)
+            actions = (log_p - noise.log_()).argmax(-1)
+            return actions, _of_chosen(log_p, actions)
+        std = self.log_std.exp()
+        noise = torch.randn(out.shape, generator=generator, dtype=out.dtype)
+        actions = out + std * noise
+        return actions, self._log_density(noise)
+
+    def evaluate(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Logarithms of the probabilities of actions, (B,), and the mean entropy.
+
+        Args:
+            observations: normalised observations, (B, n).
+            actions: actions, (B, k).
+        """
+        out = self.net(observations)
+        if self.discrete:
+            log_p = self._log_probabilities(out)
+            return _of_chosen(log_p, actions), -(log_p.exp() * log_p).sum((-1, -2)).mean()
+        entropy = (self.log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
+        return self._log_density((actions - out) / self.log_std.exp()), entropy
+
+    def _log_probabilities(self, out: Tensor) -> Tensor:
+        """Logarithms of the probabilities of each choice, (B, k, 3)."""
+        return out.unflatten(-1, (-1, CHOICES)).log_softmax(-1)
+
+    def _log_density(self, noise: Tensor) -> Tensor:
+        """Logarithm of the density at a distance from the mean in standard deviations, (B,)."""
+        each = -0.5 * noise * noise - self.log_std - 0.5 * math.log(2.0 * math.pi)
+        return each.sum(-1)
+
+
+def _of_chosen(log_p: Tensor, actions: Tensor) -> Tensor:
+    """Logarithm of the probability of the choices made, (B,)."""
+    return log_p.gather(-1, actions.unsqueeze(-1)).squeeze(-1).sum(-1)

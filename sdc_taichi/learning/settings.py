@@ -1,0 +1,47 @@
+"""Settings of algorithms and of their training."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Hidden = tuple[Annotated[int, Field(strict=True, ge=1, le=4096)], ...]
+
+
+class OnPolicySettings(BaseModel):
+    """Settings of ``ppo``, ``ippo``, ``mappo``, ``happo`` and ``haa2c``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rollout_steps: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 32
+    """Steps of each data center between two updates."""
+    epochs: Annotated[int, Field(strict=True, ge=1, le=100)] = 4
+    """Passes over the steps of an update; ``haa2c`` makes one."""
+    mini_batches: Annotated[int, Field(strict=True, ge=1, le=1024)] = 4
+    """Parts that the steps of an update are learned from in turn."""
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
+    """Learning rate of Adam for policies and critics."""
+    anneal: bool = True
+    """Whether the learning rate falls to 0 in even steps over the training."""
+    discount: Share = 0.99
+    """Weight of a reward one step later, gamma."""
+    gae_lambda: Share = 0.95
+    """Weight of later steps in the advantage, lambda (Schulman et al. 2016)."""
+    clip: Annotated[float, Field(gt=0, le=10)] = 0.2
+    """Largest change of the probability ratio that pays, epsilon; ``haa2c`` has none."""
+    entropy: Annotated[float, Field(ge=0, le=10)] = 0.003
+    """Weight of the entropy of policies."""
+    gradient_norm: Annotated[float, Field(gt=0)] = 0.5
+    """Largest norm of a gradient of a network."""
+    hidden: Hidden = (64, 64)
+    """Units of the hidden layers of policies and critics."""
+    activation: Literal["tanh", "relu"] = "tanh"
+    """Activation of all layers but the last."""
+    reward: Literal["own", "team"] | None = None
+    """Reward that critics learn: that of each learner, or the mean of all; None is that of the
+    algorithm's source."""
+    critic: Literal["observation", "state"] | None = None
+    """Input of critics: what their learner observes, or the shared state; None is that of the
+    algorithm's source."""

@@ -1,0 +1,171 @@
+"""A stream of transitions from a batch of environments, as tensors, one learner at a time.
+
+A learner is whatever has one policy: one agent, or all learning agents together. Episodes follow
+each other without a gap; where they are cut off, a step also holds what they ended with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from sdc_taichi.envs.core import Observation, Transition
+from sdc_taichi.envs.learners import JointLearner
+from sdc_taichi.envs.vector import MultiAgentVectorEnv
+from sdc_taichi.errors import ConfigError
+
+JOINT = "joint"
+"""Name of the learner that stands for all learning agents."""
+CHOICES = 3
+"""Number of discrete actions for each number that an agent decides."""
+
+
+@dataclass(frozen=True, slots=True)
+class LearnerSpaces:
+    """What a learner sees and does in one environment."""
+
+    agents: tuple[str, ...]
+    """Agents that it acts for, in the order of its actions."""
+    observation_width: int
+    """Number of entries of its observation, n."""
+    action_width: int
+    """Number of numbers that it decides, k."""
+    discrete: bool
+    """Whether each number is one of three choices, or else lies within -1..1."""
+
+
+class StreamStep(NamedTuple):
+    """What a step of all environments returned, besides the observations that follow."""
+
+    rewards: dict[str, Tensor]
+    """Reward of each learner, (B,) each."""
+    ended: bool
+    """Whether the episodes were cut off after the step; those of a batch end together."""
+    next_observations: dict[str, Tensor]
+    """Observations after the step by learner, (B, n) each; of the same episode even where it was
+    cut off."""
+    next_state: Tensor
+    """Shared state after the step, (B, m); of the same episode even where it was cut off."""
+
+
+class EnvironmentStream:
+    """Environments without end, whose episodes begin anew by themselves.
+
+    Args:
+        env: a batch, as ``sdc_taichi.vector_env`` makes it.
+        joint: whether all learning agents are one learner.
+        shares_state: whether the shared state is wanted, which takes time.
+        seed: seed of the first reset; environment i takes ``seed + i``.
+
+    Attributes:
+        learners: names of the learners.
+        spaces: what each learner sees and does.
+        state_width: number of entries of the shared state, m; 0 if it is not wanted.
+        size: number of environments, B.
+        observations: observations before the next step by learner, (B, n) each.
+        state: shared state before the next step, (B, m).
+
+    Raises:
+        ConfigError: observations with heat maps, which these networks do not take.
+    """
+
+    def __init__(
+        self,
+        env: MultiAgentVectorEnv,
+        *,
+        joint: bool = False,
+        shares_state: bool = True,
+        seed: int = 0,
+    ) -> None:
+        self._core = core = env.core
+        if core.options.heat_map:
+            raise ConfigError("heat_map: learners take features alone; valid is False")
+        self._joint = JointLearner(core) if joint else None
+        self.size = core.num_envs
+        self.spaces = _spaces(core.agents, env, self._joint)
+        self.learners = tuple(self.spaces)
+        self._shares_state = shares_state
+        self.state_width = int(np.prod(core.state_space.shape or ())) if shares_state else 0
+        self._take(core.reset(seed))
+
+    def step(self, actions: Mapping[str, Tensor]) -> StreamStep:
+        """Advance all environments.
+
+        Args:
+            actions: of each learner, (B, k): choices 0, 1 or 2, or numbers within -1..1.
+        """
+        core = self._core
+        transition = core.step(self._by_agent(actions))
+        ended = transition.ended
+        rewards = self._rewards(transition)
+        self._take(transition.observations)
+        after = StreamStep(rewards, ended, self.observations, self.state)
+        if ended:
+            self._take(core.next_episode())
+        return after
+
+    def state_dict(self) -> dict[str, Any]:
+        """State of the environments, for ``load_state_dict`` of a stream made alike."""
+        return self._core.state_dict()
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> None:
+        """Go on from what ``state_dict`` returned.
+
+        Raises:
+            SdcError: a state of other environments.
+        """
+        self._take(self._core.load_state_dict(values))
+
+    def _by_agent(self, actions: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Actions by agent as arrays, (B,) where an agent decides one choice, else (B, k)."""
+        arrays = {name: given.numpy() for name, given in actions.items()}
+        if self._joint is not None:
+            return self._joint.actions(arrays[JOINT])
+        one_choice = {
+            a: self.spaces[a].discrete and self.spaces[a].action_width == 1 for a in arrays
+        }
+        return {a: given[:, 0] if one_choice[a] else given for a, given in arrays.items()}
+
+    def _rewards(self, transition: Transition) -> dict[str, Tensor]:
+        if self._joint is not None:
+            return {JOINT: _tensor(transition.joint_reward)}
+        return {agent: _tensor(reward) for agent, reward in transition.rewards.items()}
+
+    def _take(self, by_agent: Mapping[str, Observation]) -> None:
+        """Keep observations and shared state before the next step."""
+        found = by_agent if self._joint is None else {JOINT: self._joint.observation(by_agent)}
+        self.observations = {name: _tensor(found[name]) for name in self.learners}
+        if self._shares_state:
+            self.state = _tensor(self._core.state())
+        else:
+            self.state = torch.empty(self.size, 0)
+
+
+def _spaces(
+    agents: tuple[str, ...], env: MultiAgentVectorEnv, joint: JointLearner | None
+) -> dict[str, LearnerSpaces]:
+    """What each learner sees and does."""
+    if joint is not None:
+        of_joint = joint.observation_space, joint.action_space
+        return {JOINT: _learner_spaces(agents, *of_joint)}
+    return {
+        a: _learner_spaces((a,), env.observation_spaces[a], env.action_spaces[a]) for a in agents
+    }
+
+
+def _learner_spaces(
+    agents: tuple[str, ...], observation: spaces.Space[Any], action: spaces.Space[Any]
+) -> LearnerSpaces:
+    shape, discrete = observation.shape or (), not isinstance(action, spaces.Box)
+    return LearnerSpaces(agents, int(np.prod(shape)), int(np.prod(action.shape or (1,))), discrete)
+
+
+def _tensor(array: Any) -> Tensor:
+    """A float32 tensor of its own."""
+    return torch.from_numpy(np.array(array, dtype=np.float32))
