@@ -6,13 +6,15 @@ SHELL := bash
 VENV := .venv
 PY := $(VENV)/bin/python
 READY := $(VENV)/.installed
-READY_TRAIN := $(VENV)/.installed-train
 PIP_FLAGS := -qq --disable-pip-version-check
 SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
 # The oldest Python and libraries that pyproject.toml admits.
 OLDEST := .venv-oldest
 READY_OLDEST := $(OLDEST)/.installed
 PYTHON_OLDEST ?= python3.11
+# Training libraries apart, because RLlib pins an older Gymnasium, whose types are others.
+TRAIN := .venv-train
+READY_TRAIN := $(TRAIN)/.installed
 # Installed before the libraries on top of it, which would take the newest build. May carry options
 # of pip, such as an index of builds for the CPU alone.
 TORCH ?= torch==2.13.0
@@ -21,6 +23,7 @@ PYTHON ?= python3.13 python3.12 python3.11 python3 python
 
 # A file stays with one process, because its fixtures are shared; each process may take 1 GB.
 SPREAD := --numprocesses auto --maxprocesses 4 --dist loadfile
+TRAINING_TESTS := $(wildcard tests/test_training*.py tests/test_learning*.py tests/test_policy*.py)
 TYPED := build/typecheck
 SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
@@ -43,8 +46,8 @@ test-oldest: $(READY_OLDEST) ## Run all tests with Python 3.11 and the oldest li
 test-processors: $(READY) ## Run tests of results as on older processors, and with one thread.
 	$(PY) tests/other_processors.py $(SPREAD)
 
-test-train: $(READY_TRAIN) ## Install the training libraries and test the examples that use them.
-	$(PY) -m pytest tests/test_training.py
+test-train: $(READY_TRAIN) ## Install the training libraries and run the tests that need them.
+	$(TRAIN)/bin/python -m pytest $(SPREAD) $(TRAINING_TESTS)
 
 bench: $(READY) ## Measure every speed target; tables, JSON and plot in runs/bench.
 	$(PY) benchmarks/bench.py
@@ -65,13 +68,20 @@ wheel-test: $(READY) ## Build the wheel and run the tests against it, away from 
 	.ci/wheel-test $(PY) $(SPREAD)
 
 clean: ## Remove everything that can be built again, the environment included.
-	rm -rf $(VENV) $(OLDEST) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLDEST) $(TRAIN) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(READY_TRAIN): $(READY)
-	@echo "Installing the training libraries into $(VENV) (once, a few minutes at most)"
+	@echo "Installing the training libraries into $(TRAIN) (once, a few minutes at most)"
+	@$(PY) -m venv --clear $(TRAIN)
+	@$(TRAIN)/bin/python -m pip install $(PIP_FLAGS) $(TORCH)
+	@$(TRAIN)/bin/python -m pip install $(PIP_FLAGS) --editable '.[test,onnx,recipes]'
+	@touch $@
+
+# Torch in the environment of development, for work on sdc_taichi/learning.
+$(VENV)/.installed-train: $(READY)
 	@$(PY) -m pip install $(PIP_FLAGS) $(TORCH)
-	@$(PY) -m pip install $(PIP_FLAGS) --editable '.[plot,dev,train]'
+	@$(PY) -m pip install $(PIP_FLAGS) --editable '.[dev,plot,onnx,train]' skrl stable-baselines3
 	@touch $@
 
 $(READY_OLDEST): pyproject.toml .ci/lowest_versions.py

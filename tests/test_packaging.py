@@ -19,7 +19,10 @@ MAPPED = ("configs", "data", "kernels", "viz")
 PYPROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PACKAGES: list[str] = PYPROJECT["tool"]["setuptools"]["packages"]
 # Imported by the functions that need them, so that `import sdc_taichi` stays light.
-LAZY = {"matplotlib", "pandas", "pettingzoo", "psychrolib", "pyarrow", "rerun", "taichi"}
+LAZY = {
+    *("matplotlib", "pandas", "pettingzoo", "psychrolib", "pyarrow", "rerun", "safetensors"),
+    *("taichi", "torch"),
+}
 
 
 def run_python(code: str, cwd: Path) -> str:
