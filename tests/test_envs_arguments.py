@@ -25,8 +25,8 @@ from sdc_taichi import (
 from sdc_taichi.control import CONTROLLABLE
 from sdc_taichi.envs.actions import BATTERY_COMMANDS
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT
-from sdc_taichi.envs.core import OBSERVERS
 from sdc_taichi.envs.features import DEFAULT_FEATURES, all_features
+from sdc_taichi.envs.observers import OBSERVERS
 from sdc_taichi.envs.registration import IDS
 from sdc_taichi.envs.reward_terms import TERMS
 from sdc_taichi.envs.rewards import DEFAULT_SCALES, REWARD_SETS

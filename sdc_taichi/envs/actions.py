@@ -34,6 +34,7 @@ class ActionDecoder:
     Attributes:
         spaces: space of the actions of each agent in one environment.
         commands: commands that learning agents decide.
+        action_order: order of the battery's discrete actions.
 
     Raises:
         ConfigError: data centers that differ in the number of what is decided on, or whose models
@@ -64,6 +65,7 @@ class ActionDecoder:
         if order is None:
             models = {c.battery.model for c in fleet.configs}
             order = "sustaindc" if models == {"released"} else "paper"
+        self.action_order = order
         three_ways = np.array([-1.0, 0.0, 1.0])
         self._discrete_commands = {
             "load": three_ways,

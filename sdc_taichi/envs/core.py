@@ -7,7 +7,7 @@ environments first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from enum import Enum
@@ -31,16 +31,15 @@ from sdc_taichi.envs.agents import COMMAND_OF_AGENT
 from sdc_taichi.envs.costs import Costs
 from sdc_taichi.envs.drawn_inputs import Draw, DrawnInputs, draw_info, draws_inputs
 from sdc_taichi.envs.episode_reset import Seed, chosen_start_days, seeded_generators
+from sdc_taichi.envs.features import Feature
 from sdc_taichi.envs.heat_map import heat_map, heat_map_space
-from sdc_taichi.envs.observer import Observer
+from sdc_taichi.envs.observers import make_observer
 from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.envs.released_observer import ReleasedObserver
 from sdc_taichi.envs.rewards import Rewards
 from sdc_taichi.envs.saved_state import SavedState, check_state
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError, whole_number
 from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.sim.events import require_events_start_before
-from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.fleet_configs import MOST_DCS
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
@@ -68,30 +67,6 @@ class Transition:
     """Whether the episodes are over; all have the same length."""
     result: StepResult
     """Result of the simulator's step."""
-
-
-def _named_features(fleet: Fleet, options: EnvOptions) -> Observer:
-    return Observer(
-        fleet,
-        agents=options.agents,
-        features=options.features,
-        ci_leads_h=options.ci_leads_h,
-        weather_leads_h=options.weather_leads_h,
-        forecast_error=options.forecast_error,
-        new_inputs=draws_inputs(options),
-        commands={agent: options.commands_of(agent) for agent in options.agents},
-    )
-
-
-def _released_vectors(fleet: Fleet, options: EnvOptions) -> ReleasedObserver:
-    return ReleasedObserver(options.agents)
-
-
-OBSERVERS: dict[str, Callable[[Fleet, EnvOptions], Observer | ReleasedObserver]] = {
-    "default": _named_features,
-    "sustaindc": _released_vectors,
-}
-"""Makers of observers by value of the option ``observations``."""
 
 
 class Core:
@@ -160,9 +135,11 @@ class Core:
         self._identity = options.model_dump(exclude={"rewards", "costs"}) | {
             "rewards": self._rewards.identity
         }
-        self._observer = OBSERVERS[options.observations](fleet, options)
+        self._observer = make_observer(fleet, options, new_inputs=draws_inputs(options))
         self._decoder = ActionDecoder(fleet, options)
-        self.features = {a: self._observer.features[a] for a in self.agents}
+        self.features: dict[str, tuple[Feature, ...]] = {
+            a: self._observer.features[a] for a in self.agents
+        }
         self.observation_spaces: dict[str, spaces.Space[Any]] = {
             a: self._observation_space(a) for a in self.agents
         }

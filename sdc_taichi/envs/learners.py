@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +13,14 @@ from sdc_taichi.envs.actions import checked_array
 from sdc_taichi.envs.core import Core, Observation, Transition
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.types import F32, F64
+
+
+class _Feature(Protocol):
+    """A named part of an observation; those that are equal are one feature."""
+
+    @property
+    def size(self) -> int:
+        """Number of entries side by side."""
 
 
 class Learner(Protocol):
@@ -80,7 +88,7 @@ class JointLearner:
 
     def __init__(self, core: Core) -> None:
         self._core = core
-        self._new_entries = _entries_of_new_features(core)
+        self._new_entries = entries_of_new_features(core.features)
         boxes = {agent: _features_box(core, agent) for agent in core.agents}
         low = np.concatenate([boxes[a].low[entries] for a, entries in self._new_entries.items()])
         high = np.concatenate([boxes[a].high[entries] for a, entries in self._new_entries.items()])
@@ -140,11 +148,17 @@ def learning_agent(agent: str | None, registered_agent: str | None) -> str | Non
     return registered_agent or agent
 
 
-def _entries_of_new_features(core: Core) -> dict[str, npt.NDArray[np.int64] | slice]:
-    """Entries of each agent's observation whose features no agent before it has."""
+def entries_of_new_features(
+    features_of: Mapping[str, Sequence[_Feature]],
+) -> dict[str, npt.NDArray[np.int64] | slice]:
+    """Entries of each agent's observation whose features no agent before it has.
+
+    Args:
+        features_of: features of each agent, in the order of its observation.
+    """
     known: set[Any] = set()
     out: dict[str, npt.NDArray[np.int64] | slice] = {}
-    for agent, features in core.features.items():
+    for agent, features in features_of.items():
         new = np.repeat([f not in known for f in features], [f.size for f in features])
         entries = np.flatnonzero(new)
         # Side by side they need no copy of their own.

@@ -1,32 +1,374 @@
-"""Policies: networks that agents act by, and the environment that they fit."""
+"""Policies: networks of a training with the interface that they fit, kept in a folder.
+
+``policy.safetensors`` holds the networks, and in its header everything else as JSON, so that it is
+whole or it is not there; ``policy.json`` is the header for people to read.
+"""
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, get_args
 
-from sdc_taichi.types import F32
+import numpy as np
+from pydantic import Field, ValidationError
+
+from sdc_taichi.atomic_file import atomic_write
+from sdc_taichi.config import explain
+from sdc_taichi.config.fields import Section
+from sdc_taichi.envs.learners import entries_of_new_features
+from sdc_taichi.errors import SdcError, shortened
+from sdc_taichi.learning.forward import Activation, Forward
+from sdc_taichi.learning.interface import Interface
+from sdc_taichi.types import F32, I64
+from sdc_taichi.user_file import decoding, read_bytes
+
+WEIGHTS, DESCRIPTION = "policy.safetensors", "policy.json"
+"""Names of the files of a policy."""
+FOLDERS = ("best", "policy")
+"""Folders of a training run that may hold a policy, the one to prefer first."""
+CHOICES = 3
+"""Number of discrete actions for each number that an agent decides."""
+MOST_BYTES = 256_000_000
+"""Largest file of a policy, in bytes: 60 million weights."""
+Head = Literal["argmax", "clip", "tanh"]
+"""What becomes of the last layer: the largest of three scores for each number that is decided, or
+the number itself, cut at -1 and 1 or bent to between them by a hyperbolic tangent."""
+_FORMAT = 1
+_HEADER_KEY = "policy"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PolicyNetwork:
-    """A perceptron that chooses the actions of one learner.
+    """A perceptron that acts for one agent, or for several at once.
 
-    Its input is the observation, normalised: (x - mean) / std, within -clip..clip.
+    Observations of several agents stand side by side, each feature once; so do their actions.
+
+    Raises:
+        SdcError: shapes that do not fit each other, or numbers that are not finite.
     """
 
     agents: tuple[str, ...]
-    """Agents that it acts for, in the order of its actions."""
+    """Agents that the network acts for, in the order of their actions."""
     mean: F32
-    """Mean of each entry of the observation, (n,)."""
+    """Subtracted from each entry of the observation, (n,)."""
     std: F32
-    """Standard deviation of each entry of the observation, (n,)."""
+    """Divides each entry of the observation after that, above 0, (n,)."""
     clip: float
-    """Largest normalised entry, of either sign."""
+    """Largest scaled entry, of either sign."""
     layers: tuple[tuple[F32, F32], ...]
     """Weight, (out, in), and bias, (out,), of each layer."""
-    activation: Literal["tanh", "relu"]
-    """Activation of all layers but the last."""
-    head: Literal["argmax", "clip", "tanh"]
-    """Meaning of the k * 3 or k outputs: the largest of each three is chosen, or each is a number
-    cut at -1 and 1, or its hyperbolic tangent is."""
+    activation: Activation
+    """Function of the units of all layers but the last."""
+    head: Head
+    """What becomes of the outputs of the last layer."""
+
+    def __post_init__(self) -> None:
+        """Check the values, and take arrays of their own in f32."""
+        who = f"network of {', '.join(self.agents)}"
+        for name, valid in (("activation", Activation), ("head", Head)):
+            if getattr(self, name) not in get_args(valid):
+                raise SdcError(
+                    f"{who}: {name} {getattr(self, name)!r}; valid: {', '.join(get_args(valid))}"
+                )
+        if not 0.0 < self.clip < math.inf:
+            raise SdcError(f"{who}: clip {self.clip!r}; valid is a number above 0")
+        if not self.layers:
+            raise SdcError(f"{who}: has no layer")
+        mean, std = (_numbers(getattr(self, n), f"{who}: {n}", 1) for n in ("mean", "std"))
+        if std.shape != mean.shape or not len(mean) or std.min() <= 0.0:
+            raise SdcError(
+                f"{who}: std {std.shape} of mean {mean.shape}; valid is above 0 for each"
+            )
+        layers, width = [], len(mean)
+        for i, (given_weight, given_bias) in enumerate(self.layers):
+            weight = _numbers(given_weight, f"{who}: weight of layer {i}", 2)
+            bias = _numbers(given_bias, f"{who}: bias of layer {i}", 1)
+            if not len(bias) or weight.shape != (len(bias), width):
+                raise SdcError(
+                    f"{who}: layer {i} has weight {weight.shape} and bias {bias.shape} after "
+                    f"{width} units; valid is (out, {width}) and (out,)"
+                )
+            layers.append((weight, bias))
+            width = len(bias)
+        if self.head == "argmax" and width % CHOICES:
+            raise SdcError(f"{who}: {width} outputs; valid is a multiple of {CHOICES} for argmax")
+        for name, value in (("mean", mean), ("std", std), ("layers", tuple(layers))):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "clip", float(self.clip))
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of inputs, then of units of each layer."""
+        return (len(self.mean), *(len(bias) for _, bias in self.layers))
+
+    @property
+    def action_width(self) -> int:
+        """Number of numbers that it decides, k."""
+        return self.sizes[-1] // CHOICES if self.head == "argmax" else self.sizes[-1]
+
+    def scores(self, observations: F32) -> F32:
+        """Outputs of the last layer, (B, 3 k) or (B, k), from observations, (B, n).
+
+        A row has the same bits whatever the other rows are.
+        """
+        return self._forward(observations)
+
+    def actions(self, observations: F32) -> F32 | I64:
+        """Actions, (B, k): whole numbers 0, 1 or 2, or numbers within -1..1."""
+        scores = self.scores(observations)
+        if self.head == "argmax":
+            return np.asarray(scores.reshape(len(scores), -1, CHOICES).argmax(axis=2))
+        return np.asarray(np.tanh(scores) if self.head == "tanh" else np.clip(scores, -1.0, 1.0))
+
+    @cached_property
+    def _forward(self) -> Forward:
+        return Forward(self.mean, self.std, self.clip, self.layers, self.activation)
+
+
+class About(Section):
+    """Where a policy comes from."""
+
+    algorithm: str
+    """Name of the algorithm that it was trained with."""
+    seed: int | None = None
+    """Seed of the training; None if it had none."""
+    steps: int = Field(default=0, ge=0)
+    """Number of steps of environments that it was trained for."""
+    fingerprint: str = ""
+    """Fingerprint of the settings and inputs of the training."""
+    others: str = "idle"
+    """Controller of the agents that did not learn, by name."""
+    version: str = ""
+    """Version of the package that it was trained with."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Networks that act for all agents of an interface.
+
+    Raises:
+        SdcError: networks that do not fit the interface.
+    """
+
+    networks: tuple[PolicyNetwork, ...]
+    """Networks, of which each agent has one, alone or with others."""
+    interface: Interface
+    """Everything of an environment that the networks depend on."""
+    about: About
+    """Where the policy comes from."""
+
+    def __post_init__(self) -> None:
+        """Check that the networks fit the interface."""
+        served = [agent for network in self.networks for agent in network.agents]
+        if sorted(served) != sorted(self.interface.agents):
+            raise SdcError(
+                f"policy: networks of {', '.join(served)}; valid is one for each of "
+                f"{', '.join(self.interface.agents)}"
+            )
+        for network, entries in zip(self.networks, self._entries, strict=True):
+            who = f"policy: network of {', '.join(network.agents)}"
+            width = sum(len(np.arange(self.interface.width(a))[e]) for a, e in entries.items())
+            if network.sizes[0] != width:
+                raise SdcError(f"{who} has {network.sizes[0]} inputs; observations have {width}")
+            numbers = sum(map(self.interface.action_width, network.agents))
+            if network.action_width != numbers:
+                raise SdcError(
+                    f"{who} decides {network.action_width} numbers; its agents decide {numbers}"
+                )
+            if (network.head == "argmax") != (self.interface.actions == "discrete"):
+                raise SdcError(
+                    f"{who} has head {network.head}, which is not for {self.interface.actions} "
+                    "actions"
+                )
+
+    def actions(self, observations: Mapping[str, F32]) -> dict[str, F32 | I64]:
+        """Actions of each agent, (B, k), from the observations of each agent, (B, n)."""
+        found: dict[str, F32 | I64] = {}
+        for network, entries in zip(self.networks, self._entries, strict=True):
+            parts = [observations[agent][:, of_agent] for agent, of_agent in entries.items()]
+            actions = network.actions(parts[0] if len(parts) == 1 else np.concatenate(parts, 1))
+            first = 0
+            for agent in network.agents:
+                end = first + self.interface.action_width(agent)
+                found[agent] = actions[:, first:end]
+                first = end
+        return {agent: found[agent] for agent in self.interface.agents}
+
+    @cached_property
+    def _entries(self) -> tuple[dict[str, Any], ...]:
+        """For each network, the entries of each agent's observation that it reads, side by side."""
+        features = self.interface.features
+        return tuple(
+            entries_of_new_features({agent: features[agent] for agent in network.agents})
+            for network in self.networks
+        )
+
+    def save(self, folder: Path) -> None:
+        """Write the policy into a folder, in place of one that is there.
+
+        Whoever reads finds the one before or this one, whole.
+
+        Args:
+            folder: the folder, made if it is not there.
+
+        Raises:
+            SdcError: the files cannot be written.
+        """
+        from safetensors.numpy import save
+
+        description = {
+            "format": _FORMAT,
+            "about": self.about.model_dump(mode="json"),
+            "interface": self.interface.model_dump(mode="json"),
+            "networks": [
+                {
+                    "agents": network.agents,
+                    "sizes": network.sizes,
+                    "activation": network.activation,
+                    "clip": network.clip,
+                    "head": network.head,
+                }
+                for network in self.networks
+            ],
+        }
+        tensors = {
+            f"{i}.{name}": values
+            for i, network in enumerate(self.networks)
+            for name, values in _tensors(network).items()
+        }
+        content = save(tensors, {_HEADER_KEY: json.dumps(description)})
+        with atomic_write(folder / WEIGHTS, parents=True) as file:
+            file.write(content)
+        with atomic_write(folder / DESCRIPTION) as file:
+            file.write(json.dumps(description, indent=1).encode() + b"\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> Policy:
+        """Read the policy of a folder, or of the training run in it, the best one first.
+
+        Args:
+            folder: the folder.
+
+        Raises:
+            SdcError: no policy there, or a file that is damaged or of another kind.
+        """
+        path = policy_folder(folder) / WEIGHTS
+        content = read_bytes(path, MOST_BYTES)
+        with decoding(path, "a policy"):
+            from safetensors.numpy import load
+
+            tensors = load(content)
+            header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+            text = header.get("__metadata__", {}).get(_HEADER_KEY)
+            described = None if text is None else json.loads(text)
+        if not isinstance(described, Mapping):
+            raise SdcError(f"{path}: holds no policy; valid is a file that Policy.save wrote")
+        if described.get("format") != _FORMAT:
+            raise SdcError(
+                f"{path}: has format {shortened(described.get('format'))}; valid is {_FORMAT}, "
+                "which this version of sdc-taichi reads"
+            )
+        try:
+            read = _Description.model_validate_json(text)
+        except ValidationError as error:
+            raise SdcError(explain(error, str(path), _Description)) from None
+        try:
+            networks = tuple(_network(i, one, tensors) for i, one in enumerate(read.networks))
+            if tensors:
+                raise SdcError(f"unknown array {shortened(next(iter(tensors)))}")
+            return cls(networks, read.interface, read.about)
+        except SdcError as error:
+            raise SdcError(f"{path}: {error}") from None
+
+
+def policy_folder(folder: Path) -> Path:
+    """The folder with the policy of a training run, or a folder that holds one itself.
+
+    Args:
+        folder: either of them.
+
+    Raises:
+        SdcError: there is no such folder, or no policy in it.
+    """
+    for found in (folder, *(folder / name for name in FOLDERS)):
+        if (found / WEIGHTS).exists():
+            return found
+    if not folder.is_dir():
+        raise SdcError(f"{folder}: no such folder; valid is that of a training run or a policy")
+    raise SdcError(
+        f"{folder}: holds no policy; valid is the folder of a training run, or one with {WEIGHTS}"
+    )
+
+
+class _NetworkDescription(Section):
+    """Everything of a network but its arrays."""
+
+    agents: tuple[str, ...]
+    sizes: tuple[int, ...]
+    activation: Activation
+    clip: float
+    head: Head
+
+
+class _Description(Section):
+    """Content of policy.json."""
+
+    format: int
+    about: About
+    interface: Interface
+    networks: tuple[_NetworkDescription, ...]
+
+
+def _tensors(network: PolicyNetwork) -> dict[str, F32]:
+    """Arrays of a network by name."""
+    arrays = {"mean": network.mean, "std": network.std}
+    for i, (weight, bias) in enumerate(network.layers):
+        arrays |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
+    return arrays
+
+
+def _network(number: int, described: _NetworkDescription, tensors: dict[str, Any]) -> PolicyNetwork:
+    """A network of its description and arrays, which are taken out of ``tensors``."""
+
+    def take(name: str) -> F32:
+        try:
+            values: F32 = tensors.pop(f"{number}.{name}")
+        except KeyError:
+            raise SdcError(f"array {number}.{name} is missing") from None
+        return values
+
+    layers = tuple(
+        (take(f"layers.{i}.weight"), take(f"layers.{i}.bias"))
+        for i in range(len(described.sizes) - 1)
+    )
+    network = PolicyNetwork(
+        agents=described.agents,
+        mean=take("mean"),
+        std=take("std"),
+        clip=described.clip,
+        layers=layers,
+        activation=described.activation,
+        head=described.head,
+    )
+    if network.sizes != described.sizes:
+        raise SdcError(
+            f"network {number} has {network.sizes} units; described as {described.sizes}"
+        )
+    return network
+
+
+def _numbers(given: Any, what: str, ndim: int) -> F32:
+    """An array of finite numbers in f32, which nobody else can change."""
+    array = np.asarray(given)
+    if array.dtype.kind != "f" or array.ndim != ndim:
+        raise SdcError(f"{what} is {array.dtype} {array.shape}; valid is {ndim}-D, of real numbers")
+    if not np.all(np.isfinite(array)):
+        raise SdcError(f"{what} has {array[~np.isfinite(array)].flat[0]}; valid is finite numbers")
+    own = np.array(array, dtype=np.float32, order="C")
+    own.flags.writeable = False
+    return own

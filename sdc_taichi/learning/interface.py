@@ -1,0 +1,222 @@
+"""Everything of an environment that a policy depends on: what it observes, and what its actions do.
+
+A policy fits an environment, or the data centers of a run, if their interfaces are equal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from sdc_taichi.config.fields import Section
+from sdc_taichi.envs.actions import ActionDecoder, equal_number
+from sdc_taichi.envs.agents import Agent
+from sdc_taichi.envs.features import Feature
+from sdc_taichi.envs.observers import make_observer
+from sdc_taichi.envs.options import EnvOptions, make_options
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.sim.fleet import Fleet
+
+
+class ObservedFeature(Section):
+    """A feature of an observation, or several of one kind side by side."""
+
+    name: str
+    """Name of the feature, as in docs/observations.md."""
+    unit: str
+    """Unit of the value before scaling."""
+    low: float
+    """Lower end of the range that is scaled, in ``unit``."""
+    high: float
+    """Upper end of the range that is scaled, in ``unit``."""
+    size: int
+    """Number of entries side by side."""
+
+
+class Interface(Section):
+    """Everything of an environment that a policy depends on."""
+
+    agents: tuple[Agent, ...]
+    """Agents that act, in the order of their actions."""
+    actions: Literal["discrete", "continuous"]
+    """Whether an agent chooses one of three commands or a number."""
+    action_order: Literal["paper", "sustaindc"] | None
+    """Order of the battery's discrete actions; None where there are none."""
+    commands: dict[str, tuple[str, ...]]
+    """Commands that each agent decides, in the order of its action."""
+    setpoint_change_k: float | None
+    """Change of the setpoint in one step by a continuous action of 1, in K; None where there is no
+    such action."""
+    fan_change: float | None
+    """Change of the CRAC fan speed over full speed in one step by a continuous action of 1; None
+    where there is no such action."""
+    observations: Literal["default", "sustaindc"]
+    """Whether agents observe named features or the vectors of the released code."""
+    features: dict[str, tuple[ObservedFeature, ...]]
+    """Features that each agent observes, in the order of its observation."""
+    ci_leads_h: tuple[float, ...]
+    """Leads of the carbon-intensity forecast, in h; empty for vectors of the released code."""
+    weather_leads_h: tuple[float, ...]
+    """Leads of the weather forecasts, in h; empty for vectors of the released code."""
+    step_min: int
+    """Length of a step, in min."""
+    crac_units: int | None
+    """Number of CRAC units of a data center that an agent decides on; None where none does."""
+    racks: int | None
+    """Number of racks of a data center that an agent places work on; None where none does."""
+
+    def width(self, agent: str) -> int:
+        """Number of entries of an agent's observation, n."""
+        return sum(feature.size for feature in self.features[agent])
+
+    def action_width(self, agent: str) -> int:
+        """Number of numbers that an agent decides in a step, k."""
+        numbers = {"cooling": self.crac_units, "fan": self.crac_units, "placement": self.racks}
+        return sum(numbers.get(name) or 1 for name in self.commands[agent])
+
+    def options(self, **others: Any) -> EnvOptions:
+        """Options of environments that have this interface.
+
+        Args:
+            others: further options of the environments, by name.
+        """
+        given: dict[str, Any] = {
+            "agents": self.agents,
+            "actions": self.actions,
+            "action_order": self.action_order,
+            "commands": self.commands,
+            "setpoint_change_k": self.setpoint_change_k,
+            "fan_change": self.fan_change,
+            "observations": self.observations,
+        }
+        if self.observations == "default":
+            given["features"] = {a: [f.name for f in own] for a, own in self.features.items()}
+            given["ci_leads_h"] = self.ci_leads_h
+            given["weather_leads_h"] = self.weather_leads_h
+        return make_options(**{k: v for k, v in given.items() if v is not None}, **others)
+
+    def difference(self, other: Interface) -> str | None:
+        """What differs first between this interface and another, in words; None if nothing does."""
+        for name, label in _LABELS.items():
+            mine, theirs = getattr(self, name), getattr(other, name)
+            if mine != theirs:
+                return f"{label}: {_text(mine)} in training, {_text(theirs)} here"
+        for agent in self.agents:
+            found = _feature_difference(self.features[agent], other.features[agent])
+            if found is not None:
+                return f"observation of {agent}: {found}"
+        return None
+
+    def require_fit(self, what: str, fleet: Fleet) -> None:
+        """Refuse data centers that a policy with this interface does not fit.
+
+        Args:
+            what: the policy, for errors.
+            fleet: the data centers.
+
+        Raises:
+            ConfigError: naming what differs.
+        """
+        step_min = 60 // fleet.steps_per_hour
+        if step_min != self.step_min:
+            found: str | None = f"step: {self.step_min} min in training, {step_min} min here"
+        else:
+            try:
+                found = self.difference(interface_of(fleet, self.options()))
+            except ConfigError as error:
+                found = str(error)
+        if found is not None:
+            raise ConfigError(f"{what}: does not fit these data centers ({found})")
+
+
+_LABELS = {
+    "agents": "agents",
+    "observations": "observations",
+    "actions": "actions",
+    "action_order": "action_order",
+    "commands": "commands",
+    "setpoint_change_k": "setpoint_change_k",
+    "fan_change": "fan_change",
+    "step_min": "step in min",
+    "ci_leads_h": "ci_leads_h",
+    "weather_leads_h": "weather_leads_h",
+    "crac_units": "CRAC units (hvac.crac.units)",
+    "racks": "racks",
+}
+"""What users call the fields of ``Interface``, in the order in which they are compared."""
+
+
+def interface_of(fleet: Fleet, options: EnvOptions) -> Interface:
+    """The interface between environments and the policies of the agents that learn in them.
+
+    Args:
+        fleet: the data centers.
+        options: options of the environments.
+
+    Raises:
+        ConfigError: options that do not fit the data centers, or observations that are no vectors.
+    """
+    if options.heat_map:
+        raise ConfigError("heat_map True: policies observe features alone; valid is False")
+    decoder = ActionDecoder(fleet, options)
+    features = make_observer(fleet, options).features
+    decided: dict[str, tuple[str, ...]] = {
+        agent: options.commands_of(agent) for agent in options.agents
+    }
+    names = {name for of_agent in decided.values() for name in of_agent}
+    continuous, named = options.actions == "continuous", options.observations == "default"
+    has_order = not continuous and "battery" in names
+    on_units = bool(names & {"cooling", "fan"})
+    on_racks = "placement" in names
+    return Interface(
+        agents=options.agents,
+        actions=options.actions,
+        action_order=decoder.action_order if has_order else None,
+        commands=decided,
+        setpoint_change_k=options.setpoint_change_k if continuous and "cooling" in names else None,
+        fan_change=options.fan_change if continuous and "fan" in names else None,
+        observations=options.observations,
+        features={agent: _observed(features[agent]) for agent in options.agents},
+        ci_leads_h=options.ci_leads_h if named else (),
+        weather_leads_h=options.weather_leads_h if named else (),
+        step_min=60 // fleet.steps_per_hour,
+        crac_units=equal_number(fleet.unit_offsets, "CRAC units") if on_units else None,
+        racks=equal_number(fleet.rack_offsets, "racks") if on_racks else None,
+    )
+
+
+def _observed(features: Sequence[Feature]) -> tuple[ObservedFeature, ...]:
+    return tuple(
+        ObservedFeature(name=f.name, unit=f.unit, low=f.low, high=f.high, size=f.size)
+        for f in features
+    )
+
+
+def _feature_difference(
+    mine: Sequence[ObservedFeature], theirs: Sequence[ObservedFeature]
+) -> str | None:
+    """What differs first between the features of an agent, in words; None if nothing does."""
+    by_name = {feature.name: feature for feature in theirs}
+    for feature in mine:
+        here = by_name.pop(feature.name, None)
+        if here is None:
+            return f"feature {feature.name!r} of the training is missing here"
+        if here.size != feature.size:
+            return f"{feature.name!r} has {feature.size} entries in training, {here.size} here"
+        if here != feature:
+            ranges = [f"{f.low:g}..{f.high:g} {f.unit}" for f in (feature, here)]
+            return f"{feature.name!r} is {ranges[0]} in training, {ranges[1]} here"
+    if by_name:
+        return f"feature {next(iter(by_name))!r} was not there in training"
+    if tuple(mine) != tuple(theirs):
+        return "features are in another order here than in training"
+    return None
+
+
+def _text(value: Any) -> str:
+    """A value of an interface in few words."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_text(entry)}" for name, entry in value.items())
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(_text, value)) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)

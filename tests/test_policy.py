@@ -1,0 +1,294 @@
+"""Policies: their networks, their files, and the interface that they fit."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sdc_taichi import SdcError, build_fleet, load_config
+from sdc_taichi.envs.options import make_options
+from sdc_taichi.learning.interface import Interface, interface_of
+from sdc_taichi.learning.policy import WEIGHTS, About, Head, Policy, PolicyNetwork
+from sdc_taichi.types import F32
+
+TWO_UNITS = ("hvac.crac.units=2",)
+
+
+def network(
+    agents: tuple[str, ...], inputs: int, outputs: int, head: Head = "argmax", seed: int = 0
+) -> PolicyNetwork:
+    """A network of random weights."""
+    rng = np.random.default_rng(seed)
+    sizes = (inputs, 11, 8, outputs)
+    return PolicyNetwork(
+        agents,
+        mean=rng.normal(size=inputs).astype(np.float32),
+        std=rng.uniform(0.1, 1.0, inputs).astype(np.float32),
+        clip=5.0,
+        layers=tuple(
+            (
+                rng.normal(size=(n, m)).astype(np.float32) / np.float32(m),
+                rng.normal(size=n).astype(np.float32),
+            )
+            for m, n in itertools.pairwise(sizes)
+        ),
+        activation="tanh" if seed % 2 else "relu",
+        head=head,
+    )
+
+
+def interface(**options: Any) -> Interface:
+    return interface_of(build_fleet(load_config("tiny")), make_options(**options))
+
+
+def policy(fits: Interface, *, seed: int = 0) -> Policy:
+    """A policy of random weights, one network for each agent."""
+    discrete = fits.actions == "discrete"
+    return Policy(
+        tuple(
+            network(
+                (agent,),
+                fits.width(agent),
+                fits.action_width(agent) * (3 if discrete else 1),
+                "argmax" if discrete else "clip",
+                seed + i,
+            )
+            for i, agent in enumerate(fits.agents)
+        ),
+        fits,
+        About(algorithm="none", seed=seed),
+    )
+
+
+def by_numpy(net: PolicyNetwork, observations: F32) -> Any:
+    """Outputs by the equations of a perceptron, in f64."""
+    x = np.clip((observations.astype(float) - net.mean) / net.std, -net.clip, net.clip)
+    for i, (weight, bias) in enumerate(net.layers):
+        x = x @ weight.T + bias
+        if i + 1 < len(net.layers):
+            x = np.tanh(x) if net.activation == "tanh" else np.maximum(x, 0.0)
+    return x
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("rows", [1, 7, 300])
+def test_outputs_are_those_of_a_perceptron(seed: int, rows: int) -> None:
+    net = network(("agent_bat",), 13, 6, seed=seed)
+    observations = np.random.default_rng(9).normal(size=(rows, 13)).astype(np.float32)
+    np.testing.assert_allclose(net.scores(observations), by_numpy(net, observations), atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_row_is_the_same_alone_and_in_any_batch(seed: int) -> None:
+    net = network(("agent_bat",), 13, 6, seed=seed)
+    observations = np.random.default_rng(9).normal(size=(20_001, 13)).astype(np.float32)
+    together = net.scores(observations)
+    for i in (0, 1, 8, 12_345, 20_000):
+        assert np.array_equal(net.scores(observations[i : i + 1])[0], together[i])
+
+
+def test_heads_give_choices_and_numbers_within_the_space() -> None:
+    observations = np.random.default_rng(9).normal(size=(50, 13)).astype(np.float32)
+    net = network(("agent_bat",), 13, 6)
+    scores = net.scores(observations)
+    assert np.array_equal(net.actions(observations)[:, 1], scores[:, 3:].argmax(1))
+    assert np.array_equal(replace(net, head="clip").actions(observations), scores.clip(-1, 1))
+    assert np.array_equal(replace(net, head="tanh").actions(observations), np.tanh(scores))
+
+
+def test_a_network_of_several_agents_reads_each_feature_once() -> None:
+    fits = interface(agents=("agent_ls", "agent_bat"))
+    rng = np.random.default_rng(1)
+    seen: dict[str, F32] = {
+        a: rng.uniform(size=(4, fits.width(a))).astype(np.float32) for a in fits.agents
+    }
+    names = [f.name for f in fits.features["agent_ls"]]
+    first = fits.width("agent_ls")
+    new = [f.size for f in fits.features["agent_bat"] if f.name not in names]
+    net = network(fits.agents, first + sum(new), 6)
+    joint = Policy((net,), fits, About(algorithm="none"))
+    (dc_load,) = [
+        sum(f.size for f in fits.features["agent_bat"][:i])
+        for i, f in enumerate(fits.features["agent_bat"])
+        if f.name == "dc_load"
+    ]
+    assert new == [1]
+    side_by_side = np.concatenate([seen["agent_ls"], seen["agent_bat"][:, [dc_load]]], 1)
+    expected = net.actions(side_by_side)
+    found = joint.actions(seen)
+    assert np.array_equal(found["agent_ls"], expected[:, :1])
+    assert np.array_equal(found["agent_bat"], expected[:, 1:])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"std": np.zeros(13)}, r"std \(13,\) of mean \(13,\); valid is above 0"),
+        ({"mean": np.full(13, np.nan)}, "mean has nan; valid is finite"),
+        ({"mean": np.zeros(12)}, r"std \(13,\) of mean \(12,\)"),
+        ({"clip": 0.0}, "clip 0.0; valid is a number above 0"),
+        ({"layers": ()}, "has no layer"),
+        (
+            {"layers": ((np.zeros((6, 12)), np.zeros(6)),)},
+            r"\(6, 12\).*valid is \(out, 13\)",
+        ),
+        ({"layers": ((np.zeros((4, 13)), np.zeros(4)),)}, "4 outputs; valid is a multiple of 3"),
+        ({"activation": "gelu"}, "activation 'gelu'; valid: tanh, relu"),
+        ({"head": "softmax"}, "head 'softmax'; valid: argmax, clip, tanh"),
+    ],
+)
+def test_networks_that_make_no_sense_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(SdcError, match=message):
+        replace(network(("agent_bat",), 13, 6), **changes)
+
+
+def test_networks_that_do_not_fit_the_interface_are_refused() -> None:
+    fits = interface(agents=("agent_bat",))
+    n = fits.width("agent_bat")
+    for net, message in (
+        (network(("agent_ls",), n, 3), "networks of agent_ls; valid is one for each of agent_bat"),
+        (network(("agent_bat",), n + 1, 3), f"{n + 1} inputs; observations have {n}"),
+        (network(("agent_bat",), n, 6), "decides 2 numbers; its agents decide 1"),
+        (network(("agent_bat",), n, 1, "clip"), "head clip, which is not for discrete"),
+    ):
+        with pytest.raises(SdcError, match=message):
+            Policy((net,), fits, About(algorithm="none"))
+
+
+# Files
+
+
+def test_a_policy_is_read_as_it_was_written(tmp_path: Path) -> None:
+    made = policy(interface(actions="continuous", ci_leads_h=(1.0, 2.5)))
+    made.save(tmp_path / "runs" / "a")
+    read = Policy.load(tmp_path / "runs" / "a")
+    assert (read.interface, read.about) == (made.interface, made.about)
+    seen: dict[str, F32] = {
+        a: np.random.default_rng(0).uniform(size=(5, made.interface.width(a))).astype(np.float32)
+        for a in made.interface.agents
+    }
+    for agent, actions in made.actions(seen).items():
+        assert np.array_equal(read.actions(seen)[agent], actions)
+
+
+def test_the_best_policy_of_a_run_is_preferred(tmp_path: Path) -> None:
+    fits = interface(agents=("agent_bat",))
+    policy(fits, seed=1).save(tmp_path / "policy")
+    assert Policy.load(tmp_path).about.seed == 1
+    policy(fits, seed=2).save(tmp_path / "best")
+    assert Policy.load(tmp_path).about.seed == 2
+    assert Policy.load(tmp_path / "policy").about.seed == 1
+
+
+def test_folders_without_a_policy_are_named(tmp_path: Path) -> None:
+    with pytest.raises(SdcError, match=r"nowhere: no such folder"):
+        Policy.load(tmp_path / "nowhere")
+    with pytest.raises(SdcError, match=r"holds no policy; valid is the folder of a training run"):
+        Policy.load(tmp_path)
+
+
+def test_damaged_and_foreign_files_are_one_error_that_names_the_file(tmp_path: Path) -> None:
+    from safetensors.numpy import save
+
+    policy(interface(agents=("agent_bat",))).save(tmp_path)
+    path = tmp_path / WEIGHTS
+    whole = path.read_bytes()
+    header = int.from_bytes(whole[:8], "little")
+    for content in (
+        b"",
+        whole[:5],
+        whole[: header // 2],
+        whole[:-1],
+        whole[: header + 8] + whole[header + 12 :],
+        whole + b"x",
+        b"PK\x03\x04" + whole,
+        save({"weight": np.zeros(3)}),
+        save({"weight": np.zeros(3)}, {"policy": "[1"}),
+        save({"weight": np.zeros(3)}, {"policy": '{"format": 2}'}),
+        save({"weight": np.zeros(3)}, {"policy": '{"format": 1}'}),
+        whole.replace(b"0.mean", b"0.mild"),
+        whole.replace(b"tanh", b"sinh").replace(b"relu", b"silu"),
+        whole[:-4] + np.float32(np.nan).tobytes(),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(SdcError, match=WEIGHTS) as failed:
+            Policy.load(tmp_path)
+        assert "\n" not in str(failed.value)
+
+
+# Interfaces
+
+
+def test_options_of_an_interface_make_it_again() -> None:
+    config = load_config("corrected", [*TWO_UNITS, "hvac.crac.flow_model=controlled"])
+    fleet = build_fleet(config)
+    for given in (
+        {},
+        {"agents": ("agent_bat",), "action_order": "sustaindc"},
+        {"observations": "sustaindc", "agents": ("agent_ls",)},
+        {"actions": "continuous", "setpoint_change_k": 1.0, "ci_leads_h": (2.0,)},
+        {
+            "actions": "continuous",
+            "agents": ("agent_dc",),
+            "commands": {"agent_dc": ("fan", "cooling")},
+            "fan_change": 0.1,
+            "features": {"agent_dc": ("fan_speed", "room")},
+        },
+    ):
+        made = interface_of(fleet, make_options(**given))
+        assert interface_of(fleet, made.options()) == made
+        assert Interface.model_validate_json(made.model_dump_json()) == made
+
+
+def test_the_difference_between_interfaces_is_named() -> None:
+    base = interface()
+    two_units = interface_of(build_fleet(load_config("corrected", [*TWO_UNITS])), make_options())
+    assert base.difference(base) is None
+    for other, said in (
+        (interface(agents=("agent_ls",)), "agents: [agent_ls, agent_dc, agent_bat] in training"),
+        (interface(actions="continuous"), "actions: discrete in training, continuous here"),
+        (interface(action_order="sustaindc"), "action_order: paper in training, sustaindc here"),
+        (interface(ci_leads_h=(1.0,)), "ci_leads_h: [1, 2, 3, 4, 6, 8, 12, 16, 20, 24] in train"),
+        (two_units, "CRAC units (hvac.crac.units): 1 in training, 2 here"),
+        (
+            interface(features={"agent_bat": ("soc",)}),
+            "observation of agent_bat: feature 'time_of_day' of the training is missing here",
+        ),
+    ):
+        found = base.difference(other)
+        assert found is not None
+        assert found.startswith(said)
+
+
+def test_a_feature_of_another_range_is_a_difference() -> None:
+    base = interface(agents=("agent_bat",))
+    (*_, soc) = base.features["agent_bat"]
+    for changed, said in (
+        (soc.model_copy(update={"high": 2.0}), "'soc' is 0..1 share in training, 0..2 share here"),
+        (soc.model_copy(update={"size": 2}), "'soc' has 1 entries in training, 2 here"),
+    ):
+        features = {"agent_bat": (*base.features["agent_bat"][:-1], changed)}
+        other = base.model_copy(update={"features": features})
+        assert said in str(base.difference(other))
+
+
+def test_data_centers_that_do_not_fit_are_refused() -> None:
+    fits = interface()
+    fits.require_fit("policy:x", build_fleet(load_config("tiny", ["site.location=ca"])))
+    for preset, change, said in (
+        ("tiny", "simulation.steps_per_hour=2", "step: 15 min in training, 30 min here"),
+        ("corrected", *TWO_UNITS, r"CRAC units \(hvac.crac.units\): 1 in training, 2 here"),
+    ):
+        with pytest.raises(SdcError, match=rf"policy:x: does not fit these data centers \({said}"):
+            fits.require_fit("policy:x", build_fleet(load_config(preset, [change])))
+    fan = interface_of(
+        build_fleet(load_config("tiny", ["hvac.crac.flow_model=controlled"])),
+        make_options(agents=("agent_dc",), commands={"agent_dc": ("fan",)}),
+    )
+    with pytest.raises(SdcError, match=r"fan needs hvac\.crac\.flow_model=controlled"):
+        fan.require_fit("policy:x", build_fleet(load_config("tiny")))
