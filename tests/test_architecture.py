@@ -17,6 +17,7 @@ ROOMS = (
     "atomic_file",
     "user_file",
     "number_text",
+    "user_functions",
     "configs",
     "data",
     "kernels",

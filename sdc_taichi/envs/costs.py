@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.control.view import View
-from sdc_taichi.envs.user_functions import (
+from sdc_taichi.errors import ConfigError, SdcError, shortened
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.types import F64, StepResult
+from sdc_taichi.user_functions import (
     checked_values,
     function_named,
     import_path,
     register_function,
 )
-from sdc_taichi.errors import ConfigError, SdcError, shortened
-from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import F64, StepResult
 
 CostFunction = Callable[[StepResult, View], Any]
 """A cost. It gets the result of a step and the view after it, and returns numbers of at least 0,

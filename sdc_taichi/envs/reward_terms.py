@@ -20,10 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.envs.user_functions import is_replacement
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64, StepResult
+from sdc_taichi.user_functions import is_replacement
 
 CI_G_PER_KWH = 500.0
 """Carbon intensity at which the design energy gives a carbon term of -1, a grid run on gas."""

@@ -16,16 +16,16 @@ from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.released_rewards import ReleasedRewards
 from sdc_taichi.envs.reward_terms import TERMS, TermContext
-from sdc_taichi.envs.user_functions import (
+from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
+from sdc_taichi.sim.physical_limits import POWER_LIMITS_W
+from sdc_taichi.sim.state_limits import ROUNDING
+from sdc_taichi.types import F64, I64, StepResult
+from sdc_taichi.user_functions import (
     checked_values,
     function_named,
     import_path,
     register_function,
 )
-from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
-from sdc_taichi.sim.physical_limits import POWER_LIMITS_W
-from sdc_taichi.sim.state_limits import ROUNDING
-from sdc_taichi.types import F64, I64, StepResult
 
 RewardFunction = Callable[[StepResult, View], Any]
 """A user's own reward. It gets the result of a step and the view after it, and returns rewards,

@@ -17,8 +17,8 @@ from pydantic import BaseModel
 from sdc_taichi.control.forecast_error import ForecastError
 from sdc_taichi.envs.core import Core
 from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.envs.user_functions import import_path
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.user_functions import import_path
 
 
 class HasSpec:

@@ -1,4 +1,4 @@
-"""Functions of the user that options name: registered ones, and those with an import path."""
+"""Functions of the user by name: registered ones, and those with an import path."""
 
 from __future__ import annotations
 
