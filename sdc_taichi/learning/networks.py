@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +13,34 @@ from sdc_taichi.learning.settings import OnPolicySettings
 from sdc_taichi.learning.stream import CHOICES, LearnerSpaces
 from sdc_taichi.types import F32
 
-ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU}
+
+class _TanhBySigmoid(torch.autograd.Function):
+    """The hyperbolic tangent by the logistic function, tanh(x) = 2 s(2 x) - 1.
+
+    PyTorch's logistic function takes a sixth of the time of its tanh on processors with AVX-512.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        out = (2.0 * x).sigmoid_().mul_(2.0).sub_(1.0)
+        ctx.save_for_backward(out)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        (out,) = ctx.saved_tensors
+        return torch.ops.aten.tanh_backward(gradients[0], out)
+
+
+class Tanh(nn.Module):
+    """Hyperbolic tangent, to within rounding."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Tangents of x, of its shape."""
+        return _TanhBySigmoid.apply(x)
+
+
+ACTIVATIONS = {"tanh": Tanh, "relu": nn.ReLU}
 FIRST_STD = 0.5
 """Standard deviation of continuous actions before training."""
 

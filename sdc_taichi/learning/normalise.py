@@ -36,7 +36,10 @@ class RunningMoments:
     def add(self, rows: Tensor) -> None:
         """Take rows, (n, width), into account."""
         n = len(rows)
-        mean, variance = rows.mean(0).double(), rows.var(0, correction=0).double()
+        row_mean = rows.mean(0)
+        # Many times faster than Tensor.var, which goes through rows one by one.
+        variance = (rows - row_mean).square_().mean(0).double()
+        mean = row_mean.double()
         total = self.count + n
         shift = mean - self.mean
         weight = self.count / total

@@ -294,7 +294,8 @@ class OnPolicy:
         total = 0.0
         batches = self._batches(len(targets))
         for batch in batches:
-            loss = value_loss(critic.net(inputs[batch]).squeeze(-1), targets[batch])
+            values = critic.net(inputs.index_select(0, batch)).squeeze(-1)
+            loss = value_loss(values, targets[batch])
             self._descend(loss, critic.net, critic.adam)
             total += float(loss.detach())
         return total / len(batches)
@@ -312,7 +313,8 @@ class OnPolicy:
         totals = torch.zeros(2)
         batches = self._batches(len(actions))
         for batch in batches:
-            log_p, entropy = actor.evaluate(seen[batch], actions[batch])
+            rows = seen.index_select(0, batch), actions.index_select(0, batch)
+            log_p, entropy = actor.evaluate(*rows)
             ratio = (log_p - old_log_p[batch]).exp()
             loss = policy_loss(ratio, weighed[batch], clip)
             self._descend(loss - self._settings.entropy * entropy, actor, adam)
@@ -383,7 +385,8 @@ class OnPolicy:
         return critics
 
     def _adam(self, net: nn.Module) -> torch.optim.Adam:
-        return torch.optim.Adam(net.parameters(), self._settings.learning_rate, eps=ADAM_EPSILON)
+        rate = self._settings.learning_rate
+        return torch.optim.Adam(net.parameters(), rate, eps=ADAM_EPSILON, fused=True)
 
 
 def policy_loss(ratio: Tensor, advantages: Tensor, clip: float | None) -> Tensor:
