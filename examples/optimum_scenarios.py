@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from sdc_taichi import Simulator, load_config
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.control import make_controller
+from sdc_taichi.control import commands_of, make_controller
 from sdc_taichi.errors import OddInputWarning
 from sdc_taichi.optimum.problem import AGENTS, RAMP_K, Agent
 from sdc_taichi.optimum.result import Optimum
@@ -204,9 +204,11 @@ def check(group: Group, controllers: Sequence[str] = CONTROLLERS) -> Checked:
     shares: dict[str, list[float]] = {}
     with Simulator(group.configs, precision="f64") as sim:
         for name in controllers:
-            if not set(acts_on(name)) <= set(group.agents):
+            # An optimum of fewer agents cannot be compared with it.
+            controller = make_controller(name, sim.fleet)
+            if not set(commands_of(controller)) <= set(group.agents):
                 continue
-            reached = run_beside(optimum, sim, make_controller(name, sim.fleet), name)
+            reached = run_beside(optimum, sim, controller, name)
             assert reached is not None
             keeps = np.array([not broken for broken in reached.broken])
             keeps &= keeps_ramp(group.configs, name)
@@ -231,13 +233,6 @@ def check(group: Group, controllers: Sequence[str] = CONTROLLERS) -> Checked:
         findings=tuple(found.all),
         notes=tuple(notes),
     )
-
-
-def acts_on(name: str) -> tuple[Agent, ...]:
-    """Agents that a controller may move; an optimum of fewer agents cannot be compared with it."""
-    from sdc_taichi.control.registry import given_by
-
-    return tuple(agent for agent in AGENTS if agent in given_by(name))
 
 
 def keeps_ramp(configs: Sequence[DataCenterConfig], name: str) -> npt.NDArray[np.bool_]:

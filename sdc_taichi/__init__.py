@@ -32,7 +32,7 @@ from sdc_taichi.types import (
 )
 
 if TYPE_CHECKING:
-    from sdc_taichi.control import ForecastError, View, make_controller
+    from sdc_taichi.control import ForecastError, View, make_controller, register_controller
     from sdc_taichi.envs.costs import register_cost
     from sdc_taichi.envs.options import EnvOptions
     from sdc_taichi.envs.parallel import aec_env, parallel_env
@@ -85,6 +85,7 @@ __all__ = [
     "make_controller",
     "parallel_env",
     "preset_names",
+    "register_controller",
     "register_cost",
     "register_reward",
     "simulate",
@@ -105,6 +106,7 @@ _LAZY = {
     "aec_env": "sdc_taichi.envs.parallel",
     "make_controller": "sdc_taichi.control",
     "parallel_env": "sdc_taichi.envs.parallel",
+    "register_controller": "sdc_taichi.control",
     "register_cost": "sdc_taichi.envs.costs",
     "register_reward": "sdc_taichi.envs.rewards",
     "simulate": "sdc_taichi.run.loop",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from policies import policy
 from sdc_taichi import (
     Actions,
     ConfigError,
     DataCenterConfig,
     Drivers,
+    Fleet,
     Simulator,
     StepResult,
     build_fleet,
@@ -27,13 +30,17 @@ from sdc_taichi.control import (
     CONTROLLABLE,
     Controller,
     View,
-    controlled_by,
+    commands_of,
     controller_names,
     make_controller,
+    register_controller,
+    registry,
     trim_and_respond,
     view_maker,
 )
-from sdc_taichi.control.rules import quartile_command, slots_in_step
+from sdc_taichi.control.rules import FixedSetpoint, quartile_command, slots_in_step
+from sdc_taichi.envs.options import make_options
+from sdc_taichi.learning.interface import interface_of
 from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.run.loop import simulate
 
@@ -65,14 +72,44 @@ def one_with(ci: np.ndarray) -> tuple[DataCenterConfig, Drivers]:
     return TINY, drivers_from_arrays(np.full(n, 20.0), np.full(n, 15.0), ci, np.full(n, 0.5))
 
 
+class AlwaysCharge:
+    """A controller of a user's own."""
+
+    commands = ("battery",)
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def reset(self, seed: Any) -> None:
+        self.steps = 0
+
+    def act(self, view: View) -> Actions:
+        self.steps += 1
+        return Actions(battery=1.0)
+
+
+def make_setpoint(text: str, fleet: Fleet, parts: tuple[str, ...]) -> Controller:
+    """A maker of a user's own, with a text."""
+    assert fleet.size == 3
+    assert parts == ("cooling",)
+    return FixedSetpoint(float(text))
+
+
 # Trim and respond
 
 
 def test_what_a_spec_controls() -> None:
-    assert controlled_by("g36") == controlled_by("constant:20") == ("cooling",)
-    assert controlled_by("greedy-ci") == ("load", "battery")
-    assert controlled_by("random") == CONTROLLABLE
-    assert controlled_by("load=greedy-ci, cooling=g36") == ("load", "cooling")
+    fleet = build_fleet(TINY)
+
+    def given_by(spec: str) -> tuple[str, ...]:
+        return commands_of(make_controller(spec, fleet))
+
+    assert given_by("g36") == given_by("constant:20") == ("cooling",)
+    assert given_by("greedy-ci") == ("load", "battery")
+    assert given_by("random") == CONTROLLABLE
+    assert given_by("mpc-24h:cost") == CONTROLLABLE
+    assert given_by("idle") == given_by("load=idle") == ()
+    assert given_by("load=greedy-ci, cooling=g36,battery=idle") == ("load", "cooling")
 
 
 def test_commands_that_are_not_repeated_stay_as_they_are() -> None:
@@ -302,8 +339,11 @@ def test_forecast_shorter_than_a_step_is_an_error(sim: Simulator) -> None:
 
 
 @pytest.mark.parametrize("name", controller_names())
-def test_every_name_runs(name: str, sim: Simulator) -> None:
-    controller = make_controller(name.replace(":C", ":20"), sim.fleet)
+def test_every_name_runs(name: str, sim: Simulator, tmp_path: Path) -> None:
+    if name == "policy:FOLDER":
+        policy(interface_of(sim.fleet, make_options())).save(tmp_path)
+    names = name.replace(":C", ":20").replace("FOLDER", str(tmp_path))
+    controller = make_controller(names, sim.fleet)
     assert simulate(sim, controller, 8, 1).steps == 8
 
 
@@ -366,3 +406,92 @@ def test_own_controllers_need_no_base_class(sim: Simulator) -> None:
     kept = results(sim, Alternate(), 4)
     assert [float(r.battery_command[0]) for r in kept] == [-1.0, 1.0, -1.0, 1.0]
     assert CONTROLLABLE == ("load", "cooling", "battery")
+
+
+# Controllers of the user's own
+
+
+@pytest.fixture
+def registered() -> Iterator[None]:
+    before = dict(registry._registered)
+    yield
+    registry._registered.clear()
+    registry._registered.update(before)
+
+
+@pytest.mark.usefixtures("registered")
+def test_a_registered_controller_has_a_name(sim: Simulator) -> None:
+    register_controller("always_charge", AlwaysCharge)
+    assert "always_charge" in controller_names()
+    for name in ("always_charge", "battery=always_charge", f"{__name__}:AlwaysCharge"):
+        controller = make_controller(name, sim.fleet)
+        assert commands_of(controller) == ("battery",)
+        assert np.all(results(sim, controller, 2)[1].battery_command == 1.0)
+
+
+@pytest.mark.usefixtures("registered")
+@pytest.mark.parametrize("maker", [make_setpoint, f"{__name__}:make_setpoint"])
+def test_a_maker_gets_the_text_after_its_name(maker: Any, sim: Simulator) -> None:
+    register_controller("my_setpoint", maker)
+    for name in ("my_setpoint", f"{__name__}:make_setpoint"):
+        mine = results(sim, make_controller(f"cooling={name}:19.5", sim.fleet), 3)
+        theirs = results(sim, make_controller("constant:19.5", sim.fleet), 3)
+        assert np.array_equal(mine[2].setpoint_c, theirs[2].setpoint_c)
+
+
+@pytest.mark.usefixtures("registered")
+def test_a_name_is_registered_once() -> None:
+    register_controller("mine", AlwaysCharge)
+    register_controller("mine", AlwaysCharge)
+    for name, maker in (
+        ("mine", make_setpoint),
+        ("idle", AlwaysCharge),
+        ("policy", "module:name"),
+        ("two words", AlwaysCharge),
+        ("constant", AlwaysCharge),
+    ):
+        with pytest.raises(ConfigError, match="valid is a name that is not taken"):
+            register_controller(name, maker)
+    with pytest.raises(ConfigError, match="controller 'other': is a int; valid is a function"):
+        register_controller("other", 3)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        (f"{__name__}:AlwaysCharge:20", "AlwaysCharge takes no text"),
+        (f"load={__name__}:AlwaysCharge", "does not act on load; it gives battery"),
+        (f"{__name__}:Missing", "cannot be imported .*Missing"),
+        ("no_such_module:name", "unknown; valid: idle, .*or an import path module:name"),
+        ("json.no_such:name", "cannot be imported"),
+        ("math:pi", "valid is a function"),
+        ("collections:OrderedDict", r"has no reset\(\); valid is the name of a controller, or an"),
+        ("lookahead:3", "unknown"),
+    ],
+)
+def test_import_paths_that_lead_nowhere_are_errors(spec: str, message: str, sim: Simulator) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make_controller(spec, sim.fleet)
+
+
+def test_code_that_a_file_names_is_not_run(sim: Simulator) -> None:
+    with pytest.raises(ConfigError, match="is an import path, and code that a file names is not"):
+        make_controller(f"{__name__}:AlwaysCharge", sim.fleet, imports=False)
+
+
+def test_an_object_is_copied(sim: Simulator) -> None:
+    mine = AlwaysCharge()
+    made = make_controller(mine, sim.fleet)
+    results(sim, made, 3)
+    assert mine.steps == 0
+    with pytest.raises(ConfigError, match=r"AlwaysCharge is a class; valid is an object of it"):
+        make_controller(AlwaysCharge, sim.fleet)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"3 has no reset\(\)"):
+        make_controller(3, sim.fleet)  # type: ignore[arg-type]
+    mine.commands = ("batery",)
+    with pytest.raises(ConfigError, match="gives 'batery'; did you mean 'battery'"):
+        make_controller(mine, sim.fleet)
+    mine.commands = ("battery",)
+    mine.lock = threading.Lock()  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match=r"AlwaysCharge: cannot be copied .*copy\.deepcopy"):
+        make_controller(mine, sim.fleet)

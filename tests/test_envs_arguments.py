@@ -22,7 +22,7 @@ from sdc_taichi import (
     load_config,
     with_values,
 )
-from sdc_taichi.control import CONTROLLABLE
+from sdc_taichi.control import CONTROLLABLE, FixedSetpoint, GreedyCarbon, Idle, PerAgent
 from sdc_taichi.envs.actions import BATTERY_COMMANDS
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT
 from sdc_taichi.envs.features import DEFAULT_FEATURES, all_features
@@ -131,6 +131,7 @@ def test_options_that_do_have_an_effect() -> None:
         {"others": "greedy-ci", "agents": ["agent_bat"]},
         {"others": "random", "agents": ["agent_bat"]},
         {"others": "idle", "agents": ["agent_bat"]},
+        {"others": PerAgent(GreedyCarbon(), Idle(), Idle()), "agents": ["agent_bat"]},
         {"action_order": "sustaindc", "agents": ["agent_bat"]},
         {"setpoint_change_k": 1.0, "actions": "continuous", "agents": ["agent_dc"]},
         {"collaboration": 0.5, "rewards": "sustaindc"},
@@ -177,6 +178,12 @@ INVALID: list[tuple[dict[str, Any], str]] = [
     ({"others": "load=idle,cooling=g36", "agents": ["agent_ls"]}, "without effect on load"),
     ({"others": "g36", "agents": ["agent_dc"]}, "without effect on cooling"),
     ({"others": "constant:20", "agents": ["agent_dc"]}, "valid is for load, battery"),
+    (
+        {"others": Idle, "agents": ["agent_dc"]},
+        "Idle is a class; valid is an object of it, Idle()",
+    ),
+    ({"others": FixedSetpoint(20), "agents": ["agent_dc"]}, "rules:FixedSetpoint': without effect"),
+    ({"others": object(), "agents": ["agent_dc"]}, "has no reset(); valid is the name of a con"),
     ({"action_order": "paper", "actions": "continuous"}, "action_order: without effect"),
     ({"action_order": "paper", "agents": ["agent_ls"]}, "as agent_bat does not learn"),
     ({"setpoint_change_k": 1.0}, "setpoint_change_k: without effect"),

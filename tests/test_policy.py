@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,59 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from policies import interface, network, policy
 from sdc_taichi import SdcError, build_fleet, load_config
 from sdc_taichi.envs.options import make_options
 from sdc_taichi.learning.interface import Interface, interface_of
-from sdc_taichi.learning.policy import WEIGHTS, About, Head, Policy, PolicyNetwork
+from sdc_taichi.learning.policy import WEIGHTS, About, Policy, PolicyNetwork
 from sdc_taichi.types import F32
 
 TWO_UNITS = ("hvac.crac.units=2",)
-
-
-def network(
-    agents: tuple[str, ...], inputs: int, outputs: int, head: Head = "argmax", seed: int = 0
-) -> PolicyNetwork:
-    """A network of random weights."""
-    rng = np.random.default_rng(seed)
-    sizes = (inputs, 11, 8, outputs)
-    return PolicyNetwork(
-        agents,
-        mean=rng.normal(size=inputs).astype(np.float32),
-        std=rng.uniform(0.1, 1.0, inputs).astype(np.float32),
-        clip=5.0,
-        layers=tuple(
-            (
-                rng.normal(size=(n, m)).astype(np.float32) / np.float32(m),
-                rng.normal(size=n).astype(np.float32),
-            )
-            for m, n in itertools.pairwise(sizes)
-        ),
-        activation="tanh" if seed % 2 else "relu",
-        head=head,
-    )
-
-
-def interface(**options: Any) -> Interface:
-    return interface_of(build_fleet(load_config("tiny")), make_options(**options))
-
-
-def policy(fits: Interface, *, seed: int = 0) -> Policy:
-    """A policy of random weights, one network for each agent."""
-    discrete = fits.actions == "discrete"
-    return Policy(
-        tuple(
-            network(
-                (agent,),
-                fits.width(agent),
-                fits.action_width(agent) * (3 if discrete else 1),
-                "argmax" if discrete else "clip",
-                seed + i,
-            )
-            for i, agent in enumerate(fits.agents)
-        ),
-        fits,
-        About(algorithm="none", seed=seed),
-    )
 
 
 def by_numpy(net: PolicyNetwork, observations: F32) -> Any:

@@ -13,7 +13,16 @@ import pytest
 
 import sdc_taichi
 from eventful_hall import EVENTFUL_HALL
-from sdc_taichi import ForecastError, RuntimeStateError, SdcError, Simulator, load_config
+from sdc_taichi import (
+    Actions,
+    ForecastError,
+    LoadAction,
+    RuntimeStateError,
+    SdcError,
+    Simulator,
+    View,
+    load_config,
+)
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.errors import PhysicalLimitError
 from sdc_taichi.sim.state_limits import HALL_LIMITS_C
@@ -49,6 +58,16 @@ def play(env: Any, steps: int) -> list[Any]:
     return [env.step(hold) for _ in range(steps)]
 
 
+class LoadByTheHour:
+    """A controller of a user's own that leaves the setpoint as it is."""
+
+    def reset(self, seed: Any) -> None:
+        assert len(seed) == 2
+
+    def act(self, view: View) -> Actions:
+        return Actions(load=[LoadAction.DEFER, LoadAction.DRAIN][view.state.step % 2])
+
+
 MAKERS: dict[str, Callable[[], Any]] = {
     "simulator": lambda: Simulator([CONFIG, CONFIG]),
     "steady simulator": lambda: Simulator(load_config("tiny")),
@@ -67,6 +86,9 @@ MAKERS: dict[str, Callable[[], Any]] = {
         others="greedy-ci",
     ),
     "years": lambda: sdc_taichi.vector_env(2, "tiny", days=1, years=5),
+    "others": lambda: sdc_taichi.vector_env(
+        2, CONFIG, days=1, agents=["agent_bat"], others=LoadByTheHour()
+    ),
 }
 
 

@@ -66,6 +66,9 @@ def main() -> None:
     """Run the command line of this process, and exit."""
     try:
         guard_streams()
+        if _has_current_folder():
+            # Modules of the user's, after all that are installed, for import paths ``module:name``.
+            sys.path.append(os.getcwd())
         app()
     except KeyboardInterrupt:  # commands being put together, or the last line being printed
         sys.exit(EXIT_INTERRUPTED)

@@ -125,8 +125,8 @@ def optimum_command(
     fleet.require_distinct_names()
     error = PERFECT if forecast_error is None else ForecastError.parse(forecast_error)
     named = {name: make_controller(name, fleet) for name in controller or ()}
-    for name in named:
-        _require_movable(name, movable)
+    for name, each in named.items():
+        _require_movable(name, each, movable)
     if out is not None:
         prepare_folder(out, force=force)
     with Simulator(fleet, precision=precision) as sim, interruptible() as interrupted:
@@ -281,14 +281,14 @@ def _agents(text: str) -> tuple[Agent, ...]:
     return tuple(agent for agent in AGENTS if agent in names)
 
 
-def _require_movable(controller: str, movable: tuple[Agent, ...]) -> None:
+def _require_movable(name: str, controller: Controller, movable: tuple[Agent, ...]) -> None:
     """Refuse a controller that moves more than the optimum that it is compared with."""
-    from sdc_taichi.control import given_by
+    from sdc_taichi.control import commands_of
 
-    more = [agent for agent in given_by(controller) if agent not in movable]
+    more = [command for command in commands_of(controller) if command not in movable]
     if more:
         raise ConfigError(
-            f"--controller {controller}: moves {' and '.join(more)}, which --agents "
+            f"--controller {name}: moves {' and '.join(more)}, which --agents "
             f"{','.join(movable)} leaves idle"
         )
 

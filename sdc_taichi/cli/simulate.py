@@ -66,8 +66,8 @@ def simulate_command(
         typer.Option(
             metavar="NAME",
             help="idle, random, g36, coldest, warmest, constant:C, lookahead-3h, lookahead-24h, "
-            "greedy-ci, mpc-24h; or per agent, such as "
-            "load=greedy-ci,cooling=g36,battery=lookahead-24h.",
+            "greedy-ci, mpc-24h, policy:FOLDER; or module:name of your own; or per agent, such as "
+            "load=greedy-ci,cooling=g36,battery=policy:runs/happo.",
         ),
     ] = "idle",
     seed: Seed = 0,

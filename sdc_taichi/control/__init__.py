@@ -1,4 +1,4 @@
-"""Controllers that are not learned, and what a controller sees.
+"""Controllers, by name and by rules, and what a controller sees.
 
 A controller turns a view of the data centers into actions, and knows them by nothing else.
 Learning algorithms and physics never live here.
@@ -7,10 +7,12 @@ Learning algorithms and physics never live here.
 from sdc_taichi.control.forecast_error import PERFECT, ForecastError
 from sdc_taichi.control.registry import (
     CONTROLLABLE,
-    controlled_by,
+    check_controller,
     controller_names,
-    given_by,
+    controller_text,
     make_controller,
+    parts_of,
+    register_controller,
 )
 from sdc_taichi.control.rules import (
     Controller,
@@ -21,6 +23,7 @@ from sdc_taichi.control.rules import (
     PerAgent,
     Random,
     TrimAndRespond,
+    commands_of,
     trim_and_respond,
 )
 from sdc_taichi.control.view import Forecast, Limits, View, view_maker
@@ -40,10 +43,13 @@ __all__ = [
     "Random",
     "TrimAndRespond",
     "View",
-    "controlled_by",
+    "check_controller",
+    "commands_of",
     "controller_names",
-    "given_by",
+    "controller_text",
     "make_controller",
+    "parts_of",
+    "register_controller",
     "trim_and_respond",
     "view_maker",
 ]

@@ -81,6 +81,9 @@ class ModelPredictive:
         objective: what the plan minimises; water is no part of it.
         agents: what it commands; the rest it takes to be neutral.
 
+    Attributes:
+        commands: fields of ``Actions`` that it gives.
+
     Raises:
         ConfigError: a horizon that is out of bounds, or an objective with water.
     """
@@ -102,6 +105,7 @@ class ModelPredictive:
                 "energy, cost, and sums of them"
             )
         self._hours, self._objective, self._agents = hours, objective, agents
+        self.commands: tuple[str, ...] = agents
         self._planners: _Planners | None = None
         self.reset(0)
 

@@ -1,15 +1,18 @@
-"""Controllers by name, for the command line and for benchmarks."""
+"""Controllers by name, for the command line, for environments and for benchmarks."""
 
 from __future__ import annotations
 
+import importlib.util
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sdc_taichi.control.mpc import is_mpc, model_predictive
 from sdc_taichi.control.rules import (
+    COMMANDS_OF_PART,
     Controller,
     FixedSetpoint,
     GreedyCarbon,
@@ -18,15 +21,20 @@ from sdc_taichi.control.rules import (
     PerAgent,
     Random,
     TrimAndRespond,
+    commands_of,
 )
 from sdc_taichi.control.view import limits_of
-from sdc_taichi.errors import ConfigError, suggestion
+from sdc_taichi.errors import ConfigError, shortened, suggestion, suggestion_or_valid
 from sdc_taichi.number_text import parse_number
-from sdc_taichi.optimum.problem import AGENTS
+from sdc_taichi.optimum.problem import AGENTS, Agent
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.user_functions import function_named, import_path, register_function
 
-CONTROLLABLE = AGENTS
-"""Names of the commands that a controller may give, as specs and ``Actions`` name them."""
+CONTROLLABLE: tuple[Agent, ...] = AGENTS
+"""Names of the parts of a spec, each with the command of that name, as ``Actions`` has it."""
+ControllerMaker = Callable[[str, Fleet, tuple[str, ...]], Controller]
+"""Makes a controller from the text after the colon of its name, the data centers, and the parts of
+a spec that it is named for; a class is called without arguments."""
 
 
 class _NamedController(NamedTuple):
@@ -34,8 +42,8 @@ class _NamedController(NamedTuple):
 
     make: Callable[[], Controller]
     """Makes the controller."""
-    commands: tuple[str, ...]
-    """Which of ``CONTROLLABLE`` it gives; the others it leaves neutral."""
+    parts: tuple[str, ...]
+    """Which of ``CONTROLLABLE`` it may be named for."""
 
 
 _CONTROLLERS: dict[str, _NamedController] = {
@@ -50,32 +58,85 @@ _CONTROLLERS: dict[str, _NamedController] = {
 }
 _CONSTANT = "constant:C"
 _MPC = "mpc-24h"
+_POLICY = "policy:FOLDER"
+_registered: dict[str, Any] = {"policy": "sdc_taichi.learning.controller:policy_controller"}
+"""Makers by the part of a name before its colon, or their import paths, which nothing imports
+before they are named."""
+_BUILT_IN = (*_CONTROLLERS, "constant", "policy")
 _SUGGESTION = " (did you mean {!r}?)"
 
 
 def controller_names() -> tuple[str, ...]:
     """Valid names.
 
-    ``constant:C`` stands for a setpoint in C, such as ``constant:20``, and ``mpc-24h`` for any
-    horizon, with or without an objective, such as ``mpc-72h:cost``.
+    ``constant:C`` stands for a setpoint in C, such as ``constant:20``, ``mpc-24h`` for any horizon,
+    with or without an objective, such as ``mpc-72h:cost``, and ``policy:FOLDER`` for the folder of
+    a training run or a policy. An import path ``module:name`` is valid too.
     """
-    return (*_CONTROLLERS, _CONSTANT, _MPC)
+    mine = (name for name in _registered if name not in _BUILT_IN)
+    return (*_CONTROLLERS, _CONSTANT, _MPC, _POLICY, *mine)
 
 
-def make_controller(spec: str, fleet: Fleet) -> Controller:
-    """A controller by name, or one per agent.
+def register_controller(name: str, maker: ControllerMaker | type[Any] | str) -> None:
+    """Make a controller available by a name, wherever a controller can be named.
 
     Args:
-        spec: a name, or ``agent=name`` parts joined by commas, such as
-            ``load=greedy-ci,cooling=g36``; agents not mentioned stay idle.
-        fleet: the data centers it is for.
+        name: an identifier; ``name:TEXT`` hands TEXT over to the maker.
+        maker: function of the text after the colon, the fleet, and the parts of the spec (of load,
+            cooling and battery) that the controller is named for, which returns the controller; a
+            class whose objects are controllers, made without arguments; or the import path
+            ``module:name`` of either.
 
     Raises:
-        ConfigError: an unknown agent or name, a controller that does not act on the agent, or a
-            constant setpoint that is out of range.
+        ConfigError: a name that is taken, or no maker.
     """
-    if "=" not in spec:
-        return _make(spec.strip(), fleet, CONTROLLABLE)
+    if isinstance(maker, str):
+        if not (isinstance(name, str) and name.isidentifier()) or name in _BUILT_IN:
+            raise ConfigError(f"controller {shortened(name)}: valid is a name that is not taken")
+        _registered[name] = maker
+        return
+    if isinstance(_registered.get(name), str) and name not in _BUILT_IN:
+        del _registered[name]
+    register_function("controller", name, maker, _registered, reserved=_BUILT_IN)
+
+
+def make_controller(spec: str | Controller, fleet: Fleet, *, imports: bool = True) -> Controller:
+    """A controller by name, one per agent, or a copy of a controller.
+
+    Args:
+        spec: a name, ``agent=name`` parts joined by commas, such as ``load=greedy-ci,cooling=g36``,
+            where agents not mentioned stay idle; or a controller.
+        fleet: the data centers it is for.
+        imports: whether import paths ``module:name`` are valid: in text of the user's own, and not
+            in that of a file, which may be of anybody.
+
+    Raises:
+        ConfigError: an unknown agent or name, a controller that does not act on the agent, a
+            constant setpoint that is out of range, or an object that is no controller.
+        SdcError: a policy that cannot be read or does not fit the data centers.
+    """
+    if not isinstance(spec, str):
+        return _copy(spec)
+    named = parts_of(spec)
+    if not named:
+        return _make(spec.strip(), fleet, None, imports)
+    chosen: dict[str, Controller] = {}
+    for name in dict.fromkeys(named.values()):
+        # One controller for all agents that it is named for, as a plan or a policy is made.
+        own = tuple(part for part in CONTROLLABLE if named.get(part) == name)
+        chosen |= dict.fromkeys(own, _make(name, fleet, own, imports))
+    return PerAgent(*(chosen.get(part, Idle()) for part in CONTROLLABLE))
+
+
+def parts_of(spec: str) -> dict[str, str]:
+    """Controllers by agent of a spec such as ``load=greedy-ci,cooling=g36``; none of a plain name.
+
+    Raises:
+        ConfigError: an unknown agent, or one that is given twice.
+    """
+    first, sign, _ = spec.partition("=")
+    if not sign or ":" in first:
+        return {}
     named: dict[str, str] = {}
     for part in spec.split(","):
         agent, sign, name = (text.strip() for text in part.partition("="))
@@ -87,57 +148,128 @@ def make_controller(spec: str, fleet: Fleet) -> Controller:
         if agent in named:
             raise ConfigError(f"controller {spec!r}: {agent} is given twice")
         named[agent] = name
-    made: dict[str, Controller] = {}
-    chosen: dict[str, Controller] = {}
-    for agent, name in named.items():
-        if is_mpc(name):
-            # One plan for all agents that it is named for.
-            own = tuple(a for a in CONTROLLABLE if named.get(a) == name)
-            chosen[agent] = made[name] = made.get(name) or model_predictive(name, own)
-        else:
-            chosen[agent] = _make(name, fleet, (agent,))
-    return PerAgent(*(chosen.get(agent, Idle()) for agent in CONTROLLABLE))
+    return named
 
 
-def controlled_by(spec: str) -> tuple[str, ...]:
-    """Commands that a valid spec of ``make_controller`` gives; all for ``idle`` and ``random``."""
-    if "=" in spec:
-        return tuple(part.partition("=")[0].strip() for part in spec.split(","))
-    if is_mpc(spec.strip()):
-        return CONTROLLABLE
-    entry = _CONTROLLERS.get(spec.strip())
-    return ("cooling",) if entry is None else entry.commands
+def controller_text(spec: str | Controller) -> str:
+    """Text that names a controller: its spec, or the import path of the class of an object."""
+    return spec if isinstance(spec, str) else import_path(type(spec))
 
 
-def given_by(spec: str) -> tuple[str, ...]:
-    """Commands that the controllers of a valid spec give themselves; ``idle`` gives none."""
-    if "=" in spec:
-        parts = (part.split("=") for part in spec.split(","))
-        return tuple(agent.strip() for agent, name in parts if name.strip() != "idle")
-    return () if spec.strip() == "idle" else controlled_by(spec)
+def check_controller(given: Any, what: str = "") -> Controller:
+    """A controller that a user has made.
+
+    Args:
+        given: the object.
+        what: what it was given as, at the beginning of errors, if they do not say that themselves.
+
+    Raises:
+        ConfigError: it lacks a method, is a class, or says that it gives what is no command.
+    """
+    place = f"{what}: " if what else ""
+    if isinstance(given, type):
+        raise ConfigError(
+            f"{place}{given.__name__} is a class; valid is an object of it, {given.__name__}()"
+        )
+    for method in ("reset", "act"):
+        if not callable(getattr(given, method, None)):
+            raise ConfigError(
+                f"{place}{shortened(given)} has no {method}(); valid is the name of a controller, "
+                "or an object with reset(seed) and act(view)"
+            )
+    controller: Controller = given
+    known = {name for names in COMMANDS_OF_PART.values() for name in names}
+    for name in commands_of(controller):
+        if name not in known:
+            raise ConfigError(
+                f"{place}gives {shortened(name)}{suggestion_or_valid(name, sorted(known))}"
+            )
+    return controller
 
 
-def _make(name: str, fleet: Fleet, agents: tuple[str, ...]) -> Controller:
-    """Look a name up, for use on any of ``agents``."""
+def _copy(given: Any) -> Controller:
+    """A controller of its own for each environment, as it may have a memory."""
+    controller = check_controller(given, "controller")
+    try:
+        return deepcopy(controller)
+    except Exception as error:
+        raise ConfigError(
+            f"controller {import_path(type(given))}: cannot be copied ({error}); valid is one that "
+            "copy.deepcopy copies"
+        ) from None
+
+
+def _make(name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, imports: bool) -> Controller:
+    """Look a name up, for use on the ``parts`` that it is named for; None of a plain name."""
     if is_mpc(name):
-        return model_predictive(name, CONTROLLABLE)
+        return model_predictive(name, parts or CONTROLLABLE)
     kind, colon, text = name.partition(":")
     if kind == "constant":
         entry = _NamedController(lambda: _constant(text if colon else "", fleet), ("cooling",))
     elif name in _CONTROLLERS:
         entry = _CONTROLLERS[name]
     else:
-        valid = controller_names()
-        meant = suggestion(name, valid, _SUGGESTION)
-        raise ConfigError(f"controller {name!r}: unknown; valid: {', '.join(valid)}{meant}")
-    if not set(agents) & set(entry.commands):
-        (agent,) = agents
-        able = [n for n, e in _CONTROLLERS.items() if agent in e.commands]
-        able += [_CONSTANT, _MPC] if agent == "cooling" else [_MPC]
+        return _made_by_maker(name, fleet, parts, imports)
+    agent = _first_missing(parts, entry.parts)
+    if agent is not None:
+        able = [n for n, e in _CONTROLLERS.items() if agent in e.parts]
+        able += [_CONSTANT, _MPC, _POLICY] if agent == "cooling" else [_MPC, _POLICY]
         raise ConfigError(
             f"controller {name!r}: does not act on {agent}; valid for {agent}: {', '.join(able)}"
         )
     return entry.make()
+
+
+def _first_missing(parts: tuple[Agent, ...] | None, own: Sequence[str]) -> Agent | None:
+    """The first of ``parts`` that is not in ``own``, if there is one."""
+    return next((part for part in parts or () if part not in own), None)
+
+
+def _made_by_maker(
+    name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, imports: bool
+) -> Controller:
+    """A controller of a registered maker, or of one that ``name`` has the import path of."""
+    kind, _, text = name.partition(":")
+    maker = _registered.get(kind)
+    if maker is None:
+        attribute, _, rest = text.partition(":")
+        maker, text = f"{kind}:{attribute}" if _is_path(kind, attribute) else None, rest
+        if maker is not None and not imports:
+            raise ConfigError(
+                f"controller {name!r}: is an import path, and code that a file names is not run; "
+                "valid is a name that register_controller gave it"
+            )
+    if maker is None:
+        valid = controller_names()
+        meant = suggestion(name, valid, _SUGGESTION)
+        raise ConfigError(
+            f"controller {name!r}: unknown; valid: {', '.join(valid)}, or an import path "
+            f"module:name{meant}"
+        )
+    if isinstance(maker, str):
+        maker = function_named("controller", maker, {}, valid="a name of --controller")
+    if isinstance(maker, type):
+        if text:
+            raise ConfigError(f"controller {name!r}: {maker.__name__} takes no text; valid is none")
+        made = maker()
+    else:
+        made = maker(text, fleet, parts or CONTROLLABLE)
+    controller = check_controller(made, f"controller {name!r}")
+    given = commands_of(controller)
+    agent = _first_missing(parts, given)
+    if agent is not None:
+        raise ConfigError(
+            f"controller {name!r}: does not act on {agent}; it gives {', '.join(given) or 'none'}"
+        )
+    return controller
+
+
+def _is_path(module: str, attribute: str) -> bool:
+    """Whether two texts may be a module and a name in it."""
+    first, *more = module.split(".")
+    if not all(part.isidentifier() for part in (attribute, first, *more)):
+        return False
+    return bool(more) or importlib.util.find_spec(first) is not None
 
 
 def _constant(text: str, fleet: Fleet) -> Controller:

@@ -12,7 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.control.view import View
+from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K
+from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.types import F64, I64, Actions
 
@@ -20,12 +22,22 @@ SLOT_MIN = 5.0
 """Interval of trim and respond, minutes."""
 REQUEST_INLET_C = 27.0
 """Highest recommended inlet temperature (ASHRAE TC 9.9); a rack above it requests cooling."""
+COMMANDS_OF_PART: dict[str, tuple[str, ...]] = {
+    "load": ("load", "placement"),
+    "cooling": ("cooling", "fan", "placement"),
+    "battery": ("battery",),
+}
+"""Fields of ``Actions`` that a controller may give as a part of ``PerAgent``."""
 _DRAWN_STEPS = 256
 """Steps whose random commands are drawn at once."""
 
 
 class Controller(Protocol):
-    """Source of the commands of each step: any object with these two methods."""
+    """Source of the commands of each step: any object with these two methods.
+
+    One that gives other commands than load, cooling and battery, or fewer, says so by an attribute
+    ``commands``: names of the fields of ``Actions`` that it gives, see ``commands_of``.
+    """
 
     def reset(self, seed: Any) -> None:
         """Begin an episode, on which earlier ones have no influence.
@@ -48,6 +60,9 @@ class Controller(Protocol):
 
 class Idle:
     """Neutral commands: no work moves, the battery rests, setpoints hold or follow a schedule."""
+
+    commands: tuple[str, ...] = ()
+    """Fields of ``Actions`` that it gives."""
 
     def reset(self, seed: int | I64) -> None:
         """Do nothing: no memory."""
@@ -102,6 +117,9 @@ class TrimAndRespond:
     slots on the requests of the step before. A rack whose hottest inlet is above 27 C requests.
     """
 
+    commands = ("cooling",)
+    """Fields of ``Actions`` that it gives."""
+
     def reset(self, seed: int | I64) -> None:
         """Do nothing: the setpoint is part of the simulator's state."""
 
@@ -132,6 +150,9 @@ class FixedSetpoint:
         setpoint_c: temperature, C, or the name of a limit: ``low`` or ``high``.
     """
 
+    commands = ("cooling",)
+    """Fields of ``Actions`` that it gives."""
+
     def __init__(self, setpoint_c: float | str) -> None:
         self._setpoint_c = setpoint_c
 
@@ -161,6 +182,9 @@ class Lookahead:
         hours: length of the window, in h.
     """
 
+    commands = ("battery",)
+    """Fields of ``Actions`` that it gives."""
+
     def __init__(self, hours: float) -> None:
         self._hours = hours
 
@@ -183,6 +207,9 @@ class GreedyCarbon:
         hours: length of the window, in h.
     """
 
+    commands = ("load", "battery")
+    """Fields of ``Actions`` that it gives."""
+
     def __init__(self, hours: float = 24.0) -> None:
         self._hours = hours
 
@@ -201,27 +228,53 @@ class GreedyCarbon:
 class PerAgent:
     """One controller for each of load, cooling and battery.
 
+    A controller that stands for several of them is asked once in a step.
+
     Args:
-        load: gives the load command.
-        cooling: gives the setpoint command.
+        load: gives the load command, and the placement of work if it has one.
+        cooling: gives the setpoint command, and fan speeds and placement if it has them.
         battery: gives the battery command.
+
+    Attributes:
+        commands: fields of ``Actions`` that they give.
+
+    Raises:
+        ConfigError: two of them place work.
     """
 
     def __init__(self, load: Controller, cooling: Controller, battery: Controller) -> None:
-        self._load, self._cooling, self._battery = load, cooling, battery
+        parts = {"load": load, "cooling": cooling, "battery": battery}
+        self._giver: dict[str, Controller] = {}
+        for part, controller in parts.items():
+            for command in COMMANDS_OF_PART[part]:
+                if command not in commands_of(controller):
+                    continue
+                if self._giver.get(command, controller) is not controller:
+                    raise ConfigError(f"controllers of load and cooling: both give {command}")
+                self._giver[command] = controller
+        self._controllers = list({id(c): c for c in self._giver.values()}.values())
+        self.commands = tuple(self._giver)
 
     def reset(self, seed: int | I64) -> None:
         """Reset each with the same seed."""
-        for controller in (self._load, self._cooling, self._battery):
+        for controller in self._controllers:
             controller.reset(seed)
 
     def act(self, view: View) -> Actions:
-        """Take from each controller the command that it is responsible for."""
+        """Take from each controller the commands that it is responsible for."""
+        actions = {id(controller): controller.act(view) for controller in self._controllers}
         return Actions(
-            load=self._load.act(view).load,
-            cooling=self._cooling.act(view).cooling,
-            battery=self._battery.act(view).battery,
+            **{name: getattr(actions[id(giver)], name) for name, giver in self._giver.items()}
         )
+
+
+def commands_of(controller: Controller) -> tuple[str, ...]:
+    """Fields of ``Actions`` that a controller gives; those that it does not stay neutral.
+
+    Args:
+        controller: one without an attribute ``commands`` gives load, cooling and battery.
+    """
+    return tuple(getattr(controller, "commands", AGENTS))
 
 
 def trim_and_respond(

@@ -20,14 +20,16 @@ from gymnasium import spaces
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import (
     PERFECT,
+    Controller,
     View,
-    controlled_by,
-    given_by,
+    commands_of,
+    controller_text,
     make_controller,
+    parts_of,
     view_maker,
 )
 from sdc_taichi.envs.actions import ActionDecoder
-from sdc_taichi.envs.agents import COMMAND_OF_AGENT
+from sdc_taichi.envs.agents import COMMAND_OF_AGENT, COMMANDS_OF_AGENT, commands_by_others
 from sdc_taichi.envs.costs import Costs
 from sdc_taichi.envs.drawn_inputs import Draw, DrawnInputs, draw_info, draws_inputs
 from sdc_taichi.envs.episode_reset import Seed, chosen_start_days, seeded_generators
@@ -114,16 +116,13 @@ class Core:
         fleet = self.sim.fleet
         require_events_start_before(24.0 * options.days, fleet.configs, "the episode")
         self._others = make_controller(options.others, fleet)
-        _check_others(options)
-        given = given_by(options.others)
-        self._commands_of_others = [
-            command
-            for agent, command in COMMAND_OF_AGENT.items()
-            if agent not in self.agents and command in given
-        ]
-        self._others_act = bool(self._commands_of_others)
+        _check_others(options, self._others)
         learned = [name for agent in self.agents for name in options.commands_of(agent)]
-        self._command_names = learned + self._commands_of_others
+        self._commands_of_others = commands_by_others(
+            self.agents, learned, commands_of(self._others)
+        )
+        self._others_act = bool(self._commands_of_others)
+        self._learned_commands = learned
         self._rewards = Rewards(
             options.rewards,
             options.collaboration,
@@ -132,8 +131,9 @@ class Core:
         )
         self._costs = Costs(options.costs, fleet)
         # Plain values that tell environments apart. Nothing depends on costs.
-        self._identity = options.model_dump(exclude={"rewards", "costs"}) | {
-            "rewards": self._rewards.identity
+        self._identity = options.model_dump(exclude={"rewards", "costs", "others"}) | {
+            "rewards": self._rewards.identity,
+            "others": controller_text(options.others),
         }
         self._observer = make_observer(fleet, options, new_inputs=draws_inputs(options))
         self._decoder = ActionDecoder(fleet, options)
@@ -246,7 +246,9 @@ class Core:
         if self._others_act:
             by_others = self._others.act(view)
             for name in self._commands_of_others:
-                commands[name] = _as_numbers(getattr(by_others, name))
+                command = getattr(by_others, name)
+                if command is not None:
+                    commands[name] = _as_numbers(command)
         result = self.sim.step(Actions(**commands))
         self._last = (view.state, commands)
         self._view = view = self._view_after(result)
@@ -328,7 +330,8 @@ class Core:
             options=self._identity,
             inputs=self._inputs,
             sim=self.sim,
-            commands=self._command_names,
+            learned=self._learned_commands,
+            by_others=self._commands_of_others,
             steps=self.steps,
         )
         before, terms = self._present(), self._final_terms
@@ -425,7 +428,7 @@ def _as_numbers(command: Any) -> F64:
     return np.asarray(command.value if isinstance(command, Enum) else command, dtype=np.float64)
 
 
-def _check_others(options: EnvOptions) -> None:
+def _check_others(options: EnvOptions, others: Controller) -> None:
     """Refuse controllers that would act on nothing but what learns.
 
     Raises:
@@ -434,10 +437,12 @@ def _check_others(options: EnvOptions) -> None:
     if "others" not in options.model_fields_set:
         return
     learned = [COMMAND_OF_AGENT[agent] for agent in options.agents]
-    named = controlled_by(options.others)
-    unused = set(named) & set(learned) if "=" in options.others else set(named) <= set(learned)
+    named = parts_of(options.others) if isinstance(options.others, str) else {}
+    given = {name for agent in options.agents for name in COMMANDS_OF_AGENT[agent]}
+    unused = named.keys() & set(learned) if named else set() < set(commands_of(others)) <= given
     if unused:
+        valid = [command for command in COMMAND_OF_AGENT.values() if command not in learned]
         raise ConfigError(
-            f"others {options.others!r}: without effect on {', '.join(learned)}, learned here; "
-            f"valid is for {', '.join(c for c in COMMAND_OF_AGENT.values() if c not in learned)}"
+            f"others {controller_text(options.others)!r}: without effect on {', '.join(learned)}, "
+            f"learned here; valid is for {', '.join(valid)}"
         )

@@ -98,12 +98,12 @@ class Forecasts:
         self._tables: tuple[FleetSeries, ...] = ()
         self._walks: RandomWalks | None = None
 
-    def reset(self, drivers: Drivers, keys: Sequence[int] | I64 = ()) -> bool:
+    def reset(self, drivers: Drivers, walks: RandomWalks | Sequence[int] | I64 = ()) -> bool:
         """Start an episode.
 
         Args:
             drivers: inputs of the fleet.
-            keys: seeds of the errors, one per data center; unused without errors.
+            walks: walks of the errors, or a seed for each data center; unused without errors.
 
         Returns:
             Whether the series differ from those of the episode before.
@@ -111,10 +111,12 @@ class Forecasts:
         Raises:
             ConfigError: another number of keys than of data centers.
         """
-        if not self.perfect and len(keys) != drivers.size:
-            raise ConfigError(
-                f"{len(keys)} random keys for {drivers.size} data centers; valid is one each"
-            )
+        if not self.perfect and not isinstance(walks, RandomWalks):
+            if len(walks) != drivers.size:
+                raise ConfigError(
+                    f"{len(walks)} random keys for {drivers.size} data centers; valid is one each"
+                )
+            walks = RandomWalks(walks, self._step_h)
         tables = (drivers.ci_g_per_kwh, drivers.outdoor_c, drivers.wet_bulb_c)
         new = not all(map(operator.is_, tables, self._tables)) or not self._tables
         if new:
@@ -122,9 +124,7 @@ class Forecasts:
             self._ci = ExtendedSeries(tables[0], self.ci_leads)
             self._outdoor = ExtendedSeries(tables[1], self._weather_leads)
             self._wet_bulb = ExtendedSeries(tables[2], self._weather_leads)
-        self._walks = None
-        if not self.perfect:
-            self._walks = RandomWalks(keys, self._step_h)
+        self._walks = walks if isinstance(walks, RandomWalks) and not self.perfect else None
         return new
 
     @property

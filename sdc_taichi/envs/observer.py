@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sdc_taichi.control.forecast_error import PERFECT, ForecastError
+from sdc_taichi.control.forecast_error import PERFECT, ForecastError, RandomWalks
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.features import (
@@ -130,13 +130,15 @@ class Observer:
 
         Args:
             view: the view before the first step.
-            keys: seeds of the errors of forecasts that err, one for each data center.
+            keys: seeds of the errors of forecasts that err, one for each data center, where the
+                view has no walks.
 
         Raises:
             ConfigError: another number of keys than of data centers.
         """
         arranged_width = sum(order.width for order in self._orders.values())
-        if self._time.reset(view.drivers, keys, arranged_width):
+        walks = keys if view.walks is None else view.walks
+        if self._time.reset(view.drivers, walks, arranged_width):
             self._arrange_rows()
         if view.sizing is not self._sizing:
             oldest = view.state.queue.shape[1] - 1
@@ -341,19 +343,21 @@ class _TimeEntries:
         # Steps after reset that the rows of a stretch are for.
         self._stretch = range(0)
 
-    def reset(self, drivers: Drivers, keys: Sequence[int] | I64, arranged_width: int) -> bool:
+    def reset(
+        self, drivers: Drivers, walks: RandomWalks | Sequence[int] | I64, arranged_width: int
+    ) -> bool:
         """Start an episode.
 
         Args:
             drivers: inputs of the fleet.
-            keys: seeds of the errors of forecasts, one for each data center.
+            walks: walks of the errors of forecasts, or a seed for each data center.
             arranged_width: entries that the observer keeps for each row besides those of ``rows``.
 
         Returns:
             Whether ``rows`` are others than before.
         """
         demand = drivers.demand
-        changed = self._forecasts.reset(drivers, keys)
+        changed = self._forecasts.reset(drivers, walks)
         changed = changed or not self._series or demand is not self._series[-1]
         self._stretch = range(0)
         if changed:

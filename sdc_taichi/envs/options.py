@@ -19,6 +19,7 @@ from pydantic import (
 
 from sdc_taichi.config import explain
 from sdc_taichi.config.tariff_schema import TariffConfig
+from sdc_taichi.control import check_controller
 from sdc_taichi.control.forecast_error import PERFECT, ForecastError
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT, Agent
 from sdc_taichi.envs.forecasts import (
@@ -57,9 +58,10 @@ class EnvOptions(BaseModel):
 
     agents: tuple[Agent, ...] = AGENTS  # type: ignore[assignment]
     """Agents that learn; ``others`` plays the rest."""
-    others: str = "idle"
-    """Controller of the agents that do not learn, as on the command line: a name, or
-    ``load=name,cooling=name,battery=name`` in part."""
+    others: Any = "idle"
+    """Controller of the agents that do not learn: a name as on the command line, or
+    ``load=name,cooling=name,battery=name`` in part, or an object with ``reset(seed)`` and
+    ``act(view)``, of which each environment has a copy."""
     actions: Literal["discrete", "continuous"] = "discrete"
     """Whether an agent chooses one of three commands or a number."""
     action_order: Literal["paper", "sustaindc"] | None = None
@@ -143,6 +145,11 @@ class EnvOptions(BaseModel):
             if not names or len(set(names)) < len(names):
                 raise ValueError(f"{agent}: {list(names)}; valid is one or more, each once")
         return value
+
+    @field_validator("others")
+    @classmethod
+    def _a_controller(cls, value: Any) -> Any:
+        return value if isinstance(value, str) else check_controller(value)
 
     @field_validator("agents")
     @classmethod

@@ -29,6 +29,8 @@ COMMAND_LIMITS = {
     "battery": (-1.0, 1.0),
 }
 """Lowest and highest command that an agent or a controller can give, by field of ``Actions``."""
+_MAY_BE_NONE = frozenset({"cooling", "placement"})
+"""Fields of ``Actions`` that a controller may leave at None."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,8 @@ def check_state(
     options: Mapping[str, Any],
     inputs: DrawnInputs | None,
     sim: Simulator,
-    commands: Sequence[str],
+    learned: Sequence[str],
+    by_others: Sequence[str],
     steps: int,
 ) -> SavedState:
     """Check a state against the environments that are to go on from it.
@@ -68,7 +71,8 @@ def check_state(
         options: plain values that tell the environments apart.
         inputs: what draws their years and traces; None if nothing does.
         sim: their simulator.
-        commands: names of the commands that each of their steps has.
+        learned: names of the commands that agents learn, which each of their steps has.
+        by_others: names of the commands that ``others`` may give.
         steps: number of steps of an episode.
 
     Raises:
@@ -83,7 +87,7 @@ def check_state(
     elif values["inputs"] is not None:
         raise SdcError("state: inputs were drawn; valid is None, as these environments draw none")
     state = sim.read_state(values["simulator"], drivers)
-    given = _checked_commands(values["actions"], commands, sim.fleet)
+    given = _checked_commands(values["actions"], learned, by_others, sim.fleet)
     if given is None and state.step > 0:
         raise SdcError(f"state: no actions after {state.step} steps; valid is before the first")
     done = state.step + (given is not None)
@@ -199,17 +203,21 @@ def _checked_peaks_kw(given: Any, num_envs: int) -> F64:
     return peaks_kw.copy()
 
 
-def _checked_commands(given: Any, names: Sequence[str], fleet: Fleet) -> dict[str, F64] | None:
+def _checked_commands(
+    given: Any, learned: Sequence[str], by_others: Sequence[str], fleet: Fleet
+) -> dict[str, F64] | None:
     """Commands of the last step, (), (B,), (U,) or (R,) each; None before the first step."""
     if given is None:
         return None
-    if not isinstance(given, Mapping) or set(given) != set(names):
+    names = [*learned, *by_others]
+    optional = _MAY_BE_NONE.intersection(by_others)
+    if not isinstance(given, Mapping) or not set(names) - optional <= set(given) <= set(names):
         found = sorted(map(str, given)) if isinstance(given, Mapping) else given
         raise SdcError(
             f"state: actions are {shortened(found)}; valid is a dict of {sorted(names)}, or None "
             "before the first step"
         )
-    return {name: _checked_command(name, given[name], fleet) for name in names}
+    return {name: _checked_command(name, given[name], fleet) for name in names if name in given}
 
 
 def _checked_command(name: str, given: Any, fleet: Fleet) -> F64:

@@ -34,7 +34,7 @@ class HasSpec:
 
         ``gymnasium.make``, or ``make_vec``, makes the same environment of it, or of
         ``EnvSpec.from_json(spec.to_json())``. What has no plain form stays as it is: a recorder
-        other than a path, and a function that cannot be imported.
+        other than a path, a function that cannot be imported, and a controller other than a name.
         """
         return self._spec
 

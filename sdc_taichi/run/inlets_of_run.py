@@ -88,7 +88,7 @@ def inlets_at_step(run: RunFolder, dc: int, step: int) -> InletsAtStep:
     with Simulator(fleet, precision=metrics["precision"]) as sim:
         simulate(
             sim,
-            make_controller(metrics["controller"], fleet),
+            make_controller(metrics["controller"], fleet, imports=False),
             metrics["steps_asked"],
             metrics["seed"],
             on_step=lambda result: results.__setitem__(slice(None), [result]),

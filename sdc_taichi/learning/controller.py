@@ -1,0 +1,127 @@
+"""A policy as a controller: observes, asks its networks, and decodes their actions.
+
+It gives what an environment of its training would decode from the same networks, to the bit.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sdc_taichi.control import ForecastError, View, commands_of, make_controller
+from sdc_taichi.envs.actions import ActionDecoder
+from sdc_taichi.envs.agents import COMMAND_OF_AGENT, commands_by_others
+from sdc_taichi.envs.observer import Observer
+from sdc_taichi.envs.observers import make_observer
+from sdc_taichi.envs.released_observer import ReleasedObserver
+from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.learning.policy import Policy
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.types import I64, Actions
+
+
+class PolicyController:
+    """Acts by a policy, and for agents that the policy does not have as in its training.
+
+    Args:
+        policy: the policy.
+        fleet: the data centers it is for.
+        name: what errors call it.
+        others: controller of the agents that the policy does not have; None is that of its
+            training.
+
+    Attributes:
+        policy: the policy.
+        commands: fields of ``Actions`` that it gives.
+
+    Raises:
+        SdcError: data centers that the policy does not fit, naming the difference.
+    """
+
+    def __init__(
+        self, policy: Policy, fleet: Fleet, name: str = "policy", others: str | None = None
+    ) -> None:
+        self.policy, self._name = policy, name
+        self._named_others = policy.about.others if others is None else others
+        self._prepare(fleet)
+
+    def __deepcopy__(self, _: Any) -> PolicyController:
+        """A controller of its own, of the same policy, which nothing can change."""
+        return PolicyController(self.policy, self._fleet, self._name, self._named_others)
+
+    def _prepare(self, fleet: Fleet) -> None:
+        """Make everything that depends on the data centers."""
+        interface, others = self.policy.interface, self._named_others
+        interface.require_fit(self._name, fleet)
+        self._fleet = fleet
+        self._decoder = ActionDecoder(fleet, interface.options())
+        try:
+            self._others = make_controller(others, fleet, imports=False)
+        except SdcError as error:
+            raise ConfigError(f"{self._name}: others of its training: {error}") from None
+        decided = self._decoder.commands
+        by_others = commands_by_others(interface.agents, decided, commands_of(self._others))
+        self._by_others = tuple(by_others)
+        self.commands: tuple[str, ...] = (*decided, *self._by_others)
+        self._observer: Observer | ReleasedObserver | None = None
+        self._error: ForecastError | None = None
+        self._begun = False
+
+    def reset(self, seed: int | I64) -> None:
+        """Forget the episode before."""
+        self._others.reset(seed)
+        self._begun = False
+
+    def act(self, view: View) -> Actions:
+        """Commands of the agents of the policy, and of the others in its training.
+
+        Raises:
+            SdcError: data centers that the policy does not fit.
+        """
+        if view.fleet is not self._fleet:
+            self._prepare(view.fleet)
+        observations = self._observer_of(view).observe(view)
+        actions = {
+            agent: chosen.reshape(len(chosen), *(self._decoder.spaces[agent].shape or ()))
+            for agent, chosen in self.policy.actions(observations).items()
+        }
+        commands: dict[str, Any] = {**self._decoder.decode(actions, view.state)}
+        if self._by_others:
+            by_others = self._others.act(view)
+            commands |= {name: getattr(by_others, name) for name in self._by_others}
+        return Actions(**commands)
+
+    def _observer_of(self, view: View) -> Observer | ReleasedObserver:
+        """The observer, which sees the forecast errors of the run, begun with the episode."""
+        if self._observer is None or self._error != view.forecast_error:
+            interface, self._error = self.policy.interface, view.forecast_error
+            named = interface.observations == "default"
+            options = interface.options(**({"forecast_error": self._error} if named else {}))
+            self._observer = make_observer(view.fleet, options, new_inputs=True)
+            self._begun = False
+        if not self._begun:
+            self._observer.reset(view)
+            self._begun = True
+        return self._observer
+
+
+def policy_controller(text: str, fleet: Fleet, parts: tuple[str, ...]) -> PolicyController:
+    """The controller that is named ``policy:FOLDER``.
+
+    Args:
+        text: folder of a training run or of a policy.
+        fleet: the data centers it is for.
+        parts: parts of a spec that it is named for.
+
+    Raises:
+        SdcError: no policy there, one that is damaged, or that does not fit the data centers.
+    """
+    if not text:
+        raise ConfigError("controller 'policy': valid is policy:FOLDER, such as policy:runs/happo")
+    try:
+        policy = Policy.load(Path(text))
+        own = {COMMAND_OF_AGENT[agent] for agent in policy.interface.agents}
+        others = "idle" if set(parts) <= own else None
+        return PolicyController(policy, fleet, f"policy {text}", others)
+    except RecursionError:
+        raise ConfigError(f"policy {text}: its training had this policy for others") from None

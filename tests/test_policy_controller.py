@@ -1,0 +1,278 @@
+"""Policies as controllers: the commands of their training, in runs and in environments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from policies import interface, network, policy
+from sdc_taichi import (
+    ConfigError,
+    DataCenterConfig,
+    EnvOptions,
+    ForecastError,
+    SdcError,
+    Simulator,
+    StepResult,
+    build_fleet,
+    load_config,
+    make_configs,
+    make_controller,
+    simulate,
+    vector_env,
+)
+from sdc_taichi.control import PERFECT, commands_of
+from sdc_taichi.learning.controller import PolicyController
+from sdc_taichi.learning.interface import interface_of
+from sdc_taichi.learning.policy import About, Policy
+
+COMMANDS = ("load_command", "cooling_command", "battery_command")
+SITES = ("ny", "ca", "az")
+
+
+def fleet_of() -> list[DataCenterConfig]:
+    return make_configs(load_config("tiny"), sites=SITES)
+
+
+def run(
+    configs: Sequence[DataCenterConfig], controller: Any, steps: int, **options: Any
+) -> list[StepResult]:
+    """Results of a run; ``controller`` is a name, a policy or a controller."""
+    kept: list[StepResult] = []
+    with Simulator(build_fleet(list(configs))) as sim:
+        if isinstance(controller, Policy):
+            controller = PolicyController(controller, sim.fleet)
+        elif isinstance(controller, str):
+            controller = make_controller(controller, sim.fleet)
+        simulate(sim, controller, steps, 0, on_step=kept.append, **options)
+    return kept
+
+
+def trained(
+    configs: Sequence[DataCenterConfig], made: Policy, steps: int, **options: Any
+) -> list[StepResult]:
+    """Results of the environments of a policy under its networks, asked by hand."""
+    own = made.interface.options(start="fixed", **options)
+    env = vector_env(config=list(configs), options=own)
+    observations, _ = env.reset(seed=0)
+    kept = []
+    for _ in range(steps):
+        shapes = {agent: space.shape or () for agent, space in env.action_spaces.items()}
+        chosen = made.actions({agent: np.asarray(x) for agent, x in observations.items()})
+        actions = {agent: x.reshape(len(x), *shapes[agent]) for agent, x in chosen.items()}
+        transition = env.core.step(actions)
+        observations = transition.observations
+        kept.append(transition.result)
+    env.close()
+    return kept
+
+
+def assert_equal(
+    found: Sequence[StepResult], expected: Sequence[StepResult], names: Sequence[str] = COMMANDS
+) -> None:
+    for name in (*names, "carbon_g"):
+        mine, theirs = ([getattr(result, name) for result in of] for of in (found, expected))
+        assert np.array_equal(mine, theirs), name
+
+
+def varied(results: Sequence[StepResult], name: str) -> bool:
+    """Whether a command takes more than one value."""
+    return len(np.unique([getattr(result, name) for result in results])) > 1
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"actions": "continuous", "setpoint_change_k": 1.0},
+        {"action_order": "sustaindc", "ci_leads_h": (1.0, 2.5)},
+        {"observations": "sustaindc"},
+    ],
+)
+def test_a_run_has_the_commands_of_the_training(options: dict[str, Any]) -> None:
+    configs = fleet_of()
+    made = policy(interface(**options), seed=3)
+    found = run(configs, made, 60)
+    assert_equal(found, trained(configs, made, 60))
+    assert all(varied(found, name) for name in COMMANDS)
+
+
+def test_commands_of_several_units_and_fans_are_those_of_the_training() -> None:
+    units = ["hvac.crac.units=2", "hvac.crac.flow_model=controlled"]
+    configs = [load_config("corrected", units)]
+    options = EnvOptions(
+        agents=("agent_dc",), actions="continuous", commands={"agent_dc": ("fan", "cooling")}
+    )
+    made = policy(interface_of(build_fleet(configs), options), seed=3)
+    found = run(configs, made, 12)
+    assert_equal(found, trained(configs, made, 12), ("setpoint_c", "crac_fan_w"))
+    assert varied(found, "crac_fan_w")
+
+
+def test_a_joint_policy_has_the_commands_of_the_training() -> None:
+    configs = fleet_of()
+    fits = interface()
+    names: dict[str, int] = {f.name: f.size for a in fits.agents for f in fits.features[a]}
+    made = Policy(
+        (network(fits.agents, sum(names.values()), 9, seed=5),), fits, About(algorithm="ppo")
+    )
+    found = run(configs, made, 40)
+    assert_equal(found, trained(configs, made, 40))
+    assert all(varied(found, name) for name in COMMANDS)
+
+
+def test_others_act_as_in_training() -> None:
+    configs = fleet_of()
+    made = policy(interface(agents=("agent_bat",)), seed=2)
+    others = "load=greedy-ci,cooling=g36"
+    made = replace(made, about=About(algorithm="none", others=others))
+    found = run(configs, made, 60)
+    assert_equal(found, trained(configs, made, 60, others=others))
+    assert all(varied(found, name) for name in COMMANDS)
+
+
+def test_a_data_center_is_the_same_alone_and_in_a_batch() -> None:
+    configs = fleet_of()
+    made = policy(interface(), seed=3)
+    together = run(configs, made, 40)
+    for i, config in enumerate(configs):
+        alone = run([config], made, 40)
+        for name in COMMANDS:
+            mine = [getattr(result, name)[0] for result in alone]
+            assert mine == [getattr(result, name)[i] for result in together]
+
+
+def test_forecasts_err_as_those_that_learners_of_the_episode_see() -> None:
+    error = ForecastError(ci_share=0.5, temperature_k=5.0)
+    configs = fleet_of()
+    made = policy(interface(agents=("agent_bat",)), seed=3)
+    hold = np.ones(3, dtype=np.int64)
+    batteries = PolicyController(made, build_fleet(configs))
+    given: dict[str, Any] = {"config": configs, "days": 1, "start": "fixed"}
+    found = []
+    for errs in (error, PERFECT):
+        env = vector_env(agents=("agent_ls",), others=batteries, forecast_error=errs, **given)
+        env.reset(seed=0)
+        found.append([env.core.step({"agent_ls": hold}).result for _ in range(40)])
+        env.close()
+    env = vector_env(agents=("agent_ls", "agent_bat"), forecast_error=error, **given)
+    observations, _ = env.reset(seed=0)
+    expected = []
+    for _ in range(40):
+        chosen = made.actions({"agent_bat": np.asarray(observations["agent_bat"])})
+        transition = env.core.step({"agent_ls": hold, "agent_bat": chosen["agent_bat"][:, 0]})
+        observations = transition.observations
+        expected.append(transition.result)
+    env.close()
+    assert_equal(found[0], expected)
+    erring, perfect = ([r.battery_command for r in results] for results in found)
+    assert not np.array_equal(erring, perfect)
+
+
+def test_a_second_episode_is_the_first_again() -> None:
+    configs = fleet_of()
+    with Simulator(build_fleet(configs)) as sim:
+        controller = PolicyController(policy(interface(), seed=3), sim.fleet)
+        runs: list[list[StepResult]] = [[], []]
+        for kept in runs:
+            simulate(sim, controller, 20, 0, on_step=kept.append)
+    assert_equal(runs[0], runs[1])
+
+
+# Names
+
+
+def test_a_policy_is_a_controller_by_name(tmp_path: Path) -> None:
+    made = policy(interface(), seed=3)
+    made.save(tmp_path / "best")
+    configs = fleet_of()
+    expected = run(configs, made, 30)
+    assert_equal(run(configs, f"policy:{tmp_path}", 30), expected)
+    parts = ",".join(f"{part}=policy:{tmp_path}" for part in ("load", "cooling", "battery"))
+    assert_equal(run(configs, parts, 30), expected)
+
+
+def test_a_policy_may_stand_for_one_agent_beside_others(tmp_path: Path) -> None:
+    made = policy(interface(agents=("agent_bat",)), seed=2)
+    other = replace(made, about=About(algorithm="none", others="load=greedy-ci"))
+    other.save(tmp_path)
+    configs = fleet_of()
+    found = run(configs, f"cooling=g36,battery=policy:{tmp_path}", 30)
+    expected = replace(made, about=About(algorithm="none", others="cooling=g36"))
+    assert_equal(found, run(configs, expected, 30))
+
+
+def test_what_a_policy_cannot_do_is_one_error(tmp_path: Path) -> None:
+    fleet = build_fleet(load_config("tiny"))
+    policy(interface(agents=("agent_bat",))).save(tmp_path)
+    for spec, said in (
+        ("policy", "valid is policy:FOLDER"),
+        (f"policy:{tmp_path}/no", "no such folder"),
+        (f"load=policy:{tmp_path}", "does not act on load; it gives battery"),
+    ):
+        with pytest.raises(SdcError, match=said):
+            make_controller(spec, fleet)
+    with pytest.raises(ConfigError, match=r"policy .*does not fit .*step: 15 min in training, 30"):
+        make_controller(
+            f"policy:{tmp_path}", build_fleet(load_config("tiny", ["simulation.steps_per_hour=2"]))
+        )
+
+
+def test_a_policy_runs_no_code_that_its_file_names(tmp_path: Path) -> None:
+    fleet = build_fleet(load_config("tiny"))
+    made = policy(interface(agents=("agent_bat",)))
+    replace(made, about=About(algorithm="none", others="cProfile:run:1/0")).save(tmp_path)
+    with pytest.raises(ConfigError, match=r"others of its training: .*code that a file names"):
+        make_controller(f"policy:{tmp_path}", fleet)
+    assert commands_of(make_controller(f"battery=policy:{tmp_path}", fleet)) == ("battery",)
+    replace(made, about=About(algorithm="none", others=f"policy:{tmp_path}")).save(tmp_path)
+    with pytest.raises(ConfigError, match="its training had this policy for others"):
+        make_controller(f"policy:{tmp_path}", fleet)
+
+
+def test_a_policy_acts_for_the_agents_that_do_not_learn(tmp_path: Path) -> None:
+    configs = fleet_of()
+    made = policy(interface(), seed=3)
+    made.save(tmp_path)
+    found = []
+    for others in (f"policy:{tmp_path}", PolicyController(made, build_fleet(configs))):
+        env = vector_env(
+            config=configs, agents=("agent_bat",), others=others, start="fixed", days=1
+        )
+        env.reset(seed=0)
+        hold = np.ones(3, dtype=np.int64)
+        found.append([env.core.step({"agent_bat": hold}).result for _ in range(30)])
+        env.close()
+    assert_equal(found[0], found[1])
+    assert varied(found[0], "load_command")
+    assert varied(found[0], "cooling_command")
+    assert not varied(found[0], "battery_command")
+
+
+def test_a_saved_episode_goes_on_under_a_policy() -> None:
+    configs = fleet_of()
+    made = PolicyController(policy(interface(), seed=3), build_fleet(configs))
+    env = vector_env(config=configs, agents=("agent_bat",), others=made, start="fixed", days=1)
+    env.reset(seed=0)
+    hold = {"agent_bat": np.ones(3, dtype=np.int64)}
+    for _ in range(10):
+        env.step(hold)
+    saved = env.state_dict()
+    expected = [env.core.step(hold).result for _ in range(10)]
+    env.load_state_dict(saved)
+    assert_equal([env.core.step(hold).result for _ in range(10)], expected)
+    env.close()
+
+
+def test_a_copy_has_a_memory_of_its_own() -> None:
+    made = PolicyController(policy(interface()), build_fleet(load_config("tiny")))
+    copied = deepcopy(made)
+    assert copied is not made
+    assert copied.policy is made.policy
+    assert copied.commands == made.commands
