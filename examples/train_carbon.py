@@ -2,12 +2,12 @@
 
     python examples/train_carbon.py FOLDER [--seeds 0 1 2] [--steps 1800000]
 
-trains the three agents with skrl on preset ``corrected``, one data center per site and training
-week, and runs them and rule-based controllers in every fourth week of the year, which is left out
-of training. Forecasts and rewards on the last day of a training week read ahead into the first day
-of the held-out week that follows, so only days 2 to 7 are scored, whoever acts. Writes
-``training.json`` (settings, results by seed, curves) and ``training.png`` to FOLDER and prints the
-tables of docs/training.md.
+trains the three agents with skrl and the default rewards on preset ``corrected``, one data center
+per site and training week, and runs them and rule-based controllers in every fourth week of the
+year, which is left out of training. Forecasts and rewards on the last day of a training week read
+ahead into the first day of the held-out week that follows, so only days 2 to 7 are scored, whoever
+acts. Writes ``training.json`` (settings, results by seed, curves) and ``training.png`` to FOLDER
+and prints the tables of docs/training.md.
 
 Weather, carbon intensity and work are the synthetic years of the sites.
 """
@@ -32,7 +32,6 @@ from sdc_taichi import (
     DataCenterConfig,
     Simulator,
     StepResult,
-    View,
     build_fleet,
     load_config,
     make_controller,
@@ -48,8 +47,6 @@ UNSCORED_STEPS = 96
 HELD_OUT = tuple(range(3, 52, 4))
 """Weeks of the year that are left out of training."""
 TRAINED = tuple(week for week in range(52) if week not in HELD_OUT)
-LATE_WEIGHT = 3.0
-"""Dropped and overdue work costs this many times its energy at the mean carbon intensity."""
 RULES = ("g36", "lookahead-24h", "greedy-ci", "load=greedy-ci,cooling=g36,battery=lookahead-24h")
 SUMMED = (
     *("carbon_g", "it_kwh", "hvac_kwh", "charge_kwh", "discharge_kwh", "battery_loss_kwh"),
@@ -67,36 +64,6 @@ SETTINGS: dict[str, Any] = {
 
 Sums = dict[str, F64]
 """Sums over the scored days of a week of what ``SUMMED`` names, (B,) each, site by site."""
-
-
-def carbon_reward(result: StepResult, view: View) -> dict[str, F64]:
-    """Carbon of a step, to each agent the part that it can change.
-
-    Carbon follows demand and weather more than any action, so an agent is charged for its own part
-    alone. Energy that is stored and work that is queued are valued at the mean carbon intensity of
-    the coming 24 h: an agent earns when it charges at less or runs work at less than that, and need
-    not wait for the end of the cycle, which also allows a low discount factor.
-
-    Args:
-        result: the step.
-        view: the situation after it.
-
-    Returns:
-        Rewards by agent, (B,), over the carbon of an hour of full IT load at the mean intensity.
-    """
-    ci = result.ci_g_per_kwh
-    mean_ci = view.forecast(24.0).ci_g_per_kwh.mean(axis=1)
-    full_kwh = view.sizing.it_w / 1e3
-    task_kwh = full_kwh * result.step_h / 100
-    moved = result.executed_tasks - result.arrived_tasks
-    late = result.dropped_tasks + result.overdue_tasks
-    drawn_kwh = result.charge_kwh - result.discharge_kwh
-    carbon_g = {
-        "agent_ls": task_kwh * ((ci - mean_ci) * moved + LATE_WEIGHT * mean_ci * late),
-        "agent_dc": ci * (result.facility_kwh - task_kwh * result.executed_tasks),
-        "agent_bat": (ci - mean_ci) * drawn_kwh + mean_ci * result.battery_loss_kwh,
-    }
-    return {agent: -grams / (mean_ci * full_kwh) for agent, grams in carbon_g.items()}
 
 
 def data_centers(sites: Sequence[str], weeks: Sequence[int]) -> list[DataCenterConfig]:
@@ -117,7 +84,6 @@ def make_env(configs: Sequence[DataCenterConfig]) -> BatchEnv:
         config=list(configs),
         days=DAYS,
         start="fixed",
-        rewards=carbon_reward,
         autoreset_mode="SameStep",
     )
     return BatchEnv(env, seed=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
@@ -29,7 +29,7 @@ from sdc_taichi.envs.features import DEFAULT_FEATURES, all_features
 from sdc_taichi.envs.observers import OBSERVERS
 from sdc_taichi.envs.registration import IDS
 from sdc_taichi.envs.reward_terms import TERMS
-from sdc_taichi.envs.rewards import DEFAULT_SCALES, REWARD_SETS
+from sdc_taichi.envs.rewards import REWARD_SETS, SCALES
 from sdc_taichi.envs.single import SdcEnv
 from sdc_taichi.envs.vector import SdcVectorEnv
 
@@ -193,7 +193,7 @@ INVALID: list[tuple[dict[str, Any], str]] = [
     ),
     ({"collaboration": 0.5, "rewards": "no:such"}, "collaboration: without effect"),
     ({"collaboration": 0.5, "rewards": len}, "collaboration: without effect"),
-    ({"rewards": "sustain"}, "rewards 'sustain': unknown; valid: default, sustaindc"),
+    ({"rewards": "sustain"}, "rewards 'sustain': unknown; valid: default, bill, paper, sustaindc"),
     (
         {"features": {"agent_ls": ["ci"]}, "agents": ["agent_bat"]},
         "without effect for agent_ls, which does not learn",
@@ -239,8 +239,8 @@ def test_choices_are_what_there_is() -> None:
     assert choices("observations") == set(OBSERVERS)
     assert choices("action_order") == set(BATTERY_COMMANDS)
     assert choices("agents") == set(AGENTS)
-    for by_agent in (COMMAND_OF_AGENT, DEFAULT_FEATURES, DEFAULT_SCALES):
-        assert tuple(by_agent) == AGENTS
+    by_agents: list[Iterable[str]] = [COMMAND_OF_AGENT, DEFAULT_FEATURES, *SCALES.values()]
+    assert all(tuple(by_agent) == AGENTS for by_agent in by_agents)
     assert tuple(COMMAND_OF_AGENT.values()) == CONTROLLABLE
     can_decide = {name for names in COMMANDS_OF_AGENT.values() for name in names}
     assert can_decide == {field.name for field in fields(Actions)}
@@ -248,7 +248,7 @@ def test_choices_are_what_there_is() -> None:
     assert {agent for agent in IDS.values() if agent is not None} == set(AGENTS)
     names = {feature.name for feature in all_features()}
     assert all(set(chosen) <= names for chosen in DEFAULT_FEATURES.values())
-    assert all(set(scales) <= set(TERMS) for scales in DEFAULT_SCALES.values())
+    assert all(set(own) <= set(TERMS) for scales in SCALES.values() for own in scales.values())
 
 
 @pytest.mark.parametrize("option", ["actions", "observations", "start"])

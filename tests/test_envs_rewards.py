@@ -63,7 +63,7 @@ def test_terms_are_what_their_names_say() -> None:
         np.testing.assert_allclose(found[name], values, rtol=1e-12, err_msg=name)
     for name, values in found.items():
         assert values.shape == (2,), name
-        assert np.all(values <= 0), name
+        assert np.all(values <= 0) or name.partition("_")[0] in ("work", "battery"), name
     assert np.all(found["carbon"] < -0.05)
 
 
@@ -137,8 +137,8 @@ def test_cost_follows_the_hour_and_the_peak_of_the_episode() -> None:
         assert charged == pytest.approx((0.5 * design_kw - peak_kw) / (design_kw / 4))
 
 
-def test_default_rewards_are_those_of_the_paper() -> None:
-    env = core(collaboration=1.0)
+def test_rewards_of_the_paper() -> None:
+    env = core(rewards="paper", collaboration=1.0)
     env.reset(0)
     for _ in range(94):
         done = env.step(act(1, 0))
@@ -151,6 +151,95 @@ def test_default_rewards_are_those_of_the_paper() -> None:
         for agent, expected in own.items():
             np.testing.assert_allclose(done.rewards[agent], expected, rtol=1e-12)
     assert terms["queue"][0] < 0
+
+
+PARTS = {"carbon": ("work_carbon", "cooling_carbon", "battery_carbon")}
+PARTS["cost"] = ("work_cost", "cooling_cost", "battery_cost")
+PRICES = tuple(0.05 + 0.01 * hour for hour in range(24))
+
+
+@pytest.mark.parametrize("whole", PARTS)
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [],
+        ["battery.model=released", "workload.model=tasks"],
+        ["workload.queue_limit_h=0.1", "workload.deadline_h=2"],
+        ["battery.hours_of_design_load=0", "simulation.steps_per_hour=1"],
+    ],
+)
+def test_parts_of_agents_add_up_to_the_whole_and_what_is_left(
+    whole: str, overrides: list[str]
+) -> None:
+    """Whatever agents do, the parts differ from the whole by what no action changes and by ends."""
+    env = core(overrides, num_envs=2, actions="continuous", tariff={"price_per_kwh": PRICES})
+    env.reset(0)
+    view, rng = env.view, np.random.default_rng(1)
+    task_kwh = view.sizing.it_w * view.step_h / 1e5
+    series, unit = (
+        (view.drivers.ci_g_per_kwh, CI_G_PER_KWH)
+        if whole == "carbon"
+        else (view.drivers.price_per_kwh, 0.1)
+    )
+    assert series is not None
+    first = view.drivers.start
+    step = np.arange(round(24 / view.step_h))
+    total, expected = np.zeros(2), np.zeros(2)
+    for left in reversed(range(env.steps)):
+        actions = {a: rng.uniform(-1, 1, (2, 1)).astype(np.float32) for a in AGENTS}
+        if left == 0:  # Work waits at the end.
+            actions["agent_ls"][:] = -1.0
+        done = env.step(actions)
+        r, terms = done.result, env.reward_terms()
+        total += sum(terms[name] for name in PARTS[whole])
+        gone_tasks = r.arrived_tasks - r.executed_tasks
+        gone_tasks -= r.deferred_tasks - r.drained_tasks - (r.due_tasks - r.overdue_tasks)
+        rate = series.at(first + r.step)
+        arrived = rate * task_kwh * (r.arrived_tasks - gone_tasks)
+        expected += terms[whole] + arrived / (unit * view.sizing.facility_w * view.step_h / 1e3)
+    mean = series.at(first[:, None] + env.steps + step).mean(axis=1)
+    worth = mean * (r.stored_kwh - task_kwh * r.queue_tasks)
+    expected += worth / (unit * view.sizing.facility_w * view.step_h / 1e3)
+    np.testing.assert_allclose(total, expected, rtol=1e-8)
+    assert np.any(r.queue_tasks > 0)
+
+
+@pytest.mark.parametrize("collaboration", [0.8, 1.0])
+def test_all_agents_as_one_get_each_term_once(collaboration: float) -> None:
+    env = core(collaboration=collaboration)
+    env.reset(0)
+    env.step(act(1, 0))
+    done, terms = env.step(act(1, 2)), env.reward_terms()
+    parts = sum(terms[name] for name in PARTS["carbon"])
+    expected = 10.0 * parts + 20.0 * terms["sla"] + 0.1 * terms["hot_inlets"]
+    np.testing.assert_allclose(done.joint_reward, expected, rtol=1e-12)
+    own = sum(done.rewards.values())
+    np.testing.assert_allclose(own, expected + 10.0 * terms["cooling_carbon"], rtol=1e-12)
+
+
+def test_each_agent_is_paid_for_its_own_part() -> None:
+    def rewards(**commands: int) -> dict[str, F64]:
+        env = core(["site.location=CA"], days=2, collaboration=1.0)
+        env.reset(0)
+        kept = []
+        for _ in range(96):
+            done = env.step(act(1, 1) | {a: np.array([c]) for a, c in commands.items()})
+            kept.append(done.rewards | {"ci": done.result.ci_g_per_kwh})
+        return {name: np.concatenate([one[name] for one in kept]) for name in kept[0]}
+
+    idle = rewards()
+    np.testing.assert_array_equal(idle["agent_bat"], 0.0)
+    np.testing.assert_allclose(idle["agent_ls"], idle["agent_dc"], rtol=1e-12)
+    assert np.all(idle["agent_dc"] < 0)
+    # Deferring pays where the grid is dirtier than the coming day is on average, and only there.
+    deferring = rewards(agent_ls=0)
+    np.testing.assert_array_equal(deferring["agent_bat"], 0.0)
+    gain = deferring["agent_ls"] - idle["agent_ls"]
+    assert gain[idle["ci"].argmax()] > 0 > gain[idle["ci"].argmin()]
+    charging = rewards(agent_bat=0)
+    np.testing.assert_array_equal(charging["agent_ls"], idle["agent_ls"])
+    np.testing.assert_array_equal(charging["agent_dc"], idle["agent_dc"])
+    assert charging["agent_bat"][0] != 0
 
 
 @given(
@@ -176,7 +265,9 @@ def test_agents_not_mentioned_keep_their_default() -> None:
     np.testing.assert_allclose(
         done.rewards["agent_dc"], 2 * terms["pue"] + 0.5 * terms["water"], rtol=1e-12
     )
-    np.testing.assert_allclose(done.rewards["agent_bat"], terms["carbon"], rtol=1e-12)
+    np.testing.assert_allclose(
+        done.rewards["agent_bat"], 10.0 * terms["battery_carbon"], rtol=1e-12
+    )
 
 
 def water_saved(result: StepResult, view: View) -> F64:
@@ -250,7 +341,7 @@ def test_the_first_step_of_an_episode_pays_no_more_than_others() -> None:
 @pytest.mark.parametrize(
     ("rewards", "message"),
     [
-        ("sustain", "'sustain': unknown; valid: default, sustaindc"),
+        ("sustain", "'sustain': unknown; valid: default, bill, paper, sustaindc"),
         ("no_such_module:f", "cannot be imported"),
         ("math:pi", "is a float; valid is a function"),
         ({"agent_xy": {}}, "unknown agent 'agent_xy'"),
@@ -263,7 +354,7 @@ def test_the_first_step_of_an_episode_pays_no_more_than_others() -> None:
         (":f", "rewards ':f': unknown; valid: default"),
         ("os:", "rewards 'os:': unknown"),
         (".os:x", "rewards '.os:x': unknown"),
-        (3, "rewards 3: unknown; valid: default, sustaindc"),
+        (3, "rewards 3: unknown; valid: default, bill, paper, sustaindc"),
     ],
 )
 def test_wrong_rewards_are_named(rewards: Any, message: str) -> None:

@@ -238,42 +238,6 @@ def test_sb3_has_nothing_to_say_against_single_environments(
 # --- the training of docs/training.md ---
 
 
-def test_carbon_reward_pays_each_agent_for_its_own_part(example: Load) -> None:
-    carbon = example("train_carbon", "skrl", "matplotlib")
-    configs = carbon.data_centers(("CA",), (10,))
-
-    def rewards(**commands: int) -> dict[str, Any]:
-        env = sdc_taichi.vector_env(
-            1, config=configs, days=7, start="fixed", rewards=carbon.carbon_reward
-        )
-        env.reset(seed=0)
-        kept: dict[str, list[Any]] = {a: [] for a in (*AGENTS, "ci")}
-        for _ in range(DAY):
-            hold = dict.fromkeys(AGENTS, np.ones(1, dtype=np.int64))
-            acts = hold | {a: np.full(1, c) for a, c in commands.items()}
-            _, paid, _, _, infos = env.step(acts)
-            for a in AGENTS:
-                kept[a].append(float(paid[a][0]))
-            kept["ci"].append(float(infos["ci_g_per_kwh"][0]))
-        env.close()
-        return {name: np.array(values) for name, values in kept.items()}
-
-    idle = rewards()
-    np.testing.assert_array_equal(idle["agent_bat"], 0.0)
-    np.testing.assert_allclose(idle["agent_ls"], 0.0, atol=1e-9)
-    assert np.all(idle["agent_dc"] < 0)
-    # Deferring pays where the grid is dirtier than the coming day is on average, and only there.
-    deferring = rewards(agent_ls=0)
-    np.testing.assert_array_equal(deferring["agent_bat"], 0.0)
-    assert deferring["agent_ls"][idle["ci"].argmax()] > 0
-    assert deferring["agent_ls"][idle["ci"].argmin()] < 0
-    # The first charge costs or earns by the intensity; later ones find the battery full.
-    charging = rewards(agent_bat=0)
-    np.testing.assert_allclose(charging["agent_ls"], 0.0, atol=1e-9)
-    assert charging["agent_bat"][0] != 0
-    assert abs(charging["agent_bat"][-1]) < 1e-3 * abs(charging["agent_bat"][0])
-
-
 def test_held_out_weeks_are_not_trained_on(example: Load, tmp_path: Path) -> None:
     carbon = example("train_carbon", "skrl", "matplotlib")
     assert not {*carbon.TRAINED} & {*carbon.HELD_OUT}

@@ -102,8 +102,8 @@ class EnvOptions(BaseModel):
     heat_map: bool = False
     """Whether every observation becomes a dict of features and an image of the hall."""
     rewards: Any = "default"
-    """Rewards: ``default``, ``sustaindc``, agent to term to scale, or a function, the name that
-    ``register_reward`` gave it, or its import path ``module:name``."""
+    """Rewards: ``default``, ``bill``, ``paper``, ``sustaindc``, agent to term to scale, or a
+    function, the name that ``register_reward`` gave it, or its import path ``module:name``."""
     collaboration: Annotated[float, Field(ge=0, le=1)] = 0.8
     """Share a of an agent's own reward in what it gets, 0..1; those of the other two agents share
     the rest evenly (paper, section 4.5). 1 is no collaboration."""
@@ -222,7 +222,7 @@ class EnvOptions(BaseModel):
             (
                 ("collaboration",),
                 not shared,
-                "on a function's rewards; valid with rewards default, sustaindc or a dict",
+                "on a function's rewards; valid with rewards by name or a dict",
             ),
         ]
 

@@ -1,11 +1,28 @@
 """Reward terms: what a step costs, by name.
 
-Every term is 0 or less. Energies, carbon, cost, fossil share and water are shares of what the data
-center would use, emit or pay in a step at its design point, about -1 at full load, so that sites
-and halls of any size give rewards of one size; ``sla`` is a share of the work of a full step. The
-others have units: ``pue`` is a ratio, ``hot_inlets`` in K, ``queue`` and ``dropped`` in tasks, and
-``demand_charge`` is in the money of ``cost``, due in the few steps that raise the highest power.
-Nothing is scaled by data of the run.
+Energies, carbon, cost, fossil share and water are shares of what the data center would use, emit or
+pay in a step at its design point, about -1 at full load, so that sites and halls of any size give
+rewards of one size; ``sla`` is a share of the work of a full step. The others have units: ``pue``
+is a ratio, ``hot_inlets`` in K, ``queue`` and ``dropped`` in tasks, and ``demand_charge`` is in the
+money of ``cost``, due in the few steps that raise the highest power. Nothing is scaled by data of
+the run. All terms are 0 or less but those of one agent's part.
+
+**Parts of agents.** Carbon follows demand and weather more than any action, so ``work_carbon``,
+``cooling_carbon`` and ``battery_carbon`` split the carbon of a step into what each agent can
+change. Besides, work that waits is a debt, and energy in the battery a credit, at the mean
+intensity M of the coming 24 h: with w the IT energy of a task at full load, Q the tasks that wait
+and S the energy stored,
+
+    work_carbon + cooling_carbon + battery_carbon
+        = -CI (E_grid - w (tasks that arrived - those dropped or lost)) + P' - P,  P = M (S - w Q)
+
+where ' is the end of the step, and dropped work counts as if it had run, as energy does that an
+outage withholds. P is a potential
+(Ng, Harada, Russell 1999): its changes add up to the difference between the ends of an episode, so
+that, undiscounted, the policy that is best by these terms is the one that emits least. An agent
+learns at once what an action is worth, where it would have to wait for the end of a cycle.
+``work_cost``, ``cooling_cost`` and ``battery_cost`` are the like with prices. The means are the
+true ones, whatever agents observe of them.
 
 Add a term here: a function with the decorator ``reward_term``, whose name is the name of the term
 and whose docstring's first line is its row in docs/environments.md (``terms_markdown`` prints the
@@ -53,6 +70,16 @@ class TermContext:
     """Length of the episode over the 30 days of a bill."""
     end_of_day_weight: F64
     """Weight of queued tasks, 0 before 23:00 and rising to 1 in the last step of the day, (B,)."""
+    task_kwh: F64
+    """IT energy of a task, which is 1 % of a step at full load, in kWh, (B,)."""
+    coming_ci_before: F64
+    """Mean carbon intensity of the 24 h from the beginning of the step, in g CO2e/kWh, (B,)."""
+    coming_ci: F64
+    """Mean carbon intensity of the 24 h from the end of the step, in g CO2e/kWh, (B,)."""
+    coming_price_before: F64
+    """Mean price of a kWh in the 24 h from the beginning of the step, (B,)."""
+    coming_price: F64
+    """Mean price of a kWh in the 24 h from the end of the step, (B,)."""
 
 
 Term = Callable[[StepResult, TermContext], F64]
@@ -164,6 +191,65 @@ def dropped(r: StepResult, c: TermContext) -> F64:
 def sla(r: StepResult, c: TermContext) -> F64:
     """Work past its deadline, dropped or lost, as a share of a full step."""
     return -(r.overdue_tasks + r.dropped_tasks + r.lost_tasks) / TASKS_PER_STEP
+
+
+@reward_term
+def work_carbon(r: StepResult, c: TermContext) -> F64:
+    """Carbon that moving work in time adds; what waits is due at the mean CI of the coming 24 h."""
+    added_g = _moved_work(r, c, r.ci_g_per_kwh, c.coming_ci_before, c.coming_ci)
+    return -added_g / (c.design_kwh * CI_G_PER_KWH)
+
+
+@reward_term
+def cooling_carbon(r: StepResult, c: TermContext) -> F64:
+    """Carbon of the facility's energy less that of its executed work, 1/100 of full load a task."""
+    return -r.ci_g_per_kwh * _beyond_work_kwh(r, c) / (c.design_kwh * CI_G_PER_KWH)
+
+
+@reward_term
+def battery_carbon(r: StepResult, c: TermContext) -> F64:
+    """Carbon that the battery adds; what it stores is worth the mean CI of the coming 24 h."""
+    added_g = _stored_energy(r, r.ci_g_per_kwh, c.coming_ci_before, c.coming_ci)
+    return -added_g / (c.design_kwh * CI_G_PER_KWH)
+
+
+@reward_term
+def work_cost(r: StepResult, c: TermContext) -> F64:
+    """Price of moving work in time, as `work_carbon`, in units of `cost`."""
+    added = _moved_work(r, c, r.price_per_kwh, c.coming_price_before, c.coming_price)
+    return -added / (c.design_kwh * PRICE_PER_KWH)
+
+
+@reward_term
+def cooling_cost(r: StepResult, c: TermContext) -> F64:
+    """Price of the facility's energy less that of its executed work, in units of `cost`."""
+    return -r.price_per_kwh * _beyond_work_kwh(r, c) / (c.design_kwh * PRICE_PER_KWH)
+
+
+@reward_term
+def battery_cost(r: StepResult, c: TermContext) -> F64:
+    """Price of what the battery draws, as `battery_carbon`, in units of `cost`."""
+    added = _stored_energy(r, r.price_per_kwh, c.coming_price_before, c.coming_price)
+    return -added / (c.design_kwh * PRICE_PER_KWH)
+
+
+def _moved_work(r: StepResult, c: TermContext, rate: F64, before: F64, after: F64) -> F64:
+    """What moving work in time adds at a rate per kWh, with debts before and after, (B,)."""
+    longer_tasks = r.deferred_tasks - r.drained_tasks - (r.due_tasks - r.overdue_tasks)
+    rise = after * r.queue_tasks - before * (r.queue_tasks - longer_tasks)
+    return c.task_kwh * (rise - rate * longer_tasks)
+
+
+def _stored_energy(r: StepResult, rate: F64, before: F64, after: F64) -> F64:
+    """What the battery adds at a rate per kWh, with credits before and after, (B,)."""
+    drawn_kwh = r.charge_kwh - r.discharge_kwh
+    gained_kwh = drawn_kwh - r.battery_loss_kwh
+    return rate * drawn_kwh - (after * r.stored_kwh - before * (r.stored_kwh - gained_kwh))
+
+
+def _beyond_work_kwh(r: StepResult, c: TermContext) -> F64:
+    """The facility's energy beyond that of the work it has executed, in kWh, (B,)."""
+    return r.facility_kwh - c.task_kwh * r.executed_tasks
 
 
 def terms_markdown() -> str:

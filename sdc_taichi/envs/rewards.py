@@ -7,6 +7,7 @@ option ``rewards``: itself, the name that ``register_reward`` gave it, or its im
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,11 +16,12 @@ import numpy as np
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.released_rewards import ReleasedRewards
+from sdc_taichi.envs.reward_context import RewardContext
 from sdc_taichi.envs.reward_terms import TERMS, TermContext
 from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
 from sdc_taichi.sim.physical_limits import POWER_LIMITS_W
 from sdc_taichi.sim.state_limits import ROUNDING
-from sdc_taichi.types import F64, I64, StepResult
+from sdc_taichi.types import F64, StepResult
 from sdc_taichi.user_functions import (
     checked_values,
     function_named,
@@ -31,15 +33,34 @@ RewardFunction = Callable[[StepResult, View], Any]
 """A user's own reward. It gets the result of a step and the view after it, and returns rewards,
 (B,), which all agents get alike, or a dict of them by learning agent."""
 
-REWARD_SETS = ("default", "sustaindc")
-"""Rewards that the option ``rewards`` takes by name, besides registered functions."""
-DEFAULT_SCALES: dict[str, dict[str, float]] = {
-    "agent_ls": {"carbon": 1.0, "queue": 1.0, "dropped": 10.0},
-    "agent_dc": {"facility_energy": 1.0},
-    "agent_bat": {"carbon": 1.0},
+SCALES: dict[str, dict[str, dict[str, float]]] = {
+    "default": {
+        "agent_ls": {"work_carbon": 10.0, "cooling_carbon": 10.0, "sla": 20.0},
+        "agent_dc": {"cooling_carbon": 10.0, "hot_inlets": 0.1},
+        "agent_bat": {"battery_carbon": 10.0},
+    },
+    "bill": {
+        "agent_ls": {"work_cost": 10.0, "cooling_cost": 10.0, "sla": 20.0},
+        "agent_dc": {"cooling_cost": 10.0, "hot_inlets": 0.1},
+        "agent_bat": {"battery_cost": 10.0, "demand_charge": 10.0},
+    },
+    "paper": {
+        "agent_ls": {"carbon": 1.0, "queue": 1.0, "dropped": 10.0},
+        "agent_dc": {"facility_energy": 1.0},
+        "agent_bat": {"carbon": 1.0},
+    },
 }
-"""Scales of the terms of each agent by default: r_LS, r_DC and r_BAT of the paper (4.5, F.2), with
-carbon and energies over those of the design point."""
+"""Scales of the terms of each agent, by the name of the set: ``default`` is carbon, to each agent
+the part that it can change, ``bill`` the same with prices, and ``paper`` r_LS, r_DC and r_BAT of
+the paper (4.5, F.2), with carbon and energies over those of the design point."""
+JOINT_SCALES: dict[str, dict[str, float]] = {
+    name: {term: scale for own in SCALES[name].values() for term, scale in own.items()}
+    for name in ("default", "bill")
+}
+"""Scales of the terms of all agents as one, by the name of the set: each term once, however many
+agents have it. Where there are none, the reward of all is the sum of theirs."""
+REWARD_SETS = (*SCALES, "sustaindc")
+"""Rewards that the option ``rewards`` takes by name, besides registered functions."""
 
 MOST_SCALE = 1e9
 """Largest scale of a term, of either sign, which leaves room for prices in any currency."""
@@ -49,8 +70,9 @@ MAX_PEAK_KW = POWER_LIMITS_W[1] / 1e3
 """Highest power that can be billed, in kW."""
 BILL_DAYS = 30.0
 """Days between two bills."""
-END_OF_DAY_START_H = 23.0
-"""Hour of the day from which queued tasks cost, more and more (paper, F.1)."""
+
+OWN_FIELDS = ("peak_kw", "bills")
+"""Fields of ``TermContext`` that rewards know themselves; ``RewardContext`` has the others."""
 
 _registered: dict[str, RewardFunction] = {}
 
@@ -99,11 +121,12 @@ class Rewards:
         self._bills = days / BILL_DAYS
         self._released = ReleasedRewards() if rewards == "sustaindc" else None
         self._scales: dict[str, dict[str, float]] | None = None
+        self._joint_scales = JOINT_SCALES.get(rewards) if isinstance(rewards, str) else None
         self._function: RewardFunction | None = None
-        if rewards == "default":
-            self._scales = DEFAULT_SCALES
-        elif isinstance(rewards, Mapping):
+        if isinstance(rewards, Mapping):
             self._scales = _checked_scales(rewards)
+        elif isinstance(rewards, str) and rewards in SCALES:
+            self._scales = SCALES[rewards]
         elif self._released is None:
             self._function = rewards if callable(rewards) else _function_named(rewards)
         self.identity: Any = (
@@ -113,14 +136,11 @@ class Rewards:
         self.used_terms = [name for name in TERMS if any(name in own for own in scales.values())]
         self._stage: Any = None
         self._quantities_read: tuple[str, ...] = ()
+        self._context = RewardContext()
+        self._context_read: tuple[str, ...] = ()
         # Highest power that is billed, before the last step and with it, (B,) each.
         self._peak_before_kw = self._peak_kw = np.zeros(0)
-        self._design_kwh = np.zeros(0)
         self._step_h = 0.0
-        self._first_step_of_day: I64 = np.zeros(0, dtype=np.int64)
-        self._demand_charge_per_kw = np.zeros(0)
-        # By step of the day.
-        self._end_of_day_weight = np.zeros(0)
 
     def reset(self, view: View) -> None:
         """Start an episode.
@@ -133,12 +153,7 @@ class Rewards:
         """
         self._peak_before_kw = self._peak_kw = BILLED_SHARE * view.sizing.facility_w / 1e3
         self._step_h = view.step_h
-        self._design_kwh = view.sizing.facility_w * view.step_h / 1e3
-        per_hour = view.fleet.steps_per_hour
-        step_of_day = np.arange(24 * per_hour)
-        self._demand_charge_per_kw = view.fleet.values("tariff.demand_charge_per_kw")
-        self._end_of_day_weight = _end_of_day_weight(step_of_day, view.step_h)
-        self._first_step_of_day = view.state.start % len(step_of_day)
+        self._context.reset(view)
         if self._released is not None:
             self._released.reset(view)
 
@@ -150,8 +165,9 @@ class Rewards:
             view: the view after it.
 
         Returns:
-            Rewards by learning agent, (B,) each, and of all learning agents as one, (B,): their
-            sum, or what a user's function gives for all agents alike.
+            Rewards by learning agent, (B,) each, and of all learning agents as one, (B,): each term
+            once with ``default`` and ``bill``, what a user's function gives for all agents alike,
+            and else the sum.
 
         Raises:
             SdcError: a user's function returned something of another shape, or not finite.
@@ -173,7 +189,7 @@ class Rewards:
 
     def terms(self, result: StepResult, names: Iterable[str] = TERMS) -> dict[str, F64]:
         """Terms of the last step by name, unscaled, (B,) each, whatever the rewards are made of."""
-        context = self._context(result)
+        context = self._term_context(result)
         return {name: TERMS[name](result, context) for name in names}
 
     def peaks_kw(self) -> F64:
@@ -207,12 +223,9 @@ class Rewards:
         """Rewards by learning agent, of all of them as ``joint``, and ``peak_kw``, (B,) each."""
         if self._stage is None:
             self._compile(result)
-        now = self._step_of_day(result)
         found: dict[str, F64] = self._stage(
-            design_kwh=self._design_kwh,
-            peak_kw=self._peak_before_kw,
-            demand_charge_per_kw=self._demand_charge_per_kw,
-            end_of_day_weight=self._end_of_day_weight[now],
+            peak_before_kw=self._peak_before_kw,
+            **self._context.values(result.step, self._context_read),
             **{name: getattr(result, name) for name in self._quantities_read},
         )
         return found
@@ -221,58 +234,41 @@ class Rewards:
         """Find out which quantities of a step the terms read, and compile the terms."""
         from sdc_taichi.kernels.compiler.stage import CompiledStage
 
-        reads = _NotedReads()
+        quantities, context = _NotedReads(), _NotedReads()
         for name in self.used_terms:
-            TERMS[name](reads, self._context(result))  # type: ignore[arg-type]
-        _peak_kw(self._peak_kw, reads)  # type: ignore[arg-type]
-        self._quantities_read = tuple(reads.names)
-        self._stage = CompiledStage(self._stage_function, len(self._design_kwh))
+            TERMS[name](quantities, context)  # type: ignore[arg-type]
+        _peak_kw(self._peak_kw, quantities)  # type: ignore[arg-type]
+        self._quantities_read = tuple(quantities.names)
+        self._context_read = tuple(name for name in context.names if name not in OWN_FIELDS)
+        self._stage = CompiledStage(self._stage_function, result.grid_kwh.size)
 
-    def _stage_function(
-        self,
-        design_kwh: F64,
-        peak_kw: F64,
-        demand_charge_per_kw: F64,
-        end_of_day_weight: F64,
-        **quantities: Any,
-    ) -> dict[str, F64]:
+    def _stage_function(self, peak_before_kw: F64, **read: Any) -> dict[str, F64]:
         """Weighed terms of each agent, shared, from quantities of a step, (B,) each."""
         assert self._scales is not None
-        context = TermContext(
-            design_kwh=design_kwh,
-            demand_charge_per_kw=demand_charge_per_kw,
-            peak_kw=peak_kw,
-            bills=self._bills,
-            end_of_day_weight=end_of_day_weight,
-        )
-        result: Any = SimpleNamespace(step_h=self._step_h, **quantities)
+        own_fields = {"peak_kw": peak_before_kw, "bills": self._bills}
+        in_context = {name: read.pop(name) for name in self._context_read}
+        context: Any = SimpleNamespace(**own_fields, **in_context)
+        result: Any = SimpleNamespace(step_h=self._step_h, **read)
         terms = {name: TERMS[name](result, context) for name in self.used_terms}
-        none: Any = 0.0
-        own = [
-            _sum([scale * terms[name] for name, scale in self._scales[agent].items()] or [none])
-            for agent in AGENTS
-        ]
+        own = [_weighed(terms, self._scales[agent]) for agent in AGENTS]
         by_agent, joint = _with_sum(self._shared(own))
-        return by_agent | {"joint": joint, "peak_kw": _peak_kw(peak_kw, result)}
+        if self._joint_scales is not None:
+            joint = _weighed(terms, self._joint_scales)
+        return by_agent | {"joint": joint, "peak_kw": _peak_kw(peak_before_kw, result)}
 
     def _shared(self, own: Sequence[F64]) -> dict[str, F64]:
         """Collaborative rewards by learning agent, from those of all agents in order."""
         by_agent = dict(zip(AGENTS, collaborative_rewards(own, self._collaboration), strict=True))
         return {agent: by_agent[agent] for agent in self._agents}
 
-    def _context(self, result: StepResult) -> TermContext:
-        now = self._step_of_day(result)
+    def _term_context(self, result: StepResult) -> TermContext:
+        """Everything that terms may refer to, as arrays."""
+        names = [f.name for f in fields(TermContext) if f.name not in OWN_FIELDS]
         return TermContext(
-            design_kwh=self._design_kwh,
-            demand_charge_per_kw=self._demand_charge_per_kw,
             peak_kw=self._peak_before_kw,
             bills=self._bills,
-            end_of_day_weight=self._end_of_day_weight[now],
+            **self._context.values(result.step, names),
         )
-
-    def _step_of_day(self, result: StepResult) -> I64:
-        """Step of the day, counted from 0 at midnight, (B,)."""
-        return (self._first_step_of_day + result.step) % len(self._end_of_day_weight)
 
 
 def collaborative_rewards(own: Sequence[F64], a: float) -> list[F64]:
@@ -307,13 +303,6 @@ def _peak_kw(before_kw: F64, result: StepResult) -> F64:
     return np.maximum(before_kw, result.grid_kwh / result.step_h)
 
 
-def _end_of_day_weight(step_of_day: I64, step_h: float) -> F64:
-    """Weight of queued tasks by step of the day; 1 at the last."""
-    hour, span_h = step_of_day * step_h, 24.0 - step_h - END_OF_DAY_START_H
-    weight = (hour - END_OF_DAY_START_H) / span_h if span_h > 0 else np.ones(len(hour))
-    return np.where(hour >= END_OF_DAY_START_H, weight, 0.0)
-
-
 def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
     """Scales of all agents; those that are not given have their defaults."""
     for agent, scales in given.items():
@@ -334,7 +323,7 @@ def _checked_scales(given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[
                     f"rewards of {agent}: {name} is {scale!r}; valid is a number within "
                     f"-{MOST_SCALE:g}..{MOST_SCALE:g}"
                 )
-    return {agent: dict(given.get(agent, DEFAULT_SCALES[agent])) for agent in AGENTS}
+    return {agent: dict(given.get(agent, SCALES["default"][agent])) for agent in AGENTS}
 
 
 def _function_named(given: Any) -> RewardFunction:
@@ -368,6 +357,12 @@ def _checked_by_agent(
 def _with_sum(by_agent: dict[str, F64]) -> tuple[dict[str, F64], F64]:
     """Rewards by agent, and their sum, (B,)."""
     return by_agent, _sum(list(by_agent.values()))
+
+
+def _weighed(terms: Mapping[str, F64], scales: Mapping[str, float]) -> F64:
+    """Sum of terms times their scales, (B,); 0 without any."""
+    none: Any = 0.0
+    return _sum([scale * terms[name] for name, scale in scales.items()] or [none])
 
 
 def _sum(values: Sequence[F64]) -> F64:
