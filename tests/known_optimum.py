@@ -17,7 +17,9 @@ TASK_VALUE = 1e-4
 """Value of a task that does not wait at the end."""
 
 
-def made_up_optimum(sim: Simulator, steps: int, objective: str = "carbon") -> Optimum:
+def made_up_optimum(
+    sim: Simulator, steps: int, objective: str = "carbon", scored_from: int = 0
+) -> Optimum:
     """An optimum whose achieved path lowers the setpoint by 2 K and uses the battery once."""
     aim = Objective.parse(objective)
     shape = (steps, sim.size)
@@ -25,8 +27,8 @@ def made_up_optimum(sim: Simulator, steps: int, objective: str = "carbon") -> Op
     cooling[0] = -2.0
     battery[:8] = 1.0
     battery[60:] = -1.0
-    idle = run_commands(sim, aim, np.zeros(shape), np.zeros(shape))
-    best = run_commands(sim, aim, cooling, battery)
+    idle = run_commands(sim, aim, np.zeros(shape), np.zeros(shape), scored_from)
+    best = run_commands(sim, aim, cooling, battery, scored_from)
 
     def bound_of_ends(dc: int, ends: Ends) -> float:
         stored, waiting = ends.end_kwh - ends.start_kwh, ends.end_tasks - ends.start_tasks
@@ -41,7 +43,7 @@ def made_up_optimum(sim: Simulator, steps: int, objective: str = "carbon") -> Op
         start=sim.drivers.start.copy(),
         seed=np.zeros(sim.size, dtype=np.int64),
         steps=steps,
-        scored_from=0,
+        scored_from=scored_from,
         inlet_limit_c=np.full(sim.size, np.inf),
         idle=idle.figure,
         idle_dropped_tasks=idle.dropped_tasks,
@@ -63,10 +65,12 @@ def made_up_optimum(sim: Simulator, steps: int, objective: str = "carbon") -> Op
     )
 
 
-def run_commands(sim: Simulator, objective: Objective, cooling: F64, battery: F64) -> Score:
+def run_commands(
+    sim: Simulator, objective: Objective, cooling: F64, battery: F64, scored_from: int
+) -> Score:
     """Score of a run with given commands, (T, B) each."""
     sim.reset(0)
-    score = Score(objective, sim)
+    score = Score(objective, sim, scored_from)
     for cool, store in zip(cooling, battery, strict=True):
         score.add(sim.step(Actions(cooling=cool, battery=store)))
     return score

@@ -14,7 +14,7 @@ from sdc_taichi import ConfigError, DataCenterConfig, Simulator, load_config, pr
 from sdc_taichi.control import make_controller
 from sdc_taichi.optimum import Objective, Optimum, StoppedError, solve
 from sdc_taichi.optimum.entry import OptimumCacheWarning
-from sdc_taichi.optimum.problem import AGENTS, FacilityTable
+from sdc_taichi.optimum.problem import AGENTS, Ends, FacilityTable
 from sdc_taichi.optimum.tables import facility_tables
 from sdc_taichi.run.achievable import AchievedPath, achievement, begin_score
 from sdc_taichi.run.loop import simulate
@@ -228,6 +228,27 @@ def test_what_is_kept_is_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyP
         solved(config_of("CA"), steps=24, cache="kept", objective="energy")
     with pytest.raises(AssertionError, match="solved again"):
         solved(config_of("NY"), steps=24, cache="kept")
+
+
+def test_bounds_of_ends_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ends = Ends(0.0, 0.0, 20.0, 5.0)
+    first = solved(config_of("CA"), steps=24, cache=tmp_path).bound_of_ends(0, ends)
+    (kept,) = tmp_path.glob("*-ends.npz")
+
+    def fails(*_: Any, **__: Any) -> Any:
+        raise AssertionError("solved again")
+
+    monkeypatch.setattr("sdc_taichi.optimum.end_values.bound", fails)
+    again = solved(config_of("CA"), steps=24, cache=tmp_path).bound_of_ends
+    assert again(0, ends) == first
+    with pytest.raises(AssertionError, match="solved again"):
+        again(0, Ends(0.0, 0.0, 20.0, 6.0))
+    kept.write_bytes(kept.read_bytes()[:100])
+    with (
+        pytest.warns(OptimumCacheWarning, match="bounds of ends are solved anew"),
+        pytest.raises(AssertionError, match="solved again"),
+    ):
+        solved(config_of("CA"), steps=24, cache=tmp_path).bound_of_ends(0, ends)
 
 
 def test_files_that_are_damaged_or_swapped_are_solved_anew(tmp_path: Path) -> None:

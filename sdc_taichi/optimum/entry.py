@@ -6,12 +6,15 @@ import hashlib
 import json
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sdc_taichi.errors import SdcError, SdcWarning, printable
+from sdc_taichi.optimum.problem import Ends
 from sdc_taichi.sim import snapshot
 from sdc_taichi.types import F64
 
@@ -99,12 +102,44 @@ class Cache:
 
     def keep(self, key: str, entry: Entry) -> None:
         """Keep an entry, whole or not at all."""
-        path = self._path(key)
+        self._write(self._path(key), _to_arrays(entry, key))
+
+    def find_ends(self, key: str) -> dict[Ends, float]:
+        """Bounds with given ends that are kept under a key.
+
+        Args:
+            key: What ``key_of`` returned.
+        """
+        path = self._path(f"{key}-ends")
+        if not path.is_file():
+            return {}
+        try:
+            arrays = snapshot.read(path)
+            if str(arrays["fingerprint"]) != key:
+                raise ValueError("is of other configs, inputs or options")
+            pairs = zip(arrays["ends"].tolist(), arrays["figures"].tolist(), strict=True)
+            return {Ends(*map(float, ends)): float(figure) for ends, figure in pairs}
+        except (SdcError, ValueError, TypeError, KeyError) as error:
+            _warn(f"{printable(path)}: {error}; bounds of ends are solved anew")
+            return {}
+
+    def keep_ends(self, key: str, figures: Mapping[Ends, float]) -> None:
+        """Keep bounds with given ends, whole or not at all.
+
+        Args:
+            key: What ``key_of`` returned.
+            figures: The bounds.
+        """
+        ends = np.array([astuple(each) for each in figures])
+        values = {"fingerprint": key, "ends": ends, "figures": np.array([*figures.values()])}
+        self._write(self._path(f"{key}-ends"), values)
+
+    def _write(self, path: Path, values: Mapping[str, Any]) -> None:
         try:
             if not path.is_absolute():  # the system knows no home of this user
                 raise OSError("no absolute path")
             path.parent.mkdir(parents=True, exist_ok=True)
-            snapshot.write(path, _to_arrays(entry, key))
+            snapshot.write(path, values)
         except (SdcError, OSError) as error:
             _warn(f"{printable(path.parent)}: optima are not kept ({error})")
 

@@ -123,10 +123,10 @@ def solve(
     )
     kept = None if cache is False else Cache(None if cache is True else Path(cache))
     work = _Work(progress or (lambda _stage, _done, _total: None), stop or (lambda: False))
-    return _optimum(task, work.entries(task, kept))
+    return _optimum(task, work.entries(task, kept), kept)
 
 
-def _optimum(task: Task, entries: Sequence[Entry]) -> Optimum:
+def _optimum(task: Task, entries: Sequence[Entry], cache: Cache | None) -> Optimum:
     """The optimum of a task, from what is known of each data center."""
 
     def each(name: str) -> F64:
@@ -157,7 +157,7 @@ def _optimum(task: Task, entries: Sequence[Entry]) -> Optimum:
         load=paths("load"),
         cooling=paths("cooling"),
         battery=paths("battery"),
-        bound_of_ends=BoundOfEnds(task, [entry.kind for entry in entries]),
+        bound_of_ends=BoundOfEnds(task, [entry.kind for entry in entries], cache),
         discrete=each("discrete") if task.discrete else None,
         discrete_complete=tuple(entry.discrete_complete for entry in entries if task.discrete),
     )

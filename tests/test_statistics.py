@@ -1,0 +1,95 @@
+"""Statistics of controllers: known answers, and intervals that cover what they should."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sdc_taichi import ConfigError
+from sdc_taichi.learning.statistics import (
+    bootstrap_interval,
+    change_pct,
+    interquartile_mean,
+    probability_of_improvement,
+    share_pct,
+)
+from sdc_taichi.types import F64
+
+
+def generator() -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(0))
+
+
+def mean(values: F64) -> F64:
+    return np.asarray(values.mean(axis=(-2, -1)))
+
+
+def test_interquartile_mean_leaves_out_a_quarter_at_each_end() -> None:
+    values = np.array([[9.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, -70.0]])
+    assert interquartile_mean(values) == 3.5
+    assert interquartile_mean(values) == stats.trim_mean(values.ravel(), 0.25)
+    assert interquartile_mean(np.stack([values, 2 * values])).tolist() == [3.5, 7.0]
+
+
+def test_change_and_share_are_of_sums_over_weeks() -> None:
+    idle, achieved = np.array([[100.0, 300.0]]), np.array([[90.0, 270.0]])
+    figures = np.array([[100.0, 280.0], [90.0, 290.0]])
+    assert change_pct(figures, idle) == pytest.approx(-5.0)
+    assert share_pct(figures, idle, achieved) == pytest.approx(50.0)
+    assert share_pct(idle, idle, achieved) == 0.0
+    assert share_pct(achieved, idle, achieved) == pytest.approx(100.0)
+    assert np.isnan(share_pct(figures, idle, idle))
+
+
+def test_probability_of_improvement_is_the_share_of_pairs_that_are_lower() -> None:
+    one, other = np.array([[1.0], [3.0]]), np.array([[2.0], [3.0]])
+    assert probability_of_improvement(one, other) == (1 + 1 + 0 + 0.5) / 4
+    assert probability_of_improvement(other, one) == 1 - (1 + 1 + 0 + 0.5) / 4
+    better = np.array([[0.0, 0.0, 5.0, 0.0]])
+    assert probability_of_improvement(better, np.ones((3, 4))) == 0.75
+
+
+def test_interval_of_one_training_is_that_of_its_weeks() -> None:
+    sample = generator().normal(3.0, 2.0, size=(1, 400))
+    found = bootstrap_interval(mean, [sample], np.zeros(400, dtype=np.int64), generator())
+    half = 1.96 * sample.std() / 20.0
+    assert found.value == pytest.approx(sample.mean())
+    assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.1)
+    assert found.low < found.value < found.high
+
+
+def test_differences_between_strata_do_not_widen_an_interval() -> None:
+    weeks = generator().normal(size=200)
+    strata = np.arange(200) % 2
+    apart = (weeks + 100.0 * strata)[None]
+    mixed = bootstrap_interval(mean, [apart], 0 * strata, generator())
+    found = bootstrap_interval(mean, [apart], strata, generator())
+    alone = bootstrap_interval(mean, [weeks[None]], strata, generator())
+    assert mixed.high - mixed.low > 10.0
+    assert found.high - found.low == pytest.approx(alone.high - alone.low)
+
+
+def test_trainings_are_drawn_whole() -> None:
+    trainings = np.repeat([[1.0], [2.0], [4.0], [5.0]], 50, axis=1)
+    found = bootstrap_interval(mean, [trainings], np.zeros(50, dtype=np.int64), generator())
+    # The spread of a mean of four draws, which no number of weeks makes smaller.
+    spread = np.std([1.0, 2.0, 4.0, 5.0]) / 2
+    assert found.value == 3.0
+    assert (found.high - found.low) / 2 == pytest.approx(1.96 * spread, rel=0.15)
+
+
+def test_weeks_are_paired() -> None:
+    weeks = 100.0 * generator().normal(size=(1, 60)) + 1e4
+    found = bootstrap_interval(
+        lambda one, other: mean(one) - mean(other),
+        [weeks + 1.0, weeks],
+        np.arange(60) // 20,
+        generator(),
+    )
+    np.testing.assert_allclose(found, 1.0, rtol=1e-9)
+
+
+def test_samples_of_other_weeks_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"sample \(2, 5\): valid is \(trainings, 4 weeks\)"):
+        bootstrap_interval(mean, [np.ones((2, 5))], np.zeros(4, dtype=np.int64), generator())
