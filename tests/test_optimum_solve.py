@@ -231,7 +231,7 @@ def test_what_is_kept_is_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_bounds_of_ends_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ends = Ends(0.0, 0.0, 20.0, 5.0)
+    ends = Ends(2.0, 0.0, 1.0, 5.0)
     first = solved(config_of("CA"), steps=24, cache=tmp_path).bound_of_ends(0, ends)
     (kept,) = tmp_path.glob("*-ends.npz")
 
@@ -242,7 +242,7 @@ def test_bounds_of_ends_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     again = solved(config_of("CA"), steps=24, cache=tmp_path).bound_of_ends
     assert again(0, ends) == first
     with pytest.raises(AssertionError, match="solved again"):
-        again(0, Ends(0.0, 0.0, 20.0, 6.0))
+        again(0, Ends(2.0, 0.0, 1.0, 6.0))
     kept.write_bytes(kept.read_bytes()[:100])
     with (
         pytest.warns(OptimumCacheWarning, match="bounds of ends are solved anew"),
