@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sdc_taichi.learning.off_policy import OffPolicyDefinition
 from sdc_taichi.learning.on_policy import OnPolicyDefinition
 
 ON_POLICY: dict[str, OnPolicyDefinition] = {
@@ -12,3 +13,8 @@ ON_POLICY: dict[str, OnPolicyDefinition] = {
     "haa2c": OnPolicyDefinition(critic="state", reward="team", sequential=True, clips=False),
 }
 """Algorithms that learn from the steps that their policies have just made."""
+OFF_POLICY: dict[str, OffPolicyDefinition] = {
+    "had3qn": OffPolicyDefinition(critics=1, soft=False),
+    "hasac": OffPolicyDefinition(critics=2, soft=True),
+}
+"""Algorithms that learn from all steps that a replay holds."""

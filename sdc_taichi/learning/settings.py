@@ -45,3 +45,50 @@ class OnPolicySettings(BaseModel):
     critic: Literal["observation", "state"] | None = None
     """Input of critics: what their learner observes, or the shared state; None is that of the
     algorithm's source."""
+
+
+class OffPolicySettings(BaseModel):
+    """Settings of ``had3qn`` and ``hasac``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    steps_per_update: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 8
+    """Steps of each data center between two updates."""
+    gradient_steps: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 16
+    """Gradient steps of an update, each from a batch of its own."""
+    batch_size: Annotated[int, Field(strict=True, ge=1, le=1_048_576)] = 1024
+    """Transitions of a batch."""
+    replay_size: Annotated[int, Field(strict=True, ge=1, le=100_000_000)] = 262_144
+    """Steps of all data centers together that the replay holds; each takes four bytes for every
+    entry of the shared state and of the observations, in all 170 MB by default."""
+    n_steps: Annotated[int, Field(strict=True, ge=1, le=1000)] = 4
+    """Steps of a transition, n."""
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
+    """Learning rate of Adam for policies and critics."""
+    anneal: bool = True
+    """Whether the learning rate falls to 0 in even steps over the training."""
+    discount: Share = 0.99
+    """Weight of a reward one step later, gamma."""
+    target_rate: Share = 0.005
+    """Share of the way to the critics that their slow copies go in a gradient step, tau."""
+    gradient_norm: Annotated[float, Field(gt=0)] = 10.0
+    """Largest norm of a gradient of a network."""
+    hidden: Hidden = (64, 64)
+    """Units of the hidden layers of policies and critics."""
+    activation: Literal["tanh", "relu"] = "relu"
+    """Activation of all layers but the last."""
+    exploration: Share = 0.05
+    """Lowest probability of a random choice, epsilon; of ``had3qn``."""
+    exploration_share: Share = 0.5
+    """Share of the training over which the probability of a random choice falls from 1; of
+    ``had3qn``."""
+    temperature: Annotated[float, Field(gt=0, le=100)] = 0.01
+    """Weight of the entropy at the beginning, alpha; of ``hasac``."""
+    temperature_rate: Annotated[float, Field(ge=0, le=1)] = 1e-3
+    """Learning rate of Adam for temperatures, 0 for constant ones; of ``hasac``."""
+    entropy_share: Share = 0.3
+    """Wanted entropy of discrete actions as a share of the largest, log 3 for each number; of
+    ``hasac``."""
+    continuous_entropy: float = -1.0
+    """Wanted differential entropy of each continuous number, nats; log 2 is the largest; of
+    ``hasac``."""

@@ -1,0 +1,329 @@
+"""HAD3QN and HASAC: one update, of which each algorithm is a case.
+
+All agents act for some steps, which a replay holds with many before them. Then batches of
+transitions over n steps are drawn from it. E critics Q_e of the shared state and the actions of all
+learners together fit
+
+    y = r_0 + ... + gamma^(n-1) r_(n-1) + gamma^n V(s_n),
+
+by Adam, where r is the mean of the learners' rewards and V comes from slow copies of the critics.
+Episodes are cut off, never over, so that V counts at their end too. The algorithms differ in V and
+in how learners follow the critics, one after another in random order:
+
+- ``had3qn`` (Zhong et al. 2024) has one critic, which is dueling (Wang et al. 2016). V is the value
+  of each learner's best choice by its own values (double, van Hasselt et al. 2016), which follow
+  the critic's. Agents act at random with a probability that falls over the training.
+- ``hasac`` (Liu et al. 2024) has two critics, of which the lower value counts. V is soft: the
+  expected value under the policies and their entropies, each weighed by a temperature. Learners
+  maximise it.
+
+The source of HASAC has a further temperature for the critic; here the critic's V has those of the
+learners, so that critic and learners pursue one sum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import accumulate
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.learning.action_values import ContinuousValues, JointValues
+from sdc_taichi.learning.networks import layers_of
+from sdc_taichi.learning.normalise import CLIP, RunningMoments
+from sdc_taichi.learning.off_policy_actors import (
+    GaussianActors,
+    GreedyActors,
+    Situation,
+    SoftActors,
+    adam,
+    descend,
+)
+from sdc_taichi.learning.policy import PolicyNetwork
+from sdc_taichi.learning.replay import Replay, Transitions
+from sdc_taichi.learning.settings import OffPolicySettings
+from sdc_taichi.learning.stream import CHOICES, EnvironmentStream, LearnerSpaces
+
+STATE = "state"
+"""Name of the shared state's columns."""
+LEAST_SCALE = 1e-6
+"""Least standard deviation of returns to divide by."""
+
+
+class OffPolicyDefinition(NamedTuple):
+    """What sets an off-policy algorithm apart."""
+
+    critics: int
+    """Number of critics, of which the lowest value counts."""
+    soft: bool
+    """Whether policies are drawn from and paid for their entropy, or else choices are the best by
+    value but for random ones."""
+
+
+class OffPolicy:
+    """A learner for each policy, updated from transitions drawn from a replay.
+
+    Args:
+        definition: what sets the algorithm apart.
+        settings: settings.
+        spaces: what each learner sees and does.
+        state_width: number of entries of the shared state, m.
+        updates: number of updates of the whole training, over which exploration falls.
+        seed: of weights, actions, order of learners and of transitions.
+
+    Attributes:
+        steps_per_update: steps of each data center in an update.
+
+    Raises:
+        ConfigError: actions that the algorithm does not take.
+    """
+
+    def __init__(
+        self,
+        definition: OffPolicyDefinition,
+        settings: OffPolicySettings,
+        spaces: Mapping[str, LearnerSpaces],
+        state_width: int,
+        *,
+        updates: int,
+        seed: int,
+    ) -> None:
+        self._settings, self._spaces, self._updates = settings, dict(spaces), updates
+        self.steps_per_update = settings.steps_per_update
+        self._done = 0
+        names = ("weights", "actions", "batches", "order")
+        self._generators = {
+            name: torch.Generator().manual_seed(seed * len(names) + i)
+            for i, name in enumerate(names)
+        }
+        self._columns = _columns(spaces, state_width)
+        self._numbers = sum(of.action_width for of in spaces.values())
+        self._soft = definition.soft
+        self._critic, self._actors = _critic_and_actors(
+            definition, settings, self._spaces, state_width, self._generators["weights"]
+        )
+        self._targets = [x.detach().clone() for x in self._critic.parameters]
+        self._adam = adam(self._critic.parameters, settings.learning_rate)
+        self._moments = RunningMoments(self._columns[-1][1].stop)
+        self._rewards = RunningMoments(1)
+        self._returns = RunningMoments(1)
+        self._running_return = torch.zeros(0)
+        self._replay: Replay | None = None
+
+    @property
+    def exploration(self) -> float:
+        """Probability of a random choice in the update under way."""
+        s = self._settings
+        done = self._done / max(1.0, s.exploration_share * self._updates)
+        return max(s.exploration, 1.0 - (1.0 - s.exploration) * done)
+
+    def update(self, stream: EnvironmentStream) -> dict[str, float]:
+        """Act for ``steps_per_update`` steps, and learn from what the replay holds.
+
+        Args:
+            stream: the environments.
+
+        Returns:
+            Numbers to log: ``reward/NAME``, the mean over steps; means of losses, entropies and
+            temperatures over gradient steps; ``exploration`` of algorithms that have it.
+        """
+        if self._replay is None:
+            self._replay = self._new_replay(stream.size)
+        logged = self._collect(stream, self._replay)
+        self._anneal()
+        totals: dict[str, Tensor] = {}
+        for _ in range(self._settings.gradient_steps):
+            for name, value in self._learn(self._replay).items():
+                totals[name] = totals[name] + value if name in totals else value
+        logged |= {n: float(x) / self._settings.gradient_steps for n, x in totals.items()}
+        self._done += 1
+        return logged
+
+    def networks(self) -> tuple[PolicyNetwork, ...]:
+        """The policies as they are, which take the best choice or the mean."""
+        columns = dict(self._columns)
+        mean, std = self._moments.mean.float().numpy(), self._moments.std.numpy()
+        found = []
+        for name, of in self._spaces.items():
+            *inner, (weight, bias) = layers_of(self._actors.nets[name])
+            outputs = of.action_width * (CHOICES if of.discrete else 1)
+            found.append(
+                PolicyNetwork(
+                    agents=of.agents,
+                    mean=mean[columns[name]].copy(),
+                    std=std[columns[name]].copy(),
+                    clip=CLIP,
+                    layers=(*inner, (weight[:outputs], bias[:outputs])),
+                    activation=self._settings.activation,
+                    head=self._actors.head,
+                )
+            )
+        return tuple(found)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides how the training goes on, the replay included."""
+        return {
+            "done": self._done,
+            "generators": {n: g.get_state() for n, g in self._generators.items()},
+            "critic": {str(i): x.detach() for i, x in enumerate(self._critic.parameters)},
+            "targets": {str(i): x for i, x in enumerate(self._targets)},
+            "adam": self._adam.state_dict(),
+            "actors": self._actors.state_dict(),
+            "moments": {n: m.state_dict() for n, m in self._all_moments().items()},
+            "running_return": self._running_return,
+            "replay": {} if self._replay is None else self._replay.state_dict(),
+        }
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> None:
+        """Go on from what ``state_dict`` returned, of an algorithm made alike."""
+        self._done = int(values["done"])
+        for name, generator in self._generators.items():
+            generator.set_state(values["generators"][name])
+        with torch.no_grad():
+            for i, (own, slow) in enumerate(
+                zip(self._critic.parameters, self._targets, strict=True)
+            ):
+                own.copy_(values["critic"][str(i)])
+                slow.copy_(values["targets"][str(i)])
+        self._adam.load_state_dict(values["adam"])
+        self._actors.load_state_dict(values["actors"])
+        for name, moments in self._all_moments().items():
+            moments.load_state_dict(values["moments"][name])
+        self._running_return = torch.as_tensor(values["running_return"]).clone()
+        self._replay = None
+        if values["replay"]:
+            self._replay = self._new_replay(len(self._running_return))
+            self._replay.load_state_dict(values["replay"])
+
+    def _all_moments(self) -> dict[str, RunningMoments]:
+        return {"seen": self._moments, "rewards": self._rewards, "returns": self._returns}
+
+    def _new_replay(self, num_envs: int) -> Replay:
+        return Replay(
+            self._settings.replay_size,
+            num_envs,
+            self._columns[-1][1].stop,
+            self._numbers,
+            steps=self._settings.n_steps,
+            discount=self._settings.discount,
+        )
+
+    # Acting
+
+    def _collect(self, stream: EnvironmentStream, replay: Replay) -> dict[str, float]:
+        """Act with the policies as they are, and return the mean reward of each learner."""
+        rewards = {name: torch.zeros(()) for name in self._spaces}
+        seen = []
+        with torch.no_grad():
+            for _ in range(self.steps_per_update):
+                before = torch.cat([stream.state, *(stream.observations[n] for n in rewards)], 1)
+                seen.append(before)
+                actions = self._actors.act(
+                    self._situation(before), self.exploration, self._generators["actions"]
+                )
+                parts = self._actors.numbers.items()
+                after = stream.step({name: actions[:, part] for name, part in parts})
+                reward = torch.stack([after.rewards[n] for n in rewards]).mean(0)
+                replay.add(before, actions, reward)
+                self._measure(reward)
+                if after.ended:
+                    ends = (after.next_observations[n] for n in rewards)
+                    replay.end(torch.cat([after.next_state, *ends], 1))
+                for name in rewards:
+                    rewards[name] += after.rewards[name].mean()
+            self._moments.add(torch.cat(seen))
+        logged = {f"reward/{n}": float(x) / self.steps_per_update for n, x in rewards.items()}
+        return logged if self._soft else logged | {"exploration": self.exploration}
+
+    def _measure(self, reward: Tensor) -> None:
+        """Take the reward of a step, (B,), into the moments of rewards and of returns."""
+        self._rewards.add(reward.unsqueeze(-1))
+        if not len(self._running_return):
+            self._running_return = torch.zeros_like(reward)
+        above = reward - self._rewards.mean.float()
+        self._running_return = self._settings.discount * self._running_return + above
+        self._returns.add(self._running_return.unsqueeze(-1))
+
+    def _situation(self, columns: Tensor) -> Situation:
+        """What critic and learners see, normalised, from what they see side by side."""
+        normal = self._moments.normalise(columns)
+        state, *others = ((name, normal[:, part]) for name, part in self._columns)
+        return Situation(state[1], dict(others))
+
+    # Learning
+
+    def _anneal(self) -> None:
+        """Lower the learning rate, in even steps to 0 over the training."""
+        if self._settings.anneal:
+            rate = self._settings.learning_rate * max(0.0, 1.0 - self._done / self._updates)
+            for optimiser in (self._adam, *self._actors.adams.values()):
+                optimiser.param_groups[0]["lr"] = rate
+
+    def _learn(self, replay: Replay) -> dict[str, Tensor]:
+        """Take a step of the critics, then of each learner, then of the slow critics."""
+        s = self._settings
+        drawn = replay.sample(s.batch_size, self._generators["batches"])
+        before, after = self._situation(drawn.before), self._situation(drawn.after)
+        with torch.no_grad():
+            targets = self._critic_targets(drawn, after)
+        loss = critic_loss(self._critic.of_actions(before.state, drawn.actions), targets)
+        descend(loss, self._critic.parameters, self._adam, s.gradient_norm)
+        logged = self._actors.improve(before, self._generators["order"])
+        with torch.no_grad():
+            for slow, own in zip(self._targets, self._critic.parameters, strict=True):
+                slow.lerp_(own, s.target_rate)
+        return {"critic_loss": loss.detach(), **logged}
+
+    def _critic_targets(self, drawn: Transitions, after: Situation) -> Tensor:
+        """Values that the critics learn, (N,).
+
+        Rewards count from their mean, as none ends an episode, and in standard deviations of the
+        discounted return, so that values are of order one whatever the reward is.
+        """
+        discount = self._settings.discount
+        later = discount**drawn.steps
+        terms = (1.0 - later) / (1.0 - discount) if discount < 1.0 else drawn.steps
+        scale = self._returns.variance.sqrt().clamp_min(LEAST_SCALE).float()
+        returns = (drawn.returns - terms * self._rewards.mean.float()) / scale
+        generator = self._generators["order"]
+        return returns + later * self._actors.next_values(self._targets, after, generator)
+
+
+def critic_loss(values: Tensor, targets: Tensor) -> Tensor:
+    """Half the mean squared error, summed over the critics.
+
+    Args:
+        values: values by critic, (E, N).
+        targets: values to learn, (N,).
+    """
+    return 0.5 * (values - targets).square().mean(-1).sum()
+
+
+def _columns(spaces: Mapping[str, LearnerSpaces], state_width: int) -> list[tuple[str, slice]]:
+    """Columns of the shared state and of each learner's observation, side by side."""
+    widths = [(STATE, state_width), *((n, of.observation_width) for n, of in spaces.items())]
+    ends = list(accumulate(width for _, width in widths))
+    return [(n, slice(end - width, end)) for (n, width), end in zip(widths, ends, strict=True)]
+
+
+def _critic_and_actors(
+    definition: OffPolicyDefinition,
+    settings: OffPolicySettings,
+    spaces: Mapping[str, LearnerSpaces],
+    state_width: int,
+    generator: torch.Generator,
+) -> tuple[JointValues | ContinuousValues, GreedyActors | SoftActors | GaussianActors]:
+    """Critics, and the policies that follow them."""
+    numbers = sum(of.action_width for of in spaces.values())
+    shape = definition.critics, state_width, numbers, settings, generator
+    if all(of.discrete for of in spaces.values()):
+        table = JointValues(*shape)
+        kind = SoftActors if definition.soft else GreedyActors
+        return table, kind(table, spaces, settings, generator)
+    if not definition.soft:
+        raise ConfigError("had3qn: takes discrete actions alone; valid with continuous is hasac")
+    critic = ContinuousValues(*shape)
+    return critic, GaussianActors(critic, spaces, settings, generator)

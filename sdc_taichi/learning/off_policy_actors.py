@@ -1,0 +1,479 @@
+"""Policies that learn from a critic of joint actions: those of HAD3QN and of HASAC.
+
+Learners improve one after another in random order, each against what those before it have become
+and what those after it still are (Zhong et al. 2024): no two of them move for the same gain.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from sdc_taichi.learning.action_values import ContinuousValues, JointValues, expected
+from sdc_taichi.learning.networks import perceptron
+from sdc_taichi.learning.settings import OffPolicySettings
+from sdc_taichi.learning.stream import CHOICES, LearnerSpaces
+
+LEAST_LOG_STD, MOST_LOG_STD = -5.0, 2.0
+"""Limits of the logarithm of standard deviations of continuous actions before they are squashed."""
+LAST_GAIN = 0.01
+"""Gain of the last weights of a policy, which begins with almost equal choices."""
+
+
+class Situation(NamedTuple):
+    """What critic and learners see of N environments, normalised."""
+
+    state: Tensor
+    """Shared state, (N, m)."""
+    observations: dict[str, Tensor]
+    """Observations by learner, (N, n) each."""
+
+
+class Actors:
+    """Networks of all learners, whose K numbers stand side by side.
+
+    Args:
+        spaces: what each learner sees and does.
+        settings: settings.
+        outputs: outputs of a network for each number.
+        generator: source of the weights.
+
+    Attributes:
+        nets: network of each learner.
+        adams: optimiser of each learner's network.
+        numbers: columns of each learner's numbers among all.
+        head: what makes actions of the first outputs, as ``PolicyNetwork`` names it.
+    """
+
+    head: Literal["argmax", "tanh"] = "argmax"
+
+    def __init__(
+        self,
+        spaces: Mapping[str, LearnerSpaces],
+        settings: OffPolicySettings,
+        outputs: int,
+        generator: torch.Generator,
+    ) -> None:
+        self._settings = settings
+        self.nets: dict[str, nn.Sequential] = {}
+        self.numbers: dict[str, slice] = {}
+        self.adams: dict[str, torch.optim.Adam] = {}
+        first = 0
+        for name, of in spaces.items():
+            self.nets[name] = net = perceptron(
+                of.observation_width,
+                settings.hidden,
+                outputs * of.action_width,
+                activation=settings.activation,
+                last_gain=LAST_GAIN,
+                generator=generator,
+            )
+            self.adams[name] = adam(net.parameters(), settings.learning_rate)
+            self.numbers[name] = slice(first, first + of.action_width)
+            first += of.action_width
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that ``load_state_dict`` needs."""
+        return {
+            name: {"net": net.state_dict(), "adam": self.adams[name].state_dict()}
+            for name, net in self.nets.items()
+        }
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> None:
+        """Go on from what ``state_dict`` returned."""
+        for name, net in self.nets.items():
+            net.load_state_dict(values[name]["net"])
+            self.adams[name].load_state_dict(values[name]["adam"])
+
+    def _choice_outputs(self, situation: Situation) -> Tensor:
+        """Outputs for each choice of each number, (N, K, 3)."""
+        return torch.cat(
+            [
+                self.nets[name](seen).unflatten(-1, (-1, CHOICES))
+                for name, seen in situation.observations.items()
+            ],
+            dim=1,
+        )
+
+    def _descend(self, loss: Tensor, name: str) -> None:
+        """Take a step of a learner's network down a loss."""
+        descend(
+            loss, list(self.nets[name].parameters()), self.adams[name], self._settings.gradient_norm
+        )
+
+    def _order(self, generator: torch.Generator) -> list[str]:
+        """Learners in random order."""
+        names = list(self.nets)
+        return [names[i] for i in torch.randperm(len(names), generator=generator).tolist()]
+
+
+class GreedyActors(Actors):
+    """Individual values of each choice, of which the best is taken: HAD3QN (Zhong et al. 2024).
+
+    Each learner's values follow the row of the critic's table in which the others do what they do,
+    those before it in a random order already their best choice in the table. The source fits the
+    value of the best choice alone; the row has the same value there and two more.
+
+    Args:
+        critic: values that the policies follow.
+        spaces: what each learner sees and does.
+        settings: settings.
+        generator: source of the weights.
+    """
+
+    def __init__(
+        self,
+        critic: JointValues,
+        spaces: Mapping[str, LearnerSpaces],
+        settings: OffPolicySettings,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__(spaces, settings, CHOICES, generator)
+        self._critic = critic
+
+    def act(self, situation: Situation, exploration: float, generator: torch.Generator) -> Tensor:
+        """Best choices, (N, K), each replaced by a random one with a probability.
+
+        Args:
+            situation: what is seen.
+            exploration: the probability, epsilon.
+            generator: source of the draws.
+        """
+        best = self._choice_outputs(situation).argmax(-1)
+        explores = torch.rand(best.shape, generator=generator) < exploration
+        return torch.where(explores, torch.randint(CHOICES, best.shape, generator=generator), best)
+
+    def next_values(
+        self, targets: Sequence[Tensor], after: Situation, _: torch.Generator
+    ) -> Tensor:
+        """Values of the best choices by the target critic, (N,) (van Hasselt et al. 2016)."""
+        best = self._choice_outputs(after).argmax(-1)
+        return self._critic.of_actions(after.state, best, targets).amin(0)
+
+    def improve(self, situation: Situation, generator: torch.Generator) -> dict[str, Tensor]:
+        """Fit individual values to the critic's table, and return the loss of each learner."""
+        outputs = self._choice_outputs(situation)
+        with torch.no_grad():
+            table = self._critic(situation.state).amin(0)
+            order = [
+                number
+                for name in self._order(generator)
+                for number in range(*self.numbers[name].indices(outputs.shape[1]))
+            ]
+            rows = best_replies(table, outputs.argmax(-1), order)
+            rows -= rows.mean(-1, keepdim=True)
+        losses = {}
+        for name, numbers in self.numbers.items():
+            loss = (outputs[:, numbers] - rows[:, numbers]).square().mean()
+            self._descend(loss, name)
+            losses[f"policy_loss/{name}"] = loss.detach()
+        return losses
+
+
+class EntropicActors(Actors):
+    """Policies drawn from, with a reward for their entropy.
+
+    Each learner has a temperature of its own, tuned so that its entropy meets a target (Haarnoja et
+    al. 2018).
+
+    Args:
+        spaces: what each learner sees and does.
+        settings: settings.
+        outputs: outputs of a network for each number.
+        entropy: wanted entropy of each number, nats.
+        generator: source of the weights.
+    """
+
+    def __init__(
+        self,
+        spaces: Mapping[str, LearnerSpaces],
+        settings: OffPolicySettings,
+        outputs: int,
+        entropy: float,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__(spaces, settings, outputs, generator)
+        targets = {name: entropy * of.action_width for name, of in spaces.items()}
+        self._temperatures = Temperatures(targets, settings)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that ``load_state_dict`` needs."""
+        return super().state_dict() | {"temperatures": self._temperatures.state_dict()}
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> None:
+        """Go on from what ``state_dict`` returned."""
+        super().load_state_dict(values)
+        self._temperatures.load_state_dict(values["temperatures"])
+
+    def _step(self, name: str, loss: Tensor, entropy: Tensor) -> dict[str, Tensor]:
+        """Move a learner down its loss and its temperature by its entropy; numbers to log."""
+        self._descend(loss, name)
+        self._temperatures.follow(name, entropy)
+        return {
+            f"policy_loss/{name}": loss.detach(),
+            f"entropy/{name}": entropy,
+            f"temperature/{name}": self._temperatures.of(name),
+        }
+
+
+class SoftActors(EntropicActors):
+    """Independent choices of each learner, paid for their entropy: HASAC (Liu et al. 2024).
+
+    The critic has an output for each joint action, so that all expected values are exact (as
+    Christodoulou 2019 for one agent).
+
+    Args:
+        critic: values that the policies follow.
+        spaces: what each learner sees and does.
+        settings: settings.
+        generator: source of the weights.
+    """
+
+    def __init__(
+        self,
+        critic: JointValues,
+        spaces: Mapping[str, LearnerSpaces],
+        settings: OffPolicySettings,
+        generator: torch.Generator,
+    ) -> None:
+        entropy = settings.entropy_share * math.log(CHOICES)
+        super().__init__(spaces, settings, CHOICES, entropy, generator)
+        self._critic = critic
+
+    def act(self, situation: Situation, _: float, generator: torch.Generator) -> Tensor:
+        """Choices drawn from the policies, (N, K)."""
+        scores = self._choice_outputs(situation)
+        noise = torch.empty_like(scores).exponential_(generator=generator).log_()
+        return (scores - noise).argmax(-1)
+
+    def next_values(
+        self, targets: Sequence[Tensor], after: Situation, _: torch.Generator
+    ) -> Tensor:
+        """Soft values of the target critic, (N,): expected value and entropies by temperature."""
+        log_p = self._choice_outputs(after).log_softmax(-1)
+        value = expected(self._critic(after.state, targets).amin(0), log_p.exp()).squeeze(-1)
+        return value + sum(
+            self._temperatures.of(name) * entropies(log_p[:, numbers])
+            for name, numbers in self.numbers.items()
+        )
+
+    def improve(self, situation: Situation, generator: torch.Generator) -> dict[str, Tensor]:
+        """Raise the soft value by one learner after another, and return losses and entropies."""
+        with torch.no_grad():
+            table = self._critic(situation.state).amin(0)
+            probabilities = self._choice_outputs(situation).softmax(-1)
+        logged: dict[str, Tensor] = {}
+        for name in self._order(generator):
+            numbers = self.numbers[name]
+            own = range(*numbers.indices(probabilities.shape[1]))
+            values = expected(table, probabilities, own)
+            log_p = self._log_p(name, situation)
+            loss = soft_policy_loss(log_p, values, self._temperatures.of(name))
+            logged |= self._step(name, loss, entropies(log_p.detach()).mean())
+            with torch.no_grad():
+                probabilities[:, numbers] = self._log_p(name, situation).exp()
+        return logged
+
+    def _log_p(self, name: str, situation: Situation) -> Tensor:
+        """Logarithms of a learner's probabilities of each choice, (N, k, 3)."""
+        scores = self.nets[name](situation.observations[name])
+        return scores.unflatten(-1, (-1, CHOICES)).log_softmax(-1)
+
+
+class GaussianActors(EntropicActors):
+    """Continuous actions of each learner, paid for their entropy: HASAC (Liu et al. 2024).
+
+    An action is the hyperbolic tangent of a normal number (Haarnoja et al. 2018), through which
+    gradients of the critic reach the policy.
+
+    Args:
+        critic: values that the policies follow.
+        spaces: what each learner sees and does.
+        settings: settings.
+        generator: source of the weights.
+    """
+
+    head = "tanh"
+
+    def __init__(
+        self,
+        critic: ContinuousValues,
+        spaces: Mapping[str, LearnerSpaces],
+        settings: OffPolicySettings,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__(spaces, settings, 2, settings.continuous_entropy, generator)
+        self._critic = critic
+
+    def act(self, situation: Situation, _: float, generator: torch.Generator) -> Tensor:
+        """Actions drawn from the policies, (N, K)."""
+        return self._draw_all(situation, generator)[0]
+
+    def next_values(
+        self, targets: Sequence[Tensor], after: Situation, generator: torch.Generator
+    ) -> Tensor:
+        """Soft values of drawn actions by the target critic, (N,)."""
+        actions, log_p = self._draw_all(after, generator)
+        value = self._critic.of_actions(after.state, actions, targets).amin(0)
+        return value - sum(self._temperatures.of(name) * log_p[name] for name in self.nets)
+
+    def improve(self, situation: Situation, generator: torch.Generator) -> dict[str, Tensor]:
+        """Raise the soft value by one learner after another, and return losses and entropies."""
+        with torch.no_grad():
+            actions, _ = self._draw_all(situation, generator)
+        logged: dict[str, Tensor] = {}
+        for name in self._order(generator):
+            numbers = self.numbers[name]
+            own, log_p = self._draw(name, situation, generator)
+            joint = torch.cat([actions[:, : numbers.start], own, actions[:, numbers.stop :]], 1)
+            value = self._critic.of_actions(situation.state, joint).amin(0)
+            loss = (self._temperatures.of(name) * log_p - value).mean()
+            logged |= self._step(name, loss, -log_p.detach().mean())
+            with torch.no_grad():
+                actions[:, numbers] = self._draw(name, situation, generator)[0]
+        return logged
+
+    def _draw_all(
+        self, situation: Situation, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Actions of all learners, (N, K), and logarithms of the density of each, (N,)."""
+        drawn = {name: self._draw(name, situation, generator) for name in self.nets}
+        joint = torch.cat([actions for actions, _ in drawn.values()], dim=1)
+        return joint, {name: log_p for name, (_, log_p) in drawn.items()}
+
+    def _draw(
+        self, name: str, situation: Situation, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Actions of a learner, (N, k), and logarithms of their densities, (N,)."""
+        mean, log_std = self.nets[name](situation.observations[name]).chunk(2, dim=-1)
+        log_std = log_std.clamp(LEAST_LOG_STD, MOST_LOG_STD)
+        noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype)
+        return squashed(mean, log_std, noise)
+
+
+class Temperatures:
+    """Weights of the entropy of each learner, tuned so that it meets a target.
+
+    Args:
+        targets: wanted entropy of each learner, nats.
+        settings: settings.
+    """
+
+    def __init__(self, targets: Mapping[str, float], settings: OffPolicySettings) -> None:
+        self._targets = dict(targets)
+        start = math.log(settings.temperature)
+        self._logs = {name: torch.tensor(start, requires_grad=True) for name in targets}
+        self._adam = {
+            name: adam([log], settings.temperature_rate) for name, log in self._logs.items()
+        }
+
+    def of(self, name: str) -> Tensor:
+        """Temperature of a learner, ()."""
+        return self._logs[name].detach().exp()
+
+    def follow(self, name: str, entropy: Tensor) -> None:
+        """Raise the temperature of a learner whose entropy is below its target, or lower it."""
+        loss = self._logs[name] * (entropy - self._targets[name])
+        descend(loss, [self._logs[name]], self._adam[name], math.inf)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that ``load_state_dict`` needs."""
+        return {
+            name: {"log": log.detach(), "adam": self._adam[name].state_dict()}
+            for name, log in self._logs.items()
+        }
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> None:
+        """Go on from what ``state_dict`` returned."""
+        for name, log in self._logs.items():
+            with torch.no_grad():
+                log.copy_(torch.as_tensor(values[name]["log"]))
+            self._adam[name].load_state_dict(values[name]["adam"])
+
+
+def adam(parameters: Any, learning_rate: float) -> torch.optim.Adam:
+    """Adam (Kingma, Ba 2015) with one pass over all parameters."""
+    return torch.optim.Adam(parameters, learning_rate, fused=True)
+
+
+def descend(
+    loss: Tensor, parameters: Sequence[Tensor], optimiser: torch.optim.Adam, norm: float
+) -> None:
+    """Take a step down a loss, along which nothing but the parameters changes.
+
+    Args:
+        loss: the loss, ().
+        parameters: what the optimiser moves.
+        optimiser: moves them.
+        norm: largest norm of the gradient.
+    """
+    for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
+        parameter.grad = gradient
+    if norm < math.inf:
+        nn.utils.clip_grad_norm_(parameters, norm)
+    optimiser.step()
+
+
+def best_replies(table: Tensor, choices: Tensor, order: Sequence[int]) -> Tensor:
+    """Values of each number's choices while the others stay, one number after another.
+
+    Args:
+        table: values of all joint actions, (N, 3^K).
+        choices: choices before any has moved, (N, K).
+        order: numbers in the order in which they move to their best choice.
+
+    Returns:
+        Values, (N, K, 3).
+    """
+    taken = nn.functional.one_hot(choices, CHOICES).to(table.dtype)
+    rows = torch.empty_like(taken)
+    for number in order:
+        row = expected(table, taken, (number,))
+        rows[:, number] = row
+        taken[:, number] = nn.functional.one_hot(row.argmax(-1), CHOICES).to(table.dtype)
+    return rows
+
+
+def soft_policy_loss(log_p: Tensor, values: Tensor, temperature: Tensor) -> Tensor:
+    """Negative of the soft value of k independent choices (Christodoulou 2019, eq. 12).
+
+    Args:
+        log_p: logarithms of the probabilities of each choice, (N, k, 3).
+        values: values of all combinations of the choices, (N, 3^k).
+        temperature: weight of the entropy, ().
+    """
+    value = expected(values, log_p.exp()).squeeze(-1)
+    return -(value + temperature * entropies(log_p)).mean()
+
+
+def entropies(log_p: Tensor) -> Tensor:
+    """Entropies of independent choices, (N,), nats.
+
+    Args:
+        log_p: logarithms of the probabilities of each choice, (N, k, 3).
+    """
+    return -(log_p.exp() * log_p).sum((-1, -2))
+
+
+def squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Hyperbolic tangents of normal numbers, and logarithms of their densities.
+
+    With u = mean + std noise, the density of tanh(u) is that of u over 1 - tanh(u)^2 (Haarnoja et
+    al. 2018, appendix C), whose logarithm is 2 (log 2 - u - softplus(-2 u)).
+
+    Args:
+        mean: means, (N, k).
+        log_std: logarithms of standard deviations, (N, k).
+        noise: standard normal numbers, (N, k).
+
+    Returns:
+        Actions, (N, k), and logarithms of their densities, (N,).
+    """
+    u = mean + log_std.exp() * noise
+    normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2.0 * math.pi)
+    slope = 2.0 * (math.log(2.0) - u - nn.functional.softplus(-2.0 * u))
+    return u.tanh(), (normal - slope).sum(-1)

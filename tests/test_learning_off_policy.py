@@ -1,0 +1,373 @@
+"""HAD3QN and HASAC: losses, replay, games with known answers, and going on to the same bits."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar, Literal
+
+import pytest
+
+torch = pytest.importorskip("torch", reason="torch is not installed: make test-train")
+
+from torch import Tensor  # noqa: E402
+
+from sdc_taichi.errors import ConfigError, SdcError  # noqa: E402
+from sdc_taichi.learning.action_values import JointValues, expected  # noqa: E402
+from sdc_taichi.learning.algorithms import OFF_POLICY  # noqa: E402
+from sdc_taichi.learning.off_policy import OffPolicy, critic_loss  # noqa: E402
+from sdc_taichi.learning.off_policy_actors import (  # noqa: E402
+    Temperatures,
+    best_replies,
+    entropies,
+    soft_policy_loss,
+    squashed,
+)
+from sdc_taichi.learning.replay import Replay  # noqa: E402
+from sdc_taichi.learning.settings import OffPolicySettings  # noqa: E402
+from sdc_taichi.learning.stream import LearnerSpaces, StreamStep  # noqa: E402
+
+SMALL = OffPolicySettings(
+    steps_per_update=2,
+    gradient_steps=2,
+    batch_size=64,
+    replay_size=2048,
+    n_steps=1,
+    learning_rate=0.01,
+    anneal=False,
+    discount=0.9,
+    target_rate=0.05,
+    hidden=(16,),
+    temperature=0.1,
+)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+class Game:
+    """A game of several learners in 32 rooms at once, which all of them see and are paid in."""
+
+    size: ClassVar = 32
+    length: ClassVar = 2
+    situations: ClassVar[int]
+
+    def __init__(self, learners: int = 2, discrete: bool = True, width: int = 1) -> None:
+        names = [f"player_{i}" for i in range(learners)]
+        self.spaces = {n: LearnerSpaces((n,), self.situations, width, discrete) for n in names}
+        self.state_width = self.situations
+        self.room = torch.zeros(self.size, dtype=torch.int64)
+        self.turn = 0
+
+    @property
+    def state(self) -> Tensor:
+        return torch.nn.functional.one_hot(self.room, self.situations).float()
+
+    @property
+    def observations(self) -> dict[str, Tensor]:
+        return {name: self.state for name in self.spaces}
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Rewards and next rooms of joint actions, (32, K)."""
+        raise NotImplementedError
+
+    def step(self, actions: dict[str, Tensor]) -> StreamStep:
+        reward, self.room = self.play(self.room, torch.cat(list(actions.values()), 1))
+        after = self.observations, self.state
+        self.turn += 1
+        ended = self.turn % self.length == 0
+        if ended:
+            self.room = torch.zeros_like(self.room)
+        return StreamStep({name: reward for name in self.spaces}, ended, *after)
+
+
+class Coordination(Game):
+    """The reward of two players is best where both choose 0, the only choices that none leaves.
+
+    Against a player who chooses at random, 2 is better.
+    """
+
+    situations = 1
+    rewards = torch.tensor([[5.0, -3.0, 4.0], [-3.0, 1.0, 2.0], [4.0, 2.0, 3.0]])
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        return self.rewards[actions[:, 0], actions[:, 1]], room
+
+
+class Meeting(Game):
+    """Three choices are paid best as 0, 1 and 2, and less with each that differs."""
+
+    situations = 1
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        right = actions == torch.arange(actions.shape[1])
+        return right.float().mean(1) - 1.0, room
+
+
+class Patience(Game):
+    """Choice 2 leads to a room that pays 3, and choice 0 pays 1 at once: greedy is wrong."""
+
+    situations = 2
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        first, choice = room == 0, actions[:, 0]
+        reward = torch.where(first, (choice == 0).float(), 0.0)
+        reward = torch.where(room == 1, 3.0, reward)
+        return reward, torch.where(first & (choice == 2), 1, 0)
+
+
+class Aim(Game):
+    """The reward of players is highest where their numbers are 0.5 and -0.5."""
+
+    situations = 1
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        aim = torch.tensor([0.5, -0.5])[: actions.shape[1]]
+        return -(actions - aim).square().sum(1), room
+
+
+def algorithm(
+    name: str,
+    game: Game,
+    settings: OffPolicySettings = SMALL,
+    *,
+    updates: int = 200,
+    seed: int = 0,
+) -> Any:
+    return OffPolicy(
+        OFF_POLICY[name], settings, game.spaces, game.state_width, updates=updates, seed=seed
+    )
+
+
+def trained(
+    name: str, game: Game, updates: int = 100, **changes: Any
+) -> tuple[Any, dict[str, float]]:
+    learner = algorithm(name, game, SMALL.model_copy(update=changes), updates=updates)
+    for _ in range(updates):
+        numbers = learner.update(game)
+    return learner, numbers
+
+
+def outputs(learner: Any, game: Game, room: int) -> list[Any]:
+    """Outputs of the policies in one situation, by learner."""
+    seen = torch.nn.functional.one_hot(torch.tensor(room), game.situations).float().numpy()
+    found = []
+    for net in learner.networks():
+        x = (seen - net.mean) / net.std
+        for i, (weight, bias) in enumerate(net.layers):
+            x = weight @ (x.clip(0.0) if i else x) + bias
+        found.append(x)
+    return found
+
+
+def best(learner: Any, game: Game, room: int = 0) -> list[list[int]]:
+    return [x.reshape(-1, 3).argmax(-1).tolist() for x in outputs(learner, game, room)]
+
+
+def normal(*shape: int, seed: int = 0, requires_grad: bool = False) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    values = torch.randn(*shape, generator=generator, dtype=torch.float64)
+    return values.requires_grad_(requires_grad)
+
+
+def test_gradients_of_losses_agree_with_finite_differences() -> None:
+    values, table = normal(5, 9), normal(5, 27)
+    temperature = torch.tensor(0.3, dtype=torch.float64)
+
+    def policy(scores: Tensor) -> Tensor:
+        return soft_policy_loss(scores.log_softmax(-1), values, temperature)
+
+    def squashed_policy(mean: Tensor, log_std: Tensor) -> Tensor:
+        actions, log_p = squashed(mean, log_std, normal(5, 2, seed=3))
+        return (0.3 * log_p + actions.square().sum(-1)).mean()
+
+    check = torch.autograd.gradcheck
+    assert check(policy, (normal(5, 2, 3, seed=1, requires_grad=True),))
+    assert check(critic_loss, (normal(2, 5, seed=1, requires_grad=True), normal(5, seed=2)))
+    assert check(
+        squashed_policy,
+        (normal(5, 2, seed=1, requires_grad=True), normal(5, 2, seed=2, requires_grad=True)),
+    )
+    assert check(lambda p: expected(table, p, {1}), (normal(5, 3, 3, requires_grad=True),))
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_gradient_of_a_critic_agrees_with_finite_differences(
+    activation: Literal["tanh", "relu"],
+) -> None:
+    settings = OffPolicySettings(hidden=(4,), activation=activation)
+    critic = JointValues(2, 3, 2, settings, torch.Generator().manual_seed(0))
+    state, actions, targets = normal(6, 3), torch.tensor([[0, 1], [2, 2]]).repeat(3, 1), normal(6)
+
+    def loss(*parameters: Tensor) -> Tensor:
+        return critic_loss(critic.of_actions(state, actions, parameters), targets)
+
+    own = tuple(p.detach().double().requires_grad_() for p in critic.parameters)
+    assert torch.autograd.gradcheck(loss, own)
+
+
+def test_a_dueling_table_has_every_joint_action_in_the_order_of_its_choices() -> None:
+    critic = JointValues(1, 2, 3, SMALL, torch.Generator().manual_seed(0))
+    state = torch.randn(1, 2, generator=torch.Generator().manual_seed(1))
+    table = critic(state)[0, 0]
+    for i, choices in enumerate(itertools.product(range(3), repeat=3)):
+        assert critic.of_actions(state, torch.tensor([choices]))[0, 0] == table[i]
+    assert len(table.unique()) == 27
+
+
+def test_the_expected_value_is_that_of_sampled_choices() -> None:
+    generator = torch.Generator().manual_seed(0)
+    table = torch.randn(1, 27, generator=generator)
+    probabilities = torch.rand(1, 3, 3, generator=generator).softmax(-1)
+    drawn = torch.multinomial(probabilities[0], 40_000, replacement=True, generator=generator)
+    sampled = table[0, (drawn * torch.tensor([[9], [3], [1]])).sum(0)]
+    error = sampled.std() / math.sqrt(len(sampled))
+    assert abs(expected(table, probabilities)[0, 0] - sampled.mean()) < 4 * error
+
+
+def test_the_expected_value_of_open_choices_is_that_of_each_of_them() -> None:
+    table = normal(2, 27)
+    probabilities = normal(2, 3, 3, seed=1).softmax(-1)
+    rows = expected(table, probabilities, (0, 2))
+    for first, last in itertools.product(range(3), repeat=2):
+        fixed = probabilities.clone()
+        fixed[:, 0] = torch.nn.functional.one_hot(torch.tensor(first), 3)
+        fixed[:, 2] = torch.nn.functional.one_hot(torch.tensor(last), 3)
+        torch.testing.assert_close(rows[:, 3 * first + last], expected(table, fixed)[:, 0])
+
+
+def test_even_choices_have_the_largest_entropy() -> None:
+    even = torch.full((1, 2, 3), 1 / 3).log()
+    assert entropies(even).item() == pytest.approx(2 * math.log(3))
+
+
+def test_the_density_of_squashed_numbers_integrates_to_one() -> None:
+    actions = torch.linspace(-0.9999, 0.9999, 20_001, dtype=torch.float64)[:, None]
+    mean, log_std = torch.full_like(actions, 0.4), torch.full_like(actions, -0.5)
+    noise = (actions.atanh() - mean) / log_std.exp()
+    drawn, log_p = squashed(mean, log_std, noise)
+    torch.testing.assert_close(drawn, actions)
+    assert torch.trapezoid(log_p.exp(), actions[:, 0]).item() == pytest.approx(1.0, abs=1e-3)
+
+
+def test_each_choice_is_the_best_reply_to_those_before_it() -> None:
+    table = Coordination.rewards.flatten()[None]
+    choices = torch.tensor([[2, 2]])
+    first, second = best_replies(table, choices, [0, 1])[0]
+    assert first.tolist() == [4.0, 2.0, 3.0]
+    assert second.tolist() == [5.0, -3.0, 4.0]  # the first has moved to 0
+
+
+def filled_replay(
+    steps: int, *, rows: int = 6, n_steps: int = 3, ends: Sequence[int] = ()
+) -> Replay:
+    """Step t of environment e has situation and action 10 t + e and reward 1."""
+    replay = Replay(2 * rows, 2, 1, 1, steps=n_steps, discount=0.5)
+    for t in range(steps):
+        at = torch.tensor([[10.0 * t], [10.0 * t + 1]])
+        replay.add(at, at, torch.ones(2))
+        if t in ends:
+            replay.end(at + 10.0)
+    return replay
+
+
+def drawn_from(replay: Replay) -> set[tuple[float, ...]]:
+    drawn = replay.sample(400, torch.Generator().manual_seed(0))
+    columns = drawn.before[:, 0], drawn.actions[:, 0], drawn.steps, drawn.returns, drawn.after[:, 0]
+    return set(zip(*(x.tolist() for x in columns), strict=True))
+
+
+def test_transitions_take_n_steps_or_those_that_there_are() -> None:
+    wanted = {(0, 3, 1.75, 30), (10, 2, 1.5, 30), (20, 1, 1.0, 30)}
+    expected_rows = {(b + e, b + e, n, r, a + e) for b, n, r, a in wanted for e in (0, 1)}
+    assert drawn_from(filled_replay(4)) == expected_rows
+
+
+def test_transitions_end_with_the_situation_that_their_episode_was_cut_off_in() -> None:
+    # Two steps, the end at 20, then steps from 20 on of the next episode.
+    wanted = {(0, 2, 1.5, 20), (10, 1, 1.0, 20), (20, 1, 1.0, 30)}
+    expected_rows = {(b + e, b + e, n, r, a + e) for b, n, r, a in wanted for e in (0, 1)}
+    assert drawn_from(filled_replay(4, ends=[1])) == expected_rows
+
+
+def test_a_full_replay_holds_the_latest_steps() -> None:
+    befores = {before // 10 for before, *_ in drawn_from(filled_replay(20))}
+    assert befores == {14, 15, 16, 17, 18}
+
+
+def test_a_replay_goes_on_from_its_state() -> None:
+    first, second = filled_replay(8, ends=[6]), filled_replay(1)
+    second.load_state_dict(first.state_dict())
+    assert drawn_from(second) == drawn_from(first)
+    with pytest.raises(SdcError, match="state: replay is"):
+        filled_replay(1, rows=5).load_state_dict(first.state_dict())
+
+
+def test_a_replay_too_small_for_its_transitions_is_refused() -> None:
+    with pytest.raises(ConfigError, match="replay_size 8: holds 4 steps of 2 data centers"):
+        Replay(8, 2, 1, 1, steps=3, discount=0.9)
+
+
+@pytest.mark.parametrize("name", ["had3qn", "hasac"])
+def test_players_find_the_best_joint_choice(name: str) -> None:
+    game = Coordination()
+    assert best(trained(name, game)[0], game) == [[0], [0]]
+
+
+@pytest.mark.parametrize("name", ["had3qn", "hasac"])
+def test_one_player_may_make_several_choices(name: str) -> None:
+    game = Meeting(learners=1, width=3)
+    assert best(trained(name, game)[0], game) == [[0, 1, 2]]
+
+
+@pytest.mark.parametrize("name", ["had3qn", "hasac"])
+def test_players_forgo_a_reward_for_a_larger_one_later(name: str) -> None:
+    game = Patience(learners=1)
+    assert best(trained(name, game)[0], game) == [[2]]
+
+
+def test_continuous_players_find_the_best_numbers() -> None:
+    game = Aim(discrete=False)
+    found = [math.tanh(x[0]) for x in outputs(trained("hasac", game)[0], game, 0)]
+    assert found == pytest.approx([0.5, -0.5], abs=0.2)
+
+
+def test_temperatures_rise_below_the_wanted_entropy_and_fall_above_it() -> None:
+    temperatures = Temperatures({"low": 0.5, "high": 0.5}, SMALL)
+    temperatures.follow("low", torch.tensor(0.1))
+    temperatures.follow("high", torch.tensor(0.9))
+    assert temperatures.of("low") > SMALL.temperature > temperatures.of("high")
+
+
+@pytest.mark.parametrize(
+    ("name", "discrete"), [("had3qn", True), ("hasac", True), ("hasac", False)]
+)
+def test_training_goes_on_from_its_state_to_the_same_bits(name: str, discrete: bool) -> None:
+    games = [Aim(discrete=discrete) for _ in range(2)]
+    whole, part, other = (algorithm(name, games[0], seed=seed) for seed in (3, 3, 4))
+    for _ in range(3):
+        whole.update(games[0])
+        part.update(games[1])
+    other.load_state_dict(part.state_dict())
+    assert [other.update(games[1]) for _ in range(3)] == [whole.update(games[0]) for _ in range(3)]
+    for one, two in zip(whole.networks(), other.networks(), strict=True):
+        pairs = zip(itertools.chain(*one.layers), itertools.chain(*two.layers), strict=True)
+        assert all((x == y).all() for x, y in pairs)
+
+
+def test_seeds_make_a_difference() -> None:
+    one, two = (algorithm("hasac", Aim(), seed=seed).update(Aim()) for seed in (0, 1))
+    assert one != two
+
+
+def test_actions_that_an_algorithm_does_not_take_are_refused() -> None:
+    with pytest.raises(ConfigError, match="had3qn: takes discrete actions alone"):
+        algorithm("had3qn", Aim(discrete=False))
+    with pytest.raises(ConfigError, match="7 discrete choices in a step are 2187 joint actions"):
+        algorithm("hasac", Meeting(learners=1, width=7))
