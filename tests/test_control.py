@@ -461,6 +461,10 @@ def test_a_name_is_registered_once() -> None:
     [
         (f"{__name__}:AlwaysCharge:20", "AlwaysCharge takes no text"),
         (f"load={__name__}:AlwaysCharge", "does not act on load; it gives battery"),
+        (
+            "sdc_taichi.control:FixedSetpoint",
+            "missing 1 .*a class that needs no arguments",
+        ),
         (f"{__name__}:Missing", "cannot be imported .*Missing"),
         ("no_such_module:name", "unknown; valid: idle, .*or an import path module:name"),
         ("json.no_such:name", "cannot be imported"),

@@ -17,6 +17,7 @@ from sdc_taichi.cli.config import config_app
 from sdc_taichi.cli.data import data_app
 from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.cli.optimum import optimum_command
+from sdc_taichi.cli.policy import policy_app
 from sdc_taichi.cli.report import report_command
 from sdc_taichi.cli.session import warnings_in_lines
 from sdc_taichi.cli.simulate import simulate_command
@@ -56,6 +57,7 @@ app = typer.Typer(
 app.add_typer(config_app, name="config")
 app.add_typer(data_app, name="data")
 app.add_typer(hall_app, name="hall")
+app.add_typer(policy_app, name="policy")
 app.command("report")(report_command)
 app.command("view")(view_command)
 app.command("simulate")(simulate_command)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import sys
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any, NamedTuple
@@ -233,12 +234,14 @@ def _made_by_maker(
     maker = _registered.get(kind)
     if maker is None:
         attribute, _, rest = text.partition(":")
-        maker, text = f"{kind}:{attribute}" if _is_path(kind, attribute) else None, rest
-        if maker is not None and not imports:
+        is_path = all(part.isidentifier() for part in (*kind.split("."), attribute))
+        if is_path and not imports:
             raise ConfigError(
                 f"controller {name!r}: is an import path, and code that a file names is not run; "
                 "valid is a name that register_controller gave it"
             )
+        if is_path and ("." in kind or kind in sys.modules or importlib.util.find_spec(kind)):
+            maker, text = f"{kind}:{attribute}", rest
     if maker is None:
         valid = controller_names()
         meant = suggestion(name, valid, _SUGGESTION)
@@ -251,7 +254,13 @@ def _made_by_maker(
     if isinstance(maker, type):
         if text:
             raise ConfigError(f"controller {name!r}: {maker.__name__} takes no text; valid is none")
-        made = maker()
+        try:
+            made = maker()
+        except TypeError as error:
+            raise ConfigError(
+                f"controller {name!r}: {error}; valid is a class that needs no arguments, or a "
+                "function of the text after the name, the fleet, and the agents it is named for"
+            ) from None
     else:
         made = maker(text, fleet, parts or CONTROLLABLE)
     controller = check_controller(made, f"controller {name!r}")
@@ -262,14 +271,6 @@ def _made_by_maker(
             f"controller {name!r}: does not act on {agent}; it gives {', '.join(given) or 'none'}"
         )
     return controller
-
-
-def _is_path(module: str, attribute: str) -> bool:
-    """Whether two texts may be a module and a name in it."""
-    first, *more = module.split(".")
-    if not all(part.isidentifier() for part in (attribute, first, *more)):
-        return False
-    return bool(more) or importlib.util.find_spec(first) is not None
 
 
 def _constant(text: str, fleet: Fleet) -> Controller:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field, ValidationError
 
 from sdc_taichi.atomic_file import atomic_write
@@ -170,7 +171,7 @@ class Policy:
                 f"policy: networks of {', '.join(served)}; valid is one for each of "
                 f"{', '.join(self.interface.agents)}"
             )
-        for network, entries in zip(self.networks, self._entries, strict=True):
+        for network, entries in zip(self.networks, self.entries, strict=True):
             who = f"policy: network of {', '.join(network.agents)}"
             width = sum(len(np.arange(self.interface.width(a))[e]) for a, e in entries.items())
             if network.sizes[0] != width:
@@ -189,7 +190,7 @@ class Policy:
     def actions(self, observations: Mapping[str, F32]) -> dict[str, F32 | I64]:
         """Actions of each agent, (B, k), from the observations of each agent, (B, n)."""
         found: dict[str, F32 | I64] = {}
-        for network, entries in zip(self.networks, self._entries, strict=True):
+        for network, entries in zip(self.networks, self.entries, strict=True):
             parts = [observations[agent][:, of_agent] for agent, of_agent in entries.items()]
             actions = network.actions(parts[0] if len(parts) == 1 else np.concatenate(parts, 1))
             first = 0
@@ -200,13 +201,32 @@ class Policy:
         return {agent: found[agent] for agent in self.interface.agents}
 
     @cached_property
-    def _entries(self) -> tuple[dict[str, Any], ...]:
-        """For each network, the entries of each agent's observation that it reads, side by side."""
+    def entries(self) -> tuple[dict[str, npt.NDArray[np.int64] | slice], ...]:
+        """For each network, the entries of each agent's observation that it reads side by side."""
         features = self.interface.features
         return tuple(
             entries_of_new_features({agent: features[agent] for agent in network.agents})
             for network in self.networks
         )
+
+    def description(self) -> str:
+        """Everything but the arrays, as JSON."""
+        described = _Description(
+            format=_FORMAT,
+            about=self.about,
+            interface=self.interface,
+            networks=tuple(
+                _NetworkDescription(
+                    agents=network.agents,
+                    sizes=network.sizes,
+                    activation=network.activation,
+                    clip=network.clip,
+                    head=network.head,
+                )
+                for network in self.networks
+            ),
+        )
+        return described.model_dump_json(indent=1)
 
     def save(self, folder: Path) -> None:
         """Write the policy into a folder, in place of one that is there.
@@ -221,31 +241,17 @@ class Policy:
         """
         from safetensors.numpy import save
 
-        description = {
-            "format": _FORMAT,
-            "about": self.about.model_dump(mode="json"),
-            "interface": self.interface.model_dump(mode="json"),
-            "networks": [
-                {
-                    "agents": network.agents,
-                    "sizes": network.sizes,
-                    "activation": network.activation,
-                    "clip": network.clip,
-                    "head": network.head,
-                }
-                for network in self.networks
-            ],
-        }
         tensors = {
             f"{i}.{name}": values
             for i, network in enumerate(self.networks)
             for name, values in _tensors(network).items()
         }
-        content = save(tensors, {_HEADER_KEY: json.dumps(description)})
+        text = self.description()
+        content = save(tensors, {_HEADER_KEY: text})
         with atomic_write(folder / WEIGHTS, parents=True) as file:
             file.write(content)
         with atomic_write(folder / DESCRIPTION) as file:
-            file.write(json.dumps(description, indent=1).encode() + b"\n")
+            file.write(text.encode() + b"\n")
 
     @classmethod
     def load(cls, folder: Path) -> Policy:

@@ -1,0 +1,78 @@
+"""``sdc-taichi policy``: what a policy is, and policies for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sdc_taichi.cli.arguments import check_out_file, force_option, json_option, out_option
+from sdc_taichi.errors import printable
+
+if TYPE_CHECKING:
+    from sdc_taichi.learning.policy import Policy
+
+policy_app = typer.Typer(help="Show and export policies.", no_args_is_help=True)
+Folder = Annotated[
+    Path, typer.Argument(metavar="FOLDER", help="Folder of a training run, or of a policy.")
+]
+
+
+@policy_app.command("show")
+def show_policy(
+    folder: Folder,
+    as_json: Annotated[bool, json_option("Print policy.json instead.")] = False,
+) -> None:
+    """Say where a policy comes from, what it observes and what it decides."""
+    from sdc_taichi.learning.policy import Policy, policy_folder
+
+    policy = Policy.load(folder)
+    if as_json:
+        print(policy.description())
+        return
+    print(f"{printable(policy_folder(folder))}: {printable(_origin(policy))}")
+    for label, text in _facts(policy):
+        print(f"  {label:<12} {printable(text)}")
+
+
+@policy_app.command("export")
+def export_policy(
+    folder: Folder,
+    out: Annotated[Path, out_option("File to write, ending in .onnx.", "FILE.onnx")],
+    force: Annotated[bool, force_option()] = False,
+) -> None:
+    """Write a policy as an ONNX model, with its scaling of observations."""
+    from sdc_taichi.learning.export import export_onnx
+    from sdc_taichi.learning.policy import Policy
+
+    check_out_file(out, ".onnx", force=force)
+    policy = Policy.load(folder)
+    export_onnx(policy, out)
+    print(f"{printable(out)}: inputs {', '.join(policy.interface.agents)}")
+
+
+def _origin(policy: Policy) -> str:
+    """Where a policy comes from, in one line."""
+    about = policy.about
+    parts = [about.algorithm, f"{about.steps:,} steps"]
+    parts += [] if about.seed is None else [f"seed {about.seed}"]
+    parts += [f"sdc-taichi {about.version}"] if about.version else []
+    return ", ".join(parts)
+
+
+def _facts(policy: Policy) -> list[tuple[str, str]]:
+    """What a policy observes and decides, label by label."""
+    fits = policy.interface
+    order = "" if fits.action_order is None else f", order {fits.action_order}"
+    facts = [("others", policy.about.others), ("actions", f"{fits.actions}{order}")]
+    facts += [("step", f"{fits.step_min} min"), ("observations", fits.observations)]
+    for label, number in (("CRAC units", fits.crac_units), ("racks", fits.racks)):
+        facts += [] if number is None else [(label, str(number))]
+    for network in policy.networks:
+        sizes = " x ".join(map(str, network.sizes))
+        facts.append(("network", f"{', '.join(network.agents)}: {sizes}, {network.activation}"))
+    for agent in fits.agents:
+        names = (f.name if f.size == 1 else f"{f.name} ({f.size})" for f in fits.features[agent])
+        facts.append((agent, f"{', '.join(fits.commands[agent])} by {', '.join(names)}"))
+    return facts

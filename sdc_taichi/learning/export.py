@@ -1,0 +1,149 @@
+"""Policies as ONNX graphs, for runtimes that know nothing of this package.
+
+Inputs are the observations of each agent by its name, f32 (batch, n), as environments give them;
+outputs are ``AGENT_action``, (batch, k), and ``AGENT_scores``, the outputs of the last layer.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.atomic_file import atomic_write
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.learning.policy import CHOICES, Policy, PolicyNetwork
+
+OPSET = 17
+"""Version of ONNX's operators."""
+_IR_VERSION = 8
+
+
+def export_onnx(policy: Policy, path: Path) -> None:
+    """Write a policy as an ONNX model, its interface and origin among the metadata.
+
+    Args:
+        policy: the policy.
+        path: file to write.
+
+    Raises:
+        ConfigError: ONNX is not installed.
+        SdcError: the file cannot be written.
+    """
+    try:
+        import onnx
+    except ImportError:
+        raise ConfigError(
+            'onnx is not installed; valid is after pip install "sdc-taichi[onnx]"'
+        ) from None
+    graph = _Graph(onnx)
+    for agent in policy.interface.agents:
+        graph.add_input(agent, policy.interface.width(agent))
+    for number, network in enumerate(policy.networks):
+        _add_network(graph, policy, number, network)
+    model = graph.model({"about": policy.about, "interface": policy.interface})
+    with atomic_write(path) as file:
+        file.write(model.SerializeToString())
+
+
+def _add_network(graph: _Graph, policy: Policy, number: int, network: PolicyNetwork) -> None:
+    """Nodes from the observations of a network's agents to their actions."""
+    parts = [
+        graph.columns(agent, np.arange(policy.interface.width(agent))[entries])
+        for agent, entries in policy.entries[number].items()
+    ]
+    x = parts[0] if len(parts) == 1 else graph.node("Concat", *parts, axis=1)
+    x = graph.node("Sub", x, graph.constant(network.mean))
+    x = graph.node("Div", x, graph.constant(network.std))
+    x = _between(graph, x, network.clip)
+    activation = {"tanh": "Tanh", "relu": "Relu"}[network.activation]
+    for i, (weight, bias) in enumerate(network.layers):
+        x = graph.node("Gemm", x, graph.constant(weight), graph.constant(bias), transB=1)
+        if i + 1 < len(network.layers):
+            x = graph.node(activation, x)
+    actions = _actions(graph, network, x)
+    scores_of_number = CHOICES if network.head == "argmax" else 1
+    first = 0
+    for agent in network.agents:
+        numbers = np.arange(first, first + policy.interface.action_width(agent))
+        first += len(numbers)
+        scores = (numbers[:, None] * scores_of_number + np.arange(scores_of_number)).reshape(-1)
+        kind = np.int64 if network.head == "argmax" else np.float32
+        graph.add_output(f"{agent}_action", graph.columns(actions, numbers), len(numbers), kind)
+        graph.add_output(f"{agent}_scores", graph.columns(x, scores), len(scores), np.float32)
+
+
+def _actions(graph: _Graph, network: PolicyNetwork, scores: str) -> str:
+    """Actions of a network from its outputs."""
+    if network.head == "argmax":
+        shape = graph.constant(np.array([-1, network.action_width, CHOICES], dtype=np.int64))
+        return graph.node("ArgMax", graph.node("Reshape", scores, shape), axis=2, keepdims=0)
+    return graph.node("Tanh", scores) if network.head == "tanh" else _between(graph, scores, 1.0)
+
+
+def _between(graph: _Graph, x: str, most: float) -> str:
+    """Values cut at ``-most`` and ``most``."""
+    low, high = (graph.constant(np.float32(limit)) for limit in (-most, most))
+    return graph.node("Clip", x, low, high)
+
+
+class _Graph:
+    """A graph under construction; values are known by their names.
+
+    Args:
+        onnx: the module.
+    """
+
+    def __init__(self, onnx: Any) -> None:
+        self._onnx = onnx
+        self._nodes: list[Any] = []
+        self._constants: list[Any] = []
+        self._inputs: list[Any] = []
+        self._outputs: list[Any] = []
+
+    def add_input(self, name: str, width: int) -> None:
+        """Add an input, f32 (batch, width)."""
+        self._inputs.append(self._value(name, width, np.float32))
+
+    def add_output(self, name: str, source: str, width: int, kind: Any) -> None:
+        """Add an output, (batch, width), that is a value by another name."""
+        self._nodes.append(self._onnx.helper.make_node("Identity", [source], [name]))
+        self._outputs.append(self._value(name, width, kind))
+
+    def constant(self, values: npt.ArrayLike) -> str:
+        """Name of a constant."""
+        name = f"constant_{len(self._constants)}"
+        self._constants.append(self._onnx.numpy_helper.from_array(np.asarray(values), name))
+        return name
+
+    def node(self, kind: str, *inputs: str, **attributes: Any) -> str:
+        """Name of the output of an operator."""
+        name = f"value_{len(self._nodes)}"
+        self._nodes.append(self._onnx.helper.make_node(kind, inputs, [name], **attributes))
+        return name
+
+    def columns(self, source: str, numbers: npt.NDArray[np.int64]) -> str:
+        """Name of some columns of a value."""
+        return self.node("Gather", source, self.constant(numbers.astype(np.int64)), axis=1)
+
+    def model(self, metadata: dict[str, Any]) -> Any:
+        """The model with its metadata, checked."""
+        helper = self._onnx.helper
+        graph = helper.make_graph(
+            self._nodes, "policy", self._inputs, self._outputs, self._constants
+        )
+        opset = helper.make_opsetid("", OPSET)
+        model = helper.make_model(
+            graph, producer_name="sdc-taichi", opset_imports=[opset], ir_version=_IR_VERSION
+        )
+        texts = {name: json.dumps(part.model_dump(mode="json")) for name, part in metadata.items()}
+        helper.set_model_props(model, texts)
+        self._onnx.checker.check_model(model)
+        return model
+
+    def _value(self, name: str, width: int, kind: Any) -> Any:
+        element = self._onnx.helper.np_dtype_to_tensor_dtype(np.dtype(kind))
+        return self._onnx.helper.make_tensor_value_info(name, element, ["batch", width])
