@@ -263,13 +263,14 @@ class OnPolicy:
             at_ends[-1] = True
             ends = of.inputs.normalise(after[at_ends])
             next_values[at_ends] = of.net(ends).squeeze(-1) * std + mean
-        rewards = self._rewards_of(critic, rollout)
-        advantages = torch.empty_like(rewards)
-        later = torch.zeros(rewards.shape[1])
-        for t in range(len(rewards) - 1, -1, -1):
-            delta = rewards[t] + s.discount * next_values[t] - values[t]
-            later = delta + s.discount * s.gae_lambda * (1.0 - rollout.ended[t]) * later
-            advantages[t] = later
+        advantages = generalised_advantages(
+            self._rewards_of(critic, rollout),
+            values,
+            next_values,
+            rollout.ended,
+            discount=s.discount,
+            gae_lambda=s.gae_lambda,
+        )
         targets = (advantages + values).flatten()
         self._rescale(of, targets)
         flat = advantages.flatten()
@@ -387,6 +388,34 @@ class OnPolicy:
     def _adam(self, net: nn.Module) -> torch.optim.Adam:
         rate = self._settings.learning_rate
         return torch.optim.Adam(net.parameters(), rate, eps=ADAM_EPSILON, fused=True)
+
+
+def generalised_advantages(
+    rewards: Tensor,
+    values: Tensor,
+    next_values: Tensor,
+    ended: Tensor,
+    *,
+    discount: float,
+    gae_lambda: float,
+) -> Tensor:
+    """Generalised advantages of steps (Schulman et al. 2016, eq. 16), (T, B).
+
+    Args:
+        rewards: rewards, (T, B).
+        values: values before each step, (T, B).
+        next_values: values after each step, of the same episode, (T, B).
+        ended: 1 where the episodes were cut off after the step, else 0, (T,).
+        discount: weight of a reward one step later.
+        gae_lambda: weight of later steps in the advantage.
+    """
+    errors = rewards + discount * next_values - values
+    advantages = torch.empty_like(rewards)
+    later = torch.zeros_like(rewards[0])
+    for t in range(len(rewards) - 1, -1, -1):
+        later = errors[t] + discount * gae_lambda * (1.0 - ended[t]) * later
+        advantages[t] = later
+    return advantages
 
 
 def policy_loss(ratio: Tensor, advantages: Tensor, clip: float | None) -> Tensor:

@@ -1,0 +1,136 @@
+"""Games with known answers, as streams of transitions for tests of learners."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from sdc_taichi.learning.stream import LearnerSpaces, StreamStep
+
+
+class Game:
+    """A game of several players in many tables at once, whose rooms all of them see.
+
+    All players are paid the same, and the shared state is what each observes. Episodes begin in
+    room 0 and are cut off together.
+
+    Args:
+        players: number of players.
+        discrete: whether players choose among three, or else numbers within -1..1.
+        width: numbers that a player decides.
+    """
+
+    size: ClassVar = 32
+    rooms: ClassVar = 1
+    length: ClassVar = 2
+
+    def __init__(self, players: int = 1, discrete: bool = True, width: int = 1) -> None:
+        names = [f"player_{i}" for i in range(players)]
+        self.spaces = {n: LearnerSpaces((n,), self.rooms, width, discrete) for n in names}
+        self.learners = tuple(names)
+        self.state_width = self.rooms
+        self.room = torch.zeros(self.size, dtype=torch.int64)
+        self.turn = 0
+
+    @property
+    def state(self) -> Tensor:
+        return torch.nn.functional.one_hot(self.room, self.rooms).float()
+
+    @property
+    def observations(self) -> dict[str, Tensor]:
+        return {name: self.state for name in self.spaces}
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Pay of each table and its next room, of actions of all players, (B, players * k)."""
+        raise NotImplementedError
+
+    def pay(self, player: int, pay: Tensor) -> Tensor:
+        """What a player is paid, (B,)."""
+        return pay
+
+    def first_room(self) -> Tensor:
+        """Rooms that the next episodes begin in, (B,)."""
+        return torch.zeros_like(self.room)
+
+    def step(self, actions: dict[str, Tensor]) -> StreamStep:
+        pay, self.room = self.play(self.room, torch.cat(list(actions.values()), 1))
+        after = self.observations, self.state
+        self.turn += 1
+        ended = self.turn % self.length == 0
+        if ended:
+            self.room = self.first_room()
+        rewards = {name: self.pay(i, pay) for i, name in enumerate(self.spaces)}
+        return StreamStep(rewards, ended, *after)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"room": self.room.clone(), "turn": self.turn}
+
+    def load_state_dict(self, values: dict[str, Any]) -> None:
+        self.room, self.turn = values["room"].clone(), values["turn"]
+
+
+class Meeting(Game):
+    """Choices are paid best as 0, 1, 2, 0 ..., and less with each that differs."""
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        right = actions == torch.arange(actions.shape[1]) % 3
+        return right.float().mean(1), room
+
+
+class Patience(Game):
+    """Choice 0 pays 1 at once; choice 2 pays nothing, and leads to a room where any pays 3."""
+
+    rooms = 2
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        choice = actions[:, 0]
+        pay = torch.where(room == 1, 3.0, (choice == 0).float())
+        return pay, ((room == 0) & (choice == 2)).long()
+
+
+class Aim(Game):
+    """Numbers are paid best as 0.5 and -0.5 in turn."""
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        aim = torch.tensor([0.5, -0.5]).repeat(actions.shape[1])[: actions.shape[1]]
+        return -(actions - aim).square().sum(1), room
+
+
+class Rooms(Game):
+    """Chance leads from room to room, and what is paid depends on the room, action and player."""
+
+    rooms = 3
+    length = 5
+
+    def __init__(self, players: int = 1, discrete: bool = True, width: int = 1) -> None:
+        super().__init__(players, discrete, width)
+        self.chance = torch.Generator().manual_seed(7)
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        pay = (room + 1.0) * actions.float().sum(1)
+        return pay, torch.randint(0, self.rooms, room.shape, generator=self.chance)
+
+    def pay(self, player: int, pay: Tensor) -> Tensor:
+        return pay * (player + 1.0)
+
+    def state_dict(self) -> dict[str, Any]:
+        return super().state_dict() | {"chance": self.chance.get_state()}
+
+    def load_state_dict(self, values: dict[str, Any]) -> None:
+        super().load_state_dict(values)
+        self.chance.set_state(values["chance"])
+
+
+class Turnstile(Game):
+    """Room 0 pays 1 for ever and room 1 nothing; episodes of 5 steps begin in one and the other."""
+
+    rooms = 2
+    length = 5
+
+    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        return (room == 0).float(), room
+
+    def first_room(self) -> Tensor:
+        return torch.full_like(self.room, (self.turn // self.length) % 2)
