@@ -29,7 +29,7 @@ from sdc_taichi.learning.settings import OffPolicySettings  # noqa: E402
 from sdc_taichi.learning.stream import LearnerSpaces, StreamStep  # noqa: E402
 
 SMALL = OffPolicySettings(
-    steps_per_update=2,
+    rollout_steps=2,
     gradient_steps=2,
     batch_size=64,
     replay_size=2048,

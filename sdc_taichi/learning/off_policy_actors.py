@@ -265,15 +265,15 @@ class SoftActors(EntropicActors):
         """Raise the soft value by one learner after another, and return losses and entropies."""
         with torch.no_grad():
             table = self._critic(situation.state).amin(0)
-            probabilities = self._choice_outputs(situation).softmax(-1)
+        log_p = {name: self._log_p(name, situation) for name in self.nets}
+        probabilities = torch.cat(list(log_p.values()), dim=1).detach().exp()
         logged: dict[str, Tensor] = {}
         for name in self._order(generator):
             numbers = self.numbers[name]
             own = range(*numbers.indices(probabilities.shape[1]))
             values = expected(table, probabilities, own)
-            log_p = self._log_p(name, situation)
-            loss = soft_policy_loss(log_p, values, self._temperatures.of(name))
-            logged |= self._step(name, loss, entropies(log_p.detach()).mean())
+            loss = soft_policy_loss(log_p[name], values, self._temperatures.of(name))
+            logged |= self._step(name, loss, entropies(log_p[name].detach()).mean())
             with torch.no_grad():
                 probabilities[:, numbers] = self._log_p(name, situation).exp()
         return logged
@@ -323,12 +323,12 @@ class GaussianActors(EntropicActors):
 
     def improve(self, situation: Situation, generator: torch.Generator) -> dict[str, Tensor]:
         """Raise the soft value by one learner after another, and return losses and entropies."""
-        with torch.no_grad():
-            actions, _ = self._draw_all(situation, generator)
+        drawn = {name: self._draw(name, situation, generator) for name in self.nets}
+        actions = torch.cat([own.detach() for own, _ in drawn.values()], dim=1)
         logged: dict[str, Tensor] = {}
         for name in self._order(generator):
             numbers = self.numbers[name]
-            own, log_p = self._draw(name, situation, generator)
+            own, log_p = drawn[name]
             joint = torch.cat([actions[:, : numbers.start], own, actions[:, numbers.stop :]], 1)
             value = self._critic.of_actions(situation.state, joint).amin(0)
             loss = (self._temperatures.of(name) * log_p - value).mean()

@@ -117,9 +117,9 @@ class Replay:
         environment = draws % self.num_envs
         span = self._spans[at]
         data = self._data.view(-1, self._data.shape[-1])
-        first = data[at * self.num_envs + environment]
+        first = data.index_select(0, at * self.num_envs + environment)
         later = (at + span) % self.rows * self.num_envs + environment
-        after = data[later, : self._width]
+        after = data.index_select(0, later)[:, : self._width]
         returns = first[:, -1].clone()
         for step in range(1, self._steps):
             row = (at + step) % self.rows

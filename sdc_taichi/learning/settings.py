@@ -52,7 +52,7 @@ class OffPolicySettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    steps_per_update: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 8
+    rollout_steps: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 8
     """Steps of each data center between two updates."""
     gradient_steps: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 16
     """Gradient steps of an update, each from a batch of its own."""
