@@ -8,6 +8,10 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -43,6 +47,7 @@ def example(monkeypatch: pytest.MonkeyPatch) -> Iterator[Load]:
             )
             if package == "torch":
                 threads.append(found.get_num_threads())
+                found.set_num_threads(1)
         return importlib.import_module(name)
 
     yield load
@@ -220,6 +225,115 @@ def test_torchrl_env_starts_anew_within_an_episode_and_refuses_a_part(example: L
     with pytest.raises(ValueError, match="single ones cannot be reset"):
         env.reset(part)
     env.close()
+
+
+# --- PPO in one file ---
+
+
+class Guess:
+    """A batch in which a learner is paid for each of its two choices that is right."""
+
+    num_envs = 64
+    single_observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
+    single_action_space = gymnasium.spaces.MultiDiscrete([3, 3])
+    right = (0, 2)
+
+    def reset(self, *, seed: int) -> tuple[Any, dict[str, Any]]:
+        self.random = np.random.default_rng(seed)
+        return self._observations(), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        never = np.zeros(self.num_envs, dtype=np.bool_)
+        paid = (actions == np.array(self.right)).sum(axis=1).astype(np.float64)
+        return self._observations(), paid, never, never, {}
+
+    def _observations(self) -> Any:
+        return self.random.uniform(-1.0, 1.0, (self.num_envs, 3)).astype(np.float32)
+
+
+def test_ppo_in_one_file_finds_what_pays(example: Load) -> None:
+    ppo = example("train_cleanrl")
+    game = Guess()
+    agent = ppo.train(game, steps=20 * 8 * game.num_envs, rollout=8, seed=1)
+    observations, _ = game.reset(seed=2)
+    assert (agent.best(observations) == np.array(game.right)).all()
+
+
+def test_ppo_in_one_file_values_the_state_in_which_an_episode_was_cut_off(example: Load) -> None:
+    ppo = example("train_cleanrl")
+    torch = importlib.import_module("torch")
+    env, twin = (
+        gymnasium.make_vec("sdc_taichi/Joint-v0", **SAME_STEP, config="tiny", num_envs=2)
+        for _ in range(2)
+    )
+    agent = ppo.ActorCritic(env, 3)
+    with torch.no_grad():
+        found, following = ppo.collect(env, agent, env.reset(seed=3)[0], DAY)
+    twin.reset(seed=3)
+    for actions in found[1].view(DAY, 2, -1).numpy():
+        observations, paid, _, truncated, infos = twin.step(actions)
+    assert truncated.all()
+    np.testing.assert_array_equal(following, observations)
+    last = agent.inputs.scaled(torch.from_numpy(np.stack(infos["final_obs"])))
+    expected = torch.from_numpy(paid) + ppo.DISCOUNT * agent.value(last).detach()
+    np.testing.assert_allclose(found[-1][-2:], expected, rtol=1e-5)
+    assert not np.allclose(paid, expected)
+    env.close()
+    twin.close()
+
+
+def test_ppo_in_one_file_is_reproducible(example: Load, capsys: pytest.CaptureFixture[str]) -> None:
+    ppo = example("train_cleanrl")
+
+    def printed(seed: int) -> list[str]:
+        options = ["--num-envs", "2", "--days", "1", "--rollout", "24", "--steps", "96"]
+        ppo.main([*options, "--seed", str(seed)])
+        speed, *returns = capsys.readouterr().out.splitlines()
+        assert speed.endswith(" steps/s")
+        assert [line.partition(":")[0] for line in returns] == ["idle", "untrained", "trained"]
+        return returns
+
+    once, again, other = printed(0), printed(0), printed(1)
+    assert once == again
+    assert once != other
+
+
+# --- RLlib ---
+
+RLLIB = """
+import train_rllib
+for seed in (0, 0):
+    train_rllib.main(
+        [
+            *("--num-envs", "2", "--days", "1", "--rollout", "24", "--steps", "96"),
+            *("--hidden", "8", "--seed", str(seed)),
+        ]
+    )
+"""
+
+
+def test_rllib_trains_all_agents_reproducibly_and_leaves_nothing(example: Load) -> None:
+    """In a process of its own, whose warnings and threads end with it."""
+    pytest.importorskip("ray", reason="ray is not installed: make test-train")
+    cache = os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))
+    # Paths of Ray's sockets must be short.
+    with tempfile.TemporaryDirectory(dir="/tmp" if os.path.isdir("/tmp") else None) as folder:
+        done = subprocess.run(
+            [sys.executable, "-c", RLLIB],
+            env=os.environ
+            | {"HOME": folder, "RAY_TMPDIR": folder, "RAY_AUTH_MODE": "disabled"}
+            | {"PYTHONPATH": str(EXAMPLES), "XDG_CACHE_HOME": cache},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr
+        running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True).stdout
+        assert folder not in running
+    lines = done.stdout.splitlines()
+    returns = [line for line in lines if "mean episode return" in line]
+    assert [line.partition(":")[0] for line in returns] == ["idle", "untrained", "trained"] * 2
+    assert returns[:3] == returns[3:]
+    assert returns[1].partition(":")[2] != returns[2].partition(":")[2]
 
 
 @pytest.mark.parametrize("name", IDS)
