@@ -22,6 +22,7 @@ from sdc_taichi.cli.report import report_command
 from sdc_taichi.cli.session import warnings_in_lines
 from sdc_taichi.cli.simulate import simulate_command
 from sdc_taichi.cli.streams import guard_streams, output_failure
+from sdc_taichi.cli.train import train_command
 from sdc_taichi.cli.view import view_command
 from sdc_taichi.errors import SdcError, one_line
 
@@ -62,6 +63,7 @@ app.command("report")(report_command)
 app.command("view")(view_command)
 app.command("simulate")(simulate_command)
 app.command("optimum")(optimum_command)
+app.command("train")(train_command)
 
 
 def main() -> None:

@@ -172,7 +172,7 @@ def progress_bar(steps: int, *, shown: bool) -> Iterator[Callable[[StepResult], 
         yield lambda _: None
         return
     every = max(1, steps // 1000)
-    with _progress() as progress:
+    with rich_progress() as progress:
         task = progress.add_task("simulating", total=steps)
 
         def advance(result: StepResult) -> None:
@@ -195,7 +195,7 @@ def stage_bars(*, shown: bool) -> Iterator[Callable[[str, int, int], None]]:
     if not shown or not sys.stderr.isatty():
         yield lambda _stage, _done, _total: None
         return
-    with _progress() as progress:
+    with rich_progress() as progress:
         tasks: dict[str, TaskID] = {}
 
         def advance(stage: str, done: int, total: int) -> None:
@@ -206,8 +206,8 @@ def stage_bars(*, shown: bool) -> Iterator[Callable[[str, int, int], None]]:
         yield advance
 
 
-def _progress() -> Progress:
-    """Progress bars on stderr that go when they are done."""
+def rich_progress() -> Progress:
+    """Progress bars on stderr that disappear when they are done."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

@@ -12,6 +12,7 @@ from sdc_taichi.config.event_schema import (
 )
 from sdc_taichi.config.hall_schema import HallConfig, LayoutConfig
 from sdc_taichi.config.loading import (
+    apply_override,
     apply_overrides,
     config_from_dict,
     load_config,
@@ -30,6 +31,7 @@ __all__ = [
     "LayoutConfig",
     "SampledEvent",
     "ScheduledEvent",
+    "apply_override",
     "apply_overrides",
     "config_from_dict",
     "explain",

@@ -52,7 +52,7 @@ def load_config(
         raise ConfigError(f"overrides {shortened(overrides)}: valid is a list of section.key=value")
     label, values = _read_source(DEFAULT_PRESET if source is None else source)
     for override in overrides:
-        _apply_override(values, override)
+        apply_override(values, override)
     return config_from_dict(values, label)
 
 
@@ -84,7 +84,7 @@ def apply_overrides(config: DataCenterConfig, overrides: Sequence[str]) -> DataC
     """
     values = config.model_dump(mode="json")
     for override in overrides:
-        _apply_override(values, override)
+        apply_override(values, override)
     return config_from_dict(values, config.name)
 
 
@@ -219,7 +219,16 @@ def _require_mapping(values: Any, label: str) -> dict[str, Any]:
     return values
 
 
-def _apply_override(values: dict[str, Any], override: str) -> None:
+def apply_override(values: dict[str, Any], override: str) -> None:
+    """Put an assignment into plain values, not yet checked.
+
+    Args:
+        values: sections, which are changed.
+        override: ``a.b=c``; ``c`` is read as YAML.
+
+    Raises:
+        ConfigError: no assignment, or one into what is no section.
+    """
     path, sign, text = override.partition("=")
     if not sign:
         raise ConfigError(f"override {shortened(override)}: valid is section.key=value")

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from sdc_taichi.learning.off_policy import OffPolicyDefinition
-from sdc_taichi.learning.on_policy import OnPolicyDefinition
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from sdc_taichi.learning.off_policy import OffPolicy, OffPolicyDefinition
+from sdc_taichi.learning.on_policy import OnPolicy, OnPolicyDefinition
+from sdc_taichi.learning.policy import PolicyNetwork
+from sdc_taichi.learning.settings import LearningSettings, OffPolicySettings
+from sdc_taichi.learning.stream import EnvironmentStream
 
 ON_POLICY: dict[str, OnPolicyDefinition] = {
     "ppo": OnPolicyDefinition(critic="observation", reward="own", sequential=False, clips=True),
@@ -18,3 +24,54 @@ OFF_POLICY: dict[str, OffPolicyDefinition] = {
     "hasac": OffPolicyDefinition(critics=2, soft=True),
 }
 """Algorithms that learn from all steps that a replay holds."""
+
+
+class Algorithm(Protocol):
+    """Learns in a stream of environments, and hands out networks."""
+
+    def update(self, stream: EnvironmentStream) -> dict[str, float]:
+        """Act for some steps, learn, and return numbers to log by name."""
+
+    def networks(self) -> tuple[PolicyNetwork, ...]:
+        """The policies as they are."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides how the training goes on."""
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> None:
+        """Go on from what ``state_dict`` returned, of an algorithm made alike."""
+
+
+def make_algorithm(
+    name: str, settings: LearningSettings, stream: EnvironmentStream, *, updates: int, seed: int
+) -> Algorithm:
+    """An algorithm before its first update.
+
+    Args:
+        name: name of the algorithm.
+        settings: settings of the algorithm.
+        stream: the environments that it is to learn in.
+        updates: number of updates of the whole training.
+        seed: seed of all that it draws.
+
+    Raises:
+        ConfigError: actions that the algorithm does not take.
+    """
+    given = stream.spaces, stream.state_width
+    if isinstance(settings, OffPolicySettings):
+        return OffPolicy(OFF_POLICY[name], settings, *given, updates=updates, seed=seed)
+    return OnPolicy(ON_POLICY[name], settings, *given, updates=updates, seed=seed)
+
+
+def uses_state(name: str, settings: LearningSettings) -> bool:
+    """Whether an algorithm looks at the shared state."""
+    if isinstance(settings, OffPolicySettings):
+        return True
+    return (settings.critic or ON_POLICY[name].critic) == "state"
+
+
+def steps_per_update(settings: LearningSettings) -> int:
+    """Steps of each data center in an update."""
+    if isinstance(settings, OffPolicySettings):
+        return settings.steps_per_update
+    return settings.rollout_steps

@@ -92,3 +92,12 @@ class OffPolicySettings(BaseModel):
     continuous_entropy: float = -1.0
     """Wanted differential entropy of each continuous number, nats; log 2 is the largest; of
     ``hasac``."""
+
+
+LearningSettings = OnPolicySettings | OffPolicySettings
+"""Settings of an algorithm."""
+LEARNING_SETTINGS: dict[str, type[OnPolicySettings] | type[OffPolicySettings]] = {
+    **dict.fromkeys(("ppo", "ippo", "mappo", "happo", "haa2c"), OnPolicySettings),
+    **dict.fromkeys(("had3qn", "hasac"), OffPolicySettings),
+}
+"""Classes of the settings of each algorithm, by its name."""

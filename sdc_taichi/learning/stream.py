@@ -70,6 +70,8 @@ class EnvironmentStream:
         size: number of environments, B.
         observations: observations before the next step by learner, (B, n) each.
         state: shared state before the next step, (B, m).
+        returns: sum of the rewards of the last whole episodes by learner, the mean over all
+            environments; empty before an episode has ended.
 
     Raises:
         ConfigError: observations with heat maps, which these networks do not take.
@@ -92,6 +94,8 @@ class EnvironmentStream:
         self.learners = tuple(self.spaces)
         self._shares_state = shares_state
         self.state_width = int(np.prod(core.state_space.shape or ())) if shares_state else 0
+        self.returns: dict[str, float] = {}
+        self._sums = dict.fromkeys(self.learners, 0.0)
         self._take(core.reset(seed))
 
     def step(self, actions: Mapping[str, Tensor]) -> StreamStep:
@@ -104,15 +108,19 @@ class EnvironmentStream:
         transition = core.step(self._by_agent(actions))
         ended = transition.ended
         rewards = self._rewards(transition)
+        for name, reward in rewards.items():
+            self._sums[name] += float(reward.mean())
         self._take(transition.observations)
         after = StreamStep(rewards, ended, self.observations, self.state)
         if ended:
+            self.returns, self._sums = self._sums, dict.fromkeys(self.learners, 0.0)
             self._take(core.next_episode())
         return after
 
     def state_dict(self) -> dict[str, Any]:
         """State of the environments, for ``load_state_dict`` of a stream made alike."""
-        return self._core.state_dict()
+        sums = {"returns": dict(self.returns), "sums": dict(self._sums)}
+        return {"environments": self._core.state_dict(), **sums}
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
         """Go on from what ``state_dict`` returned.
@@ -120,7 +128,8 @@ class EnvironmentStream:
         Raises:
             SdcError: a state of other environments.
         """
-        self._take(self._core.load_state_dict(values))
+        self._take(self._core.load_state_dict(values["environments"]))
+        self.returns, self._sums = dict(values["returns"]), dict(values["sums"])
 
     def _by_agent(self, actions: Mapping[str, Tensor]) -> dict[str, Any]:
         """Actions by agent as arrays, (B,) where an agent decides one choice, else (B, k)."""

@@ -1,0 +1,344 @@
+"""Settings of a training: algorithm, data centers, environments, and how often what is kept.
+
+They are YAML as configurations are, and no PyTorch is needed to read and check them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal, Self
+
+import yaml
+from pydantic import (
+    BaseModel,
+    Field,
+    SerializeAsAny,
+    ValidationError,
+    field_serializer,
+    field_validator,
+    model_validator,
+)
+
+from sdc_taichi.config import (
+    DataCenterConfig,
+    apply_override,
+    config_from_dict,
+    explain,
+    load_config,
+    load_yaml,
+    preset_names,
+    with_values,
+)
+from sdc_taichi.config.fields import Section
+from sdc_taichi.envs.options import EnvOptions
+from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
+from sdc_taichi.learning.scenarios import SCENARIOS
+from sdc_taichi.learning.settings import LEARNING_SETTINGS, LearningSettings
+from sdc_taichi.learning.split import DAYS_PER_WEEK, TRAINING, WEEKS, data_center_weeks
+from sdc_taichi.number_text import parse_number
+from sdc_taichi.sim.fleet_configs import make_configs
+from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
+
+MOST_STEPS = 10**12
+"""Largest number of steps of a training: years of the fastest machine."""
+_FIXED_BY_WEEKS = ("start", "months")
+
+Steps = Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
+"""Number of steps of all data centers together, 1..1e12."""
+
+
+class ValidationSettings(Section):
+    """Weeks in which policies are tried during a training, to keep the best one."""
+
+    steps: Annotated[int, Field(strict=True, ge=0, le=MOST_STEPS)] = 200_000
+    """Steps of all data centers together between two validations, 0..1e12; 0 is no validation."""
+    objective: Annotated[str, Field(min_length=1, max_length=200)] = "carbon"
+    """Objective whose share of the achievable is measured: ``carbon``, ``energy``, ``cost``,
+    ``water``, or a sum such as ``carbon+0.002*water``."""
+
+
+class TrainingSettings(Section):
+    """Everything that decides a training."""
+
+    algorithm: str
+    """Name of the algorithm: ``ppo``, ``ippo``, ``mappo``, ``happo``, ``haa2c``, ``had3qn`` or
+    ``hasac``."""
+    scenario: str | None = None
+    """Scenario whose settings lie beneath those given: ``carbon``, ``carbon-rich``, ``bill`` or
+    ``bill-rich``; None is none."""
+    config: Annotated[str, Field(min_length=1)] | dict[str, Any] = "corrected"
+    """Data center: a preset, a file, or the sections of a configuration."""
+    overrides: dict[str, Any] = Field(default_factory=dict)
+    """Values put into the configuration, section by section."""
+    sites: tuple[Annotated[str, Field(min_length=1)], ...] = ()
+    """Sites, one data center for each; none is the site of the configuration."""
+    weeks: (
+        Literal["training"] | tuple[Annotated[int, Field(strict=True, ge=0, lt=WEEKS)], ...] | None
+    ) = "training"
+    """Weeks of the year, 0..51, that episodes begin in, one data center for each site and week;
+    ``training`` is all that are neither held out nor for validation, None takes the first days
+    from ``environment``."""
+    data_centers: Annotated[int, Field(strict=True, ge=1, le=1_000_000)] | None = None
+    """Number of data centers at once, to which those of all sites and weeks are dealt in turn; None
+    is the smallest multiple of theirs from 256 on."""
+    environment: EnvOptions = EnvOptions()
+    """Options of the environments, as in docs/environments.md."""
+    precision: Literal["f32", "f64"] = "f32"
+    """Precision of the server kernels."""
+    steps: Steps = 2_000_000
+    """Steps of all data centers together, 1..1e12; those of a last update that would exceed it are
+    left out."""
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
+    """Seed of networks, actions, mini-batches and episodes, 0..2^31 - 1."""
+    learning: SerializeAsAny[LearningSettings] = Field(default_factory=dict, validate_default=True)
+    """Settings of the algorithm."""
+    checkpoint_steps: Steps = 100_000
+    """Steps of all data centers together between two checkpoints, 1..1e12."""
+    validation: ValidationSettings = ValidationSettings()
+    """Weeks in which policies are tried."""
+    tensorboard: bool = True
+    """Whether to write TensorBoard events."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _on_top_of_scenario(cls, values: Any) -> Any:
+        """Put the values given on top of those of their scenario."""
+        name = values.get("scenario") if isinstance(values, Mapping) else None
+        if name is None:
+            return values
+        if name not in SCENARIOS:
+            raise ValueError(f"scenario {name!r}{suggestion_or_valid(name, SCENARIOS)}")
+        return merged(SCENARIOS[name], values)
+
+    @field_validator("algorithm")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value not in LEARNING_SETTINGS:
+            raise ValueError(f"no algorithm{suggestion_or_valid(value, LEARNING_SETTINGS)}")
+        return value
+
+    @field_validator("config")
+    @classmethod
+    def _found_from_anywhere(cls, value: Any) -> Any:
+        """Files by their absolute path, as a training may be resumed elsewhere."""
+        is_file = isinstance(value, str) and value not in preset_names() and os.path.isfile(value)
+        return os.path.abspath(value) if is_file else value
+
+    @field_validator("sites")
+    @classmethod
+    def _each_once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        names = [name.strip().upper() for name in value]
+        if len(set(names)) < len(names):
+            raise ValueError(f"{list(value)}; valid is each site once")
+        return tuple(names)
+
+    @field_validator("steps", "checkpoint_steps", mode="before")
+    @classmethod
+    def _whole_steps(cls, value: Any) -> Any:
+        return whole_steps(value)
+
+    @field_validator("weeks")
+    @classmethod
+    def _weeks_once(cls, value: Any) -> Any:
+        if isinstance(value, tuple) and (not value or len(set(value)) < len(value)):
+            raise ValueError(f"{list(value)}; valid is one or more weeks, each once")
+        return value
+
+    @field_validator("learning", mode="before")
+    @classmethod
+    def _of_the_algorithm(cls, value: Any, info: Any) -> Any:
+        """Settings of the class that the algorithm has."""
+        kind = LEARNING_SETTINGS.get(info.data.get("algorithm"))
+        if kind is None or isinstance(value, kind):
+            return value
+        return _validated(kind, value, f"settings of {info.data['algorithm']}")
+
+    @field_validator("environment")
+    @classmethod
+    def _plain(cls, value: EnvOptions) -> EnvOptions:
+        """Refuse objects, which cannot be written down."""
+        for name in value.model_fields_set:
+            given = getattr(value, name)
+            if callable(given) or (name == "others" and not isinstance(given, str)):
+                raise ValueError(
+                    f"{name}: {type(given).__name__}; valid in settings is its name, or its path "
+                    "module:name"
+                )
+        return value
+
+    @field_serializer("environment")
+    def _options_given(self, value: EnvOptions) -> dict[str, Any]:
+        """The options that were given: some of the others would be errors."""
+        return value.model_dump(mode="json", exclude_unset=True)
+
+    @model_validator(mode="after")
+    def _weeks_fit_episodes(self) -> Self:
+        if self.weeks is None:
+            return self
+        given = [name for name in _FIXED_BY_WEEKS if name in self.environment.model_fields_set]
+        if given:
+            raise ValueError(
+                f"environment.{given[0]}: without effect with weeks; valid with weeks null"
+            )
+        if self.environment.days > DAYS_PER_WEEK:
+            raise ValueError(
+                f"environment.days {self.environment.days}: episodes would run into other weeks; "
+                f"valid is at most {DAYS_PER_WEEK}, or weeks null"
+            )
+        return self
+
+    def to_yaml(self) -> str:
+        """YAML text that ``load_settings`` reads back equal."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+
+    def options(self) -> EnvOptions:
+        """Options of the environments, with the first days that ``weeks`` fixes."""
+        if self.weeks is None:
+            return self.environment
+        given = {
+            name: getattr(self.environment, name) for name in self.environment.model_fields_set
+        }
+        return EnvOptions.model_validate(given | {"start": "fixed"})
+
+    def _config(self) -> DataCenterConfig:
+        """The data center, with its overrides, before sites and weeks."""
+        leaves = dict(_leaves("", self.overrides))
+        if isinstance(self.config, str):
+            return load_config(self.config, [f"{k}={json.dumps(v)}" for k, v in leaves.items()])
+        return with_values(config_from_dict(self.config), leaves)
+
+    def data_centers_of_weeks(self) -> list[DataCenterConfig]:
+        """Data centers to train in: one for each site and week, site by site.
+
+        Raises:
+            ConfigError: a file, value or site that is not valid.
+        """
+        of_sites = self.data_centers_of_sites()
+        if self.weeks is None:
+            return of_sites
+        return data_center_weeks(of_sites, TRAINING if self.weeks == "training" else self.weeks)
+
+    def data_centers_of_sites(self) -> list[DataCenterConfig]:
+        """One data center for each site, or that of the configuration.
+
+        Raises:
+            ConfigError: a file, value or site that is not valid.
+        """
+        return make_configs(self._config(), sites=self.sites)
+
+    def difference(self, other: TrainingSettings) -> str | None:
+        """The first setting but ``steps`` in which others differ, with both values.
+
+        Args:
+            other: settings to compare with.
+        """
+        mine, theirs = (dict(_leaves("", s.model_dump(mode="json"))) for s in (self, other))
+        for name in [*mine, *theirs]:
+            one, two = mine.get(name), theirs.get(name)
+            if name != "steps" and one != two:
+                return f"{name}: {shortened(one)}, not {shortened(two)}"
+        return None
+
+
+def make_settings(values: Mapping[str, Any], label: str = "settings") -> TrainingSettings:
+    """Settings of plain values.
+
+    Args:
+        values: settings as in a YAML file.
+        label: where they come from, at the start of every message.
+
+    Raises:
+        ConfigError: naming the setting, its value and what would be valid.
+    """
+    try:
+        return TrainingSettings.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(explain(error, label, TrainingSettings)) from None
+
+
+def load_settings(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> TrainingSettings:
+    """Read settings from a YAML file.
+
+    Args:
+        path: the file.
+        overrides: ``a.b=c`` assignments applied last.
+
+    Raises:
+        ConfigError: naming the file, the setting, its value and what would be valid.
+    """
+    values = read_values(path)
+    for override in overrides:
+        apply_override(values, override)
+    return make_settings(values, str(path))
+
+
+def read_values(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Plain values of a YAML file of settings, not yet checked.
+
+    Raises:
+        ConfigError: no such file, or no YAML.
+    """
+    try:
+        values = load_yaml(read_text(path, MOST_CONFIG_BYTES, ConfigError))
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid YAML ({error})") from None
+    if not isinstance(values, dict):
+        raise ConfigError(
+            f"{path}: the top level is a {type(values).__name__}; valid is a mapping of settings"
+        )
+    return values
+
+
+def whole_steps(value: Any) -> Any:
+    """A number of steps that may be written as ``2e6``; other values as they are."""
+    if isinstance(value, str):
+        try:
+            value = parse_number(value)
+        except ValueError:
+            return value
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _validated(kind: type[BaseModel], value: Any, label: str) -> Any:
+    """Settings of a class, whose errors begin with a label."""
+    try:
+        return kind.model_validate(value)
+    except ValidationError as error:
+        raise ValueError(explain(error, label, kind)) from None
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Values on top of others, section by section.
+
+    Args:
+        base: values beneath.
+        over: values that take their place; a section may be an object.
+    """
+    out = dict(base)
+    for key, value in over.items():
+        if isinstance(value, EnvOptions):
+            value = _given(value)
+        old = out.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            value = merged(old, value)
+        out[key] = value
+    return out
+
+
+def _given(options: EnvOptions) -> dict[str, Any]:
+    """Options that were given; some of the others would be errors."""
+    return {name: getattr(options, name) for name in options.model_fields_set}
+
+
+def _leaves(path: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Values that are no sections, by their dotted paths."""
+    for key, value in values.items():
+        name = f"{path}.{key}".lstrip(".")
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(name, value)
+        else:
+            yield name, value
