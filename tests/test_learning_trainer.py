@@ -43,7 +43,7 @@ SMALL: dict[str, Any] = {
 LEARNING: dict[str, dict[str, Any]] = {
     "happo": {"rollout_steps": ROLLOUT, "hidden": [8], "epochs": 1},
     "hasac": {
-        "steps_per_update": ROLLOUT,
+        "rollout_steps": ROLLOUT,
         "gradient_steps": 2,
         "batch_size": 16,
         "replay_size": 512,

@@ -68,10 +68,3 @@ def uses_state(name: str, settings: LearningSettings) -> bool:
     if isinstance(settings, OffPolicySettings):
         return True
     return (settings.critic or ON_POLICY[name].critic) == "state"
-
-
-def steps_per_update(settings: LearningSettings) -> int:
-    """Steps of each data center in an update."""
-    if isinstance(settings, OffPolicySettings):
-        return settings.steps_per_update
-    return settings.rollout_steps

@@ -19,7 +19,7 @@ import torch
 
 from sdc_taichi.envs.vector import MultiAgentVectorEnv, vector_env
 from sdc_taichi.errors import ConfigError, SdcError
-from sdc_taichi.learning.algorithms import make_algorithm, steps_per_update, uses_state
+from sdc_taichi.learning.algorithms import make_algorithm, uses_state
 from sdc_taichi.learning.checkpoint import read_state, write_state
 from sdc_taichi.learning.interface import interface_of
 from sdc_taichi.learning.policy import About, Policy
@@ -126,7 +126,7 @@ class _Run:
         try:
             self._interface = interface_of(env.core.sim.fleet, env.core.options)
             self._stream = make_stream(settings, env)
-            self._steps_each = env.num_envs * steps_per_update(settings.learning)
+            self._steps_each = env.num_envs * settings.learning.rollout_steps
             self._updates = settings.steps // self._steps_each
             if not self._updates:
                 raise ConfigError(
