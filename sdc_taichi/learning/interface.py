@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+from pydantic import Field
+
 from sdc_taichi.config.fields import Section
 from sdc_taichi.envs.actions import ActionDecoder, equal_number
 from sdc_taichi.envs.agents import Agent
@@ -29,7 +31,7 @@ class ObservedFeature(Section):
     """Lower end of the range that is scaled, in ``unit``."""
     high: float
     """Upper end of the range that is scaled, in ``unit``."""
-    size: int
+    size: int = Field(ge=1)
     """Number of entries side by side."""
 
 
@@ -58,11 +60,11 @@ class Interface(Section):
     """Leads of the carbon-intensity forecast, in h; empty for vectors of the released code."""
     weather_leads_h: tuple[float, ...]
     """Leads of the weather forecasts, in h; empty for vectors of the released code."""
-    step_min: int
+    step_min: int = Field(ge=1, le=60)
     """Length of a step, in min."""
-    crac_units: int | None
+    crac_units: int | None = Field(ge=1)
     """Number of CRAC units of a data center that an agent decides on; None where none does."""
-    racks: int | None
+    racks: int | None = Field(ge=1)
     """Number of racks of a data center that an agent places work on; None where none does."""
 
     def width(self, agent: str) -> int:

@@ -10,6 +10,7 @@ from fuzz.configs import configs
 from fuzz.data_files import data_files
 from fuzz.faults import faults
 from fuzz.matrices import matrices
+from fuzz.policies import policies
 from fuzz.run_folders import run_folders
 from fuzz.states import states
 
@@ -34,6 +35,7 @@ AREAS = {
     "data_files": Plan(data_files, 300, 45),
     "matrices": Plan(matrices, 200, 35),
     "states": Plan(states, 260, 40),
+    "policies": Plan(policies, 120, 20),
     "run_folders": Plan(run_folders, 120, 22),
     "command_lines": Plan(command_lines, 150, 24),
     "faults": Plan(faults, 70, 4),

@@ -74,7 +74,7 @@ def _damaged(scratch: Scratch) -> Path:
     elif how == 1:
         files[name] = run_files(1 if "configs.yaml" in files else 2)[name]
     elif name == "metrics.json" and how < 4:
-        files[name] = _changed_json(scratch, content)
+        files[name] = changed_json(scratch, content)
     elif how < 4:
         files[name] = damage.damaged_bytes(rng, content)
     for file, written in files.items():
@@ -83,7 +83,7 @@ def _damaged(scratch: Scratch) -> Path:
     return scratch.folder
 
 
-def _changed_json(scratch: Scratch, content: bytes) -> bytes:
+def changed_json(scratch: Scratch, content: bytes) -> bytes:
     """JSON with another value somewhere."""
     values = json.loads(content)
     node = values
