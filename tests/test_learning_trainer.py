@@ -20,6 +20,7 @@ from sdc_taichi.errors import SdcError  # noqa: E402
 from sdc_taichi.learning import trainer  # noqa: E402
 from sdc_taichi.learning.algorithms import make_algorithm  # noqa: E402
 from sdc_taichi.learning.checkpoint import read_state  # noqa: E402
+from sdc_taichi.learning.evaluation import Validation  # noqa: E402
 from sdc_taichi.learning.policy import Policy  # noqa: E402
 from sdc_taichi.learning.trainer import Progress, Training, train  # noqa: E402
 from sdc_taichi.learning.training_settings import (  # noqa: E402
@@ -294,3 +295,39 @@ def test_tensorboard_gets_the_numbers_of_the_curve(tmp_path: Path) -> None:
     found = [(e.step, e.value) for e in events.Scalars("reward/agent_dc")]
     rows = [(int(row["steps"]), float(row["reward/agent_dc"])) for row in rows_of(tmp_path)]
     np.testing.assert_allclose(found, rows, rtol=1e-6)
+
+
+def test_the_best_policy_in_the_validation_weeks_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of three validations the second reaches the most."""
+    reached = iter([Validation(-1.0, 0.2, 0), Validation(-2.0, 0.4, 1), Validation(-1.5, 0.3, 0)])
+    monkeypatch.setattr(trainer, "validate", lambda controller, weeks: next(reached))
+    monkeypatch.setattr(trainer, "VALIDATION", (1,))
+    given: dict[str, Any] = {"validation": {"steps": 240, "optimum": False}}
+    train(settings(**given), tmp_path, stop=stop_after(4))
+    done = train(settings(**given), tmp_path, resume=True)
+    assert done.best == Validation(-2.0, 0.4, 1)
+    with (tmp_path / "validation.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["update"], row["share"]) for row in rows] == [
+        ("2", "0.2"),
+        ("4", "0.4"),
+        ("6", "0.3"),
+    ]
+    assert Policy.load(tmp_path / "best").about.steps == 480
+    assert Policy.load(tmp_path).about.steps == 480
+    assert Policy.load(tmp_path / "policy").about.steps == 720
+
+
+def test_validation_runs_the_policy_in_its_weeks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trainer, "VALIDATION", (1,))
+    given: dict[str, Any] = {"validation": {"steps": 720, "optimum": False}}
+    seen: list[Progress] = []
+    done = train(settings(**given), tmp_path, on_update=seen.append)
+    assert [now.validation is not None for now in seen] == [False] * 5 + [True]
+    assert done.best == seen[-1].validation
+    assert done.best is not None
+    assert -50.0 < done.best.change_pct < 50.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +16,7 @@ from sdc_taichi.cli.session import interruptible, rich_progress
 from sdc_taichi.errors import ConfigError, printable, suggestion_or_valid
 
 if TYPE_CHECKING:
+    from sdc_taichi.learning.evaluation import Validation
     from sdc_taichi.learning.trainer import Progress, Training
     from sdc_taichi.learning.training_settings import TrainingSettings
 
@@ -106,18 +107,18 @@ def train_command(
     values["environment"] = {k: v for k, v in environment.items() if v is not None}
     if agents is not None:
         values["environment"]["agents"] = _agents(agents)
+    if resume and out is None:
+        raise ConfigError("--resume: without --out; valid is with the folder of a training")
     chosen = _settings(values, source or [], assigned or [], settings, out if resume else None)
     if show:
         print(chosen.to_yaml(), end="")
         return
     folder = Path("runs") / f"{chosen.algorithm}-{chosen.seed}" if out is None else out
-    if resume and out is None:
-        raise ConfigError("--resume: without --out; valid is with the folder of a training")
     _require_torch()
     from sdc_taichi.learning.trainer import train
 
-    with interruptible() as interrupted, progress_of_training(shown=not quiet) as on_update:
-        done = train(chosen, folder, resume=resume, on_update=on_update, stop=interrupted)
+    with interruptible() as interrupted, progress_of_training(shown=not quiet) as reports:
+        done = train(chosen, folder, resume=resume, stop=interrupted, **reports)
     if not quiet:
         _print_summary(done)
     if not done.is_whole:
@@ -200,52 +201,79 @@ def _require_torch() -> None:
 
 
 @contextlib.contextmanager
-def progress_of_training(*, shown: bool) -> Iterator[Callable[[Progress], None]]:
-    """Show how far a training has come on stderr: a bar in a terminal, lines elsewhere.
+def progress_of_training(*, shown: bool) -> Iterator[dict[str, Any]]:
+    """Show how far a training has come on stderr: bars in a terminal, lines elsewhere.
 
     Args:
         shown: whether to show it at all.
 
     Yields:
-        A function to call after every update.
+        Arguments ``on_update`` and ``on_stage`` of ``train``.
     """
     if not shown:
-        yield lambda _: None
+        yield {}
     elif sys.stderr.isatty():
         with rich_progress() as progress:
-            task = progress.add_task("training", total=None)
+            tasks: dict[str, Any] = {}
 
-            def advance(now: Progress) -> None:
-                progress.update(
-                    task, completed=now.update, total=now.updates, description=_line(now)
-                )
+            def advance(name: str, done: int, total: int, text: str | None = None) -> None:
+                if name not in tasks:
+                    tasks[name] = progress.add_task(name)
+                description = name if text is None else text
+                progress.update(tasks[name], completed=done, total=total, description=description)
 
-            yield advance
+            def update(now: Progress) -> None:
+                advance("training", now.update, now.updates, _line(now))
+
+            yield {"on_update": update, "on_stage": advance}
     else:
-        told = -SECONDS_BETWEEN_LINES
+        lines = _Lines()
+        yield {"on_update": lines.update, "on_stage": lines.stage}
 
-        def tell(now: Progress) -> None:
-            nonlocal told
-            is_last = now.update == now.updates
-            if is_last or now.share is not None or now.passed_s - told >= SECONDS_BETWEEN_LINES:
-                told = now.passed_s
-                print(f"{now.update}/{now.updates}: {_line(now)}", file=sys.stderr, flush=True)
 
-        yield tell
+class _Lines:
+    """Progress in lines, not too many of them."""
+
+    def __init__(self) -> None:
+        self._told_s = -SECONDS_BETWEEN_LINES
+        self._stages: set[str] = set()
+
+    def update(self, now: Progress) -> None:
+        """Tell of an update, if there is something to tell."""
+        is_last = now.update == now.updates
+        waited = now.passed_s - self._told_s >= SECONDS_BETWEEN_LINES
+        if is_last or waited or now.validation is not None:
+            self._told_s = now.passed_s
+            print(f"update {now.update}/{now.updates}: {_line(now)}", file=sys.stderr, flush=True)
+
+    def stage(self, name: str, _done: int, total: int) -> None:
+        """Tell of a stage when it begins."""
+        if name not in self._stages:
+            self._stages.add(name)
+            print(f"{name}: {total:,}", file=sys.stderr, flush=True)
 
 
 def _line(now: Progress) -> str:
     """Progress in a few words."""
-    parts = [f"{now.steps:,} steps, {now.steps_per_s:,.0f}/s, {_duration(now.left_s)} left"]
+    parts = [f"{now.steps:,} steps, {now.steps_per_s:,.0f}/s, {duration(now.left_s)} left"]
     returns = {n.partition("/")[2]: x for n, x in now.numbers.items() if n.startswith("return/")}
     if returns:
         parts.append("return " + " ".join(f"{name} {value:.4g}" for name, value in returns.items()))
-    if now.share is not None:
-        parts.append(f"{100 * now.share:.1f} % of the achievable")
+    if now.validation is not None:
+        parts.append(_reached(now.validation))
     return "; ".join(parts)
 
 
-def _duration(seconds: float) -> str:
+def _reached(found: Validation) -> str:
+    """What a policy reached in the validation weeks, in a few words."""
+    change = f"{found.change_pct:+.2f} % against idle"
+    share = f", {100.0 * found.share:.1f} % of the achievable" if found.share == found.share else ""
+    broken = f", {found.broken_weeks} weeks break a constraint" if found.broken_weeks else ""
+    return f"{change}{share}{broken}"
+
+
+def duration(seconds: float) -> str:
+    """A length of time as minutes and seconds, and hours from one on."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
@@ -253,9 +281,8 @@ def _duration(seconds: float) -> str:
 
 def _print_summary(done: Training) -> None:
     """Say what a training left behind."""
-    speed = f"{done.steps:,} steps in {done.updates:,} updates, {_duration(done.seconds)}"
+    speed = f"{done.steps:,} steps in {done.updates:,} updates, {duration(done.seconds)}"
     print(f"{speed}; files in {printable(done.folder)}")
-    if done.best_share is not None:
-        share = f"{100 * done.best_share:.1f} % of the achievable in the validation weeks"
-        print(f"Best policy: {share}")
+    if done.best is not None:
+        print(f"Best policy in the validation weeks: {_reached(done.best)}")
     print(f"Use it with: --controller policy:{printable(done.folder)}")

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -21,18 +22,25 @@ from sdc_taichi.envs.vector import MultiAgentVectorEnv, vector_env
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.learning.algorithms import make_algorithm, uses_state
 from sdc_taichi.learning.checkpoint import read_state, write_state
+from sdc_taichi.learning.controller import PolicyController
+from sdc_taichi.learning.evaluation import DataCenterWeeks, Validation, prepare, validate
 from sdc_taichi.learning.interface import interface_of
 from sdc_taichi.learning.policy import About, Policy
+from sdc_taichi.learning.split import VALIDATION
 from sdc_taichi.learning.stream import EnvironmentStream
 from sdc_taichi.learning.training_folder import (
+    BEST_POLICY,
     CHECKPOINT_FILE,
     EVENTS,
     LAST_POLICY,
     TRAINING_FILE,
+    VALIDATION_FILE,
     claimed,
 )
 from sdc_taichi.learning.training_log import CsvLog, EventLog
 from sdc_taichi.learning.training_settings import TrainingSettings
+from sdc_taichi.optimum.result import StoppedError
+from sdc_taichi.optimum.solve import Progress as StageProgress
 
 LEAST_DATA_CENTERS = 256
 """Least number of data centers of a training that does not say how many."""
@@ -58,9 +66,9 @@ class Progress:
     """Expected seconds until the end."""
     numbers: dict[str, float]
     """Numbers of the update by name, such as ``return/agent_ls`` and ``value_loss/agent_ls``."""
-    share: float | None
-    """Share of the achievable in the validation that followed the update, 0..1; None if none
-    did."""
+    validation: Validation | None
+    """What the policy reached in the validation weeks after the update; None if it was not
+    tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +85,8 @@ class Training:
     """Seconds that all its processes took."""
     is_whole: bool
     """Whether all steps are done; false if it was stopped."""
-    best_share: float | None
-    """Share of the achievable that the best policy reached in the validation weeks, 0..1; None
-    without validation."""
+    best: Validation | None
+    """What the best policy reached in the validation weeks; None without validation."""
 
 
 def train(
@@ -88,6 +95,7 @@ def train(
     *,
     resume: bool = False,
     on_update: Callable[[Progress], None] | None = None,
+    on_stage: StageProgress | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Training:
     """Train policies, and keep them in a folder.
@@ -98,6 +106,7 @@ def train(
         resume: whether to go on with the training in the folder, to the same bits as if it had not
             been interrupted; its settings must be those given, but that ``steps`` may be more.
         on_update: called after every update.
+        on_stage: is told of the stages of solving for the optima of the validation weeks.
         stop: asked after every update; true ends the training, which can be resumed.
 
     Raises:
@@ -111,7 +120,8 @@ def train(
         try:
             if resume:
                 run.resume()
-            run.go_on(on_update or (lambda _: None), stop or (lambda: False))
+            with run.validation(on_stage, stop) as weeks:
+                run.go_on(weeks, on_update or (lambda _: None), stop or (lambda: False))
         finally:
             run.close()
         return run.result()
@@ -146,7 +156,7 @@ class _Run:
         self._fingerprint = _fingerprint(settings, env)
         self._update = self._kept = 0
         self._begun = time.perf_counter()
-        self._best_share: float | None = None
+        self._best: Validation | None = None
 
     def close(self) -> None:
         """Close the environments."""
@@ -165,7 +175,7 @@ class _Run:
             self._algorithm.load_state_dict(saved["algorithm"])
             self._update = self._kept = int(saved["update"])
             self._begun = time.perf_counter() - float(saved["seconds"])
-            self._best_share = saved["best_share"]
+            self._best = None if saved["best"] is None else Validation(*saved["best"])
         except SdcError as error:
             raise SdcError(f"{path}: {error}") from None
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
@@ -176,36 +186,96 @@ class _Run:
                 "is as many or more"
             )
 
-    def go_on(self, on_update: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
+    @contextlib.contextmanager
+    def validation(
+        self, progress: StageProgress | None, stop: Callable[[], bool] | None
+    ) -> Iterator[DataCenterWeeks | None]:
+        """The weeks in which policies are tried; None if they are not, or if it was stopped.
+
+        Raises:
+            SdcError: there is no optimum of them.
+        """
+        settings = self._settings
+        if not settings.validation.steps or self._update == self._updates:
+            yield None
+            return
+        try:
+            weeks = prepare(
+                settings.data_centers_of_sites(),
+                VALIDATION,
+                objective=settings.validation.objective,
+                optimum=settings.validation.optimum,
+                forecast_error=self._env.core.options.forecast_error,
+                precision=settings.precision,
+                progress=progress,
+                stop=stop,
+            )
+        except StoppedError:
+            yield None
+            return
+        except SdcError as error:
+            raise SdcError(f"validation: {error}") from None
+        with weeks:
+            yield weeks
+
+    def go_on(
+        self,
+        weeks: DataCenterWeeks | None,
+        on_update: Callable[[Progress], None],
+        stop: Callable[[], bool],
+    ) -> None:
         """Update until all steps are done, or until told to stop.
 
         Raises:
             SdcError: the training diverges, or a file cannot be written.
         """
         try:
-            self._go_on(on_update, stop)
+            self._go_on(weeks, on_update, stop)
         except SdcError as error:
-            kept = (
-                f"the checkpoint of update {self._kept} is kept" if self._kept else "no checkpoint"
-            )
-            raise SdcError(f"{error}; {kept}") from None
+            kept = f"the checkpoint of update {self._kept} is kept"
+            raise SdcError(f"{error}; {kept if self._kept else 'no checkpoint yet'}") from None
 
-    def _go_on(self, on_update: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
-        events = self._folder / EVENTS if self._settings.tensorboard else None
+    def _go_on(
+        self,
+        weeks: DataCenterWeeks | None,
+        on_update: Callable[[Progress], None],
+        stop: Callable[[], bool],
+    ) -> None:
+        settings = self._settings
+        events = self._folder / EVENTS if settings.tensorboard else None
         table = CsvLog(self._folder / TRAINING_FILE, self._update)
+        validations = CsvLog(self._folder / VALIDATION_FILE, self._update)
         meter = _Speed(self._steps_each)
         with EventLog(events, after=self._steps) as log:
             while self._update < self._updates and not stop():
                 numbers = self._learn()
-                seconds = {"seconds": round(self._seconds, 3)}
-                table.add({"update": self._update, "steps": self._steps} | seconds | numbers)
+                table.add(self._row() | numbers)
                 log.add(numbers, self._steps)
-                if self._update == self._updates or self._is_due(self._settings.checkpoint_steps):
+                tried = None
+                if weeks is not None and self._is_due(settings.validation.steps):
+                    tried = self._validate(weeks)
+                    validations.add(self._row() | tried._asdict())
+                    log.add({f"validation/{k}": x for k, x in tried._asdict().items()}, self._steps)
+                if self._is_due(settings.checkpoint_steps):
                     self._keep()
                     log.flush()
-                on_update(meter.progress(self._update, self._updates, numbers, None))
+                on_update(meter.progress(self._update, self._updates, numbers, tried))
         if self._kept != self._update:
             self._keep()
+
+    def _row(self) -> dict[str, Any]:
+        """First entries of the rows of an update."""
+        seconds = round(self._seconds, 3)
+        return {"update": self._update, "steps": self._steps, "seconds": seconds}
+
+    def _validate(self, weeks: DataCenterWeeks) -> Validation:
+        """Try the policy, and keep it if it does better than all before."""
+        policy = self._policy()
+        found = validate(PolicyController(policy, weeks.sim.fleet), weeks)
+        if self._best is None or found.change_pct < self._best.change_pct:
+            self._best = found
+            policy.save(self._folder / BEST_POLICY)
+        return found
 
     def result(self) -> Training:
         """What the training left behind."""
@@ -215,7 +285,7 @@ class _Run:
             steps=self._steps,
             seconds=self._seconds,
             is_whole=self._update == self._updates,
-            best_share=self._best_share,
+            best=self._best,
         )
 
     @property
@@ -229,7 +299,9 @@ class _Run:
         return time.perf_counter() - self._begun
 
     def _is_due(self, interval: int) -> bool:
-        """Whether the last update passed a multiple of a number of steps."""
+        """Whether the last update is the last of all, or passed a multiple of a number of steps."""
+        if self._update == self._updates:
+            return True
         return self._steps // interval > (self._steps - self._steps_each) // interval
 
     def _learn(self) -> dict[str, float]:
@@ -258,7 +330,7 @@ class _Run:
             "fingerprint": self._fingerprint,
             "update": self._update,
             "seconds": self._seconds,
-            "best_share": self._best_share,
+            "best": None if self._best is None else tuple(self._best),
             "algorithm": self._algorithm.state_dict(),
             "stream": self._stream.state_dict(),
         }
@@ -289,7 +361,7 @@ class _Speed:
         update: int,
         updates: int,
         numbers: dict[str, float],
-        share: float | None,
+        validation: Validation | None,
     ) -> Progress:
         """How far the training has come after one more update."""
         self._done += 1
@@ -302,7 +374,7 @@ class _Speed:
             steps_per_s=self._done * self._steps_each / seconds,
             left_s=seconds / self._done * (updates - update),
             numbers=numbers,
-            share=share,
+            validation=validation,
         )
 
 

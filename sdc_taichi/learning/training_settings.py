@@ -57,6 +57,10 @@ class ValidationSettings(Section):
     objective: Annotated[str, Field(min_length=1, max_length=200)] = "carbon"
     """Objective whose share of the achievable is measured: ``carbon``, ``energy``, ``cost``,
     ``water``, or a sum such as ``carbon+0.002*water``."""
+    optimum: bool = True
+    """Whether to solve, once, for the optimum of these weeks, which values what is stored at their
+    ends and of which the share of the achievable is told; else policies are told against idle
+    commands alone."""
 
 
 class TrainingSettings(Section):
@@ -226,7 +230,10 @@ class TrainingSettings(Section):
         Raises:
             ConfigError: a file, value or site that is not valid.
         """
-        return make_configs(self._config(), sites=self.sites)
+        config, tariff = self._config(), self.environment.tariff
+        if tariff is not None:
+            config = config.model_copy(update={"tariff": tariff})
+        return make_configs(config, sites=self.sites)
 
     def difference(self, other: TrainingSettings) -> str | None:
         """The first setting but ``steps`` in which others differ, with both values.
@@ -237,7 +244,8 @@ class TrainingSettings(Section):
         mine, theirs = (dict(_leaves("", s.model_dump(mode="json"))) for s in (self, other))
         for name in [*mine, *theirs]:
             one, two = mine.get(name), theirs.get(name)
-            if name != "steps" and one != two:
+            is_section = {} in (one, two)
+            if name != "steps" and one != two and not is_section:
                 return f"{name}: {shortened(one)}, not {shortened(two)}"
         return None
 

@@ -1,0 +1,143 @@
+"""Settings of trainings: what is valid, scenarios, and how they are shown and changed."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from sdc_taichi import EnvOptions
+from sdc_taichi.cli import train as command
+from sdc_taichi.cli.app import app
+from sdc_taichi.errors import SdcError
+from sdc_taichi.learning.scenarios import SCENARIOS
+from sdc_taichi.learning.settings import OffPolicySettings
+from sdc_taichi.learning.split import TRAINING
+from sdc_taichi.learning.training_settings import (
+    TrainingSettings,
+    load_settings,
+    make_settings,
+)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_settings_of_every_scenario_are_read_back_equal(scenario: str, tmp_path: Path) -> None:
+    made = make_settings({"algorithm": "hasac", "scenario": scenario, "steps": "3e6"})
+    assert isinstance(made.learning, OffPolicySettings)
+    assert made.steps == 3_000_000
+    path = tmp_path / "settings.yaml"
+    path.write_text(made.to_yaml())
+    assert load_settings(path) == made
+    assert made.difference(load_settings(path)) is None
+    configs = made.data_centers_of_weeks()
+    assert len(configs) == 8 * len(TRAINING)
+    assert {config.site.start for config in configs} >= {"01-01", "12-17"}
+
+
+def test_values_lie_on_top_of_those_of_their_scenario() -> None:
+    made = TrainingSettings(
+        algorithm="ippo",
+        scenario="bill-rich",
+        sites=("ny",),
+        overrides={"workload": {"flexible_share": 0.3}},
+        environment=EnvOptions(days=3),
+    )
+    assert made.sites == ("NY",)
+    assert (made.environment.days, made.environment.rewards) == (3, "bill")
+    (config,) = made.data_centers_of_sites()
+    assert config.workload.flexible_share == 0.3
+    assert config.battery.hours_of_design_load == 4.0
+    assert made.options().start == "fixed"
+
+
+def test_difference_names_the_setting_and_both_values() -> None:
+    one = make_settings({"algorithm": "ippo", "steps": 10})
+    assert one.difference(make_settings({"algorithm": "ippo", "steps": 20})) is None
+    other = make_settings({"algorithm": "ippo", "environment": {"agents": ["agent_dc"]}})
+    assert one.difference(other) == "environment.agents: None, not ['agent_dc']"
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"algorithm": "hapo"}, "algorithm: no algorithm; did you mean 'happo'"),
+        ({"algoritm": "happo"}, "algoritm: unknown key; did you mean 'algorithm'"),
+        ({"learning": {"epoch": 1}}, "settings of happo: epoch: unknown key; did you mean 'epochs"),
+        ({"learning": {"discount": 2}}, "discount: Input should be less than or equal to 1"),
+        ({"steps": 1.5}, "steps: .* valid integer"),
+        ({"steps": 0}, "steps: .* greater than or equal to 1"),
+        ({"sites": ["NY", "ny"]}, r"sites: .* valid is each site once"),
+        ({"weeks": [52]}, "weeks.*less than 52"),
+        ({"weeks": []}, "weeks: .* one or more weeks"),
+        ({"scenario": "carbn"}, "scenario 'carbn'; did you mean 'carbon'"),
+        ({"environment": {"day": 3}}, "environment.day: unknown key; did you mean 'days'"),
+        ({"environment": {"days": 8}}, "environment.days 8: .* at most 7, or weeks null"),
+        ({"environment": {"start": "fixed"}}, "environment.start: without effect with weeks"),
+        ({"environment": {"rewards": print}}, "rewards: .* valid in settings is its name"),
+    ],
+)
+def test_settings_that_are_not_valid_are_refused(values: dict[str, Any], said: str) -> None:
+    with pytest.raises(SdcError, match=said):
+        make_settings({"algorithm": "happo"} | values)
+
+
+def shown(*arguments: str) -> str:
+    found = CliRunner().invoke(app, ["train", *arguments, "--show"])
+    assert found.exit_code == 0, found.output
+    return found.stdout
+
+
+def test_the_command_shows_the_settings_that_it_would_train_with(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(shown("happo", "tiny", "hall.rows=2", "--site", "ny,ca", "--steps", "2e6"))
+    made = load_settings(path)
+    assert (made.config, made.overrides) == ("tiny", {"hall": {"rows": 2}})
+    assert (made.sites, made.steps) == (("NY", "CA"), 2_000_000)
+    changed = shown("--settings", str(path), "--seed", "3", "--agents", "battery,load", "--set",
+                    "learning.learning_rate=3e-4")  # fmt: skip
+    path.write_text(changed)
+    made = load_settings(path)
+    assert (made.algorithm, made.seed) == ("happo", 3)
+    assert made.environment.agents == ("agent_ls", "agent_bat")
+    assert made.model_dump()["learning"]["learning_rate"] == 3e-4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "ALGORITHM: missing; valid: ppo, ippo"),
+        (["happo", "--agents", "bat"], "--agents 'bat': 'bat'; did you mean 'battery'"),
+        (["happo", "tiny", "large"], "'large': a second preset or file after 'tiny'"),
+        (["happo", "--set", "learning"], "override 'learning': valid is section.key=value"),
+        (["happo", "--resume"], "--resume: without --out"),
+        (["--resume", "--out", "none"], "none: holds no training"),
+        (["--settings", "none.yaml"], "none.yaml: no such file"),
+    ],
+)
+def test_errors_of_the_command_are_one_line(arguments: list[str], said: str) -> None:
+    found = CliRunner().invoke(app, ["train", *arguments])
+    assert found.exit_code == 2
+    assert said in found.output
+    assert found.output.count("\n") == 1
+
+
+@pytest.fixture
+def without_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+
+
+@pytest.mark.usefixtures("without_torch")
+def test_a_missing_torch_is_one_line_and_settings_need_none(tmp_path: Path) -> None:
+    assert "algorithm: happo" in shown("happo")
+    found = CliRunner().invoke(app, ["train", "happo", "--out", str(tmp_path / "run")])
+    assert found.exit_code == 2
+    assert found.output.count("\n") == 1
+    assert 'pip install "sdc-taichi[train]"' in found.output
+    assert not (tmp_path / "run").exists()
+
+
+def test_durations_are_short_texts() -> None:
+    assert [command.duration(s) for s in (5, 65, 3725)] == ["0:05", "1:05", "1:02:05"]
