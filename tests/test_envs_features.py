@@ -152,6 +152,7 @@ def by_hand(view: View, dc: int, work: list[list[float]]) -> dict[str, list[floa
     assert price is not None
     ci = at(drivers.ci_g_per_kwh, dc, index)
     ci_ahead = ahead(drivers.ci_g_per_kwh, CI_LEADS_H)
+    lowest, highest = min(ci, *ci_ahead), max(ci, *ci_ahead)
     last = view.last
     kwh_per_w = 1.0 / per_hour / 1000.0
     hvac_w = float(sizing.facility_w[dc] - sizing.it_w[dc])
@@ -163,6 +164,9 @@ def by_hand(view: View, dc: int, work: list[list[float]]) -> dict[str, list[floa
         "ci": [ci],
         "ci_forecast": ci_ahead,
         "ci_change": [value - ci for value in ci_ahead],
+        "ci_rank": [sum(value < ci for value in ci_ahead) / len(ci_ahead)],
+        "ci_relative": [(value - lowest) / (highest - lowest) for value in (ci, *ci_ahead)],
+        "ci_swing": [(highest - lowest) / ci],
         "outdoor": [at(drivers.outdoor_c, dc, index)],
         "outdoor_forecast": ahead(drivers.outdoor_c, WEATHER_LEADS_H),
         "wet_bulb": [at(drivers.wet_bulb_c, dc, index)],
@@ -270,6 +274,16 @@ def test_other_presets_and_models_fit_too(listed: list[str]) -> None:
     filled = found["queue"][:, 0] > 1e-6
     np.testing.assert_allclose(found["age_histogram"][filled].sum(axis=1), 1.0, atol=1e-5)
     np.testing.assert_array_equal(found["age_histogram"][0], 0.0)
+
+
+def test_intensities_that_never_change_have_no_rank_and_no_swing() -> None:
+    n = 200
+    same = np.full(n, 20.0)
+    drivers = drivers_from_arrays(same, same - 1.0, np.full(n, 300.0), np.full(n, 0.5))
+    observer, seen = watch([load_config("tiny")], 1, drivers)
+    of_first = parts(seen[0][2], observer.state_features)
+    for name in ("ci_rank", "ci_relative", "ci_swing"):
+        assert not of_first[name].any()
 
 
 def test_values_beyond_a_range_are_cut_at_it() -> None:

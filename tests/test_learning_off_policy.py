@@ -29,7 +29,8 @@ from sdc_taichi.learning.settings import OffPolicySettings  # noqa: E402
 from sdc_taichi.learning.stream import LearnerSpaces, StreamStep  # noqa: E402
 
 SMALL = OffPolicySettings(
-    rollout_steps=2,
+    decision_steps=1,
+    rollout_decisions=2,
     gradient_steps=2,
     batch_size=64,
     replay_size=2048,
@@ -60,7 +61,9 @@ class Game:
 
     def __init__(self, learners: int = 2, discrete: bool = True, width: int = 1) -> None:
         names = [f"player_{i}" for i in range(learners)]
-        self.spaces = {n: LearnerSpaces((n,), self.situations, width, discrete) for n in names}
+        self.spaces = {
+            n: LearnerSpaces((n,), self.situations, width, 3 if discrete else None) for n in names
+        }
         self.state_width = self.situations
         self.room = torch.zeros(self.size, dtype=torch.int64)
         self.turn = 0
@@ -259,7 +262,7 @@ def test_the_density_of_squashed_numbers_integrates_to_one() -> None:
 def test_each_choice_is_the_best_reply_to_those_before_it() -> None:
     table = Coordination.rewards.flatten()[None]
     choices = torch.tensor([[2, 2]])
-    first, second = best_replies(table, choices, [0, 1])[0]
+    first, second = best_replies(table, choices, [0, 1], 3)[0]
     assert first.tolist() == [4.0, 2.0, 3.0]
     assert second.tolist() == [5.0, -3.0, 4.0]  # the first has moved to 0
 
@@ -367,7 +370,7 @@ def test_seeds_make_a_difference() -> None:
 
 
 def test_actions_that_an_algorithm_does_not_take_are_refused() -> None:
-    with pytest.raises(ConfigError, match="had3qn: takes discrete actions alone"):
+    with pytest.raises(ConfigError, match="had3qn: learns choices alone"):
         algorithm("had3qn", Aim(discrete=False))
-    with pytest.raises(ConfigError, match="7 discrete choices in a step are 2187 joint actions"):
+    with pytest.raises(ConfigError, match="7 choices of 3 in a step are 2187 joint actions"):
         algorithm("hasac", Meeting(learners=1, width=7))

@@ -108,7 +108,10 @@ def test_networks_that_do_not_fit_the_interface_are_refused() -> None:
         (network(("agent_ls",), n, 3), "networks of agent_ls; valid is one for each of agent_bat"),
         (network(("agent_bat",), n + 1, 3), f"{n + 1} inputs; observations have {n}"),
         (network(("agent_bat",), n, 6), "decides 2 numbers; its agents decide 1"),
-        (network(("agent_bat",), n, 1, "clip"), "head clip, which is not for discrete"),
+        (
+            network(("agent_bat",), n, 1, "clip"),
+            "head clip of 3; valid for discrete actions is argmax of 3",
+        ),
     ):
         with pytest.raises(SdcError, match=message):
             Policy((net,), fits, About(algorithm="none"))

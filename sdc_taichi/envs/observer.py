@@ -435,6 +435,7 @@ class _TimeEntries:
             "ci": ci[:1],
             "ci_forecast": ci[1:],
             "ci_change": ci[1:] - ci[:1],
+            **_relative_to_extremes(ci),
             "outdoor": outdoor[:1],
             "outdoor_forecast": outdoor[1:],
             "wet_bulb": wet_bulb[:1],
@@ -447,6 +448,24 @@ class _TimeEntries:
             if name in self._features:
                 out[:, self._slices[name]] = scale(of_feature, self._features[name]).T
         return out
+
+
+def _relative_to_extremes(ci: F32) -> dict[str, F32]:
+    """Carbon intensities, (1 + leads, n), the present first, in relation to each other.
+
+    The result does not depend on how much a site's intensity swings, which is ten times more at
+    some sites than at others. Without leads there is none.
+    """
+    if len(ci) == 1:
+        return {}
+    lowest, highest = ci.min(axis=0), ci.max(axis=0)
+    swing = highest - lowest
+    moves = swing > 0
+    return {
+        "ci_rank": (ci[1:] < ci[:1]).mean(axis=0, keepdims=True, dtype=np.float32),
+        "ci_relative": (ci - lowest) / np.where(moves, swing, 1.0),
+        "ci_swing": (swing / np.where(ci[0] > 0, ci[0], 1.0))[None],
+    }
 
 
 def mean_setpoint_c(view: View) -> F64:

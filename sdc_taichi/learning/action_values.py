@@ -86,8 +86,10 @@ class JointValues:
         choices: how many choices are made in a step, K.
         settings: hidden layers and their activation.
         generator: source of the weights.
+        levels: how many possibilities each choice has, L.
 
     Attributes:
+        levels: how many possibilities each choice has, L.
         parameters: weights and biases of the critics.
 
     Raises:
@@ -101,25 +103,27 @@ class JointValues:
         choices: int,
         settings: OffPolicySettings,
         generator: torch.Generator,
+        levels: int = CHOICES,
     ) -> None:
-        joint_actions = CHOICES**choices
+        self.levels = levels
+        joint_actions = levels**choices
         if joint_actions > MOST_JOINT_ACTIONS:
             raise ConfigError(
-                f"{choices} discrete choices in a step are {joint_actions} joint actions; valid is "
-                f"at most {MOST_JOINT_ACTIONS}: choose continuous actions and hasac, or another "
-                "algorithm"
+                f"{choices} choices of {levels} in a step are {joint_actions} joint actions; valid "
+                f"is at most {MOST_JOINT_ACTIONS}: fewer levels, another algorithm, or hasac with "
+                "continuous actions and levels=null"
             )
-        self._places = CHOICES ** torch.arange(choices - 1, -1, -1)
-        digits = torch.arange(joint_actions)[:, None] // self._places % CHOICES
-        one_hot = torch.nn.functional.one_hot(digits, CHOICES).flatten(1)
-        # Outputs are V, then A_1 ... A_K, three each, then A_all.
+        self._places = levels ** torch.arange(choices - 1, -1, -1)
+        digits = torch.arange(joint_actions)[:, None] // self._places % levels
+        one_hot = torch.nn.functional.one_hot(digits, levels).flatten(1)
+        # Outputs are V, then A_1 ... A_K, one for each level, then A_all.
         self._of_choices = one_hot.T.float()
-        out = 1 + CHOICES * choices + joint_actions
+        out = 1 + levels * choices + joint_actions
         self._nets = Perceptrons(number, width, out, settings, generator)
         self.parameters = self._nets.parameters
 
     def __call__(self, state: Tensor, parameters: Sequence[Tensor] | None = None) -> Tensor:
-        """Values of all joint actions in each state, (E, N, 3^K); the last choice varies fastest.
+        """Values of all joint actions in each state, (E, N, L^K); the last choice varies fastest.
 
         Args:
             state: (N, width).
@@ -188,19 +192,19 @@ def expected(table: Tensor, probabilities: Tensor, kept: Collection[int] = ()) -
     """Expected values of joint actions over independent choices.
 
     Args:
-        table: values of all joint actions, (N, 3^K).
-        probabilities: probabilities of each choice, (N, K, 3).
+        table: values of all joint actions, (N, L^K).
+        probabilities: probabilities of each choice, (N, K, L).
         kept: choices that stay open, in any order.
 
     Returns:
-        Values of all combinations of the kept choices, (N, 3^kept); (N, 1) if none is.
+        Values of all combinations of the kept choices, (N, L^kept); (N, 1) if none is.
     """
-    right = 1
+    right, levels = 1, probabilities.shape[-1]
     for choice in reversed(range(probabilities.shape[1])):
         if choice in kept:
-            right *= CHOICES
+            right *= levels
             continue
-        table = table.view(len(table), -1, CHOICES, right)
+        table = table.view(len(table), -1, levels, right)
         table = torch.einsum("nlcr,nc->nlr", table, probabilities[:, choice])
         table = table.flatten(1)
     return table

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.learning.policy import CHOICES, Policy, PolicyNetwork
+from sdc_taichi.learning.policy import Policy, PolicyNetwork, action_levels
 
 OPSET = 17
 """Version of ONNX's operators."""
@@ -64,23 +64,29 @@ def _add_network(graph: _Graph, policy: Policy, number: int, network: PolicyNetw
         x = graph.node("Gemm", x, graph.constant(weight), graph.constant(bias), transB=1)
         if i + 1 < len(network.layers):
             x = graph.node(activation, x)
-    actions = _actions(graph, network, x)
-    scores_of_number = CHOICES if network.head == "argmax" else 1
+    discrete = policy.interface.actions == "discrete"
+    actions = _actions(graph, network, x, discrete)
+    scores_of_number = network.choices if network.head == "argmax" else 1
     first = 0
     for agent in network.agents:
         numbers = np.arange(first, first + policy.interface.action_width(agent))
         first += len(numbers)
         scores = (numbers[:, None] * scores_of_number + np.arange(scores_of_number)).reshape(-1)
-        kind = np.int64 if network.head == "argmax" else np.float32
+        kind = np.int64 if discrete else np.float32
         graph.add_output(f"{agent}_action", graph.columns(actions, numbers), len(numbers), kind)
         graph.add_output(f"{agent}_scores", graph.columns(x, scores), len(scores), np.float32)
 
 
-def _actions(graph: _Graph, network: PolicyNetwork, scores: str) -> str:
+def _actions(graph: _Graph, network: PolicyNetwork, scores: str, discrete: bool) -> str:
     """Actions of a network from its outputs."""
     if network.head == "argmax":
-        shape = graph.constant(np.array([-1, network.action_width, CHOICES], dtype=np.int64))
-        return graph.node("ArgMax", graph.node("Reshape", scores, shape), axis=2, keepdims=0)
+        shape = graph.constant(
+            np.array([-1, network.action_width, network.choices], dtype=np.int64)
+        )
+        chosen = graph.node("ArgMax", graph.node("Reshape", scores, shape), axis=2, keepdims=0)
+        if discrete:
+            return chosen
+        return graph.node("Gather", graph.constant(action_levels(network.choices)), chosen)
     return graph.node("Tanh", scores) if network.head == "tanh" else _between(graph, scores, 1.0)
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from sdc_taichi.learning.settings import OnPolicySettings
-from sdc_taichi.learning.stream import CHOICES, LearnerSpaces
+from sdc_taichi.learning.stream import LearnerSpaces
 from sdc_taichi.types import F32
 
 
@@ -90,7 +90,7 @@ def layers_of(net: nn.Sequential) -> tuple[tuple[F32, F32], ...]:
 class Actor(nn.Module):
     """Policy of a learner: a distribution of its actions for each observation.
 
-    Discrete actions are k independent choices of three, continuous ones k independent normal
+    Actions are k independent choices, or, where any number is possible, k independent normal
     distributions whose standard deviations do not depend on the observation.
 
     Args:
@@ -103,8 +103,8 @@ class Actor(nn.Module):
         self, spaces: LearnerSpaces, settings: OnPolicySettings, generator: torch.Generator
     ) -> None:
         super().__init__()
-        self.discrete = spaces.discrete
-        outputs = spaces.action_width * (CHOICES if spaces.discrete else 1)
+        self.choices = spaces.choices
+        outputs = spaces.action_width * (spaces.choices or 1)
         self.net = perceptron(
             spaces.observation_width,
             settings.hidden,
@@ -113,7 +113,7 @@ class Actor(nn.Module):
             last_gain=0.01,
             generator=generator,
         )
-        if not spaces.discrete:
+        if spaces.choices is None:
             self.log_std = nn.Parameter(torch.full((outputs,), math.log(FIRST_STD)))
 
     def sample(self, observations: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -128,7 +128,7 @@ class Actor(nn.Module):
             beyond -1..1.
         """
         out = self.net(observations)
-        if self.discrete:
+        if self.choices is not None:
             log_p = self._log_probabilities(out)
             noise = torch.empty_like(log_p).exponential_(generator=generator)
             actions = (log_p - noise.log_()).argmax(-1)
@@ -146,15 +146,15 @@ class Actor(nn.Module):
             actions: actions, (B, k).
         """
         out = self.net(observations)
-        if self.discrete:
+        if self.choices is not None:
             log_p = self._log_probabilities(out)
             return _of_chosen(log_p, actions), -(log_p.exp() * log_p).sum((-1, -2)).mean()
         entropy = (self.log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
         return self._log_density((actions - out) / self.log_std.exp()), entropy
 
     def _log_probabilities(self, out: Tensor) -> Tensor:
-        """Logarithms of the probabilities of each choice, (B, k, 3)."""
-        return out.unflatten(-1, (-1, CHOICES)).log_softmax(-1)
+        """Logarithms of the probabilities of each choice, (B, k, choices)."""
+        return out.unflatten(-1, (-1, self.choices)).log_softmax(-1)
 
     def _log_density(self, noise: Tensor) -> Tensor:
         """Logarithm of the density at a distance from the mean in standard deviations, (B,)."""

@@ -42,10 +42,10 @@ from sdc_taichi.learning.off_policy_actors import (
     adam,
     descend,
 )
-from sdc_taichi.learning.policy import PolicyNetwork
+from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
 from sdc_taichi.learning.replay import Replay, Transitions
 from sdc_taichi.learning.settings import OffPolicySettings
-from sdc_taichi.learning.stream import CHOICES, EnvironmentStream, LearnerSpaces
+from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces
 
 STATE = "state"
 """Name of the shared state's columns."""
@@ -92,7 +92,7 @@ class OffPolicy:
         seed: int,
     ) -> None:
         self._settings, self._spaces, self._updates = settings, dict(spaces), updates
-        self.steps_per_update = settings.rollout_steps
+        self.steps_per_update = settings.rollout_decisions * settings.decision_steps
         self._done = 0
         names = ("weights", "actions", "batches", "order")
         self._generators = {
@@ -149,7 +149,7 @@ class OffPolicy:
         found = []
         for name, of in self._spaces.items():
             *inner, (weight, bias) = layers_of(self._actors.nets[name])
-            outputs = of.action_width * (CHOICES if of.discrete else 1)
+            outputs = of.action_width * (of.choices or 1)
             found.append(
                 PolicyNetwork(
                     agents=of.agents,
@@ -159,6 +159,7 @@ class OffPolicy:
                     layers=(*inner, (weight[:outputs], bias[:outputs])),
                     activation=self._settings.activation,
                     head=self._actors.head,
+                    choices=of.choices or CHOICES,
                 )
             )
         return tuple(found)
@@ -218,7 +219,7 @@ class OffPolicy:
         rewards = {name: torch.zeros(()) for name in self._spaces}
         seen = []
         with torch.no_grad():
-            for _ in range(self.steps_per_update):
+            for _ in range(self._settings.rollout_decisions):
                 before = torch.cat([stream.state, *(stream.observations[n] for n in rewards)], 1)
                 seen.append(before)
                 actions = self._actors.act(
@@ -235,7 +236,10 @@ class OffPolicy:
                 for name in rewards:
                     rewards[name] += after.rewards[name].mean()
             self._moments.add(torch.cat(seen))
-        logged = {f"reward/{n}": float(x) / self.steps_per_update for n, x in rewards.items()}
+        logged = {
+            f"reward/{n}": float(x) / self._settings.rollout_decisions
+            for n, x in rewards.items()
+        }
         return logged if self._soft else logged | {"exploration": self.exploration}
 
     def _measure(self, reward: Tensor) -> None:
@@ -319,11 +323,14 @@ def _critic_and_actors(
     """Critics, and the policies that follow them."""
     numbers = sum(of.action_width for of in spaces.values())
     shape = definition.critics, state_width, numbers, settings, generator
-    if all(of.discrete for of in spaces.values()):
-        table = JointValues(*shape)
+    levels = next(iter(spaces.values())).choices
+    if levels is not None:
+        table = JointValues(*shape, levels)
         kind = SoftActors if definition.soft else GreedyActors
         return table, kind(table, spaces, settings, generator)
     if not definition.soft:
-        raise ConfigError("had3qn: takes discrete actions alone; valid with continuous is hasac")
+        raise ConfigError(
+            "had3qn: learns choices alone; valid is discrete actions, or levels of continuous ones"
+        )
     critic = ContinuousValues(*shape)
     return critic, GaussianActors(critic, spaces, settings, generator)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from sdc_taichi.learning.action_values import ContinuousValues, JointValues, expected
 from sdc_taichi.learning.networks import perceptron
 from sdc_taichi.learning.settings import OffPolicySettings
-from sdc_taichi.learning.stream import CHOICES, LearnerSpaces
+from sdc_taichi.learning.stream import LearnerSpaces
 
 LEAST_LOG_STD, MOST_LOG_STD = -5.0, 2.0
 """Limits of the logarithm of standard deviations of continuous actions before they are squashed."""
@@ -58,7 +58,7 @@ class Actors:
         outputs: int,
         generator: torch.Generator,
     ) -> None:
-        self._settings = settings
+        self._settings, self._outputs = settings, outputs
         self.nets: dict[str, nn.Sequential] = {}
         self.numbers: dict[str, slice] = {}
         self.adams: dict[str, torch.optim.Adam] = {}
@@ -90,10 +90,10 @@ class Actors:
             self.adams[name].load_state_dict(values[name]["adam"])
 
     def _choice_outputs(self, situation: Situation) -> Tensor:
-        """Outputs for each choice of each number, (N, K, 3)."""
+        """Outputs for each choice of each number, (N, K, L)."""
         return torch.cat(
             [
-                self.nets[name](seen).unflatten(-1, (-1, CHOICES))
+                self.nets[name](seen).unflatten(-1, (-1, self._outputs))
                 for name, seen in situation.observations.items()
             ],
             dim=1,
@@ -132,7 +132,7 @@ class GreedyActors(Actors):
         settings: OffPolicySettings,
         generator: torch.Generator,
     ) -> None:
-        super().__init__(spaces, settings, CHOICES, generator)
+        super().__init__(spaces, settings, critic.levels, generator)
         self._critic = critic
 
     def act(self, situation: Situation, exploration: float, generator: torch.Generator) -> Tensor:
@@ -145,7 +145,9 @@ class GreedyActors(Actors):
         """
         best = self._choice_outputs(situation).argmax(-1)
         explores = torch.rand(best.shape, generator=generator) < exploration
-        return torch.where(explores, torch.randint(CHOICES, best.shape, generator=generator), best)
+        return torch.where(
+            explores, torch.randint(self._outputs, best.shape, generator=generator), best
+        )
 
     def next_values(
         self, targets: Sequence[Tensor], after: Situation, _: torch.Generator
@@ -164,7 +166,7 @@ class GreedyActors(Actors):
                 for name in self._order(generator)
                 for number in range(*self.numbers[name].indices(outputs.shape[1]))
             ]
-            rows = best_replies(table, outputs.argmax(-1), order)
+            rows = best_replies(table, outputs.argmax(-1), order, self._outputs)
             rows -= rows.mean(-1, keepdim=True)
         losses = {}
         for name, numbers in self.numbers.items():
@@ -240,8 +242,8 @@ class SoftActors(EntropicActors):
         settings: OffPolicySettings,
         generator: torch.Generator,
     ) -> None:
-        entropy = settings.entropy_share * math.log(CHOICES)
-        super().__init__(spaces, settings, CHOICES, entropy, generator)
+        entropy = settings.entropy_share * math.log(critic.levels)
+        super().__init__(spaces, settings, critic.levels, entropy, generator)
         self._critic = critic
 
     def act(self, situation: Situation, _: float, generator: torch.Generator) -> Tensor:
@@ -279,9 +281,9 @@ class SoftActors(EntropicActors):
         return logged
 
     def _log_p(self, name: str, situation: Situation) -> Tensor:
-        """Logarithms of a learner's probabilities of each choice, (N, k, 3)."""
+        """Logarithms of a learner's probabilities of each choice, (N, k, L)."""
         scores = self.nets[name](situation.observations[name])
-        return scores.unflatten(-1, (-1, CHOICES)).log_softmax(-1)
+        return scores.unflatten(-1, (-1, self._outputs)).log_softmax(-1)
 
 
 class GaussianActors(EntropicActors):
@@ -418,23 +420,24 @@ def descend(
     optimiser.step()
 
 
-def best_replies(table: Tensor, choices: Tensor, order: Sequence[int]) -> Tensor:
+def best_replies(table: Tensor, choices: Tensor, order: Sequence[int], levels: int) -> Tensor:
     """Values of each number's choices while the others stay, one number after another.
 
     Args:
-        table: values of all joint actions, (N, 3^K).
+        table: values of all joint actions, (N, L^K).
         choices: choices before any has moved, (N, K).
         order: numbers in the order in which they move to their best choice.
+        levels: how many possibilities each choice has, L.
 
     Returns:
-        Values, (N, K, 3).
+        Values, (N, K, L).
     """
-    taken = nn.functional.one_hot(choices, CHOICES).to(table.dtype)
+    taken = nn.functional.one_hot(choices, levels).to(table.dtype)
     rows = torch.empty_like(taken)
     for number in order:
         row = expected(table, taken, (number,))
         rows[:, number] = row
-        taken[:, number] = nn.functional.one_hot(row.argmax(-1), CHOICES).to(table.dtype)
+        taken[:, number] = nn.functional.one_hot(row.argmax(-1), levels).to(table.dtype)
     return rows
 
 
@@ -442,7 +445,7 @@ def soft_policy_loss(log_p: Tensor, values: Tensor, temperature: Tensor) -> Tens
     """Negative of the soft value of k independent choices (Christodoulou 2019, eq. 12).
 
     Args:
-        log_p: logarithms of the probabilities of each choice, (N, k, 3).
+        log_p: logarithms of the probabilities of each choice, (N, k, L).
         values: values of all combinations of the choices, (N, 3^k).
         temperature: weight of the entropy, ().
     """
@@ -454,7 +457,7 @@ def entropies(log_p: Tensor) -> Tensor:
     """Entropies of independent choices, (N,), nats.
 
     Args:
-        log_p: logarithms of the probabilities of each choice, (N, k, 3).
+        log_p: logarithms of the probabilities of each choice, (N, k, L).
     """
     return -(log_p.exp() * log_p).sum((-1, -2))
 

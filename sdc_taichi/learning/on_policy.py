@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from sdc_taichi.learning.networks import Actor, layers_of, perceptron
 from sdc_taichi.learning.normalise import CLIP, RunningMoments
-from sdc_taichi.learning.policy import PolicyNetwork
+from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
 from sdc_taichi.learning.settings import OnPolicySettings
 from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces
 
@@ -58,7 +58,7 @@ class _Critic(NamedTuple):
 
 
 class _Rollout(NamedTuple):
-    """Steps of all environments under fixed policies, (T, B, ...) each."""
+    """Decisions of all environments under fixed policies, (T, B, ...) each."""
 
     observations: dict[str, Tensor]
     next_observations: dict[str, Tensor]
@@ -99,7 +99,7 @@ class OnPolicy:
         self._definition = definition._replace(
             critic=settings.critic or definition.critic, reward=settings.reward or definition.reward
         )
-        self.steps_per_update = settings.rollout_steps
+        self.steps_per_update = settings.rollout_decisions * settings.decision_steps
         self._done = 0
         names = ("weights", "actions", "batches", "order")
         self._generators = {
@@ -148,7 +148,8 @@ class OnPolicy:
                 clip=CLIP,
                 layers=layers_of(self._actors[name].net),
                 activation=self._settings.activation,
-                head="argmax" if of.discrete else "clip",
+                head="clip" if of.choices is None else "argmax",
+                choices=of.choices or CHOICES,
             )
             for name, of in self._spaces.items()
         )
@@ -189,13 +190,13 @@ class OnPolicy:
 
     def _collect(self, stream: EnvironmentStream) -> _Rollout:
         """Act with the policies as they are."""
-        steps, size = self._settings.rollout_steps, stream.size
+        steps, size = self._settings.rollout_decisions, stream.size
 
         def room(width: int | None, kind: torch.dtype = torch.float32) -> Tensor:
             return torch.empty((steps, size) if width is None else (steps, size, width), dtype=kind)
 
         of_each = self._spaces.items()
-        kinds = {n: torch.int64 if of.discrete else torch.float32 for n, of in of_each}
+        kinds = {n: torch.float32 if of.choices is None else torch.int64 for n, of in of_each}
         out = _Rollout(
             {n: room(of.observation_width) for n, of in of_each},
             {n: room(of.observation_width) for n, of in of_each},

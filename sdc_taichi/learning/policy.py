@@ -37,7 +37,7 @@ CHOICES = 3
 MOST_BYTES = 256_000_000
 """Largest file of a policy, in bytes: 60 million weights."""
 Head = Literal["argmax", "clip", "tanh"]
-"""What becomes of the last layer: the largest of three scores for each number that is decided, or
+"""What becomes of the last layer: the largest of some scores for each number that is decided, or
 the number itself, cut at -1 and 1 or bent to between them by a hyperbolic tangent."""
 _FORMAT = 1
 _HEADER_KEY = "policy"
@@ -67,6 +67,8 @@ class PolicyNetwork:
     """Function of the units of all layers but the last."""
     head: Head
     """What becomes of the outputs of the last layer."""
+    choices: int = CHOICES
+    """Number of scores for each number that is decided, with head ``argmax``."""
 
     def __post_init__(self) -> None:
         """Check the values, and take arrays of their own in f32."""
@@ -96,8 +98,12 @@ class PolicyNetwork:
                 )
             layers.append((weight, bias))
             width = len(bias)
-        if self.head == "argmax" and width % CHOICES:
-            raise SdcError(f"{who}: {width} outputs; valid is a multiple of {CHOICES} for argmax")
+        if self.choices < 2:
+            raise SdcError(f"{who}: {self.choices} choices; valid is at least 2")
+        if self.head == "argmax" and width % self.choices:
+            raise SdcError(
+                f"{who}: {width} outputs; valid is a multiple of {self.choices} for argmax"
+            )
         for name, value in (("mean", mean), ("std", std), ("layers", tuple(layers))):
             object.__setattr__(self, name, value)
         object.__setattr__(self, "clip", float(self.clip))
@@ -110,20 +116,20 @@ class PolicyNetwork:
     @property
     def action_width(self) -> int:
         """Number of numbers that it decides, k."""
-        return self.sizes[-1] // CHOICES if self.head == "argmax" else self.sizes[-1]
+        return self.sizes[-1] // self.choices if self.head == "argmax" else self.sizes[-1]
 
     def scores(self, observations: F32) -> F32:
-        """Outputs of the last layer, (B, 3 k) or (B, k), from observations, (B, n).
+        """Outputs of the last layer, (B, choices * k) or (B, k), from observations, (B, n).
 
         A row has the same bits whatever the other rows are.
         """
         return self._forward(observations)
 
     def actions(self, observations: F32) -> F32 | I64:
-        """Actions, (B, k): whole numbers 0, 1 or 2, or numbers within -1..1."""
+        """Actions, (B, k): numbers of choices from 0, or numbers within -1..1."""
         scores = self.scores(observations)
         if self.head == "argmax":
-            return np.asarray(scores.reshape(len(scores), -1, CHOICES).argmax(axis=2))
+            return np.asarray(scores.reshape(len(scores), -1, self.choices).argmax(axis=2))
         return np.asarray(np.tanh(scores) if self.head == "tanh" else np.clip(scores, -1.0, 1.0))
 
     @cached_property
@@ -162,6 +168,8 @@ class Policy:
     """Everything of an environment that the networks depend on."""
     about: About
     """Where the policy comes from."""
+    decision_steps: int = 1
+    """Steps between two decisions, in which actions are held."""
 
     def __post_init__(self) -> None:
         """Check that the networks fit the interface."""
@@ -181,10 +189,11 @@ class Policy:
                 raise SdcError(
                     f"{who} decides {network.action_width} numbers; its agents decide {numbers}"
                 )
-            if (network.head == "argmax") != (self.interface.actions == "discrete"):
+            discrete = self.interface.actions == "discrete"
+            if discrete and (network.head != "argmax" or network.choices != CHOICES):
                 raise SdcError(
-                    f"{who} has head {network.head}, which is not for {self.interface.actions} "
-                    "actions"
+                    f"{who} has head {network.head} of {network.choices}; valid for discrete "
+                    f"actions is argmax of {CHOICES}"
                 )
 
     def actions(self, observations: Mapping[str, F32]) -> dict[str, F32 | I64]:
@@ -193,6 +202,8 @@ class Policy:
         for network, entries in zip(self.networks, self.entries, strict=True):
             parts = [observations[agent][:, of_agent] for agent, of_agent in entries.items()]
             actions = network.actions(parts[0] if len(parts) == 1 else np.concatenate(parts, 1))
+            if network.head == "argmax" and self.interface.actions == "continuous":
+                actions = action_levels(network.choices)[np.asarray(actions, dtype=np.int64)]
             first = 0
             for agent in network.agents:
                 end = first + self.interface.action_width(agent)
@@ -222,9 +233,11 @@ class Policy:
                     activation=network.activation,
                     clip=network.clip,
                     head=network.head,
+                    choices=network.choices,
                 )
                 for network in self.networks
             ),
+            decision_steps=self.decision_steps,
         )
         return described.model_dump_json(indent=1)
 
@@ -287,9 +300,14 @@ class Policy:
             networks = tuple(_network(i, one, tensors) for i, one in enumerate(read.networks))
             if tensors:
                 raise SdcError(f"unknown array {shortened(next(iter(tensors)))}")
-            return cls(networks, read.interface, read.about)
+            return cls(networks, read.interface, read.about, read.decision_steps)
         except SdcError as error:
             raise SdcError(f"{path}: {error}") from None
+
+
+def action_levels(number: int) -> F32:
+    """Levels that continuous actions are chosen from, evenly from -1 to 1, (number,)."""
+    return np.linspace(-1.0, 1.0, number, dtype=np.float32)
 
 
 def policy_folder(folder: Path) -> Path:
@@ -319,6 +337,7 @@ class _NetworkDescription(Section):
     activation: Activation
     clip: float
     head: Head
+    choices: int
 
 
 class _Description(Section):
@@ -328,6 +347,7 @@ class _Description(Section):
     about: About
     interface: Interface
     networks: tuple[_NetworkDescription, ...]
+    decision_steps: int = Field(ge=1, le=96)
 
 
 def _tensors(network: PolicyNetwork) -> dict[str, F32]:
@@ -360,6 +380,7 @@ def _network(number: int, described: _NetworkDescription, tensors: dict[str, Any
         layers=layers,
         activation=described.activation,
         head=described.head,
+        choices=described.choices,
     )
     if network.sizes != described.sizes:
         raise SdcError(

@@ -15,8 +15,13 @@ class OnPolicySettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    rollout_steps: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 32
-    """Steps of each data center between two updates."""
+    decision_steps: Annotated[int, Field(strict=True, ge=1, le=96)] = 4
+    """Steps between two decisions of a policy, in which its actions are held."""
+    levels: Annotated[int, Field(strict=True, ge=2, le=101)] | None = 7
+    """Number of levels, evenly from -1 to 1, that continuous actions are chosen from (Tang and
+    Agrawal 2020); null is any number, from a normal distribution."""
+    rollout_decisions: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 32
+    """Decisions of each data center between two updates."""
     epochs: Annotated[int, Field(strict=True, ge=1, le=100)] = 4
     """Passes over the steps of an update; ``haa2c`` makes one."""
     mini_batches: Annotated[int, Field(strict=True, ge=1, le=1024)] = 4
@@ -25,10 +30,10 @@ class OnPolicySettings(BaseModel):
     """Learning rate of Adam for policies and critics."""
     anneal: bool = True
     """Whether the learning rate falls to 0 in even steps over the training."""
-    discount: Share = 0.99
-    """Weight of a reward one step later, gamma."""
+    discount: Share = 0.97
+    """Weight of a reward one decision later, gamma."""
     gae_lambda: Share = 0.95
-    """Weight of later steps in the advantage, lambda (Schulman et al. 2016)."""
+    """Weight of later decisions in the advantage, lambda (Schulman et al. 2016)."""
     clip: Annotated[float, Field(gt=0, le=10)] = 0.2
     """Largest change of the probability ratio that pays, epsilon; ``haa2c`` has none."""
     entropy: Annotated[float, Field(ge=0, le=10)] = 0.003
@@ -52,23 +57,28 @@ class OffPolicySettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    rollout_steps: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 8
-    """Steps of each data center between two updates."""
+    decision_steps: Annotated[int, Field(strict=True, ge=1, le=96)] = 4
+    """Steps between two decisions of a policy, in which its actions are held."""
+    levels: Annotated[int, Field(strict=True, ge=2, le=101)] | None = 5
+    """Number of levels, evenly from -1 to 1, that continuous actions are chosen from (Tang and
+    Agrawal 2020); null is any number, from a normal distribution."""
+    rollout_decisions: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 8
+    """Decisions of each data center between two updates."""
     gradient_steps: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 16
     """Gradient steps of an update, each from a batch of its own."""
     batch_size: Annotated[int, Field(strict=True, ge=1, le=1_048_576)] = 1024
     """Transitions of a batch."""
     replay_size: Annotated[int, Field(strict=True, ge=1, le=100_000_000)] = 262_144
-    """Steps of all data centers together that the replay holds; each takes four bytes for every
+    """Decisions of all data centers together that the replay holds; each takes four bytes for every
     entry of the shared state and of the observations, in all 170 MB by default."""
     n_steps: Annotated[int, Field(strict=True, ge=1, le=1000)] = 4
-    """Steps of a transition, n."""
+    """Decisions of a transition, n."""
     learning_rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
     """Learning rate of Adam for policies and critics."""
     anneal: bool = True
     """Whether the learning rate falls to 0 in even steps over the training."""
-    discount: Share = 0.99
-    """Weight of a reward one step later, gamma."""
+    discount: Share = 0.97
+    """Weight of a reward one decision later, gamma."""
     target_rate: Share = 0.005
     """Share of the way to the critics that their slow copies go in a gradient step, tau."""
     gradient_norm: Annotated[float, Field(gt=0)] = 10.0
@@ -87,7 +97,7 @@ class OffPolicySettings(BaseModel):
     temperature_rate: Annotated[float, Field(ge=0, le=1)] = 1e-3
     """Learning rate of Adam for temperatures, 0 for constant ones; of ``hasac``."""
     entropy_share: Share = 0.3
-    """Wanted entropy of discrete actions as a share of the largest, log 3 for each number; of
+    """Wanted entropy of choices as a share of the largest, the logarithm of their number; of
     ``hasac``."""
     continuous_entropy: float = -1.0
     """Wanted differential entropy of each continuous number, nats; log 2 is the largest; of

@@ -19,11 +19,10 @@ from sdc_taichi.envs.core import Observation, Transition
 from sdc_taichi.envs.learners import JointLearner
 from sdc_taichi.envs.vector import MultiAgentVectorEnv
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.learning.policy import CHOICES, action_levels
 
 JOINT = "joint"
 """Name of the learner that stands for all learning agents."""
-CHOICES = 3
-"""Number of discrete actions for each number that an agent decides."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +35,9 @@ class LearnerSpaces:
     """Number of entries of its observation, n."""
     action_width: int
     """Number of numbers that it decides, k."""
-    discrete: bool
-    """Whether each number is one of three choices, or else lies within -1..1."""
+    choices: int | None
+    """Number of choices for each number: 3 with discrete actions, or the levels of continuous ones;
+    None where each is any number within -1..1."""
 
 
 class StreamStep(NamedTuple):
@@ -60,6 +60,9 @@ class EnvironmentStream:
     Args:
         env: a batch, as ``sdc_taichi.vector_env`` makes it.
         joint: whether all learning agents are one learner.
+        decision_steps: steps between two decisions, in which an action is held.
+        levels: number of levels, evenly from -1 to 1, that learners choose continuous actions from;
+            None is any number.
         shares_state: whether the shared state is wanted, which takes time.
         seed: seed of the first reset; environment i takes ``seed + i``.
 
@@ -68,6 +71,7 @@ class EnvironmentStream:
         spaces: what each learner sees and does.
         state_width: number of entries of the shared state, m; 0 if it is not wanted.
         size: number of environments, B.
+        decision_steps: steps between two decisions.
         observations: observations before the next step by learner, (B, n) each.
         state: shared state before the next step, (B, m).
         returns: sum of the rewards of the last whole episodes by learner, the mean over all
@@ -82,6 +86,8 @@ class EnvironmentStream:
         env: MultiAgentVectorEnv,
         *,
         joint: bool = False,
+        decision_steps: int = 1,
+        levels: int | None = None,
         shares_state: bool = True,
         seed: int = 0,
     ) -> None:
@@ -89,8 +95,11 @@ class EnvironmentStream:
         if core.options.heat_map:
             raise ConfigError("heat_map: learners take features alone; valid is False")
         self._joint = JointLearner(core) if joint else None
-        self.size = core.num_envs
-        self.spaces = _spaces(core.agents, env, self._joint)
+        self._levels = None
+        if core.options.actions == "continuous" and levels is not None:
+            self._levels = torch.from_numpy(action_levels(levels))
+        self.size, self.decision_steps = core.num_envs, decision_steps
+        self.spaces = _spaces(core.agents, env, self._joint, levels)
         self.learners = tuple(self.spaces)
         self._shares_state = shares_state
         self.state_width = int(np.prod(core.state_space.shape or ())) if shares_state else 0
@@ -99,20 +108,27 @@ class EnvironmentStream:
         self._take(core.reset(seed))
 
     def step(self, actions: Mapping[str, Tensor]) -> StreamStep:
-        """Advance all environments.
+        """Advance all environments to the next decision, or to the end of their episodes.
 
         Args:
-            actions: of each learner, (B, k): choices 0, 1 or 2, or numbers within -1..1.
+            actions: of each learner, (B, k): numbers of choices, or numbers within -1..1.
+
+        Returns:
+            The situation after the last step, and rewards summed over the steps.
         """
-        core = self._core
-        transition = core.step(self._by_agent(actions))
-        ended = transition.ended
+        core, by_agent = self._core, self._by_agent(actions)
+        transition = core.step(by_agent)
         rewards = self._rewards(transition)
+        for _ in range(self.decision_steps - 1):
+            if transition.ended:
+                break
+            transition = core.step(by_agent)
+            rewards = {n: rewards[n] + more for n, more in self._rewards(transition).items()}
         for name, reward in rewards.items():
             self._sums[name] += float(reward.mean())
         self._take(transition.observations)
-        after = StreamStep(rewards, ended, self.observations, self.state)
-        if ended:
+        after = StreamStep(rewards, transition.ended, self.observations, self.state)
+        if transition.ended:
             self.returns, self._sums = self._sums, dict.fromkeys(self.learners, 0.0)
             self._take(core.next_episode())
         return after
@@ -133,13 +149,17 @@ class EnvironmentStream:
 
     def _by_agent(self, actions: Mapping[str, Tensor]) -> dict[str, Any]:
         """Actions by agent as arrays, (B,) where an agent decides one choice, else (B, k)."""
-        arrays = {name: given.numpy() for name, given in actions.items()}
+        levels = self._levels
+        arrays = {
+            name: (given if levels is None else levels[given]).numpy()
+            for name, given in actions.items()
+        }
         if self._joint is not None:
             return self._joint.actions(arrays[JOINT])
-        one_choice = {
-            a: self.spaces[a].discrete and self.spaces[a].action_width == 1 for a in arrays
+        return {
+            agent: given[:, 0] if given.dtype == np.int64 and given.shape[1] == 1 else given
+            for agent, given in arrays.items()
         }
-        return {a: given[:, 0] if one_choice[a] else given for a, given in arrays.items()}
 
     def _rewards(self, transition: Transition) -> dict[str, Tensor]:
         if self._joint is not None:
@@ -157,22 +177,30 @@ class EnvironmentStream:
 
 
 def _spaces(
-    agents: tuple[str, ...], env: MultiAgentVectorEnv, joint: JointLearner | None
+    agents: tuple[str, ...],
+    env: MultiAgentVectorEnv,
+    joint: JointLearner | None,
+    levels: int | None,
 ) -> dict[str, LearnerSpaces]:
     """What each learner sees and does."""
     if joint is not None:
         of_joint = joint.observation_space, joint.action_space
-        return {JOINT: _learner_spaces(agents, *of_joint)}
+        return {JOINT: _learner_spaces(agents, *of_joint, levels)}
     return {
-        a: _learner_spaces((a,), env.observation_spaces[a], env.action_spaces[a]) for a in agents
+        a: _learner_spaces((a,), env.observation_spaces[a], env.action_spaces[a], levels)
+        for a in agents
     }
 
 
 def _learner_spaces(
-    agents: tuple[str, ...], observation: spaces.Space[Any], action: spaces.Space[Any]
+    agents: tuple[str, ...],
+    observation: spaces.Space[Any],
+    action: spaces.Space[Any],
+    levels: int | None,
 ) -> LearnerSpaces:
-    shape, discrete = observation.shape or (), not isinstance(action, spaces.Box)
-    return LearnerSpaces(agents, int(np.prod(shape)), int(np.prod(action.shape or (1,))), discrete)
+    choices = levels if isinstance(action, spaces.Box) else CHOICES
+    width, action_width = (int(np.prod(space.shape or (1,))) for space in (observation, action))
+    return LearnerSpaces(agents, width, action_width, choices)
 
 
 def _tensor(array: Any) -> Tensor:
