@@ -14,7 +14,12 @@ from sdc_taichi.learning.policy import About, Head, Policy, PolicyNetwork
 
 
 def network(
-    agents: tuple[str, ...], inputs: int, outputs: int, head: Head = "argmax", seed: int = 0
+    agents: tuple[str, ...],
+    inputs: int,
+    outputs: int,
+    head: Head = "argmax",
+    seed: int = 0,
+    choices: int = 3,
 ) -> PolicyNetwork:
     """A network of random weights, whose actions depend on what it observes."""
     rng = np.random.default_rng(seed)
@@ -33,6 +38,7 @@ def network(
         ),
         activation="tanh" if seed % 2 else "relu",
         head=head,
+        choices=choices,
     )
 
 
@@ -40,20 +46,27 @@ def interface(**options: Any) -> Interface:
     return interface_of(build_fleet(load_config("tiny")), make_options(**options))
 
 
-def policy(fits: Interface, *, seed: int = 0) -> Policy:
-    """A policy of random weights, one network for each agent."""
-    discrete = fits.actions == "discrete"
+def policy(
+    fits: Interface, *, seed: int = 0, levels: int | None = None, decision_steps: int = 1
+) -> Policy:
+    """A policy of random weights, one network for each agent.
+
+    With ``levels``, it chooses continuous actions from as many.
+    """
+    choices = 3 if fits.actions == "discrete" else levels
     return Policy(
         tuple(
             network(
                 (agent,),
                 fits.width(agent),
-                fits.action_width(agent) * (3 if discrete else 1),
-                "argmax" if discrete else "clip",
+                fits.action_width(agent) * (choices or 1),
+                "clip" if choices is None else "argmax",
                 seed + i,
+                choices or 3,
             )
             for i, agent in enumerate(fits.agents)
         ),
         fits,
         About(algorithm="none", seed=seed),
+        decision_steps,
     )

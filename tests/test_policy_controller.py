@@ -62,10 +62,11 @@ def trained(
     env = vector_env(config=list(configs), options=own)
     observations, _ = env.reset(seed=0)
     kept = []
-    for _ in range(steps):
-        shapes = {agent: space.shape or () for agent, space in env.action_spaces.items()}
-        chosen = made.actions({agent: np.asarray(x) for agent, x in observations.items()})
-        actions = {agent: x.reshape(len(x), *shapes[agent]) for agent, x in chosen.items()}
+    for step in range(steps):
+        if step % made.decision_steps == 0:
+            shapes = {agent: space.shape or () for agent, space in env.action_spaces.items()}
+            chosen = made.actions({agent: np.asarray(x) for agent, x in observations.items()})
+            actions = {agent: x.reshape(len(x), *shapes[agent]) for agent, x in chosen.items()}
         transition = env.core.step(actions)
         observations = transition.observations
         kept.append(transition.result)
@@ -101,6 +102,17 @@ def test_a_run_has_the_commands_of_the_training(options: dict[str, Any]) -> None
     found = run(configs, made, 60)
     assert_equal(found, trained(configs, made, 60))
     assert all(varied(found, name) for name in COMMANDS)
+
+
+def test_actions_of_levels_are_held_between_decisions() -> None:
+    configs = fleet_of()
+    made = policy(interface(actions="continuous"), seed=3, levels=5, decision_steps=4)
+    found = run(configs, made, 60)
+    assert_equal(found, trained(configs, made, 60))
+    loads = np.array([result.load_command for result in found])
+    assert set(np.unique(loads)) <= {-1.0, -0.5, 0.0, 0.5, 1.0}
+    assert np.array_equal(loads, np.repeat(loads[::4], 4, axis=0))
+    assert varied(found, "load_command")
 
 
 def test_commands_of_several_units_and_fans_are_those_of_the_training() -> None:

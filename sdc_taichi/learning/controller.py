@@ -17,7 +17,7 @@ from sdc_taichi.envs.released_observer import ReleasedObserver
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.learning.policy import Policy
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import I64, Actions
+from sdc_taichi.types import F32, I64, Actions
 
 
 class PolicyController:
@@ -66,11 +66,14 @@ class PolicyController:
         self._observer: Observer | ReleasedObserver | None = None
         self._error: ForecastError | None = None
         self._begun = False
+        # Actions of the last decision, which are held until the next.
+        self._actions: dict[str, F32 | I64] = {}
 
     def reset(self, seed: int | I64) -> None:
         """Forget the episode before."""
         self._others.reset(seed)
         self._begun = False
+        self._actions = {}
 
     def act(self, view: View) -> Actions:
         """Commands of the agents of the policy, and of the others in its training.
@@ -80,12 +83,13 @@ class PolicyController:
         """
         if view.fleet is not self._fleet:
             self._prepare(view.fleet)
-        observations = self._observer_of(view).observe(view)
-        actions = {
-            agent: chosen.reshape(len(chosen), *(self._decoder.spaces[agent].shape or ()))
-            for agent, chosen in self.policy.actions(observations).items()
-        }
-        commands: dict[str, Any] = {**self._decoder.decode(actions, view.state)}
+        observer = self._observer_of(view)
+        if not self._actions or view.state.step % self.policy.decision_steps == 0:
+            self._actions = {
+                agent: chosen.reshape(len(chosen), *(self._decoder.spaces[agent].shape or ()))
+                for agent, chosen in self.policy.actions(observer.observe(view)).items()
+            }
+        commands: dict[str, Any] = {**self._decoder.decode(self._actions, view.state)}
         if self._by_others:
             by_others = self._others.act(view)
             commands |= {name: getattr(by_others, name) for name in self._by_others}
