@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.learning.policy import CHOICES
 from sdc_taichi.learning.settings import OffPolicySettings
-from sdc_taichi.learning.stream import CHOICES
 
 MOST_JOINT_ACTIONS = 729
 """Largest number of outputs of a critic of joint actions, those of six choices."""
