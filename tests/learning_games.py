@@ -28,7 +28,9 @@ class Game:
 
     def __init__(self, players: int = 1, discrete: bool = True, width: int = 1) -> None:
         names = [f"player_{i}" for i in range(players)]
-        self.spaces = {n: LearnerSpaces((n,), self.rooms, width, discrete) for n in names}
+        self.spaces = {
+            n: LearnerSpaces((n,), self.rooms, width, 3 if discrete else None) for n in names
+        }
         self.learners = tuple(names)
         self.state_width = self.rooms
         self.room = torch.zeros(self.size, dtype=torch.int64)

@@ -31,7 +31,13 @@ from sdc_taichi.learning.settings import OnPolicySettings  # noqa: E402
 from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces  # noqa: E402
 
 SMALL = OnPolicySettings(
-    rollout_steps=6, hidden=(16,), mini_batches=2, learning_rate=0.01, discount=0.9, anneal=False
+    decision_steps=1,
+    rollout_decisions=6,
+    hidden=(16,),
+    mini_batches=2,
+    learning_rate=0.01,
+    discount=0.9,
+    anneal=False,
 )
 QUICK = SMALL.model_copy(update={"learning_rate": 0.05, "epochs": 3, "mini_batches": 1})
 """Settings that learn simple games in few updates."""
@@ -99,7 +105,7 @@ def choices(algo: OnPolicy, observation: Tensor) -> list[int]:
 def actor_in_f64(*, discrete: bool, width: int = 2) -> Actor:
     """An actor of tiny layers, none of which is near 0."""
     generator = torch.Generator().manual_seed(1)
-    spaces = LearnerSpaces(("a",), 3, width, discrete)
+    spaces = LearnerSpaces(("a",), 3, width, 3 if discrete else None)
     actor: Actor = Actor(spaces, OnPolicySettings(hidden=(4,)), generator).double()
     with torch.no_grad():
         for parameter in actor.parameters():
@@ -241,7 +247,7 @@ def critic_says(values: Mapping[str, Any], inputs: Mapping[str, Any], seen: Tens
 
 
 def test_values_go_on_beyond_the_end_of_an_episode_and_not_into_the_next() -> None:
-    settings = QUICK.model_copy(update={"rollout_steps": 10, "anneal": True, "epochs": 6})
+    settings = QUICK.model_copy(update={"rollout_decisions": 10, "anneal": True, "epochs": 6})
     algo = trained("ippo", Turnstile(), settings, updates=50)
     critic = algo.state_dict()["critics"]["player_0"]
     paid, unpaid = critic_says(critic, critic["inputs"], torch.eye(2)).tolist()

@@ -237,8 +237,7 @@ class OffPolicy:
                     rewards[name] += after.rewards[name].mean()
             self._moments.add(torch.cat(seen))
         logged = {
-            f"reward/{n}": float(x) / self._settings.rollout_decisions
-            for n, x in rewards.items()
+            f"reward/{n}": float(x) / self._settings.rollout_decisions for n, x in rewards.items()
         }
         return logged if self._soft else logged | {"exploration": self.exploration}
 
