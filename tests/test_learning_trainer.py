@@ -42,9 +42,9 @@ SMALL: dict[str, Any] = {
     "tensorboard": False,
 }
 LEARNING: dict[str, dict[str, Any]] = {
-    "happo": {"rollout_steps": ROLLOUT, "hidden": [8], "epochs": 1},
+    "happo": {"rollout_decisions": ROLLOUT // 4, "hidden": [8], "epochs": 1},
     "hasac": {
-        "rollout_steps": ROLLOUT,
+        "rollout_decisions": ROLLOUT // 4,
         "gradient_steps": 2,
         "batch_size": 16,
         "replay_size": 512,

@@ -92,7 +92,7 @@ class OffPolicy:
         seed: int,
     ) -> None:
         self._settings, self._spaces, self._updates = settings, dict(spaces), updates
-        self.steps_per_update = settings.rollout_decisions * settings.decision_steps
+        self.steps_per_update = settings.steps_per_update
         self._done = 0
         names = ("weights", "actions", "batches", "order")
         self._generators = {

@@ -99,7 +99,7 @@ class OnPolicy:
         self._definition = definition._replace(
             critic=settings.critic or definition.critic, reward=settings.reward or definition.reward
         )
-        self.steps_per_update = settings.rollout_decisions * settings.decision_steps
+        self.steps_per_update = settings.steps_per_update
         self._done = 0
         names = ("weights", "actions", "batches", "order")
         self._generators = {

@@ -10,8 +10,8 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Hidden = tuple[Annotated[int, Field(strict=True, ge=1, le=4096)], ...]
 
 
-class OnPolicySettings(BaseModel):
-    """Settings of ``ppo``, ``ippo``, ``mappo``, ``happo`` and ``haa2c``."""
+class _ActingSettings(BaseModel):
+    """Settings of how policies act while they learn."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -19,9 +19,19 @@ class OnPolicySettings(BaseModel):
     """Steps between two decisions of a policy, in which its actions are held."""
     levels: Annotated[int, Field(strict=True, ge=2, le=101)] | None = 7
     """Number of levels, evenly from -1 to 1, that continuous actions are chosen from (Tang and
-    Agrawal 2020); null is any number, from a normal distribution."""
+    Agrawal 2020); None is any number."""
     rollout_decisions: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 32
     """Decisions of each data center between two updates."""
+
+    @property
+    def steps_per_update(self) -> int:
+        """Steps of each data center between two updates."""
+        return self.rollout_decisions * self.decision_steps
+
+
+class OnPolicySettings(_ActingSettings):
+    """Settings of ``ppo``, ``ippo``, ``mappo``, ``happo`` and ``haa2c``."""
+
     epochs: Annotated[int, Field(strict=True, ge=1, le=100)] = 4
     """Passes over the steps of an update; ``haa2c`` makes one."""
     mini_batches: Annotated[int, Field(strict=True, ge=1, le=1024)] = 4
@@ -52,16 +62,12 @@ class OnPolicySettings(BaseModel):
     algorithm's source."""
 
 
-class OffPolicySettings(BaseModel):
+class OffPolicySettings(_ActingSettings):
     """Settings of ``had3qn`` and ``hasac``."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    decision_steps: Annotated[int, Field(strict=True, ge=1, le=96)] = 4
-    """Steps between two decisions of a policy, in which its actions are held."""
     levels: Annotated[int, Field(strict=True, ge=2, le=101)] | None = 5
-    """Number of levels, evenly from -1 to 1, that continuous actions are chosen from (Tang and
-    Agrawal 2020); null is any number, from a normal distribution."""
+    """Number of levels, evenly from -1 to 1, that continuous actions are chosen from, of which the
+    critic values every combination; None is any number, for ``hasac``."""
     rollout_decisions: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 8
     """Decisions of each data center between two updates."""
     gradient_steps: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 16

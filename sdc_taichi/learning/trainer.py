@@ -136,7 +136,7 @@ class _Run:
         try:
             self._interface = interface_of(env.core.sim.fleet, env.core.options)
             self._stream = make_stream(settings, env)
-            self._steps_each = env.num_envs * settings.learning.rollout_steps
+            self._steps_each = env.num_envs * settings.learning.steps_per_update
             self._updates = settings.steps // self._steps_each
             if not self._updates:
                 raise ConfigError(
@@ -347,7 +347,12 @@ class _Run:
             others=self._env.core.options.others,
             version=version("sdc-taichi"),
         )
-        return Policy(self._algorithm.networks(), self._interface, about)
+        return Policy(
+            self._algorithm.networks(),
+            self._interface,
+            about,
+            self._settings.learning.decision_steps,
+        )
 
 
 class _Speed:
@@ -404,6 +409,8 @@ def make_stream(settings: TrainingSettings, env: MultiAgentVectorEnv) -> Environ
     return EnvironmentStream(
         env,
         joint=settings.algorithm == "ppo" and len(env.possible_agents) > 1,
+        decision_steps=settings.learning.decision_steps,
+        levels=settings.learning.levels,
         shares_state=uses_state(settings.algorithm, settings.learning),
         # No two trainings share the seed of a data center.
         seed=settings.seed * env.num_envs,
