@@ -15,6 +15,7 @@ import typer.core
 from sdc_taichi.cli.arguments import Debug
 from sdc_taichi.cli.config import config_app
 from sdc_taichi.cli.data import data_app
+from sdc_taichi.cli.evaluate import evaluate_command
 from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.cli.optimum import optimum_command
 from sdc_taichi.cli.policy import policy_app
@@ -34,7 +35,7 @@ class _Commands(typer.core.TyperGroup):
 
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> Any:
         given = sys.argv[1:] if args is None else list(args)
-        extra["standalone_mode"] = False
+        extra |= {"standalone_mode": False, "obj": given}
         try:
             with warnings_in_lines():
                 code = super().main(args, *more, **extra)
@@ -64,6 +65,7 @@ app.command("view")(view_command)
 app.command("simulate")(simulate_command)
 app.command("optimum")(optimum_command)
 app.command("train")(train_command)
+app.command("evaluate")(evaluate_command)
 
 
 def main() -> None:

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.control import PERFECT, Controller, ForecastError, View
-from sdc_taichi.control.rules import Idle
+from sdc_taichi.control import PERFECT, Controller, ForecastError, Idle, PerAgent
 from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS, data_center_weeks
 from sdc_taichi.learning.statistics import change_pct, share_pct
@@ -30,7 +29,7 @@ from sdc_taichi.run.metrics import add_step, empty_totals, metrics_per_dc
 from sdc_taichi.sim.bills import no_demand
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.types import F64, I64, Actions, StepResult
+from sdc_taichi.types import F64, I64, StepResult
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,8 +44,6 @@ METRICS = (
     *("overdue_task_h", "queue_mean_tasks", "battery_throughput_kwh", "unmet_cooling_kwh"),
 )
 """Metrics of ``run.metrics`` that rows tell of the scored steps."""
-_COMMANDS = {"load": ("load",), "cooling": ("cooling", "fan"), "battery": ("battery",)}
-"""Fields of ``Actions`` by what moves them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +262,7 @@ def evaluate(
         on_step = None if on_run is None else on_run(name)
         controller = contender.controller
         if moves != ALL:
-            controller = _Alone(controller, moves)
+            controller = PerAgent(*(controller if a == moves else Idle() for a in AGENTS))
         frame = _rows(weeks, controller, on_step, stop)
         if frame is None:
             missing.append(name)
@@ -285,22 +282,6 @@ def evaluate(
         strata=weeks.strata,
         missing=tuple(dict.fromkeys(missing)),
     )
-
-
-class _Alone:
-    """A controller of which one agent acts, and the others are idle."""
-
-    def __init__(self, controller: Controller, moves: str) -> None:
-        self._controller, self._fields = controller, _COMMANDS[moves]
-
-    def reset(self, seed: Any) -> None:
-        """Reset the controller."""
-        self._controller.reset(seed)
-
-    def act(self, view: View) -> Actions:
-        """Commands of one agent alone."""
-        given = self._controller.act(view)
-        return Actions(**{name: getattr(given, name) for name in self._fields})
 
 
 def _runs(

@@ -1,0 +1,255 @@
+"""``sdc-taichi evaluate``: policies and other controllers in weeks that were not trained in."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sdc_taichi.cli.arguments import (
+    Debug,
+    Overrides,
+    force_option,
+    json_option,
+    out_option,
+    read_config,
+)
+from sdc_taichi.cli.scenario import (
+    EXIT_INTERRUPTED,
+    Carbon,
+    ErrorOfForecasts,
+    Precision,
+    Seed,
+    Site,
+    Weather,
+    Workload,
+    data_centers,
+)
+from sdc_taichi.cli.session import interruptible, print_notes, stage_bars
+from sdc_taichi.config import apply_overrides
+from sdc_taichi.errors import ConfigError, SdcError, one_line, printable
+
+if TYPE_CHECKING:
+    from sdc_taichi.config import DataCenterConfig
+    from sdc_taichi.learning.evaluation import DataCenterWeeks, Evaluation
+    from sdc_taichi.learning.training_settings import TrainingSettings
+    from sdc_taichi.types import StepResult
+
+
+def evaluate_command(
+    context: typer.Context,
+    runs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[RUN]...",
+            help="Folders of trainings or policies; seeds of one training are put together.",
+            show_default=False,
+        ),
+    ] = None,
+    site: Site = None,
+    weeks: Annotated[
+        str,
+        typer.Option(metavar="NAME|N,N", help="held-out, validation, training, or weeks 0..51."),
+    ] = "held-out",
+    controller: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Controller to compare, as of simulate; repeatable."),
+    ] = None,
+    objective: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TERMS",
+            help="What is compared, as of optimum. [default: of the training's validation]",
+        ),
+    ] = None,
+    config: Annotated[
+        str | None,
+        typer.Option(metavar="PRESET|FILE", help="Data center. [default: that of the training]"),
+    ] = None,
+    overrides: Overrides = None,
+    days: Annotated[
+        int, typer.Option(min=2, max=7, help="Days of each week; the first is not scored.")
+    ] = 7,
+    seed: Seed = 0,
+    forecast_error: ErrorOfForecasts = None,
+    no_optimum: Annotated[
+        bool, typer.Option("--no-optimum", help="No share of the achievable, no value of ends.")
+    ] = False,
+    no_agents: Annotated[
+        bool, typer.Option("--no-agents", help="Leave out each agent alone.")
+    ] = False,
+    no_cache: Annotated[
+        bool, typer.Option("--no-cache", help="Solve anew, and keep nothing for later.")
+    ] = False,
+    precision: Precision = "f32",
+    weather: Weather = None,
+    carbon: Carbon = None,
+    workload: Workload = None,
+    out: Annotated[
+        Path | None, out_option("Folder for tables, rows and figures. [default: none]", "DIR")
+    ] = None,
+    force: Annotated[bool, force_option("Write into a folder with other files.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no tables.")] = False,
+    as_json: Annotated[bool, json_option("Print evaluation.json instead of the tables.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Compare policies and controllers in weeks that no training has seen.
+
+    All begin in equal weeks and states; the first day of each week is run but not scored. The share
+    of the achievable is 0 for idle commands and 1 for the known optimum.
+    """
+    from sdc_taichi.control import PERFECT, ForecastError
+    from sdc_taichi.learning.evaluation_folder import (
+        EVALUATION_FILE,
+        ROWS_FILE,
+        TABLE_FILE,
+        content_json,
+        evaluation_content,
+        prepare_evaluation_folder,
+        training_settings,
+        write_evaluation,
+    )
+    from sdc_taichi.learning.split import parse_weeks
+
+    folders, named = list(runs or ()), list(controller or ())
+    if not folders and not named:
+        raise ConfigError("evaluate: nothing to evaluate; valid is RUN or --controller")
+    chosen = parse_weeks(weeks)
+    error = PERFECT if forecast_error is None else ForecastError.parse(forecast_error)
+    settings = training_settings(folders) if config is None else None
+    base = _base_config(settings, config, overrides)
+    if site is None and settings is not None and settings.sites and not (weather or carbon):
+        site = ",".join(settings.sites)
+    configs = data_centers(
+        base, site, start=None, weather=weather, carbon=carbon, workload=workload
+    )
+    if objective is None:
+        objective = "carbon" if settings is None else settings.validation.objective
+    if out is not None:
+        prepare_evaluation_folder(out, force=force)
+    with interruptible() as stop:
+        with stage_bars(shown=not quiet) as progress:
+            prepared = _prepared(
+                configs,
+                chosen,
+                optimum=not no_optimum,
+                objective=objective,
+                days=days,
+                seed=seed,
+                forecast_error=error,
+                precision=precision,
+                cache=not no_cache,
+                progress=progress,
+                stop=stop,
+            )
+        with prepared:
+            found = _evaluated(
+                prepared, folders, named, agents_alone=not no_agents, quiet=quiet, stop=stop
+            )
+            command = shlex.join(["sdc-taichi", *context.obj])
+            content = evaluation_content(found, prepared, command=command, folders=folders)
+            if as_json:
+                print(content_json(content), end="")
+            elif not quiet and len(found.rows):
+                _print_tables(found, prepared)
+            if out is not None and len(found.rows):
+                write_evaluation(out, found, prepared, content)
+                if not (quiet or as_json):
+                    files = f"{EVALUATION_FILE}, {ROWS_FILE}, {TABLE_FILE}"
+                    print(f"Files in {printable(out)}: {files}")
+    if found.missing:
+        left = ", ".join(found.missing)
+        print(f"interrupted; figures are whole, without {left}", file=sys.stderr)
+        raise typer.Exit(EXIT_INTERRUPTED)
+
+
+def _base_config(
+    settings: TrainingSettings | None, config: str | None, overrides: list[str] | None
+) -> DataCenterConfig:
+    """The data center of ``--config``, or that of a training, with overrides."""
+    if settings is None:
+        return read_config([] if config is None else [config], overrides)[0]
+    return apply_overrides(settings.data_centers_of_sites()[0], overrides or [])
+
+
+def _prepared(
+    configs: Sequence[DataCenterConfig],
+    weeks: tuple[int, ...],
+    *,
+    optimum: bool,
+    stop: Callable[[], bool],
+    **options: Any,
+) -> DataCenterWeeks:
+    """The weeks, without an optimum where there is none, which is said on stderr.
+
+    Raises:
+        typer.Exit: solving was stopped; what is kept has been printed.
+    """
+    from sdc_taichi.learning.evaluation import prepare
+    from sdc_taichi.optimum.result import StoppedError
+
+    if optimum:
+        try:
+            return prepare(configs, weeks, stop=stop, **options)
+        except StoppedError as error:
+            print(f"interrupted: {one_line(str(error))}", file=sys.stderr)
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+        except SdcError as error:
+            failed = error
+    weeks_without = prepare(configs, weeks, optimum=False, stop=stop, **options)
+    if optimum:
+        print(f"note: no optimum, so no shares: {one_line(str(failed))}", file=sys.stderr)
+    return weeks_without
+
+
+def _evaluated(
+    weeks: DataCenterWeeks,
+    folders: Sequence[Path],
+    named: Sequence[str],
+    *,
+    agents_alone: bool,
+    quiet: bool,
+    stop: Callable[[], bool],
+) -> Evaluation:
+    """Run policies and named controllers, with a progress bar for each run."""
+    from sdc_taichi.control import make_controller
+    from sdc_taichi.learning.evaluation import Contender, evaluate
+    from sdc_taichi.learning.evaluation_folder import contenders_of
+
+    fleet = weeks.sim.fleet
+    print_notes(weeks.sim.drivers.notes)
+    contenders = contenders_of(folders, fleet, agents_alone=agents_alone)
+    contenders += [Contender(name, make_controller(name, fleet)) for name in named]
+    with stage_bars(shown=not quiet) as progress:
+
+        def on_run(name: str) -> Callable[[StepResult], None]:
+            return lambda result: progress(name, result.step + 1, weeks.steps)
+
+        return evaluate(weeks, contenders, on_run=on_run, stop=stop)
+
+
+def _print_tables(found: Evaluation, weeks: DataCenterWeeks) -> None:
+    """Print the tables of an evaluation."""
+    from rich.table import Table
+
+    from sdc_taichi.cli.console import PlainConsole
+    from sdc_taichi.learning.evaluation_folder import remarks, tables_of
+    from sdc_taichi.learning.evaluation_table import text_rows
+
+    width = None if sys.stdout.isatty() else 240
+    console = PlainConsole(highlight=False, width=width, soft_wrap=True)
+    for title, table in tables_of(found, weeks):
+        console.print(title)
+        titles, rows = text_rows(table)
+        shown = Table()
+        for i, head in enumerate(titles):
+            shown.add_column(head, justify="right" if i else "left", no_wrap=True)
+        for cells in rows:
+            shown.add_row(*cells)
+        console.print(shown)
+    for line in remarks(weeks):
+        console.print(line)

@@ -1,0 +1,265 @@
+"""Tables of an evaluation: all weeks together, by site, by agent, and pairs of controllers.
+
+Figures are those with valued ends where an optimum values them, and as they are where none does.
+Intervals are those of ``statistics.bootstrap_interval``, with the same draws for all rows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sdc_taichi.learning.evaluation import ALL, IDLE, Evaluation
+from sdc_taichi.learning.statistics import (
+    Interval,
+    Statistic,
+    bootstrap_interval,
+    change_pct,
+    interquartile_mean,
+    probability_of_improvement,
+    share_pct,
+)
+from sdc_taichi.optimum.problem import AGENTS
+from sdc_taichi.run.achievable import OPTIMUM
+from sdc_taichi.types import F64
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_SEED = 0
+"""Seed of the draws of intervals."""
+_AGAINST_IDLE = {
+    "carbon_pct": "cfp_kg",
+    "energy_pct": "grid_kwh",
+    "water_pct": "water_l",
+    "cost_pct": "cost",
+    "peak_pct": "peak_kw",
+}
+"""Columns of changes against idle commands, and the metrics that they are of."""
+TITLES = {
+    "controller": "controller",
+    "moves": "moves",
+    "trainings": "seeds",
+    "change_pct": "against idle (%)",
+    "interquartile_mean_pct": "interquartile mean (%)",
+    "share_pct": "share (%)",
+    "alone_pct": "optimum alone (%)",
+    "carbon_pct": "carbon (%)",
+    "energy_pct": "energy (%)",
+    "water_pct": "water (%)",
+    "cost_pct": "cost (%)",
+    "peak_pct": "peak (%)",
+    "over_27_degree_h": "over 27 C (K h)",
+    "overdue_task_h": "overdue (task h)",
+    "dropped_pct": "dropped (%)",
+    "broken_pct": "broken weeks (%)",
+    "than": "than",
+    "points": "difference (points)",
+    "probability": "improves (probability)",
+}
+"""Titles of columns in printed tables."""
+
+
+def summary(evaluation: Evaluation) -> pd.DataFrame:
+    """All weeks together, a row for each controller.
+
+    Changes against idle commands are of sums over all weeks, in %; those of ``change`` and
+    ``share`` have the ends ``_low`` and ``_high`` of a 95 % interval. ``over_27_degree_h`` (K h,
+    mean over the servers) and ``overdue_task_h`` are means of a week. ``dropped_pct`` is work
+    dropped of that arrived, ``broken_pct`` weeks that break a constraint the optimum keeps.
+    """
+    import pandas as pd
+
+    return pd.DataFrame(
+        [
+            {"controller": name, "trainings": len(_sample(own, "figure"))}
+            | _standing(evaluation, own)
+            for name, own in _groups(evaluation, ALL)
+        ]
+    )
+
+
+def by_site(evaluation: Evaluation) -> pd.DataFrame:
+    """Change against idle commands in %, a row for each controller and a column for each site."""
+    import pandas as pd
+
+    sites = list(dict.fromkeys(evaluation.rows["site"])) if len(evaluation.rows) else []
+    found = []
+    for name, own in _groups(evaluation, ALL):
+        changes = {site: _change(evaluation, own[own["site"] == site]) for site in sites}
+        found.append({"controller": name} | changes)
+    return pd.DataFrame(found)
+
+
+def by_agent(evaluation: Evaluation) -> pd.DataFrame:
+    """Each agent alone, the others idle, beside the optimum of that agent alone.
+
+    Columns are those of ``summary``, with ``alone_pct`` for the optimum of the agent. Empty if no
+    agent ran alone.
+    """
+    import pandas as pd
+
+    found = []
+    base = _base(evaluation)
+    for agent in AGENTS:
+        best = evaluation.alone.get(agent)
+        alone = math.nan if best is None else float(change_pct(best[None], base))
+        found += [
+            {"moves": agent, "controller": name, "alone_pct": alone}
+            | _standing(evaluation, own, best)
+            for name, own in _groups(evaluation, agent)
+        ]
+    return pd.DataFrame(found)
+
+
+def differences(evaluation: Evaluation, controller: str) -> pd.DataFrame:
+    """A controller against all others in the same weeks.
+
+    Args:
+        evaluation: the evaluation.
+        controller: name of the controller.
+
+    Returns:
+        A row for each other controller: ``points`` of the change against idle commands (below 0 is
+        better) with the ends of a 95 % interval, and the ``probability`` that a training of the
+        controller has the lower figure in a week, 0..1.
+    """
+    import pandas as pd
+
+    groups = dict(_groups(evaluation, ALL))
+    mine, base = _sample(groups[controller], _column(evaluation)), _base(evaluation)
+
+    def points(one: F64, other: F64, idle: F64) -> F64:
+        return np.asarray(change_pct(one, idle) - change_pct(other, idle))
+
+    found = []
+    for name, own in groups.items():
+        if name == controller:
+            continue
+        theirs = _sample(own, _column(evaluation))
+        interval = _interval(evaluation, points, mine, theirs, base)
+        probability = float(probability_of_improvement(mine, theirs))
+        found.append({"controller": controller, "than": name, **_ends("points", interval),
+                      "probability": probability})  # fmt: skip
+    return pd.DataFrame(found)
+
+
+def text_rows(table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
+    """Titles and cells of a table to print: intervals of some width in brackets, nan as a dash.
+
+    Args:
+        table: one of the tables of this module.
+    """
+    shown = [str(name) for name in table.columns if not str(name).endswith(("_low", "_high"))]
+    rows = []
+    for values in table.to_dict("records"):
+        cells = []
+        for name in shown:
+            text = _cell(values[name], 3 if name == "probability" else 2)
+            low, high = values.get(f"{name}_low"), values.get(f"{name}_high")
+            if low is not None and high is not None and high - low > 1e-9:
+                text += f" ({_cell(low)} to {_cell(high)})"
+            cells.append(text)
+        rows.append(cells)
+    return [TITLES.get(name, name) for name in shown], rows
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """A table as Markdown.
+
+    Args:
+        table: one of the tables of this module.
+    """
+    titles, rows = text_rows(table)
+    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
+    return "\n".join(lines + [f"| {' | '.join(cells)} |" for cells in rows])
+
+
+def _groups(evaluation: Evaluation, moves: str) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Rows of each controller, in their order, of what is moved."""
+    rows = evaluation.rows
+    if not len(rows):
+        return
+    own = rows[rows["moves"] == moves]
+    for name in dict.fromkeys(own["controller"]):
+        yield str(name), own[own["controller"] == name]
+
+
+def _standing(
+    evaluation: Evaluation, own: pd.DataFrame, best: F64 | None = None
+) -> dict[str, float]:
+    """How the rows of one controller do; ``best`` are figures of another optimum, (B,)."""
+    base, figures = _base(evaluation), _sample(own, _column(evaluation))
+    achieved = _sample(own, "achieved_figure")[:1] if best is None else best[None]
+    of_weeks = 100.0 * (figures / base - 1.0)
+    idle = dict(_groups(evaluation, ALL))[IDLE]
+    arrived = own["arrived_tasks"].sum()
+    return {
+        **_ends("change_pct", _interval(evaluation, change_pct, figures, base)),
+        "interquartile_mean_pct": float(interquartile_mean(of_weeks)),
+        **_ends("share_pct", _interval(evaluation, share_pct, figures, base, achieved)),
+        **{
+            name: float(change_pct(_sample(own, metric), _sample(idle, metric)))
+            for name, metric in _AGAINST_IDLE.items()
+        },
+        "over_27_degree_h": float(own["over_27_degree_h"].mean()),
+        "overdue_task_h": float(own["overdue_task_h"].mean()),
+        "dropped_pct": 100.0 * float(own["dropped_tasks"].sum() / arrived) if arrived else 0.0,
+        "broken_pct": _broken_pct(own),
+    }
+
+
+def _broken_pct(own: pd.DataFrame) -> float:
+    """Share of weeks that break a constraint, in %; nan without an optimum."""
+    known = own["broken"].notna()
+    return 100.0 * float((own["broken"][known] != "").mean()) if known.any() else math.nan
+
+
+def _change(evaluation: Evaluation, own: pd.DataFrame) -> float:
+    """Change of some weeks against idle commands, in %."""
+    base = _sample(own, "idle_figure")[:1]
+    return float(change_pct(_sample(own, _column(evaluation)), base))
+
+
+def _interval(evaluation: Evaluation, statistic: Statistic, *samples: F64) -> Interval:
+    """A statistic with its interval, by the same draws whatever the row."""
+    generator = np.random.Generator(np.random.PCG64(_SEED))
+    return bootstrap_interval(statistic, samples, evaluation.strata, generator)
+
+
+def _ends(name: str, interval: Interval) -> dict[str, float]:
+    """Columns of an interval."""
+    return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+
+
+def _column(evaluation: Evaluation) -> str:
+    """Column of the figures that are compared."""
+    return "valued_figure" if evaluation.alone else "figure"
+
+
+def _base(evaluation: Evaluation) -> F64:
+    """Figures of idle commands in each week, (1, W)."""
+    return _sample(evaluation.rows, "idle_figure")[:1]
+
+
+def _sample(rows: pd.DataFrame, column: str) -> F64:
+    """Values by training and week, (S, W), of rows that follow each other week by week."""
+    width = len(rows[["site", "week"]].drop_duplicates())
+    return rows[column].to_numpy(np.float64).reshape(-1, width)
+
+
+def _cell(value: Any, decimals: int = 2) -> str:
+    """A value of a table as text."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int | np.integer):
+        return str(value)
+    return "-" if not math.isfinite(value) else f"{value:z.{decimals}f}"
+
+
+def is_compared(name: str) -> bool:
+    """Whether a controller stands for itself, and not for an end of the scale."""
+    return name not in (IDLE, OPTIMUM)
