@@ -20,6 +20,7 @@ from sdc_taichi.learning.training_settings import (
     TrainingSettings,
     load_settings,
     make_settings,
+    settings_markdown,
 )
 
 
@@ -141,3 +142,9 @@ def test_a_missing_torch_is_one_line_and_settings_need_none(tmp_path: Path) -> N
 
 def test_durations_are_short_texts() -> None:
     assert [command.duration(s) for s in (5, 65, 3725)] == ["0:05", "1:05", "1:02:05"]
+
+
+def test_the_page_of_settings_has_their_tables() -> None:
+    page = Path(__file__).parents[1] / "docs/training-settings.md"
+    said = "docs/training-settings.md: append what settings_markdown() makes"
+    assert page.read_text("utf-8").endswith(f"{settings_markdown()}\n"), said

@@ -8,7 +8,7 @@ import itertools
 import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from pydantic import BaseModel
@@ -29,6 +29,8 @@ LISTED: dict[str, type[BaseModel]] = {
 }
 """Sections that stand in lists, by the path of the list."""
 
+_TITLES = {"DataCenterConfig": "A data center"}
+
 
 def fields_markdown() -> str:
     """The tables of docs/configuration.md, one per section, and reasons of shared bounds."""
@@ -37,6 +39,15 @@ def fields_markdown() -> str:
     reasons = [f"- {text}" for text in _types().values()]
     found = "\n\n".join([*tables, "## Bounds that fields share", "\n".join(reasons)])
     return found.replace("``", "`")
+
+
+def sections_markdown(sections: Iterable[tuple[str, type[BaseModel]]]) -> str:
+    """Tables of the fields of sections.
+
+    Args:
+        sections: path and schema of each; that of the outermost is empty.
+    """
+    return "\n\n".join(_table(path, model) for path, model in sections).replace("``", "`")
 
 
 def _sections(path: str, model: type[BaseModel]) -> Iterator[tuple[str, type[BaseModel]]]:
@@ -54,7 +65,8 @@ def _table(path: str, model: type[BaseModel]) -> str:
         for name, entry in schema["properties"].items()
         if not _is_section(entry)
     ]
-    head = [f"## {f'`{path}`' if path else 'A data center'}", "", inspect.getdoc(model) or "", ""]
+    title = f"`{path}`" if path else _TITLES.get(model.__name__, "Settings")
+    head = [f"## {title}", "", inspect.getdoc(model) or "", ""]
     columns = ["| field | default | valid | meaning |", "|---|---|---|---|"]
     return "\n".join([*head, *(columns + rows if rows else [])]).rstrip()
 
@@ -83,6 +95,10 @@ def _valid(entry: dict[str, Any], schema: dict[str, Any]) -> str:
         above = "above " if "exclusiveMinimum" in entry else ""
         below = "below " if "exclusiveMaximum" in entry else ""
         whole = "whole " if kind == "integer" else ""
+        if low is None and high is None:
+            return f"{whole}number".removeprefix("whole ")
+        if high is None:
+            return f"{whole}{above or 'from '}{_number(low)}"
         return f"{whole}{above}{_number(low)}..{below}{_number(high)}"
     if kind == "array":
         if "prefixItems" in entry:

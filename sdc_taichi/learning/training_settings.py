@@ -32,6 +32,7 @@ from sdc_taichi.config import (
     with_values,
 )
 from sdc_taichi.config.fields import Section
+from sdc_taichi.config.reference import sections_markdown
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
 from sdc_taichi.learning.scenarios import SCENARIOS
@@ -74,7 +75,7 @@ class TrainingSettings(Section):
     ``bill-rich``; None is none."""
     config: Annotated[str, Field(min_length=1)] | dict[str, Any] = "corrected"
     """Data center: a preset, a file, or the sections of a configuration."""
-    overrides: dict[str, Any] = Field(default_factory=dict)
+    overrides: dict[str, Any] = Field(default={})
     """Values put into the configuration, section by section."""
     sites: tuple[Annotated[str, Field(min_length=1)], ...] = ()
     """Sites, one data center for each; none is the site of the configuration."""
@@ -96,7 +97,7 @@ class TrainingSettings(Section):
     left out."""
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
     """Seed of networks, actions, mini-batches and episodes, 0..2^31 - 1."""
-    learning: SerializeAsAny[LearningSettings] = Field(default_factory=dict, validate_default=True)
+    learning: SerializeAsAny[LearningSettings] = Field(default={}, validate_default=True)
     """Settings of the algorithm."""
     checkpoint_steps: Steps = 100_000
     """Steps of all data centers together between two checkpoints, 1..1e12."""
@@ -350,3 +351,11 @@ def _leaves(path: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield from _leaves(name, value)
         else:
             yield name, value
+
+
+def settings_markdown() -> str:
+    """The tables of docs/training-settings.md, one for each section."""
+    sections: list[tuple[str, type[BaseModel]]] = [("", TrainingSettings)]
+    sections.append(("validation", ValidationSettings))
+    kinds = dict.fromkeys(LEARNING_SETTINGS.values())
+    return sections_markdown([*sections, *(("learning", kind) for kind in kinds)])
