@@ -114,8 +114,7 @@ def train_command(
         print(chosen.to_yaml(), end="")
         return
     folder = Path("runs") / f"{chosen.algorithm}-{chosen.seed}" if out is None else out
-    _require_torch()
-    from sdc_taichi.learning.trainer import train
+    from sdc_taichi.learning import train
 
     with interruptible() as interrupted, progress_of_training(shown=not quiet) as reports:
         done = train(chosen, folder, resume=resume, stop=interrupted, **reports)
@@ -184,20 +183,6 @@ def _agents(text: str) -> list[str]:
             raise ConfigError(f"--agents {text!r}: {name!r}{suggestion_or_valid(name, by_name)}")
         found.append(by_name[name])
     return found
-
-
-def _require_torch() -> None:
-    """Refuse to train without PyTorch.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
-    try:
-        import torch  # noqa: F401
-    except ImportError:
-        raise ConfigError(
-            'training needs PyTorch, which is not installed: pip install "sdc-taichi[train]"'
-        ) from None
 
 
 @contextlib.contextmanager

@@ -72,7 +72,8 @@ def _table(path: str, model: type[BaseModel]) -> str:
 
 
 def _is_section(entry: dict[str, Any]) -> bool:
-    return "$ref" in entry or "allOf" in entry  # the latter of pydantic 2.8
+    kinds = entry.get("anyOf", [entry])
+    return all("$ref" in kind or "allOf" in kind for kind in kinds)  # the latter of pydantic 2.8
 
 
 def _default(schema: dict[str, Any], name: str) -> str:
@@ -119,10 +120,14 @@ def _number(value: Any) -> str:
 
 
 def _docstrings(model: type[BaseModel]) -> dict[str, str]:
-    """Docstring of each field of a section, on one line."""
-    tree = ast.parse(inspect.getsource(sys.modules[model.__module__]))
-    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-    return _docstrings_in(classes[model.__name__].body)
+    """Docstring of each field of a section, inherited ones included, on one line."""
+    found: dict[str, str] = {}
+    for kind in reversed(model.__mro__):
+        if issubclass(kind, BaseModel) and kind is not BaseModel:
+            tree = ast.parse(inspect.getsource(sys.modules[kind.__module__]))
+            classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+            found |= _docstrings_in(classes[kind.__name__].body)
+    return found
 
 
 def _types() -> dict[str, str]:

@@ -4,3 +4,44 @@ An algorithm acts in a stream of environments, learns from it, and hands out net
 A policy is a set of networks with a description of the environment that it fits, and a controller.
 PyTorch is needed to train, and not to run a policy.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from sdc_taichi.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sdc_taichi.learning.trainer import train
+    from sdc_taichi.learning.training_settings import TrainingSettings
+
+__all__ = ["TrainingSettings", "require_torch", "train"]
+
+_LAZY = {
+    "TrainingSettings": "sdc_taichi.learning.training_settings",
+    "train": "sdc_taichi.learning.trainer",
+}
+
+
+def require_torch() -> None:
+    """Make sure that PyTorch is there, which all that trains needs.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        import torch  # noqa: F401
+    except ImportError:
+        raise ConfigError(
+            'training needs PyTorch, which is not installed: pip install "sdc-taichi[train]"'
+        ) from None
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "train":
+        require_torch()
+    globals()[name] = found = getattr(import_module(_LAZY[name]), name)
+    return found
