@@ -70,7 +70,7 @@ class OffPolicySettings(_ActingSettings):
     critic values every combination; None is any number, for ``hasac``."""
     rollout_decisions: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 8
     """Decisions of each data center between two updates."""
-    gradient_steps: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 16
+    gradient_steps: Annotated[int, Field(strict=True, ge=1, le=100_000)] = 64
     """Gradient steps of an update, each from a batch of its own."""
     batch_size: Annotated[int, Field(strict=True, ge=1, le=1_048_576)] = 1024
     """Transitions of a batch."""
