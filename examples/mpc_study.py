@@ -12,10 +12,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 
-from optimum_study import HELD_OUT, RULES, SITES, STEPS_PER_DAY, data_centers, week_starts
+from optimum_study import RULES, SITES, STEPS_PER_DAY, data_centers, week_starts
 
 from sdc_taichi import ForecastError, Simulator, make_controller
 from sdc_taichi.control import PERFECT
+from sdc_taichi.learning.split import HELD_OUT
 from sdc_taichi.optimum import solve
 from sdc_taichi.run.achievable import run_beside
 

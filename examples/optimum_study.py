@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import date, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +18,7 @@ import numpy as np
 
 from sdc_taichi import DataCenterConfig, Simulator, load_config, make_controller, simulate
 from sdc_taichi.control import Controller
+from sdc_taichi.learning.split import HELD_OUT, first_day
 from sdc_taichi.optimum import solve
 from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.run.achievable import AchievedPath, Achievement, run_beside
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
 SEASONS = {"winter": "01-08", "spring": "04-02", "summer": "07-02", "autumn": "10-01"}
 """First day of a week of each season."""
-HELD_OUT = tuple(range(3, 52, 4))
-"""Weeks of the year that docs/training.md leaves out of training."""
 RULES = "load=greedy-ci,cooling=g36,battery=lookahead-24h"
 CONTROLLERS = ("idle", "g36", "lookahead-24h", RULES, "mpc-24h")
 FLEXIBLE = (
@@ -85,8 +83,7 @@ def data_centers(
 
 def week_starts(weeks: Sequence[int]) -> dict[str, str]:
     """First days of weeks of the year, by the number of the week."""
-    first = date(2001, 1, 1)
-    return {str(week): f"{first + timedelta(days=7 * week):%m-%d}" for week in weeks}
+    return {str(week): first_day(week) for week in weeks}
 
 
 def season_table(sites: Sequence[str], days: int) -> str:

@@ -79,6 +79,10 @@ def evaluate_command(
     no_optimum: Annotated[
         bool, typer.Option("--no-optimum", help="No share of the achievable, no value of ends.")
     ] = False,
+    exact_ends: Annotated[
+        bool,
+        typer.Option("--exact-ends", help="Value the ends of each run anew: slow, for bills."),
+    ] = False,
     no_agents: Annotated[
         bool, typer.Option("--no-agents", help="Leave out each agent alone.")
     ] = False,
@@ -137,6 +141,7 @@ def evaluate_command(
                 configs,
                 chosen,
                 optimum=not no_optimum,
+                exact_ends=exact_ends,
                 objective=objective,
                 days=days,
                 seed=seed,

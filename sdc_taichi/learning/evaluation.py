@@ -138,6 +138,7 @@ def prepare(
     *,
     objective: Objective | str = "carbon",
     optimum: bool = True,
+    exact_ends: bool = False,
     days: int = DAYS_PER_WEEK,
     seed: int = 0,
     forecast_error: ForecastError = PERFECT,
@@ -154,6 +155,8 @@ def prepare(
         objective: what is compared, or its text.
         optimum: whether to solve for the optimum, which values ends and gives the share of the
             achievable.
+        exact_ends: whether to value the ends of each run by programmes of their own, at about a
+            second for each week, and not by curves.
         days: days of each week to run, 2..7; the first is not scored.
         seed: of sampled events, of controllers and of errors of forecasts.
         forecast_error: how the forecasts of controllers err.
@@ -190,7 +193,8 @@ def prepare(
                 progress=progress,
                 stop=stop,
             )
-            best = with_tabled_ends(best, sim, progress=progress, stop=stop)
+            if not exact_ends:
+                best = with_tabled_ends(best, sim, progress=progress, stop=stop)
         idle = np.empty(0) if best is None else best.idle
         made = DataCenterWeeks(
             sim=sim,

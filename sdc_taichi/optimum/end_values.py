@@ -76,9 +76,10 @@ def with_tabled_ends(
 
     What energy stored at the end is worth hardly depends on the work that waits there, nor either
     of them on the state days before. So the bound with given ends is the sum of two curves, linear
-    between a dozen bounds; only its differences between ends mean something. In weeks of the preset
-    ``corrected`` they are off by up to 0.01 % of the figure for a battery that is emptied, and by
-    0.03 % for ten hours of work that wait.
+    between a dozen bounds; only its differences between ends mean something. In two weeks of preset
+    ``corrected`` with random ends, empty to full and up to six hours of work, values were off by up
+    to 0.01 % of the figure for carbon. For cost it was 0.3 %, since the state at the beginning
+    shaves the peak that the demand charge is of; over many weeks such errors cancel.
 
     Args:
         optimum: Optimum of the simulator's data centers.
@@ -96,7 +97,8 @@ def with_tabled_ends(
     if np.any(limits >= UNLIMITED_TASKS):
         return optimum
     none = np.zeros(sim.size)
-    most_kwh = sim.sizing.battery_kwh if "battery" in optimum.agents else none
+    full_kwh = sim.sizing.battery_kwh * sim.fleet.values("battery.upper_v")
+    most_kwh = full_kwh if "battery" in optimum.agents else none
     most_tasks = limits if "load" in optimum.agents else none
     curves = []
     for dc in range(sim.size):
