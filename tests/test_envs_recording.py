@@ -131,7 +131,7 @@ def test_the_same_bits_whether_recorded_or_not(kind: str, tmp_path: Path) -> Non
 
 
 def test_a_recording_holds_the_steps_and_the_rewards(tmp_path: Path) -> None:
-    env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
+    env = sdc_taichi.parallel_env("tiny", days=1, rewards="paper", recorder=tmp_path / "run.rrd")
     played = play(env, STEPS)
     env.close()
     path = tmp_path / "run-episode-0.rrd"
