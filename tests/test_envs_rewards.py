@@ -57,6 +57,9 @@ def test_terms_are_what_their_names_say() -> None:
         "water": -result.water_l / (WATER_L_PER_KWH * design_kwh),
         "hot_inlets": -result.over_27_mean_k,
         "dropped": -result.dropped_tasks,
+        "high_power": -40.0
+        * np.maximum(result.grid_kwh / design_kwh - 0.5, 0.0) ** 2
+        * (12.0 / (720.0 * 0.1)),
         "sla": -(result.overdue_tasks + result.dropped_tasks + result.lost_tasks) / 100,
     }
     for name, values in expected.items():

@@ -53,6 +53,11 @@ QUEUE_SCALE_TASKS = 10.0
 """Queued tasks that cost 1 at the end of the day (paper, F.2)."""
 PRICE_PER_KWH = 0.1
 """Price per kWh at which the design energy gives a cost of -1."""
+BILL_H = 720.0
+"""Hours of a bill, 30 days."""
+HIGH_POWER_FACTOR = 40.0
+"""Weight of the square of high power: at three quarters of the design power, a further kWh costs
+20 times the demand charge over the hours of a bill, 0.33 at 12 per kW."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +153,19 @@ def demand_charge(r: StepResult, c: TermContext) -> F64:
     above_kw = np.maximum(r.grid_kwh / r.step_h - c.peak_kw, 0.0)
     charge = above_kw * c.demand_charge_per_kw * c.bills
     return -charge / (PRICE_PER_KWH * c.design_kwh)
+
+
+@reward_term
+def high_power(r: StepResult, c: TermContext) -> F64:
+    """Power above half the design power, squared: a demand charge spread over steps, as `cost`.
+
+    The demand charge falls due in the few steps that raise the highest power. While agents try
+    things out, some step raises it early whatever else they do, and what follows is free. Paid in
+    every step, power above half the design power has a price that rises with it.
+    """
+    share = np.maximum(r.grid_kwh / c.design_kwh - 0.5, 0.0)
+    hourly = c.demand_charge_per_kw / (PRICE_PER_KWH * BILL_H)
+    return -HIGH_POWER_FACTOR * hourly * share * share
 
 
 @reward_term

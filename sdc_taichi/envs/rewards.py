@@ -40,9 +40,9 @@ SCALES: dict[str, dict[str, dict[str, float]]] = {
         "agent_bat": {"battery_carbon": 10.0},
     },
     "bill": {
-        "agent_ls": {"work_cost": 10.0, "cooling_cost": 10.0, "sla": 20.0},
-        "agent_dc": {"cooling_cost": 10.0, "hot_inlets": 0.1},
-        "agent_bat": {"battery_cost": 10.0, "demand_charge": 10.0},
+        "agent_ls": {"work_cost": 10.0, "cooling_cost": 10.0, "high_power": 10.0, "sla": 60.0},
+        "agent_dc": {"cooling_cost": 10.0, "high_power": 10.0, "hot_inlets": 0.3},
+        "agent_bat": {"battery_cost": 10.0, "high_power": 10.0},
     },
     "paper": {
         "agent_ls": {"carbon": 1.0, "queue": 1.0, "dropped": 10.0},
@@ -51,8 +51,8 @@ SCALES: dict[str, dict[str, dict[str, float]]] = {
     },
 }
 """Scales of the terms of each agent, by the name of the set: ``default`` is carbon, to each agent
-the part that it can change, ``bill`` the same with prices, and ``paper`` r_LS, r_DC and r_BAT of
-the paper (4.5, F.2), with carbon and energies over those of the design point."""
+the part that it can change, ``bill`` the same with prices and high power, and ``paper`` r_LS, r_DC
+and r_BAT of the paper (4.5, F.2), with carbon and energies over those of the design point."""
 JOINT_SCALES: dict[str, dict[str, float]] = {
     name: {term: scale for own in SCALES[name].values() for term, scale in own.items()}
     for name in ("default", "bill")
