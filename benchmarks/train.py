@@ -118,7 +118,7 @@ def skrl(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> C
 
     train_skrl.prepare(seed)
     batch = sdc_taichi.vector_env(num_envs, days=days, autoreset_mode="SameStep")
-    env = train_skrl.BatchEnv(batch, seed)
+    env: Any = train_skrl.BatchEnv(batch, seed)
     step, env.state = meter.timed(env.step), meter.timed(env.state)
 
     def noted(actions: Any) -> Any:
@@ -130,7 +130,7 @@ def skrl(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> C
     agent = train_skrl.learner(
         env,
         algorithm,
-        rollout=SETTINGS.rollout_steps,
+        rollout=SETTINGS.steps_per_update,
         hidden=SETTINGS.hidden,
         learning_epochs=SETTINGS.epochs,
         mini_batches=SETTINGS.mini_batches,
@@ -144,19 +144,20 @@ def skrl(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> C
         value_loss_scale=0.5,
     )
     return lambda rollouts: train_skrl.trainer(
-        env, agent, rollouts * SETTINGS.rollout_steps
+        env, agent, rollouts * SETTINGS.steps_per_update
     ).train()
 
 
 def sb3(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> Callable[[int], Any]:
     """As ``ours``, by Stable-Baselines3, whose only algorithm here is ``ppo``."""
     import train_sb3
+    from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
     batch = gymnasium.make_vec(
         train_sb3.IDS["Battery"], num_envs=num_envs, days=days, autoreset_mode="SameStep"
     )
-    env = train_sb3.BatchVecEnv(batch)
+    env: Any = train_sb3.BatchVecEnv(batch)
     env.seed(seed)
     step = meter.timed(env.step_wait)
 
@@ -166,11 +167,11 @@ def sb3(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> Ca
         return result
 
     env.step_wait = noted
-    rows = num_envs * SETTINGS.rollout_steps
-    model = train_sb3.PPO(
+    rows = num_envs * SETTINGS.steps_per_update
+    model = PPO(
         "MlpPolicy",
         VecNormalize(env, gamma=SETTINGS.discount),
-        n_steps=SETTINGS.rollout_steps,
+        n_steps=SETTINGS.steps_per_update,
         batch_size=rows // SETTINGS.mini_batches,
         n_epochs=SETTINGS.epochs,
         learning_rate=SETTINGS.learning_rate,
@@ -201,7 +202,7 @@ def measure(case: str, num_envs: int, days: int, rollouts: int, seed: int) -> Ru
     wall, core = time.perf_counter(), time.process_time()
     train(rollouts)
     wall, core = time.perf_counter() - wall, time.process_time() - core
-    steps = num_envs * rollouts * SETTINGS.rollout_steps
+    steps = num_envs * rollouts * SETTINGS.steps_per_update
     memory = meter.memory_mb
     return Run(
         case=case,

@@ -37,8 +37,9 @@ import sdc_taichi
 from sdc_taichi.learning.algorithms import ON_POLICY
 from sdc_taichi.learning.normalise import RunningMoments
 from sdc_taichi.learning.on_policy import ADAM_EPSILON, TEAM, OnPolicy
+from sdc_taichi.learning.policy import CHOICES
 from sdc_taichi.learning.settings import OnPolicySettings
-from sdc_taichi.learning.stream import CHOICES, EnvironmentStream
+from sdc_taichi.learning.stream import EnvironmentStream
 
 TOLERANCE = 1e-5
 SETTINGS = OnPolicySettings(mini_batches=1, anneal=False)
