@@ -29,7 +29,7 @@ def train_command(
         str | None,
         typer.Argument(
             metavar="ALGORITHM",
-            help="ppo, ippo, mappo, happo, haa2c, had3qn or hasac.",
+            help="ppo, ippo, mappo, happo, haa2c, had3qn, hasac, cloning or cross-entropy.",
             show_default=False,
         ),
     ] = None,
@@ -165,9 +165,9 @@ def _settings(
     for text in assigned:
         apply_override(values, text)
     if "algorithm" not in values:
-        raise ConfigError(
-            "ALGORITHM: missing; valid: ppo, ippo, mappo, happo, haa2c, had3qn, hasac"
-        )
+        from sdc_taichi.learning.settings import LEARNING_SETTINGS
+
+        raise ConfigError(f"ALGORITHM: missing; valid: {', '.join(LEARNING_SETTINGS)}")
     return make_settings(values, "train")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,15 @@ from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.sim.fleet import STAGE_MODELS, Fleet
-from sdc_taichi.types import F64, State
+from sdc_taichi.types import F64, Actions, State
 
 BATTERY_COMMANDS = {"paper": (1.0, 0.0, -1.0), "sustaindc": (1.0, -1.0, 0.0)}
 """Commands of the battery's discrete actions 0, 1 and 2, by value of ``action_order``: 1 charges,
 -1 discharges."""
 PLACEMENT_FACTOR = 10.0
 """Relative load of a rack at an action of 1, and 1 over that of one at -1."""
+_NEUTRAL = {"placement": 1.0}
+"""Commands that change nothing where they are not 0."""
 _NEEDED_MODELS = {"fan": ("crac_flow", "controlled"), "placement": ("placement", "weights")}
 """Stage and model that a command needs."""
 
@@ -54,9 +57,11 @@ class ActionDecoder:
         self._columns: dict[str, tuple[tuple[str, slice | None], ...]] = {
             agent: _columns(names, widths) for agent, names in decided.items()
         }
+        self._widths: dict[str, int] = {
+            agent: sum(widths.get(name, 1) for name in names) for agent, names in decided.items()
+        }
         self.spaces: dict[str, spaces.Space[Any]] = {
-            agent: self._space(sum(widths.get(name, 1) for name in names))
-            for agent, names in decided.items()
+            agent: self._space(width) for agent, width in self._widths.items()
         }
         self._shapes = {
             agent: (fleet.size, *(space.shape or ())) for agent, space in self.spaces.items()
@@ -102,6 +107,27 @@ class ActionDecoder:
             raise SdcError(f"actions: {extra} do not learn here; valid: {list(self._agents)}")
         return commands
 
+    def encode(self, commands: Actions) -> dict[str, npt.NDArray[Any]]:
+        """Actions of the learning agents by which they come nearest to commands.
+
+        Args:
+            commands: commands of one step; the named ones and numbers.
+
+        Returns:
+            One entry per learning agent, as ``decode`` takes them.
+        """
+        actions: dict[str, npt.NDArray[Any]] = {}
+        for agent, shape in self._shapes.items():
+            size, width = shape[0], self._widths[agent]
+            parts = []
+            for name, columns in self._columns[agent]:
+                given = as_numbers(getattr(commands, name), _NEUTRAL.get(name, 0.0))
+                numbers = width if columns is None else columns.stop - columns.start
+                of_each = given.reshape(size if given.ndim else 1, -1)
+                parts.append(self._action(name, np.broadcast_to(of_each, (size, numbers))))
+            actions[agent] = np.concatenate(parts, axis=1).reshape(shape)
+        return actions
+
     def _space(self, width: int) -> spaces.Space[Any]:
         if self._continuous:
             return spaces.Box(-1.0, 1.0, (width,), dtype=np.float32)
@@ -140,6 +166,34 @@ class ActionDecoder:
             command = given * self._setpoint_change_k / self._setpoint_step_k
             return avoid_repeats(command, state.cooling_last)
         return given
+
+    def _action(self, name: str, command: F64) -> npt.NDArray[Any]:
+        """The part of an action that comes nearest to a command, (B, k)."""
+        if name == "placement":
+            command = np.log10(command)
+        if not self._continuous:
+            choices = self._discrete_commands[name]
+            if name == "placement":
+                choices = np.log10(choices)
+            return np.asarray(np.abs(command[..., None] - choices).argmin(-1))
+        if name == "cooling":
+            of_one = self._setpoint_change_k / self._setpoint_step_k
+            command = command / of_one.reshape(command.shape)
+        elif name == "fan":
+            command = command / self._fan_steps.reshape(command.shape)
+        return np.clip(command, -1.0, 1.0)
+
+
+def as_numbers(command: Any, neutral: float = 0.0) -> F64:
+    """A command of ``Actions``, which may be a named one, as numbers.
+
+    Args:
+        command: the command.
+        neutral: number of a command that is None.
+    """
+    if command is None:
+        command = neutral
+    return np.asarray(command.value if isinstance(command, Enum) else command, dtype=np.float64)
 
 
 def equal_number(offsets: npt.NDArray[np.integer], what: str) -> int:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from sdc_taichi.control import (
     parts_of,
     view_maker,
 )
-from sdc_taichi.envs.actions import ActionDecoder
+from sdc_taichi.envs.actions import ActionDecoder, as_numbers
 from sdc_taichi.envs.agents import COMMAND_OF_AGENT, COMMANDS_OF_AGENT, commands_by_others
 from sdc_taichi.envs.costs import Costs
 from sdc_taichi.envs.drawn_inputs import Draw, DrawnInputs, draw_info, draws_inputs
@@ -248,7 +247,7 @@ class Core:
             for name in self._commands_of_others:
                 command = getattr(by_others, name)
                 if command is not None:
-                    commands[name] = _as_numbers(command)
+                    commands[name] = as_numbers(command)
         result = self.sim.step(Actions(**commands))
         self._last = (view.state, commands)
         self._view = view = self._view_after(result)
@@ -261,6 +260,14 @@ class Core:
             ended=self.episode_over,
             result=result,
         )
+
+    def actions_of(self, commands: Actions) -> dict[str, npt.NDArray[Any]]:
+        """Actions of the learning agents that come nearest to commands, as ``step`` takes them.
+
+        Args:
+            commands: commands of one step, such as those of a controller.
+        """
+        return self._decoder.encode(commands)
 
     @property
     def view(self) -> View:
@@ -421,11 +428,6 @@ def _checked_size(num_envs: Any, configs: int) -> int:
     if size < configs:
         raise ConfigError(f"num_envs {size}: valid is at least {configs}, one for each config")
     return size
-
-
-def _as_numbers(command: Any) -> F64:
-    """A controller's command, which may be a named one, as numbers."""
-    return np.asarray(command.value if isinstance(command, Enum) else command, dtype=np.float64)
 
 
 def _check_others(options: EnvOptions, others: Controller) -> None:

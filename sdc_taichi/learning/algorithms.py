@@ -5,10 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
+from sdc_taichi.learning.cloning import Cloning
+from sdc_taichi.learning.cross_entropy import CrossEntropySearch
 from sdc_taichi.learning.off_policy import OffPolicy, OffPolicyDefinition
 from sdc_taichi.learning.on_policy import OnPolicy, OnPolicyDefinition
 from sdc_taichi.learning.policy import PolicyNetwork
-from sdc_taichi.learning.settings import LearningSettings, OffPolicySettings
+from sdc_taichi.learning.settings import (
+    CloningSettings,
+    CrossEntropySettings,
+    LearningSettings,
+    OffPolicySettings,
+)
 from sdc_taichi.learning.stream import EnvironmentStream
 
 ON_POLICY: dict[str, OnPolicyDefinition] = {
@@ -55,8 +62,25 @@ def make_algorithm(
         seed: seed of all that it draws.
 
     Raises:
-        ConfigError: actions that the algorithm does not take.
+        ConfigError: actions that the algorithm does not take, or fewer data centers than it needs.
     """
+    if isinstance(settings, CloningSettings):
+        return Cloning(
+            settings,
+            stream.spaces,
+            episode_steps=stream.episode_steps,
+            updates=updates,
+            seed=seed,
+        )
+    if isinstance(settings, CrossEntropySettings):
+        return CrossEntropySearch(
+            settings,
+            stream.spaces,
+            size=stream.size,
+            episode_steps=stream.episode_steps,
+            updates=updates,
+            seed=seed,
+        )
     given = stream.spaces, stream.state_width
     if isinstance(settings, OffPolicySettings):
         return OffPolicy(OFF_POLICY[name], settings, *given, updates=updates, seed=seed)
@@ -65,6 +89,15 @@ def make_algorithm(
 
 def uses_state(name: str, settings: LearningSettings) -> bool:
     """Whether an algorithm looks at the shared state."""
+    if isinstance(settings, CloningSettings | CrossEntropySettings):
+        return False
     if isinstance(settings, OffPolicySettings):
         return True
     return (settings.critic or ON_POLICY[name].critic) == "state"
+
+
+def steps_per_update(settings: LearningSettings, stream: EnvironmentStream) -> int:
+    """Steps of each data center in an update."""
+    if isinstance(settings, CloningSettings | CrossEntropySettings):
+        return stream.episode_steps
+    return settings.steps_per_update

@@ -10,8 +10,8 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Hidden = tuple[Annotated[int, Field(strict=True, ge=1, le=4096)], ...]
 
 
-class _ActingSettings(BaseModel):
-    """Settings of how policies act while they learn."""
+class _DecisionSettings(BaseModel):
+    """Settings of when policies decide, and between what."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -20,6 +20,11 @@ class _ActingSettings(BaseModel):
     levels: Annotated[int, Field(strict=True, ge=2, le=101)] | None = 7
     """Number of levels, evenly from -1 to 1, that continuous actions are chosen from (Tang and
     Agrawal 2020); None is any number."""
+
+
+class _ActingSettings(_DecisionSettings):
+    """Settings of how policies act while they learn."""
+
     rollout_decisions: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 32
     """Decisions of each data center between two updates."""
 
@@ -110,10 +115,60 @@ class OffPolicySettings(_ActingSettings):
     ``hasac``."""
 
 
-LearningSettings = OnPolicySettings | OffPolicySettings
+class CloningSettings(_DecisionSettings):
+    """Settings of ``cloning``."""
+
+    decision_steps: Annotated[int, Field(strict=True, ge=1, le=96)] = 1
+    """Steps between two decisions of a policy, in which its actions are held."""
+    expert: str = "mpc-24h"
+    """Controller to imitate, or ``optimum`` or ``optimum:OBJECTIVE`` for the optimum."""
+    policy_share: Share = 0.0
+    """Share of the data centers in which policies act from the second update on, and the expert
+    only tells what it would do; 0 is plain behaviour cloning. A plan made in advance, as that of
+    ``optimum``, tells less of what to do away from it."""
+    epochs: Annotated[int, Field(strict=True, ge=1, le=1000)] = 4
+    """Passes over the situations of an update."""
+    batch_size: Annotated[int, Field(strict=True, ge=1, le=1_048_576)] = 1024
+    """Situations of a gradient step."""
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = 2e-3
+    """Learning rate of Adam, which falls to 0 in even steps over the training."""
+    hidden: Hidden = (64, 64)
+    """Units of the hidden layers."""
+    activation: Literal["tanh", "relu"] = "tanh"
+    """Activation of all layers but the last."""
+
+
+class CrossEntropySettings(_DecisionSettings):
+    """Settings of ``cross-entropy``."""
+
+    levels: Annotated[int, Field(strict=True, ge=2, le=101)] | None = None
+    """Number of levels, evenly from -1 to 1, that continuous actions are chosen from, each by a
+    score of its own; None is any number."""
+    candidates: Annotated[int, Field(strict=True, ge=2, le=100_000)] = 64
+    """Policies that are drawn in an update, at most as many as there are data centers."""
+    elite_share: Annotated[float, Field(gt=0, lt=1)] = 0.25
+    """Share of the candidates that the distributions are fitted to."""
+    first_std: Annotated[float, Field(gt=0, le=100)] = 0.5
+    """Standard deviation of parameters at the beginning."""
+    noise_std: Annotated[float, Field(ge=0, le=100)] = 0.1
+    """Standard deviation that is added to those of the best candidates, falling to 0 in even steps
+    over the training."""
+    memory_rate: Annotated[float, Field(gt=0, le=1)] = 0.3
+    """Weight of the last episode in what returns of a data center are usual."""
+
+
+LearningSettings = OnPolicySettings | OffPolicySettings | CloningSettings | CrossEntropySettings
 """Settings of an algorithm."""
-LEARNING_SETTINGS: dict[str, type[OnPolicySettings] | type[OffPolicySettings]] = {
+LEARNING_SETTINGS: dict[
+    str,
+    type[OnPolicySettings]
+    | type[OffPolicySettings]
+    | type[CloningSettings]
+    | type[CrossEntropySettings],
+] = {
     **dict.fromkeys(("ppo", "ippo", "mappo", "happo", "haa2c"), OnPolicySettings),
     **dict.fromkeys(("had3qn", "hasac"), OffPolicySettings),
+    "cloning": CloningSettings,
+    "cross-entropy": CrossEntropySettings,
 }
 """Classes of the settings of each algorithm, by its name."""

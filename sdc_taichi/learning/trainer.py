@@ -20,7 +20,7 @@ import torch
 
 from sdc_taichi.envs.vector import MultiAgentVectorEnv, vector_env
 from sdc_taichi.errors import ConfigError, SdcError
-from sdc_taichi.learning.algorithms import make_algorithm, uses_state
+from sdc_taichi.learning.algorithms import make_algorithm, steps_per_update, uses_state
 from sdc_taichi.learning.checkpoint import read_state, write_state
 from sdc_taichi.learning.controller import PolicyController
 from sdc_taichi.learning.evaluation import DataCenterWeeks, Validation, prepare, validate
@@ -136,7 +136,7 @@ class _Run:
         try:
             self._interface = interface_of(env.core.sim.fleet, env.core.options)
             self._stream = make_stream(settings, env)
-            self._steps_each = env.num_envs * settings.learning.steps_per_update
+            self._steps_each = env.num_envs * steps_per_update(settings.learning, self._stream)
             self._updates = settings.steps // self._steps_each
             if not self._updates:
                 raise ConfigError(

@@ -68,8 +68,8 @@ class TrainingSettings(Section):
     """Everything that decides a training."""
 
     algorithm: str
-    """Name of the algorithm: ``ppo``, ``ippo``, ``mappo``, ``happo``, ``haa2c``, ``had3qn`` or
-    ``hasac``."""
+    """Name of the algorithm: ``ppo``, ``ippo``, ``mappo``, ``happo``, ``haa2c``, ``had3qn``,
+    ``hasac``, ``cloning`` or ``cross-entropy``."""
     scenario: str | None = None
     """Scenario whose settings lie beneath those given: ``carbon``, ``carbon-rich``, ``bill`` or
     ``bill-rich``; None is none."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from typing import Protocol
 
 import numpy as np
 
@@ -22,8 +23,9 @@ from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.queue import due_entries, due_work
 from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.workload import due_steps, queue_limit_tasks
-from sdc_taichi.types import F64, I64, Actions, StepResult
+from sdc_taichi.types import F64, I64, Actions, State, StepResult
 
 Stop = Callable[[], bool]
 """Asked now and then; true ends the work."""
@@ -132,13 +134,13 @@ def roll_out(
     steps = len(targets.setpoint_c)
     with Simulator(fleet, drivers=drivers, precision=precision) as sim:
         sim.reset(seed, start=start)
-        follow = _Follower(sim, targets)
+        follow = Follower(sim, targets)
         score = Score(objective, sim, scored_from)
         done = {f.name: np.empty((steps, fleet.size)) for f in fields(RollOut)}
         for t in range(steps):
             if stop is not None and stop():
                 return None
-            result: StepResult = sim.step(follow.actions(t))
+            result: StepResult = sim.step(follow.actions(sim.state))
             score.add(result)
             for name, values in done.items():
                 values[t] = getattr(result, name)
@@ -147,25 +149,49 @@ def roll_out(
     return RollOut(**done), score
 
 
-class _Follower:
-    """Commands that take the data centers of a simulator to their targets.
+class Followed(Protocol):
+    """Data centers that are taken along a path, such as a simulator that has been reset."""
+
+    @property
+    def fleet(self) -> Fleet:
+        """The data centers, B."""
+
+    @property
+    def drivers(self) -> Drivers:
+        """Their inputs."""
+
+    @property
+    def sizing(self) -> Sizing:
+        """Capacities of their devices."""
+
+    @property
+    def step_h(self) -> float:
+        """Length of a step, in h."""
+
+    @property
+    def state(self) -> State:
+        """Their state before the first step."""
+
+
+class Follower:
+    """Commands that take data centers to their targets.
 
     Args:
-        sim: The simulator, reset.
+        of: The data centers before their first step.
         targets: What they are to do.
     """
 
-    def __init__(self, sim: Simulator, targets: Targets) -> None:
-        fleet = sim.fleet
+    def __init__(self, of: Followed, targets: Targets) -> None:
+        fleet = of.fleet
         v, models = fleet.values, fleet.models
-        self._sim, self._targets = sim, targets
+        self._drivers, self._step_h, self._targets = of.drivers, of.step_h, targets
         self._work = {
             "flexible_share": v("workload.flexible_share"),
             "max_utilisation": v("workload.max_utilisation"),
             "queue_limit_tasks": queue_limit_tasks(fleet),
         }
         self._work_model, self._battery_model = models["workload"], models["battery"]
-        self._due = due_entries(sim.state.queue.shape[1], due_steps(fleet))
+        self._due = due_entries(of.state.queue.shape[1], due_steps(fleet))
         self._battery = {name: v(f"battery.{name}") for name in BATTERY_PARAMETERS}
         loses = self._battery_model != "released"
         one = np.ones(fleet.size)
@@ -173,20 +199,26 @@ class _Follower:
             name: self._battery[name] if loses else one
             for name in ("charge_efficiency", "discharge_factor")
         }
-        self._capacity_kwh = sim.sizing.battery_kwh
+        self._capacity_kwh = of.sizing.battery_kwh
         self._step_k = v("hvac.setpoint.step_k")[fleet.unit_dc]
         self._unit_dc = fleet.unit_dc
 
-    def actions(self, t: int) -> Actions:
-        """Commands of step ``t``."""
-        return Actions(load=self._load(t), cooling=self._cooling(t), battery=self._battery_(t))
+    def actions(self, state: State) -> Actions:
+        """Commands of the step to come.
 
-    def _load(self, t: int) -> F64:
-        target = self._targets.queue_tasks[t]
+        Args:
+            state: State before the step.
+        """
+        return Actions(
+            load=self._load(state), cooling=self._cooling(state), battery=self._battery_(state)
+        )
+
+    def _load(self, state: State) -> F64:
+        target = self._targets.queue_tasks[state.step]
         moves = ~np.isnan(target)
         if not moves.any():
             return np.zeros(len(target))
-        queue, demand = self._sim.state.queue, self._sim.drivers.at(t).demand
+        queue, demand = state.queue, self._drivers.at(state.step).demand
         arrived = arrived_tasks(self._work_model, demand, self._work["flexible_share"])
         command = load_command(
             queue[:, -1] + arrived - np.where(moves, target, 0.0),
@@ -198,25 +230,24 @@ class _Follower:
         )
         return np.where(moves, command, 0.0)
 
-    def _cooling(self, t: int) -> F64:
-        state = self._sim.state
+    def _cooling(self, state: State) -> F64:
         return setpoint_command(
-            self._targets.setpoint_c[t][self._unit_dc],
+            self._targets.setpoint_c[state.step][self._unit_dc],
             setpoint_c=state.setpoint_c,
             step_k=self._step_k,
             last=state.cooling_last,
         )
 
-    def _battery_(self, t: int) -> F64:
-        target, stored = self._targets.stored_kwh[t], self._sim.state.stored_kwh
+    def _battery_(self, state: State) -> F64:
+        target, stored = self._targets.stored_kwh[state.step], state.stored_kwh
         moves = ~np.isnan(target)
         bus_kwh = bus_energy_kwh(np.where(moves, target, stored), stored, **self._efficiency)
         return battery_command(
             bus_kwh,
             model=self._battery_model,
             stored_kwh=stored,
-            load_kw=self._targets.facility_kwh[t] / self._sim.step_h,
-            step_h=self._sim.step_h,
+            load_kw=self._targets.facility_kwh[state.step] / self._step_h,
+            step_h=self._step_h,
             capacity_kwh=self._capacity_kwh,
             parameters=self._battery,
         )

@@ -1,0 +1,246 @@
+"""Search for linear policies by the cross-entropy method, which needs no gradient.
+
+Parameters of candidates are drawn from normal distributions, which are then fitted to the best of
+them (Rubinstein, Kroese 2004), with a noise that keeps them from narrowing too early and fades over
+the search (Szita, Lorincz 2006).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.learning.normalise import CLIP, LEAST_STD
+from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
+from sdc_taichi.learning.settings import CrossEntropySettings
+from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces
+from sdc_taichi.types import F32, F64, I64
+
+LEAST_SPREAD = 1e-9
+"""Least spread of the returns of a data center over their size that tells candidates apart."""
+
+
+@dataclass(slots=True)
+class _Search:
+    """Search for the policy of one learner: n entries are observed, m scores are made of them."""
+
+    mean: F64
+    """Mean of the parameters, (m, n + 1), the last column being the biases."""
+    std: F64
+    """Standard deviation of the parameters, (m, n + 1)."""
+    seen_mean: F64
+    """Mean of what is observed, (n,)."""
+    seen_std: F64
+    """Standard deviation of what is observed, (n,)."""
+    usual: F64
+    """Return that each data center has had of late, (B,)."""
+    spread: F64
+    """Mean square of departures from it, (B,)."""
+
+
+class CrossEntropySearch:
+    """Cross-entropy search; in an update each data center tries a candidate for an episode.
+
+    Data centers differ more than candidates do. So a candidate's figure is not its return, but how
+    far that is above what its data center has had in the updates before, in standard deviations.
+
+    Args:
+        settings: the settings.
+        spaces: what each learner sees and does.
+        size: number of data centers, B.
+        episode_steps: number of steps of an episode.
+        updates: number of updates of the whole training.
+        seed: seed of all that is drawn.
+
+    Attributes:
+        steps_per_update: steps of each data center per update.
+
+    Raises:
+        ConfigError: more candidates than data centers.
+    """
+
+    def __init__(
+        self,
+        settings: CrossEntropySettings,
+        spaces: Mapping[str, LearnerSpaces],
+        *,
+        size: int,
+        episode_steps: int,
+        updates: int,
+        seed: int,
+    ) -> None:
+        if settings.candidates > size:
+            raise ConfigError(
+                f"learning.candidates {settings.candidates}: there are {size} data centers, and "
+                f"each tries one at a time; valid is 2..{size}"
+            )
+        self._settings, self._spaces, self._updates = settings, dict(spaces), updates
+        self._size, self.steps_per_update = size, episode_steps
+        self._generator = np.random.Generator(np.random.PCG64(seed))
+        self._done = 0
+        self._searches: dict[str, _Search] = {}
+        for name, of in self._spaces.items():
+            n, m = of.observation_width, of.action_width * (of.choices or 1)
+            self._searches[name] = _Search(
+                mean=np.zeros((m, n + 1)),
+                std=np.full((m, n + 1), settings.first_std),
+                seen_mean=np.zeros(n),
+                seen_std=np.ones(n),
+                usual=np.zeros(size),
+                spread=np.zeros(size),
+            )
+
+    def update(self, stream: EnvironmentStream) -> dict[str, float]:
+        """Try candidates for an episode, and fit the distributions to the best of them.
+
+        The first update only measures observations and returns.
+
+        Args:
+            stream: the environments, at the beginning of an episode.
+
+        Returns:
+            Numbers to log: ``reward/NAME``, the mean over steps; ``spread/NAME``, the mean standard
+            deviation of parameters.
+        """
+        drawn = {name: self._draw(search) for name, search in self._searches.items()}
+        tried = {name: self._shuffled() for name in self._searches}
+        returns = self._try(stream, drawn, tried)
+        self._done += 1
+        logged: dict[str, float] = {}
+        for name, search in self._searches.items():
+            if self._done > 1:
+                figures = _figures(returns[name], search)
+                of_each = np.bincount(tried[name], figures) / np.bincount(tried[name])
+                self._select(search, drawn[name], of_each)
+            self._remember(search, returns[name])
+            logged[f"reward/{name}"] = float(returns[name].mean()) / self.steps_per_update
+            logged[f"spread/{name}"] = float(search.std.mean())
+        return logged
+
+    def networks(self) -> tuple[PolicyNetwork, ...]:
+        """The policies at the means of the distributions."""
+        networks = []
+        for name, of in self._spaces.items():
+            search = self._searches[name]
+            networks.append(
+                PolicyNetwork(
+                    agents=of.agents,
+                    mean=search.seen_mean.astype(np.float32),
+                    std=search.seen_std.astype(np.float32),
+                    clip=CLIP,
+                    layers=((_f32(search.mean[:, :-1]), _f32(search.mean[:, -1])),),
+                    activation="tanh",
+                    head="clip" if of.choices is None else "argmax",
+                    choices=of.choices or CHOICES,
+                )
+            )
+        return tuple(networks)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides how the training goes on."""
+        fields = _Search.__dataclass_fields__
+        return {
+            "done": self._done,
+            "generator": self._generator.bit_generator.state,
+            "learners": {
+                name: {field: getattr(search, field).copy() for field in fields}
+                for name, search in self._searches.items()
+            },
+        }
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> None:
+        """Go on from what ``state_dict`` returned, of an algorithm made alike."""
+        self._done = int(values["done"])
+        self._generator.bit_generator.state = values["generator"]
+        for name, of in values["learners"].items():
+            arrays = {field: np.array(array, dtype=np.float64) for field, array in of.items()}
+            self._searches[name] = _Search(**arrays)
+
+    def _draw(self, search: _Search) -> F64:
+        """Parameters of candidates, (P, m, n + 1)."""
+        noise = self._generator.standard_normal((self._settings.candidates, *search.mean.shape))
+        return search.mean + search.std * noise
+
+    def _shuffled(self) -> I64:
+        """Candidate that each data center tries, (B,)."""
+        order = self._generator.permutation(self._size)
+        return np.asarray(order % self._settings.candidates, dtype=np.int64)
+
+    def _try(
+        self, stream: EnvironmentStream, drawn: Mapping[str, F64], tried: Mapping[str, I64]
+    ) -> dict[str, F64]:
+        """Returns of an episode by learner, (B,) each; the first measures observations as well."""
+        parameters = {name: drawn[name][tried[name]].astype(np.float32) for name in drawn}
+        returns = {name: np.zeros(self._size) for name in drawn}
+        sums = {name: np.zeros((2, s.seen_mean.size)) for name, s in self._searches.items()}
+        count, ended = 0, False
+        while not ended:
+            count += self._size
+            actions = {}
+            for name, search in self._searches.items():
+                seen = stream.observations[name].numpy()
+                if not self._done:
+                    sums[name] += seen.sum(0, np.float64), np.square(seen, dtype=np.float64).sum(0)
+                scores = _scores(parameters[name], seen, search)
+                actions[name] = torch.from_numpy(_actions(scores, self._spaces[name].choices))
+            after = stream.step(actions)
+            ended = after.ended
+            for name, reward in after.rewards.items():
+                returns[name] += reward.numpy()
+        if not self._done:
+            for name, search in self._searches.items():
+                mean, square = sums[name] / count
+                search.seen_mean = mean
+                search.seen_std = np.sqrt(np.maximum(square - mean * mean, LEAST_STD**2))
+        return returns
+
+    def _select(self, search: _Search, drawn: F64, figures: F64) -> None:
+        """Fit the distributions to the best candidates, and keep them from narrowing too early."""
+        s = self._settings
+        best = np.argsort(-figures, kind="stable")[: max(round(s.elite_share * len(figures)), 1)]
+        left = max(1.0 - (self._done - 1) / max(self._updates - 1, 1), 0.0)
+        noise = s.noise_std * left
+        search.mean = drawn[best].mean(0)
+        search.std = np.sqrt(drawn[best].var(0) + noise * noise)
+
+    def _remember(self, search: _Search, returns: F64) -> None:
+        """Take returns of an episode into account of what is usual."""
+        rate = 1.0 if self._done == 1 else self._settings.memory_rate
+        departure = returns - search.usual
+        search.usual = search.usual + rate * departure
+        if self._done > 1:
+            first = 1.0 if self._done == 2 else rate
+            search.spread = search.spread + first * (departure * departure - search.spread)
+
+
+def _figures(returns: F64, search: _Search) -> F64:
+    """How far returns are above what is usual, in standard deviations of the data center, (B,)."""
+    departure = returns - search.usual
+    spread = np.sqrt(search.spread)
+    # The second update knows no spread of a data center; that of all must do.
+    spread = np.where(spread > 0, spread, np.sqrt(np.mean(departure * departure)))
+    least = LEAST_SPREAD * np.maximum(np.abs(search.usual), 1.0)
+    return np.asarray(departure / np.maximum(spread, least))
+
+
+def _scores(parameters: F32, seen: F32, search: _Search) -> F32:
+    """Scores of each data center by its own candidate, (B, m)."""
+    scaled = ((seen - search.seen_mean) / search.seen_std).clip(-CLIP, CLIP).astype(np.float32)
+    product = np.matmul(parameters[:, :, :-1], scaled[:, :, None])[..., 0]
+    return np.asarray(product + parameters[:, :, -1])
+
+
+def _actions(scores: F32, choices: int | None) -> F32 | I64:
+    """Actions, (B, k): numbers of choices, or numbers within -1..1."""
+    if choices is not None:
+        return np.asarray(scores.reshape(len(scores), -1, choices).argmax(2))
+    return scores.clip(-1.0, 1.0)
+
+
+def _f32(values: F64) -> F32:
+    return values.astype(np.float32)

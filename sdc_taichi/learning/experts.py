@@ -1,0 +1,80 @@
+"""Experts that cloning imitates: controllers that tell what to do in any situation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sdc_taichi.control import Controller, View, make_controller
+from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.rollout import Follower, Targets
+from sdc_taichi.optimum.solve import solve
+from sdc_taichi.run.achievable import OPTIMUM, AchievedPath
+from sdc_taichi.run.loop import simulate
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.types import F64, I64, Actions, StepResult
+
+_RECORDED = ("queue_tasks", "setpoint_c", "stored_kwh", "facility_kwh")
+"""Fields of ``Targets``, which are those of ``StepResult`` too."""
+
+
+def make_expert(name: str, fleet: Fleet, steps: int) -> Controller:
+    """An expert by name.
+
+    Args:
+        name: ``optimum``, ``optimum:OBJECTIVE``, or the name of a controller.
+        fleet: the data centers, B.
+        steps: number of steps of an episode.
+
+    Raises:
+        ConfigError: an unknown name or objective.
+    """
+    kind, colon, objective = name.partition(":")
+    if kind == OPTIMUM:
+        return FollowedOptimum(steps, Objective.parse(objective if colon else "carbon"))
+    return make_controller(name, fleet)
+
+
+class FollowedOptimum:
+    """Commands towards the achieved path of the optimum of the episode under way, from any state.
+
+    Each episode is solved before its first step, unless a cache holds its optimum.
+
+    Args:
+        steps: number of steps of an episode.
+        objective: what is minimised.
+    """
+
+    def __init__(self, steps: int, objective: Objective) -> None:
+        self._steps, self._objective = steps, objective
+        self._follower: Follower | None = None
+
+    def reset(self, seed: int | I64) -> None:
+        """Forget the episode before."""
+        self._follower = None
+
+    def act(self, view: View) -> Actions:
+        """Commands for work, setpoint and battery."""
+        if self._follower is None:
+            self._follower = Follower(view, self._targets(view))
+        return self._follower.actions(view.state)
+
+    def _targets(self, view: View) -> Targets:
+        """States that the achieved path goes through."""
+        optimum = solve(
+            view.fleet,
+            steps=self._steps,
+            start=view.drivers.start,
+            drivers=view.drivers,
+            objective=self._objective,
+            precision=view.precision,
+        )
+        rows: dict[str, list[F64]] = {name: [] for name in _RECORDED}
+
+        def record(result: StepResult) -> None:
+            for name, of_steps in rows.items():
+                of_steps.append(np.array(getattr(result, name)))
+
+        with Simulator(view.fleet, drivers=view.drivers, precision=view.precision) as sim:
+            simulate(sim, AchievedPath(optimum), self._steps, 0, on_step=record)
+        return Targets(**{name: np.stack(of_steps) for name, of_steps in rows.items()})
