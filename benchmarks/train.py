@@ -39,7 +39,7 @@ from sdc_taichi.learning.stream import EnvironmentStream
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 
-SETTINGS = OnPolicySettings(anneal=False)
+SETTINGS = OnPolicySettings(decision_steps=1, levels=None, anneal=False)
 CASES = ("ippo", "skrl-ippo", "mappo", "skrl-mappo", "happo", "ppo", "sb3-ppo")
 WARM_UP = 2
 """Rollouts before the measurement."""

@@ -42,7 +42,7 @@ from sdc_taichi.learning.settings import OnPolicySettings
 from sdc_taichi.learning.stream import EnvironmentStream
 
 TOLERANCE = 1e-5
-SETTINGS = OnPolicySettings(mini_batches=1, anneal=False)
+SETTINGS = OnPolicySettings(decision_steps=1, mini_batches=1, anneal=False)
 Weights = Mapping[str, Tensor]
 
 
