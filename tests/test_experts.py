@@ -39,6 +39,8 @@ def test_experts_by_name() -> None:
         assert type(make_expert("g36", sim.fleet, 96)) is type(known)
         with pytest.raises(sdc_taichi.ConfigError, match="objective"):
             make_expert("optimum:joy", sim.fleet, 96)
+        with pytest.raises(sdc_taichi.ConfigError, match=r"learning\.expert 'g37'.*did you mean"):
+            make_expert("g37", sim.fleet, 96)
 
 
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])

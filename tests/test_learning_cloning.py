@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,12 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed: make test-train")
 
 import sdc_taichi  # noqa: E402
+from sdc_taichi import make_controller  # noqa: E402
+from sdc_taichi.errors import ConfigError  # noqa: E402
+from sdc_taichi.learning.algorithms import ON_POLICY  # noqa: E402
 from sdc_taichi.learning.cloning import Cloning, cloning_loss  # noqa: E402
-from sdc_taichi.learning.settings import CloningSettings  # noqa: E402
+from sdc_taichi.learning.on_policy import OnPolicy  # noqa: E402
+from sdc_taichi.learning.settings import CloningSettings, OnPolicySettings  # noqa: E402
 from sdc_taichi.learning.stream import EnvironmentStream  # noqa: E402
 
 
@@ -34,15 +39,15 @@ def stream_of(seed: int = 0, **options: Any) -> EnvironmentStream:
 
 def cloning_of(stream: EnvironmentStream, updates: int) -> Cloning:
     settings = CloningSettings(
-        expert="constant:21",
         policy_share=0.5,
         epochs=20,
         batch_size=64,
         hidden=(16,),
         learning_rate=0.02,
     )
+    expert = make_controller("constant:21", stream.view.fleet)
     return Cloning(
-        settings, stream.spaces, episode_steps=stream.episode_steps, updates=updates, seed=3
+        settings, expert, stream.spaces, episode_steps=stream.episode_steps, updates=updates, seed=3
     )
 
 
@@ -90,3 +95,20 @@ def test_loss_of_choices_is_the_negative_log_likelihood() -> None:
     probabilities = torch.tensor([[0.2, 0.3, 0.5, 0.1, 0.6, 0.3]])
     loss = cloning_loss(probabilities.log(), torch.tensor([[2, 1]]), 3)
     assert float(loss) == pytest.approx(-0.5 * (np.log(0.5) + np.log(0.6)))
+
+
+def test_trainings_start_from_a_clone() -> None:
+    stream = stream_of()
+    clone = cloning_of(stream, 1)
+    clone.update(stream)
+    settings = OnPolicySettings(hidden=(16,))
+    started = OnPolicy(ON_POLICY["ippo"], settings, stream.spaces, 0, updates=1, seed=0)
+    started.start_from(clone.networks(), 1000)
+    seen = stream.observations["agent_dc"].numpy()
+    (mine,), (given,) = started.networks(), clone.networks()
+    np.testing.assert_allclose(mine.scores(seen), given.scores(seen), rtol=1e-5, atol=1e-6)
+    wider = OnPolicy(ON_POLICY["ippo"], OnPolicySettings(), stream.spaces, 0, updates=1, seed=0)
+    with pytest.raises(ConfigError, match=r"network of agent_dc: has .* units; valid here is"):
+        wider.start_from(clone.networks(), 1000)
+    with pytest.raises(ConfigError, match="has networks of agent_bat; valid is agent_dc"):
+        started.start_from([replace(given, agents=("agent_bat",))], 1000)

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 from sdc_taichi.learning.cloning import Cloning
 from sdc_taichi.learning.cross_entropy import CrossEntropySearch
+from sdc_taichi.learning.experts import make_expert
 from sdc_taichi.learning.off_policy import OffPolicy, OffPolicyDefinition
 from sdc_taichi.learning.on_policy import OnPolicy, OnPolicyDefinition
 from sdc_taichi.learning.policy import PolicyNetwork
@@ -62,11 +63,13 @@ def make_algorithm(
         seed: seed of all that it draws.
 
     Raises:
-        ConfigError: actions that the algorithm does not take, or fewer data centers than it needs.
+        ConfigError: actions that the algorithm does not take, fewer data centers than it needs, or
+            an unknown expert.
     """
     if isinstance(settings, CloningSettings):
         return Cloning(
             settings,
+            make_expert(settings.expert, stream.view.fleet, stream.episode_steps),
             stream.spaces,
             episode_steps=stream.episode_steps,
             updates=updates,

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor, nn
 
 from sdc_taichi.control import Controller
-from sdc_taichi.learning.experts import make_expert
 from sdc_taichi.learning.networks import layers_of, perceptron
 from sdc_taichi.learning.normalise import CLIP, RunningMoments
 from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
@@ -27,6 +26,7 @@ class Cloning:
 
     Args:
         settings: the settings.
+        expert: the controller to imitate.
         spaces: what each learner sees and does.
         episode_steps: number of steps of an episode.
         updates: number of updates of the whole training.
@@ -39,6 +39,7 @@ class Cloning:
     def __init__(
         self,
         settings: CloningSettings,
+        expert: Controller,
         spaces: Mapping[str, LearnerSpaces],
         *,
         episode_steps: int,
@@ -48,7 +49,7 @@ class Cloning:
         self._settings, self._spaces, self._updates = settings, dict(spaces), updates
         self.steps_per_update = episode_steps
         self._done = 0
-        self._expert: Controller | None = None
+        self._expert = expert
         self._generator = torch.Generator().manual_seed(seed)
         self._nets: dict[str, nn.Sequential] = {}
         self._adams: dict[str, torch.optim.Adam] = {}
@@ -132,10 +133,7 @@ class Cloning:
         self, stream: EnvironmentStream
     ) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, float]]:
         """Observations and the expert's actions of an episode, (T * B, n or k), and numbers."""
-        view = stream.view
-        if self._expert is None:
-            self._expert = make_expert(self._settings.expert, view.fleet, stream.episode_steps)
-        self._expert.reset(view.state.seed)
+        self._expert.reset(stream.view.state.seed)
         seen: dict[str, list[Tensor]] = {name: [] for name in self._spaces}
         told: dict[str, list[Tensor]] = {name: [] for name in self._spaces}
         rewards = dict.fromkeys(self._spaces, 0.0)

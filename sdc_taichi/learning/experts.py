@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sdc_taichi.control import Controller, View, make_controller
+from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.rollout import Follower, Targets
 from sdc_taichi.optimum.solve import solve
@@ -30,9 +31,12 @@ def make_expert(name: str, fleet: Fleet, steps: int) -> Controller:
         ConfigError: an unknown name or objective.
     """
     kind, colon, objective = name.partition(":")
-    if kind == OPTIMUM:
-        return FollowedOptimum(steps, Objective.parse(objective if colon else "carbon"))
-    return make_controller(name, fleet)
+    try:
+        if kind == OPTIMUM:
+            return FollowedOptimum(steps, Objective.parse(objective if colon else "carbon"))
+        return make_controller(name, fleet)
+    except ConfigError as error:
+        raise ConfigError(f"learning.expert {name!r}: {error}") from None
 
 
 class FollowedOptimum:

@@ -6,9 +6,13 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.learning.normalise import CLIP, RunningMoments
+from sdc_taichi.learning.policy import PolicyNetwork
 from sdc_taichi.learning.settings import OnPolicySettings
 from sdc_taichi.learning.stream import LearnerSpaces
 from sdc_taichi.types import F32
@@ -85,6 +89,41 @@ def layers_of(net: nn.Sequential) -> tuple[tuple[F32, F32], ...]:
         for layer in net
         if isinstance(layer, nn.Linear)
     )
+
+
+def load_network(
+    net: nn.Sequential, moments: RunningMoments, network: PolicyNetwork, rows: int
+) -> None:
+    """Make a perceptron and the moments of its inputs those of a policy's network.
+
+    Args:
+        net: the perceptron.
+        moments: moments of what it observes.
+        network: the policy's network.
+        rows: rows that the moments are taken to have seen: the more, the slower they change.
+
+    Raises:
+        ConfigError: layers or functions that differ.
+    """
+    layers = [layer for layer in net if isinstance(layer, nn.Linear)]
+    sizes = (layers[0].in_features, *(layer.out_features for layer in layers))
+    who = f"network of {', '.join(network.agents)}"
+    if network.sizes != sizes:
+        raise ConfigError(f"{who}: has {network.sizes} units; valid here is {sizes}")
+    kinds = [
+        name for name, kind in ACTIVATIONS.items() if len(net) == 1 or isinstance(net[1], kind)
+    ]
+    if network.activation not in kinds:
+        raise ConfigError(f"{who}: has {network.activation} units; valid here is {kinds[0]}")
+    if network.clip != CLIP:
+        raise ConfigError(f"{who}: cuts observations at {network.clip:g}; valid here is {CLIP:g}")
+    with torch.no_grad():
+        for layer, (weight, bias) in zip(layers, network.layers, strict=True):
+            layer.weight.copy_(torch.from_numpy(weight.copy()))
+            layer.bias.copy_(torch.from_numpy(bias.copy()))
+    moments.mean = torch.from_numpy(network.mean.astype(np.float64))
+    moments.variance = torch.from_numpy(network.std.astype(np.float64) ** 2)
+    moments.count = rows
 
 
 class Actor(nn.Module):

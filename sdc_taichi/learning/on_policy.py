@@ -18,13 +18,14 @@ input, in whose reward it learns, in M_i, and in clipping:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from sdc_taichi.learning.networks import Actor, layers_of, perceptron
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.learning.networks import Actor, layers_of, load_network, perceptron
 from sdc_taichi.learning.normalise import CLIP, RunningMoments
 from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
 from sdc_taichi.learning.settings import OnPolicySettings
@@ -153,6 +154,27 @@ class OnPolicy:
             )
             for name, of in self._spaces.items()
         )
+
+    def start_from(self, networks: Sequence[PolicyNetwork], rows: int) -> None:
+        """Start with the policies of another training, such as a clone's.
+
+        Args:
+            networks: networks of the learners.
+            rows: situations that the means and variances of observations stand for.
+
+        Raises:
+            ConfigError: networks of other learners, or of another shape.
+        """
+        by_agents = {network.agents: network for network in networks}
+        learners = {of.agents: name for name, of in self._spaces.items()}
+        if set(by_agents) != set(learners):
+            found, valid = (
+                "; ".join(", ".join(agents) for agents in each) for each in (by_agents, learners)
+            )
+            raise ConfigError(f"policy to start from: has networks of {found}; valid is {valid}")
+        for agents, name in learners.items():
+            net, moments = self._actors[name].net, self._moments[name]
+            load_network(net, moments, by_agents[agents], rows)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that decides how the training goes on."""
