@@ -141,8 +141,8 @@ def their_settings(name: str, steps: int, num_envs: int) -> dict[str, Any]:
         "use_naive_recurrent_policy": False,
         "use_policy_active_masks": True,
         "action_aggregation": "prod",
-        "lr": s.learning_rate,
-        "critic_lr": s.learning_rate,
+        "lr": s.rate,
+        "critic_lr": s.rate,
         "opti_eps": ADAM_EPSILON,
         "weight_decay": 0.0,
         "clip_param": s.clip,
@@ -184,7 +184,7 @@ def without_layer_norms(model: Any) -> nn.Sequential:
 
 def adam(model: nn.Module) -> torch.optim.Adam:
     """A new optimiser, because theirs holds the layer norms too."""
-    return torch.optim.Adam(model.parameters(), SETTINGS.learning_rate, eps=ADAM_EPSILON)
+    return torch.optim.Adam(model.parameters(), SETTINGS.rate, eps=ADAM_EPSILON)
 
 
 def their_update(name: str, ours: Update) -> dict[str, list[Tensor]]:

@@ -64,7 +64,8 @@ class Game:
         if ended:
             self.room = self.first_room()
         rewards = {name: self.pay(i, pay) for i, name in enumerate(self.spaces)}
-        return StreamStep(rewards, ended, *after)
+        team = torch.stack(list(rewards.values())).mean(0)
+        return StreamStep(rewards, team, ended, *after)
 
     def state_dict(self) -> dict[str, Any]:
         return {"room": self.room.clone(), "turn": self.turn}

@@ -43,7 +43,7 @@ def cloning_of(stream: EnvironmentStream, updates: int) -> Cloning:
         epochs=20,
         batch_size=64,
         hidden=(16,),
-        learning_rate=0.02,
+        rate=0.02,
     )
     expert = make_controller("constant:21", stream.view.fleet)
     return Cloning(

@@ -51,7 +51,11 @@ class Game:
         self._look(self._seen.shape[1])
         self._steps += 1
         return StreamStep(
-            {"player": reward}, self._steps % STEPS == 0, self.observations, torch.empty(SIZE, 0)
+            {"player": reward},
+            reward,
+            self._steps % STEPS == 0,
+            self.observations,
+            torch.empty(SIZE, 0),
         )
 
 

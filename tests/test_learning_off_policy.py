@@ -35,7 +35,7 @@ SMALL = OffPolicySettings(
     batch_size=64,
     replay_size=2048,
     n_steps=1,
-    learning_rate=0.01,
+    rate=0.01,
     anneal=False,
     discount=0.9,
     target_rate=0.05,
@@ -87,7 +87,7 @@ class Game:
         ended = self.turn % self.length == 0
         if ended:
             self.room = torch.zeros_like(self.room)
-        return StreamStep({name: reward for name in self.spaces}, ended, *after)
+        return StreamStep({name: reward for name in self.spaces}, reward, ended, *after)
 
 
 class Coordination(Game):

@@ -35,11 +35,11 @@ SMALL = OnPolicySettings(
     rollout_decisions=6,
     hidden=(16,),
     mini_batches=2,
-    learning_rate=0.01,
+    rate=0.01,
     discount=0.9,
     anneal=False,
 )
-QUICK = SMALL.model_copy(update={"learning_rate": 0.05, "epochs": 3, "mini_batches": 1})
+QUICK = SMALL.model_copy(update={"rate": 0.05, "epochs": 3, "mini_batches": 1})
 """Settings that learn simple games in few updates."""
 
 
@@ -257,7 +257,7 @@ def test_values_go_on_beyond_the_end_of_an_episode_and_not_into_the_next() -> No
 
 def test_rescaling_of_returns_keeps_what_the_critic_says() -> None:
     game = Rooms()
-    algo = algorithm("ippo", game, SMALL.model_copy(update={"learning_rate": 1e-12}))
+    algo = algorithm("ippo", game, SMALL.model_copy(update={"rate": 1e-12}))
     for _ in range(2):
         algo.update(game)
     before = copy.deepcopy(algo.state_dict())["critics"]["player_0"]

@@ -128,6 +128,19 @@ class ActionDecoder:
             actions[agent] = np.concatenate(parts, axis=1).reshape(shape)
         return actions
 
+    def idle_actions(self) -> dict[str, npt.NDArray[Any]]:
+        """Actions of the learning agents that leave everything as it is, (B,) or (B, k)."""
+        found: dict[str, npt.NDArray[Any]] = {}
+        for agent, shape in self._shapes.items():
+            if self._continuous:
+                found[agent] = np.zeros(shape, dtype=np.float32)
+            else:
+                (name, _), *_ = self._columns[agent]
+                commands = self._discrete_commands[name]
+                # The battery rests at 0, racks are alike at any equal load.
+                found[agent] = np.full(shape, 1 if name != "battery" else np.argmin(abs(commands)))
+        return found
+
     def _space(self, width: int) -> spaces.Space[Any]:
         if self._continuous:
             return spaces.Box(-1.0, 1.0, (width,), dtype=np.float32)

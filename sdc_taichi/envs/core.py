@@ -286,6 +286,10 @@ class Core:
         """Whether an episode has ended and the next has not begun."""
         return self._view is not None and self._view.state.step >= self.steps
 
+    def idle_actions(self) -> dict[str, npt.NDArray[Any]]:
+        """Actions of all learning agents that leave everything as it is, (B,) or (B, k)."""
+        return self._decoder.idle_actions()
+
     def start_info(self) -> dict[str, npt.NDArray[Any]]:
         """Facts of the episodes under way by name, (B,) each: ``start_day``, and what was drawn.
 

@@ -63,7 +63,7 @@ class Cloning:
                 last_gain=0.01,
                 generator=self._generator,
             )
-            self._adams[name] = torch.optim.Adam(net.parameters(), settings.learning_rate)
+            self._adams[name] = torch.optim.Adam(net.parameters(), settings.rate)
             self._moments[name] = RunningMoments(of.observation_width)
 
     def update(self, stream: EnvironmentStream) -> dict[str, float]:
@@ -85,7 +85,7 @@ class Cloning:
                 self._moments[name].add(observations[name])
             seen = self._moments[name].normalise(observations[name])
             for group in self._adams[name].param_groups:
-                group["lr"] = self._settings.learning_rate * rate
+                group["lr"] = self._settings.rate * rate
             logged |= self._fit(name, seen, advice[name])
         return logged
 

@@ -106,7 +106,7 @@ class OffPolicy:
             definition, settings, self._spaces, state_width, self._generators["weights"]
         )
         self._targets = [x.detach().clone() for x in self._critic.parameters]
-        self._adam = adam(self._critic.parameters, settings.learning_rate)
+        self._adam = adam(self._critic.parameters, settings.rate)
         self._moments = RunningMoments(self._columns[-1][1].stop)
         self._rewards = RunningMoments(1)
         self._returns = RunningMoments(1)
@@ -227,7 +227,7 @@ class OffPolicy:
                 )
                 parts = self._actors.numbers.items()
                 after = stream.step({name: actions[:, part] for name, part in parts})
-                reward = torch.stack([after.rewards[n] for n in rewards]).mean(0)
+                reward = after.team
                 replay.add(before, actions, reward)
                 self._measure(reward)
                 if after.ended:
@@ -261,7 +261,7 @@ class OffPolicy:
     def _anneal(self) -> None:
         """Lower the learning rate, in even steps to 0 over the training."""
         if self._settings.anneal:
-            rate = self._settings.learning_rate * max(0.0, 1.0 - self._done / self._updates)
+            rate = self._settings.rate * max(0.0, 1.0 - self._done / self._updates)
             for optimiser in (self._adam, *self._actors.adams.values()):
                 optimiser.param_groups[0]["lr"] = rate
 

@@ -72,7 +72,7 @@ class Actors:
                 last_gain=LAST_GAIN,
                 generator=generator,
             )
-            self.adams[name] = adam(net.parameters(), settings.learning_rate)
+            self.adams[name] = adam(net.parameters(), settings.rate)
             self.numbers[name] = slice(first, first + of.action_width)
             first += of.action_width
 
@@ -397,9 +397,9 @@ class Temperatures:
             self._adam[name].load_state_dict(values[name]["adam"])
 
 
-def adam(parameters: Any, learning_rate: float) -> torch.optim.Adam:
+def adam(parameters: Any, rate: float) -> torch.optim.Adam:
     """Adam (Kingma, Ba 2015) with one pass over all parameters."""
-    return torch.optim.Adam(parameters, learning_rate, fused=True)
+    return torch.optim.Adam(parameters, rate, fused=True)
 
 
 def descend(

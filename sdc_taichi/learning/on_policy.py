@@ -68,6 +68,7 @@ class _Rollout(NamedTuple):
     actions: dict[str, Tensor]
     log_p: dict[str, Tensor]
     rewards: dict[str, Tensor]
+    team: Tensor
     ended: Tensor
 
 
@@ -227,6 +228,7 @@ class OnPolicy:
             {n: room(of.action_width, kinds[n]) for n, of in of_each},
             {n: room(None) for n in self._spaces},
             {n: room(None) for n in self._spaces},
+            room(None),
             torch.zeros(steps),
         )
         with torch.no_grad():
@@ -243,6 +245,7 @@ class OnPolicy:
                 for name in self._spaces:
                     out.rewards[name][t] = after.rewards[name]
                     out.next_observations[name][t] = after.next_observations[name]
+                out.team[t] = after.team
                 out.next_state[t], out.ended[t] = after.next_state, float(after.ended)
         return out
 
@@ -362,7 +365,7 @@ class OnPolicy:
     def _rewards_of(self, critic: str, rollout: _Rollout) -> Tensor:
         """Rewards that a critic learns, (T, B)."""
         if self._definition.reward == TEAM:
-            return torch.stack(list(rollout.rewards.values())).mean(0)
+            return rollout.team
         return rollout.rewards[critic]
 
     def _batches(self, rows: int) -> list[Tensor]:
@@ -387,7 +390,7 @@ class OnPolicy:
             return
         left = max(1.0 - (self._done - 1) / max(self._updates, 1), 0.0)
         for adam in (*self._adams.values(), *(c.adam for c in self._critics.values())):
-            adam.param_groups[0]["lr"] = self._settings.learning_rate * left
+            adam.param_groups[0]["lr"] = self._settings.rate * left
 
     def _make_critics(self, state_width: int) -> dict[str, _Critic]:
         """A critic for each learner, or one for the team."""
@@ -409,7 +412,7 @@ class OnPolicy:
         return critics
 
     def _adam(self, net: nn.Module) -> torch.optim.Adam:
-        rate = self._settings.learning_rate
+        rate = self._settings.rate
         return torch.optim.Adam(net.parameters(), rate, eps=ADAM_EPSILON, fused=True)
 
 

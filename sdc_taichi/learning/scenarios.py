@@ -9,6 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.envs.features import DEFAULT_FEATURES
+
 SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
 """Sites of all scenarios."""
 _FLEXIBLE = {
@@ -20,7 +23,7 @@ _FLEXIBLE = {
     },
 }
 """Twice the work that may wait, and a battery of four hours."""
-_BILL = {"actions": "continuous", "rewards": "bill"}
+_BILL = {"rewards": "bill"}
 SCENARIOS: Mapping[str, Mapping[str, Any]] = {
     "carbon": {"sites": SITES},
     "carbon-rich": {"sites": SITES, "overrides": _FLEXIBLE},
@@ -35,3 +38,44 @@ SCENARIOS: Mapping[str, Mapping[str, Any]] = {
 """Settings of each scenario, all of preset ``corrected``: the carbon of the hall as it is, the same
 with twice the work that may wait and a battery of four hours, and of both the electricity bill,
 which is energy by time of use and a demand charge."""
+
+CI_LEADS_H = tuple(range(1, 25))
+"""Leads of the forecasts of carbon intensity and price that trained agents observe, in h."""
+SETPOINT_CHANGE_K = 0.5
+"""Largest change of the setpoint in a step by trained agents, who hold it for some steps, in K."""
+_SHAPE_OF_DAY = ("ci_rank", "ci_relative", "ci_swing")
+_PRICES = ("price", "price_forecast")
+
+
+def training_environment(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of environments that trainings have beneath those given.
+
+    Actions are continuous, and agents observe the shape of the coming day by the hour: the carbon
+    intensity in relation to its own range, and with rewards of the bill the price.
+
+    Args:
+        given: options that the user or a scenario gives, by name.
+    """
+    agents = tuple(given.get("agents") or AGENTS)
+    found: dict[str, Any] = {}
+    if given.get("actions", "continuous") == "continuous":
+        found["actions"] = "continuous"
+        decided = (given.get("commands") or {}).get("agent_dc", ("cooling",))
+        if "agent_dc" in agents and "cooling" in decided:
+            found["setpoint_change_k"] = SETPOINT_CHANGE_K
+    if given.get("observations", "default") == "default":
+        found["ci_leads_h"] = CI_LEADS_H
+        if not given.get("commands"):
+            found["features"] = {agent: _features(agent, given) for agent in agents}
+    return found
+
+
+def _features(agent: str, given: Mapping[str, Any]) -> tuple[str, ...]:
+    """Features of an agent: its default ones, but for forecasts that others tell better."""
+    names = DEFAULT_FEATURES.get(agent, ())
+    if agent == "agent_dc":
+        kept = [name for name in names if name != "ci_forecast"]
+        return (*kept, "queue")
+    kept = [name for name in names if name not in ("ci_forecast", "ci_change")]
+    prices = _PRICES if given.get("rewards") == "bill" else ()
+    return (*kept, *_SHAPE_OF_DAY, *prices)

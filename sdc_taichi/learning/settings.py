@@ -22,11 +22,14 @@ class _DecisionSettings(BaseModel):
     Agrawal 2020); None is any number."""
 
 
-class _ActingSettings(_DecisionSettings):
+class ActingSettings(_DecisionSettings):
     """Settings of how policies act while they learn."""
 
     rollout_decisions: Annotated[int, Field(strict=True, ge=1, le=35_040)] = 32
     """Decisions of each data center between two updates."""
+    against_idle: bool = True
+    """Whether rewards are learned less those of idle commands in the same step of the same week,
+    as no action changes those; without effect where episodes begin on drawn days."""
 
     @property
     def steps_per_update(self) -> int:
@@ -34,14 +37,14 @@ class _ActingSettings(_DecisionSettings):
         return self.rollout_decisions * self.decision_steps
 
 
-class OnPolicySettings(_ActingSettings):
+class OnPolicySettings(ActingSettings):
     """Settings of ``ppo``, ``ippo``, ``mappo``, ``happo`` and ``haa2c``."""
 
     epochs: Annotated[int, Field(strict=True, ge=1, le=100)] = 4
     """Passes over the steps of an update; ``haa2c`` makes one."""
     mini_batches: Annotated[int, Field(strict=True, ge=1, le=1024)] = 4
     """Parts that the steps of an update are learned from in turn."""
-    learning_rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
+    rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
     """Learning rate of Adam for policies and critics."""
     anneal: bool = True
     """Whether the learning rate falls to 0 in even steps over the training."""
@@ -51,7 +54,7 @@ class OnPolicySettings(_ActingSettings):
     """Weight of later decisions in the advantage, lambda (Schulman et al. 2016)."""
     clip: Annotated[float, Field(gt=0, le=10)] = 0.2
     """Largest change of the probability ratio that pays, epsilon; ``haa2c`` has none."""
-    entropy: Annotated[float, Field(ge=0, le=10)] = 0.003
+    entropy: Annotated[float, Field(ge=0, le=10)] = 0.001
     """Weight of the entropy of policies."""
     gradient_norm: Annotated[float, Field(gt=0)] = 0.5
     """Largest norm of a gradient of a network."""
@@ -67,7 +70,7 @@ class OnPolicySettings(_ActingSettings):
     algorithm's source."""
 
 
-class OffPolicySettings(_ActingSettings):
+class OffPolicySettings(ActingSettings):
     """Settings of ``had3qn`` and ``hasac``."""
 
     levels: Annotated[int, Field(strict=True, ge=2, le=101)] | None = 5
@@ -84,7 +87,7 @@ class OffPolicySettings(_ActingSettings):
     entry of the shared state and of the observations, in all 170 MB by default."""
     n_steps: Annotated[int, Field(strict=True, ge=1, le=1000)] = 4
     """Decisions of a transition, n."""
-    learning_rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
+    rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
     """Learning rate of Adam for policies and critics."""
     anneal: bool = True
     """Whether the learning rate falls to 0 in even steps over the training."""
@@ -130,7 +133,7 @@ class CloningSettings(_DecisionSettings):
     """Passes over the situations of an update."""
     batch_size: Annotated[int, Field(strict=True, ge=1, le=1_048_576)] = 1024
     """Situations of a gradient step."""
-    learning_rate: Annotated[float, Field(gt=0, le=1)] = 2e-3
+    rate: Annotated[float, Field(gt=0, le=1)] = 2e-3
     """Learning rate of Adam, which falls to 0 in even steps over the training."""
     hidden: Hidden = (64, 64)
     """Units of the hidden layers."""

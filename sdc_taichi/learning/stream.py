@@ -17,11 +17,12 @@ from torch import Tensor
 
 from sdc_taichi.control import View
 from sdc_taichi.envs.core import Observation, Transition
+from sdc_taichi.envs.drawn_inputs import draws_inputs
 from sdc_taichi.envs.learners import JointLearner
 from sdc_taichi.envs.vector import MultiAgentVectorEnv
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.policy import CHOICES, action_levels
-from sdc_taichi.types import Actions
+from sdc_taichi.types import F64, Actions
 
 JOINT = "joint"
 """Name of the learner that stands for all learning agents."""
@@ -47,6 +48,8 @@ class StreamStep(NamedTuple):
 
     rewards: dict[str, Tensor]
     """Reward of each learner, (B,) each."""
+    team: Tensor
+    """Reward of all learning agents together over their number, (B,)."""
     ended: bool
     """Whether the episodes were cut off after the step; those of a batch end together."""
     next_observations: dict[str, Tensor]
@@ -54,6 +57,13 @@ class StreamStep(NamedTuple):
     cut off."""
     next_state: Tensor
     """Shared state after the step, (B, m); of the same episode even where it was cut off."""
+
+
+class _Rewards(NamedTuple):
+    """Rewards of a step of all environments."""
+
+    by_learner: Mapping[str, F64]
+    team: F64
 
 
 class EnvironmentStream:
@@ -66,6 +76,8 @@ class EnvironmentStream:
         levels: number of levels, evenly from -1 to 1, that learners choose continuous actions from;
             None is any number.
         shares_state: whether the shared state is wanted, which takes time.
+        against_idle: whether rewards are told less those of idle commands in the same step, where
+            all episodes of a data center have the same inputs.
         seed: seed of the first reset; environment i takes ``seed + i``.
 
     Attributes:
@@ -91,6 +103,7 @@ class EnvironmentStream:
         decision_steps: int = 1,
         levels: int | None = None,
         shares_state: bool = True,
+        against_idle: bool = False,
         seed: int = 0,
     ) -> None:
         self._core = core = env.core
@@ -107,6 +120,9 @@ class EnvironmentStream:
         self.state_width = int(np.prod(core.state_space.shape or ())) if shares_state else 0
         self.returns: dict[str, float] = {}
         self._sums = dict.fromkeys(self.learners, 0.0)
+        self._idle: list[_Rewards] = []
+        if against_idle and core.options.start == "fixed" and not draws_inputs(core.options):
+            self._idle = self._rewards_of_idle(seed)
         self._take(core.reset(seed))
 
     def step(self, actions: Mapping[str, Tensor]) -> StreamStep:
@@ -120,16 +136,19 @@ class EnvironmentStream:
         """
         core, by_agent = self._core, self._by_agent(actions)
         transition = core.step(by_agent)
-        rewards = self._rewards(transition)
+        by_learner, team = self._rewards(transition)
         for _ in range(self.decision_steps - 1):
             if transition.ended:
                 break
             transition = core.step(by_agent)
-            rewards = {n: rewards[n] + more for n, more in self._rewards(transition).items()}
+            more, more_of_team = self._rewards(transition)
+            by_learner = {name: by_learner[name] + more[name] for name in by_learner}
+            team = team + more_of_team
+        rewards = {name: _tensor(reward) for name, reward in by_learner.items()}
         for name, reward in rewards.items():
             self._sums[name] += float(reward.mean())
         self._take(transition.observations)
-        after = StreamStep(rewards, transition.ended, self.observations, self.state)
+        after = StreamStep(rewards, _tensor(team), transition.ended, self.observations, self.state)
         if transition.ended:
             self.returns, self._sums = self._sums, dict.fromkeys(self.learners, 0.0)
             self._take(core.next_episode())
@@ -185,10 +204,35 @@ class EnvironmentStream:
             for agent, given in arrays.items()
         }
 
-    def _rewards(self, transition: Transition) -> dict[str, Tensor]:
-        if self._joint is not None:
-            return {JOINT: _tensor(transition.joint_reward)}
-        return {agent: _tensor(reward) for agent, reward in transition.rewards.items()}
+    def _rewards(self, transition: Transition) -> _Rewards:
+        """Rewards of a step, less those of idle commands in it if they are known."""
+        found = self._rewards_as_they_are(transition)
+        if not self._idle:
+            return found
+        idle = self._idle[transition.result.step]
+        by_learner = {
+            name: found.by_learner[name] - idle.by_learner[name] for name in self.learners
+        }
+        return _Rewards(by_learner, found.team - idle.team)
+
+    def _rewards_as_they_are(self, transition: Transition) -> _Rewards:
+        joint = transition.joint_reward
+        by_learner = transition.rewards if self._joint is None else {JOINT: joint}
+        return _Rewards(by_learner, joint / len(self._core.agents))
+
+    def _rewards_of_idle(self, seed: int) -> list[_Rewards]:
+        """Rewards of each step of an episode of idle commands.
+
+        They do not depend on what a learner does, so the policy that is best with rewards less
+        these is the one that is best without (Weaver and Tao 2001), and demand, weather and grid,
+        which move rewards more than any action, are out of the way.
+        """
+        core = self._core
+        core.reset(seed)
+        found = []
+        for _ in range(core.steps):
+            found.append(self._rewards_as_they_are(core.step(core.idle_actions())))
+        return found
 
     def _take(self, by_agent: Mapping[str, Observation]) -> None:
         """Keep observations and shared state before the next step."""

@@ -26,6 +26,7 @@ from sdc_taichi.learning.controller import PolicyController
 from sdc_taichi.learning.evaluation import DataCenterWeeks, Validation, prepare, validate
 from sdc_taichi.learning.interface import interface_of
 from sdc_taichi.learning.policy import About, Policy
+from sdc_taichi.learning.settings import ActingSettings
 from sdc_taichi.learning.split import VALIDATION
 from sdc_taichi.learning.stream import EnvironmentStream
 from sdc_taichi.learning.training_folder import (
@@ -406,12 +407,14 @@ def make_env(settings: TrainingSettings) -> MultiAgentVectorEnv:
 
 def make_stream(settings: TrainingSettings, env: MultiAgentVectorEnv) -> EnvironmentStream:
     """The stream that the algorithm of a training learns from."""
+    learning = settings.learning
     return EnvironmentStream(
         env,
         joint=settings.algorithm == "ppo" and len(env.possible_agents) > 1,
-        decision_steps=settings.learning.decision_steps,
-        levels=settings.learning.levels,
+        decision_steps=learning.decision_steps,
+        levels=learning.levels,
         shares_state=uses_state(settings.algorithm, settings.learning),
+        against_idle=isinstance(learning, ActingSettings) and learning.against_idle,
         # No two trainings share the seed of a data center.
         seed=settings.seed * env.num_envs,
     )

@@ -35,7 +35,7 @@ from sdc_taichi.config.fields import Section
 from sdc_taichi.config.reference import sections_markdown
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
-from sdc_taichi.learning.scenarios import SCENARIOS
+from sdc_taichi.learning.scenarios import SCENARIOS, training_environment
 from sdc_taichi.learning.settings import LEARNING_SETTINGS, LearningSettings
 from sdc_taichi.learning.split import DAYS_PER_WEEK, TRAINING, WEEKS, data_center_weeks
 from sdc_taichi.number_text import parse_number
@@ -109,13 +109,20 @@ class TrainingSettings(Section):
     @model_validator(mode="before")
     @classmethod
     def _on_top_of_scenario(cls, values: Any) -> Any:
-        """Put the values given on top of those of their scenario."""
-        name = values.get("scenario") if isinstance(values, Mapping) else None
-        if name is None:
+        """Put the values given on top of those of their scenario and of all trainings."""
+        if not isinstance(values, Mapping):
             return values
-        if name not in SCENARIOS:
-            raise ValueError(f"scenario {name!r}{suggestion_or_valid(name, SCENARIOS)}")
-        return merged(SCENARIOS[name], values)
+        name = values.get("scenario")
+        if name is not None:
+            if name not in SCENARIOS:
+                raise ValueError(f"scenario {name!r}{suggestion_or_valid(name, SCENARIOS)}")
+            values = merged(SCENARIOS[name], values)
+        given = values.get("environment") or {}
+        if isinstance(given, EnvOptions):
+            given = _given(given)
+        if not isinstance(given, Mapping):
+            return values
+        return merged({"environment": training_environment(given)}, values)
 
     @field_validator("algorithm")
     @classmethod
@@ -175,8 +182,10 @@ class TrainingSettings(Section):
 
     @field_serializer("environment")
     def _options_given(self, value: EnvOptions) -> dict[str, Any]:
-        """The options that were given: some of the others would be errors."""
-        return value.model_dump(mode="json", exclude_unset=True)
+        """The options that were given: some of the others would be errors, or follow from them."""
+        dumped = value.model_dump(mode="json", exclude_unset=True)
+        follow = json.loads(json.dumps(training_environment(dumped)))
+        return {k: v for k, v in dumped.items() if k not in follow or v != follow[k]}
 
     @model_validator(mode="after")
     def _weeks_fit_episodes(self) -> Self:
