@@ -7,7 +7,6 @@ installs all of it.
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import subprocess
 import sys
@@ -349,66 +348,26 @@ def test_sb3_has_nothing_to_say_against_single_environments(
     env.close()
 
 
-# --- the training of docs/training.md ---
-
-
-def test_held_out_weeks_are_not_trained_on(example: Load, tmp_path: Path) -> None:
-    carbon = example("train_carbon", "skrl", "matplotlib")
-    assert not {*carbon.TRAINED} & {*carbon.HELD_OUT}
-    assert sorted((*carbon.TRAINED, *carbon.HELD_OUT)) == list(range(52))
-    first, second = carbon.data_centers(("NY", "CA"), (0, 51))[1:3]
-    assert (first.site.location, first.site.start) == ("NY", "12-24")
-    assert (second.site.location, second.site.start) == ("CA", "01-01")
-    with pytest.raises(SystemExit):
-        carbon.main([str(tmp_path), "--train-weeks", "1", "2", "--held-out-weeks", "2"])
-    assert not list(tmp_path.iterdir())
-
-
-def test_idle_policies_score_as_the_idle_controller(example: Load) -> None:
-    carbon = example("train_carbon", "skrl", "matplotlib")
-    torch = importlib.import_module("torch")
-    sites = ("CA", "WA")
-    configs = carbon.data_centers(sites, (3,))
-    env = carbon.make_env(configs)
-    agent = carbon.learner(env, "ippo", **carbon.SETTINGS)
-    agent.init()
-    for policy in agent.policies.values():
-        for parameter in policy.parameters():
-            torch.nn.init.zeros_(parameter)
-        policy.net[-1].bias.data[1] = 1.0  # the action in the middle changes nothing
-    idle = carbon.run_rules("idle", configs)
-    same = carbon.against_idle(carbon.run_policies(agent, env), idle, sites)
-    found = [v for v in same.values() if not isinstance(v, dict)]
-    np.testing.assert_allclose(found, 0.0, atol=1e-9)
-    env.close()
-    less = idle | {"carbon_g": 0.9 * idle["carbon_g"], "executed_tasks": idle["executed_tasks"]}
-    assert carbon.against_idle(less, idle, sites)["cfp"] == pytest.approx(-10.0)
-    undone = less | {"executed_tasks": 0.9 * idle["executed_tasks"]}
-    found = carbon.against_idle(undone, idle, sites)
-    assert found["cfp_per_work"] == pytest.approx(0.0, abs=1e-9)
-    assert list(found["cfp_per_work_by_site"].values()) == pytest.approx([0.0, 0.0], abs=1e-9)
+# --- the study of docs/training.md ---
 
 
 @pytest.mark.slow
-def test_carbon_training_writes_results_and_curve(
+def test_the_study_trains_goes_on_and_compares(
     example: Load, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    carbon = example("train_carbon", "skrl", "matplotlib")
-    carbon.main(
-        [
-            *(str(tmp_path / "out"), "--seeds", "0", "1", "--steps", "1", "--points", "1"),
-            *("--sites", "NY", "CA", "--train-weeks", "0", "--held-out-weeks", "3"),
-        ]
-    )
-    report = json.loads((tmp_path / "out" / "training.json").read_text("utf-8"))
-    assert (tmp_path / "out" / "training.png").read_bytes().startswith(b"\x89PNG")
-    assert [seed["seed"] for seed in report["seeds"]] == [0, 1]
-    for seed in report["seeds"]:
-        assert [point["steps"] for point in seed["curve"]] == [0, 2 * carbon.STEPS]
-        assert list(seed["curve"][-1]["cfp_per_work_by_site"]) == ["NY", "CA"]
-    ends = [seed["curve"][-1]["cfp_per_work"] for seed in report["seeds"]]
-    assert ends[0] != ends[1]
-    assert report["summary"]["cfp_per_work"]["mean"] == pytest.approx(np.mean(ends))
-    assert set(report["rules"]) == set(carbon.RULES)
+    study = example("learning_study", "matplotlib")
+    arguments = [
+        *(str(tmp_path), "--algorithms", "ippo", "haa2c", "--seeds", "1", "--steps", "256"),
+        *("--sites", "NY", "--weeks", "0", "--data-centers", "2", "--held-out-weeks", "3"),
+        *("--rules", "g36", "--no-optimum"),
+    ]
+    study.main(arguments)
     text = capsys.readouterr().out
-    assert text.count("\n| ") == 1 + len(carbon.RULES) + 2
+    for name in ("ippo", "haa2c", "g36", "idle"):
+        assert f"| {name} |" in text
+    assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG")
+    trained = (tmp_path / "trainings" / "ippo-0" / "policy" / "policy.safetensors").read_bytes()
+    study.main(arguments)
+    again = (tmp_path / "trainings" / "ippo-0" / "policy" / "policy.safetensors").read_bytes()
+    assert again == trained
+    assert capsys.readouterr().out == text
