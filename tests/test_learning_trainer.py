@@ -23,6 +23,7 @@ from sdc_taichi.learning.checkpoint import read_state  # noqa: E402
 from sdc_taichi.learning.evaluation import Validation  # noqa: E402
 from sdc_taichi.learning.policy import Policy  # noqa: E402
 from sdc_taichi.learning.trainer import Progress, Training, train  # noqa: E402
+from sdc_taichi.learning.training_folder import settings_of  # noqa: E402
 from sdc_taichi.learning.training_settings import (  # noqa: E402
     TrainingSettings,
     make_settings,
@@ -170,6 +171,7 @@ def test_a_training_resumes_with_its_settings_alone_but_for_more_steps(
         train(settings(learning={"epochs": 2}), tmp_path, resume=True)
     with pytest.raises(SdcError, match=r"steps 120: .* has done 240; valid is as many or more"):
         train(settings(steps=120), tmp_path, resume=True)
+    assert settings_of(tmp_path) == settings(steps=240)
     assert train(settings(), tmp_path, resume=True).updates == UPDATES
     assert [row["update"] for row in rows_of(tmp_path)] == [str(n) for n in range(1, 7)]
 
@@ -284,6 +286,7 @@ def test_fewer_steps_than_an_update_and_fewer_data_centers_than_weeks_are_refuse
         train(settings(weeks=[0, 1, 2, 4]), tmp_path / "b")
     with pytest.raises(SdcError, match="site"):
         train(settings(sites=["XX"]), tmp_path / "c")
+    assert not [*tmp_path.glob("*/*")], "the folders are free for better settings"
 
 
 def test_tensorboard_gets_the_numbers_of_the_curve(tmp_path: Path) -> None:

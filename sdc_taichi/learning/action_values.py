@@ -1,6 +1,6 @@
 """Critics of the actions of all learners together, for off-policy algorithms.
 
-K numbers are decided in a step. If each is one of three choices, there are 3^K joint actions, and a
+K numbers are decided in a step. If each is one of L choices, there are L^K joint actions, and a
 critic has one output for each: expected values over independent choices are then exact sums.
 """
 
@@ -17,7 +17,7 @@ from sdc_taichi.learning.policy import CHOICES
 from sdc_taichi.learning.settings import OffPolicySettings
 
 MOST_JOINT_ACTIONS = 729
-"""Largest number of outputs of a critic of joint actions, those of six choices."""
+"""Largest number of joint actions that a critic values: those of six choices out of three."""
 LAST_GAIN = 0.01
 """Gain of the last weights, so that all values begin near 0."""
 

@@ -1,12 +1,12 @@
 """HAD3QN and HASAC: one update, of which each algorithm is a case.
 
 All agents act for some steps, which a replay holds with many before them. Then batches of
-transitions over n steps are drawn from it. E critics Q_e of the shared state and the actions of all
-learners together fit
+transitions over n decisions are drawn from it. E critics Q_e of the shared state and the actions of
+all learners together fit
 
     y = r_0 + ... + gamma^(n-1) r_(n-1) + gamma^n V(s_n),
 
-by Adam, where r is the mean of the learners' rewards and V comes from slow copies of the critics.
+by Adam, where r is the reward of the team and V comes from slow copies of the critics.
 Episodes are cut off, never over, so that V counts at their end too. The algorithms differ in V and
 in how learners follow the critics, one after another in random order:
 
@@ -237,7 +237,7 @@ class OffPolicy:
                     rewards[name] += after.rewards[name].mean()
             self._moments.add(torch.cat(seen))
         logged = {
-            f"reward/{n}": float(x) / self._settings.rollout_decisions for n, x in rewards.items()
+            f"reward/{n}": float(x) / self._settings.steps_per_update for n, x in rewards.items()
         }
         return logged if self._soft else logged | {"exploration": self.exploration}
 

@@ -116,7 +116,7 @@ class GreedyActors(Actors):
 
     Each learner's values follow the row of the critic's table in which the others do what they do,
     those before it in a random order already their best choice in the table. The source fits the
-    value of the best choice alone; the row has the same value there and two more.
+    value of the best choice alone; the row has those of all other choices too.
 
     Args:
         critic: values that the policies follow.
@@ -446,7 +446,7 @@ def soft_policy_loss(log_p: Tensor, values: Tensor, temperature: Tensor) -> Tens
 
     Args:
         log_p: logarithms of the probabilities of each choice, (N, k, L).
-        values: values of all combinations of the choices, (N, 3^k).
+        values: values of all combinations of the choices, (N, L^k).
         temperature: weight of the entropy, ().
     """
     value = expected(values, log_p.exp()).squeeze(-1)

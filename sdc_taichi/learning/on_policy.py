@@ -42,7 +42,7 @@ class OnPolicyDefinition(NamedTuple):
     critic: str
     """Input of critics: ``observation`` of each learner, or the shared ``state``."""
     reward: str
-    """Reward that critics learn: ``own`` of each learner, or the mean of all, ``team``."""
+    """Reward that critics learn: ``own`` of each learner, or that of the ``team``."""
     sequential: bool
     """Whether learners are updated in random order, each weighed by the ratios of those before."""
     clips: bool
@@ -129,7 +129,8 @@ class OnPolicy:
             Numbers to log: ``reward/NAME``, the mean over steps; losses; entropies.
         """
         rollout = self._collect(stream)
-        logged = {f"reward/{n}": float(r.mean()) for n, r in rollout.rewards.items()}
+        held = self._settings.decision_steps
+        logged = {f"reward/{n}": float(r.mean()) / held for n, r in rollout.rewards.items()}
         self._done += 1
         if self._done > 1:
             self._anneal()

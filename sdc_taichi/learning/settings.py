@@ -63,8 +63,8 @@ class OnPolicySettings(ActingSettings):
     activation: Literal["tanh", "relu"] = "tanh"
     """Activation of all layers but the last."""
     reward: Literal["own", "team"] | None = None
-    """Reward that critics learn: that of each learner, or the mean of all; None is that of the
-    algorithm's source."""
+    """Reward that critics learn: that of each learner, or that of all together over their number;
+    None is that of the algorithm's source."""
     critic: Literal["observation", "state"] | None = None
     """Input of critics: what their learner observes, or the shared state; None is that of the
     algorithm's source."""

@@ -37,6 +37,7 @@ from sdc_taichi.learning.training_folder import (
     TRAINING_FILE,
     VALIDATION_FILE,
     claimed,
+    write_settings,
 )
 from sdc_taichi.learning.training_log import CsvLog, EventLog
 from sdc_taichi.learning.training_settings import TrainingSettings
@@ -121,6 +122,8 @@ def train(
         try:
             if resume:
                 run.resume()
+            # Settings that do not fit leave the folder as it was.
+            write_settings(path, settings)
             with run.validation(on_stage, stop) as weeks:
                 run.go_on(weeks, on_update or (lambda _: None), stop or (lambda: False))
         finally:

@@ -30,7 +30,7 @@ def claimed(out: Path, settings: TrainingSettings, *, resume: bool) -> Iterator[
 
     Args:
         out: the folder, made if need be.
-        settings: settings of the training, which are written there.
+        settings: settings of the training.
         resume: whether it is to hold a training with these settings.
 
     Raises:
@@ -59,11 +59,19 @@ def claimed(out: Path, settings: TrainingSettings, *, resume: bool) -> Iterator[
         raise ConfigError(f"{out}: holds other files ({some}); choose an empty folder with --out")
     claim = FileClaim(out / "training")
     try:
-        with atomic_write(out / SETTINGS_FILE) as file:
-            file.write(settings.to_yaml().encode())
         yield
     finally:
         claim.release()
+
+
+def write_settings(folder: Path, settings: TrainingSettings) -> None:
+    """Write the settings of the training in a folder, which holds a training from then on.
+
+    Raises:
+        SdcError: the file cannot be written.
+    """
+    with atomic_write(folder / SETTINGS_FILE) as file:
+        file.write(settings.to_yaml().encode())
 
 
 def settings_of(folder: Path) -> TrainingSettings:
