@@ -84,7 +84,7 @@ class OffPolicySettings(ActingSettings):
     """Transitions of a batch."""
     replay_size: Annotated[int, Field(strict=True, ge=1, le=100_000_000)] = 262_144
     """Decisions of all data centers together that the replay holds; each takes four bytes for every
-    entry of the shared state and of the observations, in all 170 MB by default."""
+    entry of the shared state and of the observations, in all 250 MB by default."""
     n_steps: Annotated[int, Field(strict=True, ge=1, le=1000)] = 4
     """Decisions of a transition, n."""
     rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
