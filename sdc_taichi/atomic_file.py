@@ -32,6 +32,10 @@ def naming_errors(path: Path) -> Iterator[None]:
         raise SdcError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
+class ClaimedFileError(SdcError):
+    """Another process, or another part of this one, is writing a file."""
+
+
 class FileClaim:
     """The right to write a file, which one process has at a time.
 
@@ -43,8 +47,8 @@ class FileClaim:
         path: the file that is to be written.
 
     Raises:
-        SdcError: another process, or another part of this one, is writing it; or nothing can be
-            written there.
+        ClaimedFileError: another process, or another part of this one, is writing it.
+        SdcError: nothing can be written there.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,7 +61,7 @@ class FileClaim:
                 self._part = path.with_name(f".{path.name}.{os.getpid()}{_SUFFIX}")
                 opened = self._part.open("wb")
         if opened is None:
-            raise SdcError(
+            raise ClaimedFileError(
                 f"{path}: another run is writing it; valid is another name, or to wait until it "
                 "has ended"
             )

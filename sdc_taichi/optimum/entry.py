@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sdc_taichi.atomic_file import ClaimedFileError
 from sdc_taichi.errors import SdcError, SdcWarning, printable
 from sdc_taichi.optimum.problem import Ends
 from sdc_taichi.sim import snapshot
@@ -140,6 +141,8 @@ class Cache:
                 raise OSError("no absolute path")
             path.parent.mkdir(parents=True, exist_ok=True)
             snapshot.write(path, values)
+        except ClaimedFileError:
+            pass  # another process has solved the same and is keeping it
         except (SdcError, OSError) as error:
             _warn(f"{printable(path.parent)}: optima are not kept ({error})")
 
