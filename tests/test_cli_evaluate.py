@@ -51,6 +51,15 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_controllers_that_are_unknown_are_named_before_an_optimum_is_solved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(evaluation, "solve", None)
+    done = call(*CASE, "--controller", "gready-ci")
+    assert done.exit_code == 2
+    assert "did you mean 'greedy-ci'" in done.stderr
+
+
 def test_seeds_are_put_together_and_files_tell_all(runs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = call(runs / "a-0", runs / "a-1", runs / "b", *CASE, "--controller", "g36", "--out", out)

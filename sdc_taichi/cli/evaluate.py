@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,8 +36,9 @@ from sdc_taichi.errors import ConfigError, SdcError, one_line, printable
 
 if TYPE_CHECKING:
     from sdc_taichi.config import DataCenterConfig
-    from sdc_taichi.learning.evaluation import DataCenterWeeks, Evaluation
+    from sdc_taichi.learning.evaluation import Contender, DataCenterWeeks, Evaluation
     from sdc_taichi.learning.training_settings import TrainingSettings
+    from sdc_taichi.sim.fleet import Fleet
     from sdc_taichi.types import StepResult
 
 
@@ -118,6 +120,7 @@ def evaluate_command(
         write_evaluation,
     )
     from sdc_taichi.learning.split import parse_weeks
+    from sdc_taichi.sim.fleet import build_fleet
 
     folders, named = list(runs or ()), list(controller or ())
     if not folders and not named:
@@ -133,6 +136,9 @@ def evaluate_command(
     )
     if objective is None:
         objective = "carbon" if settings is None else settings.validation.objective
+    # What is not valid is said before the optimum is solved, which may take hours.
+    with warnings.catch_warnings(action="ignore"):
+        _contenders(build_fleet(configs), folders, named)
     if out is not None:
         prepare_evaluation_folder(out, force=force)
     with interruptible() as stop:
@@ -221,20 +227,28 @@ def _evaluated(
     stop: Callable[[], bool],
 ) -> Evaluation:
     """Run policies and named controllers, with a progress bar for each run."""
-    from sdc_taichi.control import make_controller
-    from sdc_taichi.learning.evaluation import Contender, evaluate
-    from sdc_taichi.learning.evaluation_folder import contenders_of
+    from sdc_taichi.learning.evaluation import evaluate
 
-    fleet = weeks.sim.fleet
     print_notes(weeks.sim.drivers.notes)
-    contenders = contenders_of(folders, fleet, agents_alone=agents_alone)
-    contenders += [Contender(name, make_controller(name, fleet)) for name in named]
+    contenders = _contenders(weeks.sim.fleet, folders, named, agents_alone=agents_alone)
     with stage_bars(shown=not quiet) as progress:
 
         def on_run(name: str) -> Callable[[StepResult], None]:
             return lambda result: progress(name, result.step + 1, weeks.steps)
 
         return evaluate(weeks, contenders, on_run=on_run, stop=stop)
+
+
+def _contenders(
+    fleet: Fleet, folders: Sequence[Path], named: Sequence[str], *, agents_alone: bool = True
+) -> list[Contender]:
+    """Policies and named controllers for data centers."""
+    from sdc_taichi.control import make_controller
+    from sdc_taichi.learning.evaluation import Contender
+    from sdc_taichi.learning.evaluation_folder import contenders_of
+
+    contenders = contenders_of(folders, fleet, agents_alone=agents_alone)
+    return contenders + [Contender(name, make_controller(name, fleet)) for name in named]
 
 
 def _print_tables(found: Evaluation, weeks: DataCenterWeeks) -> None:
