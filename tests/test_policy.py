@@ -170,6 +170,7 @@ def test_damaged_and_foreign_files_are_one_error_that_names_the_file(tmp_path: P
         save({"weight": np.zeros(3)}, {"policy": '{"format": 1}'}),
         whole.replace(b"0.mean", b"0.mild"),
         whole.replace(b"tanh", b"sinh").replace(b"relu", b"silu"),
+        whole.replace(b'agent_bat\\": [', b'agent_bar\\": ['),
         whole[:-4] + np.float32(np.nan).tobytes(),
     ):
         path.write_bytes(content)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from sdc_taichi.config.fields import Section
 from sdc_taichi.envs.actions import ActionDecoder, equal_number
@@ -66,6 +66,13 @@ class Interface(Section):
     """Number of CRAC units of a data center that an agent decides on; None where none does."""
     racks: int | None = Field(ge=1)
     """Number of racks of a data center that an agent places work on; None where none does."""
+
+    @model_validator(mode="after")
+    def _of_all_agents(self) -> Interface:
+        for name in ("commands", "features"):
+            if set(getattr(self, name)) != set(self.agents):
+                raise ValueError(f"{name}: valid are those of agents {', '.join(self.agents)}")
+        return self
 
     def width(self, agent: str) -> int:
         """Number of entries of an agent's observation, n."""

@@ -36,6 +36,8 @@ CHOICES = 3
 """Number of discrete actions for each number that an agent decides."""
 MOST_BYTES = 256_000_000
 """Largest file of a policy, in bytes: 60 million weights."""
+MOST_DECISION_STEPS = 96
+"""Largest number of steps that an action may be held."""
 Head = Literal["argmax", "clip", "tanh"]
 """What becomes of the last layer: the largest of some scores for each number that is decided, or
 the number itself, cut at -1 and 1 or bent to between them by a hyperbolic tangent."""
@@ -173,6 +175,10 @@ class Policy:
 
     def __post_init__(self) -> None:
         """Check that the networks fit the interface."""
+        if not 1 <= self.decision_steps <= MOST_DECISION_STEPS:
+            raise SdcError(
+                f"policy: decision_steps {self.decision_steps!r}; valid is 1..{MOST_DECISION_STEPS}"
+            )
         served = [agent for network in self.networks for agent in network.agents]
         if sorted(served) != sorted(self.interface.agents):
             raise SdcError(
@@ -347,7 +353,7 @@ class _Description(Section):
     about: About
     interface: Interface
     networks: tuple[_NetworkDescription, ...]
-    decision_steps: int = Field(ge=1, le=96)
+    decision_steps: int = Field(ge=1, le=MOST_DECISION_STEPS)
 
 
 def _tensors(network: PolicyNetwork) -> dict[str, F32]:
