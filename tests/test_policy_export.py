@@ -77,7 +77,7 @@ def test_the_model_acts_as_the_policy(made: Policy, tmp_path: Path) -> None:
 def test_the_model_tells_what_it_fits(tmp_path: Path) -> None:
     from sdc_taichi.learning.export import export_onnx
 
-    made = policy(interface(agents=("agent_bat",)), seed=4)
+    made = policy(interface(agents=("agent_bat",)), seed=4, decision_steps=4)
     export_onnx(made, tmp_path / "policy.onnx")
     session = runtime.InferenceSession(
         str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"]
@@ -85,3 +85,4 @@ def test_the_model_tells_what_it_fits(tmp_path: Path) -> None:
     texts = session.get_modelmeta().custom_metadata_map
     assert json.loads(texts["interface"]) == made.interface.model_dump(mode="json")
     assert json.loads(texts["about"])["seed"] == 4
+    assert json.loads(texts["decision_steps"]) == 4

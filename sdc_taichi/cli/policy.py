@@ -66,6 +66,8 @@ def _facts(policy: Policy) -> list[tuple[str, str]]:
     fits = policy.interface
     order = "" if fits.action_order is None else f", order {fits.action_order}"
     facts = [("others", policy.about.others), ("actions", f"{fits.actions}{order}")]
+    held = policy.decision_steps
+    facts += [("decides", "in every step" if held == 1 else f"every {held} steps")]
     facts += [("step", f"{fits.step_min} min"), ("observations", fits.observations)]
     for label, number in (("CRAC units", fits.crac_units), ("racks", fits.racks)):
         facts += [] if number is None else [(label, str(number))]

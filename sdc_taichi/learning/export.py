@@ -23,7 +23,7 @@ _IR_VERSION = 8
 
 
 def export_onnx(policy: Policy, path: Path) -> None:
-    """Write a policy as an ONNX model, its interface and origin among the metadata.
+    """Write a policy as an ONNX model, with its interface, origin and decision steps as metadata.
 
     Args:
         policy: the policy.
@@ -44,7 +44,12 @@ def export_onnx(policy: Policy, path: Path) -> None:
         graph.add_input(agent, policy.interface.width(agent))
     for number, network in enumerate(policy.networks):
         _add_network(graph, policy, number, network)
-    model = graph.model({"about": policy.about, "interface": policy.interface})
+    metadata = {
+        "about": policy.about.model_dump(mode="json"),
+        "interface": policy.interface.model_dump(mode="json"),
+        "decision_steps": policy.decision_steps,
+    }
+    model = graph.model(metadata)
     with atomic_write(path) as file:
         file.write(model.SerializeToString())
 
@@ -145,7 +150,7 @@ class _Graph:
         model = helper.make_model(
             graph, producer_name="sdc-taichi", opset_imports=[opset], ir_version=_IR_VERSION
         )
-        texts = {name: json.dumps(part.model_dump(mode="json")) for name, part in metadata.items()}
+        texts = {name: json.dumps(part) for name, part in metadata.items()}
         helper.set_model_props(model, texts)
         self._onnx.checker.check_model(model)
         return model
