@@ -74,10 +74,10 @@ class JointLearner:
     """All learning agents as one learner.
 
     It sees their observations side by side, each feature once, rather than the shared state, which
-    would show it features that the option ``features`` left out. Its reward is each term of their
-    rewards once, or with rewards that are no such set the sum, in which with all three agents the
-    weights of ``collaboration`` cancel. What a reward function of the user's gives for all agents
-    alike, it gets once.
+    would show it features that the option ``features`` left out. With rewards ``default`` and
+    ``bill`` its reward is each of their terms once. With others it is the sum of theirs, in which
+    the weights of ``collaboration`` cancel if all three agents learn. What a reward function of the
+    user's gives for all agents alike, it gets once.
 
     Args:
         core: data centers in which the agents learn.

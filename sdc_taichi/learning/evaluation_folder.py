@@ -208,7 +208,7 @@ def write_evaluation(
     tables = [
         text
         for title, table in tables_of(evaluation, weeks)
-        for text in (f"## {title.capitalize()}", markdown(table))
+        for text in (f"## {title[:1].upper()}{title[1:]}", markdown(table))
     ]
     texts = {
         ROWS_FILE: evaluation.rows.to_csv(index=False),
