@@ -220,6 +220,20 @@ def test_all_agents_as_one_get_each_term_once(collaboration: float) -> None:
     np.testing.assert_allclose(own, expected + 10.0 * terms["cooling_carbon"], rtol=1e-12)
 
 
+def test_those_who_learn_as_one_get_their_own_terms_alone() -> None:
+    def joint(*agents: str) -> tuple[Any, dict[str, Any], Any]:
+        env = core(agents=agents, collaboration=1.0)
+        env.reset(0)
+        done = env.step({agent: np.zeros(1, dtype=np.int64) for agent in agents})
+        return done.joint_reward, env.reward_terms(), done.rewards
+
+    reward, _, own = joint("agent_bat")
+    np.testing.assert_array_equal(reward, own["agent_bat"])
+    reward, terms, _ = joint("agent_dc", "agent_bat")
+    expected = 10.0 * (terms["cooling_carbon"] + terms["battery_carbon"])
+    np.testing.assert_allclose(reward, expected + 0.1 * terms["hot_inlets"], rtol=1e-12)
+
+
 def test_each_agent_is_paid_for_its_own_part() -> None:
     def rewards(**commands: int) -> dict[str, F64]:
         env = core(["site.location=CA"], days=2, collaboration=1.0)

@@ -13,7 +13,6 @@ import sdc_taichi  # noqa: E402
 from sdc_taichi import load_config  # noqa: E402
 from sdc_taichi.envs.agents import AGENTS  # noqa: E402
 from sdc_taichi.envs.core import Core  # noqa: E402
-from sdc_taichi.envs.rewards import JOINT_SCALES  # noqa: E402
 from sdc_taichi.learning.algorithms import ON_POLICY  # noqa: E402
 from sdc_taichi.learning.on_policy import OnPolicy  # noqa: E402
 from sdc_taichi.learning.policy import action_levels  # noqa: E402
@@ -67,7 +66,7 @@ def totals(core: Core, learner: OnPolicy | None) -> dict[str, float]:
     return found
 
 
-@pytest.mark.parametrize("rewards", JOINT_SCALES)
+@pytest.mark.parametrize("rewards", ["default", "bill"])
 def test_agents_trained_for_a_moment_beat_idle_ones(rewards: str) -> None:
     """In carbon or in the bill, with what is stored and waits at the end at its mean worth."""
     threads = torch.get_num_threads()

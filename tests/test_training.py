@@ -357,7 +357,7 @@ def test_the_study_trains_goes_on_and_compares(
 ) -> None:
     study = example("learning_study", "matplotlib")
     arguments = [
-        *(str(tmp_path), "--algorithms", "ippo", "haa2c", "--seeds", "1", "--steps", "256"),
+        *(str(tmp_path), "--algorithms", "ippo", "haa2c", "--seeds", "1", "--steps", "512"),
         *("--sites", "NY", "--weeks", "0", "--data-centers", "2", "--held-out-weeks", "3"),
         *("--rules", "g36", "--no-optimum"),
     ]

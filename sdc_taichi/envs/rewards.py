@@ -53,12 +53,9 @@ SCALES: dict[str, dict[str, dict[str, float]]] = {
 """Scales of the terms of each agent, by the name of the set: ``default`` is carbon, to each agent
 the part that it can change, ``bill`` the same with prices and high power, and ``paper`` r_LS, r_DC
 and r_BAT of the paper (4.5, F.2), with carbon and energies over those of the design point."""
-JOINT_SCALES: dict[str, dict[str, float]] = {
-    name: {term: scale for own in SCALES[name].values() for term, scale in own.items()}
-    for name in ("default", "bill")
-}
-"""Scales of the terms of all agents as one, by the name of the set: each term once, however many
-agents have it. Where there are none, the reward of all is the sum of theirs."""
+_COUNTED_ONCE = ("default", "bill")
+"""Sets of which the reward of several agents as one counts each term once, however many of them
+have it; with others it is the sum of theirs."""
 REWARD_SETS = (*SCALES, "sustaindc")
 """Rewards that the option ``rewards`` takes by name, besides registered functions."""
 
@@ -121,7 +118,10 @@ class Rewards:
         self._bills = days / BILL_DAYS
         self._released = ReleasedRewards() if rewards == "sustaindc" else None
         self._scales: dict[str, dict[str, float]] | None = None
-        self._joint_scales = JOINT_SCALES.get(rewards) if isinstance(rewards, str) else None
+        self._joint_scales: dict[str, float] | None = None
+        if isinstance(rewards, str) and rewards in _COUNTED_ONCE and len(self._agents) > 1:
+            of_each = [SCALES[rewards][agent] for agent in self._agents]
+            self._joint_scales = {term: x for own in of_each for term, x in own.items()}
         self._function: RewardFunction | None = None
         if isinstance(rewards, Mapping):
             self._scales = _checked_scales(rewards)

@@ -175,3 +175,6 @@ LEARNING_SETTINGS: dict[
     "cross-entropy": CrossEntropySettings,
 }
 """Classes of the settings of each algorithm, by its name."""
+LEAST_UPDATES = dict.fromkeys(("ppo", "ippo", "mappo", "happo", "haa2c", "cross-entropy"), 2)
+"""Updates that a training needs by algorithm: the first of these only measures what is observed or
+returned."""

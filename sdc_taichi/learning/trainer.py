@@ -26,7 +26,7 @@ from sdc_taichi.learning.controller import PolicyController
 from sdc_taichi.learning.evaluation import DataCenterWeeks, Validation, prepare, validate
 from sdc_taichi.learning.interface import interface_of
 from sdc_taichi.learning.policy import About, Policy
-from sdc_taichi.learning.settings import ActingSettings
+from sdc_taichi.learning.settings import LEAST_UPDATES, ActingSettings
 from sdc_taichi.learning.split import VALIDATION
 from sdc_taichi.learning.stream import EnvironmentStream
 from sdc_taichi.learning.training_folder import (
@@ -142,10 +142,12 @@ class _Run:
             self._stream = make_stream(settings, env)
             self._steps_each = env.num_envs * steps_per_update(settings.learning, self._stream)
             self._updates = settings.steps // self._steps_each
-            if not self._updates:
+            least = LEAST_UPDATES.get(settings.algorithm, 1)
+            if self._updates < least:
                 raise ConfigError(
                     f"steps {settings.steps:,}: an update takes {self._steps_each:,}, of "
-                    f"{env.num_envs:,} data centers; valid is as many or more"
+                    f"{env.num_envs:,} data centers, and {settings.algorithm} learns from update "
+                    f"{least} on; valid is {least * self._steps_each:,} or more"
                 )
             self._algorithm = make_algorithm(
                 settings.algorithm,
