@@ -20,6 +20,7 @@ from sdc_taichi.optimum.problem import AGENTS, Ends, FacilityTable
 from sdc_taichi.optimum.tables import facility_tables
 from sdc_taichi.run.achievable import AchievedPath, achievement, begin_score
 from sdc_taichi.run.loop import simulate
+from sdc_taichi.sim import snapshot
 
 DAY = 96
 
@@ -287,8 +288,8 @@ def test_what_another_process_is_keeping_needs_no_warning(
         claims.append(FileClaim(path))
         snapshot_write(path, values)
 
-    snapshot_write = entry.snapshot.write
-    monkeypatch.setattr(entry.snapshot, "write", write)
+    snapshot_write = snapshot.write
+    monkeypatch.setattr(snapshot, "write", write)
     with warnings.catch_warnings():
         warnings.simplefilter("error", OptimumCacheWarning)
         entry.Cache(tmp_path).keep_ends("key", {Ends(0.0, 0.0, 0.0, 0.0): 1.0})
