@@ -230,6 +230,10 @@ def test_what_a_policy_cannot_do_is_one_error(tmp_path: Path) -> None:
     ):
         with pytest.raises(SdcError, match=said):
             make_controller(spec, fleet)
+    made = Policy.load(tmp_path)
+    replace(made, about=About(algorithm="none", others="load=greedy-ci")).save(tmp_path / "others")
+    with pytest.raises(SdcError, match="does not act on load; it gives battery"):
+        make_controller(f"load=policy:{tmp_path / 'others'}", fleet)
     with pytest.raises(ConfigError, match=r"policy .*does not fit .*step: 15 min in training, 30"):
         make_controller(
             f"policy:{tmp_path}", build_fleet(load_config("tiny", ["simulation.steps_per_hour=2"]))

@@ -8,9 +8,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sdc_taichi.control import ForecastError, View, commands_of, make_controller
+from sdc_taichi.control import (
+    CONTROLLABLE,
+    ForecastError,
+    View,
+    commands_of,
+    make_controller,
+)
 from sdc_taichi.envs.actions import ActionDecoder
-from sdc_taichi.envs.agents import COMMAND_OF_AGENT, commands_by_others
+from sdc_taichi.envs.agents import commands_by_others
 from sdc_taichi.envs.observer import Observer
 from sdc_taichi.envs.observers import make_observer
 from sdc_taichi.envs.released_observer import ReleasedObserver
@@ -124,8 +130,8 @@ def policy_controller(text: str, fleet: Fleet, parts: tuple[str, ...]) -> Policy
         raise ConfigError("controller 'policy': valid is policy:FOLDER, such as policy:runs/happo")
     try:
         policy = Policy.load(Path(text))
-        own = {COMMAND_OF_AGENT[agent] for agent in policy.interface.agents}
-        others = "idle" if set(parts) <= own else None
+        # Named for some parts, it answers for these alone.
+        others = None if set(parts) == set(CONTROLLABLE) else "idle"
         return PolicyController(policy, fleet, f"policy {text}", others)
     except RecursionError:
         raise ConfigError(f"policy {text}: its training had this policy for others") from None
