@@ -54,6 +54,14 @@ def test_values_lie_on_top_of_those_of_their_scenario() -> None:
     assert made.options().start == "fixed"
 
 
+@pytest.mark.parametrize(("rewards", "share"), [("default", 1.0), ("bill", 1.0), ("paper", 0.8)])
+def test_rewards_of_an_own_part_are_not_shared(rewards: str, share: float) -> None:
+    made = make_settings({"algorithm": "ippo", "environment": {"rewards": rewards}})
+    assert made.environment.collaboration == share
+    again = make_settings(made.model_dump(mode="json"))
+    assert again.environment == made.environment
+
+
 def test_difference_names_the_setting_and_both_values() -> None:
     one = make_settings({"algorithm": "ippo", "steps": 10})
     assert one.difference(make_settings({"algorithm": "ippo", "steps": 20})) is None

@@ -44,6 +44,8 @@ CI_LEADS_H = tuple(range(1, 25))
 SETPOINT_CHANGE_K = 0.5
 """Largest change of the setpoint in a step by trained agents, who hold it for some steps, in K."""
 _SHAPE_OF_DAY = ("ci_rank", "ci_relative", "ci_swing")
+_OWN_PARTS = ("default", "bill")
+"""Rewards that pay each agent for its own part, to which those of others would add noise."""
 _PRICES = ("price", "price_forecast")
 
 
@@ -63,6 +65,8 @@ def training_environment(given: Mapping[str, Any]) -> dict[str, Any]:
         decided = (given.get("commands") or {}).get("agent_dc", ("cooling",))
         if "agent_dc" in agents and "cooling" in decided:
             found["setpoint_change_k"] = SETPOINT_CHANGE_K
+    if given.get("rewards", "default") in _OWN_PARTS:
+        found["collaboration"] = 1.0
     if given.get("observations", "default") == "default":
         found["ci_leads_h"] = CI_LEADS_H
         if not given.get("commands"):
