@@ -675,7 +675,7 @@ def test_what_the_standards_do_not_know_is_reached_through_unwrapped() -> None:
 def test_joint_observation_has_every_feature_of_its_agents_once(
     agents: tuple[str, ...], seen: str
 ) -> None:
-    options = tiny(agents=agents, **SEEN[seen])
+    options = tiny(agents=agents, rewards="paper", **SEEN[seen])
     joint, parallel = SdcEnv(**options), sdc_taichi.parallel_env(**options)
     rng = np.random.default_rng(0)
     whole: Any = joint.reset(seed=4)[0]
