@@ -87,6 +87,8 @@ def _valid(entry: dict[str, Any], schema: dict[str, Any]) -> str:
     """Valid values of an entry of a JSON schema, as text for the column ``valid``."""
     if "anyOf" in entry:
         return " or ".join(_valid(one, schema) for one in entry["anyOf"])
+    if "const" in entry:
+        return f"`{entry['const']}`"
     if "enum" in entry:
         return ", ".join(f"`{one}`" for one in entry["enum"])
     kind = entry.get("type")
