@@ -26,7 +26,13 @@ def main() -> None:
         sys.exit(EXIT_FAILURE)
     if ends_on_interrupt:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    app.main()
+    try:
+        app.main()
+    finally:
+        if ends_on_interrupt:
+            # The interpreter gives its signals back to the system before it ends, which would then
+            # end a command that is done as one that was interrupted.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _open_closed_streams() -> None:

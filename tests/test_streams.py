@@ -120,6 +120,23 @@ sdc_taichi_command.main()
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
+@POSIX
+def test_an_interrupt_after_a_command_is_done_does_not_undo_its_exit_code() -> None:
+    code = """
+import os, signal, sys
+sys.argv = ["sdc-taichi", "--version"]
+import sdc_taichi_command
+
+try:
+    sdc_taichi_command.main()
+finally:
+    os.kill(os.getpid(), signal.SIGINT)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("sdc-taichi ")
+
+
 @pytest.mark.parametrize(
     ("error", "line", "code"),
     [
