@@ -33,6 +33,7 @@ ROOMS = (
     "viz",
     "envs",
     "learning",
+    "benchmark",
     "cli",
     "__init__",
 )
