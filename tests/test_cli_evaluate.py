@@ -51,13 +51,17 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_controllers_that_are_unknown_are_named_before_an_optimum_is_solved(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [(("gready-ci",), "did you mean 'greedy-ci'"), (("g36", "g36"), "g36 is given twice")],
+)
+def test_controllers_are_refused_before_an_optimum_is_solved(
+    names: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(evaluation, "solve", None)
-    done = call(*CASE, "--controller", "gready-ci")
+    done = call(*CASE, *(text for name in names for text in ("--controller", name)))
     assert done.exit_code == 2
-    assert "did you mean 'greedy-ci'" in done.stderr
+    assert said in done.stderr
 
 
 def test_seeds_are_put_together_and_files_tell_all(runs: Path, tmp_path: Path) -> None:
@@ -96,13 +100,17 @@ def test_without_an_optimum_there_is_no_share(runs: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(evaluation, "solve", fails)
     done = call(runs / "b", *CASE, "--no-agents", "--json")
-    assert done.exit_code == 0, done.output
-    assert done.stderr == "note: no optimum, so no shares: no plan\n"
+    assert done.exit_code == 2, done.output
+    assert done.stderr.splitlines() == [
+        "note: no optimum, so no shares: no plan",
+        "error: evaluate: no optimum to tell shares of; valid without is --no-optimum",
+    ]
     content = json.loads(done.stdout)
     assert [row["controller"] for row in content["summary"]] == ["idle", "happo"]
     assert [row["share_pct"] for row in content["summary"]] == [None, None]
     assert content["remarks"][0].startswith("Without an optimum ends have no value")
     asked = call(runs / "b", *CASE, "--no-agents", "--no-optimum", "--json")
+    assert asked.exit_code == 0, asked.output
     assert asked.stderr == ""
     assert json.loads(asked.stdout)["summary"] == content["summary"]
 
@@ -126,7 +134,6 @@ def test_an_interrupted_solution_is_told(runs: Path, monkeypatch: pytest.MonkeyP
         (("--controller", "g38", *CASE), "controller 'g38': unknown"),
         (("--controller", "g36", *CASE[:2], "--site", "XX"), "XX"),
         (("--controller", "g36", *CASE, "--objective", "coal"), "objective 'coal'"),
-        (("--controller", "g36", "--controller", "g36", *CASE), "g36 is given twice"),
     ],
 )
 def test_errors_are_one_line(arguments: tuple[str, ...], said: str) -> None:

@@ -25,6 +25,17 @@ Overrides = Annotated[
     typer.Option("--set", metavar="A.B=C", help="Override a field of the config; repeatable."),
 ]
 """Option of a command that reads a configuration."""
+Compared = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="Controller to compare, as of simulate; repeatable."),
+]
+"""Option of a command that compares controllers with an optimum."""
+NoCache = Annotated[
+    bool, typer.Option("--no-cache", help="Solve anew, and keep nothing for later.")
+]
+"""Option of a command that solves for an optimum."""
+FolderForce = Annotated[bool, typer.Option("--force", help="Write into a folder with other files.")]
+"""Option of a command that writes a folder."""
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")]
 
 
@@ -64,13 +75,11 @@ def check_out_file(out: Path | None, suffix: str, *, force: bool) -> None:
         raise ConfigError(f"--out {out}: exists; choose another name or replace it with --force")
 
 
-def read_config(
-    source: list[str] | None, overrides: list[str] | None
-) -> tuple[DataCenterConfig, str]:
-    """The config that ``Source`` and ``Overrides`` give, and the name of its preset or file.
+def parse_source(source: list[str] | None) -> tuple[str | None, list[str]]:
+    """The preset or file that ``Source`` names, None if it names none, and its overrides.
 
     Raises:
-        ConfigError: two presets or files, or a config that is not valid.
+        ConfigError: two presets or files.
     """
     given = source or []
     files = [text for text in given if "=" not in text or os.path.isfile(text)]
@@ -79,6 +88,17 @@ def read_config(
             f"{files[1]!r}: a second preset or file after {files[0]!r}; valid is one, and "
             "overrides section.key=value"
         )
-    assigned = [text for text in given if text not in files]
-    name = files[0] if files else "corrected"
+    return next(iter(files), None), [text for text in given if text not in files]
+
+
+def read_config(
+    source: list[str] | None, overrides: list[str] | None
+) -> tuple[DataCenterConfig, str]:
+    """The config that ``Source`` and ``Overrides`` give, and the name of its preset or file.
+
+    Raises:
+        ConfigError: two presets or files, or a config that is not valid.
+    """
+    found, assigned = parse_source(source)
+    name = "corrected" if found is None else found
     return load_config(name, [*(overrides or []), *assigned]), name

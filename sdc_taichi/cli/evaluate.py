@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sdc_taichi.cli.arguments import (
+    Compared,
     Debug,
+    FolderForce,
+    NoCache,
     Overrides,
-    force_option,
     json_option,
     out_option,
     read_config,
@@ -30,7 +32,7 @@ from sdc_taichi.cli.scenario import (
     Workload,
     data_centers,
 )
-from sdc_taichi.cli.session import interruptible, print_notes, stage_bars
+from sdc_taichi.cli.session import exit_if_stopped, interruptible, print_notes, stage_bars
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.errors import ConfigError, SdcError, one_line, printable
 
@@ -57,10 +59,7 @@ def evaluate_command(
         str,
         typer.Option(metavar="NAME|N,N", help="held-out, validation, training, or weeks 0..51."),
     ] = "held-out",
-    controller: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Controller to compare, as of simulate; repeatable."),
-    ] = None,
+    controller: Compared = None,
     objective: Annotated[
         str | None,
         typer.Option(
@@ -88,9 +87,7 @@ def evaluate_command(
     no_agents: Annotated[
         bool, typer.Option("--no-agents", help="Leave out each agent alone.")
     ] = False,
-    no_cache: Annotated[
-        bool, typer.Option("--no-cache", help="Solve anew, and keep nothing for later.")
-    ] = False,
+    no_cache: NoCache = False,
     precision: Precision = "f32",
     weather: Weather = None,
     carbon: Carbon = None,
@@ -98,7 +95,7 @@ def evaluate_command(
     out: Annotated[
         Path | None, out_option("Folder for tables, rows and figures. [default: none]", "DIR")
     ] = None,
-    force: Annotated[bool, force_option("Write into a folder with other files.")] = False,
+    force: FolderForce = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no tables.")] = False,
     as_json: Annotated[bool, json_option("Print evaluation.json instead of the tables.")] = False,
     debug: Debug = False,
@@ -109,6 +106,7 @@ def evaluate_command(
     of the achievable is 0 for idle commands and 1 for the known optimum.
     """
     from sdc_taichi.control import PERFECT, ForecastError
+    from sdc_taichi.learning.evaluation import check_contenders
     from sdc_taichi.learning.evaluation_folder import (
         EVALUATION_FILE,
         ROWS_FILE,
@@ -136,9 +134,9 @@ def evaluate_command(
     )
     if objective is None:
         objective = "carbon" if settings is None else settings.validation.objective
-    # What is not valid is said before the optimum is solved, which may take hours.
+    # Solving for the optimum may take hours, so invalid names and policies are refused before.
     with warnings.catch_warnings(action="ignore"):
-        _contenders(build_fleet(configs), folders, named)
+        check_contenders(_contenders(build_fleet(configs), folders, named))
     if out is not None:
         prepare_evaluation_folder(out, force=force)
     with interruptible() as stop:
@@ -176,6 +174,8 @@ def evaluate_command(
         left = ", ".join(found.missing)
         print(f"interrupted; figures are whole, without {left}", file=sys.stderr)
         raise typer.Exit(EXIT_INTERRUPTED)
+    if prepared.optimum is None and not no_optimum:
+        raise SdcError("evaluate: no optimum to tell shares of; valid without is --no-optimum")
 
 
 def _base_config(
@@ -195,20 +195,17 @@ def _prepared(
     stop: Callable[[], bool],
     **options: Any,
 ) -> DataCenterWeeks:
-    """The weeks, without an optimum where there is none, which is said on stderr.
+    """The weeks, without an optimum and with a note on stderr where it cannot be solved for.
 
     Raises:
         typer.Exit: solving was stopped; what is kept has been printed.
     """
     from sdc_taichi.learning.evaluation import prepare
-    from sdc_taichi.optimum.result import StoppedError
 
     if optimum:
         try:
-            return prepare(configs, weeks, stop=stop, **options)
-        except StoppedError as error:
-            print(f"interrupted: {one_line(str(error))}", file=sys.stderr)
-            raise typer.Exit(EXIT_INTERRUPTED) from None
+            with exit_if_stopped():
+                return prepare(configs, weeks, stop=stop, **options)
         except SdcError as error:
             failed = error
     weeks_without = prepare(configs, weeks, optimum=False, stop=stop, **options)

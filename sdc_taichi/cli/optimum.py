@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sdc_taichi.cli.arguments import (
+    Compared,
     Debug,
+    FolderForce,
+    NoCache,
     Overrides,
     Source,
-    force_option,
     json_option,
     out_option,
     read_config,
@@ -32,8 +34,14 @@ from sdc_taichi.cli.scenario import (
     data_centers,
     whole_steps,
 )
-from sdc_taichi.cli.session import interruptible, print_notes, progress_bar, stage_bars
-from sdc_taichi.errors import ConfigError, one_line, printable, suggestion
+from sdc_taichi.cli.session import (
+    exit_if_stopped,
+    interruptible,
+    print_notes,
+    progress_bar,
+    stage_bars,
+)
+from sdc_taichi.errors import ConfigError, printable, suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,10 +67,7 @@ def optimum_command(
             "carbon+0.002*water.",
         ),
     ] = "carbon",
-    controller: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Controller to compare, as of simulate; repeatable."),
-    ] = None,
+    controller: Compared = None,
     agents: Annotated[
         str,
         typer.Option(metavar="NAME[,NAME]", help="What may be moved: load, cooling, battery."),
@@ -84,9 +89,7 @@ def optimum_command(
     discrete: Annotated[
         bool, typer.Option("--discrete", help="Also solve for discrete actions.")
     ] = False,
-    no_cache: Annotated[
-        bool, typer.Option("--no-cache", help="Solve anew, and keep nothing for later.")
-    ] = False,
+    no_cache: NoCache = False,
     precision: Precision = "f32",
     overrides: Overrides = None,
     weather: Weather = None,
@@ -95,7 +98,7 @@ def optimum_command(
     out: Annotated[
         Path | None, out_option("Run folder to write the achieved path to. [default: none]", "DIR")
     ] = None,
-    force: Annotated[bool, force_option("Write into a folder with other files.")] = False,
+    force: FolderForce = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
     as_json: Annotated[bool, json_option("Print optimum.json instead of the table.")] = False,
     debug: Debug = False,
@@ -205,28 +208,23 @@ def solve_beside(
     """
     from sdc_taichi.optimum import solve
     from sdc_taichi.optimum.problem import AGENTS
-    from sdc_taichi.optimum.result import StoppedError
 
-    try:
-        with stage_bars(shown=not quiet) as progress:
-            return solve(
-                sim.fleet,
-                steps=steps,
-                seed=seed,
-                drivers=sim.drivers,
-                objective=objective,
-                agents=AGENTS if agents is None else agents,
-                scored_from=scored_from,
-                inlet_limit_c=inlet_limit_c,
-                discrete=discrete,
-                precision=sim.precision,
-                cache=cache,
-                progress=progress,
-                stop=stop,
-            )
-    except StoppedError as error:
-        print(f"interrupted: {one_line(str(error))}", file=sys.stderr)
-        raise typer.Exit(EXIT_INTERRUPTED) from None
+    with exit_if_stopped(), stage_bars(shown=not quiet) as progress:
+        return solve(
+            sim.fleet,
+            steps=steps,
+            seed=seed,
+            drivers=sim.drivers,
+            objective=objective,
+            agents=AGENTS if agents is None else agents,
+            scored_from=scored_from,
+            inlet_limit_c=inlet_limit_c,
+            discrete=discrete,
+            precision=sim.precision,
+            cache=cache,
+            progress=progress,
+            stop=stop,
+        )
 
 
 def _run_controllers(

@@ -1,4 +1,4 @@
-"""``sdc-taichi policy``: what a policy is, and policies for other programs."""
+"""``sdc-taichi policy``: show a policy, or export it for other programs."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def export_policy(
 
 
 def _origin(policy: Policy) -> str:
-    """Where a policy comes from, in one line."""
+    """Algorithm, steps, seed and version of a policy as one line of text."""
     about = policy.about
     parts = [about.algorithm, f"{about.steps:,} steps"]
     parts += [] if about.seed is None else [f"seed {about.seed}"]
@@ -62,7 +62,7 @@ def _origin(policy: Policy) -> str:
 
 
 def _facts(policy: Policy) -> list[tuple[str, str]]:
-    """What a policy observes and decides, label by label."""
+    """Interface and networks of a policy as pairs of a label and a text."""
     fits = policy.interface
     order = "" if fits.action_order is None else f", order {fits.action_order}"
     facts = [("others", policy.about.others), ("actions", f"{fits.actions}{order}")]

@@ -11,6 +11,9 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
+import typer
+
+from sdc_taichi.cli.scenario import EXIT_INTERRUPTED
 from sdc_taichi.errors import ConfigError, SdcWarning, one_line, printable
 
 if TYPE_CHECKING:
@@ -74,6 +77,22 @@ def interruptible() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def exit_if_stopped() -> Iterator[None]:
+    """End the command where Ctrl-C or SIGTERM ends the work on an optimum.
+
+    Raises:
+        typer.Exit: the work was stopped; how much of it is kept has been printed.
+    """
+    from sdc_taichi.optimum.result import StoppedError
+
+    try:
+        yield
+    except StoppedError as error:
+        print(f"interrupted: {one_line(str(error))}", file=sys.stderr)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
 def make_recorder(

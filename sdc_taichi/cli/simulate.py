@@ -10,9 +10,9 @@ import typer
 
 from sdc_taichi.cli.arguments import (
     Debug,
+    FolderForce,
     Overrides,
     Source,
-    force_option,
     json_option,
     out_option,
     read_config,
@@ -120,7 +120,7 @@ def simulate_command(
             min=0, max=65535, help="Serve on this port; 0 is any free one. [default: 9876]"
         ),
     ] = None,
-    force: Annotated[bool, force_option("Write into a folder with other files.")] = False,
+    force: FolderForce = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
     as_json: Annotated[bool, json_option("Print metrics.json instead of the summary.")] = False,
     debug: Debug = False,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sdc_taichi.cli.arguments import Debug, out_option
+from sdc_taichi.cli.arguments import Debug, Source, out_option, parse_source
 from sdc_taichi.cli.scenario import EXIT_INTERRUPTED
 from sdc_taichi.cli.session import interruptible, rich_progress
 from sdc_taichi.errors import ConfigError, printable, suggestion_or_valid
@@ -33,14 +33,7 @@ def train_command(
             show_default=False,
         ),
     ] = None,
-    source: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[PRESET|FILE] [A.B=C]...",
-            help="Preset, YAML file or SustainDC dc_config.json, and overrides of its fields.",
-            show_default=False,
-        ),
-    ] = None,
+    source: Source = None,
     site: Annotated[
         str | None,
         typer.Option(metavar="SITE[,SITE...]", help="Sites to train on. [default: of the config]"),
@@ -109,7 +102,7 @@ def train_command(
         values["environment"]["agents"] = _agents(agents)
     if resume and out is None:
         raise ConfigError("--resume: without --out; valid is with the folder of a training")
-    chosen = _settings(values, source or [], assigned or [], settings, out if resume else None)
+    chosen = _settings(values, source, assigned or [], settings, out if resume else None)
     if show:
         print(chosen.to_yaml(), end="")
         return
@@ -131,7 +124,7 @@ def train_command(
 
 def _settings(
     given: dict[str, Any],
-    source: list[str],
+    source: list[str] | None,
     assigned: list[str],
     file: Path | None,
     resumed: Path | None,
@@ -151,17 +144,11 @@ def _settings(
     if file is not None:
         values = merged(values, read_values(file))
     values = merged(values, given)
-    configs = [text for text in source if "=" not in text or Path(text).is_file()]
-    if len(configs) > 1:
-        raise ConfigError(
-            f"{configs[1]!r}: a second preset or file after {configs[0]!r}; valid is one, and "
-            "overrides section.key=value"
-        )
-    if configs:
-        values["config"] = configs[0]
-    for text in source:
-        if text not in configs:
-            apply_override(values.setdefault("overrides", {}), text)
+    config, overrides = parse_source(source)
+    if config is not None:
+        values["config"] = config
+    for text in overrides:
+        apply_override(values.setdefault("overrides", {}), text)
     for text in assigned:
         apply_override(values, text)
     if "algorithm" not in values:
@@ -187,7 +174,7 @@ def _agents(text: str) -> list[str]:
 
 @contextlib.contextmanager
 def progress_of_training(*, shown: bool) -> Iterator[dict[str, Any]]:
-    """Show how far a training has come on stderr: bars in a terminal, lines elsewhere.
+    """Show the progress of a training on stderr: bars in a terminal, lines elsewhere.
 
     Args:
         shown: whether to show it at all.
@@ -239,7 +226,7 @@ class _Lines:
 
 
 def _line(now: Progress) -> str:
-    """Progress in a few words."""
+    """Steps done, speed, time left, returns and the validation of an update, as text."""
     parts = [f"{now.steps:,} steps, {now.steps_per_s:,.0f}/s, {duration(now.left_s)} left"]
     returns = {n.partition("/")[2]: x for n, x in now.numbers.items() if n.startswith("return/")}
     if returns:
@@ -250,7 +237,7 @@ def _line(now: Progress) -> str:
 
 
 def _reached(found: Validation) -> str:
-    """What a policy reached in the validation weeks, in a few words."""
+    """Figure, share of the achievable and broken constraints of a validation, as text."""
     change = f"{found.change_pct:+.2f} % against idle"
     share = f", {100.0 * found.share:.1f} % of the achievable" if found.share == found.share else ""
     broken = f", {found.broken_weeks} weeks break a constraint" if found.broken_weeks else ""
@@ -265,7 +252,7 @@ def duration(seconds: float) -> str:
 
 
 def _print_summary(done: Training) -> None:
-    """Say what a training left behind."""
+    """Print how far a training has come, its best policy, and how to use it."""
     speed = f"{done.steps:,} steps in {done.updates:,} updates, {duration(done.seconds)}"
     print(f"{speed}; files in {printable(done.folder)}")
     if done.best is not None:

@@ -1,4 +1,4 @@
-"""How controllers do in given weeks, beside idle commands and a known optimum of the same weeks.
+"""Evaluation of controllers in given weeks, against idle commands and the optimum of these weeks.
 
 All begin in equal weeks and states. The first day of a week is run but not scored, and what is
 stored or waits at the end is valued, so that an empty battery or work put off is no saving.
@@ -35,20 +35,20 @@ if TYPE_CHECKING:
     import pandas as pd
 
 IDLE = "idle"
-"""Name of the controller that all others are told against."""
+"""Name of the controller that all others are compared with."""
 ALL = "all"
-"""What a controller moves that is not held back."""
+"""Text for a controller that gives all its commands, where others stand for one agent alone."""
 METRICS = (
     *("cfp_kg", "grid_kwh", "it_kwh", "hvac_kwh", "water_l", "cost", "peak_kw"),
     *("over_27_degree_h", "hottest_inlet_c", "arrived_tasks", "executed_tasks", "dropped_tasks"),
     *("overdue_task_h", "queue_mean_tasks", "battery_throughput_kwh", "unmet_cooling_kwh"),
 )
-"""Metrics of ``run.metrics`` that rows tell of the scored steps."""
+"""Metrics of ``run.metrics`` over the scored steps that each row holds."""
 
 
 @dataclass(frozen=True, slots=True)
 class DataCenterWeeks:
-    """Data centers in weeks of the year, with what idle commands and the optimum reach there.
+    """Data centers in weeks of the year, with the figures of idle commands and of the optimum.
 
     As a context manager it closes its simulator.
     """
@@ -68,7 +68,7 @@ class DataCenterWeeks:
     seed: int
     """Seed of sampled events, of controllers and of errors of forecasts."""
     forecast_error: ForecastError
-    """How the forecasts of controllers err."""
+    """Sizes of the errors of the forecasts that controllers get."""
     idle: F64
     """Figure of idle commands over the scored steps, in the unit of the objective, (B,)."""
     optimum: Optimum | None
@@ -88,7 +88,7 @@ class DataCenterWeeks:
 
 
 class Validation(NamedTuple):
-    """What a controller reaches over all weeks together."""
+    """Result of a controller over all validation weeks together."""
 
     change_pct: float
     """Figure against idle commands, with valued ends where there is an optimum, in %."""
@@ -110,12 +110,12 @@ class Contender:
     seed: int | None = None
     """Seed of its training; None if it was not trained."""
     agents: tuple[str, ...] = ()
-    """Of load, cooling and battery what is also run alone, the others idle."""
+    """Agents (load, cooling, battery) that are also run one at a time, the others idle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """What controllers reached in each week."""
+    """Figures and metrics of controllers in each data-center week."""
 
     rows: pd.DataFrame
     """A row for each controller, training, what it moves, and data-center week, with the columns
@@ -218,7 +218,7 @@ def prepare(
 
 
 def validate(controller: Controller, weeks: DataCenterWeeks) -> Validation:
-    """What a controller reaches over all weeks together.
+    """Compare a controller with idle commands and the optimum over all weeks together.
 
     Args:
         controller: gives the commands.
@@ -235,6 +235,31 @@ def validate(controller: Controller, weeks: DataCenterWeeks) -> Validation:
         float(share_pct(figure, weeks.idle[None], best.achieved[None])) / 100.0,
         sum(map(bool, reached.broken)),
     )
+
+
+def check_contenders(contenders: Iterable[Contender]) -> None:
+    """Refuse controllers whose rows could not be told apart, and agents that do not exist.
+
+    Args:
+        contenders: the controllers.
+
+    Raises:
+        ConfigError: a name and seed that is given twice, the name of the optimum, or an agent that
+            is neither load, cooling nor battery.
+    """
+    seen = set()
+    for each in contenders:
+        if each.name == OPTIMUM:
+            raise ConfigError(
+                f"evaluation: {each.name} names rows of the known optimum; valid is another name"
+            )
+        if each.name != IDLE and (each.name, each.seed) in seen:
+            of = "" if each.seed is None else f" of seed {each.seed}"
+            raise ConfigError(f"evaluation: {each.name}{of} is given twice; valid is each once")
+        seen.add((each.name, each.seed))
+        for agent in each.agents:
+            if agent not in AGENTS:
+                raise ConfigError(f"agent {agent!r} of {each.name}: valid are {', '.join(AGENTS)}")
 
 
 def evaluate(
@@ -255,6 +280,9 @@ def evaluate(
         on_run: called with the name of each run before it; what it returns is called with the
             result of every step.
         stop: asked before every step; true ends the evaluation, and rows of whole runs are kept.
+
+    Raises:
+        ConfigError: names or agents that ``check_contenders`` refuses.
     """
     import pandas as pd
 
@@ -292,8 +320,9 @@ def _runs(
     weeks: DataCenterWeeks, contenders: Iterable[Contender]
 ) -> list[tuple[str, str, Contender]]:
     """Name, what is moved, and controller of each run, in the order of their rows."""
-    given = [each for each in contenders if each.name != IDLE]
-    every = [Contender(IDLE, Idle()), *given]
+    given = list(contenders)
+    check_contenders(given)
+    every = [Contender(IDLE, Idle()), *(each for each in given if each.name != IDLE)]
     if weeks.optimum is not None:
         every.append(Contender(OPTIMUM, AchievedPath(weeks.optimum)))
     runs = []
@@ -301,15 +330,6 @@ def _runs(
         label = each.name if each.seed is None else f"{each.name}, seed {each.seed}"
         runs.append((label, ALL, each))
         runs += [(f"{label}, {agent} alone", agent, each) for agent in each.agents]
-    seen = [(each.name, each.seed) for each in every]
-    for name, seed in seen:
-        if seen.count((name, seed)) > 1:
-            of = "" if seed is None else f" of seed {seed}"
-            raise ConfigError(f"evaluation: {name}{of} is given twice; valid is each once")
-    for each in every:
-        for agent in each.agents:
-            if agent not in AGENTS:
-                raise ConfigError(f"agent {agent!r} of {each.name}: valid are {', '.join(AGENTS)}")
     return runs
 
 
