@@ -89,7 +89,6 @@ class JointValues:
         levels: how many possibilities each choice has, L.
 
     Attributes:
-        levels: how many possibilities each choice has, L.
         parameters: weights and biases of the critics.
 
     Raises:
@@ -105,7 +104,6 @@ class JointValues:
         generator: torch.Generator,
         levels: int = CHOICES,
     ) -> None:
-        self.levels = levels
         joint_actions = levels**choices
         if joint_actions > MOST_JOINT_ACTIONS:
             raise ConfigError(

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from sdc_taichi.control import Controller
-from sdc_taichi.learning.networks import layers_of, perceptron
-from sdc_taichi.learning.normalise import CLIP, RunningMoments
-from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
+from sdc_taichi.learning.networks import perceptron, policy_network
+from sdc_taichi.learning.normalise import RunningMoments
+from sdc_taichi.learning.policy import PolicyNetwork
 from sdc_taichi.learning.settings import CloningSettings
 from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces
 
@@ -91,17 +91,9 @@ class Cloning:
 
     def networks(self) -> tuple[PolicyNetwork, ...]:
         """The policies as they are."""
+        activation = self._settings.activation
         return tuple(
-            PolicyNetwork(
-                agents=of.agents,
-                mean=self._moments[name].mean.float().numpy().copy(),
-                std=self._moments[name].std.numpy().copy(),
-                clip=CLIP,
-                layers=layers_of(self._nets[name]),
-                activation=self._settings.activation,
-                head="clip" if of.choices is None else "argmax",
-                choices=of.choices or CHOICES,
-            )
+            policy_network(self._nets[name], self._moments[name], of, activation)
             for name, of in self._spaces.items()
         )
 

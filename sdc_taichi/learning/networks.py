@@ -11,8 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.learning.forward import Activation
 from sdc_taichi.learning.normalise import CLIP, RunningMoments
-from sdc_taichi.learning.policy import PolicyNetwork
+from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
 from sdc_taichi.learning.settings import OnPolicySettings
 from sdc_taichi.learning.stream import LearnerSpaces
 from sdc_taichi.types import F32
@@ -88,6 +89,31 @@ def layers_of(net: nn.Sequential) -> tuple[tuple[F32, F32], ...]:
         (layer.weight.detach().float().numpy().copy(), layer.bias.detach().float().numpy().copy())
         for layer in net
         if isinstance(layer, nn.Linear)
+    )
+
+
+def policy_network(
+    net: nn.Sequential, moments: RunningMoments, spaces: LearnerSpaces, activation: Activation
+) -> PolicyNetwork:
+    """The network of a policy that a perceptron has come to, with arrays of its own.
+
+    Its actions are the choices of the highest scores, or the outputs cut at -1 and 1.
+
+    Args:
+        net: the perceptron.
+        moments: moments of its observations.
+        spaces: what its learner sees and does.
+        activation: function of all layers but the last.
+    """
+    return PolicyNetwork(
+        agents=spaces.agents,
+        mean=moments.mean.float().numpy().copy(),
+        std=moments.std.numpy().copy(),
+        clip=CLIP,
+        layers=layers_of(net),
+        activation=activation,
+        head="clip" if spaces.choices is None else "argmax",
+        choices=spaces.choices or CHOICES,
     )
 
 

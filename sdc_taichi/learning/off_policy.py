@@ -32,6 +32,7 @@ from torch import Tensor
 
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.action_values import ContinuousValues, JointValues
+from sdc_taichi.learning.generators import generators
 from sdc_taichi.learning.networks import layers_of
 from sdc_taichi.learning.normalise import CLIP, RunningMoments
 from sdc_taichi.learning.off_policy_actors import (
@@ -54,20 +55,20 @@ LEAST_SCALE = 1e-6
 
 
 class OffPolicyDefinition(NamedTuple):
-    """What sets an off-policy algorithm apart."""
+    """Properties in which off-policy algorithms differ."""
 
     critics: int
     """Number of critics, of which the lowest value counts."""
     soft: bool
-    """Whether policies are drawn from and paid for their entropy, or else choices are the best by
-    value but for random ones."""
+    """Whether actions are drawn from policies that are rewarded for their entropy; if not, they are
+    those of the highest value, or at times random ones."""
 
 
 class OffPolicy:
     """A learner for each policy, updated from transitions drawn from a replay.
 
     Args:
-        definition: what sets the algorithm apart.
+        definition: properties in which the algorithm differs from others.
         settings: settings.
         spaces: what each learner sees and does.
         state_width: number of entries of the shared state, m.
@@ -94,11 +95,7 @@ class OffPolicy:
         self._settings, self._spaces, self._updates = settings, dict(spaces), updates
         self.steps_per_update = settings.steps_per_update
         self._done = 0
-        names = ("weights", "actions", "batches", "order")
-        self._generators = {
-            name: torch.Generator().manual_seed(seed * len(names) + i)
-            for i, name in enumerate(names)
-        }
+        self._generators = generators(seed)
         self._columns = _columns(spaces, state_width)
         self._numbers = sum(of.action_width for of in spaces.values())
         self._soft = definition.soft
@@ -251,7 +248,7 @@ class OffPolicy:
         self._returns.add(self._running_return.unsqueeze(-1))
 
     def _situation(self, columns: Tensor) -> Situation:
-        """What critic and learners see, normalised, from what they see side by side."""
+        """Normalised shared state and observations, from their columns side by side, (N, m + n)."""
         normal = self._moments.normalise(columns)
         state, *others = ((name, normal[:, part]) for name, part in self._columns)
         return Situation(state[1], dict(others))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -23,9 +23,12 @@ LEAST_LOG_STD, MOST_LOG_STD = -5.0, 2.0
 LAST_GAIN = 0.01
 """Gain of the last weights of a policy, which begins with almost equal choices."""
 
+Values = TypeVar("Values", bound=JointValues | ContinuousValues)
+"""Critics that policies may follow: of choices, or of continuous numbers."""
+
 
 class Situation(NamedTuple):
-    """What critic and learners see of N environments, normalised."""
+    """Normalised observations of N environments, from which critics value and learners act."""
 
     state: Tensor
     """Shared state, (N, m)."""
@@ -33,13 +36,16 @@ class Situation(NamedTuple):
     """Observations by learner, (N, n) each."""
 
 
-class Actors:
+class Actors(Generic[Values]):
     """Networks of all learners, whose K numbers stand side by side.
 
+    A network has an output for each choice of a number, or, where a number is continuous, one for
+    its mean and one for the logarithm of its standard deviation.
+
     Args:
+        critic: values that the policies follow.
         spaces: what each learner sees and does.
         settings: settings.
-        outputs: outputs of a network for each number.
         generator: source of the weights.
 
     Attributes:
@@ -53,12 +59,13 @@ class Actors:
 
     def __init__(
         self,
+        critic: Values,
         spaces: Mapping[str, LearnerSpaces],
         settings: OffPolicySettings,
-        outputs: int,
         generator: torch.Generator,
     ) -> None:
-        self._settings, self._outputs = settings, outputs
+        self._critic, self._settings = critic, settings
+        self._outputs = next(iter(spaces.values())).choices or 2
         self.nets: dict[str, nn.Sequential] = {}
         self.numbers: dict[str, slice] = {}
         self.adams: dict[str, torch.optim.Adam] = {}
@@ -67,7 +74,7 @@ class Actors:
             self.nets[name] = net = perceptron(
                 of.observation_width,
                 settings.hidden,
-                outputs * of.action_width,
+                self._outputs * of.action_width,
                 activation=settings.activation,
                 last_gain=LAST_GAIN,
                 generator=generator,
@@ -111,29 +118,13 @@ class Actors:
         return [names[i] for i in torch.randperm(len(names), generator=generator).tolist()]
 
 
-class GreedyActors(Actors):
+class GreedyActors(Actors[JointValues]):
     """Individual values of each choice, of which the best is taken: HAD3QN (Zhong et al. 2024).
 
     Each learner's values follow the row of the critic's table in which the others do what they do,
     those before it in a random order already their best choice in the table. The source fits the
     value of the best choice alone; the row has those of all other choices too.
-
-    Args:
-        critic: values that the policies follow.
-        spaces: what each learner sees and does.
-        settings: settings.
-        generator: source of the weights.
     """
-
-    def __init__(
-        self,
-        critic: JointValues,
-        spaces: Mapping[str, LearnerSpaces],
-        settings: OffPolicySettings,
-        generator: torch.Generator,
-    ) -> None:
-        super().__init__(spaces, settings, critic.levels, generator)
-        self._critic = critic
 
     def act(self, situation: Situation, exploration: float, generator: torch.Generator) -> Tensor:
         """Best choices, (N, K), each replaced by a random one with a probability.
@@ -176,30 +167,31 @@ class GreedyActors(Actors):
         return losses
 
 
-class EntropicActors(Actors):
+class EntropicActors(Actors[Values]):
     """Policies drawn from, with a reward for their entropy.
 
     Each learner has a temperature of its own, tuned so that its entropy meets a target (Haarnoja et
     al. 2018).
 
     Args:
+        critic: values that the policies follow.
         spaces: what each learner sees and does.
         settings: settings.
-        outputs: outputs of a network for each number.
-        entropy: wanted entropy of each number, nats.
         generator: source of the weights.
     """
 
     def __init__(
         self,
+        critic: Values,
         spaces: Mapping[str, LearnerSpaces],
         settings: OffPolicySettings,
-        outputs: int,
-        entropy: float,
         generator: torch.Generator,
     ) -> None:
-        super().__init__(spaces, settings, outputs, generator)
-        targets = {name: entropy * of.action_width for name, of in spaces.items()}
+        super().__init__(critic, spaces, settings, generator)
+        targets = {
+            name: wanted_entropy(of.choices, settings) * of.action_width
+            for name, of in spaces.items()
+        }
         self._temperatures = Temperatures(targets, settings)
 
     def state_dict(self) -> dict[str, Any]:
@@ -222,29 +214,12 @@ class EntropicActors(Actors):
         }
 
 
-class SoftActors(EntropicActors):
+class SoftActors(EntropicActors[JointValues]):
     """Independent choices of each learner, paid for their entropy: HASAC (Liu et al. 2024).
 
     The critic has an output for each joint action, so that all expected values are exact (as
     Christodoulou 2019 for one agent).
-
-    Args:
-        critic: values that the policies follow.
-        spaces: what each learner sees and does.
-        settings: settings.
-        generator: source of the weights.
     """
-
-    def __init__(
-        self,
-        critic: JointValues,
-        spaces: Mapping[str, LearnerSpaces],
-        settings: OffPolicySettings,
-        generator: torch.Generator,
-    ) -> None:
-        entropy = settings.entropy_share * math.log(critic.levels)
-        super().__init__(spaces, settings, critic.levels, entropy, generator)
-        self._critic = critic
 
     def act(self, situation: Situation, _: float, generator: torch.Generator) -> Tensor:
         """Choices drawn from the policies, (N, K)."""
@@ -286,30 +261,14 @@ class SoftActors(EntropicActors):
         return scores.unflatten(-1, (-1, self._outputs)).log_softmax(-1)
 
 
-class GaussianActors(EntropicActors):
+class GaussianActors(EntropicActors[ContinuousValues]):
     """Continuous actions of each learner, paid for their entropy: HASAC (Liu et al. 2024).
 
     An action is the hyperbolic tangent of a normal number (Haarnoja et al. 2018), through which
     gradients of the critic reach the policy.
-
-    Args:
-        critic: values that the policies follow.
-        spaces: what each learner sees and does.
-        settings: settings.
-        generator: source of the weights.
     """
 
     head = "tanh"
-
-    def __init__(
-        self,
-        critic: ContinuousValues,
-        spaces: Mapping[str, LearnerSpaces],
-        settings: OffPolicySettings,
-        generator: torch.Generator,
-    ) -> None:
-        super().__init__(spaces, settings, 2, settings.continuous_entropy, generator)
-        self._critic = critic
 
     def act(self, situation: Situation, _: float, generator: torch.Generator) -> Tensor:
         """Actions drawn from the policies, (N, K)."""
@@ -451,6 +410,18 @@ def soft_policy_loss(log_p: Tensor, values: Tensor, temperature: Tensor) -> Tens
     """
     value = expected(values, log_p.exp()).squeeze(-1)
     return -(value + temperature * entropies(log_p)).mean()
+
+
+def wanted_entropy(choices: int | None, settings: OffPolicySettings) -> float:
+    """Entropy that a policy is to keep in each number, nats.
+
+    Args:
+        choices: number of choices that there are; None where the number is continuous.
+        settings: settings.
+    """
+    if choices is None:
+        return settings.continuous_entropy
+    return settings.entropy_share * math.log(choices)
 
 
 def entropies(log_p: Tensor) -> Tensor:

@@ -25,9 +25,10 @@ import torch
 from torch import Tensor, nn
 
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.learning.networks import Actor, layers_of, load_network, perceptron
-from sdc_taichi.learning.normalise import CLIP, RunningMoments
-from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
+from sdc_taichi.learning.generators import generators
+from sdc_taichi.learning.networks import Actor, load_network, perceptron, policy_network
+from sdc_taichi.learning.normalise import RunningMoments
+from sdc_taichi.learning.policy import PolicyNetwork
 from sdc_taichi.learning.settings import OnPolicySettings
 from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces
 
@@ -37,7 +38,7 @@ ADAM_EPSILON = 1e-5
 
 
 class OnPolicyDefinition(NamedTuple):
-    """What sets an on-policy algorithm apart."""
+    """Properties in which on-policy algorithms differ."""
 
     critic: str
     """Input of critics: ``observation`` of each learner, or the shared ``state``."""
@@ -76,7 +77,7 @@ class OnPolicy:
     """A learner for each policy, updated from steps that the policies have just made.
 
     Args:
-        definition: what sets the algorithm apart.
+        definition: properties in which the algorithm differs from others.
         settings: settings.
         spaces: what each learner sees and does.
         state_width: number of entries of the shared state, m.
@@ -103,11 +104,7 @@ class OnPolicy:
         )
         self.steps_per_update = settings.steps_per_update
         self._done = 0
-        names = ("weights", "actions", "batches", "order")
-        self._generators = {
-            name: torch.Generator().manual_seed(seed * len(names) + i)
-            for i, name in enumerate(names)
-        }
+        self._generators = generators(seed)
         self._actors: dict[str, Actor] = {}
         self._adams: dict[str, torch.optim.Adam] = {}
         self._moments: dict[str, RunningMoments] = {}
@@ -143,17 +140,9 @@ class OnPolicy:
 
     def networks(self) -> tuple[PolicyNetwork, ...]:
         """The policies as they are."""
+        activation = self._settings.activation
         return tuple(
-            PolicyNetwork(
-                agents=of.agents,
-                mean=self._moments[name].mean.float().numpy().copy(),
-                std=self._moments[name].std.numpy().copy(),
-                clip=CLIP,
-                layers=layers_of(self._actors[name].net),
-                activation=self._settings.activation,
-                head="clip" if of.choices is None else "argmax",
-                choices=of.choices or CHOICES,
-            )
+            policy_network(self._actors[name].net, self._moments[name], of, activation)
             for name, of in self._spaces.items()
         )
 
@@ -358,7 +347,7 @@ class OnPolicy:
         return (log_p - rollout.log_p[name].flatten()).exp()
 
     def _critic_inputs(self, critic: str, rollout: _Rollout) -> tuple[Tensor, Tensor]:
-        """What a critic sees before and after each step, (T, B, n)."""
+        """Inputs of a critic before and after each step, (T, B, n) each."""
         if self._definition.critic == "state":
             return rollout.state, rollout.next_state
         return rollout.observations[critic], rollout.next_observations[critic]
