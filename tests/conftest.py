@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -29,3 +30,13 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.fail(f"SDC_REAL_DATA={name}: not a folder")
     return folder
+
+
+@pytest.fixture
+def one_torch_thread() -> Iterator[None]:
+    """Lets PyTorch use one thread, as learners of this package do: sums have the same bits then."""
+    torch = pytest.importorskip("torch", reason="torch is not installed: make test-train")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -21,13 +20,7 @@ from sdc_taichi.learning.on_policy import OnPolicy  # noqa: E402
 from sdc_taichi.learning.settings import CloningSettings, OnPolicySettings  # noqa: E402
 from sdc_taichi.learning.stream import EnvironmentStream  # noqa: E402
 
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 def stream_of(seed: int = 0, **options: Any) -> EnvironmentStream:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -21,15 +20,9 @@ from sdc_taichi.learning.stream import (  # noqa: E402
     StreamStep,
 )
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 SIZE, STEPS = 64, 8
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 class Game:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, Literal
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import pytest
 
@@ -13,6 +13,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed: make test-t
 
 from torch import Tensor  # noqa: E402
 
+from learning_games import Aim, Game, Meeting, Patience  # noqa: E402
 from sdc_taichi.errors import ConfigError, SdcError  # noqa: E402
 from sdc_taichi.learning.action_values import JointValues, expected  # noqa: E402
 from sdc_taichi.learning.algorithms import OFF_POLICY  # noqa: E402
@@ -26,7 +27,8 @@ from sdc_taichi.learning.off_policy_actors import (  # noqa: E402
 )
 from sdc_taichi.learning.replay import Replay  # noqa: E402
 from sdc_taichi.learning.settings import OffPolicySettings  # noqa: E402
-from sdc_taichi.learning.stream import LearnerSpaces, StreamStep  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 SMALL = OffPolicySettings(
     decision_steps=1,
@@ -44,95 +46,16 @@ SMALL = OffPolicySettings(
 )
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-class Game:
-    """A game of several learners in 32 rooms at once, which all of them see and are paid in."""
-
-    size: ClassVar = 32
-    length: ClassVar = 2
-    situations: ClassVar[int]
-
-    def __init__(self, learners: int = 2, discrete: bool = True, width: int = 1) -> None:
-        names = [f"player_{i}" for i in range(learners)]
-        self.spaces = {
-            n: LearnerSpaces((n,), self.situations, width, 3 if discrete else None) for n in names
-        }
-        self.state_width = self.situations
-        self.room = torch.zeros(self.size, dtype=torch.int64)
-        self.turn = 0
-
-    @property
-    def state(self) -> Tensor:
-        return torch.nn.functional.one_hot(self.room, self.situations).float()
-
-    @property
-    def observations(self) -> dict[str, Tensor]:
-        return {name: self.state for name in self.spaces}
-
-    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Rewards and next rooms of joint actions, (32, K)."""
-        raise NotImplementedError
-
-    def step(self, actions: dict[str, Tensor]) -> StreamStep:
-        reward, self.room = self.play(self.room, torch.cat(list(actions.values()), 1))
-        after = self.observations, self.state
-        self.turn += 1
-        ended = self.turn % self.length == 0
-        if ended:
-            self.room = torch.zeros_like(self.room)
-        return StreamStep({name: reward for name in self.spaces}, reward, ended, *after)
-
-
 class Coordination(Game):
     """The reward of two players is best where both choose 0, the only choices that none leaves.
 
     Against a player who chooses at random, 2 is better.
     """
 
-    situations = 1
     rewards = torch.tensor([[5.0, -3.0, 4.0], [-3.0, 1.0, 2.0], [4.0, 2.0, 3.0]])
 
     def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         return self.rewards[actions[:, 0], actions[:, 1]], room
-
-
-class Meeting(Game):
-    """Three choices are paid best as 0, 1 and 2, and less with each that differs."""
-
-    situations = 1
-
-    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        right = actions == torch.arange(actions.shape[1])
-        return right.float().mean(1) - 1.0, room
-
-
-class Patience(Game):
-    """Choice 2 leads to a room that pays 3, and choice 0 pays 1 at once: greedy is wrong."""
-
-    situations = 2
-
-    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        first, choice = room == 0, actions[:, 0]
-        reward = torch.where(first, (choice == 0).float(), 0.0)
-        reward = torch.where(room == 1, 3.0, reward)
-        return reward, torch.where(first & (choice == 2), 1, 0)
-
-
-class Aim(Game):
-    """The reward of players is highest where their numbers are 0.5 and -0.5."""
-
-    situations = 1
-
-    def play(self, room: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        aim = torch.tensor([0.5, -0.5])[: actions.shape[1]]
-        return -(actions - aim).square().sum(1), room
 
 
 def algorithm(
@@ -159,7 +82,7 @@ def trained(
 
 def outputs(learner: Any, game: Game, room: int) -> list[Any]:
     """Outputs of the policies in one situation, by learner."""
-    seen = torch.nn.functional.one_hot(torch.tensor(room), game.situations).float().numpy()
+    seen = torch.nn.functional.one_hot(torch.tensor(room), game.rooms).float().numpy()
     found = []
     for net in learner.networks():
         x = (seen - net.mean) / net.std
@@ -319,24 +242,24 @@ def test_a_replay_too_small_for_its_transitions_is_refused() -> None:
 
 @pytest.mark.parametrize("name", ["had3qn", "hasac"])
 def test_players_find_the_best_joint_choice(name: str) -> None:
-    game = Coordination()
+    game = Coordination(players=2)
     assert best(trained(name, game)[0], game) == [[0], [0]]
 
 
 @pytest.mark.parametrize("name", ["had3qn", "hasac"])
 def test_one_player_may_make_several_choices(name: str) -> None:
-    game = Meeting(learners=1, width=3)
+    game = Meeting(players=1, width=3)
     assert best(trained(name, game)[0], game) == [[0, 1, 2]]
 
 
 @pytest.mark.parametrize("name", ["had3qn", "hasac"])
 def test_players_forgo_a_reward_for_a_larger_one_later(name: str) -> None:
-    game = Patience(learners=1)
+    game = Patience(players=1)
     assert best(trained(name, game)[0], game) == [[2]]
 
 
 def test_continuous_players_find_the_best_numbers() -> None:
-    game = Aim(discrete=False)
+    game = Aim(players=2, discrete=False)
     found = [math.tanh(x[0]) for x in outputs(trained("hasac", game)[0], game, 0)]
     assert found == pytest.approx([0.5, -0.5], abs=0.2)
 
@@ -352,7 +275,7 @@ def test_temperatures_rise_below_the_wanted_entropy_and_fall_above_it() -> None:
     ("name", "discrete"), [("had3qn", True), ("hasac", True), ("hasac", False)]
 )
 def test_training_goes_on_from_its_state_to_the_same_bits(name: str, discrete: bool) -> None:
-    games = [Aim(discrete=discrete) for _ in range(2)]
+    games = [Aim(players=2, discrete=discrete) for _ in range(2)]
     whole, part, other = (algorithm(name, games[0], seed=seed) for seed in (3, 3, 4))
     for _ in range(3):
         whole.update(games[0])
@@ -365,12 +288,14 @@ def test_training_goes_on_from_its_state_to_the_same_bits(name: str, discrete: b
 
 
 def test_seeds_make_a_difference() -> None:
-    one, two = (algorithm("hasac", Aim(), seed=seed).update(Aim()) for seed in (0, 1))
+    one, two = (
+        algorithm("hasac", Aim(players=2), seed=seed).update(Aim(players=2)) for seed in (0, 1)
+    )
     assert one != two
 
 
 def test_actions_that_an_algorithm_does_not_take_are_refused() -> None:
     with pytest.raises(ConfigError, match="had3qn: learns choices alone"):
-        algorithm("had3qn", Aim(discrete=False))
+        algorithm("had3qn", Aim(players=2, discrete=False))
     with pytest.raises(ConfigError, match="7 choices of 3 in a step are 2187 joint actions"):
-        algorithm("hasac", Meeting(learners=1, width=7))
+        algorithm("hasac", Meeting(players=1, width=7))

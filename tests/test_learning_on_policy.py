@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ from sdc_taichi.learning.on_policy import (  # noqa: E402
 from sdc_taichi.learning.settings import OnPolicySettings  # noqa: E402
 from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 SMALL = OnPolicySettings(
     decision_steps=1,
     rollout_decisions=6,
@@ -41,14 +43,6 @@ SMALL = OnPolicySettings(
 )
 QUICK = SMALL.model_copy(update={"rate": 0.05, "epochs": 3, "mini_batches": 1})
 """Settings that learn simple games in few updates."""
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def algorithm(

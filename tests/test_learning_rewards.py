@@ -66,14 +66,12 @@ def totals(core: Core, learner: OnPolicy | None) -> dict[str, float]:
     return found
 
 
+@pytest.mark.usefixtures("one_torch_thread")
 @pytest.mark.parametrize("rewards", ["default", "bill"])
 def test_agents_trained_for_a_moment_beat_idle_ones(rewards: str) -> None:
     """In carbon or in the bill, with what is stored and waits at the end at its mean worth."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     core = env_of(16, rewards).core
     idle, found = totals(core, None), totals(core, trained(rewards))
-    torch.set_num_threads(threads)
     whole = {"default": "carbon", "bill": "cost"}[rewards]
     parts = [f"{part}_{whole}" for part in ("work", "cooling", "battery")]
     total = idle[whole]
