@@ -48,7 +48,7 @@ PAGE_MB = 4096 / 2**20
 
 @dataclass(frozen=True)
 class Run:
-    """What one training measured."""
+    """Speed, reward and growth of memory of one training."""
 
     case: str
     """Case, ``skrl-`` and ``sb3-`` before the algorithms of other libraries."""
@@ -93,7 +93,7 @@ class Meter:
 
 
 def ours(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> Callable[[int], Any]:
-    """What trains for some rollouts whenever it is called, by an algorithm of this package."""
+    """Make an algorithm of this package, and return a function that trains it for n rollouts."""
     definition = ON_POLICY[algorithm]
     agents = ["agent_bat"] if algorithm == "ppo" else list(AGENTS)
     env = sdc_taichi.vector_env(num_envs, days=days, agents=agents, autoreset_mode="SameStep")
@@ -113,7 +113,7 @@ def ours(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> C
 
 
 def skrl(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> Callable[[int], Any]:
-    """As ``ours``, by skrl."""
+    """Make an algorithm of skrl, and return a function that trains it for n rollouts."""
     import train_skrl
 
     train_skrl.prepare(seed)
@@ -149,7 +149,7 @@ def skrl(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> C
 
 
 def sb3(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> Callable[[int], Any]:
-    """As ``ours``, by Stable-Baselines3, whose only algorithm here is ``ppo``."""
+    """Make PPO of Stable-Baselines3, and return a function that trains it for n rollouts."""
     import train_sb3
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize

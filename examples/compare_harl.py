@@ -47,7 +47,7 @@ Weights = Mapping[str, Tensor]
 
 
 class Update(NamedTuple):
-    """What one of our updates started from, saw and made of it."""
+    """Transitions of an update of an algorithm, and its states before and after the update."""
 
     before: dict[str, Any]
     """State of the algorithm before it."""
@@ -124,7 +124,7 @@ def their_runner() -> Any:
 
 
 def their_settings(name: str, steps: int, num_envs: int) -> dict[str, Any]:
-    """Ours in their words."""
+    """Our settings by the names that HARL has for them."""
     s = SETTINGS
     epochs = 1 if name == "haa2c" else s.epochs
     return {

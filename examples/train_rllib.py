@@ -7,8 +7,8 @@ algorithm; RLlib values what an episode ended with, as it was cut off rather tha
 then act without exploring on a native batch, which needs no Python environment per data center.
 Prints the mean episode return of each agent when idling, untrained and trained.
 
-RLlib makes an empty folder in ``~/ray_results`` for each algorithm, and Ray writes logs to
-``/tmp/ray``.
+RLlib makes an empty folder in ``~/ray_results`` for each algorithm, and Ray writes logs to a folder
+``ray`` among the temporary files of the system.
 """
 
 from __future__ import annotations

@@ -214,7 +214,7 @@ def learner(
 
 
 def trainer(env: BatchEnv, agent: Any, timesteps: int) -> SequentialTrainer:
-    """What trains for ``timesteps`` steps of each environment whenever its ``train`` is called.
+    """A trainer whose ``train`` makes ``timesteps`` steps of each environment.
 
     Args:
         env: the batch.

@@ -1,4 +1,4 @@
-"""What reward terms refer to beside the result of a step, worked out as it is read."""
+"""Inputs of reward terms beside the result of a step, computed when a term reads them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COMING_SERIES = {"coming_ci": "ci_g_per_kwh", "coming_price": "price_per_kwh"}
 
 
 class RewardContext:
-    """Values of the fields of ``TermContext`` that the time and the data centers decide."""
+    """Fields of ``TermContext`` that follow from the time, the data centers and their inputs."""
 
     def __init__(self) -> None:
         # Values that hold for all steps of an episode.

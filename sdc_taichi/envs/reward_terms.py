@@ -88,7 +88,7 @@ class TermContext:
 
 
 Term = Callable[[StepResult, TermContext], F64]
-"""A reward term: (B,) from the result of a step and what it refers to."""
+"""A reward term: rewards, (B,), from the result of a step and the context of the step."""
 TERMS: dict[str, Term] = {}
 """All terms by name."""
 
@@ -252,14 +252,29 @@ def battery_cost(r: StepResult, c: TermContext) -> F64:
 
 
 def _moved_work(r: StepResult, c: TermContext, rate: F64, before: F64, after: F64) -> F64:
-    """What moving work in time adds at a rate per kWh, with debts before and after, (B,)."""
+    """Carbon or cost that moving work in time adds, (B,), in the unit of ``rate`` times kWh.
+
+    Args:
+        r: result of the step.
+        c: context of the step.
+        rate: carbon intensity or price in the step, per kWh, (B,).
+        before: rate at which work that waits is valued at the beginning of the step, (B,).
+        after: rate at which work that waits is valued at the end of the step, (B,).
+    """
     longer_tasks = r.deferred_tasks - r.drained_tasks - (r.due_tasks - r.overdue_tasks)
     rise = after * r.queue_tasks - before * (r.queue_tasks - longer_tasks)
     return c.task_kwh * (rise - rate * longer_tasks)
 
 
 def _stored_energy(r: StepResult, rate: F64, before: F64, after: F64) -> F64:
-    """What the battery adds at a rate per kWh, with credits before and after, (B,)."""
+    """Carbon or cost that the battery adds, (B,), in the unit of ``rate`` times kWh.
+
+    Args:
+        r: result of the step.
+        rate: carbon intensity or price in the step, per kWh, (B,).
+        before: rate at which stored energy is valued at the beginning of the step, (B,).
+        after: rate at which stored energy is valued at the end of the step, (B,).
+    """
     drawn_kwh = r.charge_kwh - r.discharge_kwh
     gained_kwh = drawn_kwh - r.battery_loss_kwh
     return rate * drawn_kwh - (after * r.stored_kwh - before * (r.stored_kwh - gained_kwh))

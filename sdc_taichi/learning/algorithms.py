@@ -35,7 +35,7 @@ OFF_POLICY: dict[str, OffPolicyDefinition] = {
 
 
 class Algorithm(Protocol):
-    """Learns in a stream of environments, and hands out networks."""
+    """A learner in a stream of environments that makes networks of policies."""
 
     def update(self, stream: EnvironmentStream) -> dict[str, float]:
         """Act for some steps, learn, and return numbers to log by name."""
@@ -91,7 +91,7 @@ def make_algorithm(
 
 
 def uses_state(name: str, settings: LearningSettings) -> bool:
-    """Whether an algorithm looks at the shared state."""
+    """Whether critics of an algorithm take the shared state of all agents as input."""
     if isinstance(settings, CloningSettings | CrossEntropySettings):
         return False
     if isinstance(settings, OffPolicySettings):

@@ -209,7 +209,7 @@ class CrossEntropySearch:
         search.std = np.sqrt(drawn[best].var(0) + noise * noise)
 
     def _remember(self, search: _Search, returns: F64) -> None:
-        """Take returns of an episode into account of what is usual."""
+        """Update the usual return of each data center, and its spread, by an episode."""
         rate = 1.0 if self._done == 1 else self._settings.memory_rate
         departure = returns - search.usual
         search.usual = search.usual + rate * departure
@@ -219,7 +219,7 @@ class CrossEntropySearch:
 
 
 def _figures(returns: F64, search: _Search) -> F64:
-    """How far returns are above what is usual, in standard deviations of the data center, (B,)."""
+    """Returns less the usual one of their data center, in its standard deviations, (B,)."""
     departure = returns - search.usual
     spread = np.sqrt(search.spread)
     # The second update knows no spread of a data center; that of all must do.

@@ -131,7 +131,7 @@ def evaluation_content(
 
 
 def remarks(weeks: DataCenterWeeks) -> list[str]:
-    """What is to be known of the figures of an evaluation, in words.
+    """Sentences on the figures of an evaluation that have no optimum, bound or valued ends.
 
     Args:
         weeks: the weeks that it is of.

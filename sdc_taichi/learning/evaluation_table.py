@@ -191,7 +191,13 @@ def _groups(evaluation: Evaluation, moves: str) -> Iterator[tuple[str, pd.DataFr
 def _standing(
     evaluation: Evaluation, own: pd.DataFrame, best: F64 | None = None
 ) -> dict[str, float]:
-    """How the rows of one controller do; ``best`` are figures of another optimum, (B,)."""
+    """Figures of one controller in ``summary``, by column.
+
+    Args:
+        evaluation: the evaluation.
+        own: rows of the controller.
+        best: figures that give a share of 1, (B,); None is those of the optimum of all agents.
+    """
     base, figures = _base(evaluation), _sample(own, _column(evaluation))
     achieved = _sample(own, "achieved_figure")[:1] if best is None else best[None]
     of_weeks = 100.0 * (figures / base - 1.0)
@@ -261,5 +267,5 @@ def _cell(value: Any, decimals: int = 2) -> str:
 
 
 def is_compared(name: str) -> bool:
-    """Whether a controller stands for itself, and not for an end of the scale."""
+    """Whether a controller is neither idle nor the optimum, the two ends of the scale."""
     return name not in (IDLE, OPTIMUM)

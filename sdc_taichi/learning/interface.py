@@ -105,7 +105,7 @@ class Interface(Section):
         return make_options(**{k: v for k, v in given.items() if v is not None}, **others)
 
     def difference(self, other: Interface) -> str | None:
-        """What differs first between this interface and another, in words; None if nothing does."""
+        """First difference between this interface and another, as text; None if they are equal."""
         for name, label in _LABELS.items():
             mine, theirs = getattr(self, name), getattr(other, name)
             if mine != theirs:
@@ -152,7 +152,7 @@ _LABELS = {
     "crac_units": "CRAC units (hvac.crac.units)",
     "racks": "racks",
 }
-"""What users call the fields of ``Interface``, in the order in which they are compared."""
+"""Names of the fields of ``Interface`` in messages, in the order in which they are compared."""
 
 
 def interface_of(fleet: Fleet, options: EnvOptions) -> Interface:
@@ -204,7 +204,7 @@ def _observed(features: Sequence[Feature]) -> tuple[ObservedFeature, ...]:
 def _feature_difference(
     mine: Sequence[ObservedFeature], theirs: Sequence[ObservedFeature]
 ) -> str | None:
-    """What differs first between the features of an agent, in words; None if nothing does."""
+    """First difference between the features of an agent, as text; None if they are equal."""
     by_name = {feature.name: feature for feature in theirs}
     for feature in mine:
         here = by_name.pop(feature.name, None)

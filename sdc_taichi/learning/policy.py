@@ -39,8 +39,9 @@ MOST_BYTES = 256_000_000
 MOST_DECISION_STEPS = 96
 """Largest number of steps that an action may be held."""
 Head = Literal["argmax", "clip", "tanh"]
-"""What becomes of the last layer: the largest of some scores for each number that is decided, or
-the number itself, cut at -1 and 1 or bent to between them by a hyperbolic tangent."""
+"""How actions follow from the outputs of the last layer: ``argmax`` takes the choice of the highest
+score for each number that is decided; ``clip`` cuts outputs at -1 and 1; ``tanh`` takes their
+hyperbolic tangent."""
 _FORMAT = 1
 _HEADER_KEY = "policy"
 
@@ -68,7 +69,7 @@ class PolicyNetwork:
     activation: Activation
     """Function of the units of all layers but the last."""
     head: Head
-    """What becomes of the outputs of the last layer."""
+    """How actions follow from the outputs of the last layer."""
     choices: int = CHOICES
     """Number of scores for each number that is decided, with head ``argmax``."""
 
@@ -140,7 +141,7 @@ class PolicyNetwork:
 
 
 class About(Section):
-    """Where a policy comes from."""
+    """Origin of a policy: algorithm, training and version of the package."""
 
     algorithm: str
     """Name of the algorithm that it was trained with."""
@@ -169,7 +170,7 @@ class Policy:
     interface: Interface
     """Everything of an environment that the networks depend on."""
     about: About
-    """Where the policy comes from."""
+    """Algorithm, training and version of the package that the policy comes from."""
     decision_steps: int = 1
     """Steps between two decisions, in which actions are held."""
 

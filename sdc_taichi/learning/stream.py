@@ -30,7 +30,7 @@ JOINT = "joint"
 
 @dataclass(frozen=True, slots=True)
 class LearnerSpaces:
-    """What a learner sees and does in one environment."""
+    """Sizes of the observation and the action of a learner in one environment."""
 
     agents: tuple[str, ...]
     """Agents that it acts for, in the order of its actions."""
@@ -44,7 +44,7 @@ class LearnerSpaces:
 
 
 class StreamStep(NamedTuple):
-    """What a step of all environments returned, besides the observations that follow."""
+    """Rewards, ends of episodes and next observations of a step of all environments."""
 
     rewards: dict[str, Tensor]
     """Reward of each learner, (B,) each."""
@@ -250,7 +250,7 @@ def _spaces(
     joint: JointLearner | None,
     levels: int | None,
 ) -> dict[str, LearnerSpaces]:
-    """What each learner sees and does."""
+    """Sizes of the observations and actions of each learner."""
     if joint is not None:
         of_joint = joint.observation_space, joint.action_space
         return {JOINT: _learner_spaces(agents, *of_joint, levels)}

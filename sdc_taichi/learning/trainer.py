@@ -52,7 +52,7 @@ LARGEST_LOSS = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a training has come, after an update."""
+    """Progress of a training after an update."""
 
     update: int
     """Number of updates done."""
@@ -69,13 +69,13 @@ class Progress:
     numbers: dict[str, float]
     """Numbers of the update by name, such as ``return/agent_ls`` and ``value_loss/agent_ls``."""
     validation: Validation | None
-    """What the policy reached in the validation weeks after the update; None if it was not
-    tried."""
+    """Result of the policy in the validation weeks after the update; None if it was not run
+    there."""
 
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """What a training left behind."""
+    """Result of a training: its folder, its length and its best policy."""
 
     folder: Path
     """Folder of the training."""
@@ -88,7 +88,7 @@ class Training:
     is_whole: bool
     """Whether all steps are done; false if it was stopped."""
     best: Validation | None
-    """What the best policy reached in the validation weeks; None without validation."""
+    """Result of the best policy in the validation weeks; None without validation."""
 
 
 def train(
@@ -284,7 +284,7 @@ class _Run:
         return found
 
     def result(self) -> Training:
-        """What the training left behind."""
+        """Folder, length and best policy of the training."""
         return Training(
             folder=self._folder,
             updates=self._update,
@@ -374,7 +374,7 @@ class _Speed:
         numbers: dict[str, float],
         validation: Validation | None,
     ) -> Progress:
-        """How far the training has come after one more update."""
+        """Progress of the training after one more update."""
         self._done += 1
         seconds = time.perf_counter() - self._begun
         return Progress(
