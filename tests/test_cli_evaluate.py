@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from typer.testing import CliRunner, Result
 from known_optimum import made_up_optimum
 from policies import interface, network
 from sdc_taichi import ConfigError, Fleet, Simulator
+from sdc_taichi.cli import evaluate as commands
 from sdc_taichi.cli.app import app
 from sdc_taichi.learning import evaluation
 from sdc_taichi.learning.policy import About, Policy
@@ -123,6 +125,23 @@ def test_an_interrupted_solution_is_told(runs: Path, monkeypatch: pytest.MonkeyP
     done = call(runs / "b", *CASE)
     assert done.exit_code == 130
     assert done.stderr == "interrupted: 1 of 2 data centers are kept\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--exact-ends",), "interrupted; figures are whole, without idle, g36, optimum"),
+        (("--no-optimum",), "interrupted: idle commands are not run to the end, nothing is kept"),
+    ],
+)
+def test_an_interruption_before_the_first_run_is_told(
+    options: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commands, "interruptible", lambda: nullcontext(lambda: True))
+    done = call("--controller", "g36", *CASE, *options, "--out", tmp_path)
+    assert done.exit_code == 130
+    assert done.stderr == f"{said}\n"
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

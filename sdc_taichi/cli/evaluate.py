@@ -201,16 +201,17 @@ def _prepared(
         typer.Exit: solving was stopped; what is kept has been printed.
     """
     from sdc_taichi.learning.evaluation import prepare
+    from sdc_taichi.optimum.result import StoppedError
 
-    if optimum:
+    with exit_if_stopped():
         try:
-            with exit_if_stopped():
-                return prepare(configs, weeks, stop=stop, **options)
+            return prepare(configs, weeks, optimum=optimum, stop=stop, **options)
         except SdcError as error:
+            if not optimum or isinstance(error, StoppedError):
+                raise
             failed = error
-    weeks_without = prepare(configs, weeks, optimum=False, stop=stop, **options)
-    if optimum:
-        print(f"note: no optimum, so no shares: {one_line(str(failed))}", file=sys.stderr)
+        weeks_without = prepare(configs, weeks, optimum=False, stop=stop, **options)
+    print(f"note: no optimum, so no shares: {one_line(str(failed))}", file=sys.stderr)
     return weeks_without
 
 

@@ -20,7 +20,7 @@ from sdc_taichi.learning.statistics import change_pct, share_pct
 from sdc_taichi.optimum.end_values import with_tabled_ends
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS
-from sdc_taichi.optimum.result import Optimum
+from sdc_taichi.optimum.result import Optimum, StoppedError
 from sdc_taichi.optimum.score import Score
 from sdc_taichi.optimum.solve import Progress, solve
 from sdc_taichi.run.achievable import OPTIMUM, AchievedPath, achievement, begin_score
@@ -91,11 +91,11 @@ class Validation(NamedTuple):
     """Result of a controller over all validation weeks together."""
 
     change_pct: float
-    """Figure against idle commands, with valued ends where there is an optimum, in %."""
+    """Change of the figure against idle commands, in %, with valued ends if there is an optimum."""
     share: float
     """Share of the achievable; nan without an optimum."""
     broken_weeks: int
-    """Number of weeks in which it broke a constraint that the optimum keeps; 0 without an
+    """Number of weeks in which a constraint that the optimum keeps was broken; 0 without an
     optimum."""
 
 
@@ -104,11 +104,11 @@ class Contender:
     """A controller to evaluate."""
 
     name: str
-    """Name of its rows; trainings of one name are put together."""
+    """Name of the controller in rows; trainings of one name are put together."""
     controller: Controller
-    """Gives the commands."""
+    """Controller that is run."""
     seed: int | None = None
-    """Seed of its training; None if it was not trained."""
+    """Seed of the training of the controller; None if it was not trained."""
     agents: tuple[str, ...] = ()
     """Agents (load, cooling, battery) that are also run one at a time, the others idle."""
 
@@ -124,8 +124,8 @@ class Evaluation:
     objective: Objective
     """Objective of the figures."""
     alone: dict[str, F64]
-    """Figure of the optimum with one agent alone, by its name, in each week, (B,) each; empty
-    without an optimum."""
+    """Figures of the optimum of each agent alone, by agent, in each week, (B,) each; empty without
+    an optimum."""
     strata: I64
     """Number of the site of each week, (B,)."""
     missing: tuple[str, ...]
@@ -163,7 +163,7 @@ def prepare(
         precision: of the server kernels.
         cache: whether to read and keep optima among the user's caches.
         progress: is told of the stages of solving.
-        stop: asked now and then; true ends solving.
+        stop: asked now and then; true ends the work.
 
     Raises:
         ConfigError: no data centers or weeks, or arguments that are not valid.
@@ -209,7 +209,9 @@ def prepare(
             optimum=best,
         )
         if best is None:
-            score, _ = _run(made, Idle())
+            score, is_whole = _run(made, Idle(), stop=stop)
+            if not is_whole:
+                raise StoppedError("idle commands are not run to the end, nothing is kept")
             made = replace(made, idle=score.figure)
         return made
     except BaseException:

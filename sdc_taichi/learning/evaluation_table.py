@@ -103,15 +103,13 @@ def by_agent(evaluation: Evaluation) -> pd.DataFrame:
     import pandas as pd
 
     found = []
-    base = _base(evaluation)
     for agent in AGENTS:
         best = evaluation.alone.get(agent)
-        alone = math.nan if best is None else float(change_pct(best[None], base))
-        found += [
-            {"moves": agent, "controller": name, "alone_pct": alone}
-            | _standing(evaluation, own, best)
-            for name, own in _groups(evaluation, agent)
-        ]
+        for name, own in _groups(evaluation, agent):
+            base = _base(evaluation)
+            alone = math.nan if best is None else float(change_pct(best[None], base))
+            row = {"moves": agent, "controller": name, "alone_pct": alone}
+            found.append(row | _standing(evaluation, own, best))
     return pd.DataFrame(found)
 
 
