@@ -50,9 +50,9 @@ class Update(NamedTuple):
     """Transitions of an update of an algorithm, and its states before and after the update."""
 
     before: dict[str, Any]
-    """State of the algorithm before it."""
+    """State of the algorithm before the update."""
     after: dict[str, Any]
-    """State of the algorithm after it."""
+    """State of the algorithm after the update."""
     order: list[str]
     """Learners in the order of their updates."""
     observations: dict[str, Tensor]

@@ -232,11 +232,11 @@ def _line(now: Progress) -> str:
     if returns:
         parts.append("return " + " ".join(f"{name} {value:.4g}" for name, value in returns.items()))
     if now.validation is not None:
-        parts.append(_reached(now.validation))
+        parts.append(_validation_text(now.validation))
     return "; ".join(parts)
 
 
-def _reached(found: Validation) -> str:
+def _validation_text(found: Validation) -> str:
     """Figure, share of the achievable and broken constraints of a validation, as text."""
     change = f"{found.change_pct:+.2f} % against idle"
     share = f", {100.0 * found.share:.1f} % of the achievable" if found.share == found.share else ""
@@ -256,5 +256,5 @@ def _print_summary(done: Training) -> None:
     speed = f"{done.steps:,} steps in {done.updates:,} updates, {duration(done.seconds)}"
     print(f"{speed}; files in {printable(done.folder)}")
     if done.best is not None:
-        print(f"Best policy in the validation weeks: {_reached(done.best)}")
+        print(f"Best policy in the validation weeks: {_validation_text(done.best)}")
     print(f"Use it with: --controller policy:{printable(done.folder)}")

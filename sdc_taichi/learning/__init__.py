@@ -25,7 +25,7 @@ _LAZY = {
 
 
 def require_torch() -> None:
-    """Make sure that PyTorch is there, which all that trains needs.
+    """Refuse to train without PyTorch.
 
     Raises:
         ConfigError: it is not installed.

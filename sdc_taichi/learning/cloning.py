@@ -1,4 +1,4 @@
-"""Behaviour cloning: policies learn to do what an expert would do where they are.
+"""Behaviour cloning: policies learn the actions that an expert would take in their situations.
 
 In the first update the expert acts. In later ones policies may, and the expert tells what it would
 do where they have come to (DAgger; Ross, Gordon, Bagnell 2011); each update learns from its own
@@ -67,7 +67,7 @@ class Cloning:
             self._moments[name] = RunningMoments(of.observation_width)
 
     def update(self, stream: EnvironmentStream) -> dict[str, float]:
-        """Go through an episode, ask the expert, and learn what it said.
+        """Run an episode, and fit the policies to the actions of the expert in it.
 
         Args:
             stream: the environments, at the beginning of an episode.
@@ -161,7 +161,7 @@ class Cloning:
         return actions
 
     def _fit(self, name: str, seen: Tensor, advice: Tensor) -> dict[str, float]:
-        """Learn what the expert said, in several passes over all situations."""
+        """Fit a network to the expert's actions, in several passes; loss and agreement to log."""
         net, adam, choices = self._nets[name], self._adams[name], self._spaces[name].choices
         total = torch.zeros(2)
         count = 0

@@ -27,7 +27,7 @@ from sdc_taichi.types import F32, I64, Actions
 
 
 class PolicyController:
-    """Acts by a policy, and for agents that the policy does not have as in its training.
+    """Controller by a policy; agents that it does not have act as they did in its training.
 
     Args:
         policy: the policy.

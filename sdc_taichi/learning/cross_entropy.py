@@ -34,13 +34,13 @@ class _Search:
     std: F64
     """Standard deviation of the parameters, (m, n + 1)."""
     seen_mean: F64
-    """Mean of what is observed, (n,)."""
+    """Mean of observations, (n,)."""
     seen_std: F64
-    """Standard deviation of what is observed, (n,)."""
+    """Standard deviation of observations, (n,)."""
     usual: F64
-    """Return that each data center has had of late, (B,)."""
+    """Usual return of each data center, a moving average, (B,)."""
     spread: F64
-    """Mean square of departures from it, (B,)."""
+    """Mean square of the differences between returns and the usual one, (B,)."""
 
 
 class CrossEntropySearch:

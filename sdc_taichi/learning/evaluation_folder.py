@@ -1,4 +1,4 @@
-"""Trainings to evaluate, as folders name them, and the folder of an evaluation's results."""
+"""Policies in folders as controllers to evaluate, and the folder of an evaluation's results."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def evaluation_content(
 
 
 def remarks(weeks: DataCenterWeeks) -> list[str]:
-    """Sentences on the figures of an evaluation that have no optimum, bound or valued ends.
+    """Sentences that warn of figures without an optimum, or whose ends are not valued.
 
     Args:
         weeks: the weeks that it is of.

@@ -59,11 +59,11 @@ class PolicyNetwork:
     agents: tuple[str, ...]
     """Agents that the network acts for, in the order of their actions."""
     mean: F32
-    """Subtracted from each entry of the observation, (n,)."""
+    """Mean of each entry of the observation, which is subtracted from it, (n,)."""
     std: F32
-    """Divides each entry of the observation after that, above 0, (n,)."""
+    """Standard deviation that each entry less its mean is divided by, above 0, (n,)."""
     clip: float
-    """Largest scaled entry, of either sign."""
+    """Absolute value at which scaled entries are cut."""
     layers: tuple[tuple[F32, F32], ...]
     """Weight, (out, in), and bias, (out,), of each layer."""
     activation: Activation

@@ -69,12 +69,12 @@ class Replay:
 
     @property
     def filled(self) -> int:
-        """Situations in time that are held."""
+        """Number of steps and ends of episodes that are held."""
         return min(self._count, self.rows)
 
     @property
     def bytes(self) -> int:
-        """Memory of what is held once it is full."""
+        """Memory of the replay, in bytes."""
         return int(self._data.element_size() * self._data.numel())
 
     def add(self, situations: Tensor, actions: Tensor, rewards: Tensor) -> None:

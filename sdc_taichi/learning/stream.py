@@ -49,7 +49,7 @@ class StreamStep(NamedTuple):
     rewards: dict[str, Tensor]
     """Reward of each learner, (B,) each."""
     team: Tensor
-    """Reward of all learning agents together over their number, (B,)."""
+    """Mean reward of the learning agents, (B,)."""
     ended: bool
     """Whether the episodes were cut off after the step; those of a batch end together."""
     next_observations: dict[str, Tensor]
@@ -76,7 +76,7 @@ class EnvironmentStream:
         levels: number of levels, evenly from -1 to 1, that learners choose continuous actions from;
             None is any number.
         shares_state: whether the shared state is wanted, which takes time.
-        against_idle: whether rewards are told less those of idle commands in the same step, where
+        against_idle: whether rewards of idle commands in the same step are subtracted, where
             all episodes of a data center have the same inputs.
         seed: seed of the first reset; environment i takes ``seed + i``.
 

@@ -1,4 +1,4 @@
-"""Training: an algorithm learns in a stream of environments, and what comes out is kept.
+"""Training of policies by an algorithm in a stream of environments, and the files it writes.
 
 Each file of the folder is replaced as a whole, and the checkpoint last, so that the last one stays
 whatever ends a process.
@@ -61,11 +61,11 @@ class Progress:
     steps: int
     """Steps of all data centers together that are done."""
     passed_s: float
-    """Seconds of this process since its first update began."""
+    """Time of this process since its first update began, in s."""
     steps_per_s: float
-    """Steps of all data centers together per second of this process, validations included."""
+    """Steps of all data centers together per second of this process, validations included, 1/s."""
     left_s: float
-    """Expected seconds until the end."""
+    """Expected time until the end, in s."""
     numbers: dict[str, float]
     """Numbers of the update by name, such as ``return/agent_ls`` and ``value_loss/agent_ls``."""
     validation: Validation | None
@@ -84,7 +84,7 @@ class Training:
     steps: int
     """Steps of all data centers together that are done."""
     seconds: float
-    """Seconds that all its processes took."""
+    """Time that all processes of the training took, in s."""
     is_whole: bool
     """Whether all steps are done; false if it was stopped."""
     best: Validation | None
@@ -196,7 +196,7 @@ class _Run:
     def validation(
         self, progress: StageProgress | None, stop: Callable[[], bool] | None
     ) -> Iterator[DataCenterWeeks | None]:
-        """The weeks in which policies are tried; None if they are not, or if it was stopped.
+        """Prepared validation weeks; None if there are none, or if preparing them was stopped.
 
         Raises:
             SdcError: there is no optimum of them.
@@ -275,7 +275,7 @@ class _Run:
         return {"update": self._update, "steps": self._steps, "seconds": seconds}
 
     def _validate(self, weeks: DataCenterWeeks) -> Validation:
-        """Try the policy, and keep it if it does better than all before."""
+        """Run the policy in the validation weeks, and save it if its figure is the least of all."""
         policy = self._policy()
         found = validate(PolicyController(policy, weeks.sim.fleet), weeks)
         if self._best is None or found.change_pct < self._best.change_pct:
@@ -311,7 +311,7 @@ class _Run:
         return self._steps // interval > (self._steps - self._steps_each) // interval
 
     def _learn(self) -> dict[str, float]:
-        """Make an update, and see to it that all its numbers are of use."""
+        """Make an update, and refuse numbers and networks that are not finite."""
         try:
             numbers = self._algorithm.update(self._stream)
             numbers |= {f"return/{name}": x for name, x in self._stream.returns.items()}
@@ -426,7 +426,7 @@ def make_stream(settings: TrainingSettings, env: MultiAgentVectorEnv) -> Environ
 
 
 def check_numbers(numbers: Mapping[str, float]) -> None:
-    """See to it that an update has not diverged.
+    """Refuse numbers of an update that has diverged.
 
     Args:
         numbers: numbers of the update by name.

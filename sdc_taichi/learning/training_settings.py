@@ -1,4 +1,4 @@
-"""Settings of a training: algorithm, data centers, environments, and how often what is kept.
+"""Settings of a training: algorithm, data centers, environments, validation and checkpoints.
 
 They are YAML as configurations are, and no PyTorch is needed to read and check them.
 """
@@ -51,7 +51,7 @@ Steps = Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
 
 
 class ValidationSettings(Section):
-    """Weeks in which policies are tried during a training, to keep the best one."""
+    """Settings of the validation weeks, by which a training chooses its best policy."""
 
     steps: Annotated[int, Field(strict=True, ge=0, le=MOST_STEPS)] = 200_000
     """Steps of all data centers together between two validations, 0..1e12; 0 is no validation."""
@@ -59,9 +59,9 @@ class ValidationSettings(Section):
     """Objective whose share of the achievable is measured: ``carbon``, ``energy``, ``cost``,
     ``water``, or a sum such as ``carbon+0.002*water``."""
     optimum: bool = True
-    """Whether to solve, once, for the optimum of these weeks, which values what is stored at their
-    ends and of which the share of the achievable is told; else policies are told against idle
-    commands alone."""
+    """Whether to solve, once, for the optimum of these weeks, which values stored energy and
+    waiting work at their ends and gives the share of the achievable; else policies are compared
+    with idle commands alone."""
 
 
 class TrainingSettings(Section):
