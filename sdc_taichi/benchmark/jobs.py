@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
-from collections.abc import Callable, Mapping
+import math
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from sdc_taichi.errors import SdcError, one_line
+from sdc_taichi.benchmark.source import source_digest
+from sdc_taichi.errors import SdcError, SdcWarning, one_line, shortened
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,26 +59,37 @@ class Job:
 class JobResult:
     """What a job returns. It is equal to the bit wherever the job ran on one kind of processor."""
 
-    rows: pd.DataFrame
-    """Rows of the dataset, to which the store adds the columns of the partition."""
+    rows: pd.DataFrame | None
+    """Rows of the dataset, to which the columns of the partition are added where it is read; None
+    where the job has none."""
     metrics: Mapping[str, Any]
-    """Figures of the job as a whole, as JSON can hold them."""
+    """Figures of the job as a whole, as JSON can hold them; nan and infinite ones become null."""
     files: Mapping[str, bytes] = field(default_factory=dict)
     """Content of further files by their path below the folder of the job, such as a policy."""
 
 
 @dataclass(frozen=True, slots=True)
 class DoneJob:
-    """A job that has ended, well or not."""
+    """A job that has ended, well or not, with its result as it is written to files."""
 
     job: Job
     """The job."""
-    result: JobResult | None
-    """Its result; None where it failed."""
-    error: str
+    error: str = ""
     """The error of a job that failed, in one line; empty otherwise."""
-    core_s: float
-    """Processor time that it took, in s."""
+    rows: bytes = b""
+    """Rows of the dataset as a Parquet file; empty where there are none."""
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    """Figures of the job as a whole, as JSON can hold them."""
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    """Content of further files by their path below the folder of the job."""
+    warnings: tuple[str, ...] = ()
+    """Warnings of the package while the job ran, each in one line."""
+    core_s: float = 0.0
+    """Processor time that the job took, in s."""
+    source: str = ""
+    """Digest of the source files of the package where the job ran."""
+    processor: Mapping[str, str] = field(default_factory=dict)
+    """Features of the processor and the libraries on which the last bits of the result depend."""
 
 
 def digest_of(content: bytes) -> str:
@@ -79,26 +97,58 @@ def digest_of(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
+def single_thread_environment() -> dict[str, str]:
+    """Environment variables with which a worker computes in one thread."""
+    names = ("SDC_TAICHI_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    return dict.fromkeys(names, "1")
+
+
 def run_job(job: Job, inputs: Inputs) -> DoneJob:
     """Run a job in this process.
 
     Args:
         job: the job.
-        inputs: content of all inputs of the study, of which the job reads its own.
+        inputs: content of at least the inputs that the job reads.
 
     Returns:
-        The job with its result; with the error in one line where the function raised one of the
-        package.
+        The job with its result, or with the error in one line. An error that is not one of the
+        package is told with its class and place.
     """
-    import time
-
     start_s = time.process_time()
-    result, error = None, ""
-    try:
-        result = _function(job.function)(job.values, {name: inputs[name] for name in job.inputs})
-    except SdcError as failure:
-        error = one_line(str(failure))
-    return DoneJob(job, result, error, time.process_time() - start_s)
+    seen: list[str] = []
+    done: dict[str, Any] = {}
+    with warnings.catch_warnings():
+        _collect_warnings(seen)
+        try:
+            result = _function(job.function)(job.values, {n: inputs[n] for n in job.inputs})
+            done = _packed(result, job)
+        except SdcError as error:
+            done = {"error": str(error)}
+        except Exception as error:
+            done = {"error": _unexpected(error)}
+    return DoneJob(
+        job,
+        **done,
+        warnings=tuple(dict.fromkeys(seen)),
+        core_s=time.process_time() - start_s,
+        source=source_digest(),
+        processor=_processor(),
+    )
+
+
+def check_file_name(name: str) -> None:
+    """Check the path of a file below the folder of a job.
+
+    Raises:
+        SdcError: the path is empty or hidden, leaves the folder, or is the one of the metrics.
+    """
+    parts = PurePosixPath(name).parts
+    wrong = not parts or name.startswith("/") or "\\" in name or "\0" in name
+    if wrong or any(part.startswith(".") for part in parts) or name == "metrics.json":
+        raise SdcError(
+            f"file {shortened(name)} of a result: valid is a path below the folder of the job, "
+            "such as policy/networks.safetensors"
+        )
 
 
 def _function(path: str) -> Callable[[Mapping[str, Any], Inputs], JobResult]:
@@ -106,3 +156,78 @@ def _function(path: str) -> Callable[[Mapping[str, Any], Inputs], JobResult]:
     module, _, name = path.partition(":")
     found: Callable[[Mapping[str, Any], Inputs], JobResult] = getattr(import_module(module), name)
     return found
+
+
+def _packed(result: JobResult, job: Job) -> dict[str, Any]:
+    """The fields of ``DoneJob`` that hold a result.
+
+    Raises:
+        SdcError: rows with columns of the partition, or files with paths that are not valid.
+    """
+    for name in result.files:
+        check_file_name(name)
+    rows = b""
+    if result.rows is not None and len(result.rows):
+        clash = [str(name) for name in result.rows.columns if name in job.partition]
+        if clash:
+            raise SdcError(f"rows of {job.function}: {clash[0]} is a column of the partition")
+        rows = _parquet(result.rows)
+    files = {name: bytes(content) for name, content in result.files.items()}
+    return {"rows": rows, "metrics": _plain(result.metrics), "files": files}
+
+
+def _parquet(rows: pd.DataFrame) -> bytes:
+    """Content of a Parquet file of rows, which does not depend on the version of pandas."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(None)
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer, compression="zstd")
+    return buffer.getvalue()
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON holds it, with null for numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(each) for name, each in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(each) for each in value]
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if hasattr(value, "tolist"):  # arrays and numbers of NumPy
+        return _plain(value.tolist())
+    raise TypeError(f"metrics hold {shortened(value)}, which JSON cannot")
+
+
+def _collect_warnings(seen: list[str]) -> None:
+    """Within ``warnings.catch_warnings``, collect warnings of the package and show the others."""
+    show = warnings.showwarning
+
+    def collect(
+        message: Warning | str, category: type[Warning], *place: Any, **stream: Any
+    ) -> None:
+        if issubclass(category, SdcWarning):
+            seen.append(one_line(str(message)))
+        else:
+            show(message, category, *place, **stream)
+
+    warnings.simplefilter("always", SdcWarning)
+    warnings.showwarning = collect
+
+
+def _unexpected(error: Exception) -> str:
+    """An error that is not one of the package, with its class and place, in one line."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "unknown"
+    return one_line(f"{type(error).__name__}: {error} (unexpected, at {place})")
+
+
+@cache
+def _processor() -> Mapping[str, str]:
+    """Features of this machine, which take some milliseconds to find."""
+    from sdc_taichi.run.processor import processor_features
+
+    return processor_features()
