@@ -1,5 +1,6 @@
-"""Embedded figures from which synthetic years are generated; README.md names their sources.
+"""Embedded figures; README.md names their sources.
 
-They are read by ``sdc_taichi.exogenous.synthetic``.
+Those from which synthetic years are generated are read by ``sdc_taichi.exogenous.synthetic``, the
+tables of the paper by ``sdc_taichi.benchmark.paper_accounting``.
 No measured row lives here.
 """

@@ -1,0 +1,259 @@
+"""Results in the units of tables 2 to 7 of SustainDC, beside the figures that are printed there.
+
+What these tables hold is not what their headings say. HVAC and IT energy are mean powers in kW. CFP
+is the mean of a quarter hour, at a carbon intensity too high by that of the first hour of the year:
+the code added noise around that value where noise around 0 was meant (``CI_Manager`` in
+``utils/managers.py`` of github.com/HewlettPackard/dc-rl). Water is the sum of hourly rates over
+quarter hours. All of them follow from the metrics of a run on preset ``sustaindc``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import numpy as np
+import yaml
+from pydantic import Field
+
+from sdc_taichi.config.fields import Section, Text
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.learning.evaluation import ALL
+from sdc_taichi.learning.statistics import (
+    Interval,
+    Statistic,
+    bootstrap_interval,
+    change_pct,
+)
+from sdc_taichi.types import F64
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CONSTANT_ROW = "coldest"
+"""Row of a suite that holds the lowest setpoint, which all others are told against."""
+_METRICS = ("cfp_kg", "grid_kwh", "hvac_kwh", "it_kwh", "queue_mean_tasks", "water_l")
+_QUARTERS_PER_H = 4
+_SMOOTHED_STEPS = 16
+_SEED = 0
+"""Seed of the draws of intervals."""
+
+
+class PaperFigures(NamedTuple):
+    """The five columns of a row of the tables, in what they hold."""
+
+    cfp_kg: float
+    """Mean carbon of a quarter hour at the raised intensity, in kg; printed as CFP (kgCO2)."""
+    hvac_kw: float
+    """Mean power of chiller and cooling tower, in kW; printed as HVAC energy (kWh)."""
+    it_kw: float
+    """Mean power of the servers, in kW; printed as IT energy (kWh)."""
+    queue_tasks: float
+    """Mean work that waits, in tasks of 1 % of the capacity for a step; printed as task queue."""
+    water_m3h: float
+    """Sum over the quarter hours of the water drawn, in m3/h; printed as water usage (litre)."""
+
+
+class PrintedRow(Section):
+    """A row of a printed table."""
+
+    label: Text
+    """Name of the row as it is printed."""
+    figures: PaperFigures
+    """Figures of the row as they are printed."""
+
+
+class PaperTable(Section):
+    """A table of the paper, and the case of suite ``paper`` that reproduces it."""
+
+    number: int
+    """Number of the table, 2..7."""
+    panel: Annotated[str, Field(pattern="^[a-f]$")]
+    """Panel of figure 4 that shows the table, a..f."""
+    title: Text
+    """What the table compares."""
+    case: str
+    """Case of suite ``paper`` with the same data center and months."""
+    site: str
+    """Site of the data center."""
+    noise_base_g_per_kwh: Annotated[float, Field(ge=0, le=2000)]
+    """Carbon intensity of the first hour of 2022, which is added to that of all steps, in g/kWh."""
+    water_steps: Annotated[int, Field(ge=1, le=35_040)]
+    """Number of quarter hours over which water is summed."""
+    rows: dict[str, PrintedRow]
+    """Printed rows by the name of the row of suite ``paper`` that reproduces them."""
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedRow:
+    """A row of a table: what this package reaches, beside what is printed."""
+
+    name: str
+    """Name of the row in the suite."""
+    label: str
+    """Label of the printed row; the name of the row where none is printed."""
+    seeds: int
+    """Number of seeds of ours; 0 where the row has not been run."""
+    ours: tuple[Interval, ...] | None
+    """Our figures in the order of ``PaperFigures``, with 95 % intervals; None without a run."""
+    against_constant_pct: Interval | None
+    """Our carbon against that of the constant lowest setpoint in the same weeks, in %, with a 95 %
+    interval; None without a run of either."""
+    printed: PaperFigures | None
+    """Printed figures; None where the paper has no such row."""
+
+
+@cache
+def paper_tables() -> tuple[PaperTable, ...]:
+    """Tables 2 to 7 of the paper as printed."""
+    text = resources.files("sdc_taichi.data").joinpath("paper_tables.yaml").read_text("utf-8")
+    return tuple(PaperTable.model_validate(values) for values in yaml.safe_load(text))
+
+
+def compared(table: PaperTable, rows: pd.DataFrame, scored_h: float) -> list[ComparedRow]:
+    """Rows of a table: those that are printed, and then all others of the case.
+
+    Args:
+        table: the table.
+        rows: dataset of a suite, with the columns of ``learning.evaluation`` and ``case``, ``row``
+            and ``seed``.
+        scored_h: scored hours of each week.
+
+    Raises:
+        ConfigError: rows of one case that are not of the same weeks.
+    """
+    own = rows[(rows["case"] == table.case) & (rows["site"].str.upper() == table.site)]
+    own = own[(own["moves"] == ALL) & own["it_kwh"].notna()]
+    samples = {
+        str(name): _samples(group, table, scored_h)
+        for name, group in own.groupby("row", sort=False)
+    }
+    constant = samples.get(CONSTANT_ROW)
+    elsewhere = {name for each in paper_tables() for name in each.rows} - set(table.rows)
+    names = [*table.rows, *(x for x in samples if x not in table.rows and x not in elsewhere)]
+    return [_compared_row(name, table, samples.get(name), constant) for name in names]
+
+
+def paper_figures(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> PaperFigures:
+    """Means over weeks and seeds, in the units of a table.
+
+    Args:
+        rows: rows with the metrics of ``learning.evaluation``, one for each week and seed.
+        table: the table, which gives the site's rise of the carbon intensity.
+        scored_h: scored hours of each week.
+    """
+    return PaperFigures(*(float(x) for x in _columns(rows, table, scored_h).mean(axis=0)))
+
+
+def radar(rows: list[ComparedRow], *, printed: bool) -> tuple[list[str], F64]:
+    """Rows as figure 4 shows them: low figures far from the centre.
+
+    Each column is less its mean over the rows and over their standard deviation, with its sign
+    turned. The paper does not say which standard deviation; here it is that of the population.
+
+    Args:
+        rows: rows of a table.
+        printed: whether to take the printed figures, or ours of the same rows.
+
+    Returns:
+        Labels, and values by row and column of ``PaperFigures``, (R, 5); rows without figures are
+        left out, and a column without a spread is 0.
+    """
+    labels, figures = [], []
+    for row in rows:
+        values = row.printed
+        if row.printed is not None and not printed:
+            values = None if row.ours is None else PaperFigures(*(x.value for x in row.ours))
+        if values is not None:
+            labels.append(row.label)
+            figures.append(values)
+    if not figures:
+        return [], np.zeros((0, len(PaperFigures._fields)))
+    table = np.array(figures, dtype=np.float64)
+    spread = table.std(axis=0)
+    centred = table.mean(axis=0) - table
+    return labels, np.divide(centred, spread, out=np.zeros_like(table), where=spread > 0.0)
+
+
+def released_utilisation(hourly: F64) -> F64:
+    """Utilisation by quarter hour as the released code makes it of a trace, without its noise.
+
+    Hours are interpolated over a year stretched by an hour, scaled so that the 5th and 95th
+    percentile are 0.2 and 0.8, and averaged over four hours (``Workload_Manager``).
+
+    Args:
+        hourly: utilisation by the hour, 0..1, (H,).
+
+    Returns:
+        Utilisation, 0..1, (4 H,).
+    """
+    size = _QUARTERS_PER_H * len(hourly)
+    quarters = np.interp(np.linspace(0, len(hourly), size), np.arange(len(hourly)), hourly)
+    low, high = np.percentile(quarters, [5.0, 95.0])
+    scaled = np.clip(0.2 + 0.6 * (quarters - low) / (high - low), 0.0, 1.0)
+    return np.convolve(scaled, np.full(_SMOOTHED_STEPS, 1.0 / _SMOOTHED_STEPS), mode="same")
+
+
+def _columns(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> F64:
+    """Figures of each row in the order of ``PaperFigures``, (N, 5)."""
+    metrics = {name: rows[name].to_numpy(np.float64) for name in _METRICS}
+    carbon_kg = metrics["cfp_kg"] + table.noise_base_g_per_kwh / 1e3 * metrics["grid_kwh"]
+    by_column = {
+        "cfp_kg": carbon_kg / (scored_h * _QUARTERS_PER_H),
+        "hvac_kw": metrics["hvac_kwh"] / scored_h,
+        "it_kw": metrics["it_kwh"] / scored_h,
+        "queue_tasks": metrics["queue_mean_tasks"],
+        "water_m3h": metrics["water_l"] / 1e3 / scored_h * table.water_steps,
+    }
+    return np.stack([by_column[name] for name in PaperFigures._fields], axis=1)
+
+
+def _samples(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> F64:
+    """Figures by column, seed and week, (5, S, W), weeks in their order."""
+    ordered = rows.sort_values(["seed", "week"])
+    seeds, weeks = ordered["seed"].nunique(), ordered["week"].nunique()
+    if seeds * weeks != len(ordered):
+        raise ConfigError(
+            f"table {table.number}: {len(ordered)} rows of {ordered['row'].iloc[0]} for {seeds} "
+            f"seeds and {weeks} weeks; valid is one for each"
+        )
+    return _columns(ordered, table, scored_h).T.reshape(-1, seeds, weeks)
+
+
+def _compared_row(
+    name: str, table: PaperTable, sample: F64 | None, constant: F64 | None
+) -> ComparedRow:
+    """A row of a table from its samples and those of the constant setpoint, (5, S, W) each."""
+    printed = table.rows.get(name)
+    ours, against = None, None
+    if sample is not None:
+        ours = tuple(_interval(_mean, values) for values in sample)
+        if constant is not None:
+            if constant.shape[2] != sample.shape[2]:
+                raise ConfigError(
+                    f"table {table.number}: {name} has {sample.shape[2]} weeks and {CONSTANT_ROW} "
+                    f"{constant.shape[2]}; valid is the same weeks"
+                )
+            against = _interval(change_pct, sample[0], constant[0])
+    return ComparedRow(
+        name=name,
+        label=name if printed is None else printed.label,
+        seeds=0 if sample is None else sample.shape[1],
+        ours=ours,
+        against_constant_pct=against,
+        printed=None if printed is None else printed.figures,
+    )
+
+
+def _mean(values: F64) -> F64:
+    """Mean over seeds and weeks of samples (..., S, W)."""
+    return np.asarray(values.mean(axis=(-2, -1)))
+
+
+def _interval(statistic: Statistic, *samples: F64) -> Interval:
+    """A statistic with its interval, weeks of one site being one stratum."""
+    strata = np.zeros(samples[0].shape[1], dtype=np.int64)
+    generator = np.random.Generator(np.random.PCG64(_SEED))
+    return bootstrap_interval(statistic, samples, strata, generator)

@@ -1,0 +1,170 @@
+"""The units of the paper's tables, and what a constant setpoint reaches in them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sdc_taichi import load_config, make_controller
+from sdc_taichi.benchmark.paper_accounting import (
+    CONSTANT_ROW,
+    PaperFigures,
+    PaperTable,
+    compared,
+    paper_figures,
+    paper_tables,
+    radar,
+    released_utilisation,
+)
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.run.loop import simulate
+from sdc_taichi.run.metrics import metrics_per_dc
+from sdc_taichi.sim.simulator import Simulator
+
+SCORED_H = 6 * 24.0
+COLDEST = (180.4, 416.0, 928.0)
+"""Carbon in kg and powers in kW of the lowest setpoint in New York, run in the released code."""
+
+
+def table(number: int) -> PaperTable:
+    return next(each for each in paper_tables() if each.number == number)
+
+
+def rows(**changes: object) -> pd.DataFrame:
+    """Two weeks of a controller that draws 300 kW for cooling and 900 kW for servers."""
+    values: dict[str, object] = {
+        "case": "ny",
+        "row": CONSTANT_ROW,
+        "seed": 0,
+        "moves": "all",
+        "site": "ny",
+        "week": [22, 23],
+        "cfp_kg": 0.3 * 1200.0 * SCORED_H,
+        "grid_kwh": 1200.0 * SCORED_H,
+        "hvac_kwh": 300.0 * SCORED_H,
+        "it_kwh": 900.0 * SCORED_H,
+        "queue_mean_tasks": [2.0, 4.0],
+        "water_l": 5000.0 * SCORED_H,
+    }
+    return pd.DataFrame(values | changes)
+
+
+def test_units_of_the_tables() -> None:
+    found = paper_figures(rows(), table(4), SCORED_H)
+    assert found == pytest.approx((0.55175 * 300.0, 300.0, 900.0, 3.0, 5.0 * 2880))
+
+
+def test_printed_tables_hold_power_and_not_energy() -> None:
+    """An hour of the printed IT figure is what the servers of a megawatt draw; a month is not."""
+    assert [each.number for each in paper_tables()] == [2, 3, 4, 5, 6, 7]
+    for each in paper_tables():
+        for row in each.rows.values():
+            printed = row.figures
+            ci_g_per_kwh = 4e3 * printed.cfp_kg / (printed.hvac_kw + printed.it_kw)
+            assert 180.0 < ci_g_per_kwh - each.noise_base_g_per_kwh < 640.0
+            assert 900.0 < printed.it_kw < 1100.0
+
+
+def test_rows_stand_beside_printed_ones_and_the_constant_setpoint() -> None:
+    ours = [
+        rows(),
+        *(rows(row="happo", seed=seed, cfp_kg=rows().cfp_kg * 0.9) for seed in (0, 1)),
+        rows(row="ippo-a0.1"),
+        rows(row="happo", site="ga"),
+        rows(row="happo", moves="load"),
+        rows(row="bound", it_kwh=np.nan),
+    ]
+    found = {row.name: row for row in compared(table(4), pd.concat(ours), SCORED_H)}
+    assert list(found) == [*table(4).rows, CONSTANT_ROW]
+    assert found["ippo"].ours is None
+    assert found["ippo"].seeds == 0
+    happo, constant = found["happo"], found[CONSTANT_ROW]
+    assert happo.seeds == 2
+    assert happo.label == "HAPPO"
+    assert constant.printed is None
+    assert happo.against_constant_pct is not None
+    share = 0.9 * 300.0 / 551.75 + 251.75 / 551.75
+    assert happo.against_constant_pct.value == pytest.approx(100.0 * (share - 1.0))
+    assert constant.against_constant_pct is not None
+    assert constant.against_constant_pct.value == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(
+    ("ours", "message"),
+    [
+        (pd.concat([rows(), rows()]), "4 rows of coldest for 1 seeds and 2 weeks"),
+        (pd.concat([rows(), rows(row="happo").head(1)]), "happo has 1 weeks and coldest 2"),
+    ],
+)
+def test_rows_of_other_weeks_are_refused(ours: pd.DataFrame, message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        compared(table(4), ours, SCORED_H)
+
+
+def test_radar_has_the_lowest_figures_at_the_rim() -> None:
+    labels, values = radar(compared(table(7), rows(), SCORED_H), printed=True)
+    assert labels == ["IPPO", "MAPPO", "HAPPO", "HAA2C", "HAD3QN", "HASAC"]
+    np.testing.assert_allclose(values.mean(axis=0), 0.0, atol=1e-9)
+    np.testing.assert_allclose(values.std(axis=0), 1.0)
+    assert labels[int(values[:, 0].argmax())] == "HASAC"
+    assert radar(compared(table(7), rows(), SCORED_H), printed=False)[0] == []
+
+
+def test_a_column_without_a_spread_is_at_the_middle_of_the_radar() -> None:
+    ours = pd.concat([rows(row=name, queue_mean_tasks=0.0) for name in ("ippo", "happo")])
+    labels, values = radar(compared(table(4), ours, SCORED_H), printed=False)
+    assert labels == ["IPPO", "HAPPO"]
+    assert not values.any()
+
+
+def coldest(overrides: list[str]) -> PaperFigures:
+    """The lowest setpoint through June in New York on preset ``sustaindc``, in parts of 3 days."""
+    config = load_config("sustaindc", ["site.location=NY", *overrides])
+    parts = [
+        config.model_copy(update={"site": config.site.model_copy(update={"start": f"06-{day:02}"})})
+        for day in range(1, 31, 3)
+    ]
+    with Simulator(parts) as sim:
+        totals = simulate(sim, make_controller("coldest", sim.fleet), steps=3 * 96)
+        metrics = metrics_per_dc(totals, sim.fleet)
+    return paper_figures(pd.DataFrame(metrics), table(4), 3 * 24.0)
+
+
+def test_the_lowest_setpoint_stands_among_the_printed_learners() -> None:
+    """Within 4 % of what the released code reaches, on synthetic inputs."""
+    found = coldest([])
+    assert found[:3] == pytest.approx(COLDEST, rel=0.04)
+    assert found.queue_tasks == 0.0
+    printed = [row.figures.cfp_kg for row in table(4).rows.values()]
+    assert min(printed) < found.cfp_kg < max(printed)
+
+
+def test_released_utilisation_has_nine_tenths_between_its_bounds() -> None:
+    hourly = 0.5 + 0.3 * np.sin(np.arange(24 * 14) * 2 * np.pi / 24)
+    quarters = released_utilisation(hourly)
+    assert quarters.shape == (4 * hourly.size,)
+    assert 0.2 < quarters[16:-16].min() < 0.25
+    assert 0.75 < quarters[16:-16].max() < 0.8
+
+
+def test_measured_inputs_give_the_figures_of_the_released_code(
+    real_data: Path, tmp_path: Path
+) -> None:
+    hourly = pd.read_csv(real_data / "workload" / "Alibaba_CPU_Data_Hourly_1.csv")["cpu_load"]
+    stamps = pd.date_range("2022-01-01", periods=35_040, freq="15min")
+    trace = pd.DataFrame(
+        {"timestamp": stamps, "cpu_load": released_utilisation(hourly.to_numpy()[:8760])}
+    )
+    trace.to_csv(tmp_path / "trace.csv", index=False)
+    found = coldest(
+        [
+            f"site.weather_file={real_data}/weather/USA_NY_New.York-LaGuardia.epw",
+            f"site.carbon_file={real_data}/carbon/NY_NG_&_avgCI.csv",
+            f"site.workload_file={tmp_path}/trace.csv",
+        ]
+    )
+    assert found[:3] == pytest.approx(COLDEST, rel=0.03)
