@@ -163,8 +163,9 @@ def test_what_cannot_be_evaluated_is_named(weeks: DataCenterWeeks) -> None:
         evaluate(weeks, [g36, g36])
     with pytest.raises(ConfigError, match="'agent_bat' of g36: valid are load, cooling, battery"):
         evaluate(weeks, [Contender("g36", g36.controller, agents=("agent_bat",))])
-    with pytest.raises(ConfigError, match="optimum names rows of the known optimum"):
-        evaluate(weeks, [Contender("optimum", g36.controller, seed=1)])
+    for name in ("idle", "optimum"):
+        with pytest.raises(ConfigError, match=f"{name} names other rows"):
+            evaluate(weeks, [Contender(name, g36.controller, seed=1)])
     with pytest.raises(ConfigError, match="no weeks"):
         prepare(CONFIGS, ())
     with pytest.raises(ConfigError, match="no data centers"):

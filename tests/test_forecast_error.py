@@ -152,7 +152,7 @@ def test_text_of_errors(text: str, wanted: ForecastError) -> None:
         ("", "valid is ci=SHARE, temperature=K"),
         ("0.1", "valid is ci=SHARE, temperature=K"),
         ("temprature=1", "did you mean 'temperature'"),
-        ("ci=0.1,ci=0.2", "ci stands twice"),
+        ("ci=0.1,ci=0.2", "ci is given twice"),
         ("ci=ten", "ci 'ten' is no number"),
         ("ci=11", "ci_share: 11; valid is 0..10"),
         ("ci=nan", "valid is 0..10|is no number"),

@@ -36,7 +36,7 @@ def test_weeks_are_named_or_numbered() -> None:
         ("3,52", "'52'; valid are .* 0..51 such as"),
         ("3,-1", "'-1'"),
         ("", "''; valid are"),
-        ("3,7,3", "week 3 stands twice"),
+        ("3,7,3", "week 3 is given twice"),
     ],
 )
 def test_weeks_that_are_not_valid_are_named(text: str, said: str) -> None:

@@ -275,7 +275,7 @@ def _agents(text: str) -> tuple[Agent, ...]:
             meant = suggestion(name, AGENTS, " (did you mean {!r}?)")
             raise ConfigError(f"--agents {text!r}: {name!r}; valid are {', '.join(AGENTS)}{meant}")
         if names.count(name) > 1:
-            raise ConfigError(f"--agents {text!r}: {name} is given twice")
+            raise ConfigError(f"--agents {text!r}: {name} is given twice; valid is each once")
     return tuple(agent for agent in AGENTS if agent in names)
 
 

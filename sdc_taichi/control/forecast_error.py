@@ -65,7 +65,7 @@ class ForecastError:
             text: ``ci``, a share, and ``temperature``, in K, each with its value or left out.
 
         Raises:
-            ConfigError: another name, one that stands twice, or a value that is not valid.
+            ConfigError: another name, one that is given twice, or a value that is not valid.
         """
         values: dict[str, float] = {}
         for part in text.split(","):
@@ -77,7 +77,9 @@ class ForecastError:
                     f"or both, such as ci=0.1,temperature=1{meant}"
                 )
             if _FIELD_OF_NAME[name] in values:
-                raise ConfigError(f"forecast error {text!r}: {name} stands twice")
+                raise ConfigError(
+                    f"forecast error {text!r}: {name} is given twice; valid is each once"
+                )
             try:
                 values[_FIELD_OF_NAME[name]] = parse_number(value)
             except ValueError:

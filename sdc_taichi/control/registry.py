@@ -147,7 +147,7 @@ def parts_of(spec: str) -> dict[str, str]:
                 f"agents {', '.join(CONTROLLABLE)}{suggestion(agent, CONTROLLABLE, _SUGGESTION)}"
             )
         if agent in named:
-            raise ConfigError(f"controller {spec!r}: {agent} is given twice")
+            raise ConfigError(f"controller {spec!r}: {agent} is given twice; valid is each once")
         named[agent] = name
     return named
 

@@ -246,14 +246,14 @@ def check_contenders(contenders: Iterable[Contender]) -> None:
         contenders: the controllers.
 
     Raises:
-        ConfigError: a name and seed that is given twice, the name of the optimum, or an agent that
-            is neither load, cooling nor battery.
+        ConfigError: a name and seed that is given twice, ``idle`` or ``optimum`` for another
+            controller, or an agent that is neither load, cooling nor battery.
     """
     seen = set()
     for each in contenders:
-        if each.name == OPTIMUM:
+        if each.name == OPTIMUM or (each.name == IDLE and not isinstance(each.controller, Idle)):
             raise ConfigError(
-                f"evaluation: {each.name} names rows of the known optimum; valid is another name"
+                f"evaluation: {each.name} names other rows of the tables; valid is another name"
             )
         if each.name != IDLE and (each.name, each.seed) in seen:
             of = "" if each.seed is None else f" of seed {each.seed}"

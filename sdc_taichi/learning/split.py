@@ -37,7 +37,7 @@ def parse_weeks(text: str) -> tuple[int, ...]:
     """Weeks of the year from a name such as ``held-out``, or from numbers such as ``3,7,11``.
 
     Raises:
-        ConfigError: an unknown name, a number that is no week, or one that stands twice.
+        ConfigError: an unknown name, a number that is no week, or one that is given twice.
     """
     if text.strip() in NAMED_WEEKS:
         return NAMED_WEEKS[text.strip()]
@@ -48,7 +48,7 @@ def parse_weeks(text: str) -> tuple[int, ...]:
             meant = suggestion(part, NAMED_WEEKS, " (did you mean {!r}?)")
             raise ConfigError(f"weeks {text!r}: {part!r}; valid are {valid}{meant}")
         if int(part) in weeks:
-            raise ConfigError(f"weeks {text!r}: week {part} stands twice")
+            raise ConfigError(f"weeks {text!r}: week {part} is given twice; valid is each once")
         weeks.append(int(part))
     return tuple(weeks)
 

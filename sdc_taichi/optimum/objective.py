@@ -54,7 +54,7 @@ class Objective:
             text: names of terms, joined by ``+``, each with a weight before it or with weight 1.
 
         Raises:
-            ConfigError: an unknown term, one that stands twice, or a weight that is no number.
+            ConfigError: an unknown term, one that is given twice, or a weight that is no number.
         """
         valid = [f.name for f in fields(cls)]
         weights: dict[str, float] = {}
@@ -68,7 +68,7 @@ class Objective:
                     f"such as carbon+0.002*water{meant}"
                 )
             if name in weights:
-                raise ConfigError(f"objective {text!r}: {name} stands twice")
+                raise ConfigError(f"objective {text!r}: {name} is given twice; valid is each once")
             try:
                 weights[name] = parse_number(found["weight"]) if found["weight"] else 1.0
             except ValueError:
