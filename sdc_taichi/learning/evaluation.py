@@ -6,6 +6,7 @@ stored or waits at the end is valued, so that an empty battery or work put off i
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple, Self
@@ -42,6 +43,7 @@ METRICS = (
     *("cfp_kg", "grid_kwh", "it_kwh", "hvac_kwh", "water_l", "cost", "peak_kw"),
     *("over_27_degree_h", "hottest_inlet_c", "arrived_tasks", "executed_tasks", "dropped_tasks"),
     *("overdue_task_h", "queue_mean_tasks", "battery_throughput_kwh", "unmet_cooling_kwh"),
+    *("lost_tasks", "throttled_rack_h", "tripped_rack_h", "unserved_kwh", "grid_overload_kwh"),
 )
 """Metrics of ``run.metrics`` over the scored steps that each row holds."""
 
@@ -143,7 +145,7 @@ def prepare(
     seed: int = 0,
     forecast_error: ForecastError = PERFECT,
     precision: Precision = "f32",
-    cache: bool = True,
+    cache: bool | str | os.PathLike[str] = True,
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> DataCenterWeeks:
@@ -161,7 +163,7 @@ def prepare(
         seed: of sampled events, of controllers and of errors of forecasts.
         forecast_error: how the forecasts of controllers err.
         precision: of the server kernels.
-        cache: whether to read and keep optima among the user's caches.
+        cache: whether to read and keep optima among the user's caches, or a folder for them.
         progress: is told of the stages of solving.
         stop: asked now and then; true ends the work.
 
@@ -268,17 +270,17 @@ def evaluate(
     weeks: DataCenterWeeks,
     contenders: Iterable[Contender],
     *,
+    beside: bool = True,
     on_run: Callable[[str], Callable[[StepResult], None] | None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Evaluation:
     """Run controllers in the same weeks.
 
-    Rows of idle commands come first and, where there is an optimum, those of its achieved path
-    last.
-
     Args:
         weeks: the weeks.
         contenders: the controllers.
+        beside: whether rows of idle commands come first and, where there is an optimum, those of
+            its achieved path last.
         on_run: called with the name of each run before it; what it returns is called with the
             result of every step.
         stop: asked before every step; true ends the evaluation, and rows of whole runs are kept.
@@ -289,7 +291,7 @@ def evaluate(
     import pandas as pd
 
     frames, missing = [], []
-    for name, moves, contender in _runs(weeks, contenders):
+    for name, moves, contender in _runs(weeks, contenders, beside=beside):
         if stop is not None and stop():
             missing.append(name)
             continue
@@ -319,13 +321,14 @@ def evaluate(
 
 
 def _runs(
-    weeks: DataCenterWeeks, contenders: Iterable[Contender]
+    weeks: DataCenterWeeks, contenders: Iterable[Contender], *, beside: bool
 ) -> list[tuple[str, str, Contender]]:
     """Name, what is moved, and controller of each run, in the order of their rows."""
-    given = list(contenders)
-    check_contenders(given)
-    every = [Contender(IDLE, Idle()), *(each for each in given if each.name != IDLE)]
-    if weeks.optimum is not None:
+    every = list(contenders)
+    check_contenders(every)
+    if beside:
+        every = [Contender(IDLE, Idle()), *(each for each in every if each.name != IDLE)]
+    if beside and weeks.optimum is not None:
         every.append(Contender(OPTIMUM, AchievedPath(weeks.optimum)))
     runs = []
     for each in every:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -96,6 +97,7 @@ def train(
     out: Path | str,
     *,
     resume: bool = False,
+    cache: bool | str | os.PathLike[str] = True,
     on_update: Callable[[Progress], None] | None = None,
     on_stage: StageProgress | None = None,
     stop: Callable[[], bool] | None = None,
@@ -107,6 +109,8 @@ def train(
         out: folder, made if need be.
         resume: whether to go on with the training in the folder, to the same bits as if it had not
             been interrupted; its settings must be those given, but that ``steps`` may be more.
+        cache: whether to read and keep optima of the validation weeks among the user's caches, or
+            a folder for them.
         on_update: called after every update.
         on_stage: is told of the stages of solving for the optima of the validation weeks.
         stop: asked after every update; true ends the training, which can be resumed.
@@ -124,7 +128,7 @@ def train(
                 run.resume()
             # Settings that do not fit leave the folder as it was.
             write_settings(path, settings)
-            with run.validation(on_stage, stop) as weeks:
+            with run.validation(cache, on_stage, stop) as weeks:
                 run.go_on(weeks, on_update or (lambda _: None), stop or (lambda: False))
         finally:
             run.close()
@@ -194,25 +198,30 @@ class _Run:
 
     @contextlib.contextmanager
     def validation(
-        self, progress: StageProgress | None, stop: Callable[[], bool] | None
+        self,
+        cache: bool | str | os.PathLike[str],
+        progress: StageProgress | None,
+        stop: Callable[[], bool] | None,
     ) -> Iterator[DataCenterWeeks | None]:
         """Prepared validation weeks; None if there are none, or if preparing them was stopped.
 
         Raises:
             SdcError: there is no optimum of them.
         """
-        settings = self._settings
-        if not settings.validation.steps or self._update == self._updates:
+        settings, chosen = self._settings, self._settings.validation
+        if not chosen.steps or self._update == self._updates:
             yield None
             return
         try:
             weeks = prepare(
                 settings.data_centers_of_sites(),
-                VALIDATION,
-                objective=settings.validation.objective,
-                optimum=settings.validation.optimum,
+                VALIDATION if chosen.weeks == "validation" else chosen.weeks,
+                objective=chosen.objective,
+                optimum=chosen.optimum,
+                days=chosen.days,
                 forecast_error=self._env.core.options.forecast_error,
                 precision=settings.precision,
+                cache=cache,
                 progress=progress,
                 stop=stop,
             )

@@ -37,13 +37,21 @@ from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
 from sdc_taichi.learning.scenarios import SCENARIOS, training_environment
 from sdc_taichi.learning.settings import LEARNING_SETTINGS, LearningSettings
-from sdc_taichi.learning.split import DAYS_PER_WEEK, TRAINING, WEEKS, data_center_weeks
+from sdc_taichi.learning.split import (
+    DAYS_PER_WEEK,
+    TRAINING,
+    UNSCORED_DAYS,
+    WEEKS,
+    data_center_weeks,
+)
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.sim.fleet_configs import make_configs
 from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 
 MOST_STEPS = 10**12
 """Largest number of steps of a training: years of the fastest machine."""
+Week = Annotated[int, Field(strict=True, ge=0, lt=WEEKS)]
+"""Week of the year, 0..51."""
 _FIXED_BY_WEEKS = ("start", "months")
 
 Steps = Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
@@ -55,6 +63,10 @@ class ValidationSettings(Section):
 
     steps: Annotated[int, Field(strict=True, ge=0, le=MOST_STEPS)] = 200_000
     """Steps of all data centers together between two validations, 0..1e12; 0 is no validation."""
+    weeks: Literal["validation"] | tuple[Week, ...] = "validation"
+    """Weeks of the year, 0..51; ``validation`` is weeks 1, 9, ..., 49."""
+    days: Annotated[int, Field(strict=True, gt=UNSCORED_DAYS, le=DAYS_PER_WEEK)] = DAYS_PER_WEEK
+    """Days of each week that are run, 2..7; the first is not scored."""
     objective: Annotated[str, Field(min_length=1, max_length=200)] = "carbon"
     """Objective whose share of the achievable is measured: ``carbon``, ``energy``, ``cost``,
     ``water``, or a sum such as ``carbon+0.002*water``."""
@@ -62,6 +74,11 @@ class ValidationSettings(Section):
     """Whether to solve, once, for the optimum of these weeks, which values stored energy and
     waiting work at their ends and gives the share of the achievable; else policies are compared
     with idle commands alone."""
+
+    @field_validator("weeks")
+    @classmethod
+    def _each_week_once(cls, value: Any) -> Any:
+        return _weeks_once(value)
 
 
 class TrainingSettings(Section):
@@ -79,9 +96,7 @@ class TrainingSettings(Section):
     """Values put into the configuration, section by section."""
     sites: tuple[Annotated[str, Field(min_length=1)], ...] = ()
     """Sites, one data center for each; none is the site of the configuration."""
-    weeks: (
-        Literal["training"] | tuple[Annotated[int, Field(strict=True, ge=0, lt=WEEKS)], ...] | None
-    ) = "training"
+    weeks: Literal["training"] | tuple[Week, ...] | None = "training"
     """Weeks of the year, 0..51, that episodes begin in, one data center for each site and week;
     ``training`` is all that are neither held out nor for validation, None takes the first days
     from ``environment``."""
@@ -153,10 +168,8 @@ class TrainingSettings(Section):
 
     @field_validator("weeks")
     @classmethod
-    def _weeks_once(cls, value: Any) -> Any:
-        if isinstance(value, tuple) and (not value or len(set(value)) < len(value)):
-            raise ValueError(f"{list(value)}; valid is one or more weeks, each once")
-        return value
+    def _each_week_once(cls, value: Any) -> Any:
+        return _weeks_once(value)
 
     @field_validator("learning", mode="before")
     @classmethod
@@ -309,6 +322,13 @@ def read_values(path: str | os.PathLike[str]) -> dict[str, Any]:
             f"{path}: the top level is a {type(values).__name__}; valid is a mapping of settings"
         )
     return values
+
+
+def _weeks_once(value: Any) -> Any:
+    """Weeks of the year, at least one and each once; other values as they are."""
+    if isinstance(value, tuple) and (not value or len(set(value)) < len(value)):
+        raise ValueError(f"{list(value)}; valid is one or more weeks, each once")
+    return value
 
 
 def whole_steps(value: Any) -> Any:

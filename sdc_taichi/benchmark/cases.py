@@ -1,0 +1,155 @@
+"""Cases of suites as data centers, settings of trainings, seeds and controllers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sdc_taichi.benchmark.suite import Case, Part, Row, Suite
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.control import make_controller
+from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.learning.training_settings import TrainingSettings, make_settings, merged
+from sdc_taichi.sim.fleet import build_fleet
+
+_FIXED = ("weeks", "seed", "scenario", "config", "overrides", "sites")
+"""Settings of trainings that a case or seed decides."""
+
+
+def data_centers(case: Case, part: Part) -> list[DataCenterConfig]:
+    """Data centers of a part of a case, one for each site.
+
+    Args:
+        case: the case.
+        part: held-out data centers, or those of the training.
+
+    Raises:
+        ConfigError: a file, value or site that is not valid.
+    """
+    values = _data_center_values(case)
+    if part == "held-out":
+        given = case.test.model_dump(exclude_defaults=True)
+        values = merged(values, given)
+    # An algorithm has to be named, and decides nothing here.
+    return make_settings({"algorithm": "ippo"} | values, "case").data_centers_of_sites()
+
+
+def weeks_of(case: Case, part: Part) -> tuple[int, ...]:
+    """Weeks of the year, 0..51, of a part of a case.
+
+    Args:
+        case: the case.
+        part: the part.
+    """
+    return case.weeks if part == "held-out" else case.validation_weeks
+
+
+def training_settings(
+    case: Case,
+    row: Row,
+    *,
+    objective: str,
+    seed: int,
+    training: Mapping[str, Any],
+    agent: str | None = None,
+) -> TrainingSettings:
+    """Settings of the training of a row in a case.
+
+    Args:
+        case: the case.
+        row: the row, which is one that learns.
+        objective: objective of the suite, by which the best policy is chosen.
+        seed: seed of the training.
+        training: settings of all trainings of the suite.
+        agent: agent that alone learns, the others idle; None is all that the row says.
+
+    Raises:
+        ConfigError: settings that are not valid, or that the case decides.
+    """
+    given = merged(training, row.train or {})
+    for name in _FIXED:
+        if name in given:
+            raise ConfigError(f"train: {name}: is that of the case; valid is without")
+    of_case = {
+        "weeks": case.training_weeks,
+        "seed": seed,
+        "tensorboard": False,
+        "validation": {
+            "weeks": case.validation_weeks,
+            "days": case.days,
+            "objective": objective,
+            "optimum": case.optimum,
+        },
+    }
+    values = merged(merged(_data_center_values(case), of_case), given)
+    if agent is not None:
+        values = merged(values, {"environment": {"agents": [agent], "others": "idle"}})
+    return make_settings(values, "train")
+
+
+def agents_of(settings: TrainingSettings) -> tuple[str, ...]:
+    """Agents that learn in a training.
+
+    Args:
+        settings: settings of the training.
+    """
+    return tuple(settings.environment.agents or AGENTS)
+
+
+def number_of_seeds(suite: Suite, case: str, row: str) -> int:
+    """Number of seeds of a row in a case: that of the suite where anything is random, and else 1.
+
+    Args:
+        suite: the suite.
+        case: name of the case.
+        row: name of the row.
+    """
+    chosen = suite.rows[row]
+    if chosen.seeds is not None:
+        return chosen.seeds
+    sampled = any(dc.events.sampled for dc in data_centers(suite.cases[case], "held-out"))
+    return suite.seeds if sampled or chosen.is_random else 1
+
+
+def check_suite(suite: Suite) -> None:
+    """Find what is wrong with a suite before any work is done.
+
+    Args:
+        suite: the suite.
+
+    Raises:
+        ConfigError: data centers, controllers or settings of trainings that are not valid, naming
+            the case and the row.
+    """
+    for name, case in suite.cases.items():
+        place = f"suite {suite.name}: cases.{name}"
+        try:
+            configs = data_centers(case, "held-out")
+            fleet = build_fleet(configs)
+            data_centers(case, "validation")
+        except SdcError as error:
+            raise ConfigError(f"{place}: {error}") from None
+        if case.optimum and any(config.events.sampled for config in configs):
+            raise ConfigError(
+                f"{place}: optimum true with sampled events, which no optimum foresees; valid is "
+                "optimum: false"
+            )
+        for label, row in suite.rows.items():
+            if not suite.is_for(label, name):
+                continue
+            try:
+                for spec in row.controllers:
+                    make_controller(spec, fleet)
+                if row.train is not None:
+                    training_settings(
+                        case, row, objective=suite.objective, seed=0, training=suite.training
+                    )
+            except SdcError as error:
+                raise ConfigError(f"suite {suite.name}: rows.{label}: {error}") from None
+
+
+def _data_center_values(case: Case) -> dict[str, Any]:
+    """Settings of trainings that say which data centers and options they are of."""
+    names = {"scenario", "config", "overrides", "sites", "environment"}
+    return case.model_dump(include=names, exclude_defaults=True)

@@ -1,0 +1,403 @@
+"""Jobs of suites: the optima of a site's weeks, and a row of a case with one seed.
+
+``solve_reference`` and ``run_row`` run anywhere, since all that they need is in their values and
+inputs. An optimum is solved once and kept as the files of its job, which are inputs of the rows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from sdc_taichi.benchmark.cases import (
+    agents_of,
+    data_centers,
+    number_of_seeds,
+    training_settings,
+    weeks_of,
+)
+from sdc_taichi.benchmark.jobs import Inputs, Job, JobResult
+from sdc_taichi.benchmark.suite import REFERENCE, Case, Part, Row, Suite
+from sdc_taichi.control import PERFECT, ForecastError, make_controller
+from sdc_taichi.envs.agents import COMMAND_OF_AGENT
+from sdc_taichi.learning.evaluation import (
+    ALL,
+    METRICS,
+    Contender,
+    DataCenterWeeks,
+    evaluate,
+    prepare,
+    validate,
+)
+from sdc_taichi.run.achievable import AchievedPath
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from sdc_taichi.learning.trainer import Training
+
+_MODULE = "sdc_taichi.benchmark.suite_jobs"
+_CURVES = ("training.csv", "validation.csv")
+"""Files of a training that are kept beside its settings and policy."""
+_ROW = "row"
+"""What an evaluation calls a controller, which has the name of its row afterwards."""
+_SECONDS = "seconds"
+"""Column of curves that differs between equal trainings."""
+
+
+def reference_jobs(suite: Suite) -> list[Job]:
+    """Jobs that solve for the optima of a suite, one for each case, part and site.
+
+    Args:
+        suite: the suite.
+    """
+    found = []
+    for name, case in suite.cases.items():
+        parts = _parts_needed(suite, name) if case.optimum else ()
+        for part in parts:
+            for site, config in enumerate(data_centers(case, part)):
+                values = {
+                    "case": case.model_dump(mode="json", exclude={"about"}),
+                    "part": part,
+                    "site": site,
+                    "objective": suite.objective,
+                }
+                partition = {
+                    "suite": suite.name,
+                    "case": name,
+                    "row": f"{REFERENCE}-{part}-{config.name}",
+                    "seed": "0",
+                }
+                found.append(Job(f"{_MODULE}:{solve_reference.__name__}", values, partition))
+    return found
+
+
+def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
+    """Jobs that run the rows of a suite, one for each case, row and seed.
+
+    Args:
+        suite: the suite.
+        references: jobs that have solved for its optima.
+    """
+    found = []
+    for label, row in suite.rows.items():
+        for name, case in suite.cases.items():
+            if not suite.is_for(label, name):
+                continue
+            parts = _parts_of(row)
+            inputs = {
+                job.name: job.key
+                for job in references
+                if job.partition["case"] == name and job.values["part"] in parts
+            }
+            for seed in range(number_of_seeds(suite, name, label)):
+                values = {
+                    "name": label,
+                    "case": case.model_dump(mode="json", exclude={"about"}),
+                    "row": row.model_dump(mode="json", exclude={"about", "seeds", "cases"}),
+                    "training": suite.training if row.train is not None else {},
+                    "objective": suite.objective,
+                    "seed": seed,
+                }
+                partition = {"suite": suite.name, "case": name, "row": label, "seed": str(seed)}
+                found.append(Job(f"{_MODULE}:{run_row.__name__}", values, partition, inputs))
+    return found
+
+
+def solve_reference(values: Mapping[str, Any], _inputs: Inputs) -> JobResult:
+    """Solve for the optima of a site's weeks, and value the ends of weeks.
+
+    Args:
+        values: ``case``, ``part``, the number of the ``site``, and the ``objective``.
+
+    Returns:
+        No rows; as files the entries by which ``optimum.solve`` finds the optima again.
+    """
+    case, part = Case.model_validate(values["case"]), values["part"]
+    config = data_centers(case, part)[values["site"]]
+    with (
+        TemporaryDirectory() as folder,
+        prepare(
+            [config],
+            weeks_of(case, part),
+            objective=values["objective"],
+            days=case.days,
+            cache=folder,
+        ) as weeks,
+    ):
+        files = {path.name: path.read_bytes() for path in sorted(Path(folder).glob("*.npz"))}
+        assert weeks.optimum is not None
+        metrics = {
+            "part": part,
+            "site": config.name,
+            "weeks": weeks.weeks,
+            "idle_figure": weeks.idle.tolist(),
+            "achieved_figure": weeks.optimum.achieved.tolist(),
+            "bound_figure": weeks.optimum.bound.tolist(),
+            "bound_kinds": weeks.optimum.bound_kinds,
+        }
+    return JobResult(None, metrics, files)
+
+
+def run_row(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
+    """Run a row of a case with one seed: train or choose what is to be, and evaluate it.
+
+    Args:
+        values: ``case`` and ``row``, the ``name`` of the row, settings of every ``training``, the
+            ``objective`` and the ``seed``.
+        inputs: optima of the weeks, as ``packed`` packs the files of their jobs.
+
+    Returns:
+        A row for each week, with the columns of ``learning.evaluation``; the policy and the curves
+        of a training as files.
+    """
+    task = _Task(
+        name=values["name"],
+        case=Case.model_validate(values["case"]),
+        row=Row.model_validate(values["row"]),
+        training=values["training"],
+        objective=values["objective"],
+        seed=values["seed"],
+    )
+    with TemporaryDirectory() as scratch:
+        optima = Path(scratch) / "optima"
+        optima.mkdir()
+        for content in inputs.values():
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                archive.extractall(optima)
+        made = _made(task, Path(scratch), optima)
+        error = task.row.forecast_error
+        with _weeks(task, "held-out", optima, error) as weeks:
+            rows = _rows(task, made, weeks)
+            metrics = _metrics(task, made, weeks)
+    rows = rows.drop(columns="training").assign(controller=task.name)
+    return JobResult(rows, metrics, made.files)
+
+
+def packed(files: Mapping[str, bytes]) -> bytes:
+    """Files of a reference job as one input: a ZIP archive with the same bits for the same files.
+
+    Args:
+        files: content by name.
+    """
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name in sorted(files):
+            archive.writestr(zipfile.ZipInfo(name), files[name])
+    return out.getvalue()
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """What a row job is to do."""
+
+    name: str
+    """Name of the row."""
+    case: Case
+    """Data centers and weeks."""
+    row: Row
+    """The row."""
+    training: Mapping[str, Any]
+    """Settings of every training of the suite."""
+    objective: str
+    """Objective that is compared."""
+    seed: int
+    """Seed of all that is random."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Made:
+    """The controller of a row, and how it was found."""
+
+    spec: str
+    """Controller by name; empty for an optimum."""
+    metrics: dict[str, Any]
+    """How it was found."""
+    files: dict[str, bytes]
+    """Policies and curves of trainings by their paths."""
+    agents: tuple[str, ...] = ()
+    """Of load, cooling and battery what a trained policy moves."""
+
+
+def _made(task: _Task, scratch: Path, optima: Path) -> _Made:
+    """Train or choose the controller of a row."""
+    if task.row.train is not None:
+        return _trained(task, scratch, optima)
+    if task.row.best_of is None:
+        return _Made(task.row.controller or "", {}, {})
+    with _weeks(task, "validation", optima) as weeks:
+        tried = {
+            spec: validate(make_controller(spec, weeks.sim.fleet), weeks)
+            for spec in task.row.best_of
+        }
+    best = min(tried, key=lambda spec: tried[spec].change_pct)
+    changes = {spec: found.change_pct for spec, found in tried.items()}
+    return _Made(best, {"chosen": best, "validation_change_pct": changes}, {})
+
+
+def _trained(task: _Task, scratch: Path, optima: Path) -> _Made:
+    """Train the policy of a row, or one for each of its agents."""
+    from sdc_taichi.learning import train
+
+    def settings_of(agent: str | None) -> Any:
+        return training_settings(
+            task.case,
+            task.row,
+            objective=task.objective,
+            seed=task.seed,
+            training=task.training,
+            agent=agent,
+        )
+
+    agents = agents_of(settings_of(None))
+    moved = tuple(COMMAND_OF_AGENT[agent] for agent in agents)
+    files: dict[str, bytes] = {}
+    metrics, specs = {}, []
+    for agent in agents if task.row.apart else (None,):
+        part = COMMAND_OF_AGENT[agent] if agent else ""
+        folder = scratch / "training" / part
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        done = train(settings_of(agent), folder, cache=optima)
+        files |= {
+            (Path(part) / name).as_posix(): x for name, x in _files_of_training(folder).items()
+        }
+        metrics[part or "training"] = _metrics_of_training(done)
+        specs.append(f"{part}=policy:{folder}" if part else f"policy:{folder}")
+    return _Made(",".join(specs), {"trainings": metrics}, files, moved)
+
+
+def _files_of_training(folder: Path) -> dict[str, bytes]:
+    """Settings, curves and the best policy of a training, without what differs between equal ones.
+
+    Folders keep their places, so that the folder of the job is a controller ``policy:FOLDER``.
+    """
+    from sdc_taichi.learning.policy import FOLDERS
+    from sdc_taichi.learning.training_folder import SETTINGS_FILE
+
+    chosen = next(name for name in FOLDERS if (folder / name).is_dir())
+    paths = [folder / SETTINGS_FILE, *sorted((folder / chosen).iterdir())]
+    found = {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in paths if path.is_file()
+    }
+    for name in _CURVES:
+        if (folder / name).is_file():
+            found[name] = _without_seconds(folder / name)
+    return found
+
+
+def _without_seconds(path: Path) -> bytes:
+    """A CSV file without the time that things took."""
+    import csv
+
+    with open(path, newline="", encoding="utf-8") as file:
+        lines = list(csv.reader(file))
+    at = lines[0].index(_SECONDS)
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(x[:at] + x[at + 1 :] for x in lines)
+    return out.getvalue().encode()
+
+
+def _metrics_of_training(done: Training) -> dict[str, Any]:
+    """What a training came to."""
+    best = None if done.best is None else done.best._asdict()
+    return {"updates": done.updates, "steps": done.steps, "validation": best}
+
+
+@contextlib.contextmanager
+def _weeks(
+    task: _Task, part: Part, optima: Path, forecast_error: str | None = None
+) -> Iterator[DataCenterWeeks]:
+    """Data centers and weeks of a part of a case, with their optima."""
+    with prepare(
+        data_centers(task.case, part),
+        weeks_of(task.case, part),
+        objective=task.objective,
+        optimum=task.case.optimum,
+        days=task.case.days,
+        seed=task.seed,
+        forecast_error=PERFECT if forecast_error is None else ForecastError.parse(forecast_error),
+        cache=optima,
+    ) as weeks:
+        yield weeks
+
+
+def _rows(task: _Task, made: _Made, weeks: DataCenterWeeks) -> pd.DataFrame:
+    """A row for each week of the row's controller, and of what its agents do alone."""
+    import pandas as pd
+
+    best = weeks.optimum
+    if task.row.optimum is not None:
+        assert best is not None
+        if task.row.optimum == "bound":
+            return _rows_of_figures(weeks, {ALL: best.bound})
+        own = evaluate(weeks, [Contender(_ROW, AchievedPath(best))], beside=False).rows
+        return pd.concat([own, _rows_of_figures(weeks, best.alone)], ignore_index=True)
+    agents = made.agents if task.row.agents_alone and len(made.agents) > 1 else ()
+    controller = make_controller(made.spec, weeks.sim.fleet)
+    contender = Contender(_ROW, controller, agents=agents)
+    return evaluate(weeks, [contender], beside=False).rows
+
+
+def _rows_of_figures(weeks: DataCenterWeeks, figures: Mapping[str, Any]) -> pd.DataFrame:
+    """Rows of figures alone, by what is moved; nothing is known of other metrics."""
+    import numpy as np
+    import pandas as pd
+
+    best, nan = weeks.optimum, np.full(weeks.sim.size, np.nan)
+    achieved = nan if best is None else best.achieved
+    frames = []
+    for moves, figure in figures.items():
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (weeks.idle - figure) / (weeks.idle - achieved)
+        columns = {
+            "controller": "",
+            "training": pd.array([pd.NA] * weeks.sim.size, dtype="Int64"),
+            "moves": moves,
+            "site": weeks.sites,
+            "week": weeks.weeks,
+            "figure": figure,
+            "valued_figure": figure,
+            "idle_figure": weeks.idle,
+            "achieved_figure": achieved,
+            "share": np.where(weeks.idle > achieved, share, np.nan),
+            "broken": "",
+            **{name: nan for name in METRICS},
+        }
+        frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)
+
+
+def _metrics(task: _Task, made: _Made, weeks: DataCenterWeeks) -> dict[str, Any]:
+    """What the row job did."""
+    return made.metrics | {
+        "objective": str(weeks.objective),
+        "unit": weeks.objective.unit,
+        "sites": list(dict.fromkeys(weeks.sites)),
+        "weeks": list(task.case.weeks),
+        "steps": weeks.steps,
+        "scored_from": weeks.scored_from,
+        "forecast_error": task.row.forecast_error,
+        "fingerprint": weeks.sim.fingerprint(),
+        "has_optimum": weeks.optimum is not None,
+        "bound_kinds": [] if weeks.optimum is None else sorted(set(weeks.optimum.bound_kinds)),
+    }
+
+
+def _parts_needed(suite: Suite, case: str) -> tuple[Part, ...]:
+    """Parts of a case whose optima its rows need."""
+    of_rows = [_parts_of(row) for name, row in suite.rows.items() if suite.is_for(name, case)]
+    needed = {part for parts in of_rows for part in parts}
+    order: tuple[Part, ...] = ("held-out", "validation")
+    return tuple(part for part in order if part in needed)
+
+
+def _parts_of(row: Row) -> tuple[Part, ...]:
+    """Parts of a case whose optima a row needs."""
+    chooses = row.train is not None or row.best_of is not None
+    return ("held-out", "validation") if chooses else ("held-out",)
