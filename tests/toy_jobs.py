@@ -96,3 +96,9 @@ def sleep_long(values: Mapping[str, Any], _inputs: Mapping[str, bytes]) -> JobRe
 
 def other_columns(_values: Mapping[str, Any], _inputs: Mapping[str, bytes]) -> JobResult:
     return JobResult(pd.DataFrame({"site": ["AZ"], "sum": [1], "cost": [5]}), {})
+
+
+def interrupt(_values: Mapping[str, Any], _inputs: Mapping[str, bytes]) -> JobResult:
+    """Interrupt the command as Ctrl-C does, which the job itself survives."""
+    os.kill(os.getpid(), signal.SIGINT)
+    return JobResult(None, {})

@@ -1,0 +1,104 @@
+"""Options of commands that run jobs, their progress and their ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import toy_jobs
+from sdc_taichi.benchmark.runner import InProcess
+from sdc_taichi.benchmark.store import ResultStore, Study
+from sdc_taichi.cli import execution
+from sdc_taichi.cli.execution import JobsCommand, JobSession, Ray, job_progress, job_session
+
+STUDY = Study("sweep", "sdc-taichi sweep", {}, [])
+
+
+@pytest.mark.parametrize(
+    ("line", "ray", "rest"),
+    [
+        ("a b", None, "a b"),
+        ("a --ray", "local", "a"),
+        ("--ray a --out x", "local", "a x"),
+        ("a --ray --out x", "local", "a x"),
+        ("a --ray auto --out x", "auto", "a x"),
+        ("--ray 10.0.0.1:6379 site.location=NY", "10.0.0.1:6379", "site.location=NY"),
+        ("--ray ray://head:10001", "ray://head:10001", ""),
+        ("--ray [fd00::1]:6379", "[fd00::1]:6379", ""),
+        ("--ray=anything a", "anything", "a"),
+        ("a -- --ray", None, "a --ray"),
+    ],
+)
+def test_the_address_of_ray_may_be_left_out(line: str, ray: str | None, rest: str) -> None:
+    app = typer.Typer()
+
+    @app.command(cls=JobsCommand)
+    def command(
+        words: list[str] = typer.Argument(default=[]),  # noqa: B008
+        out: str = "",
+        ray: Ray = None,
+    ) -> None:
+        typer.echo(" ".join([str(ray), *words, out]))
+
+    done = CliRunner().invoke(app, line.split())
+    assert done.output.split() == [str(ray), *rest.split()]
+
+
+def test_progress_is_lines_where_there_is_no_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    jobs = [toy_jobs.job("without_rows", i) for i in range(3)]
+    store = ResultStore(tmp_path)
+    with store.claimed(STUDY):
+        session = JobSession(store, InProcess(), lambda: False)
+        session.run("rows", jobs[:1], 1)
+        assert capsys.readouterr().err == "rows 1/1: toy/c/without_rows/0 0:00\n"
+        session.run("rows", [*jobs, toy_jobs.job("refuse", 3)], 4)
+        lines = capsys.readouterr().err.splitlines()
+        assert lines == [
+            "rows 2/4, 1 kept: toy/c/without_rows/1 0:00",
+            "failed: toy/c/refuse/3: number 3: valid is another",
+            "rows 4/4, 1 kept: toy/c/refuse/3 failed",
+        ]
+        with pytest.raises(typer.Exit) as ended:
+            session.finish()
+        assert ended.value.exit_code == 1
+        assert capsys.readouterr().err == "1 of 5 jobs failed; --resume runs them again\n"
+
+
+def test_progress_is_a_bar_in_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    from sdc_taichi.benchmark.jobs import run_job
+
+    refused = toy_jobs.job("refuse", 3)
+    with job_progress("rows [b]", 2, shown=True) as on_done:
+        on_done(toy_jobs.job("without_rows", 0), None)
+        on_done(refused, run_job(refused, {}))
+    said = capsys.readouterr().err
+    assert "failed: toy/c/refuse/3: number 3: valid is another" in said
+    assert "rows" in said
+
+
+def test_an_interrupted_study_says_how_to_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(execution, "executor_of", lambda *_: InProcess())
+    store, jobs = ResultStore(tmp_path), [toy_jobs.job("interrupt", 0), toy_jobs.job("draw", 1)]
+    with job_session(store, STUDY, resume=False, jobs=1, ray=None) as session:
+        assert not session.run("rows", jobs, 2).is_whole
+        assert session.run("more", [toy_jobs.job("draw", 2)], 1).done == 0
+    with pytest.raises(typer.Exit) as ended:
+        session.finish()
+    assert ended.value.exit_code == 130
+    assert "interrupted after 1 jobs; go on with --resume" in capsys.readouterr().err
+    with job_session(store, STUDY, resume=True, jobs=1, ray=None, quiet=True) as session:
+        done = session.run("rows", jobs, 2)
+    session.finish()
+    assert (done.done, done.kept) == (1, 1)
+    assert capsys.readouterr().err == ""
