@@ -20,6 +20,7 @@ from sdc_taichi.benchmark.paper_accounting import (
     radar,
     released_utilisation,
 )
+from sdc_taichi.benchmark.suite import load_suite
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import metrics_per_dc
@@ -168,3 +169,12 @@ def test_measured_inputs_give_the_figures_of_the_released_code(
         ]
     )
     assert found[:3] == pytest.approx(COLDEST, rel=0.03)
+
+
+def test_suite_paper_has_the_rows_and_sites_of_the_printed_tables() -> None:
+    suite = load_suite("paper")
+    for each in paper_tables():
+        case = suite.cases[each.case]
+        assert each.site in (case.test.sites or case.sites)
+        assert case.sites == (each.site,)
+        assert all(suite.is_for(row, each.case) for row in (*each.rows, CONSTANT_ROW))
