@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
 import pytest
 import yaml
 
 from sdc_taichi import ConfigError
 from sdc_taichi.benchmark.cases import check_suite, data_centers, number_of_seeds
-from sdc_taichi.benchmark.jobs import DoneJob, run_job
-from sdc_taichi.benchmark.suite import Suite, load_suite, make_suite, suite_names
-from sdc_taichi.benchmark.suite_jobs import packed, reference_jobs, row_jobs
+from sdc_taichi.benchmark.jobs import Inputs, Job, digest_of, run_job
+from sdc_taichi.benchmark.runner import InProcess, JobSummary, run_jobs
+from sdc_taichi.benchmark.store import ResultStore
+from sdc_taichi.benchmark.suite import (
+    Suite,
+    load_suite,
+    make_suite,
+    suite_markdown,
+    suite_names,
+)
+from sdc_taichi.benchmark.suite_jobs import reference_jobs, row_jobs
+from sdc_taichi.benchmark.suite_run import run_suite, study_of
 from sdc_taichi.learning.split import HELD_OUT
 
 SMALL: dict[str, Any] = {
@@ -42,16 +49,8 @@ SMALL: dict[str, Any] = {
 }
 
 
-REFERENCE_NAME = "reference-held-out-ny"
-
-
 def small(**changes: Any) -> Suite:
     return make_suite(SMALL | changes)
-
-
-def rows_of(done: DoneJob) -> pd.DataFrame:
-    assert not done.error
-    return pd.read_parquet(io.BytesIO(done.rows))
 
 
 def case(**changes: Any) -> dict[str, Any]:
@@ -66,6 +65,13 @@ def test_suites_of_the_package_are_valid(name: str, quick: bool) -> None:
     assert suite.name == name
     assert suite.about
     assert not suite.quick or not quick
+
+
+@pytest.mark.repo
+def test_the_page_of_suites_has_their_tables() -> None:
+    page = Path(__file__).parents[1] / "docs/suites.md"
+    said = "docs/suites.md: append what suite_markdown() makes"
+    assert page.read_text("utf-8").endswith(f"{suite_markdown()}\n"), said
 
 
 def test_weeks_are_those_of_the_split_unless_given() -> None:
@@ -130,7 +136,7 @@ def test_what_does_not_fit_is_found_before_any_work(
     assert message in str(caught.value)
 
 
-def test_the_quick_form_takes_the_place_of_values_and_leaves_rows_out(tmp_path: Any) -> None:
+def test_the_quick_form_takes_the_place_of_values_and_leaves_rows_out(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     quick = {"seeds": 1, "cases": {"tiny": {"sites": ["NY"]}}, "rows": {"ippo": None}}
     values = {k: v for k, v in SMALL.items() if k != "name"} | {"quick": quick}
@@ -181,51 +187,77 @@ def test_a_job_depends_on_what_it_is_of_and_not_on_titles_or_other_rows() -> Non
     assert not set(other.values()) & set(before.values())
 
 
+def run(suite: Suite, store: ResultStore, *, resume: bool = False) -> list[JobSummary]:
+    """Run a suite in this process."""
+    found = []
+
+    def stage(_: str, jobs: Sequence[Job], __: int, inputs: Inputs | None = None) -> JobSummary:
+        found.append(run_jobs(jobs, store, InProcess(), inputs))
+        return found[-1]
+
+    with store.claimed(study_of(suite, suite, "command"), resume=resume):
+        run_suite(suite, store, stage)
+    return found
+
+
 @pytest.fixture(scope="module")
-def done() -> dict[str, DoneJob]:
-    """Jobs of all rows but the training, by row."""
+def store(tmp_path_factory: pytest.TempPathFactory) -> ResultStore:
+    """Results of all rows but the training, of one site."""
     suite = small(
         **case(sites=["NY"]), rows={k: v for k, v in SMALL["rows"].items() if k != "ippo"}
     )
-    references = reference_jobs(suite)
-    inputs = {}
-    for job in references:
-        found = run_job(job, {})
-        assert not found.error
-        inputs[job.name] = packed(found.files)
-    jobs = [job for job in row_jobs(suite, references) if job.partition["seed"] == "0"]
-    jobs += [references[0]]
-    return {job.partition["row"]: run_job(job, inputs) for job in jobs}
+    found = ResultStore(tmp_path_factory.mktemp("suite") / "small")
+    assert [(each.done, each.failed) for each in run(suite, found)] == [(2, ()), (6, ())]
+    return found
 
 
-def test_rows_stand_between_idle_commands_and_the_bound(done: Mapping[str, DoneJob]) -> None:
-    rows = {name: rows_of(each) for name, each in done.items() if name != REFERENCE_NAME}
-    valued = {name: own[own["moves"] == "all"]["valued_figure"] for name, own in rows.items()}
-    assert [len(x) for x in valued.values()] == [1] * 5
-    idle = rows["idle"]
-    assert idle["valued_figure"].tolist() == idle["idle_figure"].tolist()
-    for name, figures in valued.items():
-        assert np.all(valued["bound"].to_numpy() <= figures.to_numpy() * (1 + 1e-9)), name
-    assert idle["share"].tolist() == [0.0]
-    np.testing.assert_allclose(rows["optimum"]["share"][0], 1.0)
-    assert (rows["bound"]["share"] >= 1.0 - 1e-9).all()
-    assert set(rows["optimum"]["moves"]) == {"all", "load", "cooling", "battery"}
-    columns = {tuple(own.columns) for own in rows.values()}
-    assert len(columns) == 1
+def test_rows_stand_between_idle_commands_and_the_bound(store: ResultStore) -> None:
+    rows = store.rows().set_index("row")
+    own = rows[(rows["moves"] == "all") & (rows["seed"] == 0)]
+    assert set(own.index) == {"idle", "random", "best-constant", "optimum", "bound"}
+    assert (own["controller"] == own.index).all()
+    assert own["valued_figure"]["idle"] == own["idle_figure"]["idle"]
+    assert (own["valued_figure"] >= own["valued_figure"]["bound"] * (1 - 1e-9)).all()
+    assert own["share"]["idle"] == 0.0
+    assert own["share"]["optimum"] == pytest.approx(1.0)
+    assert own["share"]["bound"] >= 1.0 - 1e-9
+    assert set(rows["moves"]["optimum"]) == {"all", "load", "cooling", "battery"}
+    assert rows["seed"]["random"].tolist() == [0, 1]
+    assert rows["figure"]["random"].nunique() == 2
 
 
-def test_the_best_of_several_is_chosen_in_the_validation_weeks(
-    done: Mapping[str, DoneJob],
-) -> None:
-    metrics = done["best-constant"].metrics
+def test_the_best_of_several_is_chosen_in_the_validation_weeks(store: ResultStore) -> None:
+    partition = {"suite": "small", "case": "tiny", "row": "best-constant", "seed": "0"}
+    metrics = store.result(partition)["metrics"]
     changes = metrics["validation_change_pct"]
     assert metrics["chosen"] == min(changes, key=changes.__getitem__)
     assert set(changes) == {"constant:16", "constant:21"}
 
 
-def test_a_job_has_the_same_bits_again(done: Mapping[str, DoneJob]) -> None:
-    first = done[REFERENCE_NAME]
-    again = run_job(first.job, {})
+def test_a_study_goes_on_with_more_rows_and_seeds_and_no_other_cases(store: ResultStore) -> None:
+    more = {"idle": {"controller": "idle"}, "coldest": {"controller": "coldest"}}
+    suite = small(**case(sites=["NY"]), rows=more, title="Another", seeds=3)
+    (optima, rows) = run(suite, store, resume=True)
+    assert (optima.done, optima.kept, rows.done, rows.kept) == (0, 1, 1, 1)
+    with pytest.raises(ConfigError, match=r"holds a study with suite.cases.tiny.days 2, here 3"):
+        run(small(**case(sites=["NY"], days=3)), store, resume=True)
+
+
+def test_a_reference_has_the_same_bits_again(store: ResultStore) -> None:
+    job = reference_jobs(small(**case(sites=["NY"])))[0]
+    again = run_job(job, {})
     assert again.rows == b""
-    assert packed(first.files) == packed(again.files)
-    assert first.metrics == again.metrics
+    kept = store.result(job.partition)
+    assert kept["metrics"] == again.metrics
+    assert {name: digest_of(x) for name, x in again.files.items()} == kept["files_sha256"]
+
+
+def test_a_row_whose_optimum_failed_fails_with_one_line(tmp_path: Path) -> None:
+    suite = small(rows={"idle": {"controller": "idle"}})
+    jobs = row_jobs(suite, reference_jobs(suite))
+    results = ResultStore(tmp_path / "out")
+    with results.claimed(study_of(suite, suite, "")):
+        found = run_jobs(jobs, results, InProcess())
+    ((name, error),) = found.failed
+    assert name == "small/tiny/idle/0"
+    assert "reference-held-out-ny" in error

@@ -12,6 +12,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,6 +52,9 @@ class Study:
     equal settings alone."""
     partitions: Sequence[Mapping[str, str]]
     """Partition of each job that the study is to do. A study that goes on may ask for more."""
+    may_change: Sequence[str] = ()
+    """Patterns of the dotted names of settings that may change while the study goes on, as those
+    that differ between its jobs may."""
 
 
 class ResultStore:
@@ -89,7 +93,7 @@ class ResultStore:
             content = _study_content(study)
             notes: list[str] = []
             if kept is not None:
-                _refuse_other_settings(self.folder, kept, content)
+                _refuse_other_settings(self.folder, kept, content, study.may_change)
                 content["partitions"] = _union(kept["partitions"], content["partitions"])
                 if kept["source"] != content["source"]:
                     notes.append(
@@ -333,7 +337,9 @@ def _result_content(done: DoneJob) -> dict[str, Any]:
     }
 
 
-def _refuse_other_settings(folder: Path, kept: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
+def _refuse_other_settings(
+    folder: Path, kept: Mapping[str, Any], asked: Mapping[str, Any], may_change: Sequence[str]
+) -> None:
     """Refuse to go on with a study of other settings.
 
     Raises:
@@ -345,6 +351,7 @@ def _refuse_other_settings(folder: Path, kept: Mapping[str, Any], asked: Mapping
         f"{name.removeprefix('settings.')} {_told(theirs, name)}, here {_told(ours, name)}"
         for name in {**theirs, **ours}
         if theirs.get(name, _told) != ours.get(name, _told)
+        and not any(fnmatch(name.removeprefix("settings."), pattern) for pattern in may_change)
     ]
     if different:
         more = len(different) - _MOST_DIFFERENCES

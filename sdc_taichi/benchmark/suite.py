@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, Field, ValidationError, field_validator, m
 
 from sdc_taichi.config import explain, load_config, load_yaml, preset_names
 from sdc_taichi.config.fields import Section, Text
+from sdc_taichi.config.reference import sections_markdown
 from sdc_taichi.control import ForecastError
 from sdc_taichi.control.registry import parts_of
 from sdc_taichi.errors import ConfigError, SdcError, suggestion, suggestion_or_valid
@@ -247,18 +248,22 @@ class Suite(Section):
         cases = self.rows[row].cases
         return cases is None or case in cases
 
-    def chosen(self, *, cases: Sequence[str] = (), rows: Sequence[str] = ()) -> Suite:
-        """The suite with some of its cases and rows.
+    def chosen(
+        self, *, cases: Sequence[str] = (), rows: Sequence[str] = (), seeds: int | None = None
+    ) -> Suite:
+        """The suite with some of its cases and rows, or another number of seeds.
 
         Args:
             cases: names of the cases; none is all.
             rows: names of the rows; none is all.
+            seeds: number of seeds; None is that of the suite.
 
         Raises:
             ConfigError: a name that the suite does not have, or rows that are for none of the
                 cases.
         """
         values = self.model_dump()
+        values["seeds"] = self.seeds if seeds is None else seeds
         for kind, names in (("cases", cases), ("rows", rows)):
             for name in names:
                 if name not in values[kind]:
@@ -333,6 +338,18 @@ def make_suite(values: Mapping[str, Any], label: str = "suite") -> Suite:
         return Suite.model_validate(values)
     except ValidationError as error:
         raise ConfigError(explain(error, label, Suite)) from None
+
+
+def suite_markdown() -> str:
+    """The tables of docs/suites.md, one for each section."""
+    return sections_markdown(
+        [
+            ("", Suite),
+            ("cases.NAME", Case),
+            ("cases.NAME.test", OtherDataCenters),
+            ("rows.NAME", Row),
+        ]
+    )
 
 
 def _quick(values: Mapping[str, Any], label: str) -> dict[str, Any]:

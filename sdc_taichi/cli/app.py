@@ -13,6 +13,7 @@ import typer
 import typer.core
 
 from sdc_taichi.cli.arguments import Debug
+from sdc_taichi.cli.benchmark import benchmark_app
 from sdc_taichi.cli.config import config_app
 from sdc_taichi.cli.data import data_app
 from sdc_taichi.cli.evaluate import evaluate_command
@@ -56,6 +57,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+app.add_typer(benchmark_app, name="benchmark")
 app.add_typer(config_app, name="config")
 app.add_typer(data_app, name="data")
 app.add_typer(hall_app, name="hall")
