@@ -11,6 +11,7 @@ from sdc_taichi.learning.statistics import (
     bootstrap_interval,
     change_pct,
     interquartile_mean,
+    performance_profile,
     probability_of_improvement,
     share_pct,
 )
@@ -93,3 +94,30 @@ def test_weeks_are_paired() -> None:
 def test_samples_of_other_weeks_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"sample \(2, 5\): valid is \(trainings, 4 weeks\)"):
         bootstrap_interval(mean, [np.ones((2, 5))], np.zeros(4, dtype=np.int64), generator())
+
+
+def test_performance_profile_is_the_share_of_runs_above_a_threshold() -> None:
+    scores = np.array([[0.0, 0.5, np.nan], [1.0, 0.5, 2.0]])
+    found = performance_profile(scores, np.array([-1.0, 0.0, 0.5, 1.5, 2.0]))
+    assert found.tolist() == [1.0, 0.8, 0.4, 0.2, 0.0]
+    stacked = performance_profile(np.stack([scores, 0 * scores]), np.array([0.2]))
+    assert stacked.tolist() == [[0.8], [0.0]]
+    assert np.isnan(performance_profile(np.full((1, 2), np.nan), np.array([0.0]))).all()
+
+
+def test_seeds_that_decide_inputs_are_drawn_together() -> None:
+    years = np.repeat([[1.0], [2.0], [40.0], [5.0]], 50, axis=1)
+    strata = np.zeros(50, dtype=np.int64)
+
+    def difference(paired: bool) -> float:
+        found = bootstrap_interval(
+            lambda one, other: mean(one) - mean(other),
+            [years + 1.0, years],
+            strata,
+            generator(),
+            paired=paired,
+        )
+        return found.high - found.low
+
+    assert difference(True) == pytest.approx(0.0, abs=1e-9)
+    assert difference(False) > 10.0

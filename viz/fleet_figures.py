@@ -25,6 +25,7 @@ from .plotting import (
     line_style,
     literal_text,
     new_figure,
+    place_radar_labels,
     repeat_last,
     scale_thousands,
     step_edges,
@@ -93,9 +94,7 @@ def radar(runs: Mapping[str, Mapping[str, Metric]]) -> Figure:
     ]
     axes.set_xticks(angle, labels, fontsize=9)
     axes.tick_params(axis="x", pad=6)
-    for text, side in zip(axes.get_xticklabels(), np.sin(angle), strict=True):
-        text.set_horizontalalignment("left" if side > 0.1 else "right" if side < -0.1 else "center")
-        text.set_verticalalignment("center" if abs(side) > 0.1 else "bottom")
+    place_radar_labels(axes, angle)
     axes.spines["polar"].set_color(GREY)
     figure.legend(loc="upper right", frameon=False, title="less is better")
     return figure

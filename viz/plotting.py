@@ -290,6 +290,18 @@ def style_axes_with_legend(axes: Axes) -> None:
     )
 
 
+def place_radar_labels(axes: Any, angle: F64) -> None:
+    """Move the labels of a radar's axes outside its circle, which begins at the top and runs right.
+
+    Args:
+        axes: polar axes with their ticks.
+        angle: angle of each tick, in rad.
+    """
+    for text, side in zip(axes.get_xticklabels(), np.sin(angle), strict=True):
+        text.set_horizontalalignment("left" if side > 0.1 else "right" if side < -0.1 else "center")
+        text.set_verticalalignment("center" if abs(side) > 0.1 else "bottom")
+
+
 def format_time_axis(axes: Axes) -> None:
     """Label a time axis with days and hours, without the year, which is a placeholder."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter

@@ -111,7 +111,7 @@ class ResultStore:
         Raises:
             ConfigError: there is none, or it is damaged.
         """
-        return _read_json(self.folder / STUDY_FILE, STUDY_FORMAT, _STUDY_KEYS)
+        return read_json(self.folder / STUDY_FILE, STUDY_FORMAT, _STUDY_KEYS)
 
     def folder_of(self, partition: Mapping[str, str]) -> Path:
         """Folder with metrics.json and further files of a job, whether it is done or not.
@@ -124,6 +124,17 @@ class ResultStore:
         """
         return self.folder / JOBS / partition_path(partition)
 
+    def rows_path(self, partition: Mapping[str, str]) -> Path:
+        """File with the rows of a job, whether it is done or not.
+
+        Args:
+            partition: columns and values that name the job.
+
+        Raises:
+            ConfigError: a column or value that cannot be the name of a folder.
+        """
+        return self.folder / RESULTS / partition_path(partition) / ROWS_FILE
+
     def result(self, partition: Mapping[str, str]) -> dict[str, Any]:
         """Content of metrics.json of a job.
 
@@ -133,16 +144,21 @@ class ResultStore:
         Raises:
             ConfigError: there is none, or it is damaged.
         """
-        return _read_json(self.folder_of(partition) / METRICS_FILE, RESULT_FORMAT, _RESULT_KEYS)
+        return read_json(self.folder_of(partition) / METRICS_FILE, RESULT_FORMAT, _RESULT_KEYS)
 
     def results(self) -> Iterator[dict[str, Any]]:
         """Content of each metrics.json, in order of their folders.
 
         Raises:
-            ConfigError: one of them is damaged.
+            ConfigError: one of them is damaged, or not in the folder that its partition names.
         """
         for path in sorted((self.folder / JOBS).rglob(METRICS_FILE)):
-            yield _read_json(path, RESULT_FORMAT, _RESULT_KEYS)
+            content = read_json(path, RESULT_FORMAT, _RESULT_KEYS)
+            if path.parent != self.folder_of(content["partition"]):
+                raise ConfigError(
+                    f"{path}: is of {shortened(content['partition'])}; valid is the folder of that"
+                )
+            yield content
 
     def file(self, partition: Mapping[str, str], name: str) -> bytes:
         """Content of a file of a job.
@@ -177,7 +193,7 @@ class ResultStore:
         partition = content["partition"]
         files = {self.folder_of(partition) / n: d for n, d in content["files_sha256"].items()}
         if content["rows_sha256"]:
-            files[self._rows_path(partition)] = content["rows_sha256"]
+            files[self.rows_path(partition)] = content["rows_sha256"]
         return all(digest_of(read_bytes(path, MOST_FILE_BYTES)) == d for path, d in files.items())
 
     def keep(self, done: DoneJob) -> None:
@@ -190,7 +206,7 @@ class ResultStore:
             SdcError: something cannot be written.
         """
         job = done.job
-        folder, rows_path = self.folder_of(job.partition), self._rows_path(job.partition)
+        folder, rows_path = self.folder_of(job.partition), self.rows_path(job.partition)
         with naming_errors(folder):
             # Until it is there again, the job is not done.
             (folder / METRICS_FILE).unlink(missing_ok=True)
@@ -212,7 +228,7 @@ class ResultStore:
 
         base = self.folder / RESULTS
         paths = [
-            str(self._rows_path(content["partition"]))
+            str(self.rows_path(content["partition"]))
             for content in self.results()
             if content["rows_sha256"]
         ]
@@ -229,9 +245,6 @@ class ResultStore:
             raise ConfigError(f"{base}: cannot be read as a dataset: {error}") from error
         frame: pd.DataFrame = table.to_pandas()
         return frame
-
-    def _rows_path(self, partition: Mapping[str, str]) -> Path:
-        return self.folder / RESULTS / partition_path(partition) / ROWS_FILE
 
     def _kept_study(self, *, resume: bool) -> dict[str, Any] | None:
         """Content of study.json of a study that goes on; None where the folder is empty.
@@ -383,8 +396,13 @@ def _union(first: Sequence[Any], second: Sequence[Any]) -> list[Any]:
     return list({json.dumps(each, sort_keys=True): each for each in (*first, *second)}.values())
 
 
-def _read_json(path: Path, form: str, keys: Mapping[str, Any]) -> dict[str, Any]:
+def read_json(path: Path, form: str, keys: Mapping[str, Any]) -> dict[str, Any]:
     """Content of a JSON file of a known format.
+
+    Args:
+        path: the file.
+        form: name and version of the format, which is its entry ``format``.
+        keys: types of other entries that it must have, by name.
 
     Raises:
         ConfigError: it cannot be read, or is not of the format.

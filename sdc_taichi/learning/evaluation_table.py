@@ -7,11 +7,13 @@ Intervals are those of ``statistics.bootstrap_interval``, with the same draws fo
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sdc_taichi.errors import printable
 from sdc_taichi.learning.evaluation import ALL, IDLE, Evaluation
 from sdc_taichi.learning.statistics import (
     Interval,
@@ -67,7 +69,8 @@ def summary(evaluation: Evaluation) -> pd.DataFrame:
     """All weeks together, a row for each controller.
 
     Changes against idle commands are of sums over all weeks, in %; those of ``change`` and
-    ``share`` have the ends ``_low`` and ``_high`` of a 95 % interval. ``over_27_degree_h`` (K h,
+    ``share`` and the mean of the middle half of all weeks' changes, ``interquartile_mean``, have
+    the ends ``_low`` and ``_high`` of a 95 % interval. ``over_27_degree_h`` (K h,
     mean over the servers) and ``overdue_task_h`` are means of a week. ``dropped_pct`` is work
     dropped of that arrived, ``broken_pct`` weeks that break a constraint the optimum keeps.
     """
@@ -106,7 +109,7 @@ def by_agent(evaluation: Evaluation) -> pd.DataFrame:
     for agent in AGENTS:
         best = evaluation.alone.get(agent)
         for name, own in _groups(evaluation, agent):
-            base = _base(evaluation)
+            base = _base(own)
             alone = math.nan if best is None else float(change_pct(best[None], base))
             row = {"moves": agent, "controller": name, "alone_pct": alone}
             found.append(row | _standing(evaluation, own, best))
@@ -128,52 +131,80 @@ def differences(evaluation: Evaluation, controller: str) -> pd.DataFrame:
     import pandas as pd
 
     groups = dict(_groups(evaluation, ALL))
-    mine, base = _sample(groups[controller], _column(evaluation)), _base(evaluation)
+    mine, base = _sample(groups[controller], _column(evaluation)), _base(groups[controller])
 
-    def points(one: F64, other: F64, idle: F64) -> F64:
-        return np.asarray(change_pct(one, idle) - change_pct(other, idle))
+    def points(one: F64, idle: F64, other: F64, other_idle: F64) -> F64:
+        return np.asarray(change_pct(one, idle) - change_pct(other, other_idle))
 
     found = []
     for name, own in groups.items():
         if name == controller:
             continue
         theirs = _sample(own, _column(evaluation))
-        interval = _interval(evaluation, points, mine, theirs, base)
+        interval = _interval(evaluation, points, mine, base, theirs, _base(own))
         probability = float(probability_of_improvement(mine, theirs))
         found.append({"controller": controller, "than": name, **_ends("points", interval),
                       "probability": probability})  # fmt: skip
     return pd.DataFrame(found)
 
 
-def text_rows(table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
+def samples(evaluation: Evaluation, moves: str = ALL) -> dict[str, tuple[F64, F64]]:
+    """Compared figures of each controller, and those of idle commands.
+
+    Args:
+        evaluation: the evaluation.
+        moves: what the controllers move: ``all``, or one of load, cooling and battery.
+
+    Returns:
+        By controller, its figures by training and week, (S, W), and those of idle commands, (1, W),
+        or (S, W) where they differ by seed.
+    """
+    return {
+        name: (_sample(own, _column(evaluation)), _base(own))
+        for name, own in _groups(evaluation, moves)
+    }
+
+
+def text_rows(
+    table: pd.DataFrame, titles: Mapping[str, str] = TITLES
+) -> tuple[list[str], list[list[str]]]:
     """Titles and cells of a table to print: intervals of some width in brackets, nan as a dash.
 
     Args:
         table: one of the tables of this module.
+        titles: title of each column; one without a title is told by its name.
     """
     shown = [str(name) for name in table.columns if not str(name).endswith(("_low", "_high"))]
     rows = []
     for values in table.to_dict("records"):
         cells = []
         for name in shown:
-            text = _cell(values[name], 3 if name == "probability" else 2)
+            decimals = 3 if name == "probability" else 2
+            text = _cell(values[name], decimals)
             low, high = values.get(f"{name}_low"), values.get(f"{name}_high")
             if low is not None and high is not None and high - low > 1e-9:
-                text += f" ({_cell(low)} to {_cell(high)})"
+                text += f" ({_cell(low, decimals)} to {_cell(high, decimals)})"
             cells.append(text)
         rows.append(cells)
-    return [TITLES.get(name, name) for name in shown], rows
+    return [titles.get(name, name) for name in shown], rows
 
 
-def markdown(table: pd.DataFrame) -> str:
-    """A table as Markdown.
+def markdown(table: pd.DataFrame, titles: Mapping[str, str] = TITLES) -> str:
+    """A table as Markdown, in which text is no markup.
 
     Args:
         table: one of the tables of this module.
+        titles: title of each column; one without a title is told by its name.
     """
-    titles, rows = text_rows(table)
-    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
-    return "\n".join(lines + [f"| {' | '.join(cells)} |" for cells in rows])
+    heads, rows = text_rows(table, titles)
+    lines = [" | ".join(map(literal_markdown, cells)) for cells in (heads, *rows)]
+    lines = [f"| {line} |" for line in lines]
+    return "\n".join([lines[0], "|---" * len(heads) + "|", *lines[1:]])
+
+
+def literal_markdown(text: str) -> str:
+    """Text on one line as Markdown that shows it unchanged."""
+    return re.sub(r"([\\`*_\[\]<>|])", r"\\\1", printable(" ".join(text.split())))
 
 
 def _groups(evaluation: Evaluation, moves: str) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -196,17 +227,19 @@ def _standing(
         own: rows of the controller.
         best: figures that give a share of 1, (B,); None is those of the optimum of all agents.
     """
-    base, figures = _base(evaluation), _sample(own, _column(evaluation))
+    base, figures = _base(own), _sample(own, _column(evaluation))
     achieved = _sample(own, "achieved_figure")[:1] if best is None else best[None]
     of_weeks = 100.0 * (figures / base - 1.0)
-    idle = dict(_groups(evaluation, ALL))[IDLE]
-    arrived = own["arrived_tasks"].sum()
+    idle = dict(_groups(evaluation, ALL)).get(IDLE)
+    arrived = own["arrived_tasks"].sum(skipna=False)
     return {
         **_ends("change_pct", _interval(evaluation, change_pct, figures, base)),
-        "interquartile_mean_pct": float(interquartile_mean(of_weeks)),
+        **_ends("interquartile_mean_pct", _interval(evaluation, interquartile_mean, of_weeks)),
         **_ends("share_pct", _interval(evaluation, share_pct, figures, base, achieved)),
         **{
-            name: float(change_pct(_sample(own, metric), _sample(idle, metric)))
+            name: math.nan
+            if idle is None
+            else float(change_pct(_sample(own, metric), _sample(idle, metric)))
             for name, metric in _AGAINST_IDLE.items()
         },
         "over_27_degree_h": float(own["over_27_degree_h"].mean()),
@@ -224,14 +257,14 @@ def _broken_pct(own: pd.DataFrame) -> float:
 
 def _change(evaluation: Evaluation, own: pd.DataFrame) -> float:
     """Change of some weeks against idle commands, in %."""
-    base = _sample(own, "idle_figure")[:1]
-    return float(change_pct(_sample(own, _column(evaluation)), base))
+    return float(change_pct(_sample(own, _column(evaluation)), _base(own)))
 
 
 def _interval(evaluation: Evaluation, statistic: Statistic, *samples: F64) -> Interval:
     """A statistic with its interval, by the same draws whatever the row."""
     generator = np.random.Generator(np.random.PCG64(_SEED))
-    return bootstrap_interval(statistic, samples, evaluation.strata, generator)
+    paired = len(_base(evaluation.rows)) > 1
+    return bootstrap_interval(statistic, samples, evaluation.strata, generator, paired=paired)
 
 
 def _ends(name: str, interval: Interval) -> dict[str, float]:
@@ -241,17 +274,19 @@ def _ends(name: str, interval: Interval) -> dict[str, float]:
 
 def _column(evaluation: Evaluation) -> str:
     """Column of the figures that are compared."""
-    return "valued_figure" if evaluation.alone else "figure"
+    has_optimum = bool(evaluation.rows["achieved_figure"].notna().any())
+    return "valued_figure" if has_optimum else "figure"
 
 
-def _base(evaluation: Evaluation) -> F64:
-    """Figures of idle commands in each week, (1, W)."""
-    return _sample(evaluation.rows, "idle_figure")[:1]
+def _base(rows: pd.DataFrame) -> F64:
+    """Figures of idle commands in each week, (1, W), or (S, W) where they differ by seed."""
+    base = _sample(rows, "idle_figure")
+    return base[:1] if np.array_equal(base, np.broadcast_to(base[:1], base.shape)) else base
 
 
 def _sample(rows: pd.DataFrame, column: str) -> F64:
     """Values by training and week, (S, W), of rows that follow each other week by week."""
-    width = len(rows[["site", "week"]].drop_duplicates())
+    width = len(set(zip(rows["site"], rows["week"], strict=True)))
     return rows[column].to_numpy(np.float64).reshape(-1, width)
 
 

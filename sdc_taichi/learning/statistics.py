@@ -3,8 +3,8 @@
 A sample is an array (S, W) of figures, by S trainings and W data-center weeks; a controller that is
 not trained has one training. Intervals come from a bootstrap (Efron 1979) that draws trainings
 whole, and weeks within each site, the same for all samples, so that differences are paired.
-Interquartile mean and probability of improvement are those that Agarwal et al. (2021, "Deep
-reinforcement learning at the edge of the statistical precipice", NeurIPS 34) propose.
+Interquartile mean, probability of improvement and performance profiles are those of Agarwal et al.
+(2021, "Deep reinforcement learning at the edge of the statistical precipice", NeurIPS 34).
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ def bootstrap_interval(
     *,
     draws: int = DRAWS,
     level: float = 0.95,
+    paired: bool = False,
 ) -> Interval:
     """A statistic of samples with its percentile interval by a stratified bootstrap.
 
@@ -54,22 +55,63 @@ def bootstrap_interval(
         generator: draws.
         draws: number of draws.
         level: share of the draws inside the interval.
+        paired: whether samples are paired by their trainings too, as where seeds decide inputs.
 
     Raises:
         ConfigError: samples of other weeks than the strata.
     """
-    for sample in samples:
-        if sample.ndim != 2 or sample.shape[1] != len(strata) or not sample.size:
-            raise ConfigError(f"sample {sample.shape}: valid is (trainings, {len(strata)} weeks)")
-    weeks = _drawn_weeks(strata, generator, draws)
+    weeks = drawn_weeks(strata, generator, draws)
+    values = bootstrap_values(statistic, samples, weeks, generator, paired=paired)
+    return percentile_interval(float(statistic(*samples)), values, level)
+
+
+def bootstrap_values(
+    statistic: Statistic,
+    samples: Sequence[F64],
+    weeks: I64,
+    generator: np.random.Generator,
+    *,
+    paired: bool = False,
+) -> F64:
+    """A statistic of samples in each draw of weeks, and of trainings drawn for each sample.
+
+    Args:
+        statistic: function of the samples.
+        samples: samples that are paired by their weeks, (S, W) each, of any S.
+        weeks: numbers of the weeks of each draw, of ``drawn_weeks``, (draws, W).
+        generator: draws trainings.
+        paired: whether the same trainings are drawn of all samples that have as many.
+
+    Returns:
+        The values, (draws,).
+
+    Raises:
+        ConfigError: samples of another number of weeks.
+    """
+    draws, width = weeks.shape
     drawn = []
+    trainings: dict[int, I64] = {}
     for sample in samples:
-        trainings = generator.integers(len(sample), size=(draws, len(sample)))
-        drawn.append(sample[trainings[:, :, None], weeks[:, None, :]])
-    values = statistic(*drawn)
+        if sample.ndim != 2 or sample.shape[1] != width or not sample.size:
+            raise ConfigError(f"sample {sample.shape}: valid is (trainings, {width} weeks)")
+        size = len(sample)
+        if size not in trainings or not paired:
+            trainings[size] = generator.integers(size, size=(draws, size))
+        drawn.append(sample[trainings[size][:, :, None], weeks[:, None, :]])
+    return np.asarray(statistic(*drawn))
+
+
+def percentile_interval(value: float, drawn: F64, level: float = 0.95) -> Interval:
+    """The interval that holds a share of the values of a bootstrap, with equal tails.
+
+    Args:
+        value: statistic of the samples themselves.
+        drawn: values of the draws, (draws,).
+        level: share of the draws inside the interval.
+    """
     tail = 50.0 * (1.0 - level)
-    low, high = np.percentile(values, [tail, 100.0 - tail])
-    return Interval(float(statistic(*samples)), float(low), float(high))
+    low, high = np.percentile(drawn, [tail, 100.0 - tail])
+    return Interval(value, float(low), float(high))
 
 
 def change_pct(figures: F64, idle: F64) -> F64:
@@ -124,8 +166,31 @@ def probability_of_improvement(figures: F64, others: F64) -> F64:
     return np.asarray(np.where(known, better, np.nan).mean(axis=(-3, -2, -1)))
 
 
-def _drawn_weeks(strata: I64, generator: np.random.Generator, draws: int) -> I64:
-    """Numbers of weeks, drawn with replacement within each stratum, (draws, W)."""
+def performance_profile(scores: F64, thresholds: F64) -> F64:
+    """Share of all trainings and weeks whose score is above each of several thresholds, 0..1.
+
+    Args:
+        scores: more is better, (..., S, W); nan is left out.
+        thresholds: of the score, (T,).
+
+    Returns:
+        Shares, (..., T); nan where no score is known.
+    """
+    flat = scores.reshape(*scores.shape[:-2], 1, -1)
+    known = np.isfinite(flat).sum(axis=-1)
+    above = (flat > thresholds[:, None]).sum(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(known > 0, above / known, np.nan))
+
+
+def drawn_weeks(strata: I64, generator: np.random.Generator, draws: int = DRAWS) -> I64:
+    """Numbers of weeks, drawn with replacement within each stratum, (draws, W).
+
+    Args:
+        strata: stratum of each week, (W,).
+        generator: draws.
+        draws: number of draws.
+    """
     weeks = np.empty((draws, len(strata)), dtype=np.int64)
     for stratum in np.unique(strata):
         own = np.flatnonzero(strata == stratum)

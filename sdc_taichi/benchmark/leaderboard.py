@@ -1,0 +1,345 @@
+"""Tables of the rows of a case: standings with places, pairs of rows, and performance profiles.
+
+Rows share a place unless a 95 % interval of the paired difference of each of them to each row of
+another place excludes 0. So nothing is ranked within overlapping intervals, and the order within a
+place is that of the suite and says nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sdc_taichi.benchmark.suite_results import (
+    ACHIEVED,
+    BOUND,
+    LEARNER,
+    RULE,
+    CaseResults,
+    evaluation_of,
+)
+from sdc_taichi.learning.evaluation import ALL, IDLE, Evaluation
+from sdc_taichi.learning.evaluation_table import TITLES, by_site, samples, summary
+from sdc_taichi.learning.statistics import (
+    DRAWS,
+    Interval,
+    bootstrap_values,
+    change_pct,
+    drawn_weeks,
+    percentile_interval,
+    performance_profile,
+    probability_of_improvement,
+)
+from sdc_taichi.optimum.problem import AGENTS
+from sdc_taichi.types import F64
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+THRESHOLDS_PCT = (0.0, 25.0, 50.0, 75.0, 90.0)
+"""Shares of the achievable at which tables tell performance profiles, in %."""
+CONSTRAINTS = {
+    "throttled_rack_h": "throttled (rack h)",
+    "tripped_rack_h": "tripped (rack h)",
+    "unserved_kwh": "unserved (kWh)",
+    "unmet_cooling_kwh": "heat left (kWh)",
+    "lost_tasks": "lost (tasks)",
+}
+"""Metrics that have a column where one of them is not 0, as means of a week."""
+BOARD_TITLES = {
+    **TITLES,
+    **CONSTRAINTS,
+    "place": "place",
+    "row": "row",
+    "kind": "kind",
+    "core_h": "core h",
+    "parts_pct": "sum of the agents alone (%)",
+    "together_pct": "together (%)",
+    "worth_points": "coordination (points)",
+    **{agent: f"{agent} alone (%)" for agent in ("load", "cooling", "battery")},
+    **{f"above_{x:g}_pct": f"above {x:g} % (%)" for x in THRESHOLDS_PCT},
+}
+"""Titles of columns in tables of this module."""
+_Samples = Mapping[str, tuple[F64, F64]]
+"""Figures of each row by seed and week, (S, W), and those of idle commands, of ``samples``."""
+_SEED = 0
+_LEAST_POINTS = 1e-9
+"""Difference up to which two changes against idle commands are equal, in points."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leaderboard:
+    """What the rows of a case came to."""
+
+    case: CaseResults
+    """Results of the case."""
+    evaluation: Evaluation
+    """The results as an evaluation."""
+    standings: pd.DataFrame
+    """A row for each row of the case, by place: changes against idle commands, share of the
+    achievable, other quantities, seeds and processor time."""
+    pairs: pd.DataFrame
+    """Differences of rows, in points of the change against idle commands, with the probability of
+    improvement: each row against the best rule, and against the row below it."""
+    profiles: pd.DataFrame
+    """Share of weeks above given shares of the achievable, in %; empty without an optimum."""
+    coordination: pd.DataFrame
+    """What agents of a row save alone and together; empty where none ran alone."""
+    apart: pd.DataFrame
+    """Rows whose agents were trained apart against those that were trained together."""
+    sites: pd.DataFrame
+    """Change against idle commands in %, by row and site."""
+    best_rule: str
+    """The rule with the lowest figure; empty where there is none."""
+
+
+def leaderboard(case: CaseResults) -> Leaderboard:
+    """Compare the rows of a case.
+
+    Args:
+        case: results of the case.
+    """
+    evaluation = evaluation_of(case)
+    figures = samples(evaluation)
+    changes = {name: float(change_pct(*pair)) for name, pair in figures.items()}
+    drawn = _drawn_changes(evaluation, figures)
+    ranked = [name for name, kind in case.kinds.items() if kind not in (ACHIEVED, BOUND)]
+    placed = places({name: changes[name] for name in ranked}, drawn)
+    rules = [name for name, kind in case.kinds.items() if kind == RULE and name != IDLE]
+    best = min(rules, key=lambda name: changes[name], default="")
+    order = [*placed, *(name for name in case.rows if name not in placed)]
+    return Leaderboard(
+        case=case,
+        evaluation=evaluation,
+        standings=_standings(case, evaluation, placed, order),
+        pairs=_pairs(evaluation, figures, drawn, list(placed), best),
+        profiles=_profiles(case, evaluation, order),
+        coordination=_coordination(case, evaluation, figures),
+        apart=_apart(case, evaluation, figures, drawn),
+        sites=by_site(evaluation).rename(columns={"controller": "row"}),
+        best_rule=best,
+    )
+
+
+def places(values: Mapping[str, float], drawn: Mapping[str, F64]) -> dict[str, tuple[int, int]]:
+    """Places of rows, of which several share one unless their intervals tell them apart.
+
+    Places part between two sets of rows where each row of one is better than each of the other:
+    where the interval of the difference of the two, draw by draw, lies below 0.
+
+    Args:
+        values: figure of each row, less is better.
+        drawn: figure of each row in the draws of a bootstrap, the same weeks for all rows.
+
+    Returns:
+        First and last of the places that a row shares, by row, from the best; rows that share
+        places stand in the order in which they were given.
+    """
+    order = sorted(values, key=lambda name: values[name])
+    given = {name: index for index, name in enumerate(values)}
+    found: dict[str, tuple[int, int]] = {}
+    begin = 0
+    for end in range(1, len(order) + 1):
+        above, below = order[:end], order[end:]
+        if all(_is_better(drawn[one], drawn[other]) for one in above for other in below):
+            for name in sorted(order[begin:end], key=lambda name: given[name]):
+                found[name] = begin + 1, end
+            begin = end
+    return found
+
+
+def _is_better(one: F64, other: F64) -> bool:
+    """Whether an interval of the difference of two figures lies below 0."""
+    return percentile_interval(0.0, one - other).high < -_LEAST_POINTS
+
+
+def _drawn_changes(evaluation: Evaluation, figures: _Samples) -> dict[str, F64]:
+    """Change of each row against idle commands in each draw of a bootstrap, (draws,) each.
+
+    Weeks of a draw are the same for all rows. Trainings are drawn for each row by its name, so that
+    its draws are the same whatever rows stand beside it; together where seeds decide inputs.
+    """
+    weeks = drawn_weeks(evaluation.strata, _generator(), DRAWS)
+    found = {}
+    for name, (own, idle) in figures.items():
+        paired = len(idle) > 1
+        generator = _generator("" if paired else name)
+        found[name] = bootstrap_values(change_pct, (own, idle), weeks, generator, paired=paired)
+    return found
+
+
+def _generator(name: str = "") -> np.random.Generator:
+    """Generator of draws."""
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence([_SEED, *name.encode()])))
+
+
+def _standings(
+    case: CaseResults,
+    evaluation: Evaluation,
+    placed: Mapping[str, tuple[int, int]],
+    order: list[str],
+) -> pd.DataFrame:
+    """Rows by place, with what they came to."""
+    table = summary(evaluation).rename(columns={"controller": "row"}).set_index("row").loc[order]
+    ends = {name: placed.get(name) for name in order}
+    texts = ["–" if x is None else str(x[0]) if x[0] == x[1] else f"{x[0]} to {x[1]}"
+             for x in ends.values()]  # fmt: skip
+    table.insert(0, "place", texts)
+    rows = evaluation.rows[evaluation.rows["moves"] == ALL]
+    weeks = len(evaluation.strata)
+    for metric in CONSTRAINTS:
+        if metric in rows and (rows[metric].fillna(0.0) != 0.0).any():
+            sums = rows.groupby("controller")[metric].sum(min_count=1)
+            table[metric] = sums.loc[order] / (weeks * table["trainings"])
+    table["core_h"] = [
+        sum(float(result.content["core_s"]) for result in case.rows[name]) / 3600 for name in order
+    ]
+    unknown = [name for name in table if table[name].isna().all()]
+    found: pd.DataFrame = table.drop(columns=unknown).reset_index()
+    return found
+
+
+def _pairs(
+    evaluation: Evaluation,
+    figures: _Samples,
+    drawn: Mapping[str, F64],
+    order: Sequence[str],
+    best: str,
+) -> pd.DataFrame:
+    """Each row against the best rule, and against the row below."""
+    import pandas as pd
+
+    found = []
+    for name, below in zip(order, [*order[1:], None], strict=True):
+        others = dict.fromkeys([*([best] if best and best != name else []), *filter(None, [below])])
+        found += [_difference(evaluation, figures, drawn, name, other) for other in others]
+    return pd.DataFrame(found)
+
+
+def _difference(
+    evaluation: Evaluation, figures: _Samples, drawn: Mapping[str, F64], one: str, other: str
+) -> dict[str, Any]:
+    """A row of a table of differences."""
+    (mine, idle), (theirs, their_idle) = figures[one], figures[other]
+    points = float(change_pct(mine, idle) - change_pct(theirs, their_idle))
+    paired = len(idle) > 1
+    weeks = drawn_weeks(evaluation.strata, _generator(), DRAWS)
+    values = bootstrap_values(
+        probability_of_improvement, (mine, theirs), weeks, _generator(), paired=paired
+    )
+    probability = float(probability_of_improvement(mine, theirs))
+    return {
+        "row": one,
+        "than": other,
+        **interval_columns("points", percentile_interval(points, drawn[one] - drawn[other])),
+        **interval_columns("probability", percentile_interval(probability, values)),
+    }
+
+
+def share_samples(evaluation: Evaluation) -> dict[str, F64]:
+    """Share of the achievable of each row by training and week, in %, (S, W) each.
+
+    Args:
+        evaluation: the evaluation.
+    """
+    rows = evaluation.rows[evaluation.rows["moves"] == ALL]
+    width = len(evaluation.strata)
+    return {
+        str(name): 100.0 * own["share"].to_numpy(np.float64).reshape(-1, width)
+        for name, own in rows.groupby("controller", sort=False)
+    }
+
+
+def interval_columns(name: str, interval: Interval) -> dict[str, float]:
+    """Columns of an interval in a table: the value and the two ends.
+
+    Args:
+        name: column of the value.
+        interval: the interval.
+    """
+    return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+
+
+def standard_scores(values: F64) -> F64:
+    """Values of each column less their mean, over their standard deviation.
+
+    Args:
+        values: a row for each of what is compared, (N, K).
+
+    Returns:
+        Standard scores, (N, K); 0 in a column of equal values.
+    """
+    centred, spread = values - values.mean(axis=0), values.std(axis=0)
+    # Equal values differ from their mean by rounding alone.
+    varies = spread > 1e-12 * np.abs(values).max(axis=0)
+    return np.asarray(np.divide(centred, spread, out=np.zeros_like(centred), where=varies))
+
+
+def _profiles(case: CaseResults, evaluation: Evaluation, order: Sequence[str]) -> pd.DataFrame:
+    """Share of weeks above shares of the achievable, in %."""
+    import pandas as pd
+
+    thresholds = np.array(THRESHOLDS_PCT)
+    weeks = drawn_weeks(evaluation.strata, _generator(), DRAWS)
+    found = []
+    shares = share_samples(evaluation)
+    for name in order:
+        sample = shares[name]
+        if case.kinds[name] in (ACHIEVED, BOUND) or not np.isfinite(sample).any():
+            continue
+        drawn = bootstrap_values(
+            lambda x: performance_profile(x, thresholds), (sample,), weeks, _generator(name)
+        )
+        own = performance_profile(sample, thresholds)
+        row: dict[str, Any] = {"row": name}
+        for index, threshold in enumerate(THRESHOLDS_PCT):
+            interval = percentile_interval(100.0 * float(own[index]), 100.0 * drawn[:, index])
+            row |= interval_columns(f"above_{threshold:g}_pct", interval)
+        found.append(row)
+    return pd.DataFrame(found)
+
+
+def _coordination(case: CaseResults, evaluation: Evaluation, figures: _Samples) -> pd.DataFrame:
+    """What agents save alone, the others idle, and together."""
+    import pandas as pd
+
+    by_agent = {agent: samples(evaluation, agent) for agent in AGENTS}
+    found = []
+    for name, (all_together, idle) in figures.items():
+        if case.kinds[name] == ACHIEVED:
+            alone = {agent: best[None] for agent, best in evaluation.alone.items()}
+        else:
+            alone = {agent: own[name][0] for agent, own in by_agent.items() if name in own}
+        changes = {agent: float(change_pct(own, idle)) for agent, own in alone.items()}
+        if not changes:
+            continue
+        together, parts = float(change_pct(all_together, idle)), sum(changes.values())
+        found.append(
+            {"row": name}
+            | {agent: changes.get(agent, math.nan) for agent in AGENTS}
+            | {"parts_pct": parts, "together_pct": together, "worth_points": parts - together}
+        )
+    return pd.DataFrame(found)
+
+
+def _apart(
+    case: CaseResults, evaluation: Evaluation, figures: _Samples, drawn: Mapping[str, F64]
+) -> pd.DataFrame:
+    """Rows whose agents were trained together, against those trained apart and played together."""
+    import pandas as pd
+
+    trained = {
+        name: dict(results[0].content["values"]["row"])
+        for name, results in case.rows.items()
+        if case.kinds[name] == LEARNER
+    }
+    found = []
+    for name, row in trained.items():
+        for other, theirs in trained.items():
+            if not row.get("apart") and theirs.get("apart") and row["train"] == theirs["train"]:
+                found.append(_difference(evaluation, figures, drawn, name, other))
+    return pd.DataFrame(found)

@@ -1,0 +1,267 @@
+"""Report of suites: tables and pictures of each case, from folders of results alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from sdc_taichi.atomic_file import atomic_write
+from sdc_taichi.benchmark.leaderboard import BOARD_TITLES, Leaderboard, leaderboard
+from sdc_taichi.benchmark.paper_report import PAPER, paper_sections
+from sdc_taichi.benchmark.report_blocks import (
+    Block,
+    Command,
+    Heading,
+    Items,
+    Note,
+    Paragraph,
+    Picture,
+    Sections,
+    Table,
+    html_report,
+    markdown_report,
+)
+from sdc_taichi.benchmark.report_pictures import case_pictures
+from sdc_taichi.benchmark.suite_results import (
+    LEARNER,
+    CaseResults,
+    RowResult,
+    SuiteResults,
+    read_suites,
+)
+from sdc_taichi.errors import SdcError
+from sdc_taichi.viz.plotting import new_figure
+
+_MOST_NAMED = 6
+_READING = (
+    "Changes are of sums over all scored weeks, against idle commands in the same weeks, in %: "
+    "below 0 is better. Values in brackets are 95 % intervals of a stratified bootstrap, which "
+    "draws seeds whole and weeks within their site. The interquartile mean is that of the changes "
+    "of all seeds and weeks. The share of the achievable is 0 for idle commands and 100 % for the "
+    "best path known with perfect foresight.",
+    "Rows share a place unless the interval of the paired difference tells each of them from each "
+    "row of the next place; the order within a place is that of the suite and says nothing. "
+    "Intervals are of one pair each: of many pairs, about one in twenty that do not differ is told "
+    "apart by chance. Optimum and bound know the future and have no place.",
+    "The probability of improvement is that of a lower figure in a week, for a seed of each row; "
+    "equal figures count half. Performance profiles tell in how many weeks, of all seeds, a row "
+    "reaches more than a share of the achievable. Definitions are those of Agarwal et al. (2021, "
+    "Deep reinforcement learning at the edge of the statistical precipice, NeurIPS 34).",
+    "Coordination is what agents save together beyond the sum of what each saves alone: below 0 "
+    "they are in each other's way, or save the same carbon twice.",
+)
+
+
+def write_report(
+    folders: Sequence[Path], *, html: Path | None = None, markdown: Path | None = None
+) -> tuple[str, ...]:
+    """Write the report of suites.
+
+    Args:
+        folders: folders of studies of suites.
+        html: file of the page; None is none.
+        markdown: file of the tables as Markdown; None is none.
+
+    Returns:
+        What is to be known, in words.
+
+    Raises:
+        SdcError: a folder without results of a suite, a damaged result, results that cannot be
+            compared, or a file that cannot be written.
+    """
+    suites = read_suites(folders)
+    title = "Benchmark" if len(suites) > 1 else str(suites[0].settings.get("title", suites[0].name))
+    sections = report_sections(suites)
+    if markdown is not None:
+        _write(markdown, markdown_report(title, sections))
+    notes: tuple[str, ...] = ()
+    if html is not None:
+        if lacking := _lacking_pictures():
+            notes = (f"tables alone: {lacking}",)
+            sections = {"Without pictures": [Note(lacking)]} | {
+                heading: [block for block in blocks if not isinstance(block, Picture)]
+                for heading, blocks in sections.items()
+            }
+        lead = f"Suites: {', '.join(suite.name for suite in suites)}"
+        _write(html, html_report(title, lead, sections))
+    return notes
+
+
+def report_sections(suites: Iterable[SuiteResults]) -> Sections:
+    """Sections of the report of suites.
+
+    Args:
+        suites: results of the suites.
+    """
+    sections: dict[str, Sequence[Block]] = {}
+    for suite in suites:
+        boards = {name: leaderboard(case) for name, case in suite.cases.items()}
+        sections[f"Suite {suite.name}"] = _suite_blocks(suite, boards)
+        if suite.settings.get("accounting") == PAPER:
+            sections |= paper_sections(suite)
+        for name, board in boards.items():
+            sections[f"{suite.name}: {name}"] = _case_blocks(suite, board)
+    sections["How to read the tables"] = [Paragraph(text) for text in _READING]
+    return sections
+
+
+def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> list[Block]:
+    """What a suite is about, what made its results, and what is to be known of them."""
+    settings = suite.settings
+    blocks: list[Block] = [
+        Paragraph(str(text)) for text in (settings.get("title"), settings.get("about")) if text
+    ]
+    blocks += [Note(text) for text in _notes(suite)]
+    blocks += [Command(text) for text in suite.commands]
+    results = [x for case in suite.cases.values() for rows in case.rows.values() for x in rows]
+    hours = sum(float(result.content["core_s"]) for result in results) / 3600
+    learners = sum(
+        float(x.content["core_s"]) for x in results if x.kind == LEARNER and x.submission is None
+    )
+    blocks.append(
+        Paragraph(
+            f"{len(results)} results took {hours:.3g} hours of a core, of which trained rows took "
+            f"{learners / 3600:.3g}; optima that several rows share are not counted."
+        )
+    )
+    if len(boards) > 1:
+        blocks.append(_overview(boards))
+    return blocks
+
+
+def _overview(boards: Mapping[str, Leaderboard]) -> Table:
+    """Change against idle commands of each row in each case."""
+    import pandas as pd
+
+    changes = {
+        case: board.standings.set_index("row")["change_pct"] for case, board in boards.items()
+    }
+    names = dict.fromkeys(name for board in boards.values() for name in board.case.rows)
+    frame = pd.DataFrame(changes).reindex(list(names)).rename_axis("row").reset_index()
+    return Table("Change against idle commands by case (%)", frame, BOARD_TITLES)
+
+
+def _notes(suite: SuiteResults) -> list[str]:
+    """What is to be known of the results of a suite."""
+    results = [x for case in suite.cases.values() for rows in case.rows.values() for x in rows]
+    notes = []
+    missing = [f"{case.name}: {x}" for case in suite.cases.values() for x in case.missing]
+    if missing:
+        notes.append(f"Unfinished, without {_named(missing)}.")
+    for key, what in (("version", "versions of the package"), ("source", "states of the source")):
+        if len({result.content[key] for result in results}) > 1:
+            notes.append(f"Results of several {what}: {_named(_users(results, key))}.")
+    if len({str(result.content["processor"]) for result in results}) > 1:
+        notes.append(
+            "Results of several kinds of processors, whose last bits differ, and with them what "
+            "was learnt."
+        )
+    for case in suite.cases.values():
+        notes += [f"{case.name}: {text}" for text in _notes_of_case(case)]
+    return notes
+
+
+def _notes_of_case(case: CaseResults) -> list[str]:
+    """What is to be known of the results of a case."""
+    notes = []
+    for name, rows in case.rows.items():
+        if rows[0].submission is not None:
+            who = {key: rows[0].submission[key] for key in ("author", "about", "link")}
+            told = ", ".join(text for text in who.values() if text)
+            notes.append(f"{name} is the work of others and was not run here: {told}.")
+    kinds = case.kinds
+    single = [x for x, rows in case.rows.items() if kinds[x] == LEARNER and len(rows) == 1]
+    if single:
+        notes.append(f"one seed of {_named(single)}, so intervals are those of weeks alone.")
+    results = [result for rows in case.rows.values() for result in rows]
+    if not any(result.frame["achieved_figure"].notna().any() for result in results):
+        notes.append(
+            "without an optimum ends have no value: an empty battery or work put off saves."
+        )
+    return notes
+
+
+def _users(results: Iterable[RowResult], key: str) -> list[str]:
+    """Values of an entry of metrics.json, and of how many results each is."""
+    values = [str(result.content[key])[:12] for result in results]
+    return [f"{value} ({values.count(value)})" for value in dict.fromkeys(values)]
+
+
+def _named(names: Sequence[str]) -> str:
+    """The first few names, and how many more there are."""
+    some = ", ".join(names[:_MOST_NAMED])
+    return some if len(names) <= _MOST_NAMED else f"{some} and {len(names) - _MOST_NAMED} more"
+
+
+def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
+    """Tables and pictures of a case."""
+    case = board.case
+    settings = suite.settings["cases"].get(case.name, {})
+    blocks: list[Block] = []
+    if settings.get("about"):
+        blocks.append(Paragraph(str(settings["about"])))
+    blocks.append(Paragraph(_weeks_text(board)))
+    tables = [
+        (f"Standings, {case.objective}; means of a week where no %", board.standings),
+        ("Each row against the best rule, and against the row below", board.pairs),
+        ("Weeks in which a row reaches more than a share of the achievable", board.profiles),
+        ("What agents save alone, the others idle, and together", board.coordination),
+        ("Agents trained together against those trained apart", board.apart),
+        ("Change against idle commands by site (%)", board.sites),
+    ]
+    pictures = case_pictures(board)
+    for caption, frame in tables:
+        if not frame.empty:
+            blocks.append(Table(caption, frame, BOARD_TITLES))
+            if frame is board.standings:
+                blocks += pictures
+    rows = _row_texts(suite, board)
+    if rows:
+        blocks += [Heading("Rows"), Items(rows)]
+    return blocks
+
+
+def _weeks_text(board: Leaderboard) -> str:
+    """Which weeks of which data centers a case is of."""
+    first = next(iter(board.case.rows.values()))[0].frame
+    sites, weeks = list(dict.fromkeys(first["site"])), list(dict.fromkeys(first["week"]))
+    objective = board.case.objective
+    return (
+        f"Objective {objective} ({objective.unit}), weeks {', '.join(map(str, weeks))} of "
+        f"{_named([str(site) for site in sites])}."
+    )
+
+
+def _row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
+    """What the rows are, and their recordings."""
+    texts = []
+    for name, results in board.case.rows.items():
+        own = suite.settings["rows"].get(name)
+        about = own.get("about") if isinstance(own, Mapping) else None
+        chosen = results[0].content["metrics"].get("chosen")
+        parts = [str(about)] if about else []
+        parts += [f"chosen in the validation weeks: {chosen}"] if chosen else []
+        parts += [
+            f"recording: {result.folder / file}"
+            for result in results
+            for file in result.content["files_sha256"]
+            if file.endswith(".rrd")
+        ]
+        if parts:
+            texts.append(f"{name}: {'; '.join(parts)}")
+    return texts
+
+
+def _lacking_pictures() -> str:
+    """Why no pictures can be drawn; empty if they can."""
+    try:
+        new_figure(1.0, 1.0)
+    except SdcError as error:
+        return str(error)
+    return ""
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all."""
+    with atomic_write(path, parents=True) as file:
+        file.write(text.encode("utf-8", "replace"))
