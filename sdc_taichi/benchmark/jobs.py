@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import math
+import os
 import time
 import traceback
 import warnings
@@ -97,10 +98,14 @@ def digest_of(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def single_thread_environment() -> dict[str, str]:
-    """Environment variables with which a worker computes in one thread."""
+@cache
+def compute_in_one_thread() -> None:
+    """Have this process, a worker, compute in one thread from here on."""
+    import threadpoolctl
+
     names = ("SDC_TAICHI_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    return dict.fromkeys(names, "1")
+    os.environ |= dict.fromkeys(names, "1")
+    threadpoolctl.threadpool_limits(1)  # of libraries that are loaded already
 
 
 def run_job(job: Job, inputs: Inputs) -> DoneJob:

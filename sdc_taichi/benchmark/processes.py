@@ -14,7 +14,7 @@ from itertools import islice
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple, Self
 
-from sdc_taichi.benchmark.jobs import DoneJob, Inputs, Job, run_job, single_thread_environment
+from sdc_taichi.benchmark.jobs import DoneJob, Inputs, Job, compute_in_one_thread, run_job
 from sdc_taichi.benchmark.runner import Stop
 from sdc_taichi.errors import whole_number
 from sdc_taichi.kernels.compiler import processors
@@ -166,10 +166,7 @@ def _serve(connection: Connection) -> None:
     """Run the jobs that come through a connection, in a process of their own."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal
     signal.signal(signal.SIGTERM, _exit)
-    os.environ |= single_thread_environment()
-    import threadpoolctl
-
-    threadpoolctl.threadpool_limits(1)  # of libraries that are loaded already
+    compute_in_one_thread()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     held: dict[str, bytes] = {}
     while True:

@@ -86,6 +86,10 @@ def executor_of(jobs: int | None, ray: str | None) -> Executor:
     Raises:
         SdcError: options that are not valid together, or no Ray.
     """
+    if ray is not None:
+        from sdc_taichi.benchmark.ray_cluster import RayCluster
+
+        return RayCluster(ray, jobs)
     from sdc_taichi.benchmark.processes import LocalProcesses
 
     return LocalProcesses(jobs)
