@@ -370,3 +370,25 @@ def test_values_of_partitions_are_quoted() -> None:
 def test_names_of_files_stay_in_the_folder(tmp_path: Path, name: str) -> None:
     with pytest.raises(SdcError, match="valid is a path below"):
         ResultStore(tmp_path).file({"a": "b"}, name)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("format", "sdc-result/0", r"format 'sdc-result/0'; valid is 'sdc-result/1'"),
+        ("partition", {"number": 1}, "partition holds 1; valid is text"),
+        ("metrics", [], r"metrics \[\] is not valid"),
+        ("core_s", True, "core_s True is not valid"),
+        ("files_sha256", {"../../study.json": "0"}, "valid is a path below the folder"),
+    ],
+)
+def test_metrics_that_others_have_edited_are_refused(
+    tmp_path: Path, key: str, value: Any, said: str
+) -> None:
+    jobs, store = draws(1), ResultStore(tmp_path)
+    run(jobs, tmp_path)
+    path = store.folder_of(jobs[0].partition) / "metrics.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(SdcError, match=said):
+        store.is_whole(store.result(jobs[0].partition))
+    assert not store.is_done(jobs[0])

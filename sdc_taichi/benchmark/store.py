@@ -188,9 +188,11 @@ class ResultStore:
             content: content of metrics.json of a job.
 
         Raises:
-            SdcError: a file is missing or cannot be read.
+            SdcError: a file is missing, cannot be read, or would lie outside of the folder.
         """
         partition = content["partition"]
+        for name in content["files_sha256"]:
+            check_file_name(name)
         files = {self.folder_of(partition) / n: d for n, d in content["files_sha256"].items()}
         if content["rows_sha256"]:
             files[self.rows_path(partition)] = content["rows_sha256"]
@@ -299,6 +301,7 @@ _STUDY_KEYS = {
     "source": str,
     "partitions": list,
 }
+_TEXTS = ("partition", "inputs", "files_sha256")
 _RESULT_KEYS = {
     "key": str,
     "function": str,
@@ -418,6 +421,9 @@ def read_json(path: Path, form: str, keys: Mapping[str, Any]) -> dict[str, Any]:
     for name, kind in keys.items():
         if not isinstance(content.get(name), kind) or isinstance(content[name], bool):
             raise ConfigError(f"{path}: {name} {shortened(content.get(name))} is not valid")
+        for each in content[name].values() if name in _TEXTS else ():
+            if not isinstance(each, str):
+                raise ConfigError(f"{path}: {name} holds {shortened(each)}; valid is text")
     return dict(content)
 
 
