@@ -17,6 +17,7 @@ from sdc_taichi.cli.benchmark import benchmark_app
 from sdc_taichi.cli.config import config_app
 from sdc_taichi.cli.data import data_app
 from sdc_taichi.cli.evaluate import evaluate_command
+from sdc_taichi.cli.execution import JobsCommand
 from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.cli.optimum import optimum_command
 from sdc_taichi.cli.policy import policy_app
@@ -24,6 +25,7 @@ from sdc_taichi.cli.report import report_command
 from sdc_taichi.cli.session import warnings_in_lines
 from sdc_taichi.cli.simulate import simulate_command
 from sdc_taichi.cli.streams import guard_streams, output_failure
+from sdc_taichi.cli.sweep import sweep_command
 from sdc_taichi.cli.train import train_command
 from sdc_taichi.cli.view import view_command
 from sdc_taichi.errors import SdcError, one_line
@@ -68,6 +70,7 @@ app.command("simulate")(simulate_command)
 app.command("optimum")(optimum_command)
 app.command("train")(train_command)
 app.command("evaluate")(evaluate_command)
+app.command("sweep", cls=JobsCommand)(sweep_command)
 
 
 def main() -> None:

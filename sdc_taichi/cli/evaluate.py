@@ -251,22 +251,10 @@ def _contenders(
 
 def _print_tables(found: Evaluation, weeks: DataCenterWeeks) -> None:
     """Print the tables of an evaluation."""
-    from rich.table import Table
-
-    from sdc_taichi.cli.console import PlainConsole
+    from sdc_taichi.cli.console import print_table
     from sdc_taichi.learning.evaluation_folder import remarks, tables_of
-    from sdc_taichi.learning.evaluation_table import text_rows
 
-    width = None if sys.stdout.isatty() else 240
-    console = PlainConsole(highlight=False, width=width, soft_wrap=True)
     for title, table in tables_of(found, weeks):
-        console.print(title)
-        titles, rows = text_rows(table)
-        shown = Table()
-        for i, head in enumerate(titles):
-            shown.add_column(head, justify="right" if i else "left", no_wrap=True)
-        for cells in rows:
-            shown.add_row(*cells)
-        console.print(shown)
+        print_table(title, table)
     for line in remarks(weeks):
-        console.print(line)
+        print(printable(line))

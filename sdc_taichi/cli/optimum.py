@@ -32,7 +32,6 @@ from sdc_taichi.cli.scenario import (
     Weather,
     Workload,
     data_centers,
-    whole_steps,
 )
 from sdc_taichi.cli.session import (
     exit_if_stopped,
@@ -42,6 +41,7 @@ from sdc_taichi.cli.session import (
     stage_bars,
 )
 from sdc_taichi.errors import ConfigError, printable, suggestion
+from sdc_taichi.exogenous.year_clock import whole_steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -121,7 +121,7 @@ def optimum_command(
     fleet = build_fleet(
         data_centers(base, site, start=start, weather=weather, carbon=carbon, workload=workload)
     )
-    steps = whole_steps(days, fleet.steps_per_hour)
+    steps = whole_steps(days, fleet.steps_per_hour, "--days")
     scored_from = _warm_up_steps(warm_up, steps, fleet.steps_per_hour)
     limit_c = _inlet_limit(max_inlet)
     require_events_start_before(24.0 * days, fleet.configs)

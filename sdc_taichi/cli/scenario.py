@@ -15,8 +15,6 @@ from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
 
 EXIT_INTERRUPTED = 130
 """Exit code of a command that Ctrl-C ended."""
-MOST_DAYS = 36_500
-"""Longest run, in days: a century."""
 
 Site = Annotated[
     str | None,
@@ -86,7 +84,7 @@ def data_centers(
     """
     from sdc_taichi.sim.fleet_configs import make_configs
 
-    sites = _site_names(site)
+    sites = site_names(site)
     files = _files_of_sites(sites, weather, carbon, workload)
     if start is not None:
         try:
@@ -109,27 +107,6 @@ def data_centers(
     ]
 
 
-def whole_steps(days: float, steps_per_hour: int, option: str = "--days") -> int:
-    """Number of steps in a length of time.
-
-    Args:
-        days: the length, in days.
-        steps_per_hour: number of steps in an hour.
-        option: option that gives the length.
-
-    Raises:
-        ConfigError: a length out of bounds, or one that makes no whole steps.
-    """
-    per_day = 24 * steps_per_hour
-    steps = days * per_day
-    if not 0 < days <= MOST_DAYS or abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
-        raise ConfigError(
-            f"{option} {days:g}: valid is a positive number of days, at most {MOST_DAYS:,}, that "
-            f"makes whole steps of {60 // steps_per_hour} min, that is n/{per_day}"
-        )
-    return round(steps)
-
-
 def default_folder(label: str, configs: Sequence[DataCenterConfig]) -> Path:
     """Folder of a run without ``--out``, named after preset, sites and first day."""
     from sdc_taichi.sim.fleet_configs import place_names
@@ -139,7 +116,12 @@ def default_folder(label: str, configs: Sequence[DataCenterConfig]) -> Path:
     return Path("runs") / f"{Path(label).stem}-{where}-{configs[0].site.start}"
 
 
-def _site_names(site: str | None) -> list[str]:
+def site_names(site: str | None) -> list[str]:
+    """Names of ``--site``; none without it.
+
+    Raises:
+        ConfigError: an empty name, or one that is given twice.
+    """
     if site is None:
         return []
     names = [name.strip() for name in site.split(",")]

@@ -31,7 +31,6 @@ from sdc_taichi.cli.scenario import (
     Workload,
     data_centers,
     default_folder,
-    whole_steps,
 )
 from sdc_taichi.cli.session import (
     interruptible,
@@ -44,6 +43,7 @@ from sdc_taichi.cli.session import (
 )
 from sdc_taichi.cli.summary import print_summary
 from sdc_taichi.errors import printable
+from sdc_taichi.exogenous.year_clock import whole_steps
 
 if TYPE_CHECKING:
     from sdc_taichi.types import StepResult
@@ -154,7 +154,7 @@ def simulate_command(
     )
     fleet = build_fleet(configs)
     error = PERFECT if forecast_error is None else ForecastError.parse(forecast_error)
-    request = RunRequest(controller, whole_steps(days, fleet.steps_per_hour), seed, error)
+    request = RunRequest(controller, whole_steps(days, fleet.steps_per_hour, "--days"), seed, error)
     require_events_start_before(24.0 * days, fleet.configs)
     driver = make_controller(controller, fleet)
     aim = None if optimum is None else Objective.parse(optimum)

@@ -107,10 +107,20 @@ def with_values(config: DataCenterConfig, assigned: Mapping[str, Any]) -> DataCe
             f"values {shortened(assigned)}: valid is a mapping of dotted paths to values, such as "
             "{'hvac.setpoint.initial_c': 20}"
         )
-    values = config.model_dump(mode="json")
+    values = _opened(config, {path.strip().partition(".")[0] for path in assigned})
     for path, value in assigned.items():
         _assign(values, path, value, f"{path}={shortened(value)}")
     return config_from_dict(values, config.name)
+
+
+def _opened(config: DataCenterConfig, sections: set[str]) -> dict[str, Any]:
+    """A config as values, of which only some sections are plain, to be changed and validated anew.
+
+    Servers of a rack stand in either of two sections, so these are plain together.
+    """
+    opened = sections | ({"hall", "servers"} if sections & {"hall", "servers"} else set())
+    values = dict(config)
+    return values | config.model_dump(mode="json", include=opened & set(values))
 
 
 def _read_source(source: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:

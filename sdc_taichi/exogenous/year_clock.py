@@ -13,7 +13,7 @@ from itertools import accumulate
 import numpy as np
 import numpy.typing as npt
 
-from sdc_taichi.errors import shortened
+from sdc_taichi.errors import ConfigError, shortened
 
 DAYS_PER_MONTH = (31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31)
 """Days of each month, January first."""
@@ -31,6 +31,29 @@ MINUTES_PER_YEAR = MINUTES_PER_DAY * DAYS_PER_YEAR
 """Minutes of a year: 525,600."""
 FIRST_YEAR = 2001
 """Calendar year of the first simulated year in time stamps; it has no other meaning."""
+MOST_DAYS = 36_500
+"""Longest run, in days: a century."""
+
+
+def whole_steps(days: float, steps_per_hour: int, what: str = "days") -> int:
+    """Number of steps in a length of time.
+
+    Args:
+        days: the length, in days.
+        steps_per_hour: number of steps in an hour.
+        what: name of the length, for the message.
+
+    Raises:
+        ConfigError: a length out of bounds, or one that makes no whole steps.
+    """
+    per_day = 24 * steps_per_hour
+    steps = days * per_day
+    if not 0 < days <= MOST_DAYS or abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
+        raise ConfigError(
+            f"{what} {days:g}: valid is a positive number of days, at most {MOST_DAYS:,}, that "
+            f"makes whole steps of {60 // steps_per_hour} min, that is n/{per_day}"
+        )
+    return round(steps)
 
 
 def day_of_year(month_day: object) -> int:

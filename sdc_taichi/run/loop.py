@@ -10,7 +10,7 @@ from sdc_taichi.run.metrics import Totals, add_step, empty_totals
 from sdc_taichi.sim.bills import no_demand
 from sdc_taichi.sim.events import require_events_start_before
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.types import StepResult
+from sdc_taichi.types import I64, StepResult
 
 MOST_STEPS = 100 * 8760 * 60
 """Most steps of a run: a century of minutes."""
@@ -20,7 +20,7 @@ def simulate(
     sim: Simulator,
     controller: Controller,
     steps: int,
-    seed: int = 0,
+    seed: int | I64 = 0,
     *,
     forecast_error: ForecastError = PERFECT,
     on_step: Callable[[StepResult], None] | None = None,
@@ -33,7 +33,8 @@ def simulate(
         sim: the simulator.
         controller: gives the actions of every step.
         steps: number of steps, at most ``MOST_STEPS``.
-        seed: of the simulator's events, of the controller and of errors of forecasts.
+        seed: of the simulator's events, of the controller and of errors of forecasts; or one for
+            each data center, (B,).
         forecast_error: how the forecasts err that the controller sees.
         on_step: called with the result of every step.
         stop: asked before every step; true ends the run.

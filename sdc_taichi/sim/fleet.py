@@ -50,6 +50,15 @@ STAGE_MODELS = {
     "thermal": "simulation.thermal",
 }
 """Where the config names the model of each stage."""
+SHARED_FIELDS = (
+    *STAGE_MODELS.values(),
+    "simulation.steps_per_hour",
+    "hvac.total_of",
+    "electrical.losses",
+    "simulation.substep_s",
+    "workload.age_horizon_h",  # One queue array serves the fleet; ages are read off its length.
+)
+"""Fields of the config whose values the data centers of a fleet have in common."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,21 +275,16 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
     """
     listed = _listed(configs)
     warn_of_odd_values(listed)
-    models = {stage: _shared(listed, path) for stage, path in STAGE_MODELS.items()}
+    shared = {path: _shared(listed, path) for path in SHARED_FIELDS}
+    models = {stage: shared[path] for stage, path in STAGE_MODELS.items()}
     models["plant"] = listed[0].hvac.plant_in_use
-    steps_per_hour = _shared(listed, "simulation.steps_per_hour")
-    _shared(listed, "hvac.total_of")
-    _shared(listed, "electrical.losses")
-    _shared(listed, "simulation.substep_s")
-    # One queue array serves the fleet; ages are read off its length.
-    _shared(listed, "workload.age_horizon_h")
     halls = _distinct_halls(listed)
     warn_of([(config.name, hall.odd) for config, hall in zip(listed, halls, strict=True)])
     racks = np.array([len(h.groups_per_rack) for h in halls])
     return Fleet(
         configs=listed,
         models=models,
-        steps_per_hour=steps_per_hour,
+        steps_per_hour=shared["simulation.steps_per_hour"],
         rack_offsets=offsets_from_counts(racks, "racks"),
         rack_dc=np.repeat(np.arange(len(listed), dtype=np.int32), racks),
         group_offsets=offsets_from_counts(
@@ -299,6 +303,11 @@ def build_fleet(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> Fleet
         setpoint_over_supply_k=np.array([h.setpoint_over_supply_k for h in halls]),
         air=_hall_air(halls) if models["inlet"] == "recirculation" else None,
     )
+
+
+def shared_values(config: DataCenterConfig) -> tuple[Any, ...]:
+    """Values of ``SHARED_FIELDS`` of a data center; those with equal ones can form a fleet."""
+    return tuple(attrgetter(path)(config) for path in SHARED_FIELDS)
 
 
 def _listed(configs: DataCenterConfig | Iterable[DataCenterConfig]) -> tuple[DataCenterConfig, ...]:

@@ -1,0 +1,257 @@
+"""``sdc-taichi sweep``: data centers that differ in chosen fields, by month and controller."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sdc_taichi.cli.arguments import Debug, Overrides, Source, out_option, read_config
+from sdc_taichi.cli.execution import EXIT_FAILED, Jobs, Ray, Resume, job_session
+from sdc_taichi.cli.scenario import ErrorOfForecasts, Precision, Seed, Site, site_names
+from sdc_taichi.cli.session import print_notes
+from sdc_taichi.errors import ConfigError, SdcError, one_line, printable
+
+if TYPE_CHECKING:
+    from sdc_taichi.benchmark.store import ResultStore
+    from sdc_taichi.benchmark.sweep import Sweep
+    from sdc_taichi.config import DataCenterConfig
+
+_MOST_LINES = 10
+"""Most reasons of failed runs that are printed."""
+
+
+def sweep_command(
+    context: typer.Context,
+    source: Source = None,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FIELD=VALUES",
+            help="Field to vary: A,B,C, or START:STOP:STEP, or LOW..HIGH to draw samples from; "
+            "repeatable.",
+        ),
+    ] = None,
+    site: Site = None,
+    months: Annotated[
+        str | None,
+        typer.Option(
+            metavar="all|N,N", help="Months, each a run of its own. [default: one run of --days]"
+        ),
+    ] = None,
+    days: Annotated[
+        float | None,
+        typer.Option(help="Length of each run, in days. [default: the month, or 365]"),
+    ] = None,
+    controller: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME", help="Controller, as of simulate; repeatable. [default: idle]"
+        ),
+    ] = None,
+    sample: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Samples of the fields with LOW..HIGH.")
+    ] = 0,
+    seed: Seed = 0,
+    forecast_error: ErrorOfForecasts = None,
+    best: Annotated[
+        str | None,
+        typer.Option(
+            metavar="METRIC",
+            help="Also tell the value with least of a metric by month, such as cfp_kg.",
+        ),
+    ] = None,
+    overrides: Overrides = None,
+    precision: Precision = "f32",
+    batch: Annotated[
+        int, typer.Option(min=1, max=100_000, help="Most data centers that run as one job.")
+    ] = 1024,
+    most: Annotated[int, typer.Option(min=1, help="Most runs; a sweep of more is refused.")] = (
+        100_000
+    ),
+    jobs: Jobs = None,
+    ray: Ray = None,
+    resume: Resume = False,
+    out: Annotated[
+        Path | None, out_option("Output folder. [default: sweeps/PRESET-FIELDS]", "DIR")
+    ] = None,
+    show: Annotated[bool, typer.Option("--show", help="Print what would run, and end.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Run all combinations of values, sites, months and controllers, and keep their metrics.
+
+    Writes a Parquet dataset with a row for each run. Ctrl-C ends the sweep, and --resume goes on
+    with it. A combination that is not valid is told, and the others run.
+    """
+    from sdc_taichi.benchmark.store import RESULTS, ResultStore, Study
+    from sdc_taichi.benchmark.sweep import check_sweep, sweep_inputs, sweep_jobs
+    from sdc_taichi.control import PERFECT, ForecastError
+
+    config, label = read_config(source, overrides)
+    sweep = _sweep(
+        config,
+        vary or [],
+        site,
+        most,
+        samples=sample,
+        controllers=tuple(controller or ["idle"]),
+        months=_months(months),
+        days=days,
+        seed=seed,
+        forecast_error=PERFECT if forecast_error is None else ForecastError.parse(forecast_error),
+        precision=precision,
+        batch=batch,
+    )
+    if best is not None:
+        sweep = _with_best(sweep, best)
+    check_sweep(sweep, most)
+    inputs = sweep_inputs(sweep)
+    partitions = [job.partition for job in sweep_jobs(sweep, inputs)]
+    if show:
+        print(_shown(sweep, label, len(partitions)), end="")
+        return
+    folder = out if out is not None else _default_folder(label, sweep)
+    store = ResultStore(folder)
+    command = shlex.join(["sdc-taichi", *context.obj])
+    study = Study("sweep", command, sweep.settings(), partitions)
+    session = job_session(store, study, resume=resume, jobs=jobs, ray=ray, quiet=quiet)
+    with session as under_way:
+        under_way.run("sweep", sweep_jobs(sweep, inputs), len(partitions), inputs)
+        failed = _print_failures(store)
+        if under_way.is_whole:
+            if not quiet:
+                done = f"{sweep.runs - failed:,} of {sweep.runs:,} runs"
+                print(f"{done} have their rows in {printable(folder / RESULTS)}")
+            if best is not None:
+                _write_best(store, sweep, best, quiet=quiet)
+        under_way.finish()
+    if failed:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _sweep(
+    config: DataCenterConfig,
+    vary: list[str],
+    site: str | None,
+    most: int,
+    **options: Any,
+) -> Sweep:
+    """The sweep of the options; sites of ``--site`` are values of ``site.location``."""
+    from sdc_taichi.benchmark.sweep import Sweep
+    from sdc_taichi.benchmark.vary import Grid, parse_vary
+
+    varied = [parse_vary(text, config, most) for text in vary]
+    sites = tuple(name.upper() for name in site_names(site))
+    if sites:
+        varied.insert(0, Grid("site.location", sites))
+    return Sweep(config, tuple(varied), **options)
+
+
+def _months(text: str | None) -> tuple[int, ...]:
+    """Months of ``--months``; none without it."""
+    if text is None:
+        return ()
+    if text.strip() == "all":
+        return tuple(range(1, 13))
+    months: list[int] = []
+    for part in (part.strip() for part in text.split(",")):
+        if not part.isascii() or not part.isdecimal() or not 1 <= int(part) <= 12:
+            raise ConfigError(
+                f"--months {text!r}: {part!r}; valid are all, or months 1..12 such as 1,7"
+            )
+        if int(part) in months:
+            raise ConfigError(f"--months {text!r}: {part} is given twice; valid is each once")
+        months.append(int(part))
+    return tuple(months)
+
+
+def _with_best(sweep: Sweep, metric: str) -> Sweep:
+    """The sweep with the value of the config among those to choose from.
+
+    Raises:
+        ConfigError: no such metric, or nothing to choose.
+    """
+    from sdc_taichi.benchmark.best_value import with_default
+    from sdc_taichi.benchmark.sweep import metric_names
+    from sdc_taichi.errors import suggestion_or_valid
+
+    names = metric_names(sweep.config)
+    if metric not in names:
+        raise ConfigError(f"--best {metric!r}: unknown metric{suggestion_or_valid(metric, names)}")
+    return with_default(sweep)
+
+
+def _shown(sweep: Sweep, label: str, jobs: int) -> str:
+    """What ``--show`` prints: size and settings of a sweep, as YAML."""
+    import yaml
+
+    settings = sweep.settings() | {"config": label}
+    counts = {"runs": sweep.runs, "combinations": sweep.combinations, "jobs": jobs}
+    return yaml.safe_dump({**counts, **settings}, sort_keys=False)
+
+
+def _default_folder(label: str, sweep: Sweep) -> Path:
+    """Folder of a sweep without ``--out``, named after preset and fields."""
+    fields = [field.rpartition(".")[2] for field in sweep.fields]
+    return Path("sweeps") / "-".join([Path(label).stem, *fields])
+
+
+def _print_failures(store: ResultStore) -> int:
+    """Print why runs failed, each reason once, on stderr.
+
+    Returns:
+        Number of runs that failed.
+    """
+    reasons: dict[str, list[str]] = {}
+    notes: dict[str, None] = {}
+    for result in store.results():
+        notes |= dict.fromkeys(result["metrics"]["notes"])
+        for each in result["metrics"]["failed"]:
+            reasons.setdefault(each["error"], []).append(each["combination"])
+    print_notes(notes)
+    for error, combinations in list(reasons.items())[:_MOST_LINES]:
+        others = f" and {len(combinations) - 1} more" if len(combinations) > 1 else ""
+        print(f"failed: {one_line(f'{combinations[0]}{others}: {error}')}", file=sys.stderr)
+    if len(reasons) > _MOST_LINES:
+        left_out = len(reasons) - _MOST_LINES
+        print(f"failed: {left_out} more reasons, in metrics.json of the jobs", file=sys.stderr)
+    return sum(map(len, reasons.values()))
+
+
+def _write_best(store: ResultStore, sweep: Sweep, metric: str, *, quiet: bool) -> None:
+    """Write and print the best value by month, with its picture where matplotlib is installed."""
+    from sdc_taichi.atomic_file import atomic_write
+    from sdc_taichi.benchmark.best_value import best_by_month, chosen_grid, figures_by_month
+    from sdc_taichi.benchmark.vary import value_at
+    from sdc_taichi.cli.console import print_table
+    from sdc_taichi.learning.evaluation_table import markdown
+    from sdc_taichi.viz.best_value import MonthlyFigures, plot_best_values
+    from sdc_taichi.viz.plotting import save_picture
+
+    field = chosen_grid(sweep).field
+    rows = store.rows()
+    table = best_by_month(rows, sweep, metric)
+    if not len(table):
+        print_notes(["no value has a run in each month, so none is best"])
+        return
+    texts = {"best.csv": table.to_csv(index=False), "best.md": markdown(table) + "\n"}
+    for name, text in texts.items():
+        with atomic_write(store.folder / name) as file:
+            file.write(text.encode())
+    names = [*texts, "best.png"]
+    held = value_at(sweep.config, field)
+    default = held if isinstance(held, int | float) else None
+    panels = [MonthlyFigures(*each) for each in figures_by_month(rows, sweep, metric)]
+    try:
+        picture = plot_best_values(panels, field, metric, default)
+        save_picture(picture, store.folder / names[-1])
+    except SdcError as error:
+        print_notes([f"no picture: {error}"])
+        names.pop()
+    if not quiet:
+        print_table(f"{field} of least {metric}", table)
+        print(f"Files in {printable(store.folder)}: {', '.join(names)}")
