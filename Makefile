@@ -24,7 +24,7 @@ PYTHON ?= python3.13 python3.12 python3.11 python3 python
 # A file stays with one process, because its fixtures are shared; each process may take 1 GB.
 SPREAD := --numprocesses auto --maxprocesses 4 --dist loadfile
 TRAINING_TESTS := $(wildcard tests/test_training*.py tests/test_learning*.py tests/test_policy*.py \
-    tests/test_ray*.py)
+    tests/test_ray*.py tests/test_offline*.py)
 TYPED := build/typecheck
 SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
@@ -76,7 +76,7 @@ $(READY_TRAIN): $(READY)
 	@echo "Installing the training libraries into $(TRAIN) (once, a few minutes at most)"
 	@$(PY) -m venv --clear $(TRAIN)
 	@$(TRAIN)/bin/python -m pip install $(PIP_FLAGS) $(TORCH)
-	@$(TRAIN)/bin/python -m pip install $(PIP_FLAGS) --editable '.[test,onnx,recipes,scale]'
+	@$(TRAIN)/bin/python -m pip install $(PIP_FLAGS) --editable '.[test,onnx,recipes,scale,offline]'
 	@touch $@
 
 # Torch in the environment of development, for work on sdc_taichi/learning.

@@ -14,6 +14,7 @@ import typer.core
 
 from sdc_taichi.cli.arguments import Debug
 from sdc_taichi.cli.benchmark import benchmark_app
+from sdc_taichi.cli.collect import collect_command
 from sdc_taichi.cli.config import config_app
 from sdc_taichi.cli.data import data_app
 from sdc_taichi.cli.evaluate import evaluate_command
@@ -71,6 +72,7 @@ app.command("optimum")(optimum_command)
 app.command("train")(train_command)
 app.command("evaluate")(evaluate_command)
 app.command("sweep", cls=JobsCommand)(sweep_command)
+app.command("collect")(collect_command)
 
 
 def main() -> None:

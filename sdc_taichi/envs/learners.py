@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from sdc_taichi.envs.actions import checked_array
 from sdc_taichi.envs.core import Core, Observation, Transition
+from sdc_taichi.envs.features import Feature
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.types import F32, F64
 
@@ -30,9 +31,14 @@ class Learner(Protocol):
     """Space of the learner's observation in one environment."""
     action_space: spaces.Space[Any]
     """Space of the learner's action in one environment."""
+    features: tuple[Feature, ...]
+    """Features of the learner's observation, in its order."""
 
     def actions(self, given: Any) -> dict[str, Any]:
         """Actions of each agent from those of the learner, (B,) or (B, k)."""
+
+    def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """Actions of the learner from those of the agents, (B,) or (B, k)."""
 
     def observation(self, by_agent: Mapping[str, Observation]) -> Observation:
         """Observations of the learner from those of the agents, (B, n)."""
@@ -50,16 +56,22 @@ class AgentLearner:
     Attributes:
         observation_space: space of the agent's observation in one environment.
         action_space: space of the agent's action in one environment.
+        features: features of its observation, in their order.
     """
 
     def __init__(self, core: Core) -> None:
         (self._agent,) = core.agents
         self.observation_space = core.observation_spaces[self._agent]
         self.action_space = core.action_spaces[self._agent]
+        self.features = core.features[self._agent]
 
     def actions(self, given: Any) -> dict[str, Any]:
         """The learner's action as the agent's."""
         return {self._agent: given}
+
+    def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """The agent's actions as the learner's, (B,) or (B, k)."""
+        return by_agent[self._agent].astype(self.action_space.dtype)
 
     def observation(self, by_agent: Mapping[str, Observation]) -> Observation:
         """The agent's observation, (B, n)."""
@@ -85,11 +97,14 @@ class JointLearner:
     Attributes:
         observation_space: space of all observations side by side in one environment.
         action_space: space of all actions side by side in one environment.
+        features: features of its observation, in their order.
     """
 
     def __init__(self, core: Core) -> None:
         self._core = core
         self._new_entries = entries_of_new_features(core.features)
+        every = [feature for agent in core.agents for feature in core.features[agent]]
+        self.features = tuple(dict.fromkeys(every))
         boxes = {agent: _features_box(core, agent) for agent in core.agents}
         low = np.concatenate([boxes[a].low[entries] for a, entries in self._new_entries.items()])
         high = np.concatenate([boxes[a].high[entries] for a, entries in self._new_entries.items()])
@@ -118,6 +133,12 @@ class JointLearner:
             out[agent] = given[:, first : first + width] if size else given[:, first]
             first += width
         return out
+
+    def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """Actions side by side, (B, k)."""
+        size = self._core.num_envs
+        parts = [by_agent[agent].reshape(size, -1) for agent in self._core.agents]
+        return np.concatenate(parts, axis=1).astype(self.action_space.dtype)
 
     def observation(self, by_agent: Mapping[str, Observation]) -> Observation:
         """Observations side by side, each feature once, (B, n)."""

@@ -15,13 +15,14 @@ from sdc_taichi.envs.arguments import ConfigSource, Overrides, configs_and_optio
 from sdc_taichi.envs.base import AgentSpaces, BatchEnv, start_day_option, step_info
 from sdc_taichi.envs.core import Core, Observation
 from sdc_taichi.envs.episode_reset import Seed
+from sdc_taichi.envs.features import Feature
 from sdc_taichi.envs.learners import learning_agent, make_learner
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.recording import RecorderOption, RecordingCore
 from sdc_taichi.envs.spec import HasSpec, check_steps
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.hall_solver import Precision
-from sdc_taichi.types import F32, F64
+from sdc_taichi.types import F32, F64, Actions
 
 Flags = npt.NDArray[np.bool_]
 
@@ -149,6 +150,19 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
             infos = self._infos({**final, **self.core.start_info()})
         ended = np.full(self.num_envs, transition.ended)
         return observation, self._learner.reward(transition), none, ended, infos
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """Features of an observation, in the order in which they stand side by side."""
+        return self._learner.features
+
+    def actions_of(self, commands: Actions) -> npt.NDArray[Any]:
+        """Actions of ``action_space`` that come nearest to commands, such as a controller's.
+
+        Args:
+            commands: commands of one step, for which a controller was shown ``core.view``.
+        """
+        return self._learner.joined(self.core.actions_of(commands))
 
     def _infos(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Infos with Gymnasium's masks of the environments that have them, which is all."""

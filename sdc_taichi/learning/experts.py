@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from sdc_taichi.control import Controller, View, make_controller
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.problem import AGENTS, Agent
 from sdc_taichi.optimum.rollout import Follower, Targets
-from sdc_taichi.optimum.solve import solve
+from sdc_taichi.optimum.solve import Progress, solve
 from sdc_taichi.run.achievable import OPTIMUM, AchievedPath
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.sim.fleet import Fleet
@@ -30,13 +33,25 @@ def make_expert(name: str, fleet: Fleet, steps: int) -> Controller:
     Raises:
         ConfigError: an unknown name or objective.
     """
-    kind, colon, objective = name.partition(":")
     try:
-        if kind == OPTIMUM:
-            return FollowedOptimum(steps, Objective.parse(objective if colon else "carbon"))
+        objective = objective_of_optimum(name)
+        if objective is not None:
+            return FollowedOptimum(steps, objective)
         return make_controller(name, fleet)
     except ConfigError as error:
         raise ConfigError(f"learning.expert {name!r}: {error}") from None
+
+
+def objective_of_optimum(name: str) -> Objective | None:
+    """Objective of ``optimum`` or ``optimum:OBJECTIVE``; None of a controller's name.
+
+    Raises:
+        ConfigError: an objective that is not valid.
+    """
+    kind, colon, objective = name.partition(":")
+    if kind != OPTIMUM:
+        return None
+    return Objective.parse(objective if colon else "carbon")
 
 
 class FollowedOptimum:
@@ -47,10 +62,22 @@ class FollowedOptimum:
     Args:
         steps: number of steps of an episode.
         objective: what is minimised.
+        agents: what the plan moves of load, cooling and battery; the rest is idle.
+        progress: is told of the stages of solving.
+        stop: asked now and then while solving; true raises ``StoppedError``.
     """
 
-    def __init__(self, steps: int, objective: Objective) -> None:
-        self._steps, self._objective = steps, objective
+    def __init__(
+        self,
+        steps: int,
+        objective: Objective,
+        *,
+        agents: Sequence[Agent] = AGENTS,
+        progress: Progress | None = None,
+        stop: Callable[[], bool] | None = None,
+    ) -> None:
+        self._steps, self._objective, self._agents = steps, objective, tuple(agents)
+        self._progress, self._stop = progress, stop
         self._follower: Follower | None = None
 
     def reset(self, seed: int | I64) -> None:
@@ -71,7 +98,10 @@ class FollowedOptimum:
             start=view.drivers.start,
             drivers=view.drivers,
             objective=self._objective,
+            agents=self._agents,
             precision=view.precision,
+            progress=self._progress,
+            stop=self._stop,
         )
         rows: dict[str, list[F64]] = {name: [] for name in _RECORDED}
 

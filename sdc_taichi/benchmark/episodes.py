@@ -1,0 +1,358 @@
+"""Episodes of controllers in the weeks of a data center, as a learner would have seen them.
+
+A controller sees what controllers see, its commands become the nearest actions of an environment,
+and the environment does these. What is collected can therefore be done again, action by action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from copy import deepcopy
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.control import commands_of, make_controller
+from sdc_taichi.control.rules import Controller
+from sdc_taichi.envs.actions import as_numbers
+from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.envs.registration import IDS
+from sdc_taichi.envs.vector import SdcVectorEnv
+from sdc_taichi.errors import ConfigError, whole_number
+from sdc_taichi.learning.experts import FollowedOptimum, objective_of_optimum
+from sdc_taichi.learning.scenarios import training_environment
+from sdc_taichi.learning.split import DAYS_PER_WEEK, WEEKS
+from sdc_taichi.optimum.problem import AGENTS as PARTS
+from sdc_taichi.optimum.result import StoppedError
+from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.types import F32, F64, Actions
+
+IDLE, RANDOM = "idle", "random"
+"""Controller that leaves everything as it is, and the one whose actions are drawn evenly."""
+QUANTITIES = ("carbon_g", "grid_kwh", "energy_cost")
+"""Quantities of ``StepResult`` that infos tell of each step."""
+MOST_REPEATS = 10_000
+"""Largest number of episodes of a week and a controller."""
+_SET_ELSEWHERE = {
+    **dict.fromkeys(("days", "start", "months"), "valid is to choose weeks and days"),
+    "heat_map": "valid is False, as learners take features alone",
+}
+"""Options of environments that are not given as such, and what is valid instead."""
+_TOGETHER, _STEPS_TOGETHER = 64, 65_536
+"""Most episodes that run side by side, and most of their steps, which bounds the memory."""
+_TOLERANCE = 1e-5
+"""Difference from which a command is another; actions are kept in f32."""
+
+Progress = Callable[[str, int, int], None]
+"""Is told the name of a stage, how much of it is done, and how much there is."""
+
+
+@dataclass(frozen=True)
+class Collection:
+    """Episodes to collect: of whom, in which weeks of one data center, in which environment."""
+
+    config: DataCenterConfig
+    """The data center."""
+    controllers: tuple[str, ...]
+    """Names of controllers, ``random``, ``optimum`` and ``optimum:OBJECTIVE`` among them."""
+    weeks: tuple[int, ...]
+    """Weeks of the year, 0..51, on whose first days episodes begin."""
+    days: int = DAYS_PER_WEEK
+    """Length of an episode, in days, 1..7."""
+    repeats: int = 1
+    """Episodes of each controller in each week, each with a seed of its own."""
+    seed: int = 0
+    """Seed of the first episode of week 0; every other has one of its own."""
+    agent: str | None = None
+    """The one agent that acts; None is all agents together."""
+    environment: Mapping[str, Any] = field(default_factory=dict)
+    """Options of the environment, as ``EnvOptions`` has them."""
+    precision: Precision = "f32"
+    """Precision of the server kernels."""
+
+    def __post_init__(self) -> None:
+        if not self.controllers:
+            raise ConfigError("controllers: none; valid is one or more, such as random, mpc-24h")
+        for name in self.controllers:
+            if self.controllers.count(name) > 1:
+                raise ConfigError(f"controller {name!r}: is given twice; valid is each once")
+        whole_number("days", self.days, 1, DAYS_PER_WEEK)
+        whole_number("repeats", self.repeats, 1, MOST_REPEATS)
+        for name, valid in _SET_ELSEWHERE.items():
+            if name in self.environment:
+                raise ConfigError(f"environment.{name}: is not chosen here; {valid}")
+
+    @property
+    def environment_id(self) -> str:
+        """Name of the environment in Gymnasium."""
+        return next(name for name, agent in IDS.items() if agent == self.agent)
+
+    @cached_property
+    def options(self) -> dict[str, Any]:
+        """Options of the environment: those given, on top of those that agents are trained with."""
+        agents = {} if self.agent is None else {"agents": (self.agent,)}
+        beneath = training_environment({**self.environment, **agents})
+        # Agents that learn take small steps of the setpoint, some controllers large ones.
+        beneath.pop("setpoint_change_k", None)
+        return {**beneath, **self.environment, **agents, "days": self.days}
+
+    @property
+    def starts(self) -> list[Start]:
+        """Beginnings of the episodes of each controller, equal for all."""
+        return [
+            Start(week=week, seed=self.seed + WEEKS * repeat + week)
+            for repeat in range(self.repeats)
+            for week in self.weeks
+        ]
+
+    def make_env(self) -> gymnasium.Env[Any, Any]:
+        """The environment of one data center, in which every episode can be done again.
+
+        Raises:
+            SdcError: options that are not valid.
+        """
+        config = self.config.model_dump(mode="json")
+        return gymnasium.make(
+            self.environment_id, config=config, precision=self.precision, **self.options
+        )
+
+    def make_batch(self, size: int) -> SdcVectorEnv:
+        """Environments of equal data centers that step together.
+
+        Args:
+            size: their number, B.
+        """
+        return SdcVectorEnv(
+            size,
+            self.config,
+            agent=self.agent,
+            precision=self.precision,
+            autoreset_mode="Disabled",
+            **self.options,
+        )
+
+    def check(self) -> None:
+        """Make sure, before any work, that all controllers can act in the environment.
+
+        Raises:
+            SdcError: an option or a controller that is not valid.
+        """
+        with closing(self.make_batch(1)) as env:
+            for name in self.controllers:
+                _make_actor(self, name, env, None, None)
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """The beginning of an episode."""
+
+    week: int
+    """Week of the year, 0..51."""
+    seed: int
+    """Seed that the environment is reset with."""
+
+    @property
+    def day(self) -> int:
+        """First day, counted from 0 in the year."""
+        return DAYS_PER_WEEK * self.week
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """An episode of T steps, with what was observed before each step and after the last."""
+
+    controller: str
+    """Name of the controller."""
+    start: Start
+    """How it began."""
+    observations: F32
+    """Observations, (T + 1, n)."""
+    actions: npt.NDArray[Any]
+    """Actions, (T, k) numbers within -1..1, or whole numbers, (T, k) or (T,)."""
+    rewards: F64
+    """Rewards, (T,)."""
+    infos: dict[str, F64]
+    """Quantities of each step by name, (T + 1,) each; the first, before any step, are 0."""
+    changed_commands: float
+    """Share of the commands that the nearest action gives otherwise than the controller did."""
+
+
+def episodes(
+    collection: Collection,
+    controller: str,
+    *,
+    progress: Progress | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Iterator[Episode]:
+    """Run a controller through all episodes of a collection.
+
+    Args:
+        collection: what is collected.
+        controller: one of its controllers, or another name.
+        progress: is told how many steps are done of each batch.
+        stop: asked before every step; true ends the run.
+
+    Yields:
+        Episodes in the order of ``collection.starts``; a few at a time are in memory.
+
+    Raises:
+        SdcError: a controller that is not valid, or what it does is not.
+        StoppedError: ``stop`` was true.
+    """
+    starts = collection.starts
+    steps = 24 * collection.days * collection.config.simulation.steps_per_hour
+    together = max(1, min(_TOGETHER, _STEPS_TOGETHER // steps))
+    for first in range(0, len(starts), together):
+        part = starts[first : first + together]
+        with closing(collection.make_batch(len(part))) as env:
+            actor = _make_actor(collection, controller, env, progress, stop)
+            yield from _run(controller, part, env, actor, progress, stop)
+
+
+class _Commander:
+    """Actions nearest to a controller's commands.
+
+    Args:
+        controller: gives the commands.
+        env: the environments.
+        decided: commands that actions decide.
+    """
+
+    def __init__(self, controller: Controller, env: SdcVectorEnv, decided: tuple[str, ...]) -> None:
+        self._controller, self._env, self._decided = controller, env, decided
+        self._given = Actions()
+
+    def reset(self, starts: list[Start]) -> None:
+        """Begin an episode of each environment."""
+        self._controller.reset(self._env.core.view.state.seed)
+
+    def act(self) -> npt.NDArray[Any]:
+        """Actions for the step to come, (B,) or (B, k)."""
+        self._given = self._controller.act(self._env.core.view)
+        return self._env.actions_of(self._given)
+
+    def changed(self, result: Mapping[str, Any]) -> F64:
+        """Share of its last commands that were carried out otherwise, (B,).
+
+        Args:
+            result: quantities of the step, (B,) each.
+        """
+        done = [name for name in self._decided if f"{name}_command" in result]
+        size = self._env.num_envs
+        out = np.zeros(size)
+        for name in done:
+            given = as_numbers(getattr(self._given, name))
+            of_each = given.reshape(size if given.ndim else 1, -1).mean(axis=1)
+            out += np.abs(result[f"{name}_command"] - of_each) > _TOLERANCE
+        return out / max(len(done), 1)
+
+
+class _Chance:
+    """Actions drawn evenly from the action space, from a stream of each environment's own.
+
+    Args:
+        env: the environments.
+    """
+
+    def __init__(self, env: SdcVectorEnv) -> None:
+        self._spaces = [deepcopy(env.single_action_space) for _ in range(env.num_envs)]
+
+    def reset(self, starts: list[Start]) -> None:
+        """Begin an episode of each environment."""
+        for space, start in zip(self._spaces, starts, strict=True):
+            # Apart from the stream that the environment draws its events from.
+            (seed,) = np.random.SeedSequence([start.seed, 1]).generate_state(1)
+            space.seed(int(seed))
+
+    def act(self) -> npt.NDArray[Any]:
+        """Actions for the step to come, (B,) or (B, k)."""
+        return np.stack([space.sample() for space in self._spaces])
+
+    def changed(self, result: Mapping[str, Any]) -> F64:
+        """None of its actions stands for a command, (B,)."""
+        return np.zeros(len(self._spaces))
+
+
+def _make_actor(
+    collection: Collection,
+    name: str,
+    env: SdcVectorEnv,
+    progress: Progress | None,
+    stop: Callable[[], bool] | None,
+) -> _Commander | _Chance:
+    """What acts in environments by the name of a controller."""
+    if name == RANDOM:
+        return _Chance(env)
+    options = env.core.options
+    decided = tuple(c for agent in options.agents for c in options.commands_of(agent))
+    objective = objective_of_optimum(name)
+    if objective is None:
+        controller = make_controller(name, env.core.sim.fleet)
+        able = commands_of(controller)
+        if name != IDLE and not set(able) & set(decided):
+            raise ConfigError(
+                f"controller {name!r}: gives {', '.join(able)}; valid is one that gives "
+                f"{', '.join(decided)}, which is decided here"
+            )
+        return _Commander(controller, env, decided)
+    if set(options.agents) != set(AGENTS) and options.others != IDLE:
+        raise ConfigError(
+            f"controller {name!r}: is not known where others act ({options.others}); valid with "
+            f"others {IDLE}"
+        )
+    planned = tuple(part for part in PARTS if part in decided)
+    plan = FollowedOptimum(env.core.steps, objective, agents=planned, progress=progress, stop=stop)
+    return _Commander(plan, env, decided)
+
+
+def _run(
+    name: str,
+    starts: list[Start],
+    env: SdcVectorEnv,
+    actor: _Commander | _Chance,
+    progress: Progress | None,
+    stop: Callable[[], bool] | None,
+) -> Iterator[Episode]:
+    """Run an episode of each environment."""
+    size, steps = env.num_envs, env.core.steps
+    first: Any = env.reset(
+        seed=[start.seed for start in starts],
+        options={"start_day": [start.day for start in starts]},
+    )[0]
+    actor.reset(starts)
+    observations = np.empty((size, steps + 1, first.shape[1]), dtype=np.float32)
+    observations[:, 0] = first
+    width = env.single_action_space.shape or ()
+    actions = np.empty((size, steps, *width), env.single_action_space.dtype)
+    rewards, changed = np.empty((size, steps)), np.zeros(size)
+    infos: dict[str, F64] = {}
+    for step in range(steps):
+        if stop is not None and stop():
+            raise StoppedError(f"{name} was stopped; nothing of it is kept")
+        actions[:, step] = action = actor.act()
+        after: Any
+        after, rewards[:, step], _, _, info = env.step(action)
+        observations[:, step + 1] = after
+        changed += actor.changed(info) / steps
+        for quantity in info:
+            if quantity in QUANTITIES or quantity.startswith("cost"):
+                of_steps = infos.setdefault(quantity, np.zeros((size, steps + 1)))
+                of_steps[:, step + 1] = info[quantity]
+        if progress is not None:
+            progress(name, step + 1, steps)
+    for i, start in enumerate(starts):
+        yield Episode(
+            controller=name,
+            start=start,
+            observations=observations[i],
+            actions=actions[i],
+            rewards=rewards[i],
+            infos={quantity: values[i] for quantity, values in infos.items()},
+            changed_commands=float(changed[i]),
+        )

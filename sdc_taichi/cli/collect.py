@@ -1,0 +1,190 @@
+"""``sdc-taichi collect``: episodes of controllers as data sets for offline learning."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from sdc_taichi.cli.arguments import Debug, Source, force_option, out_option, read_config
+from sdc_taichi.cli.scenario import (
+    EXIT_INTERRUPTED,
+    Carbon,
+    Precision,
+    Seed,
+    Site,
+    Weather,
+    Workload,
+    data_centers,
+)
+from sdc_taichi.cli.session import interruptible, stage_bars
+from sdc_taichi.errors import ConfigError, printable
+
+if TYPE_CHECKING:
+    from sdc_taichi.benchmark.data_set import DataSet
+    from sdc_taichi.config import DataCenterConfig
+
+
+def collect_command(
+    context: typer.Context,
+    source: Source = None,
+    site: Site = None,
+    controller: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Controller as of simulate, or random, optimum, optimum:OBJECTIVE; repeatable.",
+        ),
+    ] = None,
+    weeks: Annotated[
+        str,
+        typer.Option(metavar="NAME|N,N", help="training, validation, held-out, or weeks 0..51."),
+    ] = "training",
+    days: Annotated[int, typer.Option(min=1, max=7, help="Days of an episode.")] = 7,
+    repeats: Annotated[
+        int, typer.Option(min=1, help="Episodes of each controller and week, of other seeds.")
+    ] = 1,
+    agent: Annotated[
+        Literal["load", "cooling", "battery"] | None,
+        typer.Option(help="The one agent that acts. [default: all as one]"),
+    ] = None,
+    assigned: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="environment.A=B",
+            help="Option of the environment, as environment.rewards=bill; repeatable.",
+        ),
+    ] = None,
+    seed: Seed = 0,
+    precision: Precision = "f32",
+    weather: Weather = None,
+    carbon: Carbon = None,
+    workload: Workload = None,
+    name: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Name in Minari, to which -SITE-v0 is added. [default: sdc_taichi/PRESET]",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[Path, out_option("Folder of all data sets.", "DIR")] = Path("datasets"),
+    force: Annotated[bool, force_option("Replace data sets that are there.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Collect episodes of controllers for offline learning, in Minari's format.
+
+    Writes a data set for each site, with a card: observations, actions, rewards and a few
+    quantities of every step, which the environment in its metadata gives again.
+    """
+    from sdc_taichi.benchmark.episodes import Collection
+    from sdc_taichi.benchmark.offline import data_set_folder, require_minari, write_data_set
+    from sdc_taichi.learning.split import parse_weeks
+    from sdc_taichi.optimum.result import StoppedError
+
+    if not controller:
+        raise ConfigError("--controller: none; valid is one or more, such as random, mpc-24h")
+    require_minari()
+    base, label = read_config(source, None)
+    configs = data_centers(
+        base, site, start=None, weather=weather, carbon=carbon, workload=workload
+    )
+    stem = name if name is not None else f"sdc_taichi/{_identifier(Path(label).stem)}"
+    names = _names(stem, configs)
+    collections = [
+        Collection(
+            config=config,
+            controllers=tuple(controller),
+            weeks=parse_weeks(weeks),
+            days=days,
+            repeats=repeats,
+            seed=seed,
+            agent=_agent_of(agent),
+            environment=_environment(assigned or []),
+            precision=precision,
+        )
+        for config in configs
+    ]
+    # What is not valid is said before the first episode.
+    for each in names:
+        data_set_folder(out, each, replace=force)
+    for collection in collections:
+        collection.check()
+    command = shlex.join(["sdc-taichi", *context.obj])
+    done: list[str] = []
+    with interruptible() as stop:
+        for collection, each in zip(collections, names, strict=True):
+            try:
+                with stage_bars(shown=not quiet) as progress:
+                    made = write_data_set(
+                        collection,
+                        out,
+                        each,
+                        command=command,
+                        replace=force,
+                        progress=progress,
+                        stop=stop,
+                    )
+            except StoppedError:
+                kept = f"; whole: {', '.join(done)}" if done else ""
+                print(f"interrupted; nothing of {each} is kept{kept}", file=sys.stderr)
+                raise typer.Exit(EXIT_INTERRUPTED) from None
+            done.append(each)
+            if not quiet:
+                _print_summary(made)
+
+
+def _environment(assigned: list[str]) -> dict[str, Any]:
+    """Options of the environment that ``--set`` gives."""
+    from sdc_taichi.config import apply_override
+
+    values: dict[str, Any] = {}
+    for text in assigned:
+        if not text.startswith("environment."):
+            raise ConfigError(
+                f"--set {text!r}: valid is environment.OPTION=VALUE; fields of the data center "
+                "follow the preset, as workload.flexible_share=0.4"
+            )
+        apply_override(values, text)
+    found: dict[str, Any] = values.get("environment", {})
+    return found
+
+
+def _agent_of(command: str | None) -> str | None:
+    """The agent that gives a command."""
+    from sdc_taichi.envs.agents import COMMAND_OF_AGENT
+
+    return next((agent for agent, own in COMMAND_OF_AGENT.items() if own == command), None)
+
+
+def _names(stem: str, configs: list[DataCenterConfig]) -> list[str]:
+    """Name of the data set of each site."""
+    from sdc_taichi.sim.fleet_configs import place_names
+
+    return [f"{stem}-{_identifier(place)}-v0" for place in place_names(configs)]
+
+
+def _identifier(text: str) -> str:
+    """Text with ``_`` for what Minari takes in no name."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", text)
+
+
+def _print_summary(made: DataSet) -> None:
+    """Say what a data set holds and where it is."""
+    from sdc_taichi.benchmark.offline import CARD_FILE
+
+    for each in made.controllers:
+        score = made.score(each.mean_return)
+        text = "" if score is None else f", score {100.0 * score:.1f} %"
+        print(
+            f"{each.controller}: {each.episodes:,} episodes, {each.steps:,} steps, mean return "
+            f"{each.mean_return:.2f}{text}"
+        )
+    folder = printable(made.folder)
+    print(f"{made.id} in {folder}; {CARD_FILE} there tells what it holds and how to load it")
