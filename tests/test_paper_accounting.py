@@ -15,6 +15,7 @@ from sdc_taichi.benchmark.paper_accounting import (
     PaperFigures,
     PaperTable,
     compared,
+    finding,
     paper_figures,
     paper_tables,
     radar,
@@ -86,6 +87,9 @@ def test_rows_stand_beside_printed_ones_and_the_constant_setpoint() -> None:
     happo, constant = found["happo"], found[CONSTANT_ROW]
     assert happo.seeds == 2
     assert happo.label == "HAPPO"
+    told = finding([happo, constant])
+    assert told.startswith("Of 1 rows that the paper has, 1 emit less than the lowest setpoint")
+    assert "-5.44 to -5.44 %" in told
     assert constant.printed is None
     assert happo.against_constant_pct is not None
     share = 0.9 * 300.0 / 551.75 + 251.75 / 551.75
@@ -113,6 +117,7 @@ def test_radar_has_the_lowest_figures_at_the_rim() -> None:
     np.testing.assert_allclose(values.std(axis=0), 1.0)
     assert labels[int(values[:, 0].argmax())] == "HASAC"
     assert radar(compared(table(7), rows(), SCORED_H), printed=False)[0] == []
+    assert finding(compared(table(7), rows(), SCORED_H)) == ""
 
 
 def test_a_column_without_a_spread_is_at_the_middle_of_the_radar() -> None:

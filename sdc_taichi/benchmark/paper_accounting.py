@@ -9,6 +9,7 @@ quarter hours. All of them follow from the metrics of a run on preset ``sustaind
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -18,6 +19,7 @@ import numpy as np
 import yaml
 from pydantic import Field
 
+from sdc_taichi.benchmark.leaderboard import standard_scores
 from sdc_taichi.config.fields import Section, Text
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.evaluation import ALL
@@ -147,34 +149,55 @@ def paper_figures(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> Pap
     return PaperFigures(*(float(x) for x in _columns(rows, table, scored_h).mean(axis=0)))
 
 
-def radar(rows: list[ComparedRow], *, printed: bool) -> tuple[list[str], F64]:
-    """Rows as figure 4 shows them: low figures far from the centre.
+def radar(rows: Sequence[ComparedRow], *, printed: bool) -> tuple[list[str], F64]:
+    """Rows that the paper has as figure 4 shows them: low figures far from the centre.
 
-    Each column is less its mean over the rows and over their standard deviation, with its sign
-    turned. The paper does not say which standard deviation; here it is that of the population.
+    A score is the mean of the column less the figure, over the standard deviation. The paper does
+    not say which one; here it is that of the population.
 
     Args:
         rows: rows of a table.
-        printed: whether to take the printed figures, or ours of the same rows.
+        printed: whether to take the printed figures, or ours.
 
     Returns:
-        Labels, and values by row and column of ``PaperFigures``, (R, 5); rows without figures are
-        left out, and a column without a spread is 0.
+        Labels of the rows that have figures, and scores by row and column of ``PaperFigures``,
+        (R, 5).
     """
-    labels, figures = [], []
+    figures: dict[str, Sequence[float]] = {}
     for row in rows:
-        values = row.printed
-        if row.printed is not None and not printed:
-            values = None if row.ours is None else PaperFigures(*(x.value for x in row.ours))
-        if values is not None:
-            labels.append(row.label)
-            figures.append(values)
-    if not figures:
-        return [], np.zeros((0, len(PaperFigures._fields)))
-    table = np.array(figures, dtype=np.float64)
-    spread = table.std(axis=0)
-    centred = table.mean(axis=0) - table
-    return labels, np.divide(centred, spread, out=np.zeros_like(table), where=spread > 0.0)
+        if row.printed is not None and printed:
+            figures[row.label] = row.printed
+        elif row.printed is not None and row.ours is not None:
+            figures[row.label] = [interval.value for interval in row.ours]
+    values = np.array(list(figures.values()), dtype=np.float64)
+    scores = -standard_scores(values) if figures else np.zeros((0, len(PaperFigures._fields)))
+    return list(figures), scores
+
+
+def finding(rows: Sequence[ComparedRow]) -> str:
+    """How the rows that the paper has stand to the constant lowest setpoint, in words.
+
+    Args:
+        rows: rows of a table.
+
+    Returns:
+        Two sentences; empty where none of these rows has been run beside it.
+    """
+    of_paper = [row for row in rows if row.printed is not None]
+    against = [row.against_constant_pct for row in of_paper if row.against_constant_pct is not None]
+    if not against:
+        return ""
+    less, more = sum(x.high < 0.0 for x in against), sum(x.low > 0.0 for x in against)
+    values = [x.value for x in against]
+    printed_kg = [row.printed.cfp_kg for row in of_paper if row.printed is not None]
+    spread_pct = 100.0 * (max(printed_kg) / min(printed_kg) - 1.0)
+    equal = len(against) - less - more
+    return (
+        f"Of {len(against)} rows that the paper has, {less} emit less than the lowest setpoint "
+        f"held all the time, {more} more, and {equal} are not told apart from it; they lie "
+        f"{min(values):+.2f} to {max(values):+.2f} % from it. Printed, their CFP spread "
+        f"by {spread_pct:.1f} %."
+    )
 
 
 def released_utilisation(hourly: F64) -> F64:

@@ -12,10 +12,11 @@ from sdc_taichi.benchmark.paper_accounting import (
     ComparedRow,
     PaperTable,
     compared,
+    finding,
     paper_tables,
     radar,
 )
-from sdc_taichi.benchmark.report_blocks import Block, Picture, Table
+from sdc_taichi.benchmark.report_blocks import Block, Paragraph, Picture, Table
 from sdc_taichi.benchmark.suite_results import SuiteResults
 from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS
 from sdc_taichi.learning.statistics import Interval
@@ -27,6 +28,12 @@ if TYPE_CHECKING:
 
 PAPER = "paper"
 """Accounting of suites whose tables are those of SustainDC."""
+_CAPTION = "Our figures, carbon with 95 % intervals, beside those printed"
+_UNITS = (
+    " Columns are in the units that the printed ones hold, not in those of their headings: mean "
+    "powers, carbon of a quarter hour at an intensity that is raised by that of the first hour of "
+    "the year, and a sum of hourly rates of water."
+)
 _COLUMNS = {
     "cfp_kg": "CFP (kg per quarter hour)",
     "hvac_kw": "HVAC (kW)",
@@ -62,7 +69,8 @@ def paper_sections(suite: SuiteResults) -> dict[str, list[Block]]:
         days = int(suite.settings["cases"][table.case].get("days", DAYS_PER_WEEK))
         rows = compared(table, pd.concat(frames, ignore_index=True), 24.0 * (days - UNSCORED_DAYS))
         sections[f"Table {table.number}: {table.title}"] = [
-            Table("Our figures with 95 % intervals, and those printed", _frame(rows), _TITLES),
+            Table(f"{_CAPTION}, site {table.site}", _frame(rows), _TITLES),
+            Paragraph(finding(rows) + _UNITS),
             *_radars(table, rows),
         ]
     return sections
@@ -82,7 +90,8 @@ def _values(row: ComparedRow) -> dict[str, Any]:
     ours = row.ours or (nothing,) * len(_COLUMNS)
     printed = row.printed or (math.nan,) * len(_COLUMNS)
     for name, interval, other in zip(_COLUMNS, ours, printed, strict=True):
-        values |= interval_columns(name, interval) | {f"printed_{name}": other}
+        both = interval_columns(name, interval) if name == "cfp_kg" else {name: interval.value}
+        values |= both | {f"printed_{name}": other}
     return values | interval_columns("against_constant", row.against_constant_pct or nothing)
 
 
