@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +23,7 @@ from sdc_taichi.cli.app import app  # noqa: E402
 from sdc_taichi.errors import SdcError  # noqa: E402
 from sdc_taichi.optimum.result import StoppedError  # noqa: E402
 
+DOCS = Path(__file__).parent.parent / "docs"
 ID = "sdc_taichi/tiny-ca-v0"
 COMMAND = "collect tiny --site CA --weeks 0,26 --days 1 --controller g36 --controller optimum"
 
@@ -89,12 +93,28 @@ def test_scores_are_0_for_idle_commands_and_1_for_the_optimum(root: Path) -> Non
 def test_the_card_tells_what_is_in_it(root: Path) -> None:
     card = (root / ID / "README.md").read_text(encoding="utf-8")
     assert card.startswith(f"# {ID}\n")
-    assert "4 episodes, 384 steps" in card
+    assert "| episodes | 4, cut off after 96 steps" in card
     assert "| `idle` (not in it) |" in card
     assert "| `optimum` | 2 | 192 |" in card
     assert "| 57 | `dc_load` |" in card  # the last of 58 entries
     assert "| 2 | agent_bat | battery |" in card
     assert "MIT licence" in card
+
+
+@pytest.mark.repo
+def test_the_lines_of_the_docs_read_it(root: Path) -> None:
+    page = (DOCS / "offline-data.md").read_text(encoding="utf-8")
+    by_minari, by_h5py, _ = re.findall("```python\n(.*?)```", page, flags=re.DOTALL)
+    for code in (by_minari, by_h5py.replace("random", "g36")):
+        names: dict[str, Any] = {}
+        here = code.replace("datasets/sdc_taichi/corrected-ny-v0", (root / ID).as_posix())
+        assert here != code
+        exec(compile(here, "offline-data.md", "exec"), names)
+        if "env" in names:
+            names["env"].close()
+    assert {name: len(array) for name, array in names["joined"].items()} == dict.fromkeys(
+        ("observations", "actions", "rewards", "terminations", "truncations"), 192
+    )
 
 
 def test_the_same_command_gives_the_same_bytes(root: Path, tmp_path: Path) -> None:
@@ -112,7 +132,8 @@ def test_a_data_set_is_replaced_only_if_asked(root: Path) -> None:
     assert json.loads((root / ID / "data" / "metadata.json").read_text()) == before
 
 
-def test_what_is_not_whole_leaves_nothing(tmp_path: Path) -> None:
+def test_what_is_not_whole_leaves_nothing(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
     chosen = Collection(load_config("tiny"), ("random",), (0,), days=1)
     left = tmp_path / ".tiny-v0.unfinished"
     left.mkdir()
@@ -120,10 +141,18 @@ def test_what_is_not_whole_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(StoppedError):
         write_data_set(chosen, tmp_path, "tiny-v0", stop=lambda: next(asked))
     assert list(tmp_path.iterdir()) == []
-    write_data_set(chosen, tmp_path, "tiny-v0")
+    write_data_set(chosen, Path(), "tiny-v0")  # below a relative path
     metadata = minari.MinariDataset(tmp_path / "tiny-v0" / "data").storage.metadata
     assert metadata["total_episodes"] == 1
     assert "ref_max_score" not in metadata
+
+
+def test_a_disk_without_space_is_one_error(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    chosen = Collection(load_config("tiny"), ("random",), (0,), days=1)
+    with pytest.raises(SdcError, match="0 MB are free"):
+        write_data_set(chosen, tmp_path, "tiny-v0")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_cannot_be_written_is_one_error(tmp_path: Path) -> None:

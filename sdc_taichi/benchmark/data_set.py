@@ -62,8 +62,9 @@ class DataSet:
 
     @property
     def best(self) -> ControllerReturns | None:
-        """Returns of the first known optimum among the controllers; None without one."""
-        return next((c for c in self.controllers if is_optimum(c.controller)), None)
+        """Returns of the first known optimum that earns more than idle commands, if any."""
+        known = (each for each in self.controllers if is_optimum(each.controller))
+        return next((each for each in known if each.mean_return > self.idle.mean_return), None)
 
     def score(self, mean_return: float) -> float | None:
         """Share of the way from idle commands to the known optimum; None without one."""

@@ -17,11 +17,13 @@ from sdc_taichi.atomic_file import FileClaim, naming_errors
 from sdc_taichi.benchmark.data_set import ControllerReturns, DataSet
 from sdc_taichi.benchmark.episodes import IDLE, Collection, Episode, Progress, episodes
 from sdc_taichi.benchmark.offline_card import card
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, SdcError
 
 CARD_FILE = "README.md"
 """Name of the card, which lies beside the folder ``data`` that Minari reads."""
 _DATA = "data"
+_SPARE = 2.0
+"""Space to have before an episode is written, over the size of its arrays."""
 _ID = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*-v[0-9]+")
 
 
@@ -143,8 +145,9 @@ def _new_storage(collection: Collection, folder: Path) -> Any:
     from minari.dataset.minari_storage import MinariStorage
 
     with closing(collection.make_env()) as env:
+        # Minari finds no file below a relative path when it adds up their sizes.
         return MinariStorage.new(
-            folder,
+            folder.absolute(),
             observation_space=env.observation_space,
             action_space=env.action_space,
             env_spec=env.spec,
@@ -152,10 +155,30 @@ def _new_storage(collection: Collection, folder: Path) -> Any:
         )
 
 
+def _require_space(folder: Path, size: float) -> None:
+    """Make sure that a disk has space, because HDF5 crashes on a full one.
+
+    Args:
+        folder: folder that is written to.
+        size: what is needed, in bytes.
+
+    Raises:
+        SdcError: less is free.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < size:
+        raise SdcError(
+            f"{folder}: cannot be written: {size / 1e6:,.0f} MB are needed, {free / 1e6:,.0f} MB "
+            "are free"
+        )
+
+
 def _keep(storage: Any, episode: Episode) -> None:
     """Add an episode to a storage."""
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
+    arrays = (episode.observations, episode.actions, episode.rewards, *episode.infos.values())
+    _require_space(storage.data_path, _SPARE * sum(array.nbytes for array in arrays))
     steps = len(episode.rewards)
     truncated = np.arange(1, steps + 1) == steps
     number = storage.total_episodes

@@ -33,6 +33,10 @@ _INFOS = {
     "energy_cost": "price of that energy without demand charges, in the currency of the tariff",
     "cost": "weighted sum of the costs that the option `costs` names",
 }
+_SCALED = (
+    "An entry is (value - low) / (high - low), or value / high where the range lies evenly about "
+    "zero; values beyond the range are cut at it."
+)
 _LOADING = """\
 ```python
 import minari  # 0.5; also minari.load_dataset("{id}") with MINARI_DATASETS_PATH set
@@ -61,6 +65,7 @@ def card(made: DataSet, command: str) -> str:
         facts = _facts(made, env)
         observations = _observations(env)
         actions = _actions(env)
+        scaled = env.core.options.observations == "default"
         sources = env.core.sim.drivers.sources[0]
         synthetic = env.core.sim.drivers.synthetic[0] and not _files(collection)
     loading = _LOADING.format(id=made.id, folder=made.id, version=version("sdc-taichi"))
@@ -73,7 +78,8 @@ def card(made: DataSet, command: str) -> str:
         _table(*_controllers(made)),
         _about_controllers(made),
         "## Observations",
-        _table(("entries", "feature", "what it is", "unit", "range that is scaled"), observations),
+        _SCALED if scaled else "",
+        _table(("entries", "feature", "what it is", "unit", "range"), observations),
         "## Actions",
         _table(("entries", "agent", "command", "what it is"), actions),
         "## Infos",
@@ -85,7 +91,7 @@ def card(made: DataSet, command: str) -> str:
         "## Licence",
         _licence(sources, synthetic=synthetic),
     ]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
 def _facts(made: DataSet, env: SdcVectorEnv) -> list[tuple[str, str]]:
@@ -99,12 +105,8 @@ def _facts(made: DataSet, env: SdcVectorEnv) -> list[tuple[str, str]]:
     return [
         ("environment", f"`{collection.environment_id}`, with all arguments in its spec"),
         ("data center", f"{_text(collection.config.name)}, site {_text(place)}"),
-        ("size", f"{episodes:,} episodes, {steps:,} steps"),
-        (
-            "episodes",
-            f"{collection.days} days of {60 // env.core.sim.fleet.steps_per_hour}-minute steps, "
-            "cut off and never over",
-        ),
+        ("episodes", f"{episodes:,}, cut off after {env.core.steps:,} steps and never over"),
+        ("steps", f"{steps:,} of {60 // env.core.sim.fleet.steps_per_hour} min"),
         ("weeks", f"{', '.join(map(str, collection.weeks))} of the year, from 0{each_week}"),
         ("seeds", f"{collection.seed} + week, and 52 more for each further episode of a week"),
         ("observation", f"{sum(each.size for each in env.features)} numbers (float32)"),
@@ -184,9 +186,9 @@ def _actions(env: SdcVectorEnv) -> list[tuple[str, ...]]:
     for agent in core.agents:
         shape = core.action_spaces[agent].shape
         size = shape[0] if shape else 1
-        for command in options.commands_of(agent):
-            meaning = meanings[command].format_map(values)
-            rows.append((_entries(first, size), agent, command, meaning))
+        decided = options.commands_of(agent)
+        what = "; then ".join(meanings[command].format_map(values) for command in decided)
+        rows.append((_entries(first, size), agent, ", ".join(decided), what))
         first += size
     return rows
 
