@@ -83,6 +83,8 @@ def test_texts_give_values(text: str, values: tuple[Any, ...]) -> None:
         ("site.seed=1..2.5", "valid are whole LOW and HIGH"),
         (f"{SETPOINT}=16,16", "16 is given twice"),
         (f"{SETPOINT}=16,,17", "no list of YAML values"),
+        (f"{SETPOINT}=16,.nan", "no list of YAML values"),
+        (f"{SETPOINT}=]#", "no values; valid is one or more"),
     ],
 )
 def test_texts_that_are_not_valid_are_told(text: str, said: str) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sdc_taichi.types import F64
 
-from .plotting import BLUE, ORANGE, add_title, literal_text, new_figure
+from .plotting import ORANGE, add_title, literal_text, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -100,7 +100,7 @@ def _draw_panel(
     axes.axhline(panel.values[figures.sum(axis=0).argmin()], color=ORANGE, linewidth=1.6)
     if default is not None:
         axes.axhline(default, color="white", linewidth=1.2, linestyle="--")
-    axes.plot(places, panel.values[figures.argmin(axis=1)], "o", color=BLUE, mec="white", ms=7)
+    axes.plot(places, panel.values[figures.argmin(axis=1)], "o", color="white", mec="black", ms=6)
     axes.set_xticks(places, [str(month) for month in panel.months])
     axes.set_title(literal_text(panel.name), fontsize=10)
     axes.set_xlabel("month")

@@ -111,11 +111,13 @@ def parse_vary(text: str, config: DataCenterConfig, most: int) -> Varied:
         return Grid(path, _fractions(_steps(steps, most, where), held))
     try:
         values = load_yaml(f"[{given}]")
-    except ValueError as error:
+        keys = [json.dumps(value, sort_keys=True, allow_nan=False) for value in values]
+    except (ValueError, TypeError) as error:
         raise ConfigError(f"{where}: no list of YAML values ({error})") from None
+    if not values:
+        raise ConfigError(f"{where}: no values; valid is one or more")
     seen: set[str] = set()
-    for value in values:
-        key = json.dumps(value, sort_keys=True, default=str)
+    for value, key in zip(values, keys, strict=True):
         if key in seen:
             raise ConfigError(f"{where}: {shortened(value)} is given twice; valid is each once")
         seen.add(key)
