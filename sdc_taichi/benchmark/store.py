@@ -219,8 +219,11 @@ class ResultStore:
             _write(rows_path, done.rows)
         _write_json(folder / METRICS_FILE, _result_content(done))
 
-    def rows(self) -> pd.DataFrame:
+    def rows(self, columns: Sequence[str] | None = None) -> pd.DataFrame:
         """Rows of all jobs that are done, with the columns of their partitions.
+
+        Args:
+            columns: names of the columns to read; None is all.
 
         Raises:
             SdcError: there are none, or a file is damaged.
@@ -242,7 +245,7 @@ class ResultStore:
             # Its own schema is that of the first file.
             schemas = [fragment.physical_schema for fragment in found.get_fragments()]
             schema = pa.unify_schemas([found.schema, *schemas], promote_options="permissive")
-            table = found.replace_schema(schema).to_table()
+            table = found.replace_schema(schema).to_table(columns)
         except (pa.ArrowException, OSError) as error:
             raise ConfigError(f"{base}: cannot be read as a dataset: {error}") from error
         frame: pd.DataFrame = table.to_pandas()

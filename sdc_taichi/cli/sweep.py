@@ -225,7 +225,12 @@ def _print_failures(store: ResultStore) -> int:
 def _write_best(store: ResultStore, sweep: Sweep, metric: str, *, quiet: bool) -> None:
     """Write and print the best value by month, with its picture where matplotlib is installed."""
     from sdc_taichi.atomic_file import atomic_write
-    from sdc_taichi.benchmark.best_value import best_by_month, chosen_grid, figures_by_month
+    from sdc_taichi.benchmark.best_value import (
+        best_by_month,
+        chosen_grid,
+        figures_by_month,
+        group_columns,
+    )
     from sdc_taichi.benchmark.vary import value_at
     from sdc_taichi.cli.console import print_table
     from sdc_taichi.learning.evaluation_table import markdown
@@ -233,7 +238,7 @@ def _write_best(store: ResultStore, sweep: Sweep, metric: str, *, quiet: bool) -
     from sdc_taichi.viz.plotting import save_picture
 
     field = chosen_grid(sweep).field
-    rows = store.rows()
+    rows = store.rows([*group_columns(sweep), "month", field, metric])
     table = best_by_month(rows, sweep, metric)
     if not len(table):
         print_notes(["no value has a run in each month, so none is best"])
