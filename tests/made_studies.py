@@ -15,7 +15,7 @@ from sdc_taichi.benchmark.store import ResultStore, Study
 from sdc_taichi.learning.evaluation import METRICS
 from sdc_taichi.types import F64
 
-SITES, WEEKS = ("CA", "NY"), (3, 7, 11)
+SITES, WEEKS = ("ca", "ny"), (3, 7, 11)
 IDLE = np.array([100.0, 120.0, 90.0, 220.0, 200.0, 210.0])
 ACHIEVED, BOUND = 0.9 * IDLE, 0.89 * IDLE
 CI_KG_PER_KWH = 0.25
@@ -149,7 +149,9 @@ def settings_of(rows: Sequence[str] = tuple(ROWS)) -> dict[str, Any]:
         "objective": "carbon",
         "accounting": "standard",
         "seeds": 3,
-        "cases": {"two-sites": {"about": "Two sites.", "days": 7}},
+        "cases": {
+            "two-sites": {"about": "Two sites.", "sites": ["CA", "NY"], "weeks": list(WEEKS)}
+        },
         "rows": {name: ROWS[name] for name in rows},
     }
 

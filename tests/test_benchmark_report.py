@@ -6,11 +6,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from made_studies import ROWS, done_job, frames_of_row, write_study
 from report_reader import Page, read_page
 from sdc_taichi.benchmark.report import write_report
 from sdc_taichi.benchmark.store import ResultStore
+from sdc_taichi.cli.app import app
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +47,16 @@ def test_without_matplotlib_tables_stand_alone(
     assert 'pip install "sdc-taichi[plot]"' in note
     assert page.all("img") == []
     assert page.rows("mpc-24h")
+    out = tmp_path / "tables.md"
+    command = ["benchmark", "report", str(study), "--out", str(tmp_path / "page.html")]
+    done = CliRunner().invoke(app, [*command, "--markdown", str(out)])
+    assert done.exit_code == 0, done.output
+    assert done.stdout.splitlines()[-1] == f"Tables: {out}"
+    assert "note: tables alone: pictures need matplotlib" in done.stderr
+    done = CliRunner().invoke(app, command)
+    assert f"--out {tmp_path / 'page.html'}: exists" in done.stderr
+    done = CliRunner().invoke(app, ["benchmark", "report", str(study), str(study)])
+    assert "is given twice" in done.stderr
 
 
 def test_markdown_shows_texts_as_they_are(study: Path, tmp_path: Path) -> None:
@@ -68,4 +80,5 @@ def test_notes_tell_what_is_missing_or_mixed(tmp_path: Path) -> None:
         "> Unfinished, without two-sites: ippo, seed 1, two-sites: ippo, seed 2.",
         "> Results of several states of the source: 000000000000 (6), 111111111111 (1).",
         "> two-sites: one seed of ippo, so intervals are those of weeks alone.",
+        "> two-sites: 3 weeks of a site: intervals of few weeks are too narrow.",
     ]

@@ -56,7 +56,7 @@ BOARD_TITLES = {
     "place": "place",
     "row": "row",
     "kind": "kind",
-    "core_h": "core h",
+    "core_min": "core min",
     "parts_pct": "sum of the agents alone (%)",
     "together_pct": "together (%)",
     "worth_points": "coordination (points)",
@@ -186,7 +186,7 @@ def _standings(
     """Rows by place, with what they came to."""
     table = summary(evaluation).rename(columns={"controller": "row"}).set_index("row").loc[order]
     ends = {name: placed.get(name) for name in order}
-    texts = ["–" if x is None else str(x[0]) if x[0] == x[1] else f"{x[0]} to {x[1]}"
+    texts = ["-" if x is None else str(x[0]) if x[0] == x[1] else f"{x[0]} to {x[1]}"
              for x in ends.values()]  # fmt: skip
     table.insert(0, "place", texts)
     rows = evaluation.rows[evaluation.rows["moves"] == ALL]
@@ -195,8 +195,8 @@ def _standings(
         if metric in rows and (rows[metric].fillna(0.0) != 0.0).any():
             sums = rows.groupby("controller")[metric].sum(min_count=1)
             table[metric] = sums.loc[order] / (weeks * table["trainings"])
-    table["core_h"] = [
-        sum(float(result.content["core_s"]) for result in case.rows[name]) / 3600 for name in order
+    table["core_min"] = [
+        sum(float(result.content["core_s"]) for result in case.rows[name]) / 60 for name in order
     ]
     unknown = [name for name in table if table[name].isna().all()]
     found: pd.DataFrame = table.drop(columns=unknown).reset_index()
@@ -335,7 +335,7 @@ def _apart(
     trained = {
         name: dict(results[0].content["values"]["row"])
         for name, results in case.rows.items()
-        if case.kinds[name] == LEARNER
+        if case.kinds[name] == LEARNER and results[0].submission is None
     }
     found = []
     for name, row in trained.items():

@@ -30,9 +30,11 @@ from sdc_taichi.benchmark.suite_results import (
     read_suites,
 )
 from sdc_taichi.errors import SdcError
+from sdc_taichi.learning.evaluation import ALL
 from sdc_taichi.viz.plotting import new_figure
 
 _MOST_NAMED = 6
+_FEW_WEEKS = 5
 _READING = (
     "Changes are of sums over all scored weeks, against idle commands in the same weeks, in %: "
     "below 0 is better. Values in brackets are 95 % intervals of a stratified bootstrap, which "
@@ -114,19 +116,23 @@ def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> lis
     blocks += [Note(text) for text in _notes(suite)]
     blocks += [Command(text) for text in suite.commands]
     results = [x for case in suite.cases.values() for rows in case.rows.values() for x in rows]
-    hours = sum(float(result.content["core_s"]) for result in results) / 3600
-    learners = sum(
-        float(x.content["core_s"]) for x in results if x.kind == LEARNER and x.submission is None
-    )
+    trained = [x for x in results if x.kind == LEARNER and x.submission is None]
+    whole_h, trained_h = (_core_h(x.content["core_s"] for x in own) for own in (results, trained))
+    optima_h = _core_h(case.optima_core_s for case in suite.cases.values())
     blocks.append(
         Paragraph(
-            f"{len(results)} results took {hours:.3g} hours of a core, of which trained rows took "
-            f"{learners / 3600:.3g}; optima that several rows share are not counted."
+            f"{len(results)} results took {whole_h:.3g} hours of a core, trained rows "
+            f"{trained_h:.3g} of them, and optima {optima_h:.3g} beside."
         )
     )
     if len(boards) > 1:
         blocks.append(_overview(boards))
     return blocks
+
+
+def _core_h(core_s: Iterable[float]) -> float:
+    """Processor times together, in h."""
+    return sum(map(float, core_s)) / 3600
 
 
 def _overview(boards: Mapping[str, Leaderboard]) -> Table:
@@ -145,6 +151,8 @@ def _notes(suite: SuiteResults) -> list[str]:
     """What is to be known of the results of a suite."""
     results = [x for case in suite.cases.values() for rows in case.rows.values() for x in rows]
     notes = []
+    if suite.quick:
+        notes.append("Quick form, with few weeks and short trainings: no results of the suite.")
     missing = [f"{case.name}: {x}" for case in suite.cases.values() for x in case.missing]
     if missing:
         notes.append(f"Unfinished, without {_named(missing)}.")
@@ -174,6 +182,10 @@ def _notes_of_case(case: CaseResults) -> list[str]:
     if single:
         notes.append(f"one seed of {_named(single)}, so intervals are those of weeks alone.")
     results = [result for rows in case.rows.values() for result in rows]
+    frame = results[0].frame
+    fewest = int(frame[frame["moves"] == ALL].groupby("site").size().min())
+    if fewest < _FEW_WEEKS:
+        notes.append(f"{fewest} weeks of a site: intervals of few weeks are too narrow.")
     if not any(result.frame["achieved_figure"].notna().any() for result in results):
         notes.append(
             "without an optimum ends have no value: an empty battery or work put off saves."

@@ -56,7 +56,7 @@ def _interval_picture(board: Leaderboard) -> Picture | None:
         if name in far:
             left.append(f"{name} ({value:.0f} %)")
             continue
-        label = f"{name} ({values['place']})" if values["place"] != "–" else name
+        label = f"{name} ({values['place']})" if values["place"] != "-" else name
         ends[label] = value, float(values[f"{column}_low"]), float(values[f"{column}_high"])
     if len(ends) < 2:
         return None

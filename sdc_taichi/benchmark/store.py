@@ -415,7 +415,7 @@ def read_json(path: Path, form: str, keys: Mapping[str, Any]) -> dict[str, Any]:
     """
     text = read_text(path, MOST_METRICS_BYTES, ConfigError)
     try:
-        content = json.loads(text)
+        content = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: is no JSON ({error})") from None
     found = content.get("format") if isinstance(content, dict) else None
@@ -428,6 +428,15 @@ def read_json(path: Path, form: str, keys: Mapping[str, Any]) -> dict[str, Any]:
             if not isinstance(each, str):
                 raise ConfigError(f"{path}: {name} holds {shortened(each)}; valid is text")
     return dict(content)
+
+
+def _no_number(text: str) -> float:
+    """Refuse what JSON does not have.
+
+    Raises:
+        ValueError: always.
+    """
+    raise ValueError(f"{text} is no number")
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:

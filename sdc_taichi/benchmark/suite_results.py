@@ -33,7 +33,7 @@ ACHIEVED, BOUND, LEARNER, PLANNER, RULE, OTHER = (
 control, other controllers by name, and what is not known."""
 SUBMISSION_FILE, SUBMISSION_FORMAT = "submission.json", "sdc-submission/1"
 """File in the folder of a row that others have made, which says who made it, and its format."""
-SUBMISSION_KEYS = {"author": str, "about": str, "link": str}
+SUBMISSION_KEYS = {"author": str, "about": str, "link": str, "kind": str}
 """Entries of that file."""
 COLUMNS = ("suite", "case", "row", "seed")
 """Columns of the partition of a result of a suite."""
@@ -68,7 +68,9 @@ class RowResult:
     def kind(self) -> str:
         """Kind of its row, such as ``learner``."""
         row = self.content["values"].get("row")
-        if not isinstance(row, Mapping) or self.submission is not None:
+        if self.submission is not None:
+            return LEARNER if self.submission["kind"] == LEARNER else OTHER
+        if not isinstance(row, Mapping):
             return OTHER
         if row.get("optimum") is not None:
             return BOUND if row["optimum"] == "bound" else ACHIEVED
@@ -93,6 +95,8 @@ class CaseResults:
     """Results that were asked for and are not there, as ``ROW, seed SEED``."""
     bound: Mapping[tuple[str, int], float]
     """Bound of the figure by site and week, where it is known."""
+    optima_core_s: float
+    """Processor time that its optima took, in s."""
 
     @property
     def kinds(self) -> dict[str, str]:
@@ -108,6 +112,8 @@ class SuiteResults:
     """Name of the suite."""
     settings: Mapping[str, Any]
     """Settings of the suite, as study.json has them."""
+    quick: bool
+    """Whether they are those of its quick form."""
     commands: tuple[str, ...]
     """Command lines that made the results."""
     stores: tuple[ResultStore, ...]
@@ -233,11 +239,11 @@ def _suite(name: str, studies: Sequence[tuple[ResultStore, Mapping[str, Any]]]) 
     found: dict[str, dict[str, dict[int, RowResult]]] = {case: {} for case in settings["cases"]}
     asked: dict[tuple[str, str, int], None] = {}
     for store, study in studies:
-        for partition in map(_checked_partition, study["partitions"]):
+        for partition in map(checked_partition, study["partitions"]):
             if not partition["row"].startswith(REFERENCE):
                 asked[partition["case"], partition["row"], int(partition["seed"])] = None
         for content in store.results():
-            partition = _checked_partition(content["partition"])
+            partition = checked_partition(content["partition"])
             if partition["row"].startswith(REFERENCE):
                 references.append(content)
                 continue
@@ -257,18 +263,36 @@ def _suite(name: str, studies: Sequence[tuple[ResultStore, Mapping[str, Any]]]) 
             for of, row, seed in asked
             if of == case and seed not in rows.get(row, {})
         )
-        bound = _bounds([x for x in references if x["partition"]["case"] == case])
-        cases[case] = CaseResults(name, case, objective, results, missing, bound)
+        own = [content for content in references if content["partition"]["case"] == case]
+        cases[case] = CaseResults(
+            suite=name,
+            name=case,
+            objective=objective,
+            rows=results,
+            missing=missing,
+            bound=_bounds(own),
+            optima_core_s=sum(float(content["core_s"]) for content in own),
+        )
     if not cases:
         raise ConfigError(
             f"{studies[0][0].folder}: holds no results; valid is a suite that was run"
         )
     commands = tuple(dict.fromkeys(study["command"] for _, study in studies))
-    return SuiteResults(name, settings, commands, tuple(store for store, _ in studies), cases)
+    return SuiteResults(
+        name=name,
+        settings=settings,
+        quick=any(study["settings"].get("quick") is True for _, study in studies),
+        commands=commands,
+        stores=tuple(store for store, _ in studies),
+        cases=cases,
+    )
 
 
-def _checked_partition(partition: Mapping[str, Any]) -> Mapping[str, str]:
+def checked_partition(partition: Mapping[str, Any]) -> Mapping[str, str]:
     """A partition of a suite.
+
+    Args:
+        partition: its columns and values.
 
     Raises:
         ConfigError: other columns, or a seed that is no number.
@@ -276,7 +300,7 @@ def _checked_partition(partition: Mapping[str, Any]) -> Mapping[str, str]:
     texts = [partition.get(column) for column in COLUMNS]
     if set(partition) != set(COLUMNS) or not all(isinstance(text, str) for text in texts):
         raise ConfigError(f"partition {dict(partition)}: valid columns are {', '.join(COLUMNS)}")
-    if not re.fullmatch("[0-9]{1,6}", str(partition["seed"])):
+    if not re.fullmatch("0|[1-9][0-9]{0,5}", str(partition["seed"])):
         raise ConfigError(f"partition {dict(partition)}: seed; valid is a whole number")
     return partition
 

@@ -54,13 +54,14 @@ def json_option(help: str) -> Any:
     return typer.Option("--json", help=help)
 
 
-def check_out_file(out: Path | None, suffix: str, *, force: bool) -> None:
-    """Check the file of ``--out`` before any work; None is no file.
+def check_out_file(out: Path | None, suffix: str, *, force: bool, option: str = "--out") -> None:
+    """Check the file of an option such as ``--out`` before any work; None is no file.
 
     Args:
         out: the file.
         suffix: the only valid suffix, such as ``.png``.
         force: whether an existing file may be replaced.
+        option: the option, for messages.
 
     Raises:
         ConfigError: another suffix, a folder, or an existing file without ``force``.
@@ -68,11 +69,11 @@ def check_out_file(out: Path | None, suffix: str, *, force: bool) -> None:
     if out is None:
         return
     if out.suffix.lower() != suffix:
-        raise ConfigError(f"--out {out}: valid is a name that ends in {suffix}")
+        raise ConfigError(f"{option} {out}: valid is a name that ends in {suffix}")
     if os.path.isdir(out):
-        raise ConfigError(f"--out {out}: is a folder; valid is a file")
+        raise ConfigError(f"{option} {out}: is a folder; valid is a file")
     if os.path.exists(out) and not force:
-        raise ConfigError(f"--out {out}: exists; choose another name or replace it with --force")
+        raise ConfigError(f"{option} {out}: exists; choose another name or replace it with --force")
 
 
 def parse_source(source: list[str] | None) -> tuple[str | None, list[str]]:

@@ -11,6 +11,7 @@ import typer
 import typer.core
 
 from sdc_taichi.cli.arguments import Debug, out_option
+from sdc_taichi.cli.benchmark_results import add_command, report_command
 from sdc_taichi.cli.execution import Jobs, Ray, Resume, job_session, with_ray_address
 from sdc_taichi.errors import ConfigError, printable
 
@@ -35,6 +36,8 @@ benchmark_app = typer.Typer(
     no_args_is_help=True,
     help="Compare controllers in suites: sdc-taichi benchmark SUITE, such as carbon.",
 )
+benchmark_app.command("report")(report_command)
+benchmark_app.command("add")(add_command)
 
 
 @benchmark_app.command(_RUN)
