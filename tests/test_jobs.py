@@ -239,6 +239,7 @@ def test_processes_end_with_a_driver_that_is_killed_and_a_resumed_study_is_equal
     environment = {**os.environ, "PYTHONPATH": here}
     with subprocess.Popen([sys.executable, "-c", code], env=environment) as driver:
         wait_until(lambda: mark.exists() and bool(mark.read_text()))
+        wait_until(lambda: len(list(out.rglob("metrics.json"))) == 2)
         with pytest.raises(SdcError, match="another run is writing it"):
             run(draws(1), out)
         driver.kill()

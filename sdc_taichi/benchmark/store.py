@@ -111,7 +111,13 @@ class ResultStore:
         Raises:
             ConfigError: there is none, or it is damaged.
         """
-        return read_json(self.folder / STUDY_FILE, STUDY_FORMAT, _STUDY_KEYS)
+        path = self.folder / STUDY_FILE
+        content = read_json(path, STUDY_FORMAT, _STUDY_KEYS)
+        for each in content["partitions"]:
+            values = each.values() if isinstance(each, dict) else [None]
+            if not all(isinstance(value, str) for value in values):
+                raise ConfigError(f"{path}: partition {shortened(each)}; valid are texts by name")
+        return content
 
     def folder_of(self, partition: Mapping[str, str]) -> Path:
         """Folder with metrics.json and further files of a job, whether it is done or not.

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sdc_taichi.benchmark.jobs import digest_of
-from sdc_taichi.benchmark.store import MOST_FILE_BYTES, ResultStore, read_json
+from sdc_taichi.benchmark.store import MOST_FILE_BYTES, STUDY_FILE, ResultStore, read_json
 from sdc_taichi.benchmark.suite import REFERENCE
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.learning.evaluation import ALL, Evaluation
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.user_file import decoding, read_bytes
@@ -249,7 +249,10 @@ def _suite(name: str, studies: Sequence[tuple[ResultStore, Mapping[str, Any]]]) 
                 continue
             by_seed = found.setdefault(partition["case"], {}).setdefault(partition["row"], {})
             _take(by_seed, read_result(store, content))
-    objective = Objective.parse(str(settings.get("objective", "carbon")))
+    try:
+        objective = Objective.parse(str(settings.get("objective", "carbon")))
+    except ConfigError as error:
+        raise ConfigError(f"{studies[0][0].folder / STUDY_FILE}: {error}") from None
     order = [*settings["rows"]]
     cases = {}
     for case, rows in found.items():
@@ -359,6 +362,14 @@ def _bounds(references: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], fl
         metrics = content["metrics"]
         if metrics.get("part") != "held-out":
             continue
-        bounds = zip(metrics["weeks"], metrics["bound_figure"], strict=True)
-        found |= {(metrics["site"], week): bound for week, bound in bounds if bound is not None}
+        site, weeks, bounds = (metrics.get(name) for name in ("site", "weeks", "bound_figure"))
+        lists = isinstance(weeks, list) and isinstance(bounds, list) and len(weeks) == len(bounds)
+        if not lists or {type(x) for x in (*weeks, *bounds)} - {int, float, type(None)}:
+            name = "/".join(content["partition"].values())
+            raise ConfigError(
+                f"metrics.json of {name}: bound_figure {shortened(bounds)} for weeks "
+                f"{shortened(weeks)}; valid are as many numbers"
+            )
+        pairs = zip(weeks, bounds, strict=True)
+        found |= {(str(site), week): bound for week, bound in pairs if bound is not None}
     return found

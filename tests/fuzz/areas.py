@@ -13,6 +13,7 @@ from fuzz.matrices import matrices
 from fuzz.policies import policies
 from fuzz.run_folders import run_folders
 from fuzz.states import states
+from fuzz.studies import studies
 
 SEED = 17
 """Seed of the sample that is part of the suite."""
@@ -37,6 +38,7 @@ AREAS = {
     "states": Plan(states, 260, 40),
     "policies": Plan(policies, 120, 20),
     "run_folders": Plan(run_folders, 120, 22),
+    "studies": Plan(studies, 150, 20),
     "command_lines": Plan(command_lines, 150, 24),
     "faults": Plan(faults, 70, 4),
 }
