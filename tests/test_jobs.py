@@ -68,9 +68,21 @@ class _Lasting(LocalProcesses):
         pass
 
 
+class _Interrupted(processes._Worker):
+    """A process that Ctrl-C reaches while it starts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        assert self.process.pid is not None
+        os.kill(self.process.pid, signal.SIGINT)
+
+
 def test_results_are_equal_to_the_bit_in_any_number_of_processes(
-    tmp_path: Path, pair: LocalProcesses
+    tmp_path: Path, pair: LocalProcesses, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    assert run(draws(2), tmp_path / "begun", pair).done == 2
+    monkeypatch.setattr(processes, "_Worker", _Interrupted)
+    monkeypatch.setattr(processes, "MOST_ATTEMPTS", 1)
     content = {"trace": b"a" * 100_000, "other": b"b"}
     jobs = draws(5, inputs={"trace": digest_of(content["trace"])})
     for name, executor in (("here", InProcess()), ("one", LocalProcesses(1)), ("two", pair)):

@@ -112,7 +112,8 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        self.process.start()
+        with _interrupts_held():
+            self.process.start()
         theirs.close()
         self._sent: set[str] = set()
 
@@ -136,6 +137,22 @@ class _Worker:
     def exit_code(self) -> int | None:
         """Exit code of a process that has ended; the number of a signal if negative."""
         return self.process.exitcode
+
+
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Hold Ctrl-C back, as processes that are started meanwhile do from then on.
+
+    It reaches all processes of a terminal, also those that are still importing modules.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _end(workers: list[_Worker]) -> None:
@@ -164,7 +181,7 @@ def _lost(exit_code: int | None) -> str:
 
 def _serve(connection: Connection) -> None:
     """Run the jobs that come through a connection, in a process of their own."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _exit)
     compute_in_one_thread()
     threading.Thread(target=_end_with_parent, daemon=True).start()
