@@ -70,13 +70,13 @@ def test_the_suites_are_listed() -> None:
     done = call("list")
     assert done.exit_code == 0
     names = [line.split()[0] for line in done.stdout.splitlines()]
-    assert {"carbon", "carbon-rich"} <= set(names)
+    assert {"carbon", "carbon-rich", "bill", "failures", "elsewhere"} <= set(names)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["carbn"], "carbn: no such suite or file; valid: carbon"),
+        (["carbn"], "carbn: no such suite or file; did you mean 'carbon'?"),
         (["carbon", "--rows", "idel"], "no row 'idel'; did you mean 'idle'?"),
         (["carbon", "--cases", "none"], "no case 'none'; valid: eight-sites"),
         (["carbon", "--seeds", "0"], "--seeds"),

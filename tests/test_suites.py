@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+from policies import interface, network
 from sdc_taichi import ConfigError
 from sdc_taichi.benchmark.cases import check_suite, data_centers, number_of_seeds
 from sdc_taichi.benchmark.jobs import Inputs, Job, digest_of, run_job
@@ -23,6 +24,7 @@ from sdc_taichi.benchmark.suite import (
 )
 from sdc_taichi.benchmark.suite_jobs import reference_jobs, row_jobs
 from sdc_taichi.benchmark.suite_run import run_suite, study_of
+from sdc_taichi.learning.policy import About, Policy
 from sdc_taichi.learning.split import HELD_OUT
 
 SMALL: dict[str, Any] = {
@@ -65,6 +67,16 @@ def test_suites_of_the_package_are_valid(name: str, quick: bool) -> None:
     assert suite.name == name
     assert suite.about
     assert not suite.quick or not quick
+
+
+def test_another_policy_in_a_folder_makes_another_job(tmp_path: Path) -> None:
+    of, keys = interface(), []
+    for seed in (0, 0, 1):
+        networks = tuple(network((a,), of.width(a), 3, seed=seed) for a in of.agents)
+        Policy(networks, of, About(algorithm="ippo")).save(tmp_path)
+        suite = small(rows={"mine": {"controller": f"battery=policy:{tmp_path}"}})
+        keys.append(row_jobs(suite, ())[0].key)
+    assert keys[0] == keys[1] != keys[2]
 
 
 @pytest.mark.repo

@@ -192,6 +192,8 @@ def _serve(connection: Connection) -> None:
             held |= lacking
             connection.send(run_job(job, {name: held[i] for name, i in job.inputs.items()}))
         except (EOFError, OSError):  # the driver has no more jobs, or has ended
+            # Libraries that clean up at exit are to be ended without a traceback.
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
             return
 
 

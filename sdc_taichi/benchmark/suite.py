@@ -20,7 +20,7 @@ from sdc_taichi.config.fields import Section, Text
 from sdc_taichi.config.reference import sections_markdown
 from sdc_taichi.control import ForecastError
 from sdc_taichi.control.registry import parts_of
-from sdc_taichi.errors import ConfigError, SdcError, suggestion, suggestion_or_valid
+from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
 from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS, WEEKS, parse_weeks
 from sdc_taichi.learning.training_settings import merged
 from sdc_taichi.optimum.objective import Objective
@@ -307,10 +307,8 @@ def load_suite(source: str, *, quick: bool = False) -> Suite:
         except ConfigError as error:
             if not isinstance(error.__cause__, FileNotFoundError):
                 raise
-            meant = suggestion(source, suite_names())
-            raise ConfigError(
-                f"{source}: no such suite or file; valid: {', '.join(suite_names())}{meant}"
-            ) from None
+            meant = suggestion_or_valid(source, suite_names())
+            raise ConfigError(f"{source}: no such suite or file{meant}") from None
     try:
         values = load_yaml(text)
     except ValueError as error:

@@ -22,9 +22,10 @@ from sdc_taichi.benchmark.cases import (
     training_settings,
     weeks_of,
 )
-from sdc_taichi.benchmark.jobs import Inputs, Job, JobResult
+from sdc_taichi.benchmark.jobs import Inputs, Job, JobResult, digest_of
 from sdc_taichi.benchmark.suite import REFERENCE, Case, Part, Row, Suite
 from sdc_taichi.control import PERFECT, ForecastError, make_controller
+from sdc_taichi.control.registry import parts_of
 from sdc_taichi.envs.agents import COMMAND_OF_AGENT
 from sdc_taichi.learning.evaluation import (
     ALL,
@@ -35,6 +36,7 @@ from sdc_taichi.learning.evaluation import (
     prepare,
     validate,
 )
+from sdc_taichi.learning.policy import WEIGHTS
 from sdc_taichi.run.achievable import AchievedPath
 
 if TYPE_CHECKING:
@@ -90,7 +92,7 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
         for name, case in suite.cases.items():
             if not suite.is_for(label, name):
                 continue
-            parts = _parts_of(row)
+            parts, policies = _parts_of(row), _policies(row)
             inputs = {
                 job.name: job.key
                 for job in references
@@ -105,6 +107,8 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
                     "objective": suite.objective,
                     "seed": seed,
                 }
+                if policies:
+                    values["policies"] = policies
                 partition = {"suite": suite.name, "case": name, "row": label, "seed": str(seed)}
                 found.append(Job(f"{_MODULE}:{run_row.__name__}", values, partition, inputs))
     return found
@@ -387,6 +391,21 @@ def _metrics(task: _Task, made: _Made, weeks: DataCenterWeeks) -> dict[str, Any]
         "has_optimum": weeks.optimum is not None,
         "bound_kinds": [] if weeks.optimum is None else sorted(set(weeks.optimum.bound_kinds)),
     }
+
+
+def _policies(row: Row) -> dict[str, str]:
+    """Digests of the policies that the controllers of a row name, by their folders.
+
+    Another policy in the folder makes another job, though the row is the same.
+    """
+    found = {}
+    for spec in row.controllers:
+        for name in parts_of(spec).values() or [spec]:
+            kind, _, folder = name.partition(":")
+            if kind == "policy":
+                files = sorted(Path(folder).rglob(WEIGHTS))
+                found[folder] = digest_of(b"".join(path.read_bytes() for path in files))
+    return found
 
 
 def _parts_needed(suite: Suite, case: str) -> tuple[Part, ...]:

@@ -59,7 +59,7 @@ def train_command(
     ] = None,
     scenario: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="carbon, carbon-rich, bill or bill-rich."),
+        typer.Option(metavar="NAME", help="carbon, carbon-rich, bill, bill-rich or failures."),
     ] = None,
     settings: Annotated[
         Path | None,

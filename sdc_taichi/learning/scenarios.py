@@ -24,6 +24,22 @@ _FLEXIBLE = {
 }
 """Twice the work that may wait, and a battery of four hours."""
 _BILL = {"rewards": "bill"}
+_EVENTS = [
+    {"kind": "crac_down", "per_year": 26, "duration_h": [2, 24]},
+    {"kind": "chiller_derate", "per_year": 13, "duration_h": [2, 24], "share": 0.5},
+    {"kind": "pump_down", "per_year": 6, "duration_h": [1, 8], "share": 0.5},
+    {"kind": "tower_cell_down", "per_year": 13, "duration_h": [4, 48], "share": 0.5},
+    {"kind": "heat_wave", "per_year": 13, "duration_h": [24, 96], "offset_k": 8},
+]
+_FAILURES = {
+    "hvac": {"crac": {"units": 4}},
+    "protection": {"ashrae_class": "A1"},
+    "events": {"sampled": _EVENTS},
+}
+"""Four CRAC units without a spare one, servers of class A1, and failures and heat waves that come
+ten times as often as in practice, so that a few weeks have some."""
+_COOL = {"agent_dc": {"cooling_carbon": 10.0, "hot_inlets": 1.0}}
+"""Rewards as by default, with ten times the weight of hot inlets."""
 SCENARIOS: Mapping[str, Mapping[str, Any]] = {
     "carbon": {"sites": SITES},
     "carbon-rich": {"sites": SITES, "overrides": _FLEXIBLE},
@@ -34,10 +50,17 @@ SCENARIOS: Mapping[str, Mapping[str, Any]] = {
         "environment": _BILL,
         "validation": {"objective": "cost"},
     },
+    "failures": {
+        "sites": SITES,
+        "overrides": _FAILURES,
+        "environment": {"rewards": _COOL, "collaboration": 1.0},
+        "validation": {"optimum": False},
+    },
 }
 """Settings of each scenario, all of preset ``corrected``: the carbon of the hall as it is, the same
 with twice the work that may wait and a battery of four hours, and of both the electricity bill,
-which is energy by time of use and a demand charge."""
+which is energy by time of use and a demand charge; and carbon where cooling fails and hot inlets
+cost."""
 
 CI_LEADS_H = tuple(range(1, 25))
 """Leads of the forecasts of carbon intensity and price that trained agents observe, in h."""

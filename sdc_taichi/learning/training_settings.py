@@ -88,8 +88,8 @@ class TrainingSettings(Section):
     """Name of the algorithm: ``ppo``, ``ippo``, ``mappo``, ``happo``, ``haa2c``, ``had3qn``,
     ``hasac``, ``cloning`` or ``cross-entropy``."""
     scenario: str | None = None
-    """Scenario whose settings lie beneath those given: ``carbon``, ``carbon-rich``, ``bill`` or
-    ``bill-rich``; None is none."""
+    """Scenario whose settings lie beneath those given: ``carbon``, ``carbon-rich``, ``bill``,
+    ``bill-rich`` or ``failures``; None is none."""
     config: Annotated[str, Field(min_length=1)] | dict[str, Any] = "corrected"
     """Data center: a preset, a file, or the sections of a configuration."""
     overrides: dict[str, Any] = Field(default={})
