@@ -195,8 +195,8 @@ def finding(rows: Sequence[ComparedRow]) -> str:
     return (
         f"Of {len(against)} rows that the paper has, {less} emit less than the lowest setpoint "
         f"held all the time, {more} more, and {equal} are not told apart from it; they lie "
-        f"{min(values):+.2f} to {max(values):+.2f} % from it. Printed, their CFP spread "
-        f"by {spread_pct:.1f} %."
+        f"{min(values):+.2f} to {max(values):+.2f} % from it. As printed, their CFP "
+        f"spreads by {spread_pct:.1f} %."
     )
 
 
