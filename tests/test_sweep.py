@@ -159,6 +159,12 @@ def test_a_run_equals_that_of_its_data_center_alone_in_any_batch() -> None:
     assert set(metric_names(TINY)) == set(alone) == set(rows.columns[4:])
 
 
+def test_batches_of_large_halls_are_smaller() -> None:
+    large = load_config("large")  # of 1,000 racks
+    assert [Sweep(config, ()).part_size for config in (TINY, large)] == [1024, 262]
+    assert Sweep(large, (), batch=7).part_size == 7
+
+
 def test_combinations_that_fail_are_named_and_the_others_run() -> None:
     fields = varied(f"{SETPOINT}=18,40", "site.location=NY,nowhere,CA")
     (result,) = results(Sweep(TINY, fields, days=0.25))

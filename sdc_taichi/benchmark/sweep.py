@@ -1,6 +1,6 @@
 """Sweeps: data centers that differ in some fields, each in chosen months under chosen controllers.
 
-A job runs up to ``Sweep.batch`` combinations of values in one month under one controller. A
+A job runs up to ``Sweep.part_size`` combinations of values in one month under one controller. A
 combination has the same figures, to the bit, in any batch and alone: all have the seed of the
 sweep, and the name of their site, so they meet the same events and errors of forecasts.
 """
@@ -47,6 +47,9 @@ if TYPE_CHECKING:
 
 MOST_RUNS = 100_000
 """Most runs of a sweep that is not told to have more."""
+MOST_DCS, MOST_RACKS = 1024, 2**18
+"""Most data centers of a job, and most racks of all of them, unless its number is given: more step
+no faster, and need more memory."""
 FILE_FIELDS = (
     "site.weather_file",
     "site.carbon_file",
@@ -84,8 +87,9 @@ class Sweep:
     """How the forecasts of controllers err."""
     precision: Precision = "f32"
     """Precision of the server kernels."""
-    batch: int = 1024
-    """Most data centers of a job; figures do not depend on it."""
+    batch: int | None = None
+    """Most data centers of a job, on which no figure depends; None is ``MOST_DCS`` that have
+    ``MOST_RACKS`` together."""
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -103,6 +107,11 @@ class Sweep:
         """Number of runs: combinations in each month under each controller."""
         return self.combinations * max(len(self.months), 1) * len(self.controllers)
 
+    @property
+    def part_size(self) -> int:
+        """Number of combinations of a job; the last one of a month may have fewer."""
+        return self.batch or max(1, min(MOST_DCS, MOST_RACKS // self.config.hall.racks))
+
     def settings(self) -> dict[str, Any]:
         """What decides the jobs, as JSON can hold it."""
         return {
@@ -115,7 +124,7 @@ class Sweep:
             "seed": self.seed,
             "forecast_error": asdict(self.forecast_error),
             "precision": self.precision,
-            "batch": self.batch,
+            "batch": self.part_size,
         }
 
 
@@ -183,7 +192,7 @@ def sweep_jobs(sweep: Sweep, inputs: Inputs) -> Iterator[Job]:
     for controller in sweep.controllers:
         rest = combinations(sweep)
         for part in itertools.count():
-            cells = [list(values) for values in itertools.islice(rest, sweep.batch)]
+            cells = [list(values) for values in itertools.islice(rest, sweep.part_size)]
             if not cells:
                 break
             for place, month in enumerate(sweep.months or (0,)):

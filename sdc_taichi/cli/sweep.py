@@ -67,8 +67,13 @@ def sweep_command(
     overrides: Overrides = None,
     precision: Precision = "f32",
     batch: Annotated[
-        int, typer.Option(min=1, max=100_000, help="Most data centers that run as one job.")
-    ] = 1024,
+        int | None,
+        typer.Option(
+            min=1,
+            max=100_000,
+            help="Most data centers that run as one job. [default: 1024, fewer with large halls]",
+        ),
+    ] = None,
     most: Annotated[int, typer.Option(min=1, help="Most runs; a sweep of more is refused.")] = (
         100_000
     ),
