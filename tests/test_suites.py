@@ -162,6 +162,26 @@ def test_the_quick_form_takes_the_place_of_values_and_leaves_rows_out(tmp_path: 
     assert make_suite(yaml.safe_load(found.to_yaml())) == found
 
 
+def test_the_quick_form_has_no_cases_or_rows_of_its_own(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(yaml.safe_dump(SMALL | {"quick": {"rows": {"idel": None}}}))
+    with pytest.raises(ConfigError, match=r"quick.rows: no row 'idel'; did you mean 'idle'"):
+        load_suite(str(file), quick=True)
+
+
+def test_the_longest_trainings_begin_first() -> None:
+    rows = {f"a{n}": {"train": {"algorithm": "ppo", "steps": n}} for n in (40000, "2e6", 100000)}
+    suite, seen = small(seeds=1, rows={"idle": {"controller": "idle"}, **rows}), []
+
+    def stage(name: str, jobs: Sequence[Job], _: int, __: Inputs | None = None) -> JobSummary:
+        seen.append((name, [job.partition["row"] for job in jobs]))
+        return JobSummary(0, 0, (), True)
+
+    run_suite(suite, ResultStore(Path("nowhere")), stage)
+    assert [name for name, _ in seen] == ["optima", "rows"]
+    assert seen[1][1] == ["a2e6", "a100000", "a40000", "idle"]
+
+
 def test_some_rows_and_cases_can_be_chosen() -> None:
     suite = small().chosen(rows=["idle", "optimum"])
     assert list(suite.rows) == ["idle", "optimum"]

@@ -10,7 +10,12 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import make_controller
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.errors import ConfigError, SdcError
-from sdc_taichi.learning.training_settings import TrainingSettings, make_settings, merged
+from sdc_taichi.learning.training_settings import (
+    TrainingSettings,
+    make_settings,
+    merged,
+    whole_steps,
+)
 from sdc_taichi.sim.fleet import build_fleet
 
 _FIXED = ("weeks", "seed", "scenario", "config", "overrides", "sites")
@@ -86,6 +91,18 @@ def training_settings(
     if agent is not None:
         values = merged(values, {"environment": {"agents": [agent], "others": "idle"}})
     return make_settings(values, "train")
+
+
+def training_steps(training: Mapping[str, Any], train: Mapping[str, Any]) -> int:
+    """Steps of a training, of all data centers together.
+
+    Args:
+        training: settings of all trainings of the suite.
+        train: settings of the row.
+    """
+    default = TrainingSettings.model_fields["steps"].default
+    steps = whole_steps({"steps": default, **training, **train}["steps"])
+    return int(steps)
 
 
 def agents_of(settings: TrainingSettings) -> tuple[str, ...]:

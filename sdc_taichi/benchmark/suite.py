@@ -354,13 +354,17 @@ def _quick(values: Mapping[str, Any], label: str) -> dict[str, Any]:
     """Values of the quick form of a suite.
 
     Raises:
-        ConfigError: it has none.
+        ConfigError: it has none, or one of other cases or rows.
     """
     changes = values.get("quick")
     if not changes:
         raise ConfigError(f"{label}: has no quick form; valid is one with values in quick")
     found = merged({k: v for k, v in values.items() if k != "quick"}, changes)
     for kind in ("cases", "rows"):
+        for name in changes.get(kind, ()):
+            if name not in values[kind]:
+                meant = suggestion_or_valid(name, values[kind])
+                raise ConfigError(f"{label}: quick.{kind}: no {kind[:-1]} {name!r}{meant}")
         found[kind] = {name: x for name, x in found[kind].items() if x is not None}
     return found
 

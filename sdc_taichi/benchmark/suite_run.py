@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
+from sdc_taichi.benchmark.cases import training_steps
 from sdc_taichi.benchmark.jobs import Inputs, Job
 from sdc_taichi.benchmark.runner import JobSummary
 from sdc_taichi.benchmark.store import ResultStore, Study
@@ -86,5 +87,4 @@ def _steps(job: Job) -> int:
     train = job.values["row"]["train"]
     if train is None:
         return 0
-    given: Mapping[str, object] = {"steps": 1, **job.values["training"], **train}
-    return int(str(given["steps"]))
+    return training_steps(job.values["training"], train)
