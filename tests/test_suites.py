@@ -22,7 +22,7 @@ from sdc_taichi.benchmark.suite import (
     suite_markdown,
     suite_names,
 )
-from sdc_taichi.benchmark.suite_jobs import reference_jobs, row_jobs
+from sdc_taichi.benchmark.suite_jobs import packed, reference_jobs, row_jobs
 from sdc_taichi.benchmark.suite_run import run_suite, study_of
 from sdc_taichi.learning.policy import About, Policy
 from sdc_taichi.learning.split import HELD_OUT
@@ -282,6 +282,15 @@ def test_a_reference_has_the_same_bits_again(store: ResultStore) -> None:
     kept = store.result(job.partition)
     assert kept["metrics"] == again.metrics
     assert {name: digest_of(x) for name, x in again.files.items()} == kept["files_sha256"]
+
+
+def test_an_optimum_that_is_not_among_the_solved_ones_is_solved_with_a_warning() -> None:
+    suite = small(**case(sites=["NY"]), rows={"idle": {"controller": "idle"}})
+    (reference,) = reference_jobs(suite)
+    (job,) = row_jobs(suite, [reference])
+    done = run_job(job, {reference.name: packed({})})
+    assert not done.error
+    assert "solved anew" in done.warnings[0]
 
 
 def test_a_row_whose_optimum_failed_fails_with_one_line(tmp_path: Path) -> None:

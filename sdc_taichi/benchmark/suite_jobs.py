@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import warnings
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -37,6 +38,7 @@ from sdc_taichi.learning.evaluation import (
     validate,
 )
 from sdc_taichi.learning.policy import WEIGHTS
+from sdc_taichi.optimum.entry import OptimumCacheWarning
 from sdc_taichi.run.achievable import AchievedPath
 
 if TYPE_CHECKING:
@@ -317,7 +319,11 @@ def _metrics_of_training(done: Training) -> dict[str, Any]:
 def _weeks(
     task: _Task, part: Part, optima: Path, forecast_error: str | None = None
 ) -> Iterator[DataCenterWeeks]:
-    """Data centers and weeks of a part of a case, with their optima."""
+    """Data centers and weeks of a part of a case, with their optima.
+
+    Warns where an optimum was not among those that are solved.
+    """
+    known = set(optima.iterdir())
     with prepare(
         data_centers(task.case, part),
         weeks_of(task.case, part),
@@ -328,6 +334,13 @@ def _weeks(
         forecast_error=PERFECT if forecast_error is None else ForecastError.parse(forecast_error),
         cache=optima,
     ) as weeks:
+        if set(optima.iterdir()) > known:
+            warnings.warn(
+                "optima were solved anew, as those of this study are of a processor with other "
+                "features or of other libraries",
+                OptimumCacheWarning,
+                stacklevel=2,
+            )
         yield weeks
 
 
