@@ -164,7 +164,8 @@ def write_study(folder: Path, *, leave_out: Sequence[str] = (), source: str = "0
             jobs.append(done_job(name, seed, frames_of_row(name, seed), spec=spec, source=source))
     store = ResultStore(folder)
     partitions = [done.job.partition for done in jobs]
-    study = Study("suite", "sdc-taichi benchmark made-up", settings_of(), partitions)
+    settings = {"quick": False, "suite": settings_of()}
+    study = Study("suite", "sdc-taichi benchmark made-up", settings, partitions)
     with store.claimed(study):
         for done in jobs:
             if done.job.name not in leave_out:

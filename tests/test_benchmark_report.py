@@ -79,6 +79,6 @@ def test_notes_tell_what_is_missing_or_mixed(tmp_path: Path) -> None:
     assert notes == [
         "> Unfinished, without two-sites: ippo, seed 1, two-sites: ippo, seed 2.",
         "> Results of several states of the source: 000000000000 (6), 111111111111 (1).",
-        "> two-sites: one seed of ippo, so intervals are those of weeks alone.",
-        "> two-sites: 3 weeks of a site: intervals of few weeks are too narrow.",
+        "> two-sites: fewer than 3 seeds of ippo, so what another training would reach is not "
+        "known, and there is no place.",
     ]

@@ -76,6 +76,25 @@ def test_a_row_between_two_that_differ_joins_their_places() -> None:
     assert found == {"c": (1, 3), "a": (1, 3), "b": (1, 3), "d": (4, 4)}
 
 
+def test_too_few_seeds_or_weeks_have_no_place(study: Path, tmp_path: Path) -> None:
+    few = write_study(tmp_path / "seeds", leave_out=["made-up/two-sites/ippo/1"])
+    (suite,) = read_suites([few])
+    board = leaderboard(suite.cases["two-sites"])
+    found = [(row["row"], row["place"]) for row in board.standings.to_dict("records")]
+    assert found[:3] == [("mpc-24h", "1"), ("g36", "2"), ("idle", "3")]
+    assert found[4:6] == [("ippo", "-"), ("optimum", "-")]
+    assert ("ippo", "g36") in [(row["row"], row["than"]) for row in board.pairs.to_dict("records")]
+    store = ResultStore(tmp_path / "weeks")
+    shutil.copytree(study, store.folder)
+    for name in ("idle", "g36", "coldest"):
+        frame = frames_of_row(name, 0)
+        store.keep(done_job(name, 0, frame[frame["week"] != 7], spec=ROWS[name]))
+    for name in ("mpc-24h", "ippo", "optimum", "bound"):
+        shutil.rmtree(store.folder / f"jobs/suite=made-up/case=two-sites/row={name}")
+    (suite,) = read_suites([store.folder])
+    assert set(leaderboard(suite.cases["two-sites"]).standings["place"]) == {"-"}
+
+
 def test_standings_have_share_cost_and_seeds(board: Leaderboard) -> None:
     found = by_row(board.standings)
     assert found["optimum"]["share_pct"] == pytest.approx(100.0)

@@ -2,7 +2,7 @@
 
 Rows share a place unless a 95 % interval of the paired difference of each of them to each row of
 another place excludes 0. So nothing is ranked within overlapping intervals, and the order within a
-place is that of the suite and says nothing.
+place is that of the suite and says nothing. Too few weeks or seeds make no interval, and no place.
 """
 
 from __future__ import annotations
@@ -66,6 +66,8 @@ BOARD_TITLES = {
 """Titles of columns in tables of this module."""
 _Samples = Mapping[str, tuple[F64, F64]]
 """Figures of each row by seed and week, (S, W), and those of idle commands, of ``samples``."""
+FEWEST = 3
+"""Weeks of a site, and seeds of what was trained, from which intervals rank rows."""
 _SEED = 0
 _LEAST_POINTS = 1e-9
 """Difference up to which two changes against idle commands are equal, in points."""
@@ -107,16 +109,17 @@ def leaderboard(case: CaseResults) -> Leaderboard:
     figures = samples(evaluation)
     changes = {name: float(change_pct(*pair)) for name, pair in figures.items()}
     drawn = _drawn_changes(evaluation, figures)
-    ranked = [name for name, kind in case.kinds.items() if kind not in (ACHIEVED, BOUND)]
+    controllers = [name for name, kind in case.kinds.items() if kind not in (ACHIEVED, BOUND)]
+    ranked = [name for name in controllers if _has_intervals(case, evaluation, name)]
     placed = places({name: changes[name] for name in ranked}, drawn)
     rules = [name for name, kind in case.kinds.items() if kind == RULE and name != IDLE]
     best = min(rules, key=lambda name: changes[name], default="")
-    order = [*placed, *(name for name in case.rows if name not in placed)]
+    order = list(dict.fromkeys([*placed, *controllers, *case.rows]))
     return Leaderboard(
         case=case,
         evaluation=evaluation,
         standings=_standings(case, evaluation, placed, order),
-        pairs=_pairs(evaluation, figures, drawn, list(placed), best),
+        pairs=_pairs(evaluation, figures, drawn, order[: len(controllers)], best),
         profiles=_profiles(case, evaluation, order),
         coordination=_coordination(case, evaluation, figures),
         apart=_apart(case, evaluation, figures, drawn),
@@ -150,6 +153,13 @@ def places(values: Mapping[str, float], drawn: Mapping[str, F64]) -> dict[str, t
                 found[name] = begin + 1, end
             begin = end
     return found
+
+
+def _has_intervals(case: CaseResults, evaluation: Evaluation, name: str) -> bool:
+    """Whether weeks and seeds of a row are enough for intervals that rank it."""
+    seeds = len(case.rows[name])
+    weeks = int(np.bincount(evaluation.strata).min())
+    return weeks >= FEWEST and (seeds >= FEWEST or case.kinds[name] != LEARNER)
 
 
 def _is_better(one: F64, other: F64) -> bool:

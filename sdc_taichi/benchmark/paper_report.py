@@ -18,7 +18,7 @@ from sdc_taichi.benchmark.paper_accounting import (
 )
 from sdc_taichi.benchmark.report_blocks import Block, Paragraph, Picture, Table
 from sdc_taichi.benchmark.suite_results import SuiteResults
-from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS
+from sdc_taichi.learning.split import UNSCORED_DAYS
 from sdc_taichi.learning.statistics import Interval
 from sdc_taichi.viz.benchmark_figures import score_radar
 
@@ -66,7 +66,7 @@ def paper_sections(suite: SuiteResults) -> dict[str, list[Block]]:
             for name, results in case.rows.items()
             for result in results
         ]
-        days = int(suite.settings["cases"][table.case].get("days", DAYS_PER_WEEK))
+        days = case.settings.days
         rows = compared(table, pd.concat(frames, ignore_index=True), 24.0 * (days - UNSCORED_DAYS))
         sections[f"Table {table.number}: {table.title}"] = [
             Table(f"{_CAPTION}, site {table.site}", _frame(rows), _TITLES),

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from sdc_taichi.atomic_file import atomic_write
-from sdc_taichi.benchmark.leaderboard import BOARD_TITLES, Leaderboard, leaderboard
+from sdc_taichi.benchmark.leaderboard import BOARD_TITLES, FEWEST, Leaderboard, leaderboard
 from sdc_taichi.benchmark.paper_report import PAPER, paper_sections
 from sdc_taichi.benchmark.report_blocks import (
     Block,
@@ -34,7 +34,6 @@ from sdc_taichi.learning.evaluation import ALL
 from sdc_taichi.viz.plotting import new_figure
 
 _MOST_NAMED = 6
-_FEW_WEEKS = 5
 _READING = (
     "Changes are of sums over all scored weeks, against idle commands in the same weeks, in %: "
     "below 0 is better. Values in brackets are 95 % intervals of a stratified bootstrap, which "
@@ -44,7 +43,8 @@ _READING = (
     "Rows share a place unless the interval of the paired difference tells each of them from each "
     "row of the next place; the order within a place is that of the suite and says nothing. "
     "Intervals are of one pair each: of many pairs, about one in twenty that do not differ is told "
-    "apart by chance. Optimum and bound know the future and have no place.",
+    "apart by chance. Optimum and bound know the future and have no place, nor have rows that were "
+    "trained with fewer than three seeds, and cases of fewer than three weeks of a site.",
     "The probability of improvement is that of a lower figure in a week, for a seed of each row; "
     "equal figures count half. Performance profiles tell in how many weeks, of all seeds, a row "
     "reaches more than a share of the achievable. Definitions are those of Agarwal et al. (2021, "
@@ -72,7 +72,7 @@ def write_report(
             compared, or a file that cannot be written.
     """
     suites = read_suites(folders)
-    title = "Benchmark" if len(suites) > 1 else str(suites[0].settings.get("title", suites[0].name))
+    title = "Benchmark" if len(suites) > 1 else suites[0].suite.title
     sections = report_sections(suites)
     if markdown is not None:
         _write(markdown, markdown_report(title, sections))
@@ -99,7 +99,7 @@ def report_sections(suites: Iterable[SuiteResults]) -> Sections:
     for suite in suites:
         boards = {name: leaderboard(case) for name, case in suite.cases.items()}
         sections[f"Suite {suite.name}"] = _suite_blocks(suite, boards)
-        if suite.settings.get("accounting") == PAPER:
+        if suite.suite.accounting == PAPER:
             sections |= paper_sections(suite)
         for name, board in boards.items():
             sections[f"{suite.name}: {name}"] = _case_blocks(suite, board)
@@ -109,9 +109,8 @@ def report_sections(suites: Iterable[SuiteResults]) -> Sections:
 
 def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> list[Block]:
     """What a suite is about, what made its results, and what is to be known of them."""
-    settings = suite.settings
     blocks: list[Block] = [
-        Paragraph(str(text)) for text in (settings.get("title"), settings.get("about")) if text
+        Paragraph(text) for text in (suite.suite.title, suite.suite.about) if text
     ]
     blocks += [Note(text) for text in _notes(suite)]
     blocks += [Command(text) for text in suite.commands]
@@ -178,14 +177,17 @@ def _notes_of_case(case: CaseResults) -> list[str]:
             told = ", ".join(text for text in who.values() if text)
             notes.append(f"{name} is the work of others and was not run here: {told}.")
     kinds = case.kinds
-    single = [x for x, rows in case.rows.items() if kinds[x] == LEARNER and len(rows) == 1]
-    if single:
-        notes.append(f"one seed of {_named(single)}, so intervals are those of weeks alone.")
+    few = [x for x, rows in case.rows.items() if kinds[x] == LEARNER and len(rows) < FEWEST]
+    if few:
+        notes.append(
+            f"fewer than {FEWEST} seeds of {_named(few)}, so what another training would reach is "
+            "not known, and there is no place."
+        )
     results = [result for rows in case.rows.values() for result in rows]
     frame = results[0].frame
     fewest = int(frame[frame["moves"] == ALL].groupby("site").size().min())
-    if fewest < _FEW_WEEKS:
-        notes.append(f"{fewest} weeks of a site: intervals of few weeks are too narrow.")
+    if fewest < FEWEST:
+        notes.append(f"fewer than {FEWEST} weeks of a site, so rows have no place.")
     if not any(result.frame["achieved_figure"].notna().any() for result in results):
         notes.append(
             "without an optimum ends have no value: an empty battery or work put off saves."
@@ -208,10 +210,9 @@ def _named(names: Sequence[str]) -> str:
 def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
     """Tables and pictures of a case."""
     case = board.case
-    settings = suite.settings["cases"].get(case.name, {})
     blocks: list[Block] = []
-    if settings.get("about"):
-        blocks.append(Paragraph(str(settings["about"])))
+    if about := case.settings.about:
+        blocks.append(Paragraph(about))
     blocks.append(Paragraph(_weeks_text(board)))
     tables = [
         (f"Standings, {case.objective}; means of a week where no %", board.standings),
@@ -248,10 +249,9 @@ def _row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
     """What the rows are, and their recordings."""
     texts = []
     for name, results in board.case.rows.items():
-        own = suite.settings["rows"].get(name)
-        about = own.get("about") if isinstance(own, Mapping) else None
+        about = suite.suite.rows[name].about if name in suite.suite.rows else ""
         chosen = results[0].content["metrics"].get("chosen")
-        parts = [str(about)] if about else []
+        parts = [about] if about else []
         parts += [f"chosen in the validation weeks: {chosen}"] if chosen else []
         parts += [
             f"recording: {result.folder / file}"

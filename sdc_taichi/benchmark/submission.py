@@ -31,7 +31,7 @@ from sdc_taichi.benchmark.store import (
     read_json,
 )
 from sdc_taichi.benchmark.submission_checks import KnownCase, check_rows
-from sdc_taichi.benchmark.suite import REFERENCE, Case
+from sdc_taichi.benchmark.suite import REFERENCE
 from sdc_taichi.benchmark.suite_results import (
     ACHIEVED,
     BOUND,
@@ -148,7 +148,7 @@ def check_submission(submission: Submission, suite: SuiteResults) -> tuple[str, 
         raise ConfigError(
             f"{place}: is of suite {shortened(submission.suite)}; valid is {suite.name}"
         )
-    taken = {*suite.settings["rows"], *(row for case in suite.cases.values() for row in case.rows)}
+    taken = {*suite.suite.rows, *(row for case in suite.cases.values() for row in case.rows)}
     row = submission.row
     if not ROW_NAME.fullmatch(row) or row.startswith(REFERENCE):
         raise ConfigError(
@@ -369,17 +369,17 @@ def _check_case(
     by_seed = {result.seed: result for result in most} if _idle_differs(most) else {}
     count = len(by_seed) or 1
     if submission.about["kind"] == LEARNER:
-        count = max(count, int(suite.settings["seeds"]))
+        count = max(count, suite.suite.seeds)
     seeds = sorted(result.seed for result in own)
     if seeds != list(range(count)):
         raise ConfigError(
             f"{submission.store.folder}: case {case.name}: seeds {', '.join(map(str, seeds))}; "
             f"valid are {count} of them, from 0, as of the suite"
         )
-    ci_g_per_kwh, notes = _intensity(suite, case)
+    ci_g_per_kwh, notes = _intensity(case)
     for result in own:
         beside = by_seed.get(result.seed, most[0])
-        check_rows(result.frame, _known(suite, case, beside, ci_g_per_kwh), str(result.folder))
+        check_rows(result.frame, _known(case, beside, ci_g_per_kwh), str(result.folder))
     return notes
 
 
@@ -389,33 +389,21 @@ def _idle_differs(results: Sequence[RowResult]) -> bool:
     return any(not np.array_equal(figure, figures[0]) for figure in figures)
 
 
-def _known(
-    suite: SuiteResults, case: CaseResults, beside: RowResult, ci_g_per_kwh: F64
-) -> KnownCase:
+def _known(case: CaseResults, beside: RowResult, ci_g_per_kwh: F64) -> KnownCase:
     """What is known of a case."""
     frame = beside.frame[beside.frame["moves"] == ALL].reset_index(drop=True)
     keys = zip(map(str, frame["site"]), map(int, frame["week"]), strict=True)
     bound = np.array([case.bound.get(key, np.nan) for key in keys])
-    days = case_of(suite, case).days
+    days = case.settings.days
     return KnownCase(case.objective, days, frame, bound, ci_g_per_kwh)
 
 
-def case_of(suite: SuiteResults, case: CaseResults) -> Case:
-    """Settings of a case.
-
-    Args:
-        suite: results of the suite.
-        case: results of the case.
-    """
-    return Case.model_validate(suite.settings["cases"][case.name])
-
-
-def _intensity(suite: SuiteResults, case: CaseResults) -> tuple[F64, tuple[str, ...]]:
+def _intensity(case: CaseResults) -> tuple[F64, tuple[str, ...]]:
     """Lowest and highest carbon intensity of each week, in g/kWh, (W, 2), and what is to be known.
 
     It is not known where files that the case names are not here.
     """
-    chosen = case_of(suite, case)
+    chosen = case.settings
     try:
         configs = data_center_weeks(data_centers(chosen, "held-out"), chosen.weeks)
         drivers = load_drivers(configs)

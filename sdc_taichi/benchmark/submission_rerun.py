@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sdc_taichi.benchmark.cases import data_centers
-from sdc_taichi.benchmark.submission import Submission, case_of
+from sdc_taichi.benchmark.submission import Submission
 from sdc_taichi.benchmark.suite_results import RowResult, read_suites
 from sdc_taichi.control import PERFECT, Controller, ForecastError, Idle, PerAgent
 from sdc_taichi.errors import ConfigError
@@ -45,7 +45,7 @@ def rerun(submission: Submission, to: Path, weeks: int, progress: Progress | Non
         case = suite.cases.get(result.content["partition"]["case"])
         if case is None or suite.name != submission.suite:
             raise ConfigError(f"{result.folder}: no such case in {to}; valid is its suite")
-        chosen = case_of(suite, case)
+        chosen = case.settings
         step = -(-len(chosen.weeks) // weeks)
         error = result.content["metrics"].get("forecast_error")
         with prepare(

@@ -17,7 +17,7 @@ import numpy as np
 
 from sdc_taichi.benchmark.jobs import digest_of
 from sdc_taichi.benchmark.store import MOST_FILE_BYTES, STUDY_FILE, ResultStore, read_json
-from sdc_taichi.benchmark.suite import REFERENCE
+from sdc_taichi.benchmark.suite import REFERENCE, Case, Suite, make_suite
 from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.learning.evaluation import ALL, Evaluation
 from sdc_taichi.optimum.objective import Objective
@@ -87,6 +87,8 @@ class CaseResults:
     """Name of the suite."""
     name: str
     """Name of the case."""
+    settings: Case
+    """Data centers and weeks of the case."""
     objective: Objective
     """Objective of its figures."""
     rows: Mapping[str, Sequence[RowResult]]
@@ -108,18 +110,19 @@ class CaseResults:
 class SuiteResults:
     """All results of a suite."""
 
-    name: str
-    """Name of the suite."""
-    settings: Mapping[str, Any]
-    """Settings of the suite, as study.json has them."""
+    suite: Suite
+    """The suite, as study.json has it."""
     quick: bool
     """Whether they are those of its quick form."""
     commands: tuple[str, ...]
     """Command lines that made the results."""
-    stores: tuple[ResultStore, ...]
-    """Folders that hold results of the suite."""
     cases: Mapping[str, CaseResults]
     """Results of each case, in the order of the suite."""
+
+    @property
+    def name(self) -> str:
+        """Name of the suite."""
+        return self.suite.name
 
 
 def read_suites(folders: Sequence[Path]) -> list[SuiteResults]:
@@ -138,24 +141,24 @@ def read_suites(folders: Sequence[Path]) -> list[SuiteResults]:
         study = store.study()
         if study["kind"] != "suite":
             raise ConfigError(f"{folder}: holds a {study['kind']}; valid is a suite")
-        found.setdefault(suite_settings(store, study)["name"], []).append((store, study))
-    return [_suite(name, studies) for name, studies in found.items()]
+        found.setdefault(suite_of(store, study).name, []).append((store, study))
+    return [_suite(studies) for studies in found.values()]
 
 
-def suite_settings(store: ResultStore, study: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Settings of the suite of a study.
+def suite_of(store: ResultStore, study: Mapping[str, Any]) -> Suite:
+    """The suite of a study.
 
     Args:
         store: where the study is.
         study: content of study.json.
 
     Raises:
-        ConfigError: it has none.
+        ConfigError: it has none, or one that is not valid.
     """
-    settings = study["settings"].get("suite", study["settings"])
-    if not isinstance(settings, Mapping) or not isinstance(settings.get("name"), str):
-        raise ConfigError(f"{store.folder}: study.json tells of no suite; valid is one of a suite")
-    return settings
+    values, place = study["settings"].get("suite"), store.folder / STUDY_FILE
+    if not isinstance(values, dict):
+        raise ConfigError(f"{place}: settings.suite {shortened(values)}; valid is a suite")
+    return make_suite(values, f"{place}: settings.suite")
 
 
 def read_result(store: ResultStore, content: Mapping[str, Any]) -> RowResult:
@@ -232,11 +235,11 @@ def weeks_of_frame(frame: pd.DataFrame) -> dict[tuple[str, int], float]:
     return dict(zip(keys, map(float, whole["idle_figure"]), strict=True))
 
 
-def _suite(name: str, studies: Sequence[tuple[ResultStore, Mapping[str, Any]]]) -> SuiteResults:
+def _suite(studies: Sequence[tuple[ResultStore, Mapping[str, Any]]]) -> SuiteResults:
     """Results of one suite from several folders."""
-    settings = suite_settings(*studies[0])
+    suite = suite_of(*studies[0])
     references: list[Mapping[str, Any]] = []
-    found: dict[str, dict[str, dict[int, RowResult]]] = {case: {} for case in settings["cases"]}
+    found: dict[str, dict[str, dict[int, RowResult]]] = {case: {} for case in suite.cases}
     asked: dict[tuple[str, str, int], None] = {}
     for store, study in studies:
         for partition in map(checked_partition, study["partitions"]):
@@ -247,13 +250,14 @@ def _suite(name: str, studies: Sequence[tuple[ResultStore, Mapping[str, Any]]]) 
             if partition["row"].startswith(REFERENCE):
                 references.append(content)
                 continue
-            by_seed = found.setdefault(partition["case"], {}).setdefault(partition["row"], {})
+            if partition["case"] not in found:
+                raise ConfigError(
+                    f"{store.folder_of(partition)}: suite {suite.name} has no such case; valid: "
+                    f"{', '.join(found)}"
+                )
+            by_seed = found[partition["case"]].setdefault(partition["row"], {})
             _take(by_seed, read_result(store, content))
-    try:
-        objective = Objective.parse(str(settings.get("objective", "carbon")))
-    except ConfigError as error:
-        raise ConfigError(f"{studies[0][0].folder / STUDY_FILE}: {error}") from None
-    order = [*settings["rows"]]
+    order = [*suite.rows]
     cases = {}
     for case, rows in found.items():
         if not rows:
@@ -268,9 +272,10 @@ def _suite(name: str, studies: Sequence[tuple[ResultStore, Mapping[str, Any]]]) 
         )
         own = [content for content in references if content["partition"]["case"] == case]
         cases[case] = CaseResults(
-            suite=name,
+            suite=suite.name,
             name=case,
-            objective=objective,
+            settings=suite.cases[case],
+            objective=Objective.parse(suite.objective),
             rows=results,
             missing=missing,
             bound=_bounds(own),
@@ -282,11 +287,9 @@ def _suite(name: str, studies: Sequence[tuple[ResultStore, Mapping[str, Any]]]) 
         )
     commands = tuple(dict.fromkeys(study["command"] for _, study in studies))
     return SuiteResults(
-        name=name,
-        settings=settings,
+        suite=suite,
         quick=any(study["settings"].get("quick") is True for _, study in studies),
         commands=commands,
-        stores=tuple(store for store, _ in studies),
         cases=cases,
     )
 
