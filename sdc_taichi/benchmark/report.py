@@ -13,6 +13,7 @@ from sdc_taichi.benchmark.report_blocks import (
     Command,
     Heading,
     Items,
+    Links,
     Note,
     Paragraph,
     Picture,
@@ -75,7 +76,7 @@ def write_report(
     title = "Benchmark" if len(suites) > 1 else suites[0].suite.title
     sections = report_sections(suites)
     if markdown is not None:
-        _write(markdown, markdown_report(title, sections))
+        _write(markdown, markdown_report(title, sections, markdown.parent))
     notes: tuple[str, ...] = ()
     if html is not None:
         if lacking := _lacking_pictures():
@@ -85,7 +86,7 @@ def write_report(
                 for heading, blocks in sections.items()
             }
         lead = f"Suites: {', '.join(suite.name for suite in suites)}"
-        _write(html, html_report(title, lead, sections))
+        _write(html, html_report(title, lead, sections, html.parent))
     return notes
 
 
@@ -231,6 +232,9 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
     rows = _row_texts(suite, board)
     if rows:
         blocks += [Heading("Rows"), Items(rows)]
+    recordings = _recordings(case)
+    if recordings:
+        blocks += [Heading("Recordings"), Links(recordings)]
     return blocks
 
 
@@ -246,22 +250,27 @@ def _weeks_text(board: Leaderboard) -> str:
 
 
 def _row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
-    """What the rows are, and their recordings."""
+    """What the rows are."""
     texts = []
     for name, results in board.case.rows.items():
         about = suite.suite.rows[name].about if name in suite.suite.rows else ""
         chosen = results[0].content["metrics"].get("chosen")
         parts = [about] if about else []
         parts += [f"chosen in the validation weeks: {chosen}"] if chosen else []
-        parts += [
-            f"recording: {result.folder / file}"
-            for result in results
-            for file in result.content["files_sha256"]
-            if file.endswith(".rrd")
-        ]
         if parts:
             texts.append(f"{name}: {'; '.join(parts)}")
     return texts
+
+
+def _recordings(case: CaseResults) -> dict[str, Path]:
+    """Recordings of the results of a case, by their names."""
+    return {
+        f"{name}, seed {result.seed}: {file}": result.folder / file
+        for name, results in case.rows.items()
+        for result in results
+        for file in result.content["files_sha256"]
+        if file.endswith(".rrd")
+    }
 
 
 def _lacking_pictures() -> str:

@@ -5,10 +5,13 @@ Texts come from files of others: both forms show them literally.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import quote
 
 from sdc_taichi.errors import printable
 from sdc_taichi.learning.evaluation_table import literal_markdown, markdown, text_rows
@@ -41,6 +44,14 @@ class Items:
 
     texts: Sequence[str]
     """The texts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Links:
+    """A list of links to files."""
+
+    files: Mapping[str, Path]
+    """Each file by the text of its link."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,42 +94,47 @@ class Picture:
     """Text below it."""
 
 
-Block = Heading | Paragraph | Items | Note | Command | Table | Picture
+Block = Heading | Paragraph | Items | Links | Note | Command | Table | Picture
 """Part of a section of a report."""
 Sections = Mapping[str, Sequence[Block]]
 """Blocks of each section of a report, by its heading."""
 
 
-def markdown_report(title: str, sections: Sections) -> str:
+def markdown_report(title: str, sections: Sections, folder: Path) -> str:
     """A report as Markdown, without its pictures.
 
     Args:
         title: heading of the report.
         sections: its sections.
+        folder: where the report will be, which links begin at.
     """
     parts = [f"# {literal_markdown(title)}"]
     for heading, blocks in sections.items():
         parts.append(f"## {literal_markdown(heading)}")
-        parts += [text for block in blocks if (text := _markdown_block(block))]
+        parts += [text for block in blocks if (text := _markdown_block(block, folder))]
     return "\n\n".join(parts) + "\n"
 
 
-def html_report(title: str, lead: str, sections: Sections) -> str:
+def html_report(title: str, lead: str, sections: Sections, folder: Path) -> str:
     """A report as one HTML page, which holds all that it shows and needs no network.
 
     Args:
         title: heading of the report.
         lead: text below it.
         sections: its sections.
+        folder: where the report will be, which links begin at.
 
     Raises:
         SdcError: there are pictures, and matplotlib is missing.
     """
-    shown = {heading: "".join(map(_html_block, blocks)) for heading, blocks in sections.items()}
+    shown = {
+        heading: "".join(_html_block(block, folder) for block in blocks)
+        for heading, blocks in sections.items()
+    }
     return html_page(title, lead, shown, set())
 
 
-def _markdown_block(block: Block) -> str:
+def _markdown_block(block: Block, folder: Path) -> str:
     """A block as Markdown; empty for a picture."""
     match block:
         case Heading(text):
@@ -127,6 +143,11 @@ def _markdown_block(block: Block) -> str:
             return literal_markdown(text)
         case Items(texts):
             return "\n".join(f"- {literal_markdown(text)}" for text in texts)
+        case Links(files):
+            return "\n".join(
+                f"- [{literal_markdown(text)}](<{_address(path, folder)}>)"
+                for text, path in files.items()
+            )
         case Note(text):
             return f"> {literal_markdown(text)}"
         case Command(text):
@@ -137,7 +158,7 @@ def _markdown_block(block: Block) -> str:
             return ""
 
 
-def _html_block(block: Block) -> str:
+def _html_block(block: Block, folder: Path) -> str:
     """A block as HTML."""
     match block:
         case Heading(text):
@@ -147,6 +168,12 @@ def _html_block(block: Block) -> str:
         case Items(texts):
             items = "".join(f"<li>{escape(text)}</li>\n" for text in texts)
             return f"<ul>{items}</ul>\n"
+        case Links(files):
+            items = "".join(
+                f'<li><a href="{escape(_address(path, folder))}">{escape(text)}</a></li>\n'
+                for text, path in files.items()
+            )
+            return f"<ul>{items}</ul>\n"
         case Note(text):
             return notice(text)
         case Command(text):
@@ -155,6 +182,11 @@ def _html_block(block: Block) -> str:
             return _html_table(caption, frame, titles)
         case Picture(draw, alt, caption):
             return picture_element(draw(), alt, caption)
+
+
+def _address(path: Path, folder: Path) -> str:
+    """Address of a file from a folder, in which nothing has a meaning of its own."""
+    return quote(Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix())
 
 
 def _html_table(caption: str, frame: pd.DataFrame, titles: Mapping[str, str]) -> str:
