@@ -19,6 +19,7 @@ from sdc_taichi.benchmark.leaderboard import (
     places,
     standard_scores,
 )
+from sdc_taichi.benchmark.report import write_report
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.benchmark.suite_results import read_suites
 
@@ -114,6 +115,11 @@ def test_constraints_have_a_column_where_one_is_broken(board: Leaderboard, tmp_p
     (suite,) = read_suites([store.folder])
     found = by_row(leaderboard(suite.cases["two-sites"]).standings)
     assert (found["g36"]["throttled_rack_h"], found["idle"]["throttled_rack_h"]) == (1.0, 0.0)
+    assert (found["g36"]["throttled_rack_h_low"], found["idle"]["throttled_rack_h_high"]) == (0, 0)
+    assert found["g36"]["throttled_rack_h_high"] > 1.0
+    out = tmp_path / "tables.md"
+    write_report([store.folder], markdown=out)
+    assert "> Places are by carbon alone." in out.read_text()
 
 
 def test_each_row_stands_against_the_best_rule_and_the_row_below(board: Leaderboard) -> None:

@@ -50,6 +50,8 @@ CONSTRAINTS = {
     "lost_tasks": "lost (tasks)",
 }
 """Metrics that have a column where one of them is not 0, as means of a week."""
+OUTAGES = ("throttled_rack_h", "tripped_rack_h", "unserved_kwh", "lost_tasks")
+"""Those of them in which less is emitted because less is done."""
 BOARD_TITLES = {
     **TITLES,
     **CONSTRAINTS,
@@ -194,17 +196,18 @@ def _standings(
     order: list[str],
 ) -> pd.DataFrame:
     """Rows by place, with what they came to."""
+    import pandas as pd
+
     table = summary(evaluation).rename(columns={"controller": "row"}).set_index("row").loc[order]
     ends = {name: placed.get(name) for name in order}
     texts = ["-" if x is None else str(x[0]) if x[0] == x[1] else f"{x[0]} to {x[1]}"
              for x in ends.values()]  # fmt: skip
     table.insert(0, "place", texts)
-    rows = evaluation.rows[evaluation.rows["moves"] == ALL]
-    weeks = len(evaluation.strata)
     for metric in CONSTRAINTS:
-        if metric in rows and (rows[metric].fillna(0.0) != 0.0).any():
-            sums = rows.groupby("controller")[metric].sum(min_count=1)
-            table[metric] = sums.loc[order] / (weeks * table["trainings"])
+        values = row_samples(evaluation, metric)
+        if any(np.nan_to_num(sample).any() for sample in values.values()):
+            columns = [_mean_columns(metric, values[name], evaluation, name) for name in order]
+            table[list(columns[0])] = pd.DataFrame(columns, index=order)
     table["core_min"] = [
         sum(float(result.content["core_s"]) for result in case.rows[name]) / 60 for name in order
     ]
@@ -250,18 +253,31 @@ def _difference(
     }
 
 
-def share_samples(evaluation: Evaluation) -> dict[str, F64]:
-    """Share of the achievable of each row by training and week, in %, (S, W) each.
+def row_samples(evaluation: Evaluation, column: str) -> dict[str, F64]:
+    """Values of each row by training and week, (S, W) each; none of a column that is not there.
 
     Args:
         evaluation: the evaluation.
+        column: column of its rows.
     """
     rows = evaluation.rows[evaluation.rows["moves"] == ALL]
     width = len(evaluation.strata)
     return {
-        str(name): 100.0 * own["share"].to_numpy(np.float64).reshape(-1, width)
+        str(name): own[column].to_numpy(np.float64).reshape(-1, width)
         for name, own in rows.groupby("controller", sort=False)
+        if column in rows
     }
+
+
+def _mean_columns(metric: str, sample: F64, evaluation: Evaluation, name: str) -> dict[str, float]:
+    """Mean of a metric over weeks and seeds with its interval."""
+    weeks = drawn_weeks(evaluation.strata, _generator(), DRAWS)
+
+    def mean(values: F64) -> F64:
+        return np.asarray(values.mean(axis=(-2, -1)))
+
+    drawn = bootstrap_values(mean, (sample,), weeks, _generator(name))
+    return interval_columns(metric, percentile_interval(float(mean(sample)), drawn))
 
 
 def interval_columns(name: str, interval: Interval) -> dict[str, float]:
@@ -296,7 +312,7 @@ def _profiles(case: CaseResults, evaluation: Evaluation, order: Sequence[str]) -
     thresholds = np.array(THRESHOLDS_PCT)
     weeks = drawn_weeks(evaluation.strata, _generator(), DRAWS)
     found = []
-    shares = share_samples(evaluation)
+    shares = {name: 100.0 * own for name, own in row_samples(evaluation, "share").items()}
     for name in order:
         sample = shares[name]
         if case.kinds[name] in (ACHIEVED, BOUND) or not np.isfinite(sample).any():

@@ -6,7 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from sdc_taichi.atomic_file import atomic_write
-from sdc_taichi.benchmark.leaderboard import BOARD_TITLES, FEWEST, Leaderboard, leaderboard
+from sdc_taichi.benchmark.leaderboard import (
+    BOARD_TITLES,
+    CONSTRAINTS,
+    FEWEST,
+    Leaderboard,
+    leaderboard,
+)
 from sdc_taichi.benchmark.paper_report import PAPER, paper_sections
 from sdc_taichi.benchmark.report_blocks import (
     Block,
@@ -223,6 +229,13 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
         ("Agents trained together against those trained apart", board.apart),
         ("Change against idle commands by site (%)", board.sites),
     ]
+    if broken := [CONSTRAINTS[name] for name in board.standings if name in CONSTRAINTS]:
+        blocks.append(
+            Note(
+                f"Places are by {case.objective} alone. Racks that are off and work that is lost "
+                f"emit nothing: read them beside {', '.join(broken)}."
+            )
+        )
     pictures = case_pictures(board)
     for caption, frame in tables:
         if not frame.empty:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sdc_taichi.benchmark.leaderboard import Leaderboard, share_samples, standard_scores
+from sdc_taichi.benchmark.leaderboard import Leaderboard, row_samples, standard_scores
 from sdc_taichi.benchmark.report_blocks import Block, Picture
 from sdc_taichi.benchmark.suite_results import ACHIEVED, BOUND, LEARNER, OTHER, PLANNER
 from sdc_taichi.learning.evaluation import ALL, IDLE
@@ -95,9 +95,9 @@ def _chosen(board: Leaderboard) -> list[str]:
 
 def _profile_picture(board: Leaderboard, names: list[str]) -> Picture:
     """Share of weeks above each share of the achievable."""
-    shares = share_samples(board.evaluation)
+    shares = row_samples(board.evaluation, "share")
     shown = {
-        name: performance_profile(shares[name], _THRESHOLDS_PCT)
+        name: performance_profile(100.0 * shares[name], _THRESHOLDS_PCT)
         for name in names
         if np.isfinite(shares[name]).any() and board.case.kinds[name] != ACHIEVED
     }
