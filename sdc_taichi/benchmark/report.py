@@ -8,8 +8,8 @@ from pathlib import Path
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.benchmark.leaderboard import (
     BOARD_TITLES,
-    CONSTRAINTS,
     FEWEST,
+    OUTAGES,
     Leaderboard,
     leaderboard,
 )
@@ -229,11 +229,11 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
         ("Agents trained together against those trained apart", board.apart),
         ("Change against idle commands by site (%)", board.sites),
     ]
-    if broken := [CONSTRAINTS[name] for name in board.standings if name in CONSTRAINTS]:
+    if broken := [BOARD_TITLES[name] for name in OUTAGES if name in board.standings]:
         blocks.append(
             Note(
                 f"Places are by {case.objective} alone. Racks that are off and work that is lost "
-                f"emit nothing: read them beside {', '.join(broken)}."
+                f"draw no power: read them beside {', '.join(broken)}."
             )
         )
     pictures = case_pictures(board)
