@@ -244,6 +244,13 @@ def test_figures_that_contradict_each_other(frame: pd.DataFrame, message: str) -
     assert "\n" not in str(raised.value)
 
 
+def test_curves_may_value_ends_below_the_bound() -> None:
+    frame = frame_of(0.3)
+    near = BOUND - 0.04 * (BOUND - frame["figure"].to_numpy())
+    share = (IDLE - near) / (IDLE - ACHIEVED)
+    check_rows(frame.assign(valued_figure=near, share=share), KNOWN, "row")
+
+
 def test_carbon_is_grid_energy_at_intensities_of_the_week(study: Path, tmp_path: Path) -> None:
     frame = frame_of(0.05)
     for name in ("grid_kwh", "it_kwh", "hvac_kwh"):
