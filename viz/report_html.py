@@ -43,6 +43,7 @@ caption { text-align: left; color: #444; padding-bottom: .3rem; }
 th, td { padding: .2rem .6rem; border-bottom: 1px solid #ddd; text-align: left;
   vertical-align: top; }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
+td.n { white-space: nowrap; }
 td { min-width: 3.5rem; }
 thead th { border-bottom: 2px solid #888; }
 tbody th { font-weight: 400; }
@@ -65,6 +66,7 @@ a { color: #0060a0; }
   table { font-size: 8pt; width: 100%; }
   th, td { padding: .12rem .35rem; }
   td { min-width: 0; }
+  td.n { white-space: normal; }
   .long { overflow-wrap: anywhere; }
   .wide { overflow: visible; }
   img { max-height: 230mm; }

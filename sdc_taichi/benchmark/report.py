@@ -127,8 +127,8 @@ def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> lis
     optima_h = _core_h(case.optima_core_s for case in suite.cases.values())
     blocks.append(
         Paragraph(
-            f"{len(results)} results took {whole_h:.3g} hours of a core, trained rows "
-            f"{trained_h:.3g} of them, and optima {optima_h:.3g} beside."
+            f"{len(results)} results took {whole_h:.2g} core hours, {trained_h:.2g} of them for "
+            f"trained rows; solving for optima took {optima_h:.2g} more."
         )
     )
     if len(boards) > 1:
