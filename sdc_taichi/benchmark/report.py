@@ -41,7 +41,7 @@ from sdc_taichi.learning.evaluation import ALL
 from sdc_taichi.viz.plotting import new_figure
 
 _MOST_NAMED = 6
-_READING = (
+READING = (
     "Changes are of sums over all scored weeks, against idle commands in the same weeks, in %: "
     "below 0 is better. Values in brackets are 95 % intervals of a stratified bootstrap, which "
     "draws seeds whole and weeks within their site. The interquartile mean is that of the changes "
@@ -59,6 +59,7 @@ _READING = (
     "Coordination is what agents save together beyond the sum of what each saves alone: below 0 "
     "they are in each other's way, or save the same carbon twice.",
 )
+"""How to read the tables of a report."""
 
 
 def write_report(
@@ -110,7 +111,7 @@ def report_sections(suites: Iterable[SuiteResults]) -> Sections:
             sections |= paper_sections(suite)
         for name, board in boards.items():
             sections[f"{suite.name}: {name}"] = _case_blocks(suite, board)
-    sections["How to read the tables"] = [Paragraph(text) for text in _READING]
+    sections["How to read the tables"] = [Paragraph(text) for text in READING]
     return sections
 
 
@@ -119,21 +120,28 @@ def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> lis
     blocks: list[Block] = [
         Paragraph(text) for text in (suite.suite.title, suite.suite.about) if text
     ]
-    blocks += [Note(text) for text in _notes(suite)]
+    blocks += [Note(text) for text in suite_notes(suite)]
     blocks += [Command(text) for text in suite.commands]
+    blocks.append(Paragraph(cost_text(suite)))
+    if len(boards) > 1:
+        blocks.append(overview(boards))
+    return blocks
+
+
+def cost_text(suite: SuiteResults) -> str:
+    """Processor time that the results of a suite took, in words.
+
+    Args:
+        suite: the results.
+    """
     results = [x for case in suite.cases.values() for rows in case.rows.values() for x in rows]
     trained = [x for x in results if x.kind == LEARNER and x.submission is None]
     whole_h, trained_h = (_core_h(x.content["core_s"] for x in own) for own in (results, trained))
     optima_h = _core_h(case.optima_core_s for case in suite.cases.values())
-    blocks.append(
-        Paragraph(
-            f"{len(results)} results took {whole_h:.2g} core hours, {trained_h:.2g} of them for "
-            f"trained rows; solving for optima took {optima_h:.2g} more."
-        )
+    return (
+        f"{len(results)} results took {whole_h:.2g} core hours, {trained_h:.2g} of them for "
+        f"trained rows; solving for optima took {optima_h:.2g} more."
     )
-    if len(boards) > 1:
-        blocks.append(_overview(boards))
-    return blocks
 
 
 def _core_h(core_s: Iterable[float]) -> float:
@@ -141,8 +149,12 @@ def _core_h(core_s: Iterable[float]) -> float:
     return sum(map(float, core_s)) / 3600
 
 
-def _overview(boards: Mapping[str, Leaderboard]) -> Table:
-    """Change against idle commands of each row in each case."""
+def overview(boards: Mapping[str, Leaderboard]) -> Table:
+    """Change against idle commands of each row in each case.
+
+    Args:
+        boards: what the rows of each case came to.
+    """
     import pandas as pd
 
     changes = {
@@ -153,8 +165,12 @@ def _overview(boards: Mapping[str, Leaderboard]) -> Table:
     return Table("Change against idle commands by case (%)", frame, BOARD_TITLES)
 
 
-def _notes(suite: SuiteResults) -> list[str]:
-    """What is to be known of the results of a suite."""
+def suite_notes(suite: SuiteResults) -> list[str]:
+    """What is to be known of the results of a suite.
+
+    Args:
+        suite: the results.
+    """
     results = [x for case in suite.cases.values() for rows in case.rows.values() for x in rows]
     notes = []
     if suite.quick:
@@ -220,7 +236,7 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
     blocks: list[Block] = []
     if about := case.settings.about:
         blocks.append(Paragraph(about))
-    blocks.append(Paragraph(_weeks_text(board)))
+    blocks.append(Paragraph(weeks_text(board)))
     tables = [
         (f"Standings, {case.objective}; means of a week where no %", board.standings),
         ("Each row against the best rule, and against the row below", board.pairs),
@@ -229,20 +245,14 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
         ("Agents trained together against those trained apart", board.apart),
         ("Change against idle commands by site (%)", board.sites),
     ]
-    if broken := [BOARD_TITLES[name] for name in OUTAGES if name in board.standings]:
-        blocks.append(
-            Note(
-                f"Places are by {case.objective} alone. Racks that are off and work that is lost "
-                f"draw no power: read them beside {', '.join(broken)}."
-            )
-        )
+    blocks += outage_notes(board)
     pictures = case_pictures(board)
     for caption, frame in tables:
         if not frame.empty:
             blocks.append(Table(caption, frame, BOARD_TITLES))
             if frame is board.standings:
                 blocks += pictures
-    rows = _row_texts(suite, board)
+    rows = row_texts(suite, board)
     if rows:
         blocks += [Heading("Rows"), Items(rows)]
     recordings = _recordings(case)
@@ -251,8 +261,26 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
     return blocks
 
 
-def _weeks_text(board: Leaderboard) -> str:
-    """Which weeks of which data centers a case is of."""
+def outage_notes(board: Leaderboard) -> list[Note]:
+    """A note that places are by the objective alone, where work is lost or racks are off.
+
+    Args:
+        board: what the rows of a case came to.
+    """
+    broken = [BOARD_TITLES[name] for name in OUTAGES if name in board.standings]
+    text = (
+        f"Places are by {board.case.objective} alone. Racks that are off and work that is lost "
+        f"draw no power: read them beside {', '.join(broken)}."
+    )
+    return [Note(text)] if broken else []
+
+
+def weeks_text(board: Leaderboard) -> str:
+    """Which weeks of which data centers a case is of.
+
+    Args:
+        board: what its rows came to.
+    """
     first = next(iter(board.case.rows.values()))[0].frame
     sites, weeks = list(dict.fromkeys(first["site"])), list(dict.fromkeys(first["week"]))
     objective = board.case.objective
@@ -262,8 +290,13 @@ def _weeks_text(board: Leaderboard) -> str:
     )
 
 
-def _row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
-    """What the rows are."""
+def row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
+    """What the rows of a case are.
+
+    Args:
+        suite: results of the suite.
+        board: what the rows of the case came to.
+    """
     texts = []
     for name, results in board.case.rows.items():
         about = suite.suite.rows[name].about if name in suite.suite.rows else ""

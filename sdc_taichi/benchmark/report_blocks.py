@@ -94,7 +94,9 @@ class Picture:
     """Text below it."""
 
 
-Block = Heading | Paragraph | Items | Links | Note | Command | Table | Picture
+TextBlock = Heading | Paragraph | Items | Links | Note | Command | Table
+"""Part of a section of a report that is no picture."""
+Block = TextBlock | Picture
 """Part of a section of a report."""
 Sections = Mapping[str, Sequence[Block]]
 """Blocks of each section of a report, by its heading."""
@@ -111,8 +113,27 @@ def markdown_report(title: str, sections: Sections, folder: Path) -> str:
     parts = [f"# {literal_markdown(title)}"]
     for heading, blocks in sections.items():
         parts.append(f"## {literal_markdown(heading)}")
-        parts += [text for block in blocks if (text := _markdown_block(block, folder))]
+        parts += markdown_blocks(blocks, folder)
     return "\n\n".join(parts) + "\n"
+
+
+def markdown_blocks(
+    blocks: Sequence[Block], folder: Path, picture: Callable[[Picture], str] | None = None
+) -> list[str]:
+    """Blocks as Markdown, one text each.
+
+    Args:
+        blocks: the blocks.
+        folder: where the file will stand, from which links lead.
+        picture: gives the Markdown of a picture; None leaves pictures out.
+    """
+    found = []
+    for block in blocks:
+        if not isinstance(block, Picture):
+            found.append(_markdown_block(block, folder))
+        elif picture is not None:
+            found.append(picture(block))
+    return found
 
 
 def html_report(title: str, lead: str, sections: Sections, folder: Path) -> str:
@@ -134,8 +155,8 @@ def html_report(title: str, lead: str, sections: Sections, folder: Path) -> str:
     return html_page(title, lead, shown, set())
 
 
-def _markdown_block(block: Block, folder: Path) -> str:
-    """A block as Markdown; empty for a picture."""
+def _markdown_block(block: TextBlock, folder: Path) -> str:
+    """A block as Markdown."""
     match block:
         case Heading(text):
             return f"### {literal_markdown(text)}"
@@ -154,8 +175,6 @@ def _markdown_block(block: Block, folder: Path) -> str:
             return "    " + printable(" ".join(text.split()))
         case Table(caption, frame, titles):
             return f"{literal_markdown(caption)}\n\n{markdown(frame, titles)}"
-        case Picture():
-            return ""
 
 
 def _html_block(block: Block, folder: Path) -> str:

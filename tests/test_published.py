@@ -1,0 +1,137 @@
+"""Published results of suites are reached again, and new ones are published as they should be."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from made_studies import ROWS, done_job, frames_of_row, write_study
+from published import FIGURES, FOLDER, SUITES, cells, described, suite_of, tolerance
+from sdc_taichi import SdcError, make_controller
+from sdc_taichi.benchmark.cases import data_centers
+from sdc_taichi.benchmark.store import ResultStore
+from sdc_taichi.learning.evaluation import Contender, evaluate, prepare
+
+pytestmark = pytest.mark.repo
+
+ROOT = Path(__file__).parent.parent
+SHARES = "small"
+"""Suite whose shares of the achievable are computed again, which needs an optimum."""
+
+
+@pytest.mark.parametrize("suite", sorted(path.name for path in FOLDER.iterdir()))
+def test_suites_are_still_those_that_were_published(suite: str) -> None:
+    published, now = described(suite), suite_of(suite)
+    assert str(now.objective) == published["objective"]
+    case = now.cases[published["case"]].model_dump(mode="json", exclude={"about"})
+    assert case == published["case_settings"]
+    leave_out = {"about", "seeds", "cases"}
+    rows = {name: now.rows[name].model_dump(mode="json", exclude=leave_out)
+            for name in published["row_settings"]}  # fmt: skip
+    assert rows == published["row_settings"]
+
+
+@pytest.mark.parametrize("suite", ["small", *SUITES])
+def test_cells_are_reached_again(suite: str) -> None:
+    if not (FOLDER / suite).is_dir():
+        pytest.skip(f"suite {suite} is not published")
+    published, told = described(suite), cells(suite)
+    case = suite_of(suite).cases[published["case"]]
+    site, week = told["idle"]["site"], told["idle"]["week"]
+    configs = [x for x in data_centers(case, "held-out") if x.name == site]
+    solved = suite == SHARES
+    with prepare(
+        configs,
+        [week],
+        objective=published["objective"],
+        optimum=solved,
+        days=case.days,
+        cache=False,
+    ) as weeks:
+        contenders = []
+        for name, cell in told.items():
+            spec = cell["controller"].replace("policy:", f"policy:{FOLDER / suite}/")
+            contenders.append(Contender(f"row {name}", make_controller(spec, weeks.sim.fleet)))
+        rows = evaluate(weeks, contenders, beside=False).rows
+    assert len(rows) == len(told) > 1
+    for (name, cell), own in zip(told.items(), rows.to_dict("records"), strict=True):
+        limit = tolerance(name, published)
+        for figure in FIGURES:
+            assert own[figure] == pytest.approx(cell[figure], rel=limit), (name, figure)
+        if solved:
+            assert own["share"] == pytest.approx(cell["share"], abs=100 * limit), name
+
+
+# --- Publishing -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def publisher(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    return importlib.import_module("publish_benchmark")
+
+
+def test_commands_are_shown_without_places_of_results(publisher: ModuleType) -> None:
+    for text in ("--out /a/b --resume", "--out=c", ""):
+        shown = publisher.command_of(f"sdc-taichi benchmark bill {text} --jobs 2")
+        assert shown == "sdc-taichi benchmark bill --jobs 2"
+
+
+@pytest.fixture
+def docs(tmp_path: Path) -> Path:
+    folder = tmp_path / "docs"
+    folder.mkdir()
+    (folder / "benchmark.md").write_text(
+        "# Results\n<!-- how to read the tables -->\n<!-- end -->\n"
+        "Found: nothing.\n<!-- made-up -->\nold\n<!-- end -->\nNo more.\n"
+    )
+    return folder
+
+
+def test_tables_pictures_and_cells_of_a_suite(
+    publisher: ModuleType, docs: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    study, out = write_study(tmp_path / "made-up"), tmp_path / "cells"
+    store = ResultStore(study)
+    files = {"best/policy.json": b"{}", "training.csv": b"1"}
+    store.keep(done_job("ippo", 0, frames_of_row("ippo", 0), spec=ROWS["ippo"], files=files))
+    publisher.publish([study], docs, out)
+    page = (docs / "benchmark.md").read_text("utf-8")
+    assert page.startswith("# Results\n<!-- how to read")
+    assert "Found: nothing.\n<!-- made-up -->\n" in page
+    assert page.endswith("<!-- end -->\nNo more.\n")
+    assert "\nold\n" not in page
+    assert "    sdc-taichi benchmark made-up\n" in page
+    assert "| 1 | mpc-24h | 1 | -8.97 (" in page
+    assert "(img/benchmark-made-up-1.webp)" in page
+    assert (docs / "img" / "benchmark-made-up-1.webp").read_bytes()[8:12] == b"WEBP"
+    lines = (out / "made-up" / "cells.csv").read_text("utf-8").splitlines()
+    assert [line.split(",")[:4] for line in lines[1:]] == [
+        ["idle", "idle", "ca", "3"],
+        ["ippo", "policy:ippo", "ca", "3"],
+    ]
+    assert [path.name for path in (out / "made-up" / "ippo").iterdir()] == ["policy.json"]
+
+
+def test_results_that_are_not_those_of_a_suite_are_refused(
+    publisher: ModuleType, docs: Path, tmp_path: Path
+) -> None:
+    before = (docs / "benchmark.md").read_text("utf-8")
+    part = write_study(tmp_path / "part", leave_out=["made-up/two-sites/ippo/1"])
+    with pytest.raises(SdcError, match=r"two-sites: ippo, seed 1 is missing; valid are all"):
+        publisher.publish([part], docs, tmp_path / "cells")
+    mixed = write_study(tmp_path / "mixed")
+    ResultStore(mixed).keep(
+        done_job("g36", 0, frames_of_row("g36", 0), spec=ROWS["g36"], source="1" * 64)
+    )
+    with pytest.raises(SdcError, match=r"of source 0{12} and 1{12}; valid is one"):
+        publisher.publish([mixed], docs, tmp_path / "cells")
+    assert (docs / "benchmark.md").read_text("utf-8") == before
+    assert not (tmp_path / "cells").exists()
+    (docs / "benchmark.md").write_text("# Results\n")
+    with pytest.raises(SdcError, match="no lines <!-- how to read the tables -->"):
+        publisher.publish([mixed], docs, tmp_path / "cells", draft=True)
