@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from sdc_taichi.benchmark.runner import InProcess
 from sdc_taichi.benchmark.store import ResultStore, Study
 from sdc_taichi.cli import execution
 from sdc_taichi.cli.execution import JobsCommand, JobSession, Ray, job_progress, job_session
+from sdc_taichi.errors import ConfigError
 
 STUDY = Study("sweep", "sdc-taichi sweep", {}, [])
 
@@ -45,6 +47,13 @@ def test_the_address_of_ray_may_be_left_out(line: str, ray: str | None, rest: st
 
     done = CliRunner().invoke(app, line.split())
     assert done.output.split() == [str(ray), *rest.split()]
+
+
+def test_jobs_run_on_ray_only_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert execution.executor_of(3, None).workers == 3
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ConfigError, match=r'--ray needs Ray.*"sdc-taichi\[scale\]"'):
+        execution.executor_of(None, "local")
 
 
 def test_progress_is_lines_where_there_is_no_terminal(

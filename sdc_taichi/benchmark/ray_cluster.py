@@ -92,8 +92,7 @@ class RayCluster:
                 running[task.remote(job, sys.path, *contents)] = job
             if not running:
                 return
-            ray.wait(list(running), timeout=_POLL_S)
-            ended, _ = ray.wait(list(running), num_returns=len(running), timeout=0)
+            ended, _ = ray.wait(list(running), timeout=_POLL_S)
             for reference in ended:
                 yield self._result(reference, running.pop(reference))
 
@@ -109,7 +108,7 @@ class RayCluster:
         except self._ray.exceptions.RayTaskError as error:  # errors of jobs are in their results
             raise RuntimeStateError(
                 "a machine of the Ray cluster cannot run jobs; install the same sdc-taichi on all "
-                f"of them: {error.cause}"
+                f"of them: {str(error.cause).splitlines()[0]}"
             ) from error
         except self._ray.exceptions.RayError as error:
             return DoneJob(job, f"Ray could not finish it: {_reason(error)}")
