@@ -117,6 +117,8 @@ def test_weeks_are_those_of_the_split_unless_given() -> None:
         (case(config="tinny"), "no such file or preset; did you mean 'tiny'"),
         (case(optimum=False), "rows.optimum: case tiny has optimum false"),
         ({"cases": {}}, "cases"),
+        ({"quick": {"cases": ["tiny"]}}, "quick: cases ['tiny']; valid are cases by name"),
+        ({"quick": {"rows": None}}, "quick: rows None; valid are rows by name"),
     ],
 )
 def test_what_is_not_valid_is_named(changes: Mapping[str, Any], message: str) -> None:
@@ -132,6 +134,14 @@ def test_what_is_not_valid_is_named(changes: Mapping[str, Any], message: str) ->
         ({"rows": {"a": {"best_of": ["g36", "g63"]}}}, "rows.a: controller 'g63': unknown"),
         ({"rows": {"a": {"train": {"algorithm": "pppo"}}}}, "did you mean 'ppo'"),
         ({"rows": {"a": {"train": {"algorithm": "ppo", "seed": 3}}}}, "seed: is that of the case"),
+        (
+            {"rows": {"a": {"train": {"algorithm": "ippo", "environment": {"agents": 3}}}}},
+            "rows.a: train: environment.agents: Input should be a valid tuple (got 3)",
+        ),
+        (
+            {"rows": {"a": {"train": {"algorithm": "ippo", "environment": {"commands": [1]}}}}},
+            "rows.a: train: environment.commands: Input should be a valid dictionary",
+        ),
         (case(sites=["Nowhere"]), "cases.tiny"),
         (
             case(overrides={"events": {"sampled": [{"kind": "grid_outage", "per_year": 9,

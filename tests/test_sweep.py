@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 
 from sdc_taichi import Simulator, load_config, make_controller, simulate, with_values
 from sdc_taichi.benchmark.best_value import best_by_month, with_default
-from sdc_taichi.benchmark.jobs import JobResult
+from sdc_taichi.benchmark.jobs import Inputs, JobResult
 from sdc_taichi.benchmark.runner import InProcess
 from sdc_taichi.benchmark.sweep import (
     Sweep,
@@ -282,6 +282,22 @@ def test_the_command_keeps_rows_and_tells_the_best_value(tmp_path: Path) -> None
     again = call(*asked, "--resume")
     assert "kept" in again.stderr
     pd.testing.assert_frame_equal(pd.read_parquet(out / "results"), rows)
+
+
+@pytest.mark.usefixtures("_in_process")
+def test_runs_of_jobs_that_fail_are_not_counted_among_those_with_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(values: Mapping[str, Any], _inputs: Inputs) -> JobResult:
+        raise SdcError("memory is short")
+
+    monkeypatch.setattr("sdc_taichi.benchmark.sweep.run_part", refuse)
+    asked = ["--vary", f"{SETPOINT}=16,18", "--months", "1,7", "--best", "cfp_kg"]
+    done = call("tiny", *asked, "--out", tmp_path / "sweep")
+    assert done.exit_code == 1
+    assert "0 of 4 runs have their rows in" in done.stdout
+    assert "2 of 2 jobs failed; --resume runs them again" in done.stderr
+    assert not (tmp_path / "sweep/best.csv").exists()
 
 
 def test_what_would_run_is_shown_and_nothing_written(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ class Submission:
     store: ResultStore
     """The folder."""
     about: Mapping[str, Any]
-    """Content of submission.json: ``author``, ``about``, ``link`` and ``random``."""
+    """Content of submission.json: ``author``, ``about``, ``link`` and ``kind``."""
     suite: str
     """Suite that the row is of."""
     row: str

@@ -18,6 +18,7 @@ from sdc_taichi.learning.evaluation import ALL, METRICS
 from sdc_taichi.learning.split import UNSCORED_DAYS
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS
+from sdc_taichi.run.achievable import share_of_achievable
 from sdc_taichi.types import F64
 
 if TYPE_CHECKING:
@@ -194,8 +195,7 @@ def _check_figures(rows: _Rows, known: KnownCase) -> None:
     )
     idle, achieved = rows.values("idle_figure"), rows.values("achieved_figure")
     valued, share = rows.values("valued_figure"), rows.values("share")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        expected = np.where(idle > achieved, (idle - valued) / (idle - achieved), np.nan)
+    expected = share_of_achievable(valued, idle, achieved)
     size = 1.0 + np.abs(np.nan_to_num(expected))
     rows.refuse(
         np.isfinite(expected) & ~(np.abs(share - expected) <= _SAME * size),

@@ -20,7 +20,7 @@ from sdc_taichi.config.fields import Section, Text
 from sdc_taichi.config.reference import sections_markdown
 from sdc_taichi.control import ForecastError
 from sdc_taichi.control.registry import parts_of
-from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
+from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
 from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS, WEEKS, parse_weeks
 from sdc_taichi.learning.training_settings import merged
 from sdc_taichi.optimum.objective import Objective
@@ -210,6 +210,14 @@ class Suite(Section):
     @classmethod
     def _is_one(cls, value: str) -> str:
         return str(Objective.parse(value))
+
+    @field_validator("quick")
+    @classmethod
+    def _sections_are_by_name(cls, value: dict[str, Any]) -> dict[str, Any]:
+        for kind in ("cases", "rows"):
+            if not isinstance(value.get(kind, {}), dict):
+                raise ValueError(f"{kind} {shortened(value[kind])}; valid are {kind} by name")
+        return value
 
     @field_validator("rows")
     @classmethod

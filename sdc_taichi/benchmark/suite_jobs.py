@@ -39,7 +39,7 @@ from sdc_taichi.learning.evaluation import (
 )
 from sdc_taichi.learning.policy import WEIGHTS
 from sdc_taichi.optimum.entry import OptimumCacheWarning
-from sdc_taichi.run.achievable import AchievedPath
+from sdc_taichi.run.achievable import AchievedPath, share_of_achievable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -370,8 +370,6 @@ def _rows_of_figures(weeks: DataCenterWeeks, figures: Mapping[str, Any]) -> pd.D
     achieved = nan if best is None else best.achieved
     frames = []
     for moves, figure in figures.items():
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = (weeks.idle - figure) / (weeks.idle - achieved)
         columns = {
             "controller": "",
             "training": pd.array([pd.NA] * weeks.sim.size, dtype="Int64"),
@@ -382,7 +380,7 @@ def _rows_of_figures(weeks: DataCenterWeeks, figures: Mapping[str, Any]) -> pd.D
             "valued_figure": figure,
             "idle_figure": weeks.idle,
             "achieved_figure": achieved,
-            "share": np.where(weeks.idle > achieved, share, np.nan),
+            "share": share_of_achievable(figure, weeks.idle, achieved),
             "broken": "",
             **{name: nan for name in METRICS},
         }

@@ -126,12 +126,12 @@ def sweep_command(
     session = job_session(store, study, resume=resume, jobs=jobs, ray=ray, quiet=quiet)
     with session as under_way:
         under_way.run("sweep", sweep_jobs(sweep, inputs), len(partitions), inputs)
-        failed = _print_failures(store)
+        done, failed = _print_failures(store)
         if under_way.is_whole:
             if not quiet:
-                done = f"{sweep.runs - failed:,} of {sweep.runs:,} runs"
-                print(f"{done} have their rows in {printable(folder / RESULTS)}")
-            if best is not None:
+                place = printable(folder / RESULTS)
+                print(f"{done:,} of {sweep.runs:,} runs have their rows in {place}")
+            if best is not None and done:
                 _write_best(store, sweep, best, quiet=quiet)
         under_way.finish()
     if failed:
@@ -205,15 +205,17 @@ def _default_folder(label: str, sweep: Sweep) -> Path:
     return Path("sweeps") / "-".join([Path(label).stem, *fields])
 
 
-def _print_failures(store: ResultStore) -> int:
+def _print_failures(store: ResultStore) -> tuple[int, int]:
     """Print why runs failed, each reason once, on stderr.
 
     Returns:
-        Number of runs that failed.
+        Number of runs that have rows, and of those that failed in jobs that are done.
     """
+    runs = 0
     reasons: dict[str, list[str]] = {}
     notes: dict[str, None] = {}
     for result in store.results():
+        runs += len(result["values"]["cells"])
         notes |= dict.fromkeys(result["metrics"]["notes"])
         for each in result["metrics"]["failed"]:
             reasons.setdefault(each["error"], []).append(each["combination"])
@@ -224,7 +226,8 @@ def _print_failures(store: ResultStore) -> int:
     if len(reasons) > _MOST_LINES:
         left_out = len(reasons) - _MOST_LINES
         print(f"failed: {left_out} more reasons, in metrics.json of the jobs", file=sys.stderr)
-    return sum(map(len, reasons.values()))
+    failed = sum(map(len, reasons.values()))
+    return runs - failed, failed
 
 
 def _write_best(store: ResultStore, sweep: Sweep, metric: str, *, quiet: bool) -> None:

@@ -81,18 +81,22 @@ def training_environment(given: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         given: options that the user or a scenario gives, by name.
     """
-    agents = tuple(given.get("agents") or AGENTS)
+    agents, commands = given.get("agents") or AGENTS, given.get("commands") or {}
+    # What is not valid here is refused with all other options.
+    agents = [x for x in agents if x in AGENTS] if isinstance(agents, list | tuple) else []
+    commands = commands if isinstance(commands, Mapping) else {}
     found: dict[str, Any] = {}
     if given.get("actions", "continuous") == "continuous":
         found["actions"] = "continuous"
-        decided = (given.get("commands") or {}).get("agent_dc", ("cooling",))
-        if "agent_dc" in agents and "cooling" in decided:
+        decided = commands.get("agent_dc", ("cooling",))
+        moves_setpoint = isinstance(decided, list | tuple) and "cooling" in decided
+        if "agent_dc" in agents and moves_setpoint:
             found["setpoint_change_k"] = SETPOINT_CHANGE_K
     if given.get("rewards", "default") in _OWN_PARTS:
         found["collaboration"] = 1.0
     if given.get("observations", "default") == "default":
         found["ci_leads_h"] = CI_LEADS_H
-        if not given.get("commands"):
+        if not commands:
             found["features"] = {agent: _features(agent, given) for agent in agents}
     return found
 

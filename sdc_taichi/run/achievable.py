@@ -78,12 +78,25 @@ def achievement(optimum: Optimum, controller: str, score: Score) -> Achievement:
     ends = score.start_kwh, score.start_tasks, score.end_kwh, score.end_tasks
     valued = score.figure - optimum.end_value(*ends)
     room = optimum.idle - optimum.achieved
-    share = np.full(len(room), np.nan)
-    np.divide(optimum.idle - valued, room, out=share, where=room > 0)
+    share = share_of_achievable(valued, optimum.idle, optimum.achieved)
     total_room = float(room.sum())
     total = float((optimum.idle - valued).sum()) / total_room if total_room > 0 else float("nan")
     broken = tuple(tuple(_broken(optimum, score, dc)) for dc in range(len(room)))
     return Achievement(controller, score.figure, valued, share, total, broken)
+
+
+def share_of_achievable(figures: F64, idle: F64, achieved: F64) -> F64:
+    """Share of the achievable of each figure; nan where the optimum is no better than idle.
+
+    Args:
+        figures: figures, with the value of their ends, (B,).
+        idle: those of idle commands, (B,).
+        achieved: those of the optimum's achieved path, (B,); nan where there is none.
+    """
+    room = idle - achieved
+    share = np.full(room.shape, np.nan)
+    np.divide(idle - figures, room, out=share, where=room > 0)
+    return share
 
 
 def run_beside(
