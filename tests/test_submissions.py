@@ -291,11 +291,13 @@ def test_policies_of_others_run_again(tmp_path: Path) -> None:
         frame = evaluate(weeks, [contender], beside=False).rows.drop(columns="training")
     names = {"suite": "small", "case": "hall", "kind": "learner", "author": "a"}
 
-    def add(row: str, told: pd.DataFrame, policies: dict[str, bytes]) -> Result:
+    def add(row: str, told: pd.DataFrame, policies: dict[str, bytes], weeks: int = 1) -> Result:
         write_submission(tmp_path / row, {0: told}, **names, row=row, files={0: policies})
-        arguments = ["add", str(tmp_path / row), "--to", str(target), "--verify", "1"]
+        arguments = ["add", str(tmp_path / row), "--to", str(target), "--verify", str(weeks)]
         return CliRunner().invoke(app, ["benchmark", *arguments])
 
+    done = add("theirs", frame, files, weeks=2)
+    assert "verify 2: case hall has 1 weeks; valid are no more" in done.stderr
     done = add("theirs", frame, files)
     assert done.exit_code == 0, done.output
     assert "Run again in 1 weeks of each site: figures differ by 0 at most" in done.stdout

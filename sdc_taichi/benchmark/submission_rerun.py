@@ -28,14 +28,15 @@ def rerun(submission: Submission, to: Path, weeks: int, progress: Progress | Non
     Args:
         submission: the row.
         to: folder of the study of its suite.
-        weeks: number of weeks of each site.
+        weeks: number of weeks of each site, 1 or more and no more than there are.
         progress: is told of the results that are compared.
 
     Returns:
         Largest relative difference of the figure of a week.
 
     Raises:
-        SdcError: no policies, policies that do not fit, or figures that are not reached again.
+        SdcError: no policies, policies that do not fit, fewer weeks, or figures that are not
+            reached again.
     """
     (suite,) = read_suites([to])
     worst = 0.0
@@ -46,11 +47,15 @@ def rerun(submission: Submission, to: Path, weeks: int, progress: Progress | Non
         if case is None or suite.name != submission.suite:
             raise ConfigError(f"{result.folder}: no such case in {to}; valid is its suite")
         chosen = case.settings
-        step = -(-len(chosen.weeks) // weeks)
+        known = len(chosen.weeks)
+        if weeks > known:
+            raise ConfigError(
+                f"verify {weeks}: case {case.name} has {known} weeks; valid are no more"
+            )
         error = result.content["metrics"].get("forecast_error")
         with prepare(
             data_centers(chosen, "held-out"),
-            chosen.weeks[::step],
+            [chosen.weeks[known * k // weeks] for k in range(weeks)],
             objective=case.objective,
             optimum=False,
             days=chosen.days,
