@@ -107,6 +107,9 @@ def test_an_interrupt_while_the_package_is_imported_ends_the_program_quietly() -
     code = """
 import os, signal, sys
 
+# Processes of a shell's background jobs ignore it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 class Interrupt:
     def find_spec(self, name, path=None, target=None):
         if name == "numpy":
