@@ -87,7 +87,7 @@ def best_by_month(rows: pd.DataFrame, sweep: Sweep, metric: str) -> pd.DataFrame
 def figures_by_month(
     rows: pd.DataFrame, sweep: Sweep, metric: str
 ) -> list[tuple[str, list[int], F64, F64]]:
-    """What pictures show: name of each group, its months, its values and the metric there.
+    """Figures for pictures: name of each group, its months, its values and the metric there.
 
     Args:
         rows: rows of the sweep.

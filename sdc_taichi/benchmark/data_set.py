@@ -1,4 +1,4 @@
-"""What a data set for offline learning holds, and what its episodes come to."""
+"""Data sets for offline learning as they are written, and the returns of their controllers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sdc_taichi.learning.experts import objective_of_optimum
 
 @dataclass(slots=True)
 class ControllerReturns:
-    """What episodes of a controller come to."""
+    """Returns of the episodes of a controller, and sums over their steps."""
 
     controller: str
     """Name of the controller."""
@@ -54,7 +54,7 @@ class DataSet:
     folder: Path
     """Folder with its card and the folder ``data``."""
     collection: Collection
-    """What it holds."""
+    """Episodes that the data set holds."""
     idle: ControllerReturns
     """Returns of idle commands, whether their episodes are in it or not."""
     controllers: tuple[ControllerReturns, ...]

@@ -286,7 +286,7 @@ def _make_actor(
     progress: Progress | None,
     stop: Callable[[], bool] | None,
 ) -> _Commander | _Chance:
-    """What acts in environments by the name of a controller."""
+    """The source of actions in environments, by the name of a controller."""
     if name == RANDOM:
         return _Chance(env)
     options = env.core.options

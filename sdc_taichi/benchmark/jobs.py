@@ -58,7 +58,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class JobResult:
-    """What a job returns. It is equal to the bit wherever the job ran on one kind of processor."""
+    """Rows, figures and files of a job, equal to the bit on all processors of one kind."""
 
     rows: pd.DataFrame | None
     """Rows of the dataset, to which the columns of the partition are added where it is read; None

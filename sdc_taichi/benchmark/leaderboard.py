@@ -33,6 +33,7 @@ from sdc_taichi.learning.statistics import (
     percentile_interval,
     performance_profile,
     probability_of_improvement,
+    sample_mean,
 )
 from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.types import F64
@@ -77,7 +78,7 @@ _LEAST_POINTS = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Leaderboard:
-    """What the rows of a case came to."""
+    """Tables that compare the rows of a case."""
 
     case: CaseResults
     """Results of the case."""
@@ -92,7 +93,7 @@ class Leaderboard:
     profiles: pd.DataFrame
     """Share of weeks above given shares of the achievable, in %; empty without an optimum."""
     coordination: pd.DataFrame
-    """What agents of a row save alone and together; empty where none ran alone."""
+    """Savings of the agents of a row alone and together; empty where none ran alone."""
     apart: pd.DataFrame
     """Rows whose agents were trained apart against those that were trained together."""
     sites: pd.DataFrame
@@ -272,12 +273,8 @@ def row_samples(evaluation: Evaluation, column: str) -> dict[str, F64]:
 def _mean_columns(metric: str, sample: F64, evaluation: Evaluation, name: str) -> dict[str, float]:
     """Mean of a metric over weeks and seeds with its interval."""
     weeks = drawn_weeks(evaluation.strata, _generator(), DRAWS)
-
-    def mean(values: F64) -> F64:
-        return np.asarray(values.mean(axis=(-2, -1)))
-
-    drawn = bootstrap_values(mean, (sample,), weeks, _generator(name))
-    return interval_columns(metric, percentile_interval(float(mean(sample)), drawn))
+    drawn = bootstrap_values(sample_mean, (sample,), weeks, _generator(name))
+    return interval_columns(metric, percentile_interval(float(sample_mean(sample)), drawn))
 
 
 def interval_columns(name: str, interval: Interval) -> dict[str, float]:
@@ -330,7 +327,7 @@ def _profiles(case: CaseResults, evaluation: Evaluation, order: Sequence[str]) -
 
 
 def _coordination(case: CaseResults, evaluation: Evaluation, figures: _Samples) -> pd.DataFrame:
-    """What agents save alone, the others idle, and together."""
+    """Savings of each agent alone, the others idle, and of all together."""
     import pandas as pd
 
     by_agent = {agent: samples(evaluation, agent) for agent in AGENTS}

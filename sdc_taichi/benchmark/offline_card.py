@@ -95,7 +95,7 @@ def card(made: DataSet, command: str) -> str:
 
 
 def _facts(made: DataSet, env: SdcVectorEnv) -> list[tuple[str, str]]:
-    """What the data set holds, in a few words each."""
+    """Names and values of what the data set holds, in a few words each."""
     collection, options = made.collection, env.core.options
     episodes = sum(each.episodes for each in made.controllers)
     steps = sum(each.steps for each in made.controllers)
@@ -174,7 +174,7 @@ def _observations(env: SdcVectorEnv) -> list[tuple[str, ...]]:
 
 
 def _actions(env: SdcVectorEnv) -> list[tuple[str, ...]]:
-    """What the entries of an action mean."""
+    """Agent, command and meaning of the entries of an action."""
     core, options = env.core, env.core.options
     meanings = _CONTINUOUS if options.actions == "continuous" else _DISCRETE
     values: dict[str, float] = {"change": options.setpoint_change_k, "fan": options.fan_change}

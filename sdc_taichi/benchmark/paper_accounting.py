@@ -28,6 +28,7 @@ from sdc_taichi.learning.statistics import (
     Statistic,
     bootstrap_interval,
     change_pct,
+    sample_mean,
 )
 from sdc_taichi.types import F64
 
@@ -38,7 +39,6 @@ CONSTANT_ROW = "coldest"
 """Row of a suite that holds the lowest setpoint, which all others are told against."""
 _METRICS = ("cfp_kg", "grid_kwh", "hvac_kwh", "it_kwh", "queue_mean_tasks", "water_l")
 _QUARTERS_PER_H = 4
-_SMOOTHED_STEPS = 16
 _SEED = 0
 """Seed of the draws of intervals."""
 
@@ -75,7 +75,7 @@ class PaperTable(Section):
     panel: Annotated[str, Field(pattern="^[a-f]$")]
     """Panel of figure 4 that shows the table, a..f."""
     title: Text
-    """What the table compares."""
+    """Subject of the table."""
     case: str
     """Case of suite ``paper`` with the same data center and months."""
     site: str
@@ -138,17 +138,6 @@ def compared(table: PaperTable, rows: pd.DataFrame, scored_h: float) -> list[Com
     return [_compared_row(name, table, samples.get(name), constant) for name in names]
 
 
-def paper_figures(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> PaperFigures:
-    """Means over weeks and seeds, in the units of a table.
-
-    Args:
-        rows: rows with the metrics of ``learning.evaluation``, one for each week and seed.
-        table: the table, which gives the site's rise of the carbon intensity.
-        scored_h: scored hours of each week.
-    """
-    return PaperFigures(*(float(x) for x in _columns(rows, table, scored_h).mean(axis=0)))
-
-
 def radar(rows: Sequence[ComparedRow], *, printed: bool) -> tuple[list[str], F64]:
     """Rows that the paper has as figure 4 shows them: low figures far from the centre.
 
@@ -200,25 +189,6 @@ def finding(rows: Sequence[ComparedRow]) -> str:
     )
 
 
-def released_utilisation(hourly: F64) -> F64:
-    """Utilisation by quarter hour as the released code makes it of a trace, without its noise.
-
-    Hours are interpolated over a year stretched by an hour, scaled so that the 5th and 95th
-    percentile are 0.2 and 0.8, and averaged over four hours (``Workload_Manager``).
-
-    Args:
-        hourly: utilisation by the hour, 0..1, (H,).
-
-    Returns:
-        Utilisation, 0..1, (4 H,).
-    """
-    size = _QUARTERS_PER_H * len(hourly)
-    quarters = np.interp(np.linspace(0, len(hourly), size), np.arange(len(hourly)), hourly)
-    low, high = np.percentile(quarters, [5.0, 95.0])
-    scaled = np.clip(0.2 + 0.6 * (quarters - low) / (high - low), 0.0, 1.0)
-    return np.convolve(scaled, np.full(_SMOOTHED_STEPS, 1.0 / _SMOOTHED_STEPS), mode="same")
-
-
 def _columns(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> F64:
     """Figures of each row in the order of ``PaperFigures``, (N, 5)."""
     metrics = {name: rows[name].to_numpy(np.float64) for name in _METRICS}
@@ -252,7 +222,7 @@ def _compared_row(
     printed = table.rows.get(name)
     ours, against = None, None
     if sample is not None:
-        ours = tuple(_interval(_mean, values) for values in sample)
+        ours = tuple(_interval(sample_mean, values) for values in sample)
         if constant is not None:
             if constant.shape[2] != sample.shape[2]:
                 raise ConfigError(
@@ -268,11 +238,6 @@ def _compared_row(
         against_constant_pct=against,
         printed=None if printed is None else printed.figures,
     )
-
-
-def _mean(values: F64) -> F64:
-    """Mean over seeds and weeks of samples (..., S, W)."""
-    return np.asarray(values.mean(axis=(-2, -1)))
 
 
 def _interval(statistic: Statistic, *samples: F64) -> Interval:

@@ -116,7 +116,7 @@ def report_sections(suites: Iterable[SuiteResults]) -> Sections:
 
 
 def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> list[Block]:
-    """What a suite is about, what made its results, and what is to be known of them."""
+    """Subject of a suite, the commands and time behind its results, and notes on them."""
     blocks: list[Block] = [
         Paragraph(text) for text in (suite.suite.title, suite.suite.about) if text
     ]
@@ -166,7 +166,7 @@ def overview(boards: Mapping[str, Leaderboard]) -> Table:
 
 
 def suite_notes(suite: SuiteResults) -> list[str]:
-    """What is to be known of the results of a suite.
+    """Notes on the results of a suite, such as what is missing.
 
     Args:
         suite: the results.
@@ -192,7 +192,7 @@ def suite_notes(suite: SuiteResults) -> list[str]:
 
 
 def _notes_of_case(case: CaseResults) -> list[str]:
-    """What is to be known of the results of a case."""
+    """Notes on the results of a case, such as too few seeds."""
     notes = []
     for name, rows in case.rows.items():
         if rows[0].submission is not None:
@@ -291,7 +291,7 @@ def weeks_text(board: Leaderboard) -> str:
 
 
 def row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
-    """What the rows of a case are.
+    """Descriptions of the rows of a case.
 
     Args:
         suite: results of the suite.

@@ -17,7 +17,7 @@ Stop = Callable[[], bool]
 
 
 class Executor(Protocol):
-    """What runs jobs in worker processes, here or on other machines.
+    """Interface of what runs jobs in worker processes, here or on other machines.
 
     As a context manager it ends its workers, and the jobs that they run.
     """
@@ -57,7 +57,7 @@ class Executor(Protocol):
 
 
 class InProcess:
-    """Runs jobs one after the other in this process, without any worker."""
+    """Runs jobs one after the other in this process, for tests and debuggers."""
 
     workers = 1
 
@@ -77,7 +77,7 @@ class InProcess:
 
 @dataclass(frozen=True, slots=True)
 class JobSummary:
-    """What became of the jobs of a study."""
+    """Numbers of the jobs of a study that are done and were kept, and those that failed."""
 
     done: int
     """Number of jobs that were run and ended well."""

@@ -41,10 +41,10 @@ _MOST_DIFFERENCES = 3
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """What a study was asked for."""
+    """A study as it is asked for: its settings and the jobs that it is to do."""
 
     kind: str
-    """What the study is: ``suite`` or ``sweep``."""
+    """Kind of the study: ``suite`` or ``sweep``."""
     command: str
     """Command line that runs the study, or goes on with it."""
     settings: Mapping[str, Any]

@@ -390,7 +390,7 @@ def _idle_differs(results: Sequence[RowResult]) -> bool:
 
 
 def _known(case: CaseResults, beside: RowResult, ci_g_per_kwh: F64) -> KnownCase:
-    """What is known of a case."""
+    """Figures and limits that rows of others in a case are held against."""
     frame = beside.frame[beside.frame["moves"] == ALL].reset_index(drop=True)
     keys = zip(map(str, frame["site"]), map(int, frame["week"]), strict=True)
     bound = np.array([case.bound.get(key, np.nan) for key in keys])

@@ -1,4 +1,4 @@
-"""What rows of others have to fulfil: the weeks of the case, and figures that fit together.
+"""Checks of rows of others: the weeks of the case, and figures that fit together.
 
 All that is tested follows from the rows themselves, from results of the same case that are known,
 and from the inputs of the case. What a run did within a week is not known, so figures that were
@@ -41,7 +41,7 @@ off a tenth of the work of two days were below the bound by 4 % of it."""
 
 @dataclass(frozen=True, slots=True)
 class KnownCase:
-    """What is known of a case, to hold rows of others against."""
+    """Figures and limits of a case that rows of others are held against."""
 
     objective: Objective
     """Objective of its figures."""

@@ -71,7 +71,7 @@ class Case(Section):
     """Data centers and weeks in which controllers are compared."""
 
     about: Text = ""
-    """What the case is of, in a sentence."""
+    """Description of the case in a sentence."""
     scenario: str | None = None
     """Scenario of trainings whose data centers and rewards lie beneath those given here; None is
     none."""
@@ -127,7 +127,7 @@ class Row(Section):
     """
 
     about: Text = ""
-    """What the row is, in a sentence."""
+    """Description of the row in a sentence."""
     controller: Annotated[str, Field(min_length=1)] | None = None
     """Controller by name, such as ``g36`` or ``load=greedy-ci,cooling=g36``."""
     best_of: tuple[Annotated[str, Field(min_length=1)], ...] | None = None
@@ -187,9 +187,9 @@ class Suite(Section):
     title: Text
     """Title of the tables."""
     about: Text = ""
-    """What the tables show, and what they do not."""
+    """Text on what the tables show, and what they do not."""
     objective: str = "carbon"
-    """What is compared, less is better: ``carbon``, ``energy``, ``cost``, ``water``, or a sum such
+    """Compared figure, less is better: ``carbon``, ``energy``, ``cost``, ``water``, or a sum such
     as ``carbon+0.002*water``."""
     accounting: Literal["standard", "paper"] = "standard"
     """Units and definitions of the tables: those of this package, or those of the tables of

@@ -50,7 +50,7 @@ _MODULE = "sdc_taichi.benchmark.suite_jobs"
 _CURVES = ("training.csv", "validation.csv")
 """Files of a training that are kept beside its settings and policy."""
 _ROW = "row"
-"""What an evaluation calls a controller, which has the name of its row afterwards."""
+"""Name of a controller during its evaluation; its rows are named after the row of the suite."""
 _SECONDS = "seconds"
 """Column of curves that differs between equal trainings."""
 
@@ -201,7 +201,7 @@ def packed(files: Mapping[str, bytes]) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """What a row job is to do."""
+    """Arguments of a row job: a row of a case with one seed."""
 
     name: str
     """Name of the row."""
@@ -310,7 +310,7 @@ def _without_seconds(path: Path) -> bytes:
 
 
 def _metrics_of_training(done: Training) -> dict[str, Any]:
-    """What a training came to."""
+    """Length of a training, and its best validation."""
     best = None if done.best is None else done.best._asdict()
     return {"updates": done.updates, "steps": done.steps, "validation": best}
 
@@ -389,7 +389,7 @@ def _rows_of_figures(weeks: DataCenterWeeks, figures: Mapping[str, Any]) -> pd.D
 
 
 def _metrics(task: _Task, made: _Made, weeks: DataCenterWeeks) -> dict[str, Any]:
-    """What the row job did."""
+    """Metrics of a row job: how its controller was found, and what it was run in."""
     return made.metrics | {
         "objective": str(weeks.objective),
         "unit": weeks.objective.unit,

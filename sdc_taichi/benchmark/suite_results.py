@@ -26,9 +26,8 @@ from sdc_taichi.user_file import decoding, read_bytes
 if TYPE_CHECKING:
     import pandas as pd
 
-ACHIEVED, BOUND, LEARNER, PLANNER, RULE, OTHER = (
-    *("optimum", "bound", "learner", "planner", "rule", "other"),
-)
+ACHIEVED, BOUND, LEARNER = "optimum", "bound", "learner"
+PLANNER, RULE, OTHER = "planner", "rule", "other"
 """Kinds of rows: the optimum's achieved path, its bound, what was trained, model-predictive
 control, other controllers by name, and what is not known."""
 SUBMISSION_FILE, SUBMISSION_FORMAT = "submission.json", "sdc-submission/1"

@@ -36,7 +36,7 @@ class RunStage(Protocol):
 
 
 def study_of(suite: Suite, chosen: Suite, command: str, *, quick: bool = False) -> Study:
-    """What a run of a suite is asked for.
+    """The study of a run of a suite: its settings, and the jobs that it is to do.
 
     Args:
         suite: the whole suite.

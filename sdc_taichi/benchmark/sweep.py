@@ -113,7 +113,7 @@ class Sweep:
         return self.batch or max(1, min(MOST_DCS, MOST_RACKS // self.config.hall.racks))
 
     def settings(self) -> dict[str, Any]:
-        """What decides the jobs, as JSON can hold it."""
+        """All that decides the jobs, as JSON can hold it."""
         return {
             "config": self.config.model_dump(mode="json"),
             "varied": [asdict(one) for one in self.varied],

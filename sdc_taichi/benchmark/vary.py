@@ -16,7 +16,7 @@ from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.number_text import parse_number
 
 Kind = Literal["int64", "float64", "bool", "text"]
-"""What a column of values holds."""
+"""Type of a column of values."""
 _BLOCK = 1024
 """Points of a Sobol sequence that are drawn at a time; a power of two keeps it balanced."""
 
@@ -32,7 +32,7 @@ class Grid:
 
     @property
     def kind(self) -> Kind:
-        """What a column of the values holds."""
+        """Type of a column of the values."""
         return kind_of(self.values)
 
     def with_value(self, value: Any) -> Grid:
@@ -55,7 +55,7 @@ class Range:
 
     @property
     def kind(self) -> Kind:
-        """What a column of the samples holds."""
+        """Type of a column of the samples."""
         return "int64" if self.is_whole else "float64"
 
     def at(self, share: float) -> float:
@@ -70,7 +70,7 @@ Varied = Grid | Range
 
 
 def kind_of(values: Sequence[Any]) -> Kind:
-    """What a column of plain values holds: text if they are of different kinds."""
+    """Type of a column of plain values: text if they are of different types."""
     if all(isinstance(value, bool) for value in values):
         return "bool"
     if all(_is_number(value) and isinstance(value, int) for value in values):

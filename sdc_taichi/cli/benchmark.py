@@ -48,7 +48,9 @@ def run_command(
     ],
     seeds: Annotated[
         int | None,
-        typer.Option(min=1, max=1000, help="Seeds of rows that learn. [default: of the suite]"),
+        typer.Option(
+            min=1, max=1000, help="Seeds of random rows, such as trainings. [default: of the suite]"
+        ),
     ] = None,
     rows: Annotated[
         str | None, typer.Option(metavar="NAME[,NAME]", help="Rows to run. [default: all]")
@@ -63,7 +65,8 @@ def run_command(
         bool, typer.Option("--show", help="Print the suite as YAML, and do not run it.")
     ] = False,
     out: Annotated[
-        Path | None, out_option("Folder of the results. [default: results/SUITE]", "DIR")
+        Path | None,
+        out_option("Folder of results. [default: results/SUITE, or SUITE-quick]", "DIR"),
     ] = None,
     resume: Resume = False,
     jobs: Jobs = None,

@@ -77,7 +77,7 @@ def with_ray_address(args: list[str]) -> list[str]:
 
 
 def executor_of(jobs: int | None, ray: str | None) -> Executor:
-    """What runs the jobs of a command.
+    """Executor of the jobs of a command.
 
     Args:
         jobs: number of ``--jobs``.
@@ -110,7 +110,7 @@ class JobSession:
     ) -> None:
         self.store = store
         self.summaries: list[JobSummary] = []
-        """What became of the jobs of each stage that has ended."""
+        """Summary of the jobs of each stage that has ended."""
         self._executor, self._stop, self._shown = executor, stop, shown
 
     def run(

@@ -191,7 +191,7 @@ def _with_best(sweep: Sweep, metric: str) -> Sweep:
 
 
 def _shown(sweep: Sweep, label: str, jobs: int) -> str:
-    """What ``--show`` prints: size and settings of a sweep, as YAML."""
+    """Size and settings of a sweep as YAML, which ``--show`` prints."""
     import yaml
 
     settings = sweep.settings() | {"config": label}

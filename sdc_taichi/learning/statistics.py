@@ -138,6 +138,15 @@ def share_pct(figures: F64, idle: F64, achieved: F64) -> F64:
         return np.asarray(np.where(base > best, 100.0 * (base - own) / (base - best), np.nan))
 
 
+def sample_mean(values: F64) -> F64:
+    """Mean of all values of a sample, trainings and weeks alike.
+
+    Args:
+        values: (..., S, W).
+    """
+    return np.asarray(values.mean(axis=(-2, -1)))
+
+
 def interquartile_mean(values: F64) -> F64:
     """Mean of the middle half of a sample's values, trainings and weeks alike.
 
