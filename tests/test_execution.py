@@ -22,6 +22,7 @@ STUDY = Study("sweep", "sdc-taichi sweep", {}, [])
 @pytest.mark.parametrize(
     ("line", "ray", "rest"),
     [
+        ("", None, ""),
         ("a b", None, "a b"),
         ("a --ray", "local", "a"),
         ("--ray a --out x", "local", "a x"),

@@ -115,7 +115,7 @@ def test_samples_cover_a_range_and_more_of_them_begin_with_the_same() -> None:
     [
         (["hvac.setpoint.initial=16,17"], {}, "unknown key; did you mean 'initial_c'"),
         ([f"{SETPOINT}=cold,warm"], {}, "should be a valid number"),
-        ([f"{SETPOINT}=16..20"], {}, "is a range; valid is a number of samples"),
+        ([f"{SETPOINT}=16..20"], {}, "is a range; valid is a number of samples .--sample"),
         ([f"{SETPOINT}=16,18"], {"samples": 4}, r"valid is FIELD=LOW\.\.HIGH"),
         ([f"{SETPOINT}=16,18", f"{SETPOINT}=20,22"], {}, "is given twice"),
         ([f"{SETPOINT}=16:23:0.1"], {"months": (1, 7)}, "142 runs .71 combinations"),

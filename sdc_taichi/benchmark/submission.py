@@ -65,6 +65,8 @@ MOST_FILES = 10_000
 """Largest number of files of a submission."""
 MOST_BYTES = 512_000_000
 """Largest size of all files of a submission together, in bytes."""
+MOST_LETTERS = 1_000
+"""Largest length of a text of submission.json that the report shows, in letters."""
 _MOST_UNPACKED_BYTES = 256_000_000
 _MOST_CORE_S = 1e12
 _AT_TOP = (JOBS, RESULTS, STUDY_FILE, SUBMISSION_FILE)
@@ -125,6 +127,12 @@ def read_submission(folder: Path) -> Submission:
             f"{folder / SUBMISSION_FILE}: kind {shortened(about['kind'])}; valid are "
             f"{', '.join(KINDS)}"
         )
+    for key in ("author", "about", "link"):
+        if len(about[key]) > MOST_LETTERS:
+            raise ConfigError(
+                f"{folder / SUBMISSION_FILE}: {key} of {len(about[key]):,} letters; valid are at "
+                f"most {MOST_LETTERS:,}"
+            )
     suite, row = (str(names[0][column]) for column in ("suite", "row"))
     return Submission(store, about, suite, row, tuple(results))
 
@@ -152,7 +160,8 @@ def check_submission(submission: Submission, suite: SuiteResults) -> tuple[str, 
     row = submission.row
     if not ROW_NAME.fullmatch(row) or row.startswith(REFERENCE):
         raise ConfigError(
-            f"{place}: row {shortened(row)}: valid are lower-case letters, digits and . _ -"
+            f"{place}: row {shortened(row)}: valid are at most 80 lower-case letters, digits and "
+            f". _ -, not beginning with {REFERENCE}"
         )
     if row in taken:
         raise ConfigError(f"{place}: row {row}: the name is taken; valid is another")

@@ -143,7 +143,7 @@ def _check_weeks(part: pd.DataFrame, known: KnownCase, place: str) -> None:
     for keys, what in ((missing, "is missing"), (more, "is none of the case")):
         if keys:
             site, week = keys[0]
-            raise ConfigError(f"{place}: week {week} of {site} {what}; valid is each week once")
+            raise ConfigError(f"{place}: week {week:g} of {site} {what}; valid is each week once")
     if own != expected:
         raise ConfigError(f"{place}: {len(own)} rows, not in the order of the case; valid is that")
 

@@ -157,7 +157,7 @@ def check_sweep(sweep: Sweep, most_runs: int = MOST_RUNS) -> None:
     ranges = [one.field for one in sweep.varied if not isinstance(one, Grid)]
     if bool(ranges) != bool(sweep.samples):
         what = f"{ranges[0]} is a range" if ranges else f"sample {sweep.samples}: no field varies"
-        valid = "a number of samples" if ranges else "FIELD=LOW..HIGH beside it"
+        valid = "a number of samples (--sample)" if ranges else "FIELD=LOW..HIGH beside it"
         raise ConfigError(f"vary: {what}; valid is {valid}")
     if sweep.runs > most_runs:
         raise ConfigError(

@@ -7,6 +7,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -69,7 +70,7 @@ def with_ray_address(args: list[str]) -> list[str]:
     """
     end = args.index("--") if "--" in args else len(args)
     found = []
-    for i, (word, after) in enumerate(zip(args, [*args[1:], ""], strict=True)):
+    for i, (word, after) in enumerate(zip_longest(args, args[1:], fillvalue="")):
         found.append(word)
         if word == "--ray" and i < end and not _ADDRESS.fullmatch(after):
             found.append("local")
