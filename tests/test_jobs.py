@@ -312,6 +312,10 @@ def test_a_study_is_begun_once_and_gone_on_with_in_its_settings(tmp_path: Path) 
         pass
     assert store.study()["partitions"] == [{"seed": "0"}, {"seed": "1"}, {"seed": "2"}]
     assert store.study()["command"] == "b"
+    fewer = Study("suite", "d", STUDY.settings, [{"seed": "1"}])
+    with store.claimed(fewer, resume=True):
+        pass
+    assert (store.study()["command"], len(store.study()["partitions"])) == ("b", 3)
     other = Study("suite", "c", {"seeds": 3, "cases": {"a": {"days": 7, "boundary": "cyclic"}}}, [])
     said = "seeds 2, here 3; cases.a.boundary not given, here 'cyclic'"
     with pytest.raises(ConfigError, match=said):

@@ -46,7 +46,8 @@ class Study:
     kind: str
     """Kind of the study: ``suite`` or ``sweep``."""
     command: str
-    """Command line that runs the study, or goes on with it."""
+    """Command line that runs the study. One that goes on without asking for more jobs does not take
+    the place of the first."""
     settings: Mapping[str, Any]
     """Everything that decides what the results mean, as JSON can hold it. A folder takes results of
     equal settings alone."""
@@ -94,7 +95,10 @@ class ResultStore:
             notes: list[str] = []
             if kept is not None:
                 _refuse_other_settings(self.folder, kept, content, study.may_change)
-                content["partitions"] = _union(kept["partitions"], content["partitions"])
+                asked = _union(kept["partitions"], content["partitions"])
+                if len(asked) == len(kept["partitions"]):
+                    content["command"] = kept["command"]  # which asks for all of them
+                content["partitions"] = asked
                 if kept["source"] != content["source"]:
                     notes.append(
                         f"{self.folder}: results of other source files of version "

@@ -36,6 +36,8 @@ NoCache = Annotated[
 """Option of a command that solves for an optimum."""
 FolderForce = Annotated[bool, typer.Option("--force", help="Write into a folder with other files.")]
 """Option of a command that writes a folder."""
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")]
+"""Option of a command that prints a summary of what it has done."""
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")]
 
 

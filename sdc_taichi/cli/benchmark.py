@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import typer.core
 
-from sdc_taichi.cli.arguments import Debug, out_option
+from sdc_taichi.cli.arguments import Debug, Quiet, out_option
 from sdc_taichi.cli.benchmark_results import add_command, report_command
 from sdc_taichi.cli.execution import Jobs, Ray, Resume, job_session, with_ray_address
 from sdc_taichi.errors import ConfigError, printable
@@ -71,7 +71,7 @@ def run_command(
     resume: Resume = False,
     jobs: Jobs = None,
     ray: Ray = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Run the controllers of a suite in held-out weeks, trained ones with several seeds.

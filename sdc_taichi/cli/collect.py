@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from sdc_taichi.cli.arguments import Debug, Source, force_option, out_option, read_config
+from sdc_taichi.cli.arguments import Debug, Quiet, Source, force_option, out_option, read_config
 from sdc_taichi.cli.scenario import (
     EXIT_INTERRUPTED,
     Carbon,
@@ -75,7 +75,7 @@ def collect_command(
     ] = None,
     out: Annotated[Path, out_option("Folder of all data sets.", "DIR")] = Path("datasets"),
     force: Annotated[bool, force_option("Replace data sets that are there.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Collect episodes of controllers for offline learning, in Minari's format.

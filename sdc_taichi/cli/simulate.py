@@ -12,6 +12,7 @@ from sdc_taichi.cli.arguments import (
     Debug,
     FolderForce,
     Overrides,
+    Quiet,
     Source,
     json_option,
     out_option,
@@ -121,7 +122,7 @@ def simulate_command(
         ),
     ] = None,
     force: FolderForce = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    quiet: Quiet = False,
     as_json: Annotated[bool, json_option("Print metrics.json instead of the summary.")] = False,
     debug: Debug = False,
 ) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sdc_taichi.cli.arguments import Debug, Overrides, Source, out_option, read_config
+from sdc_taichi.cli.arguments import Debug, Overrides, Quiet, Source, out_option, read_config
 from sdc_taichi.cli.execution import EXIT_FAILED, Jobs, Ray, Resume, job_session
 from sdc_taichi.cli.scenario import ErrorOfForecasts, Precision, Seed, Site, site_names
 from sdc_taichi.cli.session import print_notes
@@ -84,7 +84,7 @@ def sweep_command(
         Path | None, out_option("Output folder. [default: sweeps/PRESET-FIELDS]", "DIR")
     ] = None,
     show: Annotated[bool, typer.Option("--show", help="Print what would run, and end.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Run all combinations of values, sites, months and controllers, and keep their metrics.

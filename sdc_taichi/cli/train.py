@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sdc_taichi.cli.arguments import Debug, Source, out_option, parse_source
+from sdc_taichi.cli.arguments import Debug, Quiet, Source, out_option, parse_source
 from sdc_taichi.cli.scenario import EXIT_INTERRUPTED
 from sdc_taichi.cli.session import interruptible, rich_progress
 from sdc_taichi.errors import ConfigError, printable, suggestion_or_valid
@@ -80,7 +80,7 @@ def train_command(
     show: Annotated[
         bool, typer.Option("--show", help="Print all settings as YAML, and do not train.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")] = False,
+    quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Train agents with PPO, IPPO, MAPPO, HAPPO, HAA2C, HAD3QN or HASAC.
