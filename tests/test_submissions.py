@@ -85,6 +85,7 @@ def test_a_row_of_others_enters_the_report_and_is_told_as_theirs(
         "> two-sites: theirs is the work of others and was not run here: A "
         "\\<b\\>university\\</b\\>, https://x.org/a."
     ) in out.read_text().splitlines()
+    assert "Results of several" not in out.read_text()  # a table has no source and no processor
     with pytest.raises(ConfigError, match="row theirs: the name is taken"):
         add_submission(row, target)
 

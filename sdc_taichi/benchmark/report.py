@@ -179,9 +179,10 @@ def suite_notes(suite: SuiteResults) -> list[str]:
     if missing:
         notes.append(f"Unfinished, without {_named(missing)}.")
     for key, what in (("version", "versions of the package"), ("source", "states of the source")):
-        if len({result.content[key] for result in results}) > 1:
-            notes.append(f"Results of several {what}: {_named(_users(results, key))}.")
-    if len({str(result.content["processor"]) for result in results}) > 1:
+        told = [result for result in results if result.content[key]]  # tables of others may not
+        if len({result.content[key] for result in told}) > 1:
+            notes.append(f"Results of several {what}: {_named(_users(told, key))}.")
+    if len({str(x.content["processor"]) for x in results if x.content["processor"]}) > 1:
         notes.append(
             "Results of several kinds of processors, whose last bits differ, and with them what "
             "was learnt."
