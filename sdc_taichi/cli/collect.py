@@ -68,6 +68,7 @@ def collect_command(
     name: Annotated[
         str | None,
         typer.Option(
+            "--name",  # older versions of Typer would take the metavar for it
             metavar="NAME",
             help="Name in Minari, to which -SITE-v0 is added. [default: sdc_taichi/PRESET]",
             show_default=False,
