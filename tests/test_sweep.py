@@ -323,3 +323,9 @@ def test_options_that_are_not_valid_are_one_line(options: list[str], said: str) 
     assert done.exit_code == 2
     assert re.search(said, done.stderr), done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_sweep_of_nothing_is_refused() -> None:
+    done = call("tiny")
+    assert done.exit_code == 2
+    assert done.stderr.startswith("error: sweep: nothing varies; valid is --vary")

@@ -117,9 +117,7 @@ def report_sections(suites: Iterable[SuiteResults]) -> Sections:
 
 def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> list[Block]:
     """Subject of a suite, the commands and time behind its results, and notes on them."""
-    blocks: list[Block] = [
-        Paragraph(text) for text in (suite.suite.title, suite.suite.about) if text
-    ]
+    blocks: list[Block] = [Paragraph(suite.suite.about or suite.suite.title)]
     blocks += [Note(text) for text in suite_notes(suite)]
     blocks += [Command(text) for text in suite.commands]
     blocks.append(Paragraph(cost_text(suite)))

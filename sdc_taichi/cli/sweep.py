@@ -153,7 +153,13 @@ def _sweep(
     sites = tuple(name.upper() for name in site_names(site))
     if sites:
         varied.insert(0, Grid("site.location", sites))
-    return Sweep(config, tuple(varied), **options)
+    sweep = Sweep(config, tuple(varied), **options)
+    if not sweep.varied and sweep.runs == 1:
+        raise ConfigError(
+            "sweep: nothing varies; valid is --vary FIELD=VALUES, --site, --months, or more than "
+            "one --controller"
+        )
+    return sweep
 
 
 def _months(text: str | None) -> tuple[int, ...]:
