@@ -303,6 +303,7 @@ def test_runs_of_jobs_that_fail_are_not_counted_among_those_with_rows(
 def test_what_would_run_is_shown_and_nothing_written(tmp_path: Path) -> None:
     given = ["tiny", "--vary", "battery.capacity_kwh=0..500", "--sample", "8", "--site", "ny,ca"]
     done = call(*given, "--months", "all", "--show", "--out", tmp_path / "sweep")
+    assert done.exit_code == 0, (done.output, done.exception)
     shown = yaml.safe_load(done.stdout)
     assert (shown["runs"], shown["combinations"], shown["jobs"]) == (192, 16, 12)
     assert not (tmp_path / "sweep").exists()
