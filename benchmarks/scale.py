@@ -47,10 +47,10 @@ PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1e6
 
 @dataclass(frozen=True)
 class Run:
-    """What one case measured."""
+    """Speed, processor time and memory of one case, such as a sweep in two processes."""
 
     case: str
-    """Where jobs ran, and with how many workers."""
+    """Name of the executor and its number of workers, such as ``processes-2``."""
     jobs: int
     """Number of jobs."""
     steps: int
@@ -79,7 +79,7 @@ def nothing(values: Mapping[str, Any], _inputs: Mapping[str, bytes]) -> JobResul
 
 
 def executor_of(case: str) -> Executor:
-    """What runs the jobs of a case."""
+    """The executor that runs the jobs of a case: this process, local processes, or Ray."""
     kind, _, workers = case.partition("-")
     if kind == "batch":
         return InProcess()
@@ -208,7 +208,7 @@ def medians(runs: Sequence[Run]) -> list[Run]:
 
 
 def figures(run: Run) -> tuple[Any, ...]:
-    """What a run measured, without its case and its number of jobs."""
+    """Times in s, rates and memory of a run by name, without its case and its number of jobs."""
     return astuple(run)[2:]
 
 

@@ -260,7 +260,7 @@ def columns(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
 
 
 def has_section(text: str, name: str) -> bool:
-    """Whether a page has a place for what is made under a name."""
+    """Whether a page has the marker of a name, after which its generated text is put."""
     return pattern(name).search(text) is not None
 
 
@@ -325,7 +325,7 @@ def cell_of(name: str, results: Sequence[RowResult]) -> pd.DataFrame:
 
 
 def description(case: CaseResults, chosen: dict[str, RowResult]) -> dict[str, Any]:
-    """What was run, and where."""
+    """Suite, case, site and week of the cells that were run, and the processor."""
     first = next(iter(chosen.values())).content
     return {
         "suite": case.suite,

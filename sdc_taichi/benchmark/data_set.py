@@ -76,5 +76,5 @@ class DataSet:
 
 
 def is_optimum(controller: str) -> bool:
-    """Whether a controller follows a known optimum."""
+    """Whether a controller replays the commands of a known optimum."""
     return objective_of_optimum(controller) is not None

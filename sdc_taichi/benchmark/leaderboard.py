@@ -159,14 +159,14 @@ def places(values: Mapping[str, float], drawn: Mapping[str, F64]) -> dict[str, t
 
 
 def _has_intervals(case: CaseResults, evaluation: Evaluation, name: str) -> bool:
-    """Whether weeks and seeds of a row are enough for intervals that rank it."""
+    """Whether a row has enough weeks and seeds for a place, which rests on its intervals."""
     seeds = len(case.rows[name])
     weeks = int(np.bincount(evaluation.strata).min())
     return weeks >= FEWEST and (seeds >= FEWEST or case.kinds[name] != LEARNER)
 
 
 def _is_better(one: F64, other: F64) -> bool:
-    """Whether an interval of the difference of two figures lies below 0."""
+    """Whether the whole interval of a difference lies below 0, so that the first row is better."""
     return percentile_interval(0.0, one - other).high < -_LEAST_POINTS
 
 

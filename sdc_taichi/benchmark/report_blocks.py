@@ -75,7 +75,7 @@ class Table:
     """A table, intervals in brackets behind their values."""
 
     caption: str
-    """What it shows."""
+    """Subject of the table or picture, with units, printed beside it."""
     frame: pd.DataFrame
     """Its rows; columns ``NAME_low`` and ``NAME_high`` are the ends of the interval of ``NAME``."""
     titles: Mapping[str, str]
@@ -89,7 +89,7 @@ class Picture:
     draw: Callable[[], Figure]
     """Draws it."""
     alt: str
-    """What it shows, for readers who do not see it."""
+    """Text in place of the picture, for readers who cannot see it."""
     caption: str
     """Text below it."""
 

@@ -86,7 +86,7 @@ class JobSummary:
     failed: tuple[tuple[str, str], ...]
     """Name and error of each job that failed."""
     is_whole: bool
-    """Whether no job was left out because of an interruption."""
+    """True unless an interruption left jobs out."""
 
 
 def run_jobs(

@@ -184,7 +184,7 @@ class ResultStore:
         return read_bytes(self.folder_of(partition) / name, MOST_FILE_BYTES)
 
     def is_done(self, job: Job) -> bool:
-        """Whether the result of a job is there, made of the same values, and whole."""
+        """Whether a result with the key of the job is kept, with all of its files undamaged."""
         try:
             content = self.result(job.partition)
             return content["key"] == job.key and self.is_whole(content)
@@ -192,7 +192,7 @@ class ResultStore:
             return False
 
     def is_whole(self, content: Mapping[str, Any]) -> bool:
-        """Whether rows and files are those that the content of a metrics.json tells of.
+        """Whether rows and files of a result have the digests that its metrics.json lists.
 
         Args:
             content: content of metrics.json of a job.

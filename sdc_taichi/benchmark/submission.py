@@ -374,7 +374,7 @@ def _check_case(
     if not known:
         raise ConfigError(f"{case.suite}, {case.name}: no controller to hold a row against")
     most = max(known, key=len)
-    # Where seeds decide events, idle commands differ by seed.
+    # A seed decides which failures are sampled, so figures of idle commands differ by seed too.
     by_seed = {result.seed: result for result in most} if _idle_differs(most) else {}
     count = len(by_seed) or 1
     if submission.about["kind"] == LEARNER:

@@ -139,7 +139,7 @@ class JobSession:
 
     @property
     def is_whole(self) -> bool:
-        """Whether no job was left out because of an interruption."""
+        """True unless an interruption left jobs out."""
         return all(each.is_whole for each in self.summaries)
 
     def finish(self) -> None:
