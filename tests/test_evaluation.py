@@ -26,6 +26,7 @@ from sdc_taichi.optimum.end_values import with_tabled_ends
 from sdc_taichi.optimum.problem import Ends
 from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.run.loop import simulate
+from sdc_taichi.sim.workload import queue_limit_tasks
 
 RULES = "load=greedy-ci,cooling=g36,battery=greedy-ci"
 CONFIGS = make_configs(load_config("tiny"), sites=["ny", "ca"])
@@ -205,3 +206,17 @@ def test_tabled_ends_are_lines_between_bounds(weeks: DataCenterWeeks) -> None:
     high, low = exact
     assert at_node == pytest.approx(high + 20.0)
     assert table(1, start) == pytest.approx((high + low) / 2 + 1.5)
+
+
+def test_tabled_ends_are_near_the_bounds() -> None:
+    texas = make_configs(load_config("corrected"), sites=["tx"])
+    with prepare(texas, (27,), days=2, exact_ends=True, cache=False) as weeks:
+        best = weeks.optimum
+        assert best is not None
+        table = with_tabled_ends(best, weeks.sim)
+        kwh = 0.98 * weeks.sim.sizing.battery_kwh
+        tasks = 0.85 * queue_limit_tasks(weeks.sim.fleet)
+        for shares in np.random.default_rng(0).random((4, 4)):
+            ends = shares[0] * kwh, shares[1] * tasks, shares[2] * kwh, shares[3] * tasks
+            error = table.end_value(*ends) - best.end_value(*ends)
+            assert abs(error / (best.idle - best.achieved)) < 0.02
