@@ -51,6 +51,7 @@ from sdc_taichi.benchmark.suite_results import (
     SuiteResults,
     read_suites,
 )
+from sdc_taichi.cli.execution import with_ray_address
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.learning.evaluation import ALL
 from sdc_taichi.learning.evaluation_table import literal_markdown
@@ -189,13 +190,18 @@ def section(suite: SuiteResults, docs: Path) -> list[str]:
 
 
 def command_of(text: str) -> str:
-    """A command line without the folder of its results, and without going on with them."""
-    words = iter(shlex.split(text))
+    """A command line that runs a whole suite, without what differs from run to run.
+
+    Folders, and where jobs run, are anybody's own; parts of a suite were run one after the other.
+    """
+    words = iter(with_ray_address(shlex.split(text)))
     kept = []
     for word in words:
-        if word == "--out":
-            next(words, None)
-        elif word != "--resume" and not word.startswith("--out="):
+        name, is_joined, _ = word.partition("=")
+        if name in ("--out", "--jobs", "--ray", "--rows", "--cases"):
+            if not is_joined:
+                next(words, None)
+        elif word not in ("--resume", "--quiet"):
             kept.append(word)
     return shlex.join(kept)
 

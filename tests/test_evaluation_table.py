@@ -112,6 +112,13 @@ def test_markdown_has_intervals_in_brackets(found: Evaluation) -> None:
     assert lines[3].startswith("| g36 | ippo | 3.00 (")
 
 
+def test_of_a_bound_its_figure_alone_is_known(found: Evaluation) -> None:
+    is_bound = found.rows["controller"] == "g36"
+    rows = found.rows.assign(cfp_kg=found.rows["cfp_kg"].mask(is_bound))
+    table = summary(Evaluation(rows, found.objective, {}, found.strata, ()))
+    assert table["broken_pct"].isna().tolist() == [name == "g36" for name in table["controller"]]
+
+
 def test_without_an_optimum_figures_are_compared_as_they_are(found: Evaluation) -> None:
     without = found.rows.assign(valued_figure=np.nan, achieved_figure=np.nan, broken=None)
     table = summary(Evaluation(without, found.objective, {}, found.strata, ()))

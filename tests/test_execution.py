@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Self
 
 import pytest
 import typer
@@ -14,7 +15,7 @@ from sdc_taichi.benchmark.runner import InProcess
 from sdc_taichi.benchmark.store import ResultStore, Study
 from sdc_taichi.cli import execution
 from sdc_taichi.cli.execution import JobsCommand, JobSession, Ray, job_progress, job_session
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, SdcError
 
 STUDY = Study("sweep", "sdc-taichi sweep", {}, [])
 
@@ -77,6 +78,33 @@ def test_progress_is_lines_where_there_is_no_terminal(
             session.finish()
         assert ended.value.exit_code == 1
         assert capsys.readouterr().err == "1 of 5 jobs failed; --resume runs them again\n"
+
+
+def test_a_result_that_cannot_be_written_ends_a_study_that_can_go_on(tmp_path: Path) -> None:
+    job = toy_jobs.job("without_rows", 1)
+    store = ResultStore(tmp_path)
+    with store.claimed(STUDY):
+        store.folder_of(job.partition).parent.mkdir(parents=True)
+        store.folder_of(job.partition).write_bytes(b"a file where a folder is to be")
+        session = JobSession(store, InProcess(), lambda: False)
+        with pytest.raises(SdcError, match=r"cannot be .*; what is done is kept, .* --resume$"):
+            session.run("rows", [job], 1)
+
+
+def test_a_study_whose_workers_cannot_start_is_not_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Absent(InProcess):
+        def __enter__(self) -> Self:
+            raise ConfigError("no workers")
+
+    monkeypatch.setattr(execution, "executor_of", lambda *_: Absent())
+    with (
+        pytest.raises(ConfigError, match="no workers"),
+        job_session(ResultStore(tmp_path), STUDY, resume=False, jobs=None, ray=None),
+    ):
+        pass
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_progress_is_a_bar_in_a_terminal(

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +141,16 @@ def test_jobs_that_are_done_are_kept(tmp_path: Path) -> None:
     assert changed == {"study.json"}
     other = [toy_jobs.job("draw", i, seconds=0.0) for i in range(3)]
     assert run(other, tmp_path).done == 3, "other values"
+
+
+def test_a_result_in_the_folder_of_another_job_is_not_its_own(tmp_path: Path) -> None:
+    first = toy_jobs.job("draw", 1)
+    second = replace(first, partition={name: f"{x}0" for name, x in first.partition.items()})
+    store = ResultStore(tmp_path)
+    run([first], tmp_path)
+    shutil.copytree(store.folder_of(first.partition), store.folder_of(second.partition))
+    assert first.key == second.key
+    assert (store.is_done(first), store.is_done(second)) == (True, False)
 
 
 @pytest.mark.parametrize("name", ["metrics.json", "rows.parquet", "policy/weights.bin"])

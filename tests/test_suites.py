@@ -24,6 +24,7 @@ from sdc_taichi.benchmark.suite import (
 )
 from sdc_taichi.benchmark.suite_jobs import packed, reference_jobs, row_jobs
 from sdc_taichi.benchmark.suite_run import run_suite, study_of
+from sdc_taichi.errors import SdcError
 from sdc_taichi.learning.policy import About, Policy
 from sdc_taichi.learning.split import HELD_OUT
 
@@ -79,6 +80,21 @@ def test_another_policy_in_a_folder_makes_another_job(tmp_path: Path) -> None:
     assert keys[0] == keys[1] != keys[2]
 
 
+def test_another_input_file_in_a_place_makes_other_jobs(tmp_path: Path) -> None:
+    path, keys = tmp_path / "load.csv", []
+    for content in ("a", "a", "b"):
+        path.write_text(content)
+        suite = small(**case(overrides={"site": {"workload_file": str(path)}}))
+        references = reference_jobs(suite)
+        jobs = [*references, *row_jobs(suite, references)]
+        keys.append([job.key for job in jobs])
+    assert keys[0] == keys[1]
+    assert not set(keys[1]) & set(keys[2])
+    path.unlink()
+    with pytest.raises(SdcError, match=r"load\.csv"):
+        reference_jobs(suite)
+
+
 @pytest.mark.repo
 def test_the_page_of_suites_has_their_tables() -> None:
     page = Path(__file__).parents[1] / "docs/suites.md"
@@ -111,6 +127,10 @@ def test_weeks_are_those_of_the_split_unless_given() -> None:
         ),
         ({"rows": {"a": {"controller": "idle", "cases": ["no"]}}}, "no case 'no'; valid: tiny"),
         ({"rows": {"a": {"controller": "idle", "apart": True}}}, "apart: valid with train"),
+        (
+            {"rows": {"a": {"best_of": ["g36", "idle", "g36"]}}},
+            "best_of: g36, idle, g36; valid is each once",
+        ),
         ({"objective": "carbn"}, "did you mean 'carbon'"),
         (case(weeks=[1]), "week 1 stands in weeks too, by which nothing may be chosen"),
         (case(weeks=[52]), "cases.tiny.weeks"),

@@ -187,7 +187,8 @@ class ResultStore:
         """Whether a result with the key of the job is kept, with all of its files undamaged."""
         try:
             content = self.result(job.partition)
-            return content["key"] == job.key and self.is_whole(content)
+            is_of_job = (content["key"], content["partition"]) == (job.key, dict(job.partition))
+            return is_of_job and self.is_whole(content)
         except SdcError:
             return False
 

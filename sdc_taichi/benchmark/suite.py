@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from sdc_taichi.config import explain, load_config, load_yaml, preset_names
+from sdc_taichi.config import load_config, load_yaml, preset_names, validated
 from sdc_taichi.config.fields import Section, Text
 from sdc_taichi.config.reference import sections_markdown
 from sdc_taichi.control import ForecastError
@@ -160,6 +160,8 @@ class Row(Section):
                 raise ValueError(f"{name}: valid with train")
         if self.best_of is not None and not self.best_of:
             raise ValueError("best_of: none given; valid is one or more")
+        if self.best_of is not None and len(set(self.best_of)) < len(self.best_of):
+            raise ValueError(f"best_of: {', '.join(self.best_of)}; valid is each once")
         if self.forecast_error is not None:
             if self.optimum is not None:
                 raise ValueError("forecast_error: without effect on an optimum; valid is without")
@@ -340,10 +342,7 @@ def make_suite(values: Mapping[str, Any], label: str = "suite") -> Suite:
     Raises:
         ConfigError: naming the key, the value and what would be valid.
     """
-    try:
-        return Suite.model_validate(values)
-    except ValidationError as error:
-        raise ConfigError(explain(error, label, Suite)) from None
+    return validated(Suite, values, label)
 
 
 def suite_markdown() -> str:

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from sdc_taichi.benchmark.cases import (
     agents_of,
@@ -23,6 +23,7 @@ from sdc_taichi.benchmark.cases import (
     training_settings,
     weeks_of,
 )
+from sdc_taichi.benchmark.input_files import input_paths, read_input
 from sdc_taichi.benchmark.jobs import Inputs, Job, JobResult, digest_of
 from sdc_taichi.benchmark.suite import REFERENCE, Case, Part, Row, Suite
 from sdc_taichi.control import PERFECT, ForecastError, make_controller
@@ -63,7 +64,7 @@ def reference_jobs(suite: Suite) -> list[Job]:
     """
     found = []
     for name, case in suite.cases.items():
-        parts = _parts_needed(suite, name) if case.optimum else ()
+        parts, files = (_parts_needed(suite, name), _files(case)) if case.optimum else ((), {})
         for part in parts:
             for site, config in enumerate(data_centers(case, part)):
                 values = {
@@ -71,6 +72,7 @@ def reference_jobs(suite: Suite) -> list[Job]:
                     "part": part,
                     "site": site,
                     "objective": suite.objective,
+                    **files,
                 }
                 partition = {
                     "suite": suite.name,
@@ -90,6 +92,7 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
         references: jobs that have solved for its optima.
     """
     found = []
+    files = {name: _files(case) for name, case in suite.cases.items()}
     for label, row in suite.rows.items():
         for name, case in suite.cases.items():
             if not suite.is_for(label, name):
@@ -108,6 +111,7 @@ def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
                     "training": suite.training if row.train is not None else {},
                     "objective": suite.objective,
                     "seed": seed,
+                    **files[name],
                 }
                 if policies:
                     values["policies"] = policies
@@ -402,6 +406,19 @@ def _metrics(task: _Task, made: _Made, weeks: DataCenterWeeks) -> dict[str, Any]
         "has_optimum": weeks.optimum is not None,
         "bound_kinds": [] if weeks.optimum is None else sorted(set(weeks.optimum.bound_kinds)),
     }
+
+
+def _files(case: Case) -> dict[str, dict[str, str]]:
+    """Digests of the input files that data centers of a case name, by path; empty without any.
+
+    Another file in the place makes other jobs, though the case is the same.
+
+    Raises:
+        SdcError: a file that cannot be read.
+    """
+    configs = [x for part in get_args(Part) for x in data_centers(case, part)]
+    paths = sorted({path for config in configs for path in input_paths(config)})
+    return {"files": {path: digest_of(read_input(path)) for path in paths}} if paths else {}
 
 
 def _policies(row: Row) -> dict[str, str]:

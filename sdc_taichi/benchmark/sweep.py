@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sdc_taichi.benchmark.input_files import FILE_FIELDS, input_paths, read_input
 from sdc_taichi.benchmark.jobs import Inputs, Job, JobResult, digest_of
 from sdc_taichi.benchmark.vary import (
     Grid,
@@ -40,7 +41,6 @@ from sdc_taichi.sim.fleet import build_fleet, shared_values
 from sdc_taichi.sim.fleet_configs import locations, place_names
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.user_file import read_bytes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,15 +50,6 @@ MOST_RUNS = 100_000
 MOST_DCS, MOST_RACKS = 1024, 2**18
 """Most data centers of a job, and most racks of all of them, unless its number is given: more step
 no faster, and need more memory."""
-FILE_FIELDS = (
-    "site.weather_file",
-    "site.carbon_file",
-    "site.workload_file",
-    "hall.recirculation.matrix_file",
-)
-"""Fields of the configuration that name files, whose content travels with the jobs."""
-MOST_INPUT_BYTES = 2**28
-"""Largest file that travels with the jobs, in bytes."""
 _CONFIG, _FILE = "config", "file "
 _TRIED = 100
 """Combinations of which one must be valid for a sweep to begin."""
@@ -219,14 +210,10 @@ def sweep_inputs(sweep: Sweep) -> dict[str, bytes]:
         SdcError: a file that cannot be read, or is too large.
     """
     config = json.dumps(sweep.config.model_dump(mode="json"), sort_keys=True).encode()
-    listed = {one.field: one.values for one in sweep.varied if isinstance(one, Grid)}
-    paths = [
-        path
-        for field in FILE_FIELDS
-        for path in (value_at(sweep.config, field), *listed.get(field, ()))
-        if isinstance(path, str)
-    ]
-    files = {f"{_FILE}{path}": read_bytes(path, MOST_INPUT_BYTES) for path in paths}
+    grids = [one for one in sweep.varied if isinstance(one, Grid) and one.field in FILE_FIELDS]
+    listed = [path for one in grids for path in one.values if isinstance(path, str)]
+    paths = [*input_paths(sweep.config), *listed]
+    files = {f"{_FILE}{path}": read_input(path) for path in paths}
     return {_CONFIG: config, **files}
 
 

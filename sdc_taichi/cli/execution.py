@@ -16,7 +16,7 @@ import typer.core
 from sdc_taichi.cli.scenario import EXIT_INTERRUPTED
 from sdc_taichi.cli.session import interruptible, print_notes, rich_progress
 from sdc_taichi.cli.train import SECONDS_BETWEEN_LINES, duration
-from sdc_taichi.errors import printable
+from sdc_taichi.errors import SdcError, printable
 
 if TYPE_CHECKING:
     from sdc_taichi.benchmark.jobs import DoneJob, Inputs, Job
@@ -131,9 +131,12 @@ class JobSession:
         from sdc_taichi.benchmark.runner import run_jobs
 
         with job_progress(stage, total, shown=self._shown) as on_done:
-            done = run_jobs(
-                jobs, self.store, self._executor, inputs, stop=self._stop, on_done=on_done
-            )
+            try:
+                done = run_jobs(
+                    jobs, self.store, self._executor, inputs, stop=self._stop, on_done=on_done
+                )
+            except SdcError as error:
+                raise SdcError(f"{error}; what is done is kept, go on with --resume") from error
         self.summaries.append(done)
         return done
 
@@ -186,7 +189,7 @@ def job_session(
         SdcError: the folder is not free, or options are not valid.
     """
     executor = executor_of(jobs, ray)
-    with interruptible() as stop, store.claimed(study, resume=resume) as notes, executor:
+    with interruptible() as stop, executor, store.claimed(study, resume=resume) as notes:
         if not quiet:
             print_notes(notes)
         yield JobSession(store, executor, stop, shown=not quiet)

@@ -19,7 +19,7 @@ from sdc_taichi.config.loading import (
     preset_names,
     with_values,
 )
-from sdc_taichi.config.messages import explain
+from sdc_taichi.config.messages import explain, validated
 from sdc_taichi.config.plain_values import load_json, load_yaml
 from sdc_taichi.config.schema import DataCenterConfig
 
@@ -39,5 +39,6 @@ __all__ = [
     "load_json",
     "load_yaml",
     "preset_names",
+    "validated",
     "with_values",
 ]

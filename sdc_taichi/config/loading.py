@@ -11,10 +11,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from sdc_taichi.config import sustaindc
-from sdc_taichi.config.messages import explain
+from sdc_taichi.config.messages import validated
 from sdc_taichi.config.plain_values import load_json, load_yaml
 from sdc_taichi.config.schema import DataCenterConfig
 from sdc_taichi.errors import ConfigError, shortened, suggestion
@@ -66,10 +64,7 @@ def config_from_dict(values: dict[str, Any], label: str = "config") -> DataCente
     Raises:
         ConfigError: naming the key, the value and what would be valid.
     """
-    try:
-        return DataCenterConfig.model_validate(values)
-    except ValidationError as error:
-        raise ConfigError(explain(error, label, DataCenterConfig)) from None
+    return validated(DataCenterConfig, values, label)
 
 
 def apply_overrides(config: DataCenterConfig, overrides: Sequence[str]) -> DataCenterConfig:

@@ -3,14 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from sdc_taichi.errors import shortened, suggestion_or_valid
+from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
+
+Model = TypeVar("Model", bound=BaseModel)
 
 MOST_PROBLEMS = 3
 """Number of problems that a message lists; of further ones it gives the number."""
+
+
+def validated(model: type[Model], values: Any, label: str) -> Model:
+    """Values as a model of pydantic.
+
+    Args:
+        model: the schema.
+        values: what is to be validated against it.
+        label: where the values come from, at the start of every message.
+
+    Raises:
+        ConfigError: naming the key, its value and what would be valid.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(explain(error, label, model)) from None
 
 
 def explain(error: ValidationError, label: str, model: type[BaseModel]) -> str:

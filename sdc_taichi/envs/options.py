@@ -12,12 +12,11 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
-    ValidationError,
     field_validator,
     model_validator,
 )
 
-from sdc_taichi.config import explain
+from sdc_taichi.config import validated
 from sdc_taichi.config.tariff_schema import TariffConfig
 from sdc_taichi.control import check_controller
 from sdc_taichi.control.forecast_error import PERFECT, ForecastError
@@ -28,7 +27,7 @@ from sdc_taichi.envs.forecasts import (
     LeadH,
 )
 from sdc_taichi.envs.rewards import REWARD_SETS
-from sdc_taichi.errors import ConfigError, suggestion_or_valid
+from sdc_taichi.errors import suggestion_or_valid
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MONTH_OF_DAY
 
 
@@ -248,7 +247,4 @@ def make_options(**given: Any) -> EnvOptions:
     Raises:
         ConfigError: an unknown option or a value that is not valid.
     """
-    try:
-        return EnvOptions.model_validate(given)
-    except ValidationError as error:
-        raise ConfigError(explain(error, "environment", EnvOptions)) from None
+    return validated(EnvOptions, given, "environment")

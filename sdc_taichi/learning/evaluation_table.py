@@ -250,8 +250,8 @@ def _standing(
 
 
 def _broken_pct(own: pd.DataFrame) -> float:
-    """Share of weeks that break a constraint, in %; nan without an optimum."""
-    known = own["broken"].notna()
+    """Share of weeks that break a constraint, in %; nan without an optimum, and for its bound."""
+    known = own["broken"].notna() & own["cfp_kg"].notna()  # of the bound the figure alone is known
     return 100.0 * float((own["broken"][known] != "").mean()) if known.any() else math.nan
 
 

@@ -15,7 +15,6 @@ from pydantic import (
     BaseModel,
     Field,
     SerializeAsAny,
-    ValidationError,
     field_serializer,
     field_validator,
     model_validator,
@@ -25,10 +24,10 @@ from sdc_taichi.config import (
     DataCenterConfig,
     apply_override,
     config_from_dict,
-    explain,
     load_config,
     load_yaml,
     preset_names,
+    validated,
     with_values,
 )
 from sdc_taichi.config.fields import Section
@@ -178,7 +177,7 @@ class TrainingSettings(Section):
         kind = LEARNING_SETTINGS.get(info.data.get("algorithm"))
         if kind is None or isinstance(value, kind):
             return value
-        return _validated(kind, value, f"settings of {info.data['algorithm']}")
+        return validated(kind, value, f"settings of {info.data['algorithm']}")
 
     @field_validator("environment")
     @classmethod
@@ -283,10 +282,7 @@ def make_settings(values: Mapping[str, Any], label: str = "settings") -> Trainin
     Raises:
         ConfigError: naming the setting, its value and what would be valid.
     """
-    try:
-        return TrainingSettings.model_validate(values)
-    except ValidationError as error:
-        raise ConfigError(explain(error, label, TrainingSettings)) from None
+    return validated(TrainingSettings, values, label)
 
 
 def load_settings(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> TrainingSettings:
@@ -339,14 +335,6 @@ def whole_steps(value: Any) -> Any:
         except ValueError:
             return value
     return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-def _validated(kind: type[BaseModel], value: Any, label: str) -> Any:
-    """Settings of a class, whose errors begin with a label."""
-    try:
-        return kind.model_validate(value)
-    except ValidationError as error:
-        raise ValueError(explain(error, label, kind)) from None
 
 
 def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
