@@ -90,7 +90,7 @@ $(READY_OLDEST): pyproject.toml .ci/lowest_versions.py
 	@$(PYTHON_OLDEST) -m venv --clear $(OLDEST)
 	@$(OLDEST)/bin/python .ci/lowest_versions.py > $(OLDEST)/constraints.txt
 	@$(OLDEST)/bin/python -m pip install $(PIP_FLAGS) --constraint $(OLDEST)/constraints.txt \
-	    --editable '.[plot,test]' setuptools
+	    --editable '.[plot,fetch,test]' setuptools
 	@touch $@
 
 $(READY): pyproject.toml
@@ -107,5 +107,5 @@ $(READY): pyproject.toml
 	    "$$found" -m venv $(VENV); \
 	fi
 	@echo "Installing sdc-taichi and its dependencies into $(VENV) (once, a few minutes at most)"
-	@$(PY) -m pip install $(PIP_FLAGS) --editable '.[plot,dev]'
+	@$(PY) -m pip install $(PIP_FLAGS) --editable '.[plot,fetch,dev]'
 	@touch $@

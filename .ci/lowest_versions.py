@@ -10,6 +10,7 @@ extras = project["optional-dependencies"]
 for requirement in (
     *project["dependencies"],
     *extras["plot"],
+    *extras["fetch"],
     *extras["test"],
     *content["build-system"]["requires"],
 ):

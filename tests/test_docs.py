@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from sdc_taichi.run.folder_reader import read_run
 from sdc_taichi.types import StepResult
 
 DOCS = Path(__file__).parent.parent / "docs"
-PAGES_OF_COMMANDS = ("cli.md", "data.md", "layout-solver.md")
+PAGES_OF_COMMANDS = ("cli.md", "data.md", "fetch.md", "layout-solver.md")
 
 pytestmark = pytest.mark.repo
 
@@ -59,10 +60,16 @@ def test_synopsis_lists_every_command() -> None:
 def test_every_option_is_documented() -> None:
     text = "".join((DOCS / page).read_text(encoding="utf-8") for page in PAGES_OF_COMMANDS)
     known = set(re.findall(r"--[a-z][a-z-]+", text))
+
+    def with_subcommands(command: Any) -> Iterator[Any]:
+        yield command
+        for each in getattr(command, "commands", {}).values():
+            yield from with_subcommands(each)
+
     missing = [
-        f"{name} {option}"
-        for name, command in commands().items()
-        for each in (command, *getattr(command, "commands", {}).values())
+        f"{each.name} {option}"
+        for command in commands().values()
+        for each in with_subcommands(command)
         for parameter in each.params
         for option in parameter.opts
         if option.startswith("--") and option not in known

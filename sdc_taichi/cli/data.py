@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +13,8 @@ from rich.table import Table
 
 from sdc_taichi.cli.arguments import out_option
 from sdc_taichi.cli.console import PlainConsole
+from sdc_taichi.cli.data_fetch import fetch_app
+from sdc_taichi.cli.imported_files import print_imported, print_missing_parts
 from sdc_taichi.errors import DataError, suggestion
 from sdc_taichi.exogenous import importing
 from sdc_taichi.exogenous.carbon import COLUMNS
@@ -40,6 +42,7 @@ MAPPED_COLUMNS = (*COLUMNS, "cpu_load")
 """Columns that ``--map`` may give by another name."""
 
 data_app = typer.Typer(help="Sites and workload traces.", no_args_is_help=True)
+data_app.add_typer(fetch_app, name="fetch")
 
 Seed = Annotated[int, typer.Option(help="Seed of the synthetic year.", min=0)]
 
@@ -203,10 +206,10 @@ def import_data(
             failed.append(error)
             continue
         done.append(item)
-        _print_imported(console, item)
+        print_imported(console, item)
     for file, reason in left_out:
         console.print(f"left out {file}: {reason}", soft_wrap=True)
-    _print_missing_parts(console, done, base)
+    print_missing_parts(console, done, base)
     if failed and len(jobs) == 1:
         raise failed[0]
     if failed:
@@ -244,30 +247,3 @@ def _plan_import(
     if name is None:
         raise DataError(f"{path}: a {kind} file, expected --site NAME to import it under")
     return [(kind, path, name)], []
-
-
-def _print_imported(console: PlainConsole, item: importing.Imported) -> None:
-    console.print(
-        f"{item.kind} {item.name}: {item.source.name} -> {item.target}",
-        soft_wrap=True,
-    )
-    for note in item.notes:
-        console.print(f"  {note}", soft_wrap=True)
-
-
-def _print_missing_parts(
-    console: PlainConsole, done: Sequence[importing.Imported], base: str | None
-) -> None:
-    """Say of each imported site that lacks weather or carbon where that comes from."""
-    for name in dict.fromkeys(item.name for item in done if item.kind != "workload"):
-        missing = {"weather", "carbon"} - set(imported_sites().get(name, {}))
-        if not missing:
-            continue
-        part = missing.pop()
-        text = (
-            f"site {name} lacks {part}: import a {part} file with --site {name}, or import "
-            "again with --base SITE to take it from an embedded site"
-            if base is None
-            else f"site {name}: {part} of the embedded {base} (synthetic)"
-        )
-        console.print(text, soft_wrap=True)

@@ -83,11 +83,39 @@ def file_kind(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> 
     )
 
 
+@dataclass(frozen=True)
+class Origin:
+    """Where a file was fetched from, to be kept with its data."""
+
+    service: str
+    """Name of the service, with its publisher."""
+    licence: str
+    """Licence of the data, or what is known of it."""
+    downloads: tuple[Mapping[str, Any], ...]
+    """Address, time in UTC and checksum of each download that the file was made of."""
+    notes: tuple[str, ...] = ()
+    """What was done to the downloads to make the file, with counts."""
+
+
+def site_name(name: str, data_dir: Path | None = None) -> str:
+    """Name under which a site is or will be imported.
+
+    Raises:
+        DataError: not usable, or that of an embedded site.
+    """
+    return _stored_name(new_name("site", name, synthetic_sites()), imported_sites(data_dir))
+
+
 def import_weather(
-    path: Path, name: str, base: str | None, data_dir: Path | None = None
+    path: Path,
+    name: str,
+    base: str | None,
+    data_dir: Path | None = None,
+    *,
+    origin: Origin | None = None,
 ) -> Imported:
-    """Store a weather file as ``sites/NAME/weather.parquet``."""
-    name = _stored_name(new_name("site", name, synthetic_sites()), imported_sites(data_dir))
+    """Store a weather file as ``sites/NAME/weather.parquet``, with its origin if it was fetched."""
+    name = site_name(name, data_dir)
     weather = read_epw(path)
     series = (
         weather.outdoor_c,
@@ -106,7 +134,7 @@ def import_weather(
         "base": base,
     }
     target = user_data_dir(data_dir) / "sites" / name / "weather.parquet"
-    return _store(path, name, target, [s for s in series if s is not None], metadata)
+    return _store(path, name, target, [s for s in series if s is not None], metadata, origin)
 
 
 def _design_metadata(design: DesignConditions | None) -> dict[str, float] | None:
@@ -125,16 +153,45 @@ def import_carbon(
     utc_offset_h: float | None = None,
     stamp: Stamp = "auto",
     columns: Mapping[str, str] = MappingProxyType({}),
+    origin: Origin | None = None,
 ) -> Imported:
-    """Store a carbon file as ``sites/NAME/carbon.parquet``.
+    """Store a carbon file, with its origin if it was fetched, as ``sites/NAME/carbon.parquet``.
 
-    The UTC offset is that of the weather imported under the same name, else ``utc_offset_h``, else
-    the base's. ``stamp`` and ``columns`` are those of ``read_carbon``.
+    The UTC offset is that of ``site_clock``; ``stamp`` and ``columns`` are those of
+    ``read_carbon``.
+
+    Raises:
+        DataError: the UTC offset is not known, or given otherwise than it is.
+    """
+    name = site_name(name, data_dir)
+    offset, longitude = site_clock(name, base, data_dir, utc_offset_h=utc_offset_h)
+    series = read_carbon(path, offset, stamp, longitude_deg=longitude, columns=columns)
+    metadata = {"kind": "carbon", "utc_offset_h": offset, "pairing": "local", "base": base}
+    target = user_data_dir(data_dir) / "sites" / name / "carbon.parquet"
+    return _store(path, name, target, [series], metadata, origin)
+
+
+def site_clock(
+    name: str,
+    base: str | None,
+    data_dir: Path | None = None,
+    *,
+    utc_offset_h: float | None = None,
+) -> tuple[float, float | None]:
+    """UTC offset of a site, in h, and its longitude, in degrees east, None if it is not known.
+
+    The offset is that of the weather imported under the same name, else ``utc_offset_h``, else
+    the base's.
+
+    Args:
+        name: name of the site.
+        base: embedded site that gives what is missing.
+        data_dir: folder of imported files instead of the user's.
+        utc_offset_h: local standard time minus UTC, in h.
 
     Raises:
         DataError: none of them is known, or they differ.
     """
-    name = _stored_name(new_name("site", name, synthetic_sites()), imported_sites(data_dir))
     offset, longitude = utc_offset_h, None
     weather_path = imported_sites(data_dir).get(name, {}).get("weather")
     if weather_path is not None or (base is not None and offset is None):
@@ -149,13 +206,10 @@ def import_carbon(
         offset = known
     if offset is None:
         raise DataError(
-            f"{path}: UTC offset of site {name!r} unknown, expected the weather file imported "
-            "first, --base SITE or --utc-offset HOURS"
+            f"UTC offset of site {name!r} unknown, expected the weather imported first, "
+            "--base SITE or --utc-offset HOURS"
         )
-    series = read_carbon(path, offset, stamp, longitude_deg=longitude, columns=columns)
-    metadata = {"kind": "carbon", "utc_offset_h": offset, "pairing": "local", "base": base}
-    target = user_data_dir(data_dir) / "sites" / name / "carbon.parquet"
-    return _store(path, name, target, [series], metadata)
+    return offset, longitude
 
 
 def import_workload(
@@ -246,11 +300,20 @@ def _clean(text: str) -> str:
 
 
 def _store(
-    source: Path, name: str, target: Path, series: list[Series], metadata: dict[str, Any]
+    source: Path,
+    name: str,
+    target: Path,
+    series: list[Series],
+    metadata: dict[str, Any],
+    origin: Origin | None = None,
 ) -> Imported:
     from importlib.metadata import version
 
     notes = series[0].notes
+    if origin is not None:
+        notes = (*origin.notes, *notes)
+        known = {"service": origin.service, "licence": origin.licence}
+        metadata |= {"origin": known | {"downloads": [dict(x) for x in origin.downloads]}}
     series_file.write_parquet(
         target,
         {s.name: s.values for s in series},

@@ -127,6 +127,9 @@ def imported_series(
     source = metadata_value(path, metadata, "source_file", str)
     digest = metadata_value(path, metadata, "sha256", str)
     notes = metadata_value(path, metadata, "notes", list)
+    if metadata.get("origin") is not None:
+        origin = metadata_value(path, metadata, "origin", dict)
+        source = f"{origin.get('service')}, licence {origin.get('licence')}: {source}"
     return Series(
         columns[column],
         minutes,

@@ -1,0 +1,583 @@
+"""Data of services become sites: formats, units, clocks, origin, and what is wrong in one line."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner, Result
+
+from exogenous_builders import epw_lines, text
+from faulty_server import Answer, sends, serving
+from sdc_taichi.cli.app import app
+from sdc_taichi.errors import DataError
+from sdc_taichi.exogenous import load_site, series_file
+from sdc_taichi.exogenous.fetch import eia as eia_module
+from sdc_taichi.exogenous.fetch import electricity_maps, pvgis
+from sdc_taichi.exogenous.fetch import entsoe as entsoe_module
+from sdc_taichi.exogenous.fetch.download import Patience
+from sdc_taichi.exogenous.fetch.generation import Period, by_column, carbon_table, check_year
+from sdc_taichi.exogenous.fetch.request import MOST_DOWNLOAD_BYTES, Key
+from sdc_taichi.exogenous.synthetic import FUELS, emission_factors
+from service_answers import (
+    eia,
+    eia_document,
+    electricity_maps_table,
+    entsoe,
+    entsoe_acknowledgement,
+    entsoe_document,
+    entsoe_series,
+    pvgis_year,
+    solar_mwh,
+)
+
+KEY = "0123456789abcdef"
+
+
+@pytest.fixture(autouse=True)
+def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of imported files, empty; keys are set, and failures come soon."""
+    folder = tmp_path / "data"
+    monkeypatch.setenv("SDC_TAICHI_DATA", str(folder))
+    monkeypatch.setenv("EIA_API_KEY", KEY)
+    monkeypatch.setenv("ENTSOE_API_KEY", KEY)
+    quick = Patience(attempts=2, first_wait_s=0.01)
+    monkeypatch.setattr("sdc_taichi.exogenous.fetch.download.Patience", lambda: quick)
+    return folder
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Result]]:
+    """Runs ``data fetch`` with a server in place of the services; None is no answer."""
+    with serving() as server:
+        for module in (pvgis, eia_module, entsoe_module, electricity_maps):
+            monkeypatch.setattr(module, "ADDRESS", server.url)
+
+        def fetch(answer: Answer | None, *args: str) -> Result:
+            server.answers = [answer or (lambda request: None)]
+            words = [x.replace("SERVER", server.url) for x in args]
+            return CliRunner().invoke(app, ["data", "fetch", *words])
+
+        yield fetch
+
+
+def error(result: Result) -> str:
+    """The one line of an input error, which shows no key."""
+    assert result.exit_code == 2, result.output
+    (line,) = result.stderr.splitlines()
+    assert KEY not in line
+    return line
+
+
+def metadata(data_dir: Path, part: str, site: str = "here") -> dict[str, Any]:
+    found = series_file.read_metadata(data_dir / "sites" / site / f"{part}.parquet")
+    assert found is not None
+    return found
+
+
+# PVGIS
+
+PVGIS = ("pvgis", "--latitude=45", "--longitude=8", "--site=here", "--base=NY")
+
+
+def pvgis_answer(change: Callable[[dict[str, Any]], object] = lambda year: None) -> bytes:
+    year = pvgis_year()
+    change(year)
+    return json.dumps(year).encode()
+
+
+def test_typical_year_becomes_a_site(run: Callable[..., Result], data_dir: Path) -> None:
+    result = run(sends(pvgis_answer()), *PVGIS, "--utc-offset=1")
+    assert result.exit_code == 0, result.output
+    site = load_site("here")
+    assert (site.latitude_deg, site.longitude_deg, site.elevation_m) == (45.0, 8.0, 250.0)
+    assert site.utc_offset_h == 1.0
+    # Hour h of local time is hour h-1 of UTC.
+    expected = np.roll(np.arange(8760) / 1000.0, 1)
+    np.testing.assert_allclose(site.outdoor_c.values, expected, atol=0.0051)
+    assert site.pressure_pa is not None
+    assert site.pressure_pa.values[1] == 99920.0
+    found = metadata(data_dir, "weather")
+    (download,) = found["origin"]["downloads"]
+    assert download["url"].endswith("?lat=45.0000&lon=8.0000&outputformat=json")
+    assert set(download) == {"url", "retrieved", "sha256"}
+    assert "CC BY 4.0" in found["origin"]["licence"]
+    assert "moved from UTC to local standard time" in found["notes"]
+    assert "PVGIS 5.3" in site.outdoor_c.source
+    again = run(None, *PVGIS, "--utc-offset=1")
+    assert again.exit_code == 0, again.output
+
+
+def test_half_hours_are_interpolated() -> None:
+    year = json.dumps(pvgis_year(20.0, 77.0)).encode()
+    lines = pvgis.to_epw(year, "url", 5.5).splitlines()[8:]
+    cells = [line.split(",") for line in lines]
+    # Local 06:00 is 00:30 UTC, between the rows of 00:00 and 01:00.
+    assert float(cells[6][6]) == pytest.approx(0.0005, abs=0.005)
+    # Local 00:00 is 18:30 UTC of 31 December.
+    assert float(cells[0][6]) == pytest.approx((8754 + 8755) / 2000.0, abs=0.005)
+    assert {c[20] for c in cells} == {"10", "350"}
+    assert [c[:5] for c in (cells[0], cells[-1])] == [
+        ["2016", "1", "1", "1", "60"],
+        ["2016", "12", "31", "24", "60"],
+    ]
+    assert {len(c) for c in cells} == {35}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda year: year["outputs"]["tmy_hourly"].pop(), "8759 rows in tmy_hourly"),
+        (lambda year: year["outputs"]["tmy_hourly"].reverse(), "row 1 of tmy_hourly: time(UTC)"),
+        (
+            lambda year: year["outputs"]["tmy_hourly"][7].update(T2m=None),
+            "row 8 of tmy_hourly: T2m",
+        ),
+        (lambda year: year["outputs"]["tmy_hourly"][7].update(SP="high"), "expected a number"),
+        (lambda year: year["outputs"]["tmy_hourly"][7].pop("RH"), "no RH"),
+        (lambda year: year["inputs"]["location"].update(latitude=46), "latitude 46, expected 45"),
+        (lambda year: year.pop("inputs"), "no inputs.location.latitude"),
+        (lambda year: year["outputs"].update(tmy_hourly={}), "0 rows"),
+    ],
+)
+def test_a_wrong_typical_year_is_one_line(
+    run: Callable[..., Result],
+    data_dir: Path,
+    change: Callable[[dict[str, Any]], object],
+    message: str,
+) -> None:
+    assert message in error(run(sends(pvgis_answer(change)), *PVGIS, "--utc-offset=1"))
+    assert not data_dir.exists()
+
+
+def test_values_beyond_limits_are_found_by_the_reader(run: Callable[..., Result]) -> None:
+    answer = pvgis_answer(lambda year: year["outputs"]["tmy_hourly"][7].update(T2m=99.0))
+    line = error(run(sends(answer), *PVGIS, "--utc-offset=1"))
+    assert "tmy_45.0000_8.0000_utc+1.epw: row 17, column dry bulb" in line
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--utc-offset=-8",), "about +1 at longitude 8"),
+        (("--utc-offset=15",), "--utc-offset 15"),
+        (("--utc-offset=nan",), "--utc-offset nan"),
+        (("--utc-offset=1", "--latitude=91"), "--latitude 91: expected -90 to 90"),
+        (("--utc-offset=1", "--longitude=nan"), "--longitude nan"),
+        (("--utc-offset=1", "--site=NY"), "is the embedded synthetic one"),
+        (("--utc-offset=1", "--site=../x"), "expected 1 to 64 letters"),
+        (("--utc-offset=1", "--base=XX"), "expected one of AZ"),
+        (("--utc-offset=1", "--file=none.json"), "no such file"),
+    ],
+)
+def test_bad_options_are_found_before_any_download(
+    run: Callable[..., Result], options: tuple[str, ...], message: str
+) -> None:
+    assert message in error(run(None, *PVGIS, *options))
+
+
+def test_the_sea_is_told(run: Callable[..., Result]) -> None:
+    said = b'{"message": "Location over the sea. Please, select another location"}'
+    assert "Location over the sea" in error(run(sends(said, 400), *PVGIS, "--utc-offset=1"))
+
+
+def test_without_a_network_a_file_saved_by_hand_serves(
+    run: Callable[..., Result], tmp_path: Path
+) -> None:
+    line = error(run(None, *PVGIS, "--utc-offset=1"))
+    assert "by hand: save http://" in line
+    assert "--file FILE" in line
+    saved = tmp_path / "saved.json"
+    saved.write_bytes(pvgis_answer())
+    assert run(None, *PVGIS, "--utc-offset=1", f"--file={saved}").exit_code == 0
+    assert run(None, *PVGIS, "--utc-offset=1").exit_code == 0
+
+
+# EPW
+
+
+def archive(**files: bytes) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as made:
+        for name, content in files.items():
+            made.writestr(name.replace("_epw", ".epw"), content)
+    return packed.getvalue()
+
+
+EPW = text(epw_lines()).encode()
+
+
+@pytest.mark.parametrize("content", [EPW, archive(Station_epw=EPW, Station_stat=b"x")])
+def test_weather_by_address(run: Callable[..., Result], data_dir: Path, content: bytes) -> None:
+    args = ("epw", "--site=here", "--base=NY")
+    answer = sends(content, kind="application/octet-stream")
+    result = run(answer, *args, "SERVER/a/USA_NY_Station%20x.zip?v=1")
+    assert result.exit_code == 0, result.output
+    assert load_site("here").label == "Test.Station, NY, USA"
+    url = metadata(data_dir, "weather")["origin"]["downloads"][0]["url"]
+    assert url.endswith("/a/USA_NY_Station%20x.zip?v=1")
+    assert run(None, *args, url).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (archive(a_epw=EPW, b_epw=EPW), "a.epw, b.epw; expected one"),
+        (archive(a_stat=b"x"), "none; expected one"),
+        (archive(a_epw=b"x"), "begins with 'x', expected an EPW file"),
+        (archive(a_epw=EPW)[:-40], "damaged"),
+        (archive(a_epw=EPW).replace(b"a.epw", b"a.epw", 1)[:500], "damaged"),
+        (archive(a_epw=bytes(MOST_DOWNLOAD_BYTES + 1)), "more than 64.0 MB"),
+        (b"timestamp,x\n", "expected an EPW file"),
+        (b"", "expected an EPW file"),
+        (b"<!doctype html>", "an HTML page"),
+    ],
+)
+def test_what_is_no_weather_is_one_line(
+    run: Callable[..., Result], data_dir: Path, content: bytes, message: str
+) -> None:
+    assert message in error(run(sends(content), "epw", "--site=here", "SERVER/x.epw"))
+    assert not data_dir.exists()
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("file:///etc/passwd", "begins with https://"),
+        ("station.epw", "begins with https://"),
+        ("https://[::1/x.epw", "begins with https://"),
+        ("https://a b/x.epw", "not a valid address"),
+        ("https://me:hidden@example.org/x.epw", "without"),
+    ],
+)
+def test_what_is_no_address_is_one_line(run: Callable[..., Result], url: str, message: str) -> None:
+    line = error(run(None, "epw", url, "--site=here"))
+    assert message in line
+    assert "hidden" not in line
+
+
+# EIA-930
+
+EIA = ("eia-930", "ciso", "--year=2023", "--site=here", "--base=CA")
+
+
+def average_ci(sun: np.ndarray) -> np.ndarray:
+    """Intensity of the generation of ``service_answers``, by its sun."""
+    factors = emission_factors()
+    known = {"COL": 500.0, "NG": 3000.0, "NUC": 2000.0, "WND": 800.0}
+    carbon = sum(factors[x] * mwh for x, mwh in known.items()) + factors["SUN"] * sun
+    return np.asarray(carbon / (sum(known.values()) + sun))
+
+
+def test_generation_becomes_carbon_intensity(run: Callable[..., Result], data_dir: Path) -> None:
+    result = run(eia(), *EIA)
+    assert result.exit_code == 0, result.output
+    series = load_site("here").ci_g_per_kwh
+    assert series.values.size == 8760
+    assert "stamps mark the end of the interval (solar noon)" in series.notes
+    # By local standard time: the hour from h to h + 1 ends at h + 1.
+    hours = pd.date_range("2023-01-01 01:00", periods=8760, freq="h")
+    sun = np.array([solar_mwh(x.to_pydatetime(), 0.0) for x in hours])
+    np.testing.assert_allclose(series.values, average_ci(sun), atol=0.01)
+    found = metadata(data_dir, "carbon")
+    assert len(found["origin"]["downloads"]) == 36
+    assert found["origin"]["licence"].startswith("public domain")
+    assert found["source_file"] == "CISO_2023.csv"
+    for path in data_dir.rglob("*"):
+        assert path.is_dir() or KEY.encode() not in path.read_bytes()
+    again = run(None, *EIA)
+    assert again.exit_code == 0, again.output
+
+
+def changed_rows(rows: list[dict[str, Any]]) -> None:
+    """Storage, a new source, negative and missing values, all in the first part of the year."""
+    first = rows[0]
+    if first["period"] != "2023-01-01T00":
+        return
+    rows.append(first | {"fueltype": "BAT", "value": "900"})
+    rows.append(first | {"fueltype": "SNB", "value": "100"})
+    rows.append(first | {"fueltype": "XYZ", "value": "1"})
+    rows[1]["value"] = -5
+    rows[7]["value"] = None
+
+
+def test_odd_rows_are_noted(run: Callable[..., Result]) -> None:
+    result = run(eia(changed_rows), *EIA)
+    assert result.exit_code == 0, result.output
+    for note in (
+        "BAT (storage) left out",
+        "SNB counts as SUN",
+        "warning: type XYZ is not known and counts as OTH",
+        "1 negative values of NG set to 0",
+        "SNB is not reported for 8759 h, which count as 0",
+        "rows without values interpolated",
+    ):
+        assert note in result.output
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda rows: rows.clear(), "no rows, expected a balancing authority"),
+        (lambda rows: rows[3].update({"value-units": "MW"}), "row 4: value-units 'MW'"),
+        (lambda rows: rows[3].update(period="2023-01-01"), "row 4: period '2023-01-01'"),
+        (lambda rows: rows[3].update(period="2023-13-01T00"), "row 4: period"),
+        (lambda rows: rows[3].update(period="2022-12-31T23"), "row 4: period"),
+        (lambda rows: rows[3].update(value="many"), "row 4: value: 'many'"),
+        (lambda rows: rows[3].pop("fueltype"), "no fueltype"),
+    ],
+)
+def test_wrong_rows_are_one_line(
+    run: Callable[..., Result], change: Callable[[list[dict[str, Any]]], object], message: str
+) -> None:
+    assert message in error(run(eia(change), *EIA))
+
+
+def test_rows_that_the_service_leaves_out_are_an_error() -> None:
+    document = json.loads(eia_document([{}], {}))
+    document["response"]["total"] = 5001
+    with pytest.raises(DataError, match="1 of 5,001 rows came"):
+        eia_module.rows_of(json.dumps(document).encode(), "url")
+
+
+def test_requests_cover_the_year_without_too_many_rows() -> None:
+    key = Key("EIA_API_KEY", "api_key", KEY)
+    for year in (2023, 2024):
+        periods = [period for period, _ in eia_module.requests_of_year("PJM", year, key)]
+        assert periods[0].first == 0
+        assert [p.first for p in periods[1:]] == [p.stop for p in periods[:-1]]
+        assert periods[-1].stop == 24 * (366 if year == 2024 else 365)
+        sources = len(eia_module.COLUMNS)
+        assert max(p.stop - p.first for p in periods) * sources <= eia_module.MOST_ROWS
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--year=1999",), "--year 1999: expected 2019 to"),
+        (("--year=2999",), "a calendar year that is over"),
+        (("--utc-offset=3",), "utc_offset_h: 3"),
+    ],
+)
+def test_bad_options_of_eia(
+    run: Callable[..., Result], options: tuple[str, ...], message: str, data_dir: Path
+) -> None:
+    weather = data_dir.parent / "here.epw"
+    weather.write_text(text(epw_lines()), encoding="utf-8")
+    CliRunner().invoke(app, ["data", "import", str(weather), "--site=here"])
+    assert message in error(run(None, *EIA, *options))
+
+
+def test_no_key_no_clock_no_authority(
+    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    no_clock = error(run(None, "eia-930", "CISO", "--year=2023", "--site=here"))
+    assert "expected the weather imported first, --base SITE or --utc-offset HOURS" in no_clock
+    bad = error(run(None, "eia-930", "C I", "--year=2023", "--site=here", "--utc-offset=-8"))
+    assert "such as CISO" in bad
+    monkeypatch.delenv("EIA_API_KEY")
+    assert "EIA_API_KEY: not set" in error(run(None, *EIA))
+
+
+def test_a_failure_in_the_middle_keeps_what_came(
+    run: Callable[..., Result], data_dir: Path
+) -> None:
+    answer, seen = eia(), []
+
+    def third_fails(request: Any) -> None:
+        seen.append(request.path)
+        (sends(b"", 404) if len(seen) == 3 else answer)(request)
+
+    assert "404" in error(run(third_fails, *EIA))
+    assert not (data_dir / "sites").exists()
+    assert len(list(data_dir.rglob("CISO_*.json.origin.json"))) == 2
+    assert run(third_fails, *EIA).exit_code == 0
+    assert len(seen) == 3 + 34
+
+
+# ENTSO-E
+
+ENTSOE = ("entsoe", "de-lu", "--year=2024", "--site=here", "--utc-offset=1")
+
+
+def test_generation_per_type_becomes_carbon_intensity(
+    run: Callable[..., Result], data_dir: Path
+) -> None:
+    result = run(entsoe(), *ENTSOE)
+    assert result.exit_code == 0, result.output
+    series = pd.read_parquet(data_dir / "sites" / "here" / "carbon.parquet")["ci_g_per_kwh"]
+    hours = pd.date_range("2023-01-01 01:00", periods=8760, freq="h")
+    sun = np.array([solar_mwh(x.to_pydatetime(), 0.0) for x in hours])
+    np.testing.assert_allclose(series, average_ci(sun), atol=0.01)
+    notes = metadata(data_dir, "carbon")["notes"]
+    assert "stamps mark the start of the interval (given)" in notes
+    assert "29 February removed (24 rows)" in notes
+    assert not any("B10" in note for note in notes)
+    assert "CC BY 4.0" in metadata(data_dir, "carbon")["origin"]["licence"]
+
+
+DAY = ("2024-01-01T00:00Z", "2024-01-02T00:00Z")
+
+
+def of_first_day(*series: str) -> dict[str, np.ndarray]:
+    found = entsoe_module.generation(2024, [(Period(0, 24), entsoe_document(*series), "url")])
+    return {name: values[:24] for name, values in found.items()}
+
+
+def test_points_that_repeat_are_left_out_in_one_curve_alone() -> None:
+    points = [(1, 10.0), (3, 30.0)]
+    held = of_first_day(entsoe_series("B16", *DAY, points, curve="A03"))["B16"]
+    np.testing.assert_array_equal(held, [10.0, 10.0, *[30.0] * 22])
+    missing = of_first_day(entsoe_series("B16", *DAY, points, curve="A01"))["B16"]
+    np.testing.assert_array_equal(missing, [10.0, np.nan, 30.0, *[np.nan] * 21])
+
+
+@pytest.mark.parametrize(("resolution", "per_hour"), [("PT15M", 4), ("PT30M", 2), ("PT60M", 1)])
+def test_power_is_averaged_to_hours(resolution: str, per_hour: int) -> None:
+    points = [(i + 1, float(i)) for i in range(24 * per_hour)]
+    found = of_first_day(entsoe_series("B04", *DAY, points, resolution))["B04"]
+    expected = np.arange(24.0 * per_hour).reshape(24, per_hour).mean(axis=1)
+    np.testing.assert_allclose(found, expected)
+
+
+def test_an_answer_beyond_its_period_is_cut() -> None:
+    series = entsoe_series("B04", "2023-12-31T12:00Z", "2024-01-03T00:00Z", [(1, 5.0)], curve="A03")
+    found = entsoe_module.generation(2024, [(Period(0, 24), entsoe_document(series), "url")])["B04"]
+    np.testing.assert_array_equal(found[:24], 5.0)
+    assert np.isnan(found[24:]).all()
+
+
+BOMB = (
+    b'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaaaaaaaa">'
+    + b"".join(b'<!ENTITY %c "%s">' % (98 + i, b"&%c;" % (97 + i) * 10) for i in range(9))
+    + b"]><GL_MarketDocument>&j;</GL_MarketDocument>"
+)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (entsoe_acknowledgement("No matching data found"), "'No matching data found'"),
+        (entsoe_document()[:-10], "expected whole XML"),
+        (entsoe_document(), "no TimeSeries"),
+        (b"<a/>", "a, expected GL_MarketDocument"),
+        (BOMB, "expected whole XML"),
+        (b'{"a": 1}', "expected whole XML"),
+        (entsoe_document(entsoe_series("B04", *DAY, [], "PT1M")), "resolution 'PT1M'"),
+        (entsoe_document(entsoe_series("B04", *DAY, [], unit="KWH")), "unit 'KWH', expected MAW"),
+        (entsoe_document(entsoe_series("B04", *DAY, [(25, 1.0)])), "position '25'"),
+        (entsoe_document(entsoe_series("B04", *DAY, [(1, np.inf)])), "quantity 'inf'"),
+        (entsoe_document(entsoe_series("B04", *DAY[::-1], [])), "expected whole intervals"),
+        (entsoe_document(entsoe_series("B04", "soon", DAY[1], [])), "time 'soon'"),
+        (entsoe_document(entsoe_series("B04", "2024-02-31T00:00Z", DAY[1], [])), "calendar"),
+        (entsoe_document("<TimeSeries/>"), "no quantity_Measure_Unit.name"),
+    ],
+)
+def test_wrong_documents_are_one_line(
+    run: Callable[..., Result], data_dir: Path, content: bytes, message: str
+) -> None:
+    assert message in error(run(sends(content, kind="text/xml"), *ENTSOE))
+    assert not data_dir.exists()
+
+
+def test_zones_have_names_and_codes() -> None:
+    assert entsoe_module.zone_code("de-lu") == entsoe_module.zone_code("10Y1001A1001A82H")
+    with pytest.raises(DataError, match="did you mean 'DE_LU'"):
+        entsoe_module.zone_code("DELU")
+    for code in entsoe_module.ZONES.values():
+        assert entsoe_module.zone_code(code) == code
+    assert len(set(entsoe_module.ZONES.values())) == len(entsoe_module.ZONES)
+
+
+# Electricity Maps
+
+MAPS = ("electricity-maps", "FR", "--year=2023", "--site=here", "--utc-offset=1")
+
+
+@pytest.mark.parametrize(
+    "column",
+    ["Carbon intensity gCO₂eq/kWh (Life cycle)", "Carbon Intensity gCO₂eq/kWh (LCA)"],
+)
+def test_yearly_table_becomes_carbon_intensity(
+    run: Callable[..., Result], data_dir: Path, column: str
+) -> None:
+    result = run(sends(electricity_maps_table(2023, column), kind="text/csv"), *MAPS)
+    assert result.exit_code == 0, result.output
+    series = pd.read_parquet(data_dir / "sites" / "here" / "carbon.parquet")["ci_g_per_kwh"]
+    assert series[:3].tolist() == [123.25, 100.25, 101.25]
+    assert "ODbL" in metadata(data_dir, "carbon")["origin"]["licence"]
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (sends(b"no such key", 404), "2025-04-03/FR_2023_hourly.csv: status 404 (Not Found)"),
+        (sends(b"a,b\n1,2\n"), "columns 'a, b'"),
+        (sends(b""), "columns ''"),
+        (sends(b"\xff\xfea"), "byte 0 is not UTF-8"),
+        (sends(electricity_maps_table()[:5000]), "expected a stamp after the row above"),
+    ],
+)
+def test_wrong_tables_are_one_line(
+    run: Callable[..., Result], answer: Answer, message: str
+) -> None:
+    assert message in error(run(answer, *MAPS))
+
+
+@pytest.mark.parametrize("options", [("--release=new",), ("--release=../../x",), ("--year=2020",)])
+def test_bad_options_of_electricity_maps(
+    run: Callable[..., Result], options: tuple[str, ...]
+) -> None:
+    assert "expected" in error(run(None, *MAPS, *options))
+
+
+# Generation
+
+
+def test_storage_is_left_out_and_unreported_time_is_no_gap() -> None:
+    periods = [Period(0, 2), Period(2, 4)]
+    by_type = {
+        "NG": np.array([1.0, 2.0, 3.0, np.nan]),
+        "GEO": np.array([np.nan, np.nan, 5.0, 5.0]),
+        "BAT": np.full(4, 9.0),
+    }
+    values, notes = by_column(by_type, eia_module.COLUMNS, periods)
+    gas, other = (values[:, FUELS.index(fuel)] for fuel in ("NG", "OTH"))
+    np.testing.assert_array_equal(gas[:3], [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(other[:3], [0.0, 0.0, 5.0])
+    assert np.isnan(gas[3])
+    assert notes == [
+        "BAT (storage) left out",
+        "GEO counts as OTH",
+        "GEO is not reported for 2 h, which count as 0",
+    ]
+    rows = carbon_table(2023, values).decode().splitlines()
+    assert rows[0].split(",")[0] == "timestamp"
+    assert rows[1].startswith("2023-01-01 00:00:00+00:00,")
+    assert rows[4] == "2023-01-01 03:00:00+00:00,0,0,0,0,,0,0,5,"
+
+
+def test_short_gaps_and_gaps_within_stay_missing() -> None:
+    gas = np.full(1000, 5.0)
+    gas[:24] = gas[-25:] = gas[300:400] = np.nan
+    by_type = {"NG": gas, "COL": np.full(1000, 1.0)}
+    values, notes = by_column(by_type, eia_module.COLUMNS, [Period(0, 1000)])
+    found = values[:, FUELS.index("NG")]
+    assert np.isnan(found[:24]).all()
+    assert np.isnan(found[300:400]).all()
+    np.testing.assert_array_equal(found[-25:], 0.0)
+    assert notes == ["NG is not reported for 25 h, which count as 0"]
+
+
+def test_every_type_counts_as_a_column_or_as_storage() -> None:
+    for columns in (eia_module.COLUMNS, entsoe_module.COLUMNS):
+        assert set(columns.values()) - {None} <= set(FUELS)
+    assert set(entsoe_module.COLUMNS) == {f"B{i:02d}" for i in range(1, 21)} | {"B25"}
+    check_year(2023, 2019, 2024)
