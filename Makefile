@@ -15,6 +15,10 @@ PYTHON_OLDEST ?= python3.11
 # Training libraries apart, because RLlib pins an older Gymnasium, whose types are others.
 TRAIN := .venv-train
 READY_TRAIN := $(TRAIN)/.installed
+# Sphinx and its theme apart, since the tests need neither.
+DOCS := .venv-docs
+READY_DOCS := $(DOCS)/.installed
+DOCS_PY := $(DOCS)/bin/python
 # Installed before the libraries on top of it, which would take the newest build. May carry options
 # of pip, such as an index of builds for the CPU alone.
 TORCH ?= torch==2.13.0
@@ -26,10 +30,10 @@ SPREAD := --numprocesses auto --maxprocesses 4 --dist loadfile
 TRAINING_TESTS := $(wildcard tests/test_training*.py tests/test_learning*.py tests/test_policy*.py \
     tests/test_ray*.py tests/test_offline*.py)
 TYPED := build/typecheck
-SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py)))
+SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py docs/site/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
 
-.PHONY: help demo test test-oldest test-processors test-train bench fuzz lint wheel-test clean
+.PHONY: help demo test test-oldest test-processors test-train bench fuzz lint wheel-test docs clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -68,8 +72,14 @@ lint: $(READY) ## Check style, format and types.
 wheel-test: $(READY) ## Build the wheel and run the tests against it, away from the sources.
 	.ci/wheel-test $(PY) $(SPREAD)
 
+# DOCS_VERSION names the build in the list of versions, DOCS_SWITCHER is the address of that list.
+docs: $(READY_DOCS) ## Build and check the documentation site in build/docs/html.
+	$(DOCS_PY) docs/site/stage.py build/docs/source
+	$(DOCS_PY) -m sphinx -q -W -n --keep-going -c docs/site -b html build/docs/source build/docs/html
+	$(DOCS_PY) docs/site/check.py build/docs/html
+
 clean: ## Remove everything that can be built again, the environment included.
-	rm -rf $(VENV) $(OLDEST) $(TRAIN) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLDEST) $(TRAIN) $(DOCS) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(READY_TRAIN): $(READY)
@@ -77,6 +87,12 @@ $(READY_TRAIN): $(READY)
 	@$(PY) -m venv --clear $(TRAIN)
 	@$(TRAIN)/bin/python -m pip install $(PIP_FLAGS) $(TORCH)
 	@$(TRAIN)/bin/python -m pip install $(PIP_FLAGS) --editable '.[test,onnx,recipes,scale,offline]'
+	@touch $@
+
+$(READY_DOCS): $(READY) pyproject.toml
+	@echo "Installing what builds the site into $(DOCS) (once, a few minutes at most)"
+	@$(PY) -m venv --clear $(DOCS)
+	@$(DOCS_PY) -m pip install $(PIP_FLAGS) --editable '.[docs]'
 	@touch $@
 
 # Torch in the environment of development, for work on sdc_taichi/learning.
