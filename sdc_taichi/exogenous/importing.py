@@ -311,7 +311,7 @@ def _store(
 
     notes = series[0].notes
     if origin is not None:
-        notes = (*origin.notes, *notes)
+        notes = (f"licence: {origin.licence}", *origin.notes, *notes)
         known = {"service": origin.service, "licence": origin.licence}
         metadata |= {"origin": known | {"downloads": [dict(x) for x in origin.downloads]}}
     series_file.write_parquet(

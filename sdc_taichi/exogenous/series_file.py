@@ -129,7 +129,7 @@ def imported_series(
     notes = metadata_value(path, metadata, "notes", list)
     if metadata.get("origin") is not None:
         origin = metadata_value(path, metadata, "origin", dict)
-        source = f"{origin.get('service')}, licence {origin.get('licence')}: {source}"
+        source = f"{origin.get('service')}: {source}"
     return Series(
         columns[column],
         minutes,

@@ -45,8 +45,8 @@ MOST = {"days": 0.2, "dcs": 4.0, "seed": 1e30}
 """Larger numbers are valid and take long."""
 LEFT_OUT = {"serve", "serve_port", "help", "version", "install_completion", "show_completion"}
 """Options that wait for a viewer, or print a text and end."""
-NO_COMMANDS = {"view", "sweep"}
-"""Commands that open a window, or start processes."""
+NO_COMMANDS = {"view", "sweep", "fetch"}
+"""Commands that open a window, start processes, or ask services on the web."""
 
 
 @cache

@@ -11,6 +11,7 @@ import re
 
 from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous.fetch.request import Request, Service
+from sdc_taichi.user_file import decoding
 
 SERVICE = Service(
     name="electricity-maps",
@@ -62,7 +63,8 @@ def columns_of(content: bytes, url: str) -> dict[str, str]:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as failed:
         raise DataError(f"{url}: byte {failed.start} is not UTF-8, expected a CSV table") from None
-    header = next(csv.reader([text.partition("\n")[0].rstrip("\r")]), [])
+    with decoding(url, "a CSV table", DataError):
+        header = next(csv.reader([text.partition("\n")[0].rstrip("\r")]), [])
     found = [
         column
         for column in header

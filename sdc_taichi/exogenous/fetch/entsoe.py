@@ -18,6 +18,7 @@ from sdc_taichi.errors import DataError, shortened, suggestion
 from sdc_taichi.exogenous.fetch.generation import STORAGE, Period, hours_of_year
 from sdc_taichi.exogenous.fetch.request import Key, Request, Service
 from sdc_taichi.exogenous.series import FloatArray
+from sdc_taichi.user_file import decoding
 
 SERVICE = Service(
     name="entsoe",
@@ -206,11 +207,8 @@ def generation(year: int, answers: Sequence[tuple[Period, bytes, str]]) -> dict[
 
 def _runs(content: bytes, url: str) -> Iterator[_Points]:
     """Runs of generation of an answer; consumption of storage is left out."""
-    try:
+    with decoding(url, "XML", DataError):
         root = ElementTree.fromstring(content)
-    except (ElementTree.ParseError, ValueError):
-        start = content[:40].decode("latin-1")
-        raise DataError(f"{url}: begins with {shortened(start)}, expected whole XML") from None
     if _name(root) == "Acknowledgement_MarketDocument":
         texts = [x.text.strip() for x in root.iter() if _name(x) == "text" and x.text]
         raise DataError(f"{url}: {shortened(' '.join(texts), 300)}")

@@ -14,6 +14,7 @@ from urllib.parse import unquote, urlsplit
 
 from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous.fetch.request import MOST_DOWNLOAD_BYTES, Request, Service
+from sdc_taichi.user_file import decoding
 
 SERVICE = Service(
     name="epw",
@@ -68,7 +69,8 @@ def epw_bytes(content: bytes, url: str) -> bytes:
 
 
 def _unpacked(content: bytes, url: str) -> bytes:
-    try:
+    """The one EPW file of a ZIP archive."""
+    with decoding(url, "a ZIP archive", DataError):
         archive = zipfile.ZipFile(io.BytesIO(content))
         members = [x for x in archive.infolist() if x.filename.lower().endswith(".epw")]
         if len(members) != 1:
@@ -77,12 +79,6 @@ def _unpacked(content: bytes, url: str) -> bytes:
         with archive.open(members[0]) as member:
             # What the archive tells of sizes may be wrong.
             plain = member.read(MOST_DOWNLOAD_BYTES + 1)
-    except DataError:
-        raise
-    except (zipfile.BadZipFile, OSError, RuntimeError, EOFError, ValueError, KeyError):
-        raise DataError(f"{url}: a damaged or encrypted ZIP archive") from None
-    except Exception as failed:  # zlib.error, NotImplementedError and the like
-        raise DataError(f"{url}: a damaged ZIP archive ({type(failed).__name__})") from None
     if len(plain) > MOST_DOWNLOAD_BYTES:
         raise DataError(
             f"{url}: the EPW file in the archive has more than {MOST_DOWNLOAD_BYTES / 1e6:,.1f} "

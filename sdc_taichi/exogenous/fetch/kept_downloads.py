@@ -117,6 +117,8 @@ def _kept(request: Request, data_dir: Path | None) -> Kept | None:
     asked = {"format": FORMAT, "url": request.url, "sha256": hashlib.sha256(content).hexdigest()}
     if not isinstance(origin, dict) or any(origin.get(k) != v for k, v in asked.items()):
         return None
+    if not isinstance(origin.get("retrieved"), str):
+        return None
     return Kept(path, content, origin)
 
 
