@@ -74,7 +74,9 @@ wheel-test: $(READY) ## Build the wheel and run the tests against it, away from 
 
 # DOCS_VERSION names the build in the list of versions, DOCS_SWITCHER is the address of that list.
 docs: $(READY_DOCS) ## Build and check the documentation site in build/docs/html.
+	rm -rf build/docs/html
 	$(DOCS_PY) docs/site/stage.py build/docs/source
+	$(DOCS_PY) docs/site/generate.py build/docs/source
 	$(DOCS_PY) -m sphinx -q -W -n --keep-going -c docs/site -b html build/docs/source build/docs/html
 	$(DOCS_PY) docs/site/check.py build/docs/html
 

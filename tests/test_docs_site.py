@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import re
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+import sdc_taichi
 
 pytestmark = pytest.mark.repo
 
@@ -66,6 +69,26 @@ def test_a_link_to_nothing_is_told(stage: ModuleType) -> None:
     errors: list[str] = []
     stage.with_site_links("[a](no.md)", "docs/hall.md", {"docs/hall.md": "hall.md"}, errors.append)
     assert errors == ["docs/hall.md: link to no.md: there is no such file"]
+
+
+def test_generated_pages_have_every_command_and_public_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    generate = load("generate", monkeypatch)
+    pages = generate.pages()
+    documented = set(re.findall(r"^\.\. auto\w+:: [\w.]+\.(\w+)$", "".join(pages.values()), re.M))
+    assert set(sdc_taichi.__all__) <= documented
+    for module in ("sdc_taichi.control", "sdc_taichi.exogenous", "sdc_taichi.optimum"):
+        assert set(importlib.import_module(module).__all__) <= documented
+    for part in generate.API:
+        for module, names in part.names:
+            if "learning" not in module:  # which needs torch for some
+                assert all(hasattr(importlib.import_module(module), name) for name in names)
+    text = pages["commands"]
+    assert "## `sdc-taichi simulate`" in text
+    assert "## `sdc-taichi hall why`" in text
+    for option in ("`--site", "`--controller", "`--resume`", "`--ray"):
+        assert option in text
 
 
 def write(folder: Path, **pages: str) -> None:

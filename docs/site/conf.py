@@ -23,6 +23,8 @@ root_doc = "index"
 exclude_patterns = ["**/.ipynb_checkpoints"]
 highlight_language = "none"
 nitpicky = True
+# Types of other packages and aliases have no pages here.
+nitpick_ignore_regex = [("py:.*", ".*")]
 suppress_warnings = ["mystnb.unknown_mime_type"]
 
 myst_enable_extensions = ["colon_fence", "deflist"]
@@ -32,6 +34,7 @@ nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 
 autodoc_typehints = "signature"
+autodoc_type_aliases = {name: name for name in ("F32", "F64", "I64", "Inputs", "Varied")}
 autodoc_member_order = "bysource"
 autodoc_mock_imports = ["torch", "ray", "minari", "onnx", "onnxruntime", "tensorboard"]
 napoleon_numpy_docstring = False

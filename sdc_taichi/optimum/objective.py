@@ -21,8 +21,8 @@ _TERM = re.compile(r"(?:(?P<weight>[^*]+)\*)?(?P<name>[^*]+)")
 class Objective:
     """Weights of the terms of an objective, each 0 or more.
 
-    The figure of a run is ``carbon``*kg CO2e + ``energy``*kWh + ``cost``*bill + ``water``*l, of the
-    energy that is bought and the water that is made up.
+    The figure of a run is the sum of ``carbon`` for each kg CO2e, ``energy`` for each kWh that is
+    bought, ``cost`` for each unit of the bill, and ``water`` for each litre that is made up.
 
     Raises:
         ConfigError: a weight that is negative or not finite, or no weight above 0.

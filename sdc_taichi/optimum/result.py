@@ -54,7 +54,7 @@ class Optimum:
     alone: Mapping[str, F64]
     """Lowest figure reached with one agent alone, by its name, (B,) each."""
     bound_kinds: tuple[str, ...]
-    """What the bound of each data center is: ``bound``, or ``estimate: `` or ``none: `` and why."""
+    """What the bound of each data center is: ``bound``, or ``estimate`` or ``none``, and why."""
     failures: tuple[tuple[str, ...], ...]
     """Certificates of each data center that do not hold, in words."""
     certificates: tuple[Mapping[str, float], ...]

@@ -124,7 +124,7 @@ class Simulator:
                 center; None is 0. Data centers of different names meet different events with one
                 seed; of those that share a name, the first takes an integer as it is, the others
                 seeds that are drawn from it. The stages are deterministic.
-            start: Index of the first step in the year, 0..``LAST_START``, (B,); None is the start
+            start: Index of the first step in the year, 0 to ``LAST_START``, (B,); None is the start
                 of the drivers.
             drivers: Inputs from here on; None keeps those that there are. Devices stay as they were
                 sized with the first ones.
