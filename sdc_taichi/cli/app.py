@@ -20,6 +20,7 @@ from sdc_taichi.cli.data import data_app
 from sdc_taichi.cli.evaluate import evaluate_command
 from sdc_taichi.cli.execution import JobsCommand
 from sdc_taichi.cli.hall import hall_app
+from sdc_taichi.cli.new import new_command
 from sdc_taichi.cli.optimum import optimum_command
 from sdc_taichi.cli.policy import policy_app
 from sdc_taichi.cli.report import report_command
@@ -31,6 +32,14 @@ from sdc_taichi.cli.train import train_command
 from sdc_taichi.cli.view import view_command
 from sdc_taichi.errors import SdcError, one_line
 
+_FIRST_STEPS = """Simulate data centers, and learn to run them with less carbon, energy and water.
+
+  sdc-taichi simulate --days 7 --out runs/first   a week of a data center in New York
+  sdc-taichi report runs/first                    its tables and pictures, as one HTML file
+  sdc-taichi new my_hall.yaml                     a configuration of your own to start from
+  sdc-taichi data list                            sites and workload traces; data import adds yours
+  sdc-taichi --help                               all commands"""
+"""What a user who asks nothing may do next."""
 EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
@@ -56,7 +65,6 @@ class _Commands(typer.core.TyperGroup):
 app = typer.Typer(
     cls=_Commands,
     name="sdc-taichi",
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -67,6 +75,7 @@ app.add_typer(hall_app, name="hall")
 app.add_typer(policy_app, name="policy")
 app.command("report")(report_command)
 app.command("view")(view_command)
+app.command("new")(new_command)
 app.command("simulate")(simulate_command)
 app.command("optimum")(optimum_command)
 app.command("train")(train_command)
@@ -93,8 +102,9 @@ def _show_version(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(invoke_without_command=True)
 def _options(
+    context: typer.Context,
     version: Annotated[
         bool,
         typer.Option(
@@ -104,6 +114,8 @@ def _options(
     debug: Debug = False,
 ) -> None:
     """Simulate data centers: workload, cooling, battery, carbon, and every server's air."""
+    if context.invoked_subcommand is None:
+        print(_FIRST_STEPS)
 
 
 def _print_error(error: Exception) -> int:

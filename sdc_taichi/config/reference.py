@@ -8,9 +8,11 @@ import itertools
 import json
 import re
 import sys
+import textwrap
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+import yaml
 from pydantic import BaseModel
 
 from sdc_taichi.config import fields as types
@@ -151,3 +153,44 @@ def _docstrings_in(body: list[ast.stmt]) -> dict[str, str]:
         if isinstance(target, ast.Name) and isinstance(doc, ast.Constant):
             found[target.id] = " ".join(str(doc.value).split())
     return found
+
+
+def commented_yaml(config: DataCenterConfig) -> str:
+    """YAML of a configuration with a comment above each field; it reads back equal.
+
+    Args:
+        config: the configuration.
+    """
+    lines = _commented(config.model_dump(mode="json"), DataCenterConfig, "")
+    return "\n".join(lines).replace("``", "`") + "\n"
+
+
+def _commented(values: dict[str, Any], model: type[BaseModel], indent: str) -> list[str]:
+    """Lines of a section, with what each field is and which values are valid."""
+    schema, docs = model.model_json_schema(), _docstrings(model)
+    lines = []
+    for name, entry in schema["properties"].items():
+        kind = model.model_fields[name].annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            about = " ".join((inspect.getdoc(kind) or "").partition("\n\n")[0].split())
+            inner = _commented(values[name], kind, f"{indent}  ")
+            lines += ["", *_comment(about, indent), f"{indent}{name}:", *inner]
+        else:
+            valid = _valid(entry, schema).replace("`", "").replace(" as below", "")
+            about = re.sub(r"\bNone\b", "null", docs[name])
+            lines += _comment(f"{about} Valid: {valid}.", indent)
+            lines += [f"{indent}{line}" for line in _entry(name, values[name])]
+    return lines
+
+
+def _entry(name: str, value: Any) -> list[str]:
+    """Lines of a field, with lists in brackets."""
+    if not isinstance(value, list | dict):
+        return yaml.safe_dump({name: value}).splitlines()
+    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=72)
+    return f"{name}: {text}".replace("\n", "\n  ").rstrip().split("\n")
+
+
+def _comment(text: str, indent: str) -> list[str]:
+    """Comment lines of a text."""
+    return textwrap.wrap(text, 96, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
