@@ -40,7 +40,7 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.learning.evaluation import ALL
 from sdc_taichi.viz.plotting import new_figure
 
-_MOST_NAMED = 6
+_MOST_NAMED = 8
 READING = (
     "Changes are of sums over all scored weeks, against idle commands in the same weeks, in %: "
     "below 0 is better. Values in brackets are 95 % intervals of a stratified bootstrap, which "
