@@ -257,7 +257,7 @@ def test_what_is_no_weather_is_one_line(
         ("file:///etc/passwd", "begins with https://"),
         ("station.epw", "begins with https://"),
         ("https://[::1/x.epw", "begins with https://"),
-        ("https://a b/x.epw", "not a valid address"),
+        ("https://a b/x.epw", "expected an address"),
         ("https://me:hidden@example.org/x.epw", "without"),
     ],
 )

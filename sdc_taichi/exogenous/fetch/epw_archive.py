@@ -38,7 +38,8 @@ def request_file(url: str) -> Request:
         parts = urlsplit(url)
     except ValueError:
         parts = urlsplit("")
-    if parts.scheme not in ("http", "https") or not parts.hostname:
+    # HTTP libraries differ in whether they ask for a host whose name holds a space.
+    if parts.scheme not in ("http", "https") or not parts.hostname or " " in parts.netloc:
         raise DataError(f"{shortened(url)}: expected an address that begins with https://")
     if parts.username is not None or parts.password is not None:
         raise DataError(f"{parts.hostname}: an address with a password, expected one without")
