@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
 import sdc_taichi
+from sdc_taichi import load_config
 
 pytestmark = pytest.mark.repo
 
@@ -63,6 +66,21 @@ def test_links_are_those_of_the_site(
     errors: list[str] = []
     assert stage.with_site_links(text, path, places, errors.append) == staged
     assert errors == []
+
+
+def test_every_field_of_a_configuration_has_an_anchor(stage: ModuleType) -> None:
+    def fields(values: Any, path: str) -> Iterator[str]:
+        for name, value in values.items():
+            if isinstance(value, dict) and value:
+                yield from fields(value, f"{path}{name}.")
+            else:
+                yield path + name
+
+    text = stage.with_field_anchors((ROOT / "docs" / "configuration.md").read_text("utf-8"))
+    anchors = re.findall(r'id="([^"]+)"', text)
+    assert len(anchors) == len(set(anchors))
+    named = set(fields(load_config("corrected").model_dump(), ""))
+    assert named | {"servers.groups.count", "events.sampled.per_year"} <= set(anchors)
 
 
 def test_a_link_to_nothing_is_told(stage: ModuleType) -> None:

@@ -27,6 +27,8 @@ ELSEWHERE = {
     "tests/reference/energyplus/README.md": "development/energyplus-tables.md",
 }
 """Pages outside of docs/, by their path in the repository, and their places on the site."""
+FIELDS_PAGE = "docs/configuration.md"
+"""Page with a table of fields for each section of a configuration."""
 SUFFIXES = (".md", ".ipynb", ".webp", ".png", ".svg", ".jpg")
 """Endings of files of docs/ that the site holds."""
 
@@ -62,6 +64,8 @@ def stage(out: Path) -> list[str]:
         content = (ROOT / path).read_bytes()
         if path.endswith(".md"):
             text = with_site_links(content.decode(), path, places, errors.append)
+            if path == FIELDS_PAGE:
+                text = with_field_anchors(text)
             content = text.encode()
         write(out / place, content)
     kept = {out / place for place in places.values()}
@@ -114,6 +118,19 @@ def with_site_links(
         return text if text.strip("`") in target else f"{text} (`{target}`)"
 
     return _LINK_OR_CODE.sub(rewritten, text)
+
+
+def with_field_anchors(text: str) -> str:
+    """The page of configuration fields with an anchor at each, such as ``hvac.setpoint.step_k``."""
+    lines, section = [], ""
+    for line in text.splitlines():
+        if heading := re.fullmatch(r"## (?:`(.+)`|.*)", line):
+            section = (heading[1] or "").replace("[]", "")
+        if field := re.match(r"\| `(\w+)` \|", line):
+            anchor = f"{section}.{field[1]}".lstrip(".")
+            line = line.replace("| ", f'| <span id="{anchor}"></span>', 1)
+        lines.append(line)
+    return "\n".join(lines) + "\n"
 
 
 @cache
