@@ -33,7 +33,7 @@ TYPED := build/typecheck
 SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py docs/site/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
 
-.PHONY: help demo test test-oldest test-processors test-train bench fuzz lint wheel-test docs clean
+.PHONY: help demo test test-oldest test-processors test-train bench fuzz lint wheel-test dist docs clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -71,6 +71,10 @@ lint: $(READY) ## Check style, format and types.
 
 wheel-test: $(READY) ## Build the wheel and run the tests against it, away from the sources.
 	.ci/wheel-test $(PY) $(SPREAD)
+
+dist: $(READY) ## Build sdist and wheel into dist, and check them.
+	rm -rf dist
+	.ci/build $(PY) dist
 
 # DOCS_VERSION names the build in the list of versions, DOCS_SWITCHER is the address of that list.
 docs: $(READY_DOCS) ## Build and check the documentation site in build/docs/html.

@@ -1,0 +1,174 @@
+"""Workflows, container and notes of a release name what there is."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import shlex
+import zipfile
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import yaml
+
+pytestmark = pytest.mark.repo
+
+ROOT = Path(__file__).parent.parent
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+TARGETS = re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text("utf-8"), re.M)
+
+
+def load(path: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def workflow(path: Path) -> dict[str, Any]:
+    # YAML 1.1 reads the key `on` as true.
+    found: dict[str, Any] = yaml.load(path.read_text("utf-8"), yaml.BaseLoader)
+    return found
+
+
+def steps(path: Path) -> list[dict[str, Any]]:
+    return [step for job in workflow(path)["jobs"].values() for step in job["steps"]]
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
+def test_workflows_have_least_rights_and_pinned_actions(path: Path) -> None:
+    content = workflow(path)
+    assert content["permissions"] == {}
+    assert "concurrency" in content
+    for job in content["jobs"].values():
+        assert job["permissions"]
+        assert int(job["timeout-minutes"]) <= 60
+    for line in re.findall(r"uses: (.*)", path.read_text("utf-8")):
+        assert re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+", line), line
+    for step in steps(path):
+        if step.get("uses", "").startswith("actions/checkout@"):
+            assert step["with"]["persist-credentials"] == "false"
+        # Names of branches and tags come from outside: shells read them from the environment.
+        assert "${{" not in step.get("run", "")
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
+def test_workflows_name_targets_and_files_that_exist(path: Path) -> None:
+    text = path.read_text("utf-8")
+    named = {*re.findall(r"\bmake ([a-z-]+)", text), *re.findall(r"target: ([a-z-]+)", text)}
+    assert named <= {*TARGETS}
+    files = re.findall(r"(?:\.ci|docs/site)/[\w.-]+", text)
+    assert [name for name in files if not (ROOT / name).is_file()] == []
+
+
+def test_tests_cover_what_the_package_is_offered_for() -> None:
+    project = load_project()
+    jobs = workflow(ROOT / ".github/workflows/tests.yml")["jobs"]
+    matrix = jobs["newest-libraries"]["strategy"]["matrix"]
+    listed = [x.rpartition(" ")[2] for x in project["classifiers"] if "Python :: 3." in x]
+    assert matrix["python"] == listed
+    assert [re.sub(r"-.*", "", x) for x in matrix["system"]] == ["ubuntu", "macos", "windows"]
+    run = (ROOT / ".ci" / "run").read_text("utf-8")
+    (targets,) = re.findall(r"for target in (.*);", run)
+    elsewhere = {"docs", "test"}
+    checked = {x["target"] for x in jobs["checks"]["strategy"]["matrix"]["include"]}
+    assert checked | elsewhere == {*targets.split()}
+
+
+def load_project() -> dict[str, Any]:
+    import tomllib
+
+    found: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    return found
+
+
+def release(root: Path, **changed: str) -> Path:
+    files = {
+        "pyproject.toml": '[project]\nversion = "1.2.0"\n',
+        "CITATION.cff": "cff-version: 1.2.0\nversion: 1.2.0\n",
+        "CHANGELOG.md": "## [1.2.0] - 2026-01-31\n\n- New.\n\n## [1.1.0] - 2025-01-31\n",
+    }
+    for name, text in (files | changed).items():
+        (root / name).write_text(text)
+    return root
+
+
+def test_notes_of_a_release_are_its_section(tmp_path: Path) -> None:
+    assert load(".ci/release_notes.py").notes(release(tmp_path), "v1.2.0") == "- New.\n"
+
+
+@pytest.mark.parametrize(
+    ("tag", "changed", "message"),
+    [
+        ("v1.3.0", {}, "tag v1.3.0: pyproject.toml has version 1.2.0"),
+        ("1.2.0", {}, "expected tag v1.2.0"),
+        ("v1.2.0.dev0", {"pyproject.toml": '[project]\nversion = "1.2.0.dev0"\n'}, "not that of a"),
+        ("v1.2.0", {"CITATION.cff": "version: 1.1.0\n"}, "CITATION.cff: expected version 1.2.0"),
+        ("v1.2.0", {"CHANGELOG.md": "## [1.2.0] - unreleased\n\n- New.\n"}, "expected a section"),
+        ("v1.2.0", {"CHANGELOG.md": "## [1.2.0] - 2026-01-31\n\n"}, "expected a section"),
+    ],
+)
+def test_a_tag_that_fits_no_release_is_refused(
+    tmp_path: Path, tag: str, changed: dict[str, str], message: str
+) -> None:
+    with pytest.raises(SystemExit, match=re.escape(message)):
+        load(".ci/release_notes.py").notes(release(tmp_path, **changed), tag)
+
+
+def test_wheels_that_differ_are_told(tmp_path: Path) -> None:
+    for name, content in (("a", "1"), ("b", "1"), ("c", "2")):
+        with zipfile.ZipFile(tmp_path / name, "w") as file:
+            file.writestr("module.py", content)
+            if name == "c":
+                file.writestr("more.py", "")
+    differences = load(".ci/compare_wheels.py").differences
+    assert differences(tmp_path / "a", tmp_path / "b") == []
+    assert differences(tmp_path / "a", tmp_path / "c") == ["module.py", "more.py"]
+
+
+def test_sites_of_versions_stand_side_by_side(tmp_path: Path) -> None:
+    put, build, pages = load("docs/site/versions.py").put, tmp_path / "html", tmp_path / "pages"
+    build.mkdir()
+    with pytest.raises(SystemExit, match="no index"):
+        put(pages, build, "dev")
+    (build / "index.html").write_text("first")
+    (build / "old.html").touch()
+    for name in ("dev", "0.9.0", "0.10.0"):
+        put(pages, build, name)
+    (build / "old.html").unlink()
+    put(pages, build, "dev")
+    assert not (pages / "dev" / "old.html").exists()
+    listed = json.loads((pages / "switcher.json").read_text())
+    assert [x["version"] for x in listed] == ["dev", "0.10.0", "0.9.0"]
+    assert [x["version"] for x in listed if x.get("preferred")] == ["0.10.0"]
+    assert 'url=0.10.0/"' in (pages / "index.html").read_text()
+    with pytest.raises(SystemExit, match="expected dev or a version"):
+        put(pages, build, "../dev")
+
+
+def test_the_container_gets_what_the_package_is_built_from() -> None:
+    ignored = (ROOT / ".dockerignore").read_text("utf-8").splitlines()
+    kept = {line[1:] for line in ignored if line.startswith("!")}
+    folders = {"configs", "data", "kernels", "sdc_taichi", "viz"}
+    files = {"LICENSE", "README.md", "pyproject.toml", "sdc_taichi_command.py"}
+    assert kept == folders | files
+    recipe = (ROOT / "Containerfile").read_text("utf-8")
+    assert re.search(r"^USER (?!0)\d+", recipe, re.M)
+    (entry,) = re.findall(r"^ENTRYPOINT (.*)", recipe, re.M)
+    assert json.loads(entry)[0] in load_project()["scripts"]
+    assert shlex.split(re.findall(r"^COPY --from=build (.*)", recipe, re.M)[0])[0] in recipe
+
+
+def test_the_recipe_requires_what_the_package_requires() -> None:
+    recipe = yaml.safe_load((ROOT / ".ci" / "recipe.yaml").read_text("utf-8"))
+    project = load_project()
+    run = [x.replace(" ", "") for x in recipe["requirements"]["run"] if not x.startswith("python ")]
+    assert sorted(run) == sorted(project["dependencies"])
+    assert recipe["context"]["version"] == project["version"].partition(".dev")[0]
+    ((name, target),) = project["scripts"].items()
+    assert recipe["build"]["python"]["entry_points"] == [f"{name} = {target}"]
