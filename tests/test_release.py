@@ -134,21 +134,23 @@ def test_wheels_that_differ_are_told(tmp_path: Path) -> None:
 def test_sites_of_versions_stand_side_by_side(tmp_path: Path) -> None:
     put, build, pages = load("docs/site/versions.py").put, tmp_path / "html", tmp_path / "pages"
     build.mkdir()
+    address = "https://example.org/sdc/"
     with pytest.raises(SystemExit, match="no index"):
-        put(pages, build, "dev")
+        put(pages, build, "dev", address)
     (build / "index.html").write_text("first")
     (build / "old.html").touch()
     for name in ("dev", "0.9.0", "0.10.0"):
-        put(pages, build, name)
+        put(pages, build, name, address)
     (build / "old.html").unlink()
-    put(pages, build, "dev")
+    put(pages, build, "dev", address)
     assert not (pages / "dev" / "old.html").exists()
     listed = json.loads((pages / "switcher.json").read_text())
     assert [x["version"] for x in listed] == ["dev", "0.10.0", "0.9.0"]
+    assert listed[1]["url"] == "https://example.org/sdc/0.10.0/"
     assert [x["version"] for x in listed if x.get("preferred")] == ["0.10.0"]
     assert 'url=0.10.0/"' in (pages / "index.html").read_text()
     with pytest.raises(SystemExit, match="expected dev or a version"):
-        put(pages, build, "../dev")
+        put(pages, build, "../dev", address)
 
 
 def test_the_container_gets_what_the_package_is_built_from() -> None:

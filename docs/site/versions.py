@@ -1,10 +1,10 @@
 """Builds of the site side by side, between which readers choose.
 
-    python docs/site/versions.py PAGES BUILD NAME
+    python docs/site/versions.py PAGES BUILD NAME ADDRESS
 
 puts a build into folder NAME of PAGES, in place of an older one, and writes what leads to all of
 them: ``switcher.json``, which the pages read, and an ``index.html`` that leads to the newest
-release, or to ``dev`` where there is none.
+release, or to ``dev`` where there is none. PAGES are served at ADDRESS.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ _INDEX = """<!doctype html>
 
 def main() -> None:
     """Put a build among the others from the command line."""
-    pages, build, name = sys.argv[1:]
-    put(Path(pages), Path(build), name)
+    pages, build, name, address = sys.argv[1:]
+    put(Path(pages), Path(build), name, address)
 
 
-def put(pages: Path, build: Path, name: str) -> None:
+def put(pages: Path, build: Path, name: str, address: str) -> None:
     """Put a build among the others.
 
     Args:
         pages: folder of all builds.
         build: folder of the build.
         name: ``dev``, or the version of a release.
+        address: where the folder of all builds is served, with a slash at its end.
 
     Raises:
         SystemExit: the name is none of these, or the build has no first page.
@@ -52,7 +53,7 @@ def put(pages: Path, build: Path, name: str) -> None:
     listed = [*(["dev"] if "dev" in names else []), *releases]
     newest = releases[0] if releases else "dev"
     entries = [
-        {"name": f"{x} (newest)" if x == newest else x, "version": x, "url": f"../{x}/"}
+        {"name": f"{x} (newest)" if x == newest else x, "version": x, "url": f"{address}{x}/"}
         | ({"preferred": True} if x == newest else {})
         for x in listed
     ]
