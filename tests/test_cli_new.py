@@ -65,4 +65,4 @@ def test_the_command_line_alone_says_what_to_do_first() -> None:
     done = CliRunner().invoke(app, [])
     assert done.exit_code == 0
     assert "sdc-taichi simulate --days 7 --out runs/first" in done.output
-    assert len(done.output.splitlines()) == 7
+    assert len(done.output.splitlines()) == 8

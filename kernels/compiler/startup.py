@@ -61,7 +61,7 @@ def kernel_folder() -> Path:
     Raises:
         RuntimeStateError: no temporary folder can be written either.
     """
-    folder = _usual_folder()
+    folder = usual_folder()
     try:
         _make_usable(folder)
     except OSError as error:
@@ -73,7 +73,7 @@ def kernel_folder() -> Path:
     return folder
 
 
-def _usual_folder() -> Path:
+def usual_folder() -> Path:
     """Folder in which programs of Taichi keep their kernels."""
     import platformdirs
 

@@ -17,6 +17,7 @@ from sdc_taichi.cli.benchmark import benchmark_app
 from sdc_taichi.cli.collect import collect_command
 from sdc_taichi.cli.config import config_app
 from sdc_taichi.cli.data import data_app
+from sdc_taichi.cli.doctor import doctor_command
 from sdc_taichi.cli.evaluate import evaluate_command
 from sdc_taichi.cli.execution import JobsCommand
 from sdc_taichi.cli.hall import hall_app
@@ -38,6 +39,7 @@ _FIRST_STEPS = """Simulate data centers, and learn to run them with less carbon,
   sdc-taichi report runs/first                    its tables and pictures, as one HTML file
   sdc-taichi new my_hall.yaml                     a configuration of your own to start from
   sdc-taichi data list                            sites and workload traces; data import adds yours
+  sdc-taichi doctor                               what this machine has, and what is missing
   sdc-taichi --help                               all commands"""
 """What a user who asks nothing may do next."""
 EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -75,6 +77,7 @@ app.add_typer(hall_app, name="hall")
 app.add_typer(policy_app, name="policy")
 app.command("report")(report_command)
 app.command("view")(view_command)
+app.command("doctor")(doctor_command)
 app.command("new")(new_command)
 app.command("simulate")(simulate_command)
 app.command("optimum")(optimum_command)

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from sdc_taichi.cli import completion
 from sdc_taichi.config import DataCenterConfig, load_config
 from sdc_taichi.errors import ConfigError
 
@@ -17,6 +18,7 @@ Source = Annotated[
         metavar="[PRESET|FILE] [A.B=C]...",
         help="Preset, YAML file or SustainDC dc_config.json, and overrides of its fields.",
         show_default=False,
+        autocompletion=completion.presets_and_fields,
     ),
 ]
 """Argument of a command that reads a configuration."""
@@ -27,7 +29,11 @@ Overrides = Annotated[
 """Option of a command that reads a configuration."""
 Compared = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME", help="Controller to compare, as of simulate; repeatable."),
+    typer.Option(
+        metavar="NAME",
+        help="Controller to compare, as of simulate; repeatable.",
+        autocompletion=completion.controllers,
+    ),
 ]
 """Option of a command that compares controllers with an optimum."""
 NoCache = Annotated[

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import typer.core
 
+from sdc_taichi.cli import completion
 from sdc_taichi.cli.arguments import Debug, Quiet, out_option
 from sdc_taichi.cli.benchmark_results import add_command, report_command
 from sdc_taichi.cli.execution import Jobs, Ray, Resume, job_session, with_ray_address
@@ -44,7 +45,12 @@ benchmark_app.command("add")(add_command)
 def run_command(
     context: typer.Context,
     suite: Annotated[
-        str, typer.Argument(metavar="SUITE|FILE", help="Suite (see benchmark list), or YAML file.")
+        str,
+        typer.Argument(
+            metavar="SUITE|FILE",
+            help="Suite (see benchmark list), or YAML file.",
+            autocompletion=completion.suites,
+        ),
     ],
     seeds: Annotated[
         int | None,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from sdc_taichi.cli import completion
 from sdc_taichi.cli.arguments import Debug, Quiet, Source, force_option, out_option, read_config
 from sdc_taichi.cli.scenario import (
     EXIT_INTERRUPTED,
@@ -38,6 +39,7 @@ def collect_command(
         typer.Option(
             metavar="NAME",
             help="Controller as of simulate, or random, optimum, optimum:OBJECTIVE; repeatable.",
+            autocompletion=completion.controllers,
         ),
     ] = None,
     weeks: Annotated[

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from sdc_taichi.cli import completion
 from sdc_taichi.cli.arguments import out_option
 from sdc_taichi.cli.console import PlainConsole
 from sdc_taichi.cli.data_fetch import fetch_app
@@ -94,7 +95,10 @@ def _fitted_to(series: Series) -> str:
 
 @data_app.command("show")
 def show_data(
-    name: Annotated[str, typer.Argument(help="Site or workload trace.")],
+    name: Annotated[
+        str,
+        typer.Argument(help="Site or workload trace.", autocompletion=completion.sites_and_traces),
+    ],
     seed: Seed = DEFAULT_SEED,
     out: Annotated[
         Path | None, out_option("Write a picture (PNG, SVG or PDF) to this file.")

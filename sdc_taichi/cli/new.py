@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from sdc_taichi.atomic_file import atomic_write
+from sdc_taichi.cli import completion
 from sdc_taichi.cli.arguments import check_out_file, force_option
 from sdc_taichi.config import load_config
 from sdc_taichi.errors import printable
@@ -16,7 +17,13 @@ from sdc_taichi.errors import printable
 def new_command(
     out: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="File to write.")],
     preset: Annotated[
-        str, typer.Option("--from", metavar="PRESET", help="Preset whose values it has.")
+        str,
+        typer.Option(
+            "--from",
+            metavar="PRESET",
+            help="Preset whose values it has.",
+            autocompletion=completion.presets,
+        ),
     ] = "corrected",
     force: Annotated[bool, force_option()] = False,
 ) -> None:

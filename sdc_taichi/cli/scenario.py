@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from sdc_taichi.cli import completion
 from sdc_taichi.config import DataCenterConfig, load_yaml
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import day_of_year
@@ -18,7 +19,11 @@ EXIT_INTERRUPTED = 130
 
 Site = Annotated[
     str | None,
-    typer.Option(metavar="SITE[,SITE...]", help="Sites, one data center each (see data list)."),
+    typer.Option(
+        metavar="SITE[,SITE...]",
+        help="Sites, one data center each (see data list).",
+        autocompletion=completion.sites,
+    ),
 ]
 Days = Annotated[float, typer.Option(help="Length, in days; may exceed a year.")]
 Start = Annotated[str | None, typer.Option(metavar="MM-DD", help="First day, local standard time.")]

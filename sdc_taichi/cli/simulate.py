@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sdc_taichi.cli import completion
 from sdc_taichi.cli.arguments import (
     Debug,
     FolderForce,
@@ -69,6 +70,7 @@ def simulate_command(
             help="idle, random, g36, coldest, warmest, constant:C, lookahead-3h, lookahead-24h, "
             "greedy-ci, mpc-24h, policy:FOLDER; or module:name of your own; or per agent, such as "
             "load=greedy-ci,cooling=g36,battery=policy:runs/happo.",
+            autocompletion=completion.controllers,
         ),
     ] = "idle",
     seed: Seed = 0,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sdc_taichi.cli import completion
 from sdc_taichi.cli.arguments import Debug, Overrides, Quiet, Source, out_option, read_config
 from sdc_taichi.cli.execution import EXIT_FAILED, Jobs, Ray, Resume, job_session
 from sdc_taichi.cli.scenario import ErrorOfForecasts, Precision, Seed, Site, site_names
@@ -49,7 +50,9 @@ def sweep_command(
     controller: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME", help="Controller, as of simulate; repeatable. [default: idle]"
+            metavar="NAME",
+            help="Controller, as of simulate; repeatable. [default: idle]",
+            autocompletion=completion.controllers,
         ),
     ] = None,
     sample: Annotated[

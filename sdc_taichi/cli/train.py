@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sdc_taichi.cli import completion
 from sdc_taichi.cli.arguments import Debug, Quiet, Source, out_option, parse_source
 from sdc_taichi.cli.scenario import EXIT_INTERRUPTED
 from sdc_taichi.cli.session import interruptible, rich_progress
@@ -31,12 +32,17 @@ def train_command(
             metavar="ALGORITHM",
             help="ppo, ippo, mappo, happo, haa2c, had3qn, hasac, cloning or cross-entropy.",
             show_default=False,
+            autocompletion=completion.algorithms,
         ),
     ] = None,
     source: Source = None,
     site: Annotated[
         str | None,
-        typer.Option(metavar="SITE[,SITE...]", help="Sites to train on. [default: of the config]"),
+        typer.Option(
+            metavar="SITE[,SITE...]",
+            help="Sites to train on. [default: of the config]",
+            autocompletion=completion.sites,
+        ),
     ] = None,
     steps: Annotated[
         str | None,

@@ -52,6 +52,16 @@ def sections_markdown(sections: Iterable[tuple[str, type[BaseModel]]]) -> str:
     return "\n\n".join(_table(path, model) for path, model in sections).replace("``", "`")
 
 
+def field_names() -> list[str]:
+    """Names of all fields that overrides set, such as ``hvac.setpoint.initial_c``."""
+    return [
+        f"{path}.{name}".lstrip(".")
+        for path, model in _sections("", DataCenterConfig)
+        for name, entry in model.model_json_schema()["properties"].items()
+        if not _is_section(entry)
+    ]
+
+
 def _sections(path: str, model: type[BaseModel]) -> Iterator[tuple[str, type[BaseModel]]]:
     yield path, model
     for name, field in model.model_fields.items():
