@@ -270,7 +270,7 @@ def test_a_table_of_electricity_maps(life_cycle: str, tmp_path: Path, user_folde
     path = tmp_path / "FR_2022_hourly.csv"
     header = f"Datetime (UTC),Country,Zone name,Zone id,{','.join(columns)}"
     path.write_text(build.text([header, *rows]))
-    hint = f"--map 'timestamp=Datetime (UTC)' --map 'avg_CI={columns[1]}' --stamp start"
+    hint = "data import FILE --map electricity-maps"
     arguments = ["import", str(path), "--site", "paris", "--utc-offset", "1"]
     assert hint in " ".join(str(CliRunner().invoke(data_app, arguments).exception).split())
     with pytest.raises(DataError, match=r"missing column timestamp, avg_CI.*Electricity Maps"):

@@ -564,7 +564,7 @@ def test_storage_is_left_out_and_unreported_time_is_no_gap() -> None:
         "GEO counts as OTH",
         "GEO is not reported for 2 h, which count as 0",
     ]
-    rows = carbon_table(2023, values).decode().splitlines()
+    rows = carbon_table(np.datetime64("2023-01-01"), values).decode().splitlines()
     assert rows[0].split(",")[0] == "timestamp"
     assert rows[1].startswith("2023-01-01 00:00:00+00:00,")
     assert rows[4] == "2023-01-01 03:00:00+00:00,0,0,0,0,,0,0,5,"

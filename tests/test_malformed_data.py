@@ -234,7 +234,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
     "carbon in kg": (
         CARBON,
         lambda: carbon(lambda x: ["timestamp,avg_CI", *(f"{r.split(',')[0]},0.3" for r in x[1:])]),
-        ("avg_CI", "0.3", "multiply kg/kWh by 1000"),
+        ("avg_CI", "0.3", "--map avg_CI:kg/kWh=COLUMN"),
     ),
     "carbon too high": (CARBON, lambda: carbon(cell(304, 9, "9e9")), ("row 304", "2000")),
     "carbon one row short": (CARBON, lambda: carbon(lambda x: x[:-1]), ("8759", "8760")),
@@ -247,7 +247,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
     "workload in percent": (
         LOAD,
         lambda: workload(cell(2, 1, "50")),
-        ("row 2", "cpu_load", "'50'", "divide percentages by 100"),
+        ("row 2", "cpu_load", "'50'", "--map cpu_load:%=COLUMN"),
     ),
     "workload negative": (LOAD, lambda: workload(cell(3, 1, "-0.1")), ("row 3", "'-0.1'")),
     "workload text": (LOAD, lambda: workload(cell(4, 1, "idle")), ("row 4", "'idle'")),

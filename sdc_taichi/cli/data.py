@@ -16,9 +16,9 @@ from sdc_taichi.cli.arguments import out_option
 from sdc_taichi.cli.console import PlainConsole
 from sdc_taichi.cli.data_fetch import fetch_app
 from sdc_taichi.cli.imported_files import print_imported, print_missing_parts
-from sdc_taichi.errors import DataError, suggestion
+from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import importing
-from sdc_taichi.exogenous.carbon import COLUMNS
+from sdc_taichi.exogenous.columns import COLUMN_NAMES, column_map
 from sdc_taichi.exogenous.registry import (
     find_name,
     imported_sites,
@@ -38,9 +38,7 @@ from sdc_taichi.exogenous.synthetic import (
     synthetic_trace,
     synthetic_traces,
 )
-
-MAPPED_COLUMNS = (*COLUMNS, "cpu_load")
-"""Columns that ``--map`` may give by another name."""
+from sdc_taichi.exogenous.weather_table import Place
 
 data_app = typer.Typer(help="Sites and workload traces.", no_args_is_help=True)
 data_app.add_typer(fetch_app, name="fetch")
@@ -166,40 +164,79 @@ def _write_picture(series: tuple[Series, ...], title: str, out: Path) -> None:
 
 @data_app.command("import")
 def import_data(
-    path: Annotated[Path, typer.Argument(help="EPW or CSV file, or a SustainDC data folder.")],
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE|FOLDER...",
+            help="EPW or CSV file; a SustainDC data folder; or tables of a service, with --map.",
+        ),
+    ],
     site: Annotated[
         str | None, typer.Option(help="Name to import under (of a trace, for a workload file).")
     ] = None,
     base: Annotated[
         str | None, typer.Option(help="Embedded site that gives what the file does not.")
     ] = None,
-    utc_offset: Annotated[
-        float | None, typer.Option(help="UTC offset (h) of a carbon file without weather.")
-    ] = None,
-    stamp: Annotated[
-        StampOption, typer.Option(help="What a stamp of a carbon file marks.")
-    ] = StampOption.AUTO,
     mapped: Annotated[
         list[str] | None,
         typer.Option(
             "--map",
-            metavar="NAME=COLUMN",
-            help="Column of the file that holds timestamp, avg_CI, a fuel or cpu_load; repeatable.",
+            metavar="NAME[:UNIT]=COLUMN|SERVICE",
+            help="Column of the file that holds timestamp, avg_CI, a fuel, cpu_load, dry_bulb, "
+            "dew_point, relative_humidity or pressure, and its unit, as avg_CI:lb/MWh=MOER; "
+            "repeatable. Or the layout of a service: electricity-maps, eia-930, entsoe, watttime.",
         ),
+    ] = None,
+    area: Annotated[
+        str | None,
+        typer.Option(help="Balancing authority or zone, of tables that hold several."),
+    ] = None,
+    stamp: Annotated[
+        StampOption, typer.Option(help="What a stamp of a carbon or weather table marks.")
+    ] = StampOption.AUTO,
+    utc_offset: Annotated[
+        float | None,
+        typer.Option(help="UTC offset (h), of a carbon file without weather or a weather table."),
+    ] = None,
+    latitude: Annotated[
+        float | None, typer.Option(help="Degrees north, of the station of a weather table.")
+    ] = None,
+    longitude: Annotated[
+        float | None, typer.Option(help="Degrees east, of the station of a weather table.")
+    ] = None,
+    elevation: Annotated[
+        float | None, typer.Option(help="Height above sea level (m), of the station.")
     ] = None,
 ) -> None:
     """Validate and align files, and store them in the user's data folder."""
     console = PlainConsole()
     if base is not None:
         base = find_name("base", base, synthetic_sites())
-    columns = _columns(mapped or [])
-    jobs, left_out = _plan_import(path, site, columns)
+    service, columns = _mapping(mapped or [])
+    if service is not None:
+        item = _import_tables(paths, service, site, base, area, stamp, utc_offset)
+        print_imported(console, item)
+        print_missing_parts(console, [item], base)
+        return
+    if len(paths) > 1:
+        raise DataError(f"{len(paths)} files: expected one, or tables of one service, with --map")
+    if area is not None:
+        raise DataError(f"--area {area}: only tables of a service, named by --map, hold several")
+    jobs, left_out = _plan_import(paths[0], site, columns)
+    where = {"latitude": latitude, "longitude": longitude, "elevation": elevation}
     done: list[importing.Imported] = []
     failed: list[DataError] = []
     for kind, file, name in jobs:
         try:
             if kind == "weather":
-                item = importing.import_weather(file, name, base)
+                item = importing.import_weather(
+                    file,
+                    name,
+                    base,
+                    place=_place(name, file, utc_offset, where) if columns else None,
+                    stamp="end" if stamp is StampOption.END else "start",
+                    columns=columns,
+                )
             elif kind == "carbon":
                 item = importing.import_carbon(
                     file, name, base, utc_offset_h=utc_offset, stamp=stamp.value, columns=columns
@@ -220,18 +257,55 @@ def import_data(
         raise DataError(f"{len(failed)} of {len(jobs)} files not imported; first: {failed[0]}")
 
 
-def _columns(mapped: list[str]) -> dict[str, str]:
-    """Names of columns as readers expect them, and their names in the file, of ``--map``."""
+def _mapping(mapped: list[str]) -> tuple[str | None, dict[str, str]]:
+    """Service whose layout ``--map`` names, or columns by ``NAME`` or ``NAME:UNIT``."""
     columns: dict[str, str] = {}
     for text in mapped:
-        name, sign, column = text.partition("=")
-        if not sign or not column or name not in MAPPED_COLUMNS or name in columns:
+        key, sign, column = text.partition("=")
+        if not sign and len(mapped) == 1:
+            return key, {}
+        if not sign or not column or key in columns:
             raise DataError(
-                f"--map {text}: expected NAME=COLUMN, each name once, of "
-                f"{', '.join(MAPPED_COLUMNS)}{suggestion(name, MAPPED_COLUMNS)}"
+                f"--map {text}: expected NAME=COLUMN or NAME:UNIT=COLUMN, each name once, of "
+                f"{', '.join(COLUMN_NAMES)}; or one service alone"
             )
-        columns[name] = column
-    return columns
+        columns[key] = column
+    try:
+        column_map(columns)
+    except DataError as error:
+        raise DataError(f"--map: {error}") from None
+    return None, columns
+
+
+def _import_tables(
+    paths: list[Path],
+    service: str,
+    site: str | None,
+    base: str | None,
+    area: str | None,
+    stamp: StampOption,
+    utc_offset_h: float | None,
+) -> importing.Imported:
+    """Import tables in the layout of a service."""
+    from sdc_taichi.exogenous.fetch.exports import check_service, import_export
+
+    check_service(service)
+    if stamp is not StampOption.AUTO:
+        raise DataError(f"--stamp {stamp.value}: known of the tables of {service}")
+    if site is None:
+        raise DataError(f"--map {service}: expected --site NAME to import the tables under")
+    return import_export(paths, service, site, base, area=area, utc_offset_h=utc_offset_h)
+
+
+def _place(
+    name: str, path: Path, utc_offset_h: float | None, where: Mapping[str, float | None]
+) -> Place:
+    """Where the station of a weather table is."""
+    given = {**where, "utc-offset": utc_offset_h}
+    if missing := [f"--{option}" for option, value in given.items() if value is None]:
+        raise DataError(f"{path}: a weather table, expected {', '.join(missing)} of its station")
+    latitude, longitude, elevation, offset = (float(value or 0.0) for value in given.values())
+    return Place(name, latitude, longitude, elevation, offset)
 
 
 def _plan_import(
@@ -245,7 +319,7 @@ def _plan_import(
             raise DataError(f"--site {site}: names one file, but {path} is a folder")
         return importing.plan_folder(path)
     kind = importing.file_kind(path, columns)
-    if kind == "weather" and columns:
+    if kind == "weather" and columns and "dry_bulb" not in column_map(columns).names:
         raise DataError(f"--map: without effect on the weather file {path}")
     name = site or (importing.default_name(path) if kind == "workload" else None)
     if name is None:

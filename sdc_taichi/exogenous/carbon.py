@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous import files, series_file
+from sdc_taichi.exogenous.columns import ColumnMap, column_map
 from sdc_taichi.exogenous.series import FloatArray, Series
-from sdc_taichi.exogenous.stamps import Stamp, by_start_of_interval, region_notes
+from sdc_taichi.exogenous.stamps import HAS_OFFSET, Stamp, by_start_of_interval, region_notes
 from sdc_taichi.exogenous.synthetic import FUELS, emission_factors
 
 if TYPE_CHECKING:
@@ -29,7 +30,6 @@ MAX_CI_G_PER_KWH = 2000.0
 MIX_TOLERANCE_G = 1.0
 """Largest difference of ``avg_CI`` from what the fuel mix gives, in g/kWh."""
 _MAX_GENERATION_MWH = 1e7
-_TIMEZONE = r"(?:[Zz]|UTC|[+-]\d\d:?\d\d)$"
 
 
 def read_carbon(
@@ -61,9 +61,9 @@ def read_carbon(
             pairs UTC hours with local ones.
         longitude_deg: of the site, for ``"auto"`` and for a warning if the sun of the grid is
             another; None is the middle of the time zone, without a warning.
-        columns: names above, and the names that they have in the table instead, such as
-            ``{"timestamp": "Datetime (UTC)"}``; stamps of a column whose name says UTC need no
-            offset.
+        columns: names above, with their units where they are others, and the names that they
+            have in the table, such as ``{"timestamp": "Datetime (UTC)", "avg_CI:lb/MWh": "MOER"}``
+            (``exogenous.columns``); stamps of a column whose name says UTC need no offset.
 
     Returns:
         Carbon intensity, g/kWh, resolution of the file, whole years of 365 days.
@@ -117,18 +117,19 @@ def _generation(
         Resolution in minutes, first stamp (UTC), names of the columns (fuels if there are any,
         then ``avg_CI``), values, (T, columns), and notes.
     """
-    frame, first_row = files.read_table(path, given)
-    notes = [f"{own} read as {name}" for name, own in given.items()]
+    named = column_map(given)
+    frame, first_row = files.read_table(path, named.names)
+    notes = named.notes()
     if "timestamp" not in frame.columns and frame.columns[0].strip() in files.BLANK_HEADERS:
         frame = frame.rename(columns={frame.columns[0]: "timestamp"})
         notes.append("blank first header read as timestamp")
     with_fuels = any(fuel in frame.columns for fuel in FUELS)
     files.require_columns(path, frame, COLUMNS if with_fuels else ("timestamp", "avg_CI"))
     rows = first_row + np.arange(len(frame))
-    in_utc = "UTC" in given.get("timestamp", "")
+    in_utc = "UTC" in named.names.get("timestamp", "")
     minutes, positions, start_utc = _stamps(path, frame, rows, in_utc=in_utc)
     columns = (*FUELS, "avg_CI") if with_fuels else ("avg_CI",)
-    values, number_notes = _numbers(path, frame, columns, rows)
+    values, number_notes = _numbers(path, frame, columns, rows, named)
     values = files.spread(values, positions)
     grid_rows = rows[np.minimum(np.searchsorted(positions, np.arange(len(values))), rows.size - 1)]
     values, gap_notes = _repair(path, values, minutes, columns, grid_rows, len(frame))
@@ -175,7 +176,7 @@ def _stamps(
         at = int(np.argmax(bad))
         valid = "a time such as 2022-01-01 00:00:00+00:00"
         raise files.fault(path, int(rows[at]), "timestamp", text.iloc[at], valid)
-    naive = ~text.str.contains(_TIMEZONE, regex=True).to_numpy(dtype=bool)
+    naive = ~text.str.contains(HAS_OFFSET, regex=True).to_numpy(dtype=bool)
     if naive.any() and not in_utc:
         at = int(np.argmax(naive))
         valid = "a UTC offset at the end, such as +00:00"
@@ -186,7 +187,11 @@ def _stamps(
 
 
 def _numbers(
-    path: Path, frame: pd.DataFrame, columns: tuple[str, ...], rows: NDArray[np.int64]
+    path: Path,
+    frame: pd.DataFrame,
+    columns: tuple[str, ...],
+    rows: NDArray[np.int64],
+    named: ColumnMap,
 ) -> tuple[FloatArray, list[str]]:
     """Generation and intensity, checked against each other; shape (T, columns)."""
     notes = []
@@ -199,6 +204,7 @@ def _numbers(
                 rows,
                 0.0,
                 MAX_CI_G_PER_KWH if column == "avg_CI" else _MAX_GENERATION_MWH,
+                unit=named.unit(column),
             )
             for column in columns
         ],
@@ -208,7 +214,7 @@ def _numbers(
     if not np.isnan(values[:, -1]).all() and 0.0 < np.nanmax(values[:, -1]) < 2.0:
         raise DataError(
             f"{path}: row {int(rows[0])}, column avg_CI: at most {np.nanmax(values[:, -1]):g} in "
-            "all rows, expected g/kWh (multiply kg/kWh by 1000)"
+            "all rows, expected g/kWh (kg/kWh are read with --map avg_CI:kg/kWh=COLUMN)"
         )
     if len(columns) == 1:
         return values, ["no fuel mix to check avg_CI against"]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import re
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sdc_taichi.errors import DataError, shortened
+from sdc_taichi.exogenous.columns import Unit
 from sdc_taichi.exogenous.series import FloatArray
 from sdc_taichi.exogenous.year_clock import (
     MINUTES_PER_DAY,
@@ -40,6 +40,8 @@ BLANK_HEADERS = frozenset({"", "Unnamed: 0"})
 """Blank column names; pandas calls a blank first one ``Unnamed: 0``."""
 MISSING_TEXT = frozenset({"", "nan", "na", "n/a", "null", "none"})
 """Texts, in lower case, that stand for a missing number."""
+NO_UNIT = Unit("")
+"""The unit of the reader."""
 _FIRST_BYTES = 4096
 
 
@@ -211,11 +213,7 @@ def mapping_hint(found: Iterable[object]) -> str:
     intensities = [x for x in names if x.casefold().startswith("carbon intensity gco")]
     if "Datetime (UTC)" not in names or not intensities:
         return ""
-    of_life_cycle = [x for x in intensities if re.search("life cycle|lca", x.casefold())]
-    return (
-        " (a table of Electricity Maps: data import FILE --map 'timestamp=Datetime (UTC)' "
-        f"--map 'avg_CI={(of_life_cycle or intensities)[0]}' --stamp start)"
-    )
+    return " (a table of Electricity Maps: data import FILE --map electricity-maps)"
 
 
 def numbers(
@@ -226,6 +224,7 @@ def numbers(
     low: float,
     high: float,
     hint: str = "",
+    unit: Unit = NO_UNIT,
 ) -> FloatArray:
     """A column of text as numbers; blanks and NaN markers become NaN.
 
@@ -237,6 +236,10 @@ def numbers(
         low: least valid value.
         high: greatest valid value.
         hint: appended to what would be valid.
+        unit: of the text.
+
+    Returns:
+        Numbers in the unit of ``low`` and ``high``, (T,).
 
     Raises:
         DataError: text that is no number, or a value outside [low, high].
@@ -244,13 +247,13 @@ def numbers(
     import pandas as pd
 
     text = text.str.strip()
-    values = np.array(pd.to_numeric(text, errors="coerce"), dtype=np.float64)
+    values = unit.convert(np.array(pd.to_numeric(text, errors="coerce"), dtype=np.float64))
     missing = text.str.lower().isin(MISSING_TEXT).to_numpy(dtype=bool)
     wrong = ~missing & ~((values >= low) & (values <= high))
     if wrong.any():
         at = int(np.argmax(wrong))
-        valid = f"a number from {low:g} to {high:g}{hint}"
-        raise fault(path, int(rows[at]), column, text.iloc[at], valid)
+        ends = f"{unit.invert(low):g} to {unit.invert(high):g} {unit.symbol}".rstrip()
+        raise fault(path, int(rows[at]), column, text.iloc[at], f"a number from {ends}{hint}")
     values[missing] = np.nan
     return values
 

@@ -7,11 +7,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import files, series_file
 from sdc_taichi.exogenous.carbon import read_carbon
+from sdc_taichi.exogenous.columns import column_map
 from sdc_taichi.exogenous.registry import (
     find_name,
     imported_sites,
@@ -28,6 +29,7 @@ from sdc_taichi.exogenous.synthetic import (
     synthetic_traces,
 )
 from sdc_taichi.exogenous.weather import read_epw
+from sdc_taichi.exogenous.weather_table import Place, read_weather_table
 from sdc_taichi.exogenous.workload import read_workload
 from sdc_taichi.user_file import MOST_TABLE_BYTES, list_folder, open_input
 
@@ -56,7 +58,8 @@ def file_kind(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> 
 
     Args:
         path: the file.
-        columns: names of columns as the readers expect them, and their names in the file.
+        columns: names of columns as the readers expect them, and their names in the file, as of
+            ``exogenous.columns``.
 
     Raises:
         DataError: none of them.
@@ -72,11 +75,14 @@ def file_kind(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> 
         if line.upper().startswith("LOCATION,"):
             return "weather"
         header = {cell.strip() for cell in next(csv.reader([line]), [])}
-    kinds = {"avg_CI": "carbon", "cpu_load": "workload"}
-    for column, kind in sorted(kinds.items(), key=lambda item: item[0] not in columns):
-        if columns.get(column, column) in header:
+    kinds = {"avg_CI": "carbon", "cpu_load": "workload", "dry_bulb": "weather"}
+    names = column_map(columns).names
+    for column, kind in sorted(kinds.items(), key=lambda item: item[0] not in names):
+        if names.get(column, column) in header:
             return kind
-    hint = files.mapping_hint(header) or " or --map avg_CI=COLUMN, --map cpu_load=COLUMN"
+    hint = files.mapping_hint(header) or (
+        " or --map avg_CI=COLUMN, --map cpu_load=COLUMN, --map dry_bulb=COLUMN"
+    )
     raise DataError(
         f"{path}: row 1: expected an EPW file (LOCATION,...), a column avg_CI (carbon) or "
         f"a column cpu_load (workload){hint}"
@@ -112,11 +118,21 @@ def import_weather(
     base: str | None,
     data_dir: Path | None = None,
     *,
+    place: Place | None = None,
+    stamp: Literal["start", "end"] = "start",
+    columns: Mapping[str, str] = MappingProxyType({}),
     origin: Origin | None = None,
 ) -> Imported:
-    """Store a weather file as ``sites/NAME/weather.parquet``, with its origin if it was fetched."""
+    """Store a weather file as ``sites/NAME/weather.parquet``, with its origin if it was fetched.
+
+    A table, which does not say where its station is, is read by ``read_weather_table`` with
+    ``place``, ``stamp`` and ``columns``; without a place the file is an EPW file.
+    """
     name = site_name(name, data_dir)
-    weather = read_epw(path)
+    if place is None:
+        weather = read_epw(path)
+    else:
+        weather = read_weather_table(path, place, columns=columns, stamp=stamp)
     series = (
         weather.outdoor_c,
         weather.wet_bulb_c,

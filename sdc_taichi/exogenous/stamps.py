@@ -21,6 +21,9 @@ Arizona has the largest of the embedded sites, 1.1 h."""
 Stamp = Literal["auto", "start", "end"]
 """Moment of its interval that a stamp marks; ``auto`` infers it from the solar generation."""
 
+HAS_OFFSET = r"(?:[Zz]|UTC|[+-]\d\d:?\d\d)$"
+"""Regular expression of the end of a stamp that tells its UTC offset."""
+
 
 def by_start_of_interval(
     stamp: Stamp,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -58,8 +59,10 @@ class _Column(NamedTuple):
 
 _FAHRENHEIT = " C (degrees Fahrenheit taken for C?)"
 _DRY_BULB = _Column("dry bulb (column 7)", 6, OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT)
+HUMIDITY_LIMITS_PCT = (0.0, 110.0)
+"""Limits of relative humidity, of which 100 % is what air can hold."""
 _DEW_POINT = _Column("dew point (column 8)", 7, OUTDOOR_LIMITS_C, 99.9, _FAHRENHEIT)
-_HUMIDITY = _Column("relative humidity (column 9)", 8, (0.0, 110.0), 999.0)
+_HUMIDITY = _Column("relative humidity (column 9)", 8, HUMIDITY_LIMITS_PCT, 999.0)
 _PRESSURE = _Column("station pressure (column 10)", 9, PRESSURE_LIMITS_PA, 999_999.0)
 _USED = (_DRY_BULB, _HUMIDITY, _PRESSURE)
 """Columns that give the weather; the dew point is only checked."""
@@ -133,17 +136,49 @@ def read_epw(path: str | Path) -> Weather:
     notes += _pressure_notes(pressure, minutes, location["elevation_m"])
     design, design_notes = _design_conditions(lines)
     notes += design_notes
-    wet_bulb = wet_bulb_c(outdoor, humidity, pressure)
+    air = Air(outdoor, humidity, pressure)
+    return make_weather(path, location, minutes, air, notes, design)
+
+
+class Air(NamedTuple):
+    """Outdoor air of whole years."""
+
+    outdoor_c: FloatArray
+    """Dry bulb, in C, (T,)."""
+    relative_humidity_pct: FloatArray
+    """Relative humidity, in %, (T,)."""
+    pressure_pa: FloatArray
+    """Station pressure, in Pa, (T,)."""
+
+
+def make_weather(
+    path: Path,
+    location: Mapping[str, Any],
+    minutes: float,
+    air: Air,
+    notes: Sequence[str],
+    design: DesignConditions | None = None,
+) -> Weather:
+    """Weather of measured air, with its wet bulb.
+
+    Args:
+        path: file that was read.
+        location: fields of ``Weather`` that say where the station is.
+        minutes: resolution.
+        air: the air.
+        notes: repairs and warnings.
+        design: design conditions of the file; None if it has none.
+    """
 
     def series(name: str, unit: str, x: FloatArray) -> Series:
         return Series(x, minutes, name, unit, path.name, synthetic=False, notes=tuple(notes))
 
     return Weather(
         **location,
-        outdoor_c=series("outdoor_c", "C", outdoor),
-        wet_bulb_c=series("wet_bulb_c", "C", wet_bulb),
-        relative_humidity_pct=series("relative_humidity_pct", "%", humidity),
-        pressure_pa=series("pressure_pa", "Pa", pressure),
+        outdoor_c=series("outdoor_c", "C", air.outdoor_c),
+        wet_bulb_c=series("wet_bulb_c", "C", wet_bulb_c(*air)),
+        relative_humidity_pct=series("relative_humidity_pct", "%", air.relative_humidity_pct),
+        pressure_pa=series("pressure_pa", "Pa", air.pressure_pa),
         design=design,
     )
 
@@ -372,21 +407,38 @@ def _columns(path: Path, frame: pd.DataFrame) -> tuple[FloatArray, list[str]]:
         if missing and column in _USED:
             notes.append(f"{missing} missing values of {column.name} interpolated")
     outdoor, humidity = values[_DRY_BULB], values[_HUMIDITY]
-    above = values[_DEW_POINT] > outdoor + _DEW_POINT_SLACK_K
-    if above.any():
-        at = int(np.argmax(above))
-        dew_point = float(values[_DEW_POINT][at])
-        valid = f"at most the dry bulb of {outdoor[at]:g} C (the wet bulb would lie above it)"
-        raise files.fault(path, int(frame.index[at]), _DEW_POINT.name, dew_point, valid)
-    over = humidity > 100.0
-    if over.any():
-        notes.append(f"{int(over.sum())} values of relative humidity over 100 % set to 100 %")
-        values[_HUMIDITY] = np.where(over, 100.0, humidity)
+    check_dew_point(path, _DEW_POINT.name, rows, values[_DEW_POINT], outdoor)
+    values[_HUMIDITY], humidity_notes = capped_humidity(humidity)
+    notes += humidity_notes
     pressure = values[_PRESSURE]
     known = pressure[~np.isnan(pressure)]
     if known.size and known.std() < 100.0:
         notes.append(f"warning: station pressure is nearly constant ({known.mean():.0f} Pa)")
     return np.stack([values[column] for column in _USED], axis=1), notes
+
+
+def check_dew_point(
+    path: Path, column: str, rows: NDArray[np.int64], dew_point_c: FloatArray, outdoor_c: FloatArray
+) -> None:
+    """Reject a dew point above the dry bulb, (T,) both.
+
+    Raises:
+        DataError: names file, row, column and value.
+    """
+    above = dew_point_c > outdoor_c + _DEW_POINT_SLACK_K
+    if above.any():
+        at = int(np.argmax(above))
+        valid = f"at most the dry bulb of {outdoor_c[at]:g} C (the wet bulb would lie above it)"
+        raise files.fault(path, int(rows[at]), column, float(dew_point_c[at]), valid)
+
+
+def capped_humidity(percent: FloatArray) -> tuple[FloatArray, list[str]]:
+    """Relative humidity of at most 100 %, (T,), and notes."""
+    over = percent > 100.0
+    if not over.any():
+        return percent, []
+    notes = [f"{int(over.sum())} values of relative humidity over 100 % set to 100 %"]
+    return np.where(over, 100.0, percent), notes
 
 
 def _is_code(text: pd.Series[str], code: float) -> pd.Series[bool]:

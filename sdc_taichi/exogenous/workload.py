@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous import files, series_file
+from sdc_taichi.exogenous.columns import column_map
 from sdc_taichi.exogenous.series import Series
 from sdc_taichi.number_text import parse_number
 
@@ -22,7 +23,7 @@ Rows: TypeAlias = NDArray[np.int64]
 Stamps: TypeAlias = NDArray[np.datetime64]
 
 _INDEX_HEADERS = frozenset({"index", "hour", "step", "time", "timestamp", "datetime"})
-_PERCENT_HINT = " (divide percentages by 100)"
+_PERCENT_HINT = " (percentages are read with --map cpu_load:%=COLUMN)"
 
 
 def read_workload(
@@ -41,7 +42,9 @@ def read_workload(
     Args:
         path: CSV or Parquet.
         minutes: resolution of a file without stamps; None means hourly.
-        columns: ``cpu_load`` or ``timestamp``, and the names that they have in the table instead.
+        columns: ``cpu_load``, with its unit where it is another, or ``timestamp``, and the names
+            that they have in the table, such as ``{"cpu_load:kW,120..800": "PDU"}``
+            (``exogenous.columns``).
 
     Returns:
         Utilisation, whole years of 365 days.
@@ -56,13 +59,16 @@ def read_workload(
         metadata = series_file.read_metadata(path)
         if metadata is not None:
             return _read_imported(path, metadata)
-    frame, first_row = files.read_table(path, columns)
+    named = column_map(columns)
+    frame, first_row = files.read_table(path, named.names)
     files.require_columns(path, frame, ("cpu_load",))
     rows = first_row + np.arange(len(frame))
-    values = files.numbers(path, frame["cpu_load"], "cpu_load", rows, 0.0, 1.0, _PERCENT_HINT)
+    unit = named.unit("cpu_load")
+    hint = "" if unit.symbol else _PERCENT_HINT
+    values = files.numbers(path, frame["cpu_load"], "cpu_load", rows, 0.0, 1.0, hint, unit)
     blank = int(np.isnan(values).sum())
     minutes, positions, first_stamp, notes = _clock(path, frame, rows, minutes)
-    notes += [f"{own} read as {name}" for name, own in columns.items()]
+    notes += named.notes()
     values = files.spread(values, positions)
     absent = values.size - len(frame)
     for count, what in ((absent, "absent rows"), (blank, "rows without values")):

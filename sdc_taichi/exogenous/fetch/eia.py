@@ -89,7 +89,7 @@ def requests_of_year(authority: str, year: int, key: Key) -> list[tuple[Period, 
             query,
             key,
             by_hand="by hand: download hourly generation by energy source from "
-            "https://www.eia.gov/electricity/gridmonitor, then data import with --map",
+            "https://www.eia.gov/electricity/gridmonitor, then data import --map eia-930",
             check=rows_of,
         )
         found.append((period, request))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Sequence
 
 from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous.fetch.request import Request, Service
@@ -47,7 +48,10 @@ def request_year(zone: str, year: int, release: str = RELEASE) -> Request:
     if not _RELEASE.fullmatch(release):
         raise DataError(f"--release {shortened(release)}: expected a day such as {RELEASE}")
     name = f"{zone}_{year}_hourly.csv"
-    hint = f"by hand: download {name} from {SERVICE.page}, then data import FILE with --map"
+    hint = (
+        f"by hand: download {name} from {SERVICE.page}, then data import FILE "
+        "--map electricity-maps"
+    )
     return Request(
         SERVICE, f"{ADDRESS}/{release}/{name}", f"{release}_{name}", by_hand=hint, check=columns_of
     )
@@ -65,6 +69,19 @@ def columns_of(content: bytes, url: str) -> dict[str, str]:
         raise DataError(f"{url}: byte {failed.start} is not UTF-8, expected a CSV table") from None
     with decoding(url, "a CSV table", DataError):
         header = next(csv.reader([text.partition("\n")[0].rstrip("\r")]), [])
+    return intensity_columns(header, url)
+
+
+def intensity_columns(header: Sequence[str], place: str) -> dict[str, str]:
+    """Columns of stamps and life-cycle intensity among those of a table.
+
+    Args:
+        header: columns of the table.
+        place: address or file, for messages.
+
+    Raises:
+        DataError: no such columns.
+    """
     found = [
         column
         for column in header
@@ -73,7 +90,7 @@ def columns_of(content: bytes, url: str) -> dict[str, str]:
     ]
     if STAMP_COLUMN not in header or len(found) != 1:
         raise DataError(
-            f"{url}: columns {shortened(', '.join(header), 200)}, expected {STAMP_COLUMN!r} and a "
-            "carbon intensity of the life cycle"
+            f"{place}: columns {shortened(', '.join(header), 200)}, expected {STAMP_COLUMN!r} and "
+            "a carbon intensity of the life cycle"
         )
     return {"timestamp": STAMP_COLUMN, "avg_CI": found[0]}

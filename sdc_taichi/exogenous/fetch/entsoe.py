@@ -169,7 +169,7 @@ def requests_of_year(zone: str, year: int, key: Key) -> list[tuple[Period, Reque
             query,
             key,
             by_hand="by hand: export actual generation per production type from "
-            "https://transparency.entsoe.eu, then data import with --map",
+            "https://transparency.entsoe.eu, then data import --map entsoe",
             check=lambda content, url: list(_runs(content, url)),
         )
         found.append((Period(first, first + (end - start).days * 24), request))

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
+
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import importing
 from sdc_taichi.exogenous.fetch import eia, electricity_maps, entsoe, epw_archive, pvgis
@@ -230,7 +232,8 @@ def _import_generation(
     ]
     periods = [period for period, _ in asked]
     values, notes = by_column(generation(year, answers), columns, periods)
-    path = write_file(downloads_dir(service, into.data_dir) / file_name, carbon_table(year, values))
+    table = carbon_table(np.datetime64(f"{year}-01-01"), values)
+    path = write_file(downloads_dir(service, into.data_dir) / file_name, table)
     with into.checking():
         return importing.import_carbon(
             path,

@@ -109,16 +109,16 @@ def _absent(series: FloatArray, periods: Sequence[Period]) -> NDArray[np.bool_]:
     return absent
 
 
-def carbon_table(year: int, values: FloatArray) -> bytes:
+def carbon_table(start: np.datetime64, values: FloatArray) -> bytes:
     """A carbon table as CSV, with the average intensity by the factors of this package.
 
     Args:
-        year: calendar year in UTC.
+        start: first hour, in UTC.
         values: generation of each hour in MWh, (T, 8), NaN where it is missing.
     """
     factors = np.array([emission_factors()[fuel] for fuel in FUELS])
     intensity = values @ factors / values.sum(axis=1)
-    stamps = np.datetime64(f"{year}-01-01T00", "h") + np.arange(len(values))
+    stamps = start.astype("datetime64[h]") + np.arange(len(values))
     lines = [",".join(("timestamp", *FUELS, "avg_CI"))]
     for stamp, row, average in zip(stamps.tolist(), values.tolist(), intensity, strict=True):
         cells = ["" if np.isnan(x) else f"{x:.6g}" for x in row]
