@@ -81,7 +81,8 @@ docs: $(READY_DOCS) ## Build and check the documentation site in build/docs/html
 	rm -rf build/docs/html
 	$(DOCS_PY) docs/site/stage.py build/docs/source
 	$(DOCS_PY) docs/site/generate.py build/docs/source
-	$(DOCS_PY) -m sphinx -q -W -n --keep-going -c docs/site -b html build/docs/source build/docs/html
+	PATH="$(CURDIR)/$(DOCS)/bin:$$PATH" $(DOCS_PY) -m sphinx -q -W -n --keep-going -c docs/site \
+	    -b html build/docs/source build/docs/html
 	$(DOCS_PY) docs/site/check.py build/docs/html
 
 clean: ## Remove everything that can be built again, the environment included.
@@ -98,7 +99,8 @@ $(READY_TRAIN): $(READY)
 $(READY_DOCS): $(READY) pyproject.toml
 	@echo "Installing what builds the site into $(DOCS) (once, a few minutes at most)"
 	@$(PY) -m venv --clear $(DOCS)
-	@$(DOCS_PY) -m pip install $(PIP_FLAGS) --editable '.[docs]'
+	@$(DOCS_PY) -m pip install $(PIP_FLAGS) $(TORCH)
+	@$(DOCS_PY) -m pip install $(PIP_FLAGS) --editable '.[docs,train]'
 	@touch $@
 
 # Torch in the environment of development, for work on sdc_taichi/learning.

@@ -236,6 +236,14 @@ def test_damaged_weather_tables(
         read_weather_table(table, PLACE, columns=columns)
 
 
+def test_degrees_fahrenheit_are_not_taken_for_celsius(tmp_path: Path) -> None:
+    table = tmp_path / "a.csv"
+    table.write_text(build.text(weather_lines()))
+    columns = {"timestamp": "when", "dry_bulb": "t", "dew_point": "td"}
+    with pytest.raises(DataError, match=r"to 60 C \(degrees Fahrenheit are read with --map"):
+        read_weather_table(table, PLACE, columns=columns)
+
+
 def test_gaps_and_leap_days(tmp_path: Path) -> None:
     lines = weather_lines()
     table = tmp_path / "a.csv"

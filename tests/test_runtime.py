@@ -106,6 +106,20 @@ def test_creating_a_simulator_starts_no_runtime() -> None:
     assert done.stdout == "", "Taichi's banner reached standard output"
 
 
+def test_nothing_is_printed_where_standard_output_is_replaced() -> None:
+    """As in notebooks, where Taichi says that there is one."""
+    code = (
+        "import io, sys; sys.stdout = io.StringIO(); import sdc_taichi as s;"
+        "sim = s.Simulator(s.load_config('tiny'),"
+        " drivers=s.drivers_from_arrays([20.], [15.], [300.], [.5]));"
+        "sim.reset(); sim.step(); sys.__stdout__.write(sys.stdout.getvalue())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system binds no threads")
 @pytest.mark.skipif(uses_plain_taichi(), reason="plain Taichi leaves threads to the system")
 def test_as_many_threads_as_processors_are_bound_to_one_each() -> None:

@@ -21,7 +21,12 @@ LOCK_S = 60.0
 """Age, in s, from which a lock of the folder is one that a killed process left; Taichi holds it for
 milliseconds."""
 _LOCK, _INDEX = "ticache.lock", "ticache.tcb"
-_OWN = {"ENABLE_TAICHI_HEADER_PRINT": "False", "TI_SKIP_VERSION_CHECK": "ON"}
+_OWN = {
+    "ENABLE_TAICHI_HEADER_PRINT": "False",
+    "TI_SKIP_VERSION_CHECK": "ON",
+    # In notebooks it would print that there is one, and look for text to print at each launch.
+    "TI_ENABLE_PYBUF": "0",
+}
 # Layout of the index of Taichi 1.7.4: length of the file, version, sum of sizes and number of
 # kernels; then, for each kernel, its key twice, each after its length, its size and two times.
 _HEADER_BYTES, _ENTRY_BYTES, _KEY_BYTES = 30, 170, 65

@@ -37,6 +37,8 @@ _LIMITS = {
     "pressure": PRESSURE_LIMITS_PA,
 }
 
+_FAHRENHEIT = " C (degrees Fahrenheit are read with --map dry_bulb:F=COLUMN)"
+
 
 class Place(NamedTuple):
     """Where a station is."""
@@ -163,7 +165,9 @@ def _numbers(
     notes = named.notes()
     values = {}
     for name in read:
-        x = files.numbers(path, frame[name], name, rows, *_LIMITS[name], unit=named.unit(name))
+        unit = named.unit(name)
+        hint = _FAHRENHEIT if name == "dry_bulb" and not unit.symbol else ""
+        x = files.numbers(path, frame[name], name, rows, *_LIMITS[name], hint, unit)
         if blank := int(np.isnan(x).sum()):
             notes.append(f"{blank} missing values of {name} interpolated")
         values[name] = x
