@@ -1,51 +1,99 @@
-"""The how-to guides and the first page of the site: their Python and their commands run."""
+"""What the documentation shows: commands and Python of its pages run, or are valid."""
 
 from __future__ import annotations
 
 import inspect
 import re
 import shlex
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from exogenous_builders import carbon_lines, epw_lines, text
+import made_studies
+from exogenous_builders import carbon_lines, epw_lines, text, workload_lines
 from sdc_taichi.cli.app import app
 
 pytestmark = pytest.mark.repo
 
-DOCS = Path(__file__).parent.parent / "docs"
-PAGES = [DOCS / "index.md", *(x for x in sorted(DOCS.glob("how-to/*.md")) if x.stem != "index")]
-NOT_RUN = ("train", "benchmark")
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+GUIDES = [
+    DOCS / "index.md",
+    *(x for x in sorted(DOCS.glob("how-to/*.md")) if x.stem != "index"),
+    *(x for x in sorted(DOCS.glob("tutorials/*.md")) if x.stem != "index"),
+]
+"""Pages whose commands are run as they stand."""
+PAGES = [
+    ROOT / "README.md",
+    *(
+        page
+        for page in sorted(DOCS.rglob("*.md"))
+        if page not in GUIDES and "site" not in page.relative_to(DOCS).parts
+    ),
+]
+"""Pages whose Python is run, and whose commands have to be valid."""
+POLICY = ROOT / "tests" / "reference" / "benchmark" / "carbon" / "ippo"
+NOT_RUN = ("train", "evaluate", "benchmark")
 """Commands that take long or need an extra: it is seen that they are valid."""
+_NOT_RUN_MARK = re.compile(r"<!-- not run: .+ -->\s*\Z")
 _LINE = re.compile(r"^ {4}(\S.*)$", re.M)
+_SYNOPSIS = re.compile(r"^# Command line\n\n(?: {4}.*\n)+", re.M)
 
 
-def blocks(page: Path) -> list[tuple[str, str]]:
-    """Python and command lines of a page in their order, each with its kind."""
+class Shown(NamedTuple):
+    """A piece of a page."""
+
+    kind: str
+    """``python``, or ``line`` of what stands indented."""
+    code: str
+    """The text."""
+    is_run: bool = True
+    """Whether no mark before it says that it is not run."""
+
+
+def shown_on(page: Path) -> list[Shown]:
+    """Python and indented lines of a page in their order."""
     found = []
-    for part in re.split(r"(^```.*?^```$)", page.read_text("utf-8"), flags=re.M | re.S):
+    content = _SYNOPSIS.sub("", page.read_text("utf-8"))
+    is_run = True
+    for part in re.split(r"(^```.*?^```$)", content, flags=re.M | re.S):
         if part.startswith("```python\n"):
-            found.append(("python", part.removeprefix("```python\n").removesuffix("```")))
+            code = part.removeprefix("```python\n").removesuffix("```")
+            found.append(Shown("python", code, is_run))
+        elif part.startswith("```\n"):
+            lines = part.splitlines()[1:-1]
+            found += [Shown("line", line) for line in lines if line.startswith("sdc-taichi ")]
         elif not part.startswith("```"):
-            found += [("command", line) for line in _LINE.findall(part)]
+            joined = re.sub(r" \\\n +", " ", part)
+            found += [Shown("line", line) for line in _LINE.findall(joined)]
+        is_run = not _NOT_RUN_MARK.search(part)
     return found
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_what_a_guide_shows_runs(
-    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the files that pages speak of."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SDC_TAICHI_DATA", str(tmp_path / "data"))
     Path("station.epw").write_text(text(epw_lines()))
     Path("ci.csv").write_text(text(carbon_lines()))
+    Path("my_trace.csv").write_text(text(workload_lines()))
+    shutil.copytree(POLICY, "runs/ippo")
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.stem)
+def test_what_a_guide_shows_runs(
+    page: Path, there: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     names: dict[str, Any] = {}
-    shown = blocks(page)
-    for kind, code in shown:
+    shown = shown_on(page)
+    for kind, code, _ in shown:
         if kind == "python":
             exec(compile(inspect.cleandoc(code), str(page), "exec"), names)
         else:
@@ -84,3 +132,64 @@ def check(words: list[str]) -> None:
 def test_what_is_not_run_is_parsed(line: str) -> None:
     with pytest.raises(typer.TyperException):
         check(line.split())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_commands_of_a_page_are_valid(page: Path) -> None:
+    for line in commands_on(page):
+        try:
+            check(line)
+        except (typer.TyperException, KeyError) as error:
+            pytest.fail(f"{shlex.join(line)}: {error}")
+
+
+def commands_on(page: Path) -> Iterator[list[str]]:
+    """Words of the commands of a page, without redirections and what follows them."""
+    for shown in shown_on(page):
+        if shown.kind == "line" and shown.code.startswith("sdc-taichi "):
+            for part in shown.code.split(" && "):
+                words = shlex.split(part, comments=True)
+                end = words.index(">") if ">" in words else len(words)
+                yield words[1:end]
+
+
+def test_pages_show_commands() -> None:
+    """The expression that finds them finds most."""
+    assert sum(1 for page in PAGES for _ in commands_on(page)) > 130
+
+
+PYTHON_PAGES = [
+    page
+    for page in PAGES
+    if page.stem != "README" and any(shown.kind == "python" for shown in shown_on(page))
+]
+
+
+@pytest.mark.parametrize("page", PYTHON_PAGES, ids=lambda page: page.stem)
+def test_python_of_a_page_runs(
+    page: Path, there: Path, runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(runs, there, dirs_exist_ok=True)
+    names: dict[str, Any] = {"__name__": "shown"}
+    for kind, code, is_run in shown_on(page):
+        if kind == "python":
+            compiled = compile(code, str(page), "exec")
+            if is_run:
+                exec(compiled, names)
+
+
+@pytest.fixture(scope="session")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs, a policy, a sweep and results of a study, under the names that pages give them."""
+    folder = tmp_path_factory.mktemp("shown")
+    for name in ("demo", "july", "july-idle"):
+        out = str(folder / "runs" / name)
+        command = ["simulate", "tiny", "--start", "07-01", "--days", "1", "--out", out, "--quiet"]
+        assert CliRunner().invoke(app, command).exit_code == 0
+    shutil.copytree(POLICY, folder / "runs" / "happo")
+    made_studies.write_study(folder / "results")
+    command = ["sweep", "tiny", "--vary", "hvac.setpoint.initial_c=16:17:1", "--days", "1"]
+    command += ["--jobs", "1", "--out", str(folder / "sweeps" / "setpoints"), "--quiet"]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    (folder / "evaluation").mkdir()
+    return folder
