@@ -17,6 +17,8 @@ from typer.testing import CliRunner
 import made_studies
 from exogenous_builders import carbon_lines, epw_lines, text, workload_lines
 from sdc_taichi.cli.app import app
+from sdc_taichi.control import registry
+from sdc_taichi.envs import costs, rewards
 
 pytestmark = pytest.mark.repo
 
@@ -77,7 +79,9 @@ def shown_on(page: Path) -> list[Shown]:
 
 @pytest.fixture
 def there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the files that pages speak of."""
+    """A folder with the files that pages speak of; what pages register is forgotten."""
+    for module in (costs, rewards, registry):
+        monkeypatch.setattr(module, "_registered", dict(module._registered))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SDC_TAICHI_DATA", str(tmp_path / "data"))
     Path("station.epw").write_text(text(epw_lines()))
