@@ -80,8 +80,9 @@ def shown_on(page: Path) -> list[Shown]:
 @pytest.fixture
 def there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the files that pages speak of; what pages register is forgotten."""
-    for module in (costs, rewards, registry):
-        monkeypatch.setattr(module, "_registered", dict(module._registered))
+    for module in (costs, rewards):
+        monkeypatch.setattr(module, "_registered", {})
+    monkeypatch.setattr(registry, "_registered", dict(registry._registered))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SDC_TAICHI_DATA", str(tmp_path / "data"))
     Path("station.epw").write_text(text(epw_lines()))
