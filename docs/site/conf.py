@@ -51,7 +51,7 @@ html_theme_options = {
     "logo": {"text": "sdc-taichi"},
     "show_toc_level": 2,
     "navigation_with_keys": False,
-    "header_links_before_dropdown": 6,
+    "header_links_before_dropdown": 4,
     "navbar_center": ["navbar-nav"],
     "navbar_end": ["theme-switcher"],
     "footer_start": ["copyright"],
