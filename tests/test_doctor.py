@@ -96,6 +96,7 @@ def test_a_home_that_cannot_be_made_is_told(
     assert "SDC_TAICHI_DATA" in found["advice"]
 
 
+@pytest.mark.repo
 def test_extras_are_those_of_the_project() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = project["optional-dependencies"]
