@@ -9,6 +9,8 @@ READY := $(VENV)/.installed
 PIP_FLAGS := -qq --disable-pip-version-check
 SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
 # The oldest Python and libraries that pyproject.toml admits.
+# Extras whose oldest libraries are tested; others join after removing $(OLDEST).
+OLDEST_EXTRAS ?= plot,fetch,test
 OLDEST := .venv-oldest
 READY_OLDEST := $(OLDEST)/.installed
 PYTHON_OLDEST ?= python3.11
@@ -112,9 +114,9 @@ $(VENV)/.installed-train: $(READY)
 $(READY_OLDEST): pyproject.toml .ci/lowest_versions.py
 	@echo "Installing the oldest supported libraries into $(OLDEST) (once, a few minutes at most)"
 	@$(PYTHON_OLDEST) -m venv --clear $(OLDEST)
-	@$(OLDEST)/bin/python .ci/lowest_versions.py > $(OLDEST)/constraints.txt
+	@$(OLDEST)/bin/python .ci/lowest_versions.py $(OLDEST_EXTRAS) > $(OLDEST)/constraints.txt
 	@$(OLDEST)/bin/python -m pip install $(PIP_FLAGS) --constraint $(OLDEST)/constraints.txt \
-	    --editable '.[plot,fetch,test]' setuptools
+	    --editable '.[$(OLDEST_EXTRAS)]' setuptools
 	@touch $@
 
 $(READY): pyproject.toml

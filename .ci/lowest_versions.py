@@ -1,6 +1,12 @@
-"""Print the lowest version that pyproject.toml admits of each library, as constraints for pip."""
+"""Print the lowest version that pyproject.toml admits of each library, as constraints for pip.
+
+    python .ci/lowest_versions.py EXTRA[,EXTRA...]
+
+Libraries are those of the core, of the extras that are named, and of the build.
+"""
 
 import re
+import sys
 import tomllib
 from pathlib import Path
 
@@ -9,12 +15,10 @@ project = content["project"]
 extras = project["optional-dependencies"]
 for requirement in (
     *project["dependencies"],
-    *extras["plot"],
-    *extras["fetch"],
-    *extras["test"],
+    *(requirement for extra in sys.argv[1].split(",") for requirement in extras[extra]),
     *content["build-system"]["requires"],
 ):
-    found = re.match(r"([\w.-]+)>=([\w.]+)", requirement)
+    found = re.match(r"([\w.-]+)(?:\[[\w,]+\])?>=([\w.]+)", requirement)
     if found is None:
         raise SystemExit(f"pyproject.toml: {requirement!r} has no lower bound")
     print(f"{found[1]}=={found[2]}")

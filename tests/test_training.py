@@ -313,7 +313,7 @@ for seed in (0, 0):
 
 def test_rllib_trains_all_agents_reproducibly_and_leaves_nothing(example: Load) -> None:
     """In a process of its own, whose warnings and threads end with it."""
-    pytest.importorskip("ray", reason="ray is not installed: make test-train")
+    pytest.importorskip("ray.rllib", reason="RLlib is not installed: make test-train")
     cache = os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))
     # Paths of Ray's sockets must be short.
     with tempfile.TemporaryDirectory(dir="/tmp" if os.path.isdir("/tmp") else None) as folder:
