@@ -283,6 +283,32 @@ def test_weather_tables_that_say_too_little(
     assert not user_folder.exists()
 
 
+def test_a_table_with_the_names_of_the_reader_needs_no_map(
+    tmp_path: Path, user_folder: Path
+) -> None:
+    table = tmp_path / "roof.csv"
+    lines = [line.split(",") for line in build.epw_lines()[8:]]
+    rows = [f"{y}-{int(m):02d}-{int(d):02d} {int(h) - 1:02d}:00,{x},60"
+            for y, m, d, h, _, _, x, *_ in lines]  # fmt: skip
+    table.write_text(build.text(["timestamp,dry_bulb,relative_humidity", *rows]))
+    with pytest.raises(DataError, match="a weather table, expected --latitude"):
+        run(str(table), "--site", "roof")
+    assert run(str(table), "--site", "roof", "--base", "NY", *STATION).exit_code == 0
+    assert load_site("roof").outdoor_c.values.max() > 20.0
+
+
+@pytest.mark.parametrize("kind", ["epw", "carbon", "service"])
+def test_a_place_beside_other_files_is_refused(
+    kind: str, tmp_path: Path, user_folder: Path
+) -> None:
+    path = tmp_path / "file.csv"
+    lines = build.epw_lines() if kind == "epw" else build.carbon_lines()
+    path.write_text(build.text(lines))
+    more = ["--map", "entsoe"] if kind == "service" else []
+    with pytest.raises(DataError, match=r"--latitude: without effect on .*file\.csv"):
+        run(str(path), "--site", "x", "--latitude", "3", *more)
+
+
 def test_several_files_need_a_service(tmp_path: Path, user_folder: Path) -> None:
     for name in "ab":
         (tmp_path / f"{name}.csv").write_text("avg_CI\n1\n")

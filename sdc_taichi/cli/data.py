@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.table import Table
@@ -213,7 +213,9 @@ def import_data(
     if base is not None:
         base = find_name("base", base, synthetic_sites())
     service, columns = _mapping(mapped or [])
+    where = {"latitude": latitude, "longitude": longitude, "elevation": elevation}
     if service is not None:
+        _refuse_place(where, paths[0])
         item = _import_tables(paths, service, site, base, area, stamp, utc_offset)
         print_imported(console, item)
         print_missing_parts(console, [item], base)
@@ -223,19 +225,19 @@ def import_data(
     if area is not None:
         raise DataError(f"--area {area}: only tables of a service, named by --map, hold several")
     jobs, left_out = _plan_import(paths[0], site, columns)
-    where = {"latitude": latitude, "longitude": longitude, "elevation": elevation}
+    if not any(kind == "weather table" for kind, _, _ in jobs):
+        _refuse_place(where, paths[0])
     done: list[importing.Imported] = []
     failed: list[DataError] = []
     for kind, file, name in jobs:
         try:
             if kind == "weather":
+                item = importing.import_weather(file, name, base)
+            elif kind == "weather table":
+                place = _place(name, file, utc_offset, where)
+                marks: Literal["start", "end"] = "end" if stamp is StampOption.END else "start"
                 item = importing.import_weather(
-                    file,
-                    name,
-                    base,
-                    place=_place(name, file, utc_offset, where) if columns else None,
-                    stamp="end" if stamp is StampOption.END else "start",
-                    columns=columns,
+                    file, name, base, place=place, stamp=marks, columns=columns
                 )
             elif kind == "carbon":
                 item = importing.import_carbon(
@@ -297,6 +299,13 @@ def _import_tables(
     return import_export(paths, service, site, base, area=area, utc_offset_h=utc_offset_h)
 
 
+def _refuse_place(where: Mapping[str, float | None], path: Path) -> None:
+    """Refuse options of a weather table beside other files."""
+    given = [f"--{option}" for option, value in where.items() if value is not None]
+    if given:
+        raise DataError(f"{', '.join(given)}: without effect on {path}, which is no weather table")
+
+
 def _place(
     name: str, path: Path, utc_offset_h: float | None, where: Mapping[str, float | None]
 ) -> Place:
@@ -319,7 +328,7 @@ def _plan_import(
             raise DataError(f"--site {site}: names one file, but {path} is a folder")
         return importing.plan_folder(path)
     kind = importing.file_kind(path, columns)
-    if kind == "weather" and columns and "dry_bulb" not in column_map(columns).names:
+    if kind == "weather" and columns:
         raise DataError(f"--map: without effect on the weather file {path}")
     name = site or (importing.default_name(path) if kind == "workload" else None)
     if name is None:

@@ -54,7 +54,7 @@ class Imported:
 
 
 def file_kind(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Whether a file is ``weather``, ``carbon`` or ``workload``, by its content.
+    """Whether a file is ``weather``, ``weather table``, ``carbon`` or ``workload``, by its content.
 
     Args:
         path: the file.
@@ -75,7 +75,7 @@ def file_kind(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> 
         if line.upper().startswith("LOCATION,"):
             return "weather"
         header = {cell.strip() for cell in next(csv.reader([line]), [])}
-    kinds = {"avg_CI": "carbon", "cpu_load": "workload", "dry_bulb": "weather"}
+    kinds = {"avg_CI": "carbon", "cpu_load": "workload", "dry_bulb": "weather table"}
     names = column_map(columns).names
     for column, kind in sorted(kinds.items(), key=lambda item: item[0] not in names):
         if names.get(column, column) in header:
