@@ -132,16 +132,30 @@ def test_memory_is_that_of_the_control_group(
 
 def completed(*words: str) -> list[str]:
     """Words that bash is offered for the last one."""
-    environment = os.environ | {
+    environment = {
         "_SDC_TAICHI_COMPLETE": "complete_bash",
         "COMP_WORDS": " ".join(["sdc-taichi", *words]),
         "COMP_CWORD": str(len(words)),
     }
-    code = "from sdc_taichi.cli.app import main; import sys; sys.argv[0] = 'sdc-taichi'; main()"
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
-    assert not done.stderr
+    done = CliRunner().invoke(app, [], env=environment, prog_name="sdc-taichi")
+    assert (done.exit_code, done.stderr) == (0, "")
     return done.stdout.split()
+
+
+def test_bash_asks_the_program() -> None:
+    """In a process of its own, by the name that the printed script gives."""
+    code = "from sdc_taichi.cli.app import main; import sys; sys.argv[0] = 'sdc-taichi'; main()"
+    script = CliRunner().invoke(app, ["--show-completion", "bash"], prog_name="sdc-taichi").output
+    variable = script.split("=complete_bash")[0].split()[-1]
+    environment = os.environ | {
+        variable: "complete_bash",
+        "COMP_WORDS": "sdc-taichi optim",
+        "COMP_CWORD": "1",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert (done.stdout, done.stderr) == ("optimum\n", "")
 
 
 @pytest.mark.parametrize(

@@ -202,7 +202,7 @@ def test_design_point_comes_out_with_any_airflow_of_the_servers(full_m3s: float)
     np.testing.assert_allclose(sums.rack_inlet_c - 23.0, approach_k, rtol=0, atol=1e-9)
 
 
-@settings(phases=AS_FOUND, max_examples=12)
+@settings(phases=AS_FOUND, max_examples=8)
 @given(seed=SEEDS)
 def test_any_design_point_comes_out(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -256,7 +256,7 @@ def leaving(part: Part, sums: HallSums, layers: ServerLayers) -> tuple[float, fl
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@settings(phases=AS_FOUND, max_examples=12)
+@settings(phases=AS_FOUND, max_examples=6)
 @given(seed=SEEDS)
 def test_all_power_leaves_with_the_air(precision: Precision, seed: int) -> None:
     configs = random_halls(seed)
@@ -306,7 +306,7 @@ def test_racks_with_failing_fans_give_no_more_heat_than_they_have(
         assert np.all(np.abs(others) < 0.8)
 
 
-@settings(phases=AS_FOUND, max_examples=15)
+@settings(phases=AS_FOUND, max_examples=10)
 @given(seed=SEEDS, load=st.floats(0, 1), supply_c=st.floats(16, 23))
 def test_racks_loaded_alike_give_no_more_air_than_they_exhaust(
     seed: int, load: float, supply_c: float
@@ -338,7 +338,7 @@ def test_without_recirculation_servers_breathe_supply_air(
 
 
 @pytest.mark.parametrize("simple", [True, False], ids=["flat", "curves"])
-@settings(phases=AS_FOUND, max_examples=8)
+@settings(phases=AS_FOUND, max_examples=5)
 @given(seed=SEEDS, load=st.floats(0.2, 1))
 def test_more_supply_air_never_warms_an_inlet(simple: bool, seed: int, load: float) -> None:
     rng = np.random.default_rng(seed)
@@ -410,7 +410,7 @@ def test_effect_of_a_rack_fades_with_distance() -> None:
     assert means[0] > 10 * abs(means[-1])
 
 
-@settings(phases=AS_FOUND, max_examples=10)
+@settings(phases=AS_FOUND, max_examples=7)
 @given(seed=SEEDS)
 def test_servers_agree_with_their_racks_and_get_warmer_upwards(seed: int) -> None:
     rng = np.random.default_rng(seed)

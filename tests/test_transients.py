@@ -271,7 +271,7 @@ def held_j(fleet: Fleet, state: HallState, room_j: F64) -> F64:
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@settings(phases=AS_FOUND, max_examples=10)
+@settings(phases=AS_FOUND, max_examples=6)
 @given(seed=SEEDS)
 def test_heat_that_comes_in_stays_or_leaves(precision: Precision, seed: int) -> None:
     configs, rng = random_halls(seed), np.random.default_rng(seed + 1)
