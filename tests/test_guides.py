@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -119,9 +120,15 @@ def run(line: str) -> None:
     assert done.exit_code == 0, f"{line}: {done.output}"
 
 
+@cache
+def commands() -> Any:
+    """The command line."""
+    return typer.main.get_command(app)
+
+
 def check(words: list[str]) -> None:
     """See that a command takes the arguments and options of a line."""
-    command: Any = typer.main.get_command(app)
+    command = commands()
     names = []
     while within := getattr(command, "commands", {}):
         # `benchmark SUITE` runs a suite, by a command that has a name of its own.

@@ -51,7 +51,7 @@ from sdc_taichi.types import F64, ServerLayers
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@settings(phases=AS_FOUND, max_examples=8)
+@settings(phases=AS_FOUND, max_examples=6)
 @given(seed=SEEDS)
 def test_steady_halls_agree_with_the_twin(precision: Precision, seed: int) -> None:
     configs = random_halls(seed)
@@ -448,7 +448,7 @@ def test_servers_agree_with_their_racks_and_get_warmer_upwards(seed: int) -> Non
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@settings(phases=AS_FOUND, max_examples=8)
+@settings(phases=AS_FOUND, max_examples=6)
 @given(seed=SEEDS)
 def test_a_hall_of_a_batch_equals_itself_alone(precision: Precision, seed: int) -> None:
     configs = random_halls(seed)
