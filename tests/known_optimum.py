@@ -60,8 +60,6 @@ def made_up_optimum(
         cooling=cooling,
         battery=battery,
         bound_of_ends=bound_of_ends,
-        discrete=0.9 * best.figure + 0.1 * idle.figure,
-        discrete_complete=(False,) * sim.size,
     )
 
 

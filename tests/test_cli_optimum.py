@@ -52,7 +52,7 @@ def test_table_tells_figures_gaps_and_shares(asked: dict[str, Any]) -> None:
     assert done.stdout.startswith("Optimum of carbon: 2 data centers, 1 day\n")
     rows = rows_of(done.stdout)
     assert list(rows) == ["idle (kg CO2e)", "bound (% against idle)", "achieved (% against idle)",
-                          "gap (points)", "cooling alone (%)", "discrete actions (%)",
+                          "gap (points)", "cooling alone (%)",
                           "g36 (% of the achievable)",
                           "battery=lookahead-3h (% of the achievable)"]  # fmt: skip
     bound, achieved, gap = ([float(x) for x in rows[title]] for title in list(rows)[1:4])
@@ -67,7 +67,7 @@ def test_table_tells_figures_gaps_and_shares(asked: dict[str, Any]) -> None:
 
 def test_options_reach_the_solver(asked: dict[str, Any]) -> None:
     done = call("optimum", *CASE, "--objective", "carbon+0.002*water", "--agents", "battery,load",
-                "--warm-up", "0.5", "--max-inlet", "27", "--discrete", "--no-cache",
+                "--warm-up", "0.5", "--max-inlet", "27", "--no-cache",
                 "--precision", "f64", "--quiet")  # fmt: skip
     assert done.exit_code == 0, done.output
     assert done.output == ""
@@ -75,7 +75,6 @@ def test_options_reach_the_solver(asked: dict[str, Any]) -> None:
     assert asked["agents"] == ("load", "battery")
     assert asked["scored_from"] == 48
     assert asked["inlet_limit_c"] == 27.0
-    assert asked["discrete"] is True
     assert asked["cache"] is False
     assert asked["precision"] == "f64"
     assert asked["steps"] == 96

@@ -1,63 +1,159 @@
-"""The discrete optimum of a few steps against all sequences of discrete actions there are."""
+"""The bound against all sequences of discrete actions over a few steps, run by the simulator."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterator
-from pathlib import Path
-from types import ModuleType
-from typing import Any
+from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pytest
 
-from sdc_taichi.optimum.discrete import discrete_plans
+from sdc_taichi import Actions, Simulator, load_config
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.hall.protection import Mask
+from sdc_taichi.optimum import Objective, solve
+from sdc_taichi.optimum.problem import Ends
+from sdc_taichi.optimum.score import Score
+from sdc_taichi.sim.fleet import build_fleet
+from sdc_taichi.types import F64
 
-pytestmark = pytest.mark.repo
-
-EXAMPLES = Path(__file__).parent.parent / "examples"
-STEPS = {"released models": 4}
-"""Steps of scenarios that need more than three to show what they are for."""
-
-
-@pytest.fixture(scope="module")
-def study() -> Iterator[ModuleType]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(EXAMPLES)
-        yield importlib.import_module("optimum_brute_force")
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "carbon",
-        "bill of two months",
-        "released models",
-        "discharge limited by the load",
-        "full queue",
-        "inlet limit",
-    ],
-)
-def test_no_sequence_is_better_than_the_one_found(study: Any, name: str) -> None:
-    assert len(study.SCENARIOS) == 6
-    scenario, steps = study.SCENARIOS[name], STEPS.get(name, 3)
-    outcomes = study.all_outcomes(scenario, steps)
-    assert len(outcomes.figure) == 27**steps
-    problem, demand = study.problem_at(scenario, steps, outcomes)
-    for ends in (None, study.FREE):
-        kept = study.permitted(outcomes, scenario, ends, problem.storage.stored_kwh)
-        plans = discrete_plans(problem, scenario.config, demand, ends=ends, beam=27**3)
-        assert plans.is_complete
-        least = outcomes.figure[kept].min()
-        assert plans.figure[0] == pytest.approx(least, rel=1e-9)
-        reached = study.figures(scenario, plans)
-        assert reached[0] == pytest.approx(least, rel=1e-9)
-        assert np.all(np.diff(plans.figure) >= 0.0)
+STEPS = 3
+SUMMER_NOON = 195 * 96 + 48
+ACTIONS = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
+"""Discrete commands of load, cooling and battery in a step, (27, 3); the middle row is idle."""
+ROUNDING = 1e-6
 
 
-def test_scenarios_meet_what_they_are_named_for(study: Any) -> None:
-    full = study.all_outcomes(study.SCENARIOS["full queue"], 2)
-    assert full.dropped_tasks.max() > 1.0
-    scenario = study.SCENARIOS["inlet limit"]
-    hot = study.all_outcomes(scenario, 2)
-    assert hot.hottest_inlet_c.min() < scenario.inlet_limit_c < hot.hottest_inlet_c.max()
+@dataclass(frozen=True)
+class Scenario:
+    """A small data center, what is minimised, and when."""
+
+    overrides: tuple[str, ...]
+    objective: str = "carbon"
+    start: int = SUMMER_NOON
+    inlet_limit_c: float | None = None
+
+    @property
+    def config(self) -> DataCenterConfig:
+        # Short deadlines and queues make few steps enough to reach them.
+        common = ("workload.age_horizon_h=1", "workload.deadline_h=0.5")
+        return load_config("tiny", [*common, *self.overrides])
+
+
+SCENARIOS = {
+    "carbon": Scenario(("site.location=CA", "battery.initial_soc=0.2")),
+    "bill of two months": Scenario(
+        (
+            "battery.initial_soc=0.3",
+            "battery.hours_of_design_load=0.5",
+            "workload.flexible_share=0.5",
+            "tariff.demand_charge_per_kw=1000",
+        ),
+        objective="cost",
+        start=31 * 96 - 2,
+    ),
+    "released models": Scenario(
+        (
+            "site.location=AZ",
+            "workload.model=tasks",
+            "workload.max_utilisation=0.9",
+            "battery.model=released",
+            "battery.initial_soc=0.4",
+            "hvac.setpoint.model=accelerating",
+            "hvac.setpoint.max_c=21.6",
+            "hvac.setpoint.min_c=15",
+        ),
+    ),
+    "discharge limited by the load": Scenario(
+        (
+            "site.location=TX",
+            "battery.model=paper",
+            "battery.initial_soc=0.06",
+            "battery.hours_of_design_load=4",
+            "battery.discharge_limit_c_rate=3",
+        ),
+        objective="energy",
+        start=9 * 96 + 12,
+    ),
+    "full queue": Scenario(
+        (
+            "site.location=WA",
+            "workload.flexible_share=0.8",
+            "workload.queue_limit_h=0.15",
+            "workload.max_utilisation=0.8",
+            "workload.trace=alibaba_1",
+        ),
+    ),
+    "inlet limit": Scenario(
+        ("site.location=GA", "hvac.setpoint.initial_c=20", "battery.initial_soc=0.2"),
+        objective="carbon+0.01*water",
+        inlet_limit_c=25.2,
+    ),
+}  # fmt: skip
+
+
+FIELDS = ("figure", "start_kwh", "end_kwh", "start_tasks", "end_tasks", "dropped_tasks",
+          "most_overdue_tasks", "hottest_inlet_c")  # fmt: skip
+Scores = dict[str, F64]
+"""Values of ``Score`` by name, for each of N sequences, (N,)."""
+
+
+def run_all(scenario: Scenario, steps: int = STEPS) -> Scores:
+    """Scores of all 27**steps sequences; those that begin with one action are one batch."""
+    size = len(ACTIONS) ** (steps - 1)
+    later = np.unravel_index(np.arange(size), (len(ACTIONS),) * (steps - 1))
+    scores = []
+    with Simulator(build_fleet([scenario.config] * size), precision="f64") as sim:
+        for first in range(len(ACTIONS)):
+            sim.reset(start=np.full(size, scenario.start))
+            score = Score(Objective.parse(scenario.objective), sim)
+            for which in (np.full(size, first), *later):
+                load, cooling, battery = ACTIONS[which].T
+                score.add(sim.step(Actions(load=load, cooling=cooling, battery=battery)))
+            scores.append(score)
+    return {name: np.concatenate([getattr(score, name) for score in scores]) for name in FIELDS}
+
+
+def keeps_constraints(scores: Scores, scenario: Scenario) -> Mask:
+    """Whether each sequence keeps the constraints of work and inlets, (N,)."""
+    idle = len(scores["figure"]) // 2
+    keeps = np.ones(len(scores["figure"]), dtype=bool)
+    for name in ("dropped_tasks", "most_overdue_tasks"):
+        keeps &= scores[name] <= scores[name][idle] + ROUNDING
+    if scenario.inlet_limit_c is not None:
+        keeps &= scores["hottest_inlet_c"] <= scenario.inlet_limit_c + ROUNDING
+    return keeps
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_no_sequence_comes_below_the_bound(name: str) -> None:
+    scenario = SCENARIOS[name]
+    scores = run_all(scenario)
+    optimum = solve(
+        scenario.config,
+        steps=STEPS,
+        start=[scenario.start],
+        objective=scenario.objective,
+        inlet_limit_c=scenario.inlet_limit_c,
+        precision="f64",
+        cache=False,
+    )
+    keeps = keeps_constraints(scores, scenario)
+    cyclic = keeps & (scores["end_kwh"] >= scores["start_kwh"] - ROUNDING)
+    cyclic &= scores["end_tasks"] <= scores["start_tasks"] + ROUNDING
+    assert keeps.sum() > cyclic.sum() > 1
+    least = scores["figure"][cyclic].min()
+    assert optimum.bound[0] <= least
+    # Continuous actions reach what discrete ones do.
+    assert optimum.achieved[0] <= least * (1.0 + 1e-9)
+    assert optimum.bound[0] >= least - 0.02 * optimum.idle[0]
+    free = optimum.bound_of_ends(0, Ends(float(scores["start_kwh"][0]), 0.0, 0.0, np.inf))
+    assert free <= scores["figure"][keeps].min() * (1.0 + 1e-6)
+
+
+def test_scenarios_reach_the_limits_that_they_are_named_for() -> None:
+    assert run_all(SCENARIOS["full queue"], 2)["dropped_tasks"].max() > 1.0
+    limit_c = SCENARIOS["inlet limit"].inlet_limit_c
+    assert limit_c is not None
+    hottest_c = run_all(SCENARIOS["inlet limit"], 2)["hottest_inlet_c"]
+    assert hottest_c.min() < limit_c < hottest_c.max()

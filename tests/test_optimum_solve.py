@@ -152,17 +152,6 @@ def test_every_preset_has_an_optimum(preset: str) -> None:
     assert found.failures == ((),)
 
 
-def test_discrete_actions_reach_a_figure_of_their_own(tmp_path: Path) -> None:
-    found = solved(config_of("CA"), steps=8, discrete=True, cache=tmp_path)
-    assert found.discrete is not None
-    assert found.bound[0] <= found.discrete[0] <= found.idle[0]
-    assert len(found.discrete_complete) == 1
-    again = solved(config_of("CA"), steps=8, discrete=True, cache=tmp_path)
-    np.testing.assert_array_equal(again.discrete, found.discrete)
-    assert again.discrete_complete == found.discrete_complete
-    assert solved(config_of("CA"), steps=8, cache=tmp_path).discrete is None
-
-
 def test_idle_setpoints_follow_their_schedule() -> None:
     hours = ",".join(str(17 + hour % 3) for hour in range(24))
     config = config_of("CA", f"hvac.setpoint.schedule_c=[{hours}]")

@@ -138,7 +138,6 @@ def _table(run: RunFolder, content: Mapping[str, Any]) -> str:
     names = [each["controller"] for each in content["controllers"]]
     heads = ["idle", "bound", "achieved", "gap (points)"]
     heads += [f"{name} alone" for name in content["total"]["alone"]]
-    heads += ["discrete actions"] if "discrete" in content["total"] else []
     heads += ["this run, ends valued", "share (%)"] if has_own else []
     heads += [f"{name}, share (%)" for name in names]
     shown = content["data_centers"][:MAX_ROWS]
@@ -172,7 +171,6 @@ def _row(
     """Row of a data center, or of all."""
     values = [figures[key] for key in ("idle", "bound", "achieved", "gap_points")]
     values += list(figures["alone"].values())
-    values += [figures["discrete"]] if "discrete" in figures else []
     if has_own:
         values += [metrics.get("valued_figure"), _percent(metrics.get("achievable_share"))]
     values += [_percent(share) for share in shares]

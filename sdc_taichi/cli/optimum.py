@@ -86,9 +86,6 @@ def optimum_command(
     ] = None,
     seed: Seed = 0,
     forecast_error: ErrorOfForecasts = None,
-    discrete: Annotated[
-        bool, typer.Option("--discrete", help="Also solve for discrete actions.")
-    ] = False,
     no_cache: NoCache = False,
     precision: Precision = "f32",
     overrides: Overrides = None,
@@ -142,7 +139,6 @@ def optimum_command(
             agents=movable,
             scored_from=scored_from,
             inlet_limit_c=limit_c,
-            discrete=discrete,
             cache=not no_cache,
             quiet=quiet,
             stop=interrupted,
@@ -182,7 +178,6 @@ def solve_beside(
     agents: tuple[Agent, ...] | None = None,
     scored_from: int = 0,
     inlet_limit_c: float | None = None,
-    discrete: bool = False,
     cache: bool = True,
     quiet: bool,
     stop: Callable[[], bool],
@@ -197,7 +192,6 @@ def solve_beside(
         agents: what may be moved; None is all.
         scored_from: first step that counts.
         inlet_limit_c: hottest inlet to allow, in C; None is that of ``protection.ashrae_class``.
-        discrete: whether to solve for discrete actions as well.
         cache: whether to read and keep results.
         quiet: whether to show no progress.
         stop: asked now and then; true ends the work.
@@ -219,7 +213,6 @@ def solve_beside(
             agents=AGENTS if agents is None else agents,
             scored_from=scored_from,
             inlet_limit_c=inlet_limit_c,
-            discrete=discrete,
             precision=sim.precision,
             cache=cache,
             progress=progress,

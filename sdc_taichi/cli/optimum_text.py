@@ -53,7 +53,6 @@ def _titles(content: Mapping[str, Any]) -> list[str]:
         "achieved (% against idle)",
         "gap (points)",
         *(f"{name} alone (%)" for name in content["total"]["alone"]),
-        *(["discrete actions (%)"] if "discrete" in content["total"] else []),
         *(f"{each['controller']} (% of the achievable)" for each in content["controllers"]),
     ]
 
@@ -66,7 +65,6 @@ def _values(figures: Mapping[str, Any], shares: Sequence[float | None]) -> list[
         return None if value is None or not idle else 100.0 * (value / idle - 1.0)
 
     alone = [change(value) for value in figures["alone"].values()]
-    alone += [change(figures["discrete"])] if "discrete" in figures else []
     own = [None if share is None else 100.0 * share for share in shares]
     both = change(figures["bound"]), change(figures["achieved"])
     return [idle, *both, figures["gap_points"], *alone, *own]

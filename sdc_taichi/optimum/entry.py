@@ -21,7 +21,7 @@ from sdc_taichi.types import F64
 
 METHOD = 1
 """Version of how optima are found; files of another one are not read."""
-_TEXT = ("fingerprint", "alone", "kind", "failures", "certificate", "discrete_complete")
+_TEXT = ("fingerprint", "alone", "kind", "failures", "certificate")
 
 
 class OptimumCacheWarning(SdcWarning):
@@ -54,10 +54,6 @@ class Entry:
     """Cooling commands of the achieved path, in steps of the setpoint, (T,)."""
     battery: F64
     """Battery commands of the achieved path, (T,)."""
-    discrete: float = float("nan")
-    """Lowest figure reached with discrete actions alone; nan where there is none."""
-    discrete_complete: bool = False
-    """Whether the search for discrete actions left no state out."""
 
 
 def key_of(fingerprint: str, arguments: Mapping[str, Any]) -> str:
@@ -178,7 +174,7 @@ def _from_arrays(arrays: Mapping[str, Any], key: str, steps: int) -> Entry:
         values[name] = arrays[name]
         if values[name].shape != (steps,):
             raise ValueError(f"has no {name} commands of {steps} steps")
-    for name in ("idle", "idle_dropped_tasks", "bound", "achieved", "discrete"):
+    for name in ("idle", "idle_dropped_tasks", "bound", "achieved"):
         values[name] = float(arrays[name])
     return Entry(**values)
 

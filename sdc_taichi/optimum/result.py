@@ -67,11 +67,6 @@ class Optimum:
     """Battery commands of the achieved path, (T, B)."""
     bound_of_ends: Callable[[int, Ends], float]
     """Bound of a data center, by its index, with given ends; nan where there is none."""
-    discrete: F64 | None = None
-    """Lowest figure reached with discrete actions alone, (B,), nan where none was found; None
-    where it was not asked for."""
-    discrete_complete: tuple[bool, ...] = ()
-    """Whether the search for discrete actions left no state of a data center out, B."""
 
     @property
     def gap_points(self) -> F64:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from threading import Event
 from typing import TypeVar
@@ -21,8 +21,6 @@ from sdc_taichi.optimum.certificates import (
     against_table,
     measured,
 )
-from sdc_taichi.optimum.discrete import DiscretePlans, discrete_plans
-from sdc_taichi.optimum.discrete_run import run_discrete
 from sdc_taichi.optimum.eligibility import (
     forced_discharge_reason,
     no_table_reasons,
@@ -33,7 +31,7 @@ from sdc_taichi.optimum.entry import Cache, Entry
 from sdc_taichi.optimum.linear_programme import bound
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.paths import IDLE, JOINT, agents_of, path_of, with_battery_for
-from sdc_taichi.optimum.problem import AGENTS, Agent, Plan, Problem
+from sdc_taichi.optimum.problem import AGENTS, Agent, Problem
 from sdc_taichi.optimum.result import Optimum, StoppedError
 from sdc_taichi.optimum.rollout import RollOut, Targets, repeated, roll_out
 from sdc_taichi.optimum.task import Task, checked_task
@@ -73,7 +71,6 @@ def solve(
     agents: Sequence[Agent] = AGENTS,
     scored_from: int = 0,
     inlet_limit_c: float | None = None,
-    discrete: bool = False,
     precision: Precision = "f32",
     cache: bool | str | os.PathLike[str] = True,
     progress: Progress | None = None,
@@ -97,7 +94,6 @@ def solve(
             have there.
         inlet_limit_c: Highest inlet that plans may cause where they have a choice, in C; None is
             the limit of ``protection.ashrae_class``, and none where that is not set.
-        discrete: Whether to look for the best path of discrete actions as well.
         precision: Floating-point precision of the hall kernels.
         cache: Whether to read and keep results among the user's caches, or a folder for them.
         progress: Is told of the stages of the work.
@@ -119,7 +115,6 @@ def solve(
         scored_from=scored_from,
         inlet_limit_c=inlet_limit_c,
         precision=precision,
-        discrete=discrete,
     )
     kept = None if cache is False else Cache(None if cache is True else Path(cache))
     work = _Work(progress or (lambda _stage, _done, _total: None), stop or (lambda: False))
@@ -158,8 +153,6 @@ def _optimum(task: Task, entries: Sequence[Entry], cache: Cache | None) -> Optim
         cooling=paths("cooling"),
         battery=paths("battery"),
         bound_of_ends=BoundOfEnds(task, [entry.kind for entry in entries], cache),
-        discrete=each("discrete") if task.discrete else None,
-        discrete_complete=tuple(entry.discrete_complete for entry in entries if task.discrete),
     )
 
 
@@ -228,21 +221,6 @@ def _suggestion(
 def _joint(problem: Problem, runs: Mapping[str, _Run]) -> _Run:
     """The run that moves all agents."""
     return runs[JOINT if JOINT in runs else problem.agents[0]]
-
-
-def _discrete(
-    given: tuple[Problem, DataCenterConfig, F64, _Run], _stop: Callable[[], bool]
-) -> DiscretePlans:
-    """Sequences of discrete actions, guided by a run of continuous ones.
-
-    Args:
-        given: The planning problem, the config, work that arrives as a share of capacity, (T,), and
-            the run.
-    """
-    problem, config, demand, run = given
-    done = run.done
-    paths = (done.executed_tasks, done.setpoint_c, done.charge_kwh, done.discharge_kwh)
-    return discrete_plans(problem, config, demand, guide=Plan(*(path[:, 0] for path in paths)))
 
 
 def _battery_again(given: tuple[Problem, _Run], _stop: Callable[[], bool]) -> Targets:
@@ -375,43 +353,9 @@ class _Work:
         found = self._suggestions(problems, reasons)
         runs = self._run(task, [suggestion.paths for suggestion in found])
         self._plan_batteries_again(task, problems, runs)
-        entries = [
+        return [
             _entry(problem, suggestion, of)
             for problem, suggestion, of in zip(problems, found, runs, strict=True)
-        ]
-        return self._with_discrete(task, problems, runs, entries) if task.discrete else entries
-
-    def _with_discrete(
-        self,
-        task: Task,
-        problems: Sequence[Problem],
-        runs: Sequence[Mapping[str, _Run]],
-        entries: Sequence[Entry],
-    ) -> list[Entry]:
-        """Entries with the best paths of discrete actions, B."""
-        demand = task.drivers.demand.at(task.start[:, None] + np.arange(task.steps))
-        given = [
-            (problems[i], config, demand[i], _joint(problems[i], runs[i]))
-            for i, config in enumerate(task.fleet.configs)
-        ]
-        plans = self._side_by_side(_discrete, given, "discrete actions")
-        found = run_discrete(
-            task.fleet,
-            task.drivers,
-            plans,
-            agents=task.agents,
-            start=task.start,
-            objective=task.objective,
-            scored_from=task.scored_from,
-            seed=task.seed,
-            precision=task.precision,
-            stop=self._stop,
-        )
-        if found is None:
-            raise self._stopped()
-        return [
-            replace(entry, discrete=float(figure), discrete_complete=of.is_complete)
-            for entry, figure, of in zip(entries, found, plans, strict=True)
         ]
 
     def _plan_batteries_again(

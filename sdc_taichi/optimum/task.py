@@ -55,8 +55,6 @@ class Task:
     """Highest inlet where there is a choice, in C; None is that of the protection."""
     precision: Precision
     """Floating-point precision of the hall kernels."""
-    discrete: bool = False
-    """Whether to look for the best path of discrete actions as well."""
 
     def part(self, where: Sequence[int]) -> Task:
         """The task of some of the data centers.
@@ -99,7 +97,6 @@ class Task:
             "agents": self.agents,
             "scored_from": self.scored_from,
             "inlet_limit_c": self.inlet_limit_c,
-            "discrete": self.discrete,
         }
         halls: dict[Hashable, Fleet] = {}
         keys = []
@@ -170,7 +167,6 @@ def checked_task(
     scored_from: int,
     inlet_limit_c: float | None,
     precision: Precision,
-    discrete: bool,
 ) -> Task:
     """The task that arguments of ``solve`` mean.
 
@@ -203,7 +199,6 @@ def checked_task(
         scored_from=scored_from,
         inlet_limit_c=inlet_limit_c,
         precision=precision,
-        discrete=discrete,
     )
 
 

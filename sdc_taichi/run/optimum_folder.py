@@ -45,8 +45,6 @@ def optimum_content(optimum: Optimum, reached: Sequence[Achievement] = ()) -> di
         {name: float(getattr(optimum, name).sum()) for name in _FIGURES},
         {name: float(values.sum()) for name, values in optimum.alone.items()},
     )
-    if optimum.discrete is not None:
-        total["discrete"] = _or_none(optimum.discrete.sum())
     return {
         "format": FORMAT,
         "fingerprint": optimum.fingerprint,
@@ -194,9 +192,6 @@ def _data_center(optimum: Optimum, dc: int) -> dict[str, Any]:
         {name: float(getattr(optimum, name)[dc]) for name in _FIGURES},
         {name: float(values[dc]) for name, values in optimum.alone.items()},
     )
-    if optimum.discrete is not None:
-        figures["discrete"] = _or_none(optimum.discrete[dc])
-        figures["discrete_complete"] = optimum.discrete_complete[dc]
     return {
         "name": optimum.names[dc],
         **figures,
