@@ -32,7 +32,7 @@ SPREAD := --numprocesses auto --maxprocesses 4 --dist loadfile
 TRAINING_TESTS := $(wildcard tests/test_training*.py tests/test_learning*.py tests/test_policy*.py \
     tests/test_ray*.py tests/test_offline*.py)
 TYPED := build/typecheck
-SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py docs/site/*.py examples/*.py)))
+SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py docs/make/*.py docs/site/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
 
 .PHONY: help demo test test-oldest test-processors test-train bench fuzz lint wheel-test dist docs clean

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import itertools
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -13,14 +11,13 @@ import numpy.typing as npt
 import pandas as pd
 import pytest
 
-from sdc_taichi import SdcError, Simulator, StepResult, load_config, make_configs
+from sdc_taichi import SdcError, Simulator, StepResult, load_config
 from sdc_taichi.config import EventKind
 from sdc_taichi.control import make_controller, view_maker
 from sdc_taichi.exogenous.synthetic import synthetic_site
 from sdc_taichi.run.metrics import Metric
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.viz import (
-    animation,
     dashboards,
     data_figures,
     figures,
@@ -543,102 +540,6 @@ def test_series_that_are_too_short() -> None:
         data_figures.comparison({}, data_figures.CARBON)
     with pytest.raises(SdcError, match="series 'x': 1 values"):
         data_figures.comparison({"x": one}, data_figures.CARBON)
-
-
-def test_animation_shows_every_rack(run: Run, tmp_path: Path) -> None:
-    from PIL import Image
-
-    fleet, results = run
-    path = tmp_path / "hall.webp"
-    animation.write_animation(
-        path, iter(results[130:160]), fleet, frame_ms=50, limits_c=(15.0, 40.0)
-    )
-    picture: Any = Image.open(path)
-    assert (picture.n_frames, picture.format) == (30, "WEBP")
-    palette = animation._palette()
-    index = animation._rack_of_pixel(4, 5)
-    for frame in (0, 14, 29):
-        picture.seek(frame)
-        pixels = np.asarray(picture.convert("RGB"))
-        inside = pixels[34 : 34 + index.shape[0], 12 : 12 + index.shape[1]]
-        values = results[130 + frame].rack_inlet_c.astype(np.float64)
-        levels = np.clip((values - 15.0) * 255 / 25.0 + 0.5, 0, 255).astype(int)
-        for rack in range(20):
-            drawn = np.unique(inside[index == rack], axis=0)
-            np.testing.assert_array_equal(drawn, [palette[levels[rack]]])
-        assert (inside[index == 20] == 255).all(), "gaps between the racks"
-    assert path.stat().st_size < 100_000
-    assert [p.name for p in tmp_path.iterdir()] == ["hall.webp"]
-
-
-def test_animation_holds_one_frame_at_a_time(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from PIL import Image, ImageDraw
-
-    draw, alive = ImageDraw.Draw, []
-
-    def counted(picture: Any) -> Any:
-        alive.append(sum(type(each) is Image.Image for each in gc.get_objects()))
-        return draw(picture)
-
-    monkeypatch.setattr(ImageDraw, "Draw", counted)
-    animation.write_animation(tmp_path / "hall.webp", run[1][:8], run[0])
-    assert len(alive) >= 8
-    assert max(alive) - alive[0] <= 2
-
-
-def test_animation_of_a_data_center_of_many(tmp_path: Path) -> None:
-    from PIL import Image
-
-    with Simulator(make_configs(load_config("tiny"), count=2)) as sim:
-        sim.reset()
-        results = [sim.step() for _ in range(3)]
-        animation.write_animation(tmp_path / "x.WEBP", results, sim.fleet, 1, what="outlet")
-    pixels = np.asarray(Image.open(tmp_path / "x.WEBP").convert("RGB")).astype(int)
-    outlets = results[0].rack_outlet_c[4:]
-    order = np.argsort(outlets, kind="stable")
-    index = animation._rack_of_pixel(2, 2)
-    at = [np.argwhere(index == rack)[0] + (34, 12) for rack in order]
-    brightness = [pixels[y, x].sum() for y, x in at]
-    assert brightness == sorted(brightness)
-
-
-@pytest.mark.parametrize(("rows", "per_row"), [(4, 5), (250, 400), (1, 1), (2, 900), (900, 2)])
-def test_every_rack_has_pixels_alike(rows: int, per_row: int) -> None:
-    counts = np.bincount(animation._rack_of_pixel(rows, per_row).ravel(), minlength=rows * per_row)
-    assert counts.min() > 0
-    assert np.ptp(counts[: rows * per_row]) == 0
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments", "message"),
-    [
-        ("x.gif", {}, r"valid is a name that ends in \.webp"),
-        ("x.webp", {"dc": 1}, r"data center 1: valid is 0\.\.0"),
-        ("x.webp", {"what": "power"}, "what 'power'"),
-        ("x.webp", {"limits_c": (30.0, 20.0)}, "limits_c"),
-        ("x.webp", {"frame_ms": 0}, "frame_ms 0"),
-        ("none/x.webp", {}, "cannot be written"),
-    ],
-)
-def test_bad_animations(
-    run: Run, tmp_path: Path, name: str, arguments: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(SdcError, match=message):
-        animation.write_animation(tmp_path / name, run[1][:2], run[0], **arguments)
-    assert not list(tmp_path.iterdir())
-
-
-def test_animation_without_steps_or_of_another_fleet(run: Run, tmp_path: Path) -> None:
-    with pytest.raises(SdcError, match="no steps to show"):
-        animation.write_animation(tmp_path / "x.webp", [], run[0])
-    with Simulator(load_config("tiny")) as sim:
-        sim.reset()
-        with pytest.raises(SdcError, match="result of 4 racks, expected 20"):
-            animation.write_animation(tmp_path / "x.webp", [sim.step()], run[0])
-    with pytest.raises(SdcError, match="too large for WebP"):
-        animation._rack_of_pixel(20_000, 1)
 
 
 def test_long_names_are_cut() -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import struct
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -205,19 +203,3 @@ def test_bad_results_and_tables(run: tuple[Simulator, list[StepResult]]) -> None
         figures.overview(pd.concat([steps, steps]))
     with pytest.raises(SdcError, match="1 rows"):
         figures.overview(steps[:1])
-
-
-@pytest.mark.repo
-def test_example_writes_the_pictures(tmp_path: Path) -> None:
-    example = Path(__file__).parent.parent / "examples" / "plot_hall.py"
-    subprocess.run([sys.executable, str(example), str(tmp_path)], check=True, timeout=120)
-    assert {p.name for p in tmp_path.iterdir()} == {"hall.png", "week.png", "overview.png"}
-    assert png_size(tmp_path / "overview.png") == (1600, 700)
-    assert (tmp_path / "overview.png").stat().st_size < 250_000
-
-
-def png_size(path: Path) -> tuple[int, int]:
-    data = path.read_bytes()
-    assert data[:8] == b"\x89PNG\r\n\x1a\n"
-    width, height = struct.unpack(">II", data[16:24])
-    return width, height
