@@ -1,0 +1,24 @@
+"""Presets, environments, policies and an optimum against digests of the version before."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+import golden
+
+GOLDEN = json.loads(golden.FILE.read_text())
+CASES = dict(golden.cases())
+
+
+@pytest.mark.skipif(GOLDEN["processor"] != golden.processor(), reason="made on another processor")
+@pytest.mark.parametrize("name", CASES)
+def test_results_keep_their_bits(name: str) -> None:
+    digests: dict[str, Any] = CASES[name]()
+    assert digests == GOLDEN["cases"][name]
+
+
+def test_optimum_keeps_its_figures() -> None:
+    assert golden.same_optimum(golden.optimum(), GOLDEN["optimum"])
