@@ -51,7 +51,7 @@ from sdc_taichi.benchmark.suite_results import (
     SuiteResults,
     read_suites,
 )
-from sdc_taichi.cli.execution import with_ray_address
+from sdc_taichi.cli.jobs import with_ray_address
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.learning.evaluation import ALL
 from sdc_taichi.learning.evaluation_table import literal_markdown

@@ -155,6 +155,8 @@ def fields_of_records() -> Iterator[tuple[str, str | None]]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not isinstance(node, ast.ClassDef) or node.name.startswith("_"):
                 continue
+            if module.startswith("cli.") and node.name.endswith("Options"):
+                continue  # the help of each option says what it is
             marks = [ast.unparse(x) for x in (*node.decorator_list, *node.bases)]
             if not any(re.search(r"dataclass|BaseModel|_Section|NamedTuple", m) for m in marks):
                 continue

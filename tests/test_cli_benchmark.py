@@ -11,8 +11,8 @@ from typer.testing import CliRunner, Result
 
 from sdc_taichi.benchmark.runner import InProcess
 from sdc_taichi.benchmark.store import ResultStore
-from sdc_taichi.cli import execution
 from sdc_taichi.cli.app import app
+from sdc_taichi.cli.jobs import JobOptions
 
 SUITE = {
     "title": "A week of a small data center",
@@ -31,7 +31,7 @@ def call(*arguments: str) -> Result:
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(execution, "executor_of", lambda *_: InProcess())
+    monkeypatch.setattr(JobOptions, "executor", lambda _: InProcess())
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump(SUITE))
     return path

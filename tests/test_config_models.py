@@ -9,6 +9,7 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 
+from sdc_taichi.cli.options import RunOptions
 from sdc_taichi.cli.simulate import simulate_command
 from sdc_taichi.config import DataCenterConfig, EventKind, EventsConfig, load_config
 from sdc_taichi.control.registry import controller_names
@@ -116,8 +117,8 @@ def test_the_command_line_offers_every_controller_and_precision() -> None:
     _, option = get_args(hints["controller"])
     offered = set(option.help.partition(";")[0].split(", "))
     assert offered == set(controller_names()), "the help of --controller in cli/simulate.py differs"
-    names, _ = get_args(hints["precision"])
-    assert get_args(names) == get_args(Precision), "--precision in cli/simulate.py differs"
+    names, _ = get_args(get_type_hints(RunOptions, include_extras=True)["precision"])
+    assert get_args(names) == get_args(Precision), "--precision in cli/options.py differs"
 
 
 def test_workloads_say_when_work_is_due() -> None:

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 import toy_jobs
 from sdc_taichi.benchmark.runner import InProcess
 from sdc_taichi.benchmark.store import ResultStore, Study
-from sdc_taichi.cli import execution
-from sdc_taichi.cli.execution import JobsCommand, JobSession, Ray, job_progress, job_session
+from sdc_taichi.cli.jobs import JobOptions, JobsCommand, JobSession, job_progress, job_session
+from sdc_taichi.cli.options import CommandApp
 from sdc_taichi.errors import ConfigError, SdcError
 
 STUDY = Study("sweep", "sdc-taichi sweep", {}, [])
@@ -37,25 +37,26 @@ STUDY = Study("sweep", "sdc-taichi sweep", {}, [])
     ],
 )
 def test_the_address_of_ray_may_be_left_out(line: str, ray: str | None, rest: str) -> None:
-    app = typer.Typer()
+    app = CommandApp()
 
     @app.command(cls=JobsCommand)
     def command(
         words: list[str] = typer.Argument(default=[]),  # noqa: B008
         out: str = "",
-        ray: Ray = None,
+        *,
+        jobs: JobOptions,
     ) -> None:
-        typer.echo(" ".join([str(ray), *words, out]))
+        typer.echo(" ".join([str(jobs.ray), *words, out]))
 
     done = CliRunner().invoke(app, line.split())
     assert done.output.split() == [str(ray), *rest.split()]
 
 
 def test_jobs_run_on_ray_only_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert execution.executor_of(3, None).workers == 3
+    assert JobOptions(jobs=3).executor().workers == 3
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r'--ray needs Ray.*"sdc-taichi\[scale\]"'):
-        execution.executor_of(None, "local")
+        JobOptions(ray="local").executor()
 
 
 def test_progress_is_lines_where_there_is_no_terminal(
@@ -98,10 +99,10 @@ def test_a_study_whose_workers_cannot_start_is_not_begun(
         def __enter__(self) -> Self:
             raise ConfigError("no workers")
 
-    monkeypatch.setattr(execution, "executor_of", lambda *_: Absent())
+    monkeypatch.setattr(JobOptions, "executor", lambda _: Absent())
     with (
         pytest.raises(ConfigError, match="no workers"),
-        job_session(ResultStore(tmp_path), STUDY, resume=False, jobs=None, ray=None),
+        job_session(ResultStore(tmp_path), STUDY, JobOptions()),
     ):
         pass
     assert list(tmp_path.iterdir()) == []
@@ -126,16 +127,16 @@ def test_progress_is_a_bar_in_a_terminal(
 def test_an_interrupted_study_says_how_to_go_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(execution, "executor_of", lambda *_: InProcess())
+    monkeypatch.setattr(JobOptions, "executor", lambda _: InProcess())
     store, jobs = ResultStore(tmp_path), [toy_jobs.job("interrupt", 0), toy_jobs.job("draw", 1)]
-    with job_session(store, STUDY, resume=False, jobs=1, ray=None) as session:
+    with job_session(store, STUDY, JobOptions(jobs=1)) as session:
         assert not session.run("rows", jobs, 2).is_whole
         assert session.run("more", [toy_jobs.job("draw", 2)], 1).done == 0
     with pytest.raises(typer.Exit) as ended:
         session.finish()
     assert ended.value.exit_code == 130
     assert "interrupted after 1 jobs; go on with --resume" in capsys.readouterr().err
-    with job_session(store, STUDY, resume=True, jobs=1, ray=None, quiet=True) as session:
+    with job_session(store, STUDY, JobOptions(jobs=1, resume=True), quiet=True) as session:
         done = session.run("rows", jobs, 2)
     session.finish()
     assert (done.done, done.kept) == (1, 1)

@@ -30,11 +30,11 @@ DRIVER = """
 import sys
 from pathlib import Path
 from sdc_taichi.benchmark.store import ResultStore
-from sdc_taichi.cli.execution import job_session
+from sdc_taichi.cli.jobs import JobOptions, job_session
 from test_jobs import STUDY, draws
 if __name__ == "__main__":
     store, jobs = ResultStore(Path(sys.argv[1])), draws(8, seconds=0.3)
-    with job_session(store, STUDY, resume=True, jobs=None, ray=sys.argv[2]) as session:
+    with job_session(store, STUDY, JobOptions(ray=sys.argv[2], resume=True)) as session:
         session.run("draws", jobs, len(jobs))
     session.finish()
 """

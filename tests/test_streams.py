@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import sdc_taichi
 from sdc_taichi import SdcError
 from sdc_taichi.cli import app, streams
-from sdc_taichi.cli.console import PlainConsole
+from sdc_taichi.cli.terminal import PlainConsole
 from sdc_taichi.errors import MOST_CHARACTERS, one_line, printable
 
 PROGRAM = (sys.executable, "-c", "import sdc_taichi_command as c; c.main()")

@@ -27,8 +27,8 @@ from sdc_taichi.benchmark.sweep import (
     sweep_jobs,
 )
 from sdc_taichi.benchmark.vary import Grid, Range, draw, parse_vary
-from sdc_taichi.cli import execution
 from sdc_taichi.cli.app import app
+from sdc_taichi.cli.jobs import JobOptions
 from sdc_taichi.errors import SdcError
 from sdc_taichi.run.metrics import metrics_per_dc
 
@@ -256,7 +256,7 @@ def call(*arguments: object) -> Result:
 @pytest.fixture
 def _in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run jobs in this process, which needs no start."""
-    monkeypatch.setattr(execution, "executor_of", lambda *_: InProcess())
+    monkeypatch.setattr(JobOptions, "executor", lambda _: InProcess())
 
 
 @pytest.mark.usefixtures("_in_process")

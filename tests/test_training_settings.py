@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from sdc_taichi import EnvOptions
-from sdc_taichi.cli import train as command
 from sdc_taichi.cli.app import app
+from sdc_taichi.cli.terminal import duration
 from sdc_taichi.errors import SdcError
 from sdc_taichi.learning.scenarios import SCENARIOS
 from sdc_taichi.learning.settings import OffPolicySettings
@@ -149,7 +149,7 @@ def test_a_missing_torch_is_one_line_and_settings_need_none(tmp_path: Path) -> N
 
 
 def test_durations_are_short_texts() -> None:
-    assert [command.duration(s) for s in (5, 65, 3725)] == ["0:05", "1:05", "1:02:05"]
+    assert [duration(s) for s in (5, 65, 3725)] == ["0:05", "1:05", "1:02:05"]
 
 
 def test_the_page_of_settings_has_their_tables() -> None:

@@ -12,23 +12,22 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from sdc_taichi.cli.arguments import Debug
 from sdc_taichi.cli.benchmark import benchmark_app
 from sdc_taichi.cli.collect import collect_command
-from sdc_taichi.cli.config import config_app
+from sdc_taichi.cli.config import config_app, new_command
 from sdc_taichi.cli.data import data_app
 from sdc_taichi.cli.doctor import doctor_command
 from sdc_taichi.cli.evaluate import evaluate_command
-from sdc_taichi.cli.execution import JobsCommand
 from sdc_taichi.cli.hall import hall_app
-from sdc_taichi.cli.new import new_command
+from sdc_taichi.cli.jobs import JobsCommand
 from sdc_taichi.cli.optimum import optimum_command
+from sdc_taichi.cli.options import CommandApp, Debug
 from sdc_taichi.cli.policy import policy_app
 from sdc_taichi.cli.report import report_command
-from sdc_taichi.cli.session import warnings_in_lines
 from sdc_taichi.cli.simulate import simulate_command
 from sdc_taichi.cli.streams import guard_streams, output_failure
 from sdc_taichi.cli.sweep import sweep_command
+from sdc_taichi.cli.terminal import EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED, warnings_in_lines
 from sdc_taichi.cli.train import train_command
 from sdc_taichi.cli.view import view_command
 from sdc_taichi.errors import SdcError, one_line
@@ -42,7 +41,6 @@ _FIRST_STEPS = """Simulate data centers, and learn to run them with less carbon,
   sdc-taichi doctor                               what this machine has, and what is missing
   sdc-taichi --help                               all commands"""
 """What a user who asks nothing may do next."""
-EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
 class _Commands(typer.core.TyperGroup):
@@ -64,7 +62,7 @@ class _Commands(typer.core.TyperGroup):
         sys.exit(code if isinstance(code, int) else 0)
 
 
-app = typer.Typer(
+app = CommandApp(
     cls=_Commands,
     name="sdc-taichi",
     pretty_exceptions_enable=False,

@@ -10,16 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import typer.core
 
-from sdc_taichi.cli import completion
-from sdc_taichi.cli.arguments import Debug, Quiet, out_option
 from sdc_taichi.cli.benchmark_results import add_command, report_command
-from sdc_taichi.cli.execution import Jobs, Ray, Resume, job_session, with_ray_address
+from sdc_taichi.cli.jobs import JobOptions, JobsCommand, job_session
+from sdc_taichi.cli.options import CommandApp, Quiet, completed_by, out_option
 from sdc_taichi.errors import ConfigError, printable
 
 if TYPE_CHECKING:
     from sdc_taichi.benchmark.suite import Suite
 
 _RUN = "run"
+
+
+def _suites() -> list[str]:
+    from sdc_taichi.benchmark.suite import suite_names
+
+    return suite_names()
 
 
 class _Suites(typer.core.TyperGroup):
@@ -29,10 +34,10 @@ class _Suites(typer.core.TyperGroup):
         """Parse arguments, with ``run`` put in where no command is named."""
         if args and args[0] not in (*self.commands, *ctx.help_option_names):
             args = [_RUN, *args]
-        return super().parse_args(ctx, with_ray_address(args))
+        return super().parse_args(ctx, args)
 
 
-benchmark_app = typer.Typer(
+benchmark_app = CommandApp(
     cls=_Suites,
     no_args_is_help=True,
     help="Compare controllers in suites: sdc-taichi benchmark SUITE, such as carbon.",
@@ -41,15 +46,16 @@ benchmark_app.command("report")(report_command)
 benchmark_app.command("add")(add_command)
 
 
-@benchmark_app.command(_RUN)
+@benchmark_app.command(_RUN, cls=JobsCommand)
 def run_command(
     context: typer.Context,
+    *,
     suite: Annotated[
         str,
         typer.Argument(
             metavar="SUITE|FILE",
             help="Suite (see benchmark list), or YAML file.",
-            autocompletion=completion.suites,
+            autocompletion=completed_by(_suites),
         ),
     ],
     seeds: Annotated[
@@ -74,11 +80,8 @@ def run_command(
         Path | None,
         out_option("Folder of results. [default: results/SUITE, or SUITE-quick]", "DIR"),
     ] = None,
-    resume: Resume = False,
-    jobs: Jobs = None,
-    ray: Ray = None,
+    jobs: JobOptions,
     quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Run the controllers of a suite in held-out weeks, trained ones with several seeds.
 
@@ -95,12 +98,12 @@ def run_command(
         print(chosen.to_yaml(), end="")
         return
     check_suite(chosen)
-    if ray is None:
+    if jobs.ray is None:
         _require_torch(chosen)
     folder = Path("results") / (f"{chosen.name}-quick" if quick else chosen.name)
     store = ResultStore(folder if out is None else out)
     study = study_of(whole, chosen, shlex.join(["sdc-taichi", *context.obj]), quick=quick)
-    with job_session(store, study, resume=resume, jobs=jobs, ray=ray, quiet=quiet) as session:
+    with job_session(store, study, jobs, quiet=quiet) as session:
         run_suite(chosen, store, session.run)
     if not quiet and session.is_whole:
         place = printable(store.folder)

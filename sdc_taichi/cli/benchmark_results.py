@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from sdc_taichi.cli.arguments import Debug, check_out_file, force_option, out_option
-from sdc_taichi.cli.session import print_notes, stage_bars
+from sdc_taichi.cli.options import check_out_file, force_option, out_option
+from sdc_taichi.cli.terminal import print_notes, stage_bars
 from sdc_taichi.errors import ConfigError, printable
 
 
@@ -25,7 +25,6 @@ def report_command(
         Path | None, typer.Option(metavar="FILE.md", help="Also write the tables as Markdown.")
     ] = None,
     force: Annotated[bool, force_option("Replace existing files of --out, --markdown.")] = False,
-    debug: Debug = False,
 ) -> None:
     """Make tables and pictures of suites: one HTML page, and Markdown.
 
@@ -61,7 +60,6 @@ def add_command(
             min=0, max=52, metavar="N", help="Run its policies again in N weeks, and compare."
         ),
     ] = 0,
-    debug: Debug = False,
 ) -> None:
     """Put a row that others have run among the results of a suite, once it is checked.
 

@@ -10,19 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from sdc_taichi.cli import completion
-from sdc_taichi.cli.arguments import Debug, Quiet, Source, force_option, out_option, read_config
-from sdc_taichi.cli.scenario import (
-    EXIT_INTERRUPTED,
-    Carbon,
-    Precision,
-    Seed,
-    Site,
-    Weather,
-    Workload,
-    data_centers,
+from sdc_taichi.cli.options import (
+    Quiet,
+    RunOptions,
+    SiteOptions,
+    Source,
+    complete_controllers,
+    force_option,
+    out_option,
+    read_config,
 )
-from sdc_taichi.cli.session import interruptible, stage_bars
+from sdc_taichi.cli.terminal import EXIT_INTERRUPTED, interruptible, stage_bars
 from sdc_taichi.errors import ConfigError, printable
 
 if TYPE_CHECKING:
@@ -32,14 +30,15 @@ if TYPE_CHECKING:
 
 def collect_command(
     context: typer.Context,
+    *,
     source: Source = None,
-    site: Site = None,
+    sites: SiteOptions,
     controller: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME",
             help="Controller as of simulate, or random, optimum, optimum:OBJECTIVE; repeatable.",
-            autocompletion=completion.controllers,
+            autocompletion=complete_controllers,
         ),
     ] = None,
     weeks: Annotated[
@@ -62,11 +61,7 @@ def collect_command(
             help="Option of the environment, as environment.rewards=bill; repeatable.",
         ),
     ] = None,
-    seed: Seed = 0,
-    precision: Precision = "f32",
-    weather: Weather = None,
-    carbon: Carbon = None,
-    workload: Workload = None,
+    run: RunOptions,
     name: Annotated[
         str | None,
         typer.Option(
@@ -79,7 +74,6 @@ def collect_command(
     out: Annotated[Path, out_option("Folder of all data sets.", "DIR")] = Path("datasets"),
     force: Annotated[bool, force_option("Replace data sets that are there.")] = False,
     quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Collect episodes of controllers for offline learning, in Minari's format.
 
@@ -94,10 +88,8 @@ def collect_command(
     if not controller:
         raise ConfigError("--controller: none; valid is one or more, such as random, mpc-24h")
     require_minari()
-    base, label = read_config(source, None)
-    configs = data_centers(
-        base, site, start=None, weather=weather, carbon=carbon, workload=workload
-    )
+    base, label = read_config(source)
+    configs = sites.data_centers(base)
     stem = name if name is not None else f"sdc_taichi/{_identifier(Path(label).stem)}"
     names = _names(stem, configs)
     collections = [
@@ -107,10 +99,10 @@ def collect_command(
             weeks=parse_weeks(weeks),
             days=days,
             repeats=repeats,
-            seed=seed,
+            seed=run.seed,
             agent=_agent_of(agent),
             environment=_environment(assigned or []),
-            precision=precision,
+            precision=run.precision,
         )
         for config in configs
     ]

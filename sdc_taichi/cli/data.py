@@ -11,11 +11,9 @@ from typing import Annotated, Literal
 import typer
 from rich.table import Table
 
-from sdc_taichi.cli import completion
-from sdc_taichi.cli.arguments import out_option
-from sdc_taichi.cli.console import PlainConsole
-from sdc_taichi.cli.data_fetch import fetch_app
-from sdc_taichi.cli.imported_files import print_imported, print_missing_parts
+from sdc_taichi.cli.data_fetch import fetch_app, print_imported, print_missing_parts
+from sdc_taichi.cli.options import CommandApp, completed_by, out_option
+from sdc_taichi.cli.terminal import PlainConsole
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import importing
 from sdc_taichi.exogenous.columns import COLUMN_NAMES, column_map
@@ -40,10 +38,14 @@ from sdc_taichi.exogenous.synthetic import (
 )
 from sdc_taichi.exogenous.weather_table import Place
 
-data_app = typer.Typer(help="Sites and workload traces.", no_args_is_help=True)
+data_app = CommandApp(help="Sites and workload traces.", no_args_is_help=True)
 data_app.add_typer(fetch_app, name="fetch")
 
 Seed = Annotated[int, typer.Option(help="Seed of the synthetic year.", min=0)]
+
+
+def _sites_and_traces() -> list[str]:
+    return [*site_names(), *trace_names()]
 
 
 class StampOption(StrEnum):
@@ -95,7 +97,9 @@ def _fitted_to(series: Series) -> str:
 def show_data(
     name: Annotated[
         str,
-        typer.Argument(help="Site or workload trace.", autocompletion=completion.sites_and_traces),
+        typer.Argument(
+            help="Site or workload trace.", autocompletion=completed_by(_sites_and_traces)
+        ),
     ],
     seed: Seed = DEFAULT_SEED,
     out: Annotated[

@@ -18,8 +18,8 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from sdc_taichi.cli.arguments import json_option
-from sdc_taichi.cli.console import PlainConsole
+from sdc_taichi.cli.options import json_option
+from sdc_taichi.cli.terminal import PlainConsole
 from sdc_taichi.errors import SdcError, SdcWarning, one_line
 
 MODULES = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 import sys
 import warnings
@@ -11,28 +12,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sdc_taichi.cli.arguments import (
+from sdc_taichi.cli.options import (
     Compared,
-    Debug,
     FolderForce,
+    ForecastRunOptions,
     NoCache,
     Overrides,
+    SiteOptions,
     json_option,
     out_option,
     read_config,
 )
-from sdc_taichi.cli.scenario import (
+from sdc_taichi.cli.terminal import (
     EXIT_INTERRUPTED,
-    Carbon,
-    ErrorOfForecasts,
-    Precision,
-    Seed,
-    Site,
-    Weather,
-    Workload,
-    data_centers,
+    exit_if_stopped,
+    interruptible,
+    print_notes,
+    print_table,
+    stage_bars,
 )
-from sdc_taichi.cli.session import exit_if_stopped, interruptible, print_notes, stage_bars
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.errors import ConfigError, SdcError, one_line, printable
 
@@ -46,6 +44,7 @@ if TYPE_CHECKING:
 
 def evaluate_command(
     context: typer.Context,
+    *,
     runs: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -54,7 +53,7 @@ def evaluate_command(
             show_default=False,
         ),
     ] = None,
-    site: Site = None,
+    sites: SiteOptions,
     weeks: Annotated[
         str,
         typer.Option(metavar="NAME|N,N", help="held-out, validation, training, or weeks 0..51."),
@@ -75,8 +74,7 @@ def evaluate_command(
     days: Annotated[
         int, typer.Option(min=2, max=7, help="Days of each week; the first is not scored.")
     ] = 7,
-    seed: Seed = 0,
-    forecast_error: ErrorOfForecasts = None,
+    run: ForecastRunOptions,
     no_optimum: Annotated[
         bool, typer.Option("--no-optimum", help="No share of the achievable, no value of ends.")
     ] = False,
@@ -88,24 +86,18 @@ def evaluate_command(
         bool, typer.Option("--no-agents", help="Leave out each agent alone.")
     ] = False,
     no_cache: NoCache = False,
-    precision: Precision = "f32",
-    weather: Weather = None,
-    carbon: Carbon = None,
-    workload: Workload = None,
     out: Annotated[
         Path | None, out_option("Folder for tables, rows and figures. [default: none]", "DIR")
     ] = None,
     force: FolderForce = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no tables.")] = False,
     as_json: Annotated[bool, json_option("Print evaluation.json instead of the tables.")] = False,
-    debug: Debug = False,
 ) -> None:
     """Compare policies and controllers in weeks that no training has seen.
 
     All begin in equal weeks and states; the first day of each week is run but not scored. The share
     of the achievable is 0 for idle commands and 1 for the known optimum.
     """
-    from sdc_taichi.control import PERFECT, ForecastError
     from sdc_taichi.learning.evaluation import check_contenders
     from sdc_taichi.learning.evaluation_folder import (
         EVALUATION_FILE,
@@ -124,14 +116,12 @@ def evaluate_command(
     if not folders and not named:
         raise ConfigError("evaluate: nothing to evaluate; valid is RUN or --controller")
     chosen = parse_weeks(weeks)
-    error = PERFECT if forecast_error is None else ForecastError.parse(forecast_error)
     settings = training_settings(folders) if config is None else None
     base = _base_config(settings, config, overrides)
-    if site is None and settings is not None and settings.sites and not (weather or carbon):
-        site = ",".join(settings.sites)
-    configs = data_centers(
-        base, site, start=None, weather=weather, carbon=carbon, workload=workload
-    )
+    if sites.site is None and settings is not None and settings.sites:
+        trained_on = None if sites.weather or sites.carbon else ",".join(settings.sites)
+        sites = dataclasses.replace(sites, site=trained_on)
+    configs = sites.data_centers(base)
     if objective is None:
         objective = "carbon" if settings is None else settings.validation.objective
     # Solving for the optimum may take hours, so invalid names and policies are refused before.
@@ -148,9 +138,9 @@ def evaluate_command(
                 exact_ends=exact_ends,
                 objective=objective,
                 days=days,
-                seed=seed,
-                forecast_error=error,
-                precision=precision,
+                seed=run.seed,
+                forecast_error=run.error(),
+                precision=run.precision,
                 cache=not no_cache,
                 progress=progress,
                 stop=stop,
@@ -251,7 +241,6 @@ def _contenders(
 
 def _print_tables(found: Evaluation, weeks: DataCenterWeeks) -> None:
     """Print the tables of an evaluation."""
-    from sdc_taichi.cli.console import print_table
     from sdc_taichi.learning.evaluation_folder import remarks, tables_of
 
     for title, table in tables_of(found, weeks):

@@ -12,17 +12,16 @@ from rich.console import Console
 from rich.table import Table
 
 from sdc_taichi.atomic_file import atomic_write
-from sdc_taichi.cli.arguments import (
-    Overrides,
-    Source,
+from sdc_taichi.cli.hall_failover import failover_command
+from sdc_taichi.cli.hall_why import why_command
+from sdc_taichi.cli.options import (
+    CommandApp,
+    ConfigOptions,
     check_out_file,
     force_option,
     json_option,
     out_option,
-    read_config,
 )
-from sdc_taichi.cli.hall_failover import failover_command
-from sdc_taichi.cli.hall_why import why_command
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import printable
 from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M
@@ -32,16 +31,16 @@ if TYPE_CHECKING:
     from sdc_taichi.layout_solver.solve import LayoutSolution
     from sdc_taichi.sim.design_hall import DesignHall
 
-hall_app = typer.Typer(help="Describe a hall, solve its air.", no_args_is_help=True)
+hall_app = CommandApp(help="Describe a hall, solve its air.", no_args_is_help=True)
 hall_app.command("why")(why_command)
 hall_app.command("failover")(failover_command)
 
 
 @hall_app.command("show")
 def show_hall(
-    source: Source = None,
+    *,
+    config: ConfigOptions,
     out: Annotated[Path | None, out_option("Draw the floor plan.", "FILE.png")] = None,
-    overrides: Overrides = None,
     force: Annotated[bool, force_option()] = False,
     as_json: Annotated[bool, json_option("Print the description as JSON.")] = False,
 ) -> None:
@@ -49,9 +48,8 @@ def show_hall(
     from sdc_taichi.cli.hall_text import describe_hall
     from sdc_taichi.sim.design_hall import design_hall_values, solve_design_hall
 
-    config, _ = read_config(source, overrides)
     check_out_file(out, ".png", force=force)
-    hall = solve_design_hall(config)
+    hall = solve_design_hall(config.read()[0])
     if out is not None:
         _write_floor_plan(out, hall)
     if as_json:
@@ -64,7 +62,8 @@ def show_hall(
 
 @hall_app.command("solve")
 def solve_hall(
-    source: Source = None,
+    *,
+    config: ConfigOptions,
     cell: Annotated[
         float, typer.Option(metavar="M", help="Longest cell of the grid.")
     ] = DEFAULT_CELL_M,
@@ -72,7 +71,6 @@ def solve_hall(
         Path | None,
         out_option("Write R and its provenance, for recirculation.matrix_file.", "FILE.npz"),
     ] = None,
-    overrides: Overrides = None,
     force: Annotated[bool, force_option()] = False,
     as_json: Annotated[bool, json_option("Print the report as JSON.")] = False,
 ) -> None:
@@ -84,14 +82,14 @@ def solve_hall(
     from sdc_taichi.layout_solver.solve import solve_at_design_point
 
     check_out_file(out, ".npz", force=force)
-    config, _ = read_config(source, overrides)
-    solution = solve_at_design_point(config, cell)
+    center, _ = config.read()
+    solution = solve_at_design_point(center, cell)
     if out is not None:
         _write_matrix(out, solution)
     if as_json:
-        typer.echo(json.dumps(layout_solution_values(config, solution), indent=2))
+        typer.echo(json.dumps(layout_solution_values(center, solution), indent=2))
         return
-    _print_layout_solution(config, solution)
+    _print_layout_solution(center, solution)
     if out is not None:
         typer.echo(f"Matrix: {printable(out)} (for hall.recirculation.matrix_file)")
 

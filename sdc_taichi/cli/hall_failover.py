@@ -14,14 +14,12 @@ from rich.console import Console
 from rich.table import Table
 
 from sdc_taichi.atomic_file import atomic_write
-from sdc_taichi.cli.arguments import (
-    Overrides,
-    Source,
+from sdc_taichi.cli.options import (
+    ConfigOptions,
     check_out_file,
     force_option,
     json_option,
     out_option,
-    read_config,
 )
 from sdc_taichi.errors import printable
 
@@ -40,7 +38,8 @@ class LostParts(StrEnum):
 
 
 def failover_command(
-    source: Source = None,
+    *,
+    config: ConfigOptions,
     of: Annotated[
         LostParts, typer.Option("--of", help="Lose CRAC units, or devices of the plant.")
     ] = LostParts.units,
@@ -48,7 +47,6 @@ def failover_command(
         Path | None,
         out_option("Draw floor plan and curves, and write all losses beside it.", "FILE.png"),
     ] = None,
-    overrides: Overrides = None,
     force: Annotated[bool, force_option()] = False,
     as_json: Annotated[bool, json_option("Print all losses as JSON.")] = False,
 ) -> None:
@@ -58,11 +56,10 @@ def failover_command(
     """
     from sdc_taichi.run.failover import failover_rows, failover_values, study_failover
 
-    config, _ = read_config(source, overrides)
     check_out_file(out, ".png", force=force)
     table_path = None if out is None else out.with_suffix(".csv")
     check_out_file(table_path, ".csv", force=force)
-    study = study_failover(config, of.value)
+    study = study_failover(config.read()[0], of.value)
     if out is not None and table_path is not None:
         from sdc_taichi.viz.failover_figure import failover_figure
         from sdc_taichi.viz.plotting import save_picture

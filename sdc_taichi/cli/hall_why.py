@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from sdc_taichi.cli.arguments import (
+from sdc_taichi.cli.options import (
     Overrides,
     check_out_file,
     force_option,

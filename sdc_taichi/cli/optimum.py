@@ -8,32 +8,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sdc_taichi.cli.arguments import (
+from sdc_taichi.cli.optimum_text import print_optimum
+from sdc_taichi.cli.options import (
     Compared,
-    Debug,
+    ConfigOptions,
+    Days,
     FolderForce,
+    ForecastRunOptions,
     NoCache,
-    Overrides,
-    Source,
+    SiteOptions,
+    Start,
     json_option,
     out_option,
-    read_config,
 )
-from sdc_taichi.cli.optimum_text import print_optimum
-from sdc_taichi.cli.scenario import (
+from sdc_taichi.cli.terminal import (
     EXIT_INTERRUPTED,
-    Carbon,
-    Days,
-    ErrorOfForecasts,
-    Precision,
-    Seed,
-    Site,
-    Start,
-    Weather,
-    Workload,
-    data_centers,
-)
-from sdc_taichi.cli.session import (
     exit_if_stopped,
     interruptible,
     print_notes,
@@ -55,8 +44,9 @@ if TYPE_CHECKING:
 
 
 def optimum_command(
-    source: Source = None,
-    site: Site = None,
+    *,
+    config: ConfigOptions,
+    sites: SiteOptions,
     days: Days = 31.0,
     start: Start = None,
     objective: Annotated[
@@ -84,28 +74,21 @@ def optimum_command(
             metavar="C", help="Hottest inlet to allow. [default: of protection.ashrae_class]"
         ),
     ] = None,
-    seed: Seed = 0,
-    forecast_error: ErrorOfForecasts = None,
+    run: ForecastRunOptions,
     no_cache: NoCache = False,
-    precision: Precision = "f32",
-    overrides: Overrides = None,
-    weather: Weather = None,
-    carbon: Carbon = None,
-    workload: Workload = None,
     out: Annotated[
         Path | None, out_option("Run folder to write the achieved path to. [default: none]", "DIR")
     ] = None,
     force: FolderForce = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
     as_json: Annotated[bool, json_option("Print optimum.json instead of the table.")] = False,
-    debug: Debug = False,
 ) -> None:
     """Find out how low carbon, energy, cost or water of data centers can come.
 
     Prints a bound that no controller comes below, a figure that the simulator has reached, and
     where named controllers stand between idle commands and that. All inputs are known in advance.
     """
-    from sdc_taichi.control import PERFECT, ForecastError, make_controller
+    from sdc_taichi.control import make_controller
     from sdc_taichi.optimum.objective import Objective
     from sdc_taichi.run.folder_writer import metrics_json, prepare_folder
     from sdc_taichi.run.optimum_folder import optimum_content, write_optimum
@@ -114,28 +97,25 @@ def optimum_command(
     from sdc_taichi.sim.simulator import Simulator
 
     aim, movable = Objective.parse(objective), _agents(agents)
-    base, _ = read_config(source, overrides)
-    fleet = build_fleet(
-        data_centers(base, site, start=start, weather=weather, carbon=carbon, workload=workload)
-    )
+    fleet = build_fleet(sites.data_centers(config.read()[0], start=start))
     steps = whole_steps(days, fleet.steps_per_hour, "--days")
     scored_from = _warm_up_steps(warm_up, steps, fleet.steps_per_hour)
     limit_c = _inlet_limit(max_inlet)
     require_events_start_before(24.0 * days, fleet.configs)
     fleet.require_distinct_names()
-    error = PERFECT if forecast_error is None else ForecastError.parse(forecast_error)
+    error = run.error()
     named = {name: make_controller(name, fleet) for name in controller or ()}
     for name, each in named.items():
         _require_movable(name, each, movable)
     if out is not None:
         prepare_folder(out, force=force)
-    with Simulator(fleet, precision=precision) as sim, interruptible() as interrupted:
+    with Simulator(fleet, precision=run.precision) as sim, interruptible() as interrupted:
         print_notes(sim.drivers.notes)
         found = solve_beside(
             sim,
             aim,
             steps,
-            seed=seed,
+            seed=run.seed,
             agents=movable,
             scored_from=scored_from,
             inlet_limit_c=limit_c,
@@ -143,7 +123,7 @@ def optimum_command(
             quiet=quiet,
             stop=interrupted,
         )
-        reached = _run_controllers(sim, found, named, seed, error, quiet, interrupted)
+        reached = _run_controllers(sim, found, named, run.seed, error, quiet, interrupted)
         if as_json:
             print(metrics_json(optimum_content(found, reached)))
         elif not quiet:
@@ -156,7 +136,7 @@ def optimum_command(
                     found,
                     out,
                     reached=reached,
-                    seed=seed,
+                    seed=run.seed,
                     force=force,
                     on_step=advance,
                     stop=interrupted,

@@ -22,7 +22,7 @@ def print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
         content: content of optimum.json.
         steps_per_hour: number of steps in an hour.
     """
-    from sdc_taichi.cli.console import PlainConsole
+    from sdc_taichi.cli.terminal import PlainConsole
     from sdc_taichi.run.optimum_folder import optimum_remarks
 
     # A pipe or a file has no width to fit into.

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sdc_taichi.cli.arguments import check_out_file, force_option, json_option, out_option
+from sdc_taichi.cli.options import CommandApp, check_out_file, force_option, json_option, out_option
 from sdc_taichi.errors import printable
 
 if TYPE_CHECKING:
     from sdc_taichi.learning.policy import Policy
 
-policy_app = typer.Typer(help="Show and export policies.", no_args_is_help=True)
+policy_app = CommandApp(help="Show and export policies.", no_args_is_help=True)
 Folder = Annotated[
     Path, typer.Argument(metavar="FOLDER", help="Folder of a training run, or of a policy.")
 ]

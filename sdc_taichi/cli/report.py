@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sdc_taichi.cli.arguments import check_out_file, force_option, out_option
+from sdc_taichi.cli.options import check_out_file, force_option, out_option
 from sdc_taichi.errors import ConfigError, printable
 
 

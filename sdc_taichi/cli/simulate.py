@@ -2,66 +2,119 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sdc_taichi.cli import completion
-from sdc_taichi.cli.arguments import (
-    Debug,
+from sdc_taichi.cli.optimum import solve_beside
+from sdc_taichi.cli.options import (
+    ConfigOptions,
+    Days,
     FolderForce,
-    Overrides,
+    ForecastRunOptions,
     Quiet,
-    Source,
+    SiteOptions,
+    Start,
+    complete_controllers,
     json_option,
     out_option,
-    read_config,
-)
-from sdc_taichi.cli.optimum import solve_beside
-from sdc_taichi.cli.scenario import (
-    EXIT_INTERRUPTED,
-    Carbon,
-    Days,
-    ErrorOfForecasts,
-    Precision,
-    Seed,
-    Site,
-    Start,
-    Weather,
-    Workload,
-    data_centers,
-    default_folder,
-)
-from sdc_taichi.cli.session import (
-    interruptible,
-    make_recorder,
-    print_notes,
-    print_recording,
-    progress_bar,
-    recording,
-    serve_until_interrupted,
 )
 from sdc_taichi.cli.summary import print_summary
-from sdc_taichi.errors import printable
+from sdc_taichi.cli.terminal import EXIT_INTERRUPTED, interruptible, print_notes, progress_bar
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.errors import ConfigError, printable
 from sdc_taichi.exogenous.year_clock import whole_steps
 
 if TYPE_CHECKING:
+    from sdc_taichi.run.description import RunRequest
+    from sdc_taichi.sim.simulator import Simulator
     from sdc_taichi.types import StepResult
+    from sdc_taichi.viz.recorder import Recorder
 
 MAX_DCS = 100_000
 """Largest number of data centers of ``--dcs``."""
 
 
+@dataclass(frozen=True)
+class RecordingOptions:
+    """The Rerun recording of a run, in a file or for viewers that watch it."""
+
+    record: Annotated[
+        str | None,
+        typer.Option(
+            "--record",
+            metavar="FILE.rrd|ADDRESS",
+            help="Also write a Rerun recording, or show the run in a viewer that listens there.",
+        ),
+    ] = None
+    focus: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME[,NAME...]", help="Data centers recorded in full. [default: the first 2]"
+        ),
+    ] = None
+    every: Annotated[
+        int | None,
+        typer.Option(min=1, help="Steps between two recorded heat maps. [default: by size]"),
+    ] = None
+    serve: Annotated[
+        bool,
+        typer.Option("--serve", help="Let viewers of this machine watch the run, until Ctrl-C."),
+    ] = False
+    serve_port: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=65535, help="Serve on this port; 0 is any free one. [default: 9876]"
+        ),
+    ] = None
+
+    def recorder(self) -> Recorder | None:
+        """The recorder that the options ask for; None if they ask for no recording.
+
+        Raises:
+            SdcError: options of a recording without one, or a recording that cannot be made.
+        """
+        from sdc_taichi.viz.recording_target import DEFAULT_PORT, is_address
+
+        port = self.serve_port
+        if self.serve or port is not None:
+            port = DEFAULT_PORT if port is None else port
+        elif self.record is None:
+            for name, value in (("--focus", self.focus), ("--every", self.every)):
+                if value is not None:
+                    raise ConfigError(
+                        f"{name}: given without a recording; valid with --record, --serve"
+                    )
+            return None
+        from sdc_taichi.viz.recorder import Recorder
+
+        target = self.record
+        if target is not None and target.endswith(".rrd") and not is_address(target):
+            with contextlib.suppress(OSError):  # the recorder says what is wrong with it
+                Path(target).parent.mkdir(parents=True, exist_ok=True)
+        names = None if self.focus is None else [name.strip() for name in self.focus.split(",")]
+        return Recorder(target, focus=names, every=self.every, serve_port=port)
+
+
 def simulate_command(
-    source: Source = None,
-    site: Site = None,
+    *,
+    config: ConfigOptions,
+    sites: SiteOptions,
     days: Days = 365.0,
     start: Start = None,
     dcs: Annotated[
         int | None,
         typer.Option(min=1, max=MAX_DCS, help="Number of data centers; sites are dealt in turn."),
+    ] = None,
+    sample: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="YAML of fields to vary between data centers."),
     ] = None,
     controller: Annotated[
         str,
@@ -70,11 +123,10 @@ def simulate_command(
             help="idle, random, g36, coldest, warmest, constant:C, lookahead-3h, lookahead-24h, "
             "greedy-ci, mpc-24h, policy:FOLDER; or module:name of your own; or per agent, such as "
             "load=greedy-ci,cooling=g36,battery=policy:runs/happo.",
-            autocompletion=completion.controllers,
+            autocompletion=complete_controllers,
         ),
     ] = "idle",
-    seed: Seed = 0,
-    forecast_error: ErrorOfForecasts = None,
+    run: ForecastRunOptions,
     optimum: Annotated[
         str | None,
         typer.Option(
@@ -83,50 +135,13 @@ def simulate_command(
             "carbon+0.002*water, and tell the run's share of the achievable.",
         ),
     ] = None,
-    precision: Precision = "f32",
-    overrides: Overrides = None,
-    sample: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="YAML of fields to vary between data centers."),
-    ] = None,
-    weather: Weather = None,
-    carbon: Carbon = None,
-    workload: Workload = None,
     out: Annotated[
         Path | None, out_option("Output folder. [default: runs/PRESET-SITES-START]", "DIR")
     ] = None,
-    record: Annotated[
-        str | None,
-        typer.Option(
-            "--record",
-            metavar="FILE.rrd|ADDRESS",
-            help="Also write a Rerun recording, or show the run in a viewer that listens there.",
-        ),
-    ] = None,
-    focus: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME[,NAME...]", help="Data centers recorded in full. [default: the first 2]"
-        ),
-    ] = None,
-    every: Annotated[
-        int | None,
-        typer.Option(min=1, help="Steps between two recorded heat maps. [default: by size]"),
-    ] = None,
-    serve: Annotated[
-        bool,
-        typer.Option("--serve", help="Let viewers of this machine watch the run, until Ctrl-C."),
-    ] = False,
-    serve_port: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=65535, help="Serve on this port; 0 is any free one. [default: 9876]"
-        ),
-    ] = None,
+    recording: RecordingOptions,
     force: FolderForce = False,
     quiet: Quiet = False,
     as_json: Annotated[bool, json_option("Print metrics.json instead of the summary.")] = False,
-    debug: Debug = False,
 ) -> None:
     """Simulate data centers and record every step.
 
@@ -134,7 +149,7 @@ def simulate_command(
     run and leaves whole files of the steps done. Without weather, carbon or workload files the
     inputs are synthetic years.
     """
-    from sdc_taichi.control import PERFECT, ForecastError, make_controller
+    from sdc_taichi.control import make_controller
     from sdc_taichi.optimum.objective import Objective
     from sdc_taichi.run.description import RunRequest
     from sdc_taichi.run.folder_writer import metrics_json, prepare_folder, simulate_to_folder
@@ -143,36 +158,28 @@ def simulate_command(
     from sdc_taichi.sim.fleet import build_fleet
     from sdc_taichi.sim.simulator import Simulator
 
-    base, label = read_config(source, overrides)
-    configs = data_centers(
-        base,
-        site,
-        start=start,
-        weather=weather,
-        carbon=carbon,
-        workload=workload,
-        dcs=dcs,
-        sample=sample,
-        seed=seed,
-    )
+    base, label = config.read()
+    configs = sites.data_centers(base, start=start, dcs=dcs, sample=sample, seed=run.seed)
     fleet = build_fleet(configs)
-    error = PERFECT if forecast_error is None else ForecastError.parse(forecast_error)
-    request = RunRequest(controller, whole_steps(days, fleet.steps_per_hour, "--days"), seed, error)
+    steps = whole_steps(days, fleet.steps_per_hour, "--days")
+    request = RunRequest(controller, steps, run.seed, run.error())
     require_events_start_before(24.0 * days, fleet.configs)
     driver = make_controller(controller, fleet)
-    aim = None if optimum is None else Objective.parse(optimum)
-    recorder = make_recorder(record, focus, every, serve, serve_port)
-    folder = out if out is not None else default_folder(label, configs)
-    with Simulator(fleet, precision=precision) as sim:
+    objective = None if optimum is None else Objective.parse(optimum)
+    recorder = recording.recorder()
+    folder = out if out is not None else _default_folder(label, configs)
+    with Simulator(fleet, precision=run.precision) as sim:
         print_notes(sim.drivers.notes)
-        with interruptible() as interrupted, recording(recorder, sim, request) as record_step:
+        with interruptible() as interrupted, _recorded(recorder, sim, request) as record_step:
             prepare_folder(folder, force=force)
             best = (
                 None
-                if aim is None
-                else solve_beside(sim, aim, request.steps, seed=seed, quiet=quiet, stop=interrupted)
+                if objective is None
+                else solve_beside(
+                    sim, objective, steps, seed=run.seed, quiet=quiet, stop=interrupted
+                )
             )
-            with progress_bar(request.steps, shown=not quiet) as advance:
+            with progress_bar(steps, shown=not quiet) as advance:
 
                 def after_step(result: StepResult) -> None:
                     record_step(result)
@@ -191,19 +198,76 @@ def simulate_command(
             if metrics is None:
                 print("interrupted before the first step; nothing written", file=sys.stderr)
                 raise typer.Exit(EXIT_INTERRUPTED)
-            is_whole = metrics["steps_done"] == request.steps
+            is_whole = metrics["steps_done"] == steps
             if best is not None and is_whole:
-                is_whole = write_optimum(sim, best, folder / FOLDER, seed=seed, stop=interrupted)
+                is_whole = write_optimum(
+                    sim, best, folder / FOLDER, seed=run.seed, stop=interrupted
+                )
             if as_json:
                 print(metrics_json(metrics))
             elif not quiet:
                 print_summary(metrics, label, folder, fleet.steps_per_hour)
-                print_recording(recorder)
-            serve_until_interrupted(recorder, interrupted)
+                _print_recording(recorder)
+            _serve_until_interrupted(recorder, interrupted)
     if not is_whole:
         done = metrics["steps_done"]
-        where = f"after {done} of {request.steps} steps; {printable(folder)} holds the steps done"
-        if done == request.steps:
+        where = f"after {done} of {steps} steps; {printable(folder)} holds the steps done"
+        if done == steps:
             where = f"after the run; {printable(folder)} holds it without the path of the optimum"
         print(f"interrupted {where}", file=sys.stderr)
         raise typer.Exit(EXIT_INTERRUPTED)
+
+
+def _default_folder(label: str, configs: Sequence[DataCenterConfig]) -> Path:
+    """Folder of a run without ``--out``, named after preset, sites and first day."""
+    from sdc_taichi.sim.fleet_configs import place_names
+
+    sites = list(dict.fromkeys(place_names(configs)))
+    where = "-".join(sites) if len(sites) <= 4 else f"{len(sites)}sites"
+    return Path("runs") / f"{Path(label).stem}-{where}-{configs[0].site.start}"
+
+
+@contextlib.contextmanager
+def _recorded(
+    recorder: Recorder | None, sim: Simulator, request: RunRequest
+) -> Iterator[Callable[[StepResult], None]]:
+    """Keep a recording open while a run lasts, if there is a recorder.
+
+    Args:
+        recorder: what records; None records nothing.
+        sim: the simulator, before its first step.
+        request: what it is to do.
+
+    Yields:
+        A function to call with the result of every step.
+    """
+    if recorder is None:
+        yield lambda _: None
+        return
+    from sdc_taichi.run.description import describe_run
+
+    with recorder:
+        recorder.begin(sim, describe_run(sim, request))
+        if recorder.served_address is not None:
+            command = f"sdc-taichi view {recorder.served_address}"
+            print(f"serving the run; watch it with: {command} [--web]", file=sys.stderr)
+        yield recorder.add
+
+
+def _print_recording(recorder: Recorder | None) -> None:
+    """Print where the recording of a run is, if it is a file."""
+    if recorder is not None and recorder.file is not None and not recorder.failed:
+        file = printable(recorder.file)
+        print(f"Recording: {file} (open with: sdc-taichi view {file})")
+
+
+def _serve_until_interrupted(recorder: Recorder | None, interrupted: Callable[[], bool]) -> None:
+    """Keep a run that is done on show until Ctrl-C, if it is served to viewers."""
+    if recorder is None or recorder.served_address is None or recorder.failed:
+        return
+    recorder.flush()
+    if not interrupted():
+        text = f"the run is done and still served at {recorder.served_address}; Ctrl-C ends it"
+        print(text, file=sys.stderr)
+    while not interrupted():
+        time.sleep(0.1)

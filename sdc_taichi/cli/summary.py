@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from rich.table import Table
+from sdc_taichi.cli.terminal import figure_text, figures_table, wide_console
 
-TABLE_DCS = 12
-"""Number of data centers up to which each has a column of its own."""
+NUMBER_FORMAT = "z.4g"
+"""Format of figures below 1000."""
+MOST_LINES = 12
+"""Largest number of sources, and of remarks on the optimum, that are printed."""
 EVENT_LINES = 8
 """Number of events up to which each is listed."""
 
@@ -54,11 +54,7 @@ def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_h
         folder: the run folder.
         steps_per_hour: number of steps in an hour.
     """
-    from sdc_taichi.cli.console import PlainConsole
-
-    # A pipe or a file has no width to fit into.
-    width = None if sys.stdout.isatty() else 200
-    console = PlainConsole(highlight=False, width=width, soft_wrap=True)
+    console = wide_console(200)
     dcs, steps = metrics["data_centers"], metrics["steps_done"]
     days = steps / steps_per_hour / 24
     count = "1 data center" if len(dcs) == 1 else f"{len(dcs)} data centers"
@@ -66,10 +62,11 @@ def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_h
         f"{label}: {count}, {days:g} days from {dcs[0]['start']} ({steps} steps of "
         f"{60 // steps_per_hour} min), controller {metrics['controller']}"
     )
-    table = _per_dc_table(metrics)
-    if len(dcs) > TABLE_DCS or console.measure(table).maximum > console.width:
-        table = _aggregate_table(metrics)
-    console.print(table)
+    titles, keys = zip(*_ROWS, strict=True)
+    columns = [[dc["metrics"][key] for key in keys] for dc in dcs]
+    total = [metrics["total"][key] for key in keys]
+    names = [dc["name"] for dc in dcs]
+    console.print(figures_table(console, titles, names, columns, total, NUMBER_FORMAT))
     console.print(_hottest_line(metrics))
     if "optimum" in metrics:
         for line in _optimum_lines(metrics):
@@ -81,10 +78,10 @@ def print_summary(metrics: dict[str, Any], label: str, folder: Path, steps_per_h
     sources = dict.fromkeys(
         f"{kind}: {source}" for dc in dcs for kind, source in dc["provenance"].items()
     )
-    for line in sorted(sources)[:TABLE_DCS]:
+    for line in sorted(sources)[:MOST_LINES]:
         console.print(f"  {line}")
-    if len(sources) > TABLE_DCS:
-        console.print(f"  and {len(sources) - TABLE_DCS} more, see metrics.json")
+    if len(sources) > MOST_LINES:
+        console.print(f"  and {len(sources) - MOST_LINES} more, see metrics.json")
     config_file = "config.yaml" if len(dcs) == 1 else "configs.yaml"
     more = ", optimum/" if "optimum" in metrics else ""
     console.print(f"Files in {folder}: steps.parquet, metrics.json, {config_file}{more}")
@@ -105,13 +102,13 @@ def _optimum_lines(metrics: dict[str, Any]) -> list[str]:
 
     total, of = metrics["total"], metrics["optimum"]
     names = ("idle_figure", "bound_figure", "achieved_figure")
-    idle, bound, achieved = (_figure(total[name]) for name in names)
+    idle, bound, achieved = (figure_text(total[name], NUMBER_FORMAT) for name in names)
     share = total["achievable_share"]
     reached = "-" if share is None else f"{100 * share:z.1f} %"
     remarks = remarks_beside(metrics)
-    shown = remarks[:TABLE_DCS]
-    if len(remarks) > TABLE_DCS:
-        shown.append(f"and {len(remarks) - TABLE_DCS} more, see metrics.json")
+    shown = remarks[:MOST_LINES]
+    if len(remarks) > MOST_LINES:
+        shown.append(f"and {len(remarks) - MOST_LINES} more, see metrics.json")
     return [
         f"Share of the achievable ({of['objective']}): {reached}; idle {idle}, achieved {achieved},"
         f" bound {bound} {of['unit']}; work and energy left at the end are valued",
@@ -133,39 +130,3 @@ def _event_lines(metrics: dict[str, Any]) -> list[str]:
     if len(lines) > EVENT_LINES:
         lines[EVENT_LINES:] = [f"and {len(lines) - EVENT_LINES} more events, see metrics.json"]
     return lines
-
-
-def _per_dc_table(metrics: dict[str, Any]) -> Table:
-    from rich.table import Table
-
-    dcs = metrics["data_centers"]
-    several = len(dcs) > 1
-    table = Table("")
-    for dc in dcs:
-        table.add_column(dc["name"], justify="right", no_wrap=True)
-    if several:
-        table.add_column("all", justify="right", no_wrap=True)
-    for title, name in _ROWS:
-        values = [dc["metrics"][name] for dc in dcs] + ([metrics["total"][name]] if several else [])
-        table.add_row(title, *map(_figure, values))
-    return table
-
-
-def _aggregate_table(metrics: dict[str, Any]) -> Table:
-    from rich.table import Table
-
-    table = Table("")
-    for column in ("lowest", "mean", "highest", "all"):
-        table.add_column(column, justify="right", no_wrap=True)
-    for title, name in _ROWS:
-        values = [dc["metrics"][name] for dc in metrics["data_centers"]]
-        known = [v for v in values if v is not None]
-        spread = [min(known), sum(known) / len(known), max(known)] if known else [None] * 3
-        table.add_row(title, *map(_figure, [*spread, metrics["total"][name]]))
-    return table
-
-
-def _figure(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:z.4g}"

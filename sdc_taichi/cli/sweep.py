@@ -9,11 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sdc_taichi.cli import completion
-from sdc_taichi.cli.arguments import Debug, Overrides, Quiet, Source, out_option, read_config
-from sdc_taichi.cli.execution import EXIT_FAILED, Jobs, Ray, Resume, job_session
-from sdc_taichi.cli.scenario import ErrorOfForecasts, Precision, Seed, Site, site_names
-from sdc_taichi.cli.session import print_notes
+from sdc_taichi.cli.jobs import JobOptions, job_session
+from sdc_taichi.cli.options import (
+    ConfigOptions,
+    ForecastRunOptions,
+    Quiet,
+    Site,
+    complete_controllers,
+    out_option,
+    site_names,
+)
+from sdc_taichi.cli.terminal import EXIT_FAILURE, print_notes, print_table
 from sdc_taichi.errors import ConfigError, SdcError, one_line, printable
 
 if TYPE_CHECKING:
@@ -27,7 +33,8 @@ _MOST_LINES = 10
 
 def sweep_command(
     context: typer.Context,
-    source: Source = None,
+    *,
+    config: ConfigOptions,
     vary: Annotated[
         list[str] | None,
         typer.Option(
@@ -52,14 +59,13 @@ def sweep_command(
         typer.Option(
             metavar="NAME",
             help="Controller, as of simulate; repeatable. [default: idle]",
-            autocompletion=completion.controllers,
+            autocompletion=complete_controllers,
         ),
     ] = None,
     sample: Annotated[
         int, typer.Option(metavar="N", min=0, help="Samples of the fields with LOW..HIGH.")
     ] = 0,
-    seed: Seed = 0,
-    forecast_error: ErrorOfForecasts = None,
+    run: ForecastRunOptions,
     best: Annotated[
         str | None,
         typer.Option(
@@ -67,8 +73,6 @@ def sweep_command(
             help="Also tell the value with least of a metric by month, such as cfp_kg.",
         ),
     ] = None,
-    overrides: Overrides = None,
-    precision: Precision = "f32",
     batch: Annotated[
         int | None,
         typer.Option(
@@ -80,15 +84,12 @@ def sweep_command(
     most: Annotated[int, typer.Option(min=1, help="Most runs; a sweep of more is refused.")] = (
         100_000
     ),
-    jobs: Jobs = None,
-    ray: Ray = None,
-    resume: Resume = False,
+    jobs: JobOptions,
     out: Annotated[
         Path | None, out_option("Output folder. [default: sweeps/PRESET-FIELDS]", "DIR")
     ] = None,
     show: Annotated[bool, typer.Option("--show", help="Print what would run, and end.")] = False,
     quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Run all combinations of values, sites, months and controllers, and keep their metrics.
 
@@ -97,11 +98,10 @@ def sweep_command(
     """
     from sdc_taichi.benchmark.store import RESULTS, ResultStore, Study
     from sdc_taichi.benchmark.sweep import check_sweep, sweep_inputs, sweep_jobs
-    from sdc_taichi.control import PERFECT, ForecastError
 
-    config, label = read_config(source, overrides)
+    base, label = config.read()
     sweep = _sweep(
-        config,
+        base,
         vary or [],
         site,
         most,
@@ -109,9 +109,9 @@ def sweep_command(
         controllers=tuple(controller or ["idle"]),
         months=_months(months),
         days=days,
-        seed=seed,
-        forecast_error=PERFECT if forecast_error is None else ForecastError.parse(forecast_error),
-        precision=precision,
+        seed=run.seed,
+        forecast_error=run.error(),
+        precision=run.precision,
         batch=batch,
     )
     if best is not None:
@@ -126,8 +126,7 @@ def sweep_command(
     store = ResultStore(folder)
     command = shlex.join(["sdc-taichi", *context.obj])
     study = Study("sweep", command, sweep.settings(), partitions)
-    session = job_session(store, study, resume=resume, jobs=jobs, ray=ray, quiet=quiet)
-    with session as under_way:
+    with job_session(store, study, jobs, quiet=quiet) as under_way:
         under_way.run("sweep", sweep_jobs(sweep, inputs), len(partitions), inputs)
         done, failed = _print_failures(store)
         if under_way.is_whole:
@@ -138,7 +137,7 @@ def sweep_command(
                 _write_best(store, sweep, best, quiet=quiet)
         under_way.finish()
     if failed:
-        raise typer.Exit(EXIT_FAILED)
+        raise typer.Exit(EXIT_FAILURE)
 
 
 def _sweep(
@@ -249,7 +248,6 @@ def _write_best(store: ResultStore, sweep: Sweep, metric: str, *, quiet: bool) -
         group_columns,
     )
     from sdc_taichi.benchmark.vary import value_at
-    from sdc_taichi.cli.console import print_table
     from sdc_taichi.learning.evaluation_table import markdown
     from sdc_taichi.viz.best_value import MonthlyFigures, plot_best_values
     from sdc_taichi.viz.plotting import save_picture

@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sdc_taichi.cli import completion
-from sdc_taichi.cli.arguments import Debug, Quiet, Source, out_option, parse_source
-from sdc_taichi.cli.scenario import EXIT_INTERRUPTED
-from sdc_taichi.cli.session import interruptible, rich_progress
+from sdc_taichi.cli.options import (
+    Quiet,
+    Source,
+    complete_sites,
+    completed_by,
+    out_option,
+    parse_source,
+)
+from sdc_taichi.cli.terminal import (
+    EXIT_INTERRUPTED,
+    SECONDS_BETWEEN_LINES,
+    duration,
+    interruptible,
+    rich_progress,
+)
 from sdc_taichi.errors import ConfigError, printable, suggestion_or_valid
 
 if TYPE_CHECKING:
@@ -21,8 +32,11 @@ if TYPE_CHECKING:
     from sdc_taichi.learning.trainer import Progress, Training
     from sdc_taichi.learning.training_settings import TrainingSettings
 
-SECONDS_BETWEEN_LINES = 30.0
-"""Least time between two lines of progress where there is no terminal."""
+
+def _algorithms() -> Iterable[str]:
+    from sdc_taichi.learning.settings import LEARNING_SETTINGS
+
+    return LEARNING_SETTINGS
 
 
 def train_command(
@@ -32,7 +46,7 @@ def train_command(
             metavar="ALGORITHM",
             help="ppo, ippo, mappo, happo, haa2c, had3qn, hasac, cloning or cross-entropy.",
             show_default=False,
-            autocompletion=completion.algorithms,
+            autocompletion=completed_by(_algorithms),
         ),
     ] = None,
     source: Source = None,
@@ -41,7 +55,7 @@ def train_command(
         typer.Option(
             metavar="SITE[,SITE...]",
             help="Sites to train on. [default: of the config]",
-            autocompletion=completion.sites,
+            autocompletion=complete_sites,
         ),
     ] = None,
     steps: Annotated[
@@ -87,7 +101,6 @@ def train_command(
         bool, typer.Option("--show", help="Print all settings as YAML, and do not train.")
     ] = False,
     quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Train agents with PPO, IPPO, MAPPO, HAPPO, HAA2C, HAD3QN or HASAC.
 
@@ -248,13 +261,6 @@ def _validation_text(found: Validation) -> str:
     share = f", {100.0 * found.share:.1f} % of the achievable" if found.share == found.share else ""
     broken = f", {found.broken_weeks} weeks break a constraint" if found.broken_weeks else ""
     return f"{change}{share}{broken}"
-
-
-def duration(seconds: float) -> str:
-    """A length of time as minutes and seconds, and hours from one on."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def _print_summary(done: Training) -> None:

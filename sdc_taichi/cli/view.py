@@ -11,7 +11,6 @@ from urllib.parse import quote
 
 import typer
 
-from sdc_taichi.cli.arguments import Debug
 from sdc_taichi.errors import SdcError
 from sdc_taichi.user_file import open_input
 
@@ -40,7 +39,6 @@ def view_command(
             help=f"Of the page with --web; 0 is any free one. [default: {WEB_PORT}, or any]",
         ),
     ] = None,
-    debug: Debug = False,
 ) -> None:
     """Show a recording in Rerun's viewer, or serve it on 127.0.0.1 to a browser.
 

@@ -1,28 +1,116 @@
-"""Warnings, Ctrl-C, the progress bar and the Rerun recording during a command."""
+"""The terminal of a command: exit codes, tables, notes, warnings, Ctrl-C and progress."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
 import sys
-import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
-from sdc_taichi.cli.scenario import EXIT_INTERRUPTED
-from sdc_taichi.errors import ConfigError, SdcWarning, one_line, printable
+from sdc_taichi.errors import SdcWarning, one_line, printable
 
 if TYPE_CHECKING:
+    import pandas as pd
     from rich.progress import Progress, TaskID
 
-    from sdc_taichi.run.description import RunRequest
-    from sdc_taichi.sim.simulator import Simulator
     from sdc_taichi.types import StepResult
-    from sdc_taichi.viz.recorder import Recorder
+
+EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+"""Exit codes of a command that failed, that refused its input, and that Ctrl-C ended."""
+MOST_COLUMNS = 12
+"""Largest number of data centers that have a column each in a table."""
+SECONDS_BETWEEN_LINES = 30.0
+"""Least time between two lines of progress where there is no terminal."""
+
+
+class PlainConsole(Console):
+    """A console that reads no markup in texts, and escapes what a terminal would obey."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Text as it is shown; every string of a line or table passes here."""
+        return super().render_str("\n".join(map(printable, text.split("\n"))), **options)
+
+
+def wide_console(width: int) -> PlainConsole:
+    """A console on standard output, with a given width where that is a pipe or a file."""
+    return PlainConsole(
+        highlight=False, width=None if sys.stdout.isatty() else width, soft_wrap=True
+    )
+
+
+def print_table(title: str, table: pd.DataFrame) -> None:
+    """Print a table with a title, the first column to the left and the others to the right."""
+    from sdc_taichi.learning.evaluation_table import text_rows
+
+    console = wide_console(240)
+    console.print(title)
+    titles, rows = text_rows(table)
+    shown = Table()
+    for i, head in enumerate(titles):
+        shown.add_column(head, justify="right" if i else "left", no_wrap=True)
+    for cells in rows:
+        shown.add_row(*cells)
+    console.print(shown)
+
+
+def figures_table(
+    console: Console,
+    titles: Sequence[str],
+    names: Sequence[str],
+    columns: Sequence[Sequence[float | None]],
+    total: Sequence[float | None],
+    number_format: str,
+) -> Table:
+    """Table of the figures of data centers, and of all of them together.
+
+    Each data center has a column where these fit on the console. Otherwise there are columns for
+    the lowest, mean and highest value.
+
+    Args:
+        console: where the table is to be printed.
+        titles: titles of the rows.
+        names: names of the data centers.
+        columns: values of the rows for each data center; None is an unknown value.
+        total: values of the rows for all data centers together.
+        number_format: format of values below 1000.
+    """
+
+    def made(heads: Sequence[str], values: Sequence[Sequence[float | None]]) -> Table:
+        table = Table("")
+        for head in heads:
+            table.add_column(head, justify="right", no_wrap=True)
+        for title, *row in zip(titles, *values, strict=True):
+            table.add_row(title, *(figure_text(value, number_format) for value in row))
+        return table
+
+    table = made([*names, "all"], [*columns, total]) if len(names) > 1 else made(names, columns)
+    if len(names) <= MOST_COLUMNS and console.measure(table).maximum <= console.width:
+        return table
+    spread = [_spread(row) for row in zip(*columns, strict=True)]
+    return made(["lowest", "mean", "highest", "all"], [*zip(*spread, strict=True), total])
+
+
+def _spread(values: Sequence[float | None]) -> tuple[float | None, float | None, float | None]:
+    """Lowest, mean and highest of the known values."""
+    known = [value for value in values if value is not None]
+    return (min(known), sum(known) / len(known), max(known)) if known else (None, None, None)
+
+
+def figure_text(value: float | None, number_format: str) -> str:
+    """A figure in a format, or whole with separators from 1000 on; a dash if it is unknown."""
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if abs(value) >= 1000 else format(value, number_format)
 
 
 def print_notes(notes: Iterable[str]) -> None:
@@ -95,87 +183,6 @@ def exit_if_stopped() -> Iterator[None]:
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
-def make_recorder(
-    target: str | None, focus: str | None, every: int | None, serve: bool, port: int | None
-) -> Recorder | None:
-    """The recorder that the options ask for; None if they ask for no recording.
-
-    Args:
-        target: file or address of ``--record``.
-        focus: names of ``--focus``.
-        every: steps of ``--every``.
-        serve: whether ``--serve`` is given.
-        port: port of ``--serve-port``.
-
-    Raises:
-        SdcError: options of a recording without one, or a recording that cannot be made.
-    """
-    from sdc_taichi.viz.recording_target import DEFAULT_PORT, is_address
-
-    if serve or port is not None:
-        port = DEFAULT_PORT if port is None else port
-    elif target is None:
-        for name, value in (("--focus", focus), ("--every", every)):
-            if value is not None:
-                raise ConfigError(
-                    f"{name}: given without a recording; valid with --record, --serve"
-                )
-        return None
-    from sdc_taichi.viz.recorder import Recorder
-
-    if target is not None and target.endswith(".rrd") and not is_address(target):
-        with contextlib.suppress(OSError):  # the recorder says what is wrong with it
-            Path(target).parent.mkdir(parents=True, exist_ok=True)
-    names = None if focus is None else [name.strip() for name in focus.split(",")]
-    return Recorder(target, focus=names, every=every, serve_port=port)
-
-
-@contextlib.contextmanager
-def recording(
-    recorder: Recorder | None, sim: Simulator, request: RunRequest
-) -> Iterator[Callable[[StepResult], None]]:
-    """Keep a recording open while a run lasts, if there is a recorder.
-
-    Args:
-        recorder: what records; None records nothing.
-        sim: the simulator, before its first step.
-        request: what it is to do.
-
-    Yields:
-        A function to call with the result of every step.
-    """
-    if recorder is None:
-        yield lambda _: None
-        return
-    from sdc_taichi.run.description import describe_run
-
-    with recorder:
-        recorder.begin(sim, describe_run(sim, request))
-        if recorder.served_address is not None:
-            command = f"sdc-taichi view {recorder.served_address}"
-            print(f"serving the run; watch it with: {command} [--web]", file=sys.stderr)
-        yield recorder.add
-
-
-def print_recording(recorder: Recorder | None) -> None:
-    """Print where the recording of a run is, if it is a file."""
-    if recorder is not None and recorder.file is not None and not recorder.failed:
-        file = printable(recorder.file)
-        print(f"Recording: {file} (open with: sdc-taichi view {file})")
-
-
-def serve_until_interrupted(recorder: Recorder | None, interrupted: Callable[[], bool]) -> None:
-    """Keep a run that is done on show until Ctrl-C, if it is served to viewers."""
-    if recorder is None or recorder.served_address is None or recorder.failed:
-        return
-    recorder.flush()
-    if not interrupted():
-        text = f"the run is done and still served at {recorder.served_address}; Ctrl-C ends it"
-        print(text, file=sys.stderr)
-    while not interrupted():
-        time.sleep(0.1)
-
-
 @contextlib.contextmanager
 def progress_bar(steps: int, *, shown: bool) -> Iterator[Callable[[StepResult], None]]:
     """Show a progress bar on stderr, if that is a terminal.
@@ -227,7 +234,6 @@ def stage_bars(*, shown: bool) -> Iterator[Callable[[str, int, int], None]]:
 
 def rich_progress() -> Progress:
     """Progress bars on stderr that disappear when they are done."""
-    from rich.console import Console
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -239,3 +245,10 @@ def rich_progress() -> Progress:
     text = TextColumn("{task.description}")
     columns = (text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     return Progress(*columns, console=Console(stderr=True), transient=True)
+
+
+def duration(seconds: float) -> str:
+    """A length of time as minutes and seconds, and hours from one on."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -7,15 +7,22 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 import typer.core
 
-from sdc_taichi.cli.scenario import EXIT_INTERRUPTED
-from sdc_taichi.cli.session import interruptible, print_notes, rich_progress
-from sdc_taichi.cli.train import SECONDS_BETWEEN_LINES, duration
+from sdc_taichi.cli.terminal import (
+    EXIT_FAILURE,
+    EXIT_INTERRUPTED,
+    SECONDS_BETWEEN_LINES,
+    duration,
+    interruptible,
+    print_notes,
+    rich_progress,
+)
 from sdc_taichi.errors import SdcError, printable
 
 if TYPE_CHECKING:
@@ -23,39 +30,11 @@ if TYPE_CHECKING:
     from sdc_taichi.benchmark.runner import Executor, JobSummary, Stop
     from sdc_taichi.benchmark.store import ResultStore, Study
 
-EXIT_FAILED = 1
-"""Exit code of a study some of whose jobs failed."""
-Jobs = Annotated[
-    int | None,
-    typer.Option(
-        "--jobs",
-        min=1,
-        max=1024,
-        metavar="N",
-        help="Processes that compute at a time. [default: one for each processor]",
-    ),
-]
-"""Option of a command that runs jobs."""
-Ray = Annotated[
-    str | None,
-    typer.Option(
-        "--ray",
-        metavar="[ADDRESS]",
-        help="Run jobs on Ray: on a cluster that is started here, or on that at HOST:PORT or auto.",
-    ),
-]
-"""Option of a command that runs jobs, whose value may be left out (``JobsCommand``)."""
-Resume = Annotated[
-    bool,
-    typer.Option("--resume", help="Go on with the study in --out: run what is missing."),
-]
-"""Option of a command that runs jobs."""
-
 _ADDRESS = re.compile(r"auto|local|(ray://)?[\w.\-]+:\d+|(ray://)?\[[0-9a-fA-F:.]+\]:\d+")
 
 
 class JobsCommand(typer.core.TyperCommand):
-    """A command with the option ``Ray``, whose value may be left out."""
+    """A command with ``JobOptions``; the value of ``--ray`` may be left out."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse arguments, with the value of ``--ray`` put in where it is left out."""
@@ -77,23 +56,50 @@ def with_ray_address(args: list[str]) -> list[str]:
     return found
 
 
-def executor_of(jobs: int | None, ray: str | None) -> Executor:
-    """Executor of the jobs of a command.
+@dataclass(frozen=True)
+class JobOptions:
+    """Where jobs run, and whether those of a study that was cut off are left out.
 
-    Args:
-        jobs: number of ``--jobs``.
-        ray: address of ``--ray``; None is processes of this machine.
-
-    Raises:
-        SdcError: options that are not valid together, or no Ray.
+    A command with these options is a ``JobsCommand``.
     """
-    if ray is not None:
-        from sdc_taichi.benchmark.ray_cluster import RayCluster
 
-        return RayCluster(ray, jobs)
-    from sdc_taichi.benchmark.processes import LocalProcesses
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs",
+            min=1,
+            max=1024,
+            metavar="N",
+            help="Processes that compute at a time. [default: one for each processor]",
+        ),
+    ] = None
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            "--ray",
+            metavar="[ADDRESS]",
+            help="Run jobs on Ray: on a cluster that is started here, or on that at HOST:PORT or "
+            "auto.",
+        ),
+    ] = None
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on with the study in --out: run what is missing."),
+    ] = False
 
-    return LocalProcesses(jobs)
+    def executor(self) -> Executor:
+        """The executor that runs the jobs.
+
+        Raises:
+            SdcError: options that are not valid together, or no Ray.
+        """
+        if self.ray is not None:
+            from sdc_taichi.benchmark.ray_cluster import RayCluster
+
+            return RayCluster(self.ray, self.jobs)
+        from sdc_taichi.benchmark.processes import LocalProcesses
+
+        return LocalProcesses(self.jobs)
 
 
 class JobSession:
@@ -159,27 +165,19 @@ class JobSession:
         if failed:
             text = f"{failed:,} of {failed + whole:,} jobs failed; --resume runs them again"
             print(text, file=sys.stderr)
-            raise typer.Exit(EXIT_FAILED)
+            raise typer.Exit(EXIT_FAILURE)
 
 
 @contextlib.contextmanager
 def job_session(
-    store: ResultStore,
-    study: Study,
-    *,
-    resume: bool,
-    jobs: int | None,
-    ray: str | None,
-    quiet: bool = False,
+    store: ResultStore, study: Study, options: JobOptions, *, quiet: bool = False
 ) -> Iterator[JobSession]:
     """Begin a study, or go on with it, and end its workers and its claim on the folder.
 
     Args:
         store: folder of the study.
         study: what is to be done.
-        resume: whether to go on with the study in the folder.
-        jobs: number of ``--jobs``.
-        ray: address of ``--ray``.
+        options: where the jobs run, and whether the study in the folder goes on.
         quiet: whether to show neither progress nor notes.
 
     Yields:
@@ -188,7 +186,7 @@ def job_session(
     Raises:
         SdcError: the folder is not free, or options are not valid.
     """
-    executor = executor_of(jobs, ray)
+    executor, resume = options.executor(), options.resume
     with interruptible() as stop, executor, store.claimed(study, resume=resume) as notes:
         if not quiet:
             print_notes(notes)

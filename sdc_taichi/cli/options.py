@@ -1,0 +1,432 @@
+"""Options that several commands share, groups of them, and what they stand for.
+
+A group of options is a dataclass whose fields are options. A command names the group as the type
+of a parameter, and ``CommandApp`` gives it one option for each field.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hints
+
+import typer
+
+from sdc_taichi.config import DataCenterConfig, load_config, load_yaml, preset_names
+from sdc_taichi.errors import ConfigError
+from sdc_taichi.exogenous.year_clock import day_of_year
+from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
+
+if TYPE_CHECKING:
+    from sdc_taichi.control import ForecastError
+
+CommandFunction = TypeVar("CommandFunction", bound=Callable[..., None])
+Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")]
+"""Option of every command, which ``app`` looks for among the arguments."""
+
+
+class CommandApp(typer.Typer):
+    """Commands whose parameters may be groups of options, each with the option ``--debug``."""
+
+    def command(
+        self, name: str | None = None, **settings: Any
+    ) -> Callable[[CommandFunction], CommandFunction]:
+        """Register the decorated function as a command.
+
+        Args:
+            name: name of the command.
+            settings: further arguments of ``typer.Typer.command``.
+        """
+        register = super().command(name, **settings)
+
+        def decorate(function: CommandFunction) -> CommandFunction:
+            register(_flattened(function))
+            return function
+
+        return decorate
+
+
+def _flattened(function: Callable[..., None]) -> Callable[..., None]:
+    """The function of a command with an option in the place of each field of its groups."""
+    groups: dict[str, Any] = {}
+    parameters: list[inspect.Parameter] = []
+    for parameter in inspect.signature(function, eval_str=True).parameters.values():
+        group = parameter.annotation
+        if isinstance(group, type) and dataclasses.is_dataclass(group):
+            groups[parameter.name] = group
+            parameters += _parameters_of(group)
+        else:
+            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+    debug = inspect.Parameter(
+        "debug", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Debug
+    )
+    parameters.append(debug)
+
+    @functools.wraps(function)
+    def command(**values: Any) -> None:
+        del values["debug"]
+        for name, group in groups.items():
+            fields = dataclasses.fields(group)
+            values[name] = group(**{field.name: values.pop(field.name) for field in fields})
+        function(**values)
+
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {each.name: each.annotation for each in parameters}
+    return command
+
+
+def _parameters_of(group: type[Any]) -> list[inspect.Parameter]:
+    """A keyword parameter for each field of a group of options."""
+    types = get_type_hints(group, include_extras=True)
+    missing, required = dataclasses.MISSING, inspect.Parameter.empty
+    return [
+        inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=required if field.default is missing else field.default,
+            annotation=types[field.name],
+        )
+        for field in dataclasses.fields(group)
+    ]
+
+
+# --- Words that shells complete -------------------------------------------------------------------
+
+
+def completed_by(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Completion of a word of the command line: the names that begin like it.
+
+    Where no name does, shells offer files.
+    """
+
+    def complete(incomplete: str) -> list[str]:
+        return [name for name in names() if name.startswith(incomplete)]
+
+    return complete
+
+
+def _presets_and_fields() -> list[str]:
+    from sdc_taichi.config.reference import field_names
+
+    return [*preset_names(), *(f"{name}=" for name in field_names())]
+
+
+def _controllers() -> Iterable[str]:
+    """Names of controllers; of those that take a value, the part up to the colon."""
+    from sdc_taichi.control.registry import controller_names
+
+    return ("".join(name.partition(":")[:2]) for name in controller_names())
+
+
+def complete_sites(incomplete: str) -> list[str]:
+    """Completion of the last of several sites that are separated by commas."""
+    from sdc_taichi.exogenous.registry import site_names
+
+    before, comma, _ = incomplete.rpartition(",")
+    return completed_by(lambda: (f"{before}{comma}{name.lower()}" for name in site_names()))(
+        incomplete
+    )
+
+
+complete_controllers = completed_by(_controllers)
+
+# --- Single options -------------------------------------------------------------------------------
+
+Source = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[PRESET|FILE] [A.B=C]...",
+        help="Preset, YAML file or SustainDC dc_config.json, and overrides of its fields.",
+        show_default=False,
+        autocompletion=completed_by(_presets_and_fields),
+    ),
+]
+"""Argument of a command that reads a configuration."""
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="A.B=C", help="Override a field of the config; repeatable."),
+]
+Site = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SITE[,SITE...]",
+        help="Sites, one data center each (see data list).",
+        autocompletion=complete_sites,
+    ),
+]
+Days = Annotated[float, typer.Option(help="Length, in days; may exceed a year.")]
+Start = Annotated[str | None, typer.Option(metavar="MM-DD", help="First day, local standard time.")]
+Compared = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME",
+        help="Controller to compare, as of simulate; repeatable.",
+        autocompletion=complete_controllers,
+    ),
+]
+"""Option of a command that compares controllers with an optimum."""
+NoCache = Annotated[
+    bool, typer.Option("--no-cache", help="Solve anew, and keep nothing for later.")
+]
+"""Option of a command that solves for an optimum."""
+FolderForce = Annotated[bool, typer.Option("--force", help="Write into a folder with other files.")]
+"""Option of a command that writes a folder."""
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress, no summary.")]
+"""Option of a command that prints a summary of what it has done."""
+
+
+def out_option(help: str, metavar: str | None = None) -> Any:
+    """Option ``--out`` of a command that writes a file or a folder."""
+    return typer.Option("--out", metavar=metavar, help=help)
+
+
+def force_option(help: str = "Replace an existing file.") -> Any:
+    """Option ``--force`` of a command that replaces nothing without it."""
+    return typer.Option("--force", help=help)
+
+
+def json_option(help: str) -> Any:
+    """Option ``--json`` of a command that prints JSON in place of text."""
+    return typer.Option("--json", help=help)
+
+
+# --- Groups of options ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ConfigOptions:
+    """The configuration that a command begins with."""
+
+    source: Source = None
+    overrides: Overrides = None
+
+    def read(self) -> tuple[DataCenterConfig, str]:
+        """The configuration, and the name of its preset or file.
+
+        Raises:
+            ConfigError: two presets or files, or a configuration that is not valid.
+        """
+        return read_config(self.source, self.overrides)
+
+
+@dataclass(frozen=True)
+class SiteOptions:
+    """Sites, and files with their inputs."""
+
+    site: Site = None
+    weather: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE", help="EPW file; repeated, one per site in their order."),
+    ] = None
+    carbon: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE", help="Carbon-intensity CSV; repeated, one per site."),
+    ] = None
+    workload: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE", help="Workload CSV for all sites; or repeated, one per site."),
+    ] = None
+
+    def data_centers(
+        self,
+        base: DataCenterConfig,
+        *,
+        start: str | None = None,
+        dcs: int | None = None,
+        sample: Path | None = None,
+        seed: int = 0,
+    ) -> list[DataCenterConfig]:
+        """Configurations of the data centers at the sites.
+
+        Args:
+            base: configuration that they all begin with.
+            start: first day, of ``--start``.
+            dcs: number of ``--dcs``; None is one per site.
+            sample: file of ``--sample``.
+            seed: seed of ``--sample``.
+
+        Raises:
+            ConfigError: an option that is not valid, or does not fit the others.
+        """
+        from sdc_taichi.sim.fleet_configs import make_configs
+
+        sites, files = site_names(self.site), self._files()
+        if start is not None:
+            try:
+                day_of_year(start)
+            except ValueError as error:
+                raise ConfigError(f"--start: {error}") from None
+            base = _with_site(base, start=start.strip())
+        # Without --site the files are those of the one data center; with it each site has its own.
+        base = _with_site(base, **{field: None if sites else of[0] for field, of in files.items()})
+        rules = None if sample is None else _read_sample(sample)
+        try:
+            configs = make_configs(base, count=dcs, sites=sites, sample=rules, seed=seed)
+        except ConfigError as error:
+            if sample is None:
+                raise
+            raise ConfigError(f"{sample}: {error}") from None
+        return [
+            _with_site(config, **{field: of[i % len(of)] for field, of in files.items()})
+            for i, config in enumerate(configs)
+        ]
+
+    def _files(self) -> dict[str, list[str]]:
+        """Files by their field of section ``site``: one per site, or one for all sites."""
+        count = max(len(site_names(self.site)), 1)
+        files = {}
+        for option in ("weather", "carbon", "workload"):
+            paths = getattr(self, option)
+            if not paths:
+                continue
+            is_shared = option == "workload" and len(paths) == 1
+            if len(paths) != count and not is_shared:
+                raise ConfigError(
+                    f"--{option}: {len(paths)} given for {count} of --site; valid is one per site, "
+                    "in their order"
+                )
+            files[f"{option}_file"] = [str(Path(path).absolute()) for path in paths]
+        return files
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Random numbers and precision of runs."""
+
+    seed: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=2**63 - 1,
+            help="Of controllers, forecast errors, sampled events and samples (not of the "
+            "synthetic year).",
+        ),
+    ] = 0
+    precision: Annotated[Literal["f32", "f64"], typer.Option(help="Of the per-server kernels.")] = (
+        "f32"
+    )
+
+
+@dataclass(frozen=True)
+class ForecastRunOptions(RunOptions):
+    """Random numbers, precision, and errors of forecasts of runs."""
+
+    forecast_error: Annotated[
+        str | None,
+        typer.Option(
+            "--forecast-error",
+            metavar="ci=SHARE,temperature=K",
+            help="Errors of controllers' forecasts at 24 h, such as ci=0.1,temperature=1.",
+        ),
+    ] = None
+
+    def error(self) -> ForecastError:
+        """Errors of the forecasts that controllers get.
+
+        Raises:
+            ConfigError: the text of the option is not valid.
+        """
+        from sdc_taichi.control import PERFECT, ForecastError
+
+        return PERFECT if self.forecast_error is None else ForecastError.parse(self.forecast_error)
+
+
+# --- What options stand for -----------------------------------------------------------------------
+
+
+def check_out_file(out: Path | None, suffix: str, *, force: bool, option: str = "--out") -> None:
+    """Check the file of an option such as ``--out`` before any work; None is no file.
+
+    Args:
+        out: the file.
+        suffix: the only valid suffix, such as ``.png``.
+        force: whether an existing file may be replaced.
+        option: the option, for messages.
+
+    Raises:
+        ConfigError: another suffix, a folder, or an existing file without ``force``.
+    """
+    if out is None:
+        return
+    if out.suffix.lower() != suffix:
+        raise ConfigError(f"{option} {out}: valid is a name that ends in {suffix}")
+    if os.path.isdir(out):
+        raise ConfigError(f"{option} {out}: is a folder; valid is a file")
+    if os.path.exists(out) and not force:
+        raise ConfigError(f"{option} {out}: exists; choose another name or replace it with --force")
+
+
+def parse_source(source: list[str] | None) -> tuple[str | None, list[str]]:
+    """The preset or file that ``Source`` names, None if it names none, and its overrides.
+
+    Raises:
+        ConfigError: two presets or files.
+    """
+    given = source or []
+    files = [text for text in given if "=" not in text or os.path.isfile(text)]
+    if len(files) > 1:
+        raise ConfigError(
+            f"{files[1]!r}: a second preset or file after {files[0]!r}; valid is one, and "
+            "overrides section.key=value"
+        )
+    return next(iter(files), None), [text for text in given if text not in files]
+
+
+def read_config(
+    source: list[str] | None, overrides: list[str] | None = None
+) -> tuple[DataCenterConfig, str]:
+    """The config that ``Source`` and ``Overrides`` give, and the name of its preset or file.
+
+    Raises:
+        ConfigError: two presets or files, or a config that is not valid.
+    """
+    found, assigned = parse_source(source)
+    name = "corrected" if found is None else found
+    return load_config(name, [*(overrides or []), *assigned]), name
+
+
+def site_names(site: str | None) -> list[str]:
+    """Names of ``--site``; none without it.
+
+    Raises:
+        ConfigError: an empty name, or one that is given twice.
+    """
+    if site is None:
+        return []
+    names = [name.strip() for name in site.split(",")]
+    folded = [name.casefold() for name in names]
+    if not all(names):
+        raise ConfigError(f"--site {site!r}: an empty name; valid is SITE or SITE,SITE")
+    for index, name in enumerate(folded):
+        if name in folded[:index]:
+            raise ConfigError(
+                f"--site {site!r}: {names[index]} is given twice; valid is each site once "
+                "(--dcs makes copies)"
+            )
+    return names
+
+
+def _with_site(config: DataCenterConfig, **update: str | None) -> DataCenterConfig:
+    site = config.site.model_copy(update=update)
+    return config.model_copy(update={"site": site})
+
+
+def _read_sample(path: Path) -> dict[str, Any]:
+    text = read_text(path, MOST_CONFIG_BYTES, ConfigError)
+    try:
+        rules = load_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid YAML ({error})") from None
+    wrong = [name for name in rules if not isinstance(name, str)] if isinstance(rules, dict) else []
+    if not isinstance(rules, dict) or wrong:
+        found = f"key {wrong[0]!r}" if wrong else f"the top level is a {type(rules).__name__}"
+        raise ConfigError(
+            f"{path}: {found}; valid is a mapping of fields, such as hvac.chiller.reference_cop, "
+            "to {uniform: [low, high]} or {choice: [a, b]}"
+        )
+    return rules
