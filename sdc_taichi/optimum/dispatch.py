@@ -33,9 +33,9 @@ import numpy as np
 
 from sdc_taichi.optimum.battery_limits import battery_limits
 from sdc_taichi.optimum.problem import Problem
-from sdc_taichi.optimum.programme import Matrix, Programme, Solution
+from sdc_taichi.optimum.programme import Linear, Programme, Solution
 from sdc_taichi.optimum.stage_cost import LoadCurves, StageCost
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, I64
 
 DEFER, DRAIN, DUE = -1, 1, 0
 """What a step of a plan does with its queue: add work, take work out, or both with due work."""
@@ -110,46 +110,44 @@ class DispatchProgramme:
     """
 
     def __init__(self, problem: Problem, stage: StageCost, curves: LoadCurves, span: Span) -> None:
-        from scipy import sparse
-
-        self.problem, self.span = problem, span
-        self._size = n = span.end - span.first
+        self._problem, self._span = problem, span
+        self._size = span.end - span.first
+        self._steps = slice(span.first, span.end)
         self._programme = Programme()
-        self._now: Matrix = sparse.eye_array(n, format="csr")
-        self._change: Matrix = self._now - sparse.eye_array(n, k=-1, format="csr")
-        steps = slice(span.first, span.end)
-        self._base_kwh = curves.base_kwh[steps]
-        self._base_tasks = curves.least_tasks[steps]
-        self._base_cost = float(curves.base_cost[steps].sum())
-        self._stage = stage
-        self._has_battery = "battery" in problem.agents and problem.storage.capacity_kwh > 0
-        self._has_load = "load" in problem.agents
-        self._of_tasks: dict[str, Matrix] = {}
-        self._of_kwh: dict[str, Matrix] = {}
-        self._add_segments(curves)
-        if self._has_load:
+        nothing = Linear(np.zeros(self._size))
+        self._base_cost = float(curves.base_cost[self._steps].sum())
+        self._executed, self._energy_kwh = self._add_segments(curves)
+        self._queue, self._start_tasks = nothing, nothing[0]
+        self._entered: Linear | None = None
+        self._within_deadline = nothing
+        if "load" in problem.agents:
             self._add_queue()
+        self._charge, self._discharge = nothing, nothing
+        self._stored = nothing + (span.start_kwh or 0.0)
         if self._has_battery:
-            self._add_battery()
+            self._add_battery(stage)
         self._add_peaks()
+
+    @property
+    def _has_battery(self) -> bool:
+        return "battery" in self._problem.agents and self._problem.storage.capacity_kwh > 0
+
+    @property
+    def _left(self) -> Linear:
+        """Work that leaves the queue in each step of a programme with a deadline, (n,)."""
+        assert self._entered is not None
+        return self._entered - (self._queue - self._queue.before(self._start_tasks))
 
     def add_deferral_weight(self, weight: F64) -> None:
         """Weigh each task that enters the queue, as a hint and not a cost, (n,)."""
-        if "deferred" not in self._programme.sizes:
+        if self._entered is None:
             return
         self._programme.add_cost("deferred", weight - np.append(weight[1:], 0.0))
         # Without a weight more may always enter, so the bound does without these rows.
-        none = np.zeros(self._size)
-        self._programme.at_most("entered", none, deferred=-self._change)
-        self._programme.at_most(
-            "left",
-            none,
-            deferred=-self._change,
-            queue=self._change,
-            start_tasks=self._start_column,
-        )
+        self._programme.at_most("entered", 0.0, self._entered)
+        self._programme.at_most("left", 0.0, self._left)
 
-    def keep_modes(self, modes: np.ndarray) -> None:
+    def keep_modes(self, modes: I64) -> None:
         """Let work enter and leave as a first-in-first-out queue can do it.
 
         A step with mode DEFER takes nothing out, one with DRAIN puts nothing in, and one with DUE
@@ -158,257 +156,206 @@ class DispatchProgramme:
         Args:
             modes: DEFER, DRAIN or DUE, (n,).
         """
-        if "deferred" not in self._programme.sizes:
+        if self._entered is None:
             return
         defer, drain, due = (np.flatnonzero(modes == m) for m in (DEFER, DRAIN, DUE))
-        change, p = self._change, self._programme
-        start = self._start_column
-        leaves = {"deferred": change, "queue": -change, "start_tasks": -start}
-        none = np.zeros(self._size)
-        p.equal("defer", none[defer], **_rows(leaves, defer))
-        p.equal("drain", none[drain], **_rows({"deferred": change}, drain))
-        both = {name: -m for name, m in leaves.items()}
-        for name, rows in (("drained", drain), ("run", due)):
-            p.at_most(name, none[rows], **_rows(both, rows))
-        if self.problem.work.model == "tasks":
-            # But for due work, a queue falls by no more than the flexible work of its step, and
-            # none that was deferred is taken back in a step with due work.
-            most = self.problem.work.most_deferred_tasks[self.span.first : self.span.end]
-            falls, others = {"queue": -change, "start_tasks": -start}, np.flatnonzero(modes != DUE)
-            p.at_most("drain_limit", most[others], **_rows(falls, others))
-            p.at_most("entered_due", none[due], **_rows({"deferred": -change}, due))
-        matrices, right = self._deadline()
-        p.equal("due", right[due], **_rows(matrices, due))
+        p, entered, left = self._programme, self._entered, self._left
+        p.equal("defer", left[defer], 0.0)
+        p.equal("drain", entered[drain], 0.0)
+        p.at_most("drained", 0.0, left[drain])
+        p.at_most("run", 0.0, left[due])
+        if self._problem.work.model == "tasks":
+            # Except for due work, a queue falls by no more than the flexible work of its step, and
+            # in a step with due work no work is taken back that was deferred.
+            most = self._problem.work.most_deferred_tasks[self._steps]
+            fall, others = self._queue.before(self._start_tasks) - self._queue, modes != DUE
+            p.at_most("drain_limit", fall[others], most[others])
+            p.at_most("entered_due", 0.0, entered[due])
+        p.equal("due", self._queue[due], self._within_deadline[due])
 
     def solve(self) -> Dispatch:
-        """The least cost of the steps, and how it is reached.
+        """Find the least cost of the steps, and how it is reached.
 
         Raises:
-            InfeasibleError: nothing keeps all rows.
+            InfeasibleError: Nothing satisfies all rows.
         """
-        found, n = self._programme.solve(), self._size
-        none = np.zeros(n)
-        values, span = found.values, self.span
-        executed = self._base_tasks.copy()
-        for name, matrix in self._of_tasks.items():
-            executed += matrix @ values[name]
-        waiting = values.get("queue", none)
-        start = values["start_tasks"][0] if "start_tasks" in values else 0.0
-        change = np.diff(waiting, prepend=start)
-        total = values.get("deferred")
-        deferred = np.maximum(change, 0.0) if total is None else np.diff(total, prepend=0.0)
-        charge, discharge = self._netted(found)
-        stored = values.get("stored", np.full(n, span.start_kwh or 0.0))
+        solution, none = self._programme.solve(), np.zeros(self._size)
+        waiting = solution.of(self._queue)
+        rise = np.diff(waiting, prepend=solution.of(self._start_tasks))
+        deferred = np.maximum(rise, 0.0) if self._entered is None else solution.of(self._entered)
+        charge, discharge = self._net_battery(solution)
         return Dispatch(
-            figure=self._base_cost + found.figure,
-            executed_tasks=executed,
+            figure=self._base_cost + solution.figure,
+            executed_tasks=solution.of(self._executed),
             waiting_tasks=waiting,
             deferred_tasks=deferred,
             charge_kwh=charge,
             discharge_kwh=discharge,
-            stored_kwh=stored,
-            task_price=found.prices.get("work", none),
-            kwh_price=-found.prices.get("energy", none),
-            end_task_price=float(-found.prices.get("end_work", np.zeros(1))[0]),
-            end_kwh_price=float(-found.prices.get("end_energy", np.zeros(1))[0]),
+            stored_kwh=solution.of(self._stored),
+            task_price=solution.prices.get("work", none),
+            kwh_price=-solution.prices.get("energy", none),
+            end_task_price=float(-solution.prices.get("end_work", none)[0]),
+            end_kwh_price=float(-solution.prices.get("end_energy", none)[0]),
             peaks_kw=tuple(
-                float(values[f"peak_{k}"][0]) if f"peak_{k}" in values else 0.0
-                for k in range(len(self.problem.months))
+                float(solution.values.get(_peak_name(k), none)[0])
+                for k in range(len(self._problem.months))
             ),
         )
 
-    def _add_segments(self, curves: LoadCurves) -> None:
-        """Use of the segments of the curves."""
+    def _add_segments(self, curves: LoadCurves) -> tuple[Linear, Linear]:
+        """Add the use of each segment of the cost curves.
+
+        Returns:
+            Work done in each step, in tasks, and energy of the facility, in kWh, (n,) each.
+        """
         from scipy import sparse
 
-        first, last = np.searchsorted(curves.step, [self.span.first, self.span.end])
-        size = int(last - first)
+        executed = Linear(curves.least_tasks[self._steps])
+        energy_kwh = Linear(curves.base_kwh[self._steps])
+        part = slice(*np.searchsorted(curves.step, [self._span.first, self._span.end]))
+        size = part.stop - part.start
         if size == 0:
-            return
-        part = slice(first, last)
-        at = (curves.step[part] - self.span.first, np.arange(size))
-        shape = (self._size, size)
+            return executed, energy_kwh
         self._programme.variables(
             "segments", size, upper=curves.width_tasks[part], cost=curves.slope_cost[part]
         )
-        self._of_tasks["segments"] = sparse.csr_array((np.ones(size), at), shape=shape)
-        self._of_kwh["segments"] = sparse.csr_array((curves.slope_kwh[part], at), shape=shape)
+
+        def by_step(value: F64) -> Linear:
+            """Sum over the segments of each step of a value times the use of the segment."""
+            at = (curves.step[part] - self._span.first, np.arange(size))
+            matrix = sparse.csr_array((value, at), shape=(self._size, size))
+            return Linear(np.zeros(self._size), {"segments": matrix})
+
+        return executed + by_step(np.ones(size)), energy_kwh + by_step(curves.slope_kwh[part])
 
     def _add_queue(self) -> None:
-        """Work that waits, its limits and its deadline."""
-        from scipy import sparse
-
-        span, work, n, p = self.span, self.problem.work, self._size, self._programme
-        steps = slice(span.first, span.end)
-        arrived = work.arrived_tasks[steps]
-        limit = work.queue_limit_tasks
+        """Add work that waits, its limits and its deadline."""
+        span, work, n, p = self._span, self._problem.work, self._size, self._programme
+        arrived, limit = work.arrived_tasks[self._steps], work.queue_limit_tasks
         upper = np.full(n, limit)
         if span.end_tasks is not None:
             upper[-1] = min(limit, span.end_tasks)
-        p.variables("queue", n, upper=upper, cost=self._values(tasks=True))
-        rows = {"queue": self._change, **self._of_tasks}
+        self._queue = p.variables("queue", n, upper=upper, cost=self._values(tasks=True))
         if span.start_tasks != 0.0:
-            given = span.start_tasks
-            p.variables(
+            known = span.start_tasks
+            self._start_tasks = p.variables(
                 "start_tasks",
                 1,
-                lower=0.0 if given is None else given,
-                upper=limit if given is None else given,
+                lower=0.0 if known is None else known,
+                upper=limit if known is None else known,
                 cost=self._start_value(tasks=True),
             )
-            rows["start_tasks"] = self._start_column
+        lost = Linear(np.zeros(n))
         if work.most_dropped_tasks > 0:
-            p.variables("dropped", n, upper=arrived)
-            rows["dropped"] = self._now
-            scored = (np.arange(span.first, span.end) >= self.problem.scored_from).astype(float)
-            p.at_most(
-                "drops", np.array([work.most_dropped_tasks]), dropped=sparse.csr_array([scored])
-            )
-        p.equal("work", arrived - self._base_tasks, **rows)
+            lost = p.variables("dropped", n, upper=arrived)
+            scored = np.arange(span.first, span.end) >= self._problem.scored_from
+            p.at_most("drops", lost[scored].sum(), work.most_dropped_tasks)
+        rise = self._queue - self._queue.before(self._start_tasks)
+        p.equal("work", rise + self._executed + lost, arrived)
         if span.as_after is not None:
-            p.at_most("end_work", np.zeros(1), queue=self._last_less_than_after())
+            p.at_most("end_work", self._queue[-1], self._queue[span.as_after - span.first])
         if work.deadline_steps is None:
             return
-        p.variables("deferred", n, lower=-np.inf)
-        p.at_most("entry", work.most_deferred_tasks[steps], deferred=self._change)
-        p.at_most("kept", np.zeros(n), deferred=self._change, queue=-self._now)
-        matrices, right = self._deadline()
-        aged = np.arange(n)
-        if span.deferred_before is None:
-            aged = aged[work.deadline_steps :]
-        p.at_most("deadline", right[aged], **_rows(matrices, aged))
+        deferred = p.variables("deferred", n, lower=-np.inf)
+        self._entered = deferred - deferred.before(0.0)
+        p.at_most("entry", self._entered, work.most_deferred_tasks[self._steps])
+        p.at_most("kept", self._entered, self._queue)
+        # Without a record of what entered before the first step, its age is not known.
+        first = work.deadline_steps if span.deferred_before is None else 0
+        aged = np.arange(first, n)
+        self._within_deadline = self._deferred_within(work.deadline_steps, deferred)
+        p.at_most("deadline", self._queue[aged], self._within_deadline[aged])
 
-    def _deadline(self) -> tuple[dict[str, Matrix], F64]:
-        """Rows of work that waits less what entered within the deadline, and right-hand sides."""
-        from scipy import sparse
-
-        steps, n = self.problem.work.deadline_steps, self._size
-        assert steps is not None
-        before = self.span.deferred_before
-        right = np.zeros(n)
+    def _deferred_within(self, steps: int, deferred: Linear) -> Linear:
+        """Work that entered the queue in the last ``steps`` steps up to each step, (n,)."""
+        earlier, before = np.zeros(self._size), self._span.deferred_before
         if before is not None:
-            # Of the work deferred earlier, what is within the deadline of each of the first steps.
+            # Of the work deferred before the first step, what is still within its deadline.
             within = np.cumsum(before[::-1])[::-1][1:]
-            right[: steps - 1] = within[:n]
-        earlier = sparse.eye_array(n, k=-steps, format="csr") if steps < n else 0.0 * self._now
-        return {"queue": self._now, "deferred": earlier - self._now}, right
+            earlier[: steps - 1] = within[: self._size]
+        return deferred - deferred.shifted(steps) + earlier
 
-    def _add_battery(self) -> None:
-        """Charge, discharge, energy stored, and what limits them."""
-        span, p, n = self.span, self._programme, self._size
-        problem, storage, steps = self.problem, self.problem.storage, slice(span.first, span.end)
-        weight = problem.kwh_weight[steps]
+    def _add_battery(self, stage: StageCost) -> None:
+        """Add charge, discharge, energy stored, and what limits them."""
+        problem, span, p, n = self._problem, self._span, self._programme, self._size
+        storage, weight = problem.storage, problem.kwh_weight[self._steps]
         start = storage.stored_kwh if span.start_kwh is None else span.start_kwh
         limits = battery_limits(storage, problem.step_h, start)
-        p.variables("charge", n, upper=limits.most_charge_kwh, cost=weight)
-        p.variables("discharge", n, upper=limits.most_discharge_kwh, cost=-weight)
-        lower = np.zeros(n)
+        charge = p.variables("charge", n, upper=limits.most_charge_kwh, cost=weight)
+        discharge = p.variables("discharge", n, upper=limits.most_discharge_kwh, cost=-weight)
+        lower, capacity = np.zeros(n), storage.capacity_kwh
         if span.end_kwh is not None:
             lower[-1] = span.end_kwh
-        p.variables(
-            "stored",
-            n,
-            lower=lower,
-            upper=storage.capacity_kwh,
-            cost=self._values(tasks=False),
-        )
-        given = span.start_kwh
-        p.variables(
+        value = self._values(tasks=False)
+        stored = p.variables("stored", n, lower=lower, upper=capacity, cost=value)
+        start_kwh = p.variables(
             "start_kwh",
             1,
-            lower=0.0 if given is None else given,
-            upper=storage.capacity_kwh if given is None else given,
+            lower=0.0 if span.start_kwh is None else span.start_kwh,
+            upper=capacity if span.start_kwh is None else span.start_kwh,
             cost=self._start_value(tasks=False),
         )
-        now, start_column = self._now, self._start_column
-        p.equal(
-            "energy",
-            np.full(n, limits.rounding_kwh),
-            stored=self._change,
-            start_kwh=start_column,
-            charge=-limits.charge_efficiency * now,
-            discharge=limits.discharge_factor * now,
-        )
+        before = stored.before(start_kwh)
+        gain = limits.charge_efficiency * charge - limits.discharge_factor * discharge
+        p.equal("energy", stored - before - gain, limits.rounding_kwh)
         if span.as_after is not None:
-            p.at_most("end_energy", np.zeros(1), stored=-self._last_less_than_after())
-        before = now - self._change
-        for name, lines in (("charge", limits.charge), ("discharge", limits.discharge)):
-            for k, (most, slope) in enumerate(lines):
-                blocks = {name: now, "stored": -slope * before, "start_kwh": slope * start_column}
-                p.at_most(f"{name}_limit_{k}", np.full(n, most), **blocks)
-        spread = np.zeros(n)
+            p.at_most("end_energy", stored[span.as_after - span.first], stored[-1])
+        for name, energy, lines in (
+            ("charge", charge, limits.charge),
+            ("discharge", discharge, limits.discharge),
+        ):
+            for k, (empty_kwh, slope) in enumerate(lines):
+                p.at_most(f"{name}_limit_{k}", energy, empty_kwh + slope * before)
+        least_kwh, most_kwh = stage.least_facility_kwh[self._steps], stage.most_facility_kwh
+        spread = 0.0
         if problem.litre_weight:
-            stage = self._stage
-            spread = (stage.most_facility_kwh - stage.least_facility_kwh)[steps].max(axis=1)
-        share = limits.discharge_load_share
-        carried = {name: -share * m for name, m in self._of_kwh.items()}
-        p.at_most("carried", share * (self._base_kwh + spread), discharge=now, **carried)
+            spread = (most_kwh[self._steps] - least_kwh).max(axis=1)
+        p.at_most("carried", discharge, limits.discharge_load_share * (self._energy_kwh + spread))
         if np.isfinite(problem.grid_limit_kw):
-            largest = self._stage.least_facility_kwh[steps].max(axis=1)
-            most = np.maximum(problem.grid_limit_kw * problem.step_h, largest)
-            p.at_most("grid", most - self._base_kwh, charge=now, **self._of_kwh)
+            most = np.maximum(problem.grid_limit_kw * problem.step_h, least_kwh.max(axis=1))
+            p.at_most("grid", charge + self._energy_kwh, most)
+        self._charge, self._discharge, self._stored = charge, discharge, stored
 
     def _add_peaks(self) -> None:
-        """The highest power of each month."""
-        from scipy import sparse
-
-        span, p, step_h = self.span, self._programme, self.problem.step_h
-        bought = dict(self._of_kwh)
-        if self._has_battery:
-            bought |= {"charge": self._now, "discharge": -self._now}
-        for k, month in enumerate(self.problem.months):
+        """Add the highest power of each month."""
+        span = self._span
+        bought_kwh = self._energy_kwh + self._charge - self._discharge
+        for k, month in enumerate(self._problem.months):
             first, end = max(month.first, span.first), min(month.end, span.end)
             if first >= end or month.weight_per_kw == 0.0:
                 continue
-            name = f"peak_{k}"
             least = span.least_peaks_kw[k] if span.least_peaks_kw else 0.0
-            p.variables(name, 1, lower=least, cost=month.weight_per_kw)
+            name = _peak_name(k)
+            peak_kw = self._programme.variables(name, 1, lower=least, cost=month.weight_per_kw)
             rows = np.arange(first, end) - span.first
-            column = sparse.csr_array(np.full((len(rows), 1), -step_h))
-            p.at_most(name, -self._base_kwh[rows], **_rows(bought, rows), **{name: column})
+            self._programme.at_most(name, bought_kwh[rows], self._problem.step_h * peak_kw)
 
-    def _netted(self, found: Solution) -> tuple[F64, F64]:
+    def _net_battery(self, solution: Solution) -> tuple[F64, F64]:
         """Charge and discharge, of which one is 0 in each step, with the same energy stored."""
+        charge, discharge = solution.of(self._charge), solution.of(self._discharge)
         if not self._has_battery:
-            return np.zeros(self._size), np.zeros(self._size)
-        storage = self.problem.storage
-        limits = battery_limits(storage, self.problem.step_h, storage.stored_kwh)
+            return charge, discharge
+        storage = self._problem.storage
+        limits = battery_limits(storage, self._problem.step_h, storage.stored_kwh)
         eta_c, eta_d = limits.charge_efficiency, limits.discharge_factor
-        gain = eta_c * found.values["charge"] - eta_d * found.values["discharge"]
+        gain = eta_c * charge - eta_d * discharge
         return np.maximum(gain, 0.0) / eta_c, np.maximum(-gain, 0.0) / eta_d
 
     def _values(self, *, tasks: bool) -> F64:
         """Cost of a task that waits, or of a kWh stored, at the end of each step, (n,)."""
         cost = np.zeros(self._size)
-        for step, task, kwh in self.span.state_values:
-            if step >= self.span.first:
-                cost[step - self.span.first] += task if tasks else kwh
+        for step, task, kwh in self._span.state_values:
+            if step >= self._span.first:
+                cost[step - self._span.first] += task if tasks else kwh
         return cost
 
     def _start_value(self, *, tasks: bool) -> float:
         """Cost of a task that waits, or of a kWh stored, before the first step."""
-        before = self.span.first - 1
-        values = self.span.state_values
+        before = self._span.first - 1
+        values = self._span.state_values
         return sum(task if tasks else kwh for step, task, kwh in values if step == before)
 
-    @property
-    def _start_column(self) -> Matrix:
-        """The state before the first step in the rows of changes, (n, 1)."""
-        from scipy import sparse
 
-        column = np.zeros((self._size, 1))
-        column[0] = -1.0
-        return sparse.csr_array(column)
-
-    def _last_less_than_after(self) -> Matrix:
-        """One row: the state after the last step less that after ``as_after``."""
-        from scipy import sparse
-
-        assert self.span.as_after is not None
-        at = ([0, 0], [self._size - 1, self.span.as_after - self.span.first])
-        return sparse.csr_array(([1.0, -1.0], at), shape=(1, self._size))
-
-
-def _rows(blocks: dict[str, Matrix], rows: np.ndarray) -> dict[str, Matrix]:
-    """The rows of each of some matrices."""
-    return {name: matrix[rows] for name, matrix in blocks.items()}
+def _peak_name(month: int) -> str:
+    """Name of the variable and the rows of the highest power of a month, by its number."""
+    return f"peak_{month}"

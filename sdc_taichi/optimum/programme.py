@@ -1,15 +1,32 @@
-"""A linear programme in named blocks of variables and rows, solved by HiGHS."""
+"""A linear programme written as equations between blocks of variables, solved by HiGHS.
+
+Three hours of a battery that buys at changing prices and has to be full at the end::
+
+    programme = Programme()
+    charge = programme.variables("charge", 3, upper=2.0, cost=np.array([0.3, 0.1, 0.2]))
+    stored = programme.variables("stored", 3, upper=4.0)
+    programme.equal("energy", stored, stored.before(1.0) + 0.9 * charge)
+    programme.at_most("full", 4.0, stored[-1])
+    solution = programme.solve()
+    solution.of(stored)  # array of the energy stored after each hour
+    solution.prices["full"]  # what a kWh more at the end costs
+
+``charge``, ``stored`` and what is computed from them are ``Linear``: one row for each step, each a
+sum of variables with coefficients and a constant. Blocks and rows reach the solver in the order in
+which they are added.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from sdc_taichi.types import F64
+from sdc_taichi.hall.protection import Mask
+from sdc_taichi.types import F64, I64
 
 Matrix = Any
 """A sparse matrix of ``scipy.sparse``."""
@@ -21,49 +38,131 @@ _ATTEMPTS: tuple[tuple[str, dict[str, Any]], ...] = (
 )
 """Methods and options in the order in which they are tried.
 
-The dual simplex method takes a third less with Devex pricing; presolve now and then takes fifty
-times as long as all the rest. The interior point method takes several times as long.
+The dual simplex method takes a third less time with Devex pricing. Presolve now and then takes
+fifty times as long as all the rest, and the interior point method always several times as long.
 """
 _RELIEFS = (0.0, 1e-7, 1e-6)
-"""By how much right-hand sides are raised for the attempts, over the largest of them.
+"""Amounts by which right-hand sides are raised in turn, as a share of the largest of them.
 
-Rows that hold by rounding alone, as those of a battery that is full at the beginning, may keep the
-solver from telling that it has found an optimum. Raised, they allow more, so that a bound is one.
+Rows that hold only up to rounding, such as those of a battery that is full at the beginning, can
+keep the solver from recognising an optimum. Raised right-hand sides allow more, so the least value
+stays a bound.
 """
 _INFEASIBLE = 2
 """Status of ``scipy.optimize.linprog`` for rows that contradict each other."""
 
 
 class InfeasibleError(Exception):
-    """No values of the variables keep all rows and bounds."""
+    """No values of the variables satisfy all rows and bounds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linear:
+    """Linear expressions of variables, one for each of m rows: matrices @ variables + constant.
+
+    Expressions, arrays (m,) and numbers can be added and subtracted; one row is repeated where the
+    other side has more.
+    """
+
+    constant: F64
+    """Constant of each row, (m,)."""
+    terms: Mapping[str, Matrix] = field(default_factory=dict)
+    """Coefficients of the variables of each block, by its name, (m, n) each."""
+
+    __array_ufunc__ = None  # NumPy arrays leave arithmetic with expressions to this class.
+
+    def __len__(self) -> int:
+        """Number of rows, m."""
+        return len(self.constant)
+
+    def __add__(self, other: Linear | F64 | float) -> Linear:
+        """Sum of two expressions, row by row."""
+        right = _linear(other)
+        rows = len(right) if len(self) == 1 else len(self)
+        left, right = self._repeated(rows), right._repeated(rows)
+        terms = dict(left.terms)
+        for name, matrix in right.terms.items():
+            terms[name] = terms[name] + matrix if name in terms else matrix
+        return Linear(left.constant + right.constant, terms)
+
+    __radd__ = __add__
+
+    def __mul__(self, factor: float) -> Linear:
+        """Every row times a number."""
+        terms = {name: factor * matrix for name, matrix in self.terms.items()}
+        return Linear(factor * self.constant, terms)
+
+    __rmul__ = __mul__
+
+    def __neg__(self) -> Linear:
+        """Every row with the opposite sign."""
+        return -1.0 * self
+
+    def __sub__(self, other: Linear | F64 | float) -> Linear:
+        """Difference of two expressions, row by row."""
+        return self + -1.0 * _linear(other)
+
+    def __getitem__(self, rows: int | I64 | Mask) -> Linear:
+        """Some of the rows, by number or by a mask (m,)."""
+        index = np.arange(len(self))[np.atleast_1d(rows)]
+        return Linear(self.constant[index], {n: matrix[index] for n, matrix in self.terms.items()})
+
+    def sum(self) -> Linear:
+        """Sum of all rows, one row."""
+        return self._times(np.ones((1, len(self))))
+
+    def shifted(self, steps: int) -> Linear:
+        """The value of ``steps`` rows before each row; 0 where there is none."""
+        from scipy import sparse
+
+        return self._times(sparse.eye_array(len(self), k=-min(steps, len(self)), format="csr"))
+
+    def before(self, start: Linear | float) -> Linear:
+        """The value of the row before each row; ``start`` before the first."""
+        first = np.zeros((len(self), 1))
+        first[0] = 1.0
+        return self.shifted(1) + _linear(start)._times(first)
+
+    def _repeated(self, rows: int) -> Linear:
+        return self if len(self) == rows else self._times(np.ones((rows, 1)))
+
+    def _times(self, matrix: Matrix) -> Linear:
+        """A matrix times all rows."""
+        from scipy import sparse
+
+        factor = sparse.csr_array(matrix)
+        return Linear(factor @ self.constant, {n: factor @ m for n, m in self.terms.items()})
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Values at which a linear programme is least."""
+    """Values of the variables at which a linear programme is least."""
 
     figure: float
     """The least value of the sum."""
     values: Mapping[str, F64]
     """Values of each block of variables, by its name."""
     prices: Mapping[str, F64]
-    """Rise of the figure with the right-hand side of each named block of rows."""
+    """Rise of the figure with the right-hand side of each block of rows, by its name."""
+
+    def of(self, expression: Linear) -> F64:
+        """Value of each row of an expression, (m,)."""
+        value = expression.constant.copy()
+        for name, matrix in expression.terms.items():
+            value += matrix @ self.values[name]
+        return value
 
 
 class Programme:
-    """A linear programme: minimise a sum over variables within bounds, subject to rows.
-
-    Variables and rows come in blocks, of which rows name those of variables that they read.
-    """
+    """A linear programme: minimise a sum over variables within bounds, subject to rows."""
 
     def __init__(self) -> None:
-        self.sizes: dict[str, int] = {}
-        """Number of variables of each block, by its name."""
+        self._sizes: dict[str, int] = {}
         self._lower: list[F64] = []
         self._upper: list[F64] = []
         self._cost: dict[str, F64] = {}
-        self._equal: list[tuple[str, F64, Mapping[str, Matrix]]] = []
-        self._at_most: list[tuple[str, F64, Mapping[str, Matrix]]] = []
+        self._equal: dict[str, Linear] = {}
+        self._at_most: dict[str, Linear] = {}
 
     def variables(
         self,
@@ -73,113 +172,115 @@ class Programme:
         lower: F64 | float = 0.0,
         upper: F64 | float = np.inf,
         cost: F64 | float = 0.0,
-    ) -> None:
+    ) -> Linear:
         """Add a block of variables.
 
         Args:
-            name: of the block.
-            size: number of variables, n.
+            name: Name of the block.
+            size: Number of variables, n.
             lower: Least value of each, (n,).
             upper: Largest value of each, (n,).
             cost: What a unit of each adds to the sum, (n,).
+
+        Returns:
+            The variables, (n,).
         """
-        self.sizes[name] = size
+        from scipy import sparse
+
+        self._sizes[name] = size
         self._lower.append(np.broadcast_to(np.asarray(lower, float), size))
         self._upper.append(np.broadcast_to(np.asarray(upper, float), size))
         self._cost[name] = np.broadcast_to(np.asarray(cost, float), size)
+        return Linear(np.zeros(size), {name: sparse.eye_array(size, format="csr")})
 
     def add_cost(self, name: str, cost: F64) -> None:
-        """Add to what a unit of each variable of a block adds to the sum.
-
-        Args:
-            name: of the block.
-            cost: What is added, (n,).
-        """
+        """Add to the cost of each variable of a block, (n,)."""
         self._cost[name] = self._cost[name] + cost
 
-    def equal(self, name: str, right: F64, **blocks: Matrix) -> None:
-        """Add rows whose sum over variables equals the right-hand side.
+    def equal(self, name: str, left: Linear, right: Linear | F64 | float) -> None:
+        """Require that two expressions are equal in every row.
 
         Args:
-            name: of the block of rows.
-            right: Right-hand sides, (m,).
-            blocks: Coefficients of the variables of each block, (m, n).
+            name: Name of the block of rows.
+            left: The expressions, (m,).
+            right: What they are equal to, (m,).
         """
-        self._equal.append((name, right, blocks))
+        self._equal[name] = left - right
 
-    def at_most(self, name: str, right: F64, **blocks: Matrix) -> None:
-        """Add rows whose sum over variables is at most the right-hand side.
+    def at_most(self, name: str, left: Linear | F64 | float, right: Linear | F64 | float) -> None:
+        """Require that an expression is at most another in every row.
 
         Args:
-            name: of the block of rows.
-            right: Right-hand sides, (m,).
-            blocks: Coefficients of the variables of each block, (m, n).
+            name: Name of the block of rows.
+            left: The lower expressions, (m,).
+            right: The upper expressions, (m,).
         """
-        self._at_most.append((name, right, blocks))
+        self._at_most[name] = _linear(left) - right
 
     def solve(self) -> Solution:
-        """The least sum, and where it is.
+        """Find the least sum, and values of the variables that reach it.
 
         Raises:
-            InfeasibleError: no values keep all rows and bounds.
-            RuntimeError: the solver found no optimum.
+            InfeasibleError: No values satisfy all rows and bounds.
+            RuntimeError: The solver found no optimum.
         """
         from scipy.optimize import linprog
 
-        if not self.sizes:
+        if not self._sizes:
             return Solution(0.0, {}, {})
         upper, upper_right = self._matrix(self._at_most)
         equal, equal_right = self._matrix(self._equal)
         bounds = np.stack([np.concatenate(self._lower), np.concatenate(self._upper)], axis=1)
         if np.any(bounds[:, 0] > bounds[:, 1]):
             raise InfeasibleError
-        room = 0.0 if upper_right is None else max(1.0, float(np.abs(upper_right).max()))
+        largest = 0.0 if upper_right is None else max(1.0, float(np.abs(upper_right).max()))
         for relief, (method, options) in product(_RELIEFS, _ATTEMPTS):
-            found = linprog(
+            result = linprog(
                 np.concatenate(list(self._cost.values())),
                 A_ub=upper,
-                b_ub=None if upper_right is None else upper_right + relief * room,
+                b_ub=None if upper_right is None else upper_right + relief * largest,
                 A_eq=equal,
                 b_eq=equal_right,
                 bounds=bounds,
                 method=method,
                 options=options,
             )
-            if found.status == 0:
+            if result.status == 0:
                 break
-        if found.status == _INFEASIBLE:
+        if result.status == _INFEASIBLE:
             raise InfeasibleError
-        if found.status != 0:
-            raise RuntimeError(f"linear programme: {found.message}")
+        if result.status != 0:
+            raise RuntimeError(f"linear programme: {result.message}")
+        rows = [{n: len(row) for n, row in block.items()} for block in (self._at_most, self._equal)]
         return Solution(
-            float(found.fun),
-            _split(found.x, self.sizes),
-            _split(found.ineqlin.marginals, {n: len(r) for n, r, _ in self._at_most})
-            | _split(found.eqlin.marginals, {n: len(r) for n, r, _ in self._equal}),
+            float(result.fun),
+            _split(result.x, self._sizes),
+            _split(result.ineqlin.marginals, rows[0]) | _split(result.eqlin.marginals, rows[1]),
         )
 
-    def _matrix(
-        self, rows: list[tuple[str, F64, Mapping[str, Matrix]]]
-    ) -> tuple[Matrix | None, F64 | None]:
-        """Coefficients and right-hand sides of blocks of rows, None where there are none."""
+    def _matrix(self, rows: Mapping[str, Linear]) -> tuple[Matrix | None, F64 | None]:
+        """Coefficients and right-hand sides of blocks of rows; None where there are none."""
         from scipy import sparse
 
         if not rows:
             return None, None
         blocks = [
             [
-                b[name] if name in b else sparse.csr_array((len(right), size))
-                for name, size in self.sizes.items()
+                row.terms.get(name, sparse.csr_array((len(row), size)))
+                for name, size in self._sizes.items()
             ]
-            for _, right, b in rows
+            for row in rows.values()
         ]
-        return sparse.block_array(blocks, format="csc"), np.concatenate([r for _, r, _ in rows])
+        right = np.concatenate([-row.constant for row in rows.values()])
+        return sparse.block_array(blocks, format="csc"), right
+
+
+def _linear(value: Linear | F64 | float) -> Linear:
+    """An expression without variables of an array or a number."""
+    return value if isinstance(value, Linear) else Linear(np.atleast_1d(np.asarray(value, float)))
 
 
 def _split(values: F64, sizes: Mapping[str, int]) -> dict[str, F64]:
     """Values end to end, by the names and sizes of their blocks."""
-    found, first = {}, 0
-    for name, size in sizes.items():
-        found[name] = values[first : first + size]
-        first += size
-    return found
+    ends = np.cumsum([*sizes.values()], dtype=np.int64)
+    return dict(zip(sizes, np.split(values, ends), strict=False))
