@@ -5,7 +5,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from sdc_taichi.config import DataCenterConfig, load_config, preset_names, with_values
-from sdc_taichi.envs import registration
+from sdc_taichi.envs import register as register_environments
 from sdc_taichi.errors import (
     ConfigError,
     DataError,
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 __version__ = version("sdc-taichi")
 
-registration.register()
+register_environments()
 
 __all__ = [
     "Actions",

@@ -23,11 +23,11 @@ from sdc_taichi import (
     with_values,
 )
 from sdc_taichi.control import CONTROLLABLE, FixedSetpoint, GreedyCarbon, Idle, PerAgent
+from sdc_taichi.envs import IDS
 from sdc_taichi.envs.actions import BATTERY_COMMANDS
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT
 from sdc_taichi.envs.features import DEFAULT_FEATURES, all_features
 from sdc_taichi.envs.observers import OBSERVERS
-from sdc_taichi.envs.registration import IDS
 from sdc_taichi.envs.reward_terms import TERMS
 from sdc_taichi.envs.rewards import REWARD_SETS, SCALES
 from sdc_taichi.envs.single import SdcEnv

@@ -25,7 +25,7 @@ from sdc_taichi import (
     make_configs,
 )
 from sdc_taichi.control import ForecastError, View, view_maker
-from sdc_taichi.envs import time_rows
+from sdc_taichi.envs import observer as time_rows
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.features import (
     DEFAULT_FEATURES,
@@ -39,7 +39,7 @@ from sdc_taichi.envs.forecasts import (
     Forecasts,
     lead_steps,
 )
-from sdc_taichi.envs.heat_map import HEAT_MAP_CHANNELS, heat_map, heat_map_space
+from sdc_taichi.envs.images import HEAT_MAP_CHANNELS, heat_map, heat_map_space
 from sdc_taichi.envs.observer import Observer
 from sdc_taichi.sim.drivers import FleetSeries
 

@@ -27,7 +27,7 @@ import sdc_taichi
 from rrd import read, scalars
 from sdc_taichi import EpisodeRecorder, RecordEpisodes, SdcError, StepResult, load_config
 from sdc_taichi.control import View
-from sdc_taichi.control.forecast_error import ForecastError
+from sdc_taichi.control.view import ForecastError
 from sdc_taichi.envs.recording import capped_cubic_schedule
 from sdc_taichi.viz import recording_cadence
 from sdc_taichi.viz.recorder import Recorder

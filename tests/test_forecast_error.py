@@ -14,7 +14,7 @@ import sdc_taichi
 from sdc_taichi import ConfigError, ForecastError, RuntimeStateError, Simulator, load_config
 from sdc_taichi.cli.app import app
 from sdc_taichi.control import Forecast, View, view_maker
-from sdc_taichi.control.forecast_error import walk_keys
+from sdc_taichi.control.view import walk_keys
 from sdc_taichi.envs.core import Core
 from sdc_taichi.envs.forecasts import Forecasts
 from sdc_taichi.envs.options import EnvOptions

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 import sdc_taichi
-from sdc_taichi.envs.registration import IDS
+from sdc_taichi.envs import IDS
 
 pytestmark = pytest.mark.repo
 

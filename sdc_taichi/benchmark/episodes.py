@@ -20,9 +20,9 @@ import numpy.typing as npt
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import commands_of, make_controller
 from sdc_taichi.control.rules import Controller
+from sdc_taichi.envs import IDS
 from sdc_taichi.envs.actions import as_numbers
 from sdc_taichi.envs.agents import AGENTS
-from sdc_taichi.envs.registration import IDS
 from sdc_taichi.envs.vector import SdcVectorEnv
 from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.learning.experts import FollowedOptimum, objective_of_optimum

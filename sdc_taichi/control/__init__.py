@@ -4,7 +4,6 @@ A controller turns a view of the data centers into actions, and knows them by no
 Learning algorithms and physics never live here.
 """
 
-from sdc_taichi.control.forecast_error import PERFECT, ForecastError
 from sdc_taichi.control.registry import (
     CONTROLLABLE,
     check_controller,
@@ -26,7 +25,7 @@ from sdc_taichi.control.rules import (
     commands_of,
     trim_and_respond,
 )
-from sdc_taichi.control.view import Forecast, Limits, View, view_maker
+from sdc_taichi.control.view import PERFECT, Forecast, ForecastError, Limits, View, view_maker
 
 __all__ = [
     "CONTROLLABLE",

@@ -25,8 +25,7 @@ from sdc_taichi.sim.bills import BilledDemand, add_power, no_demand
 from sdc_taichi.types import F64, I64, Actions
 
 if TYPE_CHECKING:
-    from sdc_taichi.control.queue_plan import QueuePlan, Weather
-    from sdc_taichi.control.store_plan import StorePlanner
+    from sdc_taichi.control.plans import QueuePlan, StorePlanner, Weather
 
 HORIZON_H = (1.0, 168.0)
 """Shortest and longest horizon, in h."""
@@ -124,7 +123,7 @@ class ModelPredictive:
         return self._actions
 
     def _plan(self, view: View, planners: _Planners) -> Actions:
-        from sdc_taichi.control.queue_plan import EnergyCost, Weather
+        from sdc_taichi.control.plans import EnergyCost, Weather
 
         coming = view.forecast(self._hours)
         peak_cost = self._objective.kw_month_weight(view.fleet) / view.step_h
@@ -170,8 +169,7 @@ class _Planners:
     """What plans are made with, which lasts as long as data centers and weather stay the same."""
 
     def __init__(self, view: View, agents: tuple[Agent, ...]) -> None:
-        from sdc_taichi.control.queue_plan import QueuePlanner
-        from sdc_taichi.control.store_plan import StorePlanner
+        from sdc_taichi.control.plans import QueuePlanner, StorePlanner
         from sdc_taichi.optimum.facility_map import facility_map
         from sdc_taichi.optimum.problems import inlet_limits_c
 

@@ -1,37 +1,102 @@
-"""Shared parts of the environments of all standards: reset options, infos, added methods."""
+"""Parts that environments of all standards share: arguments, infos, added methods, spec."""
 
 from __future__ import annotations
 
+import importlib
+import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import asdict
+from enum import Enum
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from pydantic import BaseModel
 
-from sdc_taichi.envs import rendering
+from sdc_taichi.control.view import ForecastError
 from sdc_taichi.envs.core import Core, Observation, Transition
+from sdc_taichi.envs.images import RENDER_MODES, Image, check_render_mode, frame
+from sdc_taichi.envs.options import ConfigSource, EnvOptions, Overrides, configs_and_options
+from sdc_taichi.envs.recording import RecorderOption, RecordingCore
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
+from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F32, F64
+from sdc_taichi.user_functions import import_path
 
 RESET_OPTIONS = ("start_day",)
 """Names that ``reset(options=...)`` takes."""
+METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 8}
+"""Metadata of all environments, as Gymnasium and PettingZoo define them."""
 
 
-class _Env:
+class Environment:
     """Attributes and methods that all environments have beyond their standards."""
 
-    core: Core
+    core: RecordingCore
     """The data centers."""
     render_mode: str | None
     """None or ``rgb_array``."""
+    state_space: spaces.Space[Any]
+    """Space of the shared state of one environment."""
+
+    def _open(
+        self,
+        config: ConfigSource,
+        num_envs: int | None,
+        only_agent: str | None = None,
+        *,
+        overrides: Overrides = (),
+        options: EnvOptions | None = None,
+        precision: Precision = "f32",
+        render_mode: str | None = None,
+        recorder: RecorderOption = None,
+        **keywords: Any,
+    ) -> None:
+        """Make the data centers from the arguments that all entry points take alike.
+
+        Args:
+            config: a preset, a file, a config or a dict of its sections; for batches several of
+                the latter two, of which environment i takes entry i modulo their number.
+            num_envs: number of environments; None is one per config.
+            only_agent: the one agent that learns, if the entry point has a single one.
+            overrides: values put into every config: a dict of section.key to value, or a list of
+                ``section.key=value``.
+            options: options; None is the default ones.
+            precision: precision of the server kernels, ``f32`` or ``f64``.
+            render_mode: None or ``rgb_array``.
+            recorder: records episodes: a file ending in .rrd, or an ``EpisodeRecorder``.
+            keywords: fields of ``EnvOptions``, which take precedence over ``options``.
+
+        Raises:
+            SdcError: a config, number or option that is not valid.
+        """
+        check_render_mode(render_mode)
+        configs, chosen = configs_and_options(config, overrides, options, keywords, only_agent)
+        if isinstance(self, SingleEnv) and len(configs) != 1:
+            raise ConfigError(f"config: {len(configs)} data centers; valid is one, or vector_env")
+        self.core = RecordingCore(configs, chosen, num_envs, precision, recorder)
+        self.render_mode = render_mode
+        self.state_space = self.core.state_space
+
+    def _frame(self, env: int) -> Image:
+        """Picture of the hall of one environment, (height, width, 3)."""
+        if self.render_mode is None:
+            raise ConfigError("render: made without render_mode; valid is render_mode='rgb_array'")
+        return frame(self.core.view, env)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the episodes go on; picklable."""
+        """Everything that decides how the episodes continue; picklable."""
         return self.core.state_dict()
 
+    def close(self) -> None:
+        """Close the simulator, which is unusable afterwards."""
+        self.core.close()
 
-class SingleEnv(_Env):
+
+class SingleEnv(Environment):
     """Methods that environments with one data center have beyond their standards."""
 
     def state(self) -> F32:
@@ -42,22 +107,20 @@ class SingleEnv(_Env):
         """All reward terms of the last step by name, unscaled; empty before the first."""
         return as_floats(self.core.reward_terms())
 
-    def render(self) -> rendering.Image:
-        """The hall after the last step, (height, width, 3).
+    def render(self) -> Image:
+        """Picture of the hall after the last step, (height, width, 3).
 
         Raises:
             ConfigError: made without ``render_mode``.
         """
-        rendering.require_render_mode(self.render_mode)
-        return rendering.frame(self.core, 0)
-
-    def close(self) -> None:
-        """Close the simulator, which is unusable afterwards."""
-        self.core.close()
+        return self._frame(0)
 
 
-class BatchEnv(_Env):
+class BatchEnv(Environment):
     """Methods that batches of environments have beyond their standards."""
+
+    num_envs: int
+    """Number of environments, B."""
 
     def state(self) -> F32:
         """Shared state for centralised critics, (B, m)."""
@@ -70,14 +133,13 @@ class BatchEnv(_Env):
         """
         return self.core.reward_terms()
 
-    def render(self) -> tuple[rendering.Image, ...]:
-        """The hall of each environment after the last step, (height, width, 3) each.
+    def render(self) -> tuple[Image, ...]:
+        """Picture of the hall of each environment after the last step, (height, width, 3) each.
 
         Raises:
             ConfigError: made without ``render_mode``.
         """
-        rendering.require_render_mode(self.render_mode)
-        return tuple(rendering.frame(self.core, i) for i in range(self.core.num_envs))
+        return tuple(self._frame(i) for i in range(self.core.num_envs))
 
 
 class AgentSpaces:
@@ -156,3 +218,100 @@ def first_of_batch(observation: Observation) -> Observation:
     if isinstance(observation, dict):
         return {name: values[0] for name, values in observation.items()}
     return np.asarray(observation[0])
+
+
+class HasSpec:
+    """Has the spec that Gymnasium keeps of an environment it has made."""
+
+    core: RecordingCore
+    """The data centers."""
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The arguments as plain values, and the length of an episode; None if made without an id.
+
+        ``gymnasium.make``, or ``make_vec``, makes the same environment of it, or of
+        ``EnvSpec.from_json(spec.to_json())``. What has no plain form stays as it is: a recorder
+        other than a path, a function that cannot be imported, and a controller other than a name.
+        """
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None:
+            spec = copy(spec)
+            spec.kwargs = _plain_arguments(spec.kwargs)
+            spec.max_episode_steps = self.core.steps
+        self._spec = spec
+
+
+def check_steps(given: Any, core: Core) -> int:
+    """Number of steps of an episode with Gymnasium's argument ``max_episode_steps``.
+
+    Args:
+        given: the argument; None and -1 are no limit.
+        core: the data centers.
+
+    Raises:
+        ConfigError: no whole number, or more steps than an episode has.
+    """
+    if given is None or (given == -1 and not isinstance(given, bool)):
+        return core.steps
+    whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
+    if not whole or not 1 <= given <= core.steps:
+        raise ConfigError(
+            f"max_episode_steps {given!r}: valid is 1..{core.steps}, of which the last is an "
+            f"episode of days {core.options.days}"
+        )
+    return int(given)
+
+
+def _plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of an entry point; those in ``options`` by keyword, which means the same."""
+    given = dict(arguments)
+    options = given.pop("options", None)
+    if isinstance(options, EnvOptions):
+        # Fields left at their default are not given: some are errors where they have no effect.
+        given = {name: getattr(options, name) for name in options.model_fields_set} | given
+    known: dict[int, Any] = {}
+    return {name: _plain(value, known) for name, value in given.items()}
+
+
+def _plain(value: Any, known: dict[int, Any]) -> Any:
+    """A value as JSON has it, or the value itself.
+
+    Args:
+        value: any value.
+        known: models by id and what became of them, since configs of a batch are often the same.
+    """
+    if isinstance(value, BaseModel):
+        if id(value) not in known:
+            known[id(value)] = value.model_dump(mode="json")
+        return known[id(value)]
+    if isinstance(value, ForecastError):
+        return _plain(asdict(value), known)
+    if isinstance(value, Mapping):
+        return {name: _plain(entry, known) for name, entry in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [_plain(entry, known) for entry in value]
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return _path_of(value) if callable(value) else value
+
+
+def _path_of(function: Callable[..., Any]) -> Any:
+    """Import path of a function, or the function if none leads to it in another process."""
+    path = import_path(function)
+    module, _, name = path.partition(":")
+    if module != "__main__":
+        try:
+            if getattr(importlib.import_module(module), name) is function:
+                return path
+        except (ImportError, AttributeError):
+            pass
+    return function

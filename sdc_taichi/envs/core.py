@@ -30,14 +30,22 @@ from sdc_taichi.control import (
 from sdc_taichi.envs.actions import ActionDecoder, as_numbers
 from sdc_taichi.envs.agents import COMMAND_OF_AGENT, COMMANDS_OF_AGENT, commands_by_others
 from sdc_taichi.envs.costs import Costs
-from sdc_taichi.envs.drawn_inputs import Draw, DrawnInputs, draw_info, draws_inputs
-from sdc_taichi.envs.episode_reset import Seed, chosen_start_days, seeded_generators
+from sdc_taichi.envs.episodes import (
+    Draw,
+    DrawnInputs,
+    SavedState,
+    Seed,
+    check_state,
+    chosen_start_days,
+    draw_info,
+    draws_inputs,
+    seeded_generators,
+)
 from sdc_taichi.envs.features import Feature
-from sdc_taichi.envs.heat_map import heat_map, heat_map_space
+from sdc_taichi.envs.images import heat_map, heat_map_space
 from sdc_taichi.envs.observers import make_observer
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.rewards import Rewards
-from sdc_taichi.envs.saved_state import SavedState, check_state
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError, whole_number
 from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.sim.events import require_events_start_before

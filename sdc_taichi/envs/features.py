@@ -13,8 +13,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium.spaces import Box
 
 from sdc_taichi.envs.agents import AGENTS
@@ -239,6 +241,34 @@ def feature_slices(features: Sequence[Feature]) -> dict[str, slice]:
     """Entries of each feature, by name, where ``features`` stand side by side."""
     ends = np.cumsum([0, *(f.size for f in features)]).tolist()
     return {f.name: slice(first, first + f.size) for f, first in zip(features, ends, strict=False)}
+
+
+class _Sized(Protocol):
+    """A named part of an observation; equal parts are one feature."""
+
+    @property
+    def size(self) -> int:
+        """Number of entries side by side."""
+
+
+def entries_of_new_features(
+    features_of: Mapping[str, Sequence[_Sized]],
+) -> dict[str, npt.NDArray[np.int64] | slice]:
+    """Entries of each agent's observation whose features no agent before it has.
+
+    Args:
+        features_of: features of each agent, in the order of its observation.
+    """
+    known: set[Any] = set()
+    out: dict[str, npt.NDArray[np.int64] | slice] = {}
+    for agent, features in features_of.items():
+        new = np.repeat([f not in known for f in features], [f.size for f in features])
+        entries = np.flatnonzero(new)
+        # A slice needs no copy.
+        contiguous = len(entries) > 0 and entries[-1] - entries[0] == len(entries) - 1
+        out[agent] = slice(int(entries[0]), int(entries[-1]) + 1) if contiguous else entries
+        known.update(features)
+    return out
 
 
 def features_markdown() -> str:

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from sdc_taichi.control.forecast_error import (
+from sdc_taichi.control.view import (
     CI_WALK,
     PERFECT,
     TEMPERATURE_WALK,

@@ -8,9 +8,8 @@ from typing import Any
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
-from sdc_taichi.envs import rendering
-from sdc_taichi.envs.arguments import ConfigSource, Overrides, single_core
 from sdc_taichi.envs.base import (
+    METADATA,
     AgentSpaces,
     SingleEnv,
     as_floats,
@@ -20,9 +19,7 @@ from sdc_taichi.envs.base import (
     step_info,
 )
 from sdc_taichi.envs.core import Observation
-from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.envs.recording import RecorderOption
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.envs.options import ConfigSource
 
 
 class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
@@ -34,13 +31,8 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
 
     Args:
         config: a preset, a file or a config.
-        overrides: values put into the config: a dict of section.key to value, or a list of
-            ``section.key=value``.
-        options: options; None is the default ones.
-        precision: precision of the server kernels, ``f32`` or ``f64``.
-        render_mode: None or ``rgb_array``.
-        recorder: records episodes: a file ending in .rrd, or what ``EpisodeRecorder`` says.
-        keywords: fields of ``EnvOptions``, in place of those in ``options``.
+        arguments: ``overrides``, ``options``, ``precision``, ``render_mode``, ``recorder`` and
+            fields of ``EnvOptions``, as docs/environments.md lists them.
 
     Raises:
         SdcError: a config or option that is not valid.
@@ -48,30 +40,16 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
 
     metadata: dict[str, Any] = {  # noqa: RUF012  as the base class has it
         "name": "sdc_taichi_v0",
-        "render_modes": list(rendering.RENDER_MODES),
-        "render_fps": 8,
+        **METADATA,
         "is_parallelizable": True,
     }
 
-    def __init__(
-        self,
-        config: ConfigSource = "corrected",
-        *,
-        overrides: Overrides = (),
-        options: EnvOptions | None = None,
-        precision: Precision = "f32",
-        render_mode: str | None = None,
-        recorder: RecorderOption = None,
-        **keywords: Any,
-    ) -> None:
-        rendering.check_render_mode(render_mode)
-        self.core = single_core(config, overrides, options, keywords, precision, recorder)
-        self.render_mode = render_mode
+    def __init__(self, config: ConfigSource = "corrected", **arguments: Any) -> None:
+        self._open(config, 1, **arguments)
         self.possible_agents: list[str] = list(self.core.agents)
         self.agents: list[str] = []
         self.observation_spaces = self.core.observation_spaces
         self.action_spaces = self.core.action_spaces
-        self.state_space = self.core.state_space
 
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -139,42 +117,17 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
 parallel_env = SdcParallelEnv
 
 
-def aec_env(
-    config: ConfigSource = "corrected",
-    *,
-    overrides: Overrides = (),
-    options: EnvOptions | None = None,
-    precision: Precision = "f32",
-    render_mode: str | None = None,
-    recorder: RecorderOption = None,
-    **keywords: Any,
-) -> AECEnv[str, Observation, Any]:
+def aec_env(config: ConfigSource = "corrected", **arguments: Any) -> AECEnv[str, Observation, Any]:
     """A PettingZoo environment whose agents act in turn, by PettingZoo's own conversion.
 
     Args:
         config: a preset, a file or a config.
-        overrides: values put into the config: a dict of section.key to value, or a list of
-            ``section.key=value``.
-        options: options; None is the default ones.
-        precision: precision of the server kernels, ``f32`` or ``f64``.
-        render_mode: None or ``rgb_array``.
-        recorder: records episodes: a file ending in .rrd, or what ``EpisodeRecorder`` says.
-        keywords: fields of ``EnvOptions``, in place of those in ``options``.
+        arguments: the same as those of ``parallel_env``.
 
     Raises:
         SdcError: a config or option that is not valid.
     """
-    return parallel_to_aec(
-        parallel_env(
-            config,
-            overrides=overrides,
-            options=options,
-            precision=precision,
-            render_mode=render_mode,
-            recorder=recorder,
-            **keywords,
-        )
-    )
+    return parallel_to_aec(parallel_env(config, **arguments))
 
 
 def _first_of_each(observations: Mapping[str, Observation]) -> dict[str, Observation]:

@@ -11,6 +11,7 @@ from gymnasium.spaces import Box
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.features import AGE_EDGES_H
+from sdc_taichi.envs.observer import EntryOrder
 from sdc_taichi.envs.released_features import (
     ENTRY_NUMBERS,
     FEATURES,
@@ -20,7 +21,6 @@ from sdc_taichi.envs.released_features import (
     ranges,
 )
 from sdc_taichi.envs.released_rows import ReleasedRows, ScaledEpisode
-from sdc_taichi.envs.time_rows import EntryOrder
 from sdc_taichi.errors import RuntimeStateError
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP, age_histogram
 from sdc_taichi.types import F32, F64, I64

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from sdc_taichi.control.view import View
+from sdc_taichi.envs.observer import TimeRows, time_rows
 from sdc_taichi.envs.released_features import (
     CI_STEPS,
     ENTRY_NUMBERS,
@@ -19,7 +20,6 @@ from sdc_taichi.envs.released_features import (
     cut,
     ranges,
 )
-from sdc_taichi.envs.time_rows import TimeRows, time_rows
 from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.types import F32, F64, I64
 

@@ -16,8 +16,7 @@ import numpy as np
 from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.released_rewards import ReleasedRewards
-from sdc_taichi.envs.reward_context import RewardContext
-from sdc_taichi.envs.reward_terms import TERMS, TermContext
+from sdc_taichi.envs.reward_terms import TERMS, RewardContext, TermContext
 from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
 from sdc_taichi.sim.physical_limits import POWER_LIMITS_W
 from sdc_taichi.sim.state_limits import ROUNDING

@@ -1,15 +1,19 @@
-"""One data center as a Gymnasium environment with one learner."""
+"""One data center as a Gymnasium environment with one learner: an agent, or all agents as one."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
 
-from sdc_taichi.envs import rendering
-from sdc_taichi.envs.arguments import ConfigSource, Overrides, single_core
+from sdc_taichi.envs.actions import checked_array
 from sdc_taichi.envs.base import (
+    METADATA,
+    HasSpec,
     SingleEnv,
     as_floats,
     first_info,
@@ -17,12 +21,179 @@ from sdc_taichi.envs.base import (
     start_day_option,
     step_info,
 )
-from sdc_taichi.envs.core import Observation
-from sdc_taichi.envs.learners import learning_agent, make_learner
-from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.envs.recording import RecorderOption
-from sdc_taichi.envs.spec import HasSpec
-from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.envs.core import Core, Observation, Transition
+from sdc_taichi.envs.features import Feature, entries_of_new_features
+from sdc_taichi.envs.options import ConfigSource
+from sdc_taichi.errors import ConfigError, SdcError
+from sdc_taichi.types import F32, F64
+
+
+class Learner(Protocol):
+    """Stands between the one learner of a batch and its agents; arrays have environments first."""
+
+    observation_space: spaces.Space[Any]
+    """Space of the learner's observation in one environment."""
+    action_space: spaces.Space[Any]
+    """Space of the learner's action in one environment."""
+    features: tuple[Feature, ...]
+    """Features of the learner's observation, in its order."""
+
+    def actions(self, given: Any) -> dict[str, Any]:
+        """Actions of each agent from those of the learner, (B,) or (B, k)."""
+
+    def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """Actions of the learner from those of the agents, (B,) or (B, k)."""
+
+    def observation(self, by_agent: Mapping[str, Observation]) -> Observation:
+        """Observations of the learner from those of the agents, (B, n)."""
+
+    def reward(self, transition: Transition) -> F64:
+        """Reward of the learner, (B,)."""
+
+
+class AgentLearner:
+    """One agent learns; it gets its own reward, shared as ``collaboration`` says.
+
+    Args:
+        core: data centers in which it alone learns.
+
+    Attributes:
+        observation_space: space of the agent's observation in one environment.
+        action_space: space of the agent's action in one environment.
+        features: features of its observation, in their order.
+    """
+
+    def __init__(self, core: Core) -> None:
+        (self._agent,) = core.agents
+        self.observation_space = core.observation_spaces[self._agent]
+        self.action_space = core.action_spaces[self._agent]
+        self.features = core.features[self._agent]
+
+    def actions(self, given: Any) -> dict[str, Any]:
+        """The learner's action as the agent's."""
+        return {self._agent: given}
+
+    def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """The agent's actions as the learner's, (B,) or (B, k)."""
+        return by_agent[self._agent].astype(self.action_space.dtype)
+
+    def observation(self, by_agent: Mapping[str, Observation]) -> Observation:
+        """The agent's observation, (B, n)."""
+        return by_agent[self._agent]
+
+    def reward(self, transition: Transition) -> F64:
+        """The agent's reward, (B,)."""
+        return np.array(transition.rewards[self._agent])
+
+
+class JointLearner:
+    """All learning agents as one learner.
+
+    It sees their observations side by side, each feature once, rather than the shared state, which
+    would show it features that the option ``features`` left out. With rewards ``default`` and
+    ``bill`` its reward is each of their terms once. With others it is the sum of theirs, in which
+    the weights of ``collaboration`` cancel if all three agents learn. What a reward function of the
+    user's gives for all agents alike, it gets once.
+
+    Args:
+        core: data centers in which the agents learn.
+
+    Attributes:
+        observation_space: space of all observations side by side in one environment.
+        action_space: space of all actions side by side in one environment.
+        features: features of its observation, in their order.
+    """
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._new_entries = entries_of_new_features(core.features)
+        every = [feature for agent in core.agents for feature in core.features[agent]]
+        self.features = tuple(dict.fromkeys(every))
+        boxes = {agent: _features_box(core, agent) for agent in core.agents}
+        low = np.concatenate([boxes[a].low[entries] for a, entries in self._new_entries.items()])
+        high = np.concatenate([boxes[a].high[entries] for a, entries in self._new_entries.items()])
+        features = spaces.Box(low, high, dtype=np.float32)
+        of_first = core.observation_spaces[core.agents[0]]
+        self.observation_space: spaces.Space[Any] = features
+        if isinstance(of_first, spaces.Dict):
+            self.observation_space = spaces.Dict({**of_first.spaces, "features": features})
+        self.action_space = _actions_side_by_side([core.action_spaces[a] for a in core.agents])
+
+    def actions(self, given: Any) -> dict[str, Any]:
+        """Columns of the learner's actions, (B, k), for each agent.
+
+        Raises:
+            SdcError: actions of another shape.
+        """
+        given = checked_array(given, "actions")
+        shape = (self._core.num_envs, *(self.action_space.shape or ()))
+        if given.shape != shape:
+            raise SdcError(f"actions: shape {given.shape}, expected {shape}")
+        out: dict[str, Any] = {}
+        first = 0
+        for agent in self._core.agents:
+            size = self._core.action_spaces[agent].shape
+            width = size[0] if size else 1
+            out[agent] = given[:, first : first + width] if size else given[:, first]
+            first += width
+        return out
+
+    def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """Actions side by side, (B, k)."""
+        size = self._core.num_envs
+        parts = [by_agent[agent].reshape(size, -1) for agent in self._core.agents]
+        return np.concatenate(parts, axis=1).astype(self.action_space.dtype)
+
+    def observation(self, by_agent: Mapping[str, Observation]) -> Observation:
+        """Observations side by side, each feature once, (B, n)."""
+        parts = [_features(by_agent[a])[:, entries] for a, entries in self._new_entries.items()]
+        features: F32 = np.concatenate(parts, axis=1)
+        of_first = by_agent[self._core.agents[0]]
+        return {**of_first, "features": features} if isinstance(of_first, dict) else features
+
+    def reward(self, transition: Transition) -> F64:
+        """The reward of all agents together, (B,)."""
+        return np.array(transition.joint_reward)
+
+
+def make_learner(core: Core, agent: str | None) -> Learner:
+    """The learner of an environment for one agent, or with None for all that learn."""
+    return JointLearner(core) if agent is None else AgentLearner(core)
+
+
+def learning_agent(agent: str | None, registered_agent: str | None) -> str | None:
+    """The agent that learns alone, None being all ``agents`` as one.
+
+    Raises:
+        ConfigError: another agent than that of the id.
+    """
+    if registered_agent is not None and agent not in (None, registered_agent):
+        raise ConfigError(
+            f"agent {agent!r}: the one agent here is {registered_agent}; valid with another id"
+        )
+    return registered_agent or agent
+
+
+def _features_box(core: Core, agent: str) -> spaces.Box:
+    """Space of an agent's features, without the heat map."""
+    space = core.observation_spaces[agent]
+    found = space["features"] if isinstance(space, spaces.Dict) else space
+    assert isinstance(found, spaces.Box)
+    return found
+
+
+def _features(observation: Observation) -> F32:
+    """Features of an observation, without the heat map."""
+    return observation["features"] if isinstance(observation, dict) else observation
+
+
+def _actions_side_by_side(parts: list[spaces.Space[Any]]) -> spaces.Space[Any]:
+    boxes = [p for p in parts if isinstance(p, spaces.Box)]
+    if boxes:
+        low, high = (np.concatenate([getattr(b, side) for b in boxes]) for side in ("low", "high"))
+        return spaces.Box(low, high, dtype=np.float32)
+    widths = [p.shape[0] if p.shape else 1 for p in parts]
+    return spaces.MultiDiscrete([3] * sum(widths))
 
 
 class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
@@ -34,48 +205,30 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
 
     Args:
         config: a preset, a file or a config.
-        overrides: values put into the config: a dict of section.key to value, or a list of
-            ``section.key=value``.
-        options: options; None is the default ones.
         agent: agent that learns while ``others`` plays the rest; None is all ``agents`` as one.
-        precision: precision of the server kernels, ``f32`` or ``f64``.
-        render_mode: None or ``rgb_array``.
         registered_agent: set by the ids of one agent.
-        recorder: records episodes: a file ending in .rrd, or what ``EpisodeRecorder`` says.
-        keywords: fields of ``EnvOptions``, in place of those in ``options``.
+        arguments: ``overrides``, ``options``, ``precision``, ``render_mode``, ``recorder`` and
+            fields of ``EnvOptions``, as docs/environments.md lists them.
 
     Raises:
         SdcError: a config or option that is not valid.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012  as the base class has it
-        "render_modes": list(rendering.RENDER_MODES),
-        "render_fps": 8,
-    }
+    metadata: dict[str, Any] = METADATA
 
     def __init__(
         self,
         config: ConfigSource = "corrected",
         *,
-        overrides: Overrides = (),
-        options: EnvOptions | None = None,
         agent: str | None = None,
-        precision: Precision = "f32",
-        render_mode: str | None = None,
         registered_agent: str | None = None,
-        recorder: RecorderOption = None,
-        **keywords: Any,
+        **arguments: Any,
     ) -> None:
-        rendering.check_render_mode(render_mode)
         agent = learning_agent(agent, registered_agent)
-        self.core = single_core(
-            config, overrides, options, keywords, precision, recorder, only_agent=agent
-        )
-        self.render_mode = render_mode
+        self._open(config, 1, agent, **arguments)
         self._learner = make_learner(self.core, agent)
         self.observation_space = self._learner.observation_space
         self.action_space = self._learner.action_space
-        self.state_space = self.core.state_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -10,23 +10,24 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 
-from sdc_taichi.envs import rendering
-from sdc_taichi.envs.arguments import ConfigSource, Overrides, configs_and_options
-from sdc_taichi.envs.base import AgentSpaces, BatchEnv, start_day_option, step_info
-from sdc_taichi.envs.core import Core, Observation
-from sdc_taichi.envs.episode_reset import Seed
+from sdc_taichi.envs.base import (
+    METADATA,
+    AgentSpaces,
+    BatchEnv,
+    HasSpec,
+    check_steps,
+    start_day_option,
+    step_info,
+)
+from sdc_taichi.envs.core import Observation
+from sdc_taichi.envs.episodes import Seed
 from sdc_taichi.envs.features import Feature
-from sdc_taichi.envs.learners import learning_agent, make_learner
-from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.envs.recording import RecorderOption, RecordingCore
-from sdc_taichi.envs.spec import HasSpec, check_steps
+from sdc_taichi.envs.options import ConfigSource
+from sdc_taichi.envs.single import learning_agent, make_learner
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F32, F64, Actions
 
 Flags = npt.NDArray[np.bool_]
-
-_METADATA: dict[str, Any] = {"render_modes": list(rendering.RENDER_MODES), "render_fps": 8}
 
 
 class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
@@ -39,21 +40,15 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
     Args:
         num_envs: number of environments.
         config: a preset, a file, or configs; environment i takes config i modulo their number.
-        overrides: values put into every config: a dict of section.key to value, or a list of
-            ``section.key=value``.
-        options: options; None is the default ones.
         agent: agent that learns while ``others`` plays the rest; None is all ``agents`` as one.
-        precision: precision of the server kernels, ``f32`` or ``f64``.
-        render_mode: None or ``rgb_array``.
         registered_agent: set by the ids of one agent.
         autoreset_mode: when the next episodes start, as the enum or its value: ``NextStep``, in the
             step after the one that ends the last ones; ``SameStep``, in that step itself;
             ``Disabled``, by ``reset`` alone.
         max_episode_steps: ends episodes after fewer steps than their days have, as Gymnasium's
             ``TimeLimit`` does around a single environment; None and -1 do not.
-        recorder: records episodes of the first environment into a file ending in .rrd, or what
-            ``EpisodeRecorder`` says.
-        keywords: fields of ``EnvOptions``, in place of those in ``options``.
+        arguments: ``overrides``, ``options``, ``precision``, ``render_mode``, ``recorder`` and
+            fields of ``EnvOptions``, as docs/environments.md lists them.
 
     Raises:
         SdcError: a config, number or option that is not valid.
@@ -62,7 +57,7 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
     closed = True
     """Whether there is nothing to close: before the environment is made, and once it is closed.
 
-    Gymnasium closes on deletion whatever says that it is open, even what could not be made.
+    Gymnasium closes every environment on deletion, even one whose constructor failed.
     """
 
     def __init__(
@@ -70,34 +65,23 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         num_envs: int = 1,
         config: ConfigSource = "corrected",
         *,
-        overrides: Overrides = (),
-        options: EnvOptions | None = None,
         agent: str | None = None,
-        precision: Precision = "f32",
-        render_mode: str | None = None,
         registered_agent: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
-        recorder: RecorderOption = None,
-        **keywords: Any,
+        **arguments: Any,
     ) -> None:
-        rendering.check_render_mode(render_mode)
         self._mode = _autoreset_mode(autoreset_mode)
         agent = learning_agent(agent, registered_agent)
-        configs, chosen = configs_and_options(
-            config, overrides, options, keywords, only_agent=agent
-        )
-        self.core = RecordingCore(configs, chosen, num_envs, precision, recorder)
+        self._open(config, num_envs, agent, **arguments)
         self.core.end_after(check_steps(max_episode_steps, self.core))
         self.num_envs = num_envs = self.core.num_envs
-        self.render_mode = render_mode
-        self.metadata = _METADATA | {"autoreset_mode": self._mode}
+        self.metadata = METADATA | {"autoreset_mode": self._mode}
         self._learner = make_learner(self.core, agent)
         self.single_observation_space = self._learner.observation_space
         self.single_action_space = self._learner.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.state_space = self.core.state_space
         self._everyone = np.ones(num_envs, dtype=np.bool_)
         self._everyone.flags.writeable = False
         self.closed = False
@@ -186,18 +170,27 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         """
         return self._learner.observation(self.core.load_state_dict(values))
 
-    def close_extras(self, **_: Any) -> None:
+    def close(self, **_: Any) -> None:
         """Close the simulator, which is unusable afterwards."""
-        self.core.close()
+        if not self.closed:
+            super().close()
+            self.closed = True
 
 
 class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
-    """Data centers with several learning agents each that step together; see ``vector_env``.
+    """Data centers with several learning agents each that step together.
+
+    All episodes have the same length and end, by truncation, in the same step. The step after that
+    starts the next ones: it ignores its actions and returns first observations and rewards of 0.
 
     Args:
-        core: the data centers.
-        render_mode: None or ``rgb_array``.
-        autoreset_mode: when the next episodes start, as in ``vector_env``.
+        num_envs: number of environments; None is one per config.
+        config: a preset, a file, or configs; environment i takes config i modulo their number.
+        autoreset_mode: when the next episodes start, as Gymnasium's enum or its value:
+            ``NextStep``, in the step after the one that ends the last ones; ``SameStep``, in that
+            step itself; ``Disabled``, by ``reset`` alone.
+        arguments: ``overrides``, ``options``, ``precision``, ``render_mode``, ``recorder`` and
+            fields of ``EnvOptions``, as docs/environments.md lists them.
 
     Attributes:
         num_envs: number of environments, B.
@@ -208,26 +201,25 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
         metadata: name, render modes, and ``autoreset_mode`` as Gymnasium's enum.
 
     Raises:
-        ConfigError: a mode that is not valid.
+        SdcError: a config, number or option that is not valid.
     """
 
     def __init__(
         self,
-        core: Core,
-        render_mode: str | None = None,
+        num_envs: int | None = None,
+        config: ConfigSource = "corrected",
+        *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **arguments: Any,
     ) -> None:
-        rendering.check_render_mode(render_mode)
         self._mode = _autoreset_mode(autoreset_mode)
-        self.metadata = {"name": "sdc_taichi_v0", **_METADATA, "autoreset_mode": self._mode}
-        self.core = core
-        self.render_mode = render_mode
-        self.num_envs = core.num_envs
-        self.possible_agents: list[str] = list(core.agents)
-        self.agents: list[str] = list(core.agents)
-        self.observation_spaces = core.observation_spaces
-        self.action_spaces = core.action_spaces
-        self.state_space = core.state_space
+        self._open(config, num_envs, **arguments)
+        self.metadata = {"name": "sdc_taichi_v0", **METADATA, "autoreset_mode": self._mode}
+        self.num_envs = self.core.num_envs
+        self.possible_agents: list[str] = list(self.core.agents)
+        self.agents: list[str] = list(self.core.agents)
+        self.observation_spaces = self.core.observation_spaces
+        self.action_spaces = self.core.action_spaces
 
     @property
     def num_agents(self) -> int:
@@ -327,49 +319,8 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
         """
         return self.core.load_state_dict(values)
 
-    def close(self) -> None:
-        """Close the simulator, which is unusable afterwards."""
-        self.core.close()
 
-
-def vector_env(
-    num_envs: int | None = None,
-    config: ConfigSource = "corrected",
-    *,
-    overrides: Overrides = (),
-    options: EnvOptions | None = None,
-    precision: Precision = "f32",
-    render_mode: str | None = None,
-    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    recorder: RecorderOption = None,
-    **keywords: Any,
-) -> MultiAgentVectorEnv:
-    """A batch of data centers with several learning agents each.
-
-    All episodes have the same length and end, by truncation, in the same step. The step after that
-    starts the next ones: it ignores its actions and returns first observations and rewards of 0.
-
-    Args:
-        num_envs: number of environments; None is one per config.
-        config: a preset, a file, or configs; environment i takes config i modulo their number.
-        overrides: values put into every config: a dict of section.key to value, or a list of
-            ``section.key=value``.
-        options: options; None is the default ones.
-        precision: precision of the server kernels, ``f32`` or ``f64``.
-        render_mode: None or ``rgb_array``.
-        autoreset_mode: when the next episodes start, as Gymnasium's enum or its value:
-            ``NextStep``, in the step after the one that ends the last ones; ``SameStep``, in that
-            step itself; ``Disabled``, by ``reset`` alone.
-        recorder: records episodes of the first environment into a file ending in .rrd, or what
-            ``EpisodeRecorder`` says.
-        keywords: fields of ``EnvOptions``, in place of those in ``options``.
-
-    Raises:
-        SdcError: a config, number or option that is not valid.
-    """
-    configs, chosen = configs_and_options(config, overrides, options, keywords)
-    core = RecordingCore(configs, chosen, num_envs, precision, recorder)
-    return MultiAgentVectorEnv(core, render_mode, autoreset_mode)
+vector_env = MultiAgentVectorEnv
 
 
 def _autoreset_mode(given: AutoresetMode | str) -> AutoresetMode:

@@ -21,7 +21,7 @@ from pydantic import Field, ValidationError
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.config import explain
 from sdc_taichi.config.fields import Section
-from sdc_taichi.envs.learners import entries_of_new_features
+from sdc_taichi.envs.features import entries_of_new_features
 from sdc_taichi.errors import SdcError, shortened
 from sdc_taichi.learning.forward import Activation, Forward
 from sdc_taichi.learning.interface import Interface

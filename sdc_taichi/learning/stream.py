@@ -17,8 +17,8 @@ from torch import Tensor
 
 from sdc_taichi.control import View
 from sdc_taichi.envs.core import Observation, Transition
-from sdc_taichi.envs.drawn_inputs import draws_inputs
-from sdc_taichi.envs.learners import JointLearner
+from sdc_taichi.envs.episodes import draws_inputs
+from sdc_taichi.envs.single import JointLearner
 from sdc_taichi.envs.vector import MultiAgentVectorEnv
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.policy import CHOICES, action_levels

@@ -1,4 +1,4 @@
-"""Checks of what ``state_dict`` of an environment gave, before anything is changed by it."""
+"""Seeds and first days of episodes, as ``reset`` is given them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,198 @@ from typing import Any
 
 import numpy as np
 
+from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.envs.actions import PLACEMENT_FACTOR
-from sdc_taichi.envs.drawn_inputs import Draw, DrawnInputs
-from sdc_taichi.errors import SdcError, shortened
-from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR
+from sdc_taichi.envs.options import EnvOptions
+from sdc_taichi.errors import ConfigError, SdcError, shortened
+from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, day_of_year
 from sdc_taichi.sim.actions import MOST_MOVES
-from sdc_taichi.sim.drivers import Drivers
+from sdc_taichi.sim.drivers import Drivers, InputReader
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.snapshot import as_array
 from sdc_taichi.types import F64, I64, State
+
+Seed = int | Sequence[int | None] | I64 | None
+"""Seed of environment 0, to which environment i adds i; or one for each environment, of which None
+goes on with the generator that is there; or None for all."""
+
+
+def seeded_generators(
+    seed: Seed, present: Sequence[np.random.Generator], num_envs: int
+) -> list[np.random.Generator]:
+    """A generator for each environment, by its seed or the present one.
+
+    Args:
+        seed: environment i takes ``seed + i``, or entry i.
+        present: generators of the episode before; none before the first.
+        num_envs: number of environments.
+
+    Raises:
+        ConfigError: a seed that is not valid, or another number of them than of environments.
+    """
+    if seed is None and present:
+        return list(present)
+    if seed is None:
+        seed = int(np.random.SeedSequence().generate_state(1, np.uint32)[0])
+    if isinstance(seed, np.ndarray) and seed.ndim == 0:
+        seed = seed[()]
+    if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
+        seeds: list[Any] = list(seed)
+    else:
+        seeds = [_checked_seed(seed) + i for i in range(num_envs)]
+    if len(seeds) != num_envs:
+        raise ConfigError(f"seed: {len(seeds)} for {num_envs} environments")
+    before: list[np.random.Generator | None] = [*present] or [None] * num_envs
+    return [
+        (rng or np.random.default_rng())
+        if one is None
+        else np.random.Generator(np.random.PCG64(_checked_seed(one)))
+        for one, rng in zip(seeds, before, strict=True)
+    ]
+
+
+def chosen_start_days(given: Any, num_envs: int) -> I64:
+    """First day of each episode, counted from 0 in the year, (B,).
+
+    Args:
+        given: a day as ``MM-DD`` or counted from 0, or one for each environment.
+        num_envs: number of environments.
+
+    Raises:
+        ConfigError: a day that is not valid, or another number of them than of environments.
+    """
+    if isinstance(given, np.ndarray) and given.ndim == 0:
+        given = given[()]
+    several = isinstance(given, list | tuple | np.ndarray)
+    days = np.array([_checked_day(day) for day in (given if several else [given])], dtype=np.int64)
+    if len(days) not in (1, num_envs):
+        raise ConfigError(f"start_day: {len(days)} days for {num_envs} environments")
+    return np.broadcast_to(days, (num_envs,))
+
+
+def _checked_seed(seed: Any) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**63:
+        raise ConfigError(f"seed {seed!r}: valid is an integer of 0..2**63 - 1")
+    return int(seed)
+
+
+def _checked_day(day: Any) -> int:
+    """Day of the year, 0..364."""
+    if isinstance(day, int | np.integer) and not isinstance(day, bool):
+        if 0 <= day < DAYS_PER_YEAR:
+            return int(day)
+    elif isinstance(day, str):
+        try:
+            return day_of_year(day)
+        except ValueError:
+            pass
+    raise ConfigError(f"start_day {day!r}: valid is MM-DD or a day of the year, 0..364")
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """Inputs of the episodes of B environments."""
+
+    years: tuple[int, ...] | None
+    """Seed of the synthetic series of each environment, B; None is ``site.seed``."""
+    traces: tuple[str, ...] | None
+    """Workload trace of each environment, B; None is what the config names."""
+
+
+class DrawnInputs:
+    """Draws years and traces of episodes, and reads them.
+
+    Args:
+        configs: config of each environment, B.
+        options: what episodes draw from.
+
+    Raises:
+        ConfigError: years of data centers without a synthetic series, or an unknown trace.
+        DataError: the file of a trace is not valid.
+    """
+
+    def __init__(self, configs: Sequence[DataCenterConfig], options: EnvOptions) -> None:
+        self._years, self._traces = options.years, options.traces
+        self._reader = InputReader(configs)
+        self._last: tuple[Draw, Drivers] | None = None
+        traces = [self._reader.check_trace(trace) for trace in self._traces or ()]
+        some_trace_is_synthetic = any(trace.synthetic for trace in traces)
+        if self._years is not None and not some_trace_is_synthetic:
+            for config, synthetic in zip(configs, self._reader.is_synthetic(), strict=True):
+                if not synthetic:
+                    raise ConfigError(
+                        f"years: without effect on {config.name}, of which no input is synthetic; "
+                        "valid with embedded sites or traces"
+                    )
+
+    def first(self) -> Drivers:
+        """Inputs that the configs name, by which devices are sized."""
+        return self._reader.read()
+
+    def draw(self, generators: Sequence[np.random.Generator]) -> Draw:
+        """Year and trace of the next episodes.
+
+        Args:
+            generators: that of each environment, of which the same numbers are drawn whatever the
+                options.
+        """
+        drawn = np.array([rng.integers(2**63 - 1, size=2) for rng in generators], dtype=np.int64)
+        years = traces = None
+        if isinstance(self._years, int):
+            years = tuple((drawn[:, 0] % self._years).tolist())
+        elif self._years is not None:
+            years = tuple(self._years[i] for i in drawn[:, 0] % len(self._years))
+        if self._traces is not None:
+            traces = tuple(self._traces[i] for i in drawn[:, 1] % len(self._traces))
+        return Draw(years, traces)
+
+    def drivers(self, draw: Draw) -> Drivers:
+        """Inputs of a draw; the same object while the draws are the same."""
+        if self._last is None or self._last[0] != draw:
+            self._last = draw, self._reader.read(draw.years, draw.traces)
+        return self._last[1]
+
+    def checked(self, given: Any, num_envs: int) -> Draw:
+        """The draw that a saved state names.
+
+        Raises:
+            SdcError: a draw that these options cannot give.
+        """
+        names = {"years", "traces"}
+        if not isinstance(given, Mapping) or set(given) != names:
+            raise SdcError("state: inputs are not valid; valid is what state_dict() gave")
+        years, traces = given["years"], given["traces"]
+        for name, values, valid in (
+            ("years", years, range(self._years) if isinstance(self._years, int) else self._years),
+            ("traces", traces, self._traces),
+        ):
+            if valid is None or values is None:
+                good = valid is values
+            else:
+                listed = isinstance(values, list | tuple) and len(values) == num_envs
+                good = listed and all(type(x) is type(valid[0]) and x in valid for x in values)
+            if not good:
+                raise SdcError(
+                    f"state: {name} {shortened(values)}: not drawn by these environments"
+                )
+        return Draw(None if years is None else tuple(years), traces and tuple(traces))
+
+
+def draws_inputs(options: EnvOptions) -> bool:
+    """Whether episodes draw years or traces."""
+    return options.years is not None or options.traces is not None
+
+
+def draw_info(draw: Draw | None) -> dict[str, Any]:
+    """Infos of a draw: ``year`` and ``trace``, (B,) each, as far as they are drawn."""
+    info: dict[str, I64 | np.ndarray[Any, Any]] = {}
+    if draw is not None and draw.years is not None:
+        info["year"] = np.array(draw.years, dtype=np.int64)
+    if draw is not None and draw.traces is not None:
+        info["trace"] = np.array(draw.traces, dtype=object)
+    return info
+
 
 PARTS = ("options", "inputs", "simulator", "actions", "rewards", "generators", "keys")
 """Entries of a state; all are plain values, arrays, or dicts and lists of them."""

@@ -1,23 +1,113 @@
-"""Plans of when work runs: inputs of the programme over queues in ``kernels/planning.py``."""
+"""Plans of queues and batteries: inputs and calls of the kernels in ``kernels/planning.py``."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sdc_taichi.control.planning_kernel import PlanningKernel, first_commands
-from sdc_taichi.kernels.arguments import in_row_order
-from sdc_taichi.kernels.planning_arguments import QUEUE_ARGUMENTS, QUEUE_ROWS, STEP_ROWS
+from sdc_taichi.kernels.arguments import Argument, in_row_order
+from sdc_taichi.kernels.compiler import runtime
+from sdc_taichi.kernels.planning_arguments import (
+    QUEUE_ARGUMENTS,
+    QUEUE_ROWS,
+    STEP_ROWS,
+    STORE_ARGUMENTS,
+    STORE_ROWS,
+)
 from sdc_taichi.optimum.facility_map import FacilityMap
 from sdc_taichi.plant import workload
+from sdc_taichi.plant.battery import BATTERIES, BatteryResult
 from sdc_taichi.plant.workload import TASKS_PER_STEP, UNLIMITED_TASKS
+from sdc_taichi.sim.facility import BATTERY_PARAMETERS
 from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.workload import due_steps, queue_limit_tasks
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, I64
 
-LEVELS = 51
-"""Levels of the queue."""
+MOST_AT_ONCE = 256
+"""Data centers of a call, which limits the memory of its work space."""
+
+
+def first_commands() -> F64:
+    """Candidates of the step to come, (C,), the mildest first: of equal ones the first counts."""
+    steps = np.concatenate([[0.01, 0.02, 0.04, 0.06, 0.08], np.arange(1, 11) / 10.0])
+    return np.concatenate([[0.0], np.stack([-steps, steps], axis=1).ravel()])
+
+
+class PlanningKernel:
+    """One of the two kernels with its work space.
+
+    Args:
+        kernel: the kernel.
+        arguments: spec of its arguments.
+        levels: levels of what is carried from step to step.
+    """
+
+    def __init__(self, kernel: Any, arguments: Mapping[str, Argument], levels: int) -> None:
+        from sdc_taichi.kernels.compiler.named_kernel import NamedKernel
+
+        self._threads = runtime.ensure_started()
+        self._kernel = NamedKernel(kernel, arguments)
+        self._kernel.bind(serial=False, levels=levels)
+        self._arguments, self._levels = arguments, levels
+
+    def run(
+        self,
+        size: int,
+        horizon: int,
+        *,
+        commands: F64,
+        peaks: int,
+        table: F64 | None = None,
+        facility_kwh: F64 | None = None,
+        **of_each: F64,
+    ) -> tuple[I64, F64]:
+        """Run the kernel for all data centers.
+
+        Args:
+            size: number of data centers, B.
+            horizon: number of coming steps, H.
+            commands: commands of steps after the first.
+            peaks: peaks of the month that are tried.
+            table: the kernel's argument of this name, if it has one.
+            facility_kwh: energy of the facility in each step, (B, H); None has it computed.
+            of_each: other arguments by name, with the data centers first.
+
+        Returns:
+            Number of the command of the first step that is best, (B,), and ``facility_kwh``.
+        """
+        chosen = np.zeros(size, dtype=np.int32)
+        kwh = np.zeros((size, horizon)) if facility_kwh is None else facility_kwh
+        given: dict[str, Any] = of_each | {"chosen": chosen, "facility_kwh": kwh}
+        whole = {"commands": commands, "peaks": peaks, "horizon": horizon}
+        if table is not None:
+            whole["table"] = table
+        for first in range(0, size, MOST_AT_ONCE):
+            part = slice(first, min(first + MOST_AT_ONCE, size))
+            count = part.stop - first
+            mine = {name: np.ascontiguousarray(values[part]) for name, values in given.items()}
+            flat = {n: v.reshape(-1) for n, v in mine.items() if self._arguments[n].of}
+            self._kernel(
+                size=count,
+                slices=min(count, 4 * self._threads),
+                **whole,
+                **(mine | flat),
+                **self._work_space(count, horizon, table),
+            )
+        return chosen.astype(np.int64), kwh
+
+    def _work_space(self, count: int, horizon: int, table: F64 | None) -> dict[str, Any]:
+        space: dict[str, Any] = {"cost": np.empty((count, 2, self._levels))}
+        if table is not None:
+            space["policy"] = np.empty((count, horizon, self._levels), dtype=np.int32)
+            space["kwh"] = np.empty((count, table.shape[-1]))
+        return space
+
+
+QUEUE_LEVELS, STORE_LEVELS = 51, 41
+"""Levels of the queue and of the stored energy in plans."""
 COMMANDS = (0.0, -0.25, 0.25, -0.5, 0.5, -0.75, 0.75, -1.0, 1.0)
 """Commands of steps after the first; of equal ones the first counts."""
 
@@ -75,7 +165,7 @@ class QueuePlanner:
         self._cap = fleet.values("workload.max_utilisation")[:, None]
         self._limit = queue_limit_tasks(fleet)
         self._due_steps = due_steps(fleet)
-        self._kernel = PlanningKernel(queue_kernel(), QUEUE_ARGUMENTS, LEVELS)
+        self._kernel = PlanningKernel(queue_kernel(), QUEUE_ARGUMENTS, QUEUE_LEVELS)
         most_kwh = [kwh.max() for kwh in facility.at_own_nodes(self._table)]
         self._most_kwh = np.array(most_kwh)[facility.which]
         self._first = first_commands() if moves_work else np.zeros(1)
@@ -174,7 +264,7 @@ class QueuePlanner:
             "most_drained": most_drained,
             "most_due": most_due,
             "not_due": most_waiting - held_back,
-            "spacing": np.where(reached > 0, reached, 1.0) / (LEVELS - 1),
+            "spacing": np.where(reached > 0, reached, 1.0) / (QUEUE_LEVELS - 1),
         }
 
     def _not_due(self, held_back: F64) -> F64:
@@ -215,3 +305,96 @@ def _due_by(queue: F64, due_after_steps: F64, horizon: int) -> F64:
     row = np.minimum(first[:, None] + np.arange(horizon), length - 1)
     due = np.take_along_axis(queue, np.maximum(row, 0), axis=1)
     return np.where((row < 0) | np.isinf(due_after_steps)[:, None], 0.0, due)
+
+
+_AMPLE_KW, _SLIGHT_KW = 1e9, 1e-3
+"""Powers of a facility that never limit, and always limit, what a battery delivers."""
+
+
+class StorePlanner:
+    """Plans the batteries of B data centers.
+
+    Args:
+        fleet: the data centers.
+        sizing: their devices.
+        step_h: length of a step, in h.
+    """
+
+    def __init__(self, fleet: Fleet, sizing: Sizing, step_h: float) -> None:
+        from sdc_taichi.kernels.planning import store_kernel
+
+        self._model = BATTERIES[fleet.models["battery"]]
+        self._parameters = {n: fleet.values(f"battery.{n}")[:, None] for n in BATTERY_PARAMETERS}
+        self._capacity_kwh, self._step_h = sizing.battery_kwh, step_h
+        self._limit_kw = sizing.grid_limit_kw
+        self._kernel = PlanningKernel(store_kernel(), STORE_ARGUMENTS, STORE_LEVELS)
+        self._first, self._later = first_commands(), np.array(COMMANDS)
+        levels_kwh = sizing.battery_kwh[:, None] * np.linspace(0.0, 1.0, STORE_LEVELS)
+        charged = self._step(levels_kwh, 1.0, _AMPLE_KW)
+        ample, slight = (self._step(levels_kwh, -1.0, kw) for kw in (_AMPLE_KW, _SLIGHT_KW))
+        self._most = {
+            "most_charge": charged.charge_kwh,
+            "most_discharge": ample.discharge_kwh,
+            "load_share": slight.discharge_kwh / (_SLIGHT_KW * step_h),
+        }
+        self._charge_efficiency = _ratio(
+            charged.stored_kwh[:, 0] - levels_kwh[:, 0], charged.charge_kwh[:, 0]
+        )
+        self._discharge_factor = _ratio(
+            levels_kwh[:, -1] - ample.stored_kwh[:, -1], ample.discharge_kwh[:, -1]
+        )
+
+    def plan(self, stored_kwh: F64, facility_kwh: F64, cost: EnergyCost, *, peaks: int) -> F64:
+        """Battery command of the step to come, (B,).
+
+        Args:
+            stored_kwh: energy in the store, in kWh, (B,).
+            facility_kwh: energy of the facility in the coming steps, in kWh, (B, H).
+            cost: what energy costs.
+            peaks: peaks of the month that are tried; 1 without a demand charge.
+        """
+        size, horizon = facility_kwh.shape
+        load_kw = facility_kwh[:, :1] / self._step_h
+        now = self._step(stored_kwh[:, None], self._first[None], load_kw, self._limit_kw[:, None])
+        capacity_kwh = np.where(self._capacity_kwh > 0, self._capacity_kwh, 1.0)
+        of_dc = {
+            "spacing": capacity_kwh / (STORE_LEVELS - 1),
+            "charge_efficiency": self._charge_efficiency,
+            "discharge_factor": self._discharge_factor,
+            "grid_limit": self._limit_kw * self._step_h,
+            "end_value": cost.weight.mean(axis=1) / self._discharge_factor,
+            "peak_kwh": cost.peak_kwh,
+            "peak_cost": cost.peak_cost,
+        }
+        chosen, _ = self._kernel.run(
+            size,
+            horizon,
+            commands=self._later,
+            peaks=peaks,
+            facility_kwh=facility_kwh,
+            of_dc=np.stack(in_row_order(STORE_ROWS, of_dc), axis=1),
+            weight=cost.weight,
+            first_grid=now.grid_kwh,
+            first_stored=now.stored_kwh,
+            **self._most,
+        )
+        return self._first[chosen]
+
+    def _step(
+        self, stored_kwh: F64, command: F64 | float, load_kw: F64 | float, limit: F64 | None = None
+    ) -> BatteryResult:
+        """One step of each battery from several levels or by several commands, (B, n)."""
+        return self._model(
+            stored_kwh,
+            command,
+            capacity_kwh=self._capacity_kwh[:, None],
+            load_kw=load_kw,
+            dt_h=self._step_h,
+            grid_limit_kw=limit,
+            **self._parameters,
+        )
+
+
+def _ratio(part: F64, whole: F64) -> F64:
+    """Part over whole, (B,); 1 where there is nothing."""
+    return np.divide(part, whole, out=np.ones_like(whole), where=whole > 0)
