@@ -1010,6 +1010,9 @@ def test_large_halls_are_drawn_smaller() -> None:
 @pytest.mark.repo
 def test_docs_have_every_option_and_term() -> None:
     text = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
+    table = text.partition("## Options")[2].partition("\n## ")[0]
+    listed = re.findall(r"^\| `(\w+)` \| (.*?) \|", table, re.MULTILINE)
+    assert [name for name, _ in listed] == list(EnvOptions.model_fields)
     for name, shown in listed:
         default = EnvOptions.model_fields[name].default
         if isinstance(default, str | int | float | bool | None):
