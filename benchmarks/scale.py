@@ -29,10 +29,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from sdc_taichi.benchmark.executors import Executor, LocalProcesses, run_jobs
 from sdc_taichi.benchmark.jobs import DoneJob, Job, JobResult
-from sdc_taichi.benchmark.processes import LocalProcesses
 from sdc_taichi.benchmark.ray_cluster import RayCluster
-from sdc_taichi.benchmark.runner import Executor, InProcess, run_jobs
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.benchmark.sweep import Sweep, sweep_inputs, sweep_jobs
 from sdc_taichi.benchmark.vary import Grid
@@ -82,7 +81,7 @@ def executor_of(case: str) -> Executor:
     """The executor that runs the jobs of a case: this process, local processes, or Ray."""
     kind, _, workers = case.partition("-")
     if kind == "batch":
-        return InProcess()
+        return Executor()
     return (
         LocalProcesses(int(workers)) if kind == "processes" else RayCluster("local", int(workers))
     )

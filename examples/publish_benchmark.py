@@ -148,7 +148,7 @@ def check_whole(suite: SuiteResults) -> None:
             if suite.suite.is_for(row, name) and row not in case.rows:
                 raise ConfigError(f"{label}: {name}: no row {row}; valid are all rows")
     for key in ("version", "source"):
-        found = sorted({str(result.content[key]) for result in own_results(suite)})
+        found = sorted({str(getattr(result.record, key)) for result in own_results(suite)})
         if len(found) > 1:
             raise ConfigError(
                 f"{label}: results of {key} {found[0][:12]} and {found[1][:12]}; valid is one"
@@ -208,9 +208,9 @@ def command_of(text: str) -> str:
 
 def made_by(suite: SuiteResults) -> str:
     """Version and processors that made the results of a suite, in words."""
-    contents = [result.content for result in own_results(suite)]
-    versions = sorted({str(content["version"]) for content in contents})
-    processors = sorted({text_of(content["processor"]) for content in contents})
+    contents = [result.record for result in own_results(suite)]
+    versions = sorted({content.version for content in contents})
+    processors = sorted({text_of(content.processor) for content in contents})
     return f"Version {', '.join(versions)}; {'; '.join(processors)}."
 
 
@@ -309,9 +309,9 @@ def write_cells(suite: SuiteResults, folder: Path) -> list[str]:
     out = pd.concat(frames, ignore_index=True).to_csv(index=False, lineterminator="\n")
     write(folder / "cells.csv", out.encode())
     for name, result in chosen.items():
-        for file in result.content["files_sha256"]:
+        for file in result.record.files_sha256:
             if result.kind == LEARNER and file.split("/")[0] in FOLDERS:
-                content = result.store.file(result.content["partition"], file)
+                content = result.store.file(result.record.partition, file)
                 write(folder / name / file.split("/")[1], content)
     described = json.dumps(description(case, chosen), indent=1, sort_keys=True)
     write(folder / "published.json", f"{described}\n".encode())
@@ -320,9 +320,9 @@ def write_cells(suite: SuiteResults, folder: Path) -> list[str]:
 
 def cell_of(name: str, results: Sequence[RowResult]) -> pd.DataFrame:
     """Figures of a row with its first seed, and the lowest and highest figure of all its seeds."""
-    first = results[0].content
+    first = results[0].record
     frames = [x.frame[x.frame["moves"] == ALL].iloc[:1].reset_index(drop=True) for x in results]
-    spec = first["metrics"].get("chosen") or first["values"]["row"].get("controller")
+    spec = first.metrics.get("chosen") or first.values["row"].get("controller")
     own = frames[0][["site", "week", *CELL_COLUMNS]]
     own.insert(0, "row", name)
     own.insert(1, "controller", spec or f"policy:{name}")
@@ -332,16 +332,16 @@ def cell_of(name: str, results: Sequence[RowResult]) -> pd.DataFrame:
 
 def description(case: CaseResults, chosen: dict[str, RowResult]) -> dict[str, Any]:
     """Suite, case, site and week of the cells that were run, and the processor."""
-    first = next(iter(chosen.values())).content
+    first = next(iter(chosen.values())).record
     return {
         "suite": case.suite,
         "case": case.name,
         "objective": str(case.objective),
-        "case_settings": first["values"]["case"],
-        "row_settings": {name: x.content["values"]["row"] for name, x in chosen.items()},
-        "processors": {name: dict(x.content["processor"]) for name, x in chosen.items()},
-        "version": first["version"],
-        "source": first["source"],
+        "case_settings": first.values["case"],
+        "row_settings": {name: x.record.values["row"] for name, x in chosen.items()},
+        "processors": {name: dict(x.record.processor) for name, x in chosen.items()},
+        "version": first.version,
+        "source": first.source,
     }
 
 

@@ -163,9 +163,10 @@ def write_study(folder: Path, *, leave_out: Sequence[str] = (), source: str = "0
         for seed in range(len(SAVED_PCT.get(name, (0.0,)))):
             jobs.append(done_job(name, seed, frames_of_row(name, seed), spec=spec, source=source))
     store = ResultStore(folder)
-    partitions = [done.job.partition for done in jobs]
+    partitions = [dict(done.job.partition) for done in jobs]
     settings = {"quick": False, "suite": settings_of()}
-    study = Study("suite", "sdc-taichi benchmark made-up", settings, partitions)
+    command = "sdc-taichi benchmark made-up"
+    study = Study(kind="suite", command=command, settings=settings, partitions=partitions)
     with store.claimed(study):
         for done in jobs:
             if done.job.name not in leave_out:

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from sdc_taichi.benchmark.runner import InProcess
+from sdc_taichi.benchmark.executors import Executor
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.cli.app import app
 from sdc_taichi.cli.jobs import JobOptions
@@ -31,7 +31,7 @@ def call(*arguments: str) -> Result:
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(JobOptions, "executor", lambda _: InProcess())
+    monkeypatch.setattr(JobOptions, "executor", lambda _: Executor())
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump(SUITE))
     return path
@@ -55,7 +55,7 @@ def test_a_suite_is_run_and_goes_on_with_what_is_missing(file: Path, tmp_path: P
         ["mine", "tiny", "idle", 0, 27],
     ]
     assert (rows["figure"] == rows["cfp_kg"]).all()
-    assert ResultStore(out).study()["command"].startswith("sdc-taichi ")
+    assert ResultStore(out).study().command.startswith("sdc-taichi ")
 
 
 def test_a_suite_is_printed_as_it_would_be_run() -> None:

@@ -11,13 +11,13 @@ import typer
 from typer.testing import CliRunner
 
 import toy_jobs
-from sdc_taichi.benchmark.runner import InProcess
+from sdc_taichi.benchmark.executors import Executor
 from sdc_taichi.benchmark.store import ResultStore, Study
 from sdc_taichi.cli.jobs import JobOptions, JobsCommand, JobSession, job_progress, job_session
 from sdc_taichi.cli.options import CommandApp
 from sdc_taichi.errors import ConfigError, SdcError
 
-STUDY = Study("sweep", "sdc-taichi sweep", {}, [])
+STUDY = Study(kind="sweep", command="sdc-taichi sweep", settings={}, partitions=[])
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_progress_is_lines_where_there_is_no_terminal(
     jobs = [toy_jobs.job("without_rows", i) for i in range(3)]
     store = ResultStore(tmp_path)
     with store.claimed(STUDY):
-        session = JobSession(store, InProcess(), lambda: False)
+        session = JobSession(store, Executor(), lambda: False)
         session.run("rows", jobs[:1], 1)
         assert capsys.readouterr().err == "rows 1/1: toy/c/without_rows/0 0:00\n"
         session.run("rows", [*jobs, toy_jobs.job("refuse", 3)], 4)
@@ -87,7 +87,7 @@ def test_a_result_that_cannot_be_written_ends_a_study_that_can_go_on(tmp_path: P
     with store.claimed(STUDY):
         store.folder_of(job.partition).parent.mkdir(parents=True)
         store.folder_of(job.partition).write_bytes(b"a file where a folder is to be")
-        session = JobSession(store, InProcess(), lambda: False)
+        session = JobSession(store, Executor(), lambda: False)
         with pytest.raises(SdcError, match=r"cannot be .*; what is done is kept, .* --resume$"):
             session.run("rows", [job], 1)
 
@@ -95,7 +95,7 @@ def test_a_result_that_cannot_be_written_ends_a_study_that_can_go_on(tmp_path: P
 def test_a_study_whose_workers_cannot_start_is_not_begun(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Absent(InProcess):
+    class Absent(Executor):
         def __enter__(self) -> Self:
             raise ConfigError("no workers")
 
@@ -127,7 +127,7 @@ def test_progress_is_a_bar_in_a_terminal(
 def test_an_interrupted_study_says_how_to_go_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(JobOptions, "executor", lambda _: InProcess())
+    monkeypatch.setattr(JobOptions, "executor", lambda _: Executor())
     store, jobs = ResultStore(tmp_path), [toy_jobs.job("interrupt", 0), toy_jobs.job("draw", 1)]
     with job_session(store, STUDY, JobOptions(jobs=1)) as session:
         assert not session.run("rows", jobs, 2).is_whole

@@ -19,14 +19,14 @@ import pyarrow.dataset as ds
 import pytest
 
 import toy_jobs
-from sdc_taichi.benchmark import processes
+from sdc_taichi.benchmark import executors
+from sdc_taichi.benchmark.executors import Executor, JobSummary, LocalProcesses, run_jobs
 from sdc_taichi.benchmark.jobs import Job, digest_of, run_job
-from sdc_taichi.benchmark.processes import LocalProcesses
-from sdc_taichi.benchmark.runner import Executor, InProcess, JobSummary, run_jobs
 from sdc_taichi.benchmark.store import ResultStore, Study, partition_path
 from sdc_taichi.errors import ConfigError, SdcError, SdcWarning
 
-STUDY = Study("suite", "sdc-taichi benchmark toy", {"seeds": 2, "cases": {"a": {"days": 7}}}, [])
+SETTINGS = {"seeds": 2, "cases": {"a": {"days": 7}}}
+STUDY = Study(kind="suite", command="sdc-taichi benchmark toy", settings=SETTINGS, partitions=[])
 
 
 def run(
@@ -34,7 +34,7 @@ def run(
 ) -> JobSummary:
     """Run jobs as a study of its own, or go on with it."""
     store = ResultStore(folder)
-    with store.claimed(STUDY, resume=True), executor or InProcess() as workers:
+    with store.claimed(STUDY, resume=True), executor or Executor() as workers:
         return run_jobs(jobs, store, workers, **options)
 
 
@@ -55,53 +55,26 @@ def draws(count: int, **values: Any) -> list[Job]:
     return [toy_jobs.job("draw", i, **values) for i in range(count)]
 
 
-@pytest.fixture(scope="module")
-def pair() -> Iterator[LocalProcesses]:
-    """Two processes that all tests of this file share."""
-    executor = _Lasting(2)
-    yield executor
-    LocalProcesses.__exit__(executor)
-
-
-class _Lasting(LocalProcesses):
-    """Processes that do not end with a study."""
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-
-class _Interrupted(processes._Worker):
-    """A process that Ctrl-C reaches while it starts."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        assert self.process.pid is not None
-        os.kill(self.process.pid, signal.SIGINT)
-
-
 def test_results_are_equal_to_the_bit_in_any_number_of_processes(
-    tmp_path: Path, pair: LocalProcesses, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    assert run(draws(2), tmp_path / "begun", pair).done == 2
-    monkeypatch.setattr(processes, "_Worker", _Interrupted)
-    monkeypatch.setattr(processes, "MOST_ATTEMPTS", 1)
     content = {"trace": b"a" * 100_000, "other": b"b"}
     jobs = draws(5, inputs={"trace": digest_of(content["trace"])})
-    for name, executor in (("here", InProcess()), ("one", LocalProcesses(1)), ("two", pair)):
+    for name, executor in (("here", Executor()), ("two", LocalProcesses(2))):
         done = run(jobs, tmp_path / name, executor, inputs=content)
         assert done == JobSummary(5, 0, (), True)
     here = content_of(tmp_path / "here")
-    assert here == content_of(tmp_path / "one") == content_of(tmp_path / "two")
+    assert here == content_of(tmp_path / "two")
     assert len(here) == 1 + 5 * 3
-    metrics = ResultStore(tmp_path / "two").result(jobs[3].partition)
-    assert metrics["metrics"]["read"] == {"trace": 100_000}
-    assert metrics["metrics"]["bound"] is None
+    metrics = ResultStore(tmp_path / "two").result(jobs[3].partition).metrics
+    assert metrics["read"] == {"trace": 100_000}
+    assert metrics["bound"] is None
 
 
-def test_a_process_computes_in_one_thread(tmp_path: Path, pair: LocalProcesses) -> None:
+def test_a_process_computes_in_one_thread(tmp_path: Path) -> None:
     job = toy_jobs.job("about_process", 0)
-    run([job], tmp_path, pair)
-    told = ResultStore(tmp_path).result(job.partition)["metrics"]
+    run([job], tmp_path, LocalProcesses(2))
+    told = ResultStore(tmp_path).result(job.partition).metrics
     assert set(told["pools"]) <= {1}
     assert told["taichi"] == "1"
     assert told["main"] is True
@@ -171,13 +144,11 @@ def test_a_damaged_result_is_made_again(tmp_path: Path, name: str, damage: str) 
     assert content_of(tmp_path) == before
 
 
-def test_a_job_that_fails_is_one_line_and_the_others_are_done(
-    tmp_path: Path, pair: LocalProcesses
-) -> None:
+def test_a_job_that_fails_is_one_line_and_the_others_are_done(tmp_path: Path) -> None:
     jobs = [toy_jobs.job("refuse", 1), toy_jobs.job("divide", 2), *draws(2)]
     jobs.append(toy_jobs.job("no_such_function", 3))
     jobs.append(toy_jobs.job("draw", 4, inputs={"optimum": "0"}))
-    done = run(jobs, tmp_path, pair)
+    done = run(jobs, tmp_path, LocalProcesses(2))
     assert (done.done, done.is_whole) == (2, True)
     errors = dict(done.failed)
     assert errors["toy/c/refuse/1"] == "number 1: valid is another"
@@ -195,7 +166,7 @@ def test_a_job_that_fails_is_one_line_and_the_others_are_done(
     [
         ("partition", "number is a column of the partition"),
         ("mixed", "unexpected"),
-        ("set", "which JSON cannot"),
+        ("object", "unexpected"),
         ("path", "'../../x'"),
         ("metrics", "'metrics.json'"),
     ],
@@ -211,26 +182,22 @@ def test_warnings_of_jobs_are_issued_again(tmp_path: Path) -> None:
         run([toy_jobs.job("warn", 0)], tmp_path)
 
 
-def test_a_killed_process_loses_nothing(
-    tmp_path: Path, pair: LocalProcesses, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(processes, "MOST_ATTEMPTS", 2)
+def test_a_killed_process_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executors, "MOST_ATTEMPTS", 2)
     mark = str(tmp_path / "mark")
     jobs = [*draws(3), toy_jobs.job("killed_once", 3, mark=mark), toy_jobs.job("killed", 4)]
-    done = run(jobs, tmp_path / "out", pair)
+    done = run(jobs, tmp_path / "out", LocalProcesses(2))
     assert (done.done, done.is_whole) == (4, True)
     ((name, error),) = done.failed
     assert name == "toy/c/killed/4"
-    assert "ended 2 times, the last time by SIGKILL" in error
+    assert "killed 2 times; memory may be short" in error
     # Files are those of the same jobs that nothing happened to.
     assert run(jobs[:4], tmp_path / "again").done == 4
     undisturbed = content_of(tmp_path / "again")
     assert content_of(tmp_path / "out") == undisturbed
 
 
-def test_an_interruption_ends_running_jobs_and_keeps_the_others(
-    tmp_path: Path, pair: LocalProcesses
-) -> None:
+def test_an_interruption_ends_running_jobs_and_keeps_the_others(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
     jobs = [toy_jobs.job("sleep_long", 1, mark=str(mark)), *draws(2)]
     ended: list[str] = []
@@ -239,7 +206,11 @@ def test_an_interruption_ends_running_jobs_and_keeps_the_others(
         return bool(ended) and mark.exists() and bool(mark.read_text())
 
     done = run(
-        jobs, tmp_path / "out", pair, stop=stop, on_done=lambda job, _: ended.append(job.name)
+        jobs,
+        tmp_path / "out",
+        LocalProcesses(2),
+        stop=stop,
+        on_done=lambda job, _: ended.append(job.name),
     )
     assert not done.is_whole
     assert not done.failed
@@ -254,7 +225,7 @@ def test_processes_end_with_a_driver_that_is_killed_and_a_resumed_study_is_equal
     out, mark = tmp_path / "out", tmp_path / "mark"
     code = (
         "from pathlib import Path; import test_jobs, toy_jobs\n"
-        "from sdc_taichi.benchmark.processes import LocalProcesses\n"
+        "from sdc_taichi.benchmark.executors import LocalProcesses\n"
         "if __name__ == '__main__':\n"
         f"    jobs = [*test_jobs.draws(2), toy_jobs.job('sleep_long', 2, mark={str(mark)!r})]\n"
         f"    test_jobs.run(jobs, Path({str(out)!r}), LocalProcesses(1))\n"
@@ -292,7 +263,7 @@ def is_running(pid: int) -> bool:
         return False
 
 
-def test_jobs_are_generated_as_they_are_needed(tmp_path: Path, pair: LocalProcesses) -> None:
+def test_jobs_are_generated_as_they_are_needed(tmp_path: Path) -> None:
     taken: list[int] = []
     ended: list[Job] = []
 
@@ -303,7 +274,12 @@ def test_jobs_are_generated_as_they_are_needed(tmp_path: Path, pair: LocalProces
             yield toy_jobs.job("without_rows", i)
 
     with ResultStore(tmp_path).claimed(STUDY):
-        run_jobs(jobs(), ResultStore(tmp_path), pair, on_done=lambda job, _: ended.append(job))
+        run_jobs(
+            jobs(),
+            ResultStore(tmp_path),
+            LocalProcesses(2),
+            on_done=lambda job, _: ended.append(job),
+        )
     assert len(ended) == 12
 
 
@@ -312,39 +288,41 @@ def test_two_jobs_of_one_partition_are_refused(tmp_path: Path) -> None:
         run([*draws(2), toy_jobs.job("draw", 1, seconds=0.0)], tmp_path)
 
 
-def test_a_study_is_begun_once_and_gone_on_with_in_its_settings(tmp_path: Path) -> None:
+def study(command: str, *seeds: str) -> Study:
+    """A study with a job for each seed."""
+    partitions = [{"seed": seed} for seed in seeds]
+    return Study(kind="suite", command=command, settings=SETTINGS, partitions=partitions)
+
+
+def test_a_study_is_begun_once_and_continued_with_its_settings(tmp_path: Path) -> None:
     store = ResultStore(tmp_path)
-    first = Study("suite", "a", STUDY.settings, [{"seed": "0"}, {"seed": "1"}])
-    with store.claimed(first, resume=True) as notes:
+    with store.claimed(study("a", "0", "1"), resume=True) as notes:
         assert notes == ()
     with pytest.raises(ConfigError, match="holds a study; go on with it with --resume"):
-        store.claimed(first).__enter__()
-    more = Study("suite", "b", STUDY.settings, [{"seed": "1"}, {"seed": "2"}])
-    with store.claimed(more, resume=True):
-        pass
-    assert store.study()["partitions"] == [{"seed": "0"}, {"seed": "1"}, {"seed": "2"}]
-    assert store.study()["command"] == "b"
-    fewer = Study("suite", "d", STUDY.settings, [{"seed": "1"}])
-    with store.claimed(fewer, resume=True):
-        pass
-    assert (store.study()["command"], len(store.study()["partitions"])) == ("b", 3)
-    other = Study("suite", "c", {"seeds": 3, "cases": {"a": {"days": 7, "boundary": "cyclic"}}}, [])
+        store.claimed(study("a")).__enter__()
+    for command, seeds in (("b", "12"), ("d", "1")):
+        with store.claimed(study(command, *seeds), resume=True):
+            pass
+        assert store.study().command == "b"
+        assert store.study().partitions == [{"seed": "0"}, {"seed": "1"}, {"seed": "2"}]
+    settings = {"seeds": 3, "cases": {"a": {"days": 7, "boundary": "cyclic"}}}
+    other = STUDY.model_copy(update={"settings": settings})
     said = "seeds 2, here 3; cases.a.boundary not given, here 'cyclic'"
     with pytest.raises(ConfigError, match=said):
         store.claimed(other, resume=True).__enter__()
-    assert store.study()["command"] == "b"
+    assert store.study().command == "b"
 
 
 def test_results_of_other_source_files_are_kept_with_a_note(tmp_path: Path) -> None:
     store = ResultStore(tmp_path)
     run(draws(1), tmp_path)
-    content = store.study()
+    content = json.loads((tmp_path / "study.json").read_text())
     for name, value in (("source", "0" * 64), ("version", "0.0.1")):
         (tmp_path / "study.json").write_text(json.dumps(content | {name: value}))
         if name == "source":
             with store.claimed(STUDY, resume=True) as notes:
                 assert "other source files" in notes[0]
-                assert run_jobs(draws(1), store, InProcess()).kept == 1
+                assert run_jobs(draws(1), store, Executor()).kept == 1
         else:
             with pytest.raises(ConfigError, match=r"version '0\.0\.1', here"):
                 store.claimed(STUDY, resume=True).__enter__()
@@ -353,7 +331,7 @@ def test_results_of_other_source_files_are_kept_with_a_note(tmp_path: Path) -> N
 def test_folders_that_are_not_free_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for out, said in (
-        (tmp_path, r"holds other files \(file\)"),
+        (tmp_path, r"holds other files \('file'\)"),
         (tmp_path / "file", "is a file"),
         (tmp_path / "file" / "out", "cannot be written"),
     ):
@@ -361,7 +339,7 @@ def test_folders_that_are_not_free_are_refused(tmp_path: Path) -> None:
             ResultStore(out).claimed(STUDY).__enter__()
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "study.json").write_text('{"format": "sdc-study/1"')
-    with pytest.raises(ConfigError, match=r"study\.json: is no JSON"):
+    with pytest.raises(ConfigError, match=r"study\.json: Invalid JSON"):
         ResultStore(tmp_path / "out").claimed(STUDY, resume=True).__enter__()
 
 
@@ -378,7 +356,7 @@ def test_a_full_disk_is_one_line_and_the_study_can_go_on(tmp_path: Path) -> None
         with store.claimed(STUDY):
             resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))
             with pytest.raises(SdcError, match=r"weights\.bin: cannot be written: File too large"):
-                run_jobs(jobs, store, InProcess())
+                run_jobs(jobs, store, Executor())
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
@@ -404,10 +382,10 @@ def test_names_of_files_stay_in_the_folder(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("format", "sdc-result/0", r"format 'sdc-result/0'; valid is 'sdc-result/1'"),
-        ("partition", {"number": 1}, "partition holds 1; valid is text"),
-        ("metrics", [], r"metrics \[\] is not valid"),
-        ("core_s", True, "core_s True is not valid"),
+        ("format", "sdc-result/0", "format: Input should be 'sdc-result/1'"),
+        ("partition", {"number": 1}, "partition.number: Input should be a valid string"),
+        ("metrics", [], "metrics: Input should be an object"),
+        ("core_s", True, "core_s: Input should be a valid number"),
         ("files_sha256", {"../../study.json": "0"}, "valid is a path below the folder"),
     ],
 )

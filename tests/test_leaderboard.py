@@ -227,7 +227,7 @@ def test_damaged_folders_are_one_line(study: Path, tmp_path: Path) -> None:
     path = store.rows_path(partition)
     content = path.read_bytes()
     path.write_bytes(content[:-1])
-    with pytest.raises(ConfigError, match="is not the file that"):
+    with pytest.raises(ConfigError, match="has another digest"):
         read_suites([store.folder])
     path.write_bytes(content)
     moved = store.folder_of(partition).parent / "seed=9"

@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 
 import toy_jobs
+from sdc_taichi.benchmark.executors import Executor, JobSummary, run_jobs
 from sdc_taichi.benchmark.jobs import Job, digest_of
 from sdc_taichi.benchmark.ray_cluster import RayCluster
-from sdc_taichi.benchmark.runner import InProcess, JobSummary, run_jobs
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.errors import ConfigError, RuntimeStateError
 from test_jobs import STUDY, content_of, draws, run
@@ -103,7 +103,7 @@ def test_results_equal_those_of_one_process_to_the_bit(tmp_path: Path, cluster: 
     content = {"trace": b"a" * 1_000_000, "other": b"b"}
     jobs = draws(4, inputs={"trace": digest_of(content["trace"])})
     assert cluster.workers == 2
-    for name, executor in (("ray", cluster), ("here", InProcess())):
+    for name, executor in (("ray", cluster), ("here", Executor())):
         done = run_jobs(jobs, ResultStore(tmp_path / name), executor, content)
         assert done == JobSummary(4, 0, (), True)
     assert content_of(tmp_path / "here") == content_of(tmp_path / "ray")
@@ -123,7 +123,7 @@ def test_workers_compute_in_one_thread_and_find_modules_of_the_driver(
 
 def test_a_worker_that_is_killed_loses_nothing(tmp_path: Path, cluster: RayCluster) -> None:
     jobs = [*draws(2), toy_jobs.job("killed_once", 2, mark=str(tmp_path / "mark"))]
-    for name, executor in (("ray", cluster), ("here", InProcess())):
+    for name, executor in (("ray", cluster), ("here", Executor())):
         done = run_jobs(jobs, ResultStore(tmp_path / name), executor)
         assert done == JobSummary(3, 0, (), True)
     assert content_of(tmp_path / "here") == content_of(tmp_path / "ray")
@@ -160,7 +160,7 @@ def test_a_node_that_is_removed_loses_nothing(
     assert done == JobSummary(6, 0, (), True)
     assert not more
     assert len(list(begun.iterdir())) > 6
-    run_jobs(jobs, ResultStore(tmp_path / "here"), InProcess())
+    run_jobs(jobs, ResultStore(tmp_path / "here"), Executor())
     assert content_of(tmp_path / "here") == content_of(tmp_path / "ray")
 
 

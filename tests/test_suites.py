@@ -12,8 +12,8 @@ import yaml
 from policies import interface, network
 from sdc_taichi import ConfigError
 from sdc_taichi.benchmark.cases import check_suite, data_centers, number_of_seeds
+from sdc_taichi.benchmark.executors import Executor, JobSummary, run_jobs
 from sdc_taichi.benchmark.jobs import Inputs, Job, digest_of, run_job
-from sdc_taichi.benchmark.runner import InProcess, JobSummary, run_jobs
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.benchmark.suite import (
     Suite,
@@ -254,7 +254,7 @@ def run(suite: Suite, store: ResultStore, *, resume: bool = False) -> list[JobSu
     found = []
 
     def stage(_: str, jobs: Sequence[Job], __: int, inputs: Inputs | None = None) -> JobSummary:
-        found.append(run_jobs(jobs, store, InProcess(), inputs))
+        found.append(run_jobs(jobs, store, Executor(), inputs))
         return found[-1]
 
     with store.claimed(study_of(suite, suite, "command"), resume=resume):
@@ -290,7 +290,7 @@ def test_rows_stand_between_idle_commands_and_the_bound(store: ResultStore) -> N
 
 def test_the_best_of_several_is_chosen_in_the_validation_weeks(store: ResultStore) -> None:
     partition = {"suite": "small", "case": "tiny", "row": "best-constant", "seed": "0"}
-    metrics = store.result(partition)["metrics"]
+    metrics = store.result(partition).metrics
     changes = metrics["validation_change_pct"]
     assert metrics["chosen"] == min(changes, key=changes.__getitem__)
     assert set(changes) == {"constant:16", "constant:21"}
@@ -310,8 +310,8 @@ def test_a_reference_has_the_same_bits_again(store: ResultStore) -> None:
     again = run_job(job, {})
     assert again.rows == b""
     kept = store.result(job.partition)
-    assert kept["metrics"] == again.metrics
-    assert {name: digest_of(x) for name, x in again.files.items()} == kept["files_sha256"]
+    assert kept.metrics == again.metrics
+    assert {name: digest_of(x) for name, x in again.files.items()} == kept.files_sha256
 
 
 def test_an_optimum_that_is_not_among_the_solved_ones_is_solved_with_a_warning() -> None:
@@ -328,7 +328,7 @@ def test_a_row_whose_optimum_failed_fails_with_one_line(tmp_path: Path) -> None:
     jobs = row_jobs(suite, reference_jobs(suite))
     results = ResultStore(tmp_path / "out")
     with results.claimed(study_of(suite, suite, "")):
-        found = run_jobs(jobs, results, InProcess())
+        found = run_jobs(jobs, results, Executor())
     ((name, error),) = found.failed
     assert name == "small/tiny/idle/0"
     assert "reference-held-out-ny" in error

@@ -15,8 +15,8 @@ from typer.testing import CliRunner, Result
 
 from sdc_taichi import Simulator, load_config, make_controller, simulate, with_values
 from sdc_taichi.benchmark.best_value import best_by_month, with_default
+from sdc_taichi.benchmark.executors import Executor
 from sdc_taichi.benchmark.jobs import Inputs, JobResult
-from sdc_taichi.benchmark.runner import InProcess
 from sdc_taichi.benchmark.sweep import (
     Sweep,
     check_sweep,
@@ -256,7 +256,7 @@ def call(*arguments: object) -> Result:
 @pytest.fixture
 def _in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run jobs in this process, which needs no start."""
-    monkeypatch.setattr(JobOptions, "executor", lambda _: InProcess())
+    monkeypatch.setattr(JobOptions, "executor", lambda _: Executor())
 
 
 @pytest.mark.usefixtures("_in_process")

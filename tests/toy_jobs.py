@@ -60,7 +60,9 @@ def bad_result(values: Mapping[str, Any], _inputs: Mapping[str, bytes]) -> JobRe
     }
     files = {"path": {"../../x": b""}, "metrics": {"metrics.json": b""}}
     kind = values["kind"]
-    return JobResult(rows.get(kind), {"x": {1, 2} if kind == "set" else 1}, files.get(kind, {}))
+    return JobResult(
+        rows.get(kind), {"x": object() if kind == "object" else 1}, files.get(kind, {})
+    )
 
 
 def killed_once(values: Mapping[str, Any], inputs: Mapping[str, bytes]) -> JobResult:

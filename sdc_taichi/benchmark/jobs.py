@@ -5,27 +5,42 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import math
 import os
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from sdc_taichi.benchmark.source import source_digest
+from pydantic_core import to_json
+
+from sdc_taichi.benchmark.vary import value_at
+from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import SdcError, SdcWarning, one_line, shortened
+from sdc_taichi.user_file import read_bytes
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Inputs = Mapping[str, bytes]
-"""Content of large inputs by name, which travel to each worker once and not with every job."""
+"""Content of large inputs by name; each worker process receives it once, not with every job."""
+FILE_FIELDS = (
+    "site.weather_file",
+    "site.carbon_file",
+    "site.workload_file",
+    "hall.recirculation.matrix_file",
+)
+"""Fields of the configuration that name files, whose content decides results."""
+MOST_INPUT_BYTES = 2**28
+"""Largest input file that is read, in bytes."""
+_SOURCE_FOLDERS = ("", "configs", "data", "kernels", "viz")
+_SOURCE_SUFFIXES = (".py", ".yaml", ".csv", ".json")
 
 
 @dataclass(frozen=True)
@@ -36,13 +51,13 @@ class Job:
     """Import path ``module:name`` of a function of the values and the inputs that returns a
     ``JobResult``."""
     values: Mapping[str, Any]
-    """Arguments of the function; everything in them is what JSON can hold."""
+    """Arguments of the function, as JSON can hold them."""
     partition: Mapping[str, str]
     """Columns and values that name the result, such as suite, case, row and seed, in their order;
     no two jobs of a study have equal ones."""
     inputs: Mapping[str, str] = field(default_factory=dict)
     """Identity of each input that the function reads, by name: the digest of its content, or the
-    keys of the jobs that made it."""
+    key of the job that makes it."""
 
     @property
     def name(self) -> str:
@@ -53,7 +68,7 @@ class Job:
     def key(self) -> str:
         """Digest of all that decides the result, the version of the package included."""
         content = [self.function, self.values, self.inputs, version("sdc-taichi")]
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        return digest_of(json.dumps(content, sort_keys=True).encode())
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,24 +76,24 @@ class JobResult:
     """Rows, figures and files of a job, equal to the bit on all processors of one kind."""
 
     rows: pd.DataFrame | None
-    """Rows of the dataset, to which the columns of the partition are added where it is read; None
-    where the job has none."""
+    """Rows of the dataset; reading the dataset adds the columns of the partition. None if the job
+    has no rows."""
     metrics: Mapping[str, Any]
-    """Figures of the job as a whole, as JSON can hold them; nan and infinite ones become null."""
+    """Figures of the job as a whole; NaN and infinite ones become null in JSON."""
     files: Mapping[str, bytes] = field(default_factory=dict)
     """Content of further files by their path below the folder of the job, such as a policy."""
 
 
 @dataclass(frozen=True, slots=True)
 class DoneJob:
-    """A job that has ended, well or not, with its result as it is written to files."""
+    """A job that has ended, successfully or not, with its result as it is written to files."""
 
     job: Job
     """The job."""
     error: str = ""
-    """The error of a job that failed, in one line; empty otherwise."""
+    """Error of a job that failed, in one line; empty otherwise."""
     rows: bytes = b""
-    """Rows of the dataset as a Parquet file; empty where there are none."""
+    """Rows of the dataset as a Parquet file; empty if there are none."""
     metrics: Mapping[str, Any] = field(default_factory=dict)
     """Figures of the job as a whole, as JSON can hold them."""
     files: Mapping[str, bytes] = field(default_factory=dict)
@@ -100,12 +115,12 @@ def digest_of(content: bytes) -> str:
 
 @cache
 def compute_in_one_thread() -> None:
-    """Have this process, a worker, compute in one thread from here on."""
+    """Make this process, a worker, compute in one thread from here on."""
     import threadpoolctl
 
     names = ("SDC_TAICHI_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     os.environ |= dict.fromkeys(names, "1")
-    threadpoolctl.threadpool_limits(1)  # of libraries that are loaded already
+    threadpoolctl.threadpool_limits(1)  # for libraries that are loaded already
 
 
 def run_job(job: Job, inputs: Inputs) -> DoneJob:
@@ -116,28 +131,36 @@ def run_job(job: Job, inputs: Inputs) -> DoneJob:
         inputs: content of at least the inputs that the job reads.
 
     Returns:
-        The job with its result, or with the error in one line. An error that is not one of the
-        package is told with its class and place.
+        The job with its result, or with its error in one line. An error that does not belong to
+        the package is reported with its class and place.
     """
+    from sdc_taichi.run.processor import processor_features
+
     start_s = time.process_time()
-    seen: list[str] = []
-    done: dict[str, Any] = {}
-    with warnings.catch_warnings():
-        _collect_warnings(seen)
+    outcome: dict[str, Any] = {}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", SdcWarning)
         try:
-            result = _function(job.function)(job.values, {n: inputs[n] for n in job.inputs})
-            done = _packed(result, job)
+            module, _, name = job.function.partition(":")
+            function: Callable[..., JobResult] = getattr(import_module(module), name)
+            outcome = _packed(function(job.values, {n: inputs[n] for n in job.inputs}), job)
         except SdcError as error:
-            done = {"error": str(error)}
+            outcome = {"error": str(error)}
         except Exception as error:
-            done = {"error": _unexpected(error)}
+            outcome = {"error": _unexpected(error)}
+    texts = []
+    for each in caught:
+        if issubclass(each.category, SdcWarning):
+            texts.append(one_line(str(each.message)))
+        else:
+            warnings.showwarning(each.message, each.category, each.filename, each.lineno)
     return DoneJob(
         job,
-        **done,
-        warnings=tuple(dict.fromkeys(seen)),
+        **outcome,
+        warnings=tuple(dict.fromkeys(texts)),
         core_s=time.process_time() - start_s,
         source=source_digest(),
-        processor=_processor(),
+        processor=processor_features(),
     )
 
 
@@ -156,11 +179,47 @@ def check_file_name(name: str) -> None:
         )
 
 
-def _function(path: str) -> Callable[[Mapping[str, Any], Inputs], JobResult]:
-    """The function of an import path."""
-    module, _, name = path.partition(":")
-    found: Callable[[Mapping[str, Any], Inputs], JobResult] = getattr(import_module(module), name)
-    return found
+def input_paths(config: DataCenterConfig) -> list[str]:
+    """Paths of the files that a configuration names, each once.
+
+    Args:
+        config: the configuration.
+    """
+    named = (value_at(config, name) for name in FILE_FIELDS)
+    return list(dict.fromkeys(path for path in named if path is not None))
+
+
+def read_input(path: str) -> bytes:
+    """Content of an input file.
+
+    Args:
+        path: the file.
+
+    Raises:
+        SdcError: it cannot be read, or is too large.
+    """
+    return read_bytes(path, MOST_INPUT_BYTES)
+
+
+@cache
+def source_digest() -> str:
+    """SHA-256 of names and content of the package's source files, equal wherever it is installed.
+
+    A result keeps it beside the version, because many states of the source share a version.
+    """
+    paths: dict[str, Path] = {}
+    for folder in _SOURCE_FOLDERS:
+        spec = find_spec(f"sdc_taichi.{folder}".rstrip("."))
+        for root in (spec and spec.submodule_search_locations) or ():
+            for path in Path(root).rglob("*"):
+                if path.suffix in _SOURCE_SUFFIXES and "__pycache__" not in path.parts:
+                    paths[Path(folder, path.relative_to(root)).as_posix()] = path
+    digest = hashlib.sha256()
+    for name, path in sorted(paths.items()):
+        content = path.read_bytes()
+        digest.update(f"{name}\0{len(content)}\0".encode())
+        digest.update(content)
+    return digest.hexdigest()
 
 
 def _packed(result: JobResult, job: Job) -> dict[str, Any]:
@@ -176,13 +235,18 @@ def _packed(result: JobResult, job: Job) -> dict[str, Any]:
         clash = [str(name) for name in result.rows.columns if name in job.partition]
         if clash:
             raise SdcError(f"rows of {job.function}: {clash[0]} is a column of the partition")
-        rows = _parquet(result.rows)
+        rows = parquet(result.rows)
+    metrics = to_json(result.metrics, inf_nan_mode="null", fallback=lambda array: array.tolist())
     files = {name: bytes(content) for name, content in result.files.items()}
-    return {"rows": rows, "metrics": _plain(result.metrics), "files": files}
+    return {"rows": rows, "metrics": json.loads(metrics), "files": files}
 
 
-def _parquet(rows: pd.DataFrame) -> bytes:
-    """Content of a Parquet file of rows, which does not depend on the version of pandas."""
+def parquet(rows: pd.DataFrame) -> bytes:
+    """Content of a Parquet file of rows, which does not depend on the version of pandas.
+
+    Args:
+        rows: the rows.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -192,47 +256,8 @@ def _parquet(rows: pd.DataFrame) -> bytes:
     return buffer.getvalue()
 
 
-def _plain(value: Any) -> Any:
-    """A value as JSON holds it, with null for numbers that are not finite."""
-    if isinstance(value, Mapping):
-        return {str(name): _plain(each) for name, each in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(each) for each in value]
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    if hasattr(value, "tolist"):  # arrays and numbers of NumPy
-        return _plain(value.tolist())
-    raise TypeError(f"metrics hold {shortened(value)}, which JSON cannot")
-
-
-def _collect_warnings(seen: list[str]) -> None:
-    """Within ``warnings.catch_warnings``, collect warnings of the package and show the others."""
-    show = warnings.showwarning
-
-    def collect(
-        message: Warning | str, category: type[Warning], *place: Any, **stream: Any
-    ) -> None:
-        if issubclass(category, SdcWarning):
-            seen.append(one_line(str(message)))
-        else:
-            show(message, category, *place, **stream)
-
-    warnings.simplefilter("always", SdcWarning)
-    warnings.showwarning = collect
-
-
 def _unexpected(error: Exception) -> str:
-    """An error that is not one of the package, with its class and place, in one line."""
+    """An error of another library, with its class and place, in one line."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "unknown"
     return one_line(f"{type(error).__name__}: {error} (unexpected, at {place})")
-
-
-@cache
-def _processor() -> Mapping[str, str]:
-    """Features of this machine, which take some milliseconds to find."""
-    from sdc_taichi.run.processor import processor_features
-
-    return processor_features()

@@ -210,7 +210,7 @@ def _standings(
             columns = [_mean_columns(metric, values[name], evaluation, name) for name in order]
             table[list(columns[0])] = pd.DataFrame(columns, index=order)
     table["core_min"] = [
-        sum(float(result.content["core_s"]) for result in case.rows[name]) / 60 for name in order
+        sum(result.record.core_s for result in case.rows[name]) / 60 for name in order
     ]
     unknown = [name for name in table if table[name].isna().all()]
     found: pd.DataFrame = table.drop(columns=unknown).reset_index()
@@ -356,7 +356,7 @@ def _apart(
     import pandas as pd
 
     trained = {
-        name: dict(results[0].content["values"]["row"])
+        name: dict(results[0].record.values["row"])
         for name, results in case.rows.items()
         if case.kinds[name] == LEARNER and results[0].submission is None
     }

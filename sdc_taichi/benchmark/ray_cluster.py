@@ -14,10 +14,15 @@ import threading
 from collections.abc import Iterator, Sequence
 from typing import Any, Self
 
-from sdc_taichi.benchmark.jobs import DoneJob, Inputs, Job, compute_in_one_thread, run_job
-from sdc_taichi.benchmark.processes import MOST_ATTEMPTS, default_workers
-from sdc_taichi.benchmark.runner import Stop
-from sdc_taichi.benchmark.source import source_digest
+from sdc_taichi.benchmark.executors import MOST_ATTEMPTS, Executor, Stop, default_workers
+from sdc_taichi.benchmark.jobs import (
+    DoneJob,
+    Inputs,
+    Job,
+    compute_in_one_thread,
+    run_job,
+    source_digest,
+)
 from sdc_taichi.errors import ConfigError, RuntimeStateError, one_line
 
 LOCAL = "local"
@@ -27,7 +32,7 @@ ANSWER_S = 15
 _POLL_S = 0.2
 
 
-class RayCluster:
+class RayCluster(Executor):
     """Runs jobs as tasks of Ray, each on one processor and in one thread.
 
     A job whose worker is killed or whose machine is lost is run again on another, ``MOST_ATTEMPTS``

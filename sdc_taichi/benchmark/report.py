@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -32,7 +33,6 @@ from sdc_taichi.benchmark.report_pictures import case_pictures
 from sdc_taichi.benchmark.suite_results import (
     LEARNER,
     CaseResults,
-    RowResult,
     SuiteResults,
     read_suites,
 )
@@ -132,9 +132,9 @@ def cost_text(suite: SuiteResults) -> str:
     Args:
         suite: the results.
     """
-    results = [x for case in suite.cases.values() for rows in case.rows.values() for x in rows]
+    results = suite.results
     trained = [x for x in results if x.kind == LEARNER and x.submission is None]
-    whole_h, trained_h = (_core_h(x.content["core_s"] for x in own) for own in (results, trained))
+    whole_h, trained_h = (_core_h(x.record.core_s for x in own) for own in (results, trained))
     optima_h = _core_h(case.optima_core_s for case in suite.cases.values())
     return (
         f"{len(results)} results took {whole_h:.2g} core hours, {trained_h:.2g} of them for "
@@ -169,7 +169,7 @@ def suite_notes(suite: SuiteResults) -> list[str]:
     Args:
         suite: the results.
     """
-    results = [x for case in suite.cases.values() for rows in case.rows.values() for x in rows]
+    results = suite.results
     notes = []
     if suite.quick:
         notes.append("Quick form, with few weeks and short trainings: no results of the suite.")
@@ -177,10 +177,12 @@ def suite_notes(suite: SuiteResults) -> list[str]:
     if missing:
         notes.append(f"Unfinished, without {_named(missing)}.")
     for key, what in (("version", "versions of the package"), ("source", "states of the source")):
-        told = [result for result in results if result.content[key]]  # tables of others may not
-        if len({result.content[key] for result in told}) > 1:
-            notes.append(f"Results of several {what}: {_named(_users(told, key))}.")
-    if len({str(x.content["processor"]) for x in results if x.content["processor"]}) > 1:
+        values = [getattr(result.record, key)[:12] for result in results]
+        counts = Counter(filter(None, values))  # submitted tables have none
+        if len(counts) > 1:
+            several = [f"{value} ({count})" for value, count in counts.items()]
+            notes.append(f"Results of several {what}: {_named(several)}.")
+    if len({str(x.record.processor) for x in results if x.record.processor}) > 1:
         notes.append(
             "Results of several kinds of processors, whose last bits differ, and with them what "
             "was learnt."
@@ -194,9 +196,8 @@ def _notes_of_case(case: CaseResults) -> list[str]:
     """Notes on the results of a case, such as too few seeds."""
     notes = []
     for name, rows in case.rows.items():
-        if rows[0].submission is not None:
-            who = {key: rows[0].submission[key] for key in ("author", "about", "link")}
-            told = ", ".join(text for text in who.values() if text)
+        if (about := rows[0].submission) is not None:
+            told = ", ".join(filter(None, (about.author, about.about, about.link)))
             notes.append(f"{name} is the work of others and was not run here: {told}.")
     kinds = case.kinds
     few = [x for x, rows in case.rows.items() if kinds[x] == LEARNER and len(rows) < FEWEST]
@@ -205,7 +206,7 @@ def _notes_of_case(case: CaseResults) -> list[str]:
             f"fewer than {FEWEST} seeds of {_named(few)}, so what another training would reach is "
             "not known, and there is no place."
         )
-    results = [result for rows in case.rows.values() for result in rows]
+    results = case.results
     frame = results[0].frame
     fewest = int(frame[frame["moves"] == ALL].groupby("site").size().min())
     if fewest < FEWEST:
@@ -215,12 +216,6 @@ def _notes_of_case(case: CaseResults) -> list[str]:
             "without an optimum ends have no value: an empty battery or work put off saves."
         )
     return notes
-
-
-def _users(results: Iterable[RowResult], key: str) -> list[str]:
-    """Values of an entry of metrics.json, and of how many results each is."""
-    values = [str(result.content[key])[:12] for result in results]
-    return [f"{value} ({values.count(value)})" for value in dict.fromkeys(values)]
 
 
 def _named(names: Sequence[str]) -> str:
@@ -299,7 +294,7 @@ def row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
     texts = []
     for name, results in board.case.rows.items():
         about = suite.suite.rows[name].about if name in suite.suite.rows else ""
-        chosen = results[0].content["metrics"].get("chosen")
+        chosen = results[0].record.metrics.get("chosen")
         parts = [about] if about else []
         parts += [f"chosen in the validation weeks: {chosen}"] if chosen else []
         if parts:
@@ -313,7 +308,7 @@ def _recordings(case: CaseResults) -> dict[str, Path]:
         f"{name}, seed {result.seed}: {file}": result.folder / file
         for name, results in case.rows.items()
         for result in results
-        for file in result.content["files_sha256"]
+        for file in result.record.files_sha256
         if file.endswith(".rrd")
     }
 

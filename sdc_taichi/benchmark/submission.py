@@ -1,36 +1,25 @@
-"""Rows of others: a folder with the results of one row is checked and put among those of a suite.
+"""Rows that other people have run, which are checked and join the results of a suite.
 
-The folder is laid out as that of a study, with ``submission.json`` in it, which says who made the
-row. docs/submissions.md tells how to make one.
+The folder is laid out as that of a study, with ``submission.json`` beside it, which names the
+author. The checks are of schema and completeness: figures that were made up with care pass them, so
+``rerun`` runs submitted policies again and compares the figures.
 """
 
 from __future__ import annotations
 
-import io
-import json
-import os
 import re
-import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from sdc_taichi.atomic_file import FileClaim, atomic_write, naming_errors
+from sdc_taichi.atomic_file import FileClaim, naming_errors
 from sdc_taichi.benchmark.cases import data_centers
-from sdc_taichi.benchmark.jobs import DoneJob, Job, check_file_name
-from sdc_taichi.benchmark.store import (
-    JOBS,
-    METRICS_FILE,
-    RESULTS,
-    STUDY_FILE,
-    ResultStore,
-    read_json,
-)
-from sdc_taichi.benchmark.submission_checks import KnownCase, check_rows
+from sdc_taichi.benchmark.jobs import DoneJob, Job, check_file_name, parquet
+from sdc_taichi.benchmark.store import JOBS, METRICS_FILE, ResultStore, read_record, write_record
 from sdc_taichi.benchmark.suite import REFERENCE
 from sdc_taichi.benchmark.suite_results import (
     ACHIEVED,
@@ -38,178 +27,148 @@ from sdc_taichi.benchmark.suite_results import (
     COLUMNS,
     LEARNER,
     SUBMISSION_FILE,
-    SUBMISSION_FORMAT,
-    SUBMISSION_KEYS,
     CaseResults,
     RowResult,
+    SubmissionRecord,
     SuiteResults,
-    checked_partition,
+    check_partition,
+    check_weeks,
     read_result,
     read_suites,
 )
-from sdc_taichi.errors import ConfigError, SdcError, shortened
-from sdc_taichi.learning.evaluation import ALL
-from sdc_taichi.learning.split import UNSCORED_DAYS, data_center_weeks
-from sdc_taichi.sim.drivers import load_drivers
-from sdc_taichi.types import F64
-from sdc_taichi.user_file import list_folder, read_bytes
+from sdc_taichi.control import PERFECT, Controller, ForecastError, Idle, PerAgent
+from sdc_taichi.errors import ConfigError, shortened
+from sdc_taichi.learning.controller import PolicyController
+from sdc_taichi.learning.evaluation import ALL, Contender, evaluate, prepare
+from sdc_taichi.learning.policy import FOLDERS, WEIGHTS, Policy
+from sdc_taichi.optimum.problem import AGENTS
+from sdc_taichi.optimum.solve import Progress
+from sdc_taichi.sim.fleet import Fleet
 
 if TYPE_CHECKING:
     import pandas as pd
 
-KINDS = (LEARNER, "controller")
-"""Kinds of rows of others: those that were trained, with all seeds of the suite, and all others."""
 ROW_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,79}")
-"""Name of a row."""
-MOST_FILES = 10_000
-"""Largest number of files of a submission."""
-MOST_BYTES = 512_000_000
-"""Largest size of all files of a submission together, in bytes."""
-MOST_LETTERS = 1_000
-"""Largest length of a text of submission.json that the report shows, in letters."""
-_MOST_UNPACKED_BYTES = 256_000_000
-_MOST_CORE_S = 1e12
-_AT_TOP = (JOBS, RESULTS, STUDY_FILE, SUBMISSION_FILE)
+"""Valid name of a row."""
+_SAME = 1e-3
+"""Largest relative difference of figures that are run again: policies magnify the last bits, which
+differ between processors."""
+_NEEDED = ("figure", "idle_figure", "cfp_kg", "grid_kwh", "hvac_kwh", "it_kwh", "water_l")
 
 
 @dataclass(frozen=True, slots=True)
 class Submission:
-    """A row of others, as its folder holds it."""
+    """A row as its folder holds it."""
 
     store: ResultStore
     """The folder."""
-    about: Mapping[str, Any]
-    """Content of submission.json: ``author``, ``about``, ``link`` and ``kind``."""
+    about: SubmissionRecord
+    """Content of submission.json."""
     suite: str
-    """Suite that the row is of."""
+    """Name of the suite."""
     row: str
     """Name of the row."""
     results: tuple[RowResult, ...]
     """Its results by case and seed."""
 
+    def of_case(self, name: str) -> list[RowResult]:
+        """Results of one case."""
+        return [x for x in self.results if x.record.partition["case"] == name]
+
     @property
     def cases(self) -> tuple[str, ...]:
-        """Cases that it has results of."""
-        return tuple(dict.fromkeys(_of(result, "case") for result in self.results))
+        """Names of the cases that it has results of."""
+        return tuple(dict.fromkeys(x.record.partition["case"] for x in self.results))
 
 
 def read_submission(folder: Path) -> Submission:
-    """Read the folder of a row of others, whose files must be those that its metrics.json tell of.
+    """Read the folder of a submitted row and check its schema.
 
     Args:
         folder: the folder.
 
     Raises:
-        SdcError: links, special files, files that are too many, too large, missing, damaged or not
-            told of, results of another version, or of several rows.
+        SdcError: files are missing, damaged, of another format or of another version of the
+            package, or belong to several rows.
     """
-    _check_files(folder)
     store = ResultStore(folder)
-    about = read_json(folder / SUBMISSION_FILE, SUBMISSION_FORMAT, SUBMISSION_KEYS)
-    contents = list(store.results())
-    for content in contents:
-        checked_partition(content["partition"])
-    if not contents:
-        raise ConfigError(f"{folder}: holds no results; valid is a metrics.json for each seed")
-    names = [
-        {column: content["partition"].get(column) for column in ("suite", "row")}
-        for content in contents
-    ]
-    if any(name != names[0] for name in names):
-        raise ConfigError(f"{folder}: holds {names[0]} and others; valid is one row of one suite")
+    about = read_record(folder / SUBMISSION_FILE, SubmissionRecord)
     results = []
-    for content in contents:
-        _check_content(store, content)
-        _check_parquet(store.rows_path(content["partition"]))
-        results.append(read_result(store, content))
-    if about["kind"] not in KINDS:
-        raise ConfigError(
-            f"{folder / SUBMISSION_FILE}: kind {shortened(about['kind'])}; valid are "
-            f"{', '.join(KINDS)}"
-        )
-    for key in ("author", "about", "link"):
-        if len(about[key]) > MOST_LETTERS:
+    for record in store.results():
+        place = store.folder_of(record.partition) / METRICS_FILE
+        check_partition(record.partition)
+        if record.version != version("sdc-taichi"):
             raise ConfigError(
-                f"{folder / SUBMISSION_FILE}: {key} of {len(about[key]):,} letters; valid are at "
-                f"most {MOST_LETTERS:,}"
+                f"{place}: version {shortened(record.version)}; valid is {version('sdc-taichi')}"
             )
-    suite, row = (str(names[0][column]) for column in ("suite", "row"))
+        if not record.rows_sha256 or not store.is_whole(record):
+            raise ConfigError(f"{place}: rows or files do not have the digests that it lists")
+        results.append(read_result(store, record))
+    names = {(x.record.partition["suite"], x.record.partition["row"]) for x in results}
+    if len(names) != 1:
+        raise ConfigError(f"{folder}: holds {len(names)} rows; valid is one row of one suite")
+    ((suite, row),) = names
     return Submission(store, about, suite, row, tuple(results))
 
 
-def check_submission(submission: Submission, suite: SuiteResults) -> tuple[str, ...]:
-    """See that a row of others is whole, of the same data centers, and free of contradictions.
+def check_submission(submission: Submission, suite: SuiteResults) -> None:
+    """Check that a row belongs to a suite and is complete.
 
     Args:
         submission: the row.
-        suite: results of the suite that it is to stand among.
-
-    Returns:
-        What is to be known, in words.
+        suite: results of the suite that the row is to join.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: the name is taken or not valid, the suite or case is another, or seeds, weeks
+            or figures are missing.
     """
-    notes: list[str] = []
-    place = submission.store.folder
+    place, row = submission.store.folder, submission.row
     if submission.suite != suite.name:
         raise ConfigError(
             f"{place}: is of suite {shortened(submission.suite)}; valid is {suite.name}"
         )
-    taken = {*suite.suite.rows, *(row for case in suite.cases.values() for row in case.rows)}
-    row = submission.row
     if not ROW_NAME.fullmatch(row) or row.startswith(REFERENCE):
         raise ConfigError(
             f"{place}: row {shortened(row)}: valid are at most 80 lower-case letters, digits and "
             f". _ -, not beginning with {REFERENCE}"
         )
-    if row in taken:
+    if row in suite.suite.rows or any(row in case.rows for case in suite.cases.values()):
         raise ConfigError(f"{place}: row {row}: the name is taken; valid is another")
     for name in submission.cases:
-        case = suite.cases.get(name)
-        if case is None:
+        if name not in suite.cases:
             raise ConfigError(
-                f"{place}: case {shortened(name)}: no results to hold it against; valid: "
+                f"{place}: case {shortened(name)}: {suite.name} has no results of it; valid: "
                 f"{', '.join(suite.cases)}"
             )
-        own = [result for result in submission.results if _of(result, "case") == name]
-        notes += _check_case(submission, own, suite, case)
-    return tuple(notes)
+        _check_case(submission, suite.suite.seeds, suite.cases[name])
 
 
-def add_submission(folder: Path, to: Path) -> tuple[Submission, tuple[str, ...]]:
-    """Check a row of others and put it among the results of a suite.
+def add_submission(folder: Path, to: Path) -> Submission:
+    """Check a row and copy it into the results of a suite.
 
     Args:
         folder: folder with the results of the row.
         to: folder of the study of the suite.
 
-    Returns:
-        The row, and what is to be known, in words.
-
     Raises:
-        SdcError: the row is not valid, a study is under way in ``to``, or it cannot be written.
+        SdcError: the row is not valid, another process uses ``to``, or it cannot be written.
     """
-    submission = read_submission(folder)
-    target = ResultStore(to)
-    if folder.resolve() == to.resolve():
-        raise ConfigError(f"{folder}: is the folder that it is to be added to; valid is another")
+    submission, target = read_submission(folder), ResultStore(to)
     (suite,) = read_suites([to])
-    notes = check_submission(submission, suite)
+    check_submission(submission, suite)
     with naming_errors(to):
         claim = FileClaim(to / JOBS)
     try:
         for result in submission.results:
-            partition = result.content["partition"]
-            # Written first, so that nobody's work is ever shown as that of this package.
-            with atomic_write(
-                target.folder_of(partition).parent / SUBMISSION_FILE, parents=True
-            ) as file:
-                file.write((json.dumps(submission.about, indent=1) + "\n").encode())
-            target.keep(_done_job(result))
+            record, store = result.record, submission.store
+            files = {name: store.file(record.partition, name) for name in record.files_sha256}
+            # Written first, so that a row never appears without its author.
+            about = target.folder_of(record.partition).parent / SUBMISSION_FILE
+            write_record(about, submission.about)
+            target.write(record, store.rows_file(record), files)
     finally:
         claim.release()
-    return submission, notes
+    return submission
 
 
 def write_submission(
@@ -219,7 +178,7 @@ def write_submission(
     suite: str,
     case: str,
     row: str,
-    kind: str,
+    kind: Literal["learner", "controller"],
     author: str,
     about: str = "",
     link: str = "",
@@ -235,192 +194,128 @@ def write_submission(
         case: name of the case.
         row: name of the row.
         kind: ``learner``, which has all seeds of the suite, or ``controller``.
-        author: who made it.
-        about: what it is, in a sentence.
-        link: where more is to be found.
+        author: name of the author.
+        about: description of the row in a sentence.
+        link: address of more information.
         files: further files of each seed by their paths, such as a policy.
 
     Raises:
         SdcError: a name that is not valid, or a file that cannot be written.
     """
-    content = {"format": SUBMISSION_FORMAT, "author": author, "about": about, "link": link}
-    with atomic_write(out / SUBMISSION_FILE, parents=True) as file:
-        file.write((json.dumps(content | {"kind": kind}, indent=1) + "\n").encode())
+    record = SubmissionRecord(author=author, about=about, link=link, kind=kind)
+    write_record(out / SUBMISSION_FILE, record)
     store = ResultStore(out)
     for seed, frame in frames.items():
-        partition = {"suite": suite, "case": case, "row": row, "seed": str(seed)}
-        packed = io.BytesIO()
-        frame.to_parquet(packed, index=False)
-        own = dict((files or {}).get(seed, {}))
-        for name in own:
+        partition = dict(zip(COLUMNS, (suite, case, row, str(seed)), strict=True))
+        of_seed = dict((files or {}).get(seed, {}))
+        for name in of_seed:
             check_file_name(name)
         job = Job("", {"name": row, "seed": seed}, partition)
-        store.keep(DoneJob(job, rows=packed.getvalue(), files=own))
+        store.keep(DoneJob(job, rows=parquet(frame), files=of_seed))
 
 
-def _done_job(result: RowResult) -> DoneJob:
-    """A result as a job that has ended, to be kept elsewhere."""
-    content, store = result.content, result.store
-    partition = content["partition"]
-    return DoneJob(
-        Job(content["function"], content["values"], partition, content["inputs"]),
-        rows=read_bytes(store.rows_path(partition), MOST_BYTES),
-        metrics=content["metrics"],
-        files={name: store.file(partition, name) for name in content["files_sha256"]},
-        core_s=content["core_s"],
-        source=content["source"],
-        processor=content["processor"],
+def rerun(submission: Submission, to: Path, weeks: int, progress: Progress | None = None) -> float:
+    """Run the policies of a row again in some weeks of each site, and compare the figures.
+
+    Args:
+        submission: the row.
+        to: folder of the study of its suite.
+        weeks: number of weeks of each site, 1 or more and no more than the case has.
+        progress: progress callback ``(stage, done, total)``; counts results.
+
+    Returns:
+        Largest relative difference of the figure of a week.
+
+    Raises:
+        SdcError: no policies, policies that do not fit, too many weeks, or figures that the
+            policies do not reach.
+    """
+    (suite,) = read_suites([to])
+    check_submission(submission, suite)
+    worst = 0.0
+    for done, result in enumerate(submission.results):
+        if progress is not None:
+            progress("running again", done, len(submission.results))
+        case = suite.cases[result.record.partition["case"]]
+        worst = max(worst, _rerun_result(result, case, weeks))
+    return worst
+
+
+def _rerun_result(result: RowResult, case: CaseResults, weeks: int) -> float:
+    """Largest relative difference of the figures of one result in some weeks of each site."""
+    settings, count = case.settings, len(case.settings.weeks)
+    if weeks > count:
+        raise ConfigError(f"verify {weeks}: case {case.name} has {count} weeks; valid are no more")
+    error = result.record.metrics.get("forecast_error")
+    with prepare(
+        data_centers(settings, "held-out"),
+        [settings.weeks[count * k // weeks] for k in range(weeks)],
+        objective=case.objective,
+        optimum=False,
+        days=settings.days,
+        seed=result.seed,
+        forecast_error=PERFECT if error is None else ForecastError.parse(str(error)),
+    ) as prepared:
+        controller = _submitted_policy(result, prepared.sim.fleet)
+        again = evaluate(prepared, [Contender("again", controller)], beside=False).rows
+    whole = result.frame[result.frame["moves"] == ALL]
+    both = again.merge(whole, on=["site", "week"], suffixes=("", "_stated"))
+    difference = ((both["figure_stated"] - both["figure"]) / both["figure"]).abs()
+    if (worst := float(difference.max())) > _SAME:
+        row = both.iloc[int(np.argmax(difference))]
+        raise ConfigError(
+            f"{result.folder}: week {row['week']} of {row['site']}: figure "
+            f"{row['figure_stated']:.9g}, and its policy reaches {row['figure']:.9g}; valid are "
+            "figures of the policy"
+        )
+    return worst
+
+
+def _submitted_policy(result: RowResult, fleet: Fleet) -> Controller:
+    """The policy of a result as a controller, or one policy for each agent.
+
+    Raises:
+        SdcError: the result has no policy, or one that does not fit.
+    """
+    loaded: dict[str, Controller] = {
+        name: PolicyController(Policy.load(folder), fleet, str(folder))
+        for name, folder in {x: result.folder / x for x in ("", *AGENTS)}.items()
+        if any((folder / part / WEIGHTS).is_file() for part in ("", *FOLDERS))
+    }
+    if not loaded:
+        raise ConfigError(f"{result.folder}: holds no policy; valid is to add it without --verify")
+    return loaded.get("") or PerAgent(*(loaded.get(name, Idle()) for name in AGENTS))
+
+
+def _check_case(submission: Submission, seeds: int, case: CaseResults) -> None:
+    """Check that seeds, weeks and figures of a case are complete and of the same data centers.
+
+    Raises:
+        ConfigError: naming the place and what would be valid.
+    """
+    results = submission.of_case(case.name)
+    place = f"{submission.store.folder}: case {case.name}"
+    rows = [x for name, x in case.rows.items() if case.kinds[name] not in (ACHIEVED, BOUND)]
+    # Where events are sampled, idle commands reach other figures with each seed.
+    needed = len(max(rows, key=len, default=())) if _idle_differs(rows) else 1
+    needed = max(needed, seeds) if submission.about.kind == LEARNER else needed
+    if sorted(x.seed for x in results) != list(range(needed)):
+        raise ConfigError(
+            f"{place}: seeds {', '.join(str(x.seed) for x in results)}; valid are {needed} of "
+            "them, from 0, as of the suite"
+        )
+    check_weeks(case.name, {**case.rows, submission.row: results})
+    for result in results:
+        whole = result.frame[result.frame["moves"] == ALL]
+        for name in _NEEDED:
+            if name not in whole or not np.isfinite(whole[name].to_numpy(np.float64)).all():
+                raise ConfigError(f"{place}: column {name}; valid is a finite number in each row")
+
+
+def _idle_differs(rows: Sequence[Sequence[RowResult]]) -> bool:
+    """Whether figures of idle commands differ between the seeds of a row."""
+    return any(
+        not np.array_equal(x.frame["idle_figure"], results[0].frame["idle_figure"])
+        for results in rows
+        for x in results
     )
-
-
-def _of(result: RowResult, column: str) -> str:
-    """Value of a column of the partition of a result."""
-    return str(result.content["partition"][column])
-
-
-def _check_files(folder: Path) -> None:
-    """Refuse links, special files, and files that are too many or too large.
-
-    Raises:
-        SdcError: there are some, or there is no such folder.
-    """
-    if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such folder; valid is one with {SUBMISSION_FILE}")
-    for name in list_folder(folder):
-        if name not in _AT_TOP:
-            raise ConfigError(f"{folder / name}: valid are {', '.join(_AT_TOP)}")
-    count, size = 0, 0
-    for place, folders, files in os.walk(folder):
-        for name in (*folders, *files):
-            path = Path(place, name)
-            with naming_errors(path):
-                status = path.lstat()
-            if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
-                raise ConfigError(f"{path}: is a link or no file; valid are files and folders")
-            if name in files:
-                count, size = count + 1, size + status.st_size
-            if count > MOST_FILES or size > MOST_BYTES:
-                raise ConfigError(
-                    f"{folder}: more than {MOST_FILES:,} files or {MOST_BYTES / 1e6:,.0f} MB at "
-                    f"{path}; valid are fewer"
-                )
-
-
-def _check_content(store: ResultStore, content: Mapping[str, Any]) -> None:
-    """Refuse a result whose digests do not match, or of another version.
-
-    Raises:
-        SdcError: it is not valid, or a file is missing.
-    """
-    partition = content["partition"]
-    folder = store.folder_of(partition)
-    place = folder / METRICS_FILE
-    if list(partition) != list(COLUMNS):
-        raise ConfigError(f"{place}: partition {list(partition)}; valid is {', '.join(COLUMNS)}")
-    if not 0.0 <= content["core_s"] < _MOST_CORE_S:
-        raise ConfigError(f"{place}: core_s {content['core_s']}; valid is 0 or more seconds")
-    if content["version"] != version("sdc-taichi"):
-        raise ConfigError(
-            f"{place}: version {shortened(content['version'])}; valid is {version('sdc-taichi')}"
-        )
-    job = Job(content["function"], content["values"], partition, content["inputs"])
-    if job.key != content["key"]:
-        raise ConfigError(f"{place}: key {shortened(content['key'])}; valid is {job.key}")
-    for name in content["files_sha256"]:
-        check_file_name(name)
-    if not content["rows_sha256"] or not store.is_whole(content):
-        raise ConfigError(f"{place}: rows or files are not those that it tells of by their digests")
-    told = {folder / name for name in content["files_sha256"]} | {place}
-    for path in folder.rglob("*"):
-        if path.is_file() and path not in told:
-            raise ConfigError(f"{path}: {METRICS_FILE} does not tell of it; valid are others")
-
-
-def _check_parquet(path: Path) -> None:
-    """Refuse a file of rows that would take much memory.
-
-    Raises:
-        SdcError: it is no Parquet file, or would.
-    """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        found = pq.ParquetFile(path).metadata
-        groups = [found.row_group(index) for index in range(found.num_row_groups)]
-    except (pa.ArrowException, OSError) as error:
-        raise ConfigError(f"{path}: cannot be read as a Parquet file: {error}") from None
-    size = sum(group.total_byte_size for group in groups)
-    if size > _MOST_UNPACKED_BYTES:
-        raise ConfigError(
-            f"{path}: {size / 1e6:,.0f} MB unpacked; valid is at most "
-            f"{_MOST_UNPACKED_BYTES / 1e6:,.0f} MB"
-        )
-
-
-def _check_case(
-    submission: Submission, own: Sequence[RowResult], suite: SuiteResults, case: CaseResults
-) -> tuple[str, ...]:
-    """Check the results of a case; return what is to be known, in words.
-
-    Raises:
-        ConfigError: seeds are missing, or figures are not those of the case.
-    """
-    known = [
-        results
-        for name, results in case.rows.items()
-        if case.kinds[name] not in (ACHIEVED, BOUND) and results[0].submission is None
-    ]
-    if not known:
-        raise ConfigError(f"{case.suite}, {case.name}: no controller to hold a row against")
-    most = max(known, key=len)
-    # A seed decides which failures are sampled, so figures of idle commands differ by seed too.
-    by_seed = {result.seed: result for result in most} if _idle_differs(most) else {}
-    count = len(by_seed) or 1
-    if submission.about["kind"] == LEARNER:
-        count = max(count, suite.suite.seeds)
-    seeds = sorted(result.seed for result in own)
-    if seeds != list(range(count)):
-        raise ConfigError(
-            f"{submission.store.folder}: case {case.name}: seeds {', '.join(map(str, seeds))}; "
-            f"valid are {count} of them, from 0, as of the suite"
-        )
-    ci_g_per_kwh, notes = _intensity(case)
-    for result in own:
-        beside = by_seed.get(result.seed, most[0])
-        check_rows(result.frame, _known(case, beside, ci_g_per_kwh), str(result.folder))
-    return notes
-
-
-def _idle_differs(results: Sequence[RowResult]) -> bool:
-    """Whether idle commands reach other figures by seed."""
-    figures = [result.frame["idle_figure"].to_numpy(np.float64) for result in results]
-    return any(not np.array_equal(figure, figures[0]) for figure in figures)
-
-
-def _known(case: CaseResults, beside: RowResult, ci_g_per_kwh: F64) -> KnownCase:
-    """Figures and limits that rows of others in a case are held against."""
-    frame = beside.frame[beside.frame["moves"] == ALL].reset_index(drop=True)
-    keys = zip(map(str, frame["site"]), map(int, frame["week"]), strict=True)
-    bound = np.array([case.bound.get(key, np.nan) for key in keys])
-    days = case.settings.days
-    return KnownCase(case.objective, days, frame, bound, ci_g_per_kwh)
-
-
-def _intensity(case: CaseResults) -> tuple[F64, tuple[str, ...]]:
-    """Lowest and highest carbon intensity of each week, in g/kWh, (W, 2), and what is to be known.
-
-    It is not known where files that the case names are not here.
-    """
-    chosen = case.settings
-    try:
-        configs = data_center_weeks(data_centers(chosen, "held-out"), chosen.weeks)
-        drivers = load_drivers(configs)
-    except SdcError as error:
-        note = f"case {case.name}: carbon intensity is not known, so cfp_kg is not tested: {error}"
-        first = next(iter(case.rows.values()))[0].frame
-        return np.full((int((first["moves"] == ALL).sum()), 2), np.nan), (note,)
-    per_day = 24 * configs[0].simulation.steps_per_hour
-    scored = np.arange(UNSCORED_DAYS * per_day, chosen.days * per_day)
-    values = drivers.ci_g_per_kwh.at(drivers.start[:, None] + scored)
-    return np.stack([values.min(axis=1), values.max(axis=1)], axis=1), ()

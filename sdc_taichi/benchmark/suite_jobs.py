@@ -23,8 +23,7 @@ from sdc_taichi.benchmark.cases import (
     training_settings,
     weeks_of,
 )
-from sdc_taichi.benchmark.input_files import input_paths, read_input
-from sdc_taichi.benchmark.jobs import Inputs, Job, JobResult, digest_of
+from sdc_taichi.benchmark.jobs import Inputs, Job, JobResult, digest_of, input_paths, read_input
 from sdc_taichi.benchmark.suite import REFERENCE, Case, Part, Row, Suite
 from sdc_taichi.control import PERFECT, ForecastError, make_controller
 from sdc_taichi.control.registry import parts_of

@@ -1,7 +1,7 @@
-"""Results of suites as folders hold them, put together for reports.
+"""Results of suites read from folders, and put together for reports.
 
-Everything is read from the folders alone, so results of others, of other machines and of other
-versions stand beside each other, as long as they are of the same weeks of the same data centers.
+Everything is read from the folders alone. So results of other authors, other machines and other
+versions of the package can be compared, if they are of the same weeks of the same data centers.
 """
 
 from __future__ import annotations
@@ -11,64 +11,89 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
-from sdc_taichi.benchmark.jobs import digest_of
-from sdc_taichi.benchmark.store import MOST_FILE_BYTES, STUDY_FILE, ResultStore, read_json
+from sdc_taichi.benchmark.store import STUDY_FILE, Record, ResultRecord, ResultStore, read_record
 from sdc_taichi.benchmark.suite import REFERENCE, Case, Suite, make_suite
+from sdc_taichi.config import validated
 from sdc_taichi.errors import ConfigError, shortened
 from sdc_taichi.learning.evaluation import ALL, Evaluation
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.user_file import decoding, read_bytes
+from sdc_taichi.user_file import decoding
 
 if TYPE_CHECKING:
     import pandas as pd
 
 ACHIEVED, BOUND, LEARNER = "optimum", "bound", "learner"
 PLANNER, RULE, OTHER = "planner", "rule", "other"
-"""Kinds of rows: the optimum's achieved path, its bound, what was trained, model-predictive
-control, other controllers by name, and what is not known."""
-SUBMISSION_FILE, SUBMISSION_FORMAT = "submission.json", "sdc-submission/1"
-"""File in the folder of a row that others have made, which says who made it, and its format."""
-SUBMISSION_KEYS = {"author": str, "about": str, "link": str, "kind": str}
-"""Entries of that file."""
+"""Kinds of rows: the path that the optimum achieves, its bound, a trained policy, model-predictive
+control, another controller by name, and a submitted row that was not trained."""
+SUBMISSION_FILE = "submission.json"
+"""File in the folder of a submitted row, which names its author."""
 COLUMNS = ("suite", "case", "row", "seed")
 """Columns of the partition of a result of a suite."""
+_NEEDED = ("moves", "site", "week", "figure", "valued_figure", "idle_figure", "achieved_figure")
 _SAME = 1e-6
 """Largest relative difference of figures of idle commands between results of the same weeks."""
+_Text = Annotated[str, Field(max_length=1000)]
+
+
+class SubmissionRecord(Record):
+    """Content of submission.json."""
+
+    format: Literal["sdc-submission/1"] = "sdc-submission/1"
+    """Name and version of the format."""
+    author: _Text
+    """Name of the author."""
+    about: _Text
+    """Description of the row in a sentence."""
+    link: _Text
+    """Address of more information."""
+    kind: Literal["learner", "controller"]
+    """Kind of the row: a trained one, which has all seeds of the suite, or any other."""
+
+
+class _SolvedWeeks(Record):
+    """Metrics of a job that solved for the optima of a site's weeks."""
+
+    part: str
+    site: str
+    weeks: list[int]
+    bound_figure: list[float | None]
 
 
 @dataclass(frozen=True, slots=True)
 class RowResult:
-    """A row of a case with one seed."""
+    """Result of a row of a case with one seed."""
 
     store: ResultStore
-    """Where it is."""
-    content: Mapping[str, Any]
+    """Folder of the study that holds it."""
+    record: ResultRecord
     """Content of its metrics.json."""
     frame: pd.DataFrame
     """Its rows, one for each data-center week, and for each agent that was run alone."""
-    submission: Mapping[str, Any] | None
-    """Who made it and how, of results of others."""
+    submission: SubmissionRecord | None
+    """Author and description of a submitted row."""
 
     @property
     def folder(self) -> Path:
         """Folder with its metrics.json."""
-        return self.store.folder_of(self.content["partition"])
+        return self.store.folder_of(self.record.partition)
 
     @property
     def seed(self) -> int:
         """Its seed."""
-        return int(self.content["partition"]["seed"])
+        return int(self.record.partition["seed"])
 
     @property
     def kind(self) -> str:
         """Kind of its row, such as ``learner``."""
-        row = self.content["values"].get("row")
+        row = self.record.values.get("row")
         if self.submission is not None:
-            return LEARNER if self.submission["kind"] == LEARNER else OTHER
+            return LEARNER if self.submission.kind == LEARNER else OTHER
         if not isinstance(row, Mapping):
             return OTHER
         if row.get("optimum") is not None:
@@ -91,11 +116,11 @@ class CaseResults:
     objective: Objective
     """Objective of its figures."""
     rows: Mapping[str, Sequence[RowResult]]
-    """Results of each row by seed; rows in the order of the suite, those of others last."""
+    """Results of each row by seed; rows in the order of the suite, submitted ones last."""
     missing: tuple[str, ...]
-    """Results that were asked for and are not there, as ``ROW, seed SEED``."""
+    """Results that were asked for and do not exist, as ``ROW, seed SEED``."""
     bound: Mapping[tuple[str, int], float]
-    """Bound of the figure by site and week, where it is known."""
+    """Bound of the figure by site and week, as far as it is known."""
     optima_core_s: float
     """Processor time that its optima took, in s."""
 
@@ -103,6 +128,11 @@ class CaseResults:
     def kinds(self) -> dict[str, str]:
         """Kind of each row."""
         return {name: results[0].kind for name, results in self.rows.items()}
+
+    @property
+    def results(self) -> list[RowResult]:
+        """Results of all rows and seeds."""
+        return [result for results in self.rows.values() for result in results]
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +153,11 @@ class SuiteResults:
         """Name of the suite."""
         return self.suite.name
 
+    @property
+    def results(self) -> list[RowResult]:
+        """Results of all cases."""
+        return [result for case in self.cases.values() for result in case.results]
+
 
 def read_suites(folders: Sequence[Path]) -> list[SuiteResults]:
     """Read results of suites, each suite from all folders that hold results of it.
@@ -134,60 +169,51 @@ def read_suites(folders: Sequence[Path]) -> list[SuiteResults]:
         SdcError: a folder without a study of a suite, a damaged result, or results that are not of
             the same weeks of the same data centers.
     """
-    found: dict[str, list[tuple[ResultStore, dict[str, Any]]]] = {}
-    for folder in folders:
-        store = ResultStore(folder)
-        study = store.study()
-        if study["kind"] != "suite":
-            raise ConfigError(f"{folder}: holds a {study['kind']}; valid is a suite")
-        found.setdefault(suite_of(store, study).name, []).append((store, study))
-    return [_suite(studies) for studies in found.values()]
+    stores: dict[str, list[ResultStore]] = {}
+    for store in map(ResultStore, folders):
+        stores.setdefault(suite_of(store).name, []).append(store)
+    return [_suite(group) for group in stores.values()]
 
 
-def suite_of(store: ResultStore, study: Mapping[str, Any]) -> Suite:
+def suite_of(store: ResultStore) -> Suite:
     """The suite of a study.
 
     Args:
-        store: where the study is.
-        study: content of study.json.
+        store: folder of the study.
 
     Raises:
-        ConfigError: it has none, or one that is not valid.
+        ConfigError: the study is of another kind, or its suite is not valid.
     """
-    values, place = study["settings"].get("suite"), store.folder / STUDY_FILE
+    study = store.study()
+    if study.kind != "suite":
+        raise ConfigError(f"{store.folder}: holds a {study.kind}; valid is a suite")
+    values, place = study.settings.get("suite"), store.folder / STUDY_FILE
     if not isinstance(values, dict):
         raise ConfigError(f"{place}: settings.suite {shortened(values)}; valid is a suite")
     return make_suite(values, f"{place}: settings.suite")
 
 
-def read_result(store: ResultStore, content: Mapping[str, Any]) -> RowResult:
-    """Read the rows of a result and see that they are those that its metrics.json tells of.
+def read_result(store: ResultStore, record: ResultRecord) -> RowResult:
+    """Read the rows of a result and check that they have the digest in its metrics.json.
 
     Args:
-        store: where it is.
-        content: content of its metrics.json.
+        store: folder of the study that holds it.
+        record: content of its metrics.json.
 
     Raises:
         SdcError: a file is missing or damaged, or its rows are not those of a row of a suite.
     """
     import pandas as pd
 
-    partition = content["partition"]
-    path = store.rows_path(partition)
-    data = read_bytes(path, MOST_FILE_BYTES)
-    if digest_of(data) != content["rows_sha256"]:
-        raise ConfigError(f"{path}: is not the file that {store.folder_of(partition)} tells of")
+    path = store.rows_path(record.partition)
     with decoding(path, "a Parquet file"):
-        frame = pd.read_parquet(io.BytesIO(data))
-    needed = ("moves", "site", "week", "figure", "valued_figure", "idle_figure", "achieved_figure")
-    lacking = [name for name in needed if name not in frame.columns]
+        frame = pd.read_parquet(io.BytesIO(store.rows_file(record)))
+    lacking = [name for name in _NEEDED if name not in frame.columns]
     if lacking or frame.empty:
         raise ConfigError(f"{path}: no {', '.join(lacking) or 'rows'}; valid are rows of a suite")
-    submission = store.folder_of(partition).parent / SUBMISSION_FILE
-    about = None
-    if submission.exists():
-        about = read_json(submission, SUBMISSION_FORMAT, SUBMISSION_KEYS)
-    return RowResult(store, content, frame, about)
+    about = store.folder_of(record.partition).parent / SUBMISSION_FILE
+    submission = read_record(about, SubmissionRecord) if about.exists() else None
+    return RowResult(store, record, frame, submission)
 
 
 def evaluation_of(case: CaseResults) -> Evaluation:
@@ -223,78 +249,8 @@ def evaluation_of(case: CaseResults) -> Evaluation:
     )
 
 
-def weeks_of_frame(frame: pd.DataFrame) -> dict[tuple[str, int], float]:
-    """Figure of idle commands by site and week, of the rows of a result.
-
-    Args:
-        frame: its rows.
-    """
-    whole = frame[frame["moves"] == ALL]
-    keys = zip(map(str, whole["site"]), map(int, whole["week"]), strict=True)
-    return dict(zip(keys, map(float, whole["idle_figure"]), strict=True))
-
-
-def _suite(studies: Sequence[tuple[ResultStore, Mapping[str, Any]]]) -> SuiteResults:
-    """Results of one suite from several folders."""
-    suite = suite_of(*studies[0])
-    references: list[Mapping[str, Any]] = []
-    found: dict[str, dict[str, dict[int, RowResult]]] = {case: {} for case in suite.cases}
-    asked: dict[tuple[str, str, int], None] = {}
-    for store, study in studies:
-        for partition in map(checked_partition, study["partitions"]):
-            if not partition["row"].startswith(REFERENCE):
-                asked[partition["case"], partition["row"], int(partition["seed"])] = None
-        for content in store.results():
-            partition = checked_partition(content["partition"])
-            if partition["row"].startswith(REFERENCE):
-                references.append(content)
-                continue
-            if partition["case"] not in found:
-                raise ConfigError(
-                    f"{store.folder_of(partition)}: suite {suite.name} has no such case; valid: "
-                    f"{', '.join(found)}"
-                )
-            by_seed = found[partition["case"]].setdefault(partition["row"], {})
-            _take(by_seed, read_result(store, content))
-    order = [*suite.rows]
-    cases = {}
-    for case, rows in found.items():
-        if not rows:
-            continue
-        names = [row for row in order if row in rows] + [row for row in rows if row not in order]
-        results = {row: [rows[row][seed] for seed in sorted(rows[row])] for row in names}
-        _check_weeks(case, results)
-        missing = tuple(
-            f"{row}, seed {seed}"
-            for of, row, seed in asked
-            if of == case and seed not in rows.get(row, {})
-        )
-        own = [content for content in references if content["partition"]["case"] == case]
-        cases[case] = CaseResults(
-            suite=suite.name,
-            name=case,
-            settings=suite.cases[case],
-            objective=Objective.parse(suite.objective),
-            rows=results,
-            missing=missing,
-            bound=_bounds(own),
-            optima_core_s=sum(float(content["core_s"]) for content in own),
-        )
-    if not cases:
-        raise ConfigError(
-            f"{studies[0][0].folder}: holds no results; valid is a suite that was run"
-        )
-    commands = tuple(dict.fromkeys(study["command"] for _, study in studies))
-    return SuiteResults(
-        suite=suite,
-        quick=any(study["settings"].get("quick") is True for _, study in studies),
-        commands=commands,
-        cases=cases,
-    )
-
-
-def checked_partition(partition: Mapping[str, Any]) -> Mapping[str, str]:
-    """A partition of a suite.
+def check_partition(partition: Mapping[str, str]) -> None:
+    """Check that a partition is that of a result of a suite.
 
     Args:
         partition: its columns and values.
@@ -302,76 +258,125 @@ def checked_partition(partition: Mapping[str, Any]) -> Mapping[str, str]:
     Raises:
         ConfigError: other columns, or a seed that is no number.
     """
-    texts = [partition.get(column) for column in COLUMNS]
-    if set(partition) != set(COLUMNS) or not all(isinstance(text, str) for text in texts):
+    if set(partition) != set(COLUMNS):
         raise ConfigError(f"partition {dict(partition)}: valid columns are {', '.join(COLUMNS)}")
-    if not re.fullmatch("0|[1-9][0-9]{0,5}", str(partition["seed"])):
+    if not re.fullmatch("0|[1-9][0-9]{0,5}", partition["seed"]):
         raise ConfigError(f"partition {dict(partition)}: seed; valid is a whole number")
-    return partition
 
 
-def _take(by_seed: dict[int, RowResult], result: RowResult) -> None:
-    """Take a result, unless an equal one of another folder is there.
+def check_weeks(case: str, rows: Mapping[str, Sequence[RowResult]]) -> None:
+    """Check that all rows of a case are of the same weeks of the same data centers.
+
+    Args:
+        case: name of the case.
+        rows: results of each row by seed.
 
     Raises:
-        ConfigError: another one is there.
+        ConfigError: other weeks, or other figures of idle commands with the same seed.
+    """
+    first_of_seed: dict[int, pd.DataFrame] = {}
+    first = next(iter(rows.values()))[0]
+    for result in (result for results in rows.values() for result in results):
+        weeks = _weeks(result)
+        if not weeks.index.equals(_weeks(first).index):
+            raise ConfigError(
+                f"{result.folder}: is of other sites or weeks than {first.folder}, of the same "
+                f"case {case}; valid are equal ones"
+            )
+        idle = weeks["idle_figure"]
+        known = first_of_seed.setdefault(result.seed, weeks)["idle_figure"]
+        same = np.isclose(idle, known, rtol=_SAME, atol=0.0)
+        if not same.all():
+            site, week = weeks.index[int(np.argmin(same))]
+            raise ConfigError(
+                f"{result.folder}: idle commands reach {idle[site, week]:.8g} in week {week} of "
+                f"{site}, and {known[site, week]:.8g} elsewhere in case {case}; valid are results "
+                "of the same data centers"
+            )
+
+
+def _weeks(result: RowResult) -> pd.DataFrame:
+    """Rows of a result that move all, by site and week."""
+    return result.frame[result.frame["moves"] == ALL].set_index(["site", "week"])
+
+
+def _suite(stores: Sequence[ResultStore]) -> SuiteResults:
+    """Results of one suite from several folders."""
+    suite, studies = suite_of(stores[0]), [store.study() for store in stores]
+    references: list[ResultRecord] = []
+    rows: dict[str, dict[str, dict[int, RowResult]]] = {case: {} for case in suite.cases}
+    for store in stores:
+        for record in store.results():
+            check_partition(record.partition)
+            case, row = record.partition["case"], record.partition["row"]
+            if case not in rows:
+                raise ConfigError(
+                    f"{store.folder_of(record.partition)}: suite {suite.name} has no such case; "
+                    f"valid: {', '.join(rows)}"
+                )
+            if row.startswith(REFERENCE):
+                references.append(record)
+            else:
+                _add(rows[case].setdefault(row, {}), read_result(store, record))
+    asked: dict[str, dict[tuple[str, int], None]] = {}
+    for partition in (x for study in studies for x in study.partitions):
+        check_partition(partition)
+        if not partition["row"].startswith(REFERENCE):
+            pair = partition["row"], int(partition["seed"])
+            asked.setdefault(partition["case"], {})[pair] = None
+    cases = {}
+    for name, of_case in rows.items():
+        if not of_case:
+            continue
+        order = [*(row for row in suite.rows if row in of_case), *of_case]
+        results = {row: [x for _, x in sorted(of_case[row].items())] for row in order}
+        check_weeks(name, results)
+        solved = [x for x in references if x.partition["case"] == name]
+        cases[name] = CaseResults(
+            suite=suite.name,
+            name=name,
+            settings=suite.cases[name],
+            objective=Objective.parse(suite.objective),
+            rows=results,
+            missing=tuple(
+                f"{row}, seed {seed}"
+                for row, seed in asked.get(name, ())
+                if seed not in of_case.get(row, {})
+            ),
+            bound=_bounds(solved),
+            optima_core_s=sum(x.core_s for x in solved),
+        )
+    if not cases:
+        raise ConfigError(f"{stores[0].folder}: holds no results; valid is a suite that was run")
+    return SuiteResults(
+        suite=suite,
+        quick=any(study.settings.get("quick") is True for study in studies),
+        commands=tuple(dict.fromkeys(study.command for study in studies)),
+        cases=cases,
+    )
+
+
+def _add(by_seed: dict[int, RowResult], result: RowResult) -> None:
+    """Add a result, unless another folder has an equal one.
+
+    Raises:
+        ConfigError: another folder has a different one.
     """
     other = by_seed.setdefault(result.seed, result)
-    if other.content["rows_sha256"] != result.content["rows_sha256"]:
+    if other.record.rows_sha256 != result.record.rows_sha256:
         raise ConfigError(
             f"{result.folder} and {other.folder}: hold other results of one seed of one row; valid "
             "is one of them"
         )
 
 
-def _check_weeks(case: str, rows: Mapping[str, Sequence[RowResult]]) -> None:
-    """See that all rows of a case are of the same weeks of the same data centers.
-
-    Raises:
-        ConfigError: they are not.
-    """
-    idle: dict[int, dict[tuple[str, int], float]] = {}
-    first = next(iter(rows.values()))[0]
-    for result in (result for results in rows.values() for result in results):
-        own = weeks_of_frame(result.frame)
-        known = idle.setdefault(result.seed, own)
-        if list(own) != list(weeks_of_frame(first.frame)):
-            raise ConfigError(
-                f"{result.folder}: is of other sites or weeks than {first.folder}, of the same "
-                f"case {case}; valid are equal ones"
-            )
-        worst = max(own, key=lambda key: _relative(own[key], known[key]))
-        if _relative(own[worst], known[worst]) > _SAME:
-            raise ConfigError(
-                f"{result.folder}: idle commands reach {own[worst]:.8g} in week {worst[1]} of "
-                f"{worst[0]}, and {known[worst]:.8g} elsewhere in case {case}; valid are results "
-                "of the same data centers"
-            )
-
-
-def _relative(value: float, other: float) -> float:
-    """Difference of two figures over the larger one; infinite where it is not defined."""
-    size = max(abs(value), abs(other))
-    if not np.isfinite(size):
-        return float("inf")
-    return abs(value - other) / size if size else 0.0
-
-
-def _bounds(references: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], float]:
+def _bounds(references: Sequence[ResultRecord]) -> dict[tuple[str, int], float]:
     """Bound of the figure by site and week, from the results of jobs that solved for optima."""
-    found: dict[tuple[str, int], float] = {}
-    for content in references:
-        metrics = content["metrics"]
-        if metrics.get("part") != "held-out":
-            continue
-        site, weeks, bounds = (metrics.get(name) for name in ("site", "weeks", "bound_figure"))
-        lists = isinstance(weeks, list) and isinstance(bounds, list) and len(weeks) == len(bounds)
-        if not lists or {type(x) for x in (*weeks, *bounds)} - {int, float, type(None)}:
-            name = "/".join(content["partition"].values())
-            raise ConfigError(
-                f"metrics.json of {name}: bound_figure {shortened(bounds)} for weeks "
-                f"{shortened(weeks)}; valid are as many numbers"
-            )
-        pairs = zip(weeks, bounds, strict=True)
-        found |= {(str(site), week): bound for week, bound in pairs if bound is not None}
-    return found
+    bounds: dict[tuple[str, int], float | None] = {}
+    for record in references:
+        name = f"metrics.json of {'/'.join(record.partition.values())}"
+        solved = validated(_SolvedWeeks, record.metrics, name)
+        if solved.part == "held-out":
+            keys = ((solved.site, week) for week in solved.weeks)
+            bounds |= dict(zip(keys, solved.bound_figure, strict=False))
+    return {key: bound for key, bound in bounds.items() if bound is not None}

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from sdc_taichi.benchmark.cases import training_steps
+from sdc_taichi.benchmark.executors import JobSummary
 from sdc_taichi.benchmark.jobs import Inputs, Job
-from sdc_taichi.benchmark.runner import JobSummary
 from sdc_taichi.benchmark.store import ResultStore, Study
 from sdc_taichi.benchmark.suite import Suite
 from sdc_taichi.benchmark.suite_jobs import packed, reference_jobs, row_jobs
@@ -49,7 +49,7 @@ def study_of(suite: Suite, chosen: Suite, command: str, *, quick: bool = False) 
         kind="suite",
         command=command,
         settings={"quick": quick, "suite": suite.model_dump(mode="json", exclude={"quick"})},
-        partitions=[job.partition for job in [*references, *row_jobs(chosen, references)]],
+        partitions=[dict(job.partition) for job in [*references, *row_jobs(chosen, references)]],
         may_change=_MAY_CHANGE,
     )
 
@@ -77,7 +77,7 @@ def _optima(store: ResultStore, references: Sequence[Job]) -> Mapping[str, bytes
     found = {}
     for job in references:
         if store.is_done(job):
-            names = store.result(job.partition)["files_sha256"]
+            names = store.result(job.partition).files_sha256
             found[job.name] = packed({name: store.file(job.partition, name) for name in names})
     return found
 

@@ -19,8 +19,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sdc_taichi.benchmark.input_files import FILE_FIELDS, input_paths, read_input
-from sdc_taichi.benchmark.jobs import Inputs, Job, JobResult, digest_of
+from sdc_taichi.benchmark.jobs import (
+    FILE_FIELDS,
+    Inputs,
+    Job,
+    JobResult,
+    digest_of,
+    input_paths,
+    read_input,
+)
 from sdc_taichi.benchmark.vary import (
     Grid,
     Kind,

@@ -61,19 +61,17 @@ def add_command(
         ),
     ] = 0,
 ) -> None:
-    """Put a row that others have run among the results of a suite, once it is checked.
+    """Check a row that somebody else has run, and add it to the results of a suite.
 
-    It has to be whole, of the same weeks of the same data centers, and free of contradictions;
-    docs/submissions.md tells how to make one.
+    The row has to be complete and of the same weeks of the same data centers. The documentation
+    of suites says how to make one.
     """
-    from sdc_taichi.benchmark.submission import add_submission, read_submission
-    from sdc_taichi.benchmark.submission_rerun import rerun
+    from sdc_taichi.benchmark.submission import add_submission, read_submission, rerun
 
     if verify:
         with stage_bars(shown=True) as progress:
             worst = rerun(read_submission(folder), to, verify, progress)
         print(f"Run again in {verify} weeks of each site: figures differ by {worst:.2g} at most")
-    submission, notes = add_submission(folder, to)
-    print_notes(notes)
+    submission = add_submission(folder, to)
     cases = ", ".join(submission.cases)
     print(f"Added {printable(submission.row)} to {printable(to)}: {printable(cases)}")

@@ -26,8 +26,8 @@ from sdc_taichi.cli.terminal import (
 from sdc_taichi.errors import SdcError, printable
 
 if TYPE_CHECKING:
+    from sdc_taichi.benchmark.executors import Executor, JobSummary, Stop
     from sdc_taichi.benchmark.jobs import DoneJob, Inputs, Job
-    from sdc_taichi.benchmark.runner import Executor, JobSummary, Stop
     from sdc_taichi.benchmark.store import ResultStore, Study
 
 _ADDRESS = re.compile(r"auto|local|(ray://)?[\w.\-]+:\d+|(ray://)?\[[0-9a-fA-F:.]+\]:\d+")
@@ -97,7 +97,7 @@ class JobOptions:
             from sdc_taichi.benchmark.ray_cluster import RayCluster
 
             return RayCluster(self.ray, self.jobs)
-        from sdc_taichi.benchmark.processes import LocalProcesses
+        from sdc_taichi.benchmark.executors import LocalProcesses
 
         return LocalProcesses(self.jobs)
 
@@ -134,7 +134,7 @@ class JobSession:
         Raises:
             SdcError: a result cannot be written, or two jobs have the same partition.
         """
-        from sdc_taichi.benchmark.runner import run_jobs
+        from sdc_taichi.benchmark.executors import run_jobs
 
         with job_progress(stage, total, shown=self._shown) as on_done:
             try:

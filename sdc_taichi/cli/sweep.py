@@ -118,14 +118,14 @@ def sweep_command(
         sweep = _with_best(sweep, best)
     check_sweep(sweep, most)
     inputs = sweep_inputs(sweep)
-    partitions = [job.partition for job in sweep_jobs(sweep, inputs)]
+    partitions = [dict(job.partition) for job in sweep_jobs(sweep, inputs)]
     if show:
         print(_shown(sweep, label, len(partitions)), end="")
         return
     folder = out if out is not None else _default_folder(label, sweep)
     store = ResultStore(folder)
     command = shlex.join(["sdc-taichi", *context.obj])
-    study = Study("sweep", command, sweep.settings(), partitions)
+    study = Study(kind="sweep", command=command, settings=sweep.settings(), partitions=partitions)
     with job_session(store, study, jobs, quiet=quiet) as under_way:
         under_way.run("sweep", sweep_jobs(sweep, inputs), len(partitions), inputs)
         done, failed = _print_failures(store)
@@ -223,9 +223,9 @@ def _print_failures(store: ResultStore) -> tuple[int, int]:
     reasons: dict[str, list[str]] = {}
     notes: dict[str, None] = {}
     for result in store.results():
-        runs += len(result["values"]["cells"])
-        notes |= dict.fromkeys(result["metrics"]["notes"])
-        for each in result["metrics"]["failed"]:
+        runs += len(result.values["cells"])
+        notes |= dict.fromkeys(result.metrics["notes"])
+        for each in result.metrics["failed"]:
             reasons.setdefault(each["error"], []).append(each["combination"])
     print_notes(notes)
     for error, combinations in list(reasons.items())[:_MOST_LINES]:

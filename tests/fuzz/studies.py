@@ -11,7 +11,7 @@ from fuzz.case import DefectError, Scratch
 from fuzz.run_folders import changed_json
 from made_studies import write_study
 from sdc_taichi.benchmark.report import write_report
-from sdc_taichi.benchmark.store import ResultStore
+from sdc_taichi.benchmark.store import ResultRecord, ResultStore
 from sdc_taichi.benchmark.suite_results import read_suites
 from sdc_taichi.errors import SdcError
 
@@ -49,12 +49,12 @@ def studies(scratch: Scratch) -> None:
     scratch.named += ["study", kind]
     store = ResultStore(folder)
     changed = name in files and files[name] != study_files()[name]
-    for content in store.results():
+    for record in store.results():
         try:
-            is_whole = store.is_whole(content)
+            is_whole = store.is_whole(record)
         except SdcError:
             is_whole = False
-        if is_whole and changed and name.startswith(f"results/{_path(content)}/"):
+        if is_whole and changed and name.startswith(f"results/{_path(record)}/"):
             raise DefectError(f"{name} is not what its metrics.json tells of")
     if scratch.chance(0.3):
         store.study()
@@ -64,6 +64,6 @@ def studies(scratch: Scratch) -> None:
         write_report([folder], markdown=scratch.output("tables.md"))
 
 
-def _path(content: dict[str, dict[str, str]]) -> str:
+def _path(record: ResultRecord) -> str:
     """Path of a result, whose values need no quotes."""
-    return "/".join(f"{column}={value}" for column, value in content["partition"].items())
+    return "/".join(f"{column}={value}" for column, value in record.partition.items())
