@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from sdc_taichi import Actions, Simulator
-from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.objective import Objective, Score
 from sdc_taichi.optimum.problem import AGENTS, Ends
 from sdc_taichi.optimum.result import Optimum
-from sdc_taichi.optimum.score import Score
 from sdc_taichi.types import F64
 
 KWH_VALUE = 0.05

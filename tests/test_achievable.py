@@ -27,9 +27,8 @@ from sdc_taichi import (
     simulate_to_folder,
 )
 from sdc_taichi.cli.app import app
-from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.objective import Objective, Score
 from sdc_taichi.optimum.result import Optimum
-from sdc_taichi.optimum.score import Score
 from sdc_taichi.run.achievable import AchievedPath, Achievement, run_beside
 from sdc_taichi.run.folder_reader import read_run
 from sdc_taichi.run.optimum_folder import (

@@ -20,7 +20,8 @@ from sdc_taichi.cli import evaluate as commands
 from sdc_taichi.cli.app import app
 from sdc_taichi.learning import evaluation
 from sdc_taichi.learning.policy import About, Policy
-from sdc_taichi.optimum.result import Optimum, StoppedError
+from sdc_taichi.optimum import StoppedError
+from sdc_taichi.optimum.result import Optimum
 
 CASE = ("--config", "tiny", "--site", "ny,ca", "--weeks", "27", "--days", "2")
 

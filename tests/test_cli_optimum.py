@@ -15,7 +15,8 @@ import sdc_taichi.optimum
 from known_optimum import made_up_optimum
 from sdc_taichi import Fleet, Simulator
 from sdc_taichi.cli.app import app
-from sdc_taichi.optimum.result import Optimum, StoppedError
+from sdc_taichi.optimum import StoppedError
+from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.run import optimum_folder
 from sdc_taichi.run.folder_reader import read_run
 

@@ -13,7 +13,7 @@ import pytest
 from sdc_taichi import ConfigError, load_config
 from sdc_taichi.benchmark.episodes import Collection, Episode, episodes
 from sdc_taichi.benchmark.offline import data_set_folder, require_minari
-from sdc_taichi.optimum.result import StoppedError
+from sdc_taichi.optimum import StoppedError
 
 RULES = "load=greedy-ci,cooling=g36,battery=lookahead-24h"
 

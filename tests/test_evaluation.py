@@ -22,9 +22,8 @@ from sdc_taichi.learning.evaluation import (
     prepare,
     validate,
 )
-from sdc_taichi.optimum.end_values import with_tabled_ends
 from sdc_taichi.optimum.problem import Ends
-from sdc_taichi.optimum.result import Optimum
+from sdc_taichi.optimum.result import Optimum, with_tabled_ends
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.sim.workload import queue_limit_tasks
 

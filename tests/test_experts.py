@@ -10,8 +10,7 @@ import pytest
 import sdc_taichi
 from sdc_taichi import Simulator, load_config, make_controller, simulate
 from sdc_taichi.learning.experts import FollowedOptimum, make_expert
-from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.score import Score
+from sdc_taichi.optimum.objective import Objective, Score
 from sdc_taichi.optimum.solve import solve
 from sdc_taichi.types import Actions, BatteryAction, CoolAction, LoadAction
 from test_envs_commands import CONTROLLED, RACKS

@@ -21,7 +21,7 @@ from sdc_taichi.benchmark.episodes import Collection  # noqa: E402
 from sdc_taichi.benchmark.offline import write_data_set  # noqa: E402
 from sdc_taichi.cli.app import app  # noqa: E402
 from sdc_taichi.errors import SdcError  # noqa: E402
-from sdc_taichi.optimum.result import StoppedError  # noqa: E402
+from sdc_taichi.optimum import StoppedError  # noqa: E402
 
 DOCS = Path(__file__).parent.parent / "docs"
 ID = "sdc_taichi/tiny-ca-v0"

@@ -12,8 +12,8 @@ from sdc_taichi import Actions, Simulator, load_config
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.hall.protection import Mask
 from sdc_taichi.optimum import Objective, solve
+from sdc_taichi.optimum.objective import Score
 from sdc_taichi.optimum.problem import Ends
-from sdc_taichi.optimum.score import Score
 from sdc_taichi.sim.fleet import build_fleet
 from sdc_taichi.types import F64
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from sdc_taichi import Actions, Simulator, build_fleet, load_config
-from sdc_taichi.optimum.battery_path import battery_path, storage_parameters
 from sdc_taichi.optimum.commands import (
+    arrived_tasks,
     battery_command,
     bus_energy_kwh,
     load_command,
     setpoint_command,
 )
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.problem import FacilityTable, Problem, Storage
-from sdc_taichi.optimum.problems import problems_of
-from sdc_taichi.optimum.rollout import RollOut, Targets, arrived_tasks, repeated, roll_out
-from sdc_taichi.optimum.setpoint_path import setpoint_path
+from sdc_taichi.optimum.paths import battery_path, setpoint_path, storage_parameters
+from sdc_taichi.optimum.problem import Problem, Storage, problems_of
+from sdc_taichi.optimum.rollout import RollOut, Targets, repeated, roll_out
+from sdc_taichi.optimum.tables import FacilityTable
 from sdc_taichi.plant.battery import BATTERIES
 from sdc_taichi.plant.cooling import SETPOINTS
 from sdc_taichi.plant.workload import MODELS, Work

@@ -13,14 +13,13 @@ from sdc_taichi.optimum.problem import (
     AGENTS,
     BilledMonth,
     Ends,
-    FacilityTable,
     FlexibleWork,
     Plan,
     Problem,
     Storage,
 )
 from sdc_taichi.optimum.stage_cost import stage_cost
-from sdc_taichi.optimum.table_lookup import INLET_MARGIN_K
+from sdc_taichi.optimum.tables import INLET_MARGIN_K, FacilityTable
 from sdc_taichi.plant.battery import BATTERIES
 from sdc_taichi.sim.facility import BATTERY_PARAMETERS
 from sdc_taichi.types import F64

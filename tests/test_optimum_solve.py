@@ -14,10 +14,10 @@ import pytest
 from sdc_taichi import ConfigError, DataCenterConfig, Simulator, load_config, preset_names
 from sdc_taichi.atomic_file import FileClaim
 from sdc_taichi.control import make_controller
-from sdc_taichi.optimum import Objective, Optimum, StoppedError, entry, solve
-from sdc_taichi.optimum.entry import OptimumCacheWarning
-from sdc_taichi.optimum.problem import AGENTS, Ends, FacilityTable
-from sdc_taichi.optimum.tables import facility_tables
+from sdc_taichi.optimum import Objective, Optimum, StoppedError, solve
+from sdc_taichi.optimum.cache import Cache, OptimumCacheWarning
+from sdc_taichi.optimum.problem import AGENTS, Ends
+from sdc_taichi.optimum.tables import FacilityTable, facility_tables
 from sdc_taichi.run.achievable import AchievedPath, achievement, begin_score
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.sim import snapshot
@@ -230,7 +230,7 @@ def test_bounds_of_ends_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     def fails(*_: Any, **__: Any) -> Any:
         raise AssertionError("solved again")
 
-    monkeypatch.setattr("sdc_taichi.optimum.end_values.bound", fails)
+    monkeypatch.setattr("sdc_taichi.optimum.result.bound", fails)
     again = solved(config_of("CA"), steps=24, cache=tmp_path).bound_of_ends
     assert again(0, ends) == first
     with pytest.raises(AssertionError, match="solved again"):
@@ -281,7 +281,7 @@ def test_what_another_process_is_keeping_needs_no_warning(
     monkeypatch.setattr(snapshot, "write", write)
     with warnings.catch_warnings():
         warnings.simplefilter("error", OptimumCacheWarning)
-        entry.Cache(tmp_path).keep_ends("key", {Ends(0.0, 0.0, 0.0, 0.0): 1.0})
+        Cache(tmp_path).keep_ends("key", {Ends(0.0, 0.0, 0.0, 0.0): 1.0})
     assert [claim.path.name for claim in claims] == ["key-ends.npz"]
     assert not claims[0].path.exists()
 

@@ -13,11 +13,16 @@ from sdc_taichi import Actions, Simulator, build_fleet, load_config
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, OddInputWarning
 from sdc_taichi.optimum import tables
-from sdc_taichi.optimum.eligibility import no_table_reasons, uncooled_reason
 from sdc_taichi.optimum.facility_map import FacilityMap, facility_map
-from sdc_taichi.optimum.problem import FacilityTable
-from sdc_taichi.optimum.table_lookup import at_setpoint, at_utilisation
-from sdc_taichi.optimum.tables import Nodes, TableGrid, facility_tables
+from sdc_taichi.optimum.problem import no_table_reasons, uncooled_reason
+from sdc_taichi.optimum.tables import (
+    FacilityTable,
+    Nodes,
+    TableGrid,
+    at_setpoint,
+    at_utilisation,
+    facility_tables,
+)
 from sdc_taichi.sim.drivers import Drivers, FleetSeries, load_drivers
 
 JULY = "site.start=07-01"

@@ -28,8 +28,8 @@ from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.learning.experts import FollowedOptimum, objective_of_optimum
 from sdc_taichi.learning.scenarios import training_environment
 from sdc_taichi.learning.split import DAYS_PER_WEEK, WEEKS
+from sdc_taichi.optimum import StoppedError
 from sdc_taichi.optimum.problem import AGENTS as PARTS
-from sdc_taichi.optimum.result import StoppedError
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F32, F64, Actions
 

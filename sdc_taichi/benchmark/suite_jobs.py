@@ -38,7 +38,7 @@ from sdc_taichi.learning.evaluation import (
     validate,
 )
 from sdc_taichi.learning.policy import WEIGHTS
-from sdc_taichi.optimum.entry import OptimumCacheWarning
+from sdc_taichi.optimum.cache import OptimumCacheWarning
 from sdc_taichi.run.achievable import AchievedPath, share_of_achievable
 
 if TYPE_CHECKING:

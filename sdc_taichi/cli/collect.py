@@ -83,7 +83,7 @@ def collect_command(
     from sdc_taichi.benchmark.episodes import Collection
     from sdc_taichi.benchmark.offline import data_set_folder, require_minari, write_data_set
     from sdc_taichi.learning.split import parse_weeks
-    from sdc_taichi.optimum.result import StoppedError
+    from sdc_taichi.optimum import StoppedError
 
     if not controller:
         raise ConfigError("--controller: none; valid is one or more, such as random, mpc-24h")

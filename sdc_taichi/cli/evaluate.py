@@ -191,7 +191,7 @@ def _prepared(
         typer.Exit: solving was stopped; what is kept has been printed.
     """
     from sdc_taichi.learning.evaluation import prepare
-    from sdc_taichi.optimum.result import StoppedError
+    from sdc_taichi.optimum import StoppedError
 
     with exit_if_stopped():
         try:

@@ -174,7 +174,7 @@ def exit_if_stopped() -> Iterator[None]:
     Raises:
         typer.Exit: the work was stopped; how much of it is kept has been printed.
     """
-    from sdc_taichi.optimum.result import StoppedError
+    from sdc_taichi.optimum import StoppedError
 
     try:
         yield

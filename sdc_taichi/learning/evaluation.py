@@ -18,11 +18,10 @@ from sdc_taichi.control import PERFECT, Controller, ForecastError, Idle, PerAgen
 from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS, data_center_weeks
 from sdc_taichi.learning.statistics import change_pct, share_pct
-from sdc_taichi.optimum.end_values import with_tabled_ends
-from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum import StoppedError
+from sdc_taichi.optimum.objective import Objective, Score
 from sdc_taichi.optimum.problem import AGENTS
-from sdc_taichi.optimum.result import Optimum, StoppedError
-from sdc_taichi.optimum.score import Score
+from sdc_taichi.optimum.result import Optimum, with_tabled_ends
 from sdc_taichi.optimum.solve import Progress, solve
 from sdc_taichi.run.achievable import OPTIMUM, AchievedPath, achievement, begin_score
 from sdc_taichi.run.loop import simulate

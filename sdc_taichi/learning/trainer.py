@@ -42,7 +42,7 @@ from sdc_taichi.learning.training_folder import (
 )
 from sdc_taichi.learning.training_log import CsvLog, EventLog
 from sdc_taichi.learning.training_settings import TrainingSettings
-from sdc_taichi.optimum.result import StoppedError
+from sdc_taichi.optimum import StoppedError
 from sdc_taichi.optimum.solve import Progress as StageProgress
 
 LEAST_DATA_CENTERS = 256

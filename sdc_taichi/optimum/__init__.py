@@ -6,7 +6,8 @@ that knows the inputs in advance; the plan behind it is then run to see what can
 """
 
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.result import Optimum, StoppedError
+from sdc_taichi.optimum.problem import StoppedError
+from sdc_taichi.optimum.result import Optimum
 from sdc_taichi.optimum.solve import solve
 
 __all__ = ["Objective", "Optimum", "StoppedError", "solve"]

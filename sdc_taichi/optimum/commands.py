@@ -8,6 +8,7 @@ import numpy as np
 
 from sdc_taichi.plant.battery import BATTERIES
 from sdc_taichi.plant.cooling import avoid_repeats
+from sdc_taichi.plant.workload import MODELS as WORK_MODELS
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64
 
@@ -134,6 +135,27 @@ def bus_energy_kwh(
     """
     rise_kwh = target_kwh - stored_kwh
     return np.where(rise_kwh >= 0, rise_kwh / charge_efficiency, rise_kwh / discharge_factor)
+
+
+def arrived_tasks(model: str, demand: F64, flexible_share: F64 | float) -> F64:
+    """Work that arrives as a model of work counts it, in tasks.
+
+    Args:
+        model: name of the model of work.
+        demand: work that arrives, as a share of capacity, 0..1.
+        flexible_share: share of it that may wait, 0..1.
+    """
+    nothing = np.zeros(np.shape(demand))
+    work = WORK_MODELS[model](
+        demand,
+        nothing,
+        nothing,
+        nothing,
+        flexible_share=flexible_share,
+        max_utilisation=1.0,
+        queue_limit=0.0,
+    )
+    return np.asarray(work.arrived_tasks)
 
 
 def setpoint_command(target_c: F64, *, setpoint_c: F64, step_k: F64, last: F64) -> F64:

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sdc_taichi.hall.protection import Mask
-from sdc_taichi.optimum.problem import FacilityTable
-from sdc_taichi.optimum.table_lookup import barred
 from sdc_taichi.optimum.tables import (
+    FacilityTable,
     Nodes,
     TableGrid,
+    barred,
     batches,
     tabulate,
     what_decides_facility,

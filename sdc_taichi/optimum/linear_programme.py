@@ -9,9 +9,8 @@ import numpy as np
 
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.dispatch import DEFER, DRAIN, DUE, Dispatch, DispatchProgramme, Span
-from sdc_taichi.optimum.problem import Ends, Plan, Problem
+from sdc_taichi.optimum.problem import Ends, Plan, Problem, StoppedError
 from sdc_taichi.optimum.programme import InfeasibleError
-from sdc_taichi.optimum.result import StoppedError
 from sdc_taichi.optimum.stage_cost import (
     LoadCurves,
     StageCost,
@@ -20,7 +19,7 @@ from sdc_taichi.optimum.stage_cost import (
     stage_cost,
     step_weights,
 )
-from sdc_taichi.optimum.table_lookup import cubic
+from sdc_taichi.optimum.tables import cubic
 from sdc_taichi.optimum.windows import bound_in_windows, plan_in_windows, window_ends
 from sdc_taichi.types import F64
 

@@ -1,4 +1,4 @@
-"""What a plan minimises: carbon, energy, cost, water, or a weighed sum of them."""
+"""What a plan minimises, and the figure of a run under it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import numpy as np
 
 from sdc_taichi.errors import ConfigError, suggestion
 from sdc_taichi.number_text import parse_number
+from sdc_taichi.sim.bills import add_power, billed_kw_months, no_demand
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import F64
+from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.types import F64, StepResult
 
 _UNITS = {"carbon": "kg CO2e", "energy": "kWh", "cost": "currency of the tariff", "water": "L"}
 """Units of the objectives of one term with weight 1."""
@@ -121,3 +123,71 @@ class Objective:
 def _shortest(weight: float) -> str:
     """The shortest text that is read as this very number, without a plus sign."""
     return repr(float(weight)).removesuffix(".0").replace("e+", "e")
+
+
+class Score:
+    """What the scored steps of B data centers come to.
+
+    Args:
+        objective: what is minimised.
+        sim: the simulator, which has been reset and has done no step.
+        scored_from: first step that counts.
+    """
+
+    def __init__(self, objective: Objective, sim: Simulator, scored_from: int = 0) -> None:
+        fleet, start = sim.fleet, sim.drivers.start
+        self._objective, self._step_h, self._from = objective, sim.step_h, scored_from
+        self._charge_per_kw = fleet.values("tariff.demand_charge_per_kw")
+        self._demand = no_demand(start + scored_from, fleet.steps_per_hour)
+        names = ("carbon_g", "grid_kwh", "energy_cost", "water_l", "dropped_tasks", "unmet_w")
+        self._sums = {name: np.zeros(sim.size) for name in names}
+        self._steps = 0
+        self.start_kwh, self.start_tasks = _memory(sim)
+        """Energy stored, in kWh, and work that waits, in tasks, at the first scored step, (B,)."""
+        self.end_kwh, self.end_tasks = _memory(sim)
+        """Energy stored, in kWh, and work that waits, in tasks, after the last step, (B,)."""
+        self.most_overdue_tasks = np.zeros(sim.size)
+        """Most overdue work of a scored step, in tasks, (B,)."""
+        self.hottest_inlet_c = np.full(sim.size, -np.inf)
+        """Hottest inlet of the scored steps, in C, (B,)."""
+
+    def add(self, result: StepResult) -> None:
+        """Add the step that follows those added before."""
+        self.end_kwh = result.stored_kwh.copy()
+        self.end_tasks = result.queue_tasks.copy()
+        if result.step < self._from:
+            self.start_kwh, self.start_tasks = self.end_kwh, self.end_tasks
+            return
+        add_power(self._demand, self._steps, result.grid_kwh / self._step_h)
+        self._steps += 1
+        for name, total in self._sums.items():
+            total += getattr(result, name)
+        np.maximum(self.most_overdue_tasks, result.overdue_tasks, out=self.most_overdue_tasks)
+        np.maximum(self.hottest_inlet_c, result.inlet_max_c, out=self.hottest_inlet_c)
+
+    @property
+    def figure(self) -> F64:
+        """The figure of the scored steps, in the unit of the objective, (B,)."""
+        kw_months = billed_kw_months(self._demand, self._steps)
+        return self._objective.figure(
+            cfp_kg=self._sums["carbon_g"] / 1e3,
+            grid_kwh=self._sums["grid_kwh"],
+            cost=self._sums["energy_cost"] + kw_months * self._charge_per_kw,
+            water_l=self._sums["water_l"],
+        )
+
+    @property
+    def dropped_tasks(self) -> F64:
+        """Work that found the queue full, in tasks, (B,)."""
+        return self._sums["dropped_tasks"]
+
+    @property
+    def unmet_kwh(self) -> F64:
+        """Heat that stayed in the room, in kWh, (B,)."""
+        return self._sums["unmet_w"] * self._step_h / 1e3
+
+
+def _memory(sim: Simulator) -> tuple[F64, F64]:
+    """Energy stored, in kWh, and work that waits, in tasks, of each data center, (B,)."""
+    state = sim.state
+    return state.stored_kwh.copy(), state.queue[:, -1].copy()

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from sdc_taichi.errors import SdcError
+from sdc_taichi.optimum.cache import Cache
+from sdc_taichi.optimum.linear_programme import bound
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.problem import Agent, Ends
+from sdc_taichi.optimum.problem import Agent, Ends, Problem, StoppedError
+from sdc_taichi.optimum.task import Task
+from sdc_taichi.plant.workload import UNLIMITED_TASKS
+from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.sim.workload import queue_limit_tasks
 from sdc_taichi.types import F64, I64
-
-
-class StoppedError(SdcError):
-    """Solving was stopped before its end; the message says what is kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,3 +98,137 @@ class Optimum:
             own, cyclic = Ends(kwh, tasks, end_kwh[i], end_tasks[i]), Ends(kwh, tasks, kwh, tasks)
             value[i] = self.bound_of_ends(i, own) - self.bound_of_ends(i, cyclic)
         return value
+
+
+_KWH_SHARES = (0.0, 0.35, 0.65, 0.95)
+"""Energy stored at the nodes of a curve, over the capacity; a full battery may be out of reach."""
+_TASK_SHARES = (0.0, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 13 / 16)
+"""Work that waits at the nodes of a curve, over the longest queue; the first hours of it are the
+dearest, and the longest queue may be out of reach."""
+
+
+class BoundOfEnds:
+    """Bounds of data centers with given ends, computed when they are first asked for.
+
+    Args:
+        task: What was solved.
+        kinds: What the bound of each data center is, B.
+        cache: Keeps them for later; None keeps none.
+    """
+
+    def __init__(self, task: Task, kinds: Sequence[str], cache: Cache | None = None) -> None:
+        self._task, self._kinds, self._cache = task, kinds, cache
+        self._problem: tuple[int, Problem] | None = None
+        self._known: dict[int, dict[Ends, float]] = {}
+
+    def __call__(self, dc: int, ends: Ends) -> float:
+        """Bound of a data center, by its number, with given ends; nan where there is none."""
+        if self._kinds[dc].startswith("none"):
+            return float("nan")
+        if dc not in self._known:
+            kept = {} if self._cache is None else self._cache.find_ends(self._keys[dc])
+            self._known[dc] = kept
+        known = self._known[dc]
+        if ends not in known:
+            known[ends] = bound(self._problem_of(dc), ends).figure
+            if self._cache is not None:
+                self._cache.keep_ends(self._keys[dc], known)
+        return known[ends]
+
+    @cached_property
+    def _keys(self) -> list[str]:
+        return self._task.keys()
+
+    def _problem_of(self, dc: int) -> Problem:
+        """Planning problem of a data center; that of the last call is kept."""
+        if self._problem is None or self._problem[0] != dc:
+            part = self._task.part([dc])
+            self._problem = dc, part.problems(part.tables())[0]
+        return self._problem[1]
+
+
+def with_tabled_ends(
+    optimum: Optimum,
+    sim: Simulator,
+    *,
+    progress: Callable[[str, int, int], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Optimum:
+    """An optimum that values ends by curves, for many controllers to be compared with it.
+
+    What energy stored at the end is worth hardly depends on the work that waits there, nor either
+    of them on the state days before. So the bound with given ends is the sum of two curves, linear
+    between a dozen bounds and beyond the last of them; only its differences between ends mean
+    something. The last segments go on to a full battery and queue, where bounds bend: the last
+    percent of a battery fills so slowly that a kWh there is worth ten of those before, and no more
+    work can wait than may still be put off.
+
+    With random ends below these bends (up to 98 % of the battery and 85 % of the queue), values
+    were off by up to 0.015 % of the figure of a week of preset ``corrected``, which is 0.4 % of the
+    achievable. With more flexible work and a battery of 4 h it was 0.3 % and 2 %, for the bill,
+    where the state at the beginning shaves the peak of the demand charge, 0.4 % and 3 %. Errors
+    have either sign, and cancel over many weeks.
+
+    Args:
+        optimum: Optimum of the simulator's data centers.
+        sim: The simulator.
+        progress: Is told the name of the stage, how many data centers are done, and of how many.
+        stop: Asked before each bound; true ends the work.
+
+    Returns:
+        The optimum; the one given where a queue has no limit.
+
+    Raises:
+        StoppedError: ``stop`` was true; what the optimum keeps is kept.
+    """
+    limits = queue_limit_tasks(sim.fleet)
+    if np.any(limits >= UNLIMITED_TASKS):
+        return optimum
+    none = np.zeros(sim.size)
+    full_kwh = sim.sizing.battery_kwh * sim.fleet.values("battery.upper_v")
+    most_kwh = full_kwh if "battery" in optimum.agents else none
+    most_tasks = limits if "load" in optimum.agents else none
+    curves = []
+    for dc in range(sim.size):
+        if progress is not None:
+            progress("values of ends", dc, sim.size)
+        curves.append(_Curves(optimum, dc, float(most_kwh[dc]), float(most_tasks[dc]), stop))
+    return replace(optimum, bound_of_ends=lambda dc, ends: curves[dc].figure(ends))
+
+
+class _Curves:
+    """Bound of a data center by what is stored and by what waits at the end."""
+
+    def __init__(
+        self,
+        optimum: Optimum,
+        dc: int,
+        most_kwh: float,
+        most_tasks: float,
+        stop: Callable[[], bool] | None,
+    ) -> None:
+        self._kwh = np.unique(np.multiply(most_kwh, _KWH_SHARES))
+        self._tasks = np.unique(np.multiply(most_tasks, _TASK_SHARES))
+
+        def figure(kwh: float, tasks: float) -> float:
+            if stop is not None and stop():
+                raise StoppedError("values of ends were stopped")
+            return optimum.bound_of_ends(dc, Ends(most_kwh / 2, 0.0, float(kwh), float(tasks)))
+
+        self._of_kwh = np.array([figure(kwh, 0.0) for kwh in self._kwh])
+        self._of_tasks = np.array(
+            [self._of_kwh[0], *(figure(0.0, tasks) for tasks in self._tasks[1:])]
+        )
+
+    def figure(self, ends: Ends) -> float:
+        of_kwh = _line(ends.end_kwh, self._kwh, self._of_kwh)
+        return of_kwh + _line(ends.end_tasks, self._tasks, self._of_tasks) - float(self._of_kwh[0])
+
+
+def _line(x: float, nodes: F64, values: F64) -> float:
+    """Linear interpolation, that of the last two nodes beyond them."""
+    if len(nodes) == 1:
+        return float(values[0])
+    i = int(np.clip(np.searchsorted(nodes, x), 1, len(nodes) - 1))
+    slope = (values[i] - values[i - 1]) / (nodes[i] - nodes[i - 1])
+    return float(values[i] + slope * (x - nodes[i]))

@@ -15,25 +15,30 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.kernels.compiler import runtime
-from sdc_taichi.optimum.certificates import (
-    LARGEST_TABLE_ERROR,
-    Certificate,
-    against_table,
-    measured,
-)
-from sdc_taichi.optimum.eligibility import (
+from sdc_taichi.optimum.cache import Cache, Entry
+from sdc_taichi.optimum.linear_programme import bound
+from sdc_taichi.optimum.objective import Objective
+from sdc_taichi.optimum.paths import IDLE, JOINT, agents_of, path_of, with_battery_for
+from sdc_taichi.optimum.problem import (
+    AGENTS,
+    Agent,
+    Problem,
+    StoppedError,
     forced_discharge_reason,
     no_table_reasons,
     uncooled_reason,
 )
-from sdc_taichi.optimum.end_values import BoundOfEnds
-from sdc_taichi.optimum.entry import Cache, Entry
-from sdc_taichi.optimum.linear_programme import bound
-from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.paths import IDLE, JOINT, agents_of, path_of, with_battery_for
-from sdc_taichi.optimum.problem import AGENTS, Agent, Problem
-from sdc_taichi.optimum.result import Optimum, StoppedError
-from sdc_taichi.optimum.rollout import RollOut, Targets, repeated, roll_out
+from sdc_taichi.optimum.result import BoundOfEnds, Optimum
+from sdc_taichi.optimum.rollout import (
+    LARGEST_TABLE_ERROR,
+    Certificate,
+    RollOut,
+    Targets,
+    against_table,
+    measured,
+    repeated,
+    roll_out,
+)
 from sdc_taichi.optimum.task import Task, checked_task
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim import snapshot

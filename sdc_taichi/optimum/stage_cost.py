@@ -18,7 +18,7 @@ import numpy as np
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.protection import Mask
 from sdc_taichi.optimum.problem import Problem
-from sdc_taichi.optimum.table_lookup import INLET_MARGIN_K, at_setpoint, cubic
+from sdc_taichi.optimum.tables import INLET_MARGIN_K, at_setpoint, cubic
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64
 

@@ -9,11 +9,10 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, whole_number
-from sdc_taichi.optimum.entry import key_of
+from sdc_taichi.optimum.cache import key_of
 from sdc_taichi.optimum.objective import Objective
-from sdc_taichi.optimum.problem import AGENTS, Agent, FacilityTable, Problem
-from sdc_taichi.optimum.problems import problems_of
-from sdc_taichi.optimum.tables import UTILISATIONS, TableGrid, facility_tables
+from sdc_taichi.optimum.problem import AGENTS, Agent, Problem, problems_of
+from sdc_taichi.optimum.tables import UTILISATIONS, FacilityTable, TableGrid, facility_tables
 from sdc_taichi.sim import snapshot
 from sdc_taichi.sim.drivers import Drivers, load_drivers
 from sdc_taichi.sim.events import seeds_of_fleet

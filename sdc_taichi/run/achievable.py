@@ -15,9 +15,9 @@ import numpy as np
 
 from sdc_taichi.control import PERFECT, Controller, ForecastError, View
 from sdc_taichi.errors import SdcError
-from sdc_taichi.optimum.certificates import LEAST_K, LEAST_TASKS
+from sdc_taichi.optimum.objective import Score
 from sdc_taichi.optimum.result import Optimum
-from sdc_taichi.optimum.score import Score
+from sdc_taichi.optimum.rollout import LEAST_K, LEAST_TASKS
 from sdc_taichi.optimum.task import seeds_of_sampled_events
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.sim.simulator import Simulator
