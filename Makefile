@@ -68,7 +68,7 @@ lint: $(READY) ## Check style, format and types.
 	rm -rf $(TYPED)
 	$(PY) -c 'from setuptools import setup; setup()' --quiet build_py --build-lib $(TYPED)
 	set -o pipefail; cd $(TYPED) && ../../$(PY) -m mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache \
-	    sdc_taichi sdc_taichi_command.py $(addprefix ../../,$(SCRIPTS)) \
+	    sdc_taichi $(addprefix ../../,$(SCRIPTS)) \
 	    | sed -E 's#^sdc_taichi/($(MAPPED))/#\1/#; s#^\.\./\.\./##'
 
 wheel-test: $(READY) ## Build the wheel and run the tests against it, away from the sources.

@@ -35,6 +35,7 @@ ROOMS = (
     "learning",
     "benchmark",
     "cli",
+    "__main__",
     "__init__",
 )
 """From the ground up: a room imports rooms that stand before it, and no others."""
@@ -100,7 +101,7 @@ def test_there_are_few_rooms_and_each_has_its_place() -> None:
     rooms = {room_of(module) for module in FILES}
     assert rooms <= set(ROOMS), "say in ROOMS what the new room may import"
     assert set(ROOMS) <= rooms, "a room of ROOMS is gone"
-    assert len(rooms - set(MAPPED)) <= 20
+    assert len(rooms - {*MAPPED, "__main__"}) <= 20
 
 
 @pytest.mark.parametrize("module", FILES)

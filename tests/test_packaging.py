@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import importlib.resources
+import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -68,7 +70,7 @@ def test_build_holds_every_source_file(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     built = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
-    assert built == {"sdc_taichi_command.py", *source_files()}
+    assert built == set(source_files())
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -125,6 +127,24 @@ print("taichi" in sys.modules)
     ids, taichi = run_python(code, tmp_path).splitlines()
     assert ids.split() == [f"sdc_taichi/{n}-v0" for n in ("Joint", "Load", "Cooling", "Battery")]
     assert taichi == "False"
+
+
+@pytest.mark.repo
+def test_a_checkout_on_the_path_takes_no_folder_of_an_installed_one(tmp_path: Path) -> None:
+    for name in ("sdc_taichi", *MAPPED):
+        shutil.copytree(ROOT / name, tmp_path / name)
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    names = ", ".join(f"sdc_taichi.{name}" for name in MAPPED)
+    code = f"import {names}; print(*(m.__file__ for m in ({names})))"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        cwd=tmp_path.parent,
+        capture_output=True,
+        text=True,
+    )
+    assert done.stderr == ""
+    assert done.stdout.split() == [str(tmp_path / name / "__init__.py") for name in MAPPED]
 
 
 def test_works_without_rerun(tmp_path: Path) -> None:

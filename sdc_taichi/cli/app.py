@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import sys
 import traceback
@@ -25,7 +27,6 @@ from sdc_taichi.cli.options import CommandApp, Debug
 from sdc_taichi.cli.policy import policy_app
 from sdc_taichi.cli.report import report_command
 from sdc_taichi.cli.simulate import simulate_command
-from sdc_taichi.cli.streams import guard_streams, output_failure
 from sdc_taichi.cli.sweep import sweep_command
 from sdc_taichi.cli.terminal import EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED, warnings_in_lines
 from sdc_taichi.cli.train import train_command
@@ -47,18 +48,16 @@ class _Commands(typer.core.TyperGroup):
     """Commands whose errors are one line and an exit code."""
 
     def main(self, args: Sequence[str] | None = None, *more: Any, **extra: Any) -> Any:
-        given = sys.argv[1:] if args is None else list(args)
-        extra |= {"standalone_mode": False, "obj": given}
+        words = sys.argv[1:] if args is None else list(args)
+        extra |= {"standalone_mode": False, "obj": words}
         try:
             with warnings_in_lines():
                 code = super().main(args, *more, **extra)
+            sys.stdout.flush()
         except Exception as error:
-            if "--debug" in given:
+            if "--debug" in words:
                 traceback.print_exc()
             code = _print_error(error)
-        failure = output_failure()
-        if failure is not None and not code:
-            code = _print_error(SdcError(failure))
         sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -87,13 +86,13 @@ app.command("collect")(collect_command)
 
 def main() -> None:
     """Run the command line of this process, and exit."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    # The current folder, for import paths ``module:name``, after all that is installed.
+    sys.path.append("")
     try:
-        guard_streams()
-        if _has_current_folder():
-            # Modules of the user's, after all that are installed, for import paths ``module:name``.
-            sys.path.append(os.getcwd())
         app()
-    except KeyboardInterrupt:  # commands being put together, or the last line being printed
+    except KeyboardInterrupt:  # between two commands, where Typer does not catch it
         sys.exit(EXIT_INTERRUPTED)
 
 
@@ -126,8 +125,12 @@ def _print_error(error: Exception) -> int:
         text, code = error.format_message(), error.exit_code
     elif isinstance(error, SdcError):
         text, code = str(error), EXIT_INPUT
-    elif isinstance(error, FileNotFoundError) and not _has_current_folder():
-        text, code = "the current folder has been deleted; valid is one that exists", EXIT_INPUT
+    elif isinstance(error, BrokenPipeError):  # a reader that wants no more, such as ``head``
+        _drop_output()
+        return EXIT_FAILURE
+    elif isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EFBIG):
+        _drop_output()
+        text, code = f"output cannot be written: {error.strerror}", EXIT_INPUT
     elif isinstance(error, MemoryError):
         text, code = f"memory is short{f' ({error})' if str(error) else ''}", EXIT_FAILURE
     else:
@@ -138,9 +141,6 @@ def _print_error(error: Exception) -> int:
     return code
 
 
-def _has_current_folder() -> bool:
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        return False
-    return True
+def _drop_output() -> None:
+    """Give standard output to the null device, where Python flushes it without another error."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

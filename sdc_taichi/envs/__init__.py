@@ -6,7 +6,7 @@ Physics never does: an environment only translates between a learner and the sim
 
 from __future__ import annotations
 
-import gymnasium
+from types import ModuleType
 
 IDS: dict[str, str | None] = {
     "sdc_taichi/Joint-v0": None,
@@ -18,11 +18,14 @@ IDS: dict[str, str | None] = {
 as one."""
 
 
-def register() -> None:
+def register(gymnasium: ModuleType) -> None:
     """Register the ids that are not registered yet; the environments are imported by ``make``.
 
     The length of an episode depends on the arguments: ``max_episode_steps`` is in the spec of each
     environment (``sdc_taichi.envs.base``).
+
+    Args:
+        gymnasium: the package Gymnasium.
     """
     for name, agent in IDS.items():
         if name not in gymnasium.registry:
