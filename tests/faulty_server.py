@@ -90,21 +90,6 @@ def sends(
     return answer
 
 
-def sends_by_range(content: bytes, etag: str, *, first: int) -> Answer:
-    """Content of which ``first`` bytes arrive without a range, and the rest with one."""
-
-    def answer(request: BaseHTTPRequestHandler) -> None:
-        wanted = request.headers.get("Range")
-        if wanted is None or request.headers.get("If-Range") != etag:
-            sends(content[:first], length=len(content), ETag=etag)(request)
-            return
-        start = int(wanted.removeprefix("bytes=").removesuffix("-"))
-        told = f"bytes {start}-{len(content) - 1}/{len(content)}"
-        sends(content[start:], 206, ETag=etag, Content_Range=told)(request)
-
-    return answer
-
-
 def drips(content: bytes, pause_s: float, stopped: Callable[[], threading.Event]) -> Answer:
     """Content byte by byte, with a pause before each."""
 

@@ -15,7 +15,7 @@ from sdc_taichi.cli.data import data_app
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import load_site, read_carbon, read_epw, read_workload
 from sdc_taichi.exogenous.columns import COLUMN_NAMES, column_map
-from sdc_taichi.exogenous.fetch.exports import EXPORTS
+from sdc_taichi.exogenous.fetch.saved_tables import saved_table_services
 from sdc_taichi.exogenous.weather_table import Place, read_weather_table
 
 PLACE = Place("roof", 40.7, -75.0, 10.0, -5.0)
@@ -320,5 +320,5 @@ def test_help_names_every_column() -> None:
     commands: Any = typer.main.get_command(data_app)
     (option,) = (each for each in commands.commands["import"].params if each.name == "mapped")
     fuels = {"WND", "SUN", "WAT", "OIL", "NG", "COL", "NUC", "OTH"}
-    missing = [name for name in (*COLUMN_NAMES, *EXPORTS) if name not in option.help]
+    missing = [name for name in (*COLUMN_NAMES, *saved_table_services()) if name not in option.help]
     assert set(missing) == fuels

@@ -19,12 +19,19 @@ from faulty_server import Answer, sends, serving
 from sdc_taichi.cli.app import app
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import load_site, series_file
-from sdc_taichi.exogenous.fetch import eia as eia_module
-from sdc_taichi.exogenous.fetch import electricity_maps, pvgis
-from sdc_taichi.exogenous.fetch import entsoe as entsoe_module
-from sdc_taichi.exogenous.fetch.download import Patience
-from sdc_taichi.exogenous.fetch.generation import Period, by_column, carbon_table, check_year
-from sdc_taichi.exogenous.fetch.request import MOST_DOWNLOAD_BYTES, Key
+from sdc_taichi.exogenous.fetch.download import MOST_DOWNLOAD_BYTES, Patience
+from sdc_taichi.exogenous.fetch.generation import (
+    MOST_EIA_ROWS,
+    Period,
+    by_column,
+    carbon_table,
+    eia_rows,
+    generation_of_year,
+    year_of_requests,
+    zone_code,
+)
+from sdc_taichi.exogenous.fetch.services import STORAGE, services
+from sdc_taichi.exogenous.fetch.weather import typical_year
 from sdc_taichi.exogenous.synthetic import FUELS, emission_factors
 from service_answers import (
     eia,
@@ -57,8 +64,9 @@ def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Result]]:
     """Runs ``data fetch`` with a server in place of the services; None is no answer."""
     with serving() as server:
-        for module in (pvgis, eia_module, entsoe_module, electricity_maps):
-            monkeypatch.setattr(module, "ADDRESS", server.url)
+        for name, service in services().items():
+            here = service.model_copy(update={"address": server.url})
+            monkeypatch.setitem(services(), name, here)
 
         def fetch(answer: Answer | None, *args: str) -> Result:
             server.answers = [answer or (lambda request: None)]
@@ -118,18 +126,13 @@ def test_typical_year_becomes_a_site(run: Callable[..., Result], data_dir: Path)
 
 def test_half_hours_are_interpolated() -> None:
     year = json.dumps(pvgis_year(20.0, 77.0)).encode()
-    lines = pvgis.to_epw(year, "url", 5.5).splitlines()[8:]
-    cells = [line.split(",") for line in lines]
+    table, place = typical_year(year, "url", 5.5)
+    assert (place.latitude_deg, place.longitude_deg, place.utc_offset_h) == (20.0, 77.0, 5.5)
+    dry_bulb = pd.read_csv(io.BytesIO(table))["dry_bulb"]
     # Local 06:00 is 00:30 UTC, between the rows of 00:00 and 01:00.
-    assert float(cells[6][6]) == pytest.approx(0.0005, abs=0.005)
+    assert dry_bulb[6] == pytest.approx(0.0005, abs=0.005)
     # Local 00:00 is 18:30 UTC of 31 December.
-    assert float(cells[0][6]) == pytest.approx((8754 + 8755) / 2000.0, abs=0.005)
-    assert {c[20] for c in cells} == {"10", "350"}
-    assert [c[:5] for c in (cells[0], cells[-1])] == [
-        ["2016", "1", "1", "1", "60"],
-        ["2016", "12", "31", "24", "60"],
-    ]
-    assert {len(c) for c in cells} == {35}
+    assert dry_bulb[0] == pytest.approx((8754 + 8755) / 2000.0, abs=0.005)
 
 
 @pytest.mark.parametrize(
@@ -142,10 +145,10 @@ def test_half_hours_are_interpolated() -> None:
             "row 8 of tmy_hourly: T2m",
         ),
         (lambda year: year["outputs"]["tmy_hourly"][7].update(SP="high"), "expected a number"),
-        (lambda year: year["outputs"]["tmy_hourly"][7].pop("RH"), "no RH"),
+        (lambda year: year["outputs"]["tmy_hourly"][7].pop("RH"), "RH"),
         (lambda year: year["inputs"]["location"].update(latitude=46), "latitude 46, expected 45"),
-        (lambda year: year.pop("inputs"), "no inputs.location.latitude"),
-        (lambda year: year["outputs"].update(tmy_hourly={}), "0 rows"),
+        (lambda year: year.pop("inputs"), "no 'inputs', expected a typical year"),
+        (lambda year: year["outputs"].update(tmy_hourly={}), "expected a typical year of PVGIS"),
     ],
 )
 def test_a_wrong_typical_year_is_one_line(
@@ -161,7 +164,7 @@ def test_a_wrong_typical_year_is_one_line(
 def test_values_beyond_limits_are_found_by_the_reader(run: Callable[..., Result]) -> None:
     answer = pvgis_answer(lambda year: year["outputs"]["tmy_hourly"][7].update(T2m=99.0))
     line = error(run(sends(answer), *PVGIS, "--utc-offset=1"))
-    assert "tmy_45.0000_8.0000_utc+1.epw: row 17, column dry bulb" in line
+    assert "tmy_45.0000_8.0000_utc+1.csv: row 10, column dry_bulb" in line
 
 
 @pytest.mark.parametrize(
@@ -348,18 +351,18 @@ def test_rows_that_the_service_leaves_out_are_an_error() -> None:
     document = json.loads(eia_document([{}], {}))
     document["response"]["total"] = 5001
     with pytest.raises(DataError, match="1 of 5,001 rows came"):
-        eia_module.rows_of(json.dumps(document).encode(), "url")
+        eia_rows(json.dumps(document).encode(), "url")
 
 
 def test_requests_cover_the_year_without_too_many_rows() -> None:
-    key = Key("EIA_API_KEY", "api_key", KEY)
+    service = services()["eia-930"]
     for year in (2023, 2024):
-        periods = [period for period, _ in eia_module.requests_of_year("PJM", year, key)]
+        periods = year_of_requests(service, "PJM", year).periods
         assert periods[0].first == 0
         assert [p.first for p in periods[1:]] == [p.stop for p in periods[:-1]]
         assert periods[-1].stop == 24 * (366 if year == 2024 else 365)
-        sources = len(eia_module.COLUMNS)
-        assert max(p.stop - p.first for p in periods) * sources <= eia_module.MOST_ROWS
+        sources = len(service.types)
+        assert max(p.stop - p.first for p in periods) * sources <= MOST_EIA_ROWS
 
 
 @pytest.mark.parametrize(
@@ -431,7 +434,9 @@ DAY = ("2024-01-01T00:00Z", "2024-01-02T00:00Z")
 
 
 def of_first_day(*series: str) -> dict[str, np.ndarray]:
-    found = entsoe_module.generation(2024, [(Period(0, 24), entsoe_document(*series), "url")])
+    found = generation_of_year(
+        services()["entsoe"], 2024, [(Period(0, 24), entsoe_document(*series), "url")]
+    )
     return {name: values[:24] for name, values in found.items()}
 
 
@@ -453,7 +458,9 @@ def test_power_is_averaged_to_hours(resolution: str, per_hour: int) -> None:
 
 def test_an_answer_beyond_its_period_is_cut() -> None:
     series = entsoe_series("B04", "2023-12-31T12:00Z", "2024-01-03T00:00Z", [(1, 5.0)], curve="A03")
-    found = entsoe_module.generation(2024, [(Period(0, 24), entsoe_document(series), "url")])["B04"]
+    found = generation_of_year(
+        services()["entsoe"], 2024, [(Period(0, 24), entsoe_document(series), "url")]
+    )["B04"]
     np.testing.assert_array_equal(found[:24], 5.0)
     assert np.isnan(found[24:]).all()
 
@@ -493,12 +500,12 @@ def test_wrong_documents_are_one_line(
 
 
 def test_zones_have_names_and_codes() -> None:
-    assert entsoe_module.zone_code("de-lu") == entsoe_module.zone_code("10Y1001A1001A82H")
+    assert zone_code("de-lu") == zone_code("10Y1001A1001A82H")
     with pytest.raises(DataError, match="did you mean 'DE_LU'"):
-        entsoe_module.zone_code("DELU")
-    for code in entsoe_module.ZONES.values():
-        assert entsoe_module.zone_code(code) == code
-    assert len(set(entsoe_module.ZONES.values())) == len(entsoe_module.ZONES)
+        zone_code("DELU")
+    for code in services()["entsoe"].zones.values():
+        assert zone_code(code) == code
+    assert len(set(services()["entsoe"].zones.values())) == len(services()["entsoe"].zones)
 
 
 # Electricity Maps
@@ -526,7 +533,7 @@ def test_yearly_table_becomes_carbon_intensity(
         (sends(b"no such key", 404), "2025-04-03/FR_2023_hourly.csv: status 404 (Not Found)"),
         (sends(b"a,b\n1,2\n"), "columns 'a, b'"),
         (sends(b""), "columns ''"),
-        (sends(b"\xff\xfea"), "byte 0 is not UTF-8"),
+        (sends(b"\xff\xfea"), "cannot be read as a CSV table"),
         (sends(b"a\rb\n"), "cannot be read as a CSV table"),
         (sends(electricity_maps_table()[:5000]), "expected a stamp after the row above"),
     ],
@@ -554,7 +561,7 @@ def test_storage_is_left_out_and_unreported_time_is_no_gap() -> None:
         "GEO": np.array([np.nan, np.nan, 5.0, 5.0]),
         "BAT": np.full(4, 9.0),
     }
-    values, notes = by_column(by_type, eia_module.COLUMNS, periods)
+    values, notes = by_column(by_type, services()["eia-930"], periods)
     gas, other = (values[:, FUELS.index(fuel)] for fuel in ("NG", "OTH"))
     np.testing.assert_array_equal(gas[:3], [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(other[:3], [0.0, 0.0, 5.0])
@@ -574,7 +581,7 @@ def test_short_gaps_and_gaps_within_stay_missing() -> None:
     gas = np.full(1000, 5.0)
     gas[:24] = gas[-25:] = gas[300:400] = np.nan
     by_type = {"NG": gas, "COL": np.full(1000, 1.0)}
-    values, notes = by_column(by_type, eia_module.COLUMNS, [Period(0, 1000)])
+    values, notes = by_column(by_type, services()["eia-930"], [Period(0, 1000)])
     found = values[:, FUELS.index("NG")]
     assert np.isnan(found[:24]).all()
     assert np.isnan(found[300:400]).all()
@@ -583,7 +590,7 @@ def test_short_gaps_and_gaps_within_stay_missing() -> None:
 
 
 def test_every_type_counts_as_a_column_or_as_storage() -> None:
-    for columns in (eia_module.COLUMNS, entsoe_module.COLUMNS):
-        assert set(columns.values()) - {None} <= set(FUELS)
-    assert set(entsoe_module.COLUMNS) == {f"B{i:02d}" for i in range(1, 21)} | {"B25"}
-    check_year(2023, 2019, 2024)
+    for name in ("eia-930", "entsoe"):
+        columns = {each.counts_as for each in services()[name].types.values()}
+        assert columns - {STORAGE} <= set(FUELS)
+    assert set(services()["entsoe"].types) == {f"B{i:02d}" for i in range(1, 21)} | {"B25"}

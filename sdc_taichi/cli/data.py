@@ -293,14 +293,14 @@ def _import_tables(
     utc_offset_h: float | None,
 ) -> importing.Imported:
     """Import tables in the layout of a service."""
-    from sdc_taichi.exogenous.fetch.exports import check_service, import_export
+    from sdc_taichi.exogenous.fetch.saved_tables import find_service, import_saved_tables
 
-    check_service(service)
+    find_service(service)
     if stamp is not StampOption.AUTO:
         raise DataError(f"--stamp {stamp.value}: known of the tables of {service}")
     if site is None:
         raise DataError(f"--map {service}: expected --site NAME to import the tables under")
-    return import_export(paths, service, site, base, area=area, utc_offset_h=utc_offset_h)
+    return import_saved_tables(paths, service, site, base, area=area, utc_offset_h=utc_offset_h)
 
 
 def _refuse_place(where: Mapping[str, float | None], path: Path) -> None:

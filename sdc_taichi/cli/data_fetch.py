@@ -11,7 +11,7 @@ import typer
 
 from sdc_taichi.cli.options import CommandApp
 from sdc_taichi.cli.terminal import PlainConsole, stage_bars
-from sdc_taichi.exogenous.fetch import electricity_maps
+from sdc_taichi.exogenous.fetch.services import ELECTRICITY_MAPS_RELEASE
 from sdc_taichi.exogenous.importing import Imported
 from sdc_taichi.exogenous.registry import find_name, imported_sites
 from sdc_taichi.exogenous.synthetic import synthetic_sites
@@ -131,9 +131,11 @@ def fetch_eia_command(
     target: TargetOptions,
 ) -> None:
     """Carbon intensity in the USA by hourly generation; the key is in EIA_API_KEY."""
-    from sdc_taichi.exogenous.fetch.fetching import fetch_eia
+    from sdc_taichi.exogenous.fetch.fetching import fetch_generation
 
-    target.fetch(lambda into: fetch_eia(into, authority, year.year, year.utc_offset))
+    target.fetch(
+        lambda into: fetch_generation(into, "eia-930", authority, year.year, year.utc_offset)
+    )
 
 
 @fetch_app.command("entsoe")
@@ -144,9 +146,9 @@ def fetch_entsoe_command(
     target: TargetOptions,
 ) -> None:
     """Carbon intensity in Europe by generation per type; the key is in ENTSOE_API_KEY."""
-    from sdc_taichi.exogenous.fetch.fetching import fetch_entsoe
+    from sdc_taichi.exogenous.fetch.fetching import fetch_generation
 
-    target.fetch(lambda into: fetch_entsoe(into, zone, year.year, year.utc_offset))
+    target.fetch(lambda into: fetch_generation(into, "entsoe", zone, year.year, year.utc_offset))
 
 
 @fetch_app.command("electricity-maps")
@@ -158,7 +160,7 @@ def fetch_electricity_maps_command(
     release: Annotated[
         str,
         typer.Option("--release", metavar="YYYY-MM-DD", help="Day of the release of the table."),
-    ] = electricity_maps.RELEASE,
+    ] = ELECTRICITY_MAPS_RELEASE,
 ) -> None:
     """Carbon intensity of consumption by a yearly table, without a key."""
     from sdc_taichi.exogenous.fetch.fetching import fetch_electricity_maps

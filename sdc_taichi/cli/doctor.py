@@ -194,9 +194,12 @@ def _browser() -> Iterator[Finding]:
 
 
 def _keys() -> Iterator[Finding]:
-    from sdc_taichi.exogenous.fetch import eia, entsoe
+    from sdc_taichi.exogenous.fetch.services import services
 
-    for command, variable in (("eia-930", eia.KEY_VARIABLE), ("entsoe", entsoe.KEY_VARIABLE)):
+    for command, service in services().items():
+        if service.key is None:
+            continue
+        variable = service.key.variable
         is_set = bool(os.environ.get(variable, "").strip())
         advice = "" if is_set else f"free of charge, see: sdc-taichi data fetch {command} --help"
         yield Finding(variable, "set" if is_set else "not set", advice)

@@ -1,48 +1,56 @@
-"""Downloads over HTTP that end: whole, within their time and size, or in one line of error.
+"""Downloads over HTTP, kept with their origin, so that a second fetch needs no network.
 
-Attempts are repeated after what may pass (no connection, no answer, statuses 408, 429 and 5xx, an
-answer that is cut off), with waits that double and are spread at random, or that last as long as
-the service asks for. An answer that is cut off goes on where it ended if the service can tell that
-it is still the same (RFC 9110, sections 13.1.5 and 14.2). No text of the HTTP library reaches a
-message, because it would quote the address with the key.
+A download ends in time: with a whole answer, or with an error of one line. Attempts are repeated
+after failures that may pass (no connection, no answer, statuses 408, 425, 429 and 5xx, an answer
+that is cut off), with waits that double or that the service asks for. No text of the HTTP library
+reaches a message, since it would quote the address with the key.
+
+Answers lie in the folder of imported files, under ``downloads/SERVICE``: each file as the service
+sent it, without the key, and beside it ``NAME.origin.json`` with its address, time, checksum and
+licence.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import logging
+import os
 import random
 import re
-import socket
 import time
-import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, NoReturn
-from urllib.parse import urljoin, urlsplit
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote, urlencode, urlsplit
 
-from sdc_taichi.errors import DataError, shortened
-from sdc_taichi.exogenous.fetch.request import Request
+from sdc_taichi.atomic_file import atomic_write
+from sdc_taichi.errors import DataError, SdcError, shortened
+from sdc_taichi.exogenous.fetch.services import Service
+from sdc_taichi.exogenous.registry import user_data_dir
+from sdc_taichi.user_file import read_bytes
 
 if TYPE_CHECKING:
     import requests
 
-MOST_REDIRECTS = 5
-"""Largest number of redirects that an attempt follows."""
-_CHUNK_BYTES = 1 << 16
-_MOST_ERROR_BYTES = 1 << 16
-_REDIRECTS = frozenset({301, 302, 303, 307, 308})
+FORMAT = "sdc-download/1"
+"""Version of the files that hold origins."""
+MOST_DOWNLOAD_BYTES = 64_000_000
+"""Largest answer of a service, in bytes: fifty times that of a typical year of PVGIS."""
+_MOST_ORIGIN_BYTES = 100_000
+_CHUNK_BYTES = 1 << 14
 _PASSING = frozenset({408, 425, 429})
 """Statuses below 500 after which an attempt is repeated."""
-_HTML = re.compile(rb"\s*(<!doctype html|<html)", re.IGNORECASE)
-_CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+|\*)")
+_KEY = re.compile(r"[A-Za-z0-9_-]{8,200}")
 
 
 @dataclass(frozen=True)
 class Patience:
-    """How long a download may take, and how often it is tried."""
+    """Limits of the time and the attempts of a download."""
 
     connect_s: float = 10.0
     """Longest wait for a connection, in s."""
@@ -57,43 +65,142 @@ class Patience:
 
 
 @dataclass(frozen=True)
-class Downloaded:
-    """The whole answer of a service."""
+class Request:
+    """One download from a service."""
 
+    service: Service
+    """The service that is asked."""
+    address: str
+    """Address without query."""
+    file_name: str
+    """Name of the file that the answer is kept in."""
+    query: Mapping[str, str] = field(default_factory=dict)
+    """Parameters of the query, without the key."""
+    key: str = field(default="", repr=False)
+    """Key of the user; empty if the service asks for none."""
+    by_hand: str = ""
+    """What a user can do where the service cannot be reached, for messages."""
+    check: Callable[[bytes, str], object] = lambda content, origin: None
+    """Reads an answer, given the address for messages; raises DataError if it is not what was
+    requested."""
+    most_bytes: int = MOST_DOWNLOAD_BYTES
+    """Largest valid answer, in bytes."""
+
+    @property
+    def url(self) -> str:
+        """Address with query, without the key."""
+        query = urlencode(self.query, quote_via=quote)
+        return f"{self.address}?{query}" if query else self.address
+
+    @property
+    def host(self) -> str:
+        """Host that is asked."""
+        return urlsplit(self.address).hostname or self.address
+
+
+@dataclass(frozen=True)
+class Kept:
+    """An answer of a service, kept in a file."""
+
+    path: Path
+    """File that holds the answer."""
     content: bytes
-    """The answer, decompressed, without the key."""
-    etag: str = ""
-    """Version of the answer as the service calls it; empty if it does not tell."""
-    last_modified: str = ""
-    """Time of the last change as the service tells it; empty if it does not tell."""
+    """The answer."""
+    origin: dict[str, Any]
+    """Address without the key, time in UTC, checksum, licence and publisher."""
 
 
-class _PassingError(Exception):
-    """A failure that may pass."""
+class _AttemptError(Exception):
+    """A failed attempt, with the wait in s that the service asks for, if any.
 
-    def __init__(self, reason: str, wait_s: float | None = None) -> None:
+    ``passes`` is false of failures after which no other attempt succeeds.
+    """
+
+    def __init__(self, reason: str, wait_s: float | None = None, *, passes: bool = True) -> None:
         super().__init__(reason)
         self.wait_s = wait_s
+        self.passes = passes
 
 
-class _NoNetworkError(Exception):
-    """A failure that is not worth another attempt: without a network, or a proxy, none succeeds."""
+def read_key(service: Service) -> str:
+    """The user's key of a service, from its environment variable.
+
+    Raises:
+        DataError: the variable is not set, or holds no key; the message does not show it.
+    """
+    if service.key is None:
+        return ""
+    value = os.environ.get(service.key.variable, "").strip()
+    if not value:
+        raise DataError(
+            f"{service.key.variable}: not set, expected the key of {service.title}, which is free "
+            f"of charge at {service.page}"
+        )
+    if not _KEY.fullmatch(value):
+        raise DataError(
+            f"{service.key.variable}: no key, expected 8 to 200 letters, digits, '-' or '_' as "
+            f"{service.page} gives them"
+        )
+    return value
 
 
-@dataclass
-class _Part:
-    """The beginning of an answer."""
+def fetch(
+    requested: Sequence[Request],
+    data_dir: Path | None = None,
+    *,
+    refresh: bool = False,
+    patience: Patience | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Kept]:
+    """Answers to requests: those kept before, and the others downloaded and kept.
 
-    content: bytearray
-    """Bytes of the answer as they were sent."""
-    validator: str = ""
-    """Strong ETag, or else the time of the last change, by which the service recognises the answer;
-    empty if the answer cannot be continued."""
+    Args:
+        requested: the requests.
+        data_dir: folder of imported files instead of the user's.
+        refresh: download again what is kept.
+        patience: limits of time and attempts of each download.
+        progress: callback with the number of answers that are there, and of all.
 
-    def forget(self) -> None:
-        """Begin again."""
-        self.content.clear()
-        self.validator = ""
+    Raises:
+        DataError: an answer is not to be had or not valid; those before it are kept.
+    """
+    answers = []
+    for done, request in enumerate(requested):
+        progress(done, len(requested))
+        kept = None if refresh else _kept(request, data_dir)
+        answers.append(kept or _keep(request, download(request, patience), data_dir))
+    progress(len(requested), len(requested))
+    return answers
+
+
+def keep_file(request: Request, path: Path, data_dir: Path | None = None) -> Kept:
+    """Keep a file that a user has downloaded as the answer to a request.
+
+    Raises:
+        DataError: the file cannot be read, or is not what was requested.
+    """
+    content = read_bytes(path, request.most_bytes, DataError)
+    request.check(content, str(path))
+    return _keep(request, content, data_dir)
+
+
+def write_file(path: Path, content: bytes) -> Path:
+    """Write a file made of answers; readers see the old one or the whole new one.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    try:
+        with atomic_write(path, parents=True) as file:
+            file.write(content)
+    except SdcError as error:
+        raise DataError(str(error)) from None
+    return path
+
+
+def downloads_dir(service: Service, data_dir: Path | None = None) -> Path:
+    """Folder in which answers of a service are kept."""
+    return user_data_dir(data_dir) / "downloads" / service.name
 
 
 def download(
@@ -101,16 +208,19 @@ def download(
     patience: Patience | None = None,
     *,
     sleep: Callable[[float], None] = time.sleep,
-) -> Downloaded:
+) -> bytes:
     """Download an answer and check it.
 
     Args:
-        request: what is asked.
+        request: the request.
         patience: limits of time and attempts.
         sleep: waits for a number of seconds.
 
+    Returns:
+        The answer without the key, which some services repeat in it.
+
     Raises:
-        DataError: no answer in time, an answer that is too large or not what was asked for, or no
+        DataError: no answer in time, an answer that is too large or not what was requested, or no
             library for HTTP.
     """
     try:
@@ -121,18 +231,15 @@ def download(
         ) from None
     patience = patience or Patience()
     end = time.monotonic() + patience.total_s
-    part = _Part(bytearray())
-    by_hand = f"; {request.by_hand}" if request.by_hand else ""
-    with requests.Session() as session, _without_key_in_logs(request):
-        # Redirects are followed here; the library would read their whole content first.
-        session.get_redirect_target = lambda resp: None  # type: ignore[method-assign]
+    by_hand = f"; by hand: {request.by_hand}" if request.by_hand else ""
+    with requests.Session() as session, _without_key_in_logs(request.key):
         for attempt in range(1, patience.attempts + 1):
             try:
-                return _attempt(session, request, part, patience, end)
-            except _NoNetworkError as failed:
-                raise DataError(f"{request.host}: {failed}{by_hand}") from None
-            except _PassingError as failed:
-                reason, asked_s = str(failed), failed.wait_s
+                return _attempt(session, request, patience, end)
+            except _AttemptError as failed:
+                reason, asked_s, passes = str(failed), failed.wait_s, failed.passes
+            if not passes:
+                raise DataError(f"{request.host}: {reason}{by_hand}")
             longest_s = patience.first_wait_s * 2 ** (attempt - 1)
             wait_s = random.uniform(0.5, 1.0) * longest_s if asked_s is None else asked_s
             if time.monotonic() + wait_s > end:
@@ -146,253 +253,99 @@ def download(
     raise DataError(f"{request.host}: {reason}, {patience.attempts} times{by_hand}")
 
 
-def _attempt(
-    session: requests.Session, request: Request, part: _Part, patience: Patience, end: float
-) -> Downloaded:
-    """One attempt, with its redirects."""
-    with contextlib.closing(_answer(session, request, part, patience, end)) as response:
-        status = int(response.status_code)
-        if status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and part.content:
-            part.forget()
-            raise _PassingError("the rest of the answer is not to be had")
-        if status not in (HTTPStatus.OK, HTTPStatus.PARTIAL_CONTENT):
-            _refuse(request, response, end)
-        _begin(request, part, response)
-        _read(request, part, response, end)
-        content = _decompressed(request, bytes(part.content), response)
-        headers = response.headers
-        etag, last_modified = headers.get("ETag", ""), headers.get("Last-Modified", "")
-    if _HTML.match(content[:256]):
+def _attempt(session: requests.Session, request: Request, patience: Patience, end: float) -> bytes:
+    query = dict(request.query)
+    if request.key and request.service.key:
+        query[request.service.key.parameter] = request.key
+    content, failure = b"", ""
+    with _naming_failures(patience):
+        response = session.get(
+            request.address,
+            params=urlencode(query, quote_via=quote),
+            timeout=(patience.connect_s, patience.read_s),
+            stream=True,
+            # Keys of a .netrc file are for other uses.
+            auth=lambda prepared: prepared,
+        )
+    with contextlib.closing(response), _naming_failures(patience):
+        for chunk in response.iter_content(_CHUNK_BYTES):
+            content += chunk
+            if len(content) > request.most_bytes:
+                failure = f"more than {request.most_bytes / 1e6:,.1f} MB, the most that is valid"
+                break
+            if time.monotonic() > end:
+                raise _AttemptError(f"a slow answer, {len(content):,} bytes so far", 0.0)
+    if failure:
+        raise DataError(f"{request.url}: the answer has {failure}")
+    if request.key:
+        content = content.replace(request.key.encode(), b"KEY")
+    if response.status_code != HTTPStatus.OK:
+        _refuse(request, response, content)
+    if re.match(rb"\s*(<!doctype html|<html)", content, re.IGNORECASE):
         raise DataError(
             f"{request.url}: an HTML page came in place of data (of a proxy, a log-in or an error)"
         )
-    content = request.without_key(content)
     request.check(content, request.url)
-    return Downloaded(content, etag, last_modified)
+    return content
 
 
-def _answer(
-    session: requests.Session, request: Request, part: _Part, patience: Patience, end: float
-) -> requests.Response:
-    """Status and headers of an answer that is no redirect."""
-    url = request.secret_url
-    # Compressed answers could not be continued. Credentials of a .netrc file are for other uses.
-    headers = {"Accept-Encoding": "identity", "User-Agent": _user_agent()}
-    if part.validator:
-        headers |= {"Range": f"bytes={len(part.content)}-", "If-Range": part.validator}
-    for _ in range(MOST_REDIRECTS + 1):
-        left_s = max(0.001, end - time.monotonic())
-        timeout = (min(patience.connect_s, left_s), min(patience.read_s, left_s))
-        with _naming_failures(patience):
-            response = session.get(
-                url,
-                headers=headers,
-                timeout=timeout,
-                stream=True,
-                allow_redirects=False,
-                auth=lambda prepared: prepared,
-            )
-        if response.status_code not in _REDIRECTS:
-            return response
-        response.close()
-        url = _redirected(request, url, response.headers.get("Location", ""))
-    raise DataError(f"{request.url}: more than {MOST_REDIRECTS} redirects")
-
-
-def _user_agent() -> str:
-    from importlib.metadata import version
-
-    return f"sdc-taichi/{version('sdc-taichi')}"
-
-
-def _redirected(request: Request, url: str, location: str) -> str:
-    """Address that a redirect leads to, if it may be followed."""
-    old, new, target = urlsplit(url), urlsplit(""), ""
-    with contextlib.suppress(ValueError):
-        target = urljoin(url, location) if location else ""
-        new = urlsplit(target)
-    if new.scheme not in ("http", "https") or not new.hostname:
-        raise DataError(f"{request.url}: a redirect to no address of the web")
-    if old.scheme == "https" and new.scheme != "https":
-        raise DataError(f"{request.url}: a redirect to {new.hostname} without encryption, refused")
-    if request.key is not None and (old.scheme, old.netloc) != (new.scheme, new.netloc):
-        raise DataError(
-            f"{request.url}: a redirect to {new.hostname}, refused, since the key in "
-            f"{request.key.variable} is for {request.host} alone"
-        )
-    return target
-
-
-def _refuse(request: Request, response: requests.Response, end: float) -> NoReturn:
-    """Raise what a status other than success means."""
-    status = int(response.status_code)
-    phrase = next((f" ({x.phrase})" for x in HTTPStatus if x == status), "")
+def _refuse(request: Request, response: requests.Response, content: bytes) -> None:
+    """Raise an error for a status other than success."""
+    status = response.status_code
+    phrase = next((f" ({each.phrase})" for each in HTTPStatus if each == status), "")
     if status in _PASSING or status >= HTTPStatus.INTERNAL_SERVER_ERROR:
-        raise _PassingError(f"status {status}{phrase}", _asked_wait_s(response))
-    part = _Part(bytearray())
-    with contextlib.suppress(_PassingError, DataError):
-        _read(request, part, response, end, most_bytes=_MOST_ERROR_BYTES)
-    said = _message(request.without_key(bytes(part.content)))
-    if request.key is not None and status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
+        asked = response.headers.get("Retry-After", "")
+        raise _AttemptError(f"status {status}{phrase}", float(asked) if asked.isdecimal() else None)
+    text = content[:10_000].decode("utf-8", errors="replace")
+    # Services explain an error in JSON ("message", "error") or in XML (<text>).
+    message = re.search(r'"(?:message|error)"\s*:\s*"(.*?)"|<text>(.*?)</text>', text, re.DOTALL)
+    explained = f": {shortened(message[1] or message[2], 200)}" if message else ""
+    if request.service.key and status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
         raise DataError(
-            f"{request.host}: status {status}{phrase}{said}: the key in {request.key.variable} is "
-            f"not accepted, expected one of {request.service.page}"
+            f"{request.host}: status {status}{phrase}{explained}: the key in "
+            f"{request.service.key.variable} is not accepted, expected one of "
+            f"{request.service.page}"
         )
-    raise DataError(f"{request.url}: status {status}{phrase}{said}")
-
-
-def _asked_wait_s(response: requests.Response) -> float | None:
-    """Seconds that Retry-After asks to wait; None if it asks for none or is not readable."""
-    from urllib3.exceptions import InvalidHeader
-    from urllib3.util import Retry
-
-    with contextlib.suppress(InvalidHeader, ValueError, OverflowError):
-        asked = response.headers.get("Retry-After")
-        return None if asked is None else max(0.0, float(Retry().parse_retry_after(asked)))
-    return None
-
-
-def _message(content: bytes) -> str:
-    """What a service says of an error, in JSON or XML, to follow a status; empty if nothing."""
-    text = content.decode("utf-8", errors="replace")
-    said: Any = None
-    with contextlib.suppress(ValueError, RecursionError):
-        said = json.loads(text)
-    for name in ("error", "message"):
-        if isinstance(said, dict):
-            said = said.get(name, said)
-    if not isinstance(said, str):
-        found = re.search(r"<text>(.*?)</text>", text, re.DOTALL)
-        said = found[1] if found else ""
-    return f": {shortened(said.strip(), 200)}" if said.strip() else ""
-
-
-def _begin(request: Request, part: _Part, response: requests.Response) -> None:
-    """Prepare ``part`` for the bytes of an answer, whether it is the whole or the rest."""
-    headers = response.headers
-    if response.status_code == HTTPStatus.PARTIAL_CONTENT:
-        found = _CONTENT_RANGE.fullmatch(headers.get("Content-Range", ""))
-        if not found or int(found[1]) != len(part.content):
-            part.forget()
-            raise _PassingError("another part of the answer came than the rest")
-        return
-    part.forget()
-    told = headers.get("Content-Length", "")
-    if told.isdecimal() and int(told) > request.most_bytes:
-        raise _too_large(request)
-    if not headers.get("Content-Encoding"):
-        etag = headers.get("ETag", "")
-        part.validator = etag if etag.startswith('"') else headers.get("Last-Modified", "")
-
-
-def _read(
-    request: Request,
-    part: _Part,
-    response: requests.Response,
-    end: float,
-    *,
-    most_bytes: int | None = None,
-) -> None:
-    """Append the bytes of an answer to ``part``."""
-    most_bytes = request.most_bytes if most_bytes is None else most_bytes
-    while True:
-        with _naming_failures(None):
-            # One read of the socket, so that a slow answer does not outlast the time.
-            chunk = response.raw.read1(_CHUNK_BYTES, decode_content=False)
-        if not chunk:
-            return
-        part.content += chunk
-        if len(part.content) > most_bytes:
-            raise _too_large(request)
-        if time.monotonic() > end:
-            raise _PassingError(f"a slow answer, {len(part.content):,} bytes so far", 0.0)
-
-
-def _too_large(request: Request) -> DataError:
-    return DataError(
-        f"{request.url}: the answer has more than {request.most_bytes / 1e6:,.1f} MB, the most "
-        "that is valid"
-    )
-
-
-def _decompressed(request: Request, content: bytes, response: requests.Response) -> bytes:
-    """Content of an answer that was compressed although that was not asked for."""
-    encoding = response.headers.get("Content-Encoding", "").strip().lower()
-    if encoding in ("", "identity"):
-        return content
-    if encoding not in ("gzip", "x-gzip", "deflate"):
-        raise DataError(
-            f"{request.url}: compressed as {shortened(encoding)}, expected none or gzip"
-        )
-    decoder = zlib.decompressobj(wbits=zlib.MAX_WBITS | 32)
-    try:
-        plain = decoder.decompress(content, request.most_bytes + 1)
-    except zlib.error:
-        raise DataError(f"{request.url}: damaged, expected {encoding}") from None
-    if len(plain) > request.most_bytes:
-        raise _too_large(request)
-    if not decoder.eof:
-        raise _PassingError("an answer that is cut off")
-    return plain
+    raise DataError(f"{request.url}: status {status}{phrase}{explained}")
 
 
 @contextlib.contextmanager
-def _naming_failures(patience: Patience | None) -> Iterator[None]:
+def _naming_failures(patience: Patience) -> Iterator[None]:
     """Turn failures of the HTTP library into reasons without its text, which may hold the key."""
-    import requests
-    import urllib3
+    import requests.exceptions as failures
+    from urllib3.exceptions import NameResolutionError
 
-    reason, final = "", ""
+    reason, passes = "", True
     try:
         yield
-    except (requests.exceptions.ConnectTimeout, urllib3.exceptions.ConnectTimeoutError):
-        reason = f"no connection within {patience.connect_s:g} s" if patience else "no connection"
-    except (requests.exceptions.Timeout, urllib3.exceptions.TimeoutError, TimeoutError):
-        reason = f"no answer within {patience.read_s:g} s" if patience else "a silent answer"
-    except requests.exceptions.SSLError:
-        final = "has no certificate that is trusted here"
-    except requests.exceptions.InvalidURL:
-        final = "not a valid address"
-    except requests.exceptions.ProxyError:
-        final = "the proxy does not connect"
-    except (requests.exceptions.RequestException, urllib3.exceptions.HTTPError, OSError) as failed:
-        if any(isinstance(each, socket.gaierror) for each in _causes(failed)):
-            final = "not found (is there a network?)"
-        else:
-            reason = _reason(failed) if patience else "an answer that is cut off"
-    # Outside of the handlers, so that no traceback shows what the library said.
-    if final:
-        raise _NoNetworkError(final)
+    except failures.ConnectTimeout:
+        reason = f"no connection within {patience.connect_s:g} s"
+    except failures.Timeout:
+        reason = f"no answer within {patience.read_s:g} s"
+    except (failures.ChunkedEncodingError, failures.ContentDecodingError):
+        reason = "an answer that is cut off"
+    except failures.SSLError:
+        reason, passes = "no certificate that is trusted here", False
+    except failures.ProxyError:
+        reason, passes = "the proxy does not connect", False
+    except failures.ConnectionError as failed:
+        cause = getattr(failed.args[0] if failed.args else None, "reason", None)
+        passes = not isinstance(cause, NameResolutionError)
+        reason = "no connection" if passes else "not found (is there a network?)"
+    except failures.RequestException:
+        reason, passes = "no valid address, or too many redirects", False
+    # Outside of the handlers, so that no traceback shows the text of the library.
     if reason:
-        raise _PassingError(reason)
-
-
-def _reason(failed: BaseException) -> str:
-    """Why no answer came, in the words of the system where an error in the chain is of it."""
-    for each in _causes(failed):
-        if isinstance(each, OSError) and each.errno is not None and each.strerror:
-            return f"no connection ({each.strerror})"
-    return "a connection that ended without an answer"
-
-
-def _causes(failed: BaseException) -> Iterator[BaseException]:
-    """An error and those that it came from."""
-    seen: BaseException | None = failed
-    while seen is not None:
-        yield seen
-        seen = seen.__cause__ or seen.__context__
+        raise _AttemptError(reason, passes=passes)
 
 
 @contextlib.contextmanager
-def _without_key_in_logs(request: Request) -> Iterator[None]:
+def _without_key_in_logs(key: str) -> Iterator[None]:
     """Keep the key out of the debugging log of the HTTP library."""
-    key = request.key
-    if key is None:
-        yield
-        return
 
     def hide(record: logging.LogRecord) -> bool:
-        record.msg, record.args = record.getMessage().replace(key.value, "KEY"), ()
+        if key:
+            record.msg, record.args = record.getMessage().replace(key, "KEY"), ()
         return True
 
     logger = logging.getLogger("urllib3.connectionpool")
@@ -401,3 +354,43 @@ def _without_key_in_logs(request: Request) -> Iterator[None]:
         yield
     finally:
         logger.removeFilter(hide)
+
+
+def _paths(request: Request, data_dir: Path | None) -> tuple[Path, Path]:
+    """Files of an answer and of its origin."""
+    path = downloads_dir(request.service, data_dir) / request.file_name
+    return path, path.with_name(f"{path.name}.origin.json")
+
+
+def _kept(request: Request, data_dir: Path | None) -> Kept | None:
+    """The answer that is kept; None if there is none, or it is damaged or to another request."""
+    path, origin_path = _paths(request, data_dir)
+    if not (path.is_file() and origin_path.is_file()):
+        return None
+    try:
+        origin = json.loads(read_bytes(origin_path, _MOST_ORIGIN_BYTES, DataError))
+        content = read_bytes(path, request.most_bytes, DataError)
+        asked = {"format": FORMAT, "url": request.url, "sha256": _sha256(content)}
+        return Kept(path, content, origin) if asked.items() <= origin.items() else None
+    except (ValueError, AttributeError):
+        return None
+
+
+def _keep(request: Request, content: bytes, data_dir: Path | None) -> Kept:
+    path, origin_path = _paths(request, data_dir)
+    origin = {
+        "format": FORMAT,
+        "service": request.service.title,
+        "licence": request.service.licence,
+        "url": request.url,
+        "retrieved": datetime.now(UTC).isoformat(timespec="seconds"),
+        "sha256": _sha256(content),
+        "bytes": len(content),
+    }
+    write_file(path, content)
+    write_file(origin_path, json.dumps(origin, indent=1).encode())
+    return Kept(path, content, origin)
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

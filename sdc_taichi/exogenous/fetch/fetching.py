@@ -3,28 +3,35 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import csv
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from sdc_taichi.errors import DataError
+from sdc_taichi.errors import DataError, shortened
 from sdc_taichi.exogenous import importing
-from sdc_taichi.exogenous.fetch import eia, electricity_maps, entsoe, epw_archive, pvgis
-from sdc_taichi.exogenous.fetch.download import Patience
-from sdc_taichi.exogenous.fetch.generation import Period, by_column, carbon_table, check_year
-from sdc_taichi.exogenous.fetch.kept_downloads import (
+from sdc_taichi.exogenous.fetch import weather
+from sdc_taichi.exogenous.fetch.download import (
     Kept,
+    Patience,
+    Request,
     downloads_dir,
     fetch,
     keep_file,
     write_file,
 )
-from sdc_taichi.exogenous.fetch.request import Request, Service, read_key
-from sdc_taichi.exogenous.series import FloatArray
-from sdc_taichi.exogenous.stamps import Stamp
+from sdc_taichi.exogenous.fetch.generation import (
+    by_column,
+    carbon_table,
+    generation_of_year,
+    year_of_requests,
+)
+from sdc_taichi.exogenous.fetch.services import ELECTRICITY_MAPS_RELEASE, Service, services
+from sdc_taichi.user_file import decoding
 
 
 @dataclass(frozen=True)
@@ -42,11 +49,11 @@ class Destination:
     patience: Patience | None = None
     """Limits of time of each download; None are the usual ones."""
     progress: Callable[[int, int], None] = lambda done, total: None
-    """Told the number of downloads that are there, and of all."""
+    """Callback with the number of downloads that are there, and of all."""
 
     @contextlib.contextmanager
     def checking(self) -> Iterator[None]:
-        """Say where the reader refuses downloads how to have them anew.
+        """Add to what the reader refuses how to download it again.
 
         Raises:
             DataError: in place of one without the hint.
@@ -56,10 +63,10 @@ class Destination:
         except DataError as error:
             raise DataError(f"{error}; --refresh downloads it again") from None
 
-    def downloads(self, requests: Sequence[Request]) -> list[Kept]:
+    def downloads(self, requested: Sequence[Request]) -> list[Kept]:
         """Answers to requests, downloaded or kept from before."""
         return fetch(
-            requests,
+            requested,
             self.data_dir,
             refresh=self.refresh,
             patience=self.patience,
@@ -87,19 +94,20 @@ def fetch_pvgis(
         DataError: no typical year is to be had, or it is not valid.
     """
     name = importing.site_name(into.site, into.data_dir)
-    request = pvgis.request_year(latitude_deg, longitude_deg)
-    pvgis.check_offset(utc_offset_h, longitude_deg)
+    request = weather.request_year(latitude_deg, longitude_deg)
+    weather.check_offset(utc_offset_h, longitude_deg)
     if file is not None:
         kept = keep_file(request, file, into.data_dir)
     else:
         (kept,) = into.downloads([request])
-    epw = pvgis.to_epw(kept.content, request.url, utc_offset_h)
-    path = kept.path.with_name(f"{kept.path.stem}_utc{utc_offset_h:+g}.epw")
-    write_file(path, epw.encode())
-    notes = ("moved from UTC to local standard time",)
-    origin = _origin(pvgis.SERVICE, [kept], notes)
+    table, place = weather.typical_year(kept.content, request.url, utc_offset_h)
+    path = kept.path.with_name(f"{kept.path.stem}_utc{utc_offset_h:+g}.csv")
+    write_file(path, table)
+    origin = _origin(request.service, [kept], ["moved from UTC to local standard time"])
     with into.checking():
-        return importing.import_weather(path, name, into.base, into.data_dir, origin=origin)
+        return importing.import_weather(
+            path, name, into.base, into.data_dir, place=place, origin=origin
+        )
 
 
 def fetch_epw(into: Destination, url: str) -> importing.Imported:
@@ -113,68 +121,57 @@ def fetch_epw(into: Destination, url: str) -> importing.Imported:
         DataError: no EPW file is to be had, or it is not valid.
     """
     name = importing.site_name(into.site, into.data_dir)
-    (kept,) = into.downloads([epw_archive.request_file(url)])
-    path, plain = kept.path, epw_archive.epw_bytes(kept.content, url)
+    request = weather.request_epw(url)
+    (kept,) = into.downloads([request])
+    path, plain = kept.path, weather.epw_bytes(kept.content, url)
     if plain is not kept.content:
         path = write_file(path.with_name(f"{path.stem}.unpacked.epw"), plain)
-    origin = _origin(epw_archive.SERVICE, [kept])
+    origin = _origin(request.service, [kept])
     with into.checking():
         return importing.import_weather(path, name, into.base, into.data_dir, origin=origin)
 
 
-def fetch_eia(
-    into: Destination, authority: str, year: int, utc_offset_h: float | None = None
+def fetch_generation(
+    into: Destination,
+    service_name: str,
+    area: str,
+    year: int,
+    utc_offset_h: float | None = None,
 ) -> importing.Imported:
-    """Carbon intensity of a balancing authority of the USA, by its generation in a calendar year.
+    """Carbon intensity of an area, by its generation in a calendar year.
 
     Args:
         into: the site.
-        authority: code of the balancing authority, such as ``CISO``.
+        service_name: ``eia-930`` or ``entsoe``.
+        area: code of a balancing authority of the USA, such as ``CISO``; name of a zone of Europe,
+            such as ``DE_LU``, or its energy identification code.
         year: calendar year, in UTC.
         utc_offset_h: of the site, in h; None is that of its weather or base.
 
     Raises:
         DataError: no key, or the generation is not to be had or not valid.
     """
-    check_year(year, eia.FIRST_YEAR, _this_year())
-    _check_site(into, utc_offset_h)
-    key = read_key(eia.SERVICE, eia.KEY_VARIABLE, "api_key")
-    asked = eia.requests_of_year(authority.upper(), year, key)
-    table = f"{authority.upper()}_{year}.csv"
-    return _import_generation(
-        into, asked, eia.generation, eia.COLUMNS, table, year, "auto", utc_offset_h
-    )
-
-
-def fetch_entsoe(
-    into: Destination, zone: str, year: int, utc_offset_h: float | None = None
-) -> importing.Imported:
-    """Carbon intensity of a zone of Europe, by its generation in a calendar year.
-
-    Args:
-        into: the site.
-        zone: name of the zone, such as ``DE_LU``, or its energy identification code.
-        year: calendar year, in UTC.
-        utc_offset_h: of the site, in h; None is that of its weather or base.
-
-    Raises:
-        DataError: no key, or the generation is not to be had or not valid.
-    """
-    check_year(year, entsoe.FIRST_YEAR, _this_year())
-    _check_site(into, utc_offset_h)
-    code = entsoe.zone_code(zone)
-    key = read_key(entsoe.SERVICE, entsoe.KEY_VARIABLE, "securityToken")
-    asked = entsoe.requests_of_year(zone, year, key)
-    return _import_generation(
-        into,
-        asked,
-        entsoe.generation,
-        entsoe.COLUMNS,
-        f"{code}_{year}.csv",
-        year,
-        "start",
-        utc_offset_h,
-    )
+    service = services()[service_name]
+    _check(into, service, year, utc_offset_h)
+    code, periods, requested = year_of_requests(service, area, year)
+    kept = into.downloads(requested)
+    answers = [
+        (period, answer.content, request.url)
+        for period, answer, request in zip(periods, kept, requested, strict=True)
+    ]
+    values, notes = by_column(generation_of_year(service, year, answers), service, periods)
+    table = carbon_table(np.datetime64(f"{year}-01-01"), values)
+    path = write_file(downloads_dir(service, into.data_dir) / f"{code}_{year}.csv", table)
+    with into.checking():
+        return importing.import_carbon(
+            path,
+            into.site,
+            into.base,
+            into.data_dir,
+            utc_offset_h=utc_offset_h,
+            stamp=service.stamp,
+            origin=_origin(service, kept, notes),
+        )
 
 
 def fetch_electricity_maps(
@@ -182,7 +179,7 @@ def fetch_electricity_maps(
     zone: str,
     year: int,
     utc_offset_h: float | None = None,
-    release: str = electricity_maps.RELEASE,
+    release: str = ELECTRICITY_MAPS_RELEASE,
 ) -> importing.Imported:
     """Carbon intensity of a zone by a yearly table of Electricity Maps.
 
@@ -196,9 +193,23 @@ def fetch_electricity_maps(
     Raises:
         DataError: the table is not to be had or not valid.
     """
-    check_year(year, electricity_maps.FIRST_YEAR, _this_year())
-    _check_site(into, utc_offset_h)
-    request = electricity_maps.request_year(zone, year, release)
+    service = services()["electricity-maps"]
+    _check(into, service, year, utc_offset_h)
+    if not re.fullmatch("[A-Z]{2}(-[A-Z0-9]+){0,3}", zone):
+        raise DataError(f"zone {shortened(zone)}: expected a zone such as FR or US-CAL-CISO")
+    if not re.fullmatch(r"\d{4}-\d\d-\d\d", release):
+        raise DataError(
+            f"--release {shortened(release)}: expected a day such as {ELECTRICITY_MAPS_RELEASE}"
+        )
+    name = f"{zone}_{year}_hourly.csv"
+    request = Request(
+        service,
+        f"{service.address}/{release}/{name}",
+        f"{release}_{name}",
+        by_hand=f"download {name} from {service.page}, then data import FILE "
+        "--map electricity-maps",
+        check=_intensity_columns,
+    )
     (kept,) = into.downloads([request])
     with into.checking():
         return importing.import_carbon(
@@ -207,56 +218,45 @@ def fetch_electricity_maps(
             into.base,
             into.data_dir,
             utc_offset_h=utc_offset_h,
-            stamp="start",
-            columns=electricity_maps.columns_of(kept.content, request.url),
-            origin=_origin(electricity_maps.SERVICE, [kept]),
+            stamp=service.stamp,
+            columns=_intensity_columns(kept.content, request.url),
+            origin=_origin(service, [kept]),
         )
 
 
-def _import_generation(
-    into: Destination,
-    asked: Sequence[tuple[Period, Request]],
-    generation: Callable[[int, Sequence[tuple[Period, bytes, str]]], dict[str, FloatArray]],
-    columns: Mapping[str, str | None],
-    file_name: str,
-    year: int,
-    stamp: Stamp,
-    utc_offset_h: float | None,
-) -> importing.Imported:
-    """Import a carbon table that is made of answers about parts of a year."""
-    service = asked[0][1].service
-    kept = into.downloads([request for _, request in asked])
-    answers = [
-        (period, answer.content, request.url)
-        for (period, request), answer in zip(asked, kept, strict=True)
-    ]
-    periods = [period for period, _ in asked]
-    values, notes = by_column(generation(year, answers), columns, periods)
-    table = carbon_table(np.datetime64(f"{year}-01-01"), values)
-    path = write_file(downloads_dir(service, into.data_dir) / file_name, table)
-    with into.checking():
-        return importing.import_carbon(
-            path,
-            into.site,
-            into.base,
-            into.data_dir,
-            utc_offset_h=utc_offset_h,
-            stamp=stamp,
-            origin=_origin(service, kept, notes),
+def _intensity_columns(content: bytes, url: str) -> dict[str, str]:
+    """Columns of a table of Electricity Maps, by the names of the reader."""
+    layout = services()["electricity-maps"].saved_table
+    assert layout is not None
+    assert layout.intensity is not None
+    with decoding(url, "a CSV table", DataError):
+        header = next(csv.reader([content.decode("utf-8-sig").split("\n")[0].rstrip("\r")]), [])
+    names = {"timestamp": layout.time, "avg_CI": layout.intensity}
+    columns = {
+        name: column
+        for name, pattern in names.items()
+        for column in header
+        if re.fullmatch(pattern, column)
+    }
+    if len(columns) < len(names):
+        raise DataError(
+            f"{url}: columns {shortened(', '.join(header), 200)}, expected {layout.expected}"
         )
+    return columns
 
 
-def _check_site(into: Destination, utc_offset_h: float | None) -> None:
-    """Check before any download that the site has a valid name and a clock."""
+def _check(into: Destination, service: Service, year: int, utc_offset_h: float | None) -> None:
+    """Check before any download that the year is over and that the site has a name and a clock."""
+    this_year, first = datetime.now(UTC).year, service.first_year or 0
+    if not first <= year < this_year:
+        raise DataError(
+            f"--year {year}: expected {first} to {this_year - 1}, a calendar year that is over"
+        )
     name = importing.site_name(into.site, into.data_dir)
     importing.site_clock(name, into.base, into.data_dir, utc_offset_h=utc_offset_h)
 
 
 def _origin(service: Service, kept: Sequence[Kept], notes: Sequence[str] = ()) -> importing.Origin:
-    told = ("url", "retrieved", "sha256")
-    downloads = tuple({key: answer.origin[key] for key in told} for answer in kept)
+    fields = ("url", "retrieved", "sha256")
+    downloads = tuple({name: answer.origin[name] for name in fields} for answer in kept)
     return importing.Origin(service.title, service.licence, downloads, tuple(notes))
-
-
-def _this_year() -> int:
-    return datetime.now(UTC).year

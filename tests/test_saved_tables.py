@@ -12,7 +12,7 @@ import pytest
 import exogenous_builders as build
 from sdc_taichi.errors import DataError
 from sdc_taichi.exogenous import read_carbon
-from sdc_taichi.exogenous.fetch.exports import EXPORTS, import_export
+from sdc_taichi.exogenous.fetch.saved_tables import import_saved_tables, saved_table_services
 from sdc_taichi.exogenous.series_file import read_metadata
 
 EIA_NAMES = {
@@ -174,12 +174,12 @@ MADE: dict[str, Callable[[Path], list[Path]]] = {
 
 
 def imported(paths: list[Path], service: str, folder: Path, area: str | None = None) -> np.ndarray:
-    item = import_export(paths, service, "x", data_dir=folder, area=area, utc_offset_h=-5.0)
+    item = import_saved_tables(paths, service, "x", data_dir=folder, area=area, utc_offset_h=-5.0)
     return read_carbon(item.target, -5.0).values
 
 
 def test_half_years_of_eia(tmp_path: Path) -> None:
-    item = import_export(
+    item = import_saved_tables(
         eia_files(tmp_path)[::-1],
         "eia-930",
         "x",
@@ -227,7 +227,7 @@ def test_hours_that_clocks_skip_are_left_out(tmp_path: Path) -> None:
 
 def test_months_of_watttime_are_joined(tmp_path: Path) -> None:
     paths = watttime(tmp_path)
-    item = import_export(paths, "watttime", "x", data_dir=tmp_path / "user", utc_offset_h=0.0)
+    item = import_saved_tables(paths, "watttime", "x", data_dir=tmp_path / "user", utc_offset_h=0.0)
     series = read_carbon(item.target, 0.0)
     stamps = np.arange(365 * 288)
     expected = 0.45359237 * np.round(800 + 200 * np.sin(stamps / 500), 3)
@@ -238,22 +238,22 @@ def test_months_of_watttime_are_joined(tmp_path: Path) -> None:
 
 def test_years_of_electricity_maps_are_joined(tmp_path: Path) -> None:
     paths = electricity_maps(tmp_path)
-    item = import_export(
+    item = import_saved_tables(
         paths, "electricity-maps", "x", data_dir=tmp_path / "user", utc_offset_h=0.0
     )
     values = read_carbon(item.target, 0.0).values
     np.testing.assert_array_equal(values, np.arange(2 * 8760) % 500)
 
 
-@pytest.mark.parametrize("service", EXPORTS)
+@pytest.mark.parametrize("service", saved_table_services())
 def test_origin_and_source_are_kept(service: str, tmp_path: Path) -> None:
     paths = MADE[service](tmp_path)
     area = "CISO" if service == "eia-930" else None
-    item = import_export(
+    item = import_saved_tables(
         paths, service, "x", data_dir=tmp_path / "user", area=area, utc_offset_h=-5.0
     )
     origin = (read_metadata(item.target) or {})["origin"]
-    assert origin["service"] == EXPORTS[service].service.title
+    assert origin["service"] == saved_table_services()[service].title
     assert [each["file"] for each in origin["downloads"]] == [path.name for path in paths]
     assert all(len(each["sha256"]) == 64 for each in origin["downloads"])
 
@@ -275,12 +275,17 @@ def damage(path: Path, old: str, new: str, count: int = 1) -> None:
             '"8,000.0",,many',
             "column Net Generation .* 'many', expected a number",
         ),
-        ("eia-930", "Natural Gas (Adj", "Fairy Dust (Adj", "energy source 'Fairy Dust', expected"),
-        ("eia-930", "UTC Time at End of Hour", "UTC", "missing column UTC Time at End of Hour"),
+        (
+            "eia-930",
+            "Natural Gas (Adj",
+            "Fairy Dust (Adj",
+            "type of generation 'Fairy Dust', expected",
+        ),
+        ("eia-930", "UTC Time at End of Hour", "UTC", "expected UTC Time at End of Hour"),
         ("entsoe", "02.01.2022 05:00 - ", "2022-01-02 05:00 - ", r"row 31, column MTU: .*interval"),
         ("entsoe", "02.01.2022 05:00 - ", "02.13.2022 05:00 - ", "row 31, .*a day of the calendar"),
         ("entsoe", "02.01.2022 05:00 - ", "02.01.2022 05:10 - ", "steps of 60 min, expected"),
-        ("entsoe", "Nuclear  -", "Nuklear  -", "production type 'Nuklear', .*did you mean"),
+        ("entsoe", "Nuclear  -", "Nuklear  -", "type of generation 'Nuklear', .*did you mean"),
         ("watttime", "2022-11-02T00:05:00+00:00", "soon", "row 291, column point_time: 'soon'"),
         ("watttime", "point_time,value", "time,value", "expected point_time, value or timestamp"),
         ("electricity-maps", "Datetime (UTC)", "When", "expected 'Datetime .UTC.'"),
