@@ -68,6 +68,17 @@ def test_links_are_those_of_the_site(
     assert errors == []
 
 
+def test_tables_of_code_stand_in_their_pages(stage: ModuleType, tmp_path: Path) -> None:
+    stage.stage(tmp_path)
+    for page, names in (
+        ("environments", ("rewards", "work_carbon", "hot_inlets")),
+        ("observations", ("ci_rank",)),
+    ):
+        text = (tmp_path / f"{page}.md").read_text("utf-8")
+        assert "<!-- table" not in text
+        assert all(f"\n| `{name}` |" in text for name in names)
+
+
 def test_every_field_of_a_configuration_has_an_anchor(stage: ModuleType) -> None:
     def fields(values: Any, path: str) -> Iterator[str]:
         for name, value in values.items():

@@ -28,9 +28,8 @@ from sdc_taichi import ConfigError, RuntimeStateError, SdcError, load_config
 from sdc_taichi.control.view import ForecastError
 from sdc_taichi.envs import IDS, images
 from sdc_taichi.envs.agents import AGENTS
-from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.parallel import SdcParallelEnv
-from sdc_taichi.envs.reward_terms import TERMS, terms_markdown
+from sdc_taichi.envs.reward_terms import TERMS
 from sdc_taichi.envs.single import SdcEnv
 from sdc_taichi.envs.vector import SdcVectorEnv
 
@@ -1002,21 +1001,3 @@ def test_large_halls_are_drawn_smaller() -> None:
     assert max(image.shape) == images.LONGEST_PX
     racks = np.all(image == images.colours(np.array([35.0]))[0], axis=2)
     assert 0.2 < racks.mean() < 0.6
-
-
-# --- docs ---
-
-
-@pytest.mark.repo
-def test_docs_have_every_option_and_term() -> None:
-    text = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
-    table = text.partition("## Options")[2].partition("\n## ")[0]
-    listed = re.findall(r"^\| `(\w+)` \| (.*?) \|", table, re.MULTILINE)
-    assert [name for name, _ in listed] == list(EnvOptions.model_fields)
-    for name, shown in listed:
-        default = EnvOptions.model_fields[name].default
-        if isinstance(default, str | int | float | bool | None):
-            assert shown == f"`{default}`", name
-    assert terms_markdown() in text, f"docs/environments.md: the table is\n{terms_markdown()}"
-    for name in IDS:
-        assert f"`{name}`" in text

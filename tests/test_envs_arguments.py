@@ -27,7 +27,6 @@ from sdc_taichi.envs import IDS
 from sdc_taichi.envs.actions import BATTERY_COMMANDS
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT
 from sdc_taichi.envs.features import DEFAULT_FEATURES, all_features
-from sdc_taichi.envs.observers import OBSERVERS
 from sdc_taichi.envs.reward_terms import TERMS
 from sdc_taichi.envs.rewards import REWARD_SETS, SCALES
 from sdc_taichi.envs.single import SdcEnv
@@ -236,7 +235,6 @@ def choices(option: str) -> set[str]:
 
 def test_choices_are_what_there_is() -> None:
     """A new observer, action order or agent is named in ``EnvOptions`` and the other way round."""
-    assert choices("observations") == set(OBSERVERS)
     assert choices("action_order") == set(BATTERY_COMMANDS)
     assert choices("agents") == set(AGENTS)
     by_agents: list[Iterable[str]] = [COMMAND_OF_AGENT, DEFAULT_FEATURES, *SCALES.values()]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -14,7 +13,7 @@ import sdc_taichi
 from sdc_taichi import ConfigError, SdcError, StepResult, load_config, register_cost
 from sdc_taichi.control import View
 from sdc_taichi.envs.agents import AGENTS
-from sdc_taichi.envs.costs import COSTS, costs_markdown
+from sdc_taichi.envs.costs import COSTS
 from sdc_taichi.types import F64
 
 HOT = load_config(
@@ -191,9 +190,3 @@ def test_what_a_cost_function_returns_is_checked(returned: Any, message: str) ->
     env.reset(seed=0)
     with pytest.raises(SdcError, match=re.escape(message)):
         env.step(dict.fromkeys(AGENTS, 1))
-
-
-@pytest.mark.repo
-def test_docs_have_every_cost() -> None:
-    text = (Path(__file__).parents[1] / "docs" / "environments.md").read_text(encoding="utf-8")
-    assert costs_markdown() in text, f"docs/environments.md: the table is\n{costs_markdown()}"

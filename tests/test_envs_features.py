@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,23 +24,21 @@ from sdc_taichi import (
     load_config,
     make_configs,
 )
-from sdc_taichi.control import ForecastError, View, view_maker
-from sdc_taichi.envs import observer as time_rows
+from sdc_taichi.control import PERFECT, ForecastError, View, view_maker
+from sdc_taichi.control.view import RandomWalks
+from sdc_taichi.envs import time_rows
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.features import (
+    CI_LEADS_H,
     DEFAULT_FEATURES,
+    WEATHER_LEADS_H,
     Feature,
     all_features,
     features_markdown,
 )
-from sdc_taichi.envs.forecasts import (
-    CI_LEADS_H,
-    WEATHER_LEADS_H,
-    Forecasts,
-    lead_steps,
-)
 from sdc_taichi.envs.images import HEAT_MAP_CHANNELS, heat_map, heat_map_space
 from sdc_taichi.envs.observer import Observer
+from sdc_taichi.envs.time_rows import Forecasts, lead_steps
 from sdc_taichi.sim.drivers import FleetSeries
 
 SITES = ("ny", "ca", "az")
@@ -61,8 +59,8 @@ def fleet_of(preset: str, **changes: Any) -> list[DataCenterConfig]:
     return made
 
 
-def keys(count: int, seed: int = 0) -> list[int]:
-    return [1000 * seed + i for i in range(count)]
+def keys(count: int, seed: int = 0) -> np.ndarray:
+    return 1000 * seed + np.arange(count)
 
 
 def commands(step: int, size: int, first: int = 0) -> Actions:
@@ -82,15 +80,16 @@ def watch(
     steps: int = STEPS,
     drivers: Drivers | None = None,
     first: int = 0,
+    error: ForecastError = PERFECT,
     **options: Any,
 ) -> tuple[Observer, Seen]:
     """Observations of an episode, the first before any step."""
     with Simulator(configs, drivers=drivers) as sim:
         sim.reset(0)
-        look = view_maker(sim)
+        look = view_maker(sim, error, keys(first + sim.size)[first:])
         observer = Observer(sim.fleet, **options)
         view = look(None)
-        observer.reset(view, keys(first + sim.size)[first:])
+        observer.reset(view)
         seen: Seen = []
         for step in range(steps + 1):
             seen.append((view, observer.observe(view), observer.state(view), heat_map(view)))
@@ -302,12 +301,10 @@ def test_values_beyond_a_range_are_cut_at_it() -> None:
 
 def test_batch_equals_alone() -> None:
     configs = fleet_of("tiny")
-    error = ForecastError(0.2, 3.0)
-    choices: tuple[dict[str, Any], ...] = ({}, {"forecast_error": error})
-    for options in choices:
-        _, together = watch(configs, 40, **options)
+    for error in (PERFECT, ForecastError(0.2, 3.0)):
+        _, together = watch(configs, 40, error=error)
         for dc, config in enumerate(configs):
-            _, alone = watch([config], 40, first=dc, **options)
+            _, alone = watch([config], 40, first=dc, error=error)
             for (_, a, state, image), (_, b, one_state, one_image) in zip(
                 together, alone, strict=True
             ):
@@ -320,13 +317,13 @@ def test_batch_equals_alone() -> None:
 @pytest.mark.parametrize("error", [ForecastError(), ForecastError(0.2, 3.0)])
 def test_same_seed_same_observations_also_after_reset(error: ForecastError) -> None:
     with Simulator(fleet_of("tiny")) as sim:
-        observer = Observer(sim.fleet, forecast_error=error)
+        observer = Observer(sim.fleet)
         runs = []
         for seed in (1, 1, 2):
             sim.reset(0)
-            see = view_maker(sim)
+            see = view_maker(sim, error, keys(3, seed))
             view = see(None)
-            observer.reset(view, keys(3, seed))
+            observer.reset(view)
             states = [observer.state(view)]
             for step in range(30):
                 view = see(sim.step(commands(step, 3)))
@@ -336,29 +333,16 @@ def test_same_seed_same_observations_also_after_reset(error: ForecastError) -> N
     assert np.array_equal(runs[0], runs[2]) == (error == ForecastError())
 
 
-def test_forecasts_of_one_view_follow_the_keys_of_the_last_reset() -> None:
-    with Simulator(fleet_of("tiny")) as sim:
-        sim.reset(0)
-        view = view_maker(sim)(None)
-        observer = Observer(sim.fleet, forecast_error=ForecastError(0.2, 3.0))
-        states = []
-        for seed in (1, 2, 1):
-            observer.reset(view, keys(3, seed))
-            states.append(observer.state(view))
-    np.testing.assert_array_equal(states[0], states[2])
-    assert not np.array_equal(states[0], states[1])
-
-
 def test_start_may_move_between_episodes() -> None:
     with Simulator(fleet_of("tiny")) as sim:
         sim.reset(0)
         view = view_maker(sim)(None)
         observer = Observer(sim.fleet)
-        observer.reset(view, [])
+        observer.reset(view)
         before = observer.state(view)
         moved = replace(view.drivers, start=view.drivers.start + 96)
         later = replace(view, drivers=moved)
-        observer.reset(later, [])
+        observer.reset(later)
         after = parts(observer.state(later), observer.state_features)
     old = parts(before, observer.state_features)
     np.testing.assert_array_equal(after["time_of_day"], old["time_of_day"])
@@ -371,7 +355,7 @@ def test_what_is_handed_out_belongs_to_the_caller() -> None:
         sim.reset(0)
         view = view_maker(sim)(None)
         observer = Observer(sim.fleet)
-        observer.reset(view, [])
+        observer.reset(view)
         first = observer.state(view), observer.observe(view)
         kept = first[0].copy(), {a: x.copy() for a, x in first[1].items()}
         first[0][:] = 7.0
@@ -413,10 +397,10 @@ def test_nothing_beyond_the_longest_lead_is_seen(
         if name == "wet_bulb_c":  # room for a warmer wet bulb
             drivers = changed(drivers, "outdoor_c", 0)
     last = steps + round(lead_h * 4)
-    options: dict[str, Any] = {"forecast_error": error}
-    seen = watch(configs, steps, drivers, **options)[1]
-    unseen = watch(configs, steps, changed(drivers, name, last + 1), **options)[1]
-    nearer = watch(configs, steps, changed(drivers, name, last), **options)[1]
+    seen, unseen, nearer = (
+        watch(configs, steps, inputs, error=error)[1]
+        for inputs in (drivers, changed(drivers, name, last + 1), changed(drivers, name, last))
+    )
     for (_, _, a, _), (_, _, b, _) in zip(seen, unseen, strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(seen[-1][2], nearer[-1][2])
@@ -425,16 +409,21 @@ def test_nothing_beyond_the_longest_lead_is_seen(
 # Forecasts
 
 
-def walk_forecast(error: ForecastError, seeds: int, step: int = 0) -> tuple[Any, ...]:
-    """Forecasts of a flat world for many seeds."""
+def walk_forecasts(error: ForecastError, seeds: int, steps: Sequence[int]) -> list[Any]:
+    """CI, dry bulb and wet bulb at present and each lead, (seeds, 1 + leads), of a flat world."""
     n = 400
     drivers = drivers_from_arrays(
-        np.full(n, 20.0), np.full(n, 15.0), np.full(n, 400.0), np.full(n, 0.5), size=seeds
+        np.full(n, 20.0), np.full(n, 15.0), np.full(n, 400.0), np.full(n, 0.5)
     )
-    made = Forecasts(4, error=error)
-    made.reset(drivers, keys(seeds, 5))
-    ci, outdoor, wet_bulb = made.forecast(drivers.start + step, step)
-    return ci.T, outdoor.T, wet_bulb.T
+    with Simulator([load_config("tiny")], drivers=drivers) as sim:
+        sim.reset(0)
+        view = view_maker(sim)(None)
+    walks = RandomWalks(keys(seeds, 5), view.step_h)
+    view = replace(view, forecast_error=error, walks=walks)
+    forecasts = Forecasts(4)
+    forecasts.reset(view)
+    index = np.zeros(seeds, dtype=np.int64)
+    return [[x.T for x in forecasts.at(index + k, index, k)[:3]] for k in steps]
 
 
 def test_perfect_forecasts_are_what_comes() -> None:
@@ -456,7 +445,7 @@ def test_perfect_forecasts_are_what_comes() -> None:
 
 def test_errors_grow_with_the_square_root_of_the_lead() -> None:
     count = 4000
-    ci, outdoor, wet_bulb = walk_forecast(ForecastError(0.1, 2.0), count, step=100)
+    [(ci, outdoor, wet_bulb)] = walk_forecasts(ForecastError(0.1, 2.0), count, [100])
     np.testing.assert_array_equal(ci[:, 0], 400.0)
     np.testing.assert_array_equal(outdoor[:, 0], 20.0)
     # Five standard errors of a standard deviation and of a mean.
@@ -478,9 +467,7 @@ def test_errors_grow_with_the_square_root_of_the_lead() -> None:
 def test_successive_forecasts_of_one_hour_are_consistent() -> None:
     """What the error loses from one issue to the next is what the walk did in between."""
     count, error = 3000, ForecastError(0.1, 0.0)
-    issued = [
-        walk_forecast(error, count, step)[0] / 400.0 - 1.0 for step in (60, 92, 124, 140, 148)
-    ]
+    issued = [ci / 400.0 - 1.0 for ci, *_ in walk_forecasts(error, count, (60, 92, 124, 140, 148))]
     leads = [CI_LEADS_H.index(h) + 1 for h in (24.0, 16.0, 8.0, 4.0, 2.0)]
     errors = np.stack([e[:, k] for e, k in zip(issued, leads, strict=True)]).astype(np.float64)
     revisions = -np.diff(errors, axis=0)
@@ -492,24 +479,18 @@ def test_successive_forecasts_of_one_hour_are_consistent() -> None:
 
 
 def test_forecast_of_a_step_does_not_depend_on_the_steps_looked_at() -> None:
-    n = 1000
-    drivers = drivers_from_arrays(
-        np.full(n, 20.0), np.full(n, 15.0), np.full(n, 400.0), np.full(n, 0.5), size=2
-    )
-    each, only = Forecasts(4, error=ForecastError(0.1, 2.0)), None
-    each.reset(drivers, keys(2))
-    found = [each.forecast(drivers.start + step, step) for step in range(501)]
+    error = ForecastError(0.1, 2.0)
+    every = walk_forecasts(error, 2, range(501))
     for step in (1, 127, 128, 300, 500):
-        only = Forecasts(4, error=ForecastError(0.1, 2.0))
-        only.reset(drivers, keys(2))
-        for a, b in zip(found[step], only.forecast(drivers.start + step, step), strict=True):
+        [alone] = walk_forecasts(error, 2, [step])
+        for a, b in zip(every[step], alone, strict=True):
             np.testing.assert_array_equal(a, b)
     with pytest.raises(RuntimeStateError, match="reset starts again"):
-        each.forecast(drivers.start, 0)
+        walk_forecasts(error, 2, [500, 0])
 
 
 def test_ci_forecasts_are_never_negative() -> None:
-    ci, _, _ = walk_forecast(ForecastError(2.0, 0.0), 500)
+    [(ci, _, _)] = walk_forecasts(ForecastError(2.0, 0.0), 500, [0])
     assert ci.min() == 0.0
     assert np.count_nonzero(ci == 0.0) > 100
 
@@ -546,46 +527,17 @@ def test_series_that_end_repeat_from_their_own_start() -> None:
             np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-4)
 
 
-def test_tables_and_reading_step_by_step_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, fast = watch(fleet_of("tiny"), 30)
+def test_rows_of_a_year_and_of_short_stretches_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Data centers of two sites, two of which share their rows."""
+    configs = [*fleet_of("tiny"), load_config("tiny", ["site.location=NY", "name=other"])]
+    _, of_year = watch(configs, 30)
     monkeypatch.setattr(time_rows, "MAX_ROW_BYTES", 0)
-    _, slow = watch(fleet_of("tiny"), 30)
-    for (_, _, a, _), (_, _, b, _) in zip(fast, slow, strict=True):
+    _, of_day = watch(configs, 30)
+    monkeypatch.setattr(time_rows, "STRETCH_BYTES", 2**14)
+    _, of_few_steps = watch(configs, 30)
+    for (_, _, a, _), (_, _, b, _), (_, _, c, _) in zip(of_year, of_day, of_few_steps, strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_data_centers_of_a_site_share_rows() -> None:
-    with Simulator(make_configs(load_config("tiny"), count=9, sites=SITES)) as sim:
-        sim.reset(0)
-        d = sim.drivers
-        tables = (d.ci_g_per_kwh, d.outdoor_c, d.wet_bulb_c, d.demand)
-
-        def read(index: np.ndarray, dc: np.ndarray) -> np.ndarray:
-            return np.stack([index, dc], axis=1)
-
-        rows = time_rows.time_rows(tables, read, period=96, row_bytes=8)
-        assert rows is not None
-        assert rows.values.shape == (3 * 35040, 2)
-        found = rows.at(np.full(9, 35040 + 7))
-        assert found[:, 0].tolist() == [7] * 9
-        assert [SITES[dc] for dc in found[:, 1]] == list(SITES) * 3
-        # Series that end within a day, or more of them than there is room for.
-        assert time_rows.time_rows(tables, read, period=97, row_bytes=8) is None
-        assert time_rows.time_rows(tables, read, period=96, row_bytes=2**28) is None
-
-
-@pytest.mark.parametrize("columns", [[0, 1, 2, 3, 4], [4, 0, 3, 1], [3], [1, 2], [2, 3, 0, 4]])
-def test_entries_are_put_where_they_belong(columns: list[int]) -> None:
-    """Of three that depend on time alone and two others."""
-    rows = np.arange(12.0, dtype=np.float32).reshape(4, 3)
-    others = np.array([[100.0, 101.0], [200.0, 201.0]], dtype=np.float32)
-    entries = np.array([3, 1])
-    everything = np.concatenate([rows[entries], others.T], axis=1)
-    order = time_rows.EntryOrder(columns, 3)
-    found = order.assemble(order.arrange(rows), entries, others)
-    np.testing.assert_array_equal(found, everything[:, columns])
-    own = order.assemble(order.arrange(rows[entries]), None, others)
-    np.testing.assert_array_equal(own, found)
+        np.testing.assert_array_equal(a, c)
 
 
 # Choice of features
@@ -652,16 +604,16 @@ def test_leads_follow_the_step() -> None:
         lead_steps("x", [0.25], 1)
 
 
-def test_reset_comes_first_and_brings_a_key_each() -> None:
+def test_reset_comes_first_and_errors_need_walks() -> None:
     with Simulator(fleet_of("tiny")) as sim:
         sim.reset(0)
         view = view_maker(sim)(None)
-        observer = Observer(sim.fleet, forecast_error=ForecastError(0.1, 0.0))
+        observer = Observer(sim.fleet)
         with pytest.raises(RuntimeStateError, match="reset"):
             observer.observe(view)
-        with pytest.raises(ConfigError, match="2 random keys for 3 data centers"):
-            observer.reset(view, keys(2))
-        observer.reset(view, keys(3))
+        with pytest.raises(ConfigError, match="without walks"):
+            observer.reset(replace(view, forecast_error=ForecastError(0.1, 0.0)))
+        observer.reset(view)
         assert observer.observe(view)["agent_ls"].shape == (3, 40)
 
 
@@ -691,7 +643,7 @@ def test_setpoints_of_equal_numbers_of_units_stand_side_by_side() -> None:
         sim.reset(0)
         view = view_maker(sim)(sim.step(Actions(cooling=np.array([1.0, -1.0, 0.0, 2.0]))))
         observer = Observer(sim.fleet)
-        observer.reset(view, [])
+        observer.reset(view)
         found = parts(observer.state(view), observer.state_features)["setpoint"]
         np.testing.assert_allclose(found * 20.0 + 10.0, [[19, 17], [18, 20]], atol=1e-5)
 
@@ -701,7 +653,7 @@ def test_setpoints_of_unlike_numbers_of_units_are_means() -> None:
         sim.reset(0)
         view = view_maker(sim)(sim.step(Actions(cooling=np.array([2.0, 1.0, 1.0, -2.0]))))
         observer = Observer(sim.fleet)
-        observer.reset(view, [])
+        observer.reset(view)
         found = parts(observer.state(view), observer.state_features)["setpoint"]
         np.testing.assert_allclose(found * 20.0 + 10.0, [[20], [18]], atol=1e-5)
 
@@ -747,20 +699,14 @@ def test_heat_map_needs_halls_of_one_shape() -> None:
 
 
 @pytest.mark.repo
-def test_the_page_has_the_table_as_generated() -> None:
-    page = (Path(__file__).parent.parent / "docs" / "observations.md").read_text("utf-8")
-    made = features_markdown()
-    assert f"\n\n{made}\n" in page, f"docs/observations.md: the table is\n{made}"
-    for feature in HEAT_MAP_CHANNELS:
-        assert f"`{feature.name}` {feature.low:g}..{feature.high:g}" in page
-
-
-def test_the_table_names_who_observes_what() -> None:
+def test_the_table_describes_every_feature() -> None:
     lines = features_markdown().splitlines()[2:]
     assert len(lines) == len(all_features())
     for line, feature in zip(lines, all_features(), strict=True):
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         assert cells[:2] == [f"`{feature.name}`", str(feature.size)]
+        assert "{" not in cells[2]
+        assert len(cells[2]) > 10
         assert [bool(cell) for cell in cells[-3:]] == [
             feature.name in DEFAULT_FEATURES[agent] for agent in AGENTS
         ]

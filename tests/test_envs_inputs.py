@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import data_equivalence
 
 import sdc_taichi
 from sdc_taichi import ConfigError, DataError, SdcError, Simulator, load_config, load_drivers
-from sdc_taichi.envs import observer as time_rows
+from sdc_taichi.envs import time_rows
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.exogenous.registry import load_trace
 from sdc_taichi.sim import drivers

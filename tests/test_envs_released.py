@@ -29,9 +29,8 @@ from sdc_taichi import (
     load_config,
 )
 from sdc_taichi.control.view import View, view_maker
-from sdc_taichi.envs import released_rewards, released_rows
-from sdc_taichi.envs.released_features import FEATURES
-from sdc_taichi.envs.released_observer import ReleasedObserver
+from sdc_taichi.envs import released_rewards
+from sdc_taichi.envs.released import FEATURES, ReleasedObserver
 from sdc_taichi.envs.released_rewards import ReleasedRewards
 from sdc_taichi.errors import DataError, RuntimeStateError
 from sdc_taichi.sim.drivers import FleetSeries
@@ -286,17 +285,6 @@ def bare_view(config: DataCenterConfig, d: Drivers, step: int) -> View:
     return replace(view, drivers=d, state=replace(view.state, step=step))
 
 
-@given(
-    series=arrays(np.float64, st.integers(1, 60), elements=st.floats(-1e3, 1e3)),
-    window=st.integers(1, 80),
-)
-def test_extremes_of_what_follows(series: F64, window: int) -> None:
-    expected = [
-        [series[i : i + window].min(), series[i : i + window].max()] for i in range(len(series))
-    ]
-    assert np.array_equal(released_rows.extremes_ahead(series, window), np.array(expected))
-
-
 def test_queue_entries_by_hand() -> None:
     """10 tasks of 25 h, 20 of 13 h and 70 fresh ones, in a queue for 1,000."""
     d = drivers(inputs(0), start=[0])
@@ -353,21 +341,14 @@ def test_before_reset_is_an_error() -> None:
         ReleasedObserver().observe(view)
 
 
-def test_tables_are_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reset_takes_other_inputs() -> None:
     view = bare_view(load_config("tiny"), drivers(inputs(0), start=[0]), 0)
-    observer = ReleasedObserver()
-    observer.reset(view)
-    later = replace(view, drivers=replace(view.drivers, start=np.array([5000])))
     other = replace(view, drivers=drivers(inputs(1), start=[5000]))
-    expected = ReleasedObserver()
-    expected.reset(other)
-    with monkeypatch.context() as patch:
-        patch.setattr(released_rows, "_ci_rows", None)
-        observer.reset(later)
-        with pytest.raises(TypeError):
-            observer.reset(other)
-    observer.reset(other)
-    assert np.array_equal(observer.observe(other)["agent_ls"], expected.observe(other)["agent_ls"])
+    again, fresh = ReleasedObserver(), ReleasedObserver()
+    again.reset(view)
+    again.reset(other)
+    fresh.reset(other)
+    assert np.array_equal(again.observe(other)["agent_ls"], fresh.observe(other)["agent_ls"])
 
 
 # --- batches ------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from sdc_taichi.cli.app import app
 from sdc_taichi.control import Forecast, View, view_maker
 from sdc_taichi.control.view import walk_keys
 from sdc_taichi.envs.core import Core
-from sdc_taichi.envs.forecasts import Forecasts
+from sdc_taichi.envs.features import CI_LEADS_H, WEATHER_LEADS_H, feature_slices
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.types import F64, Actions
 
@@ -90,17 +90,18 @@ def test_carbon_intensity_is_cut_at_zero(sim: Simulator) -> None:
 def test_agents_and_controllers_beside_them_see_the_same_errors() -> None:
     options = EnvOptions(agents=("agent_ls",), days=1, forecast_error=ERROR)
     core = Core(configs(), options)
-    features = Forecasts(4, error=ERROR)
+    columns = feature_slices(core.features["agent_ls"])
     for seed in (5, 6, 5):
-        core.reset(seed)
-        features.reset(core.sim.drivers, core._keys)
-        for step in range(3):
-            view = core.view
-            ci, outdoor, _ = features.forecast(view.drivers.start + step, step)
-            coming = view.forecast(24.25)
-            np.testing.assert_allclose(coming.ci_g_per_kwh[:, features.ci_leads].T, ci, rtol=1e-5)
-            np.testing.assert_allclose(coming.outdoor_c[:, 12], outdoor[1], rtol=1e-5)
-            core.step({"agent_ls": np.ones(2, dtype=np.int64)})
+        observations = core.reset(seed)
+        for _ in range(3):
+            seen: Any = observations["agent_ls"]
+            coming = core.view.forecast(24.25)
+            ci = coming.ci_g_per_kwh[:, [round(4 * h) for h in CI_LEADS_H]]
+            np.testing.assert_allclose(seen[:, columns["ci_forecast"]] * 1000, ci, rtol=1e-5)
+            outdoor_c = coming.outdoor_c[:, [round(4 * h) for h in WEATHER_LEADS_H]]
+            of_agent_c = seen[:, columns["outdoor_forecast"]] * 80 - 30
+            np.testing.assert_allclose(of_agent_c, outdoor_c, atol=1e-4)
+            observations = core.step({"agent_ls": np.ones(2, dtype=np.int64)}).observations
     core.close()
 
 

@@ -9,6 +9,7 @@ their paths, since the site holds no sources. A link to nothing is an error.
 
 from __future__ import annotations
 
+import importlib
 import os
 import posixpath
 import re
@@ -39,6 +40,8 @@ _LINK_OR_CODE = re.compile(
     re.M | re.S,
 )
 
+_TABLE = re.compile(r"^<!-- table: (?P<module>[\w.]+):(?P<function>\w+) -->$", re.M)
+
 
 def main() -> None:
     """Stage the site from the command line."""
@@ -63,7 +66,8 @@ def stage(out: Path) -> list[str]:
     for path, place in places.items():
         content = (ROOT / path).read_bytes()
         if path.endswith(".md"):
-            text = with_site_links(content.decode(), path, places, errors.append)
+            text = with_tables(content.decode())
+            text = with_site_links(text, path, places, errors.append)
             if path == FIELDS_PAGE:
                 text = with_field_anchors(text)
             content = text.encode()
@@ -118,6 +122,19 @@ def with_site_links(
         return text if text.strip("`") in target else f"{text} (`{target}`)"
 
     return _LINK_OR_CODE.sub(rewritten, text)
+
+
+def with_tables(text: str) -> str:
+    """A page with the tables that code makes, each in place of its line ``<!-- table: ... -->``.
+
+    The line names a function without arguments that returns Markdown, as ``module:function``.
+    """
+
+    def made(match: re.Match[str]) -> str:
+        table = getattr(importlib.import_module(match["module"]), match["function"])
+        return str(table()).strip()
+
+    return _TABLE.sub(made, text)
 
 
 def with_field_anchors(text: str) -> str:

@@ -344,5 +344,11 @@ def view_maker(
     return view_after
 
 
+def mean_setpoint_c(view: View) -> F64:
+    """Mean setpoint of the CRAC units of each data center, in C, (B,)."""
+    fleet = view.fleet
+    return np.asarray(fleet.unit_sums(view.state.setpoint_c) / np.diff(fleet.unit_offsets))
+
+
 def _first_of_units(per_unit: F64, fleet: Fleet) -> F64:
     return per_unit[fleet.unit_offsets[:-1]]

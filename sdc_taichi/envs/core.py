@@ -43,7 +43,7 @@ from sdc_taichi.envs.episodes import (
 )
 from sdc_taichi.envs.features import Feature
 from sdc_taichi.envs.images import heat_map, heat_map_space
-from sdc_taichi.envs.observers import make_observer
+from sdc_taichi.envs.observer import make_observer
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.envs.rewards import Rewards
 from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError, whole_number
@@ -229,7 +229,7 @@ class Core:
             self._view_after = view_maker(self.sim, error, self._keys)
         self._last = None
         self._view = view = self._view_after(None)
-        self._observer.reset(view, self._keys)
+        self._observer.reset(view)
         self._rewards.reset(view)
 
     def _on_begin(self) -> None:

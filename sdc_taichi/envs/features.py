@@ -4,25 +4,47 @@ A value v is scaled to ``(v - low) / (high - low)``, 0..1, or, where the range l
 zero, to ``v / high``, -1..1. Values beyond the range are cut at it. Nothing looks ahead but the
 demand of the step to come and the forecasts.
 
-Add a feature here: its range in ``time_features`` or ``measured_features``, its computation in the
-method of ``observer`` for the same kind, and its row in docs/observations.md.
+Add a feature here: a function of ``TimeInputs``, of ``Measurements`` or, with an entry per rack, of
+the view. Its name is the name of the feature, its docstring the description in the documentation,
+and its decorator gives unit and range. Nothing else needs to know it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium.spaces import Box
+from pydantic import Field
 
+from sdc_taichi.control.view import View, mean_setpoint_c
 from sdc_taichi.envs.agents import AGENTS
-from sdc_taichi.envs.forecasts import CI_LEADS_H, WEATHER_LEADS_H
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
-from sdc_taichi.types import F32
+from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
+from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS
+from sdc_taichi.types import F32, F64
+
+CI_LEADS_H = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0)
+"""Default leads of the forecasts of carbon intensity and price, in h."""
+WEATHER_LEADS_H = (3.0, 6.0, 12.0, 24.0)
+"""Default leads of the weather forecasts, in h."""
+LONGEST_LEAD_H = float(HOURS_PER_YEAR)
+"""Longest valid lead, in h."""
+LeadH = Annotated[float, Field(gt=0, le=LONGEST_LEAD_H, allow_inf_nan=False)]
+"""Lead of a forecast, above 0 and at most a year of 8,760 h."""
+AGE_EDGES_H = (0.0, 6.0, 12.0, 18.0, 24.0)
+"""Lower edges of the age bins in hours, those of the released code (``carbon_ls.py``); the last bin
+is open."""
+UNLIMITED_QUEUE_H = 10.0
+"""Hours of full work that count as a full queue where the queue has no limit."""
+
+
+_Value = TypeVar("_Value", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +63,9 @@ class Feature:
     """Meaning of the value, for the docs."""
     size: int = 1
     """Number of entries side by side."""
+    value: Callable[[Any], Any] = field(default=lambda _: (), compare=False, repr=False)
+    """Function of the inputs of its kind, ``TimeInputs``, ``Measurements`` or ``View``, that gives
+    the entries in ``unit``, (size, n) or a list of arrays (n,)."""
 
     @property
     def signed(self) -> bool:
@@ -48,11 +73,110 @@ class Feature:
         return self.low == -self.high
 
 
-AGE_EDGES_H = (0.0, 6.0, 12.0, 18.0, 24.0)
-"""Lower edges of the age bins in hours, those of the released code (``carbon_ls.py``); the last bin
-is open."""
-UNLIMITED_QUEUE_H = 10.0
-"""Hours of full work that count as a full queue where the queue has no limit."""
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Numbers on which the sizes of features depend."""
+
+    ci_leads_h: Sequence[float] = CI_LEADS_H
+    """Leads of the forecasts of carbon intensity and price, in h."""
+    weather_leads_h: Sequence[float] = WEATHER_LEADS_H
+    """Leads of the weather forecasts, in h."""
+    units: int = 1
+    """Number of CRAC units whose setpoints stand side by side."""
+    fans: int = 0
+    """Number of CRAC fans whose speeds agents decide; 0 if they decide none."""
+    racks: int = 0
+    """Number of racks on which agents place work; 0 if they place none."""
+
+
+DEFAULT_LAYOUT = Layout()
+"""Layout with one CRAC unit and the default leads."""
+
+
+@dataclass(frozen=True)
+class TimeInputs:
+    """Inputs of features that depend on time alone, for n steps of any data centers."""
+
+    time_of_day: F32
+    """Sine and cosine of the local time, (2, n)."""
+    time_of_year: F32
+    """Sine and cosine of the share of the year, (2, n)."""
+    ci: F32
+    """Carbon intensity at present and at each lead, in g/kWh, (1 + leads, n)."""
+    outdoor_c: F32
+    """Dry bulb at present and at each lead, in C, (1 + leads, n)."""
+    wet_bulb_c: F32
+    """Wet bulb at present and at each lead, in C, (1 + leads, n)."""
+    price: F32
+    """Price relative to its mean at present and at each lead of ``ci``, (1 + leads, n)."""
+    workload: F32
+    """Work that arrives, as a share of capacity, (1, n)."""
+
+    @cached_property
+    def lowest_ci(self) -> F32:
+        """Lowest carbon intensity of the present and the leads, in g/kWh, (n,)."""
+        return np.asarray(self.ci.min(axis=0))
+
+    @cached_property
+    def ci_swing(self) -> F32:
+        """Highest less lowest carbon intensity of present and leads, in g/kWh, (n,)."""
+        return np.asarray(self.ci.max(axis=0) - self.lowest_ci)
+
+
+class Design(NamedTuple):
+    """Reciprocals of the quantities to which measured features are relative, (B,) each.
+
+    They are 0 where the quantity is.
+    """
+
+    per_full_queue: F64
+    """Share of a full queue per task."""
+    per_it_kwh: F64
+    """Reciprocal of the IT energy of a step at the design point, per kWh."""
+    per_hvac_kwh: F64
+    """Reciprocal of the HVAC energy of a step at the design point, per kWh."""
+    per_facility_kwh: F64
+    """Reciprocal of the energy of a step at the design point, per kWh."""
+    per_battery_kwh: F64
+    """Reciprocal of the capacity of the battery, per kWh."""
+
+
+class Measurements(NamedTuple):
+    """Inputs of features that are measured in the data center, (B,) each.
+
+    Their functions are compiled: arithmetic, the NumPy functions of ``kernels/compiler/trace.py``,
+    and ``np.where`` in place of branches.
+    """
+
+    last: Any
+    """Result of the last step, of which any (B,) field of ``StepResult`` may be read; before the
+    first step temperatures are the setpoint and all else is 0."""
+    waiting_tasks: F64
+    """Tasks in the queue."""
+    at_least_tasks: list[F64]
+    """Tasks in the queue that are at least as old as each of ``AGE_EDGES_H``."""
+    setpoints_c: list[F64]
+    """Setpoint of each CRAC unit, in C."""
+    fan_speeds: list[F64]
+    """Speed of each CRAC fan that agents decide, as a share of its design speed."""
+    stored_kwh: F64
+    """Energy in the battery, in kWh."""
+    design: Design
+    """Quantities of the design."""
+
+
+class NotedReads:
+    """Stands in for the result of a step and notes which of its quantities a function reads."""
+
+    step_h = 1.0
+
+    def __init__(self) -> None:
+        self.names: dict[str, None] = {}
+
+    def __getattr__(self, name: str) -> F64:
+        self.names[name] = None
+        return np.ones(1)
+
 
 _CLOCK = ("time_of_day", "time_of_year")
 _CI = ("ci", "ci_forecast")
@@ -94,91 +218,263 @@ FEATURE_OF_COMMAND = {"fan": "fan_speed", "placement": "rack_inlets"}
 """Feature that an agent observes by default because it decides a command."""
 
 
-def time_features(
-    ci_leads_h: Sequence[float] = CI_LEADS_H, weather_leads_h: Sequence[float] = WEATHER_LEADS_H
-) -> tuple[Feature, ...]:
-    """Features that depend on time alone: clock, carbon intensity, weather, work and price.
+@dataclass(frozen=True, slots=True)
+class _Declared:
+    """A feature as its function declares it, before its size is known."""
+
+    value: Callable[[Any], Any]
+    unit: str
+    low: float
+    high: float
+    size: int | Callable[[Layout], int]
+
+
+_TIME: dict[str, _Declared] = {}
+_MEASURED: dict[str, _Declared] = {}
+_OF_RACKS: dict[str, _Declared] = {}
+
+
+def _feature(
+    kind: dict[str, _Declared],
+    unit: str,
+    low: float,
+    high: float,
+    size: int | Callable[[Layout], int] = 1,
+) -> Callable[[_Value], _Value]:
+    """Declare the feature of a function's name; its docstring describes it.
 
     Args:
-        ci_leads_h: leads of the forecasts of carbon intensity and price, in h.
-        weather_leads_h: leads of the weather forecasts, in h.
+        kind: features with the same kind of inputs.
+        unit: unit of the value.
+        low: lower end of the range.
+        high: upper end of the range.
+        size: number of entries; there is no feature where it is 0.
     """
-    ci, weather = (", ".join(f"{h:g}" for h in leads) for leads in (ci_leads_h, weather_leads_h))
-    n, k = len(ci_leads_h), len(weather_leads_h)
-    features = (
-        Feature("time_of_day", "1", -1.0, 1.0, "sine and cosine of the local time", 2),
-        Feature("time_of_year", "1", -1.0, 1.0, "sine and cosine of the share of the year", 2),
-        Feature("ci", "g/kWh", 0.0, 1000.0, "carbon intensity of the step to come"),
-        Feature("ci_forecast", "g/kWh", 0.0, 1000.0, f"CI in {ci} h", n),
-        Feature("ci_change", "g/kWh", -300.0, 300.0, f"CI in {ci} h less `ci`", n),
-        Feature("ci_rank", "share", 0.0, 1.0, f"of the CI in {ci} h that is below `ci`", min(n, 1)),
-        Feature(
-            "ci_relative",
-            "share",
-            0.0,
-            1.0,
-            f"`ci` and CI in {ci} h between the lowest and the highest of them",
-            n + 1 if n else 0,
-        ),
-        Feature("ci_swing", "1", 0.0, 2.0, f"range of `ci` and CI in {ci} h over `ci`", min(n, 1)),
-        Feature("outdoor", "C", -30.0, 50.0, "dry bulb of the step to come"),
-        Feature("outdoor_forecast", "C", -30.0, 50.0, f"dry bulb in {weather} h", k),
-        Feature("wet_bulb", "C", -30.0, 40.0, "wet bulb of the step to come"),
-        Feature("wet_bulb_forecast", "C", -30.0, 40.0, f"wet bulb in {weather} h", k),
-        Feature("workload", "share", 0.0, 1.0, "work that arrives in the step to come"),
-        Feature("price", "1", 0.0, 3.0, "price of the step to come over its mean"),
-        Feature("price_forecast", "1", 0.0, 3.0, f"price in {ci} h over its mean", n),
+
+    def declare(function: _Value) -> _Value:
+        kind[function.__name__] = _Declared(function, unit, low, high, size)
+        return function
+
+    return declare
+
+
+def _features_of(kind: Mapping[str, _Declared], layout: Layout) -> tuple[Feature, ...]:
+    ci, weather = (
+        ", ".join(f"{h:g}" for h in leads) for leads in (layout.ci_leads_h, layout.weather_leads_h)
     )
-    return tuple(feature for feature in features if feature.size)
+    out = []
+    for name, x in kind.items():
+        size = x.size(layout) if callable(x.size) else x.size
+        if size:
+            text = (x.value.__doc__ or "").format(ci_leads=ci, weather_leads=weather)
+            out.append(Feature(name, x.unit, x.low, x.high, text, size, x.value))
+    return tuple(out)
 
 
-def measured_features(units: int = 1, fans: int = 0, racks: int = 0) -> tuple[Feature, ...]:
-    """Features measured in the data center: queue, hall and battery.
-
-    Args:
-        units: number of CRAC units whose setpoints stand side by side.
-        fans: number of CRAC fans whose speeds are decided; 0 if none are.
-        racks: number of racks that work is placed on by agents; 0 if it is not.
-    """
-    bins = [f"{a:g}-{b:g}" for a, b in pairwise(AGE_EDGES_H)]
-    ages = f"{', '.join(bins)}, over {AGE_EDGES_H[-1]:g} h"
-    limit = f"`workload.queue_limit_h`, or {UNLIMITED_QUEUE_H:g} h of full work where there is none"
-    setpoint = "of the CRAC unit, mean of several" if units == 1 else "of each CRAC unit"
-    features = (
-        Feature("queue", "share", 0.0, 1.0, f"queued work over {limit}"),
-        Feature("oldest_age", "h", 0.0, 24.0, "age of the oldest queued work"),
-        Feature("mean_age", "h", 0.0, 24.0, "mean age of queued work"),
-        Feature("age_histogram", "share", 0.0, 1.0, f"of the queue by age: {ages}", 5),
-        Feature("room", "C", 10.0, 60.0, "return air of the last step"),
-        Feature("hottest_inlet", "C", 10.0, 50.0, "hottest server inlet of the last step"),
-        Feature("setpoint", "C", 10.0, 30.0, f"supply setpoint {setpoint}", units),
-        Feature("it_energy", "share", 0.0, 1.2, "IT energy of the last step over design"),
-        Feature("hvac_energy", "share", 0.0, 1.2, "HVAC energy of the last step over design"),
-        Feature("dc_load", "share", 0.0, 1.2, "facility power of the last step over design"),
-        Feature("soc", "share", 0.0, 1.0, "state of charge; 0 without a battery"),
-        Feature("fan_speed", "share", 0.0, 1.0, "speed of each CRAC fan over design", fans),
-        Feature("rack_inlets", "C", 10.0, 50.0, "hottest inlet of each rack, last step", racks),
-    )
-    return tuple(feature for feature in features if feature.size)
+def time_features(layout: Layout) -> tuple[Feature, ...]:
+    """Features that depend on time alone: functions of ``TimeInputs``."""
+    return _features_of(_TIME, layout)
 
 
-def all_features(
-    ci_leads_h: Sequence[float] = CI_LEADS_H,
-    weather_leads_h: Sequence[float] = WEATHER_LEADS_H,
-    units: int = 1,
-    fans: int = 0,
-    racks: int = 0,
-) -> tuple[Feature, ...]:
-    """All features in the order of the shared state.
+def measured_features(layout: Layout) -> tuple[Feature, ...]:
+    """Features measured in the data center: functions of ``Measurements``."""
+    return _features_of(_MEASURED, layout)
 
-    Args:
-        ci_leads_h: leads of the forecasts of carbon intensity and price, in h.
-        weather_leads_h: leads of the weather forecasts, in h.
-        units: number of CRAC units whose setpoints stand side by side.
-        fans: number of CRAC fans whose speeds are decided; 0 if none are.
-        racks: number of racks that work is placed on by agents; 0 if it is not.
-    """
-    return (*time_features(ci_leads_h, weather_leads_h), *measured_features(units, fans, racks))
+
+def rack_features(layout: Layout) -> tuple[Feature, ...]:
+    """Features with an entry per rack: functions of the view, which are not compiled."""
+    return _features_of(_OF_RACKS, layout)
+
+
+def all_features(layout: Layout = DEFAULT_LAYOUT) -> tuple[Feature, ...]:
+    """All features in the order of the shared state."""
+    return (*time_features(layout), *measured_features(layout), *rack_features(layout))
+
+
+def _ci_leads(layout: Layout) -> int:
+    return len(layout.ci_leads_h)
+
+
+def _weather_leads(layout: Layout) -> int:
+    return len(layout.weather_leads_h)
+
+
+def _one_with_leads(layout: Layout) -> int:
+    return 1 if layout.ci_leads_h else 0
+
+
+@_feature(_TIME, "1", -1.0, 1.0, 2)
+def time_of_day(t: TimeInputs) -> F32:
+    """Sine and cosine of the local time."""
+    return t.time_of_day
+
+
+@_feature(_TIME, "1", -1.0, 1.0, 2)
+def time_of_year(t: TimeInputs) -> F32:
+    """Sine and cosine of the share of the year."""
+    return t.time_of_year
+
+
+@_feature(_TIME, "g/kWh", 0.0, 1000.0)
+def ci(t: TimeInputs) -> F32:
+    """Carbon intensity (CI) of the step to come."""
+    return t.ci[:1]
+
+
+@_feature(_TIME, "g/kWh", 0.0, 1000.0, _ci_leads)
+def ci_forecast(t: TimeInputs) -> F32:
+    """CI in {ci_leads} h."""
+    return t.ci[1:]
+
+
+@_feature(_TIME, "g/kWh", -300.0, 300.0, _ci_leads)
+def ci_change(t: TimeInputs) -> F32:
+    """CI in {ci_leads} h less `ci`."""
+    return np.asarray(t.ci[1:] - t.ci[:1])
+
+
+@_feature(_TIME, "share", 0.0, 1.0, _one_with_leads)
+def ci_rank(t: TimeInputs) -> F32:
+    """Share of the CI in {ci_leads} h that is below `ci`."""
+    is_below = t.ci[1:] < t.ci[:1]
+    return np.asarray(is_below.mean(axis=0, keepdims=True, dtype=np.float32))
+
+
+@_feature(_TIME, "share", 0.0, 1.0, lambda x: 1 + len(x.ci_leads_h) if x.ci_leads_h else 0)
+def ci_relative(t: TimeInputs) -> F32:
+    """`ci` and the CI in {ci_leads} h, between the lowest (0) and the highest (1) of them."""
+    return np.asarray((t.ci - t.lowest_ci) / np.where(t.ci_swing > 0, t.ci_swing, 1.0))
+
+
+@_feature(_TIME, "1", 0.0, 2.0, _one_with_leads)
+def ci_swing(t: TimeInputs) -> F32:
+    """Range of `ci` and the CI in {ci_leads} h, relative to `ci`."""
+    return np.asarray((t.ci_swing / np.where(t.ci[0] > 0, t.ci[0], 1.0))[None])
+
+
+@_feature(_TIME, "C", -30.0, 50.0)
+def outdoor(t: TimeInputs) -> F32:
+    """Dry bulb of the step to come."""
+    return t.outdoor_c[:1]
+
+
+@_feature(_TIME, "C", -30.0, 50.0, _weather_leads)
+def outdoor_forecast(t: TimeInputs) -> F32:
+    """Dry bulb in {weather_leads} h."""
+    return t.outdoor_c[1:]
+
+
+@_feature(_TIME, "C", -30.0, 40.0)
+def wet_bulb(t: TimeInputs) -> F32:
+    """Wet bulb of the step to come."""
+    return t.wet_bulb_c[:1]
+
+
+@_feature(_TIME, "C", -30.0, 40.0, _weather_leads)
+def wet_bulb_forecast(t: TimeInputs) -> F32:
+    """Wet bulb in {weather_leads} h."""
+    return t.wet_bulb_c[1:]
+
+
+@_feature(_TIME, "share", 0.0, 1.0)
+def workload(t: TimeInputs) -> F32:
+    """Work that arrives in the step to come."""
+    return t.workload
+
+
+@_feature(_TIME, "1", 0.0, 3.0)
+def price(t: TimeInputs) -> F32:
+    """Price of the step to come, relative to its mean."""
+    return t.price[:1]
+
+
+@_feature(_TIME, "1", 0.0, 3.0, _ci_leads)
+def price_forecast(t: TimeInputs) -> F32:
+    """Price in {ci_leads} h, relative to its mean."""
+    return t.price[1:]
+
+
+@_feature(_MEASURED, "share", 0.0, 1.0)
+def queue(m: Measurements) -> list[F64]:
+    """Queued work as a share of `workload.queue_limit_h`; without a limit, of 10 h of full work."""
+    return [m.waiting_tasks * m.design.per_full_queue]
+
+
+@_feature(_MEASURED, "h", 0.0, 24.0)
+def oldest_age(m: Measurements) -> list[F64]:
+    """Age of the oldest queued work."""
+    return [m.last.oldest_age_h]
+
+
+@_feature(_MEASURED, "h", 0.0, 24.0)
+def mean_age(m: Measurements) -> list[F64]:
+    """Mean age of queued work."""
+    return [m.last.mean_age_h]
+
+
+@_feature(_MEASURED, "share", 0.0, 1.0, len(AGE_EDGES_H))
+def age_histogram(m: Measurements) -> list[F64]:
+    """Share of the queue aged 0-6, 6-12, 12-18, 18-24 and over 24 h."""
+    counts = m.waiting_tasks > NEGLIGIBLE_TASKS
+    per_task = np.where(counts, 1.0 / np.where(counts, m.waiting_tasks, 1.0), 0.0)
+    at_least: list[Any] = [*m.at_least_tasks, 0.0]
+    return [(a - b) * per_task for a, b in pairwise(at_least)]
+
+
+@_feature(_MEASURED, "C", 10.0, 60.0)
+def room(m: Measurements) -> list[F64]:
+    """Return air of the last step."""
+    return [m.last.return_c]
+
+
+@_feature(_MEASURED, "C", 10.0, 50.0)
+def hottest_inlet(m: Measurements) -> list[F64]:
+    """Hottest server inlet of the last step."""
+    return [m.last.inlet_max_c]
+
+
+@_feature(_MEASURED, "C", 10.0, 30.0, lambda x: x.units)
+def setpoint(m: Measurements) -> list[F64]:
+    """Supply setpoint of each CRAC unit; their mean where data centers differ in their number."""
+    return m.setpoints_c
+
+
+@_feature(_MEASURED, "share", 0.0, 1.2)
+def it_energy(m: Measurements) -> list[F64]:
+    """IT energy of the last step, relative to that of a step at the design point."""
+    return [m.last.it_kwh * m.design.per_it_kwh]
+
+
+@_feature(_MEASURED, "share", 0.0, 1.2)
+def hvac_energy(m: Measurements) -> list[F64]:
+    """HVAC energy of the last step, relative to that of a step at the design point."""
+    return [m.last.hvac_kwh * m.design.per_hvac_kwh]
+
+
+@_feature(_MEASURED, "share", 0.0, 1.2)
+def dc_load(m: Measurements) -> list[F64]:
+    """Facility power of the last step, relative to that at the design point."""
+    return [m.last.facility_kwh * m.design.per_facility_kwh]
+
+
+@_feature(_MEASURED, "share", 0.0, 1.0)
+def soc(m: Measurements) -> list[F64]:
+    """State of charge; 0 without a battery."""
+    return [m.stored_kwh * m.design.per_battery_kwh]
+
+
+@_feature(_MEASURED, "share", 0.0, 1.0, lambda x: x.fans)
+def fan_speed(m: Measurements) -> list[F64]:
+    """Speed of each CRAC fan, relative to its design speed."""
+    return m.fan_speeds
+
+
+@_feature(_OF_RACKS, "C", 10.0, 50.0, lambda x: x.racks)
+def rack_inlets(view: View) -> F64:
+    """Hottest inlet of each rack in the last step."""
+    if view.last is None:
+        return np.tile(mean_setpoint_c(view), (int(view.fleet.rack_offsets[1]), 1))
+    return np.asarray(view.last.rack_inlet_max_c.reshape(view.size, -1).T)
 
 
 def features_by_agent(

@@ -7,9 +7,8 @@ import numpy.typing as npt
 from gymnasium.spaces import Box
 
 from sdc_taichi.config import HallConfig
-from sdc_taichi.control.view import View
+from sdc_taichi.control.view import View, mean_setpoint_c
 from sdc_taichi.envs.features import Feature, scale
-from sdc_taichi.envs.observer import mean_setpoint_c
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.floor_plan import floor_plan, row_distance_m
 from sdc_taichi.sim.fleet import Fleet

@@ -28,7 +28,7 @@ from sdc_taichi.config.tariff_schema import TariffConfig
 from sdc_taichi.control import check_controller
 from sdc_taichi.control.view import PERFECT, ForecastError
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT, Agent
-from sdc_taichi.envs.forecasts import (
+from sdc_taichi.envs.features import (
     CI_LEADS_H,
     WEATHER_LEADS_H,
     LeadH,
@@ -345,3 +345,10 @@ def _options(options: Any, keywords: Mapping[str, Any], only_agent: str | None) 
                 "sdc_taichi/Joint-v0"
             )
     return make_options(**given)
+
+
+def options_markdown() -> str:
+    """The table of options in docs/environments.md."""
+    from sdc_taichi.config.reference import sections_markdown
+
+    return sections_markdown([("", EnvOptions)]).partition("\n\n|")[2].join(("|", ""))

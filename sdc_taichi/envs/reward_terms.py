@@ -25,9 +25,10 @@ learns at once what an action is worth, where it would have to wait for the end 
 true ones, whatever agents observe of them.
 
 Add a term here: a function with the decorator ``reward_term``, whose name is the name of the term
-and whose docstring's first line is its row in docs/environments.md (``terms_markdown`` prints the
-table). Terms are compiled together, so they use arithmetic and NumPy functions that
-``kernels.compiler.stage`` knows, and ``np.where`` instead of branches on values.
+and whose docstring's first line describes it in the documentation. Terms are compiled together, so
+they use arithmetic, the NumPy functions of ``kernels/compiler/trace.py``, and ``np.where`` instead
+of branches on values. A quantity that neither the result nor ``TermContext`` has is a field there,
+with its value in ``RewardContext``.
 """
 
 from __future__ import annotations

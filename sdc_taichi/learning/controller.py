@@ -10,16 +10,14 @@ from typing import Any
 
 from sdc_taichi.control import (
     CONTROLLABLE,
-    ForecastError,
     View,
     commands_of,
     make_controller,
 )
 from sdc_taichi.envs.actions import ActionDecoder
 from sdc_taichi.envs.agents import commands_by_others
-from sdc_taichi.envs.observer import Observer
-from sdc_taichi.envs.observers import make_observer
-from sdc_taichi.envs.released_observer import ReleasedObserver
+from sdc_taichi.envs.observer import Observer, make_observer
+from sdc_taichi.envs.released import ReleasedObserver
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.learning.policy import Policy
 from sdc_taichi.sim.fleet import Fleet
@@ -70,7 +68,6 @@ class PolicyController:
         self._by_others = tuple(by_others)
         self.commands: tuple[str, ...] = (*decided, *self._by_others)
         self._observer: Observer | ReleasedObserver | None = None
-        self._error: ForecastError | None = None
         self._begun = False
         # Actions of the last decision, which are held until the next.
         self._actions: dict[str, F32 | I64] = {}
@@ -102,13 +99,10 @@ class PolicyController:
         return Actions(**commands)
 
     def _observer_of(self, view: View) -> Observer | ReleasedObserver:
-        """The observer, which sees the forecast errors of the run, begun with the episode."""
-        if self._observer is None or self._error != view.forecast_error:
-            interface, self._error = self.policy.interface, view.forecast_error
-            named = interface.observations == "default"
-            options = interface.options(**({"forecast_error": self._error} if named else {}))
+        """The observer, begun with the episode."""
+        if self._observer is None:
+            options = self.policy.interface.options()
             self._observer = make_observer(view.fleet, options, new_inputs=True)
-            self._begun = False
         if not self._begun:
             self._observer.reset(view)
             self._begun = True

@@ -14,7 +14,7 @@ from sdc_taichi.config.fields import Section
 from sdc_taichi.envs.actions import ActionDecoder, equal_number
 from sdc_taichi.envs.agents import Agent
 from sdc_taichi.envs.features import Feature
-from sdc_taichi.envs.observers import make_observer
+from sdc_taichi.envs.observer import make_observer
 from sdc_taichi.envs.options import EnvOptions, make_options
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.sim.fleet import Fleet

@@ -1,0 +1,399 @@
+"""Observations of the released SustainDC, batched.
+
+Source: the main branch of github.com/HewlettPackard/dc-rl at a92b475 (``sustaindc_env.py``,
+``utils/managers.py``, ``envs/carbon_ls.py``).
+
+Carbon intensity and dry bulb are scaled by their minimum and maximum over the 30 days from the
+first step. That looks at the future, which is why these vectors are not the default. Windows count
+steps, so they cover the stated hours at the 15 minutes of the released code alone.
+
+The vectors exist to reproduce published numbers: columns of the inputs are computed once for each
+series, everything else in every step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from sdc_taichi.control.view import View
+from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.envs.features import AGE_EDGES_H, Feature
+from sdc_taichi.errors import RuntimeStateError
+from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS, TASKS_PER_STEP, age_histogram
+from sdc_taichi.sim.drivers import FleetSeries
+from sdc_taichi.types import F32, F64, I64
+
+CI_STEPS = 8
+"""Steps of carbon intensity ahead (``sustaindc_env.py``)."""
+TEMPERATURE_STEPS = 16
+"""Steps of dry bulb ahead (``sustaindc_env.py``)."""
+PAST_STEPS = 16
+"""Steps of carbon intensity back (``sustaindc_env.py``)."""
+Z_SCORE_EPSILON = 1e-8
+"""Added to the standard deviation below the z-score, in scaled units (``sustaindc_env.py``)."""
+
+SMOOTHED_STEPS = 4
+"""Steps per mean that the trends of carbon intensity are fitted to (``sustaindc_env.py``)."""
+SCALING_DAYS = 30
+"""Days from the first step that scale the inputs, fewer where the year ends (``managers.py``)."""
+
+_SCALED_LIMIT = 10.0
+"""Limit of scaled inputs, which are 0..1 in the first 30 days and may exceed that afterwards."""
+_Z_SCORE_LIMIT = 1.0 / Z_SCORE_EPSILON
+"""Limit of z-scores, which are as large where the window is flat."""
+_AGE_LIMIT_DAYS = 400.0
+"""Limit of ages in days; the longest ``workload.age_horizon_h`` is 365 days."""
+
+
+def _scaled(name: str, description: str) -> Feature:
+    """An input over its range."""
+    return Feature(name, "scaled", -_SCALED_LIMIT, _SCALED_LIMIT, description)
+
+
+def _slope(name: str, description: str) -> Feature:
+    """A trend of a scaled input."""
+    return Feature(name, "scaled/step", -_SCALED_LIMIT, _SCALED_LIMIT, description)
+
+
+def _share(name: str, description: str, unit: str = "-") -> Feature:
+    """A value of 0..1."""
+    return Feature(name, unit, 0.0, 1.0, description)
+
+
+def _age(name: str, description: str) -> Feature:
+    """An age of queued tasks."""
+    return Feature(name, "d", 0.0, _AGE_LIMIT_DAYS, description)
+
+
+def _window(name: str, what: str, steps: int) -> tuple[Feature, ...]:
+    """Entries about the coming steps of an input."""
+    return (
+        _scaled(f"{name}_mean_next", f"mean {what} of the next {steps} steps"),
+        Feature(
+            f"{name}_std_next",
+            "scaled",
+            0.0,
+            _SCALED_LIMIT,
+            f"standard deviation of the {what} of the next {steps} steps",
+        ),
+        Feature(
+            f"{name}_z_score",
+            "-",
+            -_Z_SCORE_LIMIT,
+            _Z_SCORE_LIMIT,
+            f"{what} less its mean over the next {steps} steps, in standard deviations of these",
+        ),
+        _share(
+            f"{name}_steps_to_peak", f"steps to the next peak over {steps}; 1 without", "window"
+        ),
+        _share(
+            f"{name}_steps_to_valley", f"steps to the next valley over {steps}; 1 without", "window"
+        ),
+    )
+
+
+def _age_bins() -> tuple[Feature, ...]:
+    """Entries of the age histogram."""
+    edges = [f"{edge:g}" for edge in AGE_EDGES_H]
+    closed = tuple(
+        _share(f"queue_{low}_{high}h", f"share of the queued tasks aged {low} h to {high} h")
+        for low, high in pairwise(edges)
+    )
+    return (*closed, _share(f"queue_{edges[-1]}h", f"1 with a task aged {edges[-1]} h or more"))
+
+
+def ranges(features: Sequence[Feature]) -> tuple[F32, F32]:
+    """Lowest and highest value of each entry, (n,) each."""
+    low, high = ([getattr(f, side) for f in features] for side in ("low", "high"))
+    return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)
+
+
+_CI, _DRY_BULB = "carbon intensity", "dry bulb"
+_OF_ALL_AGENTS = (
+    _share("time_cos", "0.5 + 0.5 cos of the time of day, which is rounded to a thousandth of it"),
+    _share("time_sin", "0.5 + 0.5 sin of the time of day, which is rounded to a thousandth of it"),
+    _scaled("ci", f"{_CI} of the step to come"),
+    _slope("ci_slope_next", f"trend of the {_CI} over this and the next {CI_STEPS} steps"),
+    _slope("ci_slope_past", f"trend of the {_CI} over the last {PAST_STEPS} steps and this one"),
+    *_window("ci", _CI, CI_STEPS),
+)
+_WORKLOAD = _share("workload", "work that arrives in the step to come, as a share of capacity")
+_OUTDOOR = _scaled("outdoor", f"{_DRY_BULB} of the step to come")
+_AGES = (
+    _age("oldest_age", "age of the oldest queued task"),
+    _age("mean_age", "mean age of the queued tasks"),
+    _share("queue", "queued tasks over the longest queue; 0 where it has no limit"),
+)
+_OUTDOOR_AHEAD = (
+    _slope(
+        "outdoor_slope_next",
+        f"trend of the {_DRY_BULB} over this and the next {TEMPERATURE_STEPS} steps",
+    ),
+    *_window("outdoor", _DRY_BULB, TEMPERATURE_STEPS),
+)
+_WORKLOAD_NEXT = _share("workload_next", "work that arrives one step later, as a share of capacity")
+_OUTDOOR_NEXT = _scaled("outdoor_next", f"{_DRY_BULB} one step later")
+_SOC = _share("soc", "state of charge of the battery")
+
+FEATURES: dict[str, tuple[Feature, ...]] = {
+    "agent_ls": (*_OF_ALL_AGENTS, *_AGES, _WORKLOAD, _OUTDOOR, *_OUTDOOR_AHEAD, *_age_bins()),
+    "agent_dc": (*_OF_ALL_AGENTS, _WORKLOAD, _WORKLOAD_NEXT, _OUTDOOR, _OUTDOOR_NEXT),
+    "agent_bat": (*_OF_ALL_AGENTS, _WORKLOAD, _OUTDOOR, _SOC),
+}
+"""Entries of each agent's vector in order; ranges are those of the values as observed.
+
+The unit ``scaled`` is the input less its minimum over the 30 days from the first step, over the
+range of these days.
+"""
+
+_RANGES = {agent: ranges(features) for agent, features in FEATURES.items()}
+
+
+class ReleasedObserver:
+    """Observation vectors of the released code, with 26, 14 and 13 entries.
+
+    The inputs are taken from the drivers as they are; the released code cuts its dry bulb at 0 C
+    and 45 C beforehand. An input that is constant over the 30 days from the first step has no range
+    and reads 0. Entries outside the ranges of ``FEATURES`` are cut at them.
+
+    Args:
+        agents: agents whose vectors are wanted.
+
+    Attributes:
+        features: entries of each agent, in the order of its vector.
+        spaces: space of each agent's vector.
+        state_space: space of the vectors of all agents side by side.
+    """
+
+    def __init__(self, agents: Sequence[str] = AGENTS) -> None:
+        self._agents = tuple(agents)
+        self.features = FEATURES
+        self.spaces = {agent: Box(*_RANGES[agent]) for agent in AGENTS}
+        self.state_space = Box(*ranges([f for agent in AGENTS for f in FEATURES[agent]]))
+        self._ci: _ScaledInput | None = None
+        self._outdoor: _ScaledInput | None = None
+        self._observed: tuple[View, dict[str, F64]] | None = None
+
+    def reset(self, view: View) -> None:
+        """Scale the inputs by what follows the first step.
+
+        Args:
+            view: the view before the first step.
+        """
+        per_hour, drivers = view.fleet.steps_per_hour, view.drivers
+        window = SCALING_DAYS * 24 * per_hour
+        if self._ci is None or not self._ci.is_made_of(drivers.ci_g_per_kwh):
+            self._ci = _ScaledInput(drivers.ci_g_per_kwh, _CI_COLUMNS, _ci_columns)
+        if self._outdoor is None or not self._outdoor.is_made_of(drivers.outdoor_c):
+            self._outdoor = _ScaledInput(drivers.outdoor_c, _OUTDOOR_COLUMNS, _outdoor_columns)
+        for scaled in (self._ci, self._outdoor):
+            scaled.begin(drivers.start, window)
+        self._time_of_day = _time_of_day_rows(24 * per_hour)
+        self._observed = None
+        self._age_edges_steps = np.array(AGE_EDGES_H) * per_hour
+        limit_h = view.fleet.values("workload.queue_limit_h")
+        self._queue_limit_tasks = np.where(
+            np.isnan(limit_h), np.inf, limit_h * TASKS_PER_STEP * per_hour
+        )
+        battery_kwh = view.sizing.battery_kwh
+        self._capacity_kwh = np.where(battery_kwh > 0, battery_kwh, 1.0)
+
+    def observe(self, view: View) -> dict[str, F32]:
+        """The vector of each agent before the step to come, (B, entries) each.
+
+        Raises:
+            RuntimeStateError: before ``reset``.
+        """
+        return {agent: self._vector(agent, view) for agent in self._agents}
+
+    def state(self, view: View) -> F32:
+        """The vectors of all agents side by side, (B, m).
+
+        Raises:
+            RuntimeStateError: before ``reset``.
+        """
+        return np.concatenate([self._vector(agent, view) for agent in AGENTS], axis=1)
+
+    def _vector(self, agent: str, view: View) -> F32:
+        if self._observed is None or self._observed[0] is not view:
+            self._observed = view, self._entries(view)
+        entries = self._observed[1]
+        vector = np.stack([entries[f.name] for f in FEATURES[agent]], axis=1).astype(np.float32)
+        low, high = _RANGES[agent]
+        return np.maximum(np.minimum(vector, high), low)
+
+    def _entries(self, view: View) -> dict[str, F64]:
+        """Entries of all agents by name, (B,) each, before they are cut at their ranges."""
+        if self._ci is None or self._outdoor is None:
+            raise RuntimeStateError("the observer has not been reset; call reset() first")
+        state, last, drivers = view.state, view.last, view.drivers
+        index = drivers.start + state.step
+        time_of_day = self._time_of_day[index % len(self._time_of_day)]
+        waiting = state.queue[:, -1].copy()
+        tasks = age_histogram(state.queue, self._age_edges_steps).T
+        # Shares of a queue of which rounding alone left some are 0.
+        counted = np.where(waiting > NEGLIGIBLE_TASKS, waiting, np.inf)
+        zero = np.zeros(view.size)
+        return {
+            "time_cos": time_of_day[:, 0],
+            "time_sin": time_of_day[:, 1],
+            **self._ci.at(index),
+            **self._outdoor.at(index),
+            "outdoor_next": self._outdoor.level_at(index + 1),
+            "workload": drivers.demand.at(index),
+            "workload_next": drivers.demand.at(index + 1),
+            "oldest_age": zero if last is None else last.oldest_age_h / 24.0,
+            "mean_age": zero if last is None else last.mean_age_h / 24.0,
+            "queue": waiting / self._queue_limit_tasks,
+            **dict(
+                zip(_AGE_BINS, [*(tasks[:-1] / counted), tasks[-1] > NEGLIGIBLE_TASKS], strict=True)
+            ),
+            "soc": state.stored_kwh / self._capacity_kwh,
+        }
+
+
+class _ScaledInput:
+    """Entries about an input, scaled by its range over the 30 days from the first step.
+
+    Args:
+        series: the input of each data center.
+        names: names of the columns: the level, trends, and those of ``_window_columns``.
+        columns: function of a series that gives the columns in its unit, (n, columns).
+    """
+
+    def __init__(
+        self, series: FleetSeries, names: Sequence[str], columns: Callable[[F64], F64]
+    ) -> None:
+        self._series, self._names = series, names
+        self._distinct, self._which = series.distinct()
+        self._columns = np.concatenate([columns(one) for one in self._distinct])
+        first_rows = np.cumsum([0, *map(len, self._distinct)])
+        self._first_rows = first_rows[self._which]
+
+    def is_made_of(self, series: FleetSeries) -> bool:
+        """Whether the columns are those of a series."""
+        mine = self._series
+        return (
+            mine.values is series.values
+            and np.array_equal(mine.offsets, series.offsets)
+            and np.array_equal(mine.lengths, series.lengths)
+        )
+
+    def begin(self, start: I64, window: int) -> None:
+        """Take the range of the ``window`` steps from the first on, at most to the series' end."""
+        starts = start % self._series.lengths
+        windows = [
+            self._distinct[which][first : first + window]
+            for which, first in zip(self._which, starts, strict=True)
+        ]
+        self._low = np.array([one.min() for one in windows])
+        span = np.array([one.max() for one in windows]) - self._low
+        # Without a range all reads 0, as any part of infinity does.
+        self._span = np.where(span > 0, span, np.inf)
+
+    def level_at(self, index: I64) -> F64:
+        """The scaled input at steps of the year, (B,)."""
+        return np.asarray((self._series.at(index) - self._low) / self._span)
+
+    def at(self, index: I64) -> dict[str, F64]:
+        """Scaled entries by name at steps of the year, (B,) each."""
+        rows = self._columns.take(self._first_rows + index % self._series.lengths, axis=0)
+        columns = dict(zip(self._names, rows.T, strict=True))
+        out: dict[str, F64] = {}
+        for name, values in columns.items():
+            if name.endswith("_z_score"):
+                deviation = columns[name.replace("_z_score", "_std_next")]
+                out[name] = values / (deviation + Z_SCORE_EPSILON * self._span)
+            elif name.endswith(("_to_peak", "_to_valley")):
+                out[name] = values
+            elif name.endswith(("_slope_next", "_slope_past", "_std_next")):
+                out[name] = values / self._span
+            else:
+                out[name] = (values - self._low) / self._span
+        return out
+
+
+_CI_COLUMNS = tuple(f.name for f in _OF_ALL_AGENTS[2:])
+_OUTDOOR_COLUMNS = ("outdoor", *(f.name for f in _OUTDOOR_AHEAD))
+_AGE_BINS = tuple(f.name for f in _age_bins())
+
+
+def _time_of_day_rows(steps_per_day: int) -> F64:
+    """Cosine and sine of the time of day, 0..1, (steps per day, 2)."""
+    share = np.array([round(step / steps_per_day, 3) for step in range(steps_per_day)])
+    angle = 2.0 * np.pi * share
+    return np.stack([0.5 + 0.5 * np.cos(angle), 0.5 + 0.5 * np.sin(angle)], axis=1)
+
+
+def _ci_columns(series: F64) -> F64:
+    """Value, slopes to come and past, and window columns, in g/kWh, (n, 8)."""
+    following = _ahead(series, CI_STEPS)
+    past = [np.roll(series, k) for k in range(PAST_STEPS, 0, -1)]
+    slope_past = _weighted_sum(_smoothed_trend_weights(PAST_STEPS + 1), [*past, series])
+    # A year has no past before its first hours: the released code then sees none.
+    slope_past[:PAST_STEPS] = 0.0
+    slope_next = _weighted_sum(_smoothed_trend_weights(CI_STEPS + 1), [series, *following])
+    return np.column_stack([series, slope_next, slope_past, _window_columns(series, following)])
+
+
+def _outdoor_columns(series: F64) -> F64:
+    """Value, slope to come, and window columns, in C, (n, 7)."""
+    following = _ahead(series, TEMPERATURE_STEPS)
+    slope = _weighted_sum(_trend_weights(TEMPERATURE_STEPS + 1), [series, *following])
+    return np.column_stack([series, slope, _window_columns(series, following)])
+
+
+def _window_columns(now: F64, following: Sequence[F64]) -> F64:
+    """Mean, standard deviation, present excess over the mean, steps to peak and valley, (n, 5).
+
+    Args:
+        now: present values, (n,).
+        following: values of each step of the window, (n,) each.
+    """
+    count = len(following)
+    total = np.zeros_like(now)
+    for value in following:
+        total = total + value
+    mean = total / count
+    square = np.zeros_like(now)
+    for value in following:
+        square = square + (value - mean) ** 2
+    path = [now, *following]
+    # Central differences, one-sided at the ends, as in numpy.gradient; only the signs matter.
+    slopes = [path[min(i + 1, count)] - path[max(i - 1, 0)] for i in range(count + 1)]
+    peak, valley = np.full_like(now, count), np.full_like(now, count)
+    for i in reversed(range(count)):
+        peak = np.where((slopes[i] > 0) & (slopes[i + 1] <= 0), i, peak)
+        valley = np.where((slopes[i] < 0) & (slopes[i + 1] >= 0), i, valley)
+    return np.stack(
+        [mean, np.sqrt(square / count), now - mean, peak / count, valley / count], axis=-1
+    )
+
+
+def _ahead(series: F64, steps: int) -> list[F64]:
+    """The series as seen 1, 2, .. ``steps`` steps ahead, (n,) each."""
+    return [np.roll(series, -k) for k in range(1, steps + 1)]
+
+
+def _weighted_sum(weights: F64, values: Sequence[F64]) -> F64:
+    """Sum of arrays times weights, in order."""
+    total = np.zeros_like(values[0])
+    for weight, value in zip(weights, values, strict=True):
+        total = total + weight * value
+    return total
+
+
+def _trend_weights(points: int) -> F64:
+    """Weights of the least-squares slope per step, (points,)."""
+    position = np.arange(points) - (points - 1) / 2.0
+    return np.asarray(position / np.sum(position**2))
+
+
+def _smoothed_trend_weights(points: int) -> F64:
+    """Weights of a least-squares slope per step over means of ``SMOOTHED_STEPS``, (points,)."""
+    smoothed = points - SMOOTHED_STEPS + 1
+    return np.convolve(_trend_weights(smoothed), np.full(SMOOTHED_STEPS, 1.0 / SMOOTHED_STEPS))
