@@ -253,9 +253,9 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
     if dc.inlet_target_c > 0.0:
         moved_k = follow_hottest_inlet(hall, n, total.present_inlet_max_c)
     units = run_crac_units(hall, n, is_last)
-    air.crac_flow_m3s = units.flow_m3s
+    air.units_flow_m3s = units.flow_m3s
     air.supply_c = units.supply_m3k_s / units.flow_m3s
-    air.return_c = (total.return_m3k_s + units.bypass_m3k_s) / units.flow_m3s
+    air.units_return_c = (total.return_m3k_s + units.bypass_m3k_s) / units.flow_m3s
     dc.crac_m3s_per_rack = units.flow_m3s / ti.cast(dc.racks, ti.f64)
     dc.sweep = sweep + 1
     # All mixes move by the middle of the exhausts' changes, give or take half their spread.
@@ -271,13 +271,13 @@ def update_crac_and_convergence(hall: ti.template(), n, air: ti.template()):
         dc.status = RUNNING
         if is_last:
             dc.status = DONE
-        air.cooling_load_w, air.coil_w = run_coils(hall, n, units, air.return_c)
+        air.units_load_w, air.coil_w = run_coils(hall, n, units, air.units_return_c)
     else:
         if dc.adjusts_supply > 0.0:
-            load_w = air.return_c * units.flow_m3s - units.supply_m3k_s
+            load_w = air.units_return_c * units.flow_m3s - units.supply_m3k_s
             load_w *= ti.cast(dc.air_j_per_m3_k, ti.f64)
             load_w += units.fan_m3s * dc.crac_fan_w_per_m3s
-            moved_k = ti.max(moved_k, set_supply(hall, n, units, air.return_c, 0.0, load_w))
+            moved_k = ti.max(moved_k, set_supply(hall, n, units, air.units_return_c, 0.0, load_w))
         dc.status = status_after_sweep(hall, n, air.supply_c, units.most_f_change, moved_k, is_last)
         if dc.adjusts_supply > 0.0 and dc.status != RUNNING:
             keep_supply(hall, n)
@@ -303,10 +303,10 @@ def store_air(hall: ti.template(), n, is_first, air: ti.template()):
     dc = hall.dcs[n]
     supplied_m3k_s = hall.chunks[dc.first_chunk].flow_m3s * air.supply_c
     dc.inlet_m3k_s = running_mean(hall, is_first, dc.inlet_m3k_s, supplied_m3k_s)
-    dc.crac_flow_m3s = running_mean(hall, is_first, dc.crac_flow_m3s, air.crac_flow_m3s)
+    dc.units_flow_m3s = running_mean(hall, is_first, dc.units_flow_m3s, air.units_flow_m3s)
     dc.supply_c = running_mean(hall, is_first, dc.supply_c, air.supply_c)
-    dc.return_c = running_mean(hall, is_first, dc.return_c, air.return_c)
-    dc.cooling_load_w = running_mean(hall, is_first, dc.cooling_load_w, air.cooling_load_w)
+    dc.units_return_c = running_mean(hall, is_first, dc.units_return_c, air.units_return_c)
+    dc.units_load_w = running_mean(hall, is_first, dc.units_load_w, air.units_load_w)
     dc.coil_w = running_mean(hall, is_first, dc.coil_w, air.coil_w)
 
 
@@ -350,10 +350,10 @@ def finish_sweep(hall: ti.template(), n, terms_at, is_one_chunk, is_first, hotte
     combine_chunks(hall, n)
     dc, none = hall.dcs[n], ti.cast(0.0, ti.f64)
     air = ti.Struct(
-        crac_flow_m3s=none,
+        units_flow_m3s=none,
         supply_c=hall.units[dc.first_unit].supply_c,
-        return_c=none,
-        cooling_load_w=none,
+        units_return_c=none,
+        units_load_w=none,
         coil_w=none,
     )
     is_done = True

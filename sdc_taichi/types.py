@@ -1,17 +1,22 @@
 """Actions, state and results of a step, and the array types of the package.
 
 In shapes, B counts data centers, U CRAC units, R racks, G server groups and S servers, those of all
-data centers end to end. Dataclasses that every step makes are not frozen, which would take three
-times as long to make.
+data centers end to end. Dataclasses that every step makes are not frozen, since a frozen one takes
+three times as long to make.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import ast
+import inspect
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
+from functools import cache
+from itertools import pairwise
 from operator import attrgetter
-from typing import Any
+from typing import Annotated, Any, get_origin, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +41,22 @@ def as_array(values: F64 | float) -> F64:
 def fields_of(values: Any) -> dict[str, Any]:
     """Fields of a dataclass by name."""
     return {f.name: getattr(values, f.name) for f in fields(values)}
+
+
+def joined(*parts: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of all parts by name, each of which one part alone may have.
+
+    Raises:
+        ValueError: A name that two parts have.
+    """
+    values: dict[str, Any] = {}
+    for part in parts:
+        values.update(part)
+    if len(values) < sum(map(len, parts)):
+        names = Counter(name for part in parts for name in part)
+        twice = [name for name, count in names.items() if count > 1]
+        raise ValueError(f"quantities that two parts of a step have: {', '.join(twice)}")
+    return values
 
 
 class LoadAction(Enum):
@@ -94,22 +115,6 @@ class Actions:
 
 
 @dataclass(slots=True)
-class Exogenous:
-    """Weather, grid and demand during one step of B data centers."""
-
-    outdoor_c: F64
-    """Dry-bulb temperature outside, in C, (B,)."""
-    wet_bulb_c: F64
-    """Wet-bulb temperature outside, in C, (B,)."""
-    ci_g_per_kwh: F64
-    """Carbon intensity of the grid, in g CO2e/kWh, (B,)."""
-    demand: F64
-    """Work that arrives as a share of capacity, 0..1, (B,)."""
-    price_per_kwh: F64
-    """Price of a kWh from the grid, in the currency of the tariff, (B,); 0 without prices."""
-
-
-@dataclass(slots=True)
 class State:
     """Values that are carried from step to step; everything else derives from them.
 
@@ -164,215 +169,331 @@ class State:
     for transient halls."""
 
 
-@dataclass(slots=True)
-class StepResult:
+DATA_CENTERS, CRAC_UNITS, RACKS = "B", "U", "R"
+"""Axes of quantities: an entry per data center, CRAC unit or rack."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """Unit and axis of a quantity of a step, with which its field is annotated.
+
+    The annotated fields of ``StepResult`` are the one table of quantities: columns of run folders,
+    their documentation and labels are derived from it (``QUANTITIES``, ``meanings``).
+    """
+
+    unit: str
+    """Unit; "1" for shares and ratios, "" for counts and numbers of things."""
+    axis: str = DATA_CENTERS
+    """What the array has an entry for, along its only axis."""
+
+
+@dataclass
+class Exogenous:
+    """Weather, grid and demand during one step of B data centers."""
+
+    outdoor_c: Annotated[F64, Quantity("C")]
+    """Dry-bulb temperature outside."""
+    wet_bulb_c: Annotated[F64, Quantity("C")]
+    """Wet-bulb temperature outside."""
+    ci_g_per_kwh: Annotated[F64, Quantity("g CO2e/kWh")]
+    """Carbon intensity of the grid."""
+    demand: Annotated[F64, Quantity("1")]
+    """Work that arrives as a share of capacity, 0..1."""
+    price_per_kwh: Annotated[F64, Quantity("currency/kWh")]
+    """Price of a kWh from the grid, in the currency of the tariff; 0 without prices."""
+
+
+@dataclass
+class SiteQuantities(Exogenous):
+    """Conditions of one step on site, with the effects of events."""
+
+    active_events: Annotated[F64, Quantity("")]
+    """Number of events that cover the step."""
+    grid_up: Annotated[F64, Quantity("1")]
+    """1 with grid, 0 in an outage."""
+    powered: Annotated[F64, Quantity("1")]
+    """Share of the step that the data center has power, 0..1."""
+    unit_running: Annotated[F64, Quantity("1", CRAC_UNITS)]
+    """1 for CRAC units that run, 0 for those that are down or without power."""
+
+
+@dataclass
+class CommandQuantities:
+    """Commands of one step."""
+
+    load_command: Annotated[F64, Quantity("1")]
+    """Share of what could be deferred (below 0) or drained (above 0), -1..1."""
+    cooling_command: Annotated[F64, Quantity("")]
+    """Setpoint steps that were commanded, mean over the CRAC units; 0 where setpoints follow their
+    schedule."""
+    battery_command: Annotated[F64, Quantity("1")]
+    """Share of the battery's power limit, discharged (below 0) or charged, -1..1."""
+
+
+@dataclass
+class WorkQuantities:
+    """Work that arrives, starts, waits and leaves in one step."""
+
+    utilisation: Annotated[F64, Quantity("1")]
+    """Work that was started, as a share of capacity, including ``lost_tasks``."""
+    arrived_tasks: Annotated[F64, Quantity("tasks")]
+    """Work that arrived."""
+    deferred_tasks: Annotated[F64, Quantity("tasks")]
+    """Work that entered the queue."""
+    drained_tasks: Annotated[F64, Quantity("tasks")]
+    """Work that left the queue on command."""
+    due_tasks: Annotated[F64, Quantity("tasks")]
+    """Queued work whose deadline had come at the start of the step."""
+    overdue_tasks: Annotated[F64, Quantity("tasks")]
+    """Due work that did not fit into the step."""
+    dropped_tasks: Annotated[F64, Quantity("tasks")]
+    """Work that found the queue full; with model ``tasks`` it runs at once, as part of
+    ``executed_tasks``."""
+
+
+@dataclass
+class QueueQuantities:
+    """Queue of work at the end of a step."""
+
+    queue_tasks: Annotated[F64, Quantity("tasks")]
+    """Work in the queue at the end of the step."""
+    oldest_age_h: Annotated[F64, Quantity("h")]
+    """Age of the oldest work in the queue at the end of the step."""
+    mean_age_h: Annotated[F64, Quantity("h")]
+    """Mean age of the work in the queue at the end of the step."""
+
+
+@dataclass
+class SetpointQuantities:
+    """Setpoints of the CRAC units in one step."""
+
+    setpoint_c: Annotated[F64, Quantity("C")]
+    """Supply air setpoint, mean over the CRAC units."""
+    unit_setpoint_c: Annotated[F64, Quantity("C", CRAC_UNITS)]
+    """Supply air setpoint of each CRAC unit."""
+
+
+@dataclass
+class HallQuantities:
+    """Air and servers of the halls in one step."""
+
+    supply_c: Annotated[F64, Quantity("C")]
+    """Supply air temperature, mean over the CRAC airflow: the setpoint plus the warming of the
+    room by unmet cooling."""
+    inlet_mean_c: Annotated[F64, Quantity("C")]
+    """Mean over the racks of their inlet temperatures."""
+    inlet_max_c: Annotated[F64, Quantity("C")]
+    """Hottest inlet of a server, in transient halls of any substep."""
+    hottest_rack: Annotated[F64, Quantity("")]
+    """Rack with the hottest inlet, counted from 0 in its data center."""
+    hottest_server: Annotated[F64, Quantity("")]
+    """Server with the hottest inlet, counted from 0 at the floor of its rack."""
+    outlet_mean_c: Annotated[F64, Quantity("C")]
+    """Mean over the racks of their outlet temperatures."""
+    cpu_w: Annotated[F64, Quantity("W")]
+    """Power of the servers without their fans."""
+    it_fan_w: Annotated[F64, Quantity("W")]
+    """Power of the server fans."""
+    it_airflow_m3s: Annotated[F64, Quantity("m3/s")]
+    """Airflow through the servers."""
+    thermal_storage_w: Annotated[F64, Quantity("W")]
+    """Heat that goes into servers and recirculated air in transient halls."""
+    unit_supply_c: Annotated[F64, Quantity("C", CRAC_UNITS)]
+    """Supply air temperature of each CRAC unit."""
+    rack_cpu_w: Annotated[Reals, Quantity("W", RACKS)]
+    """Power of the servers of each rack without their fans."""
+    rack_fan_w: Annotated[Reals, Quantity("W", RACKS)]
+    """Power of the server fans of each rack."""
+    rack_airflow_m3s: Annotated[Reals, Quantity("m3/s", RACKS)]
+    """Airflow through each rack."""
+    rack_inlet_c: Annotated[Reals, Quantity("C", RACKS)]
+    """Inlet of each rack, mean over its servers, weighted by airflow where air recirculates."""
+    rack_inlet_max_c: Annotated[Reals, Quantity("C", RACKS)]
+    """Hottest inlet of a server of each rack, in transient halls of any substep."""
+    rack_outlet_c: Annotated[Reals, Quantity("C", RACKS)]
+    """Outlet of each rack."""
+    rack_outlet_max_c: Annotated[Reals, Quantity("C", RACKS)]
+    """Hottest outlet of a server of each rack, in transient halls of any substep."""
+
+
+@dataclass
+class CracQuantities:
+    """Air that the CRAC units of B data centers move, and heat that they take, in one step."""
+
+    crac_flow_m3s: Annotated[F64, Quantity("m3/s")]
+    """Airflow of the CRAC units."""
+    crac_fan_w: Annotated[F64, Quantity("W")]
+    """Electric power of the CRAC fans."""
+    return_c: Annotated[F64, Quantity("C")]
+    """Temperature of the air that returns to the CRAC units."""
+    cooling_load_w: Annotated[F64, Quantity("W")]
+    """Heat that the CRAC units are to take from the room."""
+
+
+@dataclass
+class AirIndices:
+    """Indices of how well the air of the halls is managed in one step."""
+
+    over_27_mean_k: Annotated[F64, Quantity("K")]
+    """Inlet temperature in excess of 27 C, mean over the servers; times hours, degree-hours."""
+    shi: Annotated[F64, Quantity("1")]
+    """Supply heat index, 0 when all inlets get supply air; see ``hall.air_metrics``."""
+    rti_pct: Annotated[F64, Quantity("%")]
+    """Return temperature index, above 100 where air recirculates on balance."""
+    rci_hi_pct: Annotated[F64, Quantity("%")]
+    """Rack cooling index at the high end, 100 without an inlet above 27 C."""
+    rci_lo_pct: Annotated[F64, Quantity("%")]
+    """Rack cooling index at the low end, 100 without an inlet below 18 C."""
+
+
+@dataclass
+class PlantQuantities:
+    """Heat, water temperatures and power of the plants in one step."""
+
+    heat_removed_w: Annotated[F64, Quantity("W")]
+    """Heat that the plant takes from the CRAC units."""
+    economiser_w: Annotated[F64, Quantity("W")]
+    """Heat that economiser, dry cooler or outdoor air takes past the chiller."""
+    chiller_load_w: Annotated[F64, Quantity("W")]
+    """Heat that the chiller takes off the chilled water."""
+    chiller_w: Annotated[F64, Quantity("W")]
+    """Electric power of the chiller."""
+    rejected_w: Annotated[F64, Quantity("W")]
+    """Heat that goes to the outside."""
+    chilled_water_c: Annotated[F64, Quantity("C")]
+    """Temperature of the chilled water supply."""
+    condenser_water_c: Annotated[F64, Quantity("C")]
+    """Temperature of the water that leaves the tower, or of the outdoor air that cools the
+    condenser."""
+    tower_fan_w: Annotated[F64, Quantity("W")]
+    """Electric power of the fans of tower, dry cooler or outdoor air."""
+    chilled_pump_w: Annotated[F64, Quantity("W")]
+    """Electric power of the chilled-water pumps."""
+    condenser_pump_w: Annotated[F64, Quantity("W")]
+    """Electric power of the pumps of condenser water, or of the dry cooler's loop."""
+
+
+@dataclass
+class RoomQuantities:
+    """Heat that the plants leave in the room or fetch from it in one step."""
+
+    unmet_w: Annotated[F64, Quantity("W")]
+    """Cooling load that is not removed and stays in the room."""
+    recovered_w: Annotated[F64, Quantity("W")]
+    """Heat held by the room earlier that spare capacity removes."""
+    room_heat_kwh: Annotated[F64, Quantity("kWh")]
+    """Heat held by the room at the end of the step, relative to that at the setpoint."""
+
+
+@dataclass
+class WaterQuantities:
+    """Water of towers and humidifiers in one step."""
+
+    evaporation_l: Annotated[F64, Quantity("l")]
+    """Water that tower, or humidifier of outdoor air, evaporates."""
+    drift_l: Annotated[F64, Quantity("l")]
+    """Water that leaves the tower as drops."""
+    blowdown_l: Annotated[F64, Quantity("l")]
+    """Water that is drained so that salt does not concentrate."""
+    water_l: Annotated[F64, Quantity("l")]
+    """Make-up water."""
+
+
+@dataclass
+class BatteryQuantities:
+    """Batteries in one step."""
+
+    stored_kwh: Annotated[F64, Quantity("kWh")]
+    """Energy in the battery at the end of the step."""
+    charge_kwh: Annotated[F64, Quantity("kWh")]
+    """Energy drawn from the grid into the battery."""
+    discharge_kwh: Annotated[F64, Quantity("kWh")]
+    """Energy delivered by the battery."""
+    battery_loss_kwh: Annotated[F64, Quantity("kWh")]
+    """Energy that the battery loses."""
+
+
+@dataclass
+class EnergyQuantities:
+    """Power, energy, emissions and cost of B data centers in one step."""
+
+    it_w: Annotated[F64, Quantity("W")]
+    """IT power, servers with their fans."""
+    hvac_w: Annotated[F64, Quantity("W")]
+    """Electric power of the devices that ``hvac.total_of`` names."""
+    ups_loss_w: Annotated[F64, Quantity("W")]
+    """Power that the UPS loses."""
+    distribution_loss_w: Annotated[F64, Quantity("W")]
+    """Power that transformers, PDUs and wiring lose behind the UPS."""
+    overhead_w: Annotated[F64, Quantity("W")]
+    """Power of the facility besides IT that the energy bought covers: ``hvac_w``, and with
+    ``electrical.losses: counted`` the losses of UPS and distribution."""
+    soc: Annotated[F64, Quantity("1")]
+    """State of charge of the battery at the end of the step, 0..1."""
+    it_kwh: Annotated[F64, Quantity("kWh")]
+    """IT energy."""
+    hvac_kwh: Annotated[F64, Quantity("kWh")]
+    """HVAC energy."""
+    grid_kwh: Annotated[F64, Quantity("kWh")]
+    """Energy bought from the grid."""
+    grid_overload_kwh: Annotated[F64, Quantity("kWh")]
+    """Energy bought beyond what the grid connection carries; part of ``grid_kwh``."""
+    unserved_kwh: Annotated[F64, Quantity("kWh")]
+    """Energy that facility and battery lack in an outage while there is power (see
+    ``powered``)."""
+    carbon_g: Annotated[F64, Quantity("g CO2e")]
+    """Emissions of the energy bought."""
+    energy_cost: Annotated[F64, Quantity("currency")]
+    """Price of the energy bought, without demand charges, in the currency of the tariff."""
+
+
+@dataclass
+class RackQuantities:
+    """Status of the racks at the end of a step, and the work that they did and lost."""
+
+    executed_tasks: Annotated[F64, Quantity("tasks")]
+    """Work that was done."""
+    lost_tasks: Annotated[F64, Quantity("tasks")]
+    """Work that had been started and found no server or went down with it."""
+    throttled_racks: Annotated[F64, Quantity("racks")]
+    """Racks that are throttled at the end of the step."""
+    tripped_racks: Annotated[F64, Quantity("racks")]
+    """Racks that have tripped and are off at the end of the step."""
+    rack_status: Annotated[Status, Quantity("", RACKS)]
+    """Status of each rack at the end of the step: 0 normal, 1 throttled, 2 tripped."""
+
+
+@dataclass
+class StepResult(
+    RackQuantities,
+    EnergyQuantities,
+    BatteryQuantities,
+    WaterQuantities,
+    RoomQuantities,
+    PlantQuantities,
+    AirIndices,
+    CracQuantities,
+    HallQuantities,
+    SetpointQuantities,
+    QueueQuantities,
+    WorkQuantities,
+    CommandQuantities,
+    SiteQuantities,
+):
     """Every quantity of one step.
 
     Powers are means over the step, energies and volumes are totals. 1 task is 1 % of the capacity
-    of a data center for one step. Arrays of a step are parts of a few larger ones: whoever keeps
-    some for long had better copy them.
+    of a data center for one step. Arrays of a step are parts of a few larger ones: copy those that
+    are kept for long.
     """
 
+    # A dataclass takes the fields of its last base first.
     step: int
     """Index of the step, 0 at reset."""
     step_h: float
     """Length of the step, in h."""
-    outdoor_c: F64
-    """Dry-bulb temperature outside, in C, (B,)."""
-    wet_bulb_c: F64
-    """Wet-bulb temperature outside, in C, (B,)."""
-    ci_g_per_kwh: F64
-    """Carbon intensity of the grid, in g CO2e/kWh, (B,)."""
-    demand: F64
-    """Work that arrives as a share of capacity, 0..1, (B,)."""
-    active_events: F64
-    """Number of events that cover the step, (B,)."""
-    price_per_kwh: F64
-    """Price of a kWh from the grid, in the currency of the tariff, (B,)."""
-    load_command: F64
-    """Share of what could be deferred (below 0) or drained (above 0), -1..1, (B,)."""
-    cooling_command: F64
-    """Steps by which the setpoints were to move, mean over the CRAC units, (B,); 0 where they
-    follow their schedule."""
-    battery_command: F64
-    """Share of the battery's power limit, discharged (below 0) or charged, -1..1, (B,)."""
-
-    utilisation: F64
-    """Work that was started, as a share of capacity, including ``lost_tasks``, (B,)."""
-    arrived_tasks: F64
-    """Work that arrived, in tasks, (B,)."""
-    executed_tasks: F64
-    """Work that was done, in tasks, (B,)."""
-    deferred_tasks: F64
-    """Work that entered the queue, in tasks, (B,)."""
-    drained_tasks: F64
-    """Work that left the queue on command, in tasks, (B,)."""
-    due_tasks: F64
-    """Queued work whose deadline had come at the start of the step, in tasks, (B,)."""
-    overdue_tasks: F64
-    """Due work that did not fit into the step, in tasks, (B,)."""
-    dropped_tasks: F64
-    """Work that found the queue full, in tasks, (B,); with model ``tasks`` it runs at once, as part
-    of ``executed_tasks``."""
-    lost_tasks: F64
-    """Work that had been started and found no server or went down with it, in tasks, (B,)."""
-    queue_tasks: F64
-    """Work in the queue at the end of the step, in tasks, (B,)."""
-    oldest_age_h: F64
-    """Age of the oldest work in the queue at the end of the step, in h, (B,)."""
-    mean_age_h: F64
-    """Mean age of the work in the queue at the end of the step, in h, (B,)."""
-
-    setpoint_c: F64
-    """Supply air setpoint, mean over the CRAC units, in C, (B,)."""
-    supply_c: F64
-    """Supply air temperature, the setpoint plus what unmet cooling has warmed the room by, mean
-    over the CRAC airflow, in C, (B,)."""
-    inlet_mean_c: F64
-    """Mean inlet of each rack, plain mean over the racks, in C, (B,)."""
-    inlet_max_c: F64
-    """Hottest inlet of a server, in C, (B,)."""
-    hottest_rack: F64
-    """Rack with the hottest inlet, counted from 0 in its data center, (B,)."""
-    hottest_server: F64
-    """Server with the hottest inlet, counted from 0 at the floor of its rack, (B,)."""
-    over_27_mean_k: F64
-    """Mean over the servers of the inlet temperature in excess of 27 C, in K, (B,); times hours,
-    degree-hours."""
-    shi: F64
-    """Supply heat index, 0 when all inlets get supply air, (B,); see ``hall.air_metrics``."""
-    rti_pct: F64
-    """Return temperature index, in %, above 100 where air recirculates on balance, (B,)."""
-    rci_hi_pct: F64
-    """Rack cooling index at the high end, in %, 100 without an inlet above 27 C, (B,)."""
-    rci_lo_pct: F64
-    """Rack cooling index at the low end, in %, 100 without an inlet below 18 C, (B,)."""
-    throttled_racks: F64
-    """Racks that are throttled at the end of the step, (B,)."""
-    tripped_racks: F64
-    """Racks that have tripped and are off at the end of the step, (B,)."""
-    outlet_mean_c: F64
-    """Outlet of each rack, plain mean over the racks, in C, (B,)."""
-    cpu_w: F64
-    """Power of the servers without their fans, in W, (B,)."""
-    it_fan_w: F64
-    """Power of the server fans, in W, (B,)."""
-    it_w: F64
-    """IT power, servers with their fans, in W, (B,)."""
-    it_airflow_m3s: F64
-    """Airflow through the servers, in m3/s, (B,)."""
-    crac_flow_m3s: F64
-    """Airflow of the CRAC units, in m3/s, (B,)."""
-    return_c: F64
-    """Temperature of the air that returns to the CRAC units, in C, (B,)."""
-    cooling_load_w: F64
-    """Heat that the CRAC units are to take from the room, in W, (B,)."""
-
-    chilled_water_c: F64
-    """Temperature of the chilled water supply, in C, (B,)."""
-    condenser_water_c: F64
-    """Temperature of the water that leaves the tower, or of the outdoor air that cools the
-    condenser, in C, (B,)."""
-    economiser_w: F64
-    """Heat that economiser, dry cooler or outdoor air takes past the chiller, in W, (B,)."""
-    chiller_load_w: F64
-    """Heat that the chiller takes off the chilled water, in W, (B,)."""
-    unmet_w: F64
-    """Cooling load that is not removed and stays in the room, in W, (B,)."""
-    recovered_w: F64
-    """Heat held by the room earlier that spare capacity removes, in W, (B,)."""
-    heat_removed_w: F64
-    """Heat that the plant takes from the CRAC units, in W, (B,)."""
-    rejected_w: F64
-    """Heat that goes to the outside, in W, (B,)."""
-    room_heat_kwh: F64
-    """Heat held by the room over that at the setpoint at the end of the step, in kWh, (B,)."""
-    thermal_storage_w: F64
-    """Heat that goes into servers and recirculated air in transient halls, in W, (B,)."""
-    chiller_w: F64
-    """Electric power of the chiller, in W, (B,)."""
-    tower_fan_w: F64
-    """Electric power of the fans of tower, dry cooler or outdoor air, in W, (B,)."""
-    chilled_pump_w: F64
-    """Electric power of the chilled-water pumps, in W, (B,)."""
-    condenser_pump_w: F64
-    """Electric power of the pumps of condenser water, or of the dry cooler's loop, in W, (B,)."""
-    crac_fan_w: F64
-    """Electric power of the CRAC fans, in W, (B,)."""
-    hvac_w: F64
-    """Electric power of the devices that ``hvac.total_of`` names, in W, (B,)."""
-    ups_loss_w: F64
-    """Power that the UPS loses, in W, (B,)."""
-    distribution_loss_w: F64
-    """Power that transformers, PDUs and wiring lose behind the UPS, in W, (B,)."""
-    overhead_w: F64
-    """Power of the facility beside IT that the energy bought covers, in W, (B,): ``hvac_w``, and
-    with ``electrical.losses: counted`` the losses of UPS and distribution."""
-
-    evaporation_l: F64
-    """Water that tower, or humidifier of outdoor air, evaporates, in l, (B,)."""
-    drift_l: F64
-    """Water that leaves the tower as drops, in l, (B,)."""
-    blowdown_l: F64
-    """Water that is drained so that salt does not concentrate, in l, (B,)."""
-    water_l: F64
-    """Make-up water, in l, (B,)."""
-
-    stored_kwh: F64
-    """Energy in the battery at the end of the step, in kWh, (B,)."""
-    soc: F64
-    """State of charge of the battery at the end of the step, 0..1, (B,)."""
-    charge_kwh: F64
-    """Energy drawn from the grid into the battery, in kWh, (B,)."""
-    discharge_kwh: F64
-    """Energy delivered by the battery, in kWh, (B,)."""
-    battery_loss_kwh: F64
-    """Energy that the battery loses, in kWh, (B,)."""
-    it_kwh: F64
-    """IT energy, in kWh, (B,)."""
-    hvac_kwh: F64
-    """HVAC energy, in kWh, (B,)."""
-    grid_kwh: F64
-    """Energy bought from the grid, in kWh, (B,)."""
-    grid_overload_kwh: F64
-    """Energy bought beyond what the grid connection carries, in kWh, (B,); part of ``grid_kwh``."""
-    unserved_kwh: F64
-    """Energy that facility and battery lack in an outage while there is power (see ``powered``), in
-    kWh, (B,)."""
-    carbon_g: F64
-    """Emissions of the energy bought, in g CO2e, (B,)."""
-    energy_cost: F64
-    """Price of the energy bought, without demand charges, in the currency of the tariff, (B,)."""
-    grid_up: F64
-    """1 with grid, 0 in an outage, (B,)."""
-    powered: F64
-    """Share of the step that the data center has power, 0..1, (B,)."""
-
-    unit_setpoint_c: F64
-    """Supply air setpoint of each CRAC unit, in C, (U,)."""
-    unit_supply_c: F64
-    """Supply air temperature of each CRAC unit, in C, (U,)."""
-    unit_flow_m3s: F64
-    """Airflow of each CRAC unit, in m3/s, (U,)."""
-    unit_running: F64
-    """1 for CRAC units that run, 0 for those that are down or without power, (U,)."""
-    rack_status: Status
-    """Status of each rack at the end of the step: 0 normal, 1 throttled, 2 tripped, (R,)."""
-    rack_cpu_w: Reals
-    """Power of the servers of each rack without their fans, in W, (R,)."""
-    rack_fan_w: Reals
-    """Power of the server fans of each rack, in W, (R,)."""
-    rack_airflow_m3s: Reals
-    """Airflow through each rack, in m3/s, (R,)."""
-    rack_inlet_c: Reals
-    """Inlet of each rack, mean over its servers, by airflow where air recirculates, in C, (R,)."""
-    rack_inlet_max_c: Reals
-    """Hottest inlet of a server of each rack, in C, (R,)."""
-    rack_outlet_c: Reals
-    """Outlet of each rack, in C, (R,)."""
-    rack_outlet_max_c: Reals
-    """Hottest outlet of a server of each rack, in C, (R,); in transient halls the highest of any
-    substep."""
+    unit_flow_m3s: Annotated[F64, Quantity("m3/s", CRAC_UNITS)]
+    """Airflow of each CRAC unit."""
 
     @property
     def rack_power_w(self) -> Reals:
@@ -396,16 +517,32 @@ class StepResult:
         return np.where(some, 1.0 + self.overhead_w / np.where(some, self.it_w, 1.0), np.inf)
 
     def per_dc(self) -> dict[str, F64]:
-        """All (B,) quantities by name, in the order of the fields."""
+        """All (B,) quantities by name, in the order of ``QUANTITIES``."""
         return dict(zip(_PER_DC, _values_per_dc(self), strict=True))
 
 
-_PER_DC = tuple(
-    f.name
-    for f in fields(StepResult)
-    if f.name not in ("step", "step_h") and not f.name.startswith(("rack_", "unit_"))
-)
+QUANTITIES: dict[str, Quantity] = {
+    name: hint.__metadata__[0]
+    for name, hint in get_type_hints(StepResult, include_extras=True).items()
+    if get_origin(hint) is Annotated
+}
+"""Unit and axis of each quantity of ``StepResult``, in the order of its fields."""
+_PER_DC = tuple(name for name, each in QUANTITIES.items() if each.axis == DATA_CENTERS)
 _values_per_dc = attrgetter(*_PER_DC)
+
+
+@cache
+def meanings() -> dict[str, str]:
+    """Meaning of each quantity of ``StepResult`` by name: the docstrings of its fields."""
+    texts: dict[str, str] = {}
+    for part in StepResult.__mro__[-2::-1]:
+        (declaration,) = ast.parse(inspect.getsource(part)).body
+        assert isinstance(declaration, ast.ClassDef)
+        for declared, text in pairwise(declaration.body):
+            if isinstance(declared, ast.AnnAssign) and isinstance(text, ast.Expr):
+                name, docstring = ast.unparse(declared.target), ast.literal_eval(text.value)
+                texts[name] = " ".join(docstring.split())
+    return {name: texts[name] for name in QUANTITIES}
 
 
 @dataclass(frozen=True, slots=True)

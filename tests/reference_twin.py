@@ -643,15 +643,16 @@ def steady(
         "under_18_sum_k": float(np.maximum(18.0 - inlet_c, 0.0).sum()),
         "inlet_m3k_s": float(flow @ (inlet_c - supply_c)),
         "outlet_m3k_s": float(rack_flow @ (outlet_c - supply_c)),
-        "crac_flow_m3s": float(moved.unit.sum()),
+        "units_flow_m3s": float(moved.unit.sum()),
         "supply_c": supply_c,
-        "return_c": return_c,
+        "units_return_c": return_c,
     }
     return Twin(
         {"inlet_c": inlet_c, "outlet_c": server_outlet_c, "power_w": heat},
         found,
         {name: np.array([value]) for name, value in dcs.items()}
-        | {"unit_flow_m3s": moved.unit, "unit_cubed_speed": running * moved.speed**3},
+        | {"unit_airflow_m3s": moved.unit}
+        | {"cubed_flow_m3s": np.array([(running * moved.unit * moved.speed**2).sum()])},
     )
 
 
@@ -779,10 +780,11 @@ def advance(
                 "under_18_sum_k": np.maximum(18 - inlet_c, 0).sum(),
                 "outlet_m3k_s": carried.sum() - rack_flow.sum() * warmth,
                 "thermal_storage_w": np.sum(capacity * (warmer - now.server_c)) / h + parcel_w,
-                "crac_flow_m3s": moved.unit.sum(),
-                "supply_c": warmth, "return_c": return_c,
-                "cooling_load_w": load_w, "coil_w": coil_w,
-                "unit_flow_m3s": moved.unit, "unit_cubed_speed": running * moved.speed**3,
+                "units_flow_m3s": moved.unit.sum(),
+                "supply_c": warmth, "units_return_c": return_c,
+                "units_load_w": load_w, "coil_w": coil_w,
+                "unit_airflow_m3s": moved.unit,
+                "cubed_flow_m3s": (running * moved.unit * moved.speed**2).sum(),
                 "rack_cpu_w": hall.per_rack(cpu), "rack_fan_w": hall.per_rack(fan),
                 "rack_airflow_m3s": rack_flow, "rack_inlet_c": rack_inlet,
                 "rack_outlet_c": outlet_c,

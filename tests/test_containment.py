@@ -38,7 +38,7 @@ def assert_at_design(shown: DesignHall, sums: HallSums) -> None:
     """Assert that the simulator finds the inlets and airflows that ``hall show`` prints."""
     np.testing.assert_allclose(sums.rack_inlet_c, shown.inlet_c, rtol=0, atol=1e-6)
     np.testing.assert_allclose(sums.rack_outlet_c, shown.outlet_c, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(sums.unit_flow_m3s, shown.unit_m3s, rtol=1e-6)
+    np.testing.assert_allclose(sums.unit_airflow_m3s, shown.unit_m3s, rtol=1e-6)
 
 
 @pytest.mark.parametrize("flow_model", FLOW_MODELS)
@@ -133,9 +133,9 @@ def test_fans_cover_what_their_racks_need_and_no_more() -> None:
     )
     cool, warm = simulated(config, 18.0), simulated(config, 23.0)
     shown = solve_design_hall(config)
-    assert np.all(cool.unit_flow_m3s < warm.unit_flow_m3s)
-    np.testing.assert_allclose(warm.unit_flow_m3s, shown.unit_m3s, rtol=1e-6)
+    assert np.all(cool.unit_airflow_m3s < warm.unit_airflow_m3s)
+    np.testing.assert_allclose(warm.unit_airflow_m3s, shown.unit_m3s, rtol=1e-6)
     idle = simulated(config, 18.0, load=0.0)
-    np.testing.assert_allclose(idle.unit_flow_m3s, low * shown.unit_m3s, rtol=1e-6)
+    np.testing.assert_allclose(idle.unit_airflow_m3s, low * shown.unit_m3s, rtol=1e-6)
     # Between lowest and full speed racks breathe the exhaust that their share says, no more.
     assert cool.inlet_mean_c[0] - 18.0 < 0.3 * 5.15

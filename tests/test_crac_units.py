@@ -329,7 +329,7 @@ def test_fans_follow_the_hottest_inlet_between_their_limits(
     )
     hall = Hall(fleet, "f32")
     found = hall.solve(met)
-    speed = found.unit_flow_m3s / fleet.unit_design_m3s
+    speed = found.unit_airflow_m3s / fleet.unit_design_m3s
     wanted = np.clip(1.0 + 0.7 * (found.inlet_max_c - target_c) / 4.0, 0.3, 1.0)
     np.testing.assert_allclose(speed, wanted, atol=1e-4)
     assert np.max(np.abs(np.diff(speed))) < 0.05

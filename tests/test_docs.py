@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from sdc_taichi.cli.app import app
 from sdc_taichi.run.folder_reader import read_run
-from sdc_taichi.types import StepResult
+from sdc_taichi.types import DATA_CENTERS, QUANTITIES, meanings
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGES_OF_COMMANDS = ("cli.md", "data.md", "fetch.md", "layout-solver.md")
@@ -79,11 +79,9 @@ def test_every_option_is_documented() -> None:
 
 def test_every_column_of_steps_is_documented(run_folder: Path) -> None:
     columns = list(pd.read_parquet(run_folder / "steps.parquet").columns)
-    assert sorted(names_in_first_column(section("run-folder.md", "steps.parquet"))) == sorted(
-        columns
-    )
-    # The two that name the row are those of the file alone.
-    assert set(columns) - {"dc", "time"} <= set(StepResult.__dataclass_fields__)
+    per_dc = [name for name, each in QUANTITIES.items() if each.axis == DATA_CENTERS]
+    assert columns == ["dc", "step", "time", *per_dc]
+    assert [*meanings()] == [*QUANTITIES]
 
 
 def test_every_metric_is_documented(run_folder: Path) -> None:

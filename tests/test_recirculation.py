@@ -185,7 +185,7 @@ def test_design_point_of_the_paper_comes_out() -> None:
     sums = at_design([load_config("corrected", ["hall.recirculation.calibrate=rack"])])
     approach_k = np.repeat([5.3, 5.0, 5.3], [5, 10, 5])
     np.testing.assert_allclose(sums.rack_inlet_c - 23.0, approach_k, rtol=0, atol=1e-9)
-    mean_return_k = sums.return_c[0] - np.mean(sums.rack_outlet_c)
+    mean_return_k = sums.units_return_c[0] - np.mean(sums.rack_outlet_c)
     assert mean_return_k == pytest.approx(-3.1, abs=1e-9)
     assert sums.inlet_mean_c[0] - 23.0 == pytest.approx(5.15, abs=1e-9)
 
@@ -218,7 +218,7 @@ def test_any_design_point_comes_out(seed: int) -> None:
         found, given = found.mean(), given.mean()
     np.testing.assert_allclose(found, given, rtol=0, atol=1e-9)
     if all(g.design_rise_k is None for rack in config.rack_groups() for g in rack):
-        mean_return_k = sums.return_c[0] - np.mean(sums.rack_outlet_c)
+        mean_return_k = sums.units_return_c[0] - np.mean(sums.rack_outlet_c)
         assert mean_return_k == pytest.approx(np.mean(hall.return_approach_k), abs=1e-9)
 
 
@@ -273,8 +273,8 @@ def test_all_power_leaves_with_the_air(precision: Precision, seed: int) -> None:
         assert heat_w == pytest.approx(power_w, rel=rel, abs=1e-6)
         assert left_over.sum() >= -1e-6
         # The kernel's own sums close without the help of another sweep.
-        carried = part.twin.air_j_per_m3_k * sums.crac_flow_m3s[i]
-        found = carried * (sums.return_c[i] - sums.supply_c[i])
+        carried = part.twin.air_j_per_m3_k * sums.units_flow_m3s[i]
+        found = carried * (sums.units_return_c[i] - sums.supply_c[i])
         assert found == pytest.approx(it_w, rel=TOLERANCE[precision], abs=1e-6 * carried)
 
 
@@ -320,8 +320,8 @@ def test_racks_loaded_alike_give_no_more_air_than_they_exhaust(
     heat_w, power_w, left_over = leaving(part, sums, layers)
     assert heat_w == pytest.approx(power_w, rel=1e-12)
     assert np.all(left_over >= 0)
-    rise_k = power_w / (part.twin.air_j_per_m3_k * sums.crac_flow_m3s[0])
-    assert sums.return_c[0] - supply_c == pytest.approx(rise_k, rel=1e-12)
+    rise_k = power_w / (part.twin.air_j_per_m3_k * sums.units_flow_m3s[0])
+    assert sums.units_return_c[0] - supply_c == pytest.approx(rise_k, rel=1e-12)
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

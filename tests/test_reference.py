@@ -768,7 +768,7 @@ def solve_even(config: DataCenterConfig, crac_flow_ratio: float) -> tuple[HallSu
 def rti_of(sums: HallSums) -> float:
     """Return temperature index as a ratio."""
     it_rise_k = air_metrics.it_rise_k(sums.inlet_m3k_s, sums.outlet_m3k_s, sums.it_airflow_m3s)
-    return float(air_metrics.rti(sums.return_c, sums.supply_c, it_rise_k)[0]) / 100.0
+    return float(air_metrics.rti(sums.units_return_c, sums.supply_c, it_rise_k)[0]) / 100.0
 
 
 def check_recirculation_of_a_row(check: Check) -> Values:
@@ -800,8 +800,8 @@ def check_recirculation_of_a_hall(check: Check) -> Values:
         "r": flows.exhaust_share,
         "W_row0": weights[0],
         "mean_approach": sums.inlet_mean_c[0] - supply_c,
-        "T_ret_minus_T_sup": sums.return_c[0] - supply_c,
-        "T_ret_minus_mean_T_out": sums.return_c[0] - np.mean(sums.rack_outlet_c),
+        "T_ret_minus_T_sup": sums.units_return_c[0] - supply_c,
+        "T_ret_minus_mean_T_out": sums.units_return_c[0] - np.mean(sums.rack_outlet_c),
         "min_s_over_V": np.min(left / airflow),
         "bypass_frac": 1.0 - flows.fresh_share,
     }
@@ -813,7 +813,7 @@ def check_crac_flow(check: Check) -> Values:
     for ratio in check["inputs"]["f"]:
         sums, supply_c = solve_even(config, ratio)
         found["mean_approach"].append(sums.inlet_mean_c[0] - supply_c)
-        found["T_ret_minus_T_sup"].append(sums.return_c[0] - supply_c)
+        found["T_ret_minus_T_sup"].append(sums.units_return_c[0] - supply_c)
         found["RTI"].append(rti_of(sums))
     return dict(found)
 

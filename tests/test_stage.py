@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from sdc_taichi import Simulator, drivers_from_arrays, load_config
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.kernels.compiler.stage import COPIED_UP_TO, SERIAL_UP_TO, CompiledStage
 from sdc_taichi.plant import workload
-from sdc_taichi.sim.facility import Facility, FacilityInputs
+from sdc_taichi.sim.facility import Facility, StepInputs
 from sdc_taichi.types import F64
 
 N = 37
@@ -128,7 +129,7 @@ def test_what_cannot_be_compiled_is_an_error(function: Callable[..., Any], messa
         compiled(function, x=np.ones(3))
 
 
-def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> dict[str, F64]:
+def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> dict[str, Any]:
     """Anything that a step may meet, with every branch of the models among it."""
     sized = facility_of.sizing
 
@@ -140,38 +141,46 @@ def random_inputs(facility_of: Simulator, rng: np.random.Generator, n: int) -> d
     it_w = sized.it_w * some(0.0, 1.1)
     inlet_m3k_s = flow_m3s * some(0.0, 5.0)
     return {
-        "plant_setpoint_c": setpoint_c,
-        "outdoor_c": some(-25.0, 45.0),
-        "wet_bulb_c": some(-26.0, 29.0),
-        "cpu_w": 0.9 * it_w,
-        "it_fan_w": 0.1 * it_w,
-        "it_airflow_m3s": sized.it_airflow_m3s * some(0.3, 1.1),
-        "over_27_sum_k": some(0.0, 100.0),
-        "under_18_sum_k": some(0.0, 100.0),
-        "inlet_m3k_s": inlet_m3k_s,
-        "outlet_m3k_s": inlet_m3k_s + it_w / 1210.0,
-        "supply_c": supply_c,
-        "outlet_mean_c": supply_c + some(5.0, 20.0),
-        "fan_speed": some(0.3, 1.0),
-        "crac_flow_m3s": flow_m3s,
-        "return_c": supply_c + some(0.0, 20.0),
-        "cubed_flow_m3s": flow_m3s * some(0.1, 1.0),
-        "cooling_load_w": it_w * some(0.8, 1.2),
-        "coil_w": it_w * some(0.8, 1.2),
-        "room_j": some(-1e6, 1e8),
-        "ci_g_per_kwh": some(0.0, 900.0),
-        "battery_command": rng.choice([-1.0, -0.3, 0.0, 0.5, 1.0], n),
-        "stored_kwh": sized.battery_kwh * rng.choice([0.0, 0.01, 0.5, 0.99, 1.0], n),
-        "room_heat_kwh": some(0.0, 50.0) * (rng.random(n) < 0.3),
-        "powered": rng.choice([0.0, 0.4, 1.0], n),
-        "grid_up": rng.choice([0.0, 1.0], n),
-        "pump_share": rng.choice([0.0, 0.5, 1.0], n),
-        "outdoor_units": rng.choice([0.0, 0.5, 1.0], n),
-        "chiller_share": rng.choice([0.0, 0.5, 1.0], n),
-        "coil_share": some(0.3, 1.0),
-        "coil_limit_w": it_w * some(0.5, 1.5),
-        "no_unit_down": (rng.random(n) < 0.8).astype(np.float64),
-        "price_per_kwh": some(0.0, 0.5),
+        "state": SimpleNamespace(
+            stored_kwh=sized.battery_kwh * rng.choice([0.0, 0.01, 0.5, 0.99, 1.0], n),
+            room_heat_kwh=some(0.0, 50.0) * (rng.random(n) < 0.3),
+        ),
+        "commands": SimpleNamespace(battery_command=rng.choice([-1.0, -0.3, 0.0, 0.5, 1.0], n)),
+        "surroundings": SimpleNamespace(
+            outdoor_c=some(-25.0, 45.0),
+            wet_bulb_c=some(-26.0, 29.0),
+            ci_g_per_kwh=some(0.0, 900.0),
+            price_per_kwh=some(0.0, 0.5),
+            powered=rng.choice([0.0, 0.4, 1.0], n),
+            grid_up=rng.choice([0.0, 1.0], n),
+            pump_share=rng.choice([0.0, 0.5, 1.0], n),
+            outdoor_units=rng.choice([0.0, 0.5, 1.0], n),
+            chiller_share=rng.choice([0.0, 0.5, 1.0], n),
+            no_unit_down=(rng.random(n) < 0.8).astype(np.float64),
+        ),
+        "supply": SimpleNamespace(
+            plant_setpoint_c=setpoint_c,
+            fan_speed=some(0.3, 1.0),
+            coil_share=some(0.3, 1.0),
+            coil_limit_w=it_w * some(0.5, 1.5),
+        ),
+        "air": SimpleNamespace(
+            cpu_w=0.9 * it_w,
+            it_fan_w=0.1 * it_w,
+            it_airflow_m3s=sized.it_airflow_m3s * some(0.3, 1.1),
+            over_27_sum_k=some(0.0, 100.0),
+            under_18_sum_k=some(0.0, 100.0),
+            inlet_m3k_s=inlet_m3k_s,
+            outlet_m3k_s=inlet_m3k_s + it_w / 1210.0,
+            supply_c=supply_c,
+            outlet_mean_c=supply_c + some(5.0, 20.0),
+            units_flow_m3s=flow_m3s,
+            units_return_c=supply_c + some(0.0, 20.0),
+            cubed_flow_m3s=flow_m3s * some(0.1, 1.0),
+            units_load_w=it_w * some(0.8, 1.2),
+            coil_w=it_w * some(0.8, 1.2),
+            room_j=some(-1e6, 1e8),
+        ),
     }
 
 
@@ -205,16 +214,17 @@ def test_facility_as_in_numpy(overrides: list[str] | str, event_free: bool) -> N
     with Simulator([load_config(preset, given)] * n, drivers=drivers) as sim:
         facility = Facility(sim.fleet, sim.sizing, event_free=event_free)
         inputs = random_inputs(sim, rng, n)
-    for run, names in (
-        (facility.step, facility.input_names),
-        (facility.removable_w, facility.plant_input_names),
-    ):
-        x = {name: inputs[name] for name in names}
+    plant_inputs = {name: inputs[name] for name in ("surroundings", "supply")}
 
-        def stage(run: Any = run, **x: F64) -> Any:
-            return run(FacilityInputs(**x))
+    def step(**stages: Any) -> dict[str, F64]:
+        return facility.step(StepInputs(**stages))
 
-        expected, found = stage(**x), CompiledStage(stage, n)(**x)
+    pairs: list[tuple[Any, dict[str, Any]]] = [
+        (step, inputs),
+        (facility.removable_w, plant_inputs),
+    ]
+    for stage, read in pairs:
+        expected, found = stage(**read), CompiledStage(stage, n)(**read)
         assert list(found) == list(expected)
         for name, values in found.items():
             # Differences of large numbers lose digits that both ways round differently.
@@ -237,8 +247,7 @@ def test_work_as_in_numpy(model: str) -> None:
     }
 
     def decide(**x: F64) -> dict[str, F64]:
-        work = workload.MODELS[model](**x)
-        return {name: getattr(work, name) for name in work.__slots__}
+        return vars(workload.MODELS[model](**x))
 
     expected = decide(**inputs)
     for name, values in CompiledStage(decide, n)(**inputs).items():

@@ -16,9 +16,8 @@ def work_step(
     queues = Queue(queue.shape[1], deadline_steps + workload.DUE_AFTER_STEPS[model])
     work = workload.MODELS[model](demand, command, *queues.begin_step(queue), **limits)
     after = queues.end_step(queue, work.dequeued_tasks, work.deferred_tasks)
-    own = {name: getattr(work, name) for name in work.__slots__}
     return SimpleNamespace(
-        **own,
+        **vars(work),
         oldest_age_steps=after.oldest_age_steps,
         mean_age_steps=after.mean_age_steps,
         queue=after.queue,

@@ -1,8 +1,8 @@
-"""Pages of the site that the code makes: the command line and the Python API.
+"""Pages of the site that the code makes: commands, quantities of a step, and the Python API.
 
     python docs/site/generate.py OUT
 
-writes ``commands.md`` and a page for each part of the API to OUT/reference/generated.
+writes ``commands.md``, ``quantities.md`` and a page for each part of the API to OUT/reference/generated.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import typer.main
 from stage import write
 
 from sdc_taichi.cli.app import app
+from sdc_taichi.types import CRAC_UNITS, DATA_CENTERS, QUANTITIES, RACKS, meanings
 
 FOLDER = "reference/generated"
 """Folder of the generated pages on the site."""
@@ -169,7 +170,7 @@ def main() -> None:
 
 def pages() -> dict[str, str]:
     """Markdown of each generated page by the name of its file."""
-    made = {"commands": commands_page(), "api": api_index()}
+    made = {"commands": commands_page(), "quantities": quantities_page(), "api": api_index()}
     return made | {f"api-{part.name}": api_page(part) for part in API}
 
 
@@ -241,6 +242,30 @@ def plain(text: str) -> str:
     text = re.split(r"\f", text)[0]
     paragraphs = [" ".join(each.split()) for each in re.split(r"\n\s*\n", text)]
     return "\n\n".join(re.sub(r"([<>*_`])", r"\\\1", each) for each in paragraphs)
+
+
+# --- Quantities of a step -------------------------------------------------------------------------
+
+
+def quantities_page() -> str:
+    """Every quantity of ``StepResult``."""
+    axes = {DATA_CENTERS: "data center", CRAC_UNITS: "CRAC unit", RACKS: "rack"}
+    lines = [
+        "# Quantities of a step",
+        "",
+        "Every quantity of `StepResult`: an array with one entry per data center, CRAC unit or "
+        "rack. Those per data center are the columns of `steps.parquet` ([files of a run]"
+        "(../../run-folder.md)). Powers are means over the step; energies, volumes and tasks are "
+        "totals of the step.",
+        "",
+        "| name | unit | per | meaning |",
+        "|---|---|---|---|",
+    ]
+    for name, meaning in meanings().items():
+        quantity = QUANTITIES[name]
+        cells = (f"`{name}`", quantity.unit, axes[quantity.axis], meaning.replace("``", "`"))
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
 
 
 # --- The API --------------------------------------------------------------------------------------

@@ -8,10 +8,10 @@ and a temporary per operation, and some hundred of them cost more than the arith
 are thousands of data centers.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from hashlib import sha256
-from operator import itemgetter
+from operator import attrgetter
 from typing import Any, no_type_check
 
 import numpy as np
@@ -23,7 +23,7 @@ from .arrays import F64_LANES, unpadded, vector_rows
 from .functions import SLICE, larger, smaller
 from .launch import BoundKernel
 from .source import define
-from .trace import Trace
+from .trace import Trace, TracedObject
 
 Arrays = Mapping[str, Any]
 
@@ -39,23 +39,20 @@ class CompiledStage:
     """A stage function that runs as one kernel.
 
     Args:
-        stage: function of arrays (n,) by name that returns arrays (n,), or numbers, by name. It may
-            use arithmetic, comparisons and the NumPy functions of ``trace.py``, but no branch on
-            values. It never changes its arguments, and infinities and NaN are no numbers here.
+        stage: function of arrays (n,), and of objects with arrays (n,) as attributes, by name. It
+            returns arrays (n,), or numbers, by name. It may use arithmetic, comparisons and the
+            NumPy functions of ``trace.py``, but no branch on values. It never changes its
+            arguments, and infinities and NaN are no numbers here. Which attributes it reads is
+            found when it is compiled, so later calls need no others.
         size: n.
-        reads: names of the arguments that ``select`` finds; None where it is not called.
     """
 
-    def __init__(
-        self, stage: Callable[..., Arrays], size: int, *, reads: Sequence[str] | None = None
-    ) -> None:
+    def __init__(self, stage: Callable[..., Arrays], size: int) -> None:
         self._stage: Callable[..., Arrays] | None = stage
         self._size = size
-        self._reads = tuple(reads or ())
-        self._values_read = itemgetter(*self._reads) if reads else None
         self._kernel: BoundKernel | None = None
 
-    def __call__(self, **inputs: npt.NDArray[np.float64]) -> dict[str, npt.NDArray[np.float64]]:
+    def __call__(self, **inputs: Any) -> dict[str, npt.NDArray[np.float64]]:
         """Results by name, each (n,): rows of one new array.
 
         Raises:
@@ -65,18 +62,7 @@ class CompiledStage:
         self._set_inputs(inputs)
         return self._new_results()
 
-    def select(self, quantities: Arrays) -> dict[str, npt.NDArray[np.float64]]:
-        """Results by name, as of a call with those of ``quantities`` that the stage reads.
-
-        Raises:
-            TypeError: the stage does what cannot be compiled.
-            KeyError: a quantity that the stage reads is missing.
-        """
-        assert self._values_read is not None, "made without reads"
-        self._copy_inputs(self._reads, self._values_read(quantities))
-        return self._new_results()
-
-    def rows(self, **inputs: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def rows(self, **inputs: Any) -> npt.NDArray[np.float64]:
         """Results in their order, (number of results, n); the next call overwrites them.
 
         Raises:
@@ -88,18 +74,16 @@ class CompiledStage:
         return self._results
 
     def _set_inputs(self, inputs: Arrays) -> None:
-        """Take arguments by name, which are the same in every call."""
-        names = tuple(inputs)
-        if self._kernel is not None and names != self._input_names:
-            raise TypeError(
-                f"arguments {[*names]}, expected {[*self._input_names]} as on the first call"
-            )
-        self._copy_inputs(names, inputs.values())
-
-    def _copy_inputs(self, names: tuple[str, ...], values: Iterable[Any]) -> None:
-        """Copy values to the rows of the kernel, which the first call compiles."""
+        """Copy arguments, of the names of the first call, to the rows of the kernel."""
         if self._kernel is None:
-            self._compile(names)
+            self._compile(inputs)
+        elif tuple(inputs) != self._names:
+            raise TypeError(
+                f"arguments {[*inputs]}, expected {[*self._names]} as on the first call"
+            )
+        values: Iterable[Any] = inputs.values()
+        if self._readers:
+            values = [x for read, of in zip(self._readers, values, strict=True) for x in read(of)]
         for row, value in zip(self._input_rows, values, strict=True):
             row[...] = value
 
@@ -119,27 +103,42 @@ class CompiledStage:
         serial = self._size <= SERIAL_UP_TO
         self._kernel(serial, 1, self._shared, self._constants, self._inputs, out)
 
-    def _compile(self, names: tuple[str, ...]) -> None:
+    def _compile(self, inputs: Arrays) -> None:
         assert self._stage is not None
         trace = Trace(self._size)
-        inputs = {name: trace.entry(f"inputs[{row}, i]") for row, name in enumerate(names)}
-        results = {name: trace.lift(x) for name, x in self._stage(**inputs).items()}
-        self._input_names, self._result_names = names, tuple(results)
+        traced = {name: trace.argument(value) for name, value in inputs.items()}
+        results = {name: trace.lift(x) for name, x in self._stage(**traced).items()}
+        self._names, self._result_names = tuple(inputs), tuple(results)
+        self._readers = []
+        """For each argument what returns its arrays; empty if all arguments are arrays."""
+        if any(isinstance(x, TracedObject) for x in traced.values()):
+            self._readers = [_reader(x) for x in traced.values()]
         self._shared = np.array([*trace.shared, 0.0])
         constants = trace.constants or [np.zeros(self._size)]
         self._constants, self._inputs, self._outputs = (
-            vector_rows(len(x), self._size) for x in (constants, names, results)
+            vector_rows(n, self._size) for n in (len(constants), trace.inputs or 1, len(results))
         )
         for rows in (self._constants, self._inputs):
             rows[:] = 0.0
         unpadded(self._constants, self._size)[:] = constants
-        self._input_rows = list(unpadded(self._inputs, self._size))
+        rows = unpadded(self._inputs, self._size)
+        self._input_rows = [rows[i] for x in traced.values() for i in x.rows]
         self._results: npt.NDArray[np.float64] = unpadded(self._outputs, self._size)
         source = _source(trace.statements(list(results.values())))
         self._kernel = BoundKernel(_kernel(source), templates=1)
         # A function that is a method of the stage's owner would make a cycle of references, which
         # only the garbage collector frees, with all arrays that the object holds.
         self._stage = None
+
+
+def _reader(argument: Any) -> Callable[[Any], Iterable[Any]]:
+    """What returns those arrays of an argument that the stage reads, in the order of its rows."""
+    if not isinstance(argument, TracedObject):
+        return lambda array: (array,)
+    names = [*argument.read]
+    if len(names) > 1:
+        return attrgetter(*names)
+    return lambda record: [getattr(record, name) for name in names]
 
 
 def _source(body: list[str]) -> str:

@@ -43,10 +43,11 @@ class Traced(NDArrayOperatorsMixin):
         trace: the trace that it belongs to.
         at: number of the operation whose result it is.
         truth: whether it is true or false instead of a number.
+        rows: row of the inputs that it is, if it is an argument.
     """
 
-    def __init__(self, trace: "Trace", at: int, truth: bool) -> None:
-        self.trace, self.at, self.truth = trace, at, truth
+    def __init__(self, trace: "Trace", at: int, truth: bool, rows: tuple[int, ...] = ()) -> None:
+        self.trace, self.at, self.truth, self.rows = trace, at, truth, rows
 
     def __array_ufunc__(self, ufunc: Any, method: str, *given: Any, **more: Any) -> "Traced":
         if method != "__call__" or more:
@@ -81,6 +82,33 @@ class Traced(NDArrayOperatorsMixin):
         raise TypeError("a compiled stage cannot branch on values; use np.where")
 
 
+class TracedObject:
+    """An argument whose arrays are its attributes; those that the function reads are written down.
+
+    Args:
+        trace: the trace that it belongs to.
+        value: the object.
+    """
+
+    def __init__(self, trace: "Trace", value: Any) -> None:
+        self._trace, self._value = trace, value
+        self.read: dict[str, Traced] = {}
+        """Quantities that have been read, by the names of their attributes."""
+
+    @property
+    def rows(self) -> list[int]:
+        """Rows of the inputs that hold the attributes read, in their order."""
+        return [row for quantity in self.read.values() for row in quantity.rows]
+
+    def __getattr__(self, name: str) -> Traced:
+        if name not in self.read:
+            value = getattr(self._value, name)
+            if np.shape(value) != (self._trace.size,):
+                raise TypeError(f"{name}: only arrays ({self._trace.size},) can be compiled")
+            self.read[name] = self._trace.argument(value)
+        return self.read[name]
+
+
 class Trace:
     """Operations of a function on arrays (n,), each different operation once.
 
@@ -89,7 +117,9 @@ class Trace:
     """
 
     def __init__(self, size: int) -> None:
-        self._size = size
+        self.size = size
+        self.inputs = 0
+        """Number of arrays that are arguments, or attributes of them."""
         self._operations: dict[tuple[str, tuple[int, ...]], int] = {}
         self._known: dict[int, tuple[str, Any]] = {}
         """Text that reads a constant, and the constant, by its identity."""
@@ -97,6 +127,14 @@ class Trace:
         """Constants that are the same for all entries, which need not be read for each."""
         self.constants: list[Any] = []
         """Constants that differ between entries, each (n,)."""
+
+    def argument(self, value: Any) -> Any:
+        """A quantity in a row of the inputs for an array or number; an object for its arrays."""
+        if not isinstance(value, np.ndarray | float | int):
+            return TracedObject(self, value)
+        row, self.inputs = self.inputs, self.inputs + 1
+        at = self.entry(f"inputs[{row}, i]").at
+        return Traced(self, at, truth=False, rows=(row,))
 
     def entry(self, text: str, *, of: tuple[int, ...] = (), truth: bool = False) -> Traced:
         """The result of an operation.
@@ -142,8 +180,8 @@ class Trace:
                 raise TypeError(f"{value}: only finite numbers can be compiled")
             # Literals without a type would be rounded to f32.
             return self.entry(f"zeros + ti.f64({float(array)!r})")
-        if array.shape != (self._size,):
-            raise TypeError(f"constant of shape {array.shape}, expected ({self._size},)")
+        if array.shape != (self.size,):
+            raise TypeError(f"constant of shape {array.shape}, expected ({self.size},)")
         if id(value) not in self._known:
             if np.all(array == array[0]):
                 text = f"zeros + shared[{len(self.shared)}]"

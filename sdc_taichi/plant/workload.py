@@ -14,32 +14,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.types import F64
+from sdc_taichi.types import F64, WorkQuantities
 
 TASKS_PER_STEP = 100.0
 """Capacity of a data center for one step."""
 
 
-@dataclass(frozen=True, slots=True)
-class Work:
+@dataclass
+class Work(WorkQuantities):
     """Amounts of work that arrive, start, wait and leave in one step of B data centers."""
 
-    utilisation: F64
-    """Work that starts, as a share of capacity, 0..1, (B,)."""
-    arrived_tasks: F64
-    """Work that arrives, in tasks, (B,)."""
     started_tasks: F64
     """Work that starts, in tasks, (B,)."""
-    deferred_tasks: F64
-    """Work that enters the queue, in tasks, (B,)."""
-    drained_tasks: F64
-    """Work that leaves the queue on command, in tasks, (B,)."""
-    due_tasks: F64
-    """Queued work whose deadline has come, in tasks, (B,)."""
-    overdue_tasks: F64
-    """Due work that does not fit into the step, in tasks, (B,)."""
-    dropped_tasks: F64
-    """Work that finds the queue full, in tasks, (B,); with ``tasks`` it starts all the same."""
     dequeued_tasks: F64
     """Work that leaves the queue, drained or due, in tasks, (B,)."""
 

@@ -11,22 +11,24 @@ import numpy as np
 from sdc_taichi.errors import SdcError
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.unit_index import UnitIndex
-from sdc_taichi.types import F64, Actions, BatteryAction, CoolAction, FanAction, LoadAction
+from sdc_taichi.types import (
+    F64,
+    Actions,
+    BatteryAction,
+    CommandQuantities,
+    CoolAction,
+    FanAction,
+    LoadAction,
+)
 
 MOST_MOVES = 1e6
 """Most steps by which a setpoint or a fan may be told to move, far beyond the range of either."""
 
 
 @dataclass
-class Commands:
+class Commands(CommandQuantities):
     """Actions of one step as arrays: B data centers, U CRAC units, G server groups."""
 
-    load_command: F64
-    """Share of what can be deferred (below 0) or drained (above 0), -1..1, (B,)."""
-    battery_command: F64
-    """Share of the battery's power limit, discharged (below 0) or charged, -1..1, (B,)."""
-    cooling_command: F64
-    """Steps by which the setpoints move, mean over the CRAC units, (B,)."""
     unit_cooling_command: F64
     """Steps by which the setpoint of each CRAC unit moves, (U,)."""
     follows_schedule: bool

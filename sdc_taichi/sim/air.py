@@ -6,6 +6,7 @@ step to step are fields of ``State``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
@@ -13,7 +14,6 @@ import numpy as np
 
 from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.crac_units import Supply
-from sdc_taichi.sim.facility_stage import FacilityStage
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
 from sdc_taichi.sim.hall_state import HallState
@@ -86,7 +86,7 @@ class TransientAir:
         fleet: B data centers.
         hall: Their halls.
         sizing: Their sized devices.
-        facility: What limits the heat that the coils can take.
+        removable_w: Heat that the plant can take during a step, in W, (B,).
         keep_inlets: Whether placement needs the inlets of the last step.
     """
 
@@ -95,11 +95,11 @@ class TransientAir:
         fleet: Fleet,
         hall: Hall,
         sizing: Sizing,
-        facility: FacilityStage,
+        removable_w: Callable[[Surroundings, Supply], F64],
         *,
         keep_inlets: bool,
     ) -> None:
-        self._hall, self._facility = hall, facility
+        self._hall, self._removable_w = hall, removable_w
         self._step_s = 1.0 / fleet.steps_per_hour * 3600.0
         self._substep_s = fleet.configs[0].simulation.substep_s
         self._room_j_per_k = sizing.room_kwh_per_k * J_PER_KWH
@@ -130,7 +130,7 @@ class TransientAir:
             setpoint_c=supply.coldest_supply_c,
             room_j=state.room_heat_kwh * J_PER_KWH,
             room_j_per_k=self._room_j_per_k,
-            limit_w=self._facility.removable_w(supply, surroundings),
+            limit_w=self._removable_w(surroundings, supply),
             fan_w_per_m3s=self._fan_w_per_m3s * surroundings.powered,
         )
         air, after = self._hall.advance(

@@ -14,20 +14,16 @@ from sdc_taichi.sim.drivers import FleetSeries, fleet_series
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.surroundings import Surroundings
 from sdc_taichi.sim.unit_index import UnitIndex
-from sdc_taichi.types import F64, I64, State
+from sdc_taichi.types import F64, I64, SetpointQuantities, State
 
 
 @dataclass
-class Supply:
+class Supply(SetpointQuantities):
     """How the CRAC units run during one step: B data centers, U units."""
 
-    unit_setpoint_c: F64
-    """Setpoint of each unit, in C, (U,)."""
     coldest_supply_c: F64
     """Coldest supply air of each unit, in C, (U,): its setpoint, less the design rise of the air
     where that is of the return air."""
-    setpoint_c: F64
-    """Setpoint, mean over the units, in C, (B,)."""
     cooling_run: I64
     """Equal cooling commands in a row that each unit has had, (U,)."""
     cooling_last: F64

@@ -117,7 +117,7 @@ def solve_design_hall(config: DataCenterConfig) -> DesignHall:
         inlet_max_c=np.asarray(sums.rack_inlet_max_c, dtype=np.float64),
         outlet_c=np.asarray(sums.rack_outlet_c, dtype=np.float64),
         unit_m3s=fleet.unit_design_m3s,
-        design_flow_m3s=float(sums.crac_flow_m3s[0] or fleet.design_flow_m3s[0]),
+        design_flow_m3s=float(sums.units_flow_m3s[0] or fleet.design_flow_m3s[0]),
         unit_places_m=unit_places_m(plan, fleet.units),
         hottest_rack=rack,
         hottest_server=int(fleet.server_offsets[group] - first_server),
@@ -136,8 +136,8 @@ def _air_flows(fleet: Fleet, sums: HallSums, approach_k: F64, supply_c: float) -
         np.asarray(sums.rack_outlet_c - supply_c, dtype=np.float64)
     )
     share = np.maximum(approach_k / mix_over_supply_k, 0.0)
-    flow_m3s = float(sums.crac_flow_m3s[0])
-    return_c = float(sums.return_c[0])
+    flow_m3s = float(sums.units_flow_m3s[0])
+    return_c = float(sums.units_return_c[0])
     inlet_rise, outlet_rise = sums.inlet_m3k_s, sums.outlet_m3k_s
     rise_k = air_metrics.it_rise_k(inlet_rise, outlet_rise, sums.it_airflow_m3s)
     bypass_share = 1.0 - float(np.sum((1.0 - share) * airflow_m3s)) / flow_m3s

@@ -6,7 +6,7 @@ One pass over B data centers, plain NumPy, which a step runs compiled. Quantitie
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -23,11 +23,25 @@ from sdc_taichi.plant.plants import DRY_PLANTS, PLANTS
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterUse
 from sdc_taichi.plant.water_side import WaterSideResult
+from sdc_taichi.sim.actions import Commands
+from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
+from sdc_taichi.sim.hall_solver import HallSums
+from sdc_taichi.sim.physical_limits import within_limits
 from sdc_taichi.sim.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k, sites_pressure_pa
-from sdc_taichi.types import F64, StepResult, as_array, fields_of
+from sdc_taichi.sim.surroundings import Surroundings
+from sdc_taichi.types import (
+    F64,
+    QUANTITIES,
+    AirIndices,
+    CracQuantities,
+    RoomQuantities,
+    State,
+    as_array,
+    fields_of,
+    joined,
+)
 
-NOT_USED = cast(F64, None)
 BATTERY_PARAMETERS = (
     "charge_efficiency",
     "discharge_factor",
@@ -39,137 +53,22 @@ BATTERY_PARAMETERS = (
     "lower_v",
 )
 """Parameters of the battery models, by their names as arguments and in section ``battery``."""
-_PLANT_INPUTS = ("plant_setpoint_c", "outdoor_c", "wet_bulb_c")
-_PLANT_EVENT_INPUTS = ("powered", "chiller_share", "pump_share", "outdoor_units", "coil_share")
-_STEP_INPUTS = (
-    "cpu_w",
-    "it_fan_w",
-    "it_airflow_m3s",
-    "over_27_sum_k",
-    "under_18_sum_k",
-    "inlet_m3k_s",
-    "outlet_m3k_s",
-    "supply_c",
-    "ci_g_per_kwh",
-    "price_per_kwh",
-    "battery_command",
-    "stored_kwh",
-    "room_heat_kwh",
-)
-_RECIRCULATION_INPUTS = ("crac_flow_m3s", "return_c", "cubed_flow_m3s")
-_APPROACH_INPUTS = ("outlet_mean_c", "fan_speed")
-_TRANSIENT_INPUTS = ("cooling_load_w", "coil_w", "room_j")
-_EVENT_INPUTS = ("grid_up", "no_unit_down")
-_RESULTS = {f.name for f in fields(StepResult)}
 
 
 @dataclass(frozen=True, slots=True)
-class FacilityInputs:
-    """Inputs of a step of B data centers; those that no model of a fleet reads are left out.
+class StepInputs:
+    """What a step of the facility starts from: the results of the stages before it."""
 
-    Sums go over the CRAC units, racks or servers of a data center.
-    """
-
-    plant_setpoint_c: F64
-    """Supply air setpoint that the chilled water follows, in C, (B,)."""
-    outdoor_c: F64
-    """Dry-bulb temperature outside, in C, (B,)."""
-    wet_bulb_c: F64
-    """Wet-bulb temperature outside, in C, (B,)."""
-
-    cpu_w: F64 = NOT_USED
-    """Power of the processors, in W, (B,)."""
-    it_fan_w: F64 = NOT_USED
-    """Power of the server fans, in W, (B,)."""
-    it_airflow_m3s: F64 = NOT_USED
-    """Airflow through the servers, in m3/s, (B,)."""
-    over_27_sum_k: F64 = NOT_USED
-    """Sum over the servers of the inlet temperature in excess of 27 C, in K, (B,)."""
-    under_18_sum_k: F64 = NOT_USED
-    """Sum over the servers of the inlet temperature's shortfall below 18 C, in K, (B,)."""
-    inlet_m3k_s: F64 = NOT_USED
-    """Sum over the racks of airflow times inlet temperature over supply, in m3 K/s, (B,)."""
-    outlet_m3k_s: F64 = NOT_USED
-    """Sum over the racks of airflow times outlet temperature over supply, in m3 K/s, (B,)."""
-    supply_c: F64 = NOT_USED
-    """Supply air temperature, mean over the CRAC airflow, in C, (B,)."""
-    outlet_mean_c: F64 = NOT_USED
-    """Outlet temperature, plain mean over the racks, in C, (B,); for inlet model ``approach``."""
-    fan_speed: F64 = NOT_USED
-    """Controlled speed of the CRAC fan over design speed, (B,); for inlet model ``approach``."""
-    crac_flow_m3s: F64 = NOT_USED
-    """Airflow of the CRAC units, in m3/s, (B,); for halls that recirculate."""
-    return_c: F64 = NOT_USED
-    """Temperature of the air that returns to the CRAC units, in C, (B,); for halls that
-    recirculate."""
-    cubed_flow_m3s: F64 = NOT_USED
-    """Sum over the CRAC units of design airflow times the mean cube of the fan speed over design
-    speed, in m3/s, (B,); for halls that recirculate."""
-    cooling_load_w: F64 = NOT_USED
-    """Heat of air and fans that reaches the CRAC units, in W, (B,); for transient halls."""
-    coil_w: F64 = NOT_USED
-    """Heat that the coils take out, in W, (B,); for transient halls."""
-    room_j: F64 = NOT_USED
-    """Heat held by the room at the end of the step over that at the setpoint, in J, (B,); for
-    transient halls."""
-
-    ci_g_per_kwh: F64 = NOT_USED
-    """Carbon intensity of the grid, in g CO2 per kWh, (B,)."""
-    price_per_kwh: F64 = NOT_USED
-    """Price of a kWh from the grid, in the currency of the tariff, (B,)."""
-    battery_command: F64 = NOT_USED
-    """Share of the battery's power limit, discharged (below 0) or charged, -1..1, (B,)."""
-    stored_kwh: F64 = NOT_USED
-    """Energy in the battery at the start of the step, in kWh, (B,)."""
-    room_heat_kwh: F64 = NOT_USED
-    """Heat held by the room at the start of the step, in kWh, (B,)."""
-
-    powered: F64 = NOT_USED
-    """Share of the step with power, 0..1, (B,); for fleets with events."""
-    grid_up: F64 = NOT_USED
-    """1 with grid, 0 in an outage, (B,); for fleets with events."""
-    chiller_share: F64 = NOT_USED
-    """Share of the chiller's capacity that is available, 0..1, (B,); for fleets with events."""
-    pump_share: F64 = NOT_USED
-    """Share of the chilled-water pumps that are in order, 0..1, (B,); for fleets with events."""
-    outdoor_units: F64 = NOT_USED
-    """Share of tower cells, dry coolers or openings for outdoor air that are in order, 0..1, (B,);
-    for fleets with events."""
-    coil_share: F64 = NOT_USED
-    """Airflow at full speed of the CRAC units that run over that of the design point, at most 1,
-    (B,); for fleets with events."""
-    no_unit_down: F64 = NOT_USED
-    """1 if all CRAC units run, 0 if one is down, (B,); for fleets with events."""
-    coil_limit_w: F64 = NOT_USED
-    """Capacity of the coils of the CRAC units that run, in W, (B,); for fleets with such limits."""
-
-
-@dataclass(frozen=True, slots=True)
-class _CracAir:
-    """Air of the CRAC units of B data centers in one step."""
-
-    crac_flow_m3s: F64
-    """Airflow of the CRAC units, in m3/s, (B,)."""
-    crac_fan_w: F64
-    """Power of the CRAC fans, in W, (B,)."""
-    supply_c: F64
-    """Supply air temperature, mean over the CRAC airflow, in C, (B,)."""
-    return_c: F64
-    """Temperature of the air that returns to the CRAC units, in C, (B,)."""
-    cooling_load_w: F64
-    """Heat that the CRAC units take from the room, in W, (B,)."""
-
-
-@dataclass(frozen=True, slots=True)
-class _HeatBalance:
-    """Heat that the plants of B data centers leave in the room or fetch from it in one step."""
-
-    unmet_w: F64
-    """Cooling load that is not removed, in W, (B,)."""
-    recovered_w: F64
-    """Heat held earlier that is removed, in W, (B,)."""
-    room_heat_kwh: F64
-    """Heat held by the room at the end of the step, in kWh, (B,)."""
+    state: State
+    """State at the start of the step: energy in the battery, heat held by the room."""
+    commands: Commands
+    """What the battery is to do."""
+    surroundings: Surroundings
+    """Weather, carbon intensity, price, grid, and what is out of order."""
+    supply: Supply
+    """How the CRAC units run."""
+    air: HallSums
+    """Air, temperatures and power of the halls."""
 
 
 class Facility:
@@ -227,29 +126,22 @@ class Facility:
         self._return_approach_k = mean_return_approach_k(fleet)
         self._fan_w_per_m3s = sizing.crac_fan_w / sizing.crac_flow_m3s
         self._limits_coils = bool(np.any(fleet.unit_capacity_w < NO_LIMIT_W))
-        self.plant_input_names = (
-            *_PLANT_INPUTS,
-            *(() if event_free else _PLANT_EVENT_INPUTS),
-            *(("coil_limit_w",) if self._limits_coils else ()),
-        )
-        """Names of the inputs that ``removable_w`` reads."""
-        self.input_names = (
-            *self.plant_input_names,
-            *_STEP_INPUTS,
-            *(_RECIRCULATION_INPUTS if self._recirculates else _APPROACH_INPUTS),
-            *(_TRANSIENT_INPUTS if self._transient else ()),
-            *(() if event_free else _EVENT_INPUTS),
-        )
-        """Names of the inputs that ``step`` reads."""
 
-    def removable_w(self, inputs: FacilityInputs) -> dict[str, F64]:
-        """Heat that the plant can take with the coils in use, W, as ``heat_removed_w``, (B,)."""
-        capacity_w, flow_m3s = self._coil_capacity_w(inputs), self._sizing.crac_flow_m3s
+    def removable_w(self, surroundings: Surroundings, supply: Supply) -> dict[str, F64]:
+        """Heat that the plant can take with the coils in use, W, as ``heat_removed_w``, (B,).
+
+        Args:
+            surroundings: Weather, and what is out of order.
+            supply: How the CRAC units run.
+        """
+        capacity_w = self._coil_capacity_w(surroundings, supply)
+        flow_m3s = self._sizing.crac_flow_m3s
         rise_k = self._sizing.water_side.cooling_w / (self._air_j_per_m3_k * flow_m3s)
-        plant = self._operate(capacity_w, inputs, inputs.plant_setpoint_c + rise_k, flow_m3s)
+        return_c = supply.plant_setpoint_c + rise_k
+        plant = self._operate(capacity_w, surroundings, supply, return_c, flow_m3s)
         return {"heat_removed_w": plant.heat_removed_w}
 
-    def step(self, inputs: FacilityInputs) -> dict[str, F64]:
+    def step(self, inputs: StepInputs) -> dict[str, F64]:
         """Everything that follows from the air of the halls.
 
         Args:
@@ -258,24 +150,22 @@ class Facility:
         Returns:
             Quantities of ``StepResult`` by their names there, each (B,).
         """
-        it_w = inputs.cpu_w + inputs.it_fan_w
+        it_w = inputs.air.cpu_w + inputs.air.it_fan_w
         air = self._crac_air(inputs, it_w)
-        requested_w = self._requested_w(inputs, air)
-        plant = self._operate(requested_w, inputs, air.return_c, air.crac_flow_m3s)
+        plant = self._operate(
+            self._requested_w(inputs, air),
+            inputs.surroundings,
+            inputs.supply,
+            air.return_c,
+            air.crac_flow_m3s,
+        )
         heat = self._balance_heat(inputs, air, plant)
         water = self._use_water(inputs, air, plant)
-        hvac_w = self._hvac_w(air, plant)
-        found: dict[str, Any] = {
-            "it_w": it_w,
-            "hvac_w": hvac_w,
-            **fields_of(air),
-            **fields_of(plant),
-            **fields_of(heat),
-            **fields_of(water),
-            **self._energy(inputs, it_w, hvac_w),
-            **self._air_indices(inputs, air),
-        }
-        return {name: values for name, values in found.items() if name in _RESULTS}
+        energy = self._energy(inputs, it_w, self._hvac_w(air, plant))
+        indices = self._air_indices(inputs.air, air.return_c)
+        found = joined(*map(fields_of, (air, plant, heat, water, indices)), energy)
+        # The plant's flows of water and air are no results.
+        return {name: values for name, values in found.items() if name in QUANTITIES}
 
     def powered_share(self, grid_up: npt.NDArray[np.bool_], stored_kwh: F64) -> F64:
         """Share of a step with power, 0..1, (B,).
@@ -298,100 +188,110 @@ class Facility:
         lasts = np.minimum(carried_kwh / (design_kw * self._step_h), 1.0)
         return np.where(grid_up, all_step, lasts)
 
-    def _crac_air(self, inputs: FacilityInputs, it_w: F64) -> _CracAir:
+    def _crac_air(self, inputs: StepInputs, it_w: F64) -> CracQuantities:
         """Airflow, supply and return air, fans and heat of the CRAC units."""
         if self._recirculates:
-            fan_w = self._while_powered(self._fan_w_per_m3s * inputs.cubed_flow_m3s, inputs)
-            return _CracAir(
-                crac_flow_m3s=inputs.crac_flow_m3s,
+            fan_w = self._while_powered(
+                self._fan_w_per_m3s * inputs.air.cubed_flow_m3s, inputs.surroundings
+            )
+            return CracQuantities(
+                crac_flow_m3s=inputs.air.units_flow_m3s,
                 crac_fan_w=fan_w,
-                supply_c=inputs.supply_c,
-                return_c=inputs.return_c,
-                cooling_load_w=inputs.cooling_load_w if self._transient else it_w + fan_w,
+                return_c=inputs.air.units_return_c,
+                cooling_load_w=inputs.air.units_load_w if self._transient else it_w + fan_w,
             )
         flow, speed = self._flow(
-            it_w, inputs.it_airflow_m3s, speed=inputs.fan_speed, **self._flow_limits
+            it_w, inputs.air.it_airflow_m3s, speed=inputs.supply.fan_speed, **self._flow_limits
         )
         full_w = crac_fan_w(speed, design_flow_m3s=1.0, design_w=self._sizing.crac_fan_w)
-        fan_w = self._while_powered(full_w, inputs)
+        fan_w = self._while_powered(full_w, inputs.surroundings)
         return_c, load_w = self._load(
             it_w,
             fan_w,
             flow,
-            inputs.supply_c,
-            inputs.plant_setpoint_c,
-            inputs.outlet_mean_c,
+            inputs.air.supply_c,
+            inputs.supply.plant_setpoint_c,
+            inputs.air.outlet_mean_c,
             air_j_per_m3_k=self._air_j_per_m3_k,
             return_approach_k=self._return_approach_k,
         )
-        return _CracAir(
+        return CracQuantities(
             crac_flow_m3s=flow,
             crac_fan_w=fan_w,
-            supply_c=inputs.supply_c,
             return_c=return_c,
             cooling_load_w=load_w,
         )
 
-    def _requested_w(self, inputs: FacilityInputs, air: _CracAir) -> F64:
+    def _requested_w(self, inputs: StepInputs, air: CracQuantities) -> F64:
         """Heat that the CRAC units ask the plant to take: load, and heat held by the room."""
         if self._transient:
-            return inputs.coil_w
-        wanted_w = air.cooling_load_w + inputs.room_heat_kwh * 1e3 / self._step_h
+            return inputs.air.coil_w
+        wanted_w = air.cooling_load_w + inputs.state.room_heat_kwh * 1e3 / self._step_h
         if self._limits_coils:
-            wanted_w = np.minimum(wanted_w, self._coil_limit_w(inputs))
+            limit_w = self._while_powered(inputs.supply.coil_limit_w, inputs.surroundings)
+            wanted_w = np.minimum(wanted_w, limit_w)
         if self._event_free:
             return wanted_w
-        reached_w = np.clip(wanted_w, 0.0, self._coil_capacity_w(inputs))
-        return np.where(inputs.no_unit_down > 0, wanted_w, reached_w)
+        reached_w = np.clip(
+            wanted_w, 0.0, self._coil_capacity_w(inputs.surroundings, inputs.supply)
+        )
+        return np.where(inputs.surroundings.no_unit_down > 0, wanted_w, reached_w)
 
     def _operate(
-        self, requested_w: F64, inputs: FacilityInputs, return_c: F64, airflow_m3s: F64
+        self,
+        requested_w: F64,
+        surroundings: Surroundings,
+        supply: Supply,
+        return_c: F64,
+        airflow_m3s: F64,
     ) -> WaterSideResult:
         """The plant, which stands still while there is no power."""
         design = self._sizing.water_side
         if not self._event_free:
-            on = np.where(inputs.powered > 0, inputs.powered, 1.0)
-            requested_w = np.where(inputs.powered > 0, requested_w / on, 0.0)
+            on = np.where(surroundings.powered > 0, surroundings.powered, 1.0)
+            requested_w = np.where(surroundings.powered > 0, requested_w / on, 0.0)
             design = replace(
                 design,
-                chiller_w=design.chiller_w * inputs.chiller_share,
-                pumped_w=design.pumped_w * inputs.pump_share,
-                outdoor_units=inputs.outdoor_units,
+                chiller_w=design.chiller_w * surroundings.chiller_share,
+                pumped_w=design.pumped_w * surroundings.pump_share,
+                outdoor_units=surroundings.outdoor_units,
             )
         found = self._plant(
             requested_w,
-            setpoint_c=inputs.plant_setpoint_c,
+            setpoint_c=supply.plant_setpoint_c,
             return_c=return_c,
             airflow_m3s=airflow_m3s,
-            outdoor_c=inputs.outdoor_c,
-            wet_bulb_c=inputs.wet_bulb_c,
+            outdoor_c=surroundings.outdoor_c,
+            wet_bulb_c=surroundings.wet_bulb_c,
             design=design,
             chiller=self._chiller,
             tower=self._tower,
             limited=self._stores_heat,
         )
-        return found if self._event_free else found.scaled(inputs.powered)
+        return found if self._event_free else found.scaled(surroundings.powered)
 
     def _balance_heat(
-        self, inputs: FacilityInputs, air: _CracAir, plant: WaterSideResult
-    ) -> _HeatBalance:
+        self, inputs: StepInputs, air: CracQuantities, plant: WaterSideResult
+    ) -> RoomQuantities:
         """Heat that was not removed stays in the room; spare capacity fetches it later."""
         load_w, removed_w = air.cooling_load_w, plant.heat_removed_w
         if self._transient:
             # The room has kept its heat within the step; here is what the plant fell short of.
-            short_kwh = (inputs.coil_w - removed_w) * self._step_h / 1e3
-            room_heat_kwh = inputs.room_j / 3.6e6 + short_kwh
+            short_kwh = (inputs.air.coil_w - removed_w) * self._step_h / 1e3
+            room_heat_kwh = inputs.air.room_j / 3.6e6 + short_kwh
             unmet_w, recovered_w = cooling.unmet_and_recovered(load_w, removed_w)
         else:
             unmet_w, recovered_w, room_heat_kwh = cooling.balance_room_heat(
-                load_w, removed_w, inputs.room_heat_kwh, self._step_h
+                load_w, removed_w, inputs.state.room_heat_kwh, self._step_h
             )
         if not self._stores_heat:
             # Of no sign, even where the load is negative.
             unmet_w = recovered_w = 0.0 * load_w + 0.0
-        return _HeatBalance(unmet_w, recovered_w, room_heat_kwh)
+        return RoomQuantities(unmet_w, recovered_w, room_heat_kwh)
 
-    def _use_water(self, inputs: FacilityInputs, air: _CracAir, plant: WaterSideResult) -> WaterUse:
+    def _use_water(
+        self, inputs: StepInputs, air: CracQuantities, plant: WaterSideResult
+    ) -> WaterUse:
         """Water that the tower evaporates, loses and gets; else that of the humidifier."""
         if self._dry:
             nothing = 0.0 * plant.rejected_w
@@ -403,49 +303,57 @@ class Facility:
             range_k=plant.tower_range_k,
             water_kg_s=plant.tower_water_kg_s,
             tower_airflow_m3s=plant.tower_airflow_m3s,
-            outdoor_c=inputs.outdoor_c,
-            wet_bulb_c=inputs.wet_bulb_c,
+            outdoor_c=inputs.surroundings.outdoor_c,
+            wet_bulb_c=inputs.surroundings.wet_bulb_c,
             return_c=air.return_c,
-            supply_setpoint_c=inputs.plant_setpoint_c,
+            supply_setpoint_c=inputs.supply.plant_setpoint_c,
             dt_s=self._step_h * 3600.0,
             **self._water,
         )
 
-    def _hvac_w(self, air: _CracAir, plant: WaterSideResult) -> F64:
+    def _hvac_w(self, air: CracQuantities, plant: WaterSideResult) -> F64:
         """Power of the devices that ``hvac.total_of`` names."""
         power_w = fields_of(plant) | fields_of(air)
         first, *rest = (power_w[f"{device}_w"] for device in self._hvac_devices)
         return cast(F64, sum(rest, first))
 
-    def _power_path_loss_w(self, inputs: FacilityInputs, it_w: F64) -> tuple[F64, F64]:
+    def _power_path_loss_w(self, inputs: StepInputs, it_w: F64) -> tuple[F64, F64]:
         """Losses of UPS and distribution, which have no power while the data center has none."""
         path = self._sizing.power_path
         if self._event_free:
             ups_w, distribution_w = power_path_loss_w(it_w, path)
         else:
-            on = np.where(inputs.powered > 0, inputs.powered, 1.0)
+            on = np.where(inputs.surroundings.powered > 0, inputs.surroundings.powered, 1.0)
             ups_w, distribution_w = power_path_loss_w(it_w / on, path)
         return (
-            self._while_powered(as_array(ups_w), inputs),
-            self._while_powered(as_array(distribution_w), inputs),
+            self._while_powered(as_array(ups_w), inputs.surroundings),
+            self._while_powered(as_array(distribution_w), inputs.surroundings),
         )
 
-    def _energy(self, inputs: FacilityInputs, it_w: F64, hvac_w: F64) -> dict[str, F64]:
+    def _energy(self, inputs: StepInputs, it_w: F64, hvac_w: F64) -> dict[str, F64]:
         """Losses, battery, grid and emissions; without grid the battery gives what it can."""
         ups_w, distribution_w = self._power_path_loss_w(inputs, it_w)
         overhead_w = hvac_w + (ups_w + distribution_w) if self._counts_losses else hvac_w
-        command = inputs.battery_command
+        command = inputs.commands.battery_command
         if not self._event_free:
-            command = np.where(inputs.grid_up > 0, command, -1.0)
+            command = np.where(inputs.surroundings.grid_up > 0, command, -1.0)
         battery = self._run_battery(
-            inputs.stored_kwh, command, load_kw=(it_w + overhead_w) / 1e3, limits=self._battery
+            inputs.state.stored_kwh,
+            command,
+            load_kw=(it_w + overhead_w) / 1e3,
+            limits=self._battery,
         )
         needed_kwh = battery.grid_kwh
-        grid_kwh = needed_kwh if self._event_free else needed_kwh * inputs.grid_up
+        grid_kwh = needed_kwh if self._event_free else needed_kwh * inputs.surroundings.grid_up
         battery_kwh = self._sizing.battery_kwh
         limit_kwh = self._sizing.grid_limit_kw * self._step_h
         return {
-            **fields_of(battery),
+            "it_w": it_w,
+            "hvac_w": hvac_w,
+            "stored_kwh": battery.stored_kwh,
+            "charge_kwh": battery.charge_kwh,
+            "discharge_kwh": battery.discharge_kwh,
+            "battery_loss_kwh": battery.battery_loss_kwh,
             "ups_loss_w": ups_w,
             "distribution_loss_w": distribution_w,
             "overhead_w": overhead_w,
@@ -457,23 +365,21 @@ class Facility:
                 overload_kwh(grid_kwh, limit_kwh) if self._grid_limited else 0.0 * grid_kwh
             ),
             "unserved_kwh": needed_kwh - grid_kwh,
-            "carbon_g": emitted_g(grid_kwh, inputs.ci_g_per_kwh),
-            "energy_cost": grid_kwh * inputs.price_per_kwh,
+            "carbon_g": emitted_g(grid_kwh, inputs.surroundings.ci_g_per_kwh),
+            "energy_cost": grid_kwh * inputs.surroundings.price_per_kwh,
         }
 
-    def _air_indices(self, inputs: FacilityInputs, air: _CracAir) -> dict[str, F64]:
+    def _air_indices(self, air: HallSums, return_c: F64) -> AirIndices:
         """Indices of how well the air of the hall is managed."""
         servers, (low_c, high_c) = self._servers, self._allowable_c
-        it_rise_k = air_metrics.it_rise_k(
-            inputs.inlet_m3k_s, inputs.outlet_m3k_s, inputs.it_airflow_m3s
+        rises = air.inlet_m3k_s, air.outlet_m3k_s, air.it_airflow_m3s
+        return AirIndices(
+            over_27_mean_k=air.over_27_sum_k / servers,
+            shi=air_metrics.shi(*rises),
+            rti_pct=air_metrics.rti(return_c, air.supply_c, air_metrics.it_rise_k(*rises)),
+            rci_hi_pct=air_metrics.rci_hi(air.over_27_sum_k, servers, allowable_c=high_c),
+            rci_lo_pct=air_metrics.rci_lo(air.under_18_sum_k, servers, allowable_c=low_c),
         )
-        return {
-            "over_27_mean_k": inputs.over_27_sum_k / servers,
-            "shi": air_metrics.shi(inputs.inlet_m3k_s, inputs.outlet_m3k_s, inputs.it_airflow_m3s),
-            "rti_pct": air_metrics.rti(air.return_c, air.supply_c, it_rise_k),
-            "rci_hi_pct": air_metrics.rci_hi(inputs.over_27_sum_k, servers, allowable_c=high_c),
-            "rci_lo_pct": air_metrics.rci_lo(inputs.under_18_sum_k, servers, allowable_c=low_c),
-        }
 
     def _run_battery(
         self, stored_kwh: F64, command: F64, *, load_kw: F64, limits: dict[str, F64]
@@ -488,19 +394,72 @@ class Facility:
             **limits,
         )
 
-    def _coil_capacity_w(self, inputs: FacilityInputs) -> F64:
+    def _coil_capacity_w(self, surroundings: Surroundings, supply: Supply) -> F64:
         """Heat that the coils in use can take, mean over the step."""
         cooling_w = self._sizing.water_side.cooling_w
         if not self._event_free:
-            cooling_w = cooling_w * inputs.coil_share * inputs.powered
-        return (
-            np.minimum(cooling_w, self._coil_limit_w(inputs)) if self._limits_coils else cooling_w
-        )
+            cooling_w = cooling_w * supply.coil_share * surroundings.powered
+        if not self._limits_coils:
+            return cooling_w
+        return np.minimum(cooling_w, self._while_powered(supply.coil_limit_w, surroundings))
 
-    def _coil_limit_w(self, inputs: FacilityInputs) -> F64:
-        """Capacity of the coils of the units that run, mean over the step."""
-        return self._while_powered(inputs.coil_limit_w, inputs)
-
-    def _while_powered(self, power_w: F64, inputs: FacilityInputs) -> F64:
+    def _while_powered(self, power_w: F64, surroundings: Surroundings) -> F64:
         """Mean over the step of a power that is drawn while there is power."""
-        return power_w if self._event_free else power_w * inputs.powered
+        return power_w if self._event_free else power_w * surroundings.powered
+
+
+class FacilityStage:
+    """Runs the models of a facility as compiled passes over the data centers.
+
+    Args:
+        fleet: B data centers.
+        facility: Their models and sized devices.
+    """
+
+    def __init__(self, fleet: Fleet, facility: Facility) -> None:
+        from sdc_taichi.kernels.compiler.stage import CompiledStage
+
+        self._recirculates = fleet.models["inlet"] == "recirculation"
+        self._step = CompiledStage(lambda **x: _checked_step(facility, **x), fleet.size)
+        self._removable = CompiledStage(facility.removable_w, fleet.size)
+
+    def removable_w(self, surroundings: Surroundings, supply: Supply) -> F64:
+        """Heat that the plant can take during a step, W, (B,)."""
+        found = self._removable(surroundings=surroundings, supply=supply)
+        return found["heat_removed_w"]
+
+    def step(
+        self,
+        state: State,
+        commands: Commands,
+        surroundings: Surroundings,
+        supply: Supply,
+        air: HallSums,
+    ) -> dict[str, F64]:
+        """Everything that follows from the air of the halls; arguments as of ``StepInputs``.
+
+        Returns:
+            Quantities by the names of ``StepResult``, and ``within_limits``, which is 1 for data
+            centers whose results are physical, else 0, (B,).
+        """
+        found = self._step(
+            state=state, commands=commands, surroundings=surroundings, supply=supply, air=air
+        )
+        found["unit_flow_m3s"] = (
+            air.unit_airflow_m3s if self._recirculates else found["crac_flow_m3s"]
+        )
+        return found
+
+
+def _checked_step(facility: Facility, **stages: Any) -> dict[str, F64]:
+    """Results of a facility, and whether they and what they follow from are physical."""
+    found = facility.step(StepInputs(**stages))
+    air, surroundings = stages["air"], stages["surroundings"]
+    checked = {
+        "outdoor_c": surroundings.outdoor_c,
+        "wet_bulb_c": surroundings.wet_bulb_c,
+        "supply_c": air.supply_c,
+        "inlet_max_c": air.inlet_max_c,
+        "outlet_mean_c": air.outlet_mean_c,
+    }
+    return joined(found, {"within_limits": within_limits(joined(found, checked))})

@@ -33,7 +33,7 @@ from sdc_taichi.sim.hall_state import HallState
 from sdc_taichi.sim.hall_tables import build_hall_tables, build_rows_along_racks, vectors
 from sdc_taichi.sim.intake_air import IntakeAir, read_intake_air
 from sdc_taichi.sim.physical_limits import BEYOND_NUMBERS_C, no_number_error, no_steady_air_error
-from sdc_taichi.types import F64, I32, Reals, ServerLayers
+from sdc_taichi.types import F64, I32, HallQuantities, ServerLayers
 
 Precision = Literal["f32", "f64"]
 
@@ -76,21 +76,9 @@ class Conditions:
 
 
 @dataclass
-class HallSums:
+class HallSums(HallQuantities):
     """Results of one step: sums and means of each data center, and values of each rack."""
 
-    cpu_w: F64
-    """Power of the servers without their fans, in W, (B,)."""
-    it_fan_w: F64
-    """Power of the server fans, in W, (B,)."""
-    it_airflow_m3s: F64
-    """Airflow of the servers, in m3/s, (B,)."""
-    inlet_mean_c: F64
-    """Plain mean over the racks of ``rack_inlet_c``, in C, (B,)."""
-    inlet_max_c: F64
-    """Hottest inlet of a server, in transient halls of any substep, in C, (B,)."""
-    outlet_mean_c: F64
-    """Plain mean over the racks of ``rack_outlet_c``, in C, (B,)."""
     inlet_m3k_s: F64
     """Sum over the servers of airflow times inlet temperature over supply, in m3 K/s, (B,)."""
     outlet_m3k_s: F64
@@ -99,46 +87,21 @@ class HallSums:
     """Sum over the servers of the inlet temperature in excess of 27 C, in K, (B,)."""
     under_18_sum_k: F64
     """Sum over the servers of the inlet temperature's shortfall below 18 C, in K, (B,)."""
-    hottest_rack: F64
-    """Rack with the hottest inlet, counted from 0 in its data center, (B,)."""
-    hottest_server: F64
-    """First server of the group with the hottest inlet, counted from 0 in its rack, (B,)."""
-    thermal_storage_w: F64
-    """Heat that goes into servers and recirculated air, in W, (B,); 0 in steady air."""
-    supply_c: F64
-    """Supply air, mean over the CRAC units by airflow, in C, (B,)."""
-    crac_flow_m3s: F64
+    units_flow_m3s: F64
     """Airflow of the CRAC units, in m3/s, (B,); 0 with inlet model ``approach``."""
-    return_c: F64
+    units_return_c: F64
     """Return air of the CRAC units, in C, (B,); 0 with inlet model ``approach``."""
-    cooling_load_w: F64
+    units_load_w: F64
     """Heat of air and CRAC fans that reaches the CRAC units, in W, (B,); 0 in steady air."""
     coil_w: F64
     """Heat that the coils take out, in W, (B,); 0 in steady air."""
-    unit_supply_c: F64
-    """Supply air of each CRAC unit, in C, (U,)."""
-    unit_flow_m3s: F64
-    """Airflow of each CRAC unit, in m3/s, (U,)."""
-    unit_cubed_speed: F64
-    """Mean cube of the fan speed of each CRAC unit over full speed, 0 for units that are down,
-    (U,)."""
+    unit_airflow_m3s: F64
+    """Airflow of each CRAC unit, in m3/s, (U,); of no meaning with inlet model ``approach``."""
+    cubed_flow_m3s: F64
+    """Sum over the CRAC units of airflow at full speed times the mean cube of the fan speed over
+    full speed, 0 for units that are down, in m3/s, (B,)."""
     room_j: F64
     """Heat held by the room at the end of the step, over the setpoint, in J, (B,)."""
-    rack_cpu_w: Reals
-    """Power of the servers of each rack without their fans, in W, (R,)."""
-    rack_fan_w: Reals
-    """Power of the server fans of each rack, in W, (R,)."""
-    rack_airflow_m3s: Reals
-    """Airflow of each rack, in m3/s, (R,)."""
-    rack_inlet_c: Reals
-    """Mean inlet over the servers of each rack, weighted by airflow with inlet model
-    ``recirculation``, in C, (R,)."""
-    rack_inlet_max_c: Reals
-    """Hottest inlet of each rack, in transient halls of any substep, in C, (R,)."""
-    rack_outlet_c: Reals
-    """Outlet of each rack, in C, (R,)."""
-    rack_outlet_max_c: Reals
-    """Hottest outlet of a server of each rack, in transient halls of any substep, in C, (R,)."""
 
 
 RESULT_NAMES = (*DC_OUT, *(f"rack_{name}" for name in RACK_OUT))
@@ -575,12 +538,15 @@ class Hall:
         if not self.hottest_outlet_c < BEYOND_NUMBERS_C:
             raise no_number_error(outlets_c, self._fleet)
         self._was_transient = transient
+        results = dict(zip(RESULT_NAMES, (*dc_out, *racks), strict=True))
+        unit = self._unit_state
+        unit_supply_c = unit["mean_supply_c"] if self._recirculates else results["supply_c"]
         return HallSums(
-            unit_supply_c=self._unit_state["mean_supply_c"].copy(),
-            unit_flow_m3s=self._unit_state["flow_m3s"].copy(),
-            unit_cubed_speed=self._unit_state["cubed_speed"].copy(),
+            unit_supply_c=unit_supply_c.copy(),
+            unit_airflow_m3s=unit["flow_m3s"].copy(),
+            cubed_flow_m3s=self._fleet.unit_sums(unit["cubed_speed"] * self._fleet.unit_design_m3s),
             room_j=self._dc["room_j"].copy(),
-            **dict(zip(RESULT_NAMES, (*dc_out, *racks), strict=True)),
+            **results,
         )
 
 

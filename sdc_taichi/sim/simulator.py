@@ -14,22 +14,20 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, PhysicalLimitError, RuntimeStateError
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim import snapshot
-from sdc_taichi.sim.actions import Commands
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.drivers import Drivers, load_drivers
 from sdc_taichi.sim.events import ActiveEvent, schedule, seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
-from sdc_taichi.sim.hall_solver import HallSums, Precision
+from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.intake_air import IntakeAir
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
 from sdc_taichi.sim.prices import with_prices
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.stages import Stages, make_stages
 from sdc_taichi.sim.state_limits import LAST_START, state_limits
-from sdc_taichi.sim.surroundings import Surroundings
 from sdc_taichi.sim.work_allocation import RackOutcome
 from sdc_taichi.sim.workload import WorkResult
-from sdc_taichi.types import I64, Actions, ServerLayers, State, StepResult
+from sdc_taichi.types import I64, Actions, ServerLayers, State, StepResult, joined
 
 
 class Simulator:
@@ -184,9 +182,9 @@ class Simulator:
             raise PhysicalLimitError(f"{error} (step {state.step})") from None
         plant = stages.facility.step(state, commands, surroundings, supply, air)
         racks = stages.allocation.protect(state, surroundings, work, placement, air, plant)
-        result = _step_result(
-            state.step, self.step_h, commands, surroundings, work, supply, air, racks, plant
-        )
+        stage_results = map(vars, (commands, surroundings, work, supply, air, racks))
+        step = {"step": state.step, "step_h": self.step_h}
+        result = StepResult(*_values_of_result(joined(step, *stage_results, plant)))
         inside, hottest_c = plant["within_limits"], stages.hall.hottest_outlet_c
         if np.minimum.reduce(inside) < 1.0 or hottest_c > AIR_LIMITS_C[1]:
             raise limit_error(inside, result, self.fleet)
@@ -388,35 +386,3 @@ def _next_state(
 
 
 _values_of_result = itemgetter(*(f.name for f in fields(StepResult)))
-
-
-def _step_result(
-    step: int,
-    step_h: float,
-    commands: Commands,
-    surroundings: Surroundings,
-    work: WorkResult,
-    supply: Supply,
-    air: HallSums,
-    racks: RackOutcome,
-    plant: Mapping[str, Any],
-) -> StepResult:
-    """Result of a step from all quantities of its stages, by the names of ``StepResult``.
-
-    Where stages have a quantity of the same name, the later one has the final value.
-
-    Raises:
-        KeyError: A field of ``StepResult`` that no stage has.
-    """
-    found = {
-        "step": step,
-        "step_h": step_h,
-        **vars(commands),
-        **vars(surroundings),
-        **vars(work),
-        **vars(supply),
-        **vars(air),
-        **plant,
-        **vars(racks),
-    }
-    return StepResult(*_values_of_result(found))

@@ -10,8 +10,7 @@ from sdc_taichi.sim.actions import ActionDecoder
 from sdc_taichi.sim.air import SteadyAir, TransientAir
 from sdc_taichi.sim.crac_units import CracUnits
 from sdc_taichi.sim.drivers import Drivers
-from sdc_taichi.sim.facility import Facility
-from sdc_taichi.sim.facility_stage import FacilityStage
+from sdc_taichi.sim.facility import Facility, FacilityStage
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Hall, Precision
 from sdc_taichi.sim.sizing import Sizing, size
@@ -90,10 +89,10 @@ def make_stages(
     hall.discard_last_step()
     allocation = WorkAllocation(fleet)
     models = Facility(fleet, sizing, event_free=event_free)
-    facility = FacilityStage(fleet, units, models, event_free=event_free)
+    facility = FacilityStage(fleet, models)
     keep = allocation.watches_inlets
     air: SteadyAir | TransientAir = (
-        TransientAir(fleet, hall, sizing, facility, keep_inlets=keep)
+        TransientAir(fleet, hall, sizing, facility.removable_w, keep_inlets=keep)
         if fleet.models["thermal"] == "transient"
         else SteadyAir(fleet, hall, sizing, units, keep_inlets=keep)
     )
@@ -101,7 +100,7 @@ def make_stages(
         hall=hall,
         sizing=sizing,
         decoder=ActionDecoder(fleet, units),
-        surroundings=SurroundingsModel(fleet, units, models),
+        surroundings=SurroundingsModel(fleet, units, models.powered_share),
         workload=Workload(fleet),
         allocation=allocation,
         crac_units=CracUnits(fleet, units),

@@ -2,37 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.sim.events import Disturbance
-from sdc_taichi.sim.facility import Facility
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.unit_index import UnitIndex
-from sdc_taichi.types import F64, Exogenous
+from sdc_taichi.types import F64, Exogenous, SiteQuantities
 
 
 @dataclass
-class Surroundings:
+class Surroundings(SiteQuantities):
     """Surroundings of one step of B data centers, U CRAC units and R racks."""
 
-    outdoor_c: F64
-    """Dry-bulb temperature outside, in C, (B,)."""
-    wet_bulb_c: F64
-    """Wet-bulb temperature outside, in C, (B,)."""
-    ci_g_per_kwh: F64
-    """Carbon intensity of the grid, in g CO2 per kWh, (B,)."""
-    demand: F64
-    """Work that arrives as a share of capacity, 0..1, (B,)."""
-    active_events: F64
-    """Number of events that cover the step, (B,)."""
-    price_per_kwh: F64
-    """Price of a kWh from the grid, in the currency of the tariff, (B,)."""
-    grid_up: F64
-    """1 with grid, 0 in an outage, (B,)."""
-    powered: F64
-    """Share of the step that the data center has power, 0..1, (B,)."""
     fully_powered: bool
     """Whether all data centers have power throughout the step."""
     chiller_share: F64
@@ -42,10 +27,10 @@ class Surroundings:
     outdoor_units: F64
     """Tower cells, dry coolers or openings for outdoor air in order, as a share of all, 0..1,
     (B,)."""
-    unit_running: F64
-    """1 for CRAC units that run, 0 for those that are down or without power, (U,)."""
+    no_unit_down: F64
+    """1 if all CRAC units run, 0 if one is down, (B,)."""
     all_running: bool
-    """Whether all CRAC units run."""
+    """Whether all CRAC units of all data centers run."""
     rack_airflow: F64 | None
     """Airflow of each rack that remains, as a share of its full airflow, 0..1, (R,); None is 1."""
 
@@ -56,11 +41,16 @@ class SurroundingsModel:
     Args:
         fleet: B data centers.
         units: Their CRAC units.
-        facility: Their batteries, which carry them through outages.
+        powered_share: ``Facility.powered_share``: how long batteries carry them in an outage.
     """
 
-    def __init__(self, fleet: Fleet, units: UnitIndex, facility: Facility) -> None:
-        self._units, self._facility = units, facility
+    def __init__(
+        self,
+        fleet: Fleet,
+        units: UnitIndex,
+        powered_share: Callable[[npt.NDArray[np.bool_], F64], F64],
+    ) -> None:
+        self._units, self._powered_share = units, powered_share
         self._ones, self._zeros = np.ones(fleet.size), np.zeros(fleet.size)
         self._unit_ones = np.ones(fleet.units)
 
@@ -87,11 +77,13 @@ class SurroundingsModel:
                 pump_share=self._ones,
                 outdoor_units=self._ones,
                 unit_running=self._unit_ones.copy(),
+                no_unit_down=self._ones,
                 all_running=True,
                 rack_airflow=None,
             )
-        powered = self._facility.powered_share(event.grid_up, stored_kwh)
+        powered = self._powered_share(event.grid_up, stored_kwh)
         running = event.unit_up & (self._units.of_each(powered) > 0)
+        unit_running = running.astype(np.float64)
         return Surroundings(
             outdoor_c=exogenous.outdoor_c + event.outdoor_offset_k,
             wet_bulb_c=exogenous.wet_bulb_c + event.outdoor_offset_k,
@@ -105,7 +97,8 @@ class SurroundingsModel:
             chiller_share=event.chiller_share,
             pump_share=event.pump_share,
             outdoor_units=event.outdoor_units,
-            unit_running=running.astype(np.float64),
+            unit_running=unit_running,
+            no_unit_down=self._units.lowest(unit_running),
             all_running=bool(np.all(running)),
             rack_airflow=event.rack_airflow,
         )

@@ -18,7 +18,7 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import HallSums
 from sdc_taichi.sim.surroundings import Surroundings
 from sdc_taichi.sim.workload import WorkResult
-from sdc_taichi.types import F64, I64, State, Status
+from sdc_taichi.types import F64, I64, RackQuantities, State, Status
 
 UNMET_SHARE = 0.01
 """Cooling keeps up where no more than this share of the cooling load stays in the room."""
@@ -52,22 +52,12 @@ class Placement:
 
 
 @dataclass
-class RackOutcome:
+class RackOutcome(RackQuantities):
     """Results of one step of R racks in B data centers, from their work and inlets."""
 
     restart_wait_min: F64
     """Time for which tripped racks have been able to restart, in min, (R,); empty where no rack
     ever trips."""
-    rack_status: Status
-    """Status at the end of the step: 0 normal, 1 throttled, 2 tripped, (R,)."""
-    throttled_racks: F64
-    """Racks that are throttled at the end of the step, (B,)."""
-    tripped_racks: F64
-    """Racks that are off at the end of the step, having tripped, (B,)."""
-    lost_tasks: F64
-    """Work that had been started and found no server or went down with its rack, (B,)."""
-    executed_tasks: F64
-    """Work that was done, (B,)."""
 
 
 class WorkAllocation:

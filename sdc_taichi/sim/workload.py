@@ -9,39 +9,15 @@ import numpy as np
 from sdc_taichi.plant import workload
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.queue import Queue
-from sdc_taichi.types import F64, fields_of
+from sdc_taichi.types import F64, QueueQuantities, fields_of
 
 
 @dataclass
-class WorkResult:
-    """Work of one step: B data centers, queues that tell L steps apart."""
+class WorkResult(QueueQuantities, workload.Work):
+    """Work of one step of B data centers, and queues that tell L steps apart."""
 
-    utilisation: F64
-    """Work that starts, as a share of all servers; ``tasks`` may round it above 1, (B,)."""
-    arrived_tasks: F64
-    """Work that arrives, (B,)."""
-    started_tasks: F64
-    """Work that starts, (B,)."""
-    deferred_tasks: F64
-    """Work that enters the queue, (B,)."""
-    drained_tasks: F64
-    """Work that leaves the queue on command, (B,)."""
-    due_tasks: F64
-    """Queued work whose deadline has come at the start of the step, (B,)."""
-    overdue_tasks: F64
-    """Due work that does not fit into the step, (B,)."""
-    dropped_tasks: F64
-    """Work that finds the queue full, (B,); with ``tasks`` it starts all the same."""
-    dequeued_tasks: F64
-    """Work that leaves the queue, drained or due, (B,)."""
     queue: F64
     """Work in the queue by the step that put it in, oldest first, accumulated, (B, L)."""
-    queue_tasks: F64
-    """Work in the queue at the end of the step, (B,)."""
-    oldest_age_h: F64
-    """Age of the oldest work in the queue, in h, (B,)."""
-    mean_age_h: F64
-    """Mean age of the work in the queue, in h, (B,)."""
 
 
 def queue_limit_tasks(fleet: Fleet) -> F64:
