@@ -2,7 +2,8 @@
 
     python docs/site/generate.py OUT
 
-writes ``commands.md``, ``quantities.md`` and a page for each part of the API to OUT/reference/generated.
+writes ``commands.md``, ``quantities.md`` and a page for each part of the API to
+OUT/reference/generated.
 """
 
 from __future__ import annotations
@@ -288,6 +289,8 @@ def api_page(part: Part) -> str:
         lines += ["", f".. auto{kind}:: {module}.{name}"]
         if kind == "class":
             lines += ["   :members:", "   :undoc-members:", f"   :exclude-members: {OF_PYDANTIC}"]
+        if name == "StepResult":
+            lines += ["   :inherited-members:"]
     return "\n".join([*lines, "```", ""])
 
 
