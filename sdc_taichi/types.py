@@ -252,6 +252,16 @@ class WorkQuantities:
 
 
 @dataclass
+class Work(WorkQuantities):
+    """Work of one step of B data centers as a workload model decides on it."""
+
+    started_tasks: F64
+    """Work that starts, in tasks, (B,)."""
+    dequeued_tasks: F64
+    """Work that leaves the queue, drained or due, in tasks, (B,)."""
+
+
+@dataclass
 class QueueQuantities:
     """Queue of work at the end of a step."""
 

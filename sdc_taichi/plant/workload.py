@@ -10,24 +10,13 @@ what happens to work from what waits and what is due; ``sim.queue`` keeps the qu
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
-from sdc_taichi.types import F64, WorkQuantities
+from sdc_taichi.types import F64, Work
 
 TASKS_PER_STEP = 100.0
 """Capacity of a data center for one step."""
-
-
-@dataclass
-class Work(WorkQuantities):
-    """Amounts of work that arrive, start, wait and leave in one step of B data centers."""
-
-    started_tasks: F64
-    """Work that starts, in tasks, (B,)."""
-    dequeued_tasks: F64
-    """Work that leaves the queue, drained or due, in tasks, (B,)."""
 
 
 WorkModel = Callable[..., Work]

@@ -9,11 +9,11 @@ import numpy as np
 from sdc_taichi.plant import workload
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.queue import Queue
-from sdc_taichi.types import F64, QueueQuantities, fields_of
+from sdc_taichi.types import F64, QueueQuantities, Work, fields_of
 
 
 @dataclass
-class WorkResult(QueueQuantities, workload.Work):
+class WorkResult(QueueQuantities, Work):
     """Work of one step of B data centers, and queues that tell L steps apart."""
 
     queue: F64
