@@ -23,10 +23,10 @@ from sdc_taichi.optimum.rollout import RollOut, Targets, repeated, roll_out
 from sdc_taichi.optimum.tables import FacilityTable
 from sdc_taichi.plant.battery import BATTERIES
 from sdc_taichi.plant.cooling import SETPOINTS
-from sdc_taichi.plant.workload import MODELS, Work
+from sdc_taichi.plant.workload import MODELS
 from sdc_taichi.sim.drivers import Drivers, load_drivers
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.types import F64, I64
+from sdc_taichi.types import F64, I64, Work
 
 CLC = Storage("clc", 100.0, 20.0, 0.97, 1.04, 0.5, 1.0, -0.04, 1.0, 0.01, 0.0)
 RELEASED = Storage("released", 100.0, 20.0, 1.0, 1.0, 0.1, 1.0, -0.04, 1.0, 0.01, 0.0)

@@ -450,7 +450,7 @@ def test_the_docs_list_a_step_in_the_order_of_the_code() -> None:
     docs = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text()
     listed = docs.partition("## One step")[2].partition("## ")[0]
     for function, pattern in (
-        (Simulator.step, r"^    ([a-z_.]+) "),
+        (Simulator.step, r"^    ([A-Za-z_.]+) "),
         (Facility.step, r"^      ([a-z_]+) "),
     ):
         names = re.findall(pattern, listed, re.MULTILINE)

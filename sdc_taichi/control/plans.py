@@ -24,7 +24,7 @@ from sdc_taichi.sim.facility import BATTERY_PARAMETERS
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.workload import due_steps, queue_limit_tasks
-from sdc_taichi.types import F64, I64
+from sdc_taichi.types import F64, I64, Work
 
 MOST_AT_ONCE = 256
 """Data centers of a call, which limits the memory of its work space."""
@@ -224,7 +224,7 @@ class QueuePlanner:
             facility_kwh=facility_kwh,
         )
 
-    def _first_step(self, demand: F64, waiting: F64, due: F64) -> workload.Work:
+    def _first_step(self, demand: F64, waiting: F64, due: F64) -> Work:
         """What each first command does with the work of the step to come, (B, C)."""
         shape = len(demand), len(self._first)
         each = [np.broadcast_to(x, shape) for x in (demand, self._first, waiting, due)]
