@@ -18,9 +18,8 @@ import numpy as np
 from yardsticks import core_s, plain_store
 
 from sdc_taichi import build_fleet, load_config, make_configs
-from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall
+from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall
 
 SIZES = ((4096, 20, 200), (256, 1000, 40), (1, 100_000, 40))
 QUICK_SIZES = ((4, 20, 200), (1, 400, 40))

@@ -20,7 +20,7 @@ from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall
 from sdc_taichi.sim.inlet_parts import Inlets
 from sdc_taichi.sim.sizing import air_j_per_m3_k
-from sdc_taichi.sim.unit_index import UnitIndex
+from sdc_taichi.sim.step_inputs import UnitIndex
 
 FOUR = "hvac.crac.units=4"
 N_PLUS_1 = "hvac.crac.spare_units=1"

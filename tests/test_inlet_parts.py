@@ -25,8 +25,7 @@ from sdc_taichi.run.inlets_of_run import hottest_inlets, inlets_at_step
 from sdc_taichi.run.steps_file import METADATA_KEY
 from sdc_taichi.sim.design_hall import solve_design_hall
 from sdc_taichi.sim.fleet_configs import make_configs
-from sdc_taichi.sim.inlet_parts import InletParts, Inlets, inlet_terms, rack_text
-from sdc_taichi.sim.intake_air import intake_air_of
+from sdc_taichi.sim.inlet_parts import InletParts, Inlets, inlet_terms, intake_air_of, rack_text
 from sdc_taichi.viz.recorder import Recorder
 from sdc_taichi.viz.recording_summary import hottest_markdown
 from sdc_taichi.viz.report_inlets import hot_racks_section

@@ -23,8 +23,7 @@ from sdc_taichi import DataCenterConfig, RuntimeStateError, Simulator, build_fle
 from sdc_taichi.config import config_from_dict
 from sdc_taichi.errors import SdcError
 from sdc_taichi.kernels.compiler import runtime
-from sdc_taichi.sim.coil import Coil
-from sdc_taichi.sim.hall_solver import SERIAL_GROUPS, Conditions, Hall, HallSums, Precision
+from sdc_taichi.sim.hall_solver import SERIAL_GROUPS, Coil, Conditions, Hall, HallSums, Precision
 from sdc_taichi.sim.hall_tables import build_hall_tables, build_rows_along_racks
 from sdc_taichi.types import F64, ServerLayers
 

@@ -10,7 +10,7 @@ import pytest
 
 from sdc_taichi.kernels.compiler.launch import BoundKernel
 from sdc_taichi.kernels.queue import SERIAL_UP_TO
-from sdc_taichi.sim.queue import Queue, QueueState
+from sdc_taichi.sim.workload import Queue, QueueState
 from sdc_taichi.types import F64
 
 

@@ -15,9 +15,8 @@ from typing import Any, Literal
 import pytest
 
 from sdc_taichi import Drivers, RuntimeStateError, Simulator, drivers_from_arrays, load_config
-from sdc_taichi.kernels.compiler import runtime, startup
-from sdc_taichi.kernels.compiler.processors import quota
-from sdc_taichi.kernels.compiler.runtime import uses_plain_taichi
+from sdc_taichi.kernels.compiler import runtime
+from sdc_taichi.kernels.compiler.runtime import processor_quota, uses_plain_taichi
 
 
 def short_drivers() -> Drivers:
@@ -149,7 +148,7 @@ def test_as_many_threads_as_processors_are_bound_to_one_each() -> None:
     "limit",
     [
         "import os; os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])",
-        "runtime.processors.quota = lambda: 1",
+        "runtime.processor_quota = lambda: 1",
     ],
 )
 def test_there_are_no_more_threads_than_processors_may_be_used(limit: str) -> None:
@@ -194,7 +193,7 @@ def test_quotas_of_control_groups_are_read(
     for name, text in settings.items():
         (mounted / name).parent.mkdir(parents=True, exist_ok=True)
         (mounted / name).write_text(f"{text}\n")
-    assert quota(told, mounted) == expected
+    assert processor_quota(told, mounted) == expected
 
 
 def test_several_threads_may_start_first() -> None:
@@ -281,22 +280,16 @@ print(os.environ["TI_ARCH"], "HOME" in os.environ)
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
-def test_what_killed_processes_left_among_the_kernels_goes(
+def test_a_lock_that_a_killed_process_left_among_the_kernels_goes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lock, index = tmp_path / "ticache.lock", tmp_path / "ticache.tcb"
+    lock = tmp_path / "ticache.lock"
     monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", str(tmp_path))
-    key = (65).to_bytes(8, "little") + b"T" * 65
-    body = bytes([1, 0, 7, 0, 4, 0, *8 * [0], 1, *7 * [0]]) + 2 * key + bytes(24)
-    good = (len(body) + 8).to_bytes(8, "little") + body
-    for content, kept in ((good, True), (good[:30] + b"\xff" * 8 + good[38:], False)):
-        index.write_bytes(content)
-        lock.write_bytes(b"")
-        assert startup.kernel_folder() == tmp_path
-        assert lock.exists(), "a lock of this moment is that of a process that runs"
-        assert index.exists() == kept
+    lock.write_bytes(b"")
+    assert runtime.kernel_folder() == tmp_path
+    assert lock.exists(), "a lock of this moment is that of a process that runs"
     os.utime(lock, (0, 0))
-    startup.kernel_folder()
+    runtime.kernel_folder()
     assert not lock.exists()
 
 

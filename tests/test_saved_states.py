@@ -25,7 +25,7 @@ from sdc_taichi import (
 )
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.errors import PhysicalLimitError
-from sdc_taichi.sim.state_limits import HALL_LIMITS_C
+from sdc_taichi.sim.snapshot import HALL_LIMITS_C
 
 CONFIG = load_config(
     "corrected",

@@ -38,10 +38,8 @@ from sdc_taichi import (
     load_config,
 )
 from sdc_taichi.config import apply_overrides
-from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums, Precision
-from sdc_taichi.sim.hall_state import HallState
+from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums, Precision
 from sdc_taichi.sim.sizing import air_j_per_m3_k
 from sdc_taichi.types import F64
 

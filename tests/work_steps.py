@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 from sdc_taichi.plant import workload
-from sdc_taichi.sim.queue import Queue
+from sdc_taichi.sim.workload import Queue
 from sdc_taichi.types import F64
 
 

@@ -1,5 +1,7 @@
 """Kernels defined from a spec of their arguments, and called by name."""
 
+import linecache
+from collections import namedtuple
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -8,8 +10,83 @@ import taichi as ti
 from ..arguments import Argument
 from .functions import SLICE, reals
 from .launch import BoundKernel
-from .named_rows import NamedRows, shared
-from .source import define
+
+
+def define(name: str, source: str, file: str, scope: Mapping[str, Any]) -> Any:
+    """Define a function from its source, and keep the source where Taichi looks for it.
+
+    Args:
+        name: of the function in the source.
+        source: Python source of the function with its decorators.
+        file: name that stands for the source in messages, different for each source.
+        scope: globals of the function.
+
+    Returns:
+        The function.
+    """
+    # Taichi reads the source of a kernel by the name of its file, as `inspect` does.
+    linecache.cache[file] = (len(source), None, source.splitlines(keepends=True), file)
+    names = dict(scope)
+    exec(compile(source, file, "exec"), names)
+    return names[name]
+
+
+class NamedRows:
+    """Arrays of named rows within a kernel: ``rows[i].name``, to read and to assign.
+
+    An array of two dimensions has a row for each name and a column for each item. In an array of
+    one dimension the values of an item stand next to each other.
+
+    Args:
+        parts: pairs of the names of the rows of an array, and the array.
+        stride: in arrays of one dimension, entries from an item to the next; None is the number of
+            names, and with 1 the index of an item is that of its first entry.
+    """
+
+    _data_oriented = True
+    """Taichi hands objects of such classes to functions as they are."""
+
+    def __init__(self, *parts: tuple[tuple[str, ...], Any], stride: int | None = None) -> None:
+        self._places: dict[str, tuple[Any, int, int]] = {}
+        for names, array in parts:
+            step = 0 if len(array.shape) > 1 else stride or len(names)
+            self._places |= {name: (array, row, step) for row, name in enumerate(names)}
+
+    def __getitem__(self, i: Any) -> "Item":
+        return Item(self._places, local(i))
+
+
+class Item:
+    """The values of one item of :class:`NamedRows`; every use reads or writes the array anew.
+
+    Args:
+        places: array, row, and entries from an item to the next (0 in two dimensions) by name.
+        i: index of the item.
+    """
+
+    _data_oriented = True
+
+    def __init__(self, places: dict[str, tuple[Any, int, int]], i: Any) -> None:
+        self._places, self._i = places, i
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in self._places:
+            raise AttributeError(f"{name}; known are {', '.join(self._places)}")
+        array, row, step = self._places[name]
+        at = (self._i * step + row,) if step else (row, self._i)
+        return ti.lang.impl.subscript(None, array, *at)
+
+
+def local(value: Any) -> Any:
+    """Copy of a number within a kernel; arguments that are not copied are read at every use."""
+    return ti.lang.impl.expr_init(value) if isinstance(value, ti.lang.expr.Expr) else value
+
+
+def shared(**values: Any) -> Any:
+    """Namedtuple of values that the functions of a kernel share; to be called in ``ti.static``."""
+    values = {name: local(value) for name, value in values.items()}
+    return namedtuple("Shared", values)(**values)
+
 
 _SOURCE = """\
 @ti.kernel

@@ -2,17 +2,216 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import importlib
 import io
+import math
 import os
+import shutil
 import sys
+import tempfile
 import threading
+import time
+import warnings
 from collections.abc import Iterator
+from pathlib import Path
 
-from sdc_taichi.errors import ConfigError, RuntimeStateError, shortened
-from sdc_taichi.kernels.compiler import processors, startup
+from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcWarning, shortened
 from sdc_taichi.number_text import parse_whole
+
+
+def allowed_processors() -> list[int]:
+    """Numbers of the processors that this process may run on, ascending."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
+def processor_quota(
+    groups: Path = Path("/proc/self/cgroup"), mounted: Path = Path("/sys/fs/cgroup")
+) -> float:
+    """Processors whose time the process is granted, as in containers; inf without a quota.
+
+    Args:
+        groups: control groups of the process, one per line (cgroups(7) of Linux).
+        mounted: where their settings are. In a container these may begin below the groups' paths.
+
+    Returns:
+        The least quota of the groups and those above, rounded up.
+    """
+    found = [math.inf]
+    for line in _text(groups).split("\n"):
+        number, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        group = Path(path.lstrip("/"))
+        for folder in (group, *group.parents) if path else ():
+            if number == "0":
+                quota_us, _, period_us = _text(mounted / folder / "cpu.max").partition(" ")
+            elif "cpu" in controllers.split(","):
+                quota_us = _text(mounted / "cpu" / folder / "cpu.cfs_quota_us")
+                period_us = _text(mounted / "cpu" / folder / "cpu.cfs_period_us")
+            else:
+                continue
+            # "max" or -1 without a quota.
+            if quota_us.strip().isdecimal() and period_us.strip().isdecimal() and int(period_us):
+                found.append(max(1, math.ceil(int(quota_us) / int(period_us))))
+    return min(found)
+
+
+def _text(file: Path) -> str:
+    """Text of a file of the operating system; empty if it cannot be read."""
+    try:
+        return file.read_text("utf-8", errors="replace")
+    except (OSError, ValueError):  # the latter of names that no file may have
+        return ""
+
+
+def _thread_ids() -> set[int]:
+    """Threads of this process; none where the system does not tell."""
+    try:
+        return set(map(int, os.listdir("/proc/self/task")))
+    except OSError:
+        return set()
+
+
+def _bind(threads: set[int], count: int) -> None:
+    """Bind threads that compute together to one processor each, if there is one for each.
+
+    Linux tends to wake all of them on the processor of the thread that waits for them, and moves
+    them apart some milliseconds later, when the step is done. Where threads are fewer or more than
+    processors, they are left to the system, which also serves processes beside this one.
+
+    Args:
+        threads: numbers of the threads; those that compute follow each other, others may be among
+            them.
+        count: how many of them compute at a time.
+    """
+    processors = allowed_processors()
+    if count != len(processors) or not hasattr(os, "sched_setaffinity"):
+        return
+    for i, thread in enumerate(sorted(threads)):
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(thread, {processors[i % count]})
+
+
+CACHE_VARIABLE = "TI_OFFLINE_CACHE_FILE_PATH"
+"""Environment variable that names Taichi's folder of compiled kernels; obeyed here too."""
+LOCK_S = 60.0
+"""Age, in s, from which a lock of the folder is one that a killed process left; Taichi holds it for
+milliseconds."""
+_LOCK = "ticache.lock"
+_OWN = {
+    "ENABLE_TAICHI_HEADER_PRINT": "False",
+    "TI_SKIP_VERSION_CHECK": "ON",
+    # In notebooks it would print that there is one, and look for text to print at each launch.
+    "TI_ENABLE_PYBUF": "0",
+}
+
+
+class KernelCacheWarning(SdcWarning):
+    """Compiled kernels cannot be kept for the next process."""
+
+
+@contextlib.contextmanager
+def taichi_environment() -> Iterator[None]:
+    """Hide the variables by which users set up other programs of Taichi, such as ``TI_ARCH``.
+
+    Taichi also aborts the process where there is neither ``HOME`` nor ``XDG_CACHE_HOME``.
+    """
+    hidden = {name: os.environ.pop(name) for name in [*os.environ] if name.startswith("TI_")}
+    hidden |= {name: os.environ[name] for name in _OWN if name in os.environ}
+    own = dict(_OWN)
+    if not {"HOME", "XDG_CACHE_HOME"} & os.environ.keys():
+        own["HOME"] = os.sep
+    os.environ.update(own)
+    try:
+        yield
+    finally:
+        for name in own:
+            os.environ.pop(name, None)
+        os.environ.update(hidden)
+
+
+def kernel_folder() -> Path:
+    """Folder in which Taichi keeps compiled kernels, fit to be used.
+
+    On Linux it is that of all programs of Taichi, or that of ``CACHE_VARIABLE``. Where none can be
+    written, it is a temporary one, which is deleted at exit, with a ``KernelCacheWarning``.
+
+    Raises:
+        RuntimeStateError: no temporary folder can be written either.
+    """
+    folder = usual_folder()
+    try:
+        _make_usable(folder)
+    except OSError as error:
+        temporary = _temporary_folder(folder)
+        reason = error.strerror or error
+        message = f"{folder}: cannot be written ({reason}); kernels are compiled in every process"
+        warnings.warn(message, KernelCacheWarning, stacklevel=2)
+        return temporary
+    return folder
+
+
+def usual_folder() -> Path:
+    """Folder in which programs of Taichi keep their kernels."""
+    import platformdirs
+
+    if named := os.environ.get(CACHE_VARIABLE):
+        return Path(named).absolute()
+    return Path(platformdirs.user_cache_dir("taichi", appauthor=False)) / "ticache"
+
+
+def _make_usable(folder: Path) -> None:
+    """Create the folder of kernels, and delete a lock that a killed process has left there.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    if not folder.is_absolute():  # the system knows no home of this user
+        raise OSError("no absolute path")
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder):
+        pass
+    lock = folder / _LOCK
+    # Taichi would wait 2 s for it at every start, and then keep no kernels.
+    with contextlib.suppress(FileNotFoundError):
+        if time.time() - lock.stat().st_mtime > LOCK_S:
+            lock.unlink()
+
+
+def _temporary_folder(folder: Path) -> Path:
+    """Folder of kernels that is deleted at exit.
+
+    Args:
+        folder: the one that cannot be written.
+
+    Raises:
+        RuntimeStateError: none can be created.
+    """
+    for parent in (None, "/dev/shm"):
+        try:
+            made = tempfile.mkdtemp(prefix="sdc-taichi-", dir=parent)
+        except OSError:
+            continue
+        atexit.register(_delete_at_exit, made, os.getpid())
+        return Path(made)
+    raise RuntimeStateError(
+        f"{folder}: cannot be written, nor can a temporary folder; valid is a folder for kernels "
+        "in XDG_CACHE_HOME, or for temporary files in TMPDIR"
+    )
+
+
+def _delete_at_exit(folder: str, owner: int) -> None:
+    """Delete a temporary folder of kernels, once Taichi, which writes to it last, has ended."""
+    if os.getpid() != owner:
+        return
+    if "taichi" in sys.modules:
+        with taichi_environment():
+            sys.modules["taichi"].reset()
+    shutil.rmtree(folder, ignore_errors=True)
+
 
 MOST_THREADS = 1024
 """Largest number of threads that may be asked for: more than any machine has processors that gain
@@ -92,7 +291,7 @@ def _import_taichi() -> None:
     Raises:
         RuntimeStateError: it is not installed, or memory is short.
     """
-    with _starting, startup.taichi_environment():
+    with _starting, taichi_environment():
         try:
             importlib.import_module("taichi")
         except (ImportError, MemoryError) as error:
@@ -114,10 +313,10 @@ def _start_taichi() -> None:
         raise RuntimeStateError(
             "the current folder has been deleted; valid is one that exists, which Taichi needs"
         ) from None
-    threads = _thread_limit() or int(min(len(processors.allowed()), processors.quota()))
-    before = processors.thread_ids()
-    folder = startup.kernel_folder()
-    with startup.taichi_environment(), _without_banner():
+    threads = _thread_limit() or int(min(len(allowed_processors()), processor_quota()))
+    before = _thread_ids()
+    folder = kernel_folder()
+    with taichi_environment(), _without_banner():
         try:
             ti.init(
                 arch=ti.cpu,
@@ -135,7 +334,7 @@ def _start_taichi() -> None:
             ) from error
     if not uses_plain_taichi():
         others = {thread.native_id for thread in threading.enumerate()}
-        processors.bind(processors.thread_ids() - before - others, ti.cfg.cpu_max_num_threads)
+        _bind(_thread_ids() - before - others, ti.cfg.cpu_max_num_threads)
 
 
 @contextlib.contextmanager

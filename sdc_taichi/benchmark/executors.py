@@ -18,7 +18,7 @@ from typing import Any, Self
 from sdc_taichi.benchmark.jobs import DoneJob, Inputs, Job, compute_in_one_thread, run_job
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.errors import ConfigError, SdcWarning, whole_number
-from sdc_taichi.kernels.compiler import processors
+from sdc_taichi.kernels.compiler.runtime import allowed_processors, processor_quota
 
 MOST_WORKERS = 1024
 """Largest number of worker processes."""
@@ -145,7 +145,7 @@ class JobSummary:
 
 def default_workers() -> int:
     """Number of processors that this process may use, within the quota of its container."""
-    return int(min(len(processors.allowed()), processors.quota(), MOST_WORKERS))
+    return int(min(len(allowed_processors()), processor_quota(), MOST_WORKERS))
 
 
 def run_jobs(

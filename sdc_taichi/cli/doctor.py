@@ -124,10 +124,10 @@ def _extras() -> Iterator[Finding]:
 
 
 def _processors() -> Iterator[Finding]:
-    from sdc_taichi.kernels.compiler import processors
+    from sdc_taichi.kernels.compiler.runtime import allowed_processors, processor_quota
     from sdc_taichi.run.processor import processor_features
 
-    allowed, quota = len(processors.allowed()), processors.quota()
+    allowed, quota = len(allowed_processors()), processor_quota()
     limits = [f"{allowed} of {os.cpu_count()} may be used"]
     if quota < allowed:
         limits.append(f"the container grants {quota:g}")
@@ -146,7 +146,7 @@ def _memory() -> Iterator[Finding]:
 
 
 def _kernel_cache() -> Iterator[Finding]:
-    from sdc_taichi.kernels.compiler.startup import CACHE_VARIABLE, usual_folder
+    from sdc_taichi.kernels.compiler.runtime import CACHE_VARIABLE, usual_folder
 
     advice = f"name a folder that can be written in XDG_CACHE_HOME or {CACHE_VARIABLE}"
     yield _folder("compiled kernels", usual_folder(), advice)

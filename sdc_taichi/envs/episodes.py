@@ -13,11 +13,11 @@ from sdc_taichi.envs.actions import PLACEMENT_FACTOR
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, day_of_year
-from sdc_taichi.sim.actions import MOST_MOVES
 from sdc_taichi.sim.drivers import Drivers, InputReader
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.snapshot import as_array
+from sdc_taichi.sim.step_inputs import MOST_MOVES
 from sdc_taichi.types import F64, I64, State
 
 Seed = int | Sequence[int | None] | I64 | None

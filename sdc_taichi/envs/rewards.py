@@ -19,7 +19,7 @@ from sdc_taichi.envs.released_rewards import ReleasedRewards
 from sdc_taichi.envs.reward_terms import TERMS, RewardContext, TermContext
 from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
 from sdc_taichi.sim.physical_limits import POWER_LIMITS_W
-from sdc_taichi.sim.state_limits import ROUNDING
+from sdc_taichi.sim.snapshot import ROUNDING
 from sdc_taichi.types import F64, StepResult
 from sdc_taichi.user_functions import (
     checked_values,

@@ -27,10 +27,9 @@ from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.facility import BATTERY_PARAMETERS
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Precision
-from sdc_taichi.sim.queue import due_entries, due_work
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.sim.sizing import Sizing
-from sdc_taichi.sim.workload import due_steps, queue_limit_tasks
+from sdc_taichi.sim.workload import due_entries, due_steps, due_work, queue_limit_tasks
 from sdc_taichi.types import F64, I64, Actions, State, StepResult
 
 Stop = Callable[[], bool]

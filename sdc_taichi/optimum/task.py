@@ -14,13 +14,13 @@ from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS, Agent, Problem, problems_of
 from sdc_taichi.optimum.tables import UTILISATIONS, FacilityTable, TableGrid, facility_tables
 from sdc_taichi.sim import snapshot
+from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.drivers import Drivers, load_drivers
 from sdc_taichi.sim.events import seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Precision
-from sdc_taichi.sim.prices import with_prices
 from sdc_taichi.sim.simulator import Simulator
-from sdc_taichi.sim.state_limits import LAST_START
+from sdc_taichi.sim.snapshot import LAST_START
 from sdc_taichi.types import I64
 
 MOST_STEPS = 100 * 8760

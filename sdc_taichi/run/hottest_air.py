@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.hall.air_metrics import rank
-from sdc_taichi.sim.intake_air import RACK_FIELDS, UNIT_FIELDS, IntakeAir, intake_air_of
+from sdc_taichi.sim.inlet_parts import RACK_FIELDS, UNIT_FIELDS, IntakeAir, intake_air_of
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import I64, StepResult, fields_of
 

@@ -12,14 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
-from sdc_taichi.sim.hall_state import HallState
+from sdc_taichi.sim.hall_solver import Coil, Conditions, Hall, HallState, HallSums
 from sdc_taichi.sim.sizing import Sizing
-from sdc_taichi.sim.surroundings import Surroundings
-from sdc_taichi.sim.unit_index import UnitIndex
+from sdc_taichi.sim.step_inputs import Surroundings, UnitIndex
 from sdc_taichi.sim.work_allocation import Placement
 from sdc_taichi.types import F64, State, fields_of
 

@@ -23,13 +23,12 @@ from sdc_taichi.plant.plants import DRY_PLANTS, PLANTS
 from sdc_taichi.plant.tower import TOWERS
 from sdc_taichi.plant.water import WATER, WaterUse
 from sdc_taichi.plant.water_side import WaterSideResult
-from sdc_taichi.sim.actions import Commands
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
 from sdc_taichi.sim.hall_solver import HallSums
 from sdc_taichi.sim.physical_limits import within_limits
 from sdc_taichi.sim.sizing import Sizing, air_j_per_m3_k, mean_return_approach_k, sites_pressure_pa
-from sdc_taichi.sim.surroundings import Surroundings
+from sdc_taichi.sim.step_inputs import Commands, Surroundings
 from sdc_taichi.types import (
     F64,
     QUANTITIES,

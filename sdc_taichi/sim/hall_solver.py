@@ -27,13 +27,49 @@ from sdc_taichi.kernels.hall_arguments import (
     RUNNING,
     STEP_ARGUMENTS,
 )
-from sdc_taichi.sim.coil import Coil
 from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_state import HallState
 from sdc_taichi.sim.hall_tables import build_hall_tables, build_rows_along_racks, vectors
-from sdc_taichi.sim.intake_air import IntakeAir, read_intake_air
+from sdc_taichi.sim.inlet_parts import IntakeAir, read_intake_air
 from sdc_taichi.sim.physical_limits import BEYOND_NUMBERS_C, no_number_error, no_steady_air_error
-from sdc_taichi.types import F64, I32, HallQuantities, ServerLayers
+from sdc_taichi.types import F64, I32, HallQuantities, Reals, ServerLayers
+
+
+@dataclass(frozen=True, slots=True)
+class HallState:
+    """Thermal memory of transient halls; quasi-steady halls have none."""
+
+    server_c: Reals
+    """Temperature of the servers of each group, in C, (G,)."""
+    mixed_c: Reals
+    """Temperature of the recirculated air before each rack, in C, (R,)."""
+    exhaust_c: Reals
+    """Temperature that each rack gives to the exhaust mixes, times its strength, in C, (R,): its
+    outlet, and for the share of its air that failing fans do not move the mix before it."""
+    captured_m3s: Reals
+    """Recirculated air that each rack takes in, in m3/s, (R,)."""
+    need_m3s: F64
+    """Supply air that the racks ask of each CRAC unit, in m3/s, (U,)."""
+    following: F64
+    """Fan speed of each CRAC unit over full speed that would just cover the need, (U,)."""
+    supply_excess_k: F64
+    """Supply air of each CRAC unit over its setpoint and what the room is warmed by, in K, (U,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Coil:
+    """Coils and plant of transient halls during one step."""
+
+    setpoint_c: F64
+    """Supply setpoint of each CRAC unit, in C, (U,)."""
+    room_j: F64
+    """Heat held by the room at the start of the step, over the setpoint, in J, (B,)."""
+    room_j_per_k: F64
+    """Heat capacity of the room, in J/K, (B,)."""
+    limit_w: F64
+    """Heat that the plant can take during the step, in W, (B,)."""
+    fan_w_per_m3s: F64
+    """CRAC fan power over airflow at full speed, in W/(m3/s), (B,)."""
+
 
 Precision = Literal["f32", "f64"]
 

@@ -41,8 +41,8 @@ from sdc_taichi.kernels.hall_arguments import (
     UNIT_INPUTS,
     UNIT_STATE,
 )
+from sdc_taichi.sim.crac_units import SharedPlenum, shares_by_block
 from sdc_taichi.sim.fleet import Fleet, offsets_from_counts
-from sdc_taichi.sim.shared_plenum import SharedPlenum, shares_by_block
 from sdc_taichi.types import F64, I32
 
 RETURN_BAND_K = 2.0

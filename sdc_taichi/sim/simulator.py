@@ -14,17 +14,17 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, PhysicalLimitError, RuntimeStateError
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.sim import snapshot
+from sdc_taichi.sim.bills import with_prices
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.drivers import Drivers, load_drivers
 from sdc_taichi.sim.events import ActiveEvent, schedule, seeds_of_fleet
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Precision
-from sdc_taichi.sim.intake_air import IntakeAir
+from sdc_taichi.sim.inlet_parts import IntakeAir
 from sdc_taichi.sim.physical_limits import AIR_LIMITS_C, limit_error
-from sdc_taichi.sim.prices import with_prices
 from sdc_taichi.sim.sizing import Sizing
+from sdc_taichi.sim.snapshot import LAST_START, state_limits
 from sdc_taichi.sim.stages import Stages, make_stages
-from sdc_taichi.sim.state_limits import LAST_START, state_limits
 from sdc_taichi.sim.work_allocation import RackOutcome
 from sdc_taichi.sim.workload import WorkResult
 from sdc_taichi.types import I64, Actions, ServerLayers, State, StepResult, joined

@@ -1,24 +1,29 @@
-"""The stages of a step, made for a fleet: its devices sized, its kernels set up."""
+"""The stages of a step, made for a fleet, and facilities at constant load and setpoint."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sdc_taichi.sim.actions import ActionDecoder
+from sdc_taichi.config import DataCenterConfig
+from sdc_taichi.config.event_schema import EventsConfig, ProtectionConfig
+from sdc_taichi.errors import OddInputWarning
 from sdc_taichi.sim.air import SteadyAir, TransientAir
 from sdc_taichi.sim.crac_units import CracUnits
-from sdc_taichi.sim.drivers import Drivers
+from sdc_taichi.sim.drivers import Drivers, FleetSeries
+from sdc_taichi.sim.events import schedule
 from sdc_taichi.sim.facility import Facility, FacilityStage
-from sdc_taichi.sim.fleet import Fleet
-from sdc_taichi.sim.hall_solver import Hall, Precision
+from sdc_taichi.sim.fleet import Fleet, build_fleet
+from sdc_taichi.sim.hall_solver import Hall, HallSums, Precision
+from sdc_taichi.sim.physical_limits import AIR_LIMITS_C
 from sdc_taichi.sim.sizing import Sizing, size
-from sdc_taichi.sim.surroundings import SurroundingsModel
-from sdc_taichi.sim.unit_index import UnitIndex
+from sdc_taichi.sim.step_inputs import ActionDecoder, SurroundingsModel, UnitIndex
 from sdc_taichi.sim.work_allocation import WorkAllocation
 from sdc_taichi.sim.workload import Workload
-from sdc_taichi.types import I64, State
+from sdc_taichi.types import F64, I64, State
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,4 +111,155 @@ def make_stages(
         crac_units=CracUnits(fleet, units),
         air=air,
         facility=facility,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SteadyStep:
+    """One step of B data centers whose room holds no heat from earlier ones."""
+
+    facility_kwh: F64
+    """IT and overhead energy, without the battery, in kWh, (B,)."""
+    water_l: F64
+    """Make-up water, in l, (B,)."""
+    unmet_w: F64
+    """Cooling load that stays in the room, in W, (B,); inf where results are beyond what is
+    physical."""
+
+
+class SteadyFacility:
+    """Copies of data centers, each at a constant utilisation and setpoint.
+
+    Copies are quasi-steady, meet no events, do not protect themselves and have nothing in the
+    queue; devices have the sizes that those of the originals have.
+
+    Args:
+        configs: Data centers to copy.
+        drivers: Their inputs, of which the design temperatures are read.
+        of: Which data center each copy is of, (B,).
+        utilisation: Utilisation of each copy, 0..1, (B,).
+        setpoint_c: Setpoint of each copy, within the range of its config, in C, (B,).
+        precision: Of the server kernels.
+
+    Raises:
+        PhysicalLimitError: A hall without steady air.
+    """
+
+    def __init__(
+        self,
+        configs: Sequence[DataCenterConfig],
+        drivers: Drivers,
+        of: I64,
+        utilisation: F64,
+        setpoint_c: F64,
+        precision: Precision,
+    ) -> None:
+        with warnings.catch_warnings():
+            # Whoever made the originals has been told.
+            warnings.simplefilter("ignore", OddInputWarning)
+            fleet = build_fleet(_copies(configs, of, setpoint_c))
+        self._step_h = 1.0 / fleet.steps_per_hour
+        # Weather is given step by step, and neither intensity nor price reaches the facility.
+        still = FleetSeries(np.zeros(1), np.zeros_like(of), np.ones_like(of))
+        own = replace(
+            drivers,
+            outdoor_c=still,
+            wet_bulb_c=still,
+            ci_g_per_kwh=still,
+            demand=FleetSeries(utilisation, np.arange(len(of)), np.ones_like(of)),
+            start=np.zeros_like(of),
+            design_outdoor_c=drivers.design_outdoor_c[of],
+            design_wet_bulb_c=drivers.design_wet_bulb_c[of],
+            sources=(),
+            synthetic=(),
+            notes=(),
+            price_per_kwh=still,
+        )
+        self._stages = stages = make_stages(fleet, own, precision, event_free=True)
+        self._state = stages.initial_state(fleet, np.zeros_like(of), own)
+        self._commands = stages.decoder.decode(None)
+        timeline = schedule(
+            fleet.configs,
+            rack_offsets=fleet.rack_offsets,
+            unit_offsets=fleet.unit_offsets,
+            steps_per_hour=fleet.steps_per_hour,
+            seed=0,
+        )
+        self._surroundings = stages.surroundings.at(
+            own.at(0), timeline.at(0), self._state.stored_kwh
+        )
+        self._supply = stages.crac_units.initial_supply()
+        self._air = self._solve_air()
+        self.inlet_max_c: F64 = self._air.inlet_max_c
+        """Hottest inlet of a server of each copy, in C, (B,)."""
+        self.outlet_max_c: F64 = np.maximum.reduceat(
+            self._air.rack_outlet_max_c.astype(np.float64), fleet.rack_offsets[:-1]
+        )
+        """Hottest outlet of a server of each copy, in C, (B,)."""
+
+    def at(self, outdoor_c: F64, wet_bulb_c: F64) -> SteadyStep:
+        """One step in some weather.
+
+        Args:
+            outdoor_c: Dry-bulb temperature outside, in C, (B,).
+            wet_bulb_c: Wet-bulb temperature outside, in C, (B,).
+        """
+        self._surroundings.outdoor_c, self._surroundings.wet_bulb_c = outdoor_c, wet_bulb_c
+        found = self._stages.facility.step(
+            self._state, self._commands, self._surroundings, self._supply, self._air
+        )
+        possible = (found["within_limits"] > 0) & (self.outlet_max_c <= AIR_LIMITS_C[1])
+        return SteadyStep(
+            facility_kwh=found["it_kwh"] + found["overhead_w"] * self._step_h / 1e3,
+            water_l=found["water_l"],
+            unmet_w=np.where(possible, found["unmet_w"], np.inf),
+        )
+
+    def close(self) -> None:
+        """Let go of the kernel arrays."""
+        self._stages.workload.close()
+
+    def _solve_air(self) -> HallSums:
+        """Air, temperatures and power of the halls under their load."""
+        stages, surroundings = self._stages, self._surroundings
+        capacity = stages.allocation.capacity(self._state, self._commands, surroundings)
+        work = stages.workload.run(
+            self._state.queue,
+            surroundings.demand,
+            self._commands.load_command,
+            capacity.utilisation,
+        )
+        placement = stages.allocation.place(
+            self._state, self._commands, surroundings, work, capacity
+        )
+        air, _ = stages.air.solve(self._state, placement, self._supply, surroundings)
+        return air
+
+
+def _copies(
+    configs: Sequence[DataCenterConfig], of: I64, setpoint_c: F64
+) -> list[DataCenterConfig]:
+    """Copies of data centers with first setpoints, which share equal sections."""
+    plain: dict[int, DataCenterConfig] = {}
+    at: dict[tuple[int, float], DataCenterConfig] = {}
+    for which, value_c in dict.fromkeys(zip(of.tolist(), setpoint_c.tolist(), strict=True)):
+        if which not in plain:
+            plain[which] = _without_memory(configs[which])
+        hvac = plain[which].hvac
+        setpoint = hvac.setpoint.model_copy(update={"initial_c": value_c})
+        hvac = hvac.model_copy(update={"setpoint": setpoint})
+        at[which, value_c] = plain[which].model_copy(update={"hvac": hvac})
+    return [at[key] for key in zip(of.tolist(), setpoint_c.tolist(), strict=True)]
+
+
+def _without_memory(config: DataCenterConfig) -> DataCenterConfig:
+    """A data center of which a step leaves nothing to the next, but for what a plan moves."""
+    work, simulation = config.workload, config.simulation
+    return config.model_copy(
+        update={
+            "events": EventsConfig(),
+            "protection": ProtectionConfig(),
+            "workload": work.model_copy(update={"model": "fluid", "max_utilisation": 1.0}),
+            "simulation": simulation.model_copy(update={"thermal": "quasi_steady"}),
+        }
     )

@@ -13,10 +13,9 @@ from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, allowable
 from sdc_taichi.hall.placement import make_bins, place
 from sdc_taichi.hall.protection import THROTTLED, TRIPPED, Mask
 from sdc_taichi.plant.workload import TASKS_PER_STEP
-from sdc_taichi.sim.actions import Commands
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import HallSums
-from sdc_taichi.sim.surroundings import Surroundings
+from sdc_taichi.sim.step_inputs import Commands, Surroundings
 from sdc_taichi.sim.workload import WorkResult
 from sdc_taichi.types import F64, I64, RackQuantities, State, Status
 
