@@ -17,7 +17,7 @@ from sdc_taichi.run.folder_reader import read_run
 from sdc_taichi.types import DATA_CENTERS, QUANTITIES, meanings
 
 DOCS = Path(__file__).parent.parent / "docs"
-PAGES_OF_COMMANDS = ("cli.md", "data.md", "fetch.md", "layout-solver.md")
+PAGES_OF_COMMANDS = ("cli.md", "data.md", "layout-solver.md")
 
 pytestmark = pytest.mark.repo
 

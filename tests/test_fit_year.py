@@ -19,7 +19,9 @@ pytestmark = pytest.mark.repo
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fit_year", ROOT / "examples" / "fit_year.py")
+    spec = importlib.util.spec_from_file_location(
+        "fit_year", ROOT / "docs" / "make" / "fit_year.py"
+    )
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)

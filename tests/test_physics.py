@@ -9,8 +9,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sdc_taichi import Simulator, drivers_from_arrays, load_config, make_configs
-from sdc_taichi.exogenous import site_names
+from sdc_taichi import Simulator, drivers_from_arrays, load_config, make_configs, with_values
+from sdc_taichi.exogenous import read_epw, site_names
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -83,18 +83,31 @@ def test_annual_pue_of_all_sites_is_that_of_real_plants() -> None:
     assert pue[hot] > pue[cold]
 
 
-@pytest.mark.repo
 def test_measured_years_agree_with_synthetic_years(real_data: Path) -> None:
-    example = _example("real_vs_synthetic")
-    configs = example.pairs_of_configs(real_data, steps_per_hour=1)
-    sums = example.year(configs, 8760)
-    pue = 1.0 + sums["hvac_kwh"] / sums["it_kwh"]
-    assert np.all((pue > 1.05) & (pue < 1.7))
-    for name, values in sums.items():
-        measured, synthetic = values[0::2], values[1::2]
-        np.testing.assert_allclose(synthetic, measured, rtol=0.04, err_msg=name)
-    lines = example.table(configs, sums).splitlines()
-    assert len(lines) == 2 + len(configs) // 2
+    configs = []
+    for site in ("AZ", "NY", "WA"):
+        base = load_config("corrected", [f"site.location={site}", "simulation.steps_per_hour=1"])
+        (weather,) = real_data.glob(f"weather/USA_{site}_*.epw")
+        (carbon,) = real_data.glob(f"carbon/{site}_NG_*.csv")
+        design = read_epw(weather).design
+        assert design is not None
+        sized = {
+            "hvac.sizing.design_outdoor_c": design.outdoor_c,
+            "hvac.sizing.design_wet_bulb_c": design.wet_bulb_c,
+        }
+        files = {
+            "site.weather_file": str(weather),
+            "site.carbon_file": str(carbon),
+            "site.workload_file": str(real_data / "workload" / "Alibaba_CPU_Data_Hourly_1.csv"),
+        }
+        configs += [with_values(base, sized | files), with_values(base, sized)]
+    names = ("it_kwh", "hvac_kwh", "grid_kwh", "carbon_g", "water_l")
+    with Simulator(configs) as sim:
+        sim.reset()
+        steps = [sim.step() for _ in range(8760)]
+    for name in names:
+        sums = np.sum([getattr(result, name) for result in steps], axis=0)
+        np.testing.assert_allclose(sums[1::2], sums[0::2], rtol=0.04, err_msg=name)
 
 
 def test_a_room_that_overheats_recovers_when_load_falls() -> None:

@@ -4,7 +4,7 @@ Each quantity is a climatology (annual and diurnal harmonics and their product) 
 autocorrelated residual, mapped onto the percentiles of the real series. Weather is dry bulb, dew
 point correlated with it, and pressure; carbon intensity follows from a generated fuel mix in which
 every fuel but the marginal one is drawn and the marginal one takes what wind leaves. The figures
-are in ``sdc_taichi.data/coefficients.json``, found by ``examples/fit_year.py``; where they come
+are in ``sdc_taichi.data/coefficients.json``, found by ``docs/make/fit_year.py``; where they come
 from is in ``data/README.md``.
 
 Random numbers are raw PCG64 bits turned to normals by Box-Muller, because NumPy guarantees the bit

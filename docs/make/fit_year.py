@@ -1,6 +1,6 @@
 """Fit the figures of the embedded synthetic year, data/coefficients.json, to measured files.
 
-    python examples/fit_year.py FOLDER OUT.json [--site XX] [--refit]
+    python docs/make/fit_year.py FOLDER OUT.json [--site XX] [--refit]
 
 FOLDER holds weather/USA_XX_*.epw, carbon/XX_NG_&_avgCI.csv and workload/*.csv. With the files named
 in data/README.md the result equals data/coefficients.json to the byte.
