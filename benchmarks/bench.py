@@ -1,4 +1,4 @@
-"""Speed beside its targets in one run; docs/performance-tables.md explains both.
+"""Speed beside its targets in one run; docs/performance.md explains both.
 
     python benchmarks/bench.py [--quick] [--out runs/bench]
 
@@ -532,7 +532,7 @@ def show(figure: Figure, last: str, quick: bool) -> None:
 
 
 def markdown(figures: list[Figure], quick: bool) -> str:
-    """The tables for docs/performance-tables.md."""
+    """Tables of all figures."""
     lines = []
     for part in dict.fromkeys(f.part for f in figures):
         lines += [

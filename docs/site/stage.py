@@ -23,7 +23,6 @@ ELSEWHERE = {
     "CONTRIBUTING.md": "development/contributing.md",
     "CHANGELOG.md": "development/changelog.md",
     "kernels/README.md": "development/kernels.md",
-    "kernels/compiler/README.md": "development/kernel-compiler.md",
     "data/README.md": "development/embedded-data.md",
     "tests/reference/energyplus/README.md": "development/energyplus-tables.md",
 }

@@ -1,6 +1,6 @@
 """Calling a kernel again and again, without what Taichi does anew at every call.
 
-README.md of this folder says what each departure from Taichi's public interface gains, and how
+kernels/README.md says what each departure from Taichi's public interface gains, and how
 ``SDC_TAICHI_PLAIN`` turns all of them off.
 """
 
