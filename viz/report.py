@@ -16,9 +16,8 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.run.folder_reader import RunFolder, is_number
 from sdc_taichi.run.folder_writer import METRICS_FILE, REPORT_FILE
 
-from .report_html import html_page
-from .report_inlets import hot_racks_section
-from .report_metrics import MAX_DC_COLUMNS, METRICS, comparison_section, metrics_section
+from .report_html import html_page, time_span_text
+from .report_metrics import LABELS, MAX_DC_COLUMNS, comparison_section, metrics_section
 from .report_optimum import known_optimum, optimum_section, shares_of
 from .report_pictures import (
     data_center_section,
@@ -26,8 +25,15 @@ from .report_pictures import (
     inputs_section,
     shown_data_centers,
 )
-from .report_sections import events_section, provenance_section, summary_section
-from .report_text import time_span_text
+from .report_sections import (
+    events_section,
+    hot_racks_section,
+    provenance_section,
+    summary_section,
+)
+
+RATIOS = ("pue", "pue_with_losses", "partial_pue", "cue_kg_per_kwh", "wue_l_per_kwh")
+"""Metrics that are undefined without IT energy."""
 
 
 def write_report(run: RunFolder, others: Sequence[RunFolder] = (), out: Path | None = None) -> Path:
@@ -97,18 +103,13 @@ def _check_metrics(run: RunFolder) -> None:
     # Rows, racks of a hall and servers of a rack are far fewer.
     places = dict.fromkeys(("hottest_row", "hottest_rack", "hottest_server"), 10**9)
     places["hottest_step"] = run.metrics["steps_done"] - 1
-    ratios = {"pue", "pue_with_losses", "partial_pue", "cue_kg_per_kwh", "wue_l_per_kwh"}
-    given = [("total", run.metrics["total"])]
-    given += [(f"data_centers[{i}].metrics", dc["metrics"]) for i, dc in enumerate(dcs)]
-    for where, metrics in given:
-        for key in (key for _, group in METRICS for key, *_ in group):
-            value = metrics.get(key)
-            may_be_empty = key == "time_to_throttle_min"
-            may_be_empty |= key in ratios and metrics.get("it_kwh") == 0
-            empty = value is None and may_be_empty
-            if not (is_number(value) or (key in metrics and empty)):
-                found = f"is {value!r}" if key in metrics else "is missing"
-                raise SdcError(f"{path}: {where}.{key} {found}; valid is a number")
+    all_metrics = {f"data_centers[{i}].metrics": dc["metrics"] for i, dc in enumerate(dcs)}
+    for where, metrics in {"total": run.metrics["total"], **all_metrics}.items():
+        undefined = {"time_to_throttle_min", *(RATIOS if metrics.get("it_kwh") == 0 else ())}
+        for key in LABELS:
+            value = metrics.get(key, "missing")
+            if not is_number(value) and (value is not None or key not in undefined):
+                raise SdcError(f"{path}: {where}.{key} is {value!r}; valid is a number")
         for key, most in places.items():
             value = metrics.get(key)
             if not (is_number(value) and isinstance(value, int) and 0 <= value <= most):

@@ -1,16 +1,26 @@
-"""HTML of a report: the page with its style, tables, notices and pictures."""
+"""HTML and words of a report: page, tables, notices and pictures; numbers, names and times.
+
+The HTML comes from the template ``report.html``, which escapes every text that it is given.
+"""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from datetime import datetime
+from functools import cache
 from html import escape
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from sdc_taichi.errors import printable
+import numpy as np
 
-from .plotting import webp
+from sdc_taichi.errors import SdcError, printable
+from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR, day_of_year, step_times
+from sdc_taichi.run.folder_reader import RunFolder
+from sdc_taichi.run.folder_writer import METRICS_FILE
+
+from .plotting import date_text, format_number, webp
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,71 +29,28 @@ PICTURE_DPI = 110
 """Resolution of the pictures, in pixels per inch."""
 LONG_WORD = 24
 """Length from which words of a table, such as names and hashes, may be broken on paper."""
-
-STYLE = """
-:root { color-scheme: light; }
-body { margin: 0 auto; padding: 1.5rem; max-width: 76rem; color: #1a1a1a; background: #fff;
-  font: 16px/1.45 system-ui, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
-h1 { font-size: 1.7rem; margin: 0 0 .3rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.3rem; margin: 2.2rem 0 .6rem; border-bottom: 2px solid #0072B2;
-  overflow-wrap: anywhere; }
-h3 { font-size: 1.05rem; margin: 1.4rem 0 .4rem; overflow-wrap: anywhere; }
-p, ul { max-width: 62rem; }
-.lead { color: #444; margin-top: 0; overflow-wrap: anywhere; }
-.notice { border-left: 5px solid #E69F00; background: #fff6e0; padding: .5rem .9rem;
-  margin: .8rem 0; overflow-wrap: anywhere; }
-.key { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.5rem, 1fr)); gap: .6rem;
-  margin: 1rem 0; padding: 0; }
-.key div { border: 1px solid #ccc; border-radius: 6px; padding: .5rem .8rem; }
-.key dt { font-size: .85rem; color: #444; }
-.key dd { margin: 0; font-size: 1.25rem; font-weight: 600; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .88rem; margin: .4rem 0; }
-caption { text-align: left; color: #444; padding-bottom: .3rem; }
-th, td { padding: .2rem .6rem; border-bottom: 1px solid #ddd; text-align: left;
-  vertical-align: top; }
-td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
-td.n { white-space: nowrap; }
-td { min-width: 3.5rem; }
-thead th { border-bottom: 2px solid #888; }
-tbody th { font-weight: 400; }
-th.group { font-weight: 600; padding-top: .7rem; }
-code { font-size: .85em; overflow-wrap: anywhere; }
-pre { font-size: .75rem; overflow-x: auto; background: #f5f5f5; padding: .8rem; }
-figure { margin: 1rem 0 1.6rem; }
-img { max-width: 100%; height: auto; }
-figcaption { font-size: .88rem; color: #444; max-width: 62rem; overflow-wrap: anywhere; }
-nav ul { columns: 2; padding-left: 1.2rem; }
-a { color: #0060a0; }
-@page { size: A4; margin: 14mm; }
-@media print {
-  body { max-width: none; padding: 0; font-size: 10pt; }
-  nav, details { display: none; }
-  h2, h3, caption, thead, tr.group { break-after: avoid; }
-  section.own { break-before: page; }
-  figure, .key, .notice, tr { break-inside: avoid; }
-  thead { display: table-header-group; }
-  table { font-size: 8pt; width: 100%; }
-  th, td { padding: .12rem .35rem; }
-  td { min-width: 0; }
-  td.n { white-space: normal; }
-  .long { overflow-wrap: anywhere; }
-  .wide { overflow: visible; }
-  img { max-height: 230mm; }
-  a { color: inherit; text-decoration: none; }
-}
-"""
-"""Style sheet of the page, on screens and on paper."""
+DASH = "–"
+"""Text of a cell without a value."""
+MAX_ROWS = 40
+"""Largest number of rows of a list that grows with the run: events, sources, notes."""
+NAMES_PER_CELL = 6
+"""Largest number of data centers that a cell names."""
 
 
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """A cell of a table."""
-
-    text: str
-    """Text of the cell."""
-    is_number: bool = False
-    """Whether the text is a number, which is aligned to the right."""
+@cache
+def _macros() -> Any:
+    """Macros of the template by name."""
+    try:
+        import jinja2
+    except ImportError as error:
+        raise SdcError(
+            f'reports need jinja2 ({error}); install it with: pip install "sdc-taichi[plot]"'
+        ) from None
+    templates = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent, encoding="utf-8"), autoescape=True
+    )
+    templates.tests["has_long_word"] = lambda text: max(map(len, text.split(" "))) >= LONG_WORD
+    return templates.get_template("report.html").module
 
 
 def html_page(title: str, lead: str, sections: Mapping[str, str], own_page: set[str]) -> str:
@@ -95,22 +62,7 @@ def html_page(title: str, lead: str, sections: Mapping[str, str], own_page: set[
         sections: from the heading of each section to its HTML.
         own_page: headings of the sections that begin a new page on paper.
     """
-    ids = {name: f"s{index}" for index, name in enumerate(sections)}
-    links = "".join(f'<li><a href="#{ids[name]}">{escape(name)}</a></li>\n' for name in sections)
-    body = "".join(
-        f'<section class="{"own" if name in own_page else "all"}" aria-labelledby="{ids[name]}">'
-        f'<h2 id="{ids[name]}">{escape(name)}</h2>\n{content}</section>\n'
-        for name, content in sections.items()
-    )
-    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-    page = (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
-        f'<h1>{escape(title)}</h1>\n<p class="lead">{escape(lead)}</p>\n'
-        f'<nav aria-label="Contents"><ul>\n{links}</ul></nav>\n{body}</main>\n</body>\n</html>\n'
-    )
+    page = str(_macros().page(title, lead, sections, own_page))
     return "\n".join(map(printable, page.split("\n")))
 
 
@@ -123,64 +75,114 @@ def picture_element(figure: Figure, alt: str, caption: str) -> str:
         caption: text below the picture.
     """
     width, height, data = webp(figure, PICTURE_DPI)
-    source = base64.b64encode(data).decode()
-    return (
-        f'<figure><img src="data:image/webp;base64,{source}" width="{width}" height="{height}" '
-        f'alt="{escape(alt)}"><figcaption>{escape(caption)}</figcaption></figure>\n'
-    )
+    return str(_macros().picture(base64.b64encode(data).decode(), width, height, alt, caption))
 
 
 def html_table(
     caption: str,
-    heads: Sequence[Cell] | None,
-    rows: Sequence[Sequence[Cell]] = (),
+    heads: Sequence[str] | None,
+    rows: Sequence[Sequence[str]] = (),
     *,
-    groups: Iterable[tuple[str, Iterable[Sequence[Cell]]]] = (),
+    numbers: Iterable[int] = (),
+    groups: Mapping[str, Sequence[Sequence[str]]] | None = None,
 ) -> str:
     """A table whose rows are headed by their first cell.
 
     Args:
         caption: text above the table.
         heads: heads of the columns; None is a table of two columns without heads.
-        rows: cells of each row.
-        groups: further rows, each group with its title.
+        rows: texts of each row.
+        numbers: indices of the columns of numbers, which are aligned to the right.
+        groups: further rows, by the title of their group.
     """
-    head = ""
-    if heads is not None:
-        cells = "".join(_cell_element("th", cell, ' scope="col"') for cell in heads)
-        head = f"<thead><tr>{cells}</tr></thead>"
-    bodies = [f"<tbody>{_table_rows(rows)}</tbody>"] if rows else []
-    for title, own in groups:
-        across = len(heads) if heads is not None else 2
-        bodies.append(
-            f'<tbody><tr class="group"><th class="group" scope="rowgroup" colspan="{across}">'
-            f"{escape(title)}</th></tr>\n{_table_rows(own)}</tbody>"
-        )
-    return (
-        f'<div class="wide" role="region" aria-label="{escape(caption)}" tabindex="0"><table>'
-        f"<caption>{escape(caption)}</caption>{head}{''.join(bodies)}</table></div>\n"
-    )
+    titled = ([("", rows)] if rows else []) + list((groups or {}).items())
+    return str(_macros().table(caption, heads, titled, set(numbers)))
 
 
-def _table_rows(rows: Iterable[Sequence[Cell]]) -> str:
-    """Rows of a table."""
-    return "".join(
-        "<tr>"
-        + _cell_element("th", row[0], ' scope="row"')
-        + "".join(_cell_element("td", cell) for cell in row[1:])
-        + "</tr>\n"
-        for row in rows
-    )
-
-
-def _cell_element(tag: str, cell: Cell, attributes: str = "") -> str:
-    """An element for a cell, ``th`` or ``td``."""
-    is_long = max(map(len, cell.text.split(" "))) >= LONG_WORD
-    classes = " ".join(["n"] * cell.is_number + ["long"] * is_long)
-    kind = f' class="{classes}"' if classes else ""
-    return f"<{tag}{attributes}{kind}>{escape(cell.text)}</{tag}>"
+def paragraph(text: str) -> str:
+    """A paragraph."""
+    return f"<p>{escape(text)}</p>\n"
 
 
 def notice(text: str) -> str:
     """A paragraph that stands out."""
     return f'<p class="notice" role="note">{escape(text)}</p>\n'
+
+
+def bullets(texts: Iterable[str]) -> str:
+    """A list of texts."""
+    return str(_macros().bullets(texts))
+
+
+def key_figures(figures: Iterable[tuple[str, str]]) -> str:
+    """Labels and figures in boxes beside each other."""
+    return str(_macros().key_figures(figures))
+
+
+def folded(summary: str, text: str) -> str:
+    """A long text that readers can unfold."""
+    return f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>\n"
+
+
+def metric_text(metrics: Mapping[str, Any], key: str) -> str:
+    """A metric as text, a dash where it is not defined."""
+    value = metrics[key]
+    return DASH if value is None else format_number(value)
+
+
+def names_text(names: Sequence[str]) -> str:
+    """The first few names, and how many more there are."""
+    if len(names) <= NAMES_PER_CELL:
+        return ", ".join(names)
+    return f"{', '.join(names[:NAMES_PER_CELL])} and {len(names) - NAMES_PER_CELL:,} more"
+
+
+def first_texts(texts: Sequence[str]) -> list[str]:
+    """The first texts of a list, and how many more there are."""
+    if len(texts) <= MAX_ROWS:
+        return list(texts)
+    return [*texts[:MAX_ROWS], f"and {len(texts) - MAX_ROWS} more, see {METRICS_FILE}"]
+
+
+def local_time(run: RunFolder, dc: int, step: int) -> datetime:
+    """Time at which a step begins on the clock of a data center.
+
+    Args:
+        run: the run.
+        dc: index of the data center.
+        step: the step, counted from 0 at reset.
+    """
+    per_hour = round(1 / run.metrics["step_h"])
+    first_day = day_of_year(run.metrics["data_centers"][dc]["start"])
+    start = np.array([first_day * 24 * per_hour])
+    moment: datetime = step_times(start, np.array([step]), per_hour)[0, 0].astype(datetime)
+    return moment
+
+
+def time_text(run: RunFolder, moment: datetime) -> str:
+    """Day and time of day, with the year of the run if it is longer than a year."""
+    day = date_text(moment, over_a_year=run.hours > HOURS_PER_YEAR)
+    return f"{day} {moment:%H:%M}"
+
+
+def count_text(value: float, noun: str) -> str:
+    """A number and a noun, in the plural unless the number is 1."""
+    return f"{format_number(value)} {noun}" + ("" if value == 1 else "s")
+
+
+def time_span_text(run: RunFolder) -> str:
+    """Data centers, length, begin and end of a run in words."""
+    begin, last = local_time(run, 0, 0), local_time(run, 0, run.metrics["steps_done"])
+    size, length = count_text(len(run.names), "data center"), count_text(run.hours / 24, "day")
+    span = f"{time_text(run, begin)} to {time_text(run, last)}, local standard time"
+    return f"{size}, {length} from {span}"
+
+
+def run_labels(runs: Sequence[RunFolder]) -> list[str]:
+    """Names of runs: their controllers, with their folders where these do not tell them apart."""
+    names = [run.metrics["controller"] for run in runs]
+    if len(set(names)) < len(names):
+        names = [f"{n} ({run.path.resolve().name})" for n, run in zip(names, runs, strict=True)]
+    if len(set(names)) < len(names):
+        names = [f"{name} #{index + 1}" for index, name in enumerate(names)]
+    return names

@@ -10,8 +10,15 @@ from sdc_taichi.run.folder_reader import RunFolder
 
 from .fleet_figures import MAX_RUNS, RADAR_METRICS, radar
 from .plotting import format_number
-from .report_html import Cell, html_table, notice, picture_element
-from .report_text import metric_text, names_text, run_labels
+from .report_html import (
+    DASH,
+    html_table,
+    metric_text,
+    names_text,
+    notice,
+    picture_element,
+    run_labels,
+)
 
 MAX_DC_COLUMNS = 6
 """Largest number of data centers with a column each."""
@@ -110,79 +117,73 @@ COMPARED = (
 
 RANKED = ("hottest_inlet_c", "pue", "cue_kg_per_kwh", "wue_l_per_kwh", "dropped_tasks")
 """Names of the metrics by which data centers are ranked; more is worse."""
+LABELS = {key: (label, unit) for _, group in METRICS for key, label, unit in group}
+"""Label and unit of each metric by its name."""
 
 
 def metrics_section(run: RunFolder) -> str:
     """All metrics, with a column for each of a few data centers, or with their range."""
     dcs, total = run.metrics["data_centers"], run.metrics["total"]
     are_few, are_several = len(dcs) <= MAX_DC_COLUMNS, len(dcs) > 1
-    heads = [Cell("metric"), Cell("unit")]
-    if are_few:
-        heads += [Cell(dc["name"], True) for dc in dcs]
-    else:
-        heads += [Cell("lowest"), Cell("mean", True), Cell("highest")]
-    heads += [Cell("all", True)] if are_several else []
-    groups = []
+    columns = [dc["name"] for dc in dcs] if are_few else ["lowest", "mean", "highest"]
+    heads = ["metric", "unit", *columns, *["all"] * are_several]
+    groups = {}
     for group, metrics in METRICS:
-        rows = []
-        for key, label, unit in metrics:
-            cells = [Cell(label), Cell(unit)]
-            if are_few:
-                cells += [Cell(metric_text(dc["metrics"], key), True) for dc in dcs]
-            else:
-                low, mean, high = _low_mean_high(dcs, key)
-                cells += [Cell(low), Cell(mean, True), Cell(high)]
-            cells += [Cell(metric_text(total, key), True)] if are_several else []
-            rows.append(cells)
-        groups.append((group, rows))
+        groups[group] = [
+            [
+                label,
+                unit,
+                *([metric_text(dc["metrics"], key) for dc in dcs] if are_few else _range(dcs, key)),
+                *[metric_text(total, key)] * are_several,
+            ]
+            for key, label, unit in metrics
+        ]
     caption = (
         "Of all data centers, energies, carbon, water, tasks and hours are sums, ratios those of "
         "the sums, queues means and maxima."
         if are_several
         else "Sums and means over the run."
     )
-    out = html_table(caption, heads, groups=groups)
-    return out if are_few else out + _ranking(dcs)
+    numbers = range(2, len(heads)) if are_few else (3, 5)
+    table = html_table(caption, heads, numbers=numbers, groups=groups)
+    return table if are_few else table + _ranking(dcs)
 
 
 def _ranking(dcs: Sequence[dict[str, Any]]) -> str:
     """The worst and the best data centers by each of a few metrics."""
-    labels = {key: f"{label} ({unit})" for _, group in METRICS for key, label, unit in group}
-    ranked = {
-        key: sorted(
-            ((dc["metrics"][key], dc["name"]) for dc in dcs if dc["metrics"][key] is not None),
-            key=lambda pair: -pair[0],
-        )
-        for key in RANKED
-    }
-    groups = []
+    ranked = {key: sorted(_values(dcs, key), key=lambda pair: -pair[0]) for key in RANKED}
+    groups = {}
     for group, count, order in (("worst", WORST_RANKS, 1), ("best", BEST_RANKS, -1)):
-        columns = [_rank_texts(ranked[key][::order], count) for key in RANKED]
-        rows = [
-            [Cell(f"{rank + 1}"), *(Cell(column[rank]) for column in columns)]
-            for rank in range(count)
-        ]
-        groups.append((group, rows))
-    heads = [Cell("rank"), *(Cell(labels[key]) for key in RANKED)]
+        columns = [_rank_texts(pairs[::order], count) for pairs in ranked.values()]
+        ranks = [str(rank + 1) for rank in range(count)]
+        groups[group] = list(zip(ranks, *columns, strict=True))
+    heads = ["rank", *("{} ({})".format(*LABELS[key]) for key in RANKED)]
     return html_table("Worst and best data centers by five metrics", heads, groups=groups)
 
 
+def _values(dcs: Sequence[dict[str, Any]], key: str) -> list[tuple[float, str]]:
+    """Values of a metric with the names of the data centers that have one."""
+    pairs = [(dc["metrics"][key], dc["name"]) for dc in dcs]
+    return [pair for pair in pairs if pair[0] is not None]
+
+
 def _rank_texts(pairs: Sequence[tuple[float, str]], count: int) -> list[str]:
-    """The first pairs of a value and a name as texts; equal values rank nobody."""
+    """The first pairs of a value and a name as texts; equal values are not ranked."""
     if pairs and pairs[0][0] == pairs[-1][0]:
-        return [f"all {format_number(pairs[0][0])}", *["–"] * (count - 1)]
-    # A space that does not break: a value alone on a line reads as another entry.
-    texts = [f"{name}:\u00a0{format_number(value)}" for value, name in pairs[:count]]
-    return texts + ["–"] * (count - len(texts))
+        texts = [f"all {format_number(pairs[0][0])}"]
+    else:
+        # A space that does not break: a value alone on a line reads as another entry.
+        texts = [f"{name}:\u00a0{format_number(value)}" for value, name in pairs[:count]]
+    return texts + [DASH] * (count - len(texts))
 
 
-def _low_mean_high(dcs: Sequence[dict[str, Any]], key: str) -> list[str]:
+def _range(dcs: Sequence[dict[str, Any]], key: str) -> list[str]:
     """Lowest, mean and highest value of a metric as texts, the extremes with a data center."""
-    known = [(dc["metrics"][key], dc["name"]) for dc in dcs if dc["metrics"][key] is not None]
-    if not known:
-        return ["–"] * 3
-    low, high = min(known, key=lambda k: k[0]), max(known, key=lambda k: k[0])
-    mean = format_number(sum(value for value, _ in known) / len(known))
+    values = _values(dcs, key)
+    if not values:
+        return [DASH] * 3
+    low, high = min(values, key=lambda v: v[0]), max(values, key=lambda v: v[0])
+    mean = format_number(sum(value for value, _ in values) / len(values))
     if low[0] == high[0]:
         return [format_number(low[0]), mean, format_number(high[0])]
     return [f"{format_number(low[0])} {low[1]}", mean, f"{format_number(high[0])} {high[1]}"]
@@ -210,63 +211,59 @@ def comparison_section(
             )
     if len(runs) > MAX_RUNS:
         raise SdcError(f"{len(runs)} runs to compare; valid are up to {MAX_RUNS}")
-    totals = [run.metrics["total"] for run in runs]
-    out = []
-    others = [
+    totals = {label: run.metrics["total"] for label, run in zip(labels, runs, strict=True)}
+    fingerprint = first.metrics["fingerprint"]
+    different = [
         label
         for label, run in zip(labels, runs, strict=True)
-        if run.metrics["fingerprint"] != first.metrics["fingerprint"]
+        if run.metrics["fingerprint"] != fingerprint
     ]
-    if others:
-        out.append(
+    parts = []
+    if different:
+        parts.append(
             notice(
-                f"Other configs, inputs or precision than {labels[0]}: {names_text(others)}. "
+                f"Other configs, inputs or precision than {labels[0]}: {names_text(different)}. "
                 "Differences come not from the controller alone."
             )
         )
+    share_of = None if shares is None else dict(zip(labels, shares, strict=True))
     for start in range(1, len(runs), COMPARED_PER_TABLE):
-        columns = [0, *range(start, min(start + COMPARED_PER_TABLE, len(runs)))]
-        own = None if shares is None else [shares[i] for i in columns]
-        out.append(
-            _comparison_table([labels[i] for i in columns], [totals[i] for i in columns], own)
-        )
+        columns = [labels[0], *labels[start : start + COMPARED_PER_TABLE]]
+        parts.append(_comparison_table({label: totals[label] for label in columns}, share_of))
     worst = "; ".join(
-        f"{label} {format_number(max(total[key] for total in totals))} {unit}"
+        f"{label} {format_number(max(total[key] for total in totals.values()))} {unit}"
         for key, label, unit in RADAR_METRICS
     )
-    out.append(
+    parts.append(
         picture_element(
-            radar(dict(zip(labels, totals, strict=True))),
+            radar(totals),
             f"Radar of five metrics for {names_text(labels)}. Worst values: {worst}.",
             "Each axis runs from the value in the middle to the worst of the runs at the rim; less "
             "is better.",
         )
     )
-    return "".join(out)
+    return "".join(parts)
 
 
 def _comparison_table(
-    labels: Sequence[str],
-    totals: Sequence[Mapping[str, Any]],
-    shares: Sequence[float | None] | None = None,
+    totals: Mapping[str, Mapping[str, Any]], share_of: Mapping[str, float | None] | None
 ) -> str:
-    """Metrics of some runs, and their changes against the first one."""
-    known = {key: (label, unit) for _, group in METRICS for key, label, unit in group}
+    """Metrics of some runs by label, and their changes against the first one."""
+    base, *_ = totals.values()
     rows = []
     for key in COMPARED:
-        base = totals[0][key]
-        cells = [Cell(known[key][0]), Cell(known[key][1])]
-        for index, total in enumerate(totals):
+        cells = [*LABELS[key], metric_text(base, key)]
+        for total in list(totals.values())[1:]:
             text = metric_text(total, key)
             # A temperature has no zero to be a share of.
-            if index and base and total[key] is not None and not key.endswith("_c"):
-                text += f" ({100 * (total[key] / base - 1):+z.2f} %)"
-            cells.append(Cell(text, True))
+            if base[key] and total[key] is not None and not key.endswith("_c"):
+                text += f" ({100 * (total[key] / base[key] - 1):+z.2f} %)"
+            cells.append(text)
         rows.append(cells)
-    if shares is not None:
-        texts = ["–" if share is None else f"{100 * share:z.1f}" for share in shares]
-        own = [Cell("share of the achievable"), Cell("%"), *(Cell(text, True) for text in texts)]
-        rows.append(own)
-    heads = [Cell("metric"), Cell("unit"), *(Cell(label, True) for label in labels)]
-    caption = f"All data centers of each run; changes are against {labels[0]}"
-    return html_table(caption, heads, rows)
+    if share_of is not None:
+        shares = [share_of[label] for label in totals]
+        texts = [DASH if share is None else f"{100 * share:z.1f}" for share in shares]
+        rows.append(["share of the achievable", "%", *texts])
+    heads = ["metric", "unit", *totals]
+    caption = f"All data centers of each run; changes are against {heads[2]}"
+    return html_table(caption, heads, rows, numbers=range(2, len(heads)))

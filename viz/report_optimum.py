@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 from sdc_taichi.errors import SdcError
@@ -16,9 +15,8 @@ from sdc_taichi.run.optimum_folder import find_optimum, optimum_remarks, remarks
 
 from .optimum_figure import COLUMNS, day_of_most_saved, optimum_day
 from .plotting import format_number
-from .report_html import Cell, html_table, picture_element
+from .report_html import DASH, MAX_ROWS, first_texts, html_table, paragraph, picture_element
 from .report_pictures import ShownDataCenter
-from .report_text import MAX_ROWS, first_texts
 
 _SAVED = {
     "carbon": "carbon_g",
@@ -27,7 +25,6 @@ _SAVED = {
     "water": "water_l",
 }
 """Columns of steps.parquet by the objectives of which days are told."""
-_DASH = "–"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +65,12 @@ def optimum_section(run: RunFolder, optimum: KnownOptimum, shown: Sequence[Shown
         shown: data centers with pictures.
     """
     content = optimum.content
-    own = remarks_beside(run.metrics) if _own(run, content) is not None else []
+    own = remarks_beside(run.metrics) if _beside_optimum(run, content) is not None else []
     remarks = first_texts(list(dict.fromkeys([*optimum_remarks(content), *own])))
-    out = ["".join(f"<p>{escape(text)}</p>\n" for text in remarks), _table(run, content)]
-    for dc in shown:
-        if run.metrics["steps_done"] > 1:
-            out.append(_day_picture(run, optimum, dc))
-    return "".join(out)
+    parts = [*map(paragraph, remarks), _table(run, content)]
+    if run.metrics["steps_done"] > 1:
+        parts += [_day_picture(run, optimum, dc) for dc in shown]
+    return "".join(parts)
 
 
 def shares_of(runs: Sequence[RunFolder], optimum: KnownOptimum) -> list[float | None]:
@@ -98,7 +94,7 @@ def _share_of(run: RunFolder, content: Mapping[str, Any]) -> float | None:
         run.path, content["fingerprint"], content["steps"]
     ):
         return 1.0
-    if _own(run, content) is not None:
+    if _beside_optimum(run, content) is not None:
         share = run.metrics["total"].get("achievable_share")
         return float(share) if is_number(share) else None
     total, best = run.metrics["total"], content["total"]
@@ -113,7 +109,7 @@ def _share_of(run: RunFolder, content: Mapping[str, Any]) -> float | None:
     return float((idle - figure) / (idle - achieved))
 
 
-def _own(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, Any] | None:
+def _beside_optimum(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """What metrics.json says of an optimum of this objective, agents and steps; None if nothing.
 
     Raises:
@@ -134,57 +130,44 @@ def _own(run: RunFolder, content: Mapping[str, Any]) -> Mapping[str, Any] | None
 
 def _table(run: RunFolder, content: Mapping[str, Any]) -> str:
     """Figures of each data center and of all."""
-    has_own = _own(run, content) is not None
-    names = [each["controller"] for each in content["controllers"]]
-    heads = ["idle", "bound", "achieved", "gap (points)"]
+    controllers, dcs = content["controllers"], content["data_centers"]
+    beside = _beside_optimum(run, content) is not None
+    heads = ["data center", "idle", "bound", "achieved", "gap (points)"]
     heads += [f"{name} alone" for name in content["total"]["alone"]]
-    heads += ["this run, ends valued", "share (%)"] if has_own else []
-    heads += [f"{name}, share (%)" for name in names]
-    shown = content["data_centers"][:MAX_ROWS]
+    heads += ["this run, ends valued", "share (%)"] if beside else []
+    heads += [f"{each['controller']}, share (%)" for each in controllers]
+
+    def row(
+        name: str, figures: Mapping[str, Any], metrics: Mapping[str, Any], shares: Iterable[Any]
+    ) -> list[str]:
+        values = [figures[key] for key in ("idle", "bound", "achieved", "gap_points")]
+        values += list(figures["alone"].values())
+        if beside:
+            values += [metrics.get("valued_figure"), _percent(metrics.get("achievable_share"))]
+        values += map(_percent, shares)
+        return [name, *(format_number(v) if is_number(v) else DASH for v in values)]
+
     rows = []
-    for i, dc in enumerate(shown):
-        shares = [each["data_centers"][i].get("share") for each in content["controllers"]]
-        rows.append(
-            _row(dc["name"], dc, run.metrics["data_centers"][i]["metrics"], has_own, shares)
-        )
-    shares = [each.get("share") for each in content["controllers"]]
-    if len(content["data_centers"]) > 1:
-        rows.append(_row("all", content["total"], run.metrics["total"], has_own, shares))
-    unit = str(content["unit"]).replace("CO2", "CO₂")
+    for i, (dc, own) in enumerate(zip(dcs, run.metrics["data_centers"], strict=True)):
+        shares = (each["data_centers"][i].get("share") for each in controllers)
+        rows.append(row(dc["name"], dc, own["metrics"], shares))
     caption = (
-        f"Objective {content['objective']}: figures in {unit}, less is better; the gap "
-        "between bound and achieved in % of idle; shares of the achievable, 0 as good as idle "
-        "commands and 100 as good as the achieved path"
+        f"Objective {content['objective']}: figures in {content['unit'].replace('CO2', 'CO₂')}, "
+        "less is better; the gap between bound and achieved in % of idle; shares of the "
+        "achievable, 0 as good as idle commands and 100 as good as the achieved path"
     )
-    if len(content["data_centers"]) > len(shown):
+    if len(rows) > MAX_ROWS:
         caption += f"; the first {MAX_ROWS} data centers, and all together"
-    return html_table(caption, [Cell("data center"), *(Cell(h, True) for h in heads)], rows)
+        rows = rows[:MAX_ROWS]
+    if len(dcs) > 1:
+        shares = (each.get("share") for each in controllers)
+        rows.append(row("all", content["total"], run.metrics["total"], shares))
+    return html_table(caption, heads, rows, numbers=range(1, len(heads)))
 
 
-def _row(
-    name: str,
-    figures: Mapping[str, Any],
-    metrics: Mapping[str, Any],
-    has_own: bool,
-    shares: Sequence[object],
-) -> list[Cell]:
-    """Row of a data center, or of all."""
-    values = [figures[key] for key in ("idle", "bound", "achieved", "gap_points")]
-    values += list(figures["alone"].values())
-    if has_own:
-        values += [metrics.get("valued_figure"), _percent(metrics.get("achievable_share"))]
-    values += [_percent(share) for share in shares]
-    return [Cell(name), *(Cell(_text(value), True) for value in values)]
-
-
-def _percent(share: object) -> float | None:
+def _percent(share: Any) -> float | None:
     """A share in %."""
-    return 100.0 * float(share) if is_number(share) else None  # type: ignore[arg-type]
-
-
-def _text(value: object) -> str:
-    """A figure as text, a dash where there is none."""
-    return format_number(float(value)) if is_number(value) else _DASH  # type: ignore[arg-type]
+    return 100.0 * share if is_number(share) else None
 
 
 def _day_picture(run: RunFolder, optimum: KnownOptimum, dc: ShownDataCenter) -> str:

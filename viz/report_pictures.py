@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,8 +21,7 @@ from sdc_taichi.run.folder_reader import (
 
 from . import dashboards, data_figures, figures, fleet_figures
 from .plotting import format_number, scale_thousands
-from .report_html import picture_element
-from .report_text import time_text
+from .report_html import folded, paragraph, picture_element, time_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -119,30 +117,27 @@ def shown_data_centers(run: RunFolder) -> list[ShownDataCenter]:
 def data_center_section(run: RunFolder, dc: ShownDataCenter) -> str:
     """A data center in words and pictures, with its config."""
     steps, hall = dc.steps, dc.config.hall
-    out = []
-    if dc.reason:
-        out.append(f"<p>Shown because {dc.reason} of {len(run.names):,}.</p>\n")
+    parts = [paragraph(f"Shown because {dc.reason} of {len(run.names):,}.")] if dc.reason else []
     location = run.metrics["data_centers"][dc.index]["location"]
     text = f"{hall.rows} rows of {hall.racks_per_row} racks, site {location}."
     if dc.config.description:
         text = f"{dc.config.description.rstrip('.')}; {text}"
-    out.append(f"<p>{escape(text)}</p>\n")
+    parts.append(paragraph(text))
     if len(steps) < 2:
-        out.append("<p>A single step has no pictures.</p>\n")
-        return "".join(out) + _config_element(dc)
-    hottest = steps.iloc[int(rank(steps["inlet_max_c"].to_numpy()).argmax())]
-    hottest_text = (
-        f"{hottest['inlet_max_c']:.1f} °C on {time_text(run, hottest['time'].to_pydatetime())}"
-    )
-    out.append(
-        f"<p>At its hottest inlet, {hottest_text}: outdoor {hottest['outdoor_c']:.1f} °C, wet bulb "
-        f"{hottest['wet_bulb_c']:.1f} °C, setpoint {hottest['setpoint_c']:.1f} °C, supply air "
-        f"{hottest['supply_c']:.1f} °C, IT {format_number(hottest['it_w'] / 1e3)} kW, HVAC "
-        f"{format_number(hottest['hvac_w'] / 1e3)} kW, airflow of CRAC units "
-        f"{format_number(hottest['crac_flow_m3s'])} and of servers "
-        f"{format_number(hottest['it_airflow_m3s'])} m³/s.</p>\n"
-    )
-    return "".join(out) + _data_center_pictures(run, dc, hottest_text) + _config_element(dc)
+        parts.append(paragraph("A single step has no pictures."))
+    else:
+        at = steps.iloc[int(rank(steps["inlet_max_c"].to_numpy()).argmax())]
+        when = f"{at['inlet_max_c']:.1f} °C on {time_text(run, at['time'].to_pydatetime())}"
+        conditions = (
+            f"At its hottest inlet, {when}: outdoor {at['outdoor_c']:.1f} °C, wet bulb "
+            f"{at['wet_bulb_c']:.1f} °C, setpoint {at['setpoint_c']:.1f} °C, supply air "
+            f"{at['supply_c']:.1f} °C, IT {format_number(at['it_w'] / 1e3)} kW, HVAC "
+            f"{format_number(at['hvac_w'] / 1e3)} kW, airflow of CRAC units "
+            f"{format_number(at['crac_flow_m3s'])} and of servers "
+            f"{format_number(at['it_airflow_m3s'])} m³/s."
+        )
+        parts += [paragraph(conditions), _data_center_pictures(run, dc, when)]
+    return "".join(parts) + folded("Configuration", dc.config.to_yaml())
 
 
 def _data_center_pictures(run: RunFolder, dc: ShownDataCenter, hottest_text: str) -> str:
@@ -221,12 +216,6 @@ def _whole_run_picture(run: RunFolder, name: str, steps: pd.DataFrame) -> str:
             f"The whole run of {name}.",
         )
     return ""
-
-
-def _config_element(dc: ShownDataCenter) -> str:
-    """The config of a data center, folded up."""
-    text = escape(dc.config.to_yaml())
-    return f"<details><summary>Configuration</summary><pre>{text}</pre></details>\n"
 
 
 def inputs_section(run: RunFolder, shown: Sequence[ShownDataCenter]) -> str:

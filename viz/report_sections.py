@@ -1,26 +1,36 @@
-"""Sections of a report in words and tables: summary, events, provenance."""
+"""Sections of a report in words and tables: summary, events, hottest racks, provenance."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.air_metrics import RECOMMENDED_C
 from sdc_taichi.run.folder_reader import RunFolder, read_configs
 from sdc_taichi.run.folder_writer import METRICS_FILE
+from sdc_taichi.run.inlets_of_run import InletsAtStep, hottest_inlets
+from sdc_taichi.sim.inlet_parts import HOTTEST_RACKS, InletParts, rack_text, state_texts
 
 from .plotting import format_number
-from .report_html import Cell, html_table, notice
-from .report_text import (
+from .report_html import (
+    DASH,
     MAX_ROWS,
+    bullets,
     count_text,
     first_texts,
+    html_table,
+    key_figures,
     local_time,
     metric_text,
     names_text,
+    notice,
+    paragraph,
     time_text,
 )
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 KEY_METRICS = (
     ("facility energy", "facility_kwh", "kWh"),
@@ -32,61 +42,69 @@ KEY_METRICS = (
     ("dropped work", "dropped_tasks", "tasks"),
 )
 """Metrics at the head of the summary: label, name in metrics.json, unit."""
+LOSSES = {
+    "throttled_rack_h": "Racks were throttled for {} rack h because of hot air.",
+    "tripped_rack_h": "Racks were switched off for {} rack h because of hot air.",
+    "unserved_kwh": "In grid outages, {} kWh could not be served.",
+    "grid_overload_kwh": "The grid connection carried {} kWh beyond its limit.",
+    "unmet_cooling_kwh": "The plant lacked capacity for {} kWh of heat.",
+}
+"""Sentences about metrics that are zero in a run without trouble, by their names."""
+NAMED_SOURCES = 3
+"""Number of racks that are named with the warming by their exhaust."""
+INLET_HEADS = (
+    "rack",
+    "inlet (°C)",
+    "supply setpoint (°C)",
+    "supply over setpoint (K)",
+    "exhaust of other racks (K)",
+    "own exhaust (K)",
+    "height in the rack (K)",
+    "CRAC air that falls short (K)",
+    "most from (K)",
+)
+"""Columns of the table of a hall with recirculation; the inlet is the sum of the four numbers that
+follow it."""
+APPROACH_HEADS = (*INLET_HEADS[:4], "approach temperature (K)")
+"""Columns of the table of a hall without recirculation; the inlet is the sum of the others."""
 
 
 def summary_section(run: RunFolder) -> str:
-    """Notices, key figures, where it was hot, where the work went, and what ran."""
-    total = run.metrics["total"]
-    cards = "".join(
-        f"<div><dt>{label}</dt><dd>{escape(metric_text(total, key))} {unit}</dd></div>"
-        for label, key, unit in KEY_METRICS
-    )
-    texts = [_hottest_inlet_text(run), *_work_texts(run)]
-    items = "".join(f"<li>{escape(text)}</li>\n" for text in texts)
-    return (
-        "".join(map(notice, _notices(run)))
-        + f'<dl class="key">{cards}</dl>\n'
-        + f"<ul>{items}</ul>\n"
-        + _what_ran(run)
-    )
-
-
-def _notices(run: RunFolder) -> list[str]:
-    """Notices at the top of a report: an interruption, synthetic inputs, notes of the loaders."""
-    done, asked = run.metrics["steps_done"], run.metrics["steps_asked"]
-    texts = []
-    if done < asked:
-        texts.append(
-            f"The run was interrupted: {done:,} of {asked:,} steps were done, and all figures "
-            "are of these."
-        )
-    if run.metrics["synthetic"]:
-        texts.append(
-            "Inputs are SYNTHETIC, at least in part: these figures do not rest on measurements "
-            "alone (see Provenance)."
-        )
-    return texts + [f"Note: {note}" for note in first_texts(run.metrics["notes"])]
-
-
-def _what_ran(run: RunFolder) -> str:
-    """Table of what ran: data centers, controller, steps, versions."""
+    """Notices, key figures, the hottest inlet, where the work went, and what ran."""
     metrics, names = run.metrics, run.names
+    total, done, asked = metrics["total"], metrics["steps_done"], metrics["steps_asked"]
+    notices = [f"Note: {note}" for note in first_texts(metrics["notes"])]
+    if metrics["synthetic"]:
+        notices.insert(
+            0,
+            "Inputs are SYNTHETIC, at least in part: these figures do not rest on measurements "
+            "alone (see Provenance).",
+        )
+    if done < asked:
+        notices.insert(
+            0,
+            f"The run was interrupted: {done:,} of {asked:,} steps were done, and all figures "
+            "are of these.",
+        )
     sites = list(dict.fromkeys(dc["location"] for dc in metrics["data_centers"]))
     length = count_text(run.hours / 24, "day")
-    steps = f"{metrics['steps_done']:,} of {60 * metrics['step_h']:g} min, {length}"
-    versions = ", ".join(f"{name} {version}" for name, version in metrics["versions"].items())
-    rows = [
-        ("data centers", f"{len(names):,}: {names_text(names)}"),
-        ("sites", names_text(sites)),
-        ("controller", metrics["controller"]),
-        ("steps", steps),
-        ("seed", f"{metrics['seed']}"),
-        ("precision of the kernels", metrics["precision"]),
-        ("folder", run.path.resolve().name),
-        ("versions", versions),
-        ("fingerprint of configs, inputs and precision", metrics["fingerprint"]),
-    ]
-    return html_table("What ran", None, [[Cell(name), Cell(value)] for name, value in rows])
+    facts = {
+        "data centers": f"{len(names):,}: {names_text(names)}",
+        "sites": names_text(sites),
+        "controller": metrics["controller"],
+        "steps": f"{done:,} of {60 * metrics['step_h']:g} min, {length}",
+        "seed": f"{metrics['seed']}",
+        "precision of the kernels": metrics["precision"],
+        "folder": run.path.resolve().name,
+        "versions": ", ".join(f"{name} {value}" for name, value in metrics["versions"].items()),
+        "fingerprint of configs, inputs and precision": metrics["fingerprint"],
+    }
+    return (
+        "".join(map(notice, notices))
+        + key_figures((k, f"{metric_text(total, key)} {unit}") for k, key, unit in KEY_METRICS)
+        + bullets([_hottest_inlet_text(run), *_work_texts(run)])
+        + html_table("What ran", None, list(facts.items()))
+    )
 
 
 def _hottest_inlet_text(run: RunFolder) -> str:
@@ -109,97 +127,157 @@ def _hottest_inlet_text(run: RunFolder) -> str:
 def _work_texts(run: RunFolder) -> list[str]:
     """Where work, stored energy and capacity went, in words."""
     total = run.metrics["total"]
+    text = {key: metric_text(total, key) for key in total if key != "hottest_dc"}
     arrived = total["arrived_tasks"]
-    dropped, lost = total["dropped_tasks"], total["lost_tasks"]
-    dropped_pct = 100 * dropped / arrived if arrived else 0.0
+    dropped_pct = 100 * total["dropped_tasks"] / arrived if arrived else 0.0
     (config,) = read_configs(run, [0])
-    full = (
-        f"were done, {format_number(dropped)} of them at once because the queue was full "
-        f"({dropped_pct:.3g} %), and {format_number(lost)}"
+    dropped = (
+        f"{text['dropped_tasks']} of them at once because the queue was full ({dropped_pct:.3g} %),"
         if config.workload.model == "tasks"
-        else f"were done, {format_number(dropped)} dropped ({dropped_pct:.3g} %) and "
-        f"{format_number(lost)}"
+        else f"{text['dropped_tasks']} dropped ({dropped_pct:.3g} %)"
     )
     texts = [
-        f"Of {format_number(arrived)} tasks that arrived, {metric_text(total, 'executed_tasks')} "
-        f"{full} lost with their servers; {metric_text(total, 'queue_end_tasks')} were queued at "
-        "the end."
+        f"Of {text['arrived_tasks']} tasks that arrived, {text['executed_tasks']} were done, "
+        f"{dropped} and {text['lost_tasks']} lost with their servers; {text['queue_end_tasks']} "
+        "were queued at the end.",
+        f"The battery took {text['battery_charge_kwh']} kWh from the grid and gave "
+        f"{text['battery_discharge_kwh']} kWh back."
+        if total["battery_charge_kwh"] > 0
+        else "The battery was not charged.",
     ]
-    if total["battery_charge_kwh"] > 0:
-        texts.append(
-            f"The battery took {metric_text(total, 'battery_charge_kwh')} kWh from the grid and "
-            f"gave {metric_text(total, 'battery_discharge_kwh')} kWh back."
-        )
-    else:
-        texts.append("The battery was not charged.")
-    for key, text in (
-        ("throttled_rack_h", "Racks were throttled for {} rack h because of hot air."),
-        ("tripped_rack_h", "Racks were switched off for {} rack h because of hot air."),
-        ("unserved_kwh", "In grid outages, {} kWh could not be served."),
-        ("grid_overload_kwh", "The grid connection carried {} kWh beyond its limit."),
-        ("unmet_cooling_kwh", "The plant lacked capacity for {} kWh of heat."),
-    ):
-        if total[key] > 0:
-            texts.append(text.format(format_number(total[key])))
+    texts += [sentence.format(text[key]) for key, sentence in LOSSES.items() if total[key] > 0]
     if total["time_to_throttle_min"] is not None:
-        minutes = metric_text(total, "time_to_throttle_min")
+        minutes = text["time_to_throttle_min"]
         texts.append(f"The first rack throttled {minutes} min after an event began.")
     return texts
 
 
 def events_section(run: RunFolder) -> str:
-    """Events that the run met, one by one, or by kind if there are many."""
-    met = [(i, event) for i, dc in enumerate(run.metrics["data_centers"]) for event in dc["events"]]
-    if not met:
-        return "<p>None: the run met no failure, outage or heat wave.</p>\n"
-    caption = f"{count_text(len(met), 'event')} that the run met"
-    if len(met) > MAX_ROWS:
-        return _events_by_kind(run, met, f"{caption}, by kind; all are in {METRICS_FILE}")
-    rows = []
-    for index, event in met:
-        begin, end = event["start_step"], event["end_step"]
-        amount = f"{100 * event['share']:.0f} % left" if "share" in event else ""
-        amount += f"{event['offset_k']:+g} K" if "offset_k" in event else ""
-        cells = [run.names[index], _kind_text(event), str(event.get("target", "")), amount,
-                 time_text(run, local_time(run, index, begin))]  # fmt: skip
-        rows.append([*map(Cell, cells), Cell(format_number(_event_hours(run, event)), True),
-                     Cell(f"{begin} to {end - 1}", True)])  # fmt: skip
-    heads = ["data center", "event", "unit or rack in hall", "amount", "from (local standard time)"]
-    return html_table(
-        caption, [*map(Cell, heads), Cell("duration (h)", True), Cell("steps", True)], rows
+    """Failures, outages and heat waves of the run, one by one, or by kind if there are many."""
+    import pandas as pd
+
+    step_h = run.metrics["step_h"]
+    events = pd.DataFrame(
+        {
+            "dc": index,
+            "kind": str(event["kind"]).replace("_", " "),
+            "target": str(event.get("target", "")),
+            "amount": _amount_text(event),
+            "begin": event["start_step"],
+            "end": event["end_step"],
+            "hours": float((event["end_step"] - event["start_step"]) * step_h),
+        }
+        for index, dc in enumerate(run.metrics["data_centers"])
+        for event in dc["events"]
     )
+    if events.empty:
+        return paragraph("None: the run met no failure, outage or heat wave.")
+    caption = f"{count_text(len(events), 'event')} that the run met"
+    if len(events) > MAX_ROWS:
+        return _events_by_kind(run, events, f"{caption}, by kind; all are in {METRICS_FILE}")
+    rows = [
+        (
+            run.names[event.dc],
+            event.kind,
+            event.target,
+            event.amount,
+            time_text(run, local_time(run, event.dc, event.begin)),
+            format_number(event.hours),
+            f"{event.begin} to {event.end - 1}",
+        )
+        for event in events.itertuples()
+    ]
+    heads = ("data center", "event", "unit or rack in hall", "amount",
+             "from (local standard time)", "duration (h)", "steps")  # fmt: skip
+    return html_table(caption, heads, rows, numbers=(5, 6))
 
 
-def _events_by_kind(
-    run: RunFolder, met: Sequence[tuple[int, Mapping[str, Any]]], caption: str
-) -> str:
+def _amount_text(event: Mapping[str, Any]) -> str:
+    """Share that an event leaves of a device, or its difference of temperature."""
+    left = f"{100 * event['share']:.0f} % left" if "share" in event else ""
+    return left + (f"{event['offset_k']:+g} K" if "offset_k" in event else "")
+
+
+def _events_by_kind(run: RunFolder, events: pd.DataFrame, caption: str) -> str:
     """Table of events with a row for each kind."""
-    groups: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
-    for index, event in met:
-        groups.setdefault(_kind_text(event), []).append((index, event))
     rows = []
-    for kind, own in sorted(groups.items()):
-        index, first = min(own, key=lambda each: each[1]["start_step"])
-        hours = sum(_event_hours(run, event) for _, event in own)
-        counts = (len(own), len({dc for dc, _ in own}), hours)
-        when = (
-            f"{time_text(run, local_time(run, index, first['start_step']))} in {run.names[index]}"
-        )
+    for kind, alike in events.groupby("kind"):
+        first = alike.loc[alike["begin"].idxmin()]
+        begin = time_text(run, local_time(run, first["dc"], first["begin"]))
+        figures = (len(alike), alike["dc"].nunique(), alike["hours"].sum())
         rows.append(
-            [Cell(kind), *(Cell(format_number(count), True) for count in counts), Cell(when)]
+            (str(kind), *map(format_number, figures), f"{begin} in {run.names[first['dc']]}")
         )
-    heads = [Cell(text, True) for text in ("events", "data centers", "duration together (h)")]
-    return html_table(caption, [Cell("event"), *heads, Cell("first (local standard time)")], rows)
+    heads = ("event", "events", "data centers", "duration together (h)",
+             "first (local standard time)")  # fmt: skip
+    return html_table(caption, heads, rows, numbers=(1, 2, 3))
 
 
-def _kind_text(event: Mapping[str, Any]) -> str:
-    """Kind of an event in words."""
-    return str(event["kind"]).replace("_", " ")
+def hot_racks_section(run: RunFolder, dcs: Sequence[int]) -> str:
+    """Why the hottest racks of some data centers are as hot as they are.
+
+    Args:
+        run: the run.
+        dcs: indices of the data centers.
+
+    Raises:
+        SdcError: steps.parquet is damaged.
+    """
+    parts = [
+        paragraph(
+            "Each inlet is the sum of setpoint, supply air over its setpoint, and exhausts or the "
+            "approach temperature of the config. Height and missing CRAC air are why a part of the "
+            "exhausts reaches it."
+        )
+    ]
+    for dc in dcs:
+        try:
+            inlets = hottest_inlets(run, dc)
+        except ConfigError as error:
+            parts.append(paragraph(f"{run.names[dc]}: {error}"))
+            continue
+        if inlets is None:
+            text = (
+                "the run has too many racks for the air of a step to be kept; sdc-taichi hall why"
+            )
+            parts.append(paragraph(f"{run.names[dc]}: {text} simulates it again."))
+        else:
+            parts.append(_hot_racks(run, dc, inlets))
+    return "".join(parts)
 
 
-def _event_hours(run: RunFolder, event: Mapping[str, Any]) -> float:
-    """Length of an event, in h."""
-    return float((event["end_step"] - event["start_step"]) * run.metrics["step_h"])
+def _hot_racks(run: RunFolder, dc: int, hottest: InletsAtStep) -> str:
+    """Table of the hottest racks of a data center, and the state of the hottest in words."""
+    hall = hottest.config.hall
+    recirculates = hall.inlet_model == "recirculation"
+    racks = [hottest.inlets.parts(rack) for rack in hottest.inlets.hottest(HOTTEST_RACKS)]
+    heads = INLET_HEADS if recirculates else APPROACH_HEADS
+    caption = (
+        f"Hottest racks of {run.names[dc]} at the end of the step of its hottest inlet, "
+        f"{hottest.hottest_c:.2f} °C on {time_text(run, local_time(run, dc, hottest.step))}"
+    )
+    texts = [f"{text[0].upper()}{text[1:]}." for text in state_texts(racks[0])]
+    if recirculates:
+        share = f"{100 * racks[0].exhaust_share:.1f} %"
+        texts.insert(0, f"Of the intake of the hottest, {share} is exhaust air.")
+    rows = [_rack_cells(parts, hall.racks_per_row, recirculates=recirculates) for parts in racks]
+    numbers = range(1, len(heads) - recirculates)
+    return html_table(caption, heads, rows, numbers=numbers) + bullets(texts)
+
+
+def _rack_cells(parts: InletParts, racks_per_row: int, *, recirculates: bool) -> list[str]:
+    """Cells of one rack."""
+    temperatures = [parts.inlet_c, parts.setpoint_c, parts.warming_k]
+    if recirculates:
+        others_k = float(parts.exhaust_k.sum()) - parts.own_exhaust_k + parts.lag_k
+        temperatures += [others_k, parts.own_exhaust_k, parts.height_k, parts.shortfall_k]
+    else:
+        temperatures.append(parts.approach_k)
+    cells = [rack_text(parts.rack, racks_per_row), *(f"{value:z.2f}" for value in temperatures)]
+    if recirculates:
+        sources = ", ".join(f"rack {rack} {k:.2f}" for rack, k in parts.sources(NAMED_SOURCES))
+        cells.append(sources or DASH)
+    return cells
 
 
 def provenance_section(run: RunFolder) -> str:
@@ -207,19 +285,15 @@ def provenance_section(run: RunFolder) -> str:
     users: dict[tuple[str, str, str], list[str]] = {}
     for dc in run.metrics["data_centers"]:
         sources, hashes = dc["provenance"], dc["sha256"]
-        for kind in (*sources, *(kind for kind in hashes if kind not in sources)):
-            key = (
-                kind,
-                str(sources.get(kind, "file that the config names")),
-                str(hashes.get(kind, "")),
-            )
-            users.setdefault(key, []).append(dc["name"])
+        for kind in {**sources, **hashes}:
+            source = str(sources.get(kind, "file that the config names"))
+            users.setdefault((kind, source, str(hashes.get(kind, ""))), []).append(dc["name"])
     rows = [
-        [Cell(kind), Cell(source), Cell(digest or "–"), Cell(names_text(names))]
+        (kind, source, digest or DASH, names_text(names))
         for (kind, source, digest), names in sorted(users.items())
     ]
-    heads = [Cell(text) for text in ("input", "source", "SHA-256 of the file", "data centers")]
     caption = f"Where the inputs come from; {count_text(len(rows), 'source')}"
     if len(rows) > MAX_ROWS:
         caption += f", the first {MAX_ROWS}, all are in {METRICS_FILE}"
+    heads = ("input", "source", "SHA-256 of the file", "data centers")
     return html_table(caption, heads, rows[:MAX_ROWS])

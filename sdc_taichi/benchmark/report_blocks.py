@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from sdc_taichi.errors import printable
 from sdc_taichi.learning.evaluation_table import literal_markdown, markdown, text_rows
-from sdc_taichi.viz.report_html import Cell, html_page, html_table, notice, picture_element
+from sdc_taichi.viz.report_html import html_page, html_table, notice, picture_element
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -211,9 +211,4 @@ def _address(path: Path, folder: Path) -> str:
 def _html_table(caption: str, frame: pd.DataFrame, titles: Mapping[str, str]) -> str:
     """A table as HTML, all but its first column aligned to the right."""
     heads, rows = text_rows(frame, titles)
-    return html_table(caption, _cells(heads), [_cells(cells) for cells in rows])
-
-
-def _cells(texts: Sequence[str]) -> list[Cell]:
-    """Cells of a row."""
-    return [Cell(text, is_number=index > 0) for index, text in enumerate(texts)]
+    return html_table(caption, heads, rows, numbers=range(1, len(heads)))
