@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.hall.air_metrics import RECOMMENDED_C
@@ -28,9 +28,6 @@ from .report_html import (
     paragraph,
     time_text,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 KEY_METRICS = (
     ("facility energy", "facility_kwh", "kWh"),
@@ -152,26 +149,41 @@ def _work_texts(run: RunFolder) -> list[str]:
     return texts
 
 
+class _Event(NamedTuple):
+    """A failure, outage or heat wave of a data center."""
+
+    dc: int
+    """Index of the data center."""
+    kind: str
+    """Kind in words."""
+    begin: int
+    """First step."""
+    end: int
+    """Step after the last."""
+    target: str
+    """Unit or rack of the hall, empty for the whole."""
+    amount: str
+    """Share left of a device, or difference of temperature."""
+
+
 def events_section(run: RunFolder) -> str:
     """Failures, outages and heat waves of the run, one by one, or by kind if there are many."""
-    import pandas as pd
-
-    step_h = run.metrics["step_h"]
-    events = pd.DataFrame(
-        {
-            "dc": index,
-            "kind": str(event["kind"]).replace("_", " "),
-            "target": str(event.get("target", "")),
-            "amount": _amount_text(event),
-            "begin": event["start_step"],
-            "end": event["end_step"],
-            "hours": float((event["end_step"] - event["start_step"]) * step_h),
-        }
+    events = [
+        _Event(
+            index,
+            str(event["kind"]).replace("_", " "),
+            event["start_step"],
+            event["end_step"],
+            str(event.get("target", "")),
+            (f"{100 * event['share']:.0f} % left" if "share" in event else "")
+            + (f"{event['offset_k']:+g} K" if "offset_k" in event else ""),
+        )
         for index, dc in enumerate(run.metrics["data_centers"])
         for event in dc["events"]
-    )
-    if events.empty:
+    ]
+    if not events:
         return paragraph("None: the run met no failure, outage or heat wave.")
+    step_h = run.metrics["step_h"]
     caption = f"{count_text(len(events), 'event')} that the run met"
     if len(events) > MAX_ROWS:
         return _events_by_kind(run, events, f"{caption}, by kind; all are in {METRICS_FILE}")
@@ -182,32 +194,26 @@ def events_section(run: RunFolder) -> str:
             event.target,
             event.amount,
             time_text(run, local_time(run, event.dc, event.begin)),
-            format_number(event.hours),
+            format_number((event.end - event.begin) * step_h),
             f"{event.begin} to {event.end - 1}",
         )
-        for event in events.itertuples()
+        for event in events
     ]
     heads = ("data center", "event", "unit or rack in hall", "amount",
              "from (local standard time)", "duration (h)", "steps")  # fmt: skip
     return html_table(caption, heads, rows, numbers=(5, 6))
 
 
-def _amount_text(event: Mapping[str, Any]) -> str:
-    """Share that an event leaves of a device, or its difference of temperature."""
-    left = f"{100 * event['share']:.0f} % left" if "share" in event else ""
-    return left + (f"{event['offset_k']:+g} K" if "offset_k" in event else "")
-
-
-def _events_by_kind(run: RunFolder, events: pd.DataFrame, caption: str) -> str:
+def _events_by_kind(run: RunFolder, events: Sequence[_Event], caption: str) -> str:
     """Table of events with a row for each kind."""
     rows = []
-    for kind, alike in events.groupby("kind"):
-        first = alike.loc[alike["begin"].idxmin()]
-        begin = time_text(run, local_time(run, first["dc"], first["begin"]))
-        figures = (len(alike), alike["dc"].nunique(), alike["hours"].sum())
-        rows.append(
-            (str(kind), *map(format_number, figures), f"{begin} in {run.names[first['dc']]}")
-        )
+    for kind in sorted({event.kind for event in events}):
+        alike = [event for event in events if event.kind == kind]
+        first = min(alike, key=lambda event: event.begin)
+        hours = sum(event.end - event.begin for event in alike) * run.metrics["step_h"]
+        figures = (len(alike), len({event.dc for event in alike}), hours)
+        begin = time_text(run, local_time(run, first.dc, first.begin))
+        rows.append((kind, *map(format_number, figures), f"{begin} in {run.names[first.dc]}"))
     heads = ("event", "events", "data centers", "duration together (h)",
              "first (local standard time)")  # fmt: skip
     return html_table(caption, heads, rows, numbers=(1, 2, 3))
