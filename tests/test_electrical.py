@@ -15,8 +15,8 @@ from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH
 from sdc_taichi.plant.electrical import loss_w
 from sdc_taichi.sim.bills import add_power, billed_kw_months, no_demand
 from sdc_taichi.types import F64
-from sdc_taichi.viz.recording_log import ConditionLog
 from sdc_taichi.viz.recording_series import FIELD_ROWS, FIELDS
+from sdc_taichi.viz.recording_text import ConditionLog
 
 
 def charged(overrides: list[str], command: float = 1.0, steps: int = 8) -> list[StepResult]:

@@ -29,7 +29,7 @@ from sdc_taichi import EpisodeRecorder, RecordEpisodes, SdcError, StepResult, lo
 from sdc_taichi.control import View
 from sdc_taichi.control.view import ForecastError
 from sdc_taichi.envs.recording import capped_cubic_schedule
-from sdc_taichi.viz import recording_cadence
+from sdc_taichi.viz import recording_blocks
 from sdc_taichi.viz.recorder import Recorder
 from sdc_taichi.viz.recording_output import RecordingWarning
 
@@ -495,7 +495,7 @@ def test_the_folder_goes_away_before_the_first_episode(tmp_path: Path) -> None:
 
 
 def test_the_folder_goes_away_in_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording_cadence, "MAX_BLOCK_STEPS", 10)
+    monkeypatch.setattr(recording_blocks, "MAX_BLOCK_STEPS", 10)
     folder, moved = tmp_path / "runs", tmp_path / "moved"
     folder.mkdir()
     settings = EpisodeRecorder(folder / "run.rrd", episode_trigger=ALL)

@@ -27,7 +27,7 @@ from sdc_taichi.sim.design_hall import solve_design_hall
 from sdc_taichi.sim.fleet_configs import make_configs
 from sdc_taichi.sim.inlet_parts import InletParts, Inlets, inlet_terms, intake_air_of, rack_text
 from sdc_taichi.viz.recorder import Recorder
-from sdc_taichi.viz.recording_summary import hottest_markdown
+from sdc_taichi.viz.recording_text import hottest_markdown
 from sdc_taichi.viz.report_sections import hot_racks_section
 
 FAILURES = (

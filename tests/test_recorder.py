@@ -35,9 +35,9 @@ from sdc_taichi.plant.workload import age_histogram
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.run.folder_writer import simulate_to_folder
 from sdc_taichi.types import F64, ServerLayers
-from sdc_taichi.viz import hall_rasters, recording_blocks, recording_cadence, recording_series
+from sdc_taichi.viz import hall_rasters, recording_blocks, recording_series
 from sdc_taichi.viz.recorder import Recorder
-from sdc_taichi.viz.recording_log import failure_entries, protection_entries
+from sdc_taichi.viz.recording_text import failure_entries, protection_entries
 
 STEPS = 130  # of blocks of 96 in this test: more than one, and no multiple
 ODD_NAME = "hall/1 [a]"
@@ -126,7 +126,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             pytest.MonkeyPatch.context() as patch,
             Recorder(path, focus=["ny-0", ODD_NAME, "ny-2"], every=2) as rec,
         ):
-            patch.setattr(recording_cadence, "MAX_BLOCK_STEPS", 96)
+            patch.setattr(recording_blocks, "MAX_BLOCK_STEPS", 96)
             rec.begin(sim, describe_run(sim, asked))
 
             def each(result: StepResult) -> None:
@@ -405,7 +405,7 @@ def test_larger_halls_are_recorded_more_coarsely(
         ],
     )  # fmt: skip
     path = tmp_path / "large.rrd"
-    monkeypatch.setattr(recording_cadence, "MAX_BLOCK_BYTES", 1_000_000)
+    monkeypatch.setattr(recording_blocks, "MAX_BLOCK_BYTES", 1_000_000)
     with Simulator(make_configs(large)) as sim, Recorder(path) as rec:
         sim.reset()
         rec.begin(sim)
@@ -443,13 +443,6 @@ def test_hall_is_shown_more_often_in_events(tmp_path: Path) -> None:
             rec.add(sim.step())
     (name,) = {entity.split("/")[2] for entity in read(path) if entity.startswith("/dc/")}
     assert read(path)[f"/dc/{name}/hall/inlet"]["step"] == [0, 12, 20, 24, 28, 36]
-
-
-@pytest.mark.parametrize(
-    ("racks", "hours"), [(200, 0.0), (201, 1.0), (2_000, 1.0), (20_000, 3.0), (100_000, 6.0)]
-)
-def test_heat_maps_are_rarer_the_more_racks(racks: int, hours: float) -> None:
-    assert recording_cadence.map_every_h(racks) == hours
 
 
 @pytest.mark.parametrize(("rows", "per_row"), [(4, 5), (20, 200), (50, 20), (1, 1), (250, 400)])
@@ -531,7 +524,7 @@ def test_episodes_get_files_of_their_own(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_interrupted_recording_is_whole(tmp_path: Path, error: type[BaseException]) -> None:
-    path, steps = tmp_path / "cut.rrd", recording_cadence.MAX_BLOCK_STEPS + 16
+    path, steps = tmp_path / "cut.rrd", recording_blocks.MAX_BLOCK_STEPS + 16
     path.write_text("older")
 
     def cut(sim: Simulator) -> None:
@@ -540,7 +533,7 @@ def test_interrupted_recording_is_whole(tmp_path: Path, error: type[BaseExceptio
             rec.begin(sim)
             for step in range(steps):
                 rec.add(sim.step())
-                if step < recording_cadence.MAX_BLOCK_STEPS - 1:
+                if step < recording_blocks.MAX_BLOCK_STEPS - 1:
                     assert path.read_text() == "older", "replaced with the first block"
             raise error
 
@@ -557,8 +550,8 @@ def test_interrupted_recording_is_whole(tmp_path: Path, error: type[BaseExceptio
 def test_recording_that_is_interrupted_amid_a_step_is_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: ModuleType, what: str
 ) -> None:
-    monkeypatch.setattr(recording_blocks, "_BUFFER_BYTES", 20_000)
-    monkeypatch.setattr(recording_cadence, "MAX_BLOCK_STEPS", 96)
+    monkeypatch.setattr(recording_blocks, "_UNREDUCED_BYTES", 20_000)
+    monkeypatch.setattr(recording_blocks, "MAX_BLOCK_STEPS", 96)
     path, rec = tmp_path / "x.rrd", Recorder(tmp_path / "x.rrd", every=1)
     with small(2) as sim:
         sim.reset()

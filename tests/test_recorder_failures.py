@@ -23,11 +23,10 @@ from rrd import VIEWER_ENVIRONMENT, read, verify
 from sdc_taichi import SdcError, Simulator, load_config, make_configs
 from sdc_taichi.cli.app import app
 from sdc_taichi.cli.view import viewer_program
-from sdc_taichi.viz import recording_output, recording_target
+from sdc_taichi.viz import recording_output
 from sdc_taichi.viz.recorder import Recorder
-from sdc_taichi.viz.recording_cadence import MAX_BLOCK_STEPS
-from sdc_taichi.viz.recording_output import RecordingWarning
-from sdc_taichi.viz.recording_target import listens, served_at
+from sdc_taichi.viz.recording_blocks import MAX_BLOCK_STEPS
+from sdc_taichi.viz.recording_output import RecordingWarning, listens, served_at
 
 PROGRAM = (sys.executable, "-c", "from sdc_taichi.cli.app import main; main()")
 POSIX = pytest.mark.skipif(os.name != "posix", reason="signals and limits of POSIX")
@@ -58,7 +57,7 @@ def go_on(sim: Simulator, rec: Recorder, steps: int) -> None:
 
 
 def free_port() -> int:
-    return recording_target.check_port(0)
+    return recording_output.check_port(0)
 
 
 @contextlib.contextmanager

@@ -13,12 +13,20 @@ from sdc_taichi.errors import SdcError
 from sdc_taichi.run.description import RunRequest, describe_run
 from sdc_taichi.types import F64, StepResult
 
-from .recording_output import RecordingOutput, import_rerun
-from .recording_target import check_address, check_path, check_port, is_address, served_at
-from .recording_writer import RecordingWriter
+from .recording_output import (
+    RecordingOutput,
+    check_address,
+    check_path,
+    check_port,
+    import_rerun,
+    is_address,
+    served_at,
+)
 
 if TYPE_CHECKING:
     from sdc_taichi.sim.simulator import Simulator
+
+    from .recording_writer import RecordingWriter
 
 MAX_FOCUS, DEFAULT_FOCUS = 4, 2
 """Largest number of data centers in focus, and the number of those taken by default."""
@@ -116,6 +124,8 @@ class Recorder:
 
     def _new_writer(self, sim: Simulator, description: Mapping[str, Any] | None) -> RecordingWriter:
         """The writer of an episode, and its output."""
+        from .recording_writer import RecordingWriter
+
         if description is None:
             unknown = ("controller", "seed")
             known = describe_run(sim, RunRequest("", 0))

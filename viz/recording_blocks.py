@@ -3,41 +3,127 @@
 from __future__ import annotations
 
 import itertools
+import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, rank
 from sdc_taichi.plant.workload import age_histogram
 from sdc_taichi.sim.events import ActiveEvent
-from sdc_taichi.types import F64, I64, Reals, Status, StepResult
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.types import F32, F64, I64, Reals, Status, StepResult
 
 from . import hall_rasters as rasters
-from .recording_cadence import Cadence
-from .recording_log import LogEntry, failure_entries, hottest_server, protection_entries
 from .recording_series import AGE_EDGES_H, FIELD_ROWS, FIELDS, FLEET_SUMS
+from .recording_text import LogEntry, failure_entries, hottest_server, protection_entries
 
 if TYPE_CHECKING:
     from sdc_taichi.sim.simulator import Simulator
 
+MAX_BLOCK_STEPS, MAX_BLOCK_BYTES = 1_024, 16_000_000
+"""Largest size of a block, which is in memory until it is written, in steps and bytes."""
+MAP_EVERY_H = ((200, 0.0), (2_000, 1.0), (20_000, 3.0), (np.inf, 6.0))
+"""Largest number of racks in focus, and the hours between two heat maps, 0 being every step."""
+HALL_EVERY_H, HALL_EVERY_H_IN_EVENTS = 3.0, 1.0
+"""Least time between two frames of the 3D hall, which need a pass over all servers, in h."""
+SMALL_HALL_LEVELS, LARGE_HALL_LEVELS = 10, 5
+"""Levels of a rack of the 3D hall, in small and in larger halls."""
+MAX_SERVERS_IN_LEVELS = 100_000
+"""Number of servers of the fleet up to which the levels of a rack show its servers."""
 HOTTEST_HALLS = 5
 """Number of halls that the list of the hottest has."""
 HOTTEST_FIELDS = ("inlet_max_c", "hottest_rack", "hottest_server")
 """Fields that the list of the hottest halls shows."""
-_BUFFER_BYTES = 4_000_000
-"""Size of the buffer of rows, one per step, that fits into the cache that processors share."""
+_UNREDUCED_BYTES = 4_000_000
+"""Size of the results that wait until they are reduced to the data centers in focus; it fits into
+the cache that processors share."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cadence:
+    """How often heat maps and 3D halls are recorded, and how finely."""
+
+    map_every_steps: int
+    """Steps between two heat maps."""
+    hall_every_steps: int
+    """Steps between two frames of the 3D hall."""
+    hall_every_steps_in_events: int
+    """Steps between two frames of the 3D hall while a failure or weather event lasts."""
+    levels: tuple[int, ...]
+    """Levels per rack of the 3D hall of each data center in focus."""
+    has_servers: bool
+    """Whether levels show servers; else a rack shows its hottest inlet and its mean outlet."""
+    block_steps: int
+    """Number of steps in a block."""
+
+
+def choose_cadence(fleet: Fleet, focus: Sequence[int], every_steps: int | None) -> Cadence:
+    """Cadence for the halls in focus.
+
+    Args:
+        fleet: the fleet.
+        focus: indices of the data centers in focus.
+        every_steps: steps between two heat maps and between two frames of the 3D hall; None
+            follows the number of racks in focus.
+    """
+    racks = int(np.diff(fleet.rack_offsets)[focus].sum())
+    map_every_h = next(hours for most, hours in MAP_EVERY_H if racks <= most)
+    per_hour = fleet.steps_per_hour
+    map_every = every_steps or max(1, round(map_every_h * per_hour))
+    hall_every = every_steps or max(map_every, round(HALL_EVERY_H * per_hour))
+    in_events = every_steps or max(map_every, round(HALL_EVERY_H_IN_EVENTS * per_hour))
+    has_servers = fleet.servers <= MAX_SERVERS_IN_LEVELS
+    is_small = racks <= rasters.MAX_RACKS_OF_SMALL_HALL
+    most_levels = SMALL_HALL_LEVELS if is_small else LARGE_HALL_LEVELS
+    levels = tuple(
+        min(most_levels, _fewest_servers(fleet, dc)) if has_servers else 1 for dc in focus
+    )
+    step_bytes: float = 8 * len(FIELDS) * (len(focus) + 2)
+    step_bytes += _map_bytes(fleet, focus) / map_every
+    step_bytes += _hall_bytes(fleet, focus, levels, has_servers=has_servers) / hall_every
+    return Cadence(
+        map_every_steps=map_every,
+        hall_every_steps=hall_every,
+        hall_every_steps_in_events=in_events,
+        levels=levels,
+        has_servers=has_servers,
+        block_steps=min(MAX_BLOCK_STEPS, max(1, int(MAX_BLOCK_BYTES / step_bytes))),
+    )
+
+
+def _map_bytes(fleet: Fleet, focus: Sequence[int]) -> int:
+    """Bytes of the heat maps of one step."""
+    halls = [fleet.configs[dc].hall for dc in focus]
+    pixels = sum(math.prod(rasters.tile_grid(hall).image_shape) for hall in halls)
+    return 2 * len(rasters.COLOURMAPS) * pixels
+
+
+def _hall_bytes(
+    fleet: Fleet, focus: Sequence[int], levels: Sequence[int], *, has_servers: bool
+) -> int:
+    """Bytes of the 3D halls of one step, and of the server groups that they are made from."""
+    halls = [fleet.configs[dc].hall for dc in focus]
+    values = sum(hall.racks * count for hall, count in zip(halls, levels, strict=True))
+    if has_servers:
+        values += int(np.diff(fleet.group_offsets[fleet.rack_offsets])[focus].sum())
+    return 4 * len(rasters.TEMPERATURE_RANGES_C) * values
+
+
+def _fewest_servers(fleet: Fleet, dc: int) -> int:
+    """Number of servers of the smallest rack of a data center."""
+    first, last = fleet.rack_offsets[dc : dc + 2]
+    return int(np.diff(fleet.server_offsets[fleet.group_offsets[first : last + 1]]).min())
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """T steps of n data centers in focus, with R racks and U CRAC units, end to end.
-
-    Arrays are valid until the next step is added to the builder.
-    """
+    """T steps of n data centers in focus, with R racks and U CRAC units, end to end."""
 
     steps: I64
     """Steps, counted from 0 at reset, (T,)."""
@@ -71,7 +157,7 @@ class BlockBuilder:
     """Collects the results of a simulator until they are taken as a block.
 
     Args:
-        sim: the simulator whose results they are.
+        sim: the simulator that makes the results.
         names: names of its data centers.
         focus: indices of the data centers in focus.
         cadence: how often heat maps and 3D halls are recorded.
@@ -82,31 +168,20 @@ class BlockBuilder:
     ) -> None:
         fleet = sim.fleet
         self._sim, self._fleet, self._names = sim, fleet, names
-        self._shape = fleet.size, fleet.racks
         self._focus, self._cadence = list(focus), cadence
-        self._read = operator.attrgetter(*FIELDS, "unit_supply_c", "unit_flow_m3s")
+        self._read = operator.attrgetter(*FIELDS)
         self._age_edges = np.array(AGE_EDGES_H) * fleet.steps_per_hour
-        # Index arrays or slices that pick what is in focus, and where each data center is then.
-        self._pick_dcs, _ = _joined([slice(dc, dc + 1) for dc in focus])
-        self._rack_slices = [slice(*fleet.rack_offsets[dc : dc + 2].tolist()) for dc in focus]
-        unit_slices = [slice(*fleet.unit_offsets[dc : dc + 2].tolist()) for dc in focus]
-        self._pick_racks, self.racks = _joined(self._rack_slices)
-        self._pick_units, self.units = _joined(unit_slices)
-        columns = self._rack_slices
+        self._pick_racks, self.racks = _pick(fleet.rack_offsets, focus)
+        """Indices of the racks in focus, and the place of each data center among these."""
+        self._pick_units, self.units = _pick(fleet.unit_offsets, focus)
+        """Indices of the CRAC units in focus, and the place of each data center among these."""
+        self._pick_hall = self._pick_racks
         if cadence.has_servers:
-            columns = [
-                slice(*fleet.group_offsets[[racks.start, racks.stop]].tolist())
-                for racks in self._rack_slices
-            ]
+            self._pick_hall, _ = _pick(fleet.group_offsets[fleet.rack_offsets], focus)
             self._levels = rasters.level_groups(fleet, focus, cadence.levels)
-        self._pick_hall_columns, hall_columns = _joined(columns)
-        counts = [
-            (racks.stop - racks.start) * levels
-            for racks, levels in zip(self._rack_slices, cadence.levels, strict=True)
-        ]
-        self.levels = [
-            slice(end - n, end) for n, end in zip(counts, np.cumsum(counts), strict=True)
-        ]
+        racks = np.diff(fleet.rack_offsets)[self._focus]
+        ends = np.cumsum([0, *(racks * cadence.levels)]).tolist()
+        self.levels = list(itertools.starmap(slice, itertools.pairwise(ends)))
         """Place of each data center in focus among the levels of all racks."""
         self.reward_names: tuple[str, ...] | None = None
         """Names of the reward terms, known from the first step on."""
@@ -116,28 +191,18 @@ class BlockBuilder:
             fleet.configs[dc].events.scheduled or fleet.configs[dc].events.sampled for dc in focus
         )
         self._active: list[ActiveEvent] = []
-        self._rows = np.empty((0, 0))
-        self._make_hall_buffers(hall_columns[-1].stop)
         self._clear()
-
-    def _make_hall_buffers(self, hall_columns: int) -> None:
-        """Buffers of heat maps and 3D halls; reused block by block, they stay in the cache."""
-        cadence = self._cadence
-        intervals = (
-            cadence.map_every_steps,
-            cadence.hall_every_steps,
-            cadence.hall_every_steps_in_events,
-        )
-        maps, *halls = (-(-cadence.block_steps // steps) for steps in intervals)
-        self._maps = np.empty((maps, 4 * self.racks[-1].stop), dtype=np.float32)
-        self._halls = np.empty((2, sum(halls), hall_columns), dtype=np.float32)
 
     def _clear(self) -> None:
         """Begin a block."""
         self._steps: list[int] = []
-        self._parts: list[list[F64]] = []
+        self._unreduced: list[tuple[npt.NDArray[Any], ...]] = []
+        self._reduced: list[tuple[F64, ...]] = []
         self._map_steps: list[int] = []
+        self._maps: list[F32] = []
         self._hall_steps: list[int] = []
+        self._halls: list[F32] = []
+        self._hottest: list[str] = []
         self._entries: list[LogEntry] = []
 
     @property
@@ -153,124 +218,89 @@ class BlockBuilder:
             rewards: reward terms by name, (B,) each.
 
         Raises:
-            SdcError: the result is none of the simulator's, or does not follow the one before, or
+            SdcError: the result is of another simulator, or does not follow the one before, or
                 has other rewards than it, or rewards that are not one value per data center.
         """
         self._check(result)
-        queue = self._sim.state.queue[self._pick_dcs].reshape(-1)
         terms = rewards or {}
         if self.reward_names is None:
-            self._make_rows(len(queue), tuple(terms))
+            self.reward_names = tuple(terms)
         if terms or self.reward_names:
             self._check_rewards(terms)
-        row = len(self._steps) % len(self._rows)
-        if row == 0 and self._steps:
-            self._split_rows()
-        np.concatenate((*self._read(result), queue, *terms.values()), out=self._rows[row])
+        fields = np.concatenate(self._read(result), dtype=np.float64)
+        queue = self._sim.state.queue[self._focus]
+        self._unreduced.append(
+            (fields, queue, result.unit_supply_c, result.unit_flow_m3s, *terms.values())
+        )
         step = self._last_step = result.step
-        # A step that is not listed yet does not count, should reading be interrupted.
+        # Only steps and frames that are listed count, should an interruption come in between.
         self._steps.append(step)
         self._add_events(result)
         cadence = self._cadence
         if step % cadence.map_every_steps == 0:
-            self._add_maps(result)
+            self._add_map(result)
         every = cadence.hall_every_steps_in_events if self._active else cadence.hall_every_steps
         if step % every == 0:
-            self._add_halls(result)
+            if self._fleet.size > 1:
+                self._hottest.append(self._hottest_text(fields.reshape(len(FIELDS), -1)))
+            self._add_hall(result)
+        if fields.nbytes * len(self._unreduced) >= _UNREDUCED_BYTES:
+            self._reduce()
 
     def take(self) -> Block:
         """The block under way; another begins."""
-        if len(self._steps) > len(self._parts) * len(self._rows):
-            self._split_rows()
-        values, sums, hottest_c, queue_by_age, supply_c, flow_m3s, rewards, above, hottest = (
-            np.concatenate(parts) for parts in zip(*self._parts, strict=True)
+        if self._unreduced:
+            self._reduce()
+        values, sums, hottest_c, queue_by_age, supply_c, flow_m3s, *rewards = (
+            np.concatenate(parts)[: len(self._steps)] for parts in zip(*self._reduced, strict=True)
         )
-        inlet_c, outlet_c, cpu_w, fan_w = np.split(self._maps[: len(self._map_steps)], 4, axis=1)
-        halls = self._halls[:, : len(self._hall_steps)]
-        if self._cadence.has_servers:
-            halls = rasters.level_maxima(halls, self._levels)
-        has_others = self._fleet.size > 1
+        maps, halls = self._maps[: len(self._map_steps)], self._halls[: len(self._hall_steps)]
+        inlet_outlet = np.stack(halls, axis=1) if halls else np.empty((0, 0, 0), dtype=np.float32)
+        if halls and self._cadence.has_servers:
+            inlet_outlet = rasters.level_maxima(inlet_outlet, self._levels)
         block = Block(
-            steps=np.array(self._steps, dtype=np.int64),
+            steps=np.array(self._steps),
             values=values,
             fleet=dict(zip(FLEET_SUMS, sums.T, strict=True)) | {"inlet_max_c": hottest_c},
             queue_by_age=queue_by_age,
             unit_supply_c=supply_c,
             unit_flow_m3s=flow_m3s,
-            rewards=rewards if self.reward_names else None,
+            rewards=np.stack(rewards, axis=1) if rewards else None,
             map_steps=np.array(self._map_steps, dtype=np.int64),
-            maps={
-                "inlet": inlet_c,
-                "outlet": outlet_c,
-                "power": (cpu_w + fan_w) * np.float32(1e-3),
-            },
+            maps=dict(zip(rasters.COLOURMAPS, np.stack(maps, axis=1), strict=True)) if maps else {},
             hall_steps=np.array(self._hall_steps, dtype=np.int64),
-            halls=dict(zip(("inlet", "outlet"), halls, strict=True)) if halls.size else {},
-            hottest=list(map(self._hottest_text, above.tolist(), hottest)) if has_others else [],
+            halls=dict(zip(rasters.TEMPERATURE_RANGES_C, inlet_outlet, strict=False)),
+            hottest=self._hottest[: len(self._hall_steps)],
             entries=self._entries,
         )
         self._clear()
         return block
 
-    def _make_rows(self, queue_columns: int, reward_names: tuple[str, ...]) -> None:
-        """Make the buffer of rows: fields, CRAC units, queues and reward terms of a step each."""
-        size = self._fleet.size
-        widths = [
-            len(FIELDS) * size,
-            *[self._fleet.units] * 2,
-            queue_columns,
-            len(reward_names) * size,
-        ]
-        ends = np.cumsum(widths).tolist()
-        self._row_parts = [slice(end - n, end) for n, end in zip(widths, ends, strict=True)]
-        width = ends[-1]
-        rows = min(max(_BUFFER_BYTES // (8 * width), 1), self._cadence.block_steps)
-        self._rows = np.empty((rows, width))
-        self.reward_names = reward_names
-
-    def _split_rows(self) -> None:
-        """Bring the rows of the buffer into the form of a block."""
-        k = len(self._steps) - len(self._parts) * len(self._rows)
-        fields, supply_c, flow_m3s, queues, rewards = (
-            self._rows[:k, part] for part in self._row_parts
+    def _reduce(self) -> None:
+        """Reduce the results that wait to data centers in focus and sums over the fleet."""
+        fields, queues, supply_c, flow_m3s, *rewards = map(
+            np.stack, zip(*self._unreduced, strict=True)
         )
-        dcs, n, size = self._pick_dcs, len(self._focus), self._fleet.size
-        by_dc = fields.reshape(k, len(FIELDS), size)
-        self._parts.append([
-            by_dc[:, :, dcs].copy(),
+        steps, n = len(fields), len(self._focus)
+        by_dc = fields.reshape(steps, len(FIELDS), -1)
+        self._reduced.append((
+            by_dc[:, :, self._focus],
             by_dc[:, : len(FLEET_SUMS)].sum(axis=2),
             by_dc[:, FIELD_ROWS["inlet_max_c"]].max(axis=1),
-            age_histogram(queues.reshape(k * n, -1), self._age_edges).reshape(k, n, -1),
-            supply_c[:, self._pick_units].copy(),
-            flow_m3s[:, self._pick_units].copy(),
-            rewards.reshape(k, -1, size)[:, :, dcs].copy(),
-            *self._hottest_halls(by_dc),
-        ])  # fmt: skip
-
-    def _hottest_halls(self, by_dc: F64) -> tuple[F64, F64]:
-        """Hottest halls of the fleet in the steps with frames of the 3D hall.
-
-        Args:
-            by_dc: values of ``FIELDS`` in the last k steps, (k, F, B).
-
-        Returns:
-            Number of halls with an inlet above the recommended range, (frames,), and of the
-            hottest ones the data center, inlet, rack and server, (frames, 4, halls).
-        """
-        first = self._steps[-1] + 1 - len(by_dc)
-        rows = np.array([step - first for step in self._hall_steps if step >= first], dtype=np.intp)
-        values = by_dc[rows[:, None], [FIELD_ROWS[field] for field in HOTTEST_FIELDS]]
-        top = np.argsort(-rank(values[:, 0]), axis=1, kind="stable")[:, None, :HOTTEST_HALLS]
-        above = np.count_nonzero(values[:, 0] > RECOMMENDED_C[1] + LEAST_EXCESS_K, axis=1)
-        return above, np.concatenate([top, np.take_along_axis(values, top, axis=2)], axis=1)
+            age_histogram(queues.reshape(steps * n, -1), self._age_edges).reshape(steps, n, -1),
+            supply_c[:, self._pick_units],
+            flow_m3s[:, self._pick_units],
+            *(term[:, self._focus] for term in rewards),
+        ))  # fmt: skip
+        self._unreduced = []
 
     def _check(self, result: StepResult) -> None:
         """Refuse a result of another simulator, or one that does not follow the last one."""
-        shape = len(result.it_w), len(result.rack_inlet_c)
-        if shape != self._shape:
+        dcs, racks, fleet = len(result.it_w), len(result.rack_inlet_c), self._fleet
+        if (dcs, racks) != (fleet.size, fleet.racks):
             raise SdcError(
-                f"recorder: result of {shape[0]} data centers and {shape[1]} racks, expected "
-                f"{self._shape[0]} and {self._shape[1]}"
+                f"recorder: result of {dcs} data centers and {racks} racks, expected "
+                f"{fleet.size} and {fleet.racks}"
             )
         step, done = result.step, self._sim.state.step
         if step != done - 1:
@@ -311,7 +341,8 @@ class BlockBuilder:
         before: Status = np.frombuffer(self._last_status, after.dtype)
         self._last_status = status
         inlet_c: Reals | None = None
-        for dc, racks in zip(self._focus, self._rack_slices, strict=True):
+        for dc in self._focus:
+            racks = slice(*fleet.rack_offsets[dc : dc + 2].tolist())
             if np.array_equal(before[racks], after[racks]):
                 continue
             if inlet_c is None and self._cadence.has_servers:
@@ -329,50 +360,50 @@ class BlockBuilder:
                 step, dc, per_row, before[racks], after[racks], hottest
             )
 
-    def _add_maps(self, result: StepResult) -> None:
+    def _add_map(self, result: StepResult) -> None:
         """Keep what the heat maps of a step show."""
         fields = result.rack_inlet_c, result.rack_outlet_c, result.rack_cpu_w, result.rack_fan_w
-        in_focus = [values[self._pick_racks] for values in fields]
-        np.concatenate(in_focus, out=self._maps[len(self._map_steps)])
+        inlet_c, outlet_c, cpu_w, fan_w = (
+            values[self._pick_racks].astype(np.float32) for values in fields
+        )
+        self._maps.append(np.stack([inlet_c, outlet_c, (cpu_w + fan_w) * np.float32(1e-3)]))
         self._map_steps.append(result.step)
 
-    def _add_halls(self, result: StepResult) -> None:
+    def _add_hall(self, result: StepResult) -> None:
         """Keep what the 3D halls of a step show."""
+        inlet_c, outlet_c = result.rack_inlet_max_c, result.rack_outlet_c
         if self._cadence.has_servers:
             groups = self._sim.server_groups()
             inlet_c, outlet_c = groups.inlet_c, groups.outlet_c
-        else:
-            inlet_c, outlet_c = result.rack_inlet_max_c, result.rack_outlet_c
-        frame = len(self._hall_steps)
-        self._halls[0, frame] = inlet_c[self._pick_hall_columns]
-        self._halls[1, frame] = outlet_c[self._pick_hall_columns]
+        pair = np.stack([inlet_c[self._pick_hall], outlet_c[self._pick_hall]])
+        self._halls.append(pair.astype(np.float32))
         self._hall_steps.append(result.step)
 
-    def _hottest_text(self, above: int, hottest: F64) -> str:
+    def _hottest_text(self, by_dc: F64) -> str:
         """Markdown of the halls with the hottest inlets in a step.
 
         Args:
-            above: number of halls with an inlet above the recommended range.
-            hottest: data center, inlet, rack and server of the hottest halls, (4, halls).
+            by_dc: values of ``FIELDS``, (F, B).
         """
-        size, recommended_c = self._fleet.size, RECOMMENDED_C[1]
+        inlet_c, racks, servers = (by_dc[FIELD_ROWS[field]] for field in HOTTEST_FIELDS)
+        recommended_c = RECOMMENDED_C[1]
+        above = np.count_nonzero(inlet_c > recommended_c + LEAST_EXCESS_K)
         lines = [
-            f"{above} of {size} halls have inlets above {recommended_c:g} C",
+            f"{above} of {len(inlet_c)} halls have inlets above {recommended_c:g} C",
             "",
             "| hall | hottest inlet [C] | row | rack | server from the floor |",
             "|---|---:|---:|---:|---:|",
         ]
-        for dc, inlet_c, rack, server in hottest.T.tolist():
-            row = int(rack) // self._fleet.configs[int(dc)].hall.racks_per_row
-            name = self._names[int(dc)]
-            lines.append(f"| {name} | {inlet_c:.2f} | {row} | {int(rack)} | {int(server)} |")
+        for dc in np.argsort(-rank(inlet_c), kind="stable")[:HOTTEST_HALLS].tolist():
+            rack = int(racks[dc])
+            row = rack // self._fleet.configs[dc].hall.racks_per_row
+            place = f"{row} | {rack} | {int(servers[dc])}"
+            lines.append(f"| {self._names[dc]} | {inlet_c[dc]:.2f} | {place} |")
         return "\n".join(lines)
 
 
-def _joined(parts: Sequence[slice]) -> tuple[slice | I64, list[slice]]:
-    """Index of several parts of an array as one, and the place of each part in what it picks."""
-    ends = np.cumsum([0, *(part.stop - part.start for part in parts)]).tolist()
-    places = [slice(first, last) for first, last in itertools.pairwise(ends)]
-    if all(a.stop == b.start for a, b in itertools.pairwise(parts)):
-        return slice(parts[0].start, parts[-1].stop), places
-    return np.concatenate([np.arange(part.start, part.stop) for part in parts]), places
+def _pick(offsets: npt.NDArray[np.integer[Any]], focus: Sequence[int]) -> tuple[I64, list[slice]]:
+    """Indices of the parts of the data centers in focus, and the place of each among these."""
+    parts = [np.arange(*offsets[dc : dc + 2]) for dc in focus]
+    ends = np.cumsum([0, *map(len, parts)]).tolist()
+    return np.concatenate(parts), list(itertools.starmap(slice, itertools.pairwise(ends)))

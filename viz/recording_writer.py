@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+import rerun as rr
 
 from sdc_taichi.exogenous.year_clock import step_times
 from sdc_taichi.hall.floor_plan import floor_plan
@@ -31,10 +32,7 @@ from sdc_taichi.run.hottest_air import HottestAir
 from sdc_taichi.types import F64, I64, StepResult
 
 from . import hall_rasters as rasters
-from .recording_blocks import Block, BlockBuilder
-from .recording_blueprint import FocusTab, make_blueprint
-from .recording_cadence import choose_cadence
-from .recording_log import ConditionLog, LogEntry
+from .recording_blocks import Block, BlockBuilder, choose_cadence
 from .recording_output import RecordingOutput
 from .recording_series import (
     COMMAND_STATES,
@@ -46,9 +44,14 @@ from .recording_series import (
     append_pue,
     plot_rows_and_factors,
 )
-from .recording_static import MAX_UNIT_LINES, data_center_entities, fleet_entities
-from .recording_summary import hottest_markdown, summary_markdown
-from .rerun_columns import TimeColumn, bytes_column, number_column
+from .recording_text import ConditionLog, LogEntry, hottest_markdown, summary_markdown
+from .recording_views import (
+    MAX_UNIT_LINES,
+    FocusTab,
+    data_center_entities,
+    fleet_entities,
+    make_blueprint,
+)
 
 if TYPE_CHECKING:
     from sdc_taichi.sim.simulator import Simulator
@@ -146,14 +149,12 @@ class RecordingWriter:
 
     def _write_hottest(self) -> None:
         """Say why the hottest racks of each data center in focus are hot."""
-        import rerun as rr
-
         for index, dc in enumerate(self._focus):
-            found = self._hottest_air.of(dc)
-            if found is None:
+            hottest = self._hottest_air.of(dc)
+            if hottest is None:
                 continue
-            clock = self._clock(np.array([found.step]))[0, index]
-            text = hottest_markdown(self._fleet, dc, found, str(clock.astype("datetime64[m]")))
+            clock = self._clock(np.array([hottest.step]))[0, index]
+            text = hottest_markdown(self._fleet, dc, hottest, str(clock.astype("datetime64[m]")))
             document = rr.TextDocument(text, media_type="text/markdown")
             self._output.send_static(f"{self._path(dc)}/hottest", document)
 
@@ -185,8 +186,6 @@ class RecordingWriter:
 
     def _open(self) -> None:
         """Open the output and send what holds at all times."""
-        import rerun as rr
-
         tabs = []
         for dc, grid in zip(self._focus, self._tile_grids, strict=True):
             hall = self._fleet.configs[dc].hall
@@ -209,11 +208,9 @@ class RecordingWriter:
                 self._output.send_static(entity, component)
 
     def _write_fleet(
-        self, block: Block, times: list[TimeColumn], hall_times: list[TimeColumn]
+        self, block: Block, times: list[rr.TimeColumn], hall_times: list[rr.TimeColumn]
     ) -> None:
         """Series over all data centers, and the hottest halls."""
-        import rerun as rr
-
         for entity, plot in FLEET_PLOTS.items():
             self._write_scalars(f"fleet/{entity}", times, plot.series(block.fleet)[:, None])
         if block.hottest:
@@ -222,7 +219,7 @@ class RecordingWriter:
             self._output.add_columns("fleet/hottest", hall_times, texts)
 
     def _write_lines(
-        self, block: Block, index: int, path: str, times: list[TimeColumn], values: F64
+        self, block: Block, index: int, path: str, times: list[rr.TimeColumn], values: F64
     ) -> None:
         """Series of a data center: plots, queue, rewards and CRAC units."""
         for entity, (rows, factors) in self._plots.items():
@@ -240,17 +237,12 @@ class RecordingWriter:
         self._write_scalars(f"{path}/crac/temperature_c", times, air_c)
         self._write_scalars(f"{path}/crac/airflow_m3s", times, flow_m3s)
 
-    def _write_scalars(self, entity: str, times: list[TimeColumn], values: F64) -> None:
+    def _write_scalars(self, entity: str, times: list[rr.TimeColumn], values: F64) -> None:
         """Lines of an entity, (T, lines)."""
-        import rerun as rr
-
-        scalars = number_column(rr.Scalars.descriptor_scalars(), values)
-        self._output.add_columns(entity, times, [scalars])
+        self._output.add_columns(entity, times, rr.Scalars.columns(scalars=values))
 
     def _write_states(self, index: int, path: str, steps: I64, values: F64) -> None:
         """Commands of a data center, in the steps in which their sign changes."""
-        import rerun as rr
-
         for entity, (command, names) in COMMAND_STATES.items():
             signs = np.sign(values[:, FIELD_ROWS[command]]).astype(np.int64)
             before = np.append(self._last_signs.get((index, entity), _NO_COMMAND), signs[:-1])
@@ -264,8 +256,6 @@ class RecordingWriter:
 
     def _write_log(self, index: int, path: str, entries: list[LogEntry]) -> None:
         """Entries of the log of a data center."""
-        import rerun as rr
-
         if not entries:
             return
         entries.sort(key=lambda entry: entry.step)
@@ -283,23 +273,22 @@ class RecordingWriter:
         index: int,
         path: str,
         maps: Frames[np.float16],
-        map_times: list[TimeColumn],
+        map_times: list[rr.TimeColumn],
         voxels: Frames[np.float32],
-        hall_times: list[TimeColumn],
+        hall_times: list[rr.TimeColumn],
     ) -> None:
         """Heat maps and 3D hall of a data center."""
-        import rerun as rr
-
-        pixels = rr.DepthImage.descriptor_buffer()
-        voxel_values = rr.VoxelGridMap.descriptor_values()
         for quantity in self._scales:
             if (index, quantity) in maps:
                 frames = maps[index, quantity]
-                column = bytes_column(pixels, frames.reshape(len(frames), -1))
-                self._output.add_columns(f"{path}/map/{quantity}", map_times, [column])
+                pixels = frames.reshape(len(frames), -1).view(np.uint8)
+                columns = rr.DepthImage.columns(buffer=pixels)
+                self._output.add_columns(f"{path}/map/{quantity}", map_times, columns)
             if (index, quantity) in voxels:
-                column = number_column(voxel_values, voxels[index, quantity])
-                self._output.add_columns(f"{path}/hall/{quantity}", hall_times, [column])
+                values = voxels[index, quantity]
+                columns = rr.VoxelGridMap.columns(values=values.reshape(-1))
+                parts = columns.partition(np.full(len(values), values.shape[1]))
+                self._output.add_columns(f"{path}/hall/{quantity}", hall_times, parts)
 
     def _heat_maps(self, block: Block) -> Frames[np.float16]:
         """Heat maps, (M, height, width)."""
@@ -325,16 +314,14 @@ class RecordingWriter:
         """Time at which steps begin on the clocks of the data centers in focus, (T, n)."""
         return step_times(self._start, steps, self._fleet.steps_per_hour)
 
-    def _times(self, steps: I64) -> list[list[TimeColumn]]:
+    def _times(self, steps: I64) -> list[list[rr.TimeColumn]]:
         """Columns of both timelines for each data center in focus."""
-        step = TimeColumn("step", steps)
+        step = rr.TimeColumn("step", sequence=steps)
         clocks = self._clock(steps).astype("datetime64[ns]").T
-        return [[step, TimeColumn("sim_time", clock)] for clock in clocks]
+        return [[step, rr.TimeColumn("sim_time", timestamp=clock)] for clock in clocks]
 
     def _path(self, dc: int) -> str:
         """Path of the entities of a data center."""
-        import rerun as rr
-
         return f"dc/{rr.escape_entity_path_part(self._names[dc])}"
 
 

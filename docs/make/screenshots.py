@@ -25,7 +25,7 @@ from PIL import Image, ImageDraw
 
 from sdc_taichi import Actions, Recorder, Simulator, StepResult, load_config
 from sdc_taichi.cli.view import viewer_program
-from sdc_taichi.viz.recording_target import HOST, check_port, listens, served_at
+from sdc_taichi.viz.recording_output import HOST, check_port, listens, served_at
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient

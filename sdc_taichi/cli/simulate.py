@@ -80,7 +80,7 @@ class RecordingOptions:
         Raises:
             SdcError: options of a recording without one, or a recording that cannot be made.
         """
-        from sdc_taichi.viz.recording_target import DEFAULT_PORT, is_address
+        from sdc_taichi.viz.recording_output import DEFAULT_PORT, is_address
 
         port = self.serve_port
         if self.serve or port is not None:

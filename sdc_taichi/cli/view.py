@@ -44,7 +44,7 @@ def view_command(
 
     Ends with the viewer, or on Ctrl-C.
     """
-    from sdc_taichi.viz.recording_target import check_address, is_address, listens
+    from sdc_taichi.viz.recording_output import check_address, is_address, listens
 
     if port is not None and not web:
         raise SdcError("--port: given without --web; valid is both")
@@ -86,7 +86,7 @@ def viewer_command(recording: str, *, web: bool, port: int | None) -> tuple[list
     Raises:
         SdcError: rerun-sdk is missing, or the port is taken.
     """
-    from sdc_taichi.viz.recording_target import HOST, check_port, is_address, served_at
+    from sdc_taichi.viz.recording_output import HOST, check_port, is_address, served_at
 
     command = [str(viewer_program()), recording, "--bind", HOST]
     data_port = check_port(0)
@@ -101,7 +101,7 @@ def viewer_command(recording: str, *, web: bool, port: int | None) -> tuple[list
 
 
 def _page_port() -> int:
-    from sdc_taichi.viz.recording_target import check_port
+    from sdc_taichi.viz.recording_output import check_port
 
     try:
         return check_port(WEB_PORT)

@@ -29,8 +29,7 @@ from sdc_taichi.errors import ConfigError, RuntimeStateError, SdcError
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, StepResult
-from sdc_taichi.viz.recording_output import RecordingWarning
-from sdc_taichi.viz.recording_target import check_path, is_address
+from sdc_taichi.viz.recording_output import RecordingWarning, check_path, is_address
 
 if TYPE_CHECKING:
     from sdc_taichi.viz.recorder import Recorder

@@ -1,0 +1,480 @@
+"""Texts of a recording: the log of what goes wrong, the summary, and why racks are hot.
+
+What lasts has an entry of the log when it begins and one when it ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, RECOMMENDED_C, allowable_c
+from sdc_taichi.hall.protection import NORMAL, THROTTLED, TRIPPED
+from sdc_taichi.run.hottest_air import AirAtStep
+from sdc_taichi.sim.events import ActiveEvent
+from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.inlet_parts import (
+    HOTTEST_RACKS,
+    Inlets,
+    exhaust_terms,
+    inlet_terms,
+    rack_text,
+    state_texts,
+)
+from sdc_taichi.types import F64, I64, Reals, Status
+
+from .hall_rasters import ColourScale
+from .recording_series import FIELD_ROWS
+
+if TYPE_CHECKING:
+    from .recording_blocks import Cadence
+
+MAX_RACKS_PER_STEP = 8
+"""Largest number of racks named when those of a data center change status in one step."""
+_LEVELS = {NORMAL: "INFO", THROTTLED: "WARN", TRIPPED: "ERROR"}
+_STATUS_NAMES = {NORMAL: "back to normal", THROTTLED: "throttled", TRIPPED: "tripped"}
+
+
+class LogEntry(NamedTuple):
+    """One line of the log."""
+
+    step: int
+    """Step, counted from 0 at reset."""
+    dc: int
+    """Index of the data center."""
+    level: str
+    """``INFO``, ``WARN`` or ``ERROR``."""
+    text: str
+    """Message, on one line."""
+
+
+class _Condition(NamedTuple):
+    """State of a data center that lasts while a field exceeds a limit."""
+
+    field: str
+    """Field of ``StepResult``."""
+    limit: float
+    """Value that the field exceeds, in its unit."""
+    level: str
+    """Level of the first entry."""
+    begin_text: str
+    """Text of the first entry, with ``{value}`` and ``{place}`` of the hottest server."""
+    end_text: str
+    """Text of the last entry, with ``{most}`` and ``{total}`` of the field since the first one."""
+    factor: float = 1.0
+    """Unit of the field over the unit of the text."""
+
+
+def _inlet_condition(name: str, limit_c: float, level: str) -> _Condition:
+    """Inlets above the end of a range of temperatures."""
+    return _Condition(
+        "inlet_max_c",
+        limit_c + LEAST_EXCESS_K,
+        level,
+        f"inlet above {name} {limit_c:g} C: {{value:.1f}} C at {{place}}",
+        f"inlets back within {name} {limit_c:g} C, hottest was {{most:.1f}} C",
+    )
+
+
+CONDITIONS = (
+    _Condition(
+        "unmet_w",
+        1.0,
+        "WARN",
+        "cooling plant at its limit: {value} kW of heat stay in the room",
+        "cooling plant below its limit again, {most} kW at the most",
+        factor=1e-3,
+    ),
+    _Condition(
+        "overdue_tasks",
+        1e-6,
+        "WARN",
+        "work overdue: {value} tasks found no capacity",
+        "no work overdue any more, {most} tasks at the most",
+    ),
+    _Condition(
+        "dropped_tasks",
+        1e-6,
+        "ERROR",
+        "work dropped: {value} tasks found the queue full",
+        "no work dropped any more, {total} tasks in all",
+    ),
+    _Condition(
+        "lost_tasks",
+        1e-6,
+        "ERROR",
+        "work lost: {value} tasks went down with their servers",
+        "no work lost any more, {total} tasks in all",
+    ),
+    _Condition(
+        "grid_overload_kwh",
+        1e-9,
+        "ERROR",
+        "grid connection overloaded: {value} kWh beyond its limit in the step",
+        "grid connection within its limit again, {total} kWh beyond it in all",
+    ),
+    _Condition(
+        "unserved_kwh",
+        1e-9,
+        "ERROR",
+        "energy unserved: {value} kWh",
+        "no energy unserved any more, {total} kWh in all",
+    ),
+)
+"""Conditions of every data center, beside those of its inlets."""
+
+
+class _Number(float):
+    """A number that texts show with three digits, or all those before the point."""
+
+    def __format__(self, spec: str) -> str:
+        return super().__format__(spec or (".3g" if abs(self) < 100 else ",.0f"))
+
+
+@dataclass(slots=True)
+class _Ongoing:
+    """A condition that lasts."""
+
+    first_step: int
+    """Step in which the condition began, counted from 0 at reset."""
+    most: float
+    """Highest value since, in the unit of the text."""
+    total: float
+    """Sum of the values since, in the unit of the text."""
+
+
+class ConditionLog:
+    """Finds where conditions of a data center begin and end, block by block.
+
+    Args:
+        fleet: the fleet.
+        dc: index of the data center.
+    """
+
+    def __init__(self, fleet: Fleet, dc: int) -> None:
+        config = fleet.configs[dc]
+        self._dc, self._per_row = dc, config.hall.racks_per_row
+        self._step_h = 1.0 / fleet.steps_per_hour
+        allowable_max_c = allowable_c(config.protection.ashrae_class)[1]
+        self._conditions = (
+            _inlet_condition("recommended", RECOMMENDED_C[1], "WARN"),
+            _inlet_condition("allowable", allowable_max_c, "ERROR"),
+            *CONDITIONS,
+        )
+        self._rows = [FIELD_ROWS[c.field] for c in self._conditions]
+        self._limits = np.array([c.limit for c in self._conditions])
+        self._ongoing: dict[int, _Ongoing] = {}
+
+    def entries(self, steps: I64, values: F64) -> Iterator[LogEntry]:
+        """Entries of a block, condition by condition.
+
+        Args:
+            steps: steps of the block, (T,).
+            values: values of ``FIELDS``, (T, F).
+        """
+        watched = values[:, self._rows]
+        over = watched > self._limits
+        for index in sorted({*np.flatnonzero(over.any(axis=0)).tolist(), *self._ongoing}):
+            yield from self._follow(index, steps, watched[:, index], over[:, index], values)
+
+    def _follow(
+        self, index: int, steps: I64, value: F64, over: npt.NDArray[np.bool_], values: F64
+    ) -> Iterator[LogEntry]:
+        """Entries of one condition in a block.
+
+        Args:
+            index: index of the condition.
+            steps: steps of the block, (T,).
+            value: values of the condition's field, (T,).
+            over: whether these exceed the limit, (T,).
+            values: values of ``FIELDS``, (T, F).
+        """
+        condition = self._conditions[index]
+        for t, step in enumerate(steps.tolist()):
+            ongoing, now = self._ongoing.get(index), float(value[t]) * condition.factor
+            if over[t] and ongoing is None:
+                self._ongoing[index] = _Ongoing(step, now, now)
+                hottest = (
+                    values[t, FIELD_ROWS[name]] for name in ("hottest_rack", "hottest_server")
+                )
+                rack, server = map(int, hottest)
+                place = rack_place(rack, self._per_row, server)
+                text = condition.begin_text.format(value=_Number(now), place=place)
+                yield LogEntry(step, self._dc, condition.level, text)
+            elif over[t] and ongoing is not None:
+                ongoing.most = max(ongoing.most, now)
+                ongoing.total += now
+            elif ongoing is not None:
+                hours = (step - ongoing.first_step) * self._step_h
+                text = condition.end_text.format(
+                    most=_Number(ongoing.most), total=_Number(ongoing.total)
+                )
+                yield LogEntry(step, self._dc, "INFO", f"{text} (after {hours:g} h)")
+                del self._ongoing[index]
+
+
+def rack_place(rack: int, racks_per_row: int, server: int | None = None) -> str:
+    """Words for the place of a rack in its hall, or of a server in it; all count from 0."""
+    place = f"row {rack // racks_per_row}, rack {rack}"
+    return place if server is None else f"{place}, server {server} from the floor"
+
+
+def protection_entries(
+    step: int,
+    dc: int,
+    racks_per_row: int,
+    before: Status,
+    after: Status,
+    hottest: Callable[[int], tuple[int | None, float]],
+) -> Iterator[LogEntry]:
+    """Racks of a data center that throttled, tripped or came back in a step.
+
+    Args:
+        step: the step, counted from 0 at reset.
+        dc: index of the data center.
+        racks_per_row: number of racks in a row of its hall.
+        before: status of its racks before the step, (R,).
+        after: status of its racks after the step, (R,).
+        hottest: from a rack to its hottest server, None if that is not known, and the server's
+            inlet in C.
+    """
+    changed = np.flatnonzero(before != after)
+    # The worst first, so that those not named are the harmless ones.
+    ordered = changed[np.argsort(-after[changed].astype(np.int64), kind="stable")].tolist()
+    for rack in ordered[:MAX_RACKS_PER_STEP]:
+        status = int(after[rack])
+        server, inlet_c = hottest(rack)
+        place = rack_place(rack, racks_per_row, server)
+        text = f"rack {_STATUS_NAMES[status]}: {place}, inlet {inlet_c:.1f} C"
+        yield LogEntry(step, dc, _LEVELS[status], text)
+    if len(ordered) > MAX_RACKS_PER_STEP:
+        rest = after[ordered[MAX_RACKS_PER_STEP:]]
+        worst = int(rest.max())
+        counts = ", ".join(
+            f"{np.count_nonzero(rest == status)} {name}"
+            for status, name in _STATUS_NAMES.items()
+            if np.any(rest == status)
+        )
+        yield LogEntry(step, dc, _LEVELS[worst], f"and more racks: {counts}")
+
+
+def failure_entries(
+    step: int,
+    before: Sequence[ActiveEvent],
+    now: Sequence[ActiveEvent],
+    fleet: Fleet,
+) -> Iterator[LogEntry]:
+    """Failures and weather events that begin or end with a step.
+
+    Args:
+        step: the step, counted from 0 at reset.
+        before: events that were active in the step before.
+        now: events that are active in the step.
+        fleet: the fleet.
+    """
+    for event in now:
+        if event not in before:
+            text = f"{_event_text(event, fleet)}, steps {event.start_step} to {event.end_step - 1}"
+            yield LogEntry(step, event.dc, "ERROR", text)
+    for event in before:
+        if event not in now:
+            yield LogEntry(step, event.dc, "INFO", f"over: {_event_text(event, fleet)}")
+
+
+_SHARE_LEFT: dict[str, str] = {
+    "chiller_derate": "chiller at {} of its capacity",
+    "pump_down": "{} of the chilled-water pumps left",
+    "tower_cell_down": "{} of the tower cells left",
+    "dry_cooler_down": "{} of the dry coolers left",
+    "outdoor_air_closed": "{} of the openings for outdoor air left",
+}
+"""Words for events that leave a share of a device of the plant, by their kind."""
+
+
+def _event_text(event: ActiveEvent, fleet: Fleet) -> str:
+    """Words for an event."""
+    if event.kind == "crac_down":
+        return "all CRAC units down" if event.target is None else f"CRAC unit {event.target} down"
+    if event.kind in _SHARE_LEFT:
+        return _SHARE_LEFT[event.kind].format(f"{event.share:.0%}")
+    if event.kind == "rack_fan_failure":
+        assert event.target is not None
+        place = rack_place(event.target, fleet.configs[event.dc].hall.racks_per_row)
+        return f"rack fans failed: {place}, airflow at {event.share:.0%}"
+    if event.kind == "heat_wave":
+        return f"heat wave, {event.offset_k:+g} K"
+    return "grid outage"
+
+
+def hottest_server(inlet_c: Reals, fleet: Fleet, rack: int) -> tuple[int, float]:
+    """Hottest server of a rack, counted from the floor, and its inlet in C.
+
+    Args:
+        inlet_c: inlets of the server groups, in C, (G,).
+        fleet: the fleet.
+        rack: index of the rack, counted over the whole fleet.
+    """
+    first, last = fleet.group_offsets[rack : rack + 2]
+    group = first + int(np.argmax(inlet_c[first:last]))
+    return int(fleet.server_offsets[group] - fleet.server_offsets[first]), float(inlet_c[group])
+
+
+def summary_markdown(
+    description: Mapping[str, Any],
+    fleet: Fleet,
+    focus: Mapping[int, str],
+    scales: Mapping[str, ColourScale],
+    cadence: Cadence,
+) -> str:
+    """Markdown of what was run, on which inputs, and how to read the recording.
+
+    Args:
+        description: what ``describe_run`` says of the run, or a part of it.
+        fleet: the fleet.
+        focus: from the index of each data center in focus to its name in the recording.
+        scales: colour scales of the heat maps, by quantity.
+        cadence: how often heat maps and halls are recorded.
+    """
+    ranges = ", ".join(f"{name} {s.low:g} to {s.high:g} {s.unit}" for name, s in scales.items())
+    resolution = ", ".join(f"{name} {s.resolution:.4g} {s.unit}" for name, s in scales.items())
+    map_every = _steps_text(cadence.map_every_steps)
+    hall_every = _steps_text(cadence.hall_every_steps)
+    in_events = _steps_text(cadence.hall_every_steps_in_events)
+    lines = [
+        "# sdc-taichi",
+        f"{_count_text(fleet.size, 'data center')}, {_count_text(fleet.racks, 'rack')}, "
+        f"{_count_text(fleet.servers, 'server')}; a step is {60 // fleet.steps_per_hour} minutes. "
+        "Times are the start of the step, local standard time of the data center, in the year "
+        "2001.",
+        "",
+        f"Series have every step, heat maps every {map_every}, the 3D hall every {hall_every}, "
+        f"while an event lasts every {in_events}. There the front of a rack shows the hottest "
+        f"inlet {_levels_text(cadence)}, in the colours of the maps; aisles are rounded to half a "
+        "rack's depth.",
+        "",
+        f"Colours cover: {ranges}; values beyond are drawn as its ends. Resolution: {resolution}.",
+        "",
+        _inputs_text(description),
+        "",
+        "| | |",
+        "|---|---|",
+        *(f"| {name} | {value} |" for name, value in _facts(description).items()),
+        "",
+        "Stage models: " + ", ".join(f"{k} {v}" for k, v in fleet.models.items()) + ".",
+        "",
+        "Counted as HVAC: " + ", ".join(fleet.configs[0].hvac.total_of) + ".",
+    ]
+    data_centers = description.get("data_centers", ())
+    for dc, name in focus.items():
+        own = data_centers[dc] if data_centers else {}
+        lines += ["", *_data_center_lines(fleet, dc, name, own)]
+    if fleet.size > len(focus):
+        rest = _count_text(fleet.size - len(focus), "other data center")
+        lines += ["", f"The {rest} count in the fleet series only."]
+    return "\n".join(lines)
+
+
+def hottest_markdown(fleet: Fleet, dc: int, air: AirAtStep, clock: str) -> str:
+    """Markdown that says why the hottest racks of a data center are as hot as they are.
+
+    Args:
+        fleet: the fleet.
+        dc: index of the data center.
+        air: its air in its hottest step.
+        clock: when the step begins, on the clock of the data center.
+    """
+    per_row = fleet.configs[dc].hall.racks_per_row
+    inlets = Inlets(fleet, dc, air.air)
+    when = clock[5:].replace("T", " ")
+    lines = ["# Why the hottest racks are hot", f"At the end of step {air.step}, {when}."]
+    for rack in inlets.hottest(HOTTEST_RACKS):
+        parts = inlets.parts(rack)
+        (first, setpoint_c), *others = inlet_terms(parts, per_row)
+        lines += [
+            "",
+            f"## {rack_text(rack, per_row)}: {parts.inlet_c:.2f} C",
+            "",
+            "| | |",
+            "|---:|---|",
+            f"| {setpoint_c:.2f} C | {first} |",
+            *(f"| {k:+.2f} K | {text} |" for text, k in others),
+            "",
+        ]
+        why = ", ".join(f"{k:+.2f} K {text}" for text, k in exhaust_terms(parts))
+        if why:
+            lines += [f"{100 * parts.exhaust_share:.1f} % of its intake is exhaust air: {why}.", ""]
+        lines += [f"- {text}" for text in state_texts(parts)]
+    return "\n".join(lines)
+
+
+def _count_text(number: int, noun: str) -> str:
+    """A number and a noun, in the plural unless the number is 1."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def _steps_text(steps: int) -> str:
+    """An interval in words."""
+    return "step" if steps == 1 else f"{steps} steps"
+
+
+def _levels_text(cadence: Cadence) -> str:
+    """Words for the temperatures that front and back of a rack of the 3D hall show."""
+    if not cadence.has_servers:
+        return "of its servers, its back the mean outlet"
+    return f"at each of {_count_text(max(cadence.levels), 'height')}, its back the hottest outlet"
+
+
+def _inputs_text(description: Mapping[str, Any]) -> str:
+    """Whether inputs are synthetic, in words."""
+    if "synthetic" not in description:
+        return ""
+    if description["synthetic"]:
+        return "These figures rest on **synthetic** inputs, not on measurements."
+    return "No input is synthetic."
+
+
+def _facts(description: Mapping[str, Any]) -> dict[str, str]:
+    """Facts of the run that are known, by name."""
+    known = {
+        name: description[name]
+        for name in ("controller", "seed", "precision")
+        if name in description
+    }
+    facts = {name: str(value) for name, value in known.items()}
+    if "fingerprint" in description:
+        facts["fingerprint"] = f"`{description['fingerprint']}`"
+    versions: Mapping[str, str] = description.get("versions", {})
+    if versions:
+        facts["versions"] = ", ".join(f"{name} {number}" for name, number in versions.items())
+    notes: Sequence[str] = description.get("notes", ())
+    if notes:
+        facts["notes"] = "; ".join(note.replace("|", r"\|") for note in notes)
+    return facts
+
+
+def _data_center_lines(
+    fleet: Fleet, dc: int, name: str, description: Mapping[str, Any]
+) -> list[str]:
+    """Markdown of a data center: site, hall and inputs."""
+    config = fleet.configs[dc]
+    first, last = fleet.rack_offsets[dc : dc + 2]
+    servers = int(fleet.server_offsets[fleet.group_offsets[last]]) - int(
+        fleet.server_offsets[fleet.group_offsets[first]]
+    )
+    location = description.get("location", config.site.location)
+    provenance: Mapping[str, str] = description.get("provenance", {})
+    hashes: Mapping[str, str] = description.get("sha256", {})
+    return [
+        f"## {name}",
+        config.description,
+        "",
+        f"- site {location}, from {config.site.start}",
+        f"- hall of {_count_text(config.hall.rows, 'row')} with "
+        f"{_count_text(config.hall.racks_per_row, 'rack')} each, {_count_text(servers, 'server')}",
+        *(f"- {kind}: {source}" for kind, source in provenance.items()),
+        *(f"- SHA-256 of the {kind} file: `{value}`" for kind, value in hashes.items()),
+    ]

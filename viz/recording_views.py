@@ -1,0 +1,383 @@
+"""Views of a recording, and its static parts: names, colours, formats, colour bars, the hall.
+
+A recording has a tab for each data center in focus, and one for the fleet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from sdc_taichi.hall.floor_plan import floor_plan, unit_places_m
+from sdc_taichi.sim.fleet import Fleet
+
+from . import hall_rasters as rasters
+from .hall_rasters import ColourScale
+from .recording_series import (
+    COMMAND_STATES,
+    FLEET_PLOTS,
+    PALETTE,
+    PLOTS,
+    QUEUE_COLOURS,
+    QUEUE_ENTITY,
+    QUEUE_NAMES,
+    RED,
+    REWARDS_ENTITY,
+    STATE_COLOURS,
+)
+
+PLAYBACK_S_PER_S = 14_400.0
+"""Simulated seconds per second of playback."""
+MAX_UNIT_LINES = 24
+"""Largest number of CRAC units with a line each; of more their range is plotted."""
+
+MAX_ROW_LABELS = 5
+"""Largest number of rows of the 3D hall with a label; more would cover each other."""
+_LABEL_RGB = (135, 135, 135)  # a grey that can be read on a dark and on a light ground
+
+Entities = Iterator[tuple[str, Any]]
+"""Paths of entities, and the component or archetype that each holds."""
+
+
+class FocusTab(NamedTuple):
+    """Tab of a data center in focus."""
+
+    name: str
+    """Name of the data center in the recording."""
+    path: str
+    """Path of the data center's entities."""
+    size_m: tuple[float, float, float]
+    """Length, width and height of the room, in m."""
+    scales: Mapping[str, ColourScale]
+    """Colour scales of the heat maps, by quantity."""
+    image_shape: tuple[int, int]
+    """Height and width of the heat maps, in pixels."""
+
+
+def make_blueprint(
+    tabs: Sequence[FocusTab], *, has_hottest: bool, has_rewards: bool
+) -> rrb.Blueprint:
+    """Arrange the views of a recording.
+
+    Args:
+        tabs: tabs of the data centers in focus.
+        has_hottest: whether the hottest halls are recorded.
+        has_rewards: whether reward terms are recorded.
+    """
+    focus_tabs = (_focus_tab(tab, has_rewards=has_rewards) for tab in tabs)
+    return rrb.Blueprint(
+        rrb.Tabs(*focus_tabs, _fleet_tab(has_hottest=has_hottest)),
+        rrb.TimePanel(
+            timeline="sim_time",
+            playback_speed=PLAYBACK_S_PER_S,
+            play_state="paused",
+            state="collapsed",
+        ),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+    )
+
+
+def _fleet_tab(*, has_hottest: bool) -> Any:
+    """Texts, and plots over all data centers."""
+    texts = [rrb.TextDocumentView(origin="summary", name="summary")]
+    if has_hottest:
+        texts.append(rrb.TextDocumentView(origin="fleet/hottest", name="hottest halls"))
+    plots = [
+        _plot_view(f"fleet/{entity}", plot.title, legend=False)
+        for entity, plot in FLEET_PLOTS.items()
+    ]
+    return rrb.Horizontal(
+        rrb.Vertical(*texts),
+        rrb.Grid(*plots, grid_columns=2),
+        column_shares=[2, 3],
+        name="fleet",
+    )
+
+
+def _focus_tab(tab: FocusTab, *, has_rewards: bool) -> Any:
+    """Heat maps, 3D hall and log at the left, plots at the right."""
+    maps = rrb.Tabs(
+        *(_heat_map(tab, quantity, scale) for quantity, scale in tab.scales.items()), active_tab=0
+    )
+    events = rrb.TextLogView(
+        origin=f"{tab.path}/events",
+        name="events",
+        columns=rrb.TextLogColumns(
+            # The text has the time, for which the column is too narrow.
+            timeline_columns=[rrb.encodings.TimelineColumn("sim_time", visible=False)],
+            text_log_columns=["loglevel", "body"],
+        ),
+    )
+    hottest = rrb.TextDocumentView(origin=f"{tab.path}/hottest", name="why the hottest are hot")
+    texts = rrb.Tabs(events, hottest, active_tab=0)
+    hall = rrb.Vertical(maps, _hall_view(tab), texts, row_shares=[5, 4, 2])
+    return rrb.Horizontal(
+        hall,
+        _plot_tabs(tab, has_rewards=has_rewards),
+        column_shares=[4, 5],
+        name=tab.name,
+    )
+
+
+def _plot_tabs(tab: FocusTab, *, has_rewards: bool) -> Any:
+    """Plots of a data center in tabs: overview, cooling and work."""
+
+    def plots(*entities: str) -> list[Any]:
+        return [_series_view(tab, entity) for entity in entities]
+
+    actions = rrb.StateTimelineView(
+        origin=f"{tab.path}/actions", name="actions", time_view=_whole_run()
+    )
+    overview = rrb.Grid(
+        *plots("temperature_c", "power_kw", "carbon_intensity", QUEUE_ENTITY, "battery"),
+        actions,
+        grid_columns=2,
+        name="overview",
+    )
+    cooling = rrb.Grid(
+        *plots("hvac_kw", "pue"),
+        _plot_view(f"{tab.path}/crac/temperature_c", "CRAC supply and return air [C]"),
+        _plot_view(f"{tab.path}/crac/airflow_m3s", "CRAC airflow [m3/s]"),
+        *plots("weather_c", "water_l"),
+        grid_columns=2,
+        name="cooling",
+    )
+    work = rrb.Grid(
+        *plots(
+            "load", "work_tasks", "queue_age_h", "commands", "carbon_kg", "price", "energy_cost"
+        ),
+        *(plots(REWARDS_ENTITY) if has_rewards else []),
+        grid_columns=2,
+        name="work",
+    )
+    return rrb.Tabs(overview, cooling, work, active_tab=0)
+
+
+def _series_view(tab: FocusTab, entity: str) -> Any:
+    """Plot of a series of a data center."""
+    origin = f"{tab.path}/series/{entity}"
+    if entity == QUEUE_ENTITY:
+        return _plot_view(origin, "queue by age [tasks]")
+    if entity == REWARDS_ENTITY:
+        return _plot_view(origin, "reward terms [-]")
+    plot = PLOTS[entity]
+    # The title of a plot with one line is its name.
+    legend = len(plot.lines) > 1
+    return _plot_view(origin, plot.title, limits=plot.limits, legend=legend)
+
+
+def _heat_map(tab: FocusTab, quantity: str, scale: ColourScale) -> Any:
+    """Heat map of the racks over its colour bar."""
+    bar = rrb.Spatial2DView(
+        origin=f"legend/{quantity}",
+        name=f"{quantity} scale, {scale.low:g} to {scale.high:g} {scale.unit}",
+        visual_bounds=rrb.VisualBounds2D(x_range=(-8, 252), y_range=(-2, 24)),
+    )
+    height, width = tab.image_shape
+    edge = 0.04 * max(height, width)
+    image = rrb.Spatial2DView(
+        origin=f"{tab.path}/map/{quantity}",
+        name=f"rack {quantity} [{scale.unit}]",
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=(-edge, width + edge), y_range=(-edge, height + edge)
+        ),
+    )
+    return rrb.Vertical(image, bar, row_shares=[5, 2], name=quantity)
+
+
+def _hall_view(tab: FocusTab) -> Any:
+    """The hall in 3D, seen from the side of row 0."""
+    length, width, _ = tab.size_m
+    far = max(length, width)
+    eye = rrb.EyeControls3D(
+        kind="Orbital",
+        position=(length / 2 - 0.24 * far, -0.28 * far, 0.48 * far),
+        look_target=(length / 2, 0.4 * width, 0.0),
+        eye_up=(0.0, 0.0, 1.0),
+    )
+    return rrb.Spatial3DView(
+        origin=f"{tab.path}/hall",
+        name="hall: fronts show inlets, backs outlets, in the colours of the maps",
+        eye_controls=eye,
+        line_grid=False,
+    )
+
+
+def _plot_view(
+    origin: str,
+    name: str,
+    *,
+    limits: tuple[float, float] | None = None,
+    legend: bool = True,
+) -> Any:
+    """Plot of an entity over time.
+
+    Args:
+        origin: path of the entity.
+        name: title of the plot.
+        limits: ends of the vertical axis; None follows the values.
+        legend: whether the names of the lines are shown.
+    """
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=name,
+        axis_x=_whole_run(),
+        axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
+        # A legend covers what is behind it; the night that a run begins with is the least loss.
+        plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
+    )
+
+
+def _whole_run() -> Any:
+    """Time axis over the whole run; without it plots open on one minute around the cursor."""
+    ends = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite()
+    return rrb.TimeAxis(link="Independent", view_range=rrb.TimeRange(start=ends[0], end=ends[1]))
+
+
+def fleet_entities(scales: dict[str, ColourScale]) -> Entities:
+    """Colour bars, and the lines of the fleet.
+
+    Args:
+        scales: colour scales of the heat maps, by quantity.
+    """
+    for quantity, scale in scales.items():
+        yield from _colour_bar(quantity, scale).items()
+    for entity, plot in FLEET_PLOTS.items():
+        yield f"fleet/{entity}", _lines([plot.title], [plot.colour])
+
+
+def data_center_entities(
+    fleet: Fleet,
+    dc: int,
+    path: str,
+    scales: dict[str, ColourScale],
+    levels: int,
+    rewards: Sequence[str],
+) -> Entities:
+    """Lines, states, images and voxels of a data center.
+
+    Args:
+        fleet: the fleet.
+        dc: index of the data center.
+        path: path of the data center in the recording.
+        scales: colour scales of the heat maps, by quantity.
+        levels: levels per rack of its 3D hall.
+        rewards: names of the reward terms.
+    """
+    for entity, plot in PLOTS.items():
+        names = [line.name for line in plot.lines]
+        yield f"{path}/series/{entity}", _lines(names, [line.colour for line in plot.lines])
+    yield f"{path}/series/{QUEUE_ENTITY}", _lines(QUEUE_NAMES, QUEUE_COLOURS)
+    if rewards:
+        reward_colours = [PALETTE[i % len(PALETTE)] for i in range(len(rewards))]
+        names = [f"{name} [-]" for name in rewards]
+        yield f"{path}/series/{REWARDS_ENTITY}", _lines(names, reward_colours)
+    units = int(fleet.unit_offsets[dc + 1] - fleet.unit_offsets[dc])
+    names, unit_colours = _unit_lines(units, "supply [C]")
+    names, unit_colours = [*names, "return, all units [C]"], [*unit_colours, RED]
+    yield f"{path}/crac/temperature_c", _lines(names, unit_colours)
+    yield f"{path}/crac/airflow_m3s", _lines(*_unit_lines(units, "airflow [m3/s]"))
+    state_colours = np.array(STATE_COLOURS, np.uint32)
+    for entity, (_, states) in COMMAND_STATES.items():
+        shown = rr.StateConfiguration(values=states, labels=states, colors=state_colours)
+        yield f"{path}/actions/{entity}", shown
+    height, width = rasters.tile_grid(fleet.configs[dc].hall).image_shape
+    image_format = rr.components.ImageFormat(
+        width=width, height=height, color_model="L", channel_datatype="F16"
+    )
+    for quantity, scale in scales.items():
+        image = rr.DepthImage.from_fields(
+            format=image_format,
+            colormap=rasters.COLOURMAPS[quantity],
+            depth_range=(scale.low, scale.high),
+            meter=1.0,
+            magnification_filter="Nearest",
+        )
+        yield f"{path}/map/{quantity}", image
+    yield from _hall_entities(fleet, dc, f"{path}/hall", scales, levels, units)
+
+
+def _hall_entities(
+    fleet: Fleet,
+    dc: int,
+    path: str,
+    scales: dict[str, ColourScale],
+    levels: int,
+    units: int,
+) -> Entities:
+    """Voxels, walls, row labels and CRAC units of a hall in 3D."""
+    hall = fleet.configs[dc].hall
+    grid = rasters.rack_voxels(hall, levels)
+    for quantity, cells in (("inlet", grid.front), ("outlet", grid.back)):
+        voxels = rr.VoxelGridMap.from_fields(
+            voxel_indices=cells.astype(np.int32),
+            voxel_size=grid.size_m,
+            value_range=(scales[quantity].low, scales[quantity].high),
+            colormap=rasters.COLOURMAPS[quantity],
+            translation=(hall.layout.end_margin_m, 0.0, 0.0),
+        )
+        yield f"{path}/{quantity}", voxels
+    plan, height_m = floor_plan(hall), hall.layout.rack_height_m
+    walls = rasters.room_outline_m(plan, hall.layout.ceiling_m)
+    yield f"{path}/room", rr.LineStrips3D(walls, colors=[[110, 110, 110]], radii=0.02)
+    beside = plan.row_ends_m[0] - 0.6
+    labelled = range(0, hall.rows, -(-hall.rows // MAX_ROW_LABELS))
+    rows = rr.Points3D(
+        [(beside, plan.centre_m[row * hall.racks_per_row, 1], height_m / 2) for row in labelled],
+        radii=0.05,
+        colors=_LABEL_RGB,
+        labels=[f"row {row}" for row in labelled],
+        show_labels=True,
+    )
+    yield f"{path}/rows", rows
+    boxes = rr.Boxes3D(
+        centers=rasters.crac_box_centres_m(unit_places_m(plan, units), plan, height_m),
+        sizes=[(0.8, 1.2, height_m)] * units,
+        fill_mode="solid",
+        colors=[80, 170, 230],
+        labels=[f"CRAC {unit}" for unit in range(units)],
+        show_labels=units <= MAX_UNIT_LINES,
+    )
+    yield f"{path}/crac", boxes
+
+
+def _unit_lines(units: int, quantity: str) -> tuple[list[str], list[int]]:
+    """Names and colours of the lines of CRAC units, or of their range if there are many."""
+    if units > MAX_UNIT_LINES:
+        return [f"{which} {quantity}" for which in ("lowest", "mean", "highest")], list(PALETTE[:3])
+    others = [colour for colour in PALETTE if colour != RED]
+    colours = [others[unit % len(others)] for unit in range(units)]
+    return [f"unit {unit} {quantity}" for unit in range(units)], colours
+
+
+def _lines(names: Sequence[str], colours: Sequence[int]) -> rr.SeriesLines:
+    """Names and colours of the lines of a plot."""
+    # An array, because a list of three or four numbers is read as one colour.
+    return rr.SeriesLines(names=list(names), colors=np.array(colours, np.uint32))
+
+
+def _colour_bar(quantity: str, scale: ColourScale) -> dict[str, Any]:
+    """A gradient with labelled points, because the viewer has no colour bar of its own."""
+    gradient, marks = rasters.colour_bar(scale)
+    height, width = gradient.shape
+    bar = rr.DepthImage(
+        gradient,
+        meter=1.0,
+        colormap=rasters.COLOURMAPS[quantity],
+        depth_range=(scale.low, scale.high),
+    )
+    x = (np.array(marks) - scale.low) / (scale.high - scale.low) * width
+    points = rr.Points2D(
+        np.stack([x, np.full_like(x, height + 2.0)], axis=1),
+        radii=rr.Radius.ui_points(1.5),
+        colors=_LABEL_RGB,
+        labels=[f"{mark:g} {scale.unit}" for mark in marks],
+        show_labels=True,
+    )
+    return {f"legend/{quantity}/bar": bar, f"legend/{quantity}/ticks": points}
