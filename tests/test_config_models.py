@@ -9,6 +9,7 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 
+from sdc_taichi import ConfigError, Simulator
 from sdc_taichi.cli.options import RunOptions
 from sdc_taichi.cli.simulate import simulate_command
 from sdc_taichi.config import DataCenterConfig, EventKind, EventsConfig, load_config
@@ -16,32 +17,22 @@ from sdc_taichi.control.registry import controller_names
 from sdc_taichi.exogenous import carbon
 from sdc_taichi.hall import air_metrics, placement
 from sdc_taichi.kernels import hall_arguments
-from sdc_taichi.plant import battery, chiller, cooling, plants, tower, water, workload
+from sdc_taichi.plant import chiller
+from sdc_taichi.plant.chiller import ChillerModel, ChillerPoint, ChillerResult
 from sdc_taichi.sim import sizing
 from sdc_taichi.sim.events import schedule
-from sdc_taichi.sim.fleet import STAGE_MODELS
 from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.types import Values
 
 REGISTRIES: dict[str, tuple[str, Collection[str]]] = {
-    "hvac.setpoint.model": ("plant.cooling.SETPOINTS", cooling.SETPOINTS),
-    "hvac.crac.flow_model": ("plant.cooling.CRAC_FLOWS", cooling.CRAC_FLOWS),
-    "hvac.cooling_load_model": ("plant.cooling.COOLING_LOADS", cooling.COOLING_LOADS),
-    "hvac.plant": ("plant.plants.PLANTS", plants.PLANTS),
-    "hvac.chiller.model": ("plant.chiller.CHILLERS", chiller.CHILLERS),
-    "hvac.tower.model": ("plant.tower.TOWERS", tower.TOWERS),
-    "hvac.water.model": ("plant.water.WATER", water.WATER),
     "hvac.sizing.model": ("sim.sizing.MODELS", sizing.MODELS),
-    "battery.model": ("plant.battery.BATTERIES", battery.BATTERIES),
-    "workload.model": ("plant.workload.MODELS", workload.MODELS),
     "workload.placement": ("hall.placement.POLICIES", placement.POLICIES),
     "servers.outlet_model": ("kernels.hall_arguments.OUTLETS", hall_arguments.OUTLETS),
     "protection.ashrae_class": ("hall.air_metrics.ALLOWABLE_C", air_metrics.ALLOWABLE_C),
     "site.carbon_pairing": ("exogenous.carbon.Pairing", get_args(carbon.Pairing)),
 }
-"""Field of the schema to the registry of what it may name."""
-
-BRANCHES = {"hall.inlet_model", "hvac.pumps.model", "simulation.thermal"}
-"""Stages whose models are two branches of the code and in no registry."""
+"""Fields of the schema whose names stand in a Literal, and the registries of what they name; the
+names of the models of ``plant`` are taken from their registries."""
 
 EVENTS: dict[EventKind, dict[str, Any]] = {
     "crac_down": {"unit": 1},
@@ -66,50 +57,10 @@ def names_in_schema(path: str) -> set[str]:
     return {name for part in parts for name in get_args(part) if isinstance(name, str)}
 
 
-def differences(path: str) -> list[str]:
-    """What to do about each name that schema or registry has alone."""
-    registry, implemented = REGISTRIES[path]
-    listed = names_in_schema(path)
-    return [
-        *(
-            f"{name!r} is in {registry} but not in the schema: add it to the Literal of {path} in "
-            "sdc_taichi/config, or remove it from the registry"
-            for name in sorted(set(implemented) - listed)
-        ),
-        *(
-            f"{name!r} is in the Literal of {path} in sdc_taichi/config but not implemented: add "
-            f"it to {registry}, or remove it from the Literal"
-            for name in sorted(listed - set(implemented))
-        ),
-    ]
-
-
 @pytest.mark.parametrize("path", REGISTRIES)
 def test_schema_and_registry_name_the_same_models(path: str) -> None:
-    assert not differences(path), "\n".join(differences(path))
-
-
-@pytest.mark.parametrize(
-    ("implemented", "said"),
-    [
-        ([*tower.TOWERS, "merkel"], "'merkel' is in plant.tower.TOWERS but not in the schema: add"),
-        (["yorkcalc", "paper"], "'released' is in the Literal of hvac.tower.model in sdc_taichi"),
-    ],
-)
-def test_a_difference_says_what_to_do(
-    implemented: list[str], said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(REGISTRIES, "hvac.tower.model", ("plant.tower.TOWERS", implemented))
-    (difference,) = differences("hvac.tower.model")
-    assert difference.startswith(said)
-
-
-def test_every_stage_is_compared() -> None:
-    stages = set(STAGE_MODELS.values())
-    left_out = stages - set(REGISTRIES) - BRANCHES
-    assert not left_out, f"add the registry of {', '.join(left_out)} to REGISTRIES in this file"
-    assert stages >= BRANCHES
-    assert all(len(names_in_schema(path)) == 2 for path in BRANCHES)
+    registry, names = REGISTRIES[path]
+    assert names_in_schema(path) == set(names), f"the Literal of {path} differs from {registry}"
 
 
 def test_the_command_line_offers_every_controller_and_precision() -> None:
@@ -121,8 +72,41 @@ def test_the_command_line_offers_every_controller_and_precision() -> None:
     assert get_args(names) == get_args(Precision), "--precision in cli/options.py differs"
 
 
-def test_workloads_say_when_work_is_due() -> None:
-    assert set(workload.DUE_AFTER_STEPS) == set(workload.MODELS)
+def constant_air_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
+    """A chiller of constant COP whose condenser stands in the air."""
+    load = np.maximum(load_w, 0.0)
+    power_w = load / point.machine.reference_cop
+    return ChillerResult(power_w, load, load + 1.0, 0.0 * load, load, load, load + power_w)
+
+
+def test_a_chiller_is_one_entry_of_the_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The entry alone decides on names, plant, COP and bounds."""
+    record = ChillerModel(
+        constant_air_cooled,
+        tower_water=False,
+        outdoor_air=True,
+        reference_cop=3.3,
+        chilled_water_bounds_c=(5.0, 15.0),
+    )
+    monkeypatch.setitem(chiller.CHILLERS, "of_mine", record)
+    july = ["hvac.chiller.model=of_mine", "site.start=07-15", "site.location=AZ"]
+    config = load_config("corrected", july)
+    assert config.hvac.plant_in_use == "air_cooled"
+    with Simulator(config) as sim:
+        sim.reset()
+        day = [sim.step() for _ in range(96)]
+        machine = sim.sizing.water_side.machine
+    assert sum(step.water_l[0] for step in day) == 0
+    assert machine.reference_cop == 3.3
+    for step in day:
+        np.testing.assert_allclose(step.chiller_load_w / step.chiller_w, 3.3)
+    for override, message in (
+        ("hvac.plant=water_cooled", "any but electric_air_cooled, of_mine"),
+        ("hvac.chiller.coil_approach_k=12", "valid within 5..15 C"),
+        ("hvac.chiller.model=other", "'of_mine'"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            load_config("corrected", [*july, override])
 
 
 def test_every_kind_of_event_disturbs_a_step() -> None:

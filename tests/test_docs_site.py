@@ -13,6 +13,7 @@ import pytest
 
 import sdc_taichi
 from sdc_taichi import load_config
+from sdc_taichi.config.reference import fields_markdown
 
 pytestmark = pytest.mark.repo
 
@@ -87,7 +88,7 @@ def test_every_field_of_a_configuration_has_an_anchor(stage: ModuleType) -> None
             else:
                 yield path + name
 
-    text = stage.with_field_anchors((ROOT / "docs" / "configuration.md").read_text("utf-8"))
+    text = stage.with_field_anchors(fields_markdown())
     anchors = re.findall(r'id="([^"]+)"', text)
     assert len(anchors) == len(set(anchors))
     named = set(fields(load_config("corrected").model_dump(), ""))

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from model_steps import chiller_step
 from reference_folders import energyplus_tables
 from sdc_taichi import (
     Simulator,
@@ -179,14 +180,17 @@ def run_tower(table: dict[str, F64]) -> tower.TowerResult:
     by_volume = water_kg_m3(table["entering_c"]) / water_kg_m3(5.05)
     return tower.yorkcalc(
         table["heat_w"],
-        wet_bulb_c=table["wet_bulb_c"],
-        outdoor_c=table["outdoor_c"],
-        condenser_setpoint_c=table["setpoint_c"],
-        supply_setpoint_c=0.0,
-        water_kg_s=table["water_kg_s"],
-        reference_water_kg_s=reference_kg_s * by_volume,
-        reference_air_m3s=0.0,
-        design_fan_w=FAN_W_PER_KG_S * design_kg_s,
+        tower.TowerPoint(
+            wet_bulb_c=table["wet_bulb_c"],
+            outdoor_c=table["outdoor_c"],
+            air_j_per_m3_k=0.0,
+            condenser_setpoint_c=table["setpoint_c"],
+            supply_setpoint_c=0.0,
+            water_kg_s=table["water_kg_s"],
+            reference_water_kg_s=reference_kg_s * by_volume,
+            reference_air_m3s=0.0,
+            design_fan_w=FAN_W_PER_KG_S * design_kg_s,
+        ),
     )
 
 
@@ -223,19 +227,21 @@ def test_evaporation(path: Path) -> None:
     """Heat, air and weather give the litres of the year, and those of every 5 K of weather."""
     table = columns(path)
     used = water.saturated_exit(
-        rejected_w=table["heat_w"],
-        range_k=table["entering_c"] - table["leaving_c"],
-        water_kg_s=table["water_kg_s"],
-        tower_airflow_m3s=run_tower(table).air_ratio
-        * (DESIGN_AIR_M3S_PER_KG_S * design_water_kg_s(table)),
-        outdoor_c=table["outdoor_c"],
-        wet_bulb_c=table["wet_bulb_c"],
-        pressure_pa=table["pressure_pa"],
-        return_c=0.0,
-        supply_setpoint_c=0.0,
-        cycles_of_concentration=CYCLES,
-        drift_share=DRIFT_SHARE,
-        dt_s=3600.0,
+        water.WaterPoint(
+            rejected_w=table["heat_w"],
+            range_k=table["entering_c"] - table["leaving_c"],
+            water_kg_s=table["water_kg_s"],
+            tower_airflow_m3s=run_tower(table).air_ratio
+            * (DESIGN_AIR_M3S_PER_KG_S * design_water_kg_s(table)),
+            outdoor_c=table["outdoor_c"],
+            wet_bulb_c=table["wet_bulb_c"],
+            pressure_pa=table["pressure_pa"],
+            return_c=0.0,
+            supply_setpoint_c=0.0,
+            cycles_of_concentration=CYCLES,
+            drift_share=DRIFT_SHARE,
+            dt_s=3600.0,
+        )
     )
     for name in ("evaporation_l", "water_l"):
         expected_l = table["makeup_l" if name == "water_l" else name]
@@ -257,7 +263,8 @@ def test_york_chiller(path: Path) -> None:
     reference_w = np.median((table["load_w"] / table["plr"] / table["capacity_factor"])[steady])
     factors = ("capacity_factor", "eir_factor_t", "eir_factor_plr", "cycling_ratio")
     full_w = reference_w * np.prod([table[name] for name in factors], axis=0)
-    machine = chiller.eir_york(
+    machine = chiller_step(
+        "eir_york",
         table["load_w"],
         reference_w=reference_w,
         chilled_water_c=table["chilled_water_c"],
@@ -275,7 +282,8 @@ def test_york_chiller(path: Path) -> None:
 )
 def test_water_cooled_electric_chiller(path: Path) -> None:
     table = columns(path)
-    machine = chiller.electric_water_cooled(
+    machine = chiller_step(
+        "electric_water_cooled",
         table["load_w"],
         reference_w=1e6,
         chilled_water_c=table["chilled_water_c"],
@@ -289,7 +297,8 @@ def test_water_cooled_electric_chiller(path: Path) -> None:
 @pytest.mark.parametrize("path", energyplus_tables("chiller_electric_air_cooled*.csv"), ids=by_name)
 def test_air_cooled_electric_chiller(path: Path) -> None:
     table = columns(path)
-    machine = chiller.electric_air_cooled(
+    machine = chiller_step(
+        "electric_air_cooled",
         table["load_w"],
         reference_w=1e6,
         chilled_water_c=table["chilled_water_c"],

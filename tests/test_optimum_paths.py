@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from model_steps import work_done
 from sdc_taichi import Actions, Simulator, build_fleet, load_config
 from sdc_taichi.optimum.commands import (
     arrived_tasks,
@@ -21,7 +22,7 @@ from sdc_taichi.optimum.paths import battery_path, setpoint_path, storage_parame
 from sdc_taichi.optimum.problem import Problem, Storage, problems_of
 from sdc_taichi.optimum.rollout import RollOut, Targets, repeated, roll_out
 from sdc_taichi.optimum.tables import FacilityTable
-from sdc_taichi.plant.battery import BATTERIES
+from sdc_taichi.plant.battery import BATTERIES, BatteryParameters, BatteryPoint
 from sdc_taichi.plant.cooling import SETPOINTS
 from sdc_taichi.plant.workload import MODELS
 from sdc_taichi.sim.drivers import Drivers, load_drivers
@@ -44,7 +45,7 @@ def test_load_commands_do_the_work_that_was_wanted(model: str) -> None:
     limits = {"flexible_share": share, "max_utilisation": cap, "queue_limit": limit}
 
     def run(command: F64) -> Work:
-        return MODELS[model](demand, command, waiting, due, **limits)
+        return work_done(model, demand, command, waiting, due, **limits)
 
     wanted = run(rng.uniform(-1.0, 1.0, n))
     command = load_command(
@@ -70,13 +71,12 @@ def test_battery_commands_draw_and_deliver_what_was_wanted(storage: Storage) -> 
     rng = np.random.default_rng(1)
     stored, own = 100.0 * rng.random(n), rng.uniform(-1.0, 1.0, n)
     load_kw = np.full(n, 60.0)
-    parameters = {k: np.full(n, x) for k, x in storage_parameters(storage).items()}
+    parameters = BatteryParameters(*(np.full(n, x) for x in storage_parameters(storage)))
     capacity = np.full(n, 100.0)
 
     def run(command: F64) -> F64:
-        done = BATTERIES[storage.model](
-            stored, command, capacity_kwh=capacity, load_kw=load_kw, dt_h=0.25, **parameters
-        )
+        point = BatteryPoint(capacity, load_kw, 0.25, parameters)
+        done = BATTERIES[storage.model].step(stored, command, point)
         return np.asarray(done.charge_kwh - done.discharge_kwh)
 
     wanted = run(own)

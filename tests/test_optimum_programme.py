@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from model_steps import battery_step
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.battery_limits import battery_limits
 from sdc_taichi.optimum.linear_programme import bound, plan
+from sdc_taichi.optimum.paths import storage_parameters
 from sdc_taichi.optimum.problem import (
     AGENTS,
     BilledMonth,
@@ -20,8 +22,6 @@ from sdc_taichi.optimum.problem import (
 )
 from sdc_taichi.optimum.stage_cost import stage_cost
 from sdc_taichi.optimum.tables import INLET_MARGIN_K, FacilityTable
-from sdc_taichi.plant.battery import BATTERIES
-from sdc_taichi.sim.facility import BATTERY_PARAMETERS
 from sdc_taichi.types import F64
 
 CLC = Storage("clc", 100.0, 0.0, 0.97, 1.04, 0.5, 1.0, -0.04, 1.0, 0.01, 0.0)
@@ -323,11 +323,11 @@ def test_a_model_never_beats_the_limits_of_its_battery(model: str, start_share: 
     storage = replace(CLC, model=model, upper_v=0.9, lower_v=0.1)
     limits = battery_limits(storage, 0.25, start_share * 100.0)
     stored, load = np.full(50, start_share * 100.0), 120.0
-    parameters = {name: getattr(storage, name) for name in BATTERY_PARAMETERS}
+    parameters = storage_parameters(storage)._asdict()
     for _ in range(40):
         command = rng.choice([-1.0, 1.0, 0.3, -0.5], 50)
-        step = BATTERIES[model](
-            stored, command, capacity_kwh=100.0, load_kw=load, dt_h=0.25, **parameters
+        step = battery_step(
+            model, stored, command, capacity_kwh=100.0, load_kw=load, dt_h=0.25, **parameters
         )
         for done, lines, most in (
             (step.charge_kwh, limits.charge, limits.most_charge_kwh),

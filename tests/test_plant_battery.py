@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from model_steps import battery_step
 from sdc_taichi.plant.battery import BATTERIES, BatteryResult
 
 REFERENCE = Path(__file__).parent / "reference"
@@ -35,8 +36,10 @@ def _no_floating_point_warnings() -> Any:
 
 def run(name: str, stored_kwh: Any, command: Any, **changes: Any) -> BatteryResult:
     arguments: dict[str, Any] = {"capacity_kwh": 2000.0, "load_kw": 1500.0, "dt_h": 0.25}
-    return BATTERIES[name](
-        np.asarray(stored_kwh, float), np.asarray(command, float), **{**arguments, **changes}
+    if name == "paper":
+        arguments |= {"charge_limit_c_rate": 0.5, "discharge_limit_c_rate": 0.5}
+    return battery_step(
+        name, np.asarray(stored_kwh, float), np.asarray(command, float), **{**arguments, **changes}
     )
 
 

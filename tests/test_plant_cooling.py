@@ -11,7 +11,8 @@ from sdc_taichi.plant.cooling import (
     COOLING_LOADS,
     CRAC_FLOWS,
     SETPOINTS,
-    STORES_UNMET_HEAT,
+    CracPoint,
+    HallPoint,
     balance_room_heat,
     unmet_and_recovered,
 )
@@ -93,28 +94,32 @@ def test_setpoints_move_in_steps_of_their_own_size() -> None:
 
 
 def test_airflow_of_the_crac_units() -> None:
-    it_w, server_flow = np.array([0.0, 2e5, 4e5]), np.array([1.0, 8.0, 30.0])
-    given_all = {
-        "design_flow_m3s": np.full(3, 20.0),
-        "design_it_airflow_m3s": np.full(3, 10.0),
-        "min_ratio": np.full(3, 0.6),
-        "supply_m3s_per_w": np.full(3, 5e-5),
-    }
-    flow, speed = CRAC_FLOWS["constant"](it_w, server_flow, **given_all)
+    point = CracPoint(
+        it_w=np.array([0.0, 2e5, 4e5]),
+        it_airflow_m3s=np.array([1.0, 8.0, 30.0]),
+        speed=np.array([0.5, 0.7, 1.0]),
+        design_flow_m3s=np.full(3, 20.0),
+        design_it_airflow_m3s=np.full(3, 10.0),
+        min_ratio=np.full(3, 0.6),
+        supply_m3s_per_w=np.full(3, 5e-5),
+    )
+    flow, speed = CRAC_FLOWS["constant"](point)
     assert flow.tolist() == [20, 20, 20]
     assert speed.tolist() == [1, 1, 1]
-    flow, speed = CRAC_FLOWS["follow_servers"](it_w, server_flow, **given_all)
+    flow, speed = CRAC_FLOWS["follow_servers"](point)
     np.testing.assert_allclose(speed, [0.6, 0.8, 1.0])
     np.testing.assert_allclose(flow, [12, 16, 20])
-    flow, speed = CRAC_FLOWS["per_watt"](it_w, server_flow, **given_all)
+    flow, speed = CRAC_FLOWS["per_watt"](point)
     np.testing.assert_allclose(flow, [0, 10, 20])
     assert speed.tolist() == [1, 1, 1]
 
 
 def load_of(model: str, outlet_c: float, setpoint_c: float = 18.0) -> tuple[float, float]:
-    return_c, load_w = COOLING_LOADS[model](
-        one(3e5), one(1.2e4), one(20.0), one(18.5), one(setpoint_c), one(outlet_c),
-        air_j_per_m3_k=AIR, return_approach_k=one(-3.0),
+    return_c, load_w = COOLING_LOADS[model].step(
+        HallPoint(
+            one(3e5), one(1.2e4), one(20.0), one(18.5), one(setpoint_c), one(outlet_c),
+            air_j_per_m3_k=AIR, return_approach_k=one(-3.0),
+        )
     )  # fmt: skip
     return float(return_c[0]), float(load_w[0])
 
@@ -135,8 +140,7 @@ def test_loads_by_return_approach(outlet_c: float, rise_k: float) -> None:
 
 
 def test_only_the_balanced_load_holds_heat() -> None:
-    assert {"heat_balance"} == STORES_UNMET_HEAT
-    assert set(COOLING_LOADS) >= STORES_UNMET_HEAT
+    assert {n for n, model in COOLING_LOADS.items() if model.stores_unmet_heat} == {"heat_balance"}
 
 
 @given(

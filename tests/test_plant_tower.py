@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sdc_taichi.errors import SdcError
 from sdc_taichi.plant import tower
-from sdc_taichi.plant.tower import TOWERS, TowerResult
+from sdc_taichi.plant.tower import TOWERS, TowerPoint, TowerResult
 
 REFERENCE = Path(__file__).parent / "reference"
 ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
@@ -51,8 +51,9 @@ def run(name: str, heat_w: Any, **changes: Any) -> TowerResult:
         "reference_water_kg_s": REFERENCE_WATER_KG_S,
         "reference_air_m3s": 53.48945350914959,
         "design_fan_w": DESIGN_FAN_W,
+        "air_j_per_m3_k": 1.225 * 1006.0,
     }
-    return TOWERS[name](np.asarray(heat_w, float), **{**arguments, **changes})
+    return TOWERS[name].step(np.asarray(heat_w, float), TowerPoint(**{**arguments, **changes}))
 
 
 # ------------------------------------------------------------------------------- reference checks

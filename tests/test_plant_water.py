@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sdc_taichi.exogenous import psychrometrics
 from sdc_taichi.plant import moist_air
-from sdc_taichi.plant.water import WATER, WaterUse
+from sdc_taichi.plant.water import WATER, WaterPoint, WaterUse
 
 REFERENCE = Path(__file__).parent / "reference"
 ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
@@ -46,7 +46,7 @@ def run(name: str, **changes: Any) -> WaterUse:
         "drift_share": 2e-5,
         "dt_s": 900.0,
     }
-    return WATER[name](**{**arguments, **changes})
+    return WATER[name](WaterPoint(**{**arguments, **changes}))
 
 
 def evaluated(check: dict[str, Any]) -> dict[str, float]:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ledgers import LEDGERS, TRANSIENT_LEDGERS, residual
+from model_steps import chiller_step
 from sdc_taichi import ConfigError, Simulator, StepResult, drivers_from_arrays, load_config
 from sdc_taichi.config import apply_overrides
 from sdc_taichi.errors import OddInputWarning, PhysicalLimitError
-from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.types import F64
 from test_ledgers import assert_closes, record, sites_and_seasons
@@ -48,7 +48,8 @@ def test_york_machine_is_sized_for_cold_condenser_water() -> None:
         design = sim.sizing.water_side
     for condenser_c in np.linspace(12.78, 30.0, 9):
         for chilled_c in (8.0, 8.89):
-            machine = CHILLERS["eir_york"](
+            machine = chiller_step(
+                "eir_york",
                 design.cooling_w,
                 reference_w=design.chiller_w,
                 chilled_water_c=chilled_c,
@@ -336,9 +337,13 @@ def test_chiller_without_capacity_is_an_error() -> None:
         steady(hot, [20.0], [15.0])
 
 
+def design_of(model: str) -> WaterSideDesign:
+    return steady([f"hvac.chiller.model={model}"], [30.0], [20.0])[1]
+
+
 def test_reference_cop_is_that_of_the_machine_unless_it_is_given() -> None:
     cops = {
-        model: steady([f"hvac.chiller.model={model}"], [30.0], [20.0])[1].reference_cop[0]
+        model: np.asarray(design_of(model).machine.reference_cop)[0]
         for model in ("centrifugal_vsd", "electric_water_cooled", "electric_air_cooled")
     }
     assert cops == {
@@ -347,6 +352,6 @@ def test_reference_cop_is_that_of_the_machine_unless_it_is_given() -> None:
         "electric_air_cooled": 3.0,
     }
     given = ["hvac.chiller.model=electric_air_cooled", "hvac.chiller.reference_cop=3.4"]
-    assert steady(given, [30.0], [20.0])[1].reference_cop == 3.4
+    assert steady(given, [30.0], [20.0])[1].machine.reference_cop == 3.4
     with pytest.warns(OddInputWarning, match="air-cooled chillers reach about 4"):
         steady([given[0], "hvac.chiller.reference_cop=5.96"], [30.0], [20.0])

@@ -11,12 +11,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from model_steps import chiller_step
 from sdc_taichi import Simulator, load_config, make_configs
 from sdc_taichi.exogenous import site_names
 from sdc_taichi.plant import chiller
-from sdc_taichi.plant.chiller import CHILLERS
+from sdc_taichi.plant.chiller import CHILLERS, ChillerParameters
+from sdc_taichi.plant.plants import Devices, PlantPoint, water_cooled
 from sdc_taichi.plant.tower import TOWERS
-from sdc_taichi.plant.water_side import WaterSideDesign, WaterSideResult, water_cooled
+from sdc_taichi.plant.water_side import WaterSideDesign, WaterSideResult
 from sdc_taichi.types import F64, fields_of
 
 TRANE_CAPACITY = (4.007341e-01, 1.148568e-03, 1.049504e-04, 5.574667e-02, -1.646131e-03,
@@ -47,7 +49,8 @@ def trane_w(plant: WaterSideResult, design: WaterSideDesign) -> F64:
 def test_default_follows_the_published_map_at_full_load() -> None:
     chilled_c, condenser_c = np.meshgrid(np.linspace(4.44, 8.89, 10), np.linspace(12.78, 35, 30))
     lift = condenser_c - chilled_c >= chiller.MIN_LIFT_K
-    machine = CHILLERS["centrifugal_vsd"](
+    machine = chiller_step(
+        "centrifugal_vsd",
         np.full(lift.sum(), 1e6),
         reference_w=1e6,
         chilled_water_c=chilled_c[lift],
@@ -66,26 +69,29 @@ def test_default_needs_the_energy_of_published_curves_in_every_climate() -> None
     configs = make_configs(load_config("corrected", ["simulation.steps_per_hour=1"]), sites=sites)
     with Simulator(configs) as sim:
         design, weather = fields_of(sim.sizing.water_side), sim.drivers
-        it_w = sim.sizing.it_w
+        it_w, machines = sim.sizing.it_w, design.pop("machine")
     cops, hours = {}, np.arange(8760)
     for dc, site in enumerate(sites):
         outdoor_c, wet_bulb_c = (
             series.at(np.repeat(hours[None], len(sites), axis=0))[dc]
             for series in (weather.outdoor_c, weather.wet_bulb_c)
         )
-        own = WaterSideDesign(**{name: values[dc] for name, values in design.items()})
+        machine = ChillerParameters(*(values[dc] for values in machines))
+        own = WaterSideDesign(
+            machine=machine, **{name: values[dc] for name, values in design.items()}
+        )
         for setpoint_c, load in ((18.0, 0.5), (18.0, 0.9), (22.0, 0.5)):
             plant = water_cooled(
                 np.full(len(hours), load * it_w[dc]),
-                setpoint_c=np.full(len(hours), setpoint_c),
-                return_c=np.full(len(hours), setpoint_c + 12.0),
-                airflow_m3s=own.tower_air_m3s,
-                outdoor_c=outdoor_c,
-                wet_bulb_c=wet_bulb_c,
-                design=own,
-                chiller=CHILLERS["centrifugal_vsd"],
-                tower=TOWERS["yorkcalc"],
-                limited=True,
+                PlantPoint(
+                    setpoint_c=np.full(len(hours), setpoint_c),
+                    return_c=np.full(len(hours), setpoint_c + 12.0),
+                    airflow_m3s=own.tower_air_m3s,
+                    outdoor_c=outdoor_c,
+                    wet_bulb_c=wet_bulb_c,
+                ),
+                own,
+                Devices(CHILLERS["centrifugal_vsd"], TOWERS["yorkcalc"], limited=True),
             )
             published_kwh = trane_w(plant, own).sum() / 1e3
             if setpoint_c == 18.0:

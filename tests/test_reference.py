@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from model_steps import battery_step, chiller_step
 from reference_folders import reference_folders
 from sdc_taichi import (
     Actions,
@@ -40,8 +41,6 @@ from sdc_taichi.hall.floor_plan import floor_plan
 from sdc_taichi.hall.mix_weights import layout_weights
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.plant import chiller, cooling, tower, water, workload
-from sdc_taichi.plant.battery import BATTERIES
-from sdc_taichi.plant.carbon import emitted_g
 from sdc_taichi.sim.drivers import FleetSeries
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums, Precision
 from sdc_taichi.sim.sizing import released_ranges
@@ -445,7 +444,8 @@ def check_rack(check: Check) -> Values:
 def check_released_chiller(check: Check) -> Values:
     given = check["inputs"]
     reference_cop = preset_fleet_values(preset_of(check))("hvac.chiller.reference_cop")
-    machine = chiller.released(
+    machine = chiller_step(
+        "released",
         given["load_W"],
         reference_w=given["max_cooling_cap"],
         chilled_water_c=0.0,
@@ -457,7 +457,7 @@ def check_released_chiller(check: Check) -> Values:
 
 
 def _curve_chiller(
-    model: Callable[..., chiller.ChillerResult], check: Check, reference_cop: float
+    model: str, check: Check, reference_cop: float
 ) -> tuple[chiller.ChillerResult, dict[str, Any]]:
     """A chiller's step, and the curve values it used on the way."""
     given = check["inputs"]
@@ -471,7 +471,8 @@ def _curve_chiller(
                 return _inner(*args, **kwargs)
 
             patch.setattr(chiller, name, noted)
-        machine = model(
+        machine = chiller_step(
+            model,
             given["load_W"],
             reference_w=given["Q_nom_W"],
             chilled_water_c=given.get("T_evap_out", given.get("T_evap_lvg")),
@@ -485,8 +486,8 @@ def _curve_chiller(
 def check_electric_chiller(check: Check) -> Values:
     # Nominal COPs of the two EnergyPlus machines.
     model, reference_cop = {
-        "WC": (chiller.electric_water_cooled, 4.75),
-        "AC": (chiller.electric_air_cooled, 3.0),
+        "WC": ("electric_water_cooled", 4.75),
+        "AC": ("electric_air_cooled", 3.0),
     }[check["id"].split("-")[2]]
     machine, used = _curve_chiller(model, check, reference_cop)
     return {
@@ -503,7 +504,7 @@ def check_electric_chiller(check: Check) -> Values:
 
 def check_york_chiller(check: Check) -> Values:
     given = check["inputs"]
-    machine, used = _curve_chiller(chiller.eir_york, check, given["COP_nom"])
+    machine, used = _curve_chiller("eir_york", check, given["COP_nom"])
     cycling = np.minimum(machine.plr / used.get("min_plr", 0.1), 1.0)
     full_load_w = machine.available_w * used["eir"] * cycling
     return {
@@ -556,7 +557,7 @@ def _water_l(model: str, **given: Any) -> water.WaterUse:
         "drift_share": 0.0,
         "dt_s": 900.0,
     }
-    return water.WATER[model](**{**needed, **given})
+    return water.WATER[model](water.WaterPoint(**{**needed, **given}))
 
 
 def check_air_side_water(check: Check) -> Values:
@@ -597,7 +598,8 @@ def check_water_balance(check: Check) -> Values:
 def check_released_battery(check: Check) -> Values:
     given = check["inputs"]
     capacity_kwh = given["cap_MWh"] * 1e3
-    after = BATTERIES["released"](
+    after = battery_step(
+        "released",
         given["SoC"] * capacity_kwh,
         float(BATTERY[given["action"]].value),
         capacity_kwh=capacity_kwh,
@@ -607,7 +609,7 @@ def check_released_battery(check: Check) -> Values:
     return {
         "SoC_after": after.stored_kwh / capacity_kwh,
         "E_grid_kWh": after.grid_kwh,
-        "CO2_g": emitted_g(after.grid_kwh, given["CI_g_kWh"]),
+        "CO2_g": after.grid_kwh * given["CI_g_kWh"],
     }
 
 
@@ -615,7 +617,8 @@ def check_clc_battery(check: Check) -> Values:
     given = check["inputs"]
     capacity_kwh = given["cap_MWh"] * 1e3
     charged, discharged = (
-        BATTERIES["clc"](
+        battery_step(
+            "clc",
             given["SoC"] * capacity_kwh,
             command,
             capacity_kwh=capacity_kwh,

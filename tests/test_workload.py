@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from model_steps import work_done
 from sdc_taichi import Actions, LoadAction, Simulator, drivers_from_arrays, load_config
 from sdc_taichi.plant.workload import MODELS, TASKS_PER_STEP, age_histogram
 from sdc_taichi.types import F64
@@ -311,7 +312,8 @@ def test_due_work_runs_before_what_arrives() -> None:
 @pytest.mark.parametrize("model", MODELS)
 def test_a_queue_that_rounding_overfills_takes_nothing(model: str) -> None:
     limit = np.array([0.3])
-    work = MODELS[model](
+    work = work_done(
+        model,
         np.array([0.5]),
         np.array([-1.0]),
         np.nextafter(limit, 1.0),

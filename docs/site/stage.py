@@ -66,9 +66,9 @@ def stage(out: Path) -> list[str]:
         content = (ROOT / path).read_bytes()
         if path.endswith(".md"):
             text = with_tables(content.decode())
-            text = with_site_links(text, path, places, errors.append)
             if path == FIELDS_PAGE:
                 text = with_field_anchors(text)
+            text = with_site_links(text, path, places, errors.append)
             content = text.encode()
         write(out / place, content)
     kept = {out / place for place in places.values()}

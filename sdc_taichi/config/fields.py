@@ -7,12 +7,15 @@ is taken. A type below says why; a field with bounds of its own says so in its d
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, get_args
+from collections.abc import Mapping
+from typing import Annotated, Any, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 from sdc_taichi.exogenous.series import OUTDOOR_LIMITS_C
 from sdc_taichi.number_text import parse_number
+from sdc_taichi.plant.plants import PLANTS
 
 Share = Annotated[float, Field(ge=0, le=1)]
 """A share, 0..1."""
@@ -72,7 +75,30 @@ FileName = Annotated[str, Field(min_length=1)]
 """Path of a file."""
 
 
-Plant = Literal["water_cooled", "air_cooled", "air_side"]
+class NameIn:
+    """Marks a text field whose value names an entry of a registry of models.
+
+    Args:
+        registry: models by their names.
+    """
+
+    def __init__(self, registry: Mapping[str, object]) -> None:
+        self._registry = registry
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self._check)
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        return {"enum": list(self._registry), "type": "string"}
+
+    def _check(self, value: Any) -> str:
+        if isinstance(value, str) and value in self._registry:
+            return value
+        *names, last = map(repr, self._registry)
+        raise PydanticKnownError("literal_error", {"expected": f"{', '.join(names)} or {last}"})
+
+
+Plant = Annotated[str, NameIn(PLANTS)]
 """A plant, see ``plant.plants``."""
 
 

@@ -14,6 +14,7 @@ from sdc_taichi.config.fields import (
     ExchangerK,
     FlowM3sPerW,
     LengthM,
+    NameIn,
     OutdoorC,
     Plant,
     RiseK,
@@ -23,13 +24,11 @@ from sdc_taichi.config.fields import (
     WorkingShare,
 )
 from sdc_taichi.exogenous.year_clock import MONTH_OF_DAY
-from sdc_taichi.plant.chiller import (
-    AIR_COOLED,
-    CHILLED_WATER_BOUNDS_C,
-    MIN_LIFT_K,
-    chilled_water_bounds_c,
-)
-from sdc_taichi.plant.plants import DRY_PLANTS
+from sdc_taichi.plant.chiller import CHILLERS, MIN_LIFT_K
+from sdc_taichi.plant.cooling import COOLING_LOADS, CRAC_FLOWS, SETPOINTS
+from sdc_taichi.plant.plants import PLANTS, fits, plant_of
+from sdc_taichi.plant.tower import TOWERS
+from sdc_taichi.plant.water import WATER
 from sdc_taichi.types import F64
 
 Device = Literal["chiller", "tower_fan", "chilled_pump", "condenser_pump", "crac_fan"]
@@ -50,7 +49,7 @@ class SetpointConfig(Section):
     It is of the supply air, or of the return air where ``crac.temperature_control`` says so.
     """
 
-    model: Literal["symmetric", "accelerating"] = "symmetric"
+    model: Annotated[str, NameIn(SETPOINTS)] = "symmetric"
     """How a command moves the setpoint: by one step, or by a step that grows with equal commands
     in a row, as in the released SustainDC."""
     min_c: AirC = 16.0
@@ -135,9 +134,7 @@ class CracConfig(Section):
     """Design airflow of all units per IT power at the design point, in m3/s per W."""
     reference_m3s_per_w: FlowM3sPerW = 9.438e-5
     """Airflow per IT power at which a fan draws ``released_fan_w``, in m3/s per W."""
-    flow_model: Literal[
-        "constant", "pressure", "follow_servers", "hottest_inlet", "per_watt", "controlled"
-    ] = "follow_servers"
+    flow_model: Annotated[str, NameIn(CRAC_FLOWS)] = "follow_servers"
     """Control of the units' fans: at the speed of the design point; by the pressure under a raised
     floor, which takes the same airflow whatever units run; by the supply air that the servers take
     in; by the hottest inlet of the servers; by IT power; or by the actions of an agent."""
@@ -184,23 +181,12 @@ class CracConfig(Section):
 class ChillerConfig(Section):
     """Chiller model and its reference point."""
 
-    model: Literal[
-        "centrifugal_vsd",
-        "carnot",
-        "eir_york",
-        "electric_water_cooled",
-        "electric_air_cooled",
-        "constant_cop",
-        "released",
-        "paper",
-    ] = "centrifugal_vsd"
+    model: Annotated[str, NameIn(CHILLERS)] = "centrifugal_vsd"
     """How power and capacity of the chiller follow from load and temperatures. Chilled water is at
-    most as warm as the model is valid for: 8.89 C with ``eir_york``, 20 C with ``centrifugal_vsd``
-    and ``carnot``."""
+    most as warm as the model is valid for."""
     reference_cop: Annotated[float, Field(ge=0.5, le=50)] | None = None
     """COP at the reference point, in W of heat per W of power, 0.5..50: from an absorption chiller
-    to Carnot's limit at a lift of 6 K; None is that of the model's machine: 3 air-cooled, 4.75 with
-    ``electric_water_cooled``, else 5.96."""
+    to Carnot's limit at a lift of 6 K; None is that of the model's machine."""
     coil_approach_k: ExchangerK = 8.0
     """Supply air setpoint above the chilled water that the coils take, in K; more where the chiller
     makes no water as warm as that."""
@@ -222,7 +208,7 @@ class ChillerConfig(Section):
 class TowerConfig(Section):
     """Cooling tower, condenser water and waterside economiser."""
 
-    model: Literal["yorkcalc", "released", "paper"] = "yorkcalc"
+    model: Annotated[str, NameIn(TOWERS)] = "yorkcalc"
     """How fan power and water temperature of the tower follow from the heat to reject."""
     approach_min_k: ExchangerK = 4.0
     """Least approach: coldest water that the tower gives, above wet bulb, in K."""
@@ -330,7 +316,7 @@ class PumpConfig(Section):
 class WaterConfig(Section):
     """Make-up water of the cooling tower."""
 
-    model: Literal["saturated_exit", "mass_balance", "released", "paper"] = "saturated_exit"
+    model: Annotated[str, NameIn(WATER)] = "saturated_exit"
     """How evaporation, drift and blowdown of the tower are computed: from air that leaves the tower
     saturated, from heat that leaves as vapour alone, or by the fits of the released SustainDC and
     of its paper."""
@@ -379,9 +365,9 @@ class HvacConfig(Section):
     plant: Plant | None = None
     """How the heat of the hall gets outdoors: by chilled water with a cooling tower and waterside
     economiser, by an air-cooled chiller with a dry cooler, or by outdoor air in the hall with an
-    air-cooled chiller for the rest. None is ``air_cooled`` with chiller ``electric_air_cooled``,
-    else ``water_cooled``."""
-    cooling_load_model: Literal["heat_balance", "released", "paper"] = "heat_balance"
+    air-cooled chiller for the rest. None is ``water_cooled`` if tower water can cool the
+    condenser of the chiller, else ``air_cooled``."""
+    cooling_load_model: Annotated[str, NameIn(COOLING_LOADS)] = "heat_balance"
     """How return air and cooling load follow from the hall: a heat balance, or the formulas of the
     released SustainDC or of its paper."""
     chiller: ChillerConfig = ChillerConfig()
@@ -417,30 +403,29 @@ class HvacConfig(Section):
     @property
     def plant_in_use(self) -> Plant:
         """The plant, that of the chiller if the config names none."""
-        if self.plant is not None:
-            return self.plant
-        return "air_cooled" if self.chiller.model == "electric_air_cooled" else "water_cooled"
+        return plant_of(CHILLERS[self.chiller.model]) if self.plant is None else self.plant
 
     @model_validator(mode="after")
     def _chiller_fits_the_plant(self) -> Self:
-        model, plant = self.chiller.model, self.plant
-        dry = self.plant_in_use in DRY_PLANTS
-        if (dry and model not in AIR_COOLED) or (not dry and model == "electric_air_cooled"):
-            fit = ", ".join(sorted(AIR_COOLED)) if dry else "any but electric_air_cooled"
+        plant = PLANTS[self.plant_in_use]
+        if not fits(CHILLERS[self.chiller.model], plant):
+            fitting = {name for name, chiller in CHILLERS.items() if fits(chiller, plant)}
+            valid = ", ".join(sorted(fitting if plant.dry else set(CHILLERS) - fitting))
             raise ValueError(
-                f"plant {plant} and chiller.model {model} do not fit together; valid with this "
-                f"plant is {fit}"
+                f"plant {self.plant} and chiller.model {self.chiller.model} do not fit together; "
+                f"valid with this plant is {valid if plant.dry else f'any but {valid}'}"
             )
         return self
 
     @model_validator(mode="after")
     def _chilled_water_within_the_model(self) -> Self:
-        low, high = chilled_water_bounds_c(self.chiller.model)
+        bounds_c = CHILLERS[self.chiller.model].chilled_water_bounds_c
         water, rise = self.setpoint.min_c - self.chiller.coil_approach_k, ""
         if self.crac.temperature_control == "return":
             rise_k = 1.0 / (USUAL_AIR_J_PER_M3_K * self.crac.supply_m3s_per_w)
             water, rise = water - rise_k, f" and the rise of the air of {rise_k:.3g} K"
-        if self.chiller.model in CHILLED_WATER_BOUNDS_C and water < low:
+        if bounds_c is not None and water < bounds_c[0]:
+            low, high = bounds_c
             raise ValueError(
                 f"setpoint.min_c {self.setpoint.min_c:g} less chiller.coil_approach_k "
                 f"{self.chiller.coil_approach_k:g}{rise} asks for chilled water of {water:.4g} C; "

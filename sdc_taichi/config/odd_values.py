@@ -9,7 +9,7 @@ import numpy as np
 
 from sdc_taichi.config.schema import DataCenterConfig
 from sdc_taichi.errors import OddInputWarning
-from sdc_taichi.plant.plants import DRY_PLANTS
+from sdc_taichi.plant.plants import PLANTS
 
 LEAST_USUAL_SERVER_W = 20.0
 """Servers of less power at full load are rare, while 1..20 is the power of large ones in kW."""
@@ -32,7 +32,7 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
     """Messages about unusual values of a configuration: field, value and what is usual."""
     yield from _odd_servers(config)
     chiller, setpoint, pumps = config.hvac.chiller, config.hvac.setpoint, config.hvac.pumps
-    dry = config.hvac.plant_in_use in DRY_PLANTS
+    dry = PLANTS[config.hvac.plant_in_use].dry
     most, reached = (MOST_USUAL_AIR_COOLED_COP, 4) if dry else (MOST_USUAL_COP, 12)
     if chiller.reference_cop is not None and chiller.reference_cop > most:
         yield (

@@ -20,6 +20,7 @@ from sdc_taichi.config.event_schema import SampledEvent, ScheduledEvent
 from sdc_taichi.config.hall_schema import RackRange, RackType, ServerGroup
 from sdc_taichi.config.schema import DataCenterConfig
 from sdc_taichi.config.tariff_schema import TariffPeriod
+from sdc_taichi.plant.chiller import CHILLERS
 
 LISTED: dict[str, type[BaseModel]] = {
     "servers.groups": ServerGroup,
@@ -35,12 +36,30 @@ _TITLES = {"DataCenterConfig": "A data center"}
 
 
 def fields_markdown() -> str:
-    """The tables of docs/configuration.md, one per section, and reasons of shared bounds."""
+    """Tables of all fields, one per section, reasons of shared bounds, and the chiller models."""
     tables = [_table(name, model) for name, model in _sections("", DataCenterConfig)]
     tables += [_table(f"{path}[]", model) for path, model in LISTED.items()]
     reasons = [f"- {text}" for text in _types().values()]
-    found = "\n\n".join([*tables, "## Bounds that fields share", "\n".join(reasons)])
-    return found.replace("``", "`")
+    bounds = "## Bounds that fields share", "\n".join(reasons)
+    return "\n\n".join([*tables, *bounds, _chillers()]).replace("``", "`")
+
+
+def _chillers() -> str:
+    """Table of the chiller models, from their records."""
+    lines = [
+        "## Chiller models",
+        "",
+        "| `hvac.chiller.model` | condenser | reference COP | chilled water, C | equations |",
+        "|---|---|---|---|---|",
+    ]
+    for name, model in CHILLERS.items():
+        places = {"tower water": model.tower_water, "outdoor air": model.outdoor_air}
+        condenser = " or ".join(place for place, fits in places.items() if fits)
+        bounds = model.chilled_water_bounds_c
+        water = "any" if bounds is None else f"{bounds[0]:g}..{bounds[1]:g}"
+        about = (inspect.getdoc(model.equations) or "").partition("\n")[0]
+        lines.append(f"| `{name}` | {condenser} | {model.reference_cop:g} | {water} | {about} |")
+    return "\n".join(lines)
 
 
 def sections_markdown(sections: Iterable[tuple[str, type[BaseModel]]]) -> str:

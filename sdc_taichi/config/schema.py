@@ -19,6 +19,7 @@ from sdc_taichi.config.fields import (
     FileName,
     Hours,
     Name,
+    NameIn,
     Section,
     Seed,
     Share,
@@ -38,6 +39,8 @@ from sdc_taichi.config.hvac_schema import HvacConfig
 from sdc_taichi.config.tariff_schema import TariffConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import day_of_year
+from sdc_taichi.plant.battery import BATTERIES
+from sdc_taichi.plant.workload import MODELS as WORK_MODELS
 
 MOST_RACK_W = 200e3
 """Highest nameplate of the servers of a rack that air cools, in W: its air, 8 m3/s at a rise of 20
@@ -47,7 +50,7 @@ K, would blow through its door of 1.3 m2 at 6 m/s. The densest on the market tak
 class BatteryConfig(Section):
     """Battery: model, capacity and limits (C/L/C of Kazhamiaka, Rosenberg and Keshav 2019)."""
 
-    model: Literal["clc", "released", "paper"] = "clc"
+    model: Annotated[str, NameIn(BATTERIES)] = "clc"
     """How energy stored, drawn and delivered follow from a command."""
     capacity_kwh: Annotated[float, Field(ge=0, le=1e8)] | None = None
     """Capacity, in kWh, up to 1e8, five times the largest plant under construction (19 GWh, Abu
@@ -87,7 +90,7 @@ class BatteryConfig(Section):
 class WorkloadConfig(Section):
     """Delay-tolerant work: its share, queue and deadline (1 task = 1 % of capacity for a step)."""
 
-    model: Literal["fluid", "tasks"] = "fluid"
+    model: Annotated[str, NameIn(WORK_MODELS)] = "fluid"
     """Whether work is a continuous quantity, or whole tasks as in the released SustainDC."""
     trace: Name = "alibaba_1"
     """Name of the workload trace (see ``sdc-taichi data list``)."""

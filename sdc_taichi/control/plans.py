@@ -18,9 +18,14 @@ from sdc_taichi.kernels.planning_arguments import (
 )
 from sdc_taichi.optimum.facility_map import FacilityMap
 from sdc_taichi.plant import workload
-from sdc_taichi.plant.battery import BATTERIES, BatteryResult
+from sdc_taichi.plant.battery import (
+    BATTERIES,
+    BatteryParameters,
+    BatteryPoint,
+    BatteryResult,
+)
 from sdc_taichi.plant.workload import TASKS_PER_STEP, UNLIMITED_TASKS
-from sdc_taichi.sim.facility import BATTERY_PARAMETERS
+from sdc_taichi.sim.facility import battery_parameters
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.workload import due_steps, queue_limit_tasks
@@ -227,13 +232,12 @@ class QueuePlanner:
     def _first_step(self, demand: F64, waiting: F64, due: F64) -> Work:
         """What each first command does with the work of the step to come, (B, C)."""
         shape = len(demand), len(self._first)
-        each = [np.broadcast_to(x, shape) for x in (demand, self._first, waiting, due)]
-        return workload.MODELS[self._model](
-            *each,
-            flexible_share=self._share,
-            max_utilisation=self._cap,
-            queue_limit=self._limit[:, None],
+        demand, command, waiting, due = (
+            np.broadcast_to(x, shape) for x in (demand, self._first, waiting, due)
         )
+        limits = self._share, self._cap, self._limit[:, None]
+        point = workload.WorkPoint(demand, command, waiting, due, *limits)
+        return workload.MODELS[self._model].step(point)
 
     def _coming(
         self, demand: F64, weather: Weather, weight: F64, waiting: F64, due: F64
@@ -324,7 +328,8 @@ class StorePlanner:
         from sdc_taichi.kernels.planning import store_kernel
 
         self._model = BATTERIES[fleet.models["battery"]]
-        self._parameters = {n: fleet.values(f"battery.{n}")[:, None] for n in BATTERY_PARAMETERS}
+        parameters = (np.asarray(values)[:, None] for values in battery_parameters(fleet))
+        self._parameters = BatteryParameters(*parameters)
         self._capacity_kwh, self._step_h = sizing.battery_kwh, step_h
         self._limit_kw = sizing.grid_limit_kw
         self._kernel = PlanningKernel(store_kernel(), STORE_ARGUMENTS, STORE_LEVELS)
@@ -384,14 +389,16 @@ class StorePlanner:
         self, stored_kwh: F64, command: F64 | float, load_kw: F64 | float, limit: F64 | None = None
     ) -> BatteryResult:
         """One step of each battery from several levels or by several commands, (B, n)."""
-        return self._model(
+        return self._model.step(
             stored_kwh,
             command,
-            capacity_kwh=self._capacity_kwh[:, None],
-            load_kw=load_kw,
-            dt_h=self._step_h,
-            grid_limit_kw=limit,
-            **self._parameters,
+            BatteryPoint(
+                capacity_kwh=self._capacity_kwh[:, None],
+                load_kw=load_kw,
+                dt_h=self._step_h,
+                parameters=self._parameters,
+                grid_limit_kw=limit,
+            ),
         )
 
 

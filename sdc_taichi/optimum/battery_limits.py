@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from sdc_taichi.optimum.problem import Storage
-from sdc_taichi.plant.battery import BATTERIES
+from sdc_taichi.plant.battery import BATTERIES, BatteryPoint
 from sdc_taichi.types import F64
 
 Line = tuple[float, float]
@@ -88,14 +88,12 @@ def _released(capacity_kwh: float, step_h: float) -> BatteryLimits:
     stored = np.linspace(0.0, capacity_kwh, _STATES)
     energy = {}
     for name, command in (("charge", 1.0), ("discharge", -1.0)):
-        step = BATTERIES["released"](
-            stored, command, capacity_kwh=capacity_kwh, load_kw=_UNLIMITED_KW, dt_h=step_h
-        )
+        point = BatteryPoint(capacity_kwh, _UNLIMITED_KW, step_h)
+        step = BATTERIES["released"].step(stored, command, point)
         energy[name] = np.asarray(getattr(step, f"{name}_kwh"))
     # The load carries a quarter of its power over a duration that depends on the state of charge.
-    light = BATTERIES["released"](
-        stored, -1.0, capacity_kwh=capacity_kwh, load_kw=1e-6 * capacity_kwh, dt_h=step_h
-    )
+    point = BatteryPoint(capacity_kwh, 1e-6 * capacity_kwh, step_h)
+    light = BATTERIES["released"].step(stored, -1.0, point)
     share = float(np.max(light.discharge_kwh) / (1e-6 * capacity_kwh * step_h))
     return BatteryLimits(
         charge_efficiency=1.0,

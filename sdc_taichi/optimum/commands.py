@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from sdc_taichi.plant.battery import BATTERIES
+from sdc_taichi.plant.battery import BATTERIES, BatteryParameters, BatteryPoint
 from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.plant.workload import MODELS as WORK_MODELS
-from sdc_taichi.plant.workload import TASKS_PER_STEP
+from sdc_taichi.plant.workload import TASKS_PER_STEP, WorkPoint
 from sdc_taichi.types import F64
 
 
@@ -95,7 +93,7 @@ def battery_command(
     load_kw: F64,
     step_h: float,
     capacity_kwh: F64,
-    parameters: Mapping[str, F64],
+    parameters: BatteryParameters,
 ) -> F64:
     """Battery command by which a step draws or delivers some energy, or as much as it can, (B,).
 
@@ -106,17 +104,14 @@ def battery_command(
         load_kw: power that the facility is expected to draw, in kW, (B,).
         step_h: length of the step, in h.
         capacity_kwh: capacity, in kWh, (B,).
-        parameters: efficiencies, rates and limits by the names of the models' arguments, (B,) each,
-            without a limit of the grid connection: what that leaves, the model sees to.
+        parameters: efficiencies, rates and limits, (B,) each; the limit of the grid connection is
+            left to the model.
     """
     charges = bus_kwh >= 0
-    full = BATTERIES[model](
+    full = BATTERIES[model].step(
         stored_kwh,
         np.where(charges, 1.0, -1.0),
-        capacity_kwh=capacity_kwh,
-        load_kw=load_kw,
-        dt_h=step_h,
-        **parameters,
+        BatteryPoint(capacity_kwh, load_kw, step_h, parameters),
     )
     share = _share(np.abs(bus_kwh), np.where(charges, full.charge_kwh, full.discharge_kwh))
     return np.where(charges, share, -share)
@@ -146,14 +141,16 @@ def arrived_tasks(model: str, demand: F64, flexible_share: F64 | float) -> F64:
         flexible_share: share of it that may wait, 0..1.
     """
     nothing = np.zeros(np.shape(demand))
-    work = WORK_MODELS[model](
-        demand,
-        nothing,
-        nothing,
-        nothing,
-        flexible_share=flexible_share,
-        max_utilisation=1.0,
-        queue_limit=0.0,
+    work = WORK_MODELS[model].step(
+        WorkPoint(
+            demand,
+            nothing,
+            nothing,
+            nothing,
+            flexible_share=flexible_share,
+            max_utilisation=1.0,
+            queue_limit=0.0,
+        )
     )
     return np.asarray(work.arrived_tasks)
 

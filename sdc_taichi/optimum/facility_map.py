@@ -23,7 +23,7 @@ from sdc_taichi.optimum.tables import (
     tabulate,
     what_decides_facility,
 )
-from sdc_taichi.plant.plants import DRY_PLANTS
+from sdc_taichi.plant.plants import PLANTS
 from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
@@ -177,7 +177,7 @@ def facility_map(
     Raises:
         PhysicalLimitError: A hall that finds no steady air at some utilisation and setpoint.
     """
-    by_wet_bulb = fleet.models["plant"] not in DRY_PLANTS
+    by_wet_bulb = not PLANTS[fleet.models["plant"]].dry
     entries: dict[Hashable, int] = {}
     keys = [_what_decides(fleet, drivers, dc, inlet_limit_c) for dc in range(fleet.size)]
     for key in keys:
@@ -249,7 +249,7 @@ def _weather_nodes(
         (low_c[:, None] + step_k * np.arange(wet))[:, :, None],
         (depression_step_k[:, None] * np.arange(dry))[:, None, :],
     )
-    towers = plant not in DRY_PLANTS
+    towers = not PLANTS[plant].dry
     return _WeatherNodes(
         first_c=low_c,
         last_c=low_c + step_k * steps,

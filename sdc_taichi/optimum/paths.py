@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,7 +19,12 @@ from sdc_taichi.optimum.tables import (
     energy_at_utilisation,
     facility_kwh,
 )
-from sdc_taichi.plant.battery import BATTERIES, BatteryResult
+from sdc_taichi.plant.battery import (
+    BATTERIES,
+    BatteryParameters,
+    BatteryPoint,
+    BatteryResult,
+)
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.types import F64
 
@@ -322,10 +327,9 @@ def battery_path(
     return _follow(storage, facility_kwh, values, levels, run, cost, step_h, end_kwh)
 
 
-def storage_parameters(storage: Storage) -> dict[str, float]:
-    """Efficiencies, rates and limits of a battery by the names of the models' arguments."""
-    beside = ("model", "capacity_kwh", "stored_kwh")
-    return {f.name: getattr(storage, f.name) for f in fields(storage) if f.name not in beside}
+def storage_parameters(storage: Storage) -> BatteryParameters:
+    """Efficiencies, rates and limits of a battery."""
+    return BatteryParameters(*(getattr(storage, name) for name in BatteryParameters._fields))
 
 
 def battery_model(storage: Storage, step_h: float, grid_limit_kw: float) -> BatteryModel:
@@ -339,15 +343,10 @@ def battery_model(storage: Storage, step_h: float, grid_limit_kw: float) -> Batt
     model, parameters = BATTERIES[storage.model], storage_parameters(storage)
 
     def run(stored_kwh: F64, command: F64, facility_kwh: F64 | float) -> BatteryResult:
-        return model(
-            stored_kwh,
-            command,
-            capacity_kwh=storage.capacity_kwh,
-            load_kw=facility_kwh / step_h,
-            dt_h=step_h,
-            grid_limit_kw=None if np.isinf(grid_limit_kw) else grid_limit_kw,
-            **parameters,
-        )
+        limit_kw = None if np.isinf(grid_limit_kw) else grid_limit_kw
+        load_kw = facility_kwh / step_h
+        point = BatteryPoint(storage.capacity_kwh, load_kw, step_h, parameters, limit_kw)
+        return model.step(stored_kwh, command, point)
 
     return run
 
@@ -367,13 +366,13 @@ def _follow(
     path = np.empty(len(facility_kwh))
     fine = np.linspace(-1.0, 1.0, 4 * (len(COMMANDS) - 1) + 1)
     capacity = np.array([storage.capacity_kwh])
-    parameters = {name: np.array([x]) for name, x in storage_parameters(storage).items()}
+    parameters = BatteryParameters(*(np.array([x]) for x in storage_parameters(storage)))
     for t, load_kwh in enumerate(facility_kwh):
         to_end = bus_energy_kwh(
             np.array([end_kwh]),
             stored,
-            charge_efficiency=parameters["charge_efficiency"],
-            discharge_factor=parameters["discharge_factor"],
+            charge_efficiency=np.asarray(parameters.charge_efficiency),
+            discharge_factor=np.asarray(parameters.discharge_factor),
         )
         exact = battery_command(
             to_end,

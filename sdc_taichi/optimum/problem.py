@@ -14,12 +14,12 @@ from sdc_taichi.hall.air_metrics import allowable_c
 from sdc_taichi.optimum.commands import arrived_tasks
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.tables import FacilityTable
+from sdc_taichi.plant.battery import BatteryParameters
 from sdc_taichi.plant.electrical import NO_LIMIT_KW
 from sdc_taichi.plant.workload import TASKS_PER_STEP, UNLIMITED_TASKS
 from sdc_taichi.sim.bills import month_around
 from sdc_taichi.sim.crac_units import schedules_c
 from sdc_taichi.sim.drivers import Drivers
-from sdc_taichi.sim.facility import BATTERY_PARAMETERS
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.sizing import Sizing
 from sdc_taichi.sim.workload import Workload, due_steps, queue_limit_tasks
@@ -345,7 +345,7 @@ def _storage(fleet: Fleet, sizing: Sizing) -> list[Storage]:
             model=fleet.models["battery"],
             capacity_kwh=float(sizing.battery_kwh[i]),
             stored_kwh=float(initial_kwh[i]),
-            **{name: getattr(config.battery, name) for name in BATTERY_PARAMETERS},
+            **{name: getattr(config.battery, name) for name in BatteryParameters._fields},
         )
         for i, config in enumerate(fleet.configs)
     ]

@@ -24,7 +24,7 @@ from sdc_taichi.optimum.tables import (
     facility_kwh,
 )
 from sdc_taichi.sim.drivers import Drivers
-from sdc_taichi.sim.facility import BATTERY_PARAMETERS
+from sdc_taichi.sim.facility import battery_parameters
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
@@ -197,11 +197,11 @@ class Follower:
         }
         self._work_model, self._battery_model = models["workload"], models["battery"]
         self._due = due_entries(of.state.queue.shape[1], due_steps(fleet))
-        self._battery = {name: v(f"battery.{name}") for name in BATTERY_PARAMETERS}
+        self._battery = battery_parameters(fleet)
         loses = self._battery_model != "released"
         one = np.ones(fleet.size)
         self._efficiency = {
-            name: self._battery[name] if loses else one
+            name: getattr(self._battery, name) if loses else one
             for name in ("charge_efficiency", "discharge_factor")
         }
         self._capacity_kwh = of.sizing.battery_kwh

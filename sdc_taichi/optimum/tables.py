@@ -11,7 +11,7 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.hall.air_metrics import LEAST_EXCESS_K, allowable_c
 from sdc_taichi.hall.protection import Mask
-from sdc_taichi.plant.plants import DRY_PLANTS
+from sdc_taichi.plant.plants import PLANTS
 from sdc_taichi.sim.drivers import Drivers, FleetSeries
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
@@ -106,7 +106,7 @@ class TableGrid:
         """Setpoints from the lowest to the highest of a data center, in C, (J,)."""
         setpoint, step_k = config.hvac.setpoint, self.setpoint_step_k
         if step_k is None:
-            step_k = 0.25 if config.hvac.plant_in_use in DRY_PLANTS else 0.5
+            step_k = 0.25 if PLANTS[config.hvac.plant_in_use].dry else 0.5
         intervals = int(np.ceil((setpoint.max_c - setpoint.min_c) / step_k - 1e-9))
         return np.linspace(setpoint.min_c, setpoint.max_c, intervals + 1)
 

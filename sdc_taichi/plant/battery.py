@@ -1,23 +1,7 @@
-"""Batteries: energy stored, drawn and delivered in one step, each model a pure function by name.
+"""Batteries: energy stored, drawn and delivered in one step, by the models in ``BATTERIES``.
 
-Every model has the same signature, so a caller can look it up in `BATTERIES` and pass all of:
-
-    stored_kwh             energy in the store, kWh
-    command                -1..1: 1 charges at the limit power, -1 discharges at it, 0 idles; the
-                           power is this share of the limit
-    capacity_kwh           capacity, kWh (0 is a battery that is not there)
-    load_kw                facility load, kW; a discharge never delivers more
-    dt_h                   length of the step, h
-    charge_efficiency      energy stored per energy drawn from the bus
-    discharge_factor       energy taken from the store per energy delivered
-    charge_limit_c_rate    largest rate into the store, in capacities per hour
-    discharge_limit_c_rate largest rate out of the store, in capacities per hour
-    upper_u_h, upper_v     highest stored energy at charge power P, u*P + v*capacity; u in h
-    lower_u_h, lower_v     lowest stored energy at discharge power P, u*P + v*capacity; u in h
-    grid_limit_kw          most power that the grid connection carries, kW; None is no limit
-
-Arguments are float64 arrays of shape (B,), or anything that broadcasts to it; a model reads only
-what its equations need. Energy at the bus: charge_kwh is drawn, discharge_kwh delivered, and
+Arguments are float64 arrays of shape (B,), or anything that broadcasts to it. Energy at the bus:
+charge_kwh is drawn, discharge_kwh delivered, and
 
     stored' = stored + charge_efficiency*charge_kwh - discharge_factor*discharge_kwh
 
@@ -35,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -60,114 +45,91 @@ class BatteryResult:
     """Energy bought, load plus charge minus discharge, in kWh, (B,), at least 0."""
 
 
-def clc(
-    stored_kwh: Values,
-    command: Values,
-    *,
-    capacity_kwh: Values,
-    load_kw: Values,
-    dt_h: Values,
-    charge_efficiency: Values = 0.97,
-    discharge_factor: Values = 1.04,
-    charge_limit_c_rate: Values = 3.0,
-    discharge_limit_c_rate: Values = 3.0,
-    upper_u_h: Values = -0.04,
-    upper_v: Values = 1.0,
-    lower_u_h: Values = 0.01,
-    lower_v: Values = 0.0,
-    grid_limit_kw: Values | None = None,
-) -> BatteryResult:
+class BatteryParameters(NamedTuple):
+    """Parameters of a battery, by the names of their fields in section ``battery``."""
+
+    charge_efficiency: Values = 0.97
+    """Energy stored per energy drawn, 0..1, (B,)."""
+    discharge_factor: Values = 1.04
+    """Energy taken from the store per energy delivered, 1 or more, (B,)."""
+    charge_limit_c_rate: Values = 3.0
+    """Largest rate into the store, in capacities per hour, (B,)."""
+    discharge_limit_c_rate: Values = 3.0
+    """Largest rate out of the store, in capacities per hour, (B,)."""
+    upper_u_h: Values = -0.04
+    """Rise of the highest stored energy with the charge power, in h, at most 0, (B,)."""
+    upper_v: Values = 1.0
+    """Highest stored energy without charge power, as a share of the capacity, (B,)."""
+    lower_u_h: Values = 0.01
+    """Rise of the lowest stored energy with the discharge power, in h, at least 0, (B,)."""
+    lower_v: Values = 0.0
+    """Lowest stored energy without discharge power, as a share of the capacity, (B,)."""
+
+
+class BatteryPoint(NamedTuple):
+    """Size of batteries and load of their facilities in one step."""
+
+    capacity_kwh: Values
+    """Capacity, in kWh, (B,); 0 is a battery that is not there."""
+    load_kw: Values
+    """Facility load, in kW, (B,); a discharge never delivers more."""
+    dt_h: Values
+    """Length of the step, in h."""
+    parameters: BatteryParameters = BatteryParameters()
+    """Parameters that the configuration gives."""
+    grid_limit_kw: Values | None = None
+    """Most power that the grid connection carries, in kW, (B,); None is no limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class BatteryModel:
+    """A battery model."""
+
+    step: Callable[[Values, Values, BatteryPoint], BatteryResult]
+    """One step from the stored energy, in kWh, (B,), and the command, the share of the limit power
+    at which the battery charges (up to 1) or discharges (down to -1), (B,)."""
+    by_rate_of_store: bool = False
+    """Whether ``discharge_limit_c_rate`` limits the rate out of the store, which losses make larger
+    than the rate delivered."""
+
+
+def clc(stored_kwh: Values, command: Values, point: BatteryPoint) -> BatteryResult:
     """C/L/C: constant efficiencies, linear limits of the stored energy, constant rate limits.
 
     P_c <= min(alpha_c*C/eta_c, (v*C - b)/(eta_c*dt - u)),
     P_d <= min(alpha_d*C/eta_d, (b - v'*C)/(u' + eta_d*dt), load), with the true step length, so
     the limits of the stored energy hold at the end of the step.
-
-    Args:
-        stored_kwh: Energy in the store b, kWh.
-        command: Share of the limit power, -1..1.
-        capacity_kwh: Capacity C, kWh.
-        load_kw: Facility load, kW.
-        dt_h: Length of the step, h.
-        charge_efficiency: Energy stored per energy drawn eta_c, 0..1.
-        discharge_factor: Energy taken from the store per energy delivered eta_d, 1 or more.
-        charge_limit_c_rate: Largest rate into the store alpha_c, 1/h.
-        discharge_limit_c_rate: Largest rate out of the store alpha_d, 1/h.
-        upper_u_h: Rise u of the highest stored energy with the charge power, h, at most 0.
-        upper_v: Highest stored energy v without charge power, over capacity.
-        lower_u_h: Rise u' of the lowest stored energy with the discharge power, h, at least 0.
-        lower_v: Lowest stored energy v' without discharge power, over capacity.
-        grid_limit_kw: Most power of the grid connection, kW; None is no limit.
-
-    Returns:
-        The battery's step.
     """
-    room_kwh = np.maximum(upper_v * capacity_kwh - stored_kwh, 0.0)
-    content_kwh = np.maximum(stored_kwh - lower_v * capacity_kwh, 0.0)
+    capacity_kwh, dt_h, battery = point.capacity_kwh, point.dt_h, point.parameters
+    efficiency, factor = battery.charge_efficiency, battery.discharge_factor
+    room_kwh = np.maximum(battery.upper_v * capacity_kwh - stored_kwh, 0.0)
+    content_kwh = np.maximum(stored_kwh - battery.lower_v * capacity_kwh, 0.0)
     return _step(
         stored_kwh,
         command,
-        capacity_kwh=capacity_kwh,
-        load_kw=load_kw,
-        dt_h=dt_h,
+        point,
         charge_limit_kw=np.minimum(
-            charge_limit_c_rate * capacity_kwh / charge_efficiency,
-            room_kwh / (charge_efficiency * dt_h - upper_u_h),
+            battery.charge_limit_c_rate * capacity_kwh / efficiency,
+            room_kwh / (efficiency * dt_h - battery.upper_u_h),
         ),
         discharge_limit_kw=np.minimum(
-            discharge_limit_c_rate * capacity_kwh / discharge_factor,
-            content_kwh / (lower_u_h + discharge_factor * dt_h),
+            battery.discharge_limit_c_rate * capacity_kwh / factor,
+            content_kwh / (battery.lower_u_h + factor * dt_h),
         ),
-        charge_efficiency=charge_efficiency,
-        discharge_factor=discharge_factor,
-        grid_limit_kw=grid_limit_kw,
     )
 
 
-def released(
-    stored_kwh: Values,
-    command: Values,
-    *,
-    capacity_kwh: Values,
-    load_kw: Values,
-    dt_h: Values,
-    charge_efficiency: Values = 1.0,
-    discharge_factor: Values = 1.0,
-    charge_limit_c_rate: Values = 0.1,
-    discharge_limit_c_rate: Values = 1.0,
-    upper_u_h: Values = -0.04,
-    upper_v: Values = 1.0,
-    lower_u_h: Values = 0.01,
-    lower_v: Values = 0.0,
-    grid_limit_kw: Values | None = None,
-) -> BatteryResult:
+def released(stored_kwh: Values, command: Values, point: BatteryPoint) -> BatteryResult:
     """The battery of the released SustainDC code, as identified from its recorded runs.
 
     The limits use a step length T that depends on the state of charge s instead of dt: charging
     T = dt*round(sigmoid(5 - 10*s)/2, 4) and energy min(0.1*C, (C - b)/(T + 0.04))*T; discharging
     T = dt*max(4*sigmoid(10*(s - 0.25)), 0.5) and energy min(C, b/(T + 0.01), load/4)*T. The
     quarter comes from passing the energy of a quarter hour where a power belongs, so even a full
-    battery carries less than the load. No losses. The store is kept in MWh with 8 decimals.
-
-    Args:
-        stored_kwh: Energy in the store b, kWh.
-        command: Share of the limit power, -1..1.
-        capacity_kwh: Capacity C, kWh.
-        load_kw: Facility load, kW.
-        dt_h: Length of the step, h; the code was only used with 0.25.
-        charge_efficiency: Not used; the model has 1.
-        discharge_factor: Not used; the model has 1.
-        charge_limit_c_rate: Not used; the model has 0.1 per hour.
-        discharge_limit_c_rate: Not used; the model has 1 per hour.
-        upper_u_h: Not used; the model has -0.04 h.
-        upper_v: Not used; the model has 1.
-        lower_u_h: Not used; the model has 0.01 h.
-        lower_v: Not used; the model has 0.
-        grid_limit_kw: Most power of the grid connection, kW; None is no limit.
-
-    Returns:
-        The battery's step. Its loss is what the rounding takes or gives, 5e-6 kWh at most.
+    battery carries less than the load. The code was only used with dt = 0.25 h. No losses but what
+    the rounding takes or gives, 5e-6 kWh at most: the store is kept in MWh with 8 decimals.
     """
+    capacity_kwh, dt_h = point.capacity_kwh, point.dt_h
     exists = np.greater(capacity_kwh, 0.0)
     soc = np.where(exists, stored_kwh / np.where(exists, capacity_kwh, 1.0), 0.0)
 
@@ -175,94 +137,49 @@ def released(
     charge_kw = np.minimum(0.1 * capacity_kwh, (capacity_kwh - stored_kwh) / (charge_h + 0.04))
     discharge_h = dt_h * np.maximum(4.0 * _sigmoid(10.0 * (soc - 0.25)), 0.5)
     discharge_kw = np.minimum(
-        np.minimum(capacity_kwh, stored_kwh / (discharge_h + 0.01)), 0.25 * load_kw
+        np.minimum(capacity_kwh, stored_kwh / (discharge_h + 0.01)), 0.25 * point.load_kw
     )
 
     charge_kwh, discharge_kwh = _within_grid_limit(
         np.maximum(command, 0.0) * charge_kw * charge_h,
         np.maximum(-command, 0.0) * discharge_kw * discharge_h,
-        most_discharge_kwh=discharge_kw * discharge_h,
-        load_kw=load_kw,
-        grid_limit_kw=grid_limit_kw,
-        dt_h=dt_h,
+        discharge_kw * discharge_h,
+        point,
     )
     change_kwh = charge_kwh - discharge_kwh
     rounded_kwh = np.clip(np.round((stored_kwh + change_kwh) / 1e3, 8) * 1e3, 0.0, capacity_kwh)
-    return _battery(
-        stored_kwh,
-        np.where(np.equal(change_kwh, 0.0), stored_kwh, rounded_kwh),
-        charge_kwh=charge_kwh,
-        discharge_kwh=discharge_kwh,
-        load_kwh=load_kw * dt_h,
-    )
+    after_kwh = np.where(np.equal(change_kwh, 0.0), stored_kwh, rounded_kwh)
+    return _battery(stored_kwh, after_kwh, charge_kwh, discharge_kwh, point)
 
 
-def paper(
-    stored_kwh: Values,
-    command: Values,
-    *,
-    capacity_kwh: Values,
-    load_kw: Values,
-    dt_h: Values,
-    charge_efficiency: Values = 0.97,
-    discharge_factor: Values = 1.04,
-    charge_limit_c_rate: Values = 0.5,
-    discharge_limit_c_rate: Values = 0.5,
-    upper_u_h: Values = -0.04,
-    upper_v: Values = 1.0,
-    lower_u_h: Values = 0.01,
-    lower_v: Values = 0.0,
-    grid_limit_kw: Values | None = None,
-) -> BatteryResult:
+def paper(stored_kwh: Values, command: Values, point: BatteryPoint) -> BatteryResult:
     """Appendix A.3.4: the rates are limited by the energy that fits and by a largest power.
 
     r_charge = min((C - E)/(eta_c*dt), P_max), r_discharge = min(E/(eta_d*dt), P_max, load). The
     paper puts P_max in terms of the rate it limits (P_charge,max = u*P_charge + v), so it is taken
     as a share of the capacity. It writes E for both the state and the flow; the latter is read as
     the change of the state, +eta_c*r*dt when charging and -eta_d*r*dt when discharging.
-
-    Args:
-        stored_kwh: Energy in the store E, kWh.
-        command: Share of the limit power, -1..1.
-        capacity_kwh: Capacity C, kWh.
-        load_kw: Facility load, kW.
-        dt_h: Length of the step, h.
-        charge_efficiency: Energy stored per energy drawn eta_c, 0..1.
-        discharge_factor: eta_d, energy taken from the store per energy delivered.
-        charge_limit_c_rate: P_max over capacity when charging, 1/h.
-        discharge_limit_c_rate: P_max over capacity when discharging, 1/h.
-        upper_u_h: Not used.
-        upper_v: Not used.
-        lower_u_h: Not used.
-        lower_v: Not used.
-        grid_limit_kw: Most power of the grid connection, kW; None is no limit.
-
-    Returns:
-        The battery's step.
     """
+    capacity_kwh, dt_h, battery = point.capacity_kwh, point.dt_h, point.parameters
     return _step(
         stored_kwh,
         command,
-        capacity_kwh=capacity_kwh,
-        load_kw=load_kw,
-        dt_h=dt_h,
+        point,
         charge_limit_kw=np.minimum(
-            (capacity_kwh - stored_kwh) / (charge_efficiency * dt_h),
-            charge_limit_c_rate * capacity_kwh,
+            (capacity_kwh - stored_kwh) / (battery.charge_efficiency * dt_h),
+            battery.charge_limit_c_rate * capacity_kwh,
         ),
         discharge_limit_kw=np.minimum(
-            stored_kwh / (discharge_factor * dt_h), discharge_limit_c_rate * capacity_kwh
+            stored_kwh / (battery.discharge_factor * dt_h),
+            battery.discharge_limit_c_rate * capacity_kwh,
         ),
-        charge_efficiency=charge_efficiency,
-        discharge_factor=discharge_factor,
-        grid_limit_kw=grid_limit_kw,
     )
 
 
-BATTERIES: dict[str, Callable[..., BatteryResult]] = {
-    "clc": clc,
-    "released": released,
-    "paper": paper,
+BATTERIES: dict[str, BatteryModel] = {
+    "clc": BatteryModel(clc, by_rate_of_store=True),
+    "released": BatteryModel(released),
+    "paper": BatteryModel(paper),
 }
 """Battery models by the names that ``battery.model`` takes."""
 
@@ -270,51 +187,38 @@ BATTERIES: dict[str, Callable[..., BatteryResult]] = {
 def _step(
     stored_kwh: Values,
     command: Values,
+    point: BatteryPoint,
     *,
-    capacity_kwh: Values,
-    load_kw: Values,
-    dt_h: Values,
     charge_limit_kw: Values,
     discharge_limit_kw: Values,
-    charge_efficiency: Values,
-    discharge_factor: Values,
-    grid_limit_kw: Values | None,
 ) -> BatteryResult:
     """Charge or discharge at a share of the limit powers; a discharge never exceeds the load."""
-    discharge_kw = np.minimum(discharge_limit_kw, load_kw)
+    discharge_kw = np.minimum(discharge_limit_kw, point.load_kw)
     charge_kwh, discharge_kwh = _within_grid_limit(
-        np.maximum(command, 0.0) * charge_limit_kw * dt_h,
-        np.maximum(-command, 0.0) * discharge_kw * dt_h,
-        most_discharge_kwh=discharge_kw * dt_h,
-        load_kw=load_kw,
-        grid_limit_kw=grid_limit_kw,
-        dt_h=dt_h,
+        np.maximum(command, 0.0) * charge_limit_kw * point.dt_h,
+        np.maximum(-command, 0.0) * discharge_kw * point.dt_h,
+        discharge_kw * point.dt_h,
+        point,
     )
-    after_kwh = stored_kwh + charge_efficiency * charge_kwh - discharge_factor * discharge_kwh
+    battery = point.parameters
+    after_kwh = (
+        stored_kwh
+        + battery.charge_efficiency * charge_kwh
+        - battery.discharge_factor * discharge_kwh
+    )
     # Emptying or filling exactly can miss by the last bits, and an empty battery carries nothing.
     after_kwh = np.where(after_kwh > _ROUND_OFF_SHARE * stored_kwh, after_kwh, 0.0)
-    return _battery(
-        stored_kwh,
-        np.minimum(after_kwh, capacity_kwh),
-        charge_kwh=charge_kwh,
-        discharge_kwh=discharge_kwh,
-        load_kwh=load_kw * dt_h,
-    )
+    after_kwh = np.minimum(after_kwh, point.capacity_kwh)
+    return _battery(stored_kwh, after_kwh, charge_kwh, discharge_kwh, point)
 
 
 def _within_grid_limit(
-    charge_kwh: Values,
-    discharge_kwh: Values,
-    *,
-    most_discharge_kwh: Values,
-    load_kw: Values,
-    grid_limit_kw: Values | None,
-    dt_h: Values,
+    charge_kwh: Values, discharge_kwh: Values, most_discharge_kwh: Values, point: BatteryPoint
 ) -> tuple[Values, Values]:
     """Charge and discharge, kWh, that keep the grid connection within its limit if they can."""
-    if grid_limit_kw is None:
+    if point.grid_limit_kw is None:
         return charge_kwh, discharge_kwh
-    load_kwh, limit_kwh = load_kw * dt_h, grid_limit_kw * dt_h
+    load_kwh, limit_kwh = point.load_kw * point.dt_h, point.grid_limit_kw * point.dt_h
     missing_kwh = np.maximum(load_kwh - limit_kwh, 0.0)
     return (
         np.minimum(charge_kwh, np.maximum(limit_kwh - load_kwh, 0.0)),
@@ -325,10 +229,9 @@ def _within_grid_limit(
 def _battery(
     before_kwh: Values,
     after_kwh: Values,
-    *,
     charge_kwh: Values,
     discharge_kwh: Values,
-    load_kwh: Values,
+    point: BatteryPoint,
 ) -> BatteryResult:
     """Result of a step, with loss and grid energy from the energies before and after it."""
     return BatteryResult(
@@ -337,7 +240,7 @@ def _battery(
             charge_kwh,
             discharge_kwh,
             charge_kwh - discharge_kwh - (after_kwh - before_kwh),
-            load_kwh + charge_kwh - discharge_kwh,
+            point.load_kw * point.dt_h + charge_kwh - discharge_kwh,
         )
     )
 

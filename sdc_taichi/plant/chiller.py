@@ -1,22 +1,13 @@
-"""Chillers: electric power for a cooling load, each model a pure function chosen by name.
+"""Chillers: electric power for a cooling load, one record per model in ``CHILLERS``.
 
-Every model has the same signature, so a caller can look it up in `CHILLERS` and pass:
+A record names the equations of a model and all that the rest of the package has to know about it:
+where its condenser gives its heat, its reference COP, and the temperatures within which its curves
+hold. The names that ``hvac.chiller.model`` accepts, the plant of a chiller, sizing and the table of
+the documentation follow from the records.
 
-    load_w          cooling load, W; a load below zero counts as none
-    reference_w     cooling capacity at the model's reference point, W
-    chilled_water_c leaving chilled water, C
-    condenser_c     entering condenser water, C
-    outdoor_c       outdoor dry bulb, C (air-cooled models)
-    reference_cop   coefficient of performance at the reference point, W/W
-    min_plr         part-load ratio below which the machine cycles on and off, above 0; each model
-                    has the default of its machine
-    min_lift_k      smallest lift, entering condenser water over leaving chilled water, K
-
-Arguments are float64 arrays of shape (B,), or anything that broadcasts to it. A model reads only
-what its equations need. Temperatures beyond a curve's bounds are evaluated at the nearest bound:
-`CHILLED_WATER_BOUNDS_C` and `CONDENSER_BOUNDS_C` name them. A plant makes no chilled water beyond
-them: colder water is an error of the configuration, and for warmer air the water stays at the
-warmest.
+The equations take the load and a ``ChillerPoint`` of float64 arrays (B,), or anything that
+broadcasts to that shape, and read what they need. A load below zero counts as none. Temperatures
+beyond the bounds of a record are evaluated at the nearest bound.
 
 Sources: EnergyPlus Engineering Reference, "Chillers" (Chiller:Electric, Chiller:Electric:EIR,
 Chiller:ConstantCOP); York and Trane data sets as in Modelica Buildings,
@@ -27,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,6 +26,8 @@ from sdc_taichi.types import F64, Values
 
 KELVIN = 273.15
 """0 C in kelvin."""
+BOILING_C = 100.0
+"""Warmest chilled water of models without bounds, in C."""
 
 # York YT 1055 kW / 5.96 COP, inlet vanes: biquadratics in (1, Te, Te^2, Tc, Tc^2, Te*Tc), C.
 YORK_CAPACITY = (
@@ -58,22 +52,13 @@ water: 0.9 % root mean square, at most 3 %. It stands for the temperature differ
 and condenser, and for the efficiency that the compressor loses at low lift.
 """
 
-CHILLED_WATER_BOUNDS_C: dict[str, tuple[float, float]] = {
-    "centrifugal_vsd": (4.0, 20.0),
-    "carnot": (4.0, 20.0),
-    "eir_york": (4.44, 8.89),
-}
-"""Leaving chilled water within which each model is evaluated, in C; a plant makes no warmer."""
-ANY_WATER_C = (0.0, 100.0)
-"""Chilled water of models that have no bounds, in C."""
-CONDENSER_BOUNDS_C: dict[str, tuple[float, float]] = {"eir_york": (12.78, 35.0)}
-"""Entering condenser water within which each model is evaluated, in C."""
-
 YORK_CHILLED_WATER_C = 6.67
 """Leaving chilled water at the reference point of the York data set, in C."""
 YORK_CONDENSER_C = 29.44
 """Entering condenser water at the reference point of the York data set, in C."""
 
+YORK_COP = 5.96
+"""COP at the reference point of the York machine, and of the Trane machine, in W/W."""
 MIN_LIFT_K = 6.11
 """Smallest lift of ``carnot`` and ``centrifugal_vsd`` by default, in K.
 
@@ -113,345 +98,220 @@ class ChillerResult:
     """Heat that the model hands to the cooling tower, in W, (B,)."""
 
 
-def chilled_water_bounds_c(model: str) -> tuple[float, float]:
-    """Coldest and warmest chilled water of a model, in C."""
-    return CHILLED_WATER_BOUNDS_C.get(model, ANY_WATER_C)
+class ChillerParameters(NamedTuple):
+    """Parameters of a machine, by the names of their fields in section ``hvac.chiller``."""
+
+    reference_cop: Values
+    """Coefficient of performance at the reference point of the model, in W/W, (B,)."""
+    min_lift_k: Values = MIN_LIFT_K
+    """Smallest lift, entering condenser water less leaving chilled water, in K, (B,)."""
 
 
-def centrifugal_vsd(
-    load_w: Values,
-    *,
-    reference_w: Values,
-    chilled_water_c: Values,
-    condenser_c: Values,
-    outdoor_c: Values,
-    reference_cop: Values,
-    min_plr: Values = 0.1,
-    min_lift_k: Values = MIN_LIFT_K,
-) -> ChillerResult:
+class ChillerPoint(NamedTuple):
+    """Size and temperatures at which chillers work."""
+
+    reference_w: Values
+    """Cooling capacity at the reference point of the model, in W, (B,)."""
+    chilled_water_c: Values
+    """Leaving chilled water, in C, (B,)."""
+    condenser_c: Values
+    """Entering condenser water, in C, (B,)."""
+    outdoor_c: Values
+    """Outdoor dry bulb, in C, (B,)."""
+    machine: ChillerParameters
+    """Parameters that the configuration gives."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChillerModel:
+    """A chiller model: its equations and what plants and sizing have to know about it."""
+
+    equations: Callable[[Values, ChillerPoint], ChillerResult]
+    """Power and heat for a cooling load in W, (B,), at a point within the bounds below."""
+    tower_water: bool = True
+    """Whether the condenser can be cooled by the water of a cooling tower."""
+    outdoor_air: bool = False
+    """Whether the condenser can be cooled by outdoor air."""
+    reference_cop: float = YORK_COP
+    """COP at the reference point of the machine, in W/W, where the configuration gives none."""
+    chilled_water_bounds_c: tuple[float, float] | None = None
+    """Leaving chilled water within which the curves hold, in C; None is any. A plant makes no
+    chilled water beyond them: colder water is an error of the configuration, and for warmer supply
+    air the water stays at the warmest."""
+    condenser_bounds_c: tuple[float, float] | None = None
+    """Entering condenser water within which the curves hold, in C; None is any."""
+
+    @property
+    def warmest_water_c(self) -> float:
+        """Warmest chilled water that a plant with this chiller makes, in C."""
+        return BOILING_C if self.chilled_water_bounds_c is None else self.chilled_water_bounds_c[1]
+
+    def step(self, load_w: Values, point: ChillerPoint) -> ChillerResult:
+        """One step of the chillers of B data centers.
+
+        Args:
+            load_w: Cooling load, W, (B,).
+            point: Size and temperatures.
+        """
+        if self.chilled_water_bounds_c is not None:
+            held_c = np.clip(point.chilled_water_c, *self.chilled_water_bounds_c)
+            point = point._replace(chilled_water_c=held_c)
+        if self.condenser_bounds_c is not None:
+            held_c = np.clip(point.condenser_c, *self.condenser_bounds_c)
+            point = point._replace(condenser_c=held_c)
+        return self.equations(load_w, point)
+
+
+def centrifugal_vsd(load_w: Values, point: ChillerPoint) -> ChillerResult:
     """Water-cooled centrifugal chiller with variable speed, fitted to a Trane CVHE of 1442 kW.
 
     COP = c * Te / (max(Tc - Te, min_lift_k) + 22 K) in kelvin, with c such that the COP is
     `reference_cop` at 6.67 C chilled and 29.44 C condenser water and full load (the data set has
     5.97 there); capacity does not depend on temperature. The part-load curve of the data set is
     divided by its value at full load (0.9993).
-
-    Args:
-        load_w: Cooling load, W.
-        reference_w: Capacity, W.
-        chilled_water_c: Leaving chilled water, C; evaluated within 4..20 C.
-        condenser_c: Entering condenser water, C.
-        outdoor_c: Not used.
-        reference_cop: COP at the reference point.
-        min_plr: Part-load ratio below which the machine cycles.
-        min_lift_k: Smallest lift between the two waters, K.
-
-    Returns:
-        The chiller's step.
     """
-    evaporator_k = np.clip(chilled_water_c, *CHILLED_WATER_BOUNDS_C["centrifugal_vsd"]) + KELVIN
-    lift_k = np.maximum(condenser_c + KELVIN - evaporator_k, min_lift_k) + VSD_LIFT_OFFSET_K
+    evaporator_k = point.chilled_water_c + KELVIN
+    lift_k = (
+        np.maximum(point.condenser_c + KELVIN - evaporator_k, point.machine.min_lift_k)
+        + VSD_LIFT_OFFSET_K
+    )
     reference_lift_k = YORK_CONDENSER_C - YORK_CHILLED_WATER_C + VSD_LIFT_OFFSET_K
     reference_carnot = (YORK_CHILLED_WATER_C + KELVIN) / reference_lift_k
     return _from_curves(
         load_w,
-        reference_w,
-        eir=reference_carnot / reference_cop * lift_k / evaporator_k,
+        point.reference_w,
+        eir=reference_carnot / point.machine.reference_cop * lift_k / evaporator_k,
         part_load=tuple(c / sum(VSD_PART_LOAD) for c in VSD_PART_LOAD),
-        min_plr=min_plr,
+        min_plr=0.1,
     )
 
 
-def carnot(
-    load_w: Values,
-    *,
-    reference_w: Values,
-    chilled_water_c: Values,
-    condenser_c: Values,
-    outdoor_c: Values,
-    reference_cop: Values,
-    min_plr: Values = 0.1,
-    min_lift_k: Values = MIN_LIFT_K,
-) -> ChillerResult:
+def carnot(load_w: Values, point: ChillerPoint) -> ChillerResult:
     """Constant Carnot effectiveness with the part-load curve of the York machine.
 
     COP = eta * Te / max(Tc - Te, min_lift_k) in kelvin, with eta such that the COP is
     `reference_cop` at 6.67 C chilled and 29.44 C condenser water and full load; capacity does not
     depend on temperature. The part-load curve is divided by its value at full load (1.0002).
-
-    Args:
-        load_w: Cooling load, W.
-        reference_w: Capacity, W.
-        chilled_water_c: Leaving chilled water, C; evaluated within 4..20 C.
-        condenser_c: Entering condenser water, C.
-        outdoor_c: Not used.
-        reference_cop: COP at the reference point.
-        min_plr: Part-load ratio below which the machine cycles.
-        min_lift_k: Smallest lift between the two waters, K.
-
-    Returns:
-        The chiller's step.
     """
-    evaporator_k = np.clip(chilled_water_c, *CHILLED_WATER_BOUNDS_C["carnot"]) + KELVIN
-    lift_k = np.maximum(condenser_c + KELVIN - evaporator_k, min_lift_k)
+    evaporator_k = point.chilled_water_c + KELVIN
+    lift_k = np.maximum(point.condenser_c + KELVIN - evaporator_k, point.machine.min_lift_k)
     reference_carnot = (YORK_CHILLED_WATER_C + KELVIN) / (YORK_CONDENSER_C - YORK_CHILLED_WATER_C)
-    full_load_cop = reference_cop / reference_carnot * evaporator_k / lift_k
+    full_load_cop = point.machine.reference_cop / reference_carnot * evaporator_k / lift_k
     return _from_curves(
         load_w,
-        reference_w,
+        point.reference_w,
         eir=1.0 / full_load_cop,
         part_load=tuple(c / sum(YORK_PART_LOAD) for c in YORK_PART_LOAD),
-        min_plr=min_plr,
+        min_plr=0.1,
     )
 
 
-def eir_york(
-    load_w: Values,
-    *,
-    reference_w: Values,
-    chilled_water_c: Values,
-    condenser_c: Values,
-    outdoor_c: Values,
-    reference_cop: Values,
-    min_plr: Values = 0.1,
-    min_lift_k: Values = MIN_LIFT_K,
-) -> ChillerResult:
+def eir_york(load_w: Values, point: ChillerPoint) -> ChillerResult:
     """York YT centrifugal chiller by its Chiller:Electric:EIR curves.
 
     Q_avail = Q_ref*CapFT, P = Q_avail/COP_ref*EIRFT*EIRFPLR*min(1, PLR/min_plr)
-    (EnergyPlus Engineering Reference, Chiller:Electric:EIR). The curves are evaluated within
-    4.44..8.89 C chilled and 12.78..35 C condenser water.
-
-    Args:
-        load_w: Cooling load, W.
-        reference_w: Capacity at 6.67 C chilled and 29.44 C entering condenser water, W.
-        chilled_water_c: Leaving chilled water, C.
-        condenser_c: Entering condenser water, C.
-        outdoor_c: Not used.
-        reference_cop: COP at the reference point (5.96 for this machine).
-        min_plr: Part-load ratio below which the machine cycles.
-        min_lift_k: Not used.
-
-    Returns:
-        The chiller's step.
+    (EnergyPlus Engineering Reference, Chiller:Electric:EIR).
     """
-    evaporator_c = np.clip(chilled_water_c, *CHILLED_WATER_BOUNDS_C["eir_york"])
-    entering_c = np.clip(condenser_c, *CONDENSER_BOUNDS_C["eir_york"])
+    evaporator_c, entering_c = point.chilled_water_c, point.condenser_c
     return _from_curves(
         load_w,
-        reference_w * _biquadratic(YORK_CAPACITY, evaporator_c, entering_c),
-        eir=_biquadratic(YORK_EIR, evaporator_c, entering_c) / reference_cop,
+        point.reference_w * _biquadratic(YORK_CAPACITY, evaporator_c, entering_c),
+        eir=_biquadratic(YORK_EIR, evaporator_c, entering_c) / point.machine.reference_cop,
         part_load=YORK_PART_LOAD,
-        min_plr=min_plr,
+        min_plr=0.1,
     )
 
 
-def electric_water_cooled(
-    load_w: Values,
-    *,
-    reference_w: Values,
-    chilled_water_c: Values,
-    condenser_c: Values,
-    outdoor_c: Values,
-    reference_cop: Values,
-    min_plr: Values = 0.15,
-    min_lift_k: Values = MIN_LIFT_K,
-) -> ChillerResult:
+def electric_water_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
     """Water-cooled Chiller:Electric (EnergyPlus Engineering Reference, after BLAST).
 
     Coefficients of the EnergyPlus unit test ChillerElectric; its nominal COP is 4.75.
-
-    Args:
-        load_w: Cooling load, W.
-        reference_w: Nominal capacity (6.667 C chilled, 29.44 C condenser water), W.
-        chilled_water_c: Leaving chilled water, C.
-        condenser_c: Entering condenser water, C.
-        outdoor_c: Not used.
-        reference_cop: Nominal COP.
-        min_plr: Part-load ratio below which the machine cycles.
-        min_lift_k: Not used.
-
-    Returns:
-        The chiller's step.
     """
-    delta_k = (condenser_c - 29.44) / 2.682759 - (chilled_water_c - 6.667)
+    delta_k = (point.condenser_c - 29.44) / 2.682759 - (point.chilled_water_c - 6.667)
     return _electric(
         load_w,
-        reference_w=reference_w,
+        reference_w=point.reference_w,
         delta_k=np.maximum(delta_k, MIN_DELTA_K),
         capacity_ratio=(0.944836, -0.0570088, -0.00185486),
         power_ratio=(1.907846, -1.204987, 0.2634623),
-        reference_cop=reference_cop,
-        min_plr=min_plr,
+        reference_cop=point.machine.reference_cop,
+        min_plr=0.15,
     )
 
 
-def electric_air_cooled(
-    load_w: Values,
-    *,
-    reference_w: Values,
-    chilled_water_c: Values,
-    condenser_c: Values,
-    outdoor_c: Values,
-    reference_cop: Values,
-    min_plr: Values = 0.05,
-    min_lift_k: Values = MIN_LIFT_K,
-) -> ChillerResult:
+def electric_air_cooled(load_w: Values, point: ChillerPoint) -> ChillerResult:
     """Air-cooled Chiller:Electric: the condenser sees the outdoor dry bulb.
 
     Coefficients of the EnergyPlus test file AirCooledElectricChiller.idf.
-
-    Args:
-        load_w: Cooling load, W.
-        reference_w: Nominal capacity (6.67 C chilled water, 35 C outdoors), W.
-        chilled_water_c: Leaving chilled water, C.
-        condenser_c: Not used.
-        outdoor_c: Outdoor dry bulb, C.
-        reference_cop: Nominal COP.
-        min_plr: Part-load ratio below which the machine cycles.
-        min_lift_k: Not used.
-
-    Returns:
-        The chiller's step.
     """
-    delta_k = (outdoor_c - 35.0) / 2.778 - (chilled_water_c - 6.67)
+    delta_k = (point.outdoor_c - 35.0) / 2.778 - (point.chilled_water_c - 6.67)
     return _electric(
         load_w,
-        reference_w=reference_w,
+        reference_w=point.reference_w,
         delta_k=np.maximum(delta_k, MIN_DELTA_K),
         capacity_ratio=(0.9949, -0.045954, -0.0013543),
         power_ratio=(2.333, -1.975, 0.6121),
-        reference_cop=reference_cop,
-        min_plr=min_plr,
+        reference_cop=point.machine.reference_cop,
+        min_plr=0.05,
     )
 
 
-def constant_cop(
-    load_w: Values,
-    *,
-    reference_w: Values,
-    chilled_water_c: Values,
-    condenser_c: Values,
-    outdoor_c: Values,
-    reference_cop: Values,
-    min_plr: Values = 0.0,
-    min_lift_k: Values = MIN_LIFT_K,
-) -> ChillerResult:
-    """Constant COP up to the capacity (EnergyPlus Engineering Reference, Chiller:ConstantCOP).
-
-    Args:
-        load_w: Cooling load, W.
-        reference_w: Capacity, W.
-        chilled_water_c: Not used.
-        condenser_c: Not used.
-        outdoor_c: Not used.
-        reference_cop: COP.
-        min_plr: Not used.
-        min_lift_k: Not used.
-
-    Returns:
-        The chiller's step.
-    """
+def constant_cop(load_w: Values, point: ChillerPoint) -> ChillerResult:
+    """Constant COP up to the capacity (EnergyPlus Engineering Reference, Chiller:ConstantCOP)."""
     load = np.maximum(load_w, 0.0)
-    evaporator_w = np.minimum(load, reference_w)
-    power_w = evaporator_w / reference_cop
-    return _chiller(load, evaporator_w, reference_w, power_w, rejected_w=evaporator_w + power_w)
+    evaporator_w = np.minimum(load, point.reference_w)
+    power_w = evaporator_w / point.machine.reference_cop
+    return _chiller(
+        load, evaporator_w, point.reference_w, power_w, rejected_w=evaporator_w + power_w
+    )
 
 
-def released(
-    load_w: Values,
-    *,
-    reference_w: Values,
-    chilled_water_c: Values,
-    condenser_c: Values,
-    outdoor_c: Values,
-    reference_cop: Values,
-    min_plr: Values = 0.05,
-    min_lift_k: Values = MIN_LIFT_K,
-) -> ChillerResult:
+def released(load_w: Values, point: ChillerPoint) -> ChillerResult:
     """The chiller of the released SustainDC code: Chiller:Electric with three departures.
 
     The difference from design is (T_amb - 35)/2.778 - (6.67 - 35), so the chilled water never
     enters and 28.33 K too much does; the last capacity coefficient is positive; the cooling load,
     not the heat rejected by the condenser, goes to the tower. As a consequence capacity grows as
     it gets hotter above -1 C outdoors, and at part load power falls.
-
-    Args:
-        load_w: Cooling load, W.
-        reference_w: Largest cooling load of the sizing day, W.
-        chilled_water_c: Not used.
-        condenser_c: Not used.
-        outdoor_c: Outdoor dry bulb, C.
-        reference_cop: COP; the released code has 3.
-        min_plr: Part-load ratio below which the machine cycles.
-        min_lift_k: Not used.
-
-    Returns:
-        The chiller's step.
     """
     result = _electric(
         load_w,
-        reference_w=reference_w,
-        delta_k=(outdoor_c - 35.0) / 2.778 - (6.67 - 35.0),
+        reference_w=point.reference_w,
+        delta_k=(point.outdoor_c - 35.0) / 2.778 - (6.67 - 35.0),
         capacity_ratio=(0.944836, -0.0570088, 0.00185486),
         power_ratio=(2.333, -1.975, 0.6121),
-        reference_cop=reference_cop,
-        min_plr=min_plr,
+        reference_cop=point.machine.reference_cop,
+        min_plr=0.05,
     )
     return replace(result, rejected_w=result.evaporator_w + result.unmet_w)
 
 
-def paper(
-    load_w: Values,
-    *,
-    reference_w: Values,
-    chilled_water_c: Values,
-    condenser_c: Values,
-    outdoor_c: Values,
-    reference_cop: Values,
-    min_plr: Values = 0.0,
-    min_lift_k: Values = MIN_LIFT_K,
-) -> ChillerResult:
+def paper(load_w: Values, point: ChillerPoint) -> ChillerResult:
     """Appendix A.2.2 as printed: P_chiller = P_cool*(1 + 1/COP), counted as electricity.
 
     The term is the heat a condenser rejects; the paper adds it to the HVAC power and hands the
     same quantity to the tower. No capacity is printed, so none limits the load.
-
-    Args:
-        load_w: Cooling load, W.
-        reference_w: Capacity the part-load ratio refers to, W; it limits nothing.
-        chilled_water_c: Not used.
-        condenser_c: Not used.
-        outdoor_c: Not used.
-        reference_cop: COP (CHILLER_COP_BASE of the configuration).
-        min_plr: Not used.
-        min_lift_k: Not used.
-
-    Returns:
-        The chiller's step.
     """
     load = np.maximum(load_w, 0.0)
-    power_w = load * (1.0 + 1.0 / reference_cop)
-    return _chiller(load, load, np.maximum(reference_w, load), power_w, rejected_w=power_w)
+    power_w = load * (1.0 + 1.0 / point.machine.reference_cop)
+    return _chiller(load, load, np.maximum(point.reference_w, load), power_w, rejected_w=power_w)
 
 
-CHILLERS: dict[str, Callable[..., ChillerResult]] = {
-    "centrifugal_vsd": centrifugal_vsd,
-    "carnot": carnot,
-    "eir_york": eir_york,
-    "electric_water_cooled": electric_water_cooled,
-    "electric_air_cooled": electric_air_cooled,
-    "constant_cop": constant_cop,
-    "released": released,
-    "paper": paper,
+CHILLERS: dict[str, ChillerModel] = {
+    "centrifugal_vsd": ChillerModel(centrifugal_vsd, chilled_water_bounds_c=(4.0, 20.0)),
+    "carnot": ChillerModel(carnot, chilled_water_bounds_c=(4.0, 20.0)),
+    "eir_york": ChillerModel(
+        eir_york, chilled_water_bounds_c=(4.44, 8.89), condenser_bounds_c=(12.78, 35.0)
+    ),
+    "electric_water_cooled": ChillerModel(electric_water_cooled, reference_cop=4.75),
+    "electric_air_cooled": ChillerModel(
+        electric_air_cooled, tower_water=False, outdoor_air=True, reference_cop=3.0
+    ),
+    "constant_cop": ChillerModel(constant_cop, outdoor_air=True),
+    "released": ChillerModel(released, reference_cop=3.0),
+    "paper": ChillerModel(paper),
 }
 """Chiller models by the names that ``hvac.chiller.model`` takes."""
-REFERENCE_COPS = {"electric_water_cooled": 4.75, "electric_air_cooled": 3.0, "released": 3.0}
-"""COP at the reference point of machines other than the default, in W/W, by their models."""
-DEFAULT_REFERENCE_COP = 5.96
-"""COP at the reference point of the York machine, and of the Trane machine, in W/W."""
-AIR_COOLED = frozenset({"electric_air_cooled", "constant_cop"})
-"""Models of chillers that reject their heat to outdoor air."""
 
 
 def _electric(

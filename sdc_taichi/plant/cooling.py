@@ -1,21 +1,20 @@
 """Air side of the plant: CRAC setpoint, airflow, return temperature and cooling load of the hall.
 
-Setpoint, airflow and cooling load each have several models with one signature, so that a caller can
-look a model up by name in ``SETPOINTS``, ``CRAC_FLOWS`` and ``COOLING_LOADS`` and pass all
-arguments; a model reads only what its equations need.
+Setpoint, airflow and cooling load have several models each, in ``SETPOINTS``, ``CRAC_FLOWS`` and
+``COOLING_LOADS``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from sdc_taichi.types import F64, I64
 
 SetpointModel = Callable[..., tuple[F64, I64, F64]]
-FlowModel = Callable[..., tuple[F64, F64]]
-LoadModel = Callable[..., tuple[F64, F64]]
 
 
 def symmetric_setpoint(
@@ -100,78 +99,48 @@ def avoid_repeats(command: F64, last: F64) -> F64:
     return np.where(command == last, np.nextafter(command, 0.0), command)
 
 
-def constant_flow(
-    it_w: F64, airflow_m3s: F64, *, design_flow_m3s: F64, **_: F64
-) -> tuple[F64, F64]:
-    """CRAC airflow of fans at fixed speed, or of fans that hold the pressure under a floor.
+class CracPoint(NamedTuple):
+    """Servers and CRAC units of B data centers, whose airflow a model gives."""
 
-    Args:
-        it_w: IT power, W, (B,); not used.
-        airflow_m3s: Airflow through the servers, m3/s, (B,); not used.
-        design_flow_m3s: CRAC airflow at design, m3/s, (B,).
-
-    Returns:
-        CRAC airflow, m3/s, and fan speed over design speed, each (B,).
-    """
-    return design_flow_m3s, np.ones_like(design_flow_m3s)
-
-
-def following_flow(
-    it_w: F64,
-    airflow_m3s: F64,
-    *,
-    design_flow_m3s: F64,
-    design_it_airflow_m3s: F64,
-    min_ratio: F64,
-    **_: F64,
-) -> tuple[F64, F64]:
-    """CRAC airflow of fans that keep pace with the servers' airflow.
-
-    Args:
-        it_w: IT power, W, (B,); not used.
-        airflow_m3s: Airflow through the servers, m3/s, (B,).
-        design_flow_m3s: CRAC airflow at design, m3/s, (B,).
-        design_it_airflow_m3s: Airflow through the servers at design, m3/s, (B,).
-        min_ratio: Lowest fan speed over design speed, (B,).
-
-    Returns:
-        CRAC airflow, m3/s, and fan speed over design speed, each (B,).
-    """
-    speed = np.clip(airflow_m3s / design_it_airflow_m3s, min_ratio, 1.0)
-    return design_flow_m3s * speed, speed
+    it_w: F64
+    """IT power, in W, (B,)."""
+    it_airflow_m3s: F64
+    """Airflow through the servers, in m3/s, (B,)."""
+    speed: F64
+    """Fan speed that an agent commands over design speed, (B,)."""
+    design_flow_m3s: F64
+    """CRAC airflow at design, in m3/s, (B,)."""
+    design_it_airflow_m3s: F64
+    """Airflow through the servers at design, in m3/s, (B,)."""
+    min_ratio: F64
+    """Lowest fan speed over design speed, (B,)."""
+    supply_m3s_per_w: F64
+    """CRAC airflow per IT power, in m3/(s W), (B,)."""
 
 
-def per_watt_flow(
-    it_w: F64, airflow_m3s: F64, *, supply_m3s_per_w: F64, **_: F64
-) -> tuple[F64, F64]:
-    """CRAC airflow in proportion to IT power at fixed fan speed, as in the released SustainDC.
-
-    Args:
-        it_w: IT power, W, (B,).
-        airflow_m3s: Airflow through the servers, m3/s, (B,); not used.
-        supply_m3s_per_w: CRAC airflow per IT power, m3/(s W), (B,).
-
-    Returns:
-        CRAC airflow, m3/s, and fan speed over design speed, each (B,).
-    """
-    return supply_m3s_per_w * it_w, np.ones_like(supply_m3s_per_w)
+FlowModel = Callable[[CracPoint], tuple[F64, F64]]
+"""CRAC airflow, in m3/s, and fan speed over design speed, each (B,)."""
 
 
-def controlled_flow(
-    it_w: F64, airflow_m3s: F64, *, design_flow_m3s: F64, speed: F64, **_: F64
-) -> tuple[F64, F64]:
-    """CRAC airflow of fans whose speed an agent controls.
+def constant_flow(point: CracPoint) -> tuple[F64, F64]:
+    """Airflow of fans at fixed speed, or of fans that hold the pressure under a floor."""
+    return point.design_flow_m3s, np.ones_like(point.design_flow_m3s)
 
-    Args:
-        it_w: IT power, W, (B,); not used.
-        airflow_m3s: Airflow through the servers, m3/s, (B,); not used.
-        design_flow_m3s: CRAC airflow at design, m3/s, (B,).
-        speed: Fan speed over design speed, (B,).
 
-    Returns:
-        CRAC airflow, m3/s, and fan speed over design speed, each (B,).
-    """
-    return design_flow_m3s * speed, speed
+def following_flow(point: CracPoint) -> tuple[F64, F64]:
+    """Airflow of fans that keep pace with the servers' airflow."""
+    speed = np.clip(point.it_airflow_m3s / point.design_it_airflow_m3s, point.min_ratio, 1.0)
+    return point.design_flow_m3s * speed, speed
+
+
+def per_watt_flow(point: CracPoint) -> tuple[F64, F64]:
+    """Airflow in proportion to IT power at fixed fan speed, as in the released SustainDC."""
+    return point.supply_m3s_per_w * point.it_w, np.ones_like(point.supply_m3s_per_w)
+
+
+def controlled_flow(point: CracPoint) -> tuple[F64, F64]:
+    """Airflow of fans whose speed an agent controls."""
+    return point.design_flow_m3s * point.speed, point.speed
 
 
 CRAC_FLOWS: dict[str, FlowModel] = {
@@ -185,94 +154,78 @@ CRAC_FLOWS: dict[str, FlowModel] = {
 """Airflow models by the names that ``hvac.crac.flow_model`` takes."""
 
 
-def heat_balance_load(
-    it_w: F64, crac_fan_w: F64, crac_flow_m3s: F64, supply_c: F64, setpoint_c: F64, outlet_c: F64,
-    *, air_j_per_m3_k: F64, return_approach_k: F64,
-) -> tuple[F64, F64]:  # fmt: skip
+class HallPoint(NamedTuple):
+    """Air of the halls of B data centers, from which a model takes the cooling load."""
+
+    it_w: F64
+    """IT power, in W, (B,)."""
+    crac_fan_w: F64
+    """Power of the CRAC fans, in W, (B,)."""
+    crac_flow_m3s: F64
+    """CRAC airflow, in m3/s, (B,)."""
+    supply_c: F64
+    """Supply air, in C, (B,)."""
+    setpoint_c: F64
+    """CRAC setpoint, in C, (B,)."""
+    outlet_c: F64
+    """Mean outlet of the racks, in C, (B,)."""
+    air_j_per_m3_k: F64
+    """Heat capacity of air per volume, in J/(m3 K), (B,)."""
+    return_approach_k: F64
+    """Return air less the mean outlet, in K, (B,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoadModel:
+    """A model of the cooling load."""
+
+    step: Callable[[HallPoint], tuple[F64, F64]]
+    """Temperature of the return air, in C, and cooling load, in W, each (B,)."""
+    stores_unmet_heat: bool = False
+    """Whether heat that the plant does not remove stays in the room; other models remove whatever
+    load they compute."""
+
+
+def heat_balance_load(point: HallPoint) -> tuple[F64, F64]:
     """Return air and cooling load from the heat balance of the hall.
 
     Servers and CRAC fans heat the air: T_ret = T_sup + P_it/(rho cp V_crac), Q = P_it + P_fan.
-
-    Args:
-        it_w: IT power, W, (B,).
-        crac_fan_w: Power of the CRAC fans, W, (B,).
-        crac_flow_m3s: CRAC airflow, m3/s, (B,).
-        supply_c: Supply air, C, (B,).
-        setpoint_c: CRAC setpoint, C, (B,); not used.
-        outlet_c: Mean outlet of the racks, C, (B,); not used.
-        air_j_per_m3_k: Heat capacity of air per volume, J/(m3 K), (B,).
-        return_approach_k: Return air over the mean outlet, K, (B,); not used.
-
-    Returns:
-        Return temperature, C, that of the supply without airflow, and cooling load, W, each (B,).
+    Without airflow the return air has the temperature of the supply.
     """
-    flows = crac_flow_m3s > 0
-    rise_k = np.where(flows, it_w, 0.0) / np.where(flows, air_j_per_m3_k * crac_flow_m3s, 1.0)
-    return supply_c + rise_k, it_w + crac_fan_w
+    flow = point.crac_flow_m3s
+    flows = flow > 0
+    rise_k = np.where(flows, point.it_w, 0.0) / np.where(flows, point.air_j_per_m3_k * flow, 1.0)
+    return point.supply_c + rise_k, point.it_w + point.crac_fan_w
 
 
-def released_load(
-    it_w: F64, crac_fan_w: F64, crac_flow_m3s: F64, supply_c: F64, setpoint_c: F64, outlet_c: F64,
-    *, air_j_per_m3_k: F64, return_approach_k: F64,
-) -> tuple[F64, F64]:  # fmt: skip
+def released_load(point: HallPoint) -> tuple[F64, F64]:
     """Return air and cooling load of the released SustainDC.
 
     Mean rack outlet plus mean return approach; Q = rho cp V max(0, T_ret - T_set). Heat removed
     differs from heat generated.
-
-    Args:
-        it_w: IT power, W, (B,); not used.
-        crac_fan_w: Power of the CRAC fans, W, (B,); not used.
-        crac_flow_m3s: CRAC airflow, m3/s, (B,).
-        supply_c: Supply air, C, (B,); not used.
-        setpoint_c: CRAC setpoint, C, (B,).
-        outlet_c: Mean outlet of the racks, C, (B,).
-        air_j_per_m3_k: Heat capacity of air per volume, J/(m3 K), (B,).
-        return_approach_k: Return air over the mean outlet, K, (B,).
-
-    Returns:
-        Return temperature, C, and cooling load, W, each (B,).
     """
-    return_c = outlet_c + return_approach_k
-    return return_c, air_j_per_m3_k * crac_flow_m3s * np.maximum(return_c - setpoint_c, 0.0)
+    return_c = point.outlet_c + point.return_approach_k
+    rise_k = np.maximum(return_c - point.setpoint_c, 0.0)
+    return return_c, point.air_j_per_m3_k * point.crac_flow_m3s * rise_k
 
 
-def paper_load(
-    it_w: F64, crac_fan_w: F64, crac_flow_m3s: F64, supply_c: F64, setpoint_c: F64, outlet_c: F64,
-    *, air_j_per_m3_k: F64, return_approach_k: F64,
-) -> tuple[F64, F64]:  # fmt: skip
+def paper_load(point: HallPoint) -> tuple[F64, F64]:
     """Return air and cooling load of the SustainDC paper, A.2.2, without a lower bound.
 
     Mean rack outlet plus mean return approach; Q = rho cp V (T_ret - T_set), negative where the
     return air is colder than the setpoint.
-
-    Args:
-        it_w: IT power, W, (B,); not used.
-        crac_fan_w: Power of the CRAC fans, W, (B,); not used.
-        crac_flow_m3s: CRAC airflow, m3/s, (B,).
-        supply_c: Supply air, C, (B,); not used.
-        setpoint_c: CRAC setpoint, C, (B,).
-        outlet_c: Mean outlet of the racks, C, (B,).
-        air_j_per_m3_k: Heat capacity of air per volume, J/(m3 K), (B,).
-        return_approach_k: Return air over the mean outlet, K, (B,).
-
-    Returns:
-        Return temperature, C, and cooling load, W, each (B,).
     """
-    return_c = outlet_c + return_approach_k
-    return return_c, air_j_per_m3_k * crac_flow_m3s * (return_c - setpoint_c)
+    return_c = point.outlet_c + point.return_approach_k
+    rise_k = return_c - point.setpoint_c
+    return return_c, point.air_j_per_m3_k * point.crac_flow_m3s * rise_k
 
 
 COOLING_LOADS: dict[str, LoadModel] = {
-    "heat_balance": heat_balance_load,
-    "released": released_load,
-    "paper": paper_load,
+    "heat_balance": LoadModel(heat_balance_load, stores_unmet_heat=True),
+    "released": LoadModel(released_load),
+    "paper": LoadModel(paper_load),
 }
 """Cooling load models by the names that ``hvac.cooling_load_model`` takes."""
-
-
-STORES_UNMET_HEAT = frozenset({"heat_balance"})
-"""Load models whose heat is conserved; the others remove whatever load they compute."""
 
 
 ROUND_OFF_SHARE = 1e-12

@@ -1,21 +1,6 @@
-"""Cooling towers: fan power and water temperature for the heat to reject.
+"""Cooling towers: fan power and water temperature for the heat to reject, models in ``TOWERS``.
 
-Every model has the same signature, so a caller can look it up in `TOWERS` and pass all of:
-
-    heat_w               heat to reject, W (`rejected_w` of the chiller, plus what an economiser
-                         takes past it)
-    wet_bulb_c           outdoor wet bulb, C
-    outdoor_c            outdoor dry bulb, C
-    condenser_setpoint_c water temperature the tower is controlled to, C
-    supply_setpoint_c    CRAC supply setpoint, C (air-side models of the paper and its code)
-    water_kg_s           condenser water flow, kg/s
-    reference_water_kg_s water flow at which the water flow ratio of YorkCalc is 1, kg/s
-    reference_air_m3s    airflow at full fan speed, m3/s (air-side models)
-    design_fan_w         fan power at full speed, W
-    air_j_per_m3_k       heat capacity of air per volume, J/(m3 K) (air-side models)
-
-Arguments are float64 arrays of shape (B,), or anything that broadcasts to it. A model reads only
-what its equations need; pass 0 for the rest.
+Arguments are float64 arrays of shape (B,), or anything that broadcasts to it.
 
 YorkCalc gives the approach (leaving water minus wet bulb) as a polynomial with 27 coefficients in
 wet bulb, range (entering minus leaving water) and the ratio of liquid to gas flow. Sources:
@@ -28,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,8 +22,6 @@ from sdc_taichi.types import F64, Values, as_array
 
 WATER_J_PER_KG_K = 4184.0
 """Heat capacity of water, in J/(kg K)."""
-AIR_J_PER_M3_K = 1.225 * 1006.0
-"""Heat capacity of air per volume, in J/(m3 K)."""
 
 YORKCALC = np.array(
     [
@@ -82,6 +66,61 @@ FAN_W_PER_KG_S = 275.0 / 0.15
 the Modelica model."""
 
 
+class TowerPoint(NamedTuple):
+    """Weather, setpoints and sizes with which towers work."""
+
+    wet_bulb_c: Values
+    """Outdoor wet bulb, in C, (B,)."""
+    outdoor_c: Values
+    """Outdoor dry bulb, in C, (B,)."""
+    condenser_setpoint_c: Values
+    """Setpoint of the water that leaves the tower, in C, (B,)."""
+    supply_setpoint_c: Values
+    """CRAC supply setpoint, in C, (B,)."""
+    water_kg_s: Values
+    """Condenser water flow, in kg/s, (B,); above 0 wherever there is heat."""
+    reference_water_kg_s: Values
+    """Water flow at which the water flow ratio is 1, in kg/s, above 0, (B,)."""
+    reference_air_m3s: Values
+    """Airflow at full fan speed, in m3/s, above 0, (B,)."""
+    design_fan_w: Values
+    """Fan power at full speed, in W, (B,)."""
+    air_j_per_m3_k: Values
+    """Heat capacity of air per volume, in J/(m3 K), (B,)."""
+
+
+class TowerDesignPoint(NamedTuple):
+    """Design point and configuration from which towers are sized."""
+
+    cooling_w: F64
+    """Cooling capacity of the plant, in W, (B,)."""
+    rejected_w: F64
+    """Heat to reject, in W, (B,)."""
+    water_kg_s: F64
+    """Condenser water flow, in kg/s, (B,)."""
+    outdoor_c: F64
+    """Design dry bulb, in C, (B,)."""
+    wet_bulb_c: F64
+    """Design wet bulb, in C, (B,)."""
+    lowest_setpoint_c: F64
+    """Lowest CRAC supply setpoint, in C, (B,)."""
+    air_j_per_m3_k: F64
+    """Heat capacity of air per volume, in J/(m3 K), (B,)."""
+    value: Callable[[str], F64]
+    """A field of section ``hvac.tower`` by its name, (B,)."""
+
+
+class TowerSize(NamedTuple):
+    """Sized towers of B data centers."""
+
+    reference_water_kg_s: F64
+    """Water flow at which the water flow ratio is 1, in kg/s, (B,)."""
+    air_m3s: F64
+    """Airflow at full fan speed, in m3/s, (B,)."""
+    fan_w: F64
+    """Fan power at full speed, in W, (B,)."""
+
+
 @dataclass(frozen=True, slots=True)
 class TowerResult:
     """One step of the cooling towers of B data centers."""
@@ -97,6 +136,17 @@ class TowerResult:
     """Range: entering minus leaving water temperature, in K, (B,)."""
     approach_k: F64
     """Approach: leaving water temperature minus wet bulb, in K, (B,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class TowerModel:
+    """A tower model."""
+
+    step: Callable[[Values, TowerPoint], TowerResult]
+    """One step, from the heat to reject in W, (B,): that of the chiller's condenser and what an
+    economiser takes past the chiller."""
+    size: Callable[[TowerDesignPoint], TowerSize]
+    """The rule by which towers are sized."""
 
 
 def yorkcalc_approach_k(wet_bulb_c: Values, range_k: Values, liquid_gas_ratio: Values) -> F64:
@@ -210,19 +260,7 @@ def fan_power_w(air_ratio: Values, *, design_fan_w: Values) -> Values:
     return design_fan_w * air_ratio**3
 
 
-def yorkcalc(
-    heat_w: Values,
-    *,
-    wet_bulb_c: Values,
-    outdoor_c: Values,
-    condenser_setpoint_c: Values,
-    supply_setpoint_c: Values,
-    water_kg_s: Values,
-    reference_water_kg_s: Values,
-    reference_air_m3s: Values,
-    design_fan_w: Values,
-    air_j_per_m3_k: Values = AIR_J_PER_M3_K,
-) -> TowerResult:
+def yorkcalc(heat_w: Values, point: TowerPoint) -> TowerResult:
     """York tower with a variable-speed fan that holds the condenser water at its setpoint.
 
     All heat is rejected: the range is r = heat_w/(c*m). At full speed the leaving water may rise
@@ -231,29 +269,14 @@ def yorkcalc(
     its full-speed cooling (EnergyPlus: T_out = T_in - f*(T_in - T_out_full)): a tower that rejects
     r with the fan off has r/f at full speed, and its approach is A_full(r/f) + r*(1 - f)/f. A
     bypass keeps the water from falling below the setpoint.
-
-    Args:
-        heat_w: Heat to reject, W.
-        wet_bulb_c: Outdoor wet bulb, C.
-        outdoor_c: Not used.
-        condenser_setpoint_c: Setpoint of the leaving water, C.
-        supply_setpoint_c: Not used.
-        water_kg_s: Condenser water flow, kg/s; above 0 wherever there is heat.
-        reference_water_kg_s: Water flow at which the flow ratio is 1, kg/s, above 0.
-        reference_air_m3s: Not used.
-        design_fan_w: Fan power at full speed, W.
-        air_j_per_m3_k: Not used.
-
-    Returns:
-        The tower's step; leaving_c is never below the setpoint.
     """
-    range_k = _range_k(heat_w, water_kg_s)
-    water_ratio = water_kg_s / reference_water_kg_s
-    wanted_k = condenser_setpoint_c - wet_bulb_c
-    parabola = _approach_parabola(wet_bulb_c, range_k)
+    range_k = _range_k(heat_w, point.water_kg_s)
+    water_ratio = point.water_kg_s / point.reference_water_kg_s
+    wanted_k = point.condenser_setpoint_c - point.wet_bulb_c
+    parabola = _approach_parabola(point.wet_bulb_c, range_k)
     full_speed_k = _approach_at(water_ratio, *parabola)
     low_speed_k = np.maximum(_approach_at(water_ratio / MIN_AIR_RATIO, *parabola), full_speed_k)
-    fan_off_k = _fan_off_approach_k(wet_bulb_c, range_k, water_ratio)
+    fan_off_k = _fan_off_approach_k(point.wet_bulb_c, range_k, water_ratio)
 
     # The ratio of the wanted approach is below that of full speed where full speed is not enough.
     loaded = range_k > 0.0
@@ -264,109 +287,91 @@ def yorkcalc(
     on_share = np.where(loaded, np.clip(on_share, 0.0, 1.0), 0.0)
     air_ratio = on_share * speed + (1.0 - on_share) * FREE_CONVECTION_SHARE
     return _tower(
-        on_share * fan_power_w(speed, design_fan_w=design_fan_w),
+        on_share * fan_power_w(speed, design_fan_w=point.design_fan_w),
         np.where(loaded, air_ratio, 0.0),
-        leaving_c=wet_bulb_c + np.where(loaded, np.maximum(wanted_k, full_speed_k), wanted_k),
+        leaving_c=point.wet_bulb_c + np.where(loaded, np.maximum(wanted_k, full_speed_k), wanted_k),
         range_k=range_k,
-        wet_bulb_c=wet_bulb_c,
+        wet_bulb_c=point.wet_bulb_c,
     )
 
 
-def released(
-    heat_w: Values,
-    *,
-    wet_bulb_c: Values,
-    outdoor_c: Values,
-    condenser_setpoint_c: Values,
-    supply_setpoint_c: Values,
-    water_kg_s: Values,
-    reference_water_kg_s: Values,
-    reference_air_m3s: Values,
-    design_fan_w: Values,
-    air_j_per_m3_k: Values = AIR_J_PER_M3_K,
-) -> TowerResult:
+def released(heat_w: Values, point: TowerPoint) -> TowerResult:
     """The tower of the released SustainDC code: a cubic fan on the airflow that carries the heat.
 
     V = Q/(cp*rho*max(50 - (T_amb - T_set), 1)), P = P_ref*min(V/V_ref, 1)^3, and no power at all
     below 5 C outdoors. There is no water loop: the condenser setpoint counts as met.
-
-    Args:
-        heat_w: Heat to reject, W (the released code hands over the CRAC cooling load).
-        wet_bulb_c: Outdoor wet bulb, C, for `approach_k` alone.
-        outdoor_c: Outdoor dry bulb, C.
-        condenser_setpoint_c: Reported as leaving water, C.
-        supply_setpoint_c: CRAC supply setpoint, C.
-        water_kg_s: Condenser water flow, kg/s, for `range_k` alone.
-        reference_water_kg_s: Not used.
-        reference_air_m3s: Airflow at full speed, m3/s, above 0.
-        design_fan_w: Fan power at full speed, W.
-        air_j_per_m3_k: Heat capacity of air per volume, J/(m3 K).
-
-    Returns:
-        The tower's step.
     """
-    air_m3s = _air_m3s(heat_w, outdoor_c, supply_setpoint_c, air_j_per_m3_k)
-    running = np.greater_equal(outdoor_c, 5.0)
-    air_ratio = np.where(running, np.minimum(air_m3s / reference_air_m3s, 1.0), 0.0)
+    air_m3s = _air_m3s(heat_w, point)
+    running = np.greater_equal(point.outdoor_c, 5.0)
+    air_ratio = np.where(running, np.minimum(air_m3s / point.reference_air_m3s, 1.0), 0.0)
     return _tower(
-        fan_power_w(air_ratio, design_fan_w=design_fan_w),
+        fan_power_w(air_ratio, design_fan_w=point.design_fan_w),
         air_ratio,
-        leaving_c=condenser_setpoint_c,
-        range_k=_range_k(heat_w, water_kg_s),
-        wet_bulb_c=wet_bulb_c,
+        leaving_c=point.condenser_setpoint_c,
+        range_k=_range_k(heat_w, point.water_kg_s),
+        wet_bulb_c=point.wet_bulb_c,
     )
 
 
-def paper(
-    heat_w: Values,
-    *,
-    wet_bulb_c: Values,
-    outdoor_c: Values,
-    condenser_setpoint_c: Values,
-    supply_setpoint_c: Values,
-    water_kg_s: Values,
-    reference_water_kg_s: Values,
-    reference_air_m3s: Values,
-    design_fan_w: Values,
-    air_j_per_m3_k: Values = AIR_J_PER_M3_K,
-) -> TowerResult:
+def paper(heat_w: Values, point: TowerPoint) -> TowerResult:
     """Appendix A.2.2 as printed: P_CT = P_ref*(V/V_ref)^-3, so less airflow costs more power.
 
     The paper leaves f_ct_delta to Breen et al. 2010; the temperature difference is that of the
     released code, max(50 - (T_amb - T_set), 1). Without airflow the fan is off: the printed
     power is infinite there. No step at 5 C and no limit at V_ref are printed.
-
-    Args:
-        heat_w: Heat to reject, W (the paper hands over P_chiller = P_cool*(1 + 1/COP)).
-        wet_bulb_c: Outdoor wet bulb, C, for `approach_k` alone.
-        outdoor_c: Outdoor dry bulb, C.
-        condenser_setpoint_c: Reported as leaving water, C.
-        supply_setpoint_c: CRAC supply setpoint, C.
-        water_kg_s: Condenser water flow, kg/s, for `range_k` alone.
-        reference_water_kg_s: Not used.
-        reference_air_m3s: V_ref, m3/s, above 0.
-        design_fan_w: P_ref, W.
-        air_j_per_m3_k: Heat capacity of air per volume, J/(m3 K).
-
-    Returns:
-        The tower's step.
     """
-    air_m3s = _air_m3s(heat_w, outdoor_c, supply_setpoint_c, air_j_per_m3_k)
-    air_ratio = air_m3s / reference_air_m3s
+    air_m3s = _air_m3s(heat_w, point)
+    air_ratio = air_m3s / point.reference_air_m3s
     moving = air_ratio > 0.0
     return _tower(
-        np.where(moving, design_fan_w * np.where(moving, air_ratio, 1.0) ** -3.0, 0.0),
+        np.where(moving, point.design_fan_w * np.where(moving, air_ratio, 1.0) ** -3.0, 0.0),
         air_ratio,
-        leaving_c=condenser_setpoint_c,
-        range_k=_range_k(heat_w, water_kg_s),
-        wet_bulb_c=wet_bulb_c,
+        leaving_c=point.condenser_setpoint_c,
+        range_k=_range_k(heat_w, point.water_kg_s),
+        wet_bulb_c=point.wet_bulb_c,
     )
 
 
-TOWERS: dict[str, Callable[..., TowerResult]] = {
-    "yorkcalc": yorkcalc,
-    "released": released,
-    "paper": paper,
+def yorkcalc_size(design: TowerDesignPoint) -> TowerSize:
+    """Size of a tower that meets its design approach with full air.
+
+    Raises:
+        SdcError: The design approach lies below what any airflow reaches.
+    """
+    return TowerSize(
+        reference_water_kg_s=yorkcalc_reference_water_kg_s(
+            design.water_kg_s,
+            wet_bulb_c=design.wet_bulb_c,
+            range_k=design.value("water_range_k"),
+            approach_k=design.value("approach_min_k"),
+        ),
+        air_m3s=design.value("airflow_m3s_per_w_rejected") * design.rejected_w,
+        fan_w=design.value("fan_w_per_w_rejected") * design.rejected_w,
+    )
+
+
+def released_size(design: TowerDesignPoint) -> TowerSize:
+    """Size of the tower of the released SustainDC code.
+
+    It carries the cooling load with 50 - (design outdoor - lowest setpoint) K of air, and its fan
+    draws as much power as that load at full speed.
+    """
+    rise_k = np.maximum(50.0 - (design.outdoor_c - design.lowest_setpoint_c), 1.0)
+    air_m3s = design.cooling_w / (design.air_j_per_m3_k * rise_k)
+    return TowerSize(design.water_kg_s, air_m3s, design.cooling_w)
+
+
+def paper_size(design: TowerDesignPoint) -> TowerSize:
+    """Size of the paper's tower: the printed figures for any load."""
+    return TowerSize(
+        design.water_kg_s, design.value("paper_airflow_m3s"), design.value("paper_fan_w")
+    )
+
+
+TOWERS: dict[str, TowerModel] = {
+    "yorkcalc": TowerModel(yorkcalc, yorkcalc_size),
+    "released": TowerModel(released, released_size),
+    "paper": TowerModel(paper, paper_size),
 }
 """Tower models by the names that ``hvac.tower.model`` takes."""
 
@@ -394,15 +399,10 @@ def _range_k(heat_w: Values, water_kg_s: Values) -> F64:
     return as_array(np.where(flowing, carried, 0.0))
 
 
-def _air_m3s(
-    heat_w: Values,
-    outdoor_c: Values,
-    supply_setpoint_c: Values,
-    air_j_per_m3_k: Values,
-) -> F64:
+def _air_m3s(heat_w: Values, point: TowerPoint) -> F64:
     """Airflow that carries the heat, in m3/s, at max(50 - (T_amb - T_set), 1) K."""
-    delta_k = np.maximum(50.0 - (outdoor_c - supply_setpoint_c), 1.0)
-    return as_array(np.maximum(heat_w, 0.0) / (air_j_per_m3_k * delta_k))
+    delta_k = np.maximum(50.0 - (point.outdoor_c - point.supply_setpoint_c), 1.0)
+    return as_array(np.maximum(heat_w, 0.0) / (point.air_j_per_m3_k * delta_k))
 
 
 def _tower(

@@ -1,28 +1,14 @@
-"""Make-up water of the cooling tower over one step, each model a pure function chosen by name.
+"""Make-up water of the cooling tower in one step, models in ``WATER``.
 
-Every model has the same signature, so a caller can look it up in `WATER` and pass all of:
-
-    rejected_w              heat rejected by the tower, W
-    range_k                 entering minus leaving tower water, K
-    water_kg_s              tower water flow, kg/s
-    tower_airflow_m3s       airflow into the tower, m3/s
-    outdoor_c               outdoor dry bulb, C
-    wet_bulb_c              outdoor wet bulb, C
-    pressure_pa             air pressure of the site, Pa
-    return_c                CRAC return air, C
-    supply_setpoint_c       CRAC supply setpoint, C
-    cycles_of_concentration of the tower water, above 1
-    drift_share             drift as a share of the tower water flow
-    dt_s                    length of the step, s
-
-Arguments are float64 arrays of shape (B,), or anything that broadcasts to it. A model reads only
-what its equations need. One kilogram of water counts as one litre.
+Arguments are float64 arrays of shape (B,), or anything that broadcasts to it. One kilogram of water
+counts as one litre.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,64 +38,55 @@ class WaterUse:
     """Make-up water, evaporation plus drift plus blowdown, in litres, (B,)."""
 
 
-def mass_balance(
-    *,
-    rejected_w: Values,
-    range_k: Values,
-    water_kg_s: Values,
-    tower_airflow_m3s: Values,
-    outdoor_c: Values,
-    wet_bulb_c: Values,
-    pressure_pa: Values,
-    return_c: Values,
-    supply_setpoint_c: Values,
-    cycles_of_concentration: Values,
-    drift_share: Values,
-    dt_s: Values,
-) -> WaterUse:
+class WaterPoint(NamedTuple):
+    """How towers work in one step."""
+
+    rejected_w: Values
+    """Heat that the tower rejects, in W, (B,)."""
+    range_k: Values
+    """Entering less leaving tower water, in K, (B,)."""
+    water_kg_s: Values
+    """Tower water flow, in kg/s, (B,)."""
+    tower_airflow_m3s: Values
+    """Airflow into the tower, in m3/s, above 0 wherever there is heat, (B,)."""
+    outdoor_c: Values
+    """Outdoor dry bulb, in C, (B,)."""
+    wet_bulb_c: Values
+    """Outdoor wet bulb, in C, (B,)."""
+    pressure_pa: Values
+    """Air pressure of the site, in Pa, (B,)."""
+    return_c: Values
+    """CRAC return air, in C, (B,)."""
+    supply_setpoint_c: Values
+    """CRAC supply setpoint, in C, (B,)."""
+    cycles_of_concentration: Values
+    """Concentration of solids in the tower water over that in the make-up, above 1, (B,)."""
+    drift_share: Values
+    """Drift as a share of the tower water flow, (B,)."""
+    dt_s: Values
+    """Length of the step, in s."""
+
+
+def mass_balance(point: WaterPoint) -> WaterUse:
     """Evaporation, drift and blowdown (EnergyPlus Engineering Reference, tower make-up water).
 
     All heat is taken to leave as vapour, an upper bound (in frost a part leaves as warm air), and
     no more than 0.2 % of the flow per kelvin of range. Blowdown = evaporation/(COC - 1) - drift,
     at least 0.
-
-    Args:
-        rejected_w: Heat rejected, W.
-        range_k: Tower range, K.
-        water_kg_s: Tower water flow, kg/s.
-        tower_airflow_m3s: Not used.
-        outdoor_c: Not used.
-        wet_bulb_c: Not used.
-        pressure_pa: Not used.
-        return_c: Not used.
-        supply_setpoint_c: Not used.
-        cycles_of_concentration: Concentration of solids in the tower over that in the make-up.
-        drift_share: Drift over water flow.
-        dt_s: Length of the step, s.
-
-    Returns:
-        The water used in the step.
     """
-    latent_kg_s = np.maximum(rejected_w, 0.0) / EVAPORATION_HEAT_J_PER_KG
-    evaporation_l = np.minimum(latent_kg_s, MAX_EVAPORATION_PER_K * range_k * water_kg_s) * dt_s
-    return _with_blowdown(evaporation_l, drift_share * water_kg_s * dt_s, cycles_of_concentration)
+    latent_kg_s = np.maximum(point.rejected_w, 0.0) / EVAPORATION_HEAT_J_PER_KG
+    evaporation_l = (
+        np.minimum(latent_kg_s, MAX_EVAPORATION_PER_K * point.range_k * point.water_kg_s)
+        * point.dt_s
+    )
+    return _with_blowdown(
+        evaporation_l,
+        point.drift_share * point.water_kg_s * point.dt_s,
+        point.cycles_of_concentration,
+    )
 
 
-def saturated_exit(
-    *,
-    rejected_w: Values,
-    range_k: Values,
-    water_kg_s: Values,
-    tower_airflow_m3s: Values,
-    outdoor_c: Values,
-    wet_bulb_c: Values,
-    pressure_pa: Values,
-    return_c: Values,
-    supply_setpoint_c: Values,
-    cycles_of_concentration: Values,
-    drift_share: Values,
-    dt_s: Values,
-) -> WaterUse:
+def saturated_exit(point: WaterPoint) -> WaterUse:
     """Evaporation into air that leaves the tower saturated, drift and blowdown.
 
     The heat raises the enthalpy of the tower's air from that of saturated air at the wet bulb, and
@@ -117,127 +94,51 @@ def saturated_exit(
     Engineering Reference, cooling tower make-up water, "saturated exit"). So little water
     evaporates in frost, when the air carries heat as warmth, and much in dry heat. Drift and
     blowdown as in ``mass_balance``.
-
-    Args:
-        rejected_w: Heat rejected, W.
-        range_k: Not used.
-        water_kg_s: Tower water flow, kg/s.
-        tower_airflow_m3s: Airflow into the tower, m3/s, above 0 wherever there is heat.
-        outdoor_c: Outdoor dry bulb, C.
-        wet_bulb_c: Outdoor wet bulb, C.
-        pressure_pa: Air pressure, Pa.
-        return_c: Not used.
-        supply_setpoint_c: Not used.
-        cycles_of_concentration: Concentration of solids in the tower over that in the make-up.
-        drift_share: Drift over water flow.
-        dt_s: Length of the step, s.
-
-    Returns:
-        The water used in the step.
     """
-    at_wet_bulb = moist_air.saturated_ratio(wet_bulb_c, pressure_pa)
-    entering = moist_air.humidity_ratio(outdoor_c, wet_bulb_c, at_wet_bulb)
-    dry_air_kg_s = tower_airflow_m3s * moist_air.dry_air_kg_m3(outdoor_c, entering, pressure_pa)
-    working = np.greater(rejected_w, 0.0) & (dry_air_kg_s > 0.0)
-    gain_j_per_kg = rejected_w / np.where(working, dry_air_kg_s, 1.0)
+    at_wet_bulb = moist_air.saturated_ratio(point.wet_bulb_c, point.pressure_pa)
+    entering = moist_air.humidity_ratio(point.outdoor_c, point.wet_bulb_c, at_wet_bulb)
+    dry_air_kg_s = point.tower_airflow_m3s * moist_air.dry_air_kg_m3(
+        point.outdoor_c, entering, point.pressure_pa
+    )
+    working = np.greater(point.rejected_w, 0.0) & (dry_air_kg_s > 0.0)
+    gain_j_per_kg = point.rejected_w / np.where(working, dry_air_kg_s, 1.0)
     leaving = moist_air.saturated_ratio_by_enthalpy(
-        moist_air.enthalpy_j_per_kg(wet_bulb_c, at_wet_bulb) + gain_j_per_kg, pressure_pa
+        moist_air.enthalpy_j_per_kg(point.wet_bulb_c, at_wet_bulb) + gain_j_per_kg,
+        point.pressure_pa,
     )
     taken_up_kg_s = np.where(working, dry_air_kg_s * np.maximum(leaving - entering, 0.0), 0.0)
-    drift_l = drift_share * water_kg_s * dt_s
-    return _with_blowdown(taken_up_kg_s * dt_s, drift_l, cycles_of_concentration)
+    drift_l = point.drift_share * point.water_kg_s * point.dt_s
+    return _with_blowdown(taken_up_kg_s * point.dt_s, drift_l, point.cycles_of_concentration)
 
 
-def released(
-    *,
-    rejected_w: Values,
-    range_k: Values,
-    water_kg_s: Values,
-    tower_airflow_m3s: Values,
-    outdoor_c: Values,
-    wet_bulb_c: Values,
-    pressure_pa: Values,
-    return_c: Values,
-    supply_setpoint_c: Values,
-    cycles_of_concentration: Values,
-    drift_share: Values,
-    dt_s: Values,
-) -> WaterUse:
+def released(point: WaterPoint) -> WaterUse:
     """The fit of the released SustainDC code, from the air temperatures of the room.
 
     max(0, 0.044*T_wb + 0.3528*(T_ret - T_set) + 0.101) m3/h, 1 % drift on top, litres rounded to
     4 decimals. The fit does not scale with the heat rejected, so neither with the size of the
     data center; evaporation and blowdown are one number, reported as evaporation.
-
-    Args:
-        rejected_w: Not used.
-        range_k: Not used.
-        water_kg_s: Not used.
-        tower_airflow_m3s: Not used.
-        outdoor_c: Not used.
-        wet_bulb_c: Outdoor wet bulb, C.
-        pressure_pa: Not used.
-        return_c: CRAC return air, C.
-        supply_setpoint_c: CRAC supply setpoint, C.
-        cycles_of_concentration: Not used.
-        drift_share: Not used; the drift rate is 1 % of the use.
-        dt_s: Length of the step, s.
-
-    Returns:
-        The water used in the step.
     """
-    use_m3h = 0.044 * wet_bulb_c + 0.3528 * (return_c - supply_setpoint_c) + 0.101
-    use_l = np.maximum(use_m3h, 0.0) * _litres_per_m3h(dt_s)
+    use_m3h = 0.044 * point.wet_bulb_c + 0.3528 * (point.return_c - point.supply_setpoint_c) + 0.101
+    use_l = np.maximum(use_m3h, 0.0) * _litres_per_m3h(point.dt_s)
     water_l = np.round(use_l * (1.0 + PAPER_DRIFT_RATE), 4)
     drift_l = use_l * PAPER_DRIFT_RATE
     return _water(water_l - drift_l, drift_l, 0.0, water_l)
 
 
-def paper(
-    *,
-    rejected_w: Values,
-    range_k: Values,
-    water_kg_s: Values,
-    tower_airflow_m3s: Values,
-    outdoor_c: Values,
-    wet_bulb_c: Values,
-    pressure_pa: Values,
-    return_c: Values,
-    supply_setpoint_c: Values,
-    cycles_of_concentration: Values,
-    drift_share: Values,
-    dt_s: Values,
-) -> WaterUse:
+def paper(point: WaterPoint) -> WaterUse:
     """Appendix A.2.6 as printed: w = 0.044*T_wb + 0.35*range + 0.1 m3/h, max(0, w) + 0.01*w.
 
     The drift term is printed on the unclipped w, so the use is slightly negative where w is.
-
-    Args:
-        rejected_w: Not used.
-        range_k: Not used.
-        water_kg_s: Not used.
-        tower_airflow_m3s: Not used.
-        outdoor_c: Not used.
-        wet_bulb_c: Outdoor wet bulb, C.
-        pressure_pa: Not used.
-        return_c: CRAC return air, C; the paper's hot_water_temp.
-        supply_setpoint_c: CRAC supply setpoint, C; the paper's cold_water_temp.
-        cycles_of_concentration: Not used.
-        drift_share: Not used; the paper prints no value of its drift_rate, the code has 1 %.
-        dt_s: Length of the step, s.
-
-    Returns:
-        The water used in the step.
     """
-    use_m3h = 0.044 * wet_bulb_c + (0.35 * (return_c - supply_setpoint_c) + 0.1)
-    evaporation_l = np.maximum(use_m3h, 0.0) * _litres_per_m3h(dt_s)
-    drift_l = use_m3h * PAPER_DRIFT_RATE * _litres_per_m3h(dt_s)
+    use_m3h = 0.044 * point.wet_bulb_c + (0.35 * (point.return_c - point.supply_setpoint_c) + 0.1)
+    evaporation_l = np.maximum(use_m3h, 0.0) * _litres_per_m3h(point.dt_s)
+    drift_l = use_m3h * PAPER_DRIFT_RATE * _litres_per_m3h(point.dt_s)
     return _water(evaporation_l, drift_l, 0.0, evaporation_l + drift_l)
 
 
-WATER: dict[str, Callable[..., WaterUse]] = {
-    "mass_balance": mass_balance,
+WATER: dict[str, Callable[[WaterPoint], WaterUse]] = {
     "saturated_exit": saturated_exit,
+    "mass_balance": mass_balance,
     "released": released,
     "paper": paper,
 }

@@ -1,15 +1,13 @@
-"""Water-cooled plant: chilled water, economiser, chiller, tower and pumps together."""
+"""What all plants share: their sized devices, the result of a step, and the chilled-water loop."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from sdc_taichi.plant.chiller import ChillerResult
+from sdc_taichi.plant.chiller import ChillerParameters
 from sdc_taichi.plant.fans_pumps import pump_w
-from sdc_taichi.plant.tower import TowerResult
 from sdc_taichi.types import F64, Values, as_array
 
 LEAST_COIL_LOAD = 0.1
@@ -26,8 +24,8 @@ class WaterSideDesign:
     """Cooling capacity of coils, heat exchanger and chilled-water pumps, in W, (B,)."""
     chiller_w: F64
     """Cooling capacity of the chiller at its reference point, in W, (B,)."""
-    reference_cop: F64
-    """Coefficient of performance of the chiller at its reference point, in W/W, (B,)."""
+    machine: ChillerParameters
+    """Parameters of the chiller that the configuration gives."""
     rejected_w: F64
     """Heat that the plant rejects at design, in W, (B,)."""
     tower_water_kg_s: F64
@@ -63,8 +61,6 @@ class WaterSideDesign:
     """Coldest condenser water that the chiller takes, in C, (B,)."""
     fullest_condenser_c: F64
     """Condenser water at which the chiller has most capacity, in C, (B,)."""
-    min_lift_k: F64
-    """Smallest lift of the chiller, condenser water over chilled water, in K, (B,)."""
     warmest_chilled_c: F64
     """Warmest chilled water that the chiller makes, in C, (B,)."""
     economiser: F64
@@ -182,129 +178,6 @@ def economiser_share(
     return as_array(
         np.where(loaded, np.clip(precooled_k / np.where(loaded, span_k, 1.0), 0.0, 1.0), 0.0)
     )
-
-
-def water_cooled(
-    requested_w: F64,
-    *,
-    setpoint_c: F64,
-    return_c: F64,
-    airflow_m3s: F64,
-    outdoor_c: F64,
-    wet_bulb_c: F64,
-    design: WaterSideDesign,
-    chiller: Callable[..., ChillerResult],
-    tower: Callable[..., TowerResult],
-    limited: bool,
-) -> WaterSideResult:
-    """Remove up to ``requested_w`` from the chilled water and reject it by a cooling tower.
-
-    Chilled water follows the air, T_chw = setpoint - coil approach, up to the warmest that the
-    chiller makes, and returns as warm as the coils let it. The integrated economiser precools the
-    return water with tower water as cold as the weather allows; the chiller does the rest. Both
-    take the heat of the chilled-water pumps as well, so the hall gets the capacity less that heat.
-    Tower and chiller depend on each other: the tower is solved for the chiller's power at the tower
-    setpoint, then chiller and economiser at the water that the tower gives.
-
-    Args:
-        requested_w: Heat to remove, W, (B,).
-        setpoint_c: CRAC supply setpoint, C, (B,).
-        return_c: Not used.
-        airflow_m3s: Not used.
-        outdoor_c: Outdoor dry bulb, C, (B,).
-        wet_bulb_c: Outdoor wet bulb, C, (B,).
-        design: Sized devices.
-        chiller: Model of ``plant.chiller``.
-        tower: Model of ``plant.tower``.
-        limited: Whether the plant's capacity limits the heat removed.
-
-    Returns:
-        The plant's step.
-    """
-    # The cells that run take the water of those that are down, but no more than at design.
-    most_w = np.minimum(design.pumped_w, design.cooling_w * design.outdoor_units)
-    load_w = np.minimum(requested_w, most_w) if limited else requested_w
-    chilled_c = chilled_water_c(setpoint_c, design)
-
-    def run_chiller(economiser: F64, condenser_c: F64) -> ChillerResult:
-        return chiller(
-            taken_w * (1.0 - economiser),
-            reference_w=design.chiller_w,
-            chilled_water_c=chilled_c,
-            condenser_c=condenser_c,
-            outdoor_c=outdoor_c,
-            reference_cop=design.reference_cop,
-            min_lift_k=design.min_lift_k,
-        )
-
-    # The exchanger stands in the return of the coils, ahead of the bypass of pumps and chiller.
-    taken_w, chilled_pump_w, range_ratio = chilled_water_load_w(load_w, design)
-    return_water_c = chilled_c + design.chilled_water_range_k * range_ratio
-    coldest_c = wet_bulb_c + design.approach_min_k
-    share = _economiser_share_at(coldest_c, chilled_c, return_water_c, design)
-    tower_setpoint_c = _tower_setpoint_c(coldest_c, share, chilled_c, design)
-    foreseen = run_chiller(share, np.maximum(tower_setpoint_c, design.min_condenser_c))
-    heat_w = taken_w * share + foreseen.rejected_w
-    flow_ratio = np.maximum(heat_w / design.rejected_w, design.pump_min_ratio)
-    tower_water_kg_s = design.tower_water_kg_s * flow_ratio
-    units = np.maximum(design.outdoor_units, LEAST_OUTDOOR_UNITS)
-    cooled = tower(
-        heat_w,
-        wet_bulb_c=wet_bulb_c,
-        outdoor_c=outdoor_c,
-        condenser_setpoint_c=tower_setpoint_c,
-        supply_setpoint_c=setpoint_c,
-        water_kg_s=tower_water_kg_s,
-        reference_water_kg_s=design.tower_reference_kg_s * units,
-        reference_air_m3s=design.tower_air_m3s * units,
-        design_fan_w=design.tower_fan_w * units,
-        air_j_per_m3_k=design.air_j_per_m3_k,
-    )
-    share = _economiser_share_at(cooled.leaving_c, chilled_c, return_water_c, design)
-    # Head pressure control: a bypass keeps the chiller's water as warm as its capacity needs.
-    short = foreseen.unmet_w > 0.0
-    warm_c = np.where(short, design.fullest_condenser_c, design.min_condenser_c)
-    machine = run_chiller(share, np.maximum(cooled.leaving_c, warm_c))
-    economiser_w = taken_w * share
-    return WaterSideResult(
-        heat_removed_w=np.maximum(load_w - machine.unmet_w, 0.0) if limited else load_w,
-        economiser_w=economiser_w,
-        chiller_load_w=machine.evaporator_w if limited else taken_w - economiser_w,
-        chiller_w=machine.power_w,
-        rejected_w=economiser_w + machine.rejected_w,
-        chilled_water_c=chilled_c,
-        condenser_water_c=cooled.leaving_c,
-        tower_range_k=cooled.range_k,
-        tower_water_kg_s=tower_water_kg_s,
-        humidifier_kg_s=0.0 * heat_w,
-        tower_airflow_m3s=cooled.air_ratio * design.tower_air_m3s * units,
-        tower_fan_w=cooled.fan_w,
-        chilled_pump_w=chilled_pump_w,
-        condenser_pump_w=loop_pump_w(heat_w, design.rejected_w, design.condenser_pump_w, design),
-    )
-
-
-def _economiser_share_at(
-    tower_water_c: F64, chilled_water_c: F64, return_water_c: F64, design: WaterSideDesign
-) -> F64:
-    """Share of the cooling load that the economiser takes with tower water, all in C, (B,)."""
-    return design.economiser * economiser_share(
-        return_water_c,
-        chilled_water_c=chilled_water_c,
-        tower_water_c=tower_water_c + design.exchanger_approach_k,
-    )
-
-
-def _tower_setpoint_c(
-    coldest_c: F64, share: F64, chilled_water_c: F64, design: WaterSideDesign
-) -> F64:
-    """Water temperature that the tower is controlled to, in C, (B,).
-
-    As cold as the economiser or else the chiller can use, and not below what the weather gives.
-    """
-    economiser_c = chilled_water_c - design.exchanger_approach_k
-    useful_c = np.where(share > 0, economiser_c, design.min_condenser_c)
-    return np.maximum(coldest_c, useful_c)
 
 
 def loop_pump_w(heat_w: F64, design_heat_w: F64, design_w: F64, design: WaterSideDesign) -> F64:

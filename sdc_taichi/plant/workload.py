@@ -10,56 +10,64 @@ what happens to work from what waits and what is due; ``sim.workload`` keeps the
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from sdc_taichi.types import F64, Work
+from sdc_taichi.types import F64, Values, Work
 
 TASKS_PER_STEP = 100.0
 """Capacity of a data center for one step."""
 
 
-WorkModel = Callable[..., Work]
+class WorkPoint(NamedTuple):
+    """Work, command and limits of one step of B data centers."""
+
+    demand: F64
+    """Arriving work as a share of capacity, 0..1, (B,)."""
+    command: F64
+    """-1 defers all flexible work, 0 neither defers nor drains, 1 drains all that fits, (B,)."""
+    waiting: F64
+    """Work in the queue, in tasks, (B,)."""
+    due: F64
+    """Part of the waiting work whose deadline has come, in tasks, (B,)."""
+    flexible_share: Values
+    """Share of the demand that may wait, 0..1, (B,)."""
+    max_utilisation: Values
+    """Highest utilisation, 0..1, (B,); with ``tasks`` that above which no queued work runs."""
+    queue_limit: Values
+    """Longest queue, in tasks, (B,)."""
 
 
-def fluid(
-    demand: F64,
-    command: F64,
-    waiting: F64,
-    due: F64,
-    *,
-    flexible_share: F64,
-    max_utilisation: F64,
-    queue_limit: F64,
-) -> Work:
+@dataclass(frozen=True, slots=True)
+class WorkModel:
+    """A model of work."""
+
+    step: Callable[[WorkPoint], Work]
+    """What happens to the work of a step."""
+    due_after_steps: float
+    """Steps between the deadline of work and the step in which the model takes it as due."""
+
+
+def fluid(point: WorkPoint) -> Work:
     """Divisible work, conserved exactly: arrived = executed + queued + dropped.
 
     Deferring queues ``-command`` of the flexible share, draining takes ``command`` of what fits
     (paper, A.1.3). Work beyond the capacity of the step queues too. Work whose deadline has come
     runs first, as far as capacity allows; what does not fit into the queue is dropped.
-
-    Args:
-        demand: Arriving work as a share of capacity, 0..1, (B,).
-        command: -1 defers all flexible work, 0 neither defers nor drains, 1 drains all that fits,
-            (B,).
-        waiting: Work in the queue, tasks, (B,).
-        due: Part of the waiting work whose deadline has come, tasks, (B,).
-        flexible_share: Share of the demand that may wait, 0..1, (B,).
-        max_utilisation: Highest utilisation, 0..1, (B,).
-        queue_limit: Longest queue, tasks, (B,).
-
-    Returns:
-        What happens to the work.
     """
-    arrived = demand * TASKS_PER_STEP
-    capacity = max_utilisation * TASKS_PER_STEP
-    flexible = flexible_share * arrived
-    wanted = arrived - np.maximum(-command, 0.0) * flexible
-    forced = np.minimum(due, capacity)
+    arrived = point.demand * TASKS_PER_STEP
+    capacity = point.max_utilisation * TASKS_PER_STEP
+    flexible = point.flexible_share * arrived
+    wanted = arrived - np.maximum(-point.command, 0.0) * flexible
+    forced = np.minimum(point.due, capacity)
     now = np.minimum(wanted, capacity - forced)
     held_back = arrived - now
-    deferred = np.minimum(held_back, _room(queue_limit, waiting - forced))
-    drained = np.minimum(waiting - forced, np.maximum(command, 0.0) * (capacity - now - forced))
+    deferred = np.minimum(held_back, _room(point.queue_limit, point.waiting - forced))
+    drained = np.minimum(
+        point.waiting - forced, np.maximum(point.command, 0.0) * (capacity - now - forced)
+    )
     started = now + forced + drained
     return Work(
         utilisation=started / TASKS_PER_STEP,
@@ -67,23 +75,14 @@ def fluid(
         started_tasks=started,
         deferred_tasks=deferred,
         drained_tasks=drained,
-        due_tasks=due,
-        overdue_tasks=due - forced,
+        due_tasks=point.due,
+        overdue_tasks=point.due - forced,
         dropped_tasks=held_back - deferred,
         dequeued_tasks=forced + drained,
     )
 
 
-def tasks(
-    demand: F64,
-    command: F64,
-    waiting: F64,
-    due: F64,
-    *,
-    flexible_share: F64,
-    max_utilisation: F64,
-    queue_limit: F64,
-) -> Work:
+def tasks(point: WorkPoint) -> Work:
     """Whole tasks as the released SustainDC counts them: arrived = executed + queued.
 
     Fixed work is rounded up and flexible work down, so a step may execute one task more than
@@ -91,29 +90,17 @@ def tasks(
     more than the step's flexible tasks and stops at the cap. Work above the cap that nobody
     deferred still runs, as in the released code, and so do tasks that find the queue full: they
     count as dropped and as started.
-
-    Args:
-        demand: Arriving work as a share of capacity, 0..1, (B,).
-        command: -1 defers all flexible work, 0 neither defers nor drains, 1 drains what fits, (B,).
-        waiting: Work in the queue, tasks, (B,).
-        due: Part of the waiting work whose deadline has come, tasks, (B,).
-        flexible_share: Share of the demand that may wait, 0..1, (B,).
-        max_utilisation: Utilisation above which no queued work runs, 0..1, (B,).
-        queue_limit: Longest queue, tasks, (B,).
-
-    Returns:
-        What happens to the work.
     """
-    fixed = np.ceil(demand * (1.0 - flexible_share) * TASKS_PER_STEP)
-    flexible = np.floor(demand * flexible_share * TASKS_PER_STEP)
-    cap = np.floor(max_utilisation * TASKS_PER_STEP)
+    fixed = np.ceil(point.demand * (1.0 - point.flexible_share) * TASKS_PER_STEP)
+    flexible = np.floor(point.demand * point.flexible_share * TASKS_PER_STEP)
+    cap = np.floor(point.max_utilisation * TASKS_PER_STEP)
     arrived = fixed + flexible
-    forced = np.minimum(due, np.maximum(cap - arrived, 0.0))
-    held_back = np.floor(np.maximum(-command, 0.0) * flexible)
-    deferred = np.minimum(held_back, _room(queue_limit, waiting - forced))
+    forced = np.minimum(point.due, np.maximum(cap - arrived, 0.0))
+    held_back = np.floor(np.maximum(-point.command, 0.0) * flexible)
+    deferred = np.minimum(held_back, _room(point.queue_limit, point.waiting - forced))
     free = np.maximum(cap - arrived - forced, 0.0)
-    drainable = np.minimum(np.minimum(waiting - forced, flexible), free)
-    drained = np.floor(np.maximum(command, 0.0) * drainable)
+    drainable = np.minimum(np.minimum(point.waiting - forced, flexible), free)
+    drained = np.floor(np.maximum(point.command, 0.0) * drainable)
     started = arrived - deferred + forced + drained
     return Work(
         utilisation=started / TASKS_PER_STEP,
@@ -121,23 +108,24 @@ def tasks(
         started_tasks=started,
         deferred_tasks=deferred,
         drained_tasks=drained,
-        due_tasks=due,
-        overdue_tasks=due - forced,
+        due_tasks=point.due,
+        overdue_tasks=point.due - forced,
         dropped_tasks=held_back - deferred,
         dequeued_tasks=forced + drained,
     )
 
 
-def _room(queue_limit: F64, waiting: F64) -> F64:
+def _room(queue_limit: Values, waiting: F64) -> F64:
     """Work that still fits into a queue, in tasks, (B,)."""
     # Rounding may leave more in a full queue than it may hold.
     return np.maximum(queue_limit - waiting, 0.0)
 
 
-MODELS: dict[str, WorkModel] = {"fluid": fluid, "tasks": tasks}
+MODELS: dict[str, WorkModel] = {
+    "fluid": WorkModel(fluid, due_after_steps=0.0),
+    "tasks": WorkModel(tasks, due_after_steps=1.0),
+}
 """Models of work by the names that ``workload.model`` takes."""
-DUE_AFTER_STEPS = {"fluid": 0.0, "tasks": 1.0}
-"""Steps between the deadline and when the models take work as due."""
 NEGLIGIBLE_TASKS = 1e-9
 """Left by rounding where a step's work was taken out in parts; no age is read off it."""
 UNLIMITED_TASKS = 1e30

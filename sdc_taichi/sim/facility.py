@@ -14,14 +14,18 @@ import numpy.typing as npt
 
 from sdc_taichi.hall import air_metrics
 from sdc_taichi.plant import cooling
-from sdc_taichi.plant.battery import BATTERIES, BatteryResult
-from sdc_taichi.plant.carbon import emitted_g
+from sdc_taichi.plant.battery import (
+    BATTERIES,
+    BatteryParameters,
+    BatteryPoint,
+    BatteryResult,
+)
 from sdc_taichi.plant.chiller import CHILLERS
 from sdc_taichi.plant.electrical import NO_LIMIT_KW, overload_kwh, power_path_loss_w
 from sdc_taichi.plant.fans_pumps import crac_fan_w
-from sdc_taichi.plant.plants import DRY_PLANTS, PLANTS
+from sdc_taichi.plant.plants import PLANTS, Devices, PlantPoint
 from sdc_taichi.plant.tower import TOWERS
-from sdc_taichi.plant.water import WATER, WaterUse
+from sdc_taichi.plant.water import WATER, WaterPoint, WaterUse
 from sdc_taichi.plant.water_side import WaterSideResult
 from sdc_taichi.sim.crac_units import Supply
 from sdc_taichi.sim.fleet import NO_LIMIT_W, Fleet
@@ -41,18 +45,6 @@ from sdc_taichi.types import (
     joined,
 )
 
-BATTERY_PARAMETERS = (
-    "charge_efficiency",
-    "discharge_factor",
-    "charge_limit_c_rate",
-    "discharge_limit_c_rate",
-    "upper_u_h",
-    "upper_v",
-    "lower_u_h",
-    "lower_v",
-)
-"""Parameters of the battery models, by their names as arguments and in section ``battery``."""
-
 
 @dataclass(frozen=True, slots=True)
 class StepInputs:
@@ -68,6 +60,11 @@ class StepInputs:
     """How the CRAC units run."""
     air: HallSums
     """Air, temperatures and power of the halls."""
+
+
+def battery_parameters(fleet: Fleet) -> BatteryParameters:
+    """Parameters of the batteries of a fleet, (B,) each."""
+    return BatteryParameters(*(fleet.values(f"battery.{n}") for n in BatteryParameters._fields))
 
 
 class Facility:
@@ -90,26 +87,24 @@ class Facility:
         self._counts_losses = fleet.configs[0].electrical.losses == "counted"
         self._recirculates = models["inlet"] == "recirculation"
         self._transient = models["thermal"] == "transient"
-        self._stores_heat = models["cooling_load"] in cooling.STORES_UNMET_HEAT
         self._flow = cooling.CRAC_FLOWS[models["crac_flow"]]
         self._load = cooling.COOLING_LOADS[models["cooling_load"]]
+        self._stores_heat = self._load.stores_unmet_heat
         self._plant = PLANTS[models["plant"]]
-        self._dry = models["plant"] in DRY_PLANTS
-        self._chiller = CHILLERS[models["chiller"]]
-        self._tower = TOWERS[models["tower"]]
+        self._devices = Devices(
+            CHILLERS[models["chiller"]], TOWERS[models["tower"]], limited=self._stores_heat
+        )
         self._water_model = WATER[models["water"]]
         self._battery_model = BATTERIES[models["battery"]]
-        self._battery = {name: v(f"battery.{name}") for name in BATTERY_PARAMETERS}
-        self._grid_limited = bool(np.any(sizing.grid_limit_kw < NO_LIMIT_KW))
-        if self._grid_limited:
-            self._battery["grid_limit_kw"] = sizing.grid_limit_kw
-        self._outage_battery = dict(self._battery)
-        if models["battery"] == "clc":
+        self._battery = battery_parameters(fleet)
+        limited = bool(np.any(sizing.grid_limit_kw < NO_LIMIT_KW))
+        self._grid_limit_kw = sizing.grid_limit_kw if limited else None
+        self._outage_battery = self._battery
+        if self._battery_model.by_rate_of_store:
             # At 1 C a battery of one hour carries the design power: its losses are less than what
             # the design power exceeds any load by.
-            self._outage_battery["discharge_limit_c_rate"] = v(
-                "battery.discharge_limit_c_rate"
-            ) * v("battery.discharge_factor")
+            rate = self._battery.discharge_limit_c_rate * self._battery.discharge_factor
+            self._outage_battery = self._battery._replace(discharge_limit_c_rate=rate)
         self._water = {
             "cycles_of_concentration": v("hvac.water.cycles_of_concentration"),
             "drift_share": v("hvac.water.drift_share"),
@@ -182,7 +177,7 @@ class Facility:
             return all_step
         design_kw = self._sizing.facility_w / 1e3
         carried_kwh = self._run_battery(
-            stored_kwh, -all_step, load_kw=design_kw, limits=self._outage_battery
+            stored_kwh, -all_step, load_kw=design_kw, parameters=self._outage_battery
         ).discharge_kwh
         lasts = np.minimum(carried_kwh / (design_kw * self._step_h), 1.0)
         return np.where(grid_up, all_step, lasts)
@@ -200,19 +195,26 @@ class Facility:
                 cooling_load_w=inputs.air.units_load_w if self._transient else it_w + fan_w,
             )
         flow, speed = self._flow(
-            it_w, inputs.air.it_airflow_m3s, speed=inputs.supply.fan_speed, **self._flow_limits
+            cooling.CracPoint(
+                it_w=it_w,
+                it_airflow_m3s=inputs.air.it_airflow_m3s,
+                speed=inputs.supply.fan_speed,
+                **self._flow_limits,
+            )
         )
         full_w = crac_fan_w(speed, design_flow_m3s=1.0, design_w=self._sizing.crac_fan_w)
         fan_w = self._while_powered(full_w, inputs.surroundings)
-        return_c, load_w = self._load(
-            it_w,
-            fan_w,
-            flow,
-            inputs.air.supply_c,
-            inputs.supply.plant_setpoint_c,
-            inputs.air.outlet_mean_c,
-            air_j_per_m3_k=self._air_j_per_m3_k,
-            return_approach_k=self._return_approach_k,
+        return_c, load_w = self._load.step(
+            cooling.HallPoint(
+                it_w=it_w,
+                crac_fan_w=fan_w,
+                crac_flow_m3s=flow,
+                supply_c=inputs.air.supply_c,
+                setpoint_c=inputs.supply.plant_setpoint_c,
+                outlet_c=inputs.air.outlet_mean_c,
+                air_j_per_m3_k=self._air_j_per_m3_k,
+                return_approach_k=self._return_approach_k,
+            )
         )
         return CracQuantities(
             crac_flow_m3s=flow,
@@ -255,19 +257,15 @@ class Facility:
                 pumped_w=design.pumped_w * surroundings.pump_share,
                 outdoor_units=surroundings.outdoor_units,
             )
-        found = self._plant(
-            requested_w,
+        point = PlantPoint(
             setpoint_c=supply.plant_setpoint_c,
             return_c=return_c,
             airflow_m3s=airflow_m3s,
             outdoor_c=surroundings.outdoor_c,
             wet_bulb_c=surroundings.wet_bulb_c,
-            design=design,
-            chiller=self._chiller,
-            tower=self._tower,
-            limited=self._stores_heat,
         )
-        return found if self._event_free else found.scaled(surroundings.powered)
+        result = self._plant.step(requested_w, point, design, self._devices)
+        return result if self._event_free else result.scaled(surroundings.powered)
 
     def _balance_heat(
         self, inputs: StepInputs, air: CracQuantities, plant: WaterSideResult
@@ -292,22 +290,24 @@ class Facility:
         self, inputs: StepInputs, air: CracQuantities, plant: WaterSideResult
     ) -> WaterUse:
         """Water that the tower evaporates, loses and gets; else that of the humidifier."""
-        if self._dry:
+        if self._plant.dry:
             nothing = 0.0 * plant.rejected_w
             evaporation_l = plant.humidifier_kg_s * (self._step_h * 3600.0)
             blowdown_l = evaporation_l / (self._water["cycles_of_concentration"] - 1.0)
             return WaterUse(evaporation_l, nothing, blowdown_l, evaporation_l + blowdown_l)
         return self._water_model(
-            rejected_w=plant.rejected_w,
-            range_k=plant.tower_range_k,
-            water_kg_s=plant.tower_water_kg_s,
-            tower_airflow_m3s=plant.tower_airflow_m3s,
-            outdoor_c=inputs.surroundings.outdoor_c,
-            wet_bulb_c=inputs.surroundings.wet_bulb_c,
-            return_c=air.return_c,
-            supply_setpoint_c=inputs.supply.plant_setpoint_c,
-            dt_s=self._step_h * 3600.0,
-            **self._water,
+            WaterPoint(
+                rejected_w=plant.rejected_w,
+                range_k=plant.tower_range_k,
+                water_kg_s=plant.tower_water_kg_s,
+                tower_airflow_m3s=plant.tower_airflow_m3s,
+                outdoor_c=inputs.surroundings.outdoor_c,
+                wet_bulb_c=inputs.surroundings.wet_bulb_c,
+                return_c=air.return_c,
+                supply_setpoint_c=inputs.supply.plant_setpoint_c,
+                dt_s=self._step_h * 3600.0,
+                **self._water,
+            )
         )
 
     def _hvac_w(self, air: CracQuantities, plant: WaterSideResult) -> F64:
@@ -340,7 +340,7 @@ class Facility:
             inputs.state.stored_kwh,
             command,
             load_kw=(it_w + overhead_w) / 1e3,
-            limits=self._battery,
+            parameters=self._battery,
         )
         needed_kwh = battery.grid_kwh
         grid_kwh = needed_kwh if self._event_free else needed_kwh * inputs.surroundings.grid_up
@@ -361,10 +361,10 @@ class Facility:
             "hvac_kwh": hvac_w * self._step_h / 1e3,
             "grid_kwh": grid_kwh,
             "grid_overload_kwh": (
-                overload_kwh(grid_kwh, limit_kwh) if self._grid_limited else 0.0 * grid_kwh
+                0.0 * grid_kwh if self._grid_limit_kw is None else overload_kwh(grid_kwh, limit_kwh)
             ),
             "unserved_kwh": needed_kwh - grid_kwh,
-            "carbon_g": emitted_g(grid_kwh, inputs.surroundings.ci_g_per_kwh),
+            "carbon_g": grid_kwh * inputs.surroundings.ci_g_per_kwh,
             "energy_cost": grid_kwh * inputs.surroundings.price_per_kwh,
         }
 
@@ -381,16 +381,19 @@ class Facility:
         )
 
     def _run_battery(
-        self, stored_kwh: F64, command: F64, *, load_kw: F64, limits: dict[str, F64]
+        self, stored_kwh: F64, command: F64, *, load_kw: F64, parameters: BatteryParameters
     ) -> BatteryResult:
         """One step of the batteries."""
-        return self._battery_model(
+        return self._battery_model.step(
             stored_kwh,
             command,
-            capacity_kwh=self._sizing.battery_kwh,
-            load_kw=load_kw,
-            dt_h=self._step_h,
-            **limits,
+            BatteryPoint(
+                capacity_kwh=self._sizing.battery_kwh,
+                load_kw=load_kw,
+                dt_h=self._step_h,
+                parameters=parameters,
+                grid_limit_kw=self._grid_limit_kw,
+            ),
         )
 
     def _coil_capacity_w(self, surroundings: Surroundings, supply: Supply) -> F64:

@@ -11,11 +11,12 @@ from sdc_taichi.errors import PhysicalLimitError
 from sdc_taichi.exogenous import site_pressure_pa
 from sdc_taichi.kernels.arguments import row_index
 from sdc_taichi.kernels.hall_arguments import DC_COEFFICIENTS
-from sdc_taichi.plant import chiller, moist_air, tower
-from sdc_taichi.plant.chiller import ChillerResult
+from sdc_taichi.plant import moist_air
+from sdc_taichi.plant.chiller import CHILLERS, ChillerParameters, ChillerPoint, ChillerResult
 from sdc_taichi.plant.electrical import NO_LIMIT_KW, PowerPath, loss_w, power_path_loss_w
 from sdc_taichi.plant.fans_pumps import hydraulic_pump_w
-from sdc_taichi.plant.plants import DRY_PLANTS
+from sdc_taichi.plant.plants import PLANTS
+from sdc_taichi.plant.tower import TOWERS, TowerDesignPoint, design_water_kg_s
 from sdc_taichi.plant.water_side import WaterSideDesign
 from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Conditions, Hall, HallSums
@@ -97,7 +98,7 @@ def _check_sizes(fleet: Fleet, found: Sizing) -> None:
     """Make sure that devices can be built: capacities, flows and powers are finite and positive."""
     sizes = fields_of(found) | fields_of(found.water_side) | fields_of(found.power_path)
     for name, values in sizes.items():
-        if name in ("water_side", "power_path") or name.endswith("_c"):
+        if name in ("water_side", "power_path", "machine") or name.endswith("_c"):
             continue
         wrong = ~(np.isfinite(values) & (values >= 0))
         if wrong.any():
@@ -188,13 +189,15 @@ def released(fleet: Fleet, hall: Hall, outdoor_c: F64, wet_bulb_c: F64) -> Sizin
     rise_k = np.maximum(full.outlet_mean_c + mean_return_approach_k(fleet) - low_c, 0.0)
     rated_w = air_j_per_m3_k(fleet) * crac_flow_m3s * rise_k
     highest_w = released_ranges(fleet, hall)["it_w"][1]
-    machine = chiller.released(
+    machine = CHILLERS["released"].step(
         highest_w,
-        reference_w=rated_w,
-        chilled_water_c=low_c,
-        condenser_c=outdoor_c,
-        outdoor_c=outdoor_c,
-        reference_cop=_reference_cop(fleet),
+        ChillerPoint(
+            reference_w=rated_w,
+            chilled_water_c=low_c,
+            condenser_c=outdoor_c,
+            outdoor_c=outdoor_c,
+            machine=_machine(fleet),
+        ),
     )
     power_path, counted_loss_w = _power_path(fleet, it_w)
     facility_w = 1.1 * (highest_w + rated_w + machine.power_w) + counted_loss_w
@@ -272,30 +275,12 @@ def mean_return_approach_k(fleet: Fleet) -> F64:
     return np.array([np.mean(np.asarray(c.hall.return_approach_k)) for c in fleet.configs])
 
 
-def _reference_cop(fleet: Fleet) -> F64:
-    """COP of the chillers at their reference point, (B,): that of the config, or of the model."""
-    given = fleet.values("hvac.chiller.reference_cop")
-    usual = chiller.REFERENCE_COPS.get(fleet.models["chiller"], chiller.DEFAULT_REFERENCE_COP)
-    return np.where(np.isnan(given), usual, given)
-
-
-def _chiller_at(fleet: Fleet, outdoor_c: F64) -> Callable[[F64, F64, F64, F64], ChillerResult]:
-    """The chillers as a function of chilled and condenser water, C, load and capacity, W, (B,)."""
-    v, model = fleet.values, chiller.CHILLERS[fleet.models["chiller"]]
-    reference_cop, min_lift_k = _reference_cop(fleet), v("hvac.chiller.min_lift_k")
-
-    def at(chilled_c: F64, condenser_c: F64, load_w: F64, reference_w: F64) -> ChillerResult:
-        return model(
-            load_w,
-            reference_w=reference_w,
-            chilled_water_c=chilled_c,
-            condenser_c=condenser_c,
-            outdoor_c=outdoor_c,
-            reference_cop=reference_cop,
-            min_lift_k=min_lift_k,
-        )
-
-    return at
+def _machine(fleet: Fleet) -> ChillerParameters:
+    """Parameters of the chillers; the COP is that of the model where the config gives none."""
+    given = {name: fleet.values(f"hvac.chiller.{name}") for name in ChillerParameters._fields}
+    usual = CHILLERS[fleet.models["chiller"]].reference_cop
+    cop = given.pop("reference_cop")
+    return ChillerParameters(reference_cop=np.where(np.isnan(cop), usual, cop), **given)
 
 
 def _design_chiller(
@@ -315,13 +300,19 @@ def _design_chiller(
         PhysicalLimitError: The chiller has no capacity in such weather.
     """
     v, name = fleet.values, fleet.models["chiller"]
-    at, zero_w, unit_w = _chiller_at(fleet, outdoor_c), np.zeros(fleet.size), np.ones(fleet.size)
+    model, machine = CHILLERS[name], _machine(fleet)
+    zero_w, unit_w = np.zeros(fleet.size), np.ones(fleet.size)
+
+    def at(chilled_c: F64, condenser_c: F64, load_w: F64, reference_w: F64) -> ChillerResult:
+        point = ChillerPoint(reference_w, chilled_c, condenser_c, outdoor_c, machine)
+        return model.step(load_w, point)
+
     coldest_c = v("hvac.chiller.min_condenser_c")
     design_c = np.maximum(wet_bulb_c + v("hvac.tower.approach_min_k"), coldest_c)
-    _, warmest_c = chiller.chilled_water_bounds_c(name)
     water_below_k = fleet.setpoint_over_supply_k + v("hvac.chiller.coil_approach_k")
     low_c, high_c = (
-        np.minimum(v(f"hvac.setpoint.{end}_c") - water_below_k, warmest_c) for end in ("min", "max")
+        np.minimum(v(f"hvac.setpoint.{end}_c") - water_below_k, model.warmest_water_c)
+        for end in ("min", "max")
     )
     chilled_c = [low_c + x * (high_c - low_c) for x in _GRID]
     condenser_c = [coldest_c + x * (design_c - coldest_c) for x in _GRID]
@@ -357,15 +348,14 @@ def _water_side(
     """Chiller, tower, pumps and economiser for the given heat and CRAC airflow, each (B,)."""
     v = fleet.values
     approach_k = v("hvac.tower.approach_min_k")
-    _, warmest_c = chiller.chilled_water_bounds_c(fleet.models["chiller"])
-    if fleet.models["plant"] in DRY_PLANTS:
+    if PLANTS[fleet.models["plant"]].dry:
         outdoor = _dry_units(fleet, cooling_w, crac_flow_m3s)
     else:
         outdoor = _tower(fleet, cooling_w, rejected_w, outdoor_c, wet_bulb_c)
     return WaterSideDesign(
         cooling_w=cooling_w,
         chiller_w=chiller_w,
-        reference_cop=_reference_cop(fleet),
+        machine=_machine(fleet),
         rejected_w=rejected_w,
         coil_approach_k=v("hvac.chiller.coil_approach_k"),
         chilled_water_range_k=v("hvac.chiller.chilled_water_range_k"),
@@ -374,8 +364,7 @@ def _water_side(
         exchanger_approach_k=v("hvac.tower.economiser_approach_k") - approach_k,
         min_condenser_c=v("hvac.chiller.min_condenser_c"),
         fullest_condenser_c=v("hvac.chiller.min_condenser_c"),
-        min_lift_k=v("hvac.chiller.min_lift_k"),
-        warmest_chilled_c=np.full(fleet.size, warmest_c),
+        warmest_chilled_c=np.full(fleet.size, CHILLERS[fleet.models["chiller"]].warmest_water_c),
         pumped_w=cooling_w,
         outdoor_units=np.ones(fleet.size),
         dry_cooler_approach_k=v("hvac.dry_cooler.approach_k"),
@@ -421,34 +410,30 @@ def _dry_units(fleet: Fleet, cooling_w: F64, crac_flow_m3s: F64) -> dict[str, F6
 def _tower(
     fleet: Fleet, cooling_w: F64, rejected_w: F64, outdoor_c: F64, wet_bulb_c: F64
 ) -> dict[str, F64]:
-    """Water, air and fan of the tower, by the rules of its model.
-
-    ``yorkcalc`` meets the design approach with full air; ``released`` carries the cooling load with
-    50 - (design outdoor - lowest setpoint) K of air and draws that load at full speed; ``paper``
-    takes the printed figures at any size.
-    """
-    v, model, air = fleet.values, fleet.models["tower"], air_j_per_m3_k(fleet)
-    range_k, approach_k = v("hvac.tower.water_range_k"), v("hvac.tower.approach_min_k")
-    water_kg_s = np.asarray(tower.design_water_kg_s(rejected_w, range_k=range_k))
-    rise_k = np.maximum(50.0 - (outdoor_c - v("hvac.setpoint.min_c")), 1.0)
-    sized = {
+    """Water, air and fan of the tower, by the rule of its model."""
+    v, air = fleet.values, air_j_per_m3_k(fleet)
+    range_k = v("hvac.tower.water_range_k")
+    water_kg_s = np.asarray(design_water_kg_s(rejected_w, range_k=range_k))
+    tower = TOWERS[fleet.models["tower"]].size(
+        TowerDesignPoint(
+            cooling_w=cooling_w,
+            rejected_w=rejected_w,
+            water_kg_s=water_kg_s,
+            outdoor_c=outdoor_c,
+            wet_bulb_c=wet_bulb_c,
+            lowest_setpoint_c=v("hvac.setpoint.min_c"),
+            air_j_per_m3_k=air,
+            value=lambda name: v(f"hvac.tower.{name}"),
+        )
+    )
+    return {
         "economiser": v("hvac.tower.economiser"),
         "tower_water_kg_s": water_kg_s,
-        "tower_reference_kg_s": water_kg_s,
-        "tower_air_m3s": cooling_w / (air * rise_k),
-        "tower_fan_w": cooling_w,
+        "tower_reference_kg_s": tower.reference_water_kg_s,
+        "tower_air_m3s": tower.air_m3s,
+        "tower_fan_w": tower.fan_w,
         "air_j_per_m3_k": air,
     }
-    if model == "yorkcalc":
-        sized["tower_fan_w"] = v("hvac.tower.fan_w_per_w_rejected") * rejected_w
-        sized["tower_air_m3s"] = v("hvac.tower.airflow_m3s_per_w_rejected") * rejected_w
-        sized["tower_reference_kg_s"] = tower.yorkcalc_reference_water_kg_s(
-            water_kg_s, wet_bulb_c=wet_bulb_c, range_k=range_k, approach_k=approach_k
-        )
-    elif model == "paper":
-        sized["tower_fan_w"] = v("hvac.tower.paper_fan_w")
-        sized["tower_air_m3s"] = v("hvac.tower.paper_airflow_m3s")
-    return sized
 
 
 def _pumps(fleet: Fleet, cooling_w: F64, rejected_w: F64) -> dict[str, F64]:
@@ -486,7 +471,7 @@ def _chilled_pump_w(fleet: Fleet, cooling_w: F64) -> F64:
 def _sized_pump_w(fleet: Fleet, heat_w: F64, range_k: F64) -> F64:
     """Power of pumps whose water carries a heat, W, with a range, K, each (B,)."""
     v = fleet.values
-    flow = np.asarray(tower.design_water_kg_s(heat_w, range_k=range_k)) / WATER_DENSITY_KG_M3
+    flow = np.asarray(design_water_kg_s(heat_w, range_k=range_k)) / WATER_DENSITY_KG_M3
     return hydraulic_pump_w(
         v("hvac.pumps.pressure_drop_pa"), flow, efficiency=v("hvac.pumps.efficiency")
     )

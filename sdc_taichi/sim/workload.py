@@ -184,7 +184,7 @@ def due_steps(fleet: Fleet) -> F64:
     deadline_h = fleet.values("workload.deadline_h")
     deadline_steps = np.rint(deadline_h * fleet.steps_per_hour)
     deadline_steps = np.where(np.isnan(deadline_h), np.inf, deadline_steps)
-    return deadline_steps + workload.DUE_AFTER_STEPS[fleet.models["workload"]]
+    return deadline_steps + workload.MODELS[fleet.models["workload"]].due_after_steps
 
 
 class Workload:
@@ -204,7 +204,9 @@ class Workload:
             "queue_limit": queue_limit_tasks(fleet),
         }
         self._size, self._step_h = fleet.size, 1.0 / per_hour
-        self._decide = CompiledStage(lambda **x: fields_of(model(**x, **limits)), fleet.size)
+        self._decide = CompiledStage(
+            lambda **x: fields_of(model.step(workload.WorkPoint(**x, **limits))), fleet.size
+        )
         self._max_utilisation = v("workload.max_utilisation")
         # One step for work that enters, one for all that is older than the horizon.
         self._length = int(np.max(np.rint(v("workload.age_horizon_h") * per_hour))) + 2
