@@ -108,7 +108,7 @@ $(READY_DOCS): $(READY) pyproject.toml
 # Torch in the environment of development, for work on sdc_taichi/learning.
 $(VENV)/.installed-train: $(READY)
 	@$(PY) -m pip install $(PIP_FLAGS) $(TORCH)
-	@$(PY) -m pip install $(PIP_FLAGS) --editable '.[dev,plot,onnx,train]' skrl stable-baselines3
+	@$(PY) -m pip install $(PIP_FLAGS) --editable '.[dev,plot,onnx,train]' stable-baselines3
 	@touch $@
 
 $(READY_OLDEST): pyproject.toml .ci/lowest_versions.py

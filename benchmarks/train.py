@@ -3,8 +3,8 @@
     python benchmarks/train.py [FOLDER] [--cases ppo sb3-ppo] [--num-envs 256] [--seeds 5]
 
 trains the agents of preset ``corrected`` with each case from each seed: by algorithms of
-``sdc_taichi.learning``, by IPPO and MAPPO of skrl, and by PPO of Stable-Baselines3, which like
-``ppo`` here has the battery alone to learn with. Networks, batches, passes, mini-batches, discount
+``sdc_taichi.learning``, and by PPO of Stable-Baselines3, which like ``ppo`` here has the battery
+alone to learn with. Networks, batches, passes, mini-batches, discount
 and learning rate are equal. Cases take turns, each in a process and thread of its own, and are
 measured by processor time after two rollouts, in which kernels are compiled. Writes ``train.json``
 to FOLDER and prints a table: steps of data centers per second, the share of the environment's
@@ -32,15 +32,14 @@ import torch
 
 import sdc_taichi
 from sdc_taichi.envs.agents import AGENTS
-from sdc_taichi.learning.algorithms import ON_POLICY
+from sdc_taichi.learning.algorithms import ON_POLICY, OnPolicySettings
 from sdc_taichi.learning.on_policy import OnPolicy
-from sdc_taichi.learning.settings import OnPolicySettings
 from sdc_taichi.learning.stream import EnvironmentStream
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 
 SETTINGS = OnPolicySettings(decision_steps=1, levels=None, anneal=False)
-CASES = ("ippo", "skrl-ippo", "mappo", "skrl-mappo", "happo", "ppo", "sb3-ppo")
+CASES = ("ippo", "mappo", "happo", "ppo", "sb3-ppo")
 WARM_UP = 2
 """Rollouts before the measurement."""
 PAGE_MB = 4096 / 2**20
@@ -51,7 +50,7 @@ class Run:
     """Speed, reward and growth of memory of one training."""
 
     case: str
-    """Case, ``skrl-`` and ``sb3-`` before the algorithms of other libraries."""
+    """Case, with ``sb3-`` before the algorithm of Stable-Baselines3."""
     seed: int
     """Seed of the training."""
     steps_per_s: float
@@ -98,9 +97,7 @@ def ours(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> C
     agents = ["agent_bat"] if algorithm == "ppo" else list(AGENTS)
     env = sdc_taichi.vector_env(num_envs, days=days, agents=agents, autoreset_mode="SameStep")
     stream = EnvironmentStream(env, shares_state=definition.critic == "state", seed=seed)
-    learner = OnPolicy(
-        definition, SETTINGS, stream.spaces, stream.state_width, updates=1, seed=seed
-    )
+    learner = OnPolicy(definition, SETTINGS, stream, updates=1, seed=seed)
     step = meter.timed(stream.step)
 
     def noted(actions: Mapping[str, torch.Tensor]) -> Any:
@@ -110,42 +107,6 @@ def ours(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> C
 
     stream.step = noted  # type: ignore[method-assign]
     return lambda rollouts: [learner.update(stream) for _ in range(rollouts)]
-
-
-def skrl(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> Callable[[int], Any]:
-    """Make an algorithm of skrl, and return a function that trains it for n rollouts."""
-    import train_skrl
-
-    train_skrl.prepare(seed)
-    batch = sdc_taichi.vector_env(num_envs, days=days, autoreset_mode="SameStep")
-    env: Any = train_skrl.BatchEnv(batch, seed)
-    step, env.state = meter.timed(env.step), meter.timed(env.state)
-
-    def noted(actions: Any) -> Any:
-        result = step(actions)
-        meter.note(float(np.mean(env.rewards.pop())))
-        return result
-
-    env.step = noted
-    agent = train_skrl.learner(
-        env,
-        algorithm,
-        rollout=SETTINGS.steps_per_update,
-        hidden=SETTINGS.hidden,
-        learning_epochs=SETTINGS.epochs,
-        mini_batches=SETTINGS.mini_batches,
-        discount_factor=SETTINGS.discount,
-        gae_lambda=SETTINGS.gae_lambda,
-        learning_rate=SETTINGS.rate,
-        entropy_loss_scale=SETTINGS.entropy,
-        grad_norm_clip=SETTINGS.gradient_norm,
-        ratio_clip=SETTINGS.clip,
-        value_clip=0.0,
-        value_loss_scale=0.5,
-    )
-    return lambda rollouts: train_skrl.trainer(
-        env, agent, rollouts * SETTINGS.steps_per_update
-    ).train()
 
 
 def sb3(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> Callable[[int], Any]:
@@ -167,11 +128,11 @@ def sb3(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> Ca
         return result
 
     env.step_wait = noted
-    rows = num_envs * SETTINGS.steps_per_update
+    rows = num_envs * SETTINGS.rollout_decisions
     model = PPO(
         "MlpPolicy",
         VecNormalize(env, gamma=SETTINGS.discount),
-        n_steps=SETTINGS.steps_per_update,
+        n_steps=SETTINGS.rollout_decisions,
         batch_size=rows // SETTINGS.mini_batches,
         n_epochs=SETTINGS.epochs,
         learning_rate=SETTINGS.rate,
@@ -188,7 +149,7 @@ def sb3(algorithm: str, num_envs: int, days: int, seed: int, meter: Meter) -> Ca
     return lambda rollouts: model.learn(rollouts * rows, reset_num_timesteps=False)
 
 
-LIBRARIES = {"": ours, "skrl": skrl, "sb3": sb3}
+LIBRARIES = {"": ours, "sb3": sb3}
 
 
 def measure(case: str, num_envs: int, days: int, rollouts: int, seed: int) -> Run:
@@ -202,7 +163,7 @@ def measure(case: str, num_envs: int, days: int, rollouts: int, seed: int) -> Ru
     wall, core = time.perf_counter(), time.process_time()
     train(rollouts)
     wall, core = time.perf_counter() - wall, time.process_time() - core
-    steps = num_envs * rollouts * SETTINGS.steps_per_update
+    steps = num_envs * rollouts * SETTINGS.rollout_decisions
     memory = meter.memory_mb
     return Run(
         case=case,

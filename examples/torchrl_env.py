@@ -1,19 +1,16 @@
 """A TorchRL environment over a batch of data centers, checked and run with random actions.
 
-    python examples/torchrl_env.py [--num-envs 64] [--steps 192]
+    python examples/torchrl_env.py
 
 Observations, actions and rewards are nested under the agents' names, the shared state is ``state``.
 """
 
 from __future__ import annotations
 
-import argparse
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
-import numpy as np
 import numpy.typing as npt
 import torch
 from tensordict import TensorDict
@@ -42,45 +39,30 @@ class BatchEnv(EnvBase):
         self._env = env
         self._next: TensorDict | None = None
         self._set_seed(seed)
-        agents, size = env.possible_agents, env.num_envs
-        self.observation_spec = Composite(
-            {
-                "state": self._spec(env.state_space),
-                **{a: self._nest(observation=env.observation_spaces[a]) for a in agents},
+        flag = Categorical(2, shape=(env.num_envs, 1), dtype=torch.bool)
+        self.observation_spec = self._group(
+            state=self._spec(env.state_space),
+            **{
+                a: self._group(observation=self._spec(x)) for a, x in env.observation_spaces.items()
             },
-            shape=(size,),
         )
-        self.action_spec = Composite(
-            {a: self._nest(action=env.action_spaces[a]) for a in agents}, shape=(size,)
+        self.action_spec = self._group(
+            **{a: self._group(action=self._spec(x)) for a, x in env.action_spaces.items()}
         )
-        self.reward_spec = Composite(
-            {a: Composite(reward=Real(shape=(size, 1)), shape=(size,)) for a in agents},
-            shape=(size,),
-        )
-        self.done_spec = Composite(
-            {
-                name: Categorical(2, shape=(size, 1), dtype=torch.bool)
-                for name in ("done", "terminated", "truncated")
-            },
-            shape=(size,),
-        )
+        reward = Real(shape=(env.num_envs, 1))
+        self.reward_spec = self._group(**{a: self._group(reward=reward) for a in env.agents})
+        self.done_spec = self._group(done=flag, terminated=flag, truncated=flag)
+
+    def _group(self, **specs: Any) -> Composite:
+        return Composite(specs, shape=self.batch_size)
 
     def _spec(self, space: gymnasium.Space[Any]) -> Any:
-        size = self._env.num_envs
-        if isinstance(space, gymnasium.spaces.Dict):
-            return self._nest(**space.spaces)
         if isinstance(space, gymnasium.spaces.Discrete):
-            return Categorical(int(space.n), shape=(size,), dtype=torch.int64)
-        if not isinstance(space, gymnasium.spaces.Box):
-            raise TypeError(f"{space}: valid is a Box, Discrete or Dict space")
-        low, high = (
-            torch.from_numpy(x).expand(size, *space.shape) for x in (space.low, space.high)
-        )
-        return Bounded(low, high, shape=(size, *space.shape), dtype=low.dtype)
-
-    def _nest(self, **spaces: gymnasium.Space[Any]) -> Any:
-        specs = {name: self._spec(space) for name, space in spaces.items()}
-        return Composite(specs, shape=(self._env.num_envs,))
+            return Categorical(int(space.n), shape=self.batch_size, dtype=torch.int64)
+        assert isinstance(space, gymnasium.spaces.Box), f"{space}: valid is a Box or Discrete"
+        shape = (*self.batch_size, *space.shape)
+        low, high = (torch.from_numpy(x).expand(shape) for x in (space.low, space.high))
+        return Bounded(low, high, shape=shape, dtype=low.dtype)
 
     def _set_seed(self, seed: int | None) -> None:
         """Seed of the next reset; further resets go on from it."""
@@ -105,54 +87,32 @@ class BatchEnv(EnvBase):
             self._next = after
             after = self._situation(infos["final_obs"], infos["final_state"])
         for agent, reward in rewards.items():
-            after[agent, "reward"] = column(reward)
+            after[agent, "reward"] = torch.from_numpy(reward).unsqueeze(-1)
         # All agents of a data center stop together.
-        ends = next(iter(terminated.values())), next(iter(truncated.values()))
-        after["terminated"], after["truncated"] = (column(x) for x in ends)
+        for name, ends in (("terminated", terminated), ("truncated", truncated)):
+            after[name] = torch.from_numpy(next(iter(ends.values()))).unsqueeze(-1)
         after["done"] = after["terminated"] | after["truncated"]
         return after
 
     def _situation(self, observations: Mapping[str, Any], state: npt.NDArray[Any]) -> TensorDict:
-        by_agent = {a: {"observation": tensors(x)} for a, x in observations.items()}
-        return TensorDict(
-            {"state": torch.from_numpy(state), **by_agent}, batch_size=self.batch_size
-        )
+        by_agent = {a: {"observation": torch.from_numpy(x)} for a, x in observations.items()}
+        return TensorDict({"state": torch.from_numpy(state), **by_agent}, self.batch_size)
 
 
-def tensors(values: Any) -> Any:
-    """Arrays as tensors, of a heat map by name."""
-    if isinstance(values, Mapping):
-        return {name: torch.from_numpy(array) for name, array in values.items()}
-    return torch.from_numpy(values)
+def main(num_envs: int = 64, steps: int = 192) -> None:
+    """Check the environment, and run it with random actions.
 
-
-def column(values: npt.NDArray[Any]) -> torch.Tensor:
-    """(B,) as (B, 1), which is how TorchRL keeps rewards and ends."""
-    return torch.from_numpy(np.asarray(values)).unsqueeze(-1)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Check the environment and run it."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--num-envs", type=int, default=64)
-    parser.add_argument("--steps", type=int, default=192, help="of each environment")
-    parser.add_argument("--days", type=int, default=1, help="length of an episode")
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args(arguments)
+    Args:
+        num_envs: data centers of the batch.
+        steps: steps of each data center.
+    """
     torch.set_num_threads(1)  # faster than two at these sizes
-    torch.manual_seed(given.seed)
-    batch = sdc_taichi.vector_env(given.num_envs, days=given.days, autoreset_mode="SameStep")
-    env = BatchEnv(batch)
+    env = BatchEnv(sdc_taichi.vector_env(num_envs, days=1, autoreset_mode="SameStep"))
     check_env_specs(env, break_when_any_done="both")
-    env.set_seed(given.seed)
-    start = time.perf_counter()
-    rollout = env.rollout(given.steps, break_when_any_done=False)
-    speed = rollout.numel() / (time.perf_counter() - start)
-    env.close()
-    print(f"{rollout.numel()} steps, {speed:,.0f} steps/s")
+    rollout = env.rollout(steps, break_when_any_done=False)
     for agent in env.full_action_spec.keys():  # noqa: SIM118  a spec iterates over batches
         mean = rollout["next", agent, "reward"].mean().item()
-        print(f"{agent}: mean reward {mean:.4f} with random actions")
+        print(f"{agent}: mean reward {mean:.4f} in {rollout.numel()} steps of random actions")
 
 
 if __name__ == "__main__":

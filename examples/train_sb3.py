@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -50,14 +49,7 @@ class BatchVecEnv(VecEnv):
         """Keep the actions for ``step_wait``."""
         self._actions = actions
 
-    def step_wait(
-        self,
-    ) -> tuple[
-        npt.NDArray[np.float32],
-        npt.NDArray[np.float32],
-        npt.NDArray[np.bool_],
-        list[dict[str, Any]],
-    ]:
+    def step_wait(self) -> tuple[Any, Any, Any, list[dict[str, Any]]]:
         """Observations, rewards, whether episodes ended, and one info per environment."""
         observations, rewards, terminated, truncated, info = self._env.step(self._actions)
         done = terminated | truncated
@@ -76,28 +68,16 @@ class BatchVecEnv(VecEnv):
         return [getattr(self._env, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Attributes belong to the whole batch, so there is nothing to set on one of it."""
+        """Refuse to set an attribute, as all belong to the whole batch."""
         raise NotImplementedError(f"cannot set {attr_name} of single environments of a batch")
 
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """Methods belong to the whole batch, too."""
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
+        """Refuse to call a method, as all belong to the whole batch."""
         raise NotImplementedError(f"cannot call {method_name} of single environments of a batch")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """Whether a wrapper is around the batch, once per environment."""
         return [isinstance(self._env, wrapper_class)] * len(list(self._get_indices(indices)))
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Mean episode rewards and speed."""
-
-    untrained: float
-    trained: float
-    steps: int
-    steps_per_s: float
 
 
 def make(agent: str, num_envs: int, days: int, seed: int) -> VecMonitor:
@@ -108,36 +88,27 @@ def make(agent: str, num_envs: int, days: int, seed: int) -> VecMonitor:
     return VecMonitor(env)
 
 
-def train(
-    agent: str, *, num_envs: int, steps: int, days: int, rollout: int, seed: int
-) -> tuple[PPO, Outcome]:
-    """Train, and evaluate on episodes of other seeds before and after."""
+def train(agent: str, num_envs: int, steps: int, days: int, rollout: int, seed: int) -> PPO:
+    """Train, and print mean episode rewards of other seeds before and after."""
     torch.set_num_threads(1)  # faster than two for networks of this size
-    env, other = make(agent, num_envs, days, seed), make(agent, num_envs, days, seed + num_envs)
+    env = make(agent, num_envs, days, seed)
+    batch_size = max(2, num_envs * rollout // 4)
     model = PPO(
-        "MlpPolicy",
-        env,
-        n_steps=rollout,
-        batch_size=max(2, num_envs * rollout // 4),
-        n_epochs=5,
-        gamma=0.995,
-        ent_coef=0.01,
-        seed=seed,
-        device="cpu",
-    )
-
-    def score() -> float:
-        other.seed(seed + num_envs)
+        *("MlpPolicy", env), n_steps=rollout, batch_size=batch_size, n_epochs=5, gamma=0.995,
+        ent_coef=0.01, seed=seed, device="cpu",
+    )  # fmt: skip
+    for moment, length in (("untrained", 0), ("trained", steps)):
+        start = time.perf_counter()
+        if length:
+            model.learn(length)
+            speed = model.num_timesteps / (time.perf_counter() - start)
+            print(f"{model.num_timesteps} steps, {speed:,.0f} steps/s")
+        other = make(agent, num_envs, days, seed + num_envs)
         mean, _ = evaluate_policy(model, other, n_eval_episodes=num_envs)
-        return float(mean)
-
-    before, start = score(), time.perf_counter()
-    model.learn(steps)
-    speed = model.num_timesteps / (time.perf_counter() - start)
-    outcome = Outcome(before, score(), model.num_timesteps, speed)
+        other.close()
+        print(f"{agent}, {moment}: mean episode reward {mean:.3f}")
     env.close()
-    other.close()
-    return model, outcome
+    return model
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -149,13 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--days", type=int, default=7, help="length of an episode")
     parser.add_argument("--rollout", type=int, default=96, help="steps between updates")
     parser.add_argument("--seed", type=int, default=0)
-    given = vars(parser.parse_args(arguments))
-    agent = given.pop("agent")
-    _, outcome = train(agent, **given)
-    print(
-        f"{agent}: mean episode reward {outcome.untrained:.3f} untrained, {outcome.trained:.3f} "
-        f"after {outcome.steps} steps ({outcome.steps_per_s:,.0f} steps/s)"
-    )
+    train(**vars(parser.parse_args(arguments)))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Multilayer perceptrons over rows of inputs, eight rows as one vector of the processor.
 
 A lane is a row, and every sum has the order of its inputs, so that a row has the same bits alone
-and in any batch. Those of a linear-algebra library have not. ``sdc_taichi/learning/forward.py``
+and in any batch. Those of a linear-algebra library have not. ``sdc_taichi/learning/policy.py``
 makes the inputs.
 """
 

@@ -10,10 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sdc_taichi import ConfigError, load_config
-from sdc_taichi.benchmark.episodes import Collection, Episode, episodes
+import sdc_taichi
+from sdc_taichi import ConfigError, Simulator, load_config, simulate
+from sdc_taichi.benchmark.episodes import Collection, Episode, FollowedOptimum, episodes
 from sdc_taichi.benchmark.offline import data_set_folder, require_minari
 from sdc_taichi.optimum import StoppedError
+from sdc_taichi.optimum.objective import Objective, Score
+from sdc_taichi.optimum.solve import solve
+from sdc_taichi.types import Actions, BatteryAction, CoolAction, LoadAction
+from test_envs_commands import CONTROLLED, RACKS
 
 RULES = "load=greedy-ci,cooling=g36,battery=lookahead-24h"
 
@@ -151,3 +156,58 @@ def test_missing_libraries_are_named_with_their_extra(monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "minari", None)
     with pytest.raises(ConfigError, match=r"sdc-taichi\[offline\]"):
         require_minari()
+
+
+def test_the_followed_optimum_reaches_what_is_achieved(tmp_path: Any, monkeypatch: Any) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    carbon = Objective(carbon=1.0)
+    with Simulator([load_config("tiny", ["site.location=CA", "site.start=07-01"])]) as sim:
+        figures = []
+        for _ in range(2):
+            sim.reset(0)
+            score = Score(carbon, sim, 0)
+            simulate(sim, FollowedOptimum(24, carbon), 24, on_step=score.add)
+            figures.append(score.figure)
+        optimum = solve(sim.fleet, steps=24, start=sim.drivers.start, drivers=sim.drivers)
+    np.testing.assert_allclose(figures, [optimum.achieved] * 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("actions", ["discrete", "continuous"])
+def test_actions_of_decoded_commands_are_the_actions(actions: str) -> None:
+    env = sdc_taichi.parallel_env(
+        config=CONTROLLED,
+        actions=actions,
+        commands={"agent_ls": ["load", "placement"], "agent_dc": ["fan", "cooling"]},
+        days=1,
+    )
+    env.reset(seed=0)
+    core = env.core
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        widths = {"agent_ls": 1 + RACKS, "agent_dc": 4, "agent_bat": 1}
+        if actions == "discrete":
+            given: Any = {a: rng.integers(3, size=(1, k)) for a, k in widths.items()}
+            given["agent_bat"] = given["agent_bat"][:, 0]
+        else:
+            given = {a: rng.uniform(-1.0, 1.0, (1, k)) for a, k in widths.items()}
+        commands = Actions(**core._decoder.decode(given, core.view.state))
+        for agent, found in core.actions_of(commands).items():
+            np.testing.assert_allclose(found, given[agent], rtol=1e-12)
+
+
+def test_named_commands_and_those_between_choices_are_the_nearest_actions() -> None:
+    env = sdc_taichi.vector_env(2, "tiny", days=1)
+    env.reset(seed=0)
+    named = Actions(LoadAction.DEFER, CoolAction.RAISE, BatteryAction.CHARGE)
+    assert {a: x.tolist() for a, x in env.core.actions_of(named).items()} == {
+        "agent_ls": [0, 0],
+        "agent_dc": [2, 2],
+        "agent_bat": [0, 0],
+    }
+    between = Actions(load=np.array([0.4, 0.6]), battery=np.array([-0.4, -0.6]))
+    assert {a: x.tolist() for a, x in env.core.actions_of(between).items()} == {
+        "agent_ls": [1, 2],
+        "agent_dc": [1, 1],
+        "agent_bat": [1, 2],
+    }
+    env.close()

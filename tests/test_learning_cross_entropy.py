@@ -12,8 +12,8 @@ torch = pytest.importorskip("torch", reason="torch is not installed: make test-t
 
 import sdc_taichi  # noqa: E402
 from sdc_taichi.errors import ConfigError  # noqa: E402
+from sdc_taichi.learning.algorithms import CrossEntropySettings  # noqa: E402
 from sdc_taichi.learning.cross_entropy import CrossEntropySearch  # noqa: E402
-from sdc_taichi.learning.settings import CrossEntropySettings  # noqa: E402
 from sdc_taichi.learning.stream import (  # noqa: E402
     EnvironmentStream,
     LearnerSpaces,
@@ -27,6 +27,8 @@ SIZE, STEPS = 64, 8
 
 class Game:
     """A step pays by how near the action is to the answer, and more in some environments."""
+
+    size, episode_steps = SIZE, STEPS
 
     def __init__(self, answer: Any, *, discrete: bool, width: int = 2) -> None:
         self.spaces = {"player": LearnerSpaces(("player",), width, 1, 3 if discrete else None)}
@@ -53,14 +55,7 @@ class Game:
 
 
 def search(game: Any, updates: int, **settings: Any) -> CrossEntropySearch:
-    return CrossEntropySearch(
-        CrossEntropySettings(**settings),
-        game.spaces,
-        size=SIZE,
-        episode_steps=STEPS,
-        updates=updates,
-        seed=1,
-    )
+    return CrossEntropySearch(CrossEntropySettings(**settings), game, updates=updates, seed=1)
 
 
 def distance(algorithm: CrossEntropySearch, answer: Any) -> float:
@@ -124,9 +119,7 @@ def test_search_beats_idle_batteries() -> None:
     hold = {"agent_bat": torch.ones(16, 1, dtype=torch.int64)}
     idle = np.mean([float(stream.step(hold).rewards["agent_bat"].mean()) for _ in range(96)])
     settings = CrossEntropySettings(candidates=16, first_std=1.0)
-    algorithm = CrossEntropySearch(
-        settings, stream.spaces, size=16, episode_steps=stream.episode_steps, updates=12, seed=0
-    )
+    algorithm = CrossEntropySearch(settings, stream, updates=12, seed=0)
     rewards = [algorithm.update(stream)["reward/agent_bat"] for _ in range(12)]
     env.close()
     assert np.mean(rewards[-3:]) > np.mean(rewards[:2])

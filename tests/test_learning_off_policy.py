@@ -16,8 +16,12 @@ from torch import Tensor  # noqa: E402
 from learning_games import Aim, Game, Meeting, Patience  # noqa: E402
 from sdc_taichi.errors import ConfigError, SdcError  # noqa: E402
 from sdc_taichi.learning.action_values import JointValues, expected  # noqa: E402
-from sdc_taichi.learning.algorithms import OFF_POLICY  # noqa: E402
-from sdc_taichi.learning.off_policy import OffPolicy, critic_loss  # noqa: E402
+from sdc_taichi.learning.algorithms import OFF_POLICY, OffPolicySettings  # noqa: E402
+from sdc_taichi.learning.off_policy import (  # noqa: E402
+    OffPolicy,
+    Replay,
+    critic_loss,
+)
 from sdc_taichi.learning.off_policy_actors import (  # noqa: E402
     Temperatures,
     best_replies,
@@ -25,8 +29,6 @@ from sdc_taichi.learning.off_policy_actors import (  # noqa: E402
     soft_policy_loss,
     squashed,
 )
-from sdc_taichi.learning.replay import Replay  # noqa: E402
-from sdc_taichi.learning.settings import OffPolicySettings  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -60,15 +62,13 @@ class Coordination(Game):
 
 def algorithm(
     name: str,
-    game: Game,
+    game: Any,
     settings: OffPolicySettings = SMALL,
     *,
     updates: int = 200,
     seed: int = 0,
 ) -> Any:
-    return OffPolicy(
-        OFF_POLICY[name], settings, game.spaces, game.state_width, updates=updates, seed=seed
-    )
+    return OffPolicy(OFF_POLICY[name], settings, game, updates=updates, seed=seed)
 
 
 def trained(

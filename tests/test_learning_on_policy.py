@@ -18,16 +18,14 @@ import sdc_taichi  # noqa: E402
 from learning_games import Aim, Game, Meeting, Patience, Rooms, Turnstile  # noqa: E402
 from sdc_taichi import load_config  # noqa: E402
 from sdc_taichi.learning import on_policy  # noqa: E402
-from sdc_taichi.learning.algorithms import ON_POLICY  # noqa: E402
-from sdc_taichi.learning.networks import Actor, Tanh, perceptron  # noqa: E402
-from sdc_taichi.learning.normalise import CLIP, RunningMoments  # noqa: E402
+from sdc_taichi.learning.algorithms import ON_POLICY, OnPolicySettings  # noqa: E402
+from sdc_taichi.learning.networks import CLIP, Actor, RunningMoments, Tanh, perceptron  # noqa: E402
 from sdc_taichi.learning.on_policy import (  # noqa: E402
     OnPolicy,
     generalised_advantages,
     policy_loss,
     value_loss,
 )
-from sdc_taichi.learning.settings import OnPolicySettings  # noqa: E402
 from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -55,9 +53,7 @@ def algorithm(
 ) -> Any:
     """An algorithm that takes a game for environments."""
     definition = ON_POLICY[name]
-    return OnPolicy(
-        definition, settings, stream.spaces, stream.state_width, updates=updates, seed=seed
-    )
+    return OnPolicy(definition, settings, stream, updates=updates, seed=seed)
 
 
 def trained(name: str, game: Game, settings: OnPolicySettings = SMALL, **more: int) -> Any:

@@ -13,10 +13,9 @@ import sdc_taichi  # noqa: E402
 from sdc_taichi import load_config  # noqa: E402
 from sdc_taichi.envs.agents import AGENTS  # noqa: E402
 from sdc_taichi.envs.core import Core  # noqa: E402
-from sdc_taichi.learning.algorithms import ON_POLICY  # noqa: E402
+from sdc_taichi.learning.algorithms import ON_POLICY, OnPolicySettings  # noqa: E402
 from sdc_taichi.learning.on_policy import OnPolicy  # noqa: E402
 from sdc_taichi.learning.policy import action_levels  # noqa: E402
-from sdc_taichi.learning.settings import OnPolicySettings  # noqa: E402
 from sdc_taichi.learning.stream import EnvironmentStream  # noqa: E402
 
 UPDATES = 40
@@ -44,7 +43,7 @@ def trained(rewards: str) -> OnPolicy:
         shares_state=False,
         seed=0,
     )
-    learner = OnPolicy(ON_POLICY["ippo"], given, stream.spaces, 0, updates=UPDATES, seed=0)
+    learner = OnPolicy(ON_POLICY["ippo"], given, stream, updates=UPDATES, seed=0)
     for _ in range(UPDATES):
         learner.update(stream)
     return learner

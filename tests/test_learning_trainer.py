@@ -18,12 +18,15 @@ torch = pytest.importorskip("torch", reason="torch is not installed: make test-t
 
 from sdc_taichi.errors import SdcError  # noqa: E402
 from sdc_taichi.learning import trainer  # noqa: E402
-from sdc_taichi.learning.algorithms import make_algorithm  # noqa: E402
-from sdc_taichi.learning.checkpoint import read_state  # noqa: E402
 from sdc_taichi.learning.evaluation import Validation  # noqa: E402
 from sdc_taichi.learning.policy import Policy  # noqa: E402
-from sdc_taichi.learning.trainer import Progress, Training, train  # noqa: E402
-from sdc_taichi.learning.training_folder import settings_of  # noqa: E402
+from sdc_taichi.learning.trainer import (  # noqa: E402
+    Progress,
+    Training,
+    make_algorithm,
+    train,
+)
+from sdc_taichi.learning.training_folder import read_state, settings_of  # noqa: E402
 from sdc_taichi.learning.training_settings import (  # noqa: E402
     TrainingSettings,
     make_settings,

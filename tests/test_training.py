@@ -86,94 +86,19 @@ def test_sb3_adapter_hands_on_what_the_batch_gives(example: Load) -> None:
 
 
 @pytest.mark.parametrize("agent", ["Load", "Cooling", "Battery"])
-def test_sb3_trains_one_agent_reproducibly(example: Load, agent: str) -> None:
+def test_sb3_trains_one_agent_reproducibly(
+    example: Load, agent: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     sb3 = example("train_sb3", "stable_baselines3")
 
     def weights(steps: int) -> Any:
-        model, outcome = sb3.train(agent, num_envs=2, steps=steps, days=1, rollout=16, seed=3)
-        assert outcome.steps == steps
-        assert np.isfinite([outcome.untrained, outcome.trained]).all()
+        model = sb3.train(agent, num_envs=2, steps=steps, days=1, rollout=16, seed=3)
         return np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()])
 
     once, again, longer = weights(32), weights(32), weights(64)
     np.testing.assert_array_equal(once, again)
     assert not np.array_equal(once, longer)
-
-
-def test_sb3_runs_from_the_command_line(example: Load, capsys: pytest.CaptureFixture[str]) -> None:
-    sb3 = example("train_sb3", "stable_baselines3")
-    sb3.main(["--num-envs", "2", "--steps", "32", "--rollout", "16", "--days", "1"])
-    assert capsys.readouterr().out.startswith("Battery: mean episode reward -")
-
-
-# --- skrl ---
-
-
-@pytest.mark.parametrize("algorithm", ["ippo", "mappo"])
-def test_skrl_trains_all_agents(
-    example: Load, algorithm: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    skrl = example("train_skrl", "skrl")
-    skrl.main(
-        [
-            *("--algorithm", algorithm, "--num-envs", "2", "--days", "1"),
-            *("--rollout", "24", "--steps", "240", "--hidden", "8"),
-        ]
-    )
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith(f"{algorithm}: ")
-    assert [line.partition(":")[0] for line in lines[1:]] == list(AGENTS)
-
-
-@pytest.mark.parametrize("algorithm", ["ippo", "mappo"])
-def test_skrl_updates_every_policy_from_the_right_inputs(example: Load, algorithm: str) -> None:
-    skrl = example("train_skrl", "skrl")
-    skrl.prepare(1)
-    env = skrl.BatchEnv(sdc_taichi.vector_env(2, **SAME_STEP), seed=1)
-    agent = skrl.learner(env, algorithm, rollout=8, hidden=(8,))
-    before = {a: agent.policies[a].net[0].weight.detach().clone() for a in AGENTS}
-    skrl.trainer(env, agent, 16).train()
-    for a in AGENTS:
-        assert not np.array_equal(before[a], agent.policies[a].net[0].weight.detach())
-        assert agent.policies[a].net[0].in_features == env.observation_space(a).shape[0]
-        seen = env.state_space(a) if algorithm == "mappo" else env.observation_space(a)
-        assert agent.values[a].net[0].in_features == seen.shape[0]
-    env.close()
-
-
-@pytest.mark.parametrize("algorithm", ["ippo", "mappo"])
-def test_skrl_values_the_state_in_which_an_episode_was_cut_off(
-    example: Load, algorithm: str
-) -> None:
-    skrl = example("train_skrl", "skrl")
-    torch = importlib.import_module("torch")
-    skrl.prepare(2)
-    env = skrl.BatchEnv(sdc_taichi.vector_env(2, **SAME_STEP), seed=2)
-    ends: list[Any] = []
-    plain_step = env.step
-
-    def step(actions: Any) -> Any:
-        given = plain_step(actions)
-        if "final" in given[4]:
-            ends.append((given[0], {a: r.clone() for a, r in given[1].items()}, given[4]["final"]))
-        return given
-
-    env.step = step
-    # Without scaling, and without an update before the episode ends, critics stay as they are.
-    agent = skrl.learner(
-        env, algorithm, rollout=DAY + 4, hidden=(8,), observation_preprocessor=None,
-        state_preprocessor=None, value_preprocessor=None,
-    )  # fmt: skip
-    skrl.trainer(env, agent, DAY + 2).train()
-    ((next_episode, paid, (observations, states)),) = ends
-    for a in AGENTS:
-        inputs = {"observations": observations[a], "states": states[a]}
-        with torch.no_grad():
-            value = agent.values[a].act(inputs, role="value")[0]
-        recorded = agent.memories[a].get_tensor_by_name("rewards")[DAY - 1]
-        assert torch.allclose(recorded, paid[a] + 0.995 * value, atol=1e-6)
-        assert not torch.equal(observations[a], next_episode[a])
-    env.close()
+    assert f"{agent}, trained: mean episode reward -" in capsys.readouterr().out
 
 
 # --- TorchRL ---
@@ -181,9 +106,8 @@ def test_skrl_values_the_state_in_which_an_episode_was_cut_off(
 
 def test_torchrl_env_passes_its_check(example: Load, capsys: pytest.CaptureFixture[str]) -> None:
     rl = example("torchrl_env", "torchrl", "tensordict")
-    rl.main(["--num-envs", "2", "--steps", str(DAY + 4)])
+    rl.main(2, DAY + 4)
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-4].startswith(f"{2 * (DAY + 4)} steps, ")
     assert [line.partition(":")[0] for line in lines[-3:]] == list(AGENTS)
 
 
@@ -226,77 +150,6 @@ def test_torchrl_env_starts_anew_within_an_episode_and_refuses_a_part(example: L
     env.close()
 
 
-# --- PPO in one file ---
-
-
-class Guess:
-    """A batch in which a learner is paid for each of its two choices that is right."""
-
-    num_envs = 64
-    single_observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
-    single_action_space = gymnasium.spaces.MultiDiscrete([3, 3])
-    right = (0, 2)
-
-    def reset(self, *, seed: int) -> tuple[Any, dict[str, Any]]:
-        self.random = np.random.default_rng(seed)
-        return self._observations(), {}
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        never = np.zeros(self.num_envs, dtype=np.bool_)
-        paid = (actions == np.array(self.right)).sum(axis=1).astype(np.float64)
-        return self._observations(), paid, never, never, {}
-
-    def _observations(self) -> Any:
-        return self.random.uniform(-1.0, 1.0, (self.num_envs, 3)).astype(np.float32)
-
-
-def test_ppo_in_one_file_finds_what_pays(example: Load) -> None:
-    ppo = example("train_cleanrl")
-    game = Guess()
-    agent = ppo.train(game, steps=20 * 8 * game.num_envs, rollout=8, seed=1)
-    observations, _ = game.reset(seed=2)
-    assert (agent.best(observations) == np.array(game.right)).all()
-
-
-def test_ppo_in_one_file_values_the_state_in_which_an_episode_was_cut_off(example: Load) -> None:
-    ppo = example("train_cleanrl")
-    torch = importlib.import_module("torch")
-    env, twin = (
-        gymnasium.make_vec("sdc_taichi/Joint-v0", **SAME_STEP, config="tiny", num_envs=2)
-        for _ in range(2)
-    )
-    agent = ppo.ActorCritic(env, 3)
-    with torch.no_grad():
-        found, following = ppo.collect(env, agent, env.reset(seed=3)[0], DAY)
-    twin.reset(seed=3)
-    for actions in found[1].view(DAY, 2, -1).numpy():
-        observations, paid, _, truncated, infos = twin.step(actions)
-    assert truncated.all()
-    np.testing.assert_array_equal(following, observations)
-    last = agent.inputs.scaled(torch.from_numpy(np.stack(infos["final_obs"])))
-    expected = torch.from_numpy(paid) + ppo.DISCOUNT * agent.value(last).detach()
-    np.testing.assert_allclose(found[-1][-2:], expected, rtol=1e-5)
-    assert not np.allclose(paid, expected)
-    env.close()
-    twin.close()
-
-
-def test_ppo_in_one_file_is_reproducible(example: Load, capsys: pytest.CaptureFixture[str]) -> None:
-    ppo = example("train_cleanrl")
-
-    def printed(seed: int) -> list[str]:
-        options = ["--num-envs", "2", "--days", "1", "--rollout", "24", "--steps", "96"]
-        ppo.main([*options, "--seed", str(seed)])
-        speed, *returns = capsys.readouterr().out.splitlines()
-        assert speed.endswith(" steps/s")
-        assert [line.partition(":")[0] for line in returns] == ["idle", "untrained", "trained"]
-        return returns
-
-    once, again, other = printed(0), printed(0), printed(1)
-    assert once == again
-    assert once != other
-
-
 # --- RLlib ---
 
 RLLIB = """
@@ -305,7 +158,7 @@ for seed in (0, 0):
     train_rllib.main(
         [
             *("--num-envs", "2", "--days", "1", "--rollout", "24", "--steps", "96"),
-            *("--hidden", "8", "--seed", str(seed)),
+            *("--seed", str(seed)),
         ]
     )
 """
@@ -346,28 +199,3 @@ def test_sb3_has_nothing_to_say_against_single_environments(
     env = gymnasium.make(name, config="tiny", days=1, actions=actions)
     checker.check_env(env.unwrapped)
     env.close()
-
-
-# --- the study of docs/training.md ---
-
-
-@pytest.mark.slow
-def test_the_study_trains_goes_on_and_compares(
-    example: Load, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    study = example("learning_study", "matplotlib")
-    arguments = [
-        *(str(tmp_path), "--algorithms", "ippo", "haa2c", "--seeds", "1", "--steps", "512"),
-        *("--sites", "NY", "--weeks", "0", "--data-centers", "2", "--held-out-weeks", "3"),
-        *("--rules", "g36", "--no-optimum"),
-    ]
-    study.main(arguments)
-    text = capsys.readouterr().out
-    for name in ("ippo", "haa2c", "g36", "idle"):
-        assert f"| {name} |" in text
-    assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG")
-    trained = (tmp_path / "trainings" / "ippo-0" / "policy" / "policy.safetensors").read_bytes()
-    study.main(arguments)
-    again = (tmp_path / "trainings" / "ippo-0" / "policy" / "policy.safetensors").read_bytes()
-    assert again == trained
-    assert capsys.readouterr().out == text

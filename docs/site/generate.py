@@ -2,8 +2,8 @@
 
     python docs/site/generate.py OUT
 
-writes ``commands.md``, ``quantities.md`` and a page for each part of the API to
-OUT/reference/generated.
+writes ``commands.md``, ``quantities.md``, ``training-settings.md`` and a page for each part of the
+API to OUT/reference/generated.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import typer.main
 from stage import write
 
 from sdc_taichi.cli.app import app
+from sdc_taichi.learning.training_settings import settings_markdown
 from sdc_taichi.types import CRAC_UNITS, DATA_CENTERS, QUANTITIES, RACKS, meanings
 
 FOLDER = "reference/generated"
@@ -171,7 +172,12 @@ def main() -> None:
 
 def pages() -> dict[str, str]:
     """Markdown of each generated page by the name of its file."""
-    made = {"commands": commands_page(), "quantities": quantities_page(), "api": api_index()}
+    made = {
+        "commands": commands_page(),
+        "quantities": quantities_page(),
+        "training-settings": settings_page(),
+        "api": api_index(),
+    }
     return made | {f"api-{part.name}": api_page(part) for part in API}
 
 
@@ -267,6 +273,23 @@ def quantities_page() -> str:
         cells = (f"`{name}`", quantity.unit, axes[quantity.axis], meaning.replace("``", "`"))
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+# --- Settings of a training -----------------------------------------------------------------------
+
+
+def settings_page() -> str:
+    """Every setting of a training."""
+    lines = [
+        "# Settings of a training",
+        "",
+        "Every setting of `sdc-taichi train`. `None` in the meanings is YAML's `null`. Section "
+        "`environment` has the [options of environments](../../environments.md#options), section "
+        "`overrides` the [fields of a configuration](../../configuration.md). "
+        "[Learning](../../learning.md) says which options of environments trainings change.",
+        "",
+    ]
+    return "\n".join(lines) + settings_markdown() + "\n"
 
 
 # --- The API --------------------------------------------------------------------------------------

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sdc_taichi.benchmark.episodes import Collection, Episode
-from sdc_taichi.learning.experts import objective_of_optimum
+from sdc_taichi.benchmark.episodes import Collection, Episode, objective_of_optimum
 
 
 @dataclass(slots=True)

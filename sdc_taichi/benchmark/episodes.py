@@ -6,10 +6,10 @@ and the environment does these. What is collected can therefore be done again, a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
@@ -18,20 +18,26 @@ import numpy as np
 import numpy.typing as npt
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.control import commands_of, make_controller
+from sdc_taichi.control import View, commands_of, make_controller
 from sdc_taichi.control.rules import Controller
 from sdc_taichi.envs import IDS
 from sdc_taichi.envs.actions import as_numbers
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.vector import SdcVectorEnv
 from sdc_taichi.errors import ConfigError, whole_number
-from sdc_taichi.learning.experts import FollowedOptimum, objective_of_optimum
-from sdc_taichi.learning.scenarios import training_environment
 from sdc_taichi.learning.split import DAYS_PER_WEEK, WEEKS
+from sdc_taichi.learning.training_settings import training_environment
 from sdc_taichi.optimum import StoppedError
+from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS as PARTS
+from sdc_taichi.optimum.problem import Agent
+from sdc_taichi.optimum.rollout import Follower, Targets
+from sdc_taichi.optimum.solve import solve
+from sdc_taichi.run.achievable import OPTIMUM, AchievedPath
+from sdc_taichi.run.loop import simulate
 from sdc_taichi.sim.hall_solver import Precision
-from sdc_taichi.types import F32, F64, Actions
+from sdc_taichi.sim.simulator import Simulator
+from sdc_taichi.types import F32, F64, I64, Actions, StepResult
 
 IDLE, RANDOM = "idle", "random"
 """Controller that leaves everything as it is, and the one whose actions are drawn evenly."""
@@ -251,6 +257,78 @@ class _Commander:
             of_each = given.reshape(size if given.ndim else 1, -1).mean(axis=1)
             out += np.abs(result[f"{name}_command"] - of_each) > _TOLERANCE
         return out / max(len(done), 1)
+
+
+class FollowedOptimum:
+    """Controller that steers towards the optimum's achieved path of the current episode.
+
+    Each episode is solved before its first step, unless a cache holds its optimum.
+
+    Args:
+        steps: number of steps of an episode.
+        objective: quantity to minimise.
+        agents: agents (load, cooling, battery) that the plan moves; the others are idle.
+        progress: progress callback of solving.
+        stop: asked now and then while solving; true raises ``StoppedError``.
+    """
+
+    def __init__(
+        self,
+        steps: int,
+        objective: Objective,
+        *,
+        agents: Sequence[Agent] = PARTS,
+        progress: Progress | None = None,
+        stop: Callable[[], bool] | None = None,
+    ) -> None:
+        self._steps, self._objective, self._agents = steps, objective, tuple(agents)
+        self._progress, self._stop = progress, stop
+        self._follower: Follower | None = None
+
+    def reset(self, seed: int | I64) -> None:
+        """Begin another episode."""
+        self._follower = None
+
+    def act(self, view: View) -> Actions:
+        """Commands for work, setpoint and battery."""
+        if self._follower is None:
+            self._follower = Follower(view, self._targets(view))
+        return self._follower.actions(view.state)
+
+    def _targets(self, view: View) -> Targets:
+        """States that the achieved path passes through."""
+        optimum = solve(
+            view.fleet,
+            steps=self._steps,
+            start=view.drivers.start,
+            drivers=view.drivers,
+            objective=self._objective,
+            agents=self._agents,
+            precision=view.precision,
+            progress=self._progress,
+            stop=self._stop,
+        )
+        rows: dict[str, list[F64]] = {name: [] for name in (f.name for f in fields(Targets))}
+
+        def record(result: StepResult) -> None:
+            for name, values in rows.items():
+                values.append(np.array(getattr(result, name)))
+
+        with Simulator(view.fleet, drivers=view.drivers, precision=view.precision) as sim:
+            simulate(sim, AchievedPath(optimum), self._steps, 0, on_step=record)
+        return Targets(**{name: np.stack(values) for name, values in rows.items()})
+
+
+def objective_of_optimum(name: str) -> Objective | None:
+    """Objective of ``optimum`` or ``optimum:OBJECTIVE``; None for the name of a controller.
+
+    Raises:
+        ConfigError: an objective that is not valid.
+    """
+    kind, colon, objective = name.partition(":")
+    if kind != OPTIMUM:
+        return None
+    return Objective.parse(objective if colon else "carbon")
 
 
 class _Chance:

@@ -98,15 +98,14 @@ def evaluate_command(
     All begin in equal weeks and states; the first day of each week is run but not scored. The share
     of the achievable is 0 for idle commands and 1 for the known optimum.
     """
-    from sdc_taichi.learning.evaluation import check_contenders
-    from sdc_taichi.learning.evaluation_folder import (
+    from sdc_taichi.learning.evaluation import check_contenders, training_settings
+    from sdc_taichi.learning.evaluation_table import (
         EVALUATION_FILE,
         ROWS_FILE,
         TABLE_FILE,
         content_json,
         evaluation_content,
         prepare_evaluation_folder,
-        training_settings,
         write_evaluation,
     )
     from sdc_taichi.learning.split import parse_weeks
@@ -232,8 +231,7 @@ def _contenders(
 ) -> list[Contender]:
     """Policies and named controllers for data centers."""
     from sdc_taichi.control import make_controller
-    from sdc_taichi.learning.evaluation import Contender
-    from sdc_taichi.learning.evaluation_folder import contenders_of
+    from sdc_taichi.learning.evaluation import Contender, contenders_of
 
     contenders = contenders_of(folders, fleet, agents_alone=agents_alone)
     return contenders + [Contender(name, make_controller(name, fleet)) for name in named]
@@ -241,7 +239,7 @@ def _contenders(
 
 def _print_tables(found: Evaluation, weeks: DataCenterWeeks) -> None:
     """Print the tables of an evaluation."""
-    from sdc_taichi.learning.evaluation_folder import remarks, tables_of
+    from sdc_taichi.learning.evaluation_table import remarks, tables_of
 
     for title, table in tables_of(found, weeks):
         print_table(title, table)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def _algorithms() -> Iterable[str]:
-    from sdc_taichi.learning.settings import LEARNING_SETTINGS
+    from sdc_taichi.learning.algorithms import LEARNING_SETTINGS
 
     return LEARNING_SETTINGS
 
@@ -44,7 +44,7 @@ def train_command(
         str | None,
         typer.Argument(
             metavar="ALGORITHM",
-            help="ppo, ippo, mappo, happo, haa2c, had3qn, hasac, cloning or cross-entropy.",
+            help="ppo, ippo, mappo, happo, haa2c, had3qn, hasac or cross-entropy.",
             show_default=False,
             autocompletion=completed_by(_algorithms),
         ),
@@ -171,7 +171,7 @@ def _settings(
     for text in assigned:
         apply_override(values, text)
     if "algorithm" not in values:
-        from sdc_taichi.learning.settings import LEARNING_SETTINGS
+        from sdc_taichi.learning.algorithms import LEARNING_SETTINGS
 
         raise ConfigError(f"ALGORITHM: missing; valid: {', '.join(LEARNING_SETTINGS)}")
     return make_settings(values, "train")

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from sdc_taichi.errors import ConfigError
+from sdc_taichi.learning.algorithms import OffPolicySettings
 from sdc_taichi.learning.policy import CHOICES
-from sdc_taichi.learning.settings import OffPolicySettings
 
 MOST_JOINT_ACTIONS = 729
 """Largest number of joint actions that a critic values: those of six choices out of three."""

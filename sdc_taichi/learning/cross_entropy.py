@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.learning.normalise import CLIP, LEAST_STD
+from sdc_taichi.learning.algorithms import CrossEntropySettings
+from sdc_taichi.learning.networks import CLIP, LEAST_STD
 from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
-from sdc_taichi.learning.settings import CrossEntropySettings
-from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces
+from sdc_taichi.learning.stream import EnvironmentStream
 from sdc_taichi.types import F32, F64, I64
 
 LEAST_SPREAD = 1e-9
@@ -51,14 +51,9 @@ class CrossEntropySearch:
 
     Args:
         settings: the settings.
-        spaces: what each learner sees and does.
-        size: number of data centers, B.
-        episode_steps: number of steps of an episode.
+        stream: the environments to learn in.
         updates: number of updates of the whole training.
         seed: seed of all that is drawn.
-
-    Attributes:
-        steps_per_update: steps of each data center per update.
 
     Raises:
         ConfigError: more candidates than data centers.
@@ -67,20 +62,18 @@ class CrossEntropySearch:
     def __init__(
         self,
         settings: CrossEntropySettings,
-        spaces: Mapping[str, LearnerSpaces],
+        stream: EnvironmentStream,
         *,
-        size: int,
-        episode_steps: int,
         updates: int,
         seed: int,
     ) -> None:
+        self._size = size = stream.size
         if settings.candidates > size:
             raise ConfigError(
                 f"learning.candidates {settings.candidates}: there are {size} data centers, and "
                 f"each tries one at a time; valid is 2..{size}"
             )
-        self._settings, self._spaces, self._updates = settings, dict(spaces), updates
-        self._size, self.steps_per_update = size, episode_steps
+        self._settings, self._spaces, self._updates = settings, stream.spaces, updates
         self._generator = np.random.Generator(np.random.PCG64(seed))
         self._done = 0
         self._searches: dict[str, _Search] = {}
@@ -118,7 +111,7 @@ class CrossEntropySearch:
                 of_each = np.bincount(tried[name], figures) / np.bincount(tried[name])
                 self._select(search, drawn[name], of_each)
             self._remember(search, returns[name])
-            logged[f"reward/{name}"] = float(returns[name].mean()) / self.steps_per_update
+            logged[f"reward/{name}"] = float(returns[name].mean()) / stream.episode_steps
             logged[f"spread/{name}"] = float(search.std.mean())
         return logged
 

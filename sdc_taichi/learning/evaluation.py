@@ -6,18 +6,26 @@ stored or waits at the end is valued, so that an empty battery or work put off i
 
 from __future__ import annotations
 
+import json
 import os
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import PERFECT, Controller, ForecastError, Idle, PerAgent
+from sdc_taichi.envs.agents import COMMAND_OF_AGENT
 from sdc_taichi.errors import ConfigError, whole_number
+from sdc_taichi.learning.controller import PolicyController
+from sdc_taichi.learning.policy import Policy
 from sdc_taichi.learning.split import DAYS_PER_WEEK, UNSCORED_DAYS, data_center_weeks
 from sdc_taichi.learning.statistics import change_pct, share_pct
+from sdc_taichi.learning.training_folder import SETTINGS_FILE, settings_of
+from sdc_taichi.learning.training_settings import TrainingSettings
 from sdc_taichi.optimum import StoppedError
 from sdc_taichi.optimum.objective import Objective, Score
 from sdc_taichi.optimum.problem import AGENTS
@@ -27,6 +35,7 @@ from sdc_taichi.run.achievable import OPTIMUM, AchievedPath, achievement, begin_
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import add_step, empty_totals, metrics_per_dc
 from sdc_taichi.sim.bills import no_demand
+from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F64, I64, StepResult
@@ -411,3 +420,83 @@ def _run(
         stop=stop,
     )
     return score, done.steps == weeks.steps
+
+
+def training_settings(folders: Sequence[Path]) -> TrainingSettings | None:
+    """Settings of the first of several trainings; None if none of the folders is of a training.
+
+    Args:
+        folders: folders of trainings or policies.
+
+    Raises:
+        ConfigError: settings that are not valid, or trainings on other data centers than the first.
+    """
+    found: tuple[Path, TrainingSettings] | None = None
+    for folder in folders:
+        if not (folder / SETTINGS_FILE).is_file():
+            continue
+        settings = settings_of(folder)
+        if found is None:
+            found = folder, settings
+        for name in ("config", "overrides"):
+            if getattr(settings, name) != getattr(found[1], name):
+                raise ConfigError(
+                    f"{folder}: was trained with another {name} than {found[0]}; valid with both "
+                    "is --config"
+                )
+    return None if found is None else found[1]
+
+
+def contenders_of(
+    folders: Sequence[Path], fleet: Fleet, *, agents_alone: bool = True
+) -> list[Contender]:
+    """Policies of trainings as contenders; those that differ in their seed alone share a name.
+
+    Args:
+        folders: folders of trainings or policies.
+        fleet: data centers that they are to control.
+        agents_alone: whether each agent of a policy of several also runs alone.
+
+    Raises:
+        SdcError: a folder without a policy, or a policy that does not fit the data centers.
+    """
+    policies = [Policy.load(folder) for folder in folders]
+    keys = [_key(folder, policy) for folder, policy in zip(folders, policies, strict=True)]
+    names = _names(folders, policies, keys)
+    found = []
+    for folder, policy, key in zip(folders, policies, keys, strict=True):
+        controller = PolicyController(policy, fleet, f"policy {folder}")
+        parts = _parts(policy)
+        alone = parts if agents_alone and len(parts) > 1 else ()
+        found.append(Contender(names[key], controller, policy.about.seed, alone))
+    return found
+
+
+def _key(folder: Path, policy: Policy) -> str:
+    """Text that is equal for trainings which differ in their seed alone."""
+    about = policy.about.model_dump(exclude={"seed", "fingerprint"})
+    settings = {}
+    if (folder / SETTINGS_FILE).is_file():
+        settings = settings_of(folder).model_dump(mode="json", exclude={"seed"})
+        about.pop("steps")  # the best policies of seeds come from different updates
+    return json.dumps([about, policy.interface.model_dump(), settings], sort_keys=True)
+
+
+def _names(
+    folders: Sequence[Path], policies: Sequence[Policy], keys: Sequence[str]
+) -> dict[str, str]:
+    """Name of each key: its algorithm, or its folder where another key has that algorithm."""
+    first = {key: i for i, key in reversed(list(enumerate(keys)))}
+    algorithms = [policies[i].about.algorithm for i in first.values()]
+    names: dict[str, str] = {}
+    for key, i in first.items():
+        name = policies[i].about.algorithm
+        if algorithms.count(name) > 1:
+            name = re.sub(r"[-_.]?(seed)?[-_.]?\d+$", "", folders[i].absolute().name) or name
+        names[key] = name if name not in names.values() else str(folders[i])
+    return names
+
+
+def _parts(policy: Policy) -> tuple[str, ...]:
+    """Of load, cooling and battery what the agents of a policy move."""
+    return tuple(COMMAND_OF_AGENT[agent] for agent in policy.interface.agents)

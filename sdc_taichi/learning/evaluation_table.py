@@ -1,4 +1,4 @@
-"""Tables of an evaluation: all weeks together, by site, by agent, and pairs of controllers.
+"""Tables of an evaluation, by controller, site, agent and pair, and the folder they are kept in.
 
 Figures are those with valued ends where an optimum values them, and as they are where none does.
 Intervals are those of ``statistics.bootstrap_interval``, with the same draws for all rows.
@@ -6,15 +6,21 @@ Intervals are those of ``statistics.bootstrap_interval``, with the same draws fo
 
 from __future__ import annotations
 
+import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sdc_taichi.errors import printable
-from sdc_taichi.learning.evaluation import ALL, IDLE, Evaluation
+from sdc_taichi.atomic_file import atomic_write
+from sdc_taichi.errors import ConfigError, SdcError, printable
+from sdc_taichi.learning.evaluation import ALL, IDLE, DataCenterWeeks, Evaluation
+from sdc_taichi.learning.policy import Policy
 from sdc_taichi.learning.statistics import (
     Interval,
     Statistic,
@@ -27,6 +33,7 @@ from sdc_taichi.learning.statistics import (
 from sdc_taichi.optimum.problem import AGENTS
 from sdc_taichi.run.achievable import OPTIMUM
 from sdc_taichi.types import F64
+from sdc_taichi.user_file import list_folder
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -302,3 +309,156 @@ def _cell(value: Any, decimals: int = 2) -> str:
 def is_compared(name: str) -> bool:
     """Whether a controller is neither idle nor the optimum, the two ends of the scale."""
     return name not in (IDLE, OPTIMUM)
+
+
+FORMAT = "sdc-evaluation/1"
+"""Version of the format of evaluation.json."""
+EVALUATION_FILE, ROWS_FILE, TABLE_FILE = "evaluation.json", "rows.csv", "table.md"
+"""Files of an evaluation."""
+_BOUND_IS_NONE = "none"
+
+
+def evaluation_content(
+    evaluation: Evaluation,
+    weeks: DataCenterWeeks,
+    *,
+    command: str = "",
+    folders: Sequence[Path] = (),
+) -> dict[str, Any]:
+    """Content of evaluation.json.
+
+    Args:
+        evaluation: the evaluation.
+        weeks: the weeks that it is of.
+        command: command line that does it again.
+        folders: folders of its trainings or policies.
+    """
+    names = [n for n in dict.fromkeys(evaluation.rows.get("controller", ())) if is_compared(n)]
+    return {
+        "format": FORMAT,
+        "version": version("sdc-taichi"),
+        "command": command,
+        "objective": str(weeks.objective),
+        "unit": weeks.objective.unit,
+        "sites": list(dict.fromkeys(weeks.sites)),
+        "weeks": list(dict.fromkeys(weeks.weeks)),
+        "steps": weeks.steps,
+        "scored_from": weeks.scored_from,
+        "seed": weeks.seed,
+        "forecast_error": asdict(weeks.forecast_error),
+        "fingerprint": weeks.sim.fingerprint(),
+        "has_optimum": weeks.optimum is not None,
+        "policies": [{"folder": str(f), **Policy.load(f).about.model_dump()} for f in folders],
+        "summary": _records(summary(evaluation)),
+        "by_site": _records(by_site(evaluation)),
+        "by_agent": _records(by_agent(evaluation)),
+        "differences": _records(differences(evaluation, names[0])) if names else [],
+        "missing": list(evaluation.missing),
+        "remarks": remarks(weeks),
+    }
+
+
+def remarks(weeks: DataCenterWeeks) -> list[str]:
+    """Sentences that warn of figures without an optimum, or whose ends are not valued.
+
+    Args:
+        weeks: the weeks that it is of.
+    """
+    if weeks.optimum is None:
+        return ["Without an optimum ends have no value: an empty battery or work put off saves."]
+    names, kinds = weeks.optimum.names, weeks.optimum.bound_kinds
+    return [
+        f"{name}: bound {kind}; ends that differ have no value there"
+        for name, kind in zip(names, kinds, strict=True)
+        if kind.startswith(_BOUND_IS_NONE)
+    ]
+
+
+def tables_of(evaluation: Evaluation, weeks: DataCenterWeeks) -> list[tuple[str, pd.DataFrame]]:
+    """Tables with their titles: all weeks together, by site, by agent, and differences.
+
+    Args:
+        evaluation: the evaluation.
+        weeks: the weeks that it is of.
+    """
+    names = [n for n in dict.fromkeys(evaluation.rows["controller"]) if is_compared(n)]
+    days = weeks.steps // (24 * weeks.sim.fleet.steps_per_hour)
+    scored = "day 2" if days == 2 else f"days 2 to {days}"
+    title = f"{weeks.objective}, {scored} of {len(weeks.weeks)} data-center weeks, 95 % intervals"
+    found = [
+        (title, summary(evaluation)),
+        ("against idle commands by site (%)", by_site(evaluation)),
+        ("each agent alone, the others idle", by_agent(evaluation)),
+    ]
+    if names:
+        found.append((f"{names[0]} against the others", differences(evaluation, names[0])))
+    return [(title, table) for title, table in found if len(table)]
+
+
+def prepare_evaluation_folder(out: Path, *, force: bool = False) -> None:
+    """Make the folder of an evaluation, or see that its files may be replaced.
+
+    Args:
+        out: the folder.
+        force: also take a folder with other files.
+
+    Raises:
+        SdcError: a file, a folder with other files, or one that cannot be made.
+    """
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"--out {out}: is a file; valid is a folder")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SdcError(f"--out {out}: cannot be made: {error.strerror or error}") from None
+    others = [name for name in list_folder(out) if not name.startswith(".")]
+    if others and EVALUATION_FILE not in others and not force:
+        some = ", ".join(sorted(others)[:3])
+        raise ConfigError(
+            f"--out {out}: holds other files ({some}); choose another folder, or --force"
+        )
+
+
+def write_evaluation(
+    out: Path, evaluation: Evaluation, weeks: DataCenterWeeks, content: Mapping[str, Any]
+) -> None:
+    """Write rows.csv, table.md and, last, evaluation.json.
+
+    Args:
+        out: the folder.
+        evaluation: the evaluation.
+        weeks: the weeks that it is of.
+        content: content of evaluation.json.
+
+    Raises:
+        SdcError: a file cannot be written.
+    """
+    tables = [
+        text
+        for title, table in tables_of(evaluation, weeks)
+        for text in (f"## {title[:1].upper()}{title[1:]}", markdown(table))
+    ]
+    texts = {
+        ROWS_FILE: evaluation.rows.to_csv(index=False),
+        TABLE_FILE: "\n\n".join([*tables, *content["remarks"], f"    {content['command']}"]) + "\n",
+        EVALUATION_FILE: content_json(content),
+    }
+    for name, text in texts.items():
+        with atomic_write(out / name) as file:
+            file.write(text.encode())
+
+
+def content_json(content: Mapping[str, Any]) -> str:
+    """JSON text of the content of evaluation.json."""
+    return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def _records(table: Any) -> list[dict[str, Any]]:
+    """Rows of a table for JSON, which has no nan."""
+    return [
+        {
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in row.items()
+        }
+        for row in table.to_dict("records")
+    ]

@@ -1,4 +1,4 @@
-"""Networks of policies and critics, and distributions of actions."""
+"""Networks of policies and critics, distributions of actions, moments of inputs, random numbers."""
 
 from __future__ import annotations
 
@@ -6,17 +6,90 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sdc_taichi.errors import ConfigError
-from sdc_taichi.learning.forward import Activation
-from sdc_taichi.learning.normalise import CLIP, RunningMoments
-from sdc_taichi.learning.policy import CHOICES, PolicyNetwork
-from sdc_taichi.learning.settings import OnPolicySettings
+from sdc_taichi.learning.algorithms import OnPolicySettings
+from sdc_taichi.learning.policy import CHOICES, Activation, PolicyNetwork
 from sdc_taichi.learning.stream import LearnerSpaces
 from sdc_taichi.types import F32
+
+USES = ("weights", "actions", "batches", "order")
+"""Uses of random numbers: first weights of networks, actions drawn from policies, steps to learn
+from, and the order in which learners are updated."""
+
+
+def generators(seed: int) -> dict[str, torch.Generator]:
+    """Generators by use, so that drawing more for one use changes no other.
+
+    Args:
+        seed: seed of the training, from which each generator gets a seed that no other has.
+    """
+    return {use: torch.Generator().manual_seed(seed * len(USES) + i) for i, use in enumerate(USES)}
+
+
+LEAST_STD = 1e-2
+"""Least standard deviation to divide by: an entry that hardly moves is not blown up."""
+CLIP = 10.0
+"""Largest normalised value, of either sign."""
+
+
+class RunningMoments:
+    """Mean and variance of all rows seen, by column (Chan, Golub, LeVeque 1983).
+
+    Args:
+        width: number of columns.
+
+    Attributes:
+        mean: mean of each column, (width,).
+        variance: variance of each column, (width,).
+        count: number of rows seen.
+    """
+
+    def __init__(self, width: int) -> None:
+        self.mean = torch.zeros(width, dtype=torch.float64)
+        self.variance = torch.ones(width, dtype=torch.float64)
+        self.count = 0
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviation to divide by, (width,), f32."""
+        return self.variance.sqrt().clamp_min(LEAST_STD).float()
+
+    def add(self, rows: Tensor) -> None:
+        """Take rows, (n, width), into account."""
+        n = len(rows)
+        row_mean = rows.mean(0)
+        # Many times faster than Tensor.var, which goes through rows one by one.
+        variance = (rows - row_mean).square_().mean(0).double()
+        mean = row_mean.double()
+        total = self.count + n
+        shift = mean - self.mean
+        weight = self.count / total
+        self.variance = (
+            weight * self.variance
+            + (1.0 - weight) * variance
+            + weight * (1.0 - weight) * shift * shift
+        )
+        self.mean = self.mean + (1.0 - weight) * shift
+        self.count = total
+
+    def normalise(self, values: Tensor) -> Tensor:
+        """Values less the mean over the standard deviation, within -CLIP..CLIP."""
+        return ((values - self.mean.float()) / self.std).clamp_(-CLIP, CLIP)
+
+    def state_dict(self) -> dict[str, object]:
+        """Everything that ``load_state_dict`` needs."""
+        return {"mean": self.mean, "variance": self.variance, "count": self.count}
+
+    def load_state_dict(self, values: dict[str, object]) -> None:
+        """Go on from what ``state_dict`` returned."""
+        self.mean, self.variance = _tensor(values["mean"]), _tensor(values["variance"])
+        self.count = int(str(values["count"]))
+
+
+def _tensor(value: object) -> Tensor:
+    return torch.as_tensor(value, dtype=torch.float64).clone()
 
 
 class _TanhBySigmoid(torch.autograd.Function):
@@ -115,41 +188,6 @@ def policy_network(
         head="clip" if spaces.choices is None else "argmax",
         choices=spaces.choices or CHOICES,
     )
-
-
-def load_network(
-    net: nn.Sequential, moments: RunningMoments, network: PolicyNetwork, rows: int
-) -> None:
-    """Make a perceptron and the moments of its inputs those of a policy's network.
-
-    Args:
-        net: the perceptron.
-        moments: moments of what it observes.
-        network: the policy's network.
-        rows: rows that the moments are taken to have seen: the more, the slower they change.
-
-    Raises:
-        ConfigError: layers or functions that differ.
-    """
-    layers = [layer for layer in net if isinstance(layer, nn.Linear)]
-    sizes = (layers[0].in_features, *(layer.out_features for layer in layers))
-    who = f"network of {', '.join(network.agents)}"
-    if network.sizes != sizes:
-        raise ConfigError(f"{who}: has {network.sizes} units; valid here is {sizes}")
-    kinds = [
-        name for name, kind in ACTIVATIONS.items() if len(net) == 1 or isinstance(net[1], kind)
-    ]
-    if network.activation not in kinds:
-        raise ConfigError(f"{who}: has {network.activation} units; valid here is {kinds[0]}")
-    if network.clip != CLIP:
-        raise ConfigError(f"{who}: cuts observations at {network.clip:g}; valid here is {CLIP:g}")
-    with torch.no_grad():
-        for layer, (weight, bias) in zip(layers, network.layers, strict=True):
-            layer.weight.copy_(torch.from_numpy(weight.copy()))
-            layer.bias.copy_(torch.from_numpy(bias.copy()))
-    moments.mean = torch.from_numpy(network.mean.astype(np.float64))
-    moments.variance = torch.from_numpy(network.std.astype(np.float64) ** 2)
-    moments.count = rows
 
 
 class Actor(nn.Module):

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from sdc_taichi.learning.action_values import ContinuousValues, JointValues, expected
+from sdc_taichi.learning.algorithms import OffPolicySettings
 from sdc_taichi.learning.networks import perceptron
-from sdc_taichi.learning.settings import OffPolicySettings
 from sdc_taichi.learning.stream import LearnerSpaces
 
 LEAST_LOG_STD, MOST_LOG_STD = -5.0, 2.0

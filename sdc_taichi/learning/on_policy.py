@@ -18,36 +18,26 @@ input, in whose reward it learns, in M_i, and in clipping:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from sdc_taichi.errors import ConfigError
-from sdc_taichi.learning.generators import generators
-from sdc_taichi.learning.networks import Actor, load_network, perceptron, policy_network
-from sdc_taichi.learning.normalise import RunningMoments
+from sdc_taichi.learning.algorithms import OnPolicyDefinition, OnPolicySettings
+from sdc_taichi.learning.networks import (
+    Actor,
+    RunningMoments,
+    generators,
+    perceptron,
+    policy_network,
+)
 from sdc_taichi.learning.policy import PolicyNetwork
-from sdc_taichi.learning.settings import OnPolicySettings
-from sdc_taichi.learning.stream import EnvironmentStream, LearnerSpaces
+from sdc_taichi.learning.stream import EnvironmentStream
 
 TEAM = "team"
 """Name of the critic of the team's reward."""
 ADAM_EPSILON = 1e-5
-
-
-class OnPolicyDefinition(NamedTuple):
-    """Properties in which on-policy algorithms differ."""
-
-    critic: str
-    """Input of critics: ``observation`` of each learner, or the shared ``state``."""
-    reward: str
-    """Reward that critics learn: ``own`` of each learner, or that of the ``team``."""
-    sequential: bool
-    """Whether learners are updated in random order, each weighed by the ratios of those before."""
-    clips: bool
-    """Whether ratios are clipped, and steps used in several passes."""
 
 
 class _Critic(NamedTuple):
@@ -79,30 +69,24 @@ class OnPolicy:
     Args:
         definition: properties in which the algorithm differs from others.
         settings: settings.
-        spaces: what each learner sees and does.
-        state_width: number of entries of the shared state, m.
+        stream: the environments to learn in.
         updates: number of updates of the whole training, over which the learning rate falls.
         seed: of weights, actions, order of learners and of mini-batches.
-
-    Attributes:
-        steps_per_update: steps of each data center in an update.
     """
 
     def __init__(
         self,
         definition: OnPolicyDefinition,
         settings: OnPolicySettings,
-        spaces: Mapping[str, LearnerSpaces],
-        state_width: int,
+        stream: EnvironmentStream,
         *,
         updates: int,
         seed: int,
     ) -> None:
-        self._settings, self._spaces, self._updates = settings, dict(spaces), updates
+        self._settings, self._spaces, self._updates = settings, stream.spaces, updates
         self._definition = definition._replace(
             critic=settings.critic or definition.critic, reward=settings.reward or definition.reward
         )
-        self.steps_per_update = settings.steps_per_update
         self._done = 0
         self._generators = generators(seed)
         self._actors: dict[str, Actor] = {}
@@ -112,10 +96,10 @@ class OnPolicy:
             self._actors[name] = actor = Actor(of, settings, self._generators["weights"])
             self._adams[name] = self._adam(actor)
             self._moments[name] = RunningMoments(of.observation_width)
-        self._critics = self._make_critics(state_width)
+        self._critics = self._make_critics(stream.state_width)
 
     def update(self, stream: EnvironmentStream) -> dict[str, float]:
-        """Act for ``steps_per_update`` steps, and learn from them.
+        """Act for ``rollout_decisions`` decisions, and learn from them.
 
         The first update only measures mean and variance of what is observed.
 
@@ -145,27 +129,6 @@ class OnPolicy:
             policy_network(self._actors[name].net, self._moments[name], of, activation)
             for name, of in self._spaces.items()
         )
-
-    def start_from(self, networks: Sequence[PolicyNetwork], rows: int) -> None:
-        """Start with the policies of another training, such as a clone's.
-
-        Args:
-            networks: networks of the learners.
-            rows: situations that the means and variances of observations stand for.
-
-        Raises:
-            ConfigError: networks of other learners, or of another shape.
-        """
-        by_agents = {network.agents: network for network in networks}
-        learners = {of.agents: name for name, of in self._spaces.items()}
-        if set(by_agents) != set(learners):
-            found, valid = (
-                "; ".join(", ".join(agents) for agents in each) for each in (by_agents, learners)
-            )
-            raise ConfigError(f"policy to start from: has networks of {found}; valid is {valid}")
-        for agents, name in learners.items():
-            net, moments = self._actors[name].net, self._moments[name]
-            load_network(net, moments, by_agents[agents], rows)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that decides how the training goes on."""

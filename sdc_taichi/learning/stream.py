@@ -15,14 +15,13 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from sdc_taichi.control import View
 from sdc_taichi.envs.core import Observation, Transition
 from sdc_taichi.envs.episodes import draws_inputs
 from sdc_taichi.envs.single import JointLearner
 from sdc_taichi.envs.vector import MultiAgentVectorEnv
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.policy import CHOICES, action_levels
-from sdc_taichi.types import F64, Actions
+from sdc_taichi.types import F64
 
 JOINT = "joint"
 """Name of the learner that stands for all learning agents."""
@@ -155,26 +154,9 @@ class EnvironmentStream:
         return after
 
     @property
-    def view(self) -> View:
-        """The situation before the next step, as controllers see it."""
-        return self._core.view
-
-    @property
     def episode_steps(self) -> int:
         """Number of steps of an episode."""
         return self._core.steps
-
-    def actions_of(self, commands: Actions) -> dict[str, Tensor]:
-        """Actions that come nearest to a controller's commands, by learner, (B, k) each."""
-        by_agent = self._core.actions_of(commands)
-        actions = {}
-        for name, of in self.spaces.items():
-            parts = [by_agent[agent].reshape(self.size, -1) for agent in of.agents]
-            found = torch.from_numpy(np.concatenate(parts, axis=1))
-            if self._levels is not None:
-                found = (found[..., None] - self._levels).abs().argmin(-1)
-            actions[name] = found.float() if of.choices is None else found
-        return actions
 
     def state_dict(self) -> dict[str, Any]:
         """State of the environments, for ``load_state_dict`` of a stream made alike."""

@@ -15,19 +15,29 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
 from sdc_taichi.envs.vector import MultiAgentVectorEnv, vector_env
 from sdc_taichi.errors import ConfigError, SdcError
-from sdc_taichi.learning.algorithms import make_algorithm, steps_per_update, uses_state
-from sdc_taichi.learning.checkpoint import read_state, write_state
+from sdc_taichi.learning.algorithms import (
+    OFF_POLICY,
+    ON_POLICY,
+    ActingSettings,
+    CrossEntropySettings,
+    LearningSettings,
+    OffPolicySettings,
+    OnPolicySettings,
+    uses_state,
+)
 from sdc_taichi.learning.controller import PolicyController
+from sdc_taichi.learning.cross_entropy import CrossEntropySearch
 from sdc_taichi.learning.evaluation import DataCenterWeeks, Validation, prepare, validate
 from sdc_taichi.learning.interface import interface_of
-from sdc_taichi.learning.policy import About, Policy
-from sdc_taichi.learning.settings import LEAST_UPDATES, ActingSettings
+from sdc_taichi.learning.off_policy import OffPolicy
+from sdc_taichi.learning.on_policy import OnPolicy
+from sdc_taichi.learning.policy import About, Policy, PolicyNetwork
 from sdc_taichi.learning.split import VALIDATION
 from sdc_taichi.learning.stream import EnvironmentStream
 from sdc_taichi.learning.training_folder import (
@@ -37,10 +47,13 @@ from sdc_taichi.learning.training_folder import (
     LAST_POLICY,
     TRAINING_FILE,
     VALIDATION_FILE,
+    CsvLog,
+    EventLog,
     claimed,
+    read_state,
     write_settings,
+    write_state,
 )
-from sdc_taichi.learning.training_log import CsvLog, EventLog
 from sdc_taichi.learning.training_settings import TrainingSettings
 from sdc_taichi.optimum import StoppedError
 from sdc_taichi.optimum.solve import Progress as StageProgress
@@ -144,9 +157,10 @@ class _Run:
         try:
             self._interface = interface_of(env.core.sim.fleet, env.core.options)
             self._stream = make_stream(settings, env)
-            self._steps_each = env.num_envs * steps_per_update(settings.learning, self._stream)
+            learning, episode_steps = settings.learning, self._stream.episode_steps
+            self._steps_each = env.num_envs * learning.steps_per_update(episode_steps)
             self._updates = settings.steps // self._steps_each
-            least = LEAST_UPDATES.get(settings.algorithm, 1)
+            least = learning.least_updates
             if self._updates < least:
                 raise ConfigError(
                     f"steps {settings.steps:,}: an update takes {self._steps_each:,}, of "
@@ -155,7 +169,7 @@ class _Run:
                 )
             self._algorithm = make_algorithm(
                 settings.algorithm,
-                settings.learning,
+                learning,
                 self._stream,
                 updates=self._updates,
                 seed=settings.seed,
@@ -368,6 +382,47 @@ class _Run:
             about,
             self._settings.learning.decision_steps,
         )
+
+
+class Algorithm(Protocol):
+    """A learner in a stream of environments that makes networks of policies."""
+
+    def update(self, stream: EnvironmentStream) -> dict[str, float]:
+        """Act for some steps, learn, and return numbers to log by name."""
+
+    def networks(self) -> tuple[PolicyNetwork, ...]:
+        """Networks of the policies as they are now."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides how the training goes on."""
+
+    def load_state_dict(self, values: Mapping[str, Any]) -> None:
+        """Restore what ``state_dict`` of an algorithm of equal settings returned."""
+
+
+def make_algorithm(
+    name: str, settings: LearningSettings, stream: EnvironmentStream, *, updates: int, seed: int
+) -> Algorithm:
+    """Make an algorithm, before its first update.
+
+    Args:
+        name: name of the algorithm.
+        settings: settings of the algorithm.
+        stream: the environments to learn in.
+        updates: number of updates of the whole training.
+        seed: seed of all random numbers of the algorithm.
+
+    Raises:
+        ConfigError: actions that the algorithm cannot decide, or fewer data centers than it needs.
+    """
+    match settings:
+        case OnPolicySettings():
+            return OnPolicy(ON_POLICY[name], settings, stream, updates=updates, seed=seed)
+        case OffPolicySettings():
+            return OffPolicy(OFF_POLICY[name], settings, stream, updates=updates, seed=seed)
+        case CrossEntropySettings():
+            return CrossEntropySearch(settings, stream, updates=updates, seed=seed)
+    raise TypeError(f"no algorithm has {type(settings).__name__}")
 
 
 class _Speed:

@@ -1,20 +1,35 @@
-"""The folder of a training: what its files are called, and who may write them.
+"""The folder of a training: who may write it, its settings, its curves, and its checkpoint.
 
 Settings are ``settings.yaml``, curves ``training.csv``, ``validation.csv`` and ``tensorboard``. The
 last policy is ``policy``, the one that did best in the validation weeks ``best``, and all that a
 resumed training needs is ``checkpoint.safetensors``.
+
+The state in a checkpoint is made of dicts, lists, tuples, texts, numbers, None, NumPy arrays and
+torch tensors. Its file is one of the format safetensors: arrays and tensors as such, and how they
+are nested, with all that is no array, as JSON in its metadata.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import csv
+import io
+import json
+import math
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
 
 from sdc_taichi.atomic_file import FileClaim, atomic_write, naming_errors
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.config.plain_values import load_json
+from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.learning.training_settings import TrainingSettings, load_settings
-from sdc_taichi.user_file import list_folder
+from sdc_taichi.user_file import decoding, list_folder, open_input
 
 SETTINGS_FILE, CHECKPOINT_FILE = "settings.yaml", "checkpoint.safetensors"
 """Files of a training."""
@@ -83,3 +98,262 @@ def settings_of(folder: Path) -> TrainingSettings:
     if not (folder / SETTINGS_FILE).is_file():
         raise ConfigError(f"{folder}: holds no training; valid is a folder that train has written")
     return load_settings(folder / SETTINGS_FILE)
+
+
+UPDATE = "update"
+"""Column that every row has: the number of the update after which it was written."""
+
+
+class CsvLog:
+    """A table that grows by rows; a row with a new column widens it.
+
+    Args:
+        path: the file; rows that it has are gone on from.
+        until: last update whose rows are kept; those of later ones are to be written anew.
+
+    Raises:
+        SdcError: the file cannot be read or written.
+    """
+
+    def __init__(self, path: Path, until: int) -> None:
+        self._path = path
+        self._columns: list[str] = []
+        rows = self._read()
+        kept = [row for row in rows if _is_whole(row, self._columns) and int(row[0]) <= until]
+        if kept:
+            self._write(kept)
+        else:
+            self._columns = []
+            with naming_errors(path):
+                path.unlink(missing_ok=True)
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Append a row, whose first entry is ``update``.
+
+        Raises:
+            SdcError: the file cannot be written.
+        """
+        new = [name for name in row if name not in self._columns]
+        if new:
+            rows = self._read()
+            self._columns += new
+            self._write(rows)
+        with naming_errors(self._path), self._path.open("ab") as file:
+            file.write(_line([row.get(name, "") for name in self._columns]))
+
+    def _read(self) -> list[list[str]]:
+        """Rows of the file, once its columns are known."""
+        if not self._path.exists():
+            return []
+        with naming_errors(self._path):
+            text = self._path.read_text(encoding="utf-8", errors="replace")
+        rows = list(csv.reader(text.splitlines()))
+        self._columns = rows[0] if rows else []
+        # A row without its end was being written when the process was killed.
+        return rows[1:] if text.endswith("\n") else rows[1:-1]
+
+    def _write(self, rows: Sequence[Sequence[str]]) -> None:
+        width = len(self._columns)
+        with atomic_write(self._path) as file:
+            file.write(_line(self._columns))
+            for row in rows:
+                file.write(_line([*row, *[""] * (width - len(row))]))
+
+
+class EventLog:
+    """TensorBoard events of a training.
+
+    Args:
+        folder: folder of the events; None writes none.
+        after: step after which events of an earlier process are void.
+
+    Raises:
+        SdcError: TensorBoard is not installed, or the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path | None, *, after: int) -> None:
+        self._writer: Any = None
+        if folder is None:
+            return
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            raise SdcError(
+                'TensorBoard is not installed: pip install "sdc-taichi[train]", or go without: '
+                "--set tensorboard=false"
+            ) from None
+        with naming_errors(folder):
+            self._writer = SummaryWriter(str(folder), purge_step=after + 1)
+        self._folder = folder
+
+    def add(self, numbers: Mapping[str, float], step: int) -> None:
+        """Write numbers by name.
+
+        Args:
+            numbers: the numbers.
+            step: steps of all data centers together before them.
+
+        Raises:
+            SdcError: the events cannot be written.
+        """
+        if self._writer is not None:
+            with naming_errors(self._folder):
+                for name, value in numbers.items():
+                    self._writer.add_scalar(name, value, step)
+
+    def flush(self) -> None:
+        """Write events that wait.
+
+        Raises:
+            SdcError: the events cannot be written.
+        """
+        if self._writer is not None:
+            with naming_errors(self._folder):
+                self._writer.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._writer is not None:
+            with naming_errors(self._folder):
+                self._writer.close()
+
+
+def _is_whole(row: Sequence[str], columns: Sequence[str]) -> bool:
+    return len(row) == len(columns) and columns[0] == UPDATE and row[0].isdecimal()
+
+
+def _line(values: Sequence[Any]) -> bytes:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerow(values)
+    return out.getvalue().encode()
+
+
+FORMAT = "sdc-taichi state"
+"""Name of the format, in the metadata of a file."""
+VERSION = "1"
+"""Version of how states are written as JSON."""
+Array = npt.NDArray[Any]
+
+
+def write_state(path: Path, state: Any) -> None:
+    """Write a state; readers see the old file until the new one is whole on the disk.
+
+    Args:
+        path: the file; its folder is made if need be.
+        state: what ``read_state`` is to return.
+
+    Raises:
+        SdcError: the file cannot be written.
+        TypeError: a value of another kind.
+    """
+    from safetensors.numpy import save
+
+    arrays: dict[str, Array] = {}
+    text = json.dumps(_encode(state, "state", arrays), allow_nan=False)
+    check = str(_checksum(text, arrays))
+    about = {"format": FORMAT, "version": VERSION, "crc32": check, "state": text}
+    content = save(arrays, about)
+    with atomic_write(path, parents=True) as file:
+        file.write(content)
+
+
+def read_state(path: Path) -> Any:
+    """Read what ``write_state`` wrote.
+
+    Raises:
+        SdcError: no such file, one that was not written by ``write_state``, or a damaged one.
+    """
+    from safetensors import safe_open
+
+    with open_input(path), decoding(path, "a saved state"):
+        with safe_open(path, framework="numpy") as file:
+            about = dict(file.metadata() or {})
+            if (about.get("format"), about.get("version")) != (FORMAT, VERSION):
+                raise SdcError(
+                    f"{path}: is no saved state of version {VERSION} of this program; valid is "
+                    "one that it has written"
+                )
+            arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
+        if str(_checksum(about["state"], arrays)) != about["crc32"]:
+            raise SdcError(f"{path}: is damaged (another checksum than when it was written)")
+        return _decode(load_json(about["state"]), arrays)
+
+
+def _encode(value: Any, place: str, arrays: dict[str, Array]) -> Any:
+    """A value as JSON has it; numbers of arrays go into ``arrays`` under the name of their place.
+
+    Whatever JSON lacks is a dict of one key that begins with ``$``.
+    """
+    if value is None or isinstance(value, bool | str):
+        return value
+    if hasattr(value, "detach"):  # a tensor of PyTorch, which reading settings does without
+        return {"$tensor": _stored(value.detach().numpy(), place, arrays)}
+    if isinstance(value, np.ndarray) and value.dtype.kind == "U":
+        return {"$text": value.tolist()}
+    if isinstance(value, np.ndarray):
+        return {"$array": _stored(value, place, arrays)}
+    if isinstance(value, np.generic):
+        return {"$number": _stored(np.asarray(value), place, arrays)}
+    if isinstance(value, int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else {"$float": str(value)}
+    if isinstance(value, list | tuple):
+        parts = [_encode(part, f"{place}.{i}", arrays) for i, part in enumerate(value)]
+        return parts if isinstance(value, list) else {"$tuple": parts}
+    if isinstance(value, Mapping):
+        pairs = [(key, _encode(part, f"{place}.{key}", arrays)) for key, part in value.items()]
+        if all(isinstance(key, str) and not key.startswith("$") for key, _ in pairs):
+            return dict(pairs)
+        return {"$dict": [[_encode(key, place, arrays), part] for key, part in pairs]}
+    raise TypeError(f"{place}: states hold no {type(value).__name__}")
+
+
+def _decode(node: Any, arrays: Mapping[str, Array]) -> Any:
+    """The value that ``_encode`` was given."""
+    if isinstance(node, list):
+        return [_decode(part, arrays) for part in node]
+    if not isinstance(node, dict):
+        return node
+    match next(iter(node.items()), ("", None)):
+        case "$tensor", name:
+            import torch
+
+            return torch.from_numpy(arrays[name])
+        case "$array", name:
+            return arrays[name]
+        case "$number", name:
+            return arrays[name][()]
+        case "$text", texts:
+            return np.array(texts)
+        case "$float", text:
+            return float(text)
+        case "$tuple", parts:
+            return tuple(_decode(part, arrays) for part in parts)
+        case "$dict", pairs:
+            return {_decode(key, arrays): _decode(part, arrays) for key, part in pairs}
+    return {key: _decode(part, arrays) for key, part in node.items()}
+
+
+def _stored(array: Array, place: str, arrays: dict[str, Array]) -> str:
+    """Put an array into ``arrays`` under a new name, and return the name."""
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"{place}: states hold no arrays of {array.dtype}")
+    name = place if place not in arrays else f"{place}#{len(arrays)}"
+    arrays[name] = np.asarray(array, order="C")
+    return name
+
+
+def _checksum(text: str, arrays: Mapping[str, Array]) -> int:
+    """CRC-32 of the text and of the arrays in the order of their names."""
+    check = zlib.crc32(text.encode())
+    for _, array in sorted(arrays.items()):
+        check = zlib.crc32(array.reshape(-1).view(np.uint8).data, check)
+    return check

@@ -32,10 +32,11 @@ from sdc_taichi.config import (
 )
 from sdc_taichi.config.fields import Section
 from sdc_taichi.config.reference import sections_markdown
+from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.envs.features import DEFAULT_FEATURES
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
-from sdc_taichi.learning.scenarios import SCENARIOS, training_environment
-from sdc_taichi.learning.settings import LEARNING_SETTINGS, LearningSettings
+from sdc_taichi.learning.algorithms import LEARNING_SETTINGS, LearningSettings
 from sdc_taichi.learning.split import (
     DAYS_PER_WEEK,
     TRAINING,
@@ -46,6 +47,106 @@ from sdc_taichi.learning.split import (
 from sdc_taichi.number_text import parse_number
 from sdc_taichi.sim.fleet_configs import make_configs
 from sdc_taichi.user_file import MOST_CONFIG_BYTES, read_text
+
+SITES = ("AZ", "CA", "GA", "IL", "NY", "TX", "VA", "WA")
+"""Sites of all scenarios."""
+_FLEXIBLE = {
+    "workload": {"flexible_share": 0.4, "queue_limit_h": 5.0},
+    "battery": {
+        "hours_of_design_load": 4.0,
+        "charge_limit_c_rate": 0.25,
+        "discharge_limit_c_rate": 0.25,
+    },
+}
+"""Twice the work that may wait, and a battery of four hours."""
+_BILL = {"rewards": "bill"}
+_EVENTS = [
+    {"kind": "crac_down", "per_year": 26, "duration_h": [2, 24]},
+    {"kind": "chiller_derate", "per_year": 13, "duration_h": [2, 24], "share": 0.5},
+    {"kind": "pump_down", "per_year": 6, "duration_h": [1, 8], "share": 0.5},
+    {"kind": "tower_cell_down", "per_year": 13, "duration_h": [4, 48], "share": 0.5},
+    {"kind": "heat_wave", "per_year": 13, "duration_h": [24, 96], "offset_k": 8},
+]
+_FAILURES = {
+    "hvac": {"crac": {"units": 4}},
+    "protection": {"ashrae_class": "A1"},
+    "events": {"sampled": _EVENTS},
+}
+"""Four CRAC units without a spare one, servers of class A1, and failures and heat waves that come
+ten times as often as in practice, so that a few weeks have some."""
+_COOL = {"agent_dc": {"cooling_carbon": 10.0, "hot_inlets": 1.0}}
+"""Rewards as by default, with ten times the weight of hot inlets."""
+SCENARIOS: Mapping[str, Mapping[str, Any]] = {
+    "carbon": {"sites": SITES},
+    "carbon-rich": {"sites": SITES, "overrides": _FLEXIBLE},
+    "bill": {"sites": SITES, "environment": _BILL, "validation": {"objective": "cost"}},
+    "bill-rich": {
+        "sites": SITES,
+        "overrides": _FLEXIBLE,
+        "environment": _BILL,
+        "validation": {"objective": "cost"},
+    },
+    "failures": {
+        "sites": SITES,
+        "overrides": _FAILURES,
+        "environment": {"rewards": _COOL, "collaboration": 1.0},
+        "validation": {"optimum": False},
+    },
+}
+"""Settings of each scenario, all of preset ``corrected``: the carbon of the hall as it is, the same
+with twice the work that may wait and a battery of four hours, and of both the electricity bill,
+which is energy by time of use and a demand charge; and carbon where cooling fails and hot inlets
+cost."""
+
+CI_LEADS_H = tuple(range(1, 25))
+"""Leads of the forecasts of carbon intensity and price that trained agents observe, in h."""
+SETPOINT_CHANGE_K = 0.5
+"""Largest change of the setpoint in a step by trained agents, who hold it for some steps, in K."""
+_SHAPE_OF_DAY = ("ci_rank", "ci_relative", "ci_swing")
+_OWN_PARTS = ("default", "bill")
+"""Rewards that pay each agent for its own part, to which those of others would add noise."""
+_PRICES = ("price", "price_forecast")
+
+
+def training_environment(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of environments that trainings have beneath those given.
+
+    Actions are continuous, and agents observe the shape of the coming day by the hour: the carbon
+    intensity in relation to its own range, and with rewards of the bill the price.
+
+    Args:
+        given: options that the user or a scenario gives, by name.
+    """
+    agents, commands = given.get("agents") or AGENTS, given.get("commands") or {}
+    # What is not valid here is refused with all other options.
+    agents = [x for x in agents if x in AGENTS] if isinstance(agents, list | tuple) else []
+    commands = commands if isinstance(commands, Mapping) else {}
+    found: dict[str, Any] = {}
+    if given.get("actions", "continuous") == "continuous":
+        found["actions"] = "continuous"
+        decided = commands.get("agent_dc", ("cooling",))
+        moves_setpoint = isinstance(decided, list | tuple) and "cooling" in decided
+        if "agent_dc" in agents and moves_setpoint:
+            found["setpoint_change_k"] = SETPOINT_CHANGE_K
+    if given.get("rewards", "default") in _OWN_PARTS:
+        found["collaboration"] = 1.0
+    if given.get("observations", "default") == "default":
+        found["ci_leads_h"] = CI_LEADS_H
+        if not commands:
+            found["features"] = {agent: _features(agent, given) for agent in agents}
+    return found
+
+
+def _features(agent: str, given: Mapping[str, Any]) -> tuple[str, ...]:
+    """Features of an agent: its default ones, but for forecasts that others tell better."""
+    names = DEFAULT_FEATURES.get(agent, ())
+    if agent == "agent_dc":
+        kept = [name for name in names if name != "ci_forecast"]
+        return (*kept, "queue")
+    kept = [name for name in names if name not in ("ci_forecast", "ci_change")]
+    prices = _PRICES if given.get("rewards") == "bill" else ()
+    return (*kept, *_SHAPE_OF_DAY, *prices)
+
 
 MOST_STEPS = 10**12
 """Largest number of steps of a training: years of the fastest machine."""
@@ -85,7 +186,7 @@ class TrainingSettings(Section):
 
     algorithm: str
     """Name of the algorithm: ``ppo``, ``ippo``, ``mappo``, ``happo``, ``haa2c``, ``had3qn``,
-    ``hasac``, ``cloning`` or ``cross-entropy``."""
+    ``hasac`` or ``cross-entropy``."""
     scenario: str | None = None
     """Scenario whose settings lie beneath those given: ``carbon``, ``carbon-rich``, ``bill``,
     ``bill-rich`` or ``failures``; None is none."""
@@ -371,7 +472,7 @@ def _leaves(path: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def settings_markdown() -> str:
-    """The tables of docs/training-settings.md, one for each section."""
+    """Tables of all settings as Markdown, one for each section."""
     sections: list[tuple[str, type[BaseModel]]] = [("", TrainingSettings)]
     sections.append(("validation", ValidationSettings))
     kinds = dict.fromkeys(LEARNING_SETTINGS.values())
