@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import BaseModel
 from typer.testing import CliRunner
 
 from sdc_taichi import EnvOptions
@@ -154,6 +155,7 @@ def test_durations_are_short_texts() -> None:
 
 def test_the_tables_of_settings_have_all_fields() -> None:
     tables = settings_markdown()
-    for section in (TrainingSettings, *LEARNING_SETTINGS.values()):
+    sections: list[type[BaseModel]] = [TrainingSettings, *LEARNING_SETTINGS.values()]
+    for section in sections:
         for name in section.model_fields.keys() - {"environment", "learning", "validation"}:
             assert f"| `{name}` |" in tables
