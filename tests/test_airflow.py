@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from sdc_taichi import DataCenterConfig, load_config
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.hall.air_properties import air_properties
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.floor_plan import floor_plan
+from sdc_taichi.hall.rack_servers import air_properties
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.layout_solver import solve as airflow
 from sdc_taichi.layout_solver.grid import MOST_CELLS, Grid, build_grid

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sdc_taichi import Actions, Simulator, StepResult, load_config
-from sdc_taichi.config.tariff_schema import TariffConfig
+from sdc_taichi.config.electrical_schema import TariffConfig
 from sdc_taichi.control import view_maker
 from sdc_taichi.errors import ConfigError, OddInputWarning
 from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH

@@ -15,7 +15,7 @@ from gymnasium.wrappers import TimeAwareObservation
 
 import sdc_taichi
 from sdc_taichi import ConfigError, EnvOptions, ForecastError, load_config
-from sdc_taichi.config.tariff_schema import TariffConfig
+from sdc_taichi.config.electrical_schema import TariffConfig
 from sdc_taichi.envs import IDS
 from sdc_taichi.envs.single import SdcEnv
 

@@ -12,8 +12,7 @@ import pytest
 
 from random_halls import at_design
 from sdc_taichi import ConfigError, DataCenterConfig, build_fleet, load_config
-from sdc_taichi.hall.exposure import exposure
-from sdc_taichi.hall.recirculation import calibrate
+from sdc_taichi.hall.recirculation import calibrate, exposure
 from sdc_taichi.layout_solver.solve import solve_at_design_point
 from sdc_taichi.types import F64
 

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sdc_taichi.atomic_file import FileClaim, atomic_write, naming_errors
 from sdc_taichi.benchmark.jobs import DoneJob, Job, check_file_name, digest_of, source_digest
-from sdc_taichi.config.messages import explain
+from sdc_taichi.config.fields import explain
 from sdc_taichi.errors import ConfigError, SdcError, shortened
 from sdc_taichi.user_file import MOST_METRICS_BYTES, list_folder, read_bytes, read_text
 

@@ -10,6 +10,7 @@ from sdc_taichi.config.event_schema import (
     SampledEvent,
     ScheduledEvent,
 )
+from sdc_taichi.config.fields import explain, validated
 from sdc_taichi.config.hall_schema import HallConfig, LayoutConfig
 from sdc_taichi.config.loading import (
     apply_override,
@@ -19,7 +20,6 @@ from sdc_taichi.config.loading import (
     preset_names,
     with_values,
 )
-from sdc_taichi.config.messages import explain, validated
 from sdc_taichi.config.plain_values import load_json, load_yaml
 from sdc_taichi.config.schema import DataCenterConfig
 

@@ -1,12 +1,15 @@
-"""Section ``electrical``: grid connection, UPS and distribution."""
+"""Sections ``electrical`` and ``tariff``: grid connection, UPS, distribution and prices."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, field_validator
 
 from sdc_taichi.config.fields import Section, Share
+from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, HOURS_PER_YEAR, MONTH_OF_DAY
+from sdc_taichi.types import F64
 
 
 class UpsConfig(Section):
@@ -60,3 +63,79 @@ class ElectricalConfig(Section):
     grid_limit_ratio: Annotated[float, Field(ge=0.01, le=1000)] | None = None
     """Most power that the grid connection carries over the facility's power at the design point,
     0.01..1,000; None is no limit, where ``grid_limit_kw`` gives none."""
+
+
+Price = Annotated[float, Field(ge=0, le=1e9)]
+"""A price, 0..1e9, which leaves room for currencies of many zeros."""
+DAYS_PER_WEEK = 7
+"""Days of a week, Monday first."""
+WORKING_DAYS = 5
+"""Days from Monday to Friday."""
+
+
+class TariffPeriod(Section):
+    """A price for some hours of some days."""
+
+    months: tuple[Annotated[int, Field(ge=1, le=12)], ...] = tuple(range(1, 13))
+    """Months of the period, 1..12."""
+    days: Literal["all", "weekdays", "weekends"] = "all"
+    """Days of the week of the period; every year begins on a Monday, and there are no holidays."""
+    from_h: Annotated[int, Field(ge=0, le=23)] = 0
+    """Local hour at which the period begins, 0..23."""
+    to_h: Annotated[int, Field(ge=1, le=24)] = 24
+    """Local hour at which the period ends, 1..24; one that is not after ``from_h`` is that of the
+    next day, whose early hours count by their own day and month."""
+    price_per_kwh: Price
+    """Price of a kWh in the period, in place of what the tariff and earlier periods say."""
+
+    @field_validator("months")
+    @classmethod
+    def _each_once(cls, value: tuple[int, ...]) -> tuple[int, ...]:
+        if not value or len(set(value)) < len(value):
+            raise ValueError(f"{list(value)}; valid is one or more months, each once")
+        return value
+
+    def hours(self) -> np.ndarray:
+        """Mask of the hours of a year in which the period applies, (8760,)."""
+        hour = np.arange(24)
+        if self.to_h > self.from_h:
+            of_day = (hour >= self.from_h) & (hour < self.to_h)
+        else:
+            of_day = (hour >= self.from_h) | (hour < self.to_h)
+        working = np.arange(DAYS_PER_YEAR) % DAYS_PER_WEEK < WORKING_DAYS
+        of_week = {"all": working | True, "weekdays": working, "weekends": ~working}[self.days]
+        of_year = of_week & np.isin(MONTH_OF_DAY, self.months)
+        return np.asarray(of_year[:, None] & of_day).reshape(-1)
+
+
+class TariffConfig(Section):
+    """Prices of electricity in any one currency, local standard time.
+
+    The default prices of a kWh have a mean of 0.125, beside the 0.127 $/kWh that commercial
+    customers in the USA paid in 2024 with all charges included (EIA, Electric Power Monthly, table
+    5.3); the default demand charge comes on top.
+    """
+
+    price_per_kwh: Price | tuple[Price, ...] = (
+        *(0.08,) * 7, *(0.12,) * 9, *(0.20,) * 5, *(0.12,) * 3,
+    )  # fmt: skip
+    """Price of a kWh: one for all hours, or a list of 24, one for each local hour of the day from
+    midnight on."""
+    periods: tuple[TariffPeriod, ...] = ()
+    """Prices of some months, days of the week and hours, of which later ones go first."""
+    demand_charge_per_kw: Price = 12.0
+    """Price of each kW of the highest mean power of a step, per month."""
+
+    @field_validator("price_per_kwh")
+    @classmethod
+    def _one_or_each_hour(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        if isinstance(value, tuple) and len(value) not in (1, 24):
+            raise ValueError(f"{len(value)} prices; valid is 1, or 24 from midnight on")
+        return value
+
+    def hourly_prices(self) -> F64:
+        """Price of a kWh in each hour of the year, (8760,)."""
+        prices = np.resize(np.array(self.price_per_kwh), HOURS_PER_YEAR)
+        for period in self.periods:
+            prices = np.where(period.hours(), period.price_per_kwh, prices)
+        return prices

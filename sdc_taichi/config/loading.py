@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sdc_taichi.config import sustaindc
-from sdc_taichi.config.messages import validated
+from sdc_taichi.config.fields import validated
 from sdc_taichi.config.plain_values import load_json, load_yaml
 from sdc_taichi.config.schema import DataCenterConfig
 from sdc_taichi.errors import ConfigError, shortened, suggestion

@@ -40,19 +40,14 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
             f"{'air-cooled ' if dry else ''}chillers reach about {reached}"
         )
     controlled = config.hvac.crac.temperature_control
-    low, high = USUAL_SETPOINTS_C[controlled]
-    for name in ("min_c", "max_c"):
-        value = getattr(setpoint, name)
+    for name, air, value in (
+        ("hvac.setpoint.min_c", controlled, setpoint.min_c),
+        ("hvac.setpoint.max_c", controlled, setpoint.max_c),
+        ("hall.design_supply_c", "supply", config.hall.design_supply_c),
+    ):
+        low, high = USUAL_SETPOINTS_C[air]
         if not low <= value <= high:
-            yield (
-                f"hvac.setpoint.{name} {value:g}: {controlled} air is usually {low:g}..{high:g} C"
-            )
-    low, high = USUAL_SETPOINTS_C["supply"]
-    if not low <= config.hall.design_supply_c <= high:
-        yield (
-            f"hall.design_supply_c {config.hall.design_supply_c:g}: supply air is usually "
-            f"{low:g}..{high:g} C"
-        )
+            yield f"{name} {value:g}: {air} air is usually {low:g}..{high:g} C"
     if pumps.model == "sized" and pumps.efficiency < LEAST_USUAL_PUMP_EFFICIENCY:
         yield (
             f"hvac.pumps.efficiency {pumps.efficiency:g}: even small pumps reach "

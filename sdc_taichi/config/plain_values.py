@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 import yaml
@@ -39,6 +40,9 @@ def load_yaml(text: str) -> Any:
         count = _count(values, {})
     except RecursionError:
         raise ValueError("nested too deeply") from None
+    except KeyError as error:
+        # The table of truth values has no such text, as that of a tag !!bool.
+        raise ValueError(f"{error} is neither true nor false") from None
     except (yaml.YAMLError, ValueError) as error:
         raise ValueError(str(error)) from None
     if count > MOST_VALUES:
@@ -86,35 +90,32 @@ class _Loader(yaml.SafeLoader):
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Leave a mapping as it is, even where a key has the tag of merge keys."""
 
-    def construct_yaml_bool(self, node: yaml.ScalarNode) -> bool:
-        text = self.construct_scalar(node)
-        if text.lower() not in self.bool_values:
-            raise _not_valid(f"{shortened(text)} is neither true nor false", node)
-        return self.bool_values[text.lower()]
 
-    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
-        text = self.construct_scalar(node)
-        try:
-            return parse_whole(text)
-        except ValueError as error:
-            raise _not_valid(str(error), node) from None
+def _number_by(parse: Callable[[str], Any]) -> Callable[[_Loader, yaml.ScalarNode], Any]:
+    """Constructor of numbers by a function that raises ``ValueError`` for other texts."""
 
-    def construct_yaml_float(self, node: yaml.ScalarNode) -> float:
-        text = self.construct_scalar(node)
+    def construct(loader: _Loader, node: yaml.ScalarNode) -> Any:
+        text = loader.construct_scalar(node)
         if text.lower().lstrip("+-") in (".inf", ".nan"):
             return float(text.replace(".", "", 1))
         try:
-            return parse_number(text)
+            return parse(text)
         except ValueError as error:
             raise _not_valid(str(error), node) from None
+
+    return construct
 
 
 def _set_plain_tags() -> None:
     """Leave the loader the tags of plain values, and resolve numbers that are decimal alone."""
     tags = {f"tag:yaml.org,2002:{name}": name for name in _PLAIN_TAGS}
-    _Loader.yaml_constructors = {
+    constructors: dict[str | None, Any] = {
         tag: getattr(_Loader, f"construct_yaml_{name}") for tag, name in tags.items()
-    } | {None: yaml.SafeLoader.construct_undefined}
+    }
+    constructors["tag:yaml.org,2002:int"] = _number_by(parse_whole)
+    constructors["tag:yaml.org,2002:float"] = _number_by(parse_number)
+    constructors[None] = yaml.SafeLoader.construct_undefined
+    _Loader.yaml_constructors = constructors
     kept = [f"tag:yaml.org,2002:{name}" for name in ("null", "bool")]
     _Loader.yaml_implicit_resolvers = {
         first: [(tag, pattern) for tag, pattern in found if tag in kept]

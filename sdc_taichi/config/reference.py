@@ -16,10 +16,10 @@ import yaml
 from pydantic import BaseModel
 
 from sdc_taichi.config import fields as types
+from sdc_taichi.config.electrical_schema import TariffPeriod
 from sdc_taichi.config.event_schema import SampledEvent, ScheduledEvent
 from sdc_taichi.config.hall_schema import RackRange, RackType, ServerGroup
 from sdc_taichi.config.schema import DataCenterConfig
-from sdc_taichi.config.tariff_schema import TariffPeriod
 from sdc_taichi.plant.chiller import CHILLERS
 
 LISTED: dict[str, type[BaseModel]] = {

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from pydantic import Field, field_validator, model_validator
 
-from sdc_taichi.config.electrical_schema import ElectricalConfig
+from sdc_taichi.config.electrical_schema import ElectricalConfig, TariffConfig
 from sdc_taichi.config.event_schema import PLANT_OF_EVENT, EventsConfig, ProtectionConfig
 from sdc_taichi.config.fields import (
     CRate,
@@ -36,7 +36,6 @@ from sdc_taichi.config.hall_schema import (
     ServerGroup,
 )
 from sdc_taichi.config.hvac_schema import HvacConfig
-from sdc_taichi.config.tariff_schema import TariffConfig
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import day_of_year
 from sdc_taichi.plant.battery import BATTERIES

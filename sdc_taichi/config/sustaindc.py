@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sdc_taichi.errors import ConfigError, shortened, suggestion
 
@@ -14,71 +14,71 @@ _HALL, _HVAC, _SERVERS = SECTIONS = (
     "hvac_configuration",
     "server_characteristics",
 )
-_KEYS: dict[str, tuple[str, ...]] = {
-    _HALL: (
-        "NUM_ROWS",
-        "NUM_RACKS_PER_ROW",
-        "RACK_SUPPLY_APPROACH_TEMP_LIST",
-        "RACK_RETURN_APPROACH_TEMP_LIST",
-        "CPUS_PER_RACK",
-    ),
-    _HVAC: (
-        "C_AIR",
-        "RHO_AIR",
-        "CRAC_SUPPLY_AIR_FLOW_RATE_pu",
-        "CRAC_REFRENCE_AIR_FLOW_RATE_pu",
-        "CRAC_FAN_REF_P",
-        "CHILLER_COP_BASE",
-        "CHILLER_COP_K",
-        "CHILLER_COP_T_NOMINAL",
-        "CT_FAN_REF_P",
-        "CT_REFRENCE_AIR_FLOW_RATE",
-        "CW_PRESSURE_DROP",
-        "CW_WATER_FLOW_RATE",
-        "CW_PUMP_EFFICIENCY",
-        "CT_PRESSURE_DROP",
-        "CT_WATER_FLOW_RATE",
-        "CT_PUMP_EFFICIENCY",
-    ),
-    _SERVERS: (
-        "CPU_POWER_RATIO_LB",
-        "CPU_POWER_RATIO_UB",
-        "IT_FAN_AIRFLOW_RATIO_LB",
-        "IT_FAN_AIRFLOW_RATIO_UB",
-        "IT_FAN_FULL_LOAD_V",
-        "ITFAN_REF_V_RATIO",
-        "ITFAN_REF_P",
-        "INLET_TEMP_RANGE",
-        "DEFAULT_SERVER_POWER_CHARACTERISTICS",
-        "HP_PROLIANT",
-    ),
-}
 LARGEST = 1e12
 """Largest number of a file; the bounds of the schema are narrower."""
-_PER_RACK = (
-    (_HALL, "RACK_SUPPLY_APPROACH_TEMP_LIST"),
-    (_HALL, "RACK_RETURN_APPROACH_TEMP_LIST"),
-    (_SERVERS, "DEFAULT_SERVER_POWER_CHARACTERISTICS"),
-)
-_DEPTHS = {
-    "RACK_SUPPLY_APPROACH_TEMP_LIST": 1,
-    "RACK_RETURN_APPROACH_TEMP_LIST": 1,
-    "CPU_POWER_RATIO_LB": 1,
-    "CPU_POWER_RATIO_UB": 1,
-    "IT_FAN_AIRFLOW_RATIO_LB": 1,
-    "IT_FAN_AIRFLOW_RATIO_UB": 1,
-    "INLET_TEMP_RANGE": 1,
-    "DEFAULT_SERVER_POWER_CHARACTERISTICS": 2,
-    "HP_PROLIANT": 1,
+
+
+class _Shape(NamedTuple):
+    """What the value of a key is."""
+
+    depth: int = 0
+    """How deep lists of numbers are nested, 0 for a number."""
+    entries: int | None = None
+    """Number of entries of the list; None is any, or ``per_rack``."""
+    per_rack: bool = False
+    """Whether the list has an entry for each rack."""
+    whole: bool = False
+    """Whether numbers are positive integers."""
+    positive: bool = False
+    """Whether numbers are above 0."""
+
+
+_NUMBER, _COUNT, _PAIR = _Shape(), _Shape(whole=True), _Shape(depth=1, entries=2)
+_PER_RACK = _Shape(depth=1, per_rack=True)
+_KEYS: dict[str, dict[str, _Shape]] = {
+    _HALL: {
+        "NUM_ROWS": _COUNT,
+        "NUM_RACKS_PER_ROW": _COUNT,
+        "RACK_SUPPLY_APPROACH_TEMP_LIST": _PER_RACK,
+        "RACK_RETURN_APPROACH_TEMP_LIST": _PER_RACK,
+        "CPUS_PER_RACK": _COUNT,
+    },
+    _HVAC: {
+        **dict.fromkeys(("CW_PUMP_EFFICIENCY", "CT_PUMP_EFFICIENCY"), _Shape(positive=True)),
+        **dict.fromkeys(
+            (
+                "C_AIR",
+                "RHO_AIR",
+                "CRAC_SUPPLY_AIR_FLOW_RATE_pu",
+                "CRAC_REFRENCE_AIR_FLOW_RATE_pu",
+                "CRAC_FAN_REF_P",
+                "CHILLER_COP_BASE",
+                "CHILLER_COP_K",
+                "CHILLER_COP_T_NOMINAL",
+                "CT_FAN_REF_P",
+                "CT_REFRENCE_AIR_FLOW_RATE",
+                "CW_PRESSURE_DROP",
+                "CW_WATER_FLOW_RATE",
+                "CT_PRESSURE_DROP",
+                "CT_WATER_FLOW_RATE",
+            ),
+            _NUMBER,
+        ),
+    },
+    _SERVERS: {
+        "CPU_POWER_RATIO_LB": _PAIR,
+        "CPU_POWER_RATIO_UB": _PAIR,
+        "IT_FAN_AIRFLOW_RATIO_LB": _PAIR,
+        "IT_FAN_AIRFLOW_RATIO_UB": _PAIR,
+        "IT_FAN_FULL_LOAD_V": _NUMBER,
+        "ITFAN_REF_V_RATIO": _NUMBER,
+        "ITFAN_REF_P": _NUMBER,
+        "INLET_TEMP_RANGE": _PAIR,
+        "DEFAULT_SERVER_POWER_CHARACTERISTICS": _Shape(depth=2, per_rack=True),
+        "HP_PROLIANT": _Shape(depth=1),
+    },
 }
-"""How deep lists of numbers are nested in the values of keys that are no single number."""
-_PAIRS = (
-    "CPU_POWER_RATIO_LB",
-    "CPU_POWER_RATIO_UB",
-    "IT_FAN_AIRFLOW_RATIO_LB",
-    "IT_FAN_AIRFLOW_RATIO_UB",
-    "INLET_TEMP_RANGE",
-)
+"""Keys of each section and what their values are; ``CPUS_PER_RACK`` may also be a list."""
 
 
 def read(values: Mapping[str, Any], label: str) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def read(values: Mapping[str, Any], label: str) -> dict[str, Any]:
     Raises:
         ConfigError: for a missing or unknown key, a wrong type, or a wrong length.
     """
-    problems = _problems(values)
+    problems = [*_problems(values)]
     if problems:
         raise ConfigError(f"{label}: {'; '.join(problems)}")
     hall, hvac, servers = (values[section] for section in SECTIONS)
@@ -131,6 +131,7 @@ def read(values: Mapping[str, Any], label: str) -> dict[str, Any]:
 
 def _hvac_values(hvac: Mapping[str, Any]) -> dict[str, Any]:
     def pump_w(prefix: str) -> float:
+        """Power from pressure drop, flow and efficiency."""
         drop, flow = hvac[f"{prefix}_PRESSURE_DROP"], hvac[f"{prefix}_WATER_FLOW_RATE"]
         return float(drop * flow / hvac[f"{prefix}_PUMP_EFFICIENCY"])
 
@@ -148,35 +149,58 @@ def _hvac_values(hvac: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _problems(values: Mapping[str, Any]) -> list[str]:
-    problems = [
-        f"{section}: unknown section; valid: {', '.join(SECTIONS)}"
-        for section in values
-        if section not in SECTIONS
-    ]
-    for section, keys in _KEYS.items():
-        found = values.get(section)
-        if not isinstance(found, dict):
-            problems.append(f"{section}: missing section")
+def _problems(values: Mapping[str, Any]) -> Iterator[str]:
+    """What is wrong with a file, section by section."""
+    for section in values:
+        if section not in SECTIONS:
+            yield f"{section}: unknown section; valid: {', '.join(SECTIONS)}"
+    racks = _racks(values.get(_HALL))
+    for section, shapes in _KEYS.items():
+        given = values.get(section)
+        if not isinstance(given, dict):
+            yield f"{section}: missing section"
             continue
-        problems.extend(
-            f"{section}.{key}: unknown key{suggestion(key, keys)}"
-            for key in found
-            if key not in keys
-        )
-        problems.extend(f"{section}.{key}: missing" for key in keys if key not in found)
-    if not all(isinstance(values.get(section), dict) for section in SECTIONS):
-        return problems
-    racks, count_problems = _count_racks(values[_HALL])
-    return [
-        *problems,
-        *_number_problems(values),
-        *count_problems,
-        *_length_problems(values, racks),
-        *_servers_per_rack_problems(values[_HALL], racks),
-        *_efficiency_problems(values[_HVAC]),
-        *_pair_problems(values[_SERVERS]),
-    ]
+        for key in given:
+            if key not in shapes:
+                yield f"{section}.{key}: unknown key{suggestion(key, shapes)}"
+        for key, shape in shapes.items():
+            if key == "CPUS_PER_RACK" and isinstance(given.get(key), list):
+                shape = _Shape(depth=1, per_rack=True, whole=True)
+            problem = _problem(given[key], shape, racks) if key in given else ": missing"
+            if problem:
+                yield f"{section}.{key}{problem}"
+
+
+def _racks(hall: Any) -> int | None:
+    """Number of racks; None if it is not known."""
+    if not isinstance(hall, dict):
+        return None
+    counts = [hall.get("NUM_ROWS"), hall.get("NUM_RACKS_PER_ROW")]
+    if not all(map(_is_count, counts)):
+        return None
+    return math.prod(int(count) for count in counts if count is not None)
+
+
+def _problem(value: Any, shape: _Shape, racks: int | None) -> str | None:
+    """What is wrong with a value, to be put after its key; None if nothing is."""
+    if shape.depth == 0:
+        if not _is_number(value):
+            return f": {shortened(value)} is not a number within {-LARGEST:g}..{LARGEST:g}"
+        if shape.whole and not _is_count(value):
+            return f": {shortened(value)} is no positive integer"
+        if shape.positive and value <= 0:
+            return f": {shortened(value)} must be positive"
+        return None
+    if not isinstance(value, list) or not value:
+        return f": {shortened(value)} is not a list of {'lists of ' * (shape.depth - 1)}numbers"
+    expected = racks if shape.per_rack else shape.entries
+    if expected is not None and len(value) != expected:
+        why = " (NUM_ROWS x NUM_RACKS_PER_ROW)" if shape.per_rack else ""
+        return f": length {len(value)}, expected {expected}{why}"
+    entry_shape = _PAIR if shape.depth == 2 else _Shape(whole=shape.whole)
+    problems = (_problem(entry, entry_shape, racks) for entry in value)
+    at, problem = next(((i, text) for i, text in enumerate(problems) if text), (0, None))
+    return f"[{at}]{problem}" if problem and shape.depth == 2 else problem
 
 
 def _is_number(value: Any) -> bool:
@@ -186,83 +210,3 @@ def _is_number(value: Any) -> bool:
 
 def _is_count(value: Any) -> bool:
     return _is_number(value) and 1 <= value <= 1e9 and value == int(value)
-
-
-def _length(value: Any) -> int:
-    return len(value) if isinstance(value, list) else 0
-
-
-def _number_problems(values: Mapping[str, Any]) -> Iterator[str]:
-    for section, keys in _KEYS.items():
-        for key in keys:
-            if key not in values[section]:
-                continue
-            value, depth = values[section][key], _DEPTHS.get(key, 0)
-            if key == "CPUS_PER_RACK" and isinstance(value, list):
-                depth = 1
-            problem = _shape_problem(value, depth)
-            if problem:
-                yield f"{section}.{key}: {problem}"
-
-
-def _shape_problem(value: Any, depth: int) -> str | None:
-    """What is wrong with a number, or with lists of numbers that are nested ``depth`` deep."""
-    if depth == 0:
-        text = f"{shortened(value)} is not a number within {-LARGEST:g}..{LARGEST:g}"
-        return None if _is_number(value) else text
-    if not isinstance(value, list) or not value:
-        return f"{shortened(value)} is not a list of {'lists of ' * (depth - 1)}numbers"
-    return next(filter(None, (_shape_problem(entry, depth - 1) for entry in value)), None)
-
-
-def _count_racks(hall: Mapping[str, Any]) -> tuple[int | None, list[str]]:
-    """Number of racks, None if it cannot be told, and what is wrong with rows and racks per row."""
-    counts = {key: hall.get(key, 1) for key in ("NUM_ROWS", "NUM_RACKS_PER_ROW")}
-    problems = [
-        f"{_HALL}.{key}: {shortened(count)} is no positive integer"
-        for key, count in counts.items()
-        if _is_number(count) and not _is_count(count)
-    ]
-    counted = all(key in hall and _is_count(count) for key, count in counts.items())
-    return (math.prod(int(count) for count in counts.values()) if counted else None), problems
-
-
-def _length_problems(values: Mapping[str, Any], racks: int | None) -> Iterator[str]:
-    for section, key in _PER_RACK:
-        if racks is not None and key in values[section]:
-            length = _length(values[section][key])
-            if length != racks:
-                yield (
-                    f"{section}.{key}: length {length}, expected {racks} "
-                    "(NUM_ROWS x NUM_RACKS_PER_ROW)"
-                )
-
-
-def _servers_per_rack_problems(hall: Mapping[str, Any], racks: int | None) -> Iterator[str]:
-    where = f"{_HALL}.CPUS_PER_RACK"
-    per_rack = hall.get("CPUS_PER_RACK", 1)
-    for count in per_rack if isinstance(per_rack, list) else [per_rack]:
-        if _is_number(count) and not _is_count(count):
-            yield f"{where}: {shortened(count)} is no positive integer"
-    if isinstance(per_rack, list) and racks is not None and len(per_rack) != racks:
-        yield f"{where}: length {len(per_rack)}, expected {racks}"
-
-
-def _efficiency_problems(hvac: Mapping[str, Any]) -> Iterator[str]:
-    for key in ("CW_PUMP_EFFICIENCY", "CT_PUMP_EFFICIENCY"):
-        efficiency = hvac.get(key, 1)
-        if _is_number(efficiency) and efficiency <= 0:
-            yield f"{_HVAC}.{key}: {shortened(efficiency)} must be positive"
-
-
-def _pair_problems(servers: Mapping[str, Any]) -> Iterator[str]:
-    for key in _PAIRS:
-        if key in servers and _length(servers[key]) != 2:
-            yield f"{_SERVERS}.{key}: length {_length(servers[key])}, expected 2"
-    pairs = servers.get("DEFAULT_SERVER_POWER_CHARACTERISTICS", [])
-    for index, pair in enumerate(pairs if isinstance(pairs, list) else []):
-        if _length(pair) != 2:
-            yield (
-                f"{_SERVERS}.DEFAULT_SERVER_POWER_CHARACTERISTICS[{index}]: "
-                f"length {_length(pair)}, expected 2 (full, idle)"
-            )

@@ -24,7 +24,7 @@ from sdc_taichi.config import (
     validated,
     with_values,
 )
-from sdc_taichi.config.tariff_schema import TariffConfig
+from sdc_taichi.config.electrical_schema import TariffConfig
 from sdc_taichi.control import check_controller
 from sdc_taichi.control.view import PERFECT, ForecastError
 from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT, Agent

@@ -5,6 +5,24 @@ over the racks until they agree. A guess near the answer saves most of the sweep
 loaded alike the answer depends on supply temperature and load alone, so it is computed once per
 hall for a grid of both and stored as shares of a few patterns over the racks. The kernel reads the
 table with cubics.
+
+Worked example: a hall of two racks, each of which takes in 10 % exhaust air, all of it from the
+other rack, at a supply of 20 C and full load. Let the racks warm their air by 12 and 8 K. The
+*mix* before rack 0 is the outlet of rack 1 over the supply, and the other way round; the inlet of
+a rack is 0.1 times its mix. Starting from mixes of 0, the outlets are (12, 8) K over the supply, so
+the mixes that they make are (8, 12) K, the inlets 0.8 and 1.2 K, and the outlets then 12.8 and
+9.2 K, if the rise of a rack does not change with its inlet: the *feedback gain*, the change of an
+outlet with its mix, is 0.1. The *residual* of a search is the mix that the outlets make less the
+mix that they were computed for, here (8, 12) - (0, 0). A Newton step adds what the residual
+brings about in turn, r + w G r + w G w G r + ..., with weights w = [[0, 1], [1, 0]] and gains G =
+0.1: (8, 12) + 0.1 (12, 8) + 0.01 (8, 12) + ... = (9.29, 12.93) K, which is the answer. Racks of a
+real hall move more air as they get warmer, so gains are read off the last two steps, and few steps
+are needed.
+
+The answers of all supplies and loads are then written as sums of patterns. If the mixes of the two
+racks were (9.29, 12.93) K times the load everywhere, one pattern (0.58, 0.81) would hold them all,
+with shares of 15.9 K times the load; a hall has up to ``PATTERNS`` of them, the principal
+components of its table.
 """
 
 from __future__ import annotations

@@ -17,9 +17,9 @@ import numpy as np
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.errors import ConfigError, SdcError
 from sdc_taichi.hall import air_metrics
-from sdc_taichi.hall.air_properties import air_properties
 from sdc_taichi.hall.design_point import design_point
 from sdc_taichi.hall.matrix_file import MOST_MATRIX_RACKS
+from sdc_taichi.hall.rack_servers import air_properties
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.layout_solver.grid import DEFAULT_CELL_M, LEAST_LEAK, Grid, build_grid

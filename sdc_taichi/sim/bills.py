@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.config.tariff_schema import TariffConfig
+from sdc_taichi.config.electrical_schema import TariffConfig
 from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, FIRST_DAY_OF_MONTH
 from sdc_taichi.sim.drivers import Drivers, FleetSeries, fleet_series
 from sdc_taichi.types import F64, I64

@@ -14,11 +14,10 @@ from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.config.hall_schema import SERVER_J_PER_K_W
 from sdc_taichi.config.odd_values import warn_of, warn_of_odd_values
 from sdc_taichi.errors import ConfigError
-from sdc_taichi.hall.design_point import design_point
+from sdc_taichi.hall.design_point import design_point, odd_airflow
 from sdc_taichi.hall.floor_plan import floor_plan, unit_shares
 from sdc_taichi.hall.initial_guess import SteadyStateTable, initial_guess
 from sdc_taichi.hall.mix_weights import MixWeights
-from sdc_taichi.hall.odd_airflow import odd_airflow
 from sdc_taichi.hall.rack_servers import RackServers, rack_servers
 from sdc_taichi.hall.recirculation import Recirculation, calibrate
 from sdc_taichi.hall.unit_supply import full_airflow_m3s, unit_weights, weighted_shares
