@@ -25,12 +25,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import counts
-import env
 import fresh
 import numpy as np
+import steps
 from peers import PEERS, Arguments, MissingError
-from thermal import QUICK_SIZES, SIZES, fleet_of
 from yardsticks import core_ratios, core_s, interpreter_loop, plain_store
 
 import sdc_taichi
@@ -40,7 +38,10 @@ from sdc_taichi.sim.hall_solver import Hall
 from sdc_taichi.types import ServerLayers
 
 HERE = Path(__file__).parent
-LIBRARIES = ("numpy", "taichi", "gymnasium", "pettingzoo", "numba")
+LIBRARIES = ("numpy", "taichi", "gymnasium", "pettingzoo")
+SIZES = ((4096, 20, 200), (256, 1000, 40), (1, 100_000, 40))
+QUICK_SIZES = ((4, 20, 200), (1, 400, 40))
+"""Data centers, racks of each and servers of a rack of the halls beside peers."""
 CURVE = (3, 25, 250, 2500, 25_000)
 """Data centers of 4,000 servers of the curve of cost against size: 1e4 to 1e8 servers."""
 BYTES_PER_SERVER_AT_WORK = 30
@@ -86,12 +87,12 @@ def number(value: float) -> str:
 
 
 def child(part: str, *arguments: Any, **variables: str) -> Any:
-    """Result of a function of fresh.py in a process of its own."""
+    """Result of a function of fresh.py, which runs in a new process."""
     return result(start(part, *arguments, **variables))
 
 
 def result(process: subprocess.Popen[str]) -> Any:
-    """What a process of fresh.py hands back."""
+    """Result that a process of fresh.py prints."""
     printed = process.communicate()[0]
     if process.returncode:
         raise SystemExit(f"benchmarks/fresh.py ended with exit code {process.returncode}")
@@ -99,7 +100,7 @@ def result(process: subprocess.Popen[str]) -> Any:
 
 
 def start(part: str, *arguments: Any, **variables: str) -> subprocess.Popen[str]:
-    """That process, running."""
+    """A process of fresh.py that runs one of its functions."""
     return subprocess.Popen(
         [sys.executable, str(HERE / "fresh.py"), part, json.dumps(arguments)],
         env=os.environ | variables,
@@ -113,11 +114,11 @@ def kernel_and_peers(quick: bool) -> Iterator[Figure]:
     """Flat halls: share of the memory roof, reduction alone, and the peers."""
     threads, rounds = runtime.ensure_started(), 1 if quick else 20
     fleets = {
-        " x ".join(map(str, size)): fleet_of(*size, "approach")
+        " x ".join(map(str, size)): steps.fleet_of(*size, "approach")
         for size in (QUICK_SIZES if quick else SIZES)
     }
     count, servers = (4, 20) if quick else (1024, 200)
-    unlike = fresh.unlike(["hall.inlet_model=approach"], servers)
+    unlike = steps.unlike(["hall.inlet_model=approach"], servers)
     fleets[f"{count} x 20 x {servers}, each server its own"] = sdc_taichi.build_fleet(
         sdc_taichi.make_configs(unlike, count=count)
     )
@@ -126,11 +127,11 @@ def kernel_and_peers(quick: bool) -> Iterator[Figure]:
 
 
 def beside_peers(name: str, fleet: Fleet, threads: int, rounds: int) -> Iterator[Figure]:
-    """One fleet: medians over the rounds, and medians of what one call takes over another."""
-    alike, met = fleet.groups < fleet.servers, fresh.conditions(fleet)
+    """Figures of one fleet: medians over the rounds of times and of their ratios."""
+    alike, met = fleet.groups < fleet.servers, steps.conditions(fleet)
     hall = Hall(fleet, "f32")
     sums, layers = hall.solve(met), hall.servers()
-    reduction, whole = fresh.stepped(fleet)
+    reduction, whole = steps.stepped(fleet)
     calls = {"roof": plain_store(fleet.servers), "reduction": reduction, "step": whole}
     peers = {}
     for peer, make in PEERS.items():
@@ -186,12 +187,12 @@ def environments(quick: bool) -> Iterator[Figure]:
     many, some, most = (8, 2, 4) if quick else (4096, 64, 1024)
     corrected = sdc_taichi.load_config("corrected")
     transient = sdc_taichi.load_config("corrected", ["simulation.thermal=transient"])
-    own = fresh.unlike([], 4 if quick else 200)
+    own = steps.unlike([], 4 if quick else 200)
     interpreter, roof = "the interpreter yardstick", "the memory roof"
 
-    one = env.single_step(corrected)
+    one = steps.single_step(corrected)
     ratio = core_ratios({"step": one}, interpreter_loop(), rounds)["step"]
-    spent_us = f"{number(1e6 / env.rate(one, 1, seconds))} us/step"
+    spent_us = f"{number(1e6 / steps.rate(one, 1, seconds))} us/step"
     where = f"corrected, PettingZoo, N = 1, over {interpreter}"
     yield Figure("environments", where, ratio, at_most=2.0, absolute=spent_us)
     runs = (
@@ -203,11 +204,11 @@ def environments(quick: bool) -> Iterator[Figure]:
     )
     for name, config, count, yardstick, at_most in runs:
         where = f"{name}, N = {count}"
-        with env.batch_step(config, count) as step:
+        with steps.batch_step(config, count) as step:
             servers = sdc_taichi.build_fleet(config).servers * count
             compared = interpreter_loop() if yardstick is interpreter else plain_store(servers)
             ratio = core_ratios({"step": step}, compared, rounds)["step"]
-            per_s = env.rate(step, count, seconds)
+            per_s = steps.rate(step, count, seconds)
         beside = f"{number(per_s)} steps/s"
         over = f"{where}, over {yardstick}"
         yield Figure("environments", over, ratio, at_most=at_most, absolute=beside)
@@ -218,14 +219,14 @@ def environments(quick: bool) -> Iterator[Figure]:
 def breakdown(
     name: str, config: sdc_taichi.DataCenterConfig, count: int, env_s: float, seconds: float
 ) -> Iterator[Figure]:
-    """What of an environment step are simulator and, in quasi-steady halls, thermal kernel."""
+    """Share of an environment step spent in the simulator, and in quasi-steady halls."""
     fleet = sdc_taichi.build_fleet(sdc_taichi.make_configs(config, count=count))
     parts = {}
     if fleet.models["thermal"] == "quasi_steady":
-        parts["thermal kernel"] = env.rate(fresh.stepped(fleet)[0], 1, seconds)
+        parts["thermal kernel"] = steps.rate(steps.stepped(fleet)[0], 1, seconds)
     sim = sdc_taichi.Simulator(fleet)
     sim.reset()
-    parts["simulator"] = env.rate(sim.step, 1, seconds)
+    parts["simulator"] = steps.rate(sim.step, 1, seconds)
     for part, per_s in parts.items():
         share = 1.0 / per_s / env_s
         yield Figure("environments", f"{name}: {part} of the step", share)
@@ -235,28 +236,28 @@ def planned(quick: bool) -> Iterator[Figure]:
     """Steps of a simulator under model-predictive control over the interpreter yardstick."""
     count, rounds = (2, 1) if quick else (104, 10)
     for name, at_most in (("mpc-24h", 350.0), ("mpc-72h", 700.0)):
-        with env.controlled_step("corrected", name, count) as step:
+        with steps.controlled_step("corrected", name, count) as step:
             ratio = core_ratios({"step": step}, interpreter_loop(), rounds)["step"]
-            per_s = env.rate(step, count, 0.005 if quick else 1.0)
+            per_s = steps.rate(step, count, 0.005 if quick else 1.0)
         where = f"{name}, {count} data centers, over the interpreter yardstick"
         beside = f"{number(per_s)} steps/s"
         yield Figure("planned", where, ratio, at_most=at_most, absolute=beside)
 
 
 def calls(quick: bool) -> Iterator[Figure]:
-    """Calls of a step, which are to be few, and as many in a batch as alone."""
+    """Number of calls of a step, which should be small and not depend on the batch."""
     many = 8 if quick else 96
     for name, overrides, at_most in (
         ("corrected", (), 4),
         ("corrected, transient", ("simulation.thermal=transient",), 5),
     ):
-        found = counts.kernel_calls_of(counts.simulator_step(many, *overrides))
+        found = steps.kernel_calls_of(steps.simulator_step(many, *overrides))
         yield Figure("calls", f"{name}: kernels of a step", found, "calls", at_most=at_most)
     for name, make, at_most in (
-        ("simulator", counts.simulator_step, 300),
-        ("vector_env", counts.environment_step, 350),
+        ("simulator", steps.simulator_step, 300),
+        ("vector_env", steps.environment_step, 350),
     ):
-        few, most = (counts.calls_of(make(size), "call") for size in (2, many))
+        few, most = (steps.calls_of(make(size), "call") for size in (2, many))
         yield Figure("calls", f"{name}: Python functions of a step", few, "calls", at_most=at_most)
         yield Figure("calls", f"{name}: N = {many} beyond N = 2", most - few, "calls", at_most=0)
 
@@ -270,8 +271,8 @@ def scaling(quick: bool) -> Iterator[Figure]:
         if servers * BYTES_PER_SERVER_AT_WORK > free_bytes():
             yield Figure("scaling", size_name(servers), None, note="skipped: too little memory")
             continue
-        fleet = fleet_of(count, 20, 200, "approach")
-        step = fresh.stepped(fleet)[1]
+        fleet = steps.fleet_of(count, 20, 200, "approach")
+        step = steps.stepped(fleet)[1]
         per_server[servers] = 1e9 * wall_s(step, repeats) / servers
         yield Figure("scaling", size_name(servers), per_server[servers], "ns/server")
         if count == CURVE[0]:
@@ -410,7 +411,7 @@ def starting(quick: bool) -> Iterator[Figure]:
 
 def optima(quick: bool) -> Iterator[Figure]:
     """Known optima, from the import to the last run, in processes of their own."""
-    every = ",".join(env.ALL_SITES)
+    every = ",".join(steps.SITES)
     cases = [("ny,ca", 2, None)] if quick else [(every, 31, 500.0), ("ny", 365, 1000.0)]
     for sites, days, at_most in cases:
         found = child("optimum", sites, days)
@@ -498,27 +499,17 @@ def machine() -> dict[str, Any]:
     """Facts of the machine and versions."""
     model = platform.processor()
     if Path("/proc/cpuinfo").exists():
-        found = re.search(r"model name\s*:\s*(.*)", Path("/proc/cpuinfo").read_text())
-        model = found[1].strip() if found else model
-    versions = {"python": platform.python_version(), "sdc-taichi": sdc_taichi.__version__}
-    for name in LIBRARIES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "not installed"
+        named = re.search(r"model name\s*:\s*(.*)", Path("/proc/cpuinfo").read_text())
+        model = named[1].strip() if named else model
+    versions = {name: importlib.metadata.version(name) for name in LIBRARIES}
+    versions |= {"python": platform.python_version(), "sdc-taichi": sdc_taichi.__version__}
     return {
         "cpu": model,
         "cores": os.cpu_count(),
         "threads": runtime.ensure_started(),
         "system": f"{platform.system()} {platform.machine()}",
-        "load_before": load(),
         "versions": versions,
     }
-
-
-def load() -> float | None:
-    """Processes that want a core, mean over a minute."""
-    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
 
 
 def show(figure: Figure, last: str, quick: bool) -> None:
@@ -597,7 +588,8 @@ def main() -> None:
         for figure in part(quick):
             show(figure, figures[-1].part if figures else "", quick)
             figures.append(figure)
-    facts["load_after"] = load()
+    if hasattr(os, "getloadavg"):
+        facts["load"] = round(os.getloadavg()[0], 2)  # processes that want a core
     facts["roof_gb_per_s_and_core"] = {
         f.name.split(":")[0]: round(12.0 / f.value, 1)
         for f in figures

@@ -1,6 +1,6 @@
 """Published cells: figures of rows of suites in one week of a site, and what is run again of them.
 
-``examples/publish_benchmark.py`` writes a folder for each suite, with cells.csv, published.json and
+``docs/make/benchmark.py`` writes a folder for each suite, with cells.csv, published.json and
 the policies of rows that learned.
 """
 

@@ -15,7 +15,7 @@ pytestmark = [
 ]
 
 SCRIPT = Path(__file__).parent.parent / "benchmarks" / "scale.py"
-SIZE = ("--rounds", "1", "--setpoints", "2", "--months", "2", "--jobs", "8")
+SIZE = ("--setpoints", "2", "--months", "2", "--jobs", "8")
 
 
 def test_a_sweep_and_jobs_that_do_nothing_are_measured(tmp_path: Path) -> None:
@@ -27,8 +27,7 @@ def test_a_sweep_and_jobs_that_do_nothing_are_measured(tmp_path: Path) -> None:
     assert (nothing["jobs"], nothing["steps"]) == (8, 0)
     for run in (sweep, nothing):
         assert run["case"] == "processes-1"
-        assert run["start_wall_s"] > 0
         assert run["wall_s"] > 0
-        assert 0 < run["quarter_mb"] <= run["end_mb"] + 1
+        assert run["most_mb"] > 0
     assert 0 < sweep["job_s"] <= 1.5 * sweep["core_s"]
     assert "| processes-1 |" in done.stdout

@@ -31,7 +31,7 @@ def test_a_page_has_tables_pictures_and_how_to_read_them(study: Path, tmp_path: 
     page, notes = page_of(study, tmp_path / "report.html")
     assert notes == ()
     assert page.problems == []
-    assert len(page.all("img")) == 3
+    assert len(page.all("img")) == 2
     (standing, *_) = page.rows("mpc-24h")
     assert standing[1] == "1"
     assert "What it shows & <what> not." in page.text

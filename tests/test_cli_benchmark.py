@@ -73,13 +73,6 @@ def test_the_suites_are_listed() -> None:
     assert {"carbon", "carbon-rich", "bill", "failures", "elsewhere"} <= set(names)
 
 
-def test_without_arguments_the_commands_are_told() -> None:
-    done = call()
-    assert done.exit_code in (0, 2)
-    assert "Compare controllers in suites" in done.output
-    assert "report" in done.output
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import toy_jobs
 from sdc_taichi.benchmark.executors import Executor
 from sdc_taichi.benchmark.store import ResultStore, Study
-from sdc_taichi.cli.jobs import JobOptions, JobsCommand, JobSession, job_progress, job_session
+from sdc_taichi.cli.jobs import JobOptions, JobsCommand, JobSession, job_session
 from sdc_taichi.cli.options import CommandApp
 from sdc_taichi.errors import ConfigError, SdcError
 
@@ -106,22 +106,6 @@ def test_a_study_whose_workers_cannot_start_is_not_begun(
     ):
         pass
     assert list(tmp_path.iterdir()) == []
-
-
-def test_progress_is_a_bar_in_a_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    monkeypatch.setenv("TERM", "xterm")
-    from sdc_taichi.benchmark.jobs import run_job
-
-    refused = toy_jobs.job("refuse", 3)
-    with job_progress("rows [b]", 2, shown=True) as on_done:
-        on_done(toy_jobs.job("without_rows", 0), None)
-        on_done(refused, run_job(refused, {}))
-    said = capsys.readouterr().err
-    assert "failed: toy/c/refuse/3: number 3: valid is another" in said
-    assert "rows" in said
 
 
 def test_an_interrupted_study_says_how_to_go_on(

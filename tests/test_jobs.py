@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,14 +90,12 @@ def test_rows_are_a_dataset_with_hive_partitions(tmp_path: Path) -> None:
     assert by_pandas["sum"].tolist() == rows["sum"].tolist()[2:]
     table = ds.dataset(results, partitioning="hive").to_table(filter=ds.field("site") == "NY")
     assert table["sum"].to_pylist() == rows["sum"].tolist()[::2]
-
-
-def test_rows_of_jobs_with_other_columns_are_put_together(tmp_path: Path) -> None:
-    run([*draws(1), toy_jobs.job("other_columns", 1)], tmp_path)
+    run([toy_jobs.job("other_columns", 1)], tmp_path)
     rows = ResultStore(tmp_path).rows().set_index("site")
     assert rows.loc["AZ", "cost"] == 5
-    assert rows["cost"].isna().tolist() == [True, True, False]
-    assert rows["sum"].dtype == float
+    assert rows["cost"].isna().sum() == 4
+    with pytest.raises(ConfigError, match=r"toy/c/draw/1: two jobs"):
+        run([*draws(2), toy_jobs.job("draw", 1, seconds=0.0)], tmp_path)
 
 
 def test_jobs_that_are_done_are_kept(tmp_path: Path) -> None:
@@ -114,16 +110,6 @@ def test_jobs_that_are_done_are_kept(tmp_path: Path) -> None:
     assert changed == {"study.json"}
     other = [toy_jobs.job("draw", i, seconds=0.0) for i in range(3)]
     assert run(other, tmp_path).done == 3, "other values"
-
-
-def test_a_result_in_the_folder_of_another_job_is_not_its_own(tmp_path: Path) -> None:
-    first = toy_jobs.job("draw", 1)
-    second = replace(first, partition={name: f"{x}0" for name, x in first.partition.items()})
-    store = ResultStore(tmp_path)
-    run([first], tmp_path)
-    shutil.copytree(store.folder_of(first.partition), store.folder_of(second.partition))
-    assert first.key == second.key
-    assert (store.is_done(first), store.is_done(second)) == (True, False)
 
 
 @pytest.mark.parametrize("name", ["metrics.json", "rows.parquet", "policy/weights.bin"])
@@ -261,31 +247,6 @@ def is_running(pid: int) -> bool:
         return not (state.exists() and state.read_text().rpartition(")")[2].split()[0] == "Z")
     except (ProcessLookupError, FileNotFoundError):
         return False
-
-
-def test_jobs_are_generated_as_they_are_needed(tmp_path: Path) -> None:
-    taken: list[int] = []
-    ended: list[Job] = []
-
-    def jobs() -> Iterator[Job]:
-        for i in range(12):
-            taken.append(i)
-            assert len(taken) - len(ended) <= 2 * 2 + 1
-            yield toy_jobs.job("without_rows", i)
-
-    with ResultStore(tmp_path).claimed(STUDY):
-        run_jobs(
-            jobs(),
-            ResultStore(tmp_path),
-            LocalProcesses(2),
-            on_done=lambda job, _: ended.append(job),
-        )
-    assert len(ended) == 12
-
-
-def test_two_jobs_of_one_partition_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"toy/c/draw/1: two jobs"):
-        run([*draws(2), toy_jobs.job("draw", 1, seconds=0.0)], tmp_path)
 
 
 def study(command: str, *seeds: str) -> Study:

@@ -13,7 +13,7 @@ from sdc_taichi import build_fleet, make_controller
 from sdc_taichi.benchmark.cases import data_centers
 from sdc_taichi.benchmark.jobs import DoneJob, run_job
 from sdc_taichi.benchmark.suite import Suite, make_suite
-from sdc_taichi.benchmark.suite_jobs import row_jobs
+from sdc_taichi.benchmark.suite_run import row_jobs
 
 pytest.importorskip("torch", reason="torch is not installed: make test-train")
 

@@ -88,33 +88,20 @@ def test_scores_are_0_for_idle_commands_and_1_for_the_optimum(root: Path) -> Non
     best = np.mean([episode.rewards.sum() for episode in list(data)[2:]])
     assert minari.get_normalized_score(data, best) == pytest.approx(1.0)
     assert data.storage.metadata["ref_min_score"] < best
-
-
-def test_the_card_tells_what_is_in_it(root: Path) -> None:
     card = (root / ID / "README.md").read_text(encoding="utf-8")
-    assert card.startswith(f"# {ID}\n")
-    assert "| episodes | 4, cut off after 96 steps" in card
-    assert "| `idle` (not in it) |" in card
     assert "| `optimum` | 2 | 192 |" in card
     assert "| 57 | `dc_load` |" in card  # the last of 58 entries
     assert "| 2 | agent_bat | battery |" in card
-    assert "MIT licence" in card
 
 
 @pytest.mark.repo
 def test_the_lines_of_the_docs_read_it(root: Path) -> None:
     page = (DOCS / "offline-data.md").read_text(encoding="utf-8")
-    by_minari, by_h5py, _ = re.findall("```python\n(.*?)```", page, flags=re.DOTALL)
-    for code in (by_minari, by_h5py.replace("random", "g36")):
-        names: dict[str, Any] = {}
-        here = code.replace("datasets/sdc_taichi/corrected-ny-v0", (root / ID).as_posix())
-        assert here != code
-        exec(compile(here, "offline-data.md", "exec"), names)
-        if "env" in names:
-            names["env"].close()
-    assert {name: len(array) for name, array in names["joined"].items()} == dict.fromkeys(
-        ("observations", "actions", "rewards", "terminations", "truncations"), 192
-    )
+    (code,) = re.findall("```python\n(.*?)```", page, flags=re.DOTALL)
+    names: dict[str, Any] = {}
+    here = code.replace("datasets/sdc_taichi/corrected-ny-v0", (root / ID).as_posix())
+    exec(compile(here, "offline-data.md", "exec"), names)
+    names["env"].close()
 
 
 def test_the_same_command_gives_the_same_bytes(root: Path, tmp_path: Path) -> None:
@@ -147,16 +134,12 @@ def test_what_is_not_whole_leaves_nothing(tmp_path: Path, monkeypatch: Any) -> N
     assert "ref_max_score" not in metadata
 
 
-def test_a_disk_without_space_is_one_error(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
-    chosen = Collection(load_config("tiny"), ("random",), (0,), days=1)
-    with pytest.raises(SdcError, match="0 MB are free"):
-        write_data_set(chosen, tmp_path, "tiny-v0")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_cannot_be_written_is_one_error(tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_one_error(tmp_path: Path, monkeypatch: Any) -> None:
     (tmp_path / "file").write_text("")
     chosen = Collection(load_config("tiny"), ("random",), (0,), days=1)
     with pytest.raises(SdcError, match=r"file/tiny-v0: cannot be written"):
         write_data_set(chosen, tmp_path / "file", "tiny-v0")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    with pytest.raises(SdcError, match="0 MB are free"):
+        write_data_set(chosen, tmp_path, "tiny-v0")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -10,16 +10,14 @@ import pandas as pd
 import pytest
 
 from sdc_taichi import load_config, make_controller
-from sdc_taichi.benchmark.paper_accounting import (
+from sdc_taichi.benchmark.paper import (
     CONSTANT_ROW,
     PaperFigures,
     PaperTable,
     compared,
     finding,
     paper_tables,
-    radar,
 )
-from sdc_taichi.benchmark.suite import load_suite
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.run.loop import simulate
 from sdc_taichi.run.metrics import metrics_per_dc
@@ -116,23 +114,6 @@ def test_rows_of_other_weeks_are_refused(ours: pd.DataFrame, message: str) -> No
         compared(table(4), ours, SCORED_H)
 
 
-def test_radar_has_the_lowest_figures_at_the_rim() -> None:
-    labels, values = radar(compared(table(7), rows(), SCORED_H), printed=True)
-    assert labels == ["IPPO", "MAPPO", "HAPPO", "HAA2C", "HAD3QN", "HASAC"]
-    np.testing.assert_allclose(values.mean(axis=0), 0.0, atol=1e-9)
-    np.testing.assert_allclose(values.std(axis=0), 1.0)
-    assert labels[int(values[:, 0].argmax())] == "HASAC"
-    assert radar(compared(table(7), rows(), SCORED_H), printed=False)[0] == []
-    assert finding(compared(table(7), rows(), SCORED_H)) == ""
-
-
-def test_a_column_without_a_spread_is_at_the_middle_of_the_radar() -> None:
-    ours = pd.concat([rows(row=name, queue_mean_tasks=0.0) for name in ("ippo", "happo")])
-    labels, values = radar(compared(table(4), ours, SCORED_H), printed=False)
-    assert labels == ["IPPO", "HAPPO"]
-    assert not values.any()
-
-
 def coldest(overrides: list[str]) -> PaperFigures:
     """The lowest setpoint through June in New York on preset ``sustaindc``, in parts of 3 days."""
     config = load_config("sustaindc", ["site.location=NY", *overrides])
@@ -175,14 +156,6 @@ def released_utilisation(hourly: F64) -> F64:
     return np.convolve(scaled, np.full(16, 1.0 / 16), mode="same")
 
 
-def test_released_utilisation_has_nine_tenths_between_its_bounds() -> None:
-    hourly = 0.5 + 0.3 * np.sin(np.arange(24 * 14) * 2 * np.pi / 24)
-    quarters = released_utilisation(hourly)
-    assert quarters.shape == (4 * hourly.size,)
-    assert 0.2 < quarters[16:-16].min() < 0.25
-    assert 0.75 < quarters[16:-16].max() < 0.8
-
-
 def test_measured_inputs_give_the_figures_of_the_released_code(
     real_data: Path, tmp_path: Path
 ) -> None:
@@ -200,12 +173,3 @@ def test_measured_inputs_give_the_figures_of_the_released_code(
         ]
     )
     assert found[:3] == pytest.approx(COLDEST, rel=0.03)
-
-
-def test_suite_paper_has_the_rows_and_sites_of_the_printed_tables() -> None:
-    suite = load_suite("paper")
-    for each in paper_tables():
-        case = suite.cases[each.case]
-        assert each.site in (case.test.sites or case.sites)
-        assert case.sites == (each.site,)
-        assert all(suite.is_for(row, each.case) for row in (*each.rows, CONSTANT_ROW))

@@ -6,6 +6,7 @@ import importlib
 from pathlib import Path
 from types import ModuleType
 
+import pandas as pd
 import pytest
 
 from made_studies import ROWS, done_job, frames_of_row, write_study
@@ -70,8 +71,8 @@ def test_cells_are_reached_again(suite: str) -> None:
 
 @pytest.fixture
 def publisher(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(ROOT / "examples")
-    return importlib.import_module("publish_benchmark")
+    monkeypatch.syspath_prepend(ROOT / "docs" / "make")
+    return importlib.import_module("benchmark")
 
 
 def test_commands_are_shown_without_what_differs_from_run_to_run(publisher: ModuleType) -> None:
@@ -91,8 +92,7 @@ def docs(tmp_path: Path) -> Path:
     folder = tmp_path / "docs"
     folder.mkdir()
     (folder / "benchmark.md").write_text(
-        "# Results\n<!-- how to read the tables -->\n<!-- end -->\n"
-        "Found: nothing.\n<!-- made-up -->\nold\n<!-- end -->\nNo more.\n"
+        "# Results\nFound: nothing.\n<!-- made-up -->\nold\n<!-- end -->\nNo more.\n"
     )
     return folder
 
@@ -107,14 +107,17 @@ def test_tables_pictures_and_cells_of_a_suite(
     store.keep(done_job("ippo", 0, frames_of_row("ippo", 0), spec=ROWS["ippo"], files=files))
     publisher.publish([study], docs, out)
     page = (docs / "benchmark.md").read_text("utf-8")
-    assert page.startswith("# Results\n<!-- how to read")
+    assert page.startswith("# Results\nFound")
     assert "Found: nothing.\n<!-- made-up -->\n" in page
     assert page.endswith("<!-- end -->\nNo more.\n")
     assert "\nold\n" not in page
     assert "    sdc-taichi benchmark made-up\n" in page
     assert "| 1 | mpc-24h | 1 | -8.97 (" in page
-    assert "(img/benchmark-made-up-1.webp)" in page
-    assert (docs / "img" / "benchmark-made-up-1.webp").read_bytes()[8:12] == b"WEBP"
+    assert "[standings](benchmark/made-up-standings.csv)" in page
+    board = pd.read_csv(docs / "benchmark" / "made-up-standings.csv")
+    assert board["change_pct"][0] == pytest.approx(-8.97, abs=0.005)
+    assert "(img/benchmark-made-up.webp)" in page
+    assert (docs / "img" / "benchmark-made-up.webp").read_bytes()[8:12] == b"WEBP"
     lines = (out / "made-up" / "cells.csv").read_text("utf-8").splitlines()
     assert [line.split(",")[:4] for line in lines[1:]] == [
         ["idle", "idle", "ca", "3"],
@@ -139,5 +142,5 @@ def test_results_that_are_not_those_of_a_suite_are_refused(
     assert (docs / "benchmark.md").read_text("utf-8") == before
     assert not (tmp_path / "cells").exists()
     (docs / "benchmark.md").write_text("# Results\n")
-    with pytest.raises(SdcError, match="no lines <!-- how to read the tables -->"):
-        publisher.publish([mixed], docs, tmp_path / "cells", draft=True)
+    with pytest.raises(SdcError, match="no line <!-- made-up -->"):
+        publisher.publish([write_study(tmp_path / "whole")], docs, tmp_path / "cells")

@@ -23,9 +23,8 @@ from sdc_taichi.benchmark.report import write_report
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.benchmark.submission import add_submission, read_submission, write_submission
 from sdc_taichi.benchmark.suite import make_suite
-from sdc_taichi.benchmark.suite_jobs import row_jobs
 from sdc_taichi.benchmark.suite_results import read_suites
-from sdc_taichi.benchmark.suite_run import study_of
+from sdc_taichi.benchmark.suite_run import row_jobs, study_of
 from sdc_taichi.cli.app import app
 from sdc_taichi.learning.controller import PolicyController
 from sdc_taichi.learning.evaluation import Contender, evaluate, prepare
@@ -79,7 +78,7 @@ def test_a_row_of_others_enters_the_report_and_is_told_as_theirs(
     out = tmp_path / "tables.md"
     write_report([target], markdown=out)
     assert (
-        "> two-sites: theirs is the work of others and was not run here: A "
+        "> two-sites: theirs was submitted and not run here: A "
         "\\<b\\>university\\</b\\>, https://x.org/a."
     ) in out.read_text().splitlines()
     assert "Results of several" not in out.read_text()  # a table has no source and no processor

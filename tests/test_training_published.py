@@ -9,7 +9,7 @@ import pytest
 
 from published import cells, described, suite_of, tolerance
 from sdc_taichi.benchmark.jobs import run_job
-from sdc_taichi.benchmark.suite_jobs import row_jobs
+from sdc_taichi.benchmark.suite_run import row_jobs
 
 torch = pytest.importorskip("torch", reason="torch is not installed: make test-train")
 

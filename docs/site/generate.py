@@ -1,4 +1,4 @@
-"""Pages of the site that the code makes: commands, quantities of a step, and the Python API.
+"""Pages of the site that the code makes: commands, quantities, fields of suites, and the API.
 
     python docs/site/generate.py OUT
 
@@ -19,6 +19,7 @@ from typing import Any
 import typer.main
 from stage import write
 
+from sdc_taichi.benchmark.suite import suite_markdown
 from sdc_taichi.cli.app import app
 from sdc_taichi.learning.training_settings import settings_markdown
 from sdc_taichi.types import CRAC_UNITS, DATA_CENTERS, QUANTITIES, RACKS, meanings
@@ -176,6 +177,7 @@ def pages() -> dict[str, str]:
         "commands": commands_page(),
         "quantities": quantities_page(),
         "training-settings": settings_page(),
+        "suite-fields": f"# Fields of suites\n\n{suite_markdown()}\n",
         "api": api_index(),
     }
     return made | {f"api-{part.name}": api_page(part) for part in API}

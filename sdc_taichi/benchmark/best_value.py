@@ -48,7 +48,7 @@ def with_default(sweep: Sweep) -> Sweep:
 
 
 def group_columns(sweep: Sweep) -> list[str]:
-    """Columns of rows that are told apart: controller, and other fields that vary, or else site."""
+    """Columns that define a group of rows: controller, and the other varied fields or else site."""
     others = [field for field in sweep.fields if field != chosen_grid(sweep).field]
     return ["controller", *(others or ["site"])]
 
@@ -73,15 +73,15 @@ def best_by_month(rows: pd.DataFrame, sweep: Sweep, metric: str) -> pd.DataFrame
     import pandas as pd
 
     default = value_at(sweep.config, chosen_grid(sweep).field)
-    found = []
-    for names, own in _groups(rows, sweep):
-        months, values, figures = _table(own, sweep, metric)
+    tables = []
+    for names, group in _groups(rows, sweep):
+        months, values, figures = _table(group, sweep, metric)
         if values.size:
             table = _months(months, values, figures, default, metric)
             for place, (column, name) in enumerate(zip(group_columns(sweep), names, strict=True)):
                 table.insert(place, column, name)
-            found.append(table)
-    return pd.concat(found, ignore_index=True) if found else pd.DataFrame()
+            tables.append(table)
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
 def figures_by_month(
@@ -97,20 +97,20 @@ def figures_by_month(
     Returns:
         For each group its name, M months, V values, (V,), and the metric, (M, V).
     """
-    found = []
-    for names, own in _groups(rows, sweep):
+    panels = []
+    for names, group in _groups(rows, sweep):
         shown = names if len(sweep.controllers) > 1 else names[1:]
-        months, values, figures = _table(own, sweep, metric)
+        months, values, figures = _table(group, sweep, metric)
         if values.size:
-            found.append((", ".join(map(str, shown)), months, values, figures))
-    return found
+            panels.append((", ".join(map(str, shown)), months, values, figures))
+    return panels
 
 
 def _groups(rows: pd.DataFrame, sweep: Sweep) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
     """Values of ``group_columns`` and rows of each group, in the order of the rows."""
     columns = group_columns(sweep)
-    for names, own in rows.groupby(columns, sort=False, dropna=False, observed=True):
-        yield tuple(names), own
+    for names, group in rows.groupby(columns, sort=False, dropna=False, observed=True):
+        yield tuple(names), group
 
 
 def _table(rows: pd.DataFrame, sweep: Sweep, metric: str) -> tuple[list[int], F64, F64]:

@@ -34,8 +34,8 @@ def data_centers(case: Case, part: Part) -> list[DataCenterConfig]:
     """
     values = _data_center_values(case)
     if part == "held-out":
-        given = case.test.model_dump(exclude_defaults=True)
-        values = merged(values, given)
+        changes = case.test.model_dump(exclude_defaults=True)
+        values = merged(values, changes)
     # An algorithm has to be named, and decides nothing here.
     return make_settings({"algorithm": "ippo"} | values, "case").data_centers_of_sites()
 
@@ -72,9 +72,9 @@ def training_settings(
     Raises:
         ConfigError: settings that are not valid, or that the case decides.
     """
-    given = merged(training, row.train or {})
+    settings = merged(training, row.train or {})
     for name in _FIXED:
-        if name in given:
+        if name in settings:
             raise ConfigError(f"train: {name}: is that of the case; valid is without")
     of_case = {
         "weeks": case.training_weeks,
@@ -87,7 +87,7 @@ def training_settings(
             "optimum": case.optimum,
         },
     }
-    values = merged(merged(_data_center_values(case), of_case), given)
+    values = merged(merged(_data_center_values(case), of_case), settings)
     if agent is not None:
         values = merged(values, {"environment": {"agents": [agent], "others": "idle"}})
     return make_settings(values, "train")

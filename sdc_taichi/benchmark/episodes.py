@@ -42,21 +42,21 @@ from sdc_taichi.types import F32, F64, I64, Actions, StepResult
 IDLE, RANDOM = "idle", "random"
 """Controller that leaves everything as it is, and the one whose actions are drawn evenly."""
 QUANTITIES = ("carbon_g", "grid_kwh", "energy_cost")
-"""Quantities of ``StepResult`` that infos tell of each step."""
+"""Quantities of ``StepResult`` in the infos of each step."""
 MOST_REPEATS = 10_000
 """Largest number of episodes of a week and a controller."""
 _SET_ELSEWHERE = {
     **dict.fromkeys(("days", "start", "months"), "valid is to choose weeks and days"),
     "heat_map": "valid is False, as learners take features alone",
 }
-"""Options of environments that are not given as such, and what is valid instead."""
+"""Options of environments that are not set here, and what is valid instead."""
 _TOGETHER, _STEPS_TOGETHER = 64, 65_536
 """Most episodes that run side by side, and most of their steps, which bounds the memory."""
 _TOLERANCE = 1e-5
-"""Difference from which a command is another; actions are kept in f32."""
+"""Commands closer than this count as equal, because actions are stored as f32."""
 
 Progress = Callable[[str, int, int], None]
-"""Is told the name of a stage, how much of it is done, and how much there is."""
+"""Progress callback ``(stage, done, total)``."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Collection:
 
     @cached_property
     def options(self) -> dict[str, Any]:
-        """Options of the environment: those given, on top of those that agents are trained with."""
+        """Options of the environment, on top of those that agents are trained with."""
         agents = {} if self.agent is None else {"agents": (self.agent,)}
         beneath = training_environment({**self.environment, **agents})
         # Agents that learn take small steps of the setpoint, some controllers large ones.
@@ -201,7 +201,7 @@ def episodes(
     Args:
         collection: what is collected.
         controller: one of its controllers, or another name.
-        progress: is told how many steps are done of each batch.
+        progress: progress callback; counts the steps of each batch.
         stop: asked before every step; true ends the run.
 
     Yields:
@@ -353,7 +353,7 @@ class _Chance:
         return np.stack([space.sample() for space in self._spaces])
 
     def changed(self, result: Mapping[str, Any]) -> F64:
-        """None of its actions stands for a command, (B,)."""
+        """Always 0, because no command precedes its actions, (B,)."""
         return np.zeros(len(self._spaces))
 
 

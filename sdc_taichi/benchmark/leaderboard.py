@@ -27,6 +27,7 @@ from sdc_taichi.learning.evaluation_table import TITLES, by_site, samples, summa
 from sdc_taichi.learning.statistics import (
     DRAWS,
     Interval,
+    Statistic,
     bootstrap_values,
     change_pct,
     drawn_weeks,
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 THRESHOLDS_PCT = (0.0, 25.0, 50.0, 75.0, 90.0)
-"""Shares of the achievable at which tables tell performance profiles, in %."""
+"""Shares of the achievable at which tables show performance profiles, in %."""
 CONSTRAINTS = {
     "throttled_rack_h": "throttled (rack h)",
     "tripped_rack_h": "tripped (rack h)",
@@ -132,7 +133,7 @@ def leaderboard(case: CaseResults) -> Leaderboard:
 
 
 def places(values: Mapping[str, float], drawn: Mapping[str, F64]) -> dict[str, tuple[int, int]]:
-    """Places of rows, of which several share one unless their intervals tell them apart.
+    """Places of rows, of which several share one unless intervals separate them.
 
     Places part between two sets of rows where each row of one is better than each of the other:
     where the interval of the difference of the two, draw by draw, lies below 0.
@@ -146,16 +147,16 @@ def places(values: Mapping[str, float], drawn: Mapping[str, F64]) -> dict[str, t
         places stand in the order in which they were given.
     """
     order = sorted(values, key=lambda name: values[name])
-    given = {name: index for index, name in enumerate(values)}
-    found: dict[str, tuple[int, int]] = {}
+    position = {name: index for index, name in enumerate(values)}
+    shared: dict[str, tuple[int, int]] = {}
     begin = 0
     for end in range(1, len(order) + 1):
         above, below = order[:end], order[end:]
         if all(_is_better(drawn[one], drawn[other]) for one in above for other in below):
-            for name in sorted(order[begin:end], key=lambda name: given[name]):
-                found[name] = begin + 1, end
+            for name in sorted(order[begin:end], key=lambda name: position[name]):
+                shared[name] = begin + 1, end
             begin = end
-    return found
+    return shared
 
 
 def _has_intervals(case: CaseResults, evaluation: Evaluation, name: str) -> bool:
@@ -173,16 +174,14 @@ def _is_better(one: F64, other: F64) -> bool:
 def _drawn_changes(evaluation: Evaluation, figures: _Samples) -> dict[str, F64]:
     """Change of each row against idle commands in each draw of a bootstrap, (draws,) each.
 
-    Weeks of a draw are the same for all rows. Trainings are drawn for each row by its name, so that
-    its draws are the same whatever rows stand beside it; together where seeds decide inputs.
+    Trainings are drawn together if seeds decide inputs.
     """
-    weeks = drawn_weeks(evaluation.strata, _generator(), DRAWS)
-    found = {}
-    for name, (own, idle) in figures.items():
-        paired = len(idle) > 1
-        generator = _generator("" if paired else name)
-        found[name] = bootstrap_values(change_pct, (own, idle), weeks, generator, paired=paired)
-    return found
+    changes = {}
+    for name, pair in figures.items():
+        paired = len(pair[1]) > 1
+        drawn_by = "" if paired else name
+        changes[name] = _bootstrap(evaluation, change_pct, pair, drawn_by, paired=paired)
+    return changes
 
 
 def _generator(name: str = "") -> np.random.Generator:
@@ -207,14 +206,18 @@ def _standings(
     for metric in CONSTRAINTS:
         values = row_samples(evaluation, metric)
         if any(np.nan_to_num(sample).any() for sample in values.values()):
-            columns = [_mean_columns(metric, values[name], evaluation, name) for name in order]
+            columns = []
+            for name in order:
+                drawn = _bootstrap(evaluation, sample_mean, (values[name],), name)
+                mean = percentile_interval(float(sample_mean(values[name])), drawn)
+                columns.append(interval_columns(metric, mean))
             table[list(columns[0])] = pd.DataFrame(columns, index=order)
     table["core_min"] = [
         sum(result.record.core_s for result in case.rows[name]) / 60 for name in order
     ]
     unknown = [name for name in table if table[name].isna().all()]
-    found: pd.DataFrame = table.drop(columns=unknown).reset_index()
-    return found
+    standings: pd.DataFrame = table.drop(columns=unknown).reset_index()
+    return standings
 
 
 def _pairs(
@@ -227,25 +230,22 @@ def _pairs(
     """Each row against the best rule, and against the row below."""
     import pandas as pd
 
-    found = []
+    pairs = []
     for name, below in zip(order, [*order[1:], None], strict=True):
         others = dict.fromkeys([*([best] if best and best != name else []), *filter(None, [below])])
-        found += [_difference(evaluation, figures, drawn, name, other) for other in others]
-    return pd.DataFrame(found)
+        pairs += [_difference(evaluation, figures, drawn, name, other) for other in others]
+    return pd.DataFrame(pairs)
 
 
 def _difference(
     evaluation: Evaluation, figures: _Samples, drawn: Mapping[str, F64], one: str, other: str
 ) -> dict[str, Any]:
     """A row of a table of differences."""
-    (mine, idle), (theirs, their_idle) = figures[one], figures[other]
-    points = float(change_pct(mine, idle) - change_pct(theirs, their_idle))
-    paired = len(idle) > 1
-    weeks = drawn_weeks(evaluation.strata, _generator(), DRAWS)
-    values = bootstrap_values(
-        probability_of_improvement, (mine, theirs), weeks, _generator(), paired=paired
-    )
-    probability = float(probability_of_improvement(mine, theirs))
+    (ones, idle), (others, others_idle) = figures[one], figures[other]
+    points = float(change_pct(ones, idle) - change_pct(others, others_idle))
+    pair = ones, others
+    values = _bootstrap(evaluation, probability_of_improvement, pair, paired=len(idle) > 1)
+    probability = float(probability_of_improvement(ones, others))
     return {
         "row": one,
         "than": other,
@@ -264,17 +264,26 @@ def row_samples(evaluation: Evaluation, column: str) -> dict[str, F64]:
     rows = evaluation.rows[evaluation.rows["moves"] == ALL]
     width = len(evaluation.strata)
     return {
-        str(name): own[column].to_numpy(np.float64).reshape(-1, width)
-        for name, own in rows.groupby("controller", sort=False)
+        str(name): group[column].to_numpy(np.float64).reshape(-1, width)
+        for name, group in rows.groupby("controller", sort=False)
         if column in rows
     }
 
 
-def _mean_columns(metric: str, sample: F64, evaluation: Evaluation, name: str) -> dict[str, float]:
-    """Mean of a metric over weeks and seeds with its interval."""
+def _bootstrap(
+    evaluation: Evaluation,
+    statistic: Statistic,
+    samples: tuple[F64, ...],
+    name: str = "",
+    *,
+    paired: bool = False,
+) -> F64:
+    """A statistic in each draw of a bootstrap; weeks of a draw are the same for all rows.
+
+    Trainings are drawn for each row by its name, so that its draws do not depend on other rows.
+    """
     weeks = drawn_weeks(evaluation.strata, _generator(), DRAWS)
-    drawn = bootstrap_values(sample_mean, (sample,), weeks, _generator(name))
-    return interval_columns(metric, percentile_interval(float(sample_mean(sample)), drawn))
+    return bootstrap_values(statistic, samples, weeks, _generator(name), paired=paired)
 
 
 def interval_columns(name: str, interval: Interval) -> dict[str, float]:
@@ -287,43 +296,27 @@ def interval_columns(name: str, interval: Interval) -> dict[str, float]:
     return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
 
 
-def standard_scores(values: F64) -> F64:
-    """Values of each column less their mean, over their standard deviation.
-
-    Args:
-        values: a row for each of what is compared, (N, K).
-
-    Returns:
-        Standard scores, (N, K); 0 in a column of equal values.
-    """
-    centred, spread = values - values.mean(axis=0), values.std(axis=0)
-    # Equal values differ from their mean by rounding alone.
-    varies = spread > 1e-12 * np.abs(values).max(axis=0)
-    return np.asarray(np.divide(centred, spread, out=np.zeros_like(centred), where=varies))
-
-
 def _profiles(case: CaseResults, evaluation: Evaluation, order: Sequence[str]) -> pd.DataFrame:
     """Share of weeks above shares of the achievable, in %."""
     import pandas as pd
 
     thresholds = np.array(THRESHOLDS_PCT)
-    weeks = drawn_weeks(evaluation.strata, _generator(), DRAWS)
-    found = []
-    shares = {name: 100.0 * own for name, own in row_samples(evaluation, "share").items()}
+    table = []
+    shares = {name: 100.0 * profile for name, profile in row_samples(evaluation, "share").items()}
     for name in order:
         sample = shares[name]
         if case.kinds[name] in (ACHIEVED, BOUND) or not np.isfinite(sample).any():
             continue
-        drawn = bootstrap_values(
-            lambda x: performance_profile(x, thresholds), (sample,), weeks, _generator(name)
+        drawn = _bootstrap(
+            evaluation, lambda x: performance_profile(x, thresholds), (sample,), name
         )
-        own = performance_profile(sample, thresholds)
+        profile = performance_profile(sample, thresholds)
         row: dict[str, Any] = {"row": name}
         for index, threshold in enumerate(THRESHOLDS_PCT):
-            interval = percentile_interval(100.0 * float(own[index]), 100.0 * drawn[:, index])
+            interval = percentile_interval(100.0 * float(profile[index]), 100.0 * drawn[:, index])
             row |= interval_columns(f"above_{threshold:g}_pct", interval)
-        found.append(row)
-    return pd.DataFrame(found)
+        table.append(row)
+    return pd.DataFrame(table)
 
 
 def _coordination(case: CaseResults, evaluation: Evaluation, figures: _Samples) -> pd.DataFrame:
@@ -331,22 +324,22 @@ def _coordination(case: CaseResults, evaluation: Evaluation, figures: _Samples) 
     import pandas as pd
 
     by_agent = {agent: samples(evaluation, agent) for agent in AGENTS}
-    found = []
+    table = []
     for name, (all_together, idle) in figures.items():
         if case.kinds[name] == ACHIEVED:
             alone = {agent: best[None] for agent, best in evaluation.alone.items()}
         else:
-            alone = {agent: own[name][0] for agent, own in by_agent.items() if name in own}
-        changes = {agent: float(change_pct(own, idle)) for agent, own in alone.items()}
+            alone = {agent: figure[name][0] for agent, figure in by_agent.items() if name in figure}
+        changes = {agent: float(change_pct(figure, idle)) for agent, figure in alone.items()}
         if not changes:
             continue
         together, parts = float(change_pct(all_together, idle)), sum(changes.values())
-        found.append(
+        table.append(
             {"row": name}
             | {agent: changes.get(agent, math.nan) for agent in AGENTS}
             | {"parts_pct": parts, "together_pct": together, "worth_points": parts - together}
         )
-    return pd.DataFrame(found)
+    return pd.DataFrame(table)
 
 
 def _apart(
@@ -360,9 +353,9 @@ def _apart(
         for name, results in case.rows.items()
         if case.kinds[name] == LEARNER and results[0].submission is None
     }
-    found = []
+    differences = []
     for name, row in trained.items():
-        for other, theirs in trained.items():
-            if not row.get("apart") and theirs.get("apart") and row["train"] == theirs["train"]:
-                found.append(_difference(evaluation, figures, drawn, name, other))
-    return pd.DataFrame(found)
+        for other, spec in trained.items():
+            if not row.get("apart") and spec.get("apart") and row["train"] == spec["train"]:
+                differences.append(_difference(evaluation, figures, drawn, name, other))
+    return pd.DataFrame(differences)

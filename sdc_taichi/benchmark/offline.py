@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from sdc_taichi.atomic_file import FileClaim, naming_errors
-from sdc_taichi.benchmark.data_set import ControllerReturns, DataSet
+from sdc_taichi.benchmark.data_set import ControllerReturns, DataSet, card
 from sdc_taichi.benchmark.episodes import IDLE, Collection, Episode, Progress, episodes
-from sdc_taichi.benchmark.offline_card import card
 from sdc_taichi.errors import ConfigError, SdcError
 
 CARD_FILE = "README.md"
@@ -89,7 +88,7 @@ def write_data_set(
         data_set: name in Minari.
         command: command line that makes it again, for the card.
         replace: whether a data set of that name is replaced.
-        progress: is told of the stages of the work.
+        progress: progress callback ``(stage, done, total)``.
         stop: asked before every step; true ends the work.
 
     Raises:
@@ -103,13 +102,13 @@ def write_data_set(
         storage = _new_storage(collection, unfinished / _DATA)
         reached = {}
         for name in dict.fromkeys((IDLE, *collection.controllers)):
-            reached[name] = found = ControllerReturns(name)
+            reached[name] = returns = ControllerReturns(name)
             for episode in episodes(collection, name, progress=progress, stop=stop):
-                found.add(episode)
+                returns.add(episode)
                 if name in collection.controllers:
                     _keep(storage, episode)
-        kept = tuple(reached[name] for name in collection.controllers)
-        made = DataSet(data_set, folder, collection, reached[IDLE], kept)
+        of_collection = tuple(reached[name] for name in collection.controllers)
+        made = DataSet(data_set, folder, collection, reached[IDLE], of_collection)
         storage.update_metadata(_metadata(made))
         (unfinished / CARD_FILE).write_text(card(made, command), encoding="utf-8")
     return made
@@ -209,7 +208,7 @@ def _keep(storage: Any, episode: Episode) -> None:
 def _metadata(made: DataSet) -> dict[str, Any]:
     """Metadata of a data set, as Minari names it."""
     names = ", ".join(made.collection.controllers)
-    found: dict[str, Any] = {
+    metadata: dict[str, Any] = {
         "dataset_id": made.id,
         "minari_version": version("minari"),
         "algorithm_name": names,
@@ -219,9 +218,9 @@ def _metadata(made: DataSet) -> dict[str, Any]:
         "requirements": [f"sdc-taichi=={version('sdc-taichi')}"],
     }
     if made.best is not None:
-        found |= {
+        metadata |= {
             "ref_min_score": made.idle.mean_return,
             "ref_max_score": made.best.mean_return,
             "num_episodes_average_score": made.best.episodes,
         }
-    return found
+    return metadata

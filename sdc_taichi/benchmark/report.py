@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from sdc_taichi.atomic_file import atomic_write
 from sdc_taichi.benchmark.leaderboard import (
@@ -13,51 +17,60 @@ from sdc_taichi.benchmark.leaderboard import (
     OUTAGES,
     Leaderboard,
     leaderboard,
+    row_samples,
 )
-from sdc_taichi.benchmark.paper_report import PAPER, paper_sections
+from sdc_taichi.benchmark.paper import PAPER, paper_sections
 from sdc_taichi.benchmark.report_blocks import (
     Block,
-    Command,
-    Heading,
     Items,
-    Links,
-    Note,
-    Paragraph,
     Picture,
     Sections,
     Table,
+    Text,
     html_report,
     markdown_report,
 )
-from sdc_taichi.benchmark.report_pictures import case_pictures
 from sdc_taichi.benchmark.suite_results import (
+    ACHIEVED,
+    BOUND,
     LEARNER,
+    OTHER,
+    PLANNER,
     CaseResults,
     SuiteResults,
     read_suites,
 )
 from sdc_taichi.errors import SdcError
-from sdc_taichi.learning.evaluation import ALL
+from sdc_taichi.learning.evaluation import ALL, IDLE
+from sdc_taichi.learning.statistics import performance_profile
+from sdc_taichi.viz.benchmark_figures import interval_plot, profile_plot
+from sdc_taichi.viz.fleet_figures import MAX_RUNS
 from sdc_taichi.viz.plotting import new_figure
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 _MOST_NAMED = 8
+_LEAST_SHARE_PCT = -100.0
+"""Share of the achievable below which pictures leave rows out, which would squeeze the others."""
+_THRESHOLDS_PCT = np.linspace(-25.0, 110.0, 136)
 READING = (
     "Changes are of sums over all scored weeks, against idle commands in the same weeks, in %: "
     "below 0 is better. Values in brackets are 95 % intervals of a stratified bootstrap, which "
     "draws seeds whole and weeks within their site. The interquartile mean is that of the changes "
     "of all seeds and weeks. The share of the achievable is 0 for idle commands and 100 % for the "
     "best path known with perfect foresight.",
-    "Rows share a place unless the interval of the paired difference tells each of them from each "
-    "row of the next place; the order within a place is that of the suite and says nothing. "
-    "Intervals are of one pair each: of many pairs, about one in twenty that do not differ is told "
-    "apart by chance. Optimum and bound know the future and have no place, nor have rows that were "
-    "trained with fewer than three seeds, and cases of fewer than three weeks of a site.",
+    "Rows share a place unless the interval of the paired difference separates each of them from "
+    "each row of the next place; the order within a place is that of the suite. Of many pairs that "
+    "do not differ, about one in twenty is separated by chance. Optimum and bound know the future "
+    "and have no place, nor have rows that were trained with fewer than three seeds, and cases of "
+    "fewer than three weeks of a site.",
     "The probability of improvement is that of a lower figure in a week, for a seed of each row; "
-    "equal figures count half. Performance profiles tell in how many weeks, of all seeds, a row "
+    "equal figures count half. Performance profiles show in how many weeks, of all seeds, a row "
     "reaches more than a share of the achievable. Definitions are those of Agarwal et al. (2021, "
     "Deep reinforcement learning at the edge of the statistical precipice, NeurIPS 34).",
     "Coordination is what agents save together beyond the sum of what each saves alone: below 0 "
-    "they are in each other's way, or save the same carbon twice.",
+    "they hinder each other, or save the same carbon twice.",
 )
 """How to read the tables of a report."""
 
@@ -73,7 +86,7 @@ def write_report(
         markdown: file of the tables as Markdown; None is none.
 
     Returns:
-        What is to be known, in words.
+        Notes on what the report leaves out.
 
     Raises:
         SdcError: a folder without results of a suite, a damaged result, results that cannot be
@@ -88,7 +101,7 @@ def write_report(
     if html is not None:
         if lacking := _lacking_pictures():
             notes = (f"tables alone: {lacking}",)
-            sections = {"Without pictures": [Note(lacking)]} | {
+            sections = {"Without pictures": [Text(lacking, "note")]} | {
                 heading: [block for block in blocks if not isinstance(block, Picture)]
                 for heading, blocks in sections.items()
             }
@@ -111,18 +124,18 @@ def report_sections(suites: Iterable[SuiteResults]) -> Sections:
             sections |= paper_sections(suite)
         for name, board in boards.items():
             sections[f"{suite.name}: {name}"] = _case_blocks(suite, board)
-    sections["How to read the tables"] = [Paragraph(text) for text in READING]
+    sections["How to read the tables"] = [Text(text) for text in READING]
     return sections
 
 
 def _suite_blocks(suite: SuiteResults, boards: Mapping[str, Leaderboard]) -> list[Block]:
     """Subject of a suite, the commands and time behind its results, and notes on them."""
-    blocks: list[Block] = [Paragraph(suite.suite.about or suite.suite.title)]
-    blocks += [Note(text) for text in suite_notes(suite)]
-    blocks += [Command(text) for text in suite.commands]
-    blocks.append(Paragraph(cost_text(suite)))
+    blocks: list[Block] = [Text(suite.suite.about or suite.suite.title)]
+    blocks += [Text(text, "note") for text in suite_notes(suite)]
+    blocks += [Text(text, "command") for text in suite.commands]
+    blocks.append(Text(cost_text(suite)))
     if len(boards) > 1:
-        blocks.append(overview(boards))
+        blocks.append(_overview(boards))
     return blocks
 
 
@@ -134,25 +147,16 @@ def cost_text(suite: SuiteResults) -> str:
     """
     results = suite.results
     trained = [x for x in results if x.kind == LEARNER and x.submission is None]
-    whole_h, trained_h = (_core_h(x.record.core_s for x in own) for own in (results, trained))
-    optima_h = _core_h(case.optima_core_s for case in suite.cases.values())
+    whole_h, trained_h = (sum(x.record.core_s for x in own) / 3600 for own in (results, trained))
+    optima_h = sum(case.optima_core_s for case in suite.cases.values()) / 3600
     return (
         f"{len(results)} results took {whole_h:.2g} core hours, {trained_h:.2g} of them for "
         f"trained rows; solving for optima took {optima_h:.2g} more."
     )
 
 
-def _core_h(core_s: Iterable[float]) -> float:
-    """Processor times together, in h."""
-    return sum(map(float, core_s)) / 3600
-
-
-def overview(boards: Mapping[str, Leaderboard]) -> Table:
-    """Change against idle commands of each row in each case.
-
-    Args:
-        boards: what the rows of each case came to.
-    """
+def _overview(boards: Mapping[str, Leaderboard]) -> Table:
+    """Change against idle commands of each row in each case."""
     import pandas as pd
 
     changes = {
@@ -197,8 +201,8 @@ def _notes_of_case(case: CaseResults) -> list[str]:
     notes = []
     for name, rows in case.rows.items():
         if (about := rows[0].submission) is not None:
-            told = ", ".join(filter(None, (about.author, about.about, about.link)))
-            notes.append(f"{name} is the work of others and was not run here: {told}.")
+            source = ", ".join(filter(None, (about.author, about.about, about.link)))
+            notes.append(f"{name} was submitted and not run here: {source}.")
     kinds = case.kinds
     few = [x for x, rows in case.rows.items() if kinds[x] == LEARNER and len(rows) < FEWEST]
     if few:
@@ -229,8 +233,8 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
     case = board.case
     blocks: list[Block] = []
     if about := case.settings.about:
-        blocks.append(Paragraph(about))
-    blocks.append(Paragraph(weeks_text(board)))
+        blocks.append(Text(about))
+    blocks.append(Text(weeks_text(board)))
     tables = [
         (f"Standings, {case.objective}; means of a week where no %", board.standings),
         ("Each row against the best rule, and against the row below", board.pairs),
@@ -239,41 +243,35 @@ def _case_blocks(suite: SuiteResults, board: Leaderboard) -> list[Block]:
         ("Agents trained together against those trained apart", board.apart),
         ("Change against idle commands by site (%)", board.sites),
     ]
-    blocks += outage_notes(board)
+    blocks += _outage_notes(board)
     pictures = case_pictures(board)
     for caption, frame in tables:
         if not frame.empty:
             blocks.append(Table(caption, frame, BOARD_TITLES))
             if frame is board.standings:
                 blocks += pictures
-    rows = row_texts(suite, board)
-    if rows:
-        blocks += [Heading("Rows"), Items(rows)]
-    recordings = _recordings(case)
-    if recordings:
-        blocks += [Heading("Recordings"), Links(recordings)]
+    if rows := _row_texts(suite, board):
+        blocks += [Text("Rows", "heading"), Items(dict.fromkeys(rows))]
+    if recordings := _recordings(case):
+        blocks += [Text("Recordings", "heading"), Items(recordings)]
     return blocks
 
 
-def outage_notes(board: Leaderboard) -> list[Note]:
-    """A note that places are by the objective alone, where work is lost or racks are off.
-
-    Args:
-        board: what the rows of a case came to.
-    """
+def _outage_notes(board: Leaderboard) -> list[Block]:
+    """A note that places are by the objective alone, where work is lost or racks are off."""
     broken = [BOARD_TITLES[name] for name in OUTAGES if name in board.standings]
     text = (
         f"Places are by {board.case.objective} alone. Racks that are off and work that is lost "
-        f"draw no power: read them beside {', '.join(broken)}."
+        f"draw no power: read the places beside {', '.join(broken)}."
     )
-    return [Note(text)] if broken else []
+    return [Text(text, "note")] if broken else []
 
 
 def weeks_text(board: Leaderboard) -> str:
     """Which weeks of which data centers a case is of.
 
     Args:
-        board: what its rows came to.
+        board: tables of the case.
     """
     first = next(iter(board.case.rows.values()))[0].frame
     sites, weeks = list(dict.fromkeys(first["site"])), list(dict.fromkeys(first["week"]))
@@ -284,13 +282,8 @@ def weeks_text(board: Leaderboard) -> str:
     )
 
 
-def row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
-    """Descriptions of the rows of a case.
-
-    Args:
-        suite: results of the suite.
-        board: what the rows of the case came to.
-    """
+def _row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
+    """Descriptions of the rows of a case."""
     texts = []
     for name, results in board.case.rows.items():
         about = suite.suite.rows[name].about if name in suite.suite.rows else ""
@@ -302,7 +295,7 @@ def row_texts(suite: SuiteResults, board: Leaderboard) -> list[str]:
     return texts
 
 
-def _recordings(case: CaseResults) -> dict[str, Path]:
+def _recordings(case: CaseResults) -> dict[str, Path | None]:
     """Recordings of the results of a case, by their names."""
     return {
         f"{name}, seed {result.seed}: {file}": result.folder / file
@@ -311,6 +304,92 @@ def _recordings(case: CaseResults) -> dict[str, Path]:
         for file in result.record.files_sha256
         if file.endswith(".rrd")
     }
+
+
+def case_pictures(board: Leaderboard) -> list[Picture]:
+    """Pictures of a case.
+
+    Args:
+        board: tables of the case.
+    """
+    pictures: list[Picture] = []
+    if picture := _interval_picture(board):
+        pictures.append(picture)
+    if not board.profiles.empty:
+        pictures.append(_profile_picture(board))
+    return pictures
+
+
+def _interval_picture(board: Leaderboard) -> Picture | None:
+    """Share of the achievable of each row, or its change against idle commands."""
+    table = board.standings
+    has_share = "share_pct" in table
+    column = "share_pct" if has_share else "change_pct"
+    kinds = board.case.kinds
+    ends: dict[str, tuple[float, float, float]] = {}
+    far, left = _far(board), []
+    for values in table.to_dict("records"):
+        name, value = str(values["row"]), float(values[column])
+        if kinds[name] == BOUND or not math.isfinite(value):
+            continue
+        if name in far:
+            left.append(f"{name} ({value:.0f} %)")
+            continue
+        label = f"{name} ({values['place']})" if values["place"] != "-" else name
+        ends[label] = value, float(values[f"{column}_low"]), float(values[f"{column}_high"])
+    if len(ends) < 2:
+        return None
+    what = "share of the achievable (%)" if has_share else "change against idle commands (%)"
+    caption = f"{what[0].upper()}{what[1:]} with 95 % intervals; places in brackets."
+    if left:
+        caption += f" Left out: {', '.join(left)}."
+
+    def draw() -> Figure:
+        return interval_plot(ends, what, marks=(0.0, 100.0) if has_share else (0.0,))
+
+    alt = "; ".join(f"{name} {value:.1f}" for name, (value, *_) in ends.items())
+    return Picture(draw, f"{what}: {alt}", caption)
+
+
+def _far(board: Leaderboard) -> set[str]:
+    """Rows so far below idle commands that pictures are without them."""
+    table = board.standings
+    if "share_pct" not in table:
+        return set()
+    return {str(name) for name in table["row"][table["share_pct"] < _LEAST_SHARE_PCT]}
+
+
+def _chosen(board: Leaderboard) -> list[str]:
+    """Rows that pictures of lines show, no more than a reader can distinguish, in table order."""
+    kinds = {name: kind for name, kind in board.case.kinds.items() if name not in _far(board)}
+    ranks = {LEARNER: 0, OTHER: 0, PLANNER: 1, ACHIEVED: 5}
+    rank = {name: ranks.get(kind, 4) for name, kind in kinds.items() if kind != BOUND}
+    for name in (board.best_rule, IDLE):
+        if name in rank:
+            rank[name] = 2
+    order = [name for name in map(str, board.standings["row"]) if name in rank]
+    chosen = sorted(order, key=lambda name: rank[name])[:MAX_RUNS]
+    return [name for name in order if name in chosen]
+
+
+def _profile_picture(board: Leaderboard) -> Picture:
+    """Share of weeks above each share of the achievable."""
+    shares = row_samples(board.evaluation, "share")
+    shown = {
+        name: performance_profile(100.0 * shares[name], _THRESHOLDS_PCT)
+        for name in _chosen(board)
+        if np.isfinite(shares[name]).any() and board.case.kinds[name] != ACHIEVED
+    }
+
+    def draw() -> Figure:
+        return profile_plot(_THRESHOLDS_PCT, shown, "share of the achievable (%)")
+
+    return Picture(
+        draw,
+        f"Performance profiles of {', '.join(shown)}.",
+        "Weeks of all seeds in which a row reaches more than a share of the achievable: the higher "
+        "the line, the better.",
+    )
 
 
 def _lacking_pictures() -> str:

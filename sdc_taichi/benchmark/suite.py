@@ -98,7 +98,7 @@ class Case(Section):
     """Data centers that results are shown for, as far as they differ from those trained in."""
     optimum: bool = True
     """Whether optima are solved for, which value what is stored or waits at the end of a week, and
-    of which the share of the achievable is told."""
+    of which the share of the achievable is derived."""
 
     @field_validator("config")
     @classmethod
@@ -151,10 +151,10 @@ class Row(Section):
 
     @model_validator(mode="after")
     def _is_one_thing(self) -> Self:
-        given = [name for name in _CONTENT if getattr(self, name) is not None]
-        if len(given) != 1:
-            found = " and ".join(given) or "nothing"
-            raise ValueError(f"{found} given; valid is one of {', '.join(_CONTENT)}")
+        contents = [name for name in _CONTENT if getattr(self, name) is not None]
+        if len(contents) != 1:
+            names = " and ".join(contents) or "nothing"
+            raise ValueError(f"{names} given; valid is one of {', '.join(_CONTENT)}")
         for name in ("apart", "agents_alone"):
             if getattr(self, name) and self.train is None:
                 raise ValueError(f"{name}: valid with train")
@@ -185,7 +185,7 @@ class Suite(Section):
     """Cases and rows, and what the tables of them are about."""
 
     name: Name
-    """Name that results are kept under; the name of the file where it gives none."""
+    """Name of the suite; by default that of its file."""
     title: Text
     """Title of the tables."""
     about: Text = ""
@@ -205,8 +205,7 @@ class Suite(Section):
     rows: dict[Name, Row] = Field(min_length=1)
     """Controllers by name, in the order of the tables."""
     quick: dict[str, Any] = Field(default={})
-    """Values that take the place of others for a run of minutes; a case or row that is null is left
-    out."""
+    """Values that replace others for a run of minutes; a case or row that is null is left out."""
 
     @field_validator("objective")
     @classmethod
@@ -237,8 +236,8 @@ class Suite(Section):
                     raise ValueError(
                         f"rows.{name}.cases: no case {case!r}; valid: {', '.join(self.cases)}"
                     )
-            own = row.cases if row.cases is not None else tuple(self.cases)
-            without = [case for case in own if not self.cases[case].optimum]
+            cases = row.cases if row.cases is not None else tuple(self.cases)
+            without = [case for case in cases if not self.cases[case].optimum]
             if row.optimum is not None and without:
                 raise ValueError(f"rows.{name}: case {without[0]} has optimum false")
         return self
@@ -366,14 +365,14 @@ def _quick(values: Mapping[str, Any], label: str) -> dict[str, Any]:
     changes = values.get("quick")
     if not changes:
         raise ConfigError(f"{label}: has no quick form; valid is one with values in quick")
-    found = merged({k: v for k, v in values.items() if k != "quick"}, changes)
+    changed = merged({k: v for k, v in values.items() if k != "quick"}, changes)
     for kind in ("cases", "rows"):
         for name in changes.get(kind, ()):
             if name not in values[kind]:
                 meant = suggestion_or_valid(name, values[kind])
                 raise ConfigError(f"{label}: quick.{kind}: no {kind[:-1]} {name!r}{meant}")
-        found[kind] = {name: x for name, x in found[kind].items() if x is not None}
-    return found
+        changed[kind] = {name: x for name, x in changed[kind].items() if x is not None}
+    return changed
 
 
 def _content(value: Any) -> Any:

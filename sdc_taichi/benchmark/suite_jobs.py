@@ -1,7 +1,7 @@
-"""Jobs of suites: the optima of a site's weeks, and a row of a case with one seed.
+"""Functions of the jobs of suites: the optima of a site's weeks, and a row of a case with one seed.
 
-``solve_reference`` and ``run_row`` run anywhere, since all that they need is in their values and
-inputs. An optimum is solved once and kept as the files of its job, which are inputs of the rows.
+They run on any machine, since all that they need is in their values and inputs. An optimum is
+solved once and kept as the files of its job, which are inputs of the rows.
 """
 
 from __future__ import annotations
@@ -10,23 +10,21 @@ import contextlib
 import io
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 from sdc_taichi.benchmark.cases import (
     agents_of,
     data_centers,
-    number_of_seeds,
     training_settings,
     weeks_of,
 )
-from sdc_taichi.benchmark.jobs import Inputs, Job, JobResult, digest_of, input_paths, read_input
-from sdc_taichi.benchmark.suite import REFERENCE, Case, Part, Row, Suite
+from sdc_taichi.benchmark.jobs import Inputs, JobResult
+from sdc_taichi.benchmark.suite import Case, Part, Row
 from sdc_taichi.control import PERFECT, ForecastError, make_controller
-from sdc_taichi.control.registry import parts_of
 from sdc_taichi.envs.agents import COMMAND_OF_AGENT
 from sdc_taichi.learning.evaluation import (
     ALL,
@@ -37,7 +35,6 @@ from sdc_taichi.learning.evaluation import (
     prepare,
     validate,
 )
-from sdc_taichi.learning.policy import WEIGHTS
 from sdc_taichi.optimum.cache import OptimumCacheWarning
 from sdc_taichi.run.achievable import AchievedPath, share_of_achievable
 
@@ -46,77 +43,12 @@ if TYPE_CHECKING:
 
     from sdc_taichi.learning.trainer import Training
 
-_MODULE = "sdc_taichi.benchmark.suite_jobs"
 _CURVES = ("training.csv", "validation.csv")
 """Files of a training that are kept beside its settings and policy."""
 _ROW = "row"
 """Name of a controller during its evaluation; its rows are named after the row of the suite."""
 _SECONDS = "seconds"
 """Column of curves that differs between equal trainings."""
-
-
-def reference_jobs(suite: Suite) -> list[Job]:
-    """Jobs that solve for the optima of a suite, one for each case, part and site.
-
-    Args:
-        suite: the suite.
-    """
-    found = []
-    for name, case in suite.cases.items():
-        parts, files = (_parts_needed(suite, name), _files(case)) if case.optimum else ((), {})
-        for part in parts:
-            for site, config in enumerate(data_centers(case, part)):
-                values = {
-                    "case": case.model_dump(mode="json", exclude={"about"}),
-                    "part": part,
-                    "site": site,
-                    "objective": suite.objective,
-                    **files,
-                }
-                partition = {
-                    "suite": suite.name,
-                    "case": name,
-                    "row": f"{REFERENCE}-{part}-{config.name}",
-                    "seed": "0",
-                }
-                found.append(Job(f"{_MODULE}:{solve_reference.__name__}", values, partition))
-    return found
-
-
-def row_jobs(suite: Suite, references: Sequence[Job]) -> list[Job]:
-    """Jobs that run the rows of a suite, one for each case, row and seed.
-
-    Args:
-        suite: the suite.
-        references: jobs that have solved for its optima.
-    """
-    found = []
-    files = {name: _files(case) for name, case in suite.cases.items()}
-    for label, row in suite.rows.items():
-        for name, case in suite.cases.items():
-            if not suite.is_for(label, name):
-                continue
-            parts, policies = _parts_of(row), _policies(row)
-            inputs = {
-                job.name: job.key
-                for job in references
-                if job.partition["case"] == name and job.values["part"] in parts
-            }
-            for seed in range(number_of_seeds(suite, name, label)):
-                values = {
-                    "name": label,
-                    "case": case.model_dump(mode="json", exclude={"about"}),
-                    "row": row.model_dump(mode="json", exclude={"about", "seeds", "cases"}),
-                    "training": suite.training if row.train is not None else {},
-                    "objective": suite.objective,
-                    "seed": seed,
-                    **files[name],
-                }
-                if policies:
-                    values["policies"] = policies
-                partition = {"suite": suite.name, "case": name, "row": label, "seed": str(seed)}
-                found.append(Job(f"{_MODULE}:{run_row.__name__}", values, partition, inputs))
-    return found
 
 
 def solve_reference(values: Mapping[str, Any], _inputs: Inputs) -> JobResult:
@@ -155,7 +87,7 @@ def solve_reference(values: Mapping[str, Any], _inputs: Inputs) -> JobResult:
 
 
 def run_row(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
-    """Run a row of a case with one seed: train or choose what is to be, and evaluate it.
+    """Run a row of a case with one seed: train or choose its controller, and evaluate it.
 
     Args:
         values: ``case`` and ``row``, the ``name`` of the row, settings of every ``training``, the
@@ -246,7 +178,7 @@ def _made(task: _Task, scratch: Path, optima: Path) -> _Made:
             for spec in task.row.best_of
         }
     best = min(tried, key=lambda spec: tried[spec].change_pct)
-    changes = {spec: found.change_pct for spec, found in tried.items()}
+    changes = {spec: validation.change_pct for spec, validation in tried.items()}
     return _Made(best, {"chosen": best, "validation_change_pct": changes}, {})
 
 
@@ -291,13 +223,13 @@ def _files_of_training(folder: Path) -> dict[str, bytes]:
 
     chosen = next(name for name in FOLDERS if (folder / name).is_dir())
     paths = [folder / SETTINGS_FILE, *sorted((folder / chosen).iterdir())]
-    found = {
+    contents = {
         path.relative_to(folder).as_posix(): path.read_bytes() for path in paths if path.is_file()
     }
     for name in _CURVES:
         if (folder / name).is_file():
-            found[name] = _without_seconds(folder / name)
-    return found
+            contents[name] = _without_seconds(folder / name)
+    return contents
 
 
 def _without_seconds(path: Path) -> bytes:
@@ -356,8 +288,8 @@ def _rows(task: _Task, made: _Made, weeks: DataCenterWeeks) -> pd.DataFrame:
         assert best is not None
         if task.row.optimum == "bound":
             return _rows_of_figures(weeks, {ALL: best.bound})
-        own = evaluate(weeks, [Contender(_ROW, AchievedPath(best))], beside=False).rows
-        return pd.concat([own, _rows_of_figures(weeks, best.alone)], ignore_index=True)
+        achieved = evaluate(weeks, [Contender(_ROW, AchievedPath(best))], beside=False).rows
+        return pd.concat([achieved, _rows_of_figures(weeks, best.alone)], ignore_index=True)
     agents = made.agents if task.row.agents_alone and len(made.agents) > 1 else ()
     controller = make_controller(made.spec, weeks.sim.fleet)
     contender = Contender(_ROW, controller, agents=agents)
@@ -405,45 +337,3 @@ def _metrics(task: _Task, made: _Made, weeks: DataCenterWeeks) -> dict[str, Any]
         "has_optimum": weeks.optimum is not None,
         "bound_kinds": [] if weeks.optimum is None else sorted(set(weeks.optimum.bound_kinds)),
     }
-
-
-def _files(case: Case) -> dict[str, dict[str, str]]:
-    """Digests of the input files that data centers of a case name, by path; empty without any.
-
-    Another file in the place makes other jobs, though the case is the same.
-
-    Raises:
-        SdcError: a file that cannot be read.
-    """
-    configs = [x for part in get_args(Part) for x in data_centers(case, part)]
-    paths = sorted({path for config in configs for path in input_paths(config)})
-    return {"files": {path: digest_of(read_input(path)) for path in paths}} if paths else {}
-
-
-def _policies(row: Row) -> dict[str, str]:
-    """Digests of the policies that the controllers of a row name, by their folders.
-
-    Another policy in the folder makes another job, though the row is the same.
-    """
-    found = {}
-    for spec in row.controllers:
-        for name in parts_of(spec).values() or [spec]:
-            kind, _, folder = name.partition(":")
-            if kind == "policy":
-                files = sorted(Path(folder).rglob(WEIGHTS))
-                found[folder] = digest_of(b"".join(path.read_bytes() for path in files))
-    return found
-
-
-def _parts_needed(suite: Suite, case: str) -> tuple[Part, ...]:
-    """Parts of a case whose optima its rows need."""
-    of_rows = [_parts_of(row) for name, row in suite.rows.items() if suite.is_for(name, case)]
-    needed = {part for parts in of_rows for part in parts}
-    order: tuple[Part, ...] = ("held-out", "validation")
-    return tuple(part for part in order if part in needed)
-
-
-def _parts_of(row: Row) -> tuple[Part, ...]:
-    """Parts of a case whose optima a row needs."""
-    chooses = row.train is not None or row.best_of is not None
-    return ("held-out", "validation") if chooses else ("held-out",)

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_RUNS = 100_000
-"""Most runs of a sweep that is not told to have more."""
+"""Most runs of a sweep, unless a larger number is allowed."""
 MOST_DCS, MOST_RACKS = 1024, 2**18
 """Most data centers of a job, and most racks of all of them, unless its number is given: more step
 no faster, and need more memory."""
@@ -240,9 +240,9 @@ def run_part(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
     with tempfile.TemporaryDirectory() as folder:
         files = _written_files(inputs, Path(folder))
         part = _Part(values, _base(inputs, files, str(values["start"])), files)
-        found, failed, notes = part.run()
+        metrics, failed, notes = part.run()
     return JobResult(
-        rows=part.rows(found), metrics={"failed": failed, "notes": list(dict.fromkeys(notes))}
+        rows=part.rows(metrics), metrics={"failed": failed, "notes": list(dict.fromkeys(notes))}
     )
 
 
@@ -274,7 +274,7 @@ class _Part:
 
     def run(self) -> tuple[dict[int, dict[str, Metric]], list[dict[str, str]], list[str]]:
         """Metrics of each combination by its place, those that failed, and notes on inputs."""
-        found: dict[int, dict[str, Metric]] = {}
+        metrics: dict[int, dict[str, Metric]] = {}
         errors: dict[int, str] = {}
         notes: list[str] = []
         fleets: dict[tuple[Any, ...], dict[int, DataCenterConfig]] = {}
@@ -291,7 +291,7 @@ class _Part:
                 place: config.model_copy(update={"name": name})
                 for (place, config), name in zip(configs.items(), names, strict=True)
             }
-            self._run_fleet(named, found, errors, notes)
+            self._run_fleet(named, metrics, errors, notes)
         failed = [
             {
                 "combination": combination_text(self._fields, self._cells[place]),
@@ -299,45 +299,45 @@ class _Part:
             }
             for place in sorted(errors)
         ]
-        return found, failed, [self._with_names(note) for note in notes]
+        return metrics, failed, [self._with_names(note) for note in notes]
 
-    def rows(self, found: Mapping[int, Mapping[str, Metric]]) -> pd.DataFrame | None:
+    def rows(self, metrics: Mapping[int, Mapping[str, Metric]]) -> pd.DataFrame | None:
         """Rows of combinations: their values, their site and their metrics; None without any."""
         import pandas as pd
 
-        if not found:
+        if not metrics:
             return None
-        places = sorted(found)
+        places = sorted(metrics)
         columns: dict[str, Any] = {}
         for at, (field, kind) in enumerate(self._values["columns"]):
-            given = [self._cells[place][at] for place in places]
-            columns[field] = _column(given, kind)
-        for name in found[places[0]]:
-            given = [found[place][name] for place in places]
-            columns[name] = _column(given, kind_of(given))
+            values = [self._cells[place][at] for place in places]
+            columns[field] = _column(values, kind)
+        for name in metrics[places[0]]:
+            values = [metrics[place][name] for place in places]
+            columns[name] = _column(values, kind_of(values))
         return pd.DataFrame(columns)
 
     def _run_fleet(
         self,
         configs: Mapping[int, DataCenterConfig],
-        found: dict[int, dict[str, Metric]],
+        metrics: dict[int, dict[str, Metric]],
         errors: dict[int, str],
         notes: list[str],
     ) -> None:
-        """Run data centers as a batch; one that fails is found by halves."""
+        """Run data centers as a batch; if one fails, halve the batch until it is isolated."""
         try:
-            metrics, of_inputs = self._metrics(list(configs.values()))
+            of_fleet, of_inputs = self._metrics(list(configs.values()))
         except SdcError as error:
             if len(configs) == 1:
                 errors[next(iter(configs))] = str(error)
                 return
             listed = list(configs.items())
             for half in (listed[: len(listed) // 2], listed[len(listed) // 2 :]):
-                self._run_fleet(dict(half), found, errors, notes)
+                self._run_fleet(dict(half), metrics, errors, notes)
             return
         places = locations(list(configs.values()))
-        for place, site, row in zip(configs, places, metrics, strict=True):
-            found[place] = {"site": site, **row}
+        for place, site, row in zip(configs, places, of_fleet, strict=True):
+            metrics[place] = {"site": site, **row}
         notes += of_inputs
 
     def _metrics(

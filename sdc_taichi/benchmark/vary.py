@@ -94,23 +94,23 @@ def parse_vary(text: str, config: DataCenterConfig, most: int) -> Varied:
     Raises:
         ConfigError: naming the text and what is valid.
     """
-    path, sign, given = (part.strip() for part in text.partition("="))
+    path, sign, listed = (part.strip() for part in text.partition("="))
     where = f"vary {shortened(text)}"
-    if not sign or not path or not given:
+    if not sign or not path or not listed:
         raise ConfigError(
             f"{where}: valid is FIELD=A,B,C, FIELD=START:STOP:STEP or FIELD=LOW..HIGH"
         )
     if "." not in path:
         raise ConfigError(f"{where}: valid is a field of a section, such as site.location")
     held = value_at(config, path)
-    ends = [_number(part) for part in given.split("..")]
+    ends = [_number(part) for part in listed.split("..")]
     if len(ends) == 2 and None not in ends:
-        return _range(path, given, held, where)
-    steps = given.split(":")
+        return _range(path, listed, held, where)
+    steps = listed.split(":")
     if len(steps) in (2, 3) and _number(steps[0]) is not None:
         return Grid(path, _fractions(_steps(steps, most, where), held))
     try:
-        values = load_yaml(f"[{given}]")
+        values = load_yaml(f"[{listed}]")
         keys = [json.dumps(value, sort_keys=True, allow_nan=False) for value in values]
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{where}: no list of YAML values ({error})") from None
@@ -174,9 +174,9 @@ def value_text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _range(path: str, given: str, held: Any, where: str) -> Range:
+def _range(path: str, ends: str, held: Any, where: str) -> Range:
     """The range of a text ``LOW..HIGH``, both of which are numbers."""
-    low, high = (parse_number(part) for part in given.split(".."))
+    low, high = (parse_number(part) for part in ends.split(".."))
     if not low < high:
         raise ConfigError(f"{where}: the range is empty; valid is LOW..HIGH with LOW below HIGH")
     is_whole = _is_number(held) and isinstance(held, int)

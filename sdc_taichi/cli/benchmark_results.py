@@ -1,4 +1,4 @@
-"""``sdc-taichi benchmark report`` and ``add``: tables of suites, and rows of others."""
+"""``sdc-taichi benchmark report`` and ``add``: tables of suites, and submitted rows."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def sweep_command(
     """Run all combinations of values, sites, months and controllers, and keep their metrics.
 
     Writes a Parquet dataset with a row for each run. Ctrl-C ends the sweep, and --resume goes on
-    with it. A combination that is not valid is told, and the others run.
+    with it. A combination that is not valid is reported, and the others run.
     """
     from sdc_taichi.benchmark.store import RESULTS, ResultStore, Study
     from sdc_taichi.benchmark.sweep import check_sweep, sweep_inputs, sweep_jobs

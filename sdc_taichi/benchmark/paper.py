@@ -1,28 +1,33 @@
-"""Results in the units of tables 2 to 7 of SustainDC, beside the figures that are printed there.
+"""Tables 2 to 7 of SustainDC: our results in their units, beside the printed figures.
 
-What these tables hold is not what their headings say. HVAC and IT energy are mean powers in kW. CFP
-is the mean of a quarter hour, at a carbon intensity too high by that of the first hour of the year:
-the code added noise around that value where noise around 0 was meant (``CI_Manager`` in
+The columns of these tables are not what their headings say. HVAC and IT energy are mean powers in
+kW. CFP is the mean of a quarter hour, at a carbon intensity too high by that of the first hour of
+the year: the code added noise around that value where noise around 0 was meant (``CI_Manager`` in
 ``utils/managers.py`` of github.com/HewlettPackard/dc-rl). Water is the sum of hourly rates over
 quarter hours. All of them follow from the metrics of a run on preset ``sustaindc``.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import yaml
 from pydantic import Field
 
-from sdc_taichi.benchmark.leaderboard import standard_scores
-from sdc_taichi.config.fields import Section, Text
+from sdc_taichi.benchmark.leaderboard import interval_columns
+from sdc_taichi.benchmark.report_blocks import Block, Table, Text
+from sdc_taichi.benchmark.suite_results import SuiteResults
+from sdc_taichi.config.fields import Section
+from sdc_taichi.config.fields import Text as FieldText
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.learning.evaluation import ALL
+from sdc_taichi.learning.split import UNSCORED_DAYS
 from sdc_taichi.learning.statistics import (
     Interval,
     Statistic,
@@ -36,11 +41,39 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CONSTANT_ROW = "coldest"
-"""Row of a suite that holds the lowest setpoint, which all others are told against."""
+"""Row of a suite that holds the lowest setpoint, which all others are compared with."""
 _METRICS = ("cfp_kg", "grid_kwh", "hvac_kwh", "it_kwh", "queue_mean_tasks", "water_l")
 _QUARTERS_PER_H = 4
 _SEED = 0
 """Seed of the draws of intervals."""
+
+
+PAPER = "paper"
+"""Accounting of suites whose tables are those of SustainDC."""
+_CAPTION = "Our figures, carbon with 95 % intervals, beside those printed"
+_UNITS = (
+    " Columns are in the units that the printed ones hold, not in those of their headings: mean "
+    "powers, carbon of a quarter hour at an intensity that is raised by that of the first hour of "
+    "the year, and a sum of hourly rates of water."
+)
+_COLUMNS = {
+    "cfp_kg": "CFP (kg per quarter hour)",
+    "hvac_kw": "HVAC (kW)",
+    "it_kw": "IT (kW)",
+    "queue_tasks": "task queue",
+    "water_m3h": "water (sum of m3/h)",
+}
+PAPER_TITLES = (
+    {
+        "table": "table",
+        "label": "row",
+        "seeds": "seeds",
+        "against_constant": f"CFP against {CONSTANT_ROW} (%)",
+    }
+    | _COLUMNS
+    | {f"printed_{name}": f"printed {title}" for name, title in _COLUMNS.items()}
+)
+"""Titles of the columns of ``paper_rows``."""
 
 
 class PaperFigures(NamedTuple):
@@ -61,7 +94,7 @@ class PaperFigures(NamedTuple):
 class PrintedRow(Section):
     """A row of a printed table."""
 
-    label: Text
+    label: FieldText
     """Name of the row as it is printed."""
     figures: PaperFigures
     """Figures of the row as they are printed."""
@@ -74,7 +107,7 @@ class PaperTable(Section):
     """Number of the table, 2..7."""
     panel: Annotated[str, Field(pattern="^[a-f]$")]
     """Panel of figure 4 that shows the table, a..f."""
-    title: Text
+    title: FieldText
     """Subject of the table."""
     case: str
     """Case of suite ``paper`` with the same data center and months."""
@@ -126,41 +159,16 @@ def compared(table: PaperTable, rows: pd.DataFrame, scored_h: float) -> list[Com
     Raises:
         ConfigError: rows of one case that are not of the same weeks.
     """
-    own = rows[(rows["case"] == table.case) & (rows["site"].str.upper() == table.site)]
-    own = own[(own["moves"] == ALL) & own["it_kwh"].notna()]
+    of_case = rows[(rows["case"] == table.case) & (rows["site"].str.upper() == table.site)]
+    of_case = of_case[(of_case["moves"] == ALL) & of_case["it_kwh"].notna()]
     samples = {
         str(name): _samples(group, table, scored_h)
-        for name, group in own.groupby("row", sort=False)
+        for name, group in of_case.groupby("row", sort=False)
     }
     constant = samples.get(CONSTANT_ROW)
     elsewhere = {name for each in paper_tables() for name in each.rows} - set(table.rows)
     names = [*table.rows, *(x for x in samples if x not in table.rows and x not in elsewhere)]
     return [_compared_row(name, table, samples.get(name), constant) for name in names]
-
-
-def radar(rows: Sequence[ComparedRow], *, printed: bool) -> tuple[list[str], F64]:
-    """Rows that the paper has as figure 4 shows them: low figures far from the centre.
-
-    A score is the mean of the column less the figure, over the standard deviation. The paper does
-    not say which one; here it is that of the population.
-
-    Args:
-        rows: rows of a table.
-        printed: whether to take the printed figures, or ours.
-
-    Returns:
-        Labels of the rows that have figures, and scores by row and column of ``PaperFigures``,
-        (R, 5).
-    """
-    figures: dict[str, Sequence[float]] = {}
-    for row in rows:
-        if row.printed is not None and printed:
-            figures[row.label] = row.printed
-        elif row.printed is not None and row.ours is not None:
-            figures[row.label] = [interval.value for interval in row.ours]
-    values = np.array(list(figures.values()), dtype=np.float64)
-    scores = -standard_scores(values) if figures else np.zeros((0, len(PaperFigures._fields)))
-    return list(figures), scores
 
 
 def finding(rows: Sequence[ComparedRow]) -> str:
@@ -183,7 +191,7 @@ def finding(rows: Sequence[ComparedRow]) -> str:
     equal = len(against) - less - more
     return (
         f"Of {len(against)} rows that the paper has, {less} emit less than the lowest setpoint "
-        f"held all the time, {more} more, and {equal} are not told apart from it; they lie "
+        f"held all the time, {more} more, and {equal} cannot be separated from it; they lie "
         f"{min(values):+.2f} to {max(values):+.2f} % from it. As printed, their CFP "
         f"spreads by {spread_pct:.1f} %."
     )
@@ -245,3 +253,71 @@ def _interval(statistic: Statistic, *samples: F64) -> Interval:
     strata = np.zeros(samples[0].shape[1], dtype=np.int64)
     generator = np.random.Generator(np.random.PCG64(_SEED))
     return bootstrap_interval(statistic, samples, strata, generator)
+
+
+def paper_rows(suite: SuiteResults) -> pd.DataFrame:
+    """Rows of all tables whose cases have results, ours and as printed.
+
+    Args:
+        suite: results of suite ``paper``.
+
+    Returns:
+        Columns of ``PAPER_TITLES`` with ends ``_low`` and ``_high`` of intervals; nan where there
+        is no figure.
+    """
+    import pandas as pd
+
+    frames = [_frame(rows).assign(table=table.number) for table, rows in _compared_tables(suite)]
+    rows = pd.concat(frames, ignore_index=True)
+    return rows[["table", *(name for name in rows if name != "table")]]
+
+
+def paper_sections(suite: SuiteResults) -> dict[str, list[Block]]:
+    """Sections of a report, one for each table of the paper whose case has results.
+
+    Args:
+        suite: results of suite ``paper``.
+    """
+    sections: dict[str, list[Block]] = {}
+    for table, rows in _compared_tables(suite):
+        sections[f"Table {table.number}: {table.title}"] = [
+            Table(f"{_CAPTION}, site {table.site}", _frame(rows), PAPER_TITLES),
+            Text(finding(rows) + _UNITS),
+        ]
+    return sections
+
+
+def _compared_tables(suite: SuiteResults) -> list[tuple[PaperTable, list[ComparedRow]]]:
+    """Tables whose cases have results, and their rows."""
+    import pandas as pd
+
+    tables = []
+    for table in paper_tables():
+        if (case := suite.cases.get(table.case)) is not None:
+            frames = [
+                x.frame.assign(case=table.case, row=x.record.partition["row"], seed=x.seed)
+                for x in case.results
+            ]
+            scored_h = 24.0 * (case.settings.days - UNSCORED_DAYS)
+            rows = compared(table, pd.concat(frames, ignore_index=True), scored_h)
+            tables.append((table, rows))
+    return tables
+
+
+def _frame(rows: Sequence[ComparedRow]) -> pd.DataFrame:
+    """Rows of a table of the paper, ours and as printed."""
+    import pandas as pd
+
+    return pd.DataFrame([_values(row) for row in rows])
+
+
+def _values(row: ComparedRow) -> dict[str, Any]:
+    """Cells of a row; nan where there is no figure."""
+    nothing = Interval(math.nan, math.nan, math.nan)
+    values: dict[str, Any] = {"label": row.label, "seeds": row.seeds}
+    ours = row.ours or (nothing,) * len(_COLUMNS)
+    printed = row.printed or (math.nan,) * len(_COLUMNS)
+    for name, interval, other in zip(_COLUMNS, ours, printed, strict=True):
+        both = interval_columns(name, interval) if name == "cfp_kg" else {name: interval.value}
+        values |= both | {f"printed_{name}": other}
+    return values | interval_columns("against_constant", row.against_constant_pct or nothing)
