@@ -19,11 +19,9 @@ from sdc_taichi import (
     RunRequest,
     SdcError,
     Simulator,
-    StepResult,
     load_config,
     make_configs,
     make_controller,
-    simulate,
     simulate_to_folder,
 )
 from sdc_taichi.cli.app import app
@@ -106,20 +104,6 @@ def test_score_of_all_steps_is_that_of_the_metrics(sim: Simulator, tmp_path: Pat
         of = dc["metrics"]
         expected = of["cfp_kg"] + 0.5 * of["grid_kwh"] + 2 * of["cost"] + 0.01 * of["water_l"]
         assert figure == pytest.approx(expected, rel=1e-12)
-
-
-def test_score_begins_with_the_first_scored_step(sim: Simulator) -> None:
-    sim.reset(0)
-    whole, late = Score(Objective(energy=1.0), sim), Score(Objective(energy=1.0), sim, 40)
-    results: list[StepResult] = []
-    simulate(sim, make_controller("battery=greedy-ci", sim.fleet), 80, on_step=results.append)
-    for result in results:
-        whole.add(result)
-        late.add(result)
-    first_kwh = np.sum([result.grid_kwh for result in results[:40]], axis=0)
-    np.testing.assert_allclose(late.figure, whole.figure - first_kwh, rtol=1e-12)
-    assert late.start_kwh.tolist() == results[39].stored_kwh.tolist()
-    assert late.end_kwh.tolist() == whole.end_kwh.tolist() == results[-1].stored_kwh.tolist()
 
 
 def test_the_achieved_path_has_share_one_and_idle_commands_zero(

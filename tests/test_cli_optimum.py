@@ -143,16 +143,6 @@ def test_bad_options_are_one_line(asked: dict[str, Any], options: list[str], sai
     assert asked == {}
 
 
-def test_folder_with_other_files_is_refused_before_the_work(
-    asked: dict[str, Any], tmp_path: Path
-) -> None:
-    (tmp_path / "mine.txt").write_text("mine")
-    done = call("optimum", *CASE, "--out", tmp_path)
-    assert done.exit_code == 2
-    assert "mine.txt" in done.stderr
-    assert asked == {}
-
-
 @pytest.mark.parametrize("command", ["optimum", "simulate"])
 def test_interrupted_solver_says_what_it_keeps(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str

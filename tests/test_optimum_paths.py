@@ -11,16 +11,14 @@ import pytest
 from model_steps import work_done
 from sdc_taichi import Actions, Simulator, build_fleet, load_config
 from sdc_taichi.optimum.commands import (
-    arrived_tasks,
     battery_command,
-    bus_energy_kwh,
     load_command,
     setpoint_command,
 )
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.paths import battery_path, setpoint_path, storage_parameters
 from sdc_taichi.optimum.problem import Problem, Storage, problems_of
-from sdc_taichi.optimum.rollout import RollOut, Targets, repeated, roll_out
+from sdc_taichi.optimum.rollout import RollOut, Targets, roll_out
 from sdc_taichi.optimum.tables import FacilityTable
 from sdc_taichi.plant.battery import BATTERIES, BatteryParameters, BatteryPoint
 from sdc_taichi.plant.cooling import SETPOINTS
@@ -92,16 +90,6 @@ def test_battery_commands_draw_and_deliver_what_was_wanted(storage: Storage) -> 
     np.testing.assert_allclose(run(command), wanted, atol=1e-12)
 
 
-def test_energy_at_the_bus_is_that_of_the_rise_with_losses() -> None:
-    found = bus_energy_kwh(
-        np.array([97.0, 0.0]),
-        np.array([0.0, 104.0]),
-        charge_efficiency=np.array([0.97, 0.97]),
-        discharge_factor=np.array([1.04, 1.04]),
-    )
-    np.testing.assert_allclose(found, [100.0, -100.0])
-
-
 @pytest.mark.parametrize("model", SETPOINTS)
 def test_setpoint_commands_reach_their_targets_each_time(model: str) -> None:
     at, run, last = np.array([16.0]), np.zeros(1, np.int64), np.array([np.nan])
@@ -167,12 +155,6 @@ def test_battery_paths_keep_below_a_peak_where_they_can() -> None:
     assert grid_kwh.max() / 0.25 <= 48.0 + 1e-6
 
 
-def test_battery_paths_without_a_battery_do_nothing() -> None:
-    none = Storage("clc", 0.0, 0.0, 0.97, 1.04, 0.5, 1.0, -0.04, 1.0, 0.01, 0.0)
-    path = battery_path(none, np.ones(4), np.ones(4), step_h=0.25, end_kwh=0.0)
-    np.testing.assert_array_equal(path, np.zeros(4))
-
-
 def neutral(steps: int, size: int, setpoint_c: float) -> Targets:
     nothing = np.full((steps, size), np.nan)
     return Targets(nothing, np.full((steps, size), setpoint_c), nothing, np.ones((steps, size)))
@@ -214,18 +196,6 @@ def test_targets_are_reached_as_far_as_models_allow() -> None:
     assert done.dropped_tasks.max() == 0.0
 
 
-def test_copies_of_a_fleet_equal_the_original() -> None:
-    configs = [load_config("tiny", [f"site.location={site}"]) for site in ("ny", "ca")]
-    fleet = build_fleet(configs)
-    drivers, start = load_drivers(fleet.configs), np.array([1000, 3000])
-    copies, inputs, starts = repeated(fleet, drivers, start, 2)
-    done = run(copies, inputs, neutral(4, 4, 18.0), starts)
-    once = run(fleet, drivers, neutral(4, 2, 18.0), start)
-    np.testing.assert_array_equal(done.grid_kwh[:, :2], once.grid_kwh)
-    np.testing.assert_array_equal(done.grid_kwh[:, 2:], once.grid_kwh)
-    np.testing.assert_array_equal(done.of([2, 3]).carbon_g, once.carbon_g)
-
-
 def test_figures_count_scored_steps_and_the_part_of_a_month() -> None:
     fleet = build_fleet(load_config("tiny"))
     drivers, start = load_drivers(fleet.configs), np.array([0])
@@ -250,31 +220,6 @@ def test_figures_count_scored_steps_and_the_part_of_a_month() -> None:
     assert figure("cost", 4)[1] == pytest.approx(bill)
 
 
-def test_a_roll_out_can_be_stopped() -> None:
-    fleet = build_fleet(load_config("tiny"))
-    drivers = load_drivers(fleet.configs)
-    steps: list[int] = []
-    done = roll_out(
-        fleet,
-        drivers,
-        neutral(8, 1, 18.0),
-        start=np.array([0]),
-        objective=Objective(carbon=1.0),
-        on_step=lambda: steps.append(1),
-        stop=lambda: len(steps) == 3,
-    )
-    assert done is None
-    assert len(steps) == 3
-
-
-def test_whole_tasks_arrive_as_the_model_counts_them() -> None:
-    demand = np.array([0.0, 0.333, 1.0])
-    np.testing.assert_allclose(arrived_tasks("fluid", demand, 0.2), [0.0, 33.3, 100.0])
-    assert np.all(
-        arrived_tasks("tasks", demand, 0.2) == np.round(arrived_tasks("tasks", demand, 0.2))
-    )
-
-
 def problem_of(preset: str, changes: list[str], steps: int, **arguments: Any) -> Problem:
     fleet = build_fleet(load_config(preset, changes))
     with Simulator(fleet) as sim:
@@ -284,16 +229,6 @@ def problem_of(preset: str, changes: list[str], steps: int, **arguments: Any) ->
         table = FacilityTable(*grid, nothing, nothing, nothing, nothing)
         found = problems_of(fleet, sim.drivers, sim.sizing, [table], start=start, **arguments)
     return found[0]
-
-
-def test_problems_say_what_weighs_in_which_step() -> None:
-    problem = problem_of("tiny", [], 200, objective=Objective(cost=1.0), scored_from=10)
-    assert np.all(problem.kwh_weight[:10] == 0.0)
-    assert np.all(problem.kwh_weight[10:] > 0.0)
-    first, second = problem.months
-    assert (first.first, first.end, second.first, second.end) == (10, 96, 96, 200)
-    assert first.weight_per_kw == pytest.approx(12.0 * 86 / (31 * 96))
-    assert second.weight_per_kw == pytest.approx(12.0 * 104 / (28 * 96))
 
 
 def test_problems_have_the_limits_of_their_configs() -> None:

@@ -107,14 +107,6 @@ def test_a_plan_lies_above_the_bound_and_below_doing_nothing() -> None:
     assert found - low < 0.005 * idle
 
 
-def test_the_queue_can_carry_a_plan_out() -> None:
-    p = problem(steps=96)
-    executed = plan(p).executed_tasks
-    done, rest = run_queue(p, executed)
-    np.testing.assert_allclose(done, executed, atol=1e-6)
-    assert rest == pytest.approx(0.0, abs=1e-6)
-
-
 def test_a_battery_is_not_charged_and_discharged_at_once_and_never_beyond_its_limits() -> None:
     p = problem(steps=96)
     found = plan(p)
@@ -302,20 +294,6 @@ def test_nothing_to_move_costs_what_idle_commands_cost() -> None:
         np.testing.assert_allclose(plan(fixed).executed_tasks, p.work.arrived_tasks, atol=1e-9)
 
 
-def test_constant_weights_leave_a_battery_with_losses_at_rest() -> None:
-    p = problem(kwh_weight=np.full(24, 0.3))
-    found = plan(p)
-    np.testing.assert_allclose(found.charge_kwh + found.discharge_kwh, 0.0, atol=1e-9)
-
-
-def test_one_step_can_only_do_what_arrives() -> None:
-    p = problem(steps=1)
-    np.testing.assert_allclose(plan(p).executed_tasks, p.work.arrived_tasks)
-    assert bound(p).figure == pytest.approx(
-        float((p.kwh_weight * energy_kwh(p, p.work.arrived_tasks)).sum()), rel=2e-3
-    )
-
-
 @pytest.mark.parametrize("model", ["clc", "paper", "released"])
 @pytest.mark.parametrize("start_share", [0.0, 0.4, 1.0])
 def test_a_model_never_beats_the_limits_of_its_battery(model: str, start_share: float) -> None:
@@ -355,17 +333,6 @@ def test_water_has_a_weight_of_its_own() -> None:
     assert weighed == pytest.approx(free + 24 * 30.0 * 0.1, rel=1e-6)
 
 
-def test_the_least_energy_between_setpoints_is_found() -> None:
-    p = problem()
-    kwh = 20.0 + 30.0 * p.table.utilisation[:, None] + 0.3 * (p.table.setpoint_c - 20.3) ** 2
-    p = replace(p, table=replace(p.table, facility_kwh=np.broadcast_to(kwh, (24, 11, 8))))
-    stage = stage_cost(p)
-    np.testing.assert_allclose(stage.setpoint_c, 20.3)
-    np.testing.assert_allclose(
-        stage.facility_kwh, np.broadcast_to(20.0 + 30.0 * p.table.utilisation, (24, 11))
-    )
-
-
 def test_work_beyond_what_can_be_cooled_is_not_planned() -> None:
     p = problem()
     unmet = np.where(p.table.utilisation[:, None] > 0.75, 1e3, np.zeros((24, 11, 8)))
@@ -386,14 +353,3 @@ def test_whole_tasks_are_drained_no_faster_than_the_flexible_work_of_a_step() ->
     drained = plan(p).executed_tasks - p.work.arrived_tasks
     assert drained.max() > 5.0
     assert np.all(drained <= p.work.most_deferred_tasks + 1e-9)
-
-
-def test_one_step_that_costs_very_much_at_high_load_does_not_hold_all_work_back() -> None:
-    p = problem(steps=48, agents=("load", "cooling"), storage=NO_BATTERY)
-    kwh = p.table.facility_kwh.copy()
-    kwh[5, -1] += 1e9
-    dear = replace(p, table=replace(p.table, facility_kwh=kwh))
-    shifted, expected = (
-        np.abs(plan(of).executed_tasks - of.work.arrived_tasks).sum() for of in (dear, p)
-    )
-    assert shifted > 0.8 * expected > 0.0

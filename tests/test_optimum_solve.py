@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +11,13 @@ import numpy as np
 import pytest
 
 from sdc_taichi import ConfigError, DataCenterConfig, Simulator, load_config, preset_names
-from sdc_taichi.atomic_file import FileClaim
 from sdc_taichi.control import make_controller
 from sdc_taichi.optimum import Objective, Optimum, StoppedError, solve
-from sdc_taichi.optimum.cache import Cache, OptimumCacheWarning
+from sdc_taichi.optimum.cache import OptimumCacheWarning
 from sdc_taichi.optimum.problem import AGENTS, Ends
 from sdc_taichi.optimum.tables import FacilityTable, facility_tables
 from sdc_taichi.run.achievable import AchievedPath, achievement, begin_score
 from sdc_taichi.run.loop import simulate
-from sdc_taichi.sim import snapshot
 
 DAY = 96
 
@@ -266,24 +263,6 @@ def test_a_folder_that_cannot_be_written_keeps_nothing(tmp_path: Path) -> None:
     with pytest.warns(OptimumCacheWarning, match="not kept"):
         found = solved(config_of("CA"), steps=24, cache=blocked / "folder")
     assert found.achieved[0] <= found.idle[0]
-
-
-def test_what_another_process_is_keeping_needs_no_warning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    claims = []
-
-    def write(path: Path, values: Any) -> None:
-        claims.append(FileClaim(path))
-        snapshot_write(path, values)
-
-    snapshot_write = snapshot.write
-    monkeypatch.setattr(snapshot, "write", write)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", OptimumCacheWarning)
-        Cache(tmp_path).keep_ends("key", {Ends(0.0, 0.0, 0.0, 0.0): 1.0})
-    assert [claim.path.name for claim in claims] == ["key-ends.npz"]
-    assert not claims[0].path.exists()
 
 
 def test_progress_is_told_and_work_can_be_stopped() -> None:

@@ -19,8 +19,6 @@ from sdc_taichi.optimum.tables import (
     FacilityTable,
     Nodes,
     TableGrid,
-    at_setpoint,
-    at_utilisation,
     facility_tables,
 )
 from sdc_taichi.sim.drivers import Drivers, FleetSeries, load_drivers
@@ -80,6 +78,7 @@ def config_of(case: str) -> DataCenterConfig:
 def test_entries_are_what_the_simulator_does(case: str) -> None:
     config = config_of(case)
     drivers, fleet = load_drivers([config]), build_fleet(config)
+    assert no_table_reasons(fleet) == (None,)
     start, steps = drivers.start + 40, 3
     (table,) = facility_tables(fleet, drivers, start=start, steps=steps, grid=GRID, precision="f64")
     assert np.all(table.unmet_w == 0)
@@ -114,25 +113,6 @@ def test_a_data_center_has_the_same_table_alone_and_beside_others() -> None:
         assert np.array_equal(alone.water_l, found.water_l)
 
 
-def test_batches_of_any_size_give_the_same_tables(monkeypatch: pytest.MonkeyPatch) -> None:
-    configs = [load_config("tiny", [JULY, f"site.location={site}"]) for site in ("NY", "CA", "AZ")]
-    fleet, drivers = build_fleet(configs), load_drivers(configs)
-    whole = facility_tables(fleet, drivers, start=drivers.start, steps=2, grid=GRID)
-    monkeypatch.setattr(tables, "MOST_COPIES", 9)
-    seen: list[tuple[int, int]] = []
-    parts = facility_tables(
-        fleet,
-        drivers,
-        start=drivers.start,
-        steps=2,
-        grid=GRID,
-        on_step=lambda done, of: seen.append((done, of)),
-    )
-    assert seen == [(n, 6) for n in range(1, 7)]
-    for one, other in zip(whole, parts, strict=True):
-        assert np.array_equal(one.facility_kwh, other.facility_kwh)
-
-
 def test_tables_are_fine_enough_between_their_nodes() -> None:
     counts = []
     for preset in ("corrected", "hall_of_2026"):
@@ -159,15 +139,6 @@ def test_tables_are_fine_enough_between_their_nodes() -> None:
             assert read == pytest.approx(expected, rel=2e-3)
             assert read.mean() == pytest.approx(expected.mean(), rel=2e-4)
     assert counts[0] < counts[1]
-
-
-def test_a_table_is_given_up_when_it_is_told_to() -> None:
-    config = load_config("tiny", [])
-    drivers = load_drivers([config])
-    found = facility_tables(
-        build_fleet(config), drivers, start=drivers.start, steps=5, grid=GRID, stop=lambda: True
-    )
-    assert found == []
 
 
 def test_entries_in_which_racks_throttle_are_barred() -> None:
@@ -223,31 +194,6 @@ def test_what_a_table_leaves_out_is_a_reason_in_words(case: str) -> None:
     assert re.search(reason.replace("(", r"\(").replace(")", r"\)"), found)
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_exact_tables_have_no_reason(case: str) -> None:
-    assert no_table_reasons(build_fleet(config_of(case))) == (None,)
-
-
-def test_all_reasons_are_told_for_each_data_center() -> None:
-    plain = load_config("corrected", [])
-    controlled = "hvac.crac.flow_model=controlled"
-    both = load_config("corrected", [controlled, "simulation.thermal=transient"])
-    first, second = (no_table_reasons(build_fleet(config))[0] for config in (plain, both))
-    assert first is None
-    assert second is not None
-    assert second.count("; ") == 1
-
-
-def test_a_node_that_is_not_reached_is_not_read() -> None:
-    unmet_w = np.array([[[np.inf, 0.0], [np.inf, 0.0], [np.inf, 0.0]]] * 3)
-    utilisation, setpoint_c = np.array([0.0, 0.5, 1.0]), np.array([16.0, 20.0])
-    read = at_utilisation(unmet_w, utilisation, np.array([0.0, 0.7, 1.0]))
-    assert np.array_equal(read, unmet_w[:, 0])
-    assert np.array_equal(
-        at_setpoint(read, setpoint_c, np.array([20.0, 20.0, 19.0])), [0, 0, np.inf]
-    )
-
-
 def test_loads_that_no_setpoint_cools_are_told() -> None:
     utilisation = np.array([0.0, 0.5, 1.0])
     unmet_w = np.zeros((3, 3, 2))
@@ -294,18 +240,6 @@ def test_a_map_has_the_simulators_figures_at_its_nodes(plant: str) -> None:
         assert found.facility_kwh[0, node, 2] == pytest.approx(table.facility_kwh[0], rel=1e-9)
 
 
-def test_weather_has_its_place_between_the_nodes_of_a_map() -> None:
-    found, _ = a_map([load_config("tiny", []), load_config("tiny", ["site.location=AZ"])])
-    last_lead, last_depression = (n - 1 for n in found.facility_kwh.shape[1:3])
-    wet_bulb_c = found.first_c[:, None] + 10.0 * np.array([0.0, 1.25, 100.0])
-    below_k = found.depression_step_k[:, None] * np.array([0.0, 1.5, 100.0])
-    lead, depression = found.places_of_weather(wet_bulb_c + below_k, wet_bulb_c)
-    own_last = (found.last_c - found.first_c) / 10.0
-    assert lead == pytest.approx(np.stack([[0.0, 1.25, last] for last in own_last]))
-    assert own_last.max() == pytest.approx(last_lead)
-    assert depression == pytest.approx(np.stack([[0.0, 1.5, last_depression]] * 2))
-
-
 @pytest.mark.parametrize("plant", ["water_cooled", "air_side"])
 def test_a_data_center_has_the_same_map_alone_and_beside_others(plant: str) -> None:
     chiller = {"water_cooled": "centrifugal_vsd", "air_side": "electric_air_cooled"}[plant]
@@ -341,20 +275,3 @@ def test_the_best_setpoint_of_a_map_is_that_of_least_energy() -> None:
         found_c.append(best_c)
     free_c, limited_c = found_c
     assert np.any(limited_c < free_c)
-
-
-def test_a_map_keeps_inlets_within_the_limit_where_it_can() -> None:
-    config = load_config("tiny", [])
-    limit_c = 23.0
-    found, _ = a_map([config], inlet_limit_c=np.array([limit_c]))
-    drivers = load_drivers([config])
-    (table,) = facility_tables(
-        build_fleet(config), drivers, start=drivers.start, steps=1, grid=GRID
-    )
-    within = table.inlet_max_c[0] <= limit_c
-    assert np.array_equal(found.allowed[0, 0, 0], within)
-    assert 0 < within.sum() < within.size
-    none, _ = a_map([config], inlet_limit_c=np.array([10.0]))
-    coolest = np.argmin(table.inlet_max_c[0], axis=-1)
-    assert np.array_equal(np.argmax(none.allowed[0, 0, 0], axis=-1), coolest)
-    assert np.all(none.allowed.sum(axis=-1) == 1)

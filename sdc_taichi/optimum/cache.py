@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from sdc_taichi.optimum.problem import Ends
 from sdc_taichi.sim import snapshot
 from sdc_taichi.types import F64
 
+_X = TypeVar("_X")
 METHOD = 1
 """Version of how optima are found; files of another one are not read."""
 _TEXT = ("fingerprint", "alone", "kind", "failures", "certificate")
@@ -88,14 +89,9 @@ class Cache:
             key: What ``key_of`` returned.
             steps: Number of steps, T.
         """
-        path = self._path(key)
-        if not path.is_file():
-            return None
-        try:
-            return _from_arrays(snapshot.read(path), key, steps)
-        except (SdcError, ValueError, TypeError, KeyError) as error:
-            _warn(f"{printable(path)}: {error}; the optimum is solved anew")
-            return None
+        return self._read(
+            self._path(key), lambda arrays: _from_arrays(arrays, key, steps), "the optimum is"
+        )
 
     def keep(self, key: str, entry: Entry) -> None:
         """Keep an entry, whole or not at all."""
@@ -107,18 +103,14 @@ class Cache:
         Args:
             key: What ``key_of`` returned.
         """
-        path = self._path(f"{key}-ends")
-        if not path.is_file():
-            return {}
-        try:
-            arrays = snapshot.read(path)
+
+        def figures(arrays: Mapping[str, Any]) -> dict[Ends, float]:
             if str(arrays["fingerprint"]) != key:
                 raise ValueError("is of other configs, inputs or options")
             pairs = zip(arrays["ends"].tolist(), arrays["figures"].tolist(), strict=True)
             return {Ends(*map(float, ends)): float(figure) for ends, figure in pairs}
-        except (SdcError, ValueError, TypeError, KeyError) as error:
-            _warn(f"{printable(path)}: {error}; bounds of ends are solved anew")
-            return {}
+
+        return self._read(self._path(f"{key}-ends"), figures, "bounds of ends are") or {}
 
     def keep_ends(self, key: str, figures: Mapping[Ends, float]) -> None:
         """Keep bounds with given ends, whole or not at all.
@@ -130,6 +122,16 @@ class Cache:
         ends = np.array([astuple(each) for each in figures])
         values = {"fingerprint": key, "ends": ends, "figures": np.array([*figures.values()])}
         self._write(self._path(f"{key}-ends"), values)
+
+    def _read(self, path: Path, parse: Callable[[Mapping[str, Any]], _X], what: str) -> _X | None:
+        """Content of a file; None, with a warning, where it is damaged."""
+        if not path.is_file():
+            return None
+        try:
+            return parse(snapshot.read(path))
+        except (SdcError, ValueError, TypeError, KeyError) as error:
+            _warn(f"{printable(path)}: {error}; {what} solved anew")
+            return None
 
     def _write(self, path: Path, values: Mapping[str, Any]) -> None:
         try:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.dispatch import DEFER, DRAIN, DUE, Dispatch, DispatchProgramme, Span
-from sdc_taichi.optimum.problem import Ends, Plan, Problem, StoppedError
+from sdc_taichi.optimum.problem import Ends, Problem, StoppedError
 from sdc_taichi.optimum.programme import InfeasibleError
 from sdc_taichi.optimum.stage_cost import (
     LoadCurves,
@@ -19,9 +19,8 @@ from sdc_taichi.optimum.stage_cost import (
     stage_cost,
     step_weights,
 )
-from sdc_taichi.optimum.tables import cubic
 from sdc_taichi.optimum.windows import bound_in_windows, plan_in_windows, window_ends
-from sdc_taichi.types import F64
+from sdc_taichi.types import I64
 
 _WARM_UP_SHARE = 1e-3
 """Weight of steps that are not scored, so that plans do nothing odd in them; with much more of it,
@@ -40,43 +39,24 @@ _AHEAD = 192
 _NEGLIGIBLE_TASKS = 1e-7
 """Work that a solver may leave for nothing."""
 
-Modes = np.ndarray[tuple[int], np.dtype[np.int64]]
-
-
-@dataclass(frozen=True, slots=True)
-class Bound:
-    """A figure below which no controller can come, and what state is worth."""
-
-    figure: float
-    """Weighed cost of the scored steps and their peaks, in the unit of the objective."""
-    task_price: F64
-    """What one task more that waits at the end of each step adds to the figure, (T,)."""
-    kwh_price: F64
-    """What one kWh more stored at the end of each step takes off the figure, (T,)."""
-    executed_tasks: F64
-    """Work that is done where the bound is reached, in tasks, (T,); no queue may be able to."""
-    kept_task_price: float
-    """What one task fewer to leave at the end adds, where the end keeps the state of a step."""
-    kept_kwh_price: float
-    """What one kWh more to leave at the end adds, where the end keeps the state of a step."""
-    peaks_kw: tuple[float, ...]
-    """Power of each month with a demand charge where the bound is reached, in kW."""
-
 
 def bound(
     problem: Problem, ends: Ends | None = None, *, stop: Callable[[], bool] | None = None
-) -> Bound:
-    """The least figure of a problem with what only helps a controller taken as granted.
+) -> Dispatch:
+    """Find a figure of the scored steps below which no controller can come.
 
-    Ramps of the setpoint are dropped, the cost of each step is the convex curve below its table,
-    and the queue and the battery are those of ``dispatch``.
+    Setpoints change freely, the cost of each step is the convex curve below its table, and queue
+    and battery are those of ``dispatch``.
 
     Args:
         problem: What is to be planned.
-        ends: State at the first scored step and at the end. By default the state before the first
-            step is that of the problem, and the end keeps at least the stored energy and at most
-            the queue of the first scored step.
+        ends: State at the first scored step and at the end; the result then has scored steps
+            alone. By default the state before the first step is that of the problem, and the end
+            keeps at least the stored energy and at most the queue of the first scored step.
         stop: Asked before every window; true ends the work.
+
+    Returns:
+        What reaches the bound, with prices of states; no queue may be able to do it.
 
     Raises:
         ConfigError: no plan keeps the limits.
@@ -92,30 +72,18 @@ def bound(
         return _solve(part, DispatchProgramme(part, cost, known, of))
 
     if span.end - span.first <= _LONGEST_BOUND:
-        found = solve(problem, stage, span)
-    else:
-        borders = window_ends(problem, span.first, _LONGEST_BOUND)
-        found = bound_in_windows(problem, stage, span, borders, _ahead(problem, _AROUND), solve)
-    before = np.zeros(span.first)
-    return Bound(
-        figure=found.figure,
-        task_price=np.concatenate([before, found.task_price]),
-        kwh_price=np.concatenate([before, found.kwh_price]),
-        executed_tasks=np.concatenate([before, found.executed_tasks]),
-        kept_task_price=found.end_task_price,
-        kept_kwh_price=found.end_kwh_price,
-        peaks_kw=found.peaks_kw,
-    )
+        return solve(problem, stage, span)
+    borders = window_ends(problem, span.first, _LONGEST_BOUND)
+    return bound_in_windows(problem, stage, span, borders, _ahead(problem, _AROUND), solve)
 
 
-def plan(problem: Problem, *, stop: Callable[[], bool] | None = None) -> Plan:
-    """A plan of low cost that a first-in-first-out queue and the battery can carry out.
+def plan(problem: Problem, *, stop: Callable[[], bool] | None = None) -> Dispatch:
+    """Find a plan of low cost that a first-in-first-out queue and the battery can carry out.
 
-    In each step of the plan work only enters the queue, or only leaves it, or what leaves is what
-    is due. Which of these is found from the bound's linear programme, and then anew from the plan
-    that it led to; the best plan is kept. Setpoints are the cheapest of each step, without a ramp.
-    Plans of many steps are made window by window, with the peaks of the bound where there is a
-    demand charge.
+    In each step of the plan work only enters the queue, or only leaves it, or exactly the due work
+    leaves it. The first guess of these modes comes from the bound's linear programme, the second
+    from the plan that results; the better plan is returned. Plans of many steps are made window by
+    window, with the peaks of the bound where there is a demand charge.
 
     Args:
         problem: What is to be planned.
@@ -142,18 +110,11 @@ def plan(problem: Problem, *, stop: Callable[[], bool] | None = None) -> Plan:
     longest = _LONGEST_BOUND if in_one else _LONGEST_PLAN
     ahead = _ahead(problem, _AHEAD)
     if problem.steps <= longest + ahead:
-        found = solve(weighed, stage, span)
-    else:
-        if span.as_after is not None or problem.months:
-            span = _with_prices(weighed, span, stop)
-        borders = window_ends(problem, 0, longest)
-        found = plan_in_windows(weighed, stage, span, borders, ahead, solve)
-    return Plan(
-        executed_tasks=found.executed_tasks,
-        setpoint_c=cubic(stage.executed_tasks, stage.setpoint_c, found.executed_tasks),
-        charge_kwh=found.charge_kwh,
-        discharge_kwh=found.discharge_kwh,
-    )
+        return solve(weighed, stage, span)
+    if span.as_after is not None or problem.months:
+        span = _with_prices(weighed, span, stop)
+    borders = window_ends(problem, 0, longest)
+    return plan_in_windows(weighed, stage, span, borders, ahead, solve)
 
 
 def _curves(problem: Problem, stage: StageCost) -> LoadCurves:
@@ -182,14 +143,14 @@ def _with_prices(problem: Problem, span: Span, stop: Callable[[], bool] | None) 
     span = replace(span, least_peaks_kw=relaxed.peaks_kw)
     if span.as_after is None:
         return span
-    held = (span.as_after, -relaxed.kept_task_price, relaxed.kept_kwh_price)
+    held = (span.as_after, -relaxed.end_task_price, relaxed.end_kwh_price)
     return replace(span, state_values=(held,))
 
 
 def _plan_of_span(problem: Problem, stage: StageCost, curves: LoadCurves, span: Span) -> Dispatch:
     """The best dispatch found of those that the queue can carry out."""
 
-    def restricted(modes: Modes) -> Dispatch | None:
+    def restricted(modes: I64) -> Dispatch | None:
         programme = DispatchProgramme(problem, stage, curves, span)
         programme.keep_modes(modes)
         try:
@@ -238,8 +199,8 @@ def _span(problem: Problem, ends: Ends | None) -> Span:
     return Span(0, problem.steps, start_kwh=stored, start_tasks=0.0, end_kwh=stored, end_tasks=0.0)
 
 
-def _modes(problem: Problem, span: Span, found: Dispatch) -> Modes:
-    """Modes that allow about what a dispatch does in each step."""
+def _modes(problem: Problem, span: Span, found: Dispatch) -> I64:
+    """I64 that allow about what a dispatch does in each step."""
     steps = problem.work.deadline_steps
     assert steps is not None
     entered, waiting = found.deferred_tasks, found.waiting_tasks
@@ -255,8 +216,8 @@ def _modes(problem: Problem, span: Span, found: Dispatch) -> Modes:
     return np.where(due & (entered > _NEGLIGIBLE_TASKS), DUE, modes)
 
 
-def _queue_modes(problem: Problem, span: Span, found: Dispatch) -> Modes:
-    """Modes of a queue that is asked to do the work of a dispatch, as far as it can."""
+def _queue_modes(problem: Problem, span: Span, found: Dispatch) -> I64:
+    """I64 of a queue that is asked to do the work of a dispatch, as far as it can."""
     work, steps = problem.work, problem.work.deadline_steps
     assert steps is not None
     arrived = work.arrived_tasks[span.first : span.end]

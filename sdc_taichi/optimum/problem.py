@@ -157,20 +157,6 @@ class Problem:
         return len(self.kwh_weight)
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What a data center is to do in T steps."""
-
-    executed_tasks: F64
-    """Work to do, in tasks, (T,)."""
-    setpoint_c: F64
-    """Setpoint, in C, (T,)."""
-    charge_kwh: F64
-    """Energy to draw into the battery, in kWh, (T,)."""
-    discharge_kwh: F64
-    """Energy to deliver from the battery, in kWh, (T,)."""
-
-
 def problems_of(
     fleet: Fleet,
     drivers: Drivers,

@@ -67,16 +67,10 @@ class RollOut:
     """Emissions of the energy bought, in g CO2e, (T, B)."""
     energy_cost: F64
     """Price of the energy bought, in the currency of the tariff, (T, B)."""
-    executed_tasks: F64
-    """Work done, in tasks, (T, B)."""
     queue_tasks: F64
     """Work in the queue after each step, in tasks, (T, B)."""
     stored_kwh: F64
     """Energy stored after each step, in kWh, (T, B)."""
-    charge_kwh: F64
-    """Energy drawn into the battery, in kWh, (T, B)."""
-    discharge_kwh: F64
-    """Energy delivered by the battery, in kWh, (T, B)."""
     setpoint_c: F64
     """Setpoint, mean over the CRAC units, in C, (T, B)."""
     inlet_max_c: F64

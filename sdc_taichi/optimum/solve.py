@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import ConfigError
+from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.kernels.compiler import runtime
 from sdc_taichi.optimum.cache import Cache, Entry
 from sdc_taichi.optimum.linear_programme import bound
@@ -39,12 +39,21 @@ from sdc_taichi.optimum.rollout import (
     repeated,
     roll_out,
 )
-from sdc_taichi.optimum.task import Task, checked_task
+from sdc_taichi.optimum.task import (
+    INLET_LIMITS_C,
+    MOST_STEPS,
+    Task,
+    checked_agents,
+    checked_start,
+    seeds_of_sampled_events,
+)
 from sdc_taichi.plant.workload import TASKS_PER_STEP
 from sdc_taichi.sim import snapshot
-from sdc_taichi.sim.drivers import Drivers
-from sdc_taichi.sim.fleet import Fleet
+from sdc_taichi.sim.drivers import Drivers, load_drivers
+from sdc_taichi.sim.events import seeds_of_fleet
+from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Precision
+from sdc_taichi.sim.prices import with_prices
 from sdc_taichi.types import F64, I64
 
 _LEAST_ENERGY_ERROR = 1e-6
@@ -109,15 +118,28 @@ def solve(
         StoppedError: ``stop`` was true.
         PhysicalLimitError: A result that no data center can reach.
     """
-    task = checked_task(
-        configs,
+    fleet = configs if isinstance(configs, Fleet) else build_fleet(configs)
+    steps = whole_number("steps", steps, 1, MOST_STEPS)
+    seed = whole_number("seed", seed, 0, 2**63 - 1)
+    low_c, high_c = INLET_LIMITS_C
+    if inlet_limit_c is not None and not low_c <= inlet_limit_c <= high_c:
+        raise ConfigError(
+            f"inlet_limit_c {inlet_limit_c:g}: valid is {low_c:g}..{high_c:g} C, or None"
+        )
+    if precision not in ("f32", "f64"):
+        raise ConfigError(f"precision {precision!r}: valid are f32 and f64")
+    inputs = load_drivers(fleet.configs) if drivers is None else drivers
+    if inputs.size != fleet.size:
+        raise ConfigError(f"drivers of {inputs.size} data centers for a fleet of {fleet.size}")
+    task = Task(
+        fleet=fleet,
+        drivers=with_prices(inputs, fleet.configs),
+        start=checked_start(inputs.start if start is None else start, fleet.size),
+        seed=seeds_of_sampled_events(seeds_of_fleet(seed, fleet.names), fleet),
         steps=steps,
-        start=start,
-        seed=seed,
-        drivers=drivers,
-        objective=objective,
-        agents=agents,
-        scored_from=scored_from,
+        objective=Objective.parse(objective) if isinstance(objective, str) else objective,
+        agents=checked_agents(agents),
+        scored_from=whole_number("scored_from", scored_from, 0, steps - 1),
         inlet_limit_c=inlet_limit_c,
         precision=precision,
     )

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sdc_taichi.config import DataCenterConfig
-from sdc_taichi.errors import ConfigError, whole_number
+from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.cache import key_of
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS, Agent, Problem, problems_of
 from sdc_taichi.optimum.tables import UTILISATIONS, FacilityTable, TableGrid, facility_tables
 from sdc_taichi.sim import snapshot
-from sdc_taichi.sim.bills import with_prices
-from sdc_taichi.sim.drivers import Drivers, load_drivers
-from sdc_taichi.sim.events import seeds_of_fleet
+from sdc_taichi.sim.drivers import Drivers
 from sdc_taichi.sim.fleet import Fleet, build_fleet
 from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.sim.simulator import Simulator
@@ -27,7 +24,8 @@ MOST_STEPS = 100 * 8760
 """Most steps of a plan."""
 MOST_TABLE_BYTES = 2**28
 """Most memory of the tables of data centers that are solved together, in bytes."""
-_INLET_LIMITS_C = -50.0, 100.0
+INLET_LIMITS_C = -50.0, 100.0
+"""Valid limits of inlets, in C."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,53 +152,6 @@ class Task:
             )
 
 
-def checked_task(
-    configs: Fleet | DataCenterConfig | Iterable[DataCenterConfig],
-    *,
-    steps: int,
-    start: I64 | Sequence[int] | None,
-    seed: int,
-    drivers: Drivers | None,
-    objective: Objective | str,
-    agents: Sequence[Agent],
-    scored_from: int,
-    inlet_limit_c: float | None,
-    precision: Precision,
-) -> Task:
-    """The task that arguments of ``solve`` mean.
-
-    Raises:
-        ConfigError: an argument that is not valid.
-    """
-    fleet = configs if isinstance(configs, Fleet) else build_fleet(configs)
-    steps = whole_number("steps", steps, 1, MOST_STEPS)
-    scored_from = whole_number("scored_from", scored_from, 0, steps - 1)
-    seed = whole_number("seed", seed, 0, 2**63 - 1)
-    if inlet_limit_c is not None:
-        low_c, high_c = _INLET_LIMITS_C
-        if not low_c <= inlet_limit_c <= high_c:
-            raise ConfigError(
-                f"inlet_limit_c {inlet_limit_c:g}: valid is {low_c:g}..{high_c:g} C, or None"
-            )
-    if precision not in ("f32", "f64"):
-        raise ConfigError(f"precision {precision!r}: valid are f32 and f64")
-    given = load_drivers(fleet.configs) if drivers is None else drivers
-    if given.size != fleet.size:
-        raise ConfigError(f"drivers of {given.size} data centers for a fleet of {fleet.size}")
-    return Task(
-        fleet=fleet,
-        drivers=with_prices(given, fleet.configs),
-        start=_checked_start(given.start if start is None else start, fleet.size),
-        seed=seeds_of_sampled_events(seeds_of_fleet(seed, fleet.names), fleet),
-        steps=steps,
-        objective=Objective.parse(objective) if isinstance(objective, str) else objective,
-        agents=_checked_agents(agents),
-        scored_from=scored_from,
-        inlet_limit_c=inlet_limit_c,
-        precision=precision,
-    )
-
-
 def seeds_of_sampled_events(seed: I64, fleet: Fleet) -> I64:
     """Seeds of the data centers that sample events, and 0 for the others, (B,).
 
@@ -211,7 +162,7 @@ def seeds_of_sampled_events(seed: I64, fleet: Fleet) -> I64:
     return np.where([bool(config.events.sampled) for config in fleet.configs], seed, 0)
 
 
-def _checked_start(start: I64 | Sequence[int], size: int) -> I64:
+def checked_start(start: I64 | Sequence[int], size: int) -> I64:
     """First steps, (B,).
 
     Raises:
@@ -227,7 +178,7 @@ def _checked_start(start: I64 | Sequence[int], size: int) -> I64:
     return first.astype(np.int64)
 
 
-def _checked_agents(agents: Sequence[Agent]) -> tuple[Agent, ...]:
+def checked_agents(agents: Sequence[Agent]) -> tuple[Agent, ...]:
     """Agents in the order of ``AGENTS``.
 
     Raises:
