@@ -39,7 +39,7 @@ class BatteryLimits:
     most_discharge_kwh: float
     """Most energy discharged at any energy stored, in kWh."""
     discharge_load_share: float
-    """Most energy discharged, over that of the facility."""
+    """Largest ratio of the energy discharged to the energy of the facility."""
     rounding_kwh: float
     """Energy that a step may gain by rounding, in kWh."""
 

@@ -1,7 +1,7 @@
 """What a step costs by weather, utilisation and setpoint, for plans on weather that is foreseen.
 
-A table has the weather of each step; a forecast may be wrong, so a map has nodes over the weather
-of the year. Between nodes it is read linearly.
+A table holds the weather of each step. A forecast may be wrong, so a map has nodes throughout the
+weather of the year and is interpolated linearly between them.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ from sdc_taichi.sim.hall_solver import Precision
 from sdc_taichi.types import F64, I64
 
 MARGIN_K = 5.0
-"""How far a map reaches beyond the weather of the year, for forecasts that err."""
+"""Distance by which a map extends beyond the weather of the year, for forecasts that err, in K."""
 _FEW = 4
-"""Nodes of dry bulb less wet bulb. Towers and dry coolers hardly feel it; plants that let outdoor
-air in open and close by its humidity, and have nodes as close as those of the dry bulb."""
+"""Number of nodes of the wet-bulb depression (dry bulb minus wet bulb), on which towers and dry
+coolers hardly depend. Plants that let outdoor air in switch by its humidity, and have nodes as
+close as those of the dry bulb."""
 
 
 _BARRED = 1e6
-"""Energy at which a barred setpoint is taken, over that of the dearest."""
+"""Factor by which the energy of a barred setpoint exceeds that of the dearest one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,21 +23,21 @@ from sdc_taichi.optimum.windows import bound_in_windows, plan_in_windows, window
 from sdc_taichi.types import I64
 
 _WARM_UP_SHARE = 1e-3
-"""Weight of steps that are not scored, so that plans do nothing odd in them; with much more of it,
-plans would not fill batteries before the steps that are scored."""
+"""Weight of steps that are not scored, relative to the others: enough for a reasonable plan, and
+so little that batteries are filled before the scored steps."""
 _DEFERRAL_WEIGHT = 0.01
-"""Weight of a task that enters the queue, over the median cost of a task: hardly any, but enough
-that work leaves the queue no earlier than it has to."""
+"""Weight of a task that enters the queue, relative to the median cost of a task: just enough that
+work leaves the queue no earlier than it has to."""
 _LONGEST_BOUND = 3072
 """Most steps of a bound's programme: a month of quarter hours. Time rises with their square."""
 _LONGEST_PLAN = 672
 """Most steps of a plan's programme: a week of quarter hours."""
 _AROUND = 480
-"""Fewest steps on both sides of a border that tell its prices."""
+"""Fewest steps on both sides of a border between windows from which its prices are computed."""
 _AHEAD = 192
 """Fewest steps that the plan of a window looks ahead."""
 _NEGLIGIBLE_TASKS = 1e-7
-"""Work that a solver may leave for nothing."""
+"""Amount of work below which a solver's result counts as zero, in tasks."""
 
 
 def bound(
@@ -53,7 +53,7 @@ def bound(
         ends: State at the first scored step and at the end; the result then has scored steps
             alone. By default the state before the first step is that of the problem, and the end
             keeps at least the stored energy and at most the queue of the first scored step.
-        stop: Asked before every window; true ends the work.
+        stop: Returns whether to end the work; called before every window.
 
     Returns:
         What reaches the bound, with prices of states; no queue may be able to do it.
@@ -87,7 +87,7 @@ def plan(problem: Problem, *, stop: Callable[[], bool] | None = None) -> Dispatc
 
     Args:
         problem: What is to be planned.
-        stop: Asked before every window; true ends the work.
+        stop: Returns whether to end the work; called before every window.
 
     Raises:
         ConfigError: no plan keeps the limits.

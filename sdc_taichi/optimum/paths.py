@@ -33,12 +33,12 @@ IDLE = "idle commands"
 JOINT = "all agents"
 """Name of the path that moves all agents of a problem together."""
 _UNSCORED_SHARE = 1e-3
-"""Weight of a kWh in steps that are not scored, over the mean of the others: it decides between
-paths that are otherwise alike."""
+"""Weight of a kWh in steps that are not scored, relative to the mean of the others: it decides
+between paths that are otherwise alike."""
 _PEAK_SHARES = (np.inf, 1.0, 0.97, 0.94, 0.9, 0.86, 0.82, 0.78)
-"""Highest power bought over that of the facility, among which paths with peaks choose."""
+"""Limits of the power bought that are tried where peaks cost, relative to the highest load."""
 _STORED_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""States of charge at the first scored step among which paths choose."""
+"""States of charge at the first scored step that are tried."""
 
 
 def agents_of(problem: Problem) -> dict[str, tuple[Agent, ...]]:
@@ -65,7 +65,7 @@ def path_of(
     Args:
         problem: The planning problem.
         agents: What the path may move.
-        stop: Asked now and then; true ends the work.
+        stop: Returns whether to end the work.
 
     Raises:
         ConfigError: No plan keeps the limits.
@@ -277,7 +277,7 @@ COMMANDS = np.linspace(-1.0, 1.0, 21)
 BatteryModel = Callable[[F64, F64, F64 | float], BatteryResult]
 """What a step does, from the energy stored, a command, and the energy of the facility, in kWh."""
 _SHORTAGE_FACTOR = 10.0
-"""Price of a kWh that is missing at the end, over the highest price of a kWh delivered."""
+"""Price of a kWh that is missing at the end, relative to the highest price of a kWh delivered."""
 
 
 def battery_path(

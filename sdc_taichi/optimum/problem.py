@@ -55,7 +55,7 @@ class FlexibleWork:
     model: str
     """Name of the model of work: ``fluid`` or ``tasks``."""
     most_dropped_tasks: float = 0.0
-    """Most work that may be dropped over the scored steps, as under idle commands."""
+    """Most work that may be dropped in all scored steps: as much as under idle commands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,11 +79,11 @@ class Storage:
     upper_u_h: float
     """Rise of the highest stored energy with the charge power, in h."""
     upper_v: float
-    """Highest stored energy without charge power, over capacity."""
+    """Highest stored energy without charge power, as a share of capacity."""
     lower_u_h: float
     """Rise of the lowest stored energy with the discharge power, in h."""
     lower_v: float
-    """Lowest stored energy without discharge power, over capacity."""
+    """Lowest stored energy without discharge power, as a share of capacity."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -101,10 +101,10 @@ class Optimum:
 
 
 _KWH_SHARES = (0.0, 0.35, 0.65, 0.95)
-"""Energy stored at the nodes of a curve, over the capacity; a full battery may be out of reach."""
+"""Energy stored at the nodes of a curve, as a share of capacity; it may never be full."""
 _TASK_SHARES = (0.0, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 13 / 16)
-"""Work that waits at the nodes of a curve, over the longest queue; the first hours of it are the
-dearest, and the longest queue may be out of reach."""
+"""Work that waits at the nodes of a curve, as a share of the longest queue. The first hours of it
+cost most, and the longest queue may be unreachable."""
 
 
 class BoundOfEnds:
@@ -172,8 +172,8 @@ def with_tabled_ends(
     Args:
         optimum: Optimum of the simulator's data centers.
         sim: The simulator.
-        progress: Is told the name of the stage, how many data centers are done, and of how many.
-        stop: Asked before each bound; true ends the work.
+        progress: Progress callback ``(stage, done, total)`` in data centers.
+        stop: Returns whether to end the work; called before each bound.
 
     Returns:
         The optimum; the one given where a queue has no limit.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
@@ -33,14 +33,14 @@ from sdc_taichi.sim.workload import due_entries, due_steps, due_work, queue_limi
 from sdc_taichi.types import F64, I64, Actions, State, StepResult
 
 Stop = Callable[[], bool]
-"""Asked now and then; true ends the work."""
+"""Function that returns whether to end the work; called before every step."""
 OnStep = Callable[[], None]
 """Called after every step that a simulator has done."""
 
 
 @dataclass(frozen=True, slots=True)
 class Targets:
-    """What B data centers are to do in T steps, told by the states that they are to reach.
+    """States that B data centers are to reach in T steps.
 
     A step that falls short of its target is made up for by the steps after it.
     """
@@ -72,7 +72,7 @@ class RollOut:
     stored_kwh: F64
     """Energy stored after each step, in kWh, (T, B)."""
     setpoint_c: F64
-    """Setpoint, mean over the CRAC units, in C, (T, B)."""
+    """Mean setpoint of the CRAC units, in C, (T, B)."""
     inlet_max_c: F64
     """Hottest inlet of a server, in C, (T, B)."""
     dropped_tasks: F64
@@ -285,8 +285,8 @@ class Certificate:
     figure: float
     """Figure of the scored steps, in the unit of the objective."""
     table_error: float
-    """Difference of the facility's energy in each step from the table at the utilisation and
-    setpoint of the step, without its sign, summed over the steps and over their energy."""
+    """Sum of the absolute differences of the facility's energy in each step from the table at the
+    utilisation and setpoint of the step, divided by the energy of all steps."""
     start_kwh: float
     """Energy stored at the first scored step, in kWh."""
     end_kwh: float
@@ -333,18 +333,21 @@ class Certificate:
         return tuple(texts)
 
 
-def measured(score: Score, i: int) -> Certificate:
-    """What the simulator measured of one path.
-
-    ``table_error`` and ``over_limit_k`` are 0 until ``against_table`` has found them.
+def certificate(problem: Problem, done: RollOut, score: Score, i: int) -> Certificate:
+    """What the simulator measured along one path, and how far that is from the table.
 
     Args:
-        score: Of several paths.
-        i: Number of the path.
+        problem: Planning problem of the data center.
+        done: What the simulator did, of this path alone.
+        score: Score of several paths.
+        i: Number of the path in the score.
     """
+    scored = slice(problem.scored_from, None)
+    measured = done.facility_kwh[scored, 0]
+    expected = facility_kwh(problem.table, done.utilisation[:, 0], done.setpoint_c[:, 0])
     return Certificate(
         figure=float(score.figure[i]),
-        table_error=0.0,
+        table_error=float(np.abs(expected[scored] - measured).sum() / measured.sum()),
         start_kwh=float(score.start_kwh[i]),
         end_kwh=float(score.end_kwh[i]),
         start_tasks=float(score.start_tasks[i]),
@@ -352,26 +355,8 @@ def measured(score: Score, i: int) -> Certificate:
         dropped_tasks=float(score.dropped_tasks[i]),
         overdue_tasks=float(score.most_overdue_tasks[i]),
         hottest_inlet_c=float(score.hottest_inlet_c[i]),
-        over_limit_k=0.0,
-        unmet_kwh=float(score.unmet_kwh[i]),
-    )
-
-
-def against_table(problem: Problem, done: RollOut, found: Certificate) -> Certificate:
-    """A certificate with its differences from the table of the data center.
-
-    Args:
-        problem: Planning problem of the data center.
-        done: What the simulator did, of one data center.
-        found: What was measured of it.
-    """
-    scored = slice(problem.scored_from, None)
-    facility = done.facility_kwh[scored, 0]
-    expected = facility_kwh(problem.table, done.utilisation[:, 0], done.setpoint_c[:, 0])
-    return replace(
-        found,
-        table_error=float(np.abs(expected[scored] - facility).sum() / facility.sum()),
         over_limit_k=float(_over_limit_k(problem, done)[scored].max()),
+        unmet_kwh=float(score.unmet_kwh[i]),
     )
 
 

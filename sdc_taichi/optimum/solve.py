@@ -34,8 +34,7 @@ from sdc_taichi.optimum.rollout import (
     Certificate,
     RollOut,
     Targets,
-    against_table,
-    measured,
+    certificate,
     repeated,
     roll_out,
 )
@@ -57,21 +56,21 @@ from sdc_taichi.sim.prices import with_prices
 from sdc_taichi.types import F64, I64
 
 _LEAST_ENERGY_ERROR = 1e-6
-"""Difference of the energy from what was planned for, as a share, below which no battery is planned
-again."""
+"""Relative difference between measured and planned energy below which no battery is planned again.
+"""
 _BOUND = "bound"
 """Name of the bound beside those of paths."""
 _SOLVER_ERROR = 1e-6
-"""Error of programmes and of what paths leave at the end, as a share of the bound."""
+"""Relative error of the bound from solvers and from what paths leave at the end."""
 _AGAIN = "all agents with the battery planned again"
 """Name of the path whose battery is planned for the energy that the simulator measured."""
 _POLL_S = 0.2
-"""Time between two questions whether to stop, in s."""
+"""Time between two calls of ``stop``, in s."""
 
 _X = TypeVar("_X")
 _Y = TypeVar("_Y")
 Progress = Callable[[str, int, int], None]
-"""Is told the name of a stage, how much of it is done, and how much there is."""
+"""Progress callback ``(stage, done, total)``."""
 
 
 def solve(
@@ -110,8 +109,8 @@ def solve(
             the limit of ``protection.ashrae_class``, and none where that is not set.
         precision: Floating-point precision of the hall kernels.
         cache: Whether to read and keep results among the user's caches, or a folder for them.
-        progress: Is told of the stages of the work.
-        stop: Asked now and then; true ends the work, and what has been solved is kept.
+        progress: Progress callback.
+        stop: Returns whether to end the work; what has been solved is kept.
 
     Raises:
         ConfigError: An argument that is not valid.
@@ -203,8 +202,8 @@ class _Run:
     """What it was to do."""
     done: RollOut
     """What it did."""
-    found: Certificate
-    """What was measured in the scored steps, before it is held against the table."""
+    certificate: Certificate
+    """What was measured in the scored steps."""
 
 
 def _suggested(
@@ -215,7 +214,7 @@ def _suggested(
     Args:
         given: Its planning problem, why its table does not hold all that a step costs, and
             ``_BOUND`` or the name of a path.
-        stop: Asked now and then; true ends the work.
+        stop: Returns whether to end the work.
 
     Raises:
         StoppedError: ``stop`` was true.
@@ -274,11 +273,11 @@ def _energy_error(run: _Run) -> float:
 
 def _entry(problem: Problem, suggestion: _Suggestion, runs: Mapping[str, _Run]) -> Entry:
     """What is known of a data center, from all its runs."""
-    certificates = {n: against_table(problem, run.done, run.found) for n, run in runs.items()}
+    certificates = {name: run.certificate for name, run in runs.items()}
     idle = certificates[IDLE]
     failures = {
-        name: found.failures(idle, problem.storage.capacity_kwh)
-        for name, found in certificates.items()
+        name: of_path.failures(idle, problem.storage.capacity_kwh)
+        for name, of_path in certificates.items()
     }
     valid = [name for name, texts in failures.items() if not texts] or [IDLE]
 
@@ -286,7 +285,7 @@ def _entry(problem: Problem, suggestion: _Suggestion, runs: Mapping[str, _Run]) 
         return min(names, key=lambda name: certificates[name].figure)
 
     best = best_of(valid)
-    error = max(found.table_error for found in certificates.values())
+    error = max(of_path.table_error for of_path in certificates.values())
     done = runs[best].done
     return Entry(
         idle=idle.figure,
@@ -326,8 +325,8 @@ class _Work:
     """The work of solving a task, stage by stage.
 
     Args:
-        progress: Is told of the stages.
-        stop: Asked now and then; true ends the work.
+        progress: Progress callback.
+        stop: Returns whether to end the work.
     """
 
     def __init__(self, progress: Progress, stop: Callable[[], bool]) -> None:
@@ -377,12 +376,12 @@ class _Work:
             or forced_discharge_reason(problem)
             for of_config, problem in zip(no_table_reasons(task.fleet), problems, strict=True)
         ]
-        found = self._suggestions(problems, reasons)
-        runs = self._run(task, [suggestion.paths for suggestion in found])
+        suggestions = self._suggestions(problems, reasons)
+        runs = self._run(task, problems, [suggestion.paths for suggestion in suggestions])
         self._plan_batteries_again(task, problems, runs)
         return [
             _entry(problem, suggestion, of)
-            for problem, suggestion, of in zip(problems, found, runs, strict=True)
+            for problem, suggestion, of in zip(problems, suggestions, runs, strict=True)
         ]
 
     def _plan_batteries_again(
@@ -399,7 +398,11 @@ class _Work:
         plans = self._side_by_side(
             _battery_again, [(problems[i], run) for i, run in chosen.items()], "programmes"
         )
-        again = self._run(task.part(list(chosen)), [{_AGAIN: path} for path in plans])
+        again = self._run(
+            task.part(list(chosen)),
+            [problems[i] for i in chosen],
+            [{_AGAIN: path} for path in plans],
+        )
         for i, of in zip(chosen, again, strict=True):
             runs[i].update(of)
 
@@ -450,11 +453,14 @@ class _Work:
     def _stopped(self) -> StoppedError:
         return StoppedError(f"optima of {self._kept} of {self._all} data centers are kept")
 
-    def _run(self, task: Task, paths: Sequence[Mapping[str, Targets]]) -> list[dict[str, _Run]]:
+    def _run(
+        self, task: Task, problems: Sequence[Problem], paths: Sequence[Mapping[str, Targets]]
+    ) -> list[dict[str, _Run]]:
         """What the simulator does along the paths of each data center, by name, B.
 
         Args:
             task: The data centers, B.
+            problems: Their planning problems, B.
             paths: Paths of each, of the same names, B.
         """
         names, steps = list(paths[0]), 0
@@ -466,7 +472,7 @@ class _Work:
             steps += 1
             self._tell("runs", steps / task.steps, task.steps)
 
-        found = roll_out(
+        rolled_out = roll_out(
             fleet,
             drivers,
             stacked,
@@ -478,13 +484,16 @@ class _Work:
             on_step=on_step,
             stop=self._stop,
         )
-        if found is None:
+        if rolled_out is None:
             raise self._stopped()
-        done, score = found
+        done, score = rolled_out
+
+        def run_of(i: int, k: int, name: str) -> _Run:
+            """Run of path k, by its name, of data center i."""
+            at = k * len(paths) + i
+            own = done.of([at])
+            return _Run(paths[i][name], own, certificate(problems[i], own, score, at))
+
         return [
-            {
-                name: _Run(of[name], done.of([at]), measured(score, at))
-                for name, at in zip(names, range(i, fleet.size, len(paths)), strict=True)
-            }
-            for i, of in enumerate(paths)
+            {name: run_of(i, k, name) for k, name in enumerate(names)} for i in range(len(paths))
         ]

@@ -74,12 +74,12 @@ def stage_cost(problem: Problem, *, warm_up_share: float = 0.0) -> StageCost:
     """The least cost of each step at each utilisation of the table.
 
     A setpoint is permitted where it leaves no heat in the room, and where the hottest inlet is
-    within its limit if any setpoint keeps it within, give or take ``INLET_MARGIN_K``. Without the
-    agent of cooling the setpoint is that of idle commands.
+    within its limit, with a tolerance of ``INLET_MARGIN_K``, if that is so at any setpoint. Without
+    the agent of cooling the setpoint is that of idle commands.
 
     Args:
         problem: What is to be planned.
-        warm_up_share: Weight of steps before the first scored one, over the mean weight.
+        warm_up_share: Weight of steps before the first scored one, relative to the mean weight.
 
     Raises:
         ConfigError: at some step hardly any utilisation can be cooled.
@@ -102,7 +102,7 @@ def step_weights(problem: Problem, warm_up_share: float = 0.0) -> tuple[F64, F64
 
     Args:
         problem: What is to be planned.
-        warm_up_share: Weight of steps before the first scored one, over the mean weight.
+        warm_up_share: Weight of steps before the first scored one, relative to the mean weight.
     """
     weight, first = problem.kwh_weight.copy(), problem.scored_from
     litre = np.full(problem.steps, problem.litre_weight)

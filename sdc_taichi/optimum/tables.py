@@ -49,8 +49,8 @@ MOST_RACKS = 2**18
 UTILISATIONS = (41, 81, 161)
 """Numbers of utilisations that a table may have where none is given; each halves the spacing."""
 MOST_ERROR = 1e-4
-"""Mean error of the energy midway between utilisations, over the energy, up to which a table counts
-as fine enough."""
+"""Mean relative error of the energy midway between utilisations up to which a table counts as fine
+enough."""
 _LEAST_USUAL = 0.15
 """Utilisation below which errors are not counted: work rarely falls so low, and power bends most
 where fans leave their lowest speed."""
@@ -76,7 +76,7 @@ class Nodes:
 
 
 OnStep = Callable[[int, int], None]
-"""Is told how many steps of data centers are done, and of how many."""
+"""Progress callback ``(done, total)`` in steps of data centers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -342,7 +342,7 @@ def _fine_enough(
 
 
 def _error_midway(utilisation: F64, kwh: F64, spacing: int) -> float:
-    """Mean error midway between nodes, over the energy.
+    """Mean relative error of the energy midway between nodes.
 
     Args:
         utilisation: Utilisations, (I,).
@@ -424,8 +424,8 @@ def _of_one(values: F64, first: int, steps: int, nodes: Nodes) -> F64:
 
 
 INLET_MARGIN_K = 0.02
-"""By how much paths stay below the limit of inlets and bounds go beyond it, in K: inlets are not
-quite linear between the utilisations of a table."""
+"""Distance by which paths stay below the limit of inlets and bounds go beyond it, in K, since
+inlets are not quite linear between the utilisations of a table."""
 
 
 def at_utilisation(values: F64, nodes: F64, utilisation: F64) -> F64:

@@ -119,8 +119,8 @@ class Task:
         """Tables of each data center, B; none where ``stop`` ended the work.
 
         Args:
-            on_step: is told how many steps of data centers are done, and of how many.
-            stop: asked now and then; true ends the work.
+            on_step: Progress callback ``(done, total)`` in steps of data centers.
+            stop: Returns whether to end the work.
         """
         return facility_tables(
             self.fleet,
