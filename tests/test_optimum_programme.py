@@ -9,6 +9,7 @@ import pytest
 from model_steps import battery_step
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.optimum.battery_limits import battery_limits
+from sdc_taichi.optimum.dispatch import Dispatch
 from sdc_taichi.optimum.linear_programme import bound, plan
 from sdc_taichi.optimum.paths import storage_parameters
 from sdc_taichi.optimum.problem import (
@@ -16,7 +17,6 @@ from sdc_taichi.optimum.problem import (
     BilledMonth,
     Ends,
     FlexibleWork,
-    Plan,
     Problem,
     Storage,
 )
@@ -72,7 +72,7 @@ def energy_kwh(p: Problem, tasks: F64) -> F64:
     )
 
 
-def figure_of(p: Problem, found: Plan) -> float:
+def figure_of(p: Problem, found: Dispatch) -> float:
     """Weighed cost of a plan at the highest setpoint, with its peaks."""
     bought = energy_kwh(p, found.executed_tasks) + found.charge_kwh - found.discharge_kwh
     peaks = (m.weight_per_kw * bought[m.first : m.end].max() / p.step_h for m in p.months)
