@@ -27,7 +27,7 @@ _NEEDED_MODELS = {"fan": ("crac_flow", "controlled"), "placement": ("placement",
 """Stage and model that a command needs."""
 
 
-class ActionDecoder:
+class AgentActions:
     """Reads what agents do as commands of the simulator.
 
     Args:

@@ -27,7 +27,7 @@ from sdc_taichi.control import (
     parts_of,
     view_maker,
 )
-from sdc_taichi.envs.actions import ActionDecoder, as_numbers
+from sdc_taichi.envs.actions import AgentActions, as_numbers
 from sdc_taichi.envs.agents import COMMAND_OF_AGENT, COMMANDS_OF_AGENT, commands_by_others
 from sdc_taichi.envs.costs import Costs
 from sdc_taichi.envs.episodes import (
@@ -143,7 +143,7 @@ class Core:
             "others": controller_text(options.others),
         }
         self._observer = make_observer(fleet, options, new_inputs=draws_inputs(options))
-        self._decoder = ActionDecoder(fleet, options)
+        self._decoder = AgentActions(fleet, options)
         self.features: dict[str, tuple[Feature, ...]] = {
             a: self._observer.features[a] for a in self.agents
         }
@@ -390,13 +390,11 @@ class Core:
         self.sim.continue_from(saved.simulator, saved.drivers)
         self._generators, self._keys, self._draw = saved.generators, saved.keys, saved.draw
         self._begin()
-        result = None
         if saved.commands is not None:
             # The last step once more: what agents see of it is no part of the state.
             self._last = (self.sim.state, saved.commands)
-            result = self.sim.step(Actions(**saved.commands))
-            self._view = self._view_after(result)
-        self._rewards.load_peaks_kw(saved.peaks_kw, result)
+            self._view = self._view_after(self.sim.step(Actions(**saved.commands)))
+        self._rewards.load_peaks_kw(saved.peaks_kw)
 
     def close(self) -> None:
         """Release the simulator and all tables; the environments are unusable afterwards."""

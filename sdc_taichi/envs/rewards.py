@@ -17,9 +17,8 @@ from sdc_taichi.control.view import View
 from sdc_taichi.envs.agents import AGENTS
 from sdc_taichi.envs.released_rewards import ReleasedRewards
 from sdc_taichi.envs.reward_terms import TERMS, RewardContext, TermContext
-from sdc_taichi.errors import ConfigError, SdcError, shortened, suggestion_or_valid
+from sdc_taichi.errors import ConfigError, SdcError, suggestion_or_valid
 from sdc_taichi.sim.physical_limits import POWER_LIMITS_W
-from sdc_taichi.sim.snapshot import ROUNDING
 from sdc_taichi.types import F64, StepResult
 from sdc_taichi.user_functions import (
     checked_values,
@@ -195,28 +194,9 @@ class Rewards:
         """Highest billed power of the episode before the last step and with it, in kW, (2, B)."""
         return np.stack([self._peak_before_kw, self._peak_kw])
 
-    def load_peaks_kw(self, peaks_kw: F64, last: StepResult | None) -> None:
-        """Go on from what ``peaks_kw`` gave, (2, B), in an episode that has been reset.
-
-        Args:
-            peaks_kw: highest billed power before the last step and with it, in kW, (2, B).
-            last: result of the last step; None before the first.
-
-        Raises:
-            SdcError: powers that do not belong to that step.
-        """
-        before_kw, with_last_kw = peaks_kw
-        least_kw = self._peak_kw
-        expected_kw = least_kw if last is None else _peak_kw(before_kw, last)
-        fits = np.isclose(with_last_kw, expected_kw, rtol=ROUNDING, atol=0.0)
-        fits &= (before_kw >= least_kw * (1.0 - ROUNDING)) & (before_kw <= MAX_PEAK_KW)
-        if not np.all(fits):
-            raise SdcError(
-                f"highest billed power in kW is {shortened(peaks_kw.tolist())} before the last "
-                f"step and with it; valid is at least {shortened(least_kw.tolist())}, and "
-                f"{shortened(expected_kw.tolist())} with it"
-            )
-        self._peak_before_kw, self._peak_kw = before_kw.copy(), with_last_kw.copy()
+    def load_peaks_kw(self, peaks_kw: F64) -> None:
+        """Continue from what ``peaks_kw`` gave, (2, B), in an episode that has been reset."""
+        self._peak_before_kw, self._peak_kw = peaks_kw.copy()
 
     def _weighed_terms(self, result: StepResult) -> dict[str, F64]:
         """Rewards by learning agent, of all of them as ``joint``, and ``peak_kw``, (B,) each."""

@@ -14,7 +14,7 @@ from sdc_taichi.control import (
     commands_of,
     make_controller,
 )
-from sdc_taichi.envs.actions import ActionDecoder
+from sdc_taichi.envs.actions import AgentActions
 from sdc_taichi.envs.agents import commands_by_others
 from sdc_taichi.envs.observer import Observer, make_observer
 from sdc_taichi.envs.released import ReleasedObserver
@@ -58,7 +58,7 @@ class PolicyController:
         interface, others = self.policy.interface, self._named_others
         interface.require_fit(self._name, fleet)
         self._fleet = fleet
-        self._decoder = ActionDecoder(fleet, interface.options())
+        self._decoder = AgentActions(fleet, interface.options())
         try:
             self._others = make_controller(others, fleet, imports=False)
         except SdcError as error:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from sdc_taichi.config.fields import Section
-from sdc_taichi.envs.actions import ActionDecoder, equal_number
+from sdc_taichi.envs.actions import AgentActions, equal_number
 from sdc_taichi.envs.agents import Agent
 from sdc_taichi.envs.features import Feature
 from sdc_taichi.envs.observer import make_observer
@@ -167,7 +167,7 @@ def interface_of(fleet: Fleet, options: EnvOptions) -> Interface:
     """
     if options.heat_map:
         raise ConfigError("heat_map True: policies observe features alone; valid is False")
-    decoder = ActionDecoder(fleet, options)
+    decoder = AgentActions(fleet, options)
     features = make_observer(fleet, options).features
     decided: dict[str, tuple[str, ...]] = {
         agent: options.commands_of(agent) for agent in options.agents
