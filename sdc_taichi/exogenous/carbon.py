@@ -51,7 +51,7 @@ def read_carbon(
     1 January wrap to the end. EIA-930 stamps mark the end of the hour, yet some authorities report
     the start, or did until some day. ``stamp="auto"`` reads it from the solar generation: its
     centre of gravity lies after solar noon when stamps mark the end and before it when they mark
-    the start (one change within the file is found); without solar generation it is the end.
+    the start (one change within the file is detected); without solar generation it is the end.
 
     Args:
         path: CSV or Parquet.
@@ -109,7 +109,7 @@ def read_carbon(
 
 
 def _generation(
-    path: Path, given: Mapping[str, str]
+    path: Path, column_names: Mapping[str, str]
 ) -> tuple[float, np.datetime64, tuple[str, ...], FloatArray, list[str]]:
     """Contiguous rows of a carbon table, repaired.
 
@@ -117,7 +117,7 @@ def _generation(
         Resolution in minutes, first stamp (UTC), names of the columns (fuels if there are any,
         then ``avg_CI``), values, (T, columns), and notes.
     """
-    named = column_map(given)
+    named = column_map(column_names)
     frame, first_row = files.read_table(path, named.names)
     notes = named.notes()
     if "timestamp" not in frame.columns and frame.columns[0].strip() in files.BLANK_HEADERS:

@@ -86,8 +86,8 @@ class ColumnMap(NamedTuple):
     def notes(self) -> list[str]:
         """What was read as what."""
         return [
-            f"{own} read as {name}" + (f", in {unit.symbol}" if unit.symbol else "")
-            for name, own in self.names.items()
+            f"{column} read as {name}" + (f", in {unit.symbol}" if unit.symbol else "")
+            for name, column in self.names.items()
             for unit in [self.unit(name)]
         ]
 
@@ -103,14 +103,14 @@ def column_map(columns: Mapping[str, str]) -> ColumnMap:
     """
     names: dict[str, str] = {}
     units: dict[str, Unit] = {}
-    for key, own in columns.items():
+    for key, column in columns.items():
         name, colon, symbol = key.partition(":")
         if name not in _UNITS or name in names:
             raise DataError(
                 f"column {shortened(key)}: expected each name once, of "
                 f"{', '.join(COLUMN_NAMES)}{suggestion(name, COLUMN_NAMES)}"
             )
-        names[name] = own
+        names[name] = column
         if colon:
             units[name] = _unit(name, symbol)
     return ColumnMap(names, units)
@@ -120,9 +120,9 @@ def _unit(name: str, symbol: str) -> Unit:
     known = _UNITS[name]
     if symbol in known:
         return known[symbol]
-    if name == "cpu_load" and (found := _RANGE.fullmatch(symbol)):
+    if name == "cpu_load" and (bounds := _RANGE.fullmatch(symbol)):
         try:
-            idle, full = parse_number(found[2]), parse_number(found[3])
+            idle, full = parse_number(bounds[2]), parse_number(bounds[3])
         except ValueError:
             idle = full = 0.0
         if 0.0 <= idle < full:

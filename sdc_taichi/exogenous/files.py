@@ -111,13 +111,13 @@ def _renamed(path: Path, frame: pd.DataFrame, columns: Mapping[str, str]) -> pd.
     if not columns:
         return frame
     require_columns(path, frame, tuple(columns.values()))
-    taken = [name for name, own in columns.items() if name in frame.columns and name != own]
+    taken = [name for name, column in columns.items() if name in frame.columns and name != column]
     if taken or len(set(columns.values())) < len(columns):
         raise DataError(
             f"{path}: columns {dict(columns)}: expected each column once, and no name that "
             f"another column of the file has"
         )
-    frame = frame.rename(columns={own: name for name, own in columns.items()})
+    frame = frame.rename(columns={column: name for name, column in columns.items()})
     return frame[sorted(frame.columns, key=lambda name: name != "timestamp")]
 
 
@@ -203,13 +203,13 @@ def require_columns(path: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -
         )
 
 
-def mapping_hint(found: Iterable[object]) -> str:
+def mapping_hint(columns: Iterable[object]) -> str:
     """End of a message about columns: how a table of Electricity Maps is imported; else empty.
 
     Args:
-        found: names of the columns of the file.
+        columns: names of the columns of the file.
     """
-    names = [str(name) for name in found]
+    names = [str(name) for name in columns]
     intensities = [x for x in names if x.casefold().startswith("carbon intensity gco")]
     if "Datetime (UTC)" not in names or not intensities:
         return ""
@@ -339,9 +339,9 @@ def without_leap_days(
     seconds = np.timedelta64(round(minutes * 60), "s")
     times = start.astype("datetime64[s]") + seconds * np.arange(len(values))
     leap = is_leap_day(times)
-    kept = times[~leap]
+    remaining = times[~leap]
     notes = [f"29 February removed ({int(leap.sum())} rows)"] if leap.any() else []
-    return values[~leap], minutes_into_year(kept[0]) if kept.size else 0.0, notes
+    return values[~leap], minutes_into_year(remaining[0]) if remaining.size else 0.0, notes
 
 
 def whole_years(

@@ -177,7 +177,7 @@ def import_carbon(
     ``read_carbon``.
 
     Raises:
-        DataError: the UTC offset is not known, or given otherwise than it is.
+        DataError: the UTC offset is not known, or differs from that of the weather.
     """
     name = site_name(name, data_dir)
     offset, longitude = site_clock(name, base, data_dir, utc_offset_h=utc_offset_h)
@@ -262,21 +262,21 @@ def plan_folder(folder: Path) -> tuple[list[tuple[str, Path, str]], list[tuple[P
         "carbon": ("carbon", ".csv"),
         "workload": ("workload", ".csv"),
     }
-    found: dict[str, list[Path]] = {kind: [] for kind in KINDS}
+    files_of_kind: dict[str, list[Path]] = {kind: [] for kind in KINDS}
     for name in list_folder(folder, DataError):
         if name.casefold() in subfolders:
             kind, suffix = subfolders[name.casefold()]
             inside = [folder / name / x for x in list_folder(folder / name, DataError)]
-            found[kind] += [path for path in inside if path.suffix.lower() == suffix]
-    if not any(found.values()):
+            files_of_kind[kind] += [path for path in inside if path.suffix.lower() == suffix]
+    if not any(files_of_kind.values()):
         raise DataError(
             f"{folder}: expected subfolders CarbonIntensity, Weather, Workload with EPW and CSV "
             "files (the data folder of SustainDC)"
         )
-    carbon = {path.name.split("_")[0]: path for path in found["carbon"]}
+    carbon = {path.name.split("_")[0]: path for path in files_of_kind["carbon"]}
     fitted = {name: str(table["station"]) for name, table in coefficients()["weather"].items()}
     by_state: dict[str, list[tuple[Path, str]]] = {}
-    for path in found["weather"]:
+    for path in files_of_kind["weather"]:
         parts = path.stem.split("_", 2)
         is_state = len(parts) == 3 and parts[0] == "USA"
         state, station = (parts[1], parts[2]) if is_state else (path.stem, path.stem)
@@ -289,7 +289,7 @@ def plan_folder(folder: Path) -> tuple[list[tuple[str, Path, str]], list[tuple[P
             plan.append(("weather", path, name))
             if state in carbon:
                 plan.append(("carbon", carbon[state], name))
-    plan += [("workload", path, default_name(path)) for path in found["workload"]]
+    plan += [("workload", path, default_name(path)) for path in files_of_kind["workload"]]
     left_out = [
         (path, f"no weather file of {key}; import it with --site NAME --base SITE")
         for key, path in carbon.items()

@@ -52,9 +52,9 @@ def imported_sites(data_dir: str | Path | None = None) -> dict[str, dict[str, Pa
     folder = user_data_dir(data_dir) / "sites"
     for name in list_folder(folder, DataError):
         paths = {part: folder / name / f"{part}.parquet" for part in ("carbon", "weather")}
-        found = {part: path for part, path in paths.items() if os.path.lexists(path)}
-        if found:
-            sites[name] = found
+        parts = {part: path for part, path in paths.items() if os.path.lexists(path)}
+        if parts:
+            sites[name] = parts
     return sites
 
 
@@ -82,12 +82,12 @@ def find_name(kind: str, name: str, valid: tuple[str, ...]) -> str:
         DataError: none does; names the nearest valid ones.
     """
     by_folded = {x.casefold(): x for x in valid}
-    found = by_folded.get(name.strip().casefold())
-    if found is None:
+    valid_name = by_folded.get(name.strip().casefold())
+    if valid_name is None:
         near = similar_names(name, valid, most=3)
         nearest = f"; nearest: {', '.join(near)}" if near else ""
         raise DataError(f"{kind} {shortened(name)}: expected one of {', '.join(valid)}{nearest}")
-    return found
+    return valid_name
 
 
 def new_name(kind: str, name: str, embedded: tuple[str, ...]) -> str:
@@ -253,8 +253,8 @@ def _with_region_note(intensity: Series, state: str | None) -> Series:
         state: two letters of the state of the weather; None if it is not known.
     """
     named = _STATE_OF_CARBON_FILE.match(intensity.source)
-    told = any("another region" in note for note in intensity.notes)
-    if named is None or state is None or named[1] == state or told:
+    has_note = any("another region" in note for note in intensity.notes)
+    if named is None or state is None or named[1] == state or has_note:
         return intensity
     note = f"warning: named after {named[1]}, another region than the weather's, {state}"
     return replace(intensity, notes=(*intensity.notes, note))

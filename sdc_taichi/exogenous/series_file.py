@@ -60,8 +60,8 @@ def read_metadata(path: Path) -> dict[str, Any] | None:
     except (RecursionError, ValueError):
         raise DataError(f"{path}: metadata sdc_taichi: not JSON") from None
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-        found = metadata.get("format") if isinstance(metadata, dict) else metadata
-        raise DataError(f"{path}: metadata format: {shortened(found)}, expected {FORMAT!r}")
+        version = metadata.get("format") if isinstance(metadata, dict) else metadata
+        raise DataError(f"{path}: metadata format: {shortened(version)}, expected {FORMAT!r}")
     return metadata
 
 
@@ -96,8 +96,8 @@ def read_columns(
     out = {}
     for column, (low, high) in limits.items():
         if column not in table.column_names:
-            found = ", ".join(table.column_names)
-            raise DataError(f"{path}: missing column {column}; found {found}")
+            present = ", ".join(table.column_names)
+            raise DataError(f"{path}: missing column {column}; found {present}")
         try:
             values = np.asarray(table[column].to_numpy(), dtype=np.float64)
         except (TypeError, ValueError):

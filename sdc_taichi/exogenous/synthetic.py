@@ -316,9 +316,9 @@ def _residual(p: Figures, slow: FloatArray, fast: FloatArray, basis: Basis) -> F
 
 
 def _match_percentiles(values: FloatArray, percentiles: list[float]) -> FloatArray:
-    """Map values onto the fitted percentiles: monotone, linear between their own percentiles."""
-    own = np.asarray(np.percentile(values, coefficients()["pins_percent"]), dtype=np.float64)
-    knots = np.maximum.accumulate(own + 1e-9 * np.arange(own.size))  # ties stay increasing
+    """Values mapped onto the fitted percentiles, linearly between their present percentiles."""
+    present = np.asarray(np.percentile(values, coefficients()["pins_percent"]), dtype=np.float64)
+    knots = np.maximum.accumulate(present + 1e-9 * np.arange(present.size))  # ties stay increasing
     return np.interp(values, knots, percentiles)
 
 
@@ -378,7 +378,7 @@ def _weather(
 
 
 def _correlated(names: list[str], pairs: dict[str, float], noise: FloatArray) -> FloatArray:
-    """Rows of noise mixed from independent ones, so that pairs of them correlate as given.
+    """Rows of noise mixed from independent ones, with given correlations between pairs.
 
     Args:
         names: of the rows.

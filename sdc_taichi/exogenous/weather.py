@@ -265,13 +265,13 @@ def _design_conditions(lines: list[str]) -> tuple[DesignConditions | None, list[
         if cells[0].upper() != "DESIGN CONDITIONS" or "Cooling" not in cells:
             continue
         cooling = cells.index("Cooling")
-        found: dict[str, Any] = {}
+        conditions: dict[str, Any] = {}
         try:
             for name, at in _COOLING_CELLS.items():
-                found[name] = parse_number(cells[cooling + at])
+                conditions[name] = parse_number(cells[cooling + at])
             if "Extremes" in cells[cooling:]:
-                found["extreme_outdoor_c"] = parse_number(cells[_EXTREME_OUTDOOR_CELL])
-            return DesignConditions(**found), []
+                conditions["extreme_outdoor_c"] = parse_number(cells[_EXTREME_OUTDOOR_CELL])
+            return DesignConditions(**conditions), []
         except (ValueError, IndexError, DataError) as error:
             note = f"warning: design conditions of the header are not usable ({error})"
             return None, [note]
@@ -352,10 +352,10 @@ def _hours(path: Path, frame: pd.DataFrame) -> tuple[NDArray[np.int64], pd.DataF
         valid = f"a day of month {month[row]}"
         raise files.fault(path, int(rows[row]), "day (column 3)", int(day[row]), valid)
     of_year = (_FIRST_DAY_OF_MONTH[month - 1] + day - 1) * 24 + hour - 1
-    kept = frame[~leap]
-    if kept.empty:
+    without_leap_days = frame[~leap]
+    if without_leap_days.empty:
         raise DataError(f"{path}: row {HEADER_LINES + 1}: only 29 February, expected 365 days")
-    return of_year[~leap], kept, int(leap.sum())
+    return of_year[~leap], without_leap_days, int(leap.sum())
 
 
 def _positions(
@@ -483,7 +483,7 @@ def _read_imported(path: Path, metadata: dict[str, Any]) -> Weather:
 
 
 def _imported_design(path: Path, metadata: dict[str, Any]) -> DesignConditions | None:
-    """Design conditions that ``data import`` kept; None where the file that it read had none."""
+    """Design conditions that ``data import`` stored; None if its file had none."""
     if metadata.get("design") is None:
         return None
     stored = series_file.metadata_value(path, metadata, "design", dict)

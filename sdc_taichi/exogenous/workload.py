@@ -122,10 +122,12 @@ def _clock(
             positions = _running_index(path, text, first, rows)
         else:
             stamps = _stamps(path, text, first, rows)
-            found, positions = files.grid_of_stamps(path, stamps, rows, first)
-            if minutes is not None and found != minutes:
-                raise DataError(f"{path}: column {first}: steps of {found:g} min, not {minutes:g}")
-            minutes, first_stamp = found, stamps[0]
+            file_minutes, positions = files.grid_of_stamps(path, stamps, rows, first)
+            if minutes is not None and file_minutes != minutes:
+                raise DataError(
+                    f"{path}: column {first}: steps of {file_minutes:g} min, not {minutes:g}"
+                )
+            minutes, first_stamp = file_minutes, stamps[0]
         if blank_header:
             kind = "index" if first_stamp is None else "timestamp"
             notes.append(f"blank first header read as {kind}")
