@@ -12,8 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sdc_taichi import DataCenterConfig, SdcError, load_config
-from sdc_taichi.cli.hall import hall_app
-from sdc_taichi.cli.hall_text import LISTED_ROWS, describe_hall
+from sdc_taichi.cli.hall import LISTED_ROWS, describe_hall, hall_app
 from sdc_taichi.hall.rack_servers import air_properties
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.sim.design_hall import (

@@ -25,12 +25,11 @@ from sdc_taichi.cli.jobs import JobsCommand
 from sdc_taichi.cli.optimum import optimum_command
 from sdc_taichi.cli.options import CommandApp, Debug
 from sdc_taichi.cli.policy import policy_app
-from sdc_taichi.cli.report import report_command
 from sdc_taichi.cli.simulate import simulate_command
 from sdc_taichi.cli.sweep import sweep_command
 from sdc_taichi.cli.terminal import EXIT_FAILURE, EXIT_INPUT, EXIT_INTERRUPTED, warnings_in_lines
 from sdc_taichi.cli.train import train_command
-from sdc_taichi.cli.view import view_command
+from sdc_taichi.cli.view import report_command, view_command
 from sdc_taichi.errors import SdcError, one_line
 
 _FIRST_STEPS = """Simulate data centers, and learn to run them with less carbon, energy and water.

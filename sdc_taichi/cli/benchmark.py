@@ -1,4 +1,4 @@
-"""``sdc-taichi benchmark``: suites of controllers, and what was found by them."""
+"""``sdc-taichi benchmark``: run suites of controllers, and report and extend their results."""
 
 from __future__ import annotations
 
@@ -10,9 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import typer.core
 
-from sdc_taichi.cli.benchmark_results import add_command, report_command
 from sdc_taichi.cli.jobs import JobOptions, JobsCommand, job_session
-from sdc_taichi.cli.options import CommandApp, Quiet, completed_by, out_option
+from sdc_taichi.cli.options import (
+    CommandApp,
+    Quiet,
+    check_out_file,
+    completed_by,
+    force_option,
+    out_option,
+)
+from sdc_taichi.cli.terminal import print_notes, stage_bars
 from sdc_taichi.errors import ConfigError, printable
 
 if TYPE_CHECKING:
@@ -42,8 +49,6 @@ benchmark_app = CommandApp(
     no_args_is_help=True,
     help="Compare controllers in suites: sdc-taichi benchmark SUITE, such as carbon.",
 )
-benchmark_app.command("report")(report_command)
-benchmark_app.command("add")(add_command)
 
 
 @benchmark_app.command(_RUN, cls=JobsCommand)
@@ -120,6 +125,73 @@ def list_command() -> None:
     width = max(map(len, names))
     for name in names:
         print(f"{name:{width}}  {load_suite(name).title}")
+
+
+@benchmark_app.command("report")
+def report_command(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Folders of results of suites.", show_default=False),
+    ],
+    out: Annotated[
+        Path | None,
+        out_option("Page with tables and pictures. [default: DIR/report.html]", "FILE.html"),
+    ] = None,
+    markdown: Annotated[
+        Path | None, typer.Option(metavar="FILE.md", help="Also write the tables as Markdown.")
+    ] = None,
+    force: Annotated[bool, force_option("Replace existing files of --out, --markdown.")] = False,
+) -> None:
+    """Make tables and pictures of suites: one HTML page, and Markdown.
+
+    Results of one suite may lie in several folders. Nothing is run. Rows share a place unless 95 %
+    intervals tell them apart.
+    """
+    from sdc_taichi.benchmark.report import write_report
+
+    if force and out is None and markdown is None:
+        raise ConfigError("--force: valid with --out or --markdown; DIR/report.html is replaced")
+    check_out_file(out, ".html", force=force)
+    check_out_file(markdown, ".md", option="--markdown", force=force)
+    for index, folder in enumerate(folders):
+        if folder.resolve() in [other.resolve() for other in folders[:index]]:
+            raise ConfigError(f"{folder}: is given twice; valid is each folder once")
+    page = folders[0] / "report.html" if out is None else out
+    print_notes(write_report(folders, html=page, markdown=markdown))
+    print(f"Report: {printable(page)}")
+    if markdown is not None:
+        print(f"Tables: {printable(markdown)}")
+
+
+@benchmark_app.command("add")
+def add_command(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Results of a row.", show_default=False)
+    ],
+    to: Annotated[
+        Path, typer.Option("--to", metavar="DIR", help="Folder of the results of its suite.")
+    ],
+    verify: Annotated[
+        int,
+        typer.Option(
+            min=0, max=52, metavar="N", help="Run its policies again in N weeks, and compare."
+        ),
+    ] = 0,
+) -> None:
+    """Check a row that somebody else has run, and add it to the results of a suite.
+
+    The row has to be complete and of the same weeks of the same data centers. The documentation
+    of suites says how to make one.
+    """
+    from sdc_taichi.benchmark.submission import add_submission, read_submission, rerun
+
+    if verify:
+        with stage_bars(shown=True) as progress:
+            worst = rerun(read_submission(folder), to, verify, progress)
+        print(f"Run again in {verify} weeks of each site: figures differ by {worst:.2g} at most")
+    submission = add_submission(folder, to)
+    cases = ", ".join(submission.cases)
+    print(f"Added {printable(submission.row)} to {printable(to)}: {printable(cases)}")
 
 
 def _names(text: str | None) -> list[str]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sdc_taichi.cli.optimum_text import print_optimum
 from sdc_taichi.cli.options import (
     Compared,
     ConfigOptions,
@@ -24,23 +24,27 @@ from sdc_taichi.cli.options import (
 from sdc_taichi.cli.terminal import (
     EXIT_INTERRUPTED,
     exit_if_stopped,
+    figures_table,
     interruptible,
     print_notes,
     progress_bar,
     stage_bars,
+    wide_console,
 )
 from sdc_taichi.errors import ConfigError, printable, suggestion
 from sdc_taichi.exogenous.year_clock import whole_steps
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from sdc_taichi.control import Controller, ForecastError
     from sdc_taichi.optimum.objective import Objective
     from sdc_taichi.optimum.problem import Agent
     from sdc_taichi.optimum.result import Optimum
     from sdc_taichi.run.achievable import Achievement
     from sdc_taichi.sim.simulator import Simulator
+
+
+MOST_LINES = 12
+"""Largest number of remarks on single data centers that are printed."""
 
 
 def optimum_command(
@@ -127,7 +131,7 @@ def optimum_command(
         if as_json:
             print(metrics_json(optimum_content(found, reached)))
         elif not quiet:
-            print_optimum(optimum_content(found, reached), fleet.steps_per_hour)
+            _print_optimum(optimum_content(found, reached), fleet.steps_per_hour)
         is_written = False
         if out is not None and not interrupted():
             with progress_bar(steps, shown=not quiet) as advance:
@@ -279,3 +283,73 @@ def _inlet_limit(limit_c: float | None) -> float | None:
     if limit_c is not None and not 10.0 <= limit_c <= 60.0:
         raise ConfigError(f"--max-inlet {limit_c:g}: valid is 10..60 C")
     return limit_c
+
+
+def _print_optimum(content: Mapping[str, Any], steps_per_hour: int) -> None:
+    """Print the figures of an optimum, and what they are.
+
+    Args:
+        content: content of optimum.json.
+        steps_per_hour: number of steps in an hour.
+    """
+    from sdc_taichi.run.optimum_folder import optimum_remarks
+
+    console = wide_console(200)
+    dcs, scored = content["data_centers"], content["steps"] - content["scored_from"]
+    days = scored / steps_per_hour / 24
+    count = "1 data center" if len(dcs) == 1 else f"{len(dcs)} data centers"
+    warm_up = content["scored_from"] / steps_per_hour / 24
+    after = f" after a warm-up of {_days(warm_up)}" if warm_up else ""
+    console.print(f"Optimum of {content['objective']}: {count}, {_days(days)}{after}")
+    names = [dc["name"] for dc in dcs]
+    columns, total = _columns(content), _total(content)
+    console.print(figures_table(console, _titles(content), names, columns, total, "z.2f"))
+    remarks = optimum_remarks(content)
+    for line in remarks[:MOST_LINES]:
+        console.print(line)
+    if len(remarks) > MOST_LINES:
+        console.print(f"and {len(remarks) - MOST_LINES} more, see --json")
+
+
+def _titles(content: Mapping[str, Any]) -> list[str]:
+    """Titles of the rows."""
+    return [
+        f"idle ({content['unit']})",
+        "bound (% against idle)",
+        "achieved (% against idle)",
+        "gap (points)",
+        *(f"{name} alone (%)" for name in content["total"]["alone"]),
+        *(f"{each['controller']} (% of the achievable)" for each in content["controllers"]),
+    ]
+
+
+def _values(figures: Mapping[str, Any], shares: Sequence[float | None]) -> list[float | None]:
+    """Values of the rows of a data center, or of all."""
+    idle = figures["idle"]
+
+    def change(value: float | None) -> float | None:
+        return None if value is None or not idle else 100.0 * (value / idle - 1.0)
+
+    alone = [change(value) for value in figures["alone"].values()]
+    own = [None if share is None else 100.0 * share for share in shares]
+    both = change(figures["bound"]), change(figures["achieved"])
+    return [idle, *both, figures["gap_points"], *alone, *own]
+
+
+def _columns(content: Mapping[str, Any]) -> list[list[float | None]]:
+    """Values of the rows of each data center."""
+    shares = [each["data_centers"] for each in content["controllers"]]
+    return [
+        _values(dc, [own[i]["share"] for own in shares])
+        for i, dc in enumerate(content["data_centers"])
+    ]
+
+
+def _total(content: Mapping[str, Any]) -> list[float | None]:
+    """Values of the rows of all data centers together."""
+    return _values(content["total"], [each["share"] for each in content["controllers"]])
+
+
+def _days(count: float) -> str:
+    """A number of days."""
+    return f"{count:g} day" + ("" if count == 1 else "s")
