@@ -43,7 +43,7 @@ help: ## List the targets.
 demo: $(READY) ## Simulate July in New York and California; results in runs/demo.
 	$(VENV)/bin/sdc-taichi simulate --site ny,ca --days 31 --start 07-01 --out runs/demo --record runs/demo/hall.rrd
 
-test: $(READY) ## Run all tests; those on measured files need SDC_REAL_DATA.
+test: $(READY) ## Run the tests that need neither PyTorch, Ray nor Minari; measured files are in SDC_REAL_DATA.
 	$(PY) -m pytest $(SPREAD)
 
 # Old libraries warn of what changed in their own dependencies since.
@@ -53,7 +53,7 @@ test-oldest: $(READY_OLDEST) ## Run all tests with Python 3.11 and the oldest li
 test-processors: $(READY) ## Run tests of results as on older processors, and with one thread.
 	$(PY) tests/other_processors.py $(SPREAD)
 
-test-train: $(READY_TRAIN) ## Install the training libraries and run the tests that need them.
+test-train: $(READY_TRAIN) ## Install PyTorch, Ray and Minari, and run the tests of training, jobs on Ray and data sets.
 	$(TRAIN)/bin/python -m pytest $(SPREAD) $(TRAINING_TESTS)
 
 bench: $(READY) ## Measure every speed target; tables, JSON and plot in runs/bench.
