@@ -1,12 +1,21 @@
 """The exhaust mixes before the racks: their first guess, their exchange, and when sweeps may stop.
 
-The mix before rack j is T_mix,j = sum_i w_ji T_out,i. *Dense* halls, of up to 64 racks, keep every
-weight. In steady air they exchange after each sweep, which tells exactly how far the next sweep
-would move any mix; the next sweep starts from where the mixes go when the share k of their change,
-the feedback gain, comes back from the racks for ever: d + k/(1 - k) W d instead of d (the step of
-Aitken 1926). In *sparse* halls an exchange costs more than a sweep. Weights sum to 1, so a mix
-moves by no more than the exhausts have moved since the last exchange; where all of them moved
-alike, the mixes are shifted by as much and nothing is exchanged.
+The mix before rack j is T_mix,j = sum_i w_ji T_out,i, where the weights w_ji of a rack sum to 1. To
+*exchange* is to compute the mixes from the outlets.
+
+*Dense* halls, of up to 64 racks, keep every weight and, in steady air, exchange after each sweep.
+The change d of the mixes then says exactly how far the next sweep would move them. Racks answer
+warmer air with a share k of its change, the feedback gain, so the mixes would go on to move by
+k W d, k^2 W^2 d, and so on. The next sweep starts from d + k/(1 - k) W d at once (Aitken 1926).
+Example: two racks that take in half of each other's exhaust (all w_ji = 0.5) and answer with
+k = 0.2. A sweep finds the mixes 1.0 K and 0.6 K warmer, d = (1.0, 0.6); W d = (0.8, 0.8); the mixes
+are moved by (1.0, 0.6) + 0.25 (0.8, 0.8) = (1.2, 0.8), which is where all later sweeps would lead.
+
+In *sparse* halls an exchange costs more than a sweep. A mix moves by no more than the exhausts have
+moved since the last exchange. Example: if all exhausts have moved by 0.95 to 1.05 K, each mix would
+move by 1.00 K, give or take 0.05 K. If that spread is below ``ALIKE`` of the tolerance, the mixes
+are shifted by 1.00 K and nothing is exchanged; if the shifted mixes would move by less than the
+tolerance, the sweeps end.
 """
 
 from typing import no_type_check

@@ -266,14 +266,15 @@ def _build_group_inputs(
             continue
         group_0 = fleet.group_offsets[fleet.rack_offsets[dc]]
         for i in range(begin, end):
-            a, n = first_rack[i], racks[i]
-            if n == 0:
+            if racks[i] == 0:
                 continue
-            ends = fleet.group_offsets[a : a + n + 1] - group_0
-            key = (rows[:, ends[0] : ends[-1]].tobytes(), (ends - ends[0]).tobytes())
+            end_rack = first_rack[i] + racks[i]
+            offsets = fleet.group_offsets[first_rack[i] : end_rack + 1] - group_0
+            values = rows[:, offsets[0] : offsets[-1]]
+            key = (values.tobytes(), (offsets - offsets[0]).tobytes())
             if key not in known:
                 known[key] = total
-                entries.append(_block_entry(rows, ends, groups[i], dtype))
+                entries.append(_block_entry(rows, offsets, groups[i], dtype))
                 total += int(groups[i])
             first_row[i] = known[key]
     out = vectors(dtype, total * len(GROUP_INPUTS))
@@ -281,42 +282,59 @@ def _build_group_inputs(
     return first_row, out
 
 
-def _block_entry(rows: F64, ends: Array, groups: int, dtype: npt.DTypeLike) -> Array:
-    """Group inputs of a block, (groups, rows, LANES); ``ends`` begin and end the racks' groups."""
-    z, n = np.arange(groups), len(ends) - 1
-    group = ends[:-1] + np.minimum(z[:, None], np.diff(ends) - 1)
+def _block_entry(rows: F64, offsets: Array, groups: int, dtype: npt.DTypeLike) -> Array:
+    """Group inputs of a block, (groups, rows, LANES).
+
+    For a block of two racks with 2 and 3 groups, ``offsets`` is [0, 2, 5]. Entry 0 holds groups 0
+    and 2 in its first two lanes, entry 1 groups 1 and 3, and entry 2 groups 1 and 4: the first rack
+    has no third group and repeats its last one, with a count of 0. The other lanes repeat the
+    second, likewise with a count of 0.
+
+    Args:
+        rows: rows GROUP_INPUTS of the groups of the hall.
+        offsets: first group of each rack of the block, and the end of the last one.
+        groups: most groups of a rack of the block.
+        dtype: type of the entry.
+    """
+    number, counts, n_racks = np.arange(groups)[:, None], np.diff(offsets), len(offsets) - 1
+    group = offsets[:-1] + np.minimum(number, counts - 1)
     entry = np.zeros((groups, len(rows), LANES), dtype)
-    entry[:, :, :n] = rows[:, group].swapaxes(0, 1)
-    count = entry[:, list(GROUP_INPUTS).index("count")]
-    count[:, :n] *= z[:, None] < np.diff(ends)
-    # Lanes without a rack repeat the last one, but for the count of servers.
-    entry[:, :, n:] = entry[:, :, n - 1 : n]
-    count[:, n:] = 0.0
+    entry[:, :, :n_racks] = rows[:, group].swapaxes(0, 1)
+    servers = entry[:, list(GROUP_INPUTS).index("count")]
+    servers[:, :n_racks] *= number < counts
+    entry[:, :, n_racks:] = entry[:, :, n_racks - 1 : n_racks]
+    servers[:, n_racks:] = 0.0
     return entry
 
 
 def build_rows_along_racks(group_inputs: Array, block_ints: Array) -> tuple[Array, Array]:
     """Group inputs with the same values once more, LANES groups of one rack at a time.
 
-    Layers alone are computed from those that are added.
+    The entries of a block have racks as lanes: entry k holds group k of each rack. For the values
+    of single servers, the kernel of layers reads groups along a rack instead. Each block is
+    therefore cut into squares of LANES groups by LANES racks, and each square is transposed: a
+    block of 20 groups becomes 3 vectors of groups for each of its 8 racks, the last filled up with
+    repeats of group 19.
 
     Returns:
         The longer group inputs, and the first entry along the racks of each block.
     """
     block = dict(zip(BLOCK_INTS, block_ints, strict=True))
     entries = group_inputs.reshape(-1, len(GROUP_INPUTS), LANES)
-    first_row, one, of_block = np.unique(block["first_row"], return_index=True, return_inverse=True)
-    groups = block["groups"][one]
-    n_vectors = -(-groups // LANES)
-    first = len(entries) + offsets_from_counts(LANES * n_vectors, "groups along racks")
-    along = vectors(group_inputs.dtype, int(first[-1]) * entries.shape[1])
-    out = along.reshape(-1, *entries.shape[1:])
+    first_row, distinct, of_block = np.unique(
+        block["first_row"], return_index=True, return_inverse=True
+    )
+    groups = block["groups"][distinct]
+    n_squares = -(-groups // LANES)
+    first_along = len(entries) + offsets_from_counts(LANES * n_squares, "groups along racks")
+    longer = vectors(group_inputs.dtype, int(first_along[-1]) * entries.shape[1])
+    out = longer.reshape(-1, *entries.shape[1:])
     out[: len(entries)] = entries
-    for a, n, b, v in zip(first_row, groups, first[:-1], n_vectors, strict=True):
-        z = np.minimum(np.arange(LANES * v), n - 1)
-        squares = entries[a : a + n][z].reshape(v, LANES, -1, LANES)
-        out[b : b + LANES * v] = squares.transpose(3, 0, 2, 1).reshape(-1, *out.shape[1:])
-    return along, first[of_block]
+    for row, n_groups, along, n in zip(first_row, groups, first_along, n_squares, strict=False):
+        group = np.minimum(np.arange(LANES * n), n_groups - 1)
+        squares = entries[row + group].reshape(n, LANES, -1, LANES)
+        out[along : along + LANES * n] = squares.transpose(3, 0, 2, 1).reshape(-1, *out.shape[1:])
+    return longer, first_along[of_block]
 
 
 def _build_air(
