@@ -35,7 +35,7 @@ TYPED := build/typecheck
 SCRIPTS := $(sort $(dir $(wildcard tests/*.py benchmarks/*.py docs/make/*.py docs/site/*.py examples/*.py)))
 MAPPED := configs|data|kernels|viz
 
-.PHONY: help demo test test-oldest test-processors test-train bench fuzz lint wheel-test dist docs clean
+.PHONY: help demo test test-oldest test-processors test-train bench lint wheel-test dist docs clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -58,9 +58,6 @@ test-train: $(READY_TRAIN) ## Install PyTorch, Ray and Minari, and run the tests
 
 bench: $(READY) ## Measure every speed target; tables, JSON and plot in runs/bench.
 	$(PY) benchmarks/bench.py
-
-fuzz: $(READY) ## Try 2,000 malformed and odd inputs; inputs of failures in runs/fuzz.
-	$(PY) -m tests.fuzz
 
 lint: $(READY) ## Check style, format and types.
 	$(PY) -m ruff check
