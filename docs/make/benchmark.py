@@ -5,7 +5,8 @@
 reads the results of whole suites. It writes a table and a picture of each suite between the lines
 ``<!-- SUITE -->`` and ``<!-- end -->`` of DOCS/benchmark.md, all tables into DOCS/benchmark/, and
 figures of some rows in one week into CELLS/SUITE, which tests/test_published.py computes again.
-Results that are not whole, of a quick form, or of several states of the source are refused.
+The page has one line for all rows that share a place. Results that are not whole, of a quick form,
+or of several states of the source are refused.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ from sdc_taichi.viz.plotting import webp
 if TYPE_CHECKING:
     import pandas as pd
 
-BOARD_COLUMNS = ("place", "row", "trainings", "change_pct", "share_pct", "tripped_rack_h")
-PAPER_COLUMNS = ("table", "label", "seeds", "cfp_kg", "printed_cfp_kg", "against_constant")
-"""Columns of the table on the page; intervals stand beside their values."""
+BOARD_COLUMNS = ("change_pct", "share_pct", "tripped_rack_h")
+PAPER_COLUMNS = ("cfp_kg", "printed_cfp_kg", "against_constant")
+"""Columns of the table on the page, which has a line for the rows of one place or one table."""
 CELL_ROWS = ("idle", "best-constant", "rules", "baselines", "ippo")
 """Rows of the cells, as far as a case has them."""
 PLANNED = {"small": "mpc-24h", "carbon": "mpc-24h"}
@@ -117,28 +118,47 @@ def section(
 ) -> list[str]:
     """Paragraphs of a suite on the page; its picture is written."""
     if suite.suite.accounting == PAPER:
-        titles, rows = PAPER_TITLES, tables["tables"]
-        shown = columns_of(rows[rows["printed_cfp_kg"].notna()], PAPER_COLUMNS)
+        rows = tables["tables"]
+        titles = {**PAPER_TITLES, "label": "rows"}
+        shown = lines_of(rows[rows["printed_cfp_kg"].notna()], "table", "label", PAPER_COLUMNS)
     else:
-        titles, shown = BOARD_TITLES, columns_of(board.standings, BOARD_COLUMNS)
-    parts = [f"    {x}" for x in dict.fromkeys(command_of(text) for text in suite.commands)]
-    parts.append(literal_markdown(f"Case {board.case.name}. {weeks_text(board)}"))
-    parts.append(markdown(shown, titles))
+        titles = {**BOARD_TITLES, "row": "rows"}
+        shown = lines_of(board.standings, "place", "row", BOARD_COLUMNS)
+    parts = [markdown(shown, titles)]
+    files = [f"[{name}](benchmark/{suite.name}-{name}.csv)" for name in tables]
+    commands = dict.fromkeys(f"`{command_of(text)}`" for text in suite.commands)
+    about = f"Case {board.case.name}. {weeks_text(board)} {cost_text(suite)} {made_by(suite)}"
+    end = f"Tables: {', '.join(files)}. Made by {', '.join(commands)}. {literal_markdown(about)}"
     for picture in case_pictures(board)[:1]:
         path = f"img/benchmark-{suite.name}.webp"
         write(docs / path, webp(picture.draw(), 80)[-1])
-        parts.append(f"![{literal_markdown(picture.alt)}]({path})")
-        parts.append(literal_markdown(picture.caption))
-    parts.append(literal_markdown(" ".join([cost_text(suite), made_by(suite)])))
-    parts += [f"> {literal_markdown(text)}" for text in suite_notes(suite)]
-    files = [f"[{name}](benchmark/{suite.name}-{name}.csv)" for name in tables]
-    return [*parts, f"All tables: {', '.join(files)}."]
+        parts.append(f"![Intervals of the rows of suite {suite.name}]({path})")
+        end = f"{literal_markdown(picture.caption)} {end}"
+    parts.append(end)
+    return [*parts, *(f"> {literal_markdown(text)}" for text in suite_notes(suite))]
 
 
-def columns_of(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
-    """Some columns of a table with their intervals, as far as it has them."""
-    wanted = [name + end for name in names for end in ("", "_low", "_high")]
-    return frame[[name for name in wanted if name in frame]]
+def lines_of(frame: pd.DataFrame, group: str, name: str, columns: Sequence[str]) -> pd.DataFrame:
+    """Lines of the table on the page: rows of one place or table, and the range of their figures.
+
+    Args:
+        frame: rows of a suite.
+        group: column whose equal neighbours make a line; rows without a place have one each.
+        name: column with the names of rows.
+        columns: columns of figures, as far as the frame has them.
+    """
+    import pandas as pd
+
+    starts = (frame[group] != frame[group].shift()) | (frame[group] == "-")
+    lines = []
+    for _, rows in frame.groupby(starts.cumsum()):
+        line = {group: str(rows[group].iloc[0]), name: ", ".join(dict.fromkeys(rows[name]))}
+        for column in columns:
+            if column in rows and rows[column].notna().any():
+                ends = dict.fromkeys(f"{x:.2f}" for x in (rows[column].min(), rows[column].max()))
+                line[column] = " to ".join(ends)
+        lines.append(line)
+    return pd.DataFrame(lines)
 
 
 def command_of(text: str) -> str:
