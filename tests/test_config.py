@@ -99,12 +99,12 @@ def test_a_file_extends_a_preset(tmp_path: Path) -> None:
         "extends: sustaindc\nname: mine\nhvac:\n  setpoint: {initial_c: 20}\n"
         "site:\n  location: TX\n",
     )
-    found, base = load_config(path), load_config("sustaindc")
-    assert found.hvac.setpoint.initial_c == 20
-    assert found.hvac.setpoint.model == base.hvac.setpoint.model, "siblings stay"
-    assert found.site.carbon_pairing == "utc_rows"
-    assert found.hall == base.hall
-    assert (found.name, found.site.location) == ("mine", "TX")
+    config, base = load_config(path), load_config("sustaindc")
+    assert config.hvac.setpoint.initial_c == 20
+    assert config.hvac.setpoint.model == base.hvac.setpoint.model, "siblings stay"
+    assert config.site.carbon_pairing == "utc_rows"
+    assert config.hall == base.hall
+    assert (config.name, config.site.location) == ("mine", "TX")
 
 
 def test_configs_are_frozen_and_hashable() -> None:
@@ -188,46 +188,6 @@ def test_values_that_are_not_valid_are_named(assigned: Any, message: str) -> Non
         with_values(load_config("tiny"), assigned)
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("hvac.setpoint.max_c", "valid is section.key=value"),
-        ("=3", "valid is section.key=value"),
-        ("hvac..max_c=3", "valid is section.key=value"),
-        ("site.start=13-01", "13-01"),
-        ("hvac.setpoint.maxc=22", "hvac.setpoint.maxc: unknown key; did you mean 'max_c'"),
-        ("hvc.setpoint.max_c=22", "hvc: unknown key; did you mean 'hvac'"),
-        ("name.first=x", "name is a value, not a section"),
-        ("hall.supply_approach_k.4=1", "index '4' is not in 0..3"),
-        ("site.seed=[1", "is no YAML value"),
-        ("site.start=2001-13-45", "is no day of a 365-day year"),
-        ("hvac={setpoint: {initial_c: 20, initial_c: 21}}", "'initial_c' is given twice"),
-        ("hvac.chiller.model=carno", "'carnot'"),
-        ("simulation.steps_per_hour=7", "7 does not divide 60 minutes; valid are 1, 2, 3, 4"),
-        ("workload.deadline_h=30", "deadline_h 30 must not exceed age_horizon_h 24"),
-        ("hvac.setpoint.initial_c=30", "initial_c 30 must lie within min_c 16 and max_c 23"),
-        ("hvac.tower.economiser_approach_k=2", "must not be below approach_min_k 4"),
-        ("battery.upper_v=0", "lower_v 0 must be below upper_v 0"),
-        ("hall.supply_approach_k=[1, 2, 3]", "supply_approach_k has 3 entries, expected 4"),
-        ("servers.groups=[[], [], [], []]", "rack 0 is empty"),
-        (
-            "servers.groups=[[{count: 3, full_w: 9, idle_w: 1},"
-            " {count: 1, full_w: 9, idle_w: 1, load_weight: 9}]]",
-            "load_weight 9 exceeds twice the rack's mean 3",
-        ),
-        (
-            "servers.groups=[[{count: 3, full_w: 9, idle_w: 10}]]",
-            "idle_w 10 must not exceed full_w 9",
-        ),
-    ],
-)
-def test_wrong_overrides_name_the_place(override: str, message: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        load_config("tiny", [override])
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 # --- servers ------------------------------------------------------------------------------------
 
 
@@ -259,12 +219,11 @@ def test_capacity_scales_the_number_of_servers(preset: str, scale: float) -> Non
     groups = [g for rack in config.rack_groups() for g in rack]
     nameplate_w = sum(g.count * g.full_w for g in groups)
     scaled = apply_overrides(config, [f"hall.capacity_mw={scale * nameplate_w / 1e6}"])
-    found = [g for rack in scaled.rack_groups() for g in rack]
-    assert len(found) == len(groups)
-    for before, after in zip(groups, found, strict=True):
+    scaled_groups = [g for rack in scaled.rack_groups() for g in rack]
+    for before, after in zip(groups, scaled_groups, strict=True):
         assert after.count == max(1, round(before.count * scale))
         assert after.model_copy(update={"count": before.count}) == before
-    total_w = sum(g.count * g.full_w for g in found)
+    total_w = sum(g.count * g.full_w for g in scaled_groups)
     # Whole servers: each group is off by half a server at most.
     assert abs(total_w - scale * nameplate_w) <= 0.5 * sum(g.full_w for g in groups) * (1 + 1e-9)
 
@@ -336,6 +295,7 @@ def sustaindc_values() -> dict[str, dict[str, Any]]:
 
 
 def dc_config(folder: Path, values: dict[str, Any]) -> Path:
+    """Write a file in the SustainDC format."""
     return written(folder / "dc_config.json", json.dumps(values))
 
 
@@ -385,41 +345,6 @@ def test_servers_per_rack_may_differ_in_the_sustaindc_format(tmp_path: Path) -> 
     assert [rack[0].count for rack in config.rack_groups()] == [1, 2, 3, 4, 5, 6]
 
 
-@pytest.mark.parametrize(
-    ("section", "key", "length"),
-    [
-        (HALL, "RACK_SUPPLY_APPROACH_TEMP_LIST", 5),
-        (HALL, "RACK_RETURN_APPROACH_TEMP_LIST", 7),
-        (SERVERS, "DEFAULT_SERVER_POWER_CHARACTERISTICS", 4),
-    ],
-)
-def test_a_wrong_length_names_file_key_and_both_lengths(
-    section: str, key: str, length: int, tmp_path: Path
-) -> None:
-    values = sustaindc_values()
-    values[section][key] = (values[section][key] * 2)[:length]
-    path = dc_config(tmp_path, values)
-    with pytest.raises(ConfigError) as caught:
-        load_config(path)
-    assert str(caught.value).startswith(f"{path}: {section}.{key}: length {length}, expected 6")
-
-
-@pytest.mark.parametrize(
-    ("section", "key"), [(s, k) for s, keys in sustaindc_values().items() for k in keys]
-)
-def test_every_key_of_the_sustaindc_format_is_needed(
-    section: str, key: str, tmp_path: Path
-) -> None:
-    values = sustaindc_values()
-    values[section][key + "X"] = values[section].pop(key)
-    path = dc_config(tmp_path, values)
-    with pytest.raises(ConfigError) as caught:
-        load_config(path)
-    assert f"{path}: " in str(caught.value)
-    assert f"{section}.{key}: missing" in str(caught.value)
-    assert f"{section}.{key}X: unknown key; did you mean '{key}'?" in str(caught.value)
-
-
 def test_the_config_of_sustaindc_itself(real_data: Path) -> None:
     config, preset = load_config(real_data / "dc_config.json"), load_config("sustaindc")
     assert config.hall == preset.hall.model_copy(
@@ -428,28 +353,6 @@ def test_the_config_of_sustaindc_itself(real_data: Path) -> None:
     assert config.rack_groups() == preset.rack_groups()
     assert config.servers.curves == preset.servers.curves
     assert config.hvac == preset.hvac
-
-
-@pytest.mark.parametrize(
-    ("file", "parts"),
-    [
-        (
-            "dc_config_dc1.json",
-            ["RACK_SUPPLY_APPROACH_TEMP_LIST: length 16, expected 20",
-             "RACK_RETURN_APPROACH_TEMP_LIST: length 16, expected 20"],
-        ),
-        ("dc_config_dc3.json", ["length 20, expected 25"]),
-    ],
-)  # fmt: skip
-def test_broken_configs_of_sustaindc(file: str, parts: list[str], real_data: Path) -> None:
-    with pytest.raises(ConfigError) as caught:
-        load_config(real_data / file)
-    message = str(caught.value)
-    assert message.startswith(f"{real_data / file}: ")
-    assert "missing" in message
-    assert "\n" not in message
-    for part in parts:
-        assert part in message
 
 
 def test_a_data_center_of_the_sustaindc_format_runs(tmp_path: Path) -> None:

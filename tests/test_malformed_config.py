@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import copy
-import json
 import os
 import re
 from collections.abc import Callable
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,54 +12,9 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from sdc_taichi import ConfigError, DataCenterConfig, load_config
+from sdc_taichi import ConfigError, load_config
 from sdc_taichi.cli.app import app
-
-HALL, HVAC, SERVERS = (
-    "data_center_configuration",
-    "hvac_configuration",
-    "server_characteristics",
-)
-# The format of SustainDC's utils/dc_config.json with the defaults of its paper (appendix B).
-DC_CONFIG: dict[str, dict[str, Any]] = {
-    HALL: {
-        "NUM_ROWS": 4,
-        "NUM_RACKS_PER_ROW": 5,
-        "RACK_SUPPLY_APPROACH_TEMP_LIST": [5.3] * 5 + [5.0] * 10 + [5.3] * 5,
-        "RACK_RETURN_APPROACH_TEMP_LIST": [-3.7] * 5 + [-2.5] * 10 + [-3.7] * 5,
-        "CPUS_PER_RACK": 200,
-    },
-    HVAC: {
-        "C_AIR": 1006,
-        "RHO_AIR": 1.225,
-        "CRAC_SUPPLY_AIR_FLOW_RATE_pu": 0.00005663,
-        "CRAC_REFRENCE_AIR_FLOW_RATE_pu": 0.00009438,
-        "CRAC_FAN_REF_P": 150,
-        "CHILLER_COP_BASE": 5.0,
-        "CHILLER_COP_K": 0.1,
-        "CHILLER_COP_T_NOMINAL": 25.0,
-        "CT_FAN_REF_P": 1000,
-        "CT_REFRENCE_AIR_FLOW_RATE": 2.8315,
-        "CW_PRESSURE_DROP": 300000,
-        "CW_WATER_FLOW_RATE": 0.0011,
-        "CW_PUMP_EFFICIENCY": 0.87,
-        "CT_PRESSURE_DROP": 300000,
-        "CT_WATER_FLOW_RATE": 0.0011,
-        "CT_PUMP_EFFICIENCY": 0.87,
-    },
-    SERVERS: {
-        "CPU_POWER_RATIO_LB": [0.01, 1.00],
-        "CPU_POWER_RATIO_UB": [0.03, 1.02],
-        "IT_FAN_AIRFLOW_RATIO_LB": [0.01, 0.225],
-        "IT_FAN_AIRFLOW_RATIO_UB": [0.225, 1.0],
-        "IT_FAN_FULL_LOAD_V": 0.051,
-        "ITFAN_REF_V_RATIO": 1.0,
-        "ITFAN_REF_P": 10.0,
-        "INLET_TEMP_RANGE": [16, 28],
-        "DEFAULT_SERVER_POWER_CHARACTERISTICS": [[170, 20]] + [[130, 10]] * 19,
-        "HP_PROLIANT": [110, 170],
-    },
-}
+from test_config import HALL, HVAC, SERVERS, dc_config, sustaindc_values
 
 
 def fails(arguments: list[str], parts: list[str]) -> None:
@@ -165,6 +117,13 @@ def test_what_is_too_long_for_the_name_of_a_file_is_an_override() -> None:
         ("=3", ["override '=3'", "section.key=value"]),
         ("a..b=3", ["override 'a..b=3'", "section.key=value"]),
         ("hall.rows=: :", ["override 'hall.rows=: :'", "YAML"]),
+        ("hall.rows", ["override 'hall.rows'", "section.key=value"]),
+        ("site.seed=[1", ["is no YAML value"]),
+        ("site.start=2001-13-45", ["is no day of a 365-day year"]),
+        ("hvac={setpoint: {initial_c: 20, initial_c: 21}}", ["'initial_c' is given twice"]),
+        ("hvc.setpoint.max_c=22", ["hvc: unknown key; did you mean 'hvac'"]),
+        ("hall.supply_approach_k.4=1", ["index '4' is not in 0..3"]),
+        ("hvac.tower.economiser_approach_k=2", ["must not be below approach_min_k 4"]),
         ("int=3", ["int: unknown key"]),
         ("hall.float=3", ["hall.float: unknown key"]),
         ("hall.[x]=3", ["hall.[x]: unknown key"]),
@@ -185,7 +144,6 @@ def test_what_is_too_long_for_the_name_of_a_file_is_an_override() -> None:
         ("hall.supply_approach_k=[1, 2]", ["supply_approach_k has 2 entries, expected 4"]),
         ("hall.rows=true", ["hall.rows", "number", "True"]),
         ("hall.capacity_mw=1e9", ["hall.capacity_mw", "less than or equal to 100000"]),
-        ("hall.capacity_mw=1e-6", ["hall.capacity_mw 1e-06", "without servers", "at least"]),
         ("hvac.total_of=[chiller, chiller]", ["hvac.total_of", "each one once"]),
         ("hvac.total_of=[]", ["hvac.total_of", "at least one device"]),
         ("hvac.chiller.coil_approach_k=50", ["coil_approach_k 50", "within 4..20 C"]),
@@ -206,15 +164,30 @@ def test_what_is_too_long_for_the_name_of_a_file_is_an_override() -> None:
         ("battery.capacity_kwh=-1", ["battery.capacity_kwh", "-1"]),
         ("battery.lower_v=1", ["battery: lower_v 1 must be below upper_v 1"]),
         ("workload.deadline_h=48", ["workload: deadline_h 48", "age_horizon_h 24"]),
-        ("workload.trace=alibba", ["trace 'alibba'", "alibaba_1"]),
         ("site.start=02-29", ["site.start", "02-29", "MM-DD"]),
         ("site.start=2001-07-01", ["site.start", "MM-DD"]),
         ("site.location=5", ["site.location", "5"]),
-        ("site.weather_file=/no/such.epw", ["/no/such.epw: no such file"]),
         ("simulation.steps_per_hour=7", ["simulation.steps_per_hour", "7", "1, 2, 3, 4, 5, 6"]),
     ],
 )
 def test_overrides(override: str, parts: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config("tiny", [override])
+    assert "\n" not in str(caught.value)
+    for part in parts:
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("hall.rows=2.5", ["hall.rows", "integer", "2.5"]),
+        ("hall.capacity_mw=1e-6", ["hall.capacity_mw 1e-06", "without servers", "at least"]),
+        ("workload.trace=alibba", ["trace 'alibba'", "alibaba_1"]),
+        ("site.weather_file=/no/such.epw", ["/no/such.epw: no such file"]),
+    ],
+)
+def test_commands_name_the_override(override: str, parts: list[str]) -> None:
     fails(["config", "check", "tiny", override], parts)
     fails(["config", "check", "tiny", "--set", override], parts)
 
@@ -222,59 +195,28 @@ def test_overrides(override: str, parts: list[str]) -> None:
 # The SustainDC format
 
 
-def test_inline_dc_config_is_valid(tmp_path: Path) -> None:
-    config = load_config(dc_config(tmp_path, lambda _: None))
-    assert isinstance(config, DataCenterConfig)
-    assert (config.hall.racks, config.hall.servers_per_rack) == (20, 200)
-
-
-def dc_config(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
-    values = copy.deepcopy(DC_CONFIG)
-    change(values)
-    path = folder / "dc_config.json"
-    path.write_text(json.dumps(values))
-    return path
-
-
-def dc1(values: dict[str, Any]) -> None:
-    """Lists of 16 racks in a hall of 20, one COP instead of three keys, as a released file has."""
-    dc3(values)
-    values[HALL]["RACK_SUPPLY_APPROACH_TEMP_LIST"] = [5.3] * 4 + [5.0] * 8 + [5.3] * 4
-    values[HALL]["RACK_RETURN_APPROACH_TEMP_LIST"] = [-3.7] * 4 + [-2.5] * 8 + [-3.7] * 4
-    values[HALL]["NUM_ROWS"] = 4
-
-
-def dc3(values: dict[str, Any]) -> None:
-    """20 power pairs in a hall of 25 racks, one COP instead of three keys, as another has."""
-    values[HALL] |= {
-        "NUM_ROWS": 5,
-        "CPUS_PER_RACK": 1e6,
-        "RACK_SUPPLY_APPROACH_TEMP_LIST": [5.3] * 5 + [5.0] * 15 + [5.3] * 5,
-        "RACK_RETURN_APPROACH_TEMP_LIST": [-3.7] * 5 + [-2.5] * 15 + [-3.7] * 5,
-    }
+def one_cop(values: dict[str, Any]) -> None:
+    """One COP instead of three keys, as a released file has."""
     for name in ("CHILLER_COP_BASE", "CHILLER_COP_K", "CHILLER_COP_T_NOMINAL"):
         del values[HVAC][name]
     values[HVAC]["CHILLER_COP"] = 6.0
 
 
+def more_racks(values: dict[str, Any]) -> None:
+    """A hall of more racks than its lists have values."""
+    values[HALL]["NUM_ROWS"] = 5
+
+
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
+        (one_cop, [f"{HVAC}.CHILLER_COP: unknown key", f"{HVAC}.CHILLER_COP_BASE: missing"]),
         (
-            dc1,
+            more_racks,
             [
-                f"{HVAC}.CHILLER_COP: unknown key",
-                f"{HVAC}.CHILLER_COP_BASE: missing",
-                f"{HALL}.RACK_SUPPLY_APPROACH_TEMP_LIST: length 16, expected 20",
-                f"{HALL}.RACK_RETURN_APPROACH_TEMP_LIST: length 16, expected 20",
-            ],
-        ),
-        (
-            dc3,
-            [
-                f"{HVAC}.CHILLER_COP: unknown key",
-                f"{HVAC}.CHILLER_COP_T_NOMINAL: missing",
-                f"{SERVERS}.DEFAULT_SERVER_POWER_CHARACTERISTICS: length 20, expected 25",
+                f"{HALL}.RACK_SUPPLY_APPROACH_TEMP_LIST: length 6, expected 15",
+                f"{HALL}.RACK_RETURN_APPROACH_TEMP_LIST: length 6, expected 15",
+                f"{SERVERS}.DEFAULT_SERVER_POWER_CHARACTERISTICS: length 6, expected 15",
             ],
         ),
         (lambda v: v.pop(SERVERS), [f"{SERVERS}: missing section"]),
@@ -282,7 +224,7 @@ def dc3(values: dict[str, Any]) -> None:
         (lambda v: v[HVAC].pop("C_AIR"), [f"{HVAC}.C_AIR: missing"]),
         (lambda v: v[HVAC].update(C_AIRR=1), [f"{HVAC}.C_AIRR", "did you mean 'C_AIR'?"]),
         (lambda v: v[HALL].update(NUM_ROWS="4"), [f"{HALL}.NUM_ROWS", "'4' is not a number"]),
-        (lambda v: v[HALL].update(CPUS_PER_RACK=[200] * 19), ["CPUS_PER_RACK: length 19", "20"]),
+        (lambda v: v[HALL].update(CPUS_PER_RACK=[200] * 5), ["CPUS_PER_RACK: length 5", "6"]),
         (lambda v: v[HALL].update(CPUS_PER_RACK=0.5), ["CPUS_PER_RACK: 0.5 is no positive int"]),
         (lambda v: v[HALL].update(CPUS_PER_RACK={}), ["CPUS_PER_RACK: {} is not a number"]),
         (lambda v: v[HVAC].update(CT_PUMP_EFFICIENCY=0), ["CT_PUMP_EFFICIENCY: 0 must be posit"]),
@@ -299,40 +241,52 @@ def dc3(values: dict[str, Any]) -> None:
 def test_dc_config(
     tmp_path: Path, change: Callable[[dict[str, Any]], object], parts: list[str]
 ) -> None:
-    path = dc_config(tmp_path, change)
+    values = sustaindc_values()
+    change(values)
+    path = dc_config(tmp_path, values)
     fails(["config", "check", str(path)], [f"{path}: ", *parts])
 
 
-def with_value(values: dict[str, Any], section: str, key: str, value: object) -> None:
-    values[section][key] = value
+def test_every_key_of_a_dc_config_is_needed(tmp_path: Path) -> None:
+    for section, keys in sustaindc_values().items():
+        for key in keys:
+            values = sustaindc_values()
+            values[section][key + "X"] = values[section].pop(key)
+            with pytest.raises(ConfigError) as caught:
+                load_config(dc_config(tmp_path, values))
+            assert f"{section}.{key}: missing" in str(caught.value)
+            assert f"{section}.{key}X: unknown key; did you mean '{key}'?" in str(caught.value)
 
 
 @pytest.mark.parametrize("wrong", [None, [], [[1]], [None], {}, "x", True])
 def test_every_value_of_a_dc_config_is_checked(tmp_path: Path, wrong: Any) -> None:
-    for section, values in DC_CONFIG.items():
-        for key in values:
-            path = dc_config(tmp_path, partial(with_value, section=section, key=key, value=wrong))
+    for section, keys in sustaindc_values().items():
+        for key in keys:
+            values = sustaindc_values()
+            values[section][key] = wrong
             with pytest.raises(ConfigError, match=f"{section}.{key}: "):
-                load_config(path)
+                load_config(dc_config(tmp_path, values))
 
 
-def test_a_dc_config_that_gives_a_key_twice_or_no_number(tmp_path: Path) -> None:
-    path = dc_config(tmp_path, lambda _: None)
-    text = path.read_text()
-    for old, new, part in (
-        ('"C_AIR": 1006', '"C_AIR": 1006, "C_AIR": 1005', "'C_AIR' is given twice"),
-        ('"C_AIR": 1006', '"C_AIR": NaN', "NaN is no finite number"),
-        ('"C_AIR": 1006', '"C_AIR": 1e999', "'1e999' is no finite decimal number"),
-    ):
-        path.write_text(text.replace(old, new))
-        fails(["config", "check", str(path)], [f"{path}: not valid JSON", part])
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ('"C_AIR": 1005, "C_AIR": 1006', "'C_AIR' is given twice"),
+        ('"C_AIR": NaN', "NaN is no finite number"),
+        ('"C_AIR": 1e999', "'1e999' is no finite decimal number"),
+        ('"C_AIR": {', ""),
+    ],
+)
+def test_json_that_is_not_valid(text: str, part: str, tmp_path: Path) -> None:
+    path = dc_config(tmp_path, sustaindc_values())
+    path.write_text(path.read_text().replace('"C_AIR": 1005', text))
+    fails(["config", "check", str(path)], [f"{path}: not valid JSON", part])
 
 
-def test_json_that_is_none(tmp_path: Path) -> None:
+def test_json_that_is_no_mapping(tmp_path: Path) -> None:
     path = tmp_path / "dc_config.json"
-    for text, part in (("{", "not valid JSON"), ("[]", "the top level is a list")):
-        path.write_text(text)
-        fails(["config", "check", str(path)], [f"{path}: {part}"])
+    path.write_text("[]")
+    fails(["config", "check", str(path)], [f"{path}: the top level is a list"])
 
 
 # Sampling

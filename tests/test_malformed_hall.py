@@ -1,10 +1,7 @@
-"""Halls, events and matrices that are not valid: one line that names the place and the way out."""
+"""Halls and events that are not valid: one line that names the place and the way out."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import numpy as np
 import pytest
 
 from sdc_taichi import ConfigError, build_fleet, load_config
@@ -108,61 +105,3 @@ def test_hall_that_cannot_close_is_refused(override: str, parts: list[str]) -> N
         build_fleet(config)
     for part in parts:
         assert part in str(caught.value)
-
-
-def matrix_error(path: Path, *overrides: str) -> str:
-    config = load_config("corrected", [f"hall.recirculation.matrix_file={path}", *overrides])
-    with pytest.raises(ConfigError) as caught:
-        build_fleet(config)
-    text = str(caught.value)
-    assert text.startswith(str(path))
-    assert "\n" not in text
-    return text
-
-
-def test_matrix_file_without_recirculation() -> None:
-    with pytest.raises(ConfigError, match=r"matrix_file needs hall\.inlet_model recirculation"):
-        load_config("tiny", ["hall.recirculation.matrix_file=r.npz"])
-
-
-def test_matrix_file_that_is_missing_or_broken(tmp_path: Path) -> None:
-    assert "no such file" in matrix_error(tmp_path / "none.npz")
-    (tmp_path / "text.npz").write_text("no archive")
-    assert "cannot be read as an .npz file" in matrix_error(tmp_path / "text.npz")
-    (tmp_path / "words.csv").write_text("a,b\nc,d\n")
-    assert "line 1: 'a' is no number; valid are numbers alone" in matrix_error(
-        tmp_path / "words.csv", "hall.recirculation.matrix_kind=R"
-    )
-
-
-def test_matrix_without_a_kind_or_with_another(tmp_path: Path) -> None:
-    np.savetxt(tmp_path / "r.csv", np.full((20, 20), 0.01), delimiter=",")
-    assert "a .csv needs hall.recirculation.matrix_kind R or D" in matrix_error(tmp_path / "r.csv")
-    np.savez(tmp_path / "x.npz", X=np.eye(20))
-    assert "holds ['X']; valid is one of the arrays R and D" in matrix_error(tmp_path / "x.npz")
-    np.savez(tmp_path / "r.npz", R=np.full((20, 20), 0.01))
-    assert "holds R, hall.recirculation.matrix_kind is D" in matrix_error(
-        tmp_path / "r.npz", "hall.recirculation.matrix_kind=D"
-    )
-
-
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        (((3, 4), np.nan), "R[3, 4] is nan; valid is a finite number"),
-        (((3, 4), -0.1), "rack 3 takes a share of -0.1 of its air from rack 4"),
-        (((3, 4), 0.9), "row 3 sums to 1.09; valid is below 1"),
-    ],
-)
-def test_matrix_entries_are_checked(
-    change: tuple[tuple[int, int], float], text: str, tmp_path: Path
-) -> None:
-    matrix = np.full((20, 20), 0.01)
-    matrix[change[0]] = change[1]
-    np.savez(tmp_path / "r.npz", R=matrix)
-    assert text in matrix_error(tmp_path / "r.npz")
-
-
-def test_matrix_of_another_hall(tmp_path: Path) -> None:
-    np.savez(tmp_path / "r.npz", R=np.full((4, 4), 0.1))
-    assert "R has shape (4, 4), expected (20, 20)" in matrix_error(tmp_path / "r.npz")

@@ -19,6 +19,19 @@ from sdc_taichi.sim.hall_solver import Conditions, Hall
 from sdc_taichi.types import F64
 
 
+SMALL_HALL = [
+    "hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
+    "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
+]  # fmt: skip
+
+
+def hall_with(path: Path, scaled_to: str, *overrides: str) -> DataCenterConfig:
+    """Six racks in two rows whose recirculation stands in a file."""
+    settings = {"matrix_file": str(path), "calibrate": scaled_to}
+    named = [f"hall.recirculation.{name}={json.dumps(text)}" for name, text in settings.items()]
+    return load_config("corrected", [*SMALL_HALL, *named, *overrides])
+
+
 def random_matrix(rng: np.random.Generator, racks: int) -> F64:
     """An R of a hall of equal racks: no more leaves than comes out, a rack that breathes none."""
     matrix = rng.uniform(0, 1, (racks, racks)) * (rng.random((racks, racks)) < 0.7)
@@ -27,15 +40,13 @@ def random_matrix(rng: np.random.Generator, racks: int) -> F64:
     return matrix
 
 
-def heat_matrix(matrix: F64, overrides: list[str], scaled: str, folder: Path) -> F64:
+def heat_matrix(matrix: F64, scaled_to: str, folder: Path, *overrides: str) -> F64:
     """D of a hall with this R: T_in - T_sup = R (I - R)^-1 K^-1 P, with its design airflow."""
     path = folder / "known.npz"
     np.savez(path, R=matrix)
-    given = [f"hall.recirculation.matrix_file={json.dumps(str(path))}",
-             f"hall.recirculation.calibrate={scaled}"]  # fmt: skip
-    config = load_config("corrected", [*overrides, *given])
+    config = hall_with(path, scaled_to, *overrides)
     # Where the file gives but shares within a row or the hall, D is that of even inlets.
-    design = calibrate(config).design if scaled == "none" else design_point(config)
+    design = calibrate(config).design if scaled_to == "none" else design_point(config)
     w_per_k = design.air_j_per_m3_k * design.airflow_m3s
     return np.asarray(matrix @ np.linalg.inv(np.eye(len(matrix)) - matrix) / w_per_k)
 
@@ -48,25 +59,13 @@ def test_matrix_of_a_file_agrees_with_the_twin(kind: str, scaled: str, tmp_path:
     if scaled == "rack":
         # Calibration needs exhaust air for a rack with an approach temperature.
         matrix[1] = matrix[0]
-    overrides = [
-        "hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
-        "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
-    ]  # fmt: skip
     name, path = kind[0], tmp_path / kind
-    given = matrix if name == "R" else heat_matrix(matrix, overrides, scaled, tmp_path)
+    values = matrix if name == "R" else heat_matrix(matrix, scaled, tmp_path)
     if path.suffix == ".npz":
-        np.savez(path, **{name: given})  # type: ignore[arg-type]
+        np.savez(path, **{name: values})  # type: ignore[arg-type]
     else:
-        np.savetxt(path, given, delimiter=",")
-    config = load_config(
-        "corrected",
-        [
-            *overrides,
-            f"hall.recirculation.matrix_file={json.dumps(str(path))}",
-            f"hall.recirculation.matrix_kind={name}",
-            f"hall.recirculation.calibrate={scaled}",
-        ],
-    )
+        np.savetxt(path, values, delimiter=",")
+    config = hall_with(path, scaled, f"hall.recirculation.matrix_kind={name}")
     met = Conditions(np.array([20.0]), np.array([0.7]))
     twin = reference_twin.calibrated_to(config, matrix)
     if scaled == "none":
@@ -85,23 +84,13 @@ def test_matrix_of_a_file_agrees_with_the_twin(kind: str, scaled: str, tmp_path:
 
 def test_power_of_a_rack_warms_the_others_by_d(tmp_path: Path) -> None:
     rng, path = np.random.default_rng(5), tmp_path / "cfd.npz"
-    overrides = [
-        "hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
-        "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
+    constant_airflow = [
         "servers.fan_full_airflow_m3s=0.019", "servers.fan_airflow_ratio_lb=[1,1]",
         "servers.fan_airflow_ratio_ub=[1,1]", "hall.air_density_kg_m3=1.225",
     ]  # fmt: skip
-    matrix = random_matrix(rng, 6)
-    d_k_per_w = heat_matrix(matrix, overrides, "none", tmp_path)
+    d_k_per_w = heat_matrix(random_matrix(rng, 6), "none", tmp_path, *constant_airflow)
     np.savez(path, D=d_k_per_w)
-    config = load_config(
-        "corrected",
-        [
-            *overrides,
-            f"hall.recirculation.matrix_file={json.dumps(str(path))}",
-            "hall.recirculation.calibrate=none",
-        ],
-    )
+    config = hall_with(path, "none", *constant_airflow)
     # Of design supply air: colder air is denser, and servers move more of it.
     met = Conditions(np.array([23.0]), np.array([0.5]), rack_load=rng.uniform(0, 1, 6))
     sums = Hall(build_fleet(config), "f64").solve(met)
@@ -113,15 +102,11 @@ def test_power_of_a_rack_warms_the_others_by_d(tmp_path: Path) -> None:
 def test_d_holds_at_the_design_point_of_servers_with_curves(
     full_m3s: float | None, tmp_path: Path
 ) -> None:
-    overrides = ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
-                 "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
-                 f"servers.fan_full_airflow_m3s={json.dumps(full_m3s)}"]  # fmt: skip
-    matrix = random_matrix(np.random.default_rng(0), 6)
-    d_k_per_w = heat_matrix(matrix, overrides, "none", tmp_path)
-    np.savez(tmp_path / "cfd.npz", D=d_k_per_w)
-    path = json.dumps(str(tmp_path / "cfd.npz"))
-    named = [f"hall.recirculation.matrix_file={path}", "hall.recirculation.calibrate=none"]
-    sums = at_design([load_config("corrected", [*overrides, *named])])
+    airflow = f"servers.fan_full_airflow_m3s={json.dumps(full_m3s)}"
+    matrix, path = random_matrix(np.random.default_rng(0), 6), tmp_path / "cfd.npz"
+    d_k_per_w = heat_matrix(matrix, "none", tmp_path, airflow)
+    np.savez(path, D=d_k_per_w)
+    sums = at_design([hall_with(path, "none", airflow)])
     rise_k = d_k_per_w @ (sums.rack_cpu_w + sums.rack_fan_w)
     np.testing.assert_allclose(sums.rack_inlet_c - 23.0, rise_k, rtol=1e-9, atol=1e-9)
 
@@ -153,13 +138,7 @@ def test_a_matrix_that_cannot_be_is_refused(
         path.write_bytes(content)
     else:
         np.savez(path, **content)  # type: ignore[arg-type]
-    config = load_config(
-        "corrected",
-        ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
-         "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
-         f"hall.recirculation.matrix_file={json.dumps(str(path))}",
-         "hall.recirculation.calibrate=none"],
-    )  # fmt: skip
+    config = hall_with(path, "none")
     with pytest.raises(ConfigError, match=message) as error:
         build_fleet(config)
     assert "cfd.npz" in str(error.value)
@@ -167,21 +146,25 @@ def test_a_matrix_that_cannot_be_is_refused(
 
 
 def matrix_hall(path: Path, *more: str) -> DataCenterConfig:
-    return load_config(
-        "corrected",
-        ["hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=[0, 3, 3, 3, 3, 3]",
-         "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
-         f"hall.recirculation.matrix_file={json.dumps(str(path))}", *more],
-    )  # fmt: skip
+    return hall_with(path, "none", "hall.supply_approach_k=[0, 3, 3, 3, 3, 3]", *more)
 
 
 def test_files_that_are_no_matrix_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "r.npz"
     np.save(tmp_path / "one.npy", np.full((6, 6), 0.1))
-    (tmp_path / "one.npy").rename(tmp_path / "one.npz")
-    with pytest.raises(ConfigError, match=r"one\.npz: holds one array without a name; valid is an"):
-        build_fleet(matrix_hall(tmp_path / "one.npz"))
-    with pytest.raises(ConfigError, match=r"ends in '.txt'; valid are .npz and .csv"):
-        build_fleet(matrix_hall(tmp_path / "r.txt", "hall.recirculation.matrix_kind=R"))
+    (tmp_path / "one.npy").rename(path)
+    as_r, as_d = (f"hall.recirculation.matrix_kind={kind}" for kind in "RD")
+    named = tmp_path / "named.npz"
+    np.savez(named, R=np.full((6, 6), 0.01))
+    for file, overrides, message in (
+        (path, [], r"r\.npz: holds one array without a name; valid is an"),
+        (tmp_path / "r.txt", [as_r], r"ends in '.txt'; valid are .npz and .csv"),
+        (tmp_path / "none.npz", [], r"none\.npz: no such file"),
+        (tmp_path / "r.csv", [], r"a \.csv needs hall\.recirculation\.matrix_kind R or D"),
+        (named, [as_d], r"holds R, hall\.recirculation\.matrix_kind is D"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            build_fleet(matrix_hall(file, *overrides))
 
 
 def archive(path: Path, header: str, values: bytes, flag_bits: int = 0) -> bytes:
@@ -266,3 +249,5 @@ def test_settings_that_a_matrix_leaves_without_effect_are_refused(tmp_path: Path
         matrix_hall(tmp_path / "r.npz", "hall.layout.containment=0.5")
     with pytest.raises(ConfigError, match="matrix_kind D needs a matrix_file; valid without one"):
         load_config("corrected", ["hall.recirculation.matrix_kind=D"])
+    with pytest.raises(ConfigError, match=r"matrix_file needs hall\.inlet_model recirculation"):
+        load_config("tiny", ["hall.recirculation.matrix_file=r.npz"])
