@@ -18,7 +18,6 @@ from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.sim.hall_solver import Conditions, Hall
 from sdc_taichi.types import F64
 
-
 SMALL_HALL = [
     "hall.rows=2", "hall.racks_per_row=3", "hall.supply_approach_k=3",
     "hall.return_approach_k=-3", "servers.power_w=[200, 20]",
