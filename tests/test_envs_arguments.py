@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
@@ -25,10 +25,10 @@ from sdc_taichi import (
 from sdc_taichi.control import CONTROLLABLE, FixedSetpoint, GreedyCarbon, Idle, PerAgent
 from sdc_taichi.envs import IDS
 from sdc_taichi.envs.actions import BATTERY_COMMANDS
-from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT
-from sdc_taichi.envs.features import DEFAULT_FEATURES, all_features
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
+from sdc_taichi.envs.features import all_features
 from sdc_taichi.envs.reward_terms import TERMS
-from sdc_taichi.envs.rewards import REWARD_SETS, SCALES
+from sdc_taichi.envs.rewards import REWARD_SETS, SCALED_SETS
 from sdc_taichi.envs.single import SdcEnv
 from sdc_taichi.envs.vector import SdcVectorEnv
 
@@ -237,16 +237,17 @@ def test_choices_are_what_there_is() -> None:
     """A new observer, action order or agent is named in ``EnvOptions`` and the other way round."""
     assert choices("action_order") == set(BATTERY_COMMANDS)
     assert choices("agents") == set(AGENTS)
-    by_agents: list[Iterable[str]] = [COMMAND_OF_AGENT, DEFAULT_FEATURES, *SCALES.values()]
-    assert all(tuple(by_agent) == AGENTS for by_agent in by_agents)
-    assert tuple(COMMAND_OF_AGENT.values()) == CONTROLLABLE
-    can_decide = {name for names in COMMANDS_OF_AGENT.values() for name in names}
-    assert can_decide == {field.name for field in fields(Actions)}
-    assert all(COMMAND_OF_AGENT[a] == names[0] for a, names in COMMANDS_OF_AGENT.items())
+    assert tuple(AGENT_DEFINITIONS) == AGENTS
+    agents = AGENT_DEFINITIONS.values()
+    assert tuple(agent.command for agent in agents) == CONTROLLABLE
+    settable = {name for agent in agents for name in agent.commands}
+    assert settable == {field.name for field in fields(Actions)}
     assert {agent for agent in IDS.values() if agent is not None} == set(AGENTS)
     names = {feature.name for feature in all_features()}
-    assert all(set(chosen) <= names for chosen in DEFAULT_FEATURES.values())
-    assert all(set(own) <= set(TERMS) for scales in SCALES.values() for own in scales.values())
+    for agent in agents:
+        assert set(agent.features) <= names
+        assert tuple(agent.scales) == SCALED_SETS
+        assert all(set(scales) <= set(TERMS) for scales in agent.scales.values())
 
 
 @pytest.mark.parametrize("option", ["actions", "observations", "start"])

@@ -27,10 +27,9 @@ from sdc_taichi import (
 from sdc_taichi.control import PERFECT, ForecastError, View, view_maker
 from sdc_taichi.control.view import RandomWalks
 from sdc_taichi.envs import time_rows
-from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
 from sdc_taichi.envs.features import (
     CI_LEADS_H,
-    DEFAULT_FEATURES,
     WEATHER_LEADS_H,
     Feature,
     all_features,
@@ -231,8 +230,12 @@ def test_agents_get_their_part_of_the_state(episode: tuple[Observer, Seen]) -> N
         found = parts(state, observer.state_features)
         assert tuple(observed) == AGENTS
         for agent, array in observed.items():
-            assert [f.name for f in observer.features[agent]] == list(DEFAULT_FEATURES[agent])
-            want = np.concatenate([found[name] for name in DEFAULT_FEATURES[agent]], axis=1)
+            assert [f.name for f in observer.features[agent]] == list(
+                AGENT_DEFINITIONS[agent].features
+            )
+            want = np.concatenate(
+                [found[name] for name in AGENT_DEFINITIONS[agent].features], axis=1
+            )
             np.testing.assert_array_equal(array, want)
             assert array.dtype == np.float32
             assert array.flags.c_contiguous
@@ -548,7 +551,8 @@ def test_features_of_an_agent_are_those_named_in_their_order() -> None:
     options: dict[str, Any] = {"features": {"agent_bat": names}}
     observer, seen = watch(fleet_of("tiny"), 3, ci_leads_h=[0.5, 3], **options)
     assert [f.name for f in observer.features["agent_bat"]] == names
-    assert [f.name for f in observer.features["agent_ls"]] == list(DEFAULT_FEATURES["agent_ls"])
+    default = AGENT_DEFINITIONS["agent_ls"].features
+    assert [f.name for f in observer.features["agent_ls"]] == list(default)
     assert len(observer.state_features) == len(all_features())
     _, observed, state, _ = seen[-1]
     found = parts(state, observer.state_features)
@@ -708,5 +712,5 @@ def test_the_table_describes_every_feature() -> None:
         assert "{" not in cells[2]
         assert len(cells[2]) > 10
         assert [bool(cell) for cell in cells[-3:]] == [
-            feature.name in DEFAULT_FEATURES[agent] for agent in AGENTS
+            feature.name in AGENT_DEFINITIONS[agent].features for agent in AGENTS
         ]

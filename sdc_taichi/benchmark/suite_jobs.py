@@ -25,7 +25,7 @@ from sdc_taichi.benchmark.cases import (
 from sdc_taichi.benchmark.jobs import Inputs, JobResult
 from sdc_taichi.benchmark.suite import Case, Part, Row
 from sdc_taichi.control import PERFECT, ForecastError, make_controller
-from sdc_taichi.envs.agents import COMMAND_OF_AGENT
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 from sdc_taichi.learning.evaluation import (
     ALL,
     METRICS,
@@ -197,11 +197,11 @@ def _trained(task: _Task, scratch: Path, optima: Path) -> _Made:
         )
 
     agents = agents_of(settings_of(None))
-    moved = tuple(COMMAND_OF_AGENT[agent] for agent in agents)
+    moved = tuple(AGENT_DEFINITIONS[agent].command for agent in agents)
     files: dict[str, bytes] = {}
     metrics, specs = {}, []
     for agent in agents if task.row.apart else (None,):
-        part = COMMAND_OF_AGENT[agent] if agent else ""
+        part = AGENT_DEFINITIONS[agent].command if agent else ""
         folder = scratch / "training" / part
         folder.parent.mkdir(parents=True, exist_ok=True)
         done = train(settings_of(agent), folder, cache=optima)

@@ -153,9 +153,9 @@ def _environment(assigned: list[str]) -> dict[str, Any]:
 
 def _agent_of(command: str | None) -> str | None:
     """The agent that gives a command."""
-    from sdc_taichi.envs.agents import COMMAND_OF_AGENT
+    from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 
-    return next((agent for agent, own in COMMAND_OF_AGENT.items() if own == command), None)
+    return next((agent for agent, d in AGENT_DEFINITIONS.items() if d.command == command), None)
 
 
 def _names(stem: str, configs: list[DataCenterConfig]) -> list[str]:

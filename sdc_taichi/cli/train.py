@@ -179,10 +179,10 @@ def _settings(
 
 def _agents(text: str) -> list[str]:
     """Agents by the names of what they command, or by their own."""
-    from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT
+    from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 
-    by_name = {command: agent for agent, command in COMMAND_OF_AGENT.items()}
-    by_name |= {agent: agent for agent in AGENTS}
+    by_name = {d.command: agent for agent, d in AGENT_DEFINITIONS.items()}
+    by_name |= {agent: agent for agent in AGENT_DEFINITIONS}
     found = []
     for name in (part.strip() for part in text.split(",")):
         if name not in by_name:

@@ -28,7 +28,7 @@ from sdc_taichi.control import (
     view_maker,
 )
 from sdc_taichi.envs.actions import AgentActions, as_numbers
-from sdc_taichi.envs.agents import COMMAND_OF_AGENT, COMMANDS_OF_AGENT, commands_by_others
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, commands_by_others
 from sdc_taichi.envs.costs import Costs
 from sdc_taichi.envs.episodes import (
     Draw,
@@ -448,12 +448,13 @@ def _check_others(options: EnvOptions, others: Controller) -> None:
     """
     if "others" not in options.model_fields_set:
         return
-    learned = [COMMAND_OF_AGENT[agent] for agent in options.agents]
+    learning = [AGENT_DEFINITIONS[agent] for agent in options.agents]
+    learned = [definition.command for definition in learning]
     named = parts_of(options.others) if isinstance(options.others, str) else {}
-    given = {name for agent in options.agents for name in COMMANDS_OF_AGENT[agent]}
-    unused = named.keys() & set(learned) if named else set() < set(commands_of(others)) <= given
+    settable = {name for definition in learning for name in definition.commands}
+    unused = named.keys() & set(learned) if named else set() < set(commands_of(others)) <= settable
     if unused:
-        valid = [command for command in COMMAND_OF_AGENT.values() if command not in learned]
+        valid = [d.command for d in AGENT_DEFINITIONS.values() if d not in learning]
         raise ConfigError(
             f"others {controller_text(options.others)!r}: without effect on {', '.join(learned)}, "
             f"learned here; valid is for {', '.join(valid)}"

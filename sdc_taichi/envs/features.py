@@ -23,7 +23,7 @@ from gymnasium.spaces import Box
 from pydantic import Field
 
 from sdc_taichi.control.view import View, mean_setpoint_c
-from sdc_taichi.envs.agents import AGENTS
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.exogenous.year_clock import HOURS_PER_YEAR
 from sdc_taichi.plant.workload import NEGLIGIBLE_TASKS
@@ -177,42 +177,6 @@ class NotedReads:
         self.names[name] = None
         return np.ones(1)
 
-
-_CLOCK = ("time_of_day", "time_of_year")
-_CI = ("ci", "ci_forecast")
-_WEATHER = ("outdoor", "outdoor_forecast", "wet_bulb", "wet_bulb_forecast")
-DEFAULT_FEATURES: dict[str, tuple[str, ...]] = {
-    "agent_ls": (
-        *_CLOCK,
-        "workload",
-        "queue",
-        "oldest_age",
-        "mean_age",
-        "age_histogram",
-        *_CI,
-        "ci_change",
-        "outdoor",
-        "outdoor_forecast",
-        "soc",
-    ),
-    "agent_dc": (
-        *_CLOCK,
-        "workload",
-        *_CI,
-        *_WEATHER,
-        "room",
-        "hottest_inlet",
-        "setpoint",
-        "it_energy",
-        "hvac_energy",
-    ),
-    "agent_bat": (*_CLOCK, *_CI, "ci_change", "dc_load", "soc"),
-}
-"""Features that each agent observes by default.
-
-They are the paper's lists (A.1.2, A.2.4, A.3.3) with ages of the queue and weather for the load
-agent, the work to come for the cooling agent, and the change of the carbon intensity.
-"""
 
 FEATURE_OF_COMMAND = {"fan": "fan_speed", "placement": "rack_inlets"}
 """Feature that an agent observes by default because it decides a command."""
@@ -482,20 +446,20 @@ def features_by_agent(
     known: Sequence[Feature],
     commands: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, tuple[Feature, ...]]:
-    """Features of every agent; agents that are not mentioned have ``DEFAULT_FEATURES``.
+    """Features of every agent; an agent without an entry in ``chosen`` has its default features.
 
     By default, an agent also observes what the commands that it decides act on.
 
     Args:
-        chosen: names of features by agent; None changes nothing.
-        known: the features that there are.
+        chosen: names of features by agent; None leaves every agent its default features.
+        known: all features.
         commands: commands that agents decide, by agent; None is the default ones.
 
     Raises:
         ConfigError: an unknown agent or feature, a feature named twice, or no feature.
     """
-    given = dict(chosen or {})
-    for agent in given:
+    chosen = chosen or {}
+    for agent in chosen:
         if agent not in AGENTS:
             raise ConfigError(
                 f"features: unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}"
@@ -504,8 +468,8 @@ def features_by_agent(
     out: dict[str, tuple[Feature, ...]] = {}
     for agent in AGENTS:
         acted_on = [FEATURE_OF_COMMAND.get(name, "") for name in (commands or {}).get(agent, ())]
-        default = [n for n in (*DEFAULT_FEATURES[agent], *acted_on) if n in by_name]
-        names = given.get(agent, default)
+        default = [n for n in (*AGENT_DEFINITIONS[agent].features, *acted_on) if n in by_name]
+        names = chosen.get(agent, default)
         if isinstance(names, str) or not names:
             raise ConfigError(f"features of {agent}: {names!r}; valid is a list of names")
         for name in names:
@@ -568,13 +532,13 @@ def entries_of_new_features(
 
 
 def features_markdown() -> str:
-    """The table of features in docs/observations.md; a dot marks who observes what by default."""
+    """The table of features in docs/observations.md, with a dot for agents' default features."""
     lines = [
         "| feature | entries | what it is | unit | range | load | cooling | battery |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for f in all_features():
-        seen = [" " if f.name not in DEFAULT_FEATURES[agent] else "●" for agent in AGENTS]
+        seen = ["●" if f.name in a.features else " " for a in AGENT_DEFINITIONS.values()]
         cells = (f"`{f.name}`", str(f.size), f.description, f.unit, f"{f.low:g}..{f.high:g}", *seen)
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"

@@ -55,7 +55,7 @@ class Observer:
     Args:
         fleet: the data centers.
         agents: agents whose observations are wanted.
-        features: names of the features of each agent; None is ``DEFAULT_FEATURES``.
+        features: names of the features of each agent; None is the default ones.
         ci_leads_h: leads of the carbon-intensity forecast in h, rising multiples of the step.
         weather_leads_h: leads of the weather forecasts in h, rising multiples of the step.
         new_inputs: whether episodes may have other inputs than those before.

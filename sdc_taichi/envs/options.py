@@ -27,7 +27,7 @@ from sdc_taichi.config import (
 from sdc_taichi.config.electrical_schema import TariffConfig
 from sdc_taichi.control import check_controller
 from sdc_taichi.control.view import PERFECT, ForecastError
-from sdc_taichi.envs.agents import AGENTS, COMMAND_OF_AGENT, COMMANDS_OF_AGENT, Agent
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS, Agent
 from sdc_taichi.envs.features import (
     CI_LEADS_H,
     WEATHER_LEADS_H,
@@ -144,7 +144,7 @@ class EnvOptions(BaseModel):
         for agent, names in (value or {}).items():
             if agent not in AGENTS:
                 raise ValueError(f"unknown agent {agent!r}{suggestion_or_valid(agent, AGENTS)}")
-            valid = COMMANDS_OF_AGENT[agent]
+            valid = AGENT_DEFINITIONS[agent].commands
             for name in names:
                 if name not in valid:
                     raise ValueError(f"{agent}: {name!r}{suggestion_or_valid(name, valid)}")
@@ -234,7 +234,7 @@ class EnvOptions(BaseModel):
 
     def commands_of(self, agent: str) -> tuple[str, ...]:
         """Commands that an agent decides if it learns, in the order of its action."""
-        return (self.commands or {}).get(agent, (COMMAND_OF_AGENT[agent],))
+        return (self.commands or {}).get(agent, (AGENT_DEFINITIONS[agent].command,))
 
     def start_days(self) -> list[int]:
         """Days of the year, from 0, on which a sampled episode may start.

@@ -18,7 +18,7 @@ import numpy as np
 
 from sdc_taichi.config import DataCenterConfig
 from sdc_taichi.control import PERFECT, Controller, ForecastError, Idle, PerAgent
-from sdc_taichi.envs.agents import COMMAND_OF_AGENT
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS
 from sdc_taichi.errors import ConfigError, whole_number
 from sdc_taichi.learning.controller import PolicyController
 from sdc_taichi.learning.policy import Policy
@@ -499,4 +499,4 @@ def _names(
 
 def _parts(policy: Policy) -> tuple[str, ...]:
     """Of load, cooling and battery what the agents of a policy move."""
-    return tuple(COMMAND_OF_AGENT[agent] for agent in policy.interface.agents)
+    return tuple(AGENT_DEFINITIONS[agent].command for agent in policy.interface.agents)

@@ -32,8 +32,7 @@ from sdc_taichi.config import (
 )
 from sdc_taichi.config.fields import Section
 from sdc_taichi.config.reference import sections_markdown
-from sdc_taichi.envs.agents import AGENTS
-from sdc_taichi.envs.features import DEFAULT_FEATURES
+from sdc_taichi.envs.agents import AGENT_DEFINITIONS, AGENTS
 from sdc_taichi.envs.options import EnvOptions
 from sdc_taichi.errors import ConfigError, shortened, suggestion_or_valid
 from sdc_taichi.learning.algorithms import LEARNING_SETTINGS, LearningSettings
@@ -139,7 +138,7 @@ def training_environment(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def _features(agent: str, given: Mapping[str, Any]) -> tuple[str, ...]:
     """Features of an agent: its default ones, but for forecasts that others tell better."""
-    names = DEFAULT_FEATURES.get(agent, ())
+    names = AGENT_DEFINITIONS[agent].features
     if agent == "agent_dc":
         kept = [name for name in names if name != "ci_forecast"]
         return (*kept, "queue")
