@@ -1,8 +1,7 @@
+"""Batteries: reference values, ledgers, limits."""
+
 from __future__ import annotations
 
-import csv
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,14 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model_steps import battery_step
+from plant_checks import assert_batch, checks_of, floating_point_errors  # noqa: F401
 from sdc_taichi.plant.battery import BATTERIES, BatteryResult
+from test_plant_released import COMMAND_OF_CODE
 
-REFERENCE = Path(__file__).parent / "reference"
-ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
-CHECKS = [c for c in ALL if c["group"] == "battery"]
-TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
 FIELDS = BatteryResult.__slots__
-COMMAND_OF_CODE = {0: 1.0, 1: -1.0, 2: 0.0}
 
 PROPERTY = settings(max_examples=80, deadline=None, derandomize=True)
 five: dict[str, Any] = {"min_size": 5, "max_size": 5}
@@ -26,12 +22,6 @@ shares = st.lists(st.floats(0.0, 1.0, allow_subnormal=False), **five)
 commands = st.lists(st.floats(-1.0, 1.0, allow_subnormal=False), **five)
 names = st.sampled_from(sorted(BATTERIES))
 steps_h = st.sampled_from([1.0 / 12.0, 0.25, 0.5, 1.0])
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _no_floating_point_warnings() -> Any:
-    with np.errstate(all="raise", under="ignore"):
-        yield
 
 
 def run(name: str, stored_kwh: Any, command: Any, **changes: Any) -> BatteryResult:
@@ -43,7 +33,7 @@ def run(name: str, stored_kwh: Any, command: Any, **changes: Any) -> BatteryResu
     )
 
 
-# ------------------------------------------------------------------------------- reference checks
+# Reference checks
 
 
 def evaluated(check: dict[str, Any]) -> dict[str, float]:
@@ -86,36 +76,12 @@ def evaluated(check: dict[str, Any]) -> dict[str, float]:
     }
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c["id"])
+@checks_of("battery")
 def test_check(check: dict[str, Any]) -> None:
     assert evaluated(check) == pytest.approx(check["expected"], **check["tolerance"], abs=1e-15)
 
 
-@pytest.mark.parametrize("path", TRAJECTORIES, ids=lambda p: p.stem)
-def test_recorded_run(path: Path) -> None:
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
-    sizing = json.loads(path.with_suffix(".json").read_text())["sizing"]
-    capacity_kwh = 1e3 * sizing["battery_capacity_mwh"]
-    stored_kwh = np.zeros(1)
-    soc, grid_kwh = [], []
-    for row in rows:
-        result = run(
-            "released",
-            stored_kwh,
-            COMMAND_OF_CODE[int(row["action_bat"])],
-            capacity_kwh=capacity_kwh,
-            load_kw=4.0 * float(row["dc_kwh"]),
-        )
-        stored_kwh = result.stored_kwh
-        soc.append(float(stored_kwh[0]) / capacity_kwh)
-        grid_kwh.append(float(result.grid_kwh[0]))
-    assert len(rows) == 672
-    np.testing.assert_allclose(soc, [float(r["soc"]) for r in rows], rtol=1e-6, atol=0.0)
-    np.testing.assert_allclose(grid_kwh, [float(r["grid_kwh"]) for r in rows], rtol=1e-6)
-
-
-# ------------------------------------------------------------------------------------- invariants
+# Invariants
 
 
 @given(names, shares, commands, shares, steps_h, st.floats(10.0, 1e5))
@@ -133,17 +99,12 @@ def test_ledger_bounds_and_batch(
     efficiency, factor = (1.0, 1.0) if name == "released" else (0.9, 1.1)
     changes |= {"charge_efficiency": efficiency, "discharge_factor": factor}
     result = run(name, stored, command, load_kw=load_kw, **changes)
+    assert_batch(
+        result, lambda i: run(name, stored[i], np.array(command)[i], load_kw=load_kw[i], **changes)
+    )
     for field in FIELDS:
-        values = getattr(result, field)
-        assert values.shape == (5,)
-        assert values.dtype == np.float64
-        assert np.isfinite(values).all()
-        assert (values >= (-5.01e-6 if field == "battery_loss_kwh" else 0.0)).all()
-        for i in range(5):
-            single = run(
-                name, stored[i : i + 1], command[i : i + 1], load_kw=load_kw[i : i + 1], **changes
-            )
-            assert getattr(single, field)[0] == values[i]
+        least = -5.01e-6 if field == "battery_loss_kwh" else 0.0
+        assert (getattr(result, field) >= least).all()
     after = stored + efficiency * result.charge_kwh - factor * result.discharge_kwh
     tiny = 5.01e-6 if name == "released" else 1e-14 * capacity_kwh
     np.testing.assert_allclose(result.stored_kwh, after, rtol=1e-13, atol=tiny)
@@ -211,11 +172,11 @@ def test_full_battery_takes_nothing_and_an_empty_one_gives_nothing(name: str) ->
 def test_a_battery_that_gives_all_it_holds_is_empty() -> None:
     # What rounding left would count as power in the next step of an outage.
     stored_kwh = np.linspace(1.0, 2000.0, 997)
-    found = run("clc", stored_kwh, -1.0, load_kw=1e9, lower_u_h=0.0, discharge_limit_c_rate=1e9)
-    assert not np.any(found.stored_kwh)
+    emptied = run("clc", stored_kwh, -1.0, load_kw=1e9, lower_u_h=0.0, discharge_limit_c_rate=1e9)
+    assert not np.any(emptied.stored_kwh)
 
 
-# -------------------------------------------------------------------------------- single equations
+# Single equations
 
 
 @given(shares, steps_h)
@@ -223,27 +184,16 @@ def test_a_battery_that_gives_all_it_holds_is_empty() -> None:
 def test_clc_ends_the_step_within_its_limits(soc: list[float], dt_h: float) -> None:
     limits = {"upper_v": 0.9, "lower_v": 0.2, "upper_u_h": -0.05, "lower_u_h": 0.02, "dt_h": dt_h}
     stored = 2000.0 * np.array(soc)
-    up = run("clc", stored, 1.0, load_kw=1e9, **limits)
-    moved = up.charge_kwh > 0.0
-    assert (moved == (stored < 1800.0)).all()
-    power_kw = up.charge_kwh / dt_h
-    assert (power_kw <= 3.0 * 2000.0 / 0.97 + 1e-6).all()
-    rate_limited = np.isclose(power_kw, 3.0 * 2000.0 / 0.97)
-    ends_at = 1800.0 - 0.05 * power_kw
-    on_limit = moved & ~rate_limited
-    np.testing.assert_allclose(up.stored_kwh[on_limit], ends_at[on_limit], rtol=1e-9)
-    assert (up.stored_kwh[moved] <= ends_at[moved] + 1e-6).all()
-
-    down = run("clc", stored, -1.0, load_kw=1e9, **limits)
-    moved = down.discharge_kwh > 0.0
-    assert (moved == (stored > 400.0)).all()
-    power_kw = down.discharge_kwh / dt_h
-    assert (power_kw <= 3.0 * 2000.0 / 1.04 + 1e-6).all()
-    rate_limited = np.isclose(power_kw, 3.0 * 2000.0 / 1.04)
-    ends_at = 400.0 + 0.02 * power_kw
-    on_limit = moved & ~rate_limited
-    np.testing.assert_allclose(down.stored_kwh[on_limit], ends_at[on_limit], rtol=1e-9)
-    assert (down.stored_kwh[moved] >= ends_at[moved] - 1e-6).all()
+    for sign, rate, end, slope in ((1.0, 1 / 0.97, 1800.0, -0.05), (-1.0, 1 / 1.04, 400.0, 0.02)):
+        result = run("clc", stored, sign, load_kw=1e9, **limits)
+        moved_kwh = result.charge_kwh + result.discharge_kwh
+        moved, power_kw = moved_kwh > 0.0, moved_kwh / dt_h
+        assert (moved == (sign * stored < sign * end)).all()
+        assert (power_kw <= 3.0 * 2000.0 * rate + 1e-6).all()
+        rate_limited = np.isclose(power_kw, 3.0 * 2000.0 * rate)
+        ends_at, on_limit = end + slope * power_kw, moved & ~rate_limited
+        np.testing.assert_allclose(result.stored_kwh[on_limit], ends_at[on_limit], rtol=1e-9)
+        assert (sign * (result.stored_kwh - ends_at)[moved] <= 1e-6).all()
 
 
 def test_clc_rate_limits_are_rates_of_the_store() -> None:
@@ -330,16 +280,16 @@ def test_the_grid_limit_is_kept_as_far_as_the_battery_can(
     stored, load_kw = np.array(soc) * 2000.0, np.array(load) * 2e4
     free = run(name, stored, command, load_kw=load_kw)
     empty = run(name, stored, -1.0, load_kw=load_kw)
-    found = run(name, stored, command, load_kw=load_kw, grid_limit_kw=limit_kw)
+    limited = run(name, stored, command, load_kw=load_kw, grid_limit_kw=limit_kw)
     # Charging gives way to the load; a load above the limit draws on the battery, asked or not.
     room_kwh = np.maximum(limit_kw - load_kw, 0.0) * 0.25
-    np.testing.assert_array_equal(found.charge_kwh, np.minimum(free.charge_kwh, room_kwh))
+    np.testing.assert_array_equal(limited.charge_kwh, np.minimum(free.charge_kwh, room_kwh))
     missing_kwh = np.maximum(load_kw - limit_kw, 0.0) * 0.25
     expected_kwh = np.maximum(free.discharge_kwh, np.minimum(missing_kwh, empty.discharge_kwh))
-    np.testing.assert_allclose(found.discharge_kwh, expected_kwh, rtol=1e-12, atol=1e-9)
-    over_kwh = found.grid_kwh - limit_kw * 0.25
-    exhausted = np.isclose(found.discharge_kwh, empty.discharge_kwh, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(limited.discharge_kwh, expected_kwh, rtol=1e-12, atol=1e-9)
+    over_kwh = limited.grid_kwh - limit_kw * 0.25
+    exhausted = np.isclose(limited.discharge_kwh, empty.discharge_kwh, rtol=1e-12, atol=1e-9)
     assert np.all((over_kwh <= 1e-9) | exhausted)
     np.testing.assert_allclose(
-        found.grid_kwh, load_kw * 0.25 + found.charge_kwh - found.discharge_kwh, rtol=1e-12
+        limited.grid_kwh, load_kw * 0.25 + limited.charge_kwh - limited.discharge_kwh, rtol=1e-12
     )

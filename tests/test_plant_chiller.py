@@ -1,8 +1,7 @@
+"""Chillers: reference values, energy balances, curves and their bounds."""
+
 from __future__ import annotations
 
-import csv
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,14 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model_steps import chiller_step
+from plant_checks import assert_batch, checks_of, floating_point_errors  # noqa: F401
 from sdc_taichi.plant import chiller
 from sdc_taichi.plant.chiller import CHILLERS, ChillerResult
 
-REFERENCE = Path(__file__).parent / "reference"
-ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
-CHECKS = [c for c in ALL if c["group"] == "chiller"]
-DC_CHECKS = [c for c in ALL if c["group"] == "dc" and "P_comp" in c["expected"]]
-TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
 FIELDS = ChillerResult.__slots__
 CURVES = (
     "centrifugal_vsd",
@@ -36,12 +31,6 @@ temperatures = st.lists(st.floats(-60.0, 80.0, allow_subnormal=False), min_size=
 names = st.sampled_from(sorted(CHILLERS))
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _no_floating_point_warnings() -> Any:
-    with np.errstate(all="raise", under="ignore"):
-        yield
-
-
 def run(name: str, load_w: Any, **changes: Any) -> ChillerResult:
     arguments: dict[str, Any] = {
         "reference_w": 1e6,
@@ -53,7 +42,7 @@ def run(name: str, load_w: Any, **changes: Any) -> ChillerResult:
     return chiller_step(name, np.asarray(load_w, float), **{**arguments, **changes})
 
 
-# ------------------------------------------------------------------------------- reference checks
+# Reference checks
 
 
 def evaluated(check: dict[str, Any]) -> dict[str, float]:
@@ -102,7 +91,7 @@ def evaluated(check: dict[str, Any]) -> dict[str, float]:
     }
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c["id"])
+@checks_of("chiller")
 def test_check(check: dict[str, Any]) -> None:
     # DeltaTemp is an intermediate of Chiller:Electric; the capacity ratio is a function of it.
     expected = {k: v for k, v in check["expected"].items() if k != "DeltaTemp"}
@@ -110,57 +99,24 @@ def test_check(check: dict[str, Any]) -> None:
     assert {k: got[k] for k in expected} == pytest.approx(expected, **check["tolerance"], abs=1e-6)
 
 
-@pytest.mark.parametrize("check", DC_CHECKS, ids=lambda c: c["id"])
-def test_compressor_of_the_released_code(check: dict[str, Any]) -> None:
-    result = run(
-        "released",
-        check["expected"]["Q_cool"],
-        reference_w=2307120.481120018,
-        outdoor_c=check["inputs"]["ambient_C"],
-        reference_cop=3.0,
-    )
-    assert float(result.power_w) == pytest.approx(check["expected"]["P_comp"], rel=1e-6)
-
-
-@pytest.mark.parametrize("path", TRAJECTORIES, ids=lambda p: p.stem)
-def test_compressor_along_a_recorded_run(path: Path) -> None:
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
-    sizing = json.loads(path.with_suffix(".json").read_text())["sizing"]
-    cooling_w = np.array([float(r["crac_cooling_w"]) for r in rows])
-    result = run(
-        "released",
-        cooling_w,
-        reference_w=sizing["ct_rated_load_w"],
-        outdoor_c=np.array([float(r["dry_bulb_c"]) for r in rows]),
-        reference_cop=3.0,
-    )
-    recorded_w = 1e3 * np.array([float(r["compressor_kw"]) for r in rows])
-    np.testing.assert_allclose(result.power_w, recorded_w, rtol=1e-6)
-    np.testing.assert_array_equal(result.rejected_w, cooling_w)
-
-
-# ------------------------------------------------------------------------------------- invariants
+# Invariants
 
 
 @given(names, loads, temperatures, temperatures, temperatures)
 @PROPERTY
-def test_energy_balance_and_bounds(
+def test_energy_balance_bounds_and_batch(
     name: str, load: list[float], chilled: list[float], condenser: list[float], air: list[float]
 ) -> None:
-    result = run(
-        name,
-        load,
-        chilled_water_c=np.array(chilled),
-        condenser_c=np.array(condenser),
-        outdoor_c=np.array(air),
-    )
-    for field in FIELDS:
-        values = getattr(result, field)
-        assert values.shape == (5,)
-        assert values.dtype == np.float64
-        assert np.isfinite(values).all()
-        assert (values >= 0.0).all()
+    loads_w = np.array(load)
+    places = {
+        "chilled_water_c": np.array(chilled),
+        "condenser_c": np.array(condenser),
+        "outdoor_c": np.array(air),
+        "reference_w": 1e6 + np.array(air),
+    }
+    result = run(name, loads_w, **places)
+    assert_batch(result, lambda i: run(name, loads_w[i], **{k: v[i] for k, v in places.items()}))
+    assert all((getattr(result, field) >= 0.0).all() for field in FIELDS)
     np.testing.assert_allclose(result.evaporator_w + result.unmet_w, load, rtol=1e-12)
     np.testing.assert_allclose(result.cop * result.power_w, result.evaporator_w, rtol=1e-12)
     np.testing.assert_allclose(result.plr * result.available_w, result.evaporator_w, rtol=1e-12)
@@ -169,22 +125,6 @@ def test_energy_balance_and_bounds(
         np.testing.assert_allclose(
             result.rejected_w, result.evaporator_w + result.power_w, rtol=1e-12
         )
-
-
-@given(names, loads, temperatures, temperatures, temperatures)
-@PROPERTY
-def test_batch_equals_each_alone(
-    name: str, load: list[float], chilled: list[float], condenser: list[float], air: list[float]
-) -> None:
-    places = [
-        {"chilled_water_c": t, "condenser_c": c, "outdoor_c": o, "reference_w": 1e6 + o}
-        for t, c, o in zip(chilled, condenser, air, strict=True)
-    ]
-    batch = run(name, load, **{k: np.array([p[k] for p in places]) for k in places[0]})
-    for i, place in enumerate(places):
-        single = run(name, load[i : i + 1], **{k: np.array([v]) for k, v in place.items()})
-        for field in FIELDS:
-            assert getattr(single, field)[0] == getattr(batch, field)[i]
 
 
 @given(names, st.floats(4.0, 20.0), st.floats(5.0, 40.0))
@@ -233,7 +173,7 @@ def test_machine_cycles_below_its_least_load(name: str) -> None:
     assert run(name, least_w * 2.0).power_w < 2.0 * at_least * (1.0 - 1e-3)
 
 
-# -------------------------------------------------------------------------------- single equations
+# Single equations
 
 
 @pytest.mark.parametrize("name", ["centrifugal_vsd", "carnot"])

@@ -1,24 +1,20 @@
+"""Fans, pumps, economiser and coils."""
+
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from plant_checks import floating_point_errors  # noqa: F401
 from sdc_taichi import Simulator, drivers_from_arrays, load_config
 from sdc_taichi.plant import fans_pumps
 from sdc_taichi.plant.water_side import coil_range_ratio, economiser_share
 
 PROPERTY = settings(max_examples=80, deadline=None, derandomize=True)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _no_floating_point_warnings() -> Any:
-    with np.errstate(all="raise", under="ignore"):
-        yield
 
 
 def test_constants_of_the_released_code() -> None:

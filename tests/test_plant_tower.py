@@ -1,8 +1,7 @@
+"""Cooling towers: reference values, YorkCalc, fans."""
+
 from __future__ import annotations
 
-import csv
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,16 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from plant_checks import assert_batch, checks_of, floating_point_errors  # noqa: F401
 from sdc_taichi.errors import SdcError
 from sdc_taichi.plant import tower
 from sdc_taichi.plant.tower import TOWERS, TowerPoint, TowerResult
-
-REFERENCE = Path(__file__).parent / "reference"
-ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
-CHECKS = [c for c in ALL if c["group"] == "tower"]
-DC_CHECKS = [c for c in ALL if c["group"] == "dc" and "P_ct" in c["expected"]]
-TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
-FIELDS = TowerResult.__slots__
 
 PROPERTY = settings(max_examples=60, deadline=None, derandomize=True)
 wet_bulbs = st.floats(-34.4, 26.7)
@@ -33,12 +26,6 @@ REFERENCE_WATER_KG_S = float(
     tower.yorkcalc_reference_water_kg_s(WATER_KG_S, wet_bulb_c=25.55, range_k=5.56, approach_k=3.89)
 )
 DESIGN_FAN_W = 2e4
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _no_floating_point_warnings() -> Any:
-    with np.errstate(all="raise", under="ignore"):
-        yield
 
 
 def run(name: str, heat_w: Any, **changes: Any) -> TowerResult:
@@ -56,7 +43,7 @@ def run(name: str, heat_w: Any, **changes: Any) -> TowerResult:
     return TOWERS[name].step(np.asarray(heat_w, float), TowerPoint(**{**arguments, **changes}))
 
 
-# ------------------------------------------------------------------------------- reference checks
+# Reference checks
 
 
 def evaluated(check: dict[str, Any]) -> dict[str, Any]:
@@ -78,7 +65,7 @@ def evaluated(check: dict[str, Any]) -> dict[str, Any]:
     return {"approach_K": float(approach)}
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c["id"])
+@checks_of("tower")
 def test_check(check: dict[str, Any]) -> None:
     got = evaluated(check)
     assert got.keys() == check["expected"].keys()
@@ -86,36 +73,7 @@ def test_check(check: dict[str, Any]) -> None:
         assert got[name] == pytest.approx(np.asarray(expected), **check["tolerance"])
 
 
-@pytest.mark.parametrize("check", DC_CHECKS, ids=lambda c: c["id"])
-def test_fan_of_the_released_code(check: dict[str, Any]) -> None:
-    result = run(
-        "released",
-        check["expected"]["Q_cool"],
-        outdoor_c=check["inputs"]["ambient_C"],
-        supply_setpoint_c=check["inputs"]["setpoint_C"],
-        design_fan_w=2307120.481120018,
-    )
-    assert float(result.fan_w) == pytest.approx(check["expected"]["P_ct"], rel=1e-6)
-
-
-@pytest.mark.parametrize("path", TRAJECTORIES, ids=lambda p: p.stem)
-def test_fan_along_a_recorded_run(path: Path) -> None:
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
-    sizing = json.loads(path.with_suffix(".json").read_text())["sizing"]
-    column = {k: np.array([float(r[k]) for r in rows]) for k in rows[0]}
-    result = run(
-        "released",
-        column["crac_cooling_w"],
-        outdoor_c=column["dry_bulb_c"],
-        supply_setpoint_c=column["setpoint_c"],
-        reference_air_m3s=sizing["ct_reference_air_flow_m3_s"],
-        design_fan_w=sizing["ct_rated_load_w"],
-    )
-    np.testing.assert_allclose(result.fan_w, 1e3 * column["ct_kw"], rtol=1e-6)
-
-
-# ---------------------------------------------------------------------------------------- YorkCalc
+# YorkCalc
 
 
 @given(wet_bulbs, ranges, st.floats(0.05, 8.0))
@@ -192,14 +150,8 @@ def test_heat_balance_bounds_and_batch(
     wet, outdoor = np.array(wet_bulb), np.array(wet_bulb) + 3.0
     changes = {"wet_bulb_c": wet, "outdoor_c": outdoor, "condenser_setpoint_c": np.array(setpoint)}
     result = run(name, heat, **changes)
-    for field in FIELDS:
-        values = getattr(result, field)
-        assert values.shape == (5,)
-        assert values.dtype == np.float64
-        assert np.isfinite(values).all()
-        for i in range(5):
-            single = run(name, heat[i : i + 1], **{k: v[i : i + 1] for k, v in changes.items()})
-            assert getattr(single, field)[0] == values[i]
+    heat_w = np.array(heat)
+    assert_batch(result, lambda i: run(name, heat_w[i], **{k: v[i] for k, v in changes.items()}))
     np.testing.assert_allclose(result.range_k * WATER_KG_S * 4184.0, heat, rtol=1e-12)
     np.testing.assert_allclose(result.leaving_c - wet, result.approach_k, rtol=1e-12, atol=1e-12)
     assert (result.fan_w >= 0.0).all()
@@ -308,7 +260,7 @@ def test_no_step_at_five_degrees() -> None:
     assert released[1] > 50.0
 
 
-# ------------------------------------------------------------------------- air-side towers
+# Air-side towers
 
 
 def test_released_airflow_carries_the_heat_up_to_full_speed() -> None:

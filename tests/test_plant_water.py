@@ -1,8 +1,7 @@
+"""Make-up water: reference values, balances, climates."""
+
 from __future__ import annotations
 
-import csv
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,25 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from plant_checks import assert_batch, checks_of, floating_point_errors  # noqa: F401
 from sdc_taichi.exogenous import psychrometrics
 from sdc_taichi.plant import moist_air
 from sdc_taichi.plant.water import WATER, WaterPoint, WaterUse
 
-REFERENCE = Path(__file__).parent / "reference"
-ALL = json.loads((REFERENCE / "physics_checks.json").read_text())["checks"]
-CHECKS = [c for c in ALL if c["group"] == "water"]
-DC_CHECKS = [c for c in ALL if c["group"] == "dc" and "water_L_15min" in c["expected"]]
-TRAJECTORIES = sorted((REFERENCE / "trajectories").glob("*.csv"))
 FIELDS = WaterUse.__slots__
 
 PROPERTY = settings(max_examples=80, deadline=None, derandomize=True)
 five: dict[str, Any] = {"min_size": 5, "max_size": 5}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _no_floating_point_warnings() -> Any:
-    with np.errstate(all="raise", under="ignore"):
-        yield
 
 
 def run(name: str, **changes: Any) -> WaterUse:
@@ -80,34 +69,9 @@ def evaluated(check: dict[str, Any]) -> dict[str, float]:
     }
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c["id"])
+@checks_of("water")
 def test_check(check: dict[str, Any]) -> None:
     assert evaluated(check) == pytest.approx(check["expected"], **check["tolerance"])
-
-
-@pytest.mark.parametrize("check", DC_CHECKS, ids=lambda c: c["id"])
-def test_water_of_the_released_code(check: dict[str, Any]) -> None:
-    result = run(
-        "released",
-        wet_bulb_c=check["inputs"]["wet_bulb_C"],
-        return_c=check["expected"]["T_ret"],
-        supply_setpoint_c=check["inputs"]["setpoint_C"],
-    )
-    assert float(result.water_l) == pytest.approx(check["expected"]["water_L_15min"], rel=1e-9)
-
-
-@pytest.mark.parametrize("path", TRAJECTORIES, ids=lambda p: p.stem)
-def test_water_along_a_recorded_run(path: Path) -> None:
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
-    column = {k: np.array([float(r[k]) for r in rows]) for k in rows[0]}
-    result = run(
-        "released",
-        wet_bulb_c=column["wet_bulb_c"],
-        return_c=column["return_c"],
-        supply_setpoint_c=column["setpoint_c"],
-    )
-    np.testing.assert_allclose(result.water_l, column["water_l"], rtol=1e-6)
 
 
 @given(
@@ -136,16 +100,9 @@ def test_balance_and_batch(
         rtol=1e-12,
         atol=1e-12,
     )
-    for field in FIELDS:
-        values = getattr(result, field)
-        assert values.shape == (5,)
-        assert values.dtype == np.float64
-        assert np.isfinite(values).all()
-        if name != "paper":
-            assert (values >= -1e-12).all()
-        for i in range(5):
-            single = run(name, **{k: v[i : i + 1] for k, v in changes.items()})
-            assert getattr(single, field)[0] == values[i]
+    assert_batch(result, lambda i: run(name, **{k: v[i] for k, v in changes.items()}))
+    if name != "paper":
+        assert all((getattr(result, field) >= -1e-12).all() for field in FIELDS)
 
 
 @given(st.floats(1e3, 1e7), st.floats(1.5, 10.0), st.floats(1e-3, 22.0))
