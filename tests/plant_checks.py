@@ -22,7 +22,7 @@ TRAJECTORIES = sorted(path.stem for path in (REFERENCE / "trajectories").glob("*
 """Names of the recorded runs of the released code."""
 
 
-def checks_of(group: str) -> Any:
+def checks_of(group: str) -> pytest.MarkDecorator:
     """Parametrise a test by the reference checks of a device, as ``check``."""
     chosen = [check for check in ALL_CHECKS if check["group"] == group]
     return pytest.mark.parametrize("check", chosen, ids=[check["id"] for check in chosen])
