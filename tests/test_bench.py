@@ -8,7 +8,6 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -62,26 +61,6 @@ def test_all_parts_are_measured_and_speed_is_judged_by_ratios(written: dict[str,
     assert all(f["unit"] == "relative" and f["met"] for f in judged)
 
 
-def test_yardsticks_of_a_call_are_shares_of_its_own_core_time(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    yardsticks = importlib.import_module("yardsticks")
-    clock_s = [0.0]
-    monkeypatch.setattr(yardsticks.time, "process_time", lambda: clock_s[0])
-    monkeypatch.setattr(yardsticks.time, "perf_counter", lambda: clock_s[0])
-
-    def call(seconds: float) -> Callable[[], None]:
-        def run() -> None:
-            clock_s[0] += seconds
-
-        return run
-
-    ratios = yardsticks.core_ratios({"a": call(3e-3), "b": call(5e-4)}, call(1e-3), 3)
-    assert ratios == pytest.approx({"a": 3.0, "b": 0.5})
-    assert yardsticks.interpreter_loop(rounds=2)() == [False, False]
-
-
 @pytest.mark.parametrize("peer", ["numba", "c"])
 @pytest.mark.parametrize("each_its_own", [False, True])
 def test_peers_compute_what_the_kernel_computes(
@@ -111,29 +90,3 @@ def test_peers_compute_what_the_kernel_computes(
     ):
         theirs, ours = given.racks[:, column], getattr(sums, f"rack_{name}")
         np.testing.assert_allclose(theirs, ours, rtol=2e-6, err_msg=name)
-
-
-@pytest.mark.parametrize(
-    ("at_most", "at_least", "value", "met"),
-    [
-        (1.3, None, 1.3, True),
-        (1.3, None, 1.4, False),
-        (None, 0.75, 0.75, True),
-        (None, 0.75, 0.7, False),
-        (None, None, 1.0, None),
-        (1.3, None, None, None),
-    ],
-)
-def test_targets_are_met_or_not(
-    monkeypatch: pytest.MonkeyPatch,
-    at_most: float | None,
-    at_least: float | None,
-    value: float | None,
-    met: bool | None,
-) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    figure = importlib.import_module("bench").Figure(
-        "kernel", "x", value, at_most=at_most, at_least=at_least
-    )
-    assert figure.met(quick=False) is met
-    assert figure.met(quick=True) is None

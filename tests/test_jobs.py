@@ -19,7 +19,7 @@ import pytest
 import toy_jobs
 from sdc_taichi.benchmark import executors
 from sdc_taichi.benchmark.executors import Executor, JobSummary, LocalProcesses, run_jobs
-from sdc_taichi.benchmark.jobs import Job, digest_of, run_job
+from sdc_taichi.benchmark.jobs import Job, digest_of
 from sdc_taichi.benchmark.store import ResultStore, Study, partition_path
 from sdc_taichi.errors import ConfigError, SdcError, SdcWarning
 
@@ -145,22 +145,6 @@ def test_a_job_that_fails_is_one_line_and_the_others_are_done(tmp_path: Path) ->
     assert "no_such_function" in errors["toy/c/no_such_function/3"]
     assert "input optimum is missing" in errors["toy/c/draw/4"]
     assert len(list(ResultStore(tmp_path).results())) == 2
-
-
-@pytest.mark.parametrize(
-    ("kind", "said"),
-    [
-        ("partition", "number is a column of the partition"),
-        ("mixed", "unexpected"),
-        ("object", "unexpected"),
-        ("path", "'../../x'"),
-        ("metrics", "'metrics.json'"),
-    ],
-)
-def test_a_result_that_cannot_be_kept_is_an_error_of_its_job(kind: str, said: str) -> None:
-    done = run_job(toy_jobs.job("bad_result", 0, kind=kind), {})
-    assert said in done.error
-    assert not done.files
 
 
 def test_warnings_of_jobs_are_issued_again(tmp_path: Path) -> None:
@@ -323,15 +307,6 @@ def test_a_full_disk_is_one_line_and_the_study_can_go_on(tmp_path: Path) -> None
         signal.signal(signal.SIGXFSZ, handler)
     assert not list(store.results())
     assert run(jobs, tmp_path).done == 2
-
-
-def test_values_of_partitions_are_quoted() -> None:
-    path = partition_path({"controller": "load=a,battery=b", "month": "07"})
-    assert path == Path("controller=load%3Da%2Cbattery%3Db/month=07")
-    assert partition_path({"a": ".."}) == Path("a=..")
-    for partition in ({"a": ""}, {"a/b": "1"}, {"": "1"}, {"a": "é" * 90}):
-        with pytest.raises(ConfigError):
-            partition_path(partition)
 
 
 @pytest.mark.parametrize("name", ["", "/a", "../a", "a/../b", ".hidden", "metrics.json", "a\\b"])

@@ -73,16 +73,6 @@ def test_minari_loads_it_and_its_environment_gives_it_again(root: Path) -> None:
     env.close()
 
 
-def test_plain_h5py_reads_it(root: Path) -> None:
-    with h5py.File(root / ID / "data" / "main_data.hdf5") as file:
-        assert set(file) == {f"episode_{i}" for i in range(4)}
-        episode = file["episode_0"]
-        assert episode["observations"].shape == (97, 58)
-        assert episode["actions"].shape == (96, 3)
-        assert episode["actions"].dtype == np.float32
-        assert (episode.attrs["controller"], episode.attrs["week"]) == ("g36", 0)
-
-
 def test_scores_are_0_for_idle_commands_and_1_for_the_optimum(root: Path) -> None:
     data = minari.load_dataset(ID)
     best = np.mean([episode.rewards.sum() for episode in list(data)[2:]])

@@ -75,18 +75,6 @@ def publisher(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("benchmark")
 
 
-def test_commands_are_shown_without_what_differs_from_run_to_run(publisher: ModuleType) -> None:
-    for text in (
-        "--out /a/b --resume --jobs 2",
-        "--out=c --rows idle,g36 --cases=eight-sites",
-        "--ray --quiet",
-        "--ray auto",
-        "",
-    ):
-        shown = publisher.command_of(f"sdc-taichi benchmark bill {text} --seeds 5")
-        assert shown == "sdc-taichi benchmark bill --seeds 5"
-
-
 @pytest.fixture
 def docs(tmp_path: Path) -> Path:
     folder = tmp_path / "docs"

@@ -22,7 +22,7 @@ from sdc_taichi.benchmark.jobs import Job, digest_of
 from sdc_taichi.benchmark.ray_cluster import RayCluster
 from sdc_taichi.benchmark.store import ResultStore
 from sdc_taichi.errors import ConfigError, RuntimeStateError
-from test_jobs import STUDY, content_of, draws, run
+from test_jobs import content_of, draws
 
 pytest.importorskip("ray", reason="ray is not installed: make test-train")
 
@@ -140,43 +140,6 @@ def test_jobs_that_fail_do_so_in_one_line_each_and_alone(
     assert failed.pop("toy/c/divide/1").startswith("ZeroDivisionError: ")
     assert list(failed) == ["toy/c/killed/1"]
     assert failed["toy/c/killed/1"].startswith("Ray could not finish it: The worker died")
-
-
-def test_a_node_that_is_removed_loses_nothing(
-    tmp_path: Path, nodes: Any, cluster: RayCluster
-) -> None:
-    more = [nodes.add_node(num_cpus=2)]
-    begun = tmp_path / "begun"
-    begun.mkdir()
-    jobs = [toy_jobs.job("noted", i, folder=str(begun), seconds=1.0) for i in range(6)]
-
-    def remove() -> bool:
-        """Remove the node once a job has begun there."""
-        if more and list(begun.glob(f"{more[0].all_processes['raylet'][0].process.pid}-*")):
-            nodes.remove_node(more.pop(), allow_graceful=False)
-        return False
-
-    done = run_jobs(jobs, ResultStore(tmp_path / "ray"), cluster, stop=remove)
-    assert done == JobSummary(6, 0, (), True)
-    assert not more
-    assert len(list(begun.iterdir())) > 6
-    run_jobs(jobs, ResultStore(tmp_path / "here"), Executor())
-    assert content_of(tmp_path / "here") == content_of(tmp_path / "ray")
-
-
-def test_a_driver_that_is_killed_goes_on_where_it_was(
-    tmp_path: Path, nodes: Any, cluster: RayCluster
-) -> None:
-    with driver(tmp_path / "ray", nodes.address) as process:
-        process.kill()
-    jobs = draws(8, seconds=0.3)
-    store = ResultStore(tmp_path / "ray")
-    with store.claimed(STUDY, resume=True):
-        done = run_jobs(jobs, store, cluster)
-    assert min(done.kept, done.done) > 0
-    assert (done.done + done.kept, done.failed, done.is_whole) == (8, (), True)
-    run(jobs, tmp_path / "here")
-    assert content_of(tmp_path / "here") == content_of(tmp_path / "ray")
 
 
 def test_stopping_leaves_jobs_for_the_next_time(tmp_path: Path, cluster: RayCluster) -> None:

@@ -21,7 +21,6 @@ from sdc_taichi.benchmark.suite import (
     make_suite,
     suite_names,
 )
-from sdc_taichi.benchmark.suite_jobs import packed
 from sdc_taichi.benchmark.suite_run import reference_jobs, row_jobs, run_suite, study_of
 from sdc_taichi.errors import SdcError
 from sdc_taichi.learning.policy import About, Policy
@@ -164,19 +163,6 @@ def test_the_quick_form_takes_the_place_of_values_and_leaves_rows_out(tmp_path: 
     assert make_suite(yaml.safe_load(found.to_yaml())) == found
 
 
-def test_the_longest_trainings_begin_first() -> None:
-    rows = {f"a{n}": {"train": {"algorithm": "ppo", "steps": n}} for n in (40000, "2e6", 100000)}
-    suite, seen = small(seeds=1, rows={"idle": {"controller": "idle"}, **rows}), []
-
-    def stage(name: str, jobs: Sequence[Job], _: int, __: Inputs | None = None) -> JobSummary:
-        seen.append((name, [job.partition["row"] for job in jobs]))
-        return JobSummary(0, 0, (), True)
-
-    run_suite(suite, ResultStore(Path("nowhere")), stage)
-    assert [name for name, _ in seen] == ["optima", "rows"]
-    assert seen[1][1] == ["a2e6", "a100000", "a40000", "idle"]
-
-
 def test_the_test_may_be_of_other_data_centers() -> None:
     other = {"sites": ["TX"], "overrides": {"site": {"seed": 3}}}
     suite = small(**case(test=other))
@@ -259,15 +245,6 @@ def test_a_reference_has_the_same_bits_again(store: ResultStore) -> None:
     kept = store.result(job.partition)
     assert kept.metrics == again.metrics
     assert {name: digest_of(x) for name, x in again.files.items()} == kept.files_sha256
-
-
-def test_an_optimum_that_is_not_among_the_solved_ones_is_solved_with_a_warning() -> None:
-    suite = small(**case(sites=["NY"]), rows={"idle": {"controller": "idle"}})
-    (reference,) = reference_jobs(suite)
-    (job,) = row_jobs(suite, [reference])
-    done = run_job(job, {reference.name: packed({})})
-    assert not done.error
-    assert "solved anew" in done.warnings[0]
 
 
 def test_a_row_whose_optimum_failed_fails_with_one_line(tmp_path: Path) -> None:

@@ -52,31 +52,12 @@ def warn(values: Mapping[str, Any], _inputs: Mapping[str, bytes]) -> JobResult:
     return JobResult(None, {})
 
 
-def bad_result(values: Mapping[str, Any], _inputs: Mapping[str, bytes]) -> JobResult:
-    """Results that cannot be kept."""
-    rows = {
-        "partition": pd.DataFrame({"number": [1]}),
-        "mixed": pd.DataFrame({"a": [1, "x", b"y"]}),
-    }
-    files = {"path": {"../../x": b""}, "metrics": {"metrics.json": b""}}
-    kind = values["kind"]
-    return JobResult(
-        rows.get(kind), {"x": object() if kind == "object" else 1}, files.get(kind, {})
-    )
-
-
 def killed_once(values: Mapping[str, Any], inputs: Mapping[str, bytes]) -> JobResult:
     """Kill the process the first time."""
     mark = Path(values["mark"])
     if not mark.exists():
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return draw(values, inputs)
-
-
-def noted(values: Mapping[str, Any], inputs: Mapping[str, bytes]) -> JobResult:
-    """Leave a file with what has started the process, and the process, and draw."""
-    Path(values["folder"], f"{os.getppid()}-{os.getpid()}-{values['number']}").touch()
     return draw(values, inputs)
 
 
