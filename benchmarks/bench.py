@@ -61,7 +61,7 @@ class Figure:
     absolute: str = ""
     """Time or rate of this machine behind a ratio, with its unit, such as ``259 us/step``."""
     note: str = ""
-    """Why there is no value, or how the value was found."""
+    """Why there is no value, or how the value was measured."""
 
     @property
     def target(self) -> str:
@@ -128,20 +128,20 @@ def kernel_and_peers(quick: bool) -> Iterator[Figure]:
 
 def beside_peers(name: str, fleet: Fleet, threads: int, rounds: int) -> Iterator[Figure]:
     """Figures of one fleet: medians over the rounds of times and of their ratios."""
-    alike, met = fleet.groups < fleet.servers, steps.conditions(fleet)
+    alike, conditions = fleet.groups < fleet.servers, steps.conditions(fleet)
     hall = Hall(fleet, "f32")
-    sums, layers = hall.solve(met), hall.servers()
+    sums, layers = hall.solve(conditions), hall.servers()
     reduction, whole = steps.stepped(fleet)
     calls = {"roof": plain_store(fleet.servers), "reduction": reduction, "step": whole}
     peers = {}
     for peer, make in PEERS.items():
-        given = Arguments(fleet, met)
+        arguments = Arguments(fleet, conditions)
         try:
-            calls[peer] = make(given, threads)
+            calls[peer] = make(arguments, threads)
         except MissingError as error:
             yield Figure("kernel", f"{name}: {peer}", None, note=f"skipped: {error}")
         else:
-            peers[peer] = given
+            peers[peer] = arguments
     spent_s = core_s(calls, rounds)
 
     def each(what: str, called: str) -> Figure:
@@ -161,22 +161,22 @@ def beside_peers(name: str, fleet: Fleet, threads: int, rounds: int) -> Iterator
         limits = (at_most, at_least) if alike else ()
         yield Figure("kernel", f"{name}: {called}", over(what, other), "", *limits)
     slowest = 1.6 if alike else 2.2
-    for peer, given in peers.items():
+    for peer, arguments in peers.items():
         where = f"{name}: {peer}"
         yield each(peer, peer)
         yield Figure("kernel", f"{where}, ours over it", over("step", peer), at_most=slowest)
         summed = np.stack([sums.cpu_w, sums.it_fan_w, sums.it_airflow_m3s])
-        apart = difference(given, layers, summed)
+        apart = difference(arguments, layers, summed)
         yield Figure("kernel", f"{where}, largest difference", apart, "relative", at_most=1e-5)
 
 
-def difference(given: Arguments, layers: ServerLayers, sums: Any) -> float:
+def difference(arguments: Arguments, layers: ServerLayers, sums: Any) -> float:
     """Largest relative difference of a peer's layers and sums from ours."""
     pairs = [
-        (given.layers.inlet_c, layers.inlet_c),
-        (given.layers.outlet_c, layers.outlet_c),
-        (given.layers.power_w, layers.power_w),
-        (given.sums.T, sums),
+        (arguments.layers.inlet_c, layers.inlet_c),
+        (arguments.layers.outlet_c, layers.outlet_c),
+        (arguments.layers.power_w, layers.power_w),
+        (arguments.sums.T, sums),
     ]
     return max(float(np.max(np.abs(theirs / ours - 1.0))) for theirs, ours in pairs)
 
@@ -187,7 +187,7 @@ def environments(quick: bool) -> Iterator[Figure]:
     many, some, most = (8, 2, 4) if quick else (4096, 64, 1024)
     corrected = sdc_taichi.load_config("corrected")
     transient = sdc_taichi.load_config("corrected", ["simulation.thermal=transient"])
-    own = steps.unlike([], 4 if quick else 200)
+    unlike = steps.unlike([], 4 if quick else 200)
     interpreter, roof = "the interpreter yardstick", "the memory roof"
 
     one = steps.single_step(corrected)
@@ -200,7 +200,7 @@ def environments(quick: bool) -> Iterator[Figure]:
         ("corrected", corrected, many, roof, 1.0),
         ("corrected, transient", transient, many, interpreter, 130.0),
         ("sustaindc", sdc_taichi.load_config("sustaindc"), many, roof, 0.9),
-        ("corrected, each server its own", own, most, interpreter, 35.0),
+        ("corrected, each server its own", unlike, most, interpreter, 35.0),
     )
     for name, config, count, yardstick, at_most in runs:
         where = f"{name}, N = {count}"
@@ -251,8 +251,8 @@ def calls(quick: bool) -> Iterator[Figure]:
         ("corrected", (), 4),
         ("corrected, transient", ("simulation.thermal=transient",), 5),
     ):
-        found = steps.kernel_calls_of(steps.simulator_step(many, *overrides))
-        yield Figure("calls", f"{name}: kernels of a step", found, "calls", at_most=at_most)
+        kernels = steps.kernel_calls_of(steps.simulator_step(many, *overrides))
+        yield Figure("calls", f"{name}: kernels of a step", kernels, "calls", at_most=at_most)
     for name, make, at_most in (
         ("simulator", steps.simulator_step, 300),
         ("vector_env", steps.environment_step, 350),
@@ -335,13 +335,13 @@ def side_by_side(quick: bool) -> Iterator[Figure]:
         ("environments", batch, computes, "the interpreter's"),
     ):
         threads, processes = gains(what)
-        for name, found, least in (
+        for name, times, least in (
             ("two threads", threads, 0.5),
             ("two processes", processes, 0.7),
         ):
             where = f"{what} {shape}, gain by {name} over {which}"
-            beside = f"{number(found)} times"
-            yield Figure("scaling", where, found / gain, at_least=least, absolute=beside)
+            beside = f"{number(times)} times"
+            yield Figure("scaling", where, times / gain, at_least=least, absolute=beside)
 
 
 def rates(what: str, size: list[int], seconds: float, processes: int, threads: int) -> float:
@@ -382,12 +382,12 @@ def wall_s(call: Callable[[], object], repeats: int) -> float:
 
 
 def free_bytes() -> int:
-    """Memory that is free; where the system does not tell, a GiB is assumed."""
+    """Free memory in bytes; a GiB where the system does not report it."""
     try:
-        found = re.search(r"MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text())
+        line = re.search(r"MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text())
     except OSError:
         return 2**30
-    return 1024 * int(found[1]) if found else 2**30
+    return 1024 * int(line[1]) if line else 2**30
 
 
 def starting(quick: bool) -> Iterator[Figure]:
@@ -400,9 +400,9 @@ def starting(quick: bool) -> Iterator[Figure]:
                 ratios, spent_s = [], []
                 for _ in range(1 if quick or state == "cold" else 5):
                     begin = time.time()
-                    found = child("first_step", what, **around)
-                    spent_s.append(found["end_s"] - begin)
-                    ratios.append(found["core_s"] / (1000.0 * found["yardstick_s"]))
+                    measured = child("first_step", what, **around)
+                    spent_s.append(measured["end_s"] - begin)
+                    ratios.append(measured["core_s"] / (1000.0 * measured["yardstick_s"]))
                 name = f"{what}, {state}, over 1,000 interpreter yardsticks"
                 beside = f"{number(min(spent_s))} s"
                 ratio = float(np.median(ratios))
@@ -414,13 +414,13 @@ def optima(quick: bool) -> Iterator[Figure]:
     every = ",".join(steps.SITES)
     cases = [("ny,ca", 2, None)] if quick else [(every, 31, 500.0), ("ny", 365, 1000.0)]
     for sites, days, at_most in cases:
-        found = child("optimum", sites, days)
+        measured = child("optimum", sites, days)
         name = f"{sites.count(',') + 1} sites, {days} days"
-        ratio = found["core_s"] / (1000.0 * found["yardstick_s"])
-        beside = f"{number(found['wall_s'])} s, {number(found['core_s'])} core s"
+        ratio = measured["core_s"] / (1000.0 * measured["yardstick_s"])
+        beside = f"{number(measured['wall_s'])} s, {number(measured['core_s'])} core s"
         over = f"{name}, over 1,000 interpreter yardsticks"
         yield Figure("optima", over, ratio, at_most=at_most, absolute=beside)
-        yield Figure("optima", f"{name}, memory", found["most_mb"], "MB", at_most=2000.0)
+        yield Figure("optima", f"{name}, memory", measured["most_mb"], "MB", at_most=2000.0)
 
 
 def recording(quick: bool) -> Iterator[Figure]:
@@ -576,9 +576,9 @@ def main() -> None:
     )
     parser.add_argument("--quick", action="store_true", help="tiny sizes, for correctness only")
     parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder to write to")
-    given = parser.parse_args()
-    quick: bool = given.quick
-    given.out.mkdir(parents=True, exist_ok=True)
+    options = parser.parse_args()
+    quick: bool = options.quick
+    options.out.mkdir(parents=True, exist_ok=True)
     facts = machine()
     print(json.dumps(facts, indent=1))
     figures: list[Figure] = []
@@ -600,10 +600,10 @@ def main() -> None:
     print(f"\n{judged - len(missed)} of {judged} targets met")
     out = [asdict(f) | {"target": f.target, "met": f.met(quick)} for f in figures]
     text = json.dumps({"quick": quick, "machine": facts, "figures": out}, indent=1)
-    (given.out / "bench.json").write_text(f"{text}\n", encoding="utf-8")
-    (given.out / "bench.md").write_text(markdown(figures, quick), encoding="utf-8")
-    plot(figures, given.out / "bench.png")
-    print(f"{given.out}: bench.json, bench.md, bench.png")
+    (options.out / "bench.json").write_text(f"{text}\n", encoding="utf-8")
+    (options.out / "bench.md").write_text(markdown(figures, quick), encoding="utf-8")
+    plot(figures, options.out / "bench.png")
+    print(f"{options.out}: bench.json, bench.md, bench.png")
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ class MissingError(Exception):
 class Arguments:
     """Arrays of one step, as both peers take them; ``sums`` is CPU W, fan W and m3/s, (B, 3)."""
 
-    def __init__(self, fleet: Fleet, met: Conditions) -> None:
+    def __init__(self, fleet: Fleet, conditions: Conditions) -> None:
         if fleet.models["inlet"] != "approach" or fleet.models["outlet"] != "server":
             raise ValueError("peers know inlet model approach and outlet model server alone")
         self.layers = ServerLayers(*(np.zeros(fleet.servers, np.float32) for _ in range(3)))
@@ -54,8 +54,8 @@ class Arguments:
                     np.concatenate(fleet.group_rows, axis=1),
                     fleet.dcs.T,
                     fleet.approach_k,
-                    met.unit_supply_c,
-                    met.utilisation,
+                    conditions.unit_supply_c,
+                    conditions.utilisation,
                 )
             ),
             *(self.racks, self.sums),
@@ -63,7 +63,7 @@ class Arguments:
         )
 
 
-def c_step(given: Arguments, threads: int) -> Step:
+def c_step(arguments: Arguments, threads: int) -> Step:
     """The step in C with OpenMP, compiled into a folder that is gone once it is loaded.
 
     Raises:
@@ -81,12 +81,12 @@ def c_step(given: Arguments, threads: int) -> Step:
             raise MissingError(f"cc fails: {done.stderr.strip().splitlines()[-1]}")
         loaded = ctypes.CDLL(str(library))
     loaded.omp_set_num_threads(threads)
-    counts = (ctypes.c_int32(len(given.sums)), ctypes.c_int32(len(given.listed[3]) - 1))
-    pointers = [a.ctypes.data_as(ctypes.c_void_p) for a in given.listed]
+    counts = (ctypes.c_int32(len(arguments.sums)), ctypes.c_int32(len(arguments.listed[3]) - 1))
+    pointers = [a.ctypes.data_as(ctypes.c_void_p) for a in arguments.listed]
     return lambda: loaded.hall_step(*counts, *pointers)
 
 
-def numba_step(given: Arguments, threads: int) -> Step:
+def numba_step(arguments: Arguments, threads: int) -> Step:
     """The step in Numba, parallel over racks.
 
     Raises:
@@ -180,7 +180,7 @@ def numba_step(given: Arguments, threads: int) -> Step:
                 sums[d, what] = total
 
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-    return lambda: step(*given.listed)
+    return lambda: step(*arguments.listed)
 
 
 PEERS: dict[str, Callable[[Arguments, int], Step]] = {"numba": numba_step, "c": c_step}

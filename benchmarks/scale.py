@@ -2,8 +2,8 @@
 
     python benchmarks/scale.py [FOLDER] [--setpoints 104] [--months 1 2] [--jobs 2000]
 
-runs a sweep of preset ``corrected`` (setpoints x 8 sites x months, 9,984 data-center months) as one
-batch after the other in this process, in one and two local processes, and on Ray with one and two
+runs a sweep of preset ``corrected`` (setpoints x 8 sites x months, 9,984 data-center months) batch
+by batch in this process, in one and two local processes, and on Ray with one and two
 processors; then many jobs that do nothing, whose cost is that of handing them out. Each case has a
 process of its own, and no worker uses more than one thread. Processor time is that of the command,
 of all workers and of Ray's own processes, their start included: other work on the machine disturbs
@@ -174,28 +174,28 @@ def main() -> None:
     parser.add_argument("--months", type=int, nargs="+", default=list(range(1, 13)))
     parser.add_argument("--jobs", type=int, default=2000, help="number of those that do nothing")
     parser.add_argument("--here", nargs=2, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.here is not None:
-        case, kind = given.here
+    options = parser.parse_args()
+    if options.here is not None:
+        case, kind = options.here
         run = (
-            sweep(case, given.setpoints, given.months)
+            sweep(case, options.setpoints, options.months)
             if kind == "sweep"
-            else measure(case, numbered(given.jobs), given.jobs, 0, {})
+            else measure(case, numbered(options.jobs), options.jobs, 0, {})
         )
         print(json.dumps(asdict(run)))
         return
     runs = []
     one_thread = os.environ | {"SDC_TAICHI_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    for kind, case in itertools.product(("sweep", "nothing"), given.cases):
+    for kind, case in itertools.product(("sweep", "nothing"), options.cases):
         command = [sys.executable, __file__, *sys.argv[1:], "--here", case, kind]
         done = subprocess.run(
             command, check=True, stdout=subprocess.PIPE, text=True, env=one_thread
         )
         runs.append(Run(**json.loads(done.stdout.splitlines()[-1])))
         print(runs[-1], file=sys.stderr, flush=True)
-    given.folder.mkdir(parents=True, exist_ok=True)
+    options.folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"runs": [asdict(run) for run in runs]}, indent=1, allow_nan=False)
-    (given.folder / "scale.json").write_text(text + "\n", encoding="utf-8")
+    (options.folder / "scale.json").write_text(text + "\n", encoding="utf-8")
     print(table(runs))
 
 

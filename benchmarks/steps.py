@@ -117,21 +117,21 @@ def unlike(overrides: list[str], servers: int = 200) -> sdc_taichi.DataCenterCon
 
 
 def conditions(fleet: Fleet) -> Conditions:
-    """Load that differs between data centers."""
+    """Supply air at 18 C and a utilisation that differs between data centers."""
     return Conditions(np.full(fleet.units, 18.0), np.linspace(0.1, 0.9, fleet.size))
 
 
 def stepped(fleet: Fleet) -> tuple[Callable[[], object], Callable[[], object]]:
     """A step of the thermal kernel without and with per-server layers."""
-    hall, met = Hall(fleet, "f32"), conditions(fleet)
-    hall.solve(met)
+    hall, load = Hall(fleet, "f32"), conditions(fleet)
+    hall.solve(load)
     layers = hall.servers()
 
     def whole() -> None:
-        hall.solve(met)
+        hall.solve(load)
         hall.servers(layers)
 
-    return lambda: hall.solve(met), whole
+    return lambda: hall.solve(load), whole
 
 
 def calls_of(function: Callable[[], object], *events: str) -> int:

@@ -81,21 +81,21 @@ def interpreter_loop(rounds: int = 12) -> Callable[[], object]:
     """
     rows = np.linspace(0.0, 1.0, 32).reshape(32, 1)
     table = np.arange(96.0)
-    kept = np.zeros((32, 1))
+    rolling = np.zeros((32, 1))
     names = [f"quantity_{number}" for number in range(12)]
 
     def bounded(values: F64, least: float, most: float) -> F64:
         return np.minimum(np.maximum(values, least), most)
 
     def one(step: int) -> Reading:
-        np.multiply(rows, 0.5, out=kept)
-        kept[step % 32] = table[step % 96]
-        mean, hottest = kept.mean(axis=0), kept.max(axis=0)
+        np.multiply(rows, 0.5, out=rolling)
+        rolling[step % 32] = table[step % 96]
+        mean, hottest = rolling.mean(axis=0), rolling.max(axis=0)
         load = bounded(mean * 1.2 - 0.1, 0.0, 1.0)
         power = np.where(load > 0.5, load**2, load) + table[step % 96]
-        found = {name: kept[number] for number, name in enumerate(names)}
+        quantities = {name: rolling[number] for number, name in enumerate(names)}
         total = 0.0
-        for name, value in found.items():
+        for name, value in quantities.items():
             if name != "quantity_3":
                 total += float(value[0])
         joined = np.concatenate([power, load, mean]).astype(np.float32)

@@ -182,13 +182,13 @@ def _controllers(made: DataSet) -> tuple[tuple[str, ...], list[tuple[str, ...]]]
         listed = (made.idle, *listed)
     rows: list[tuple[str, ...]] = []
     for each in listed:
-        kept = each in made.controllers
+        is_in_set = each in made.controllers
         score = made.score(each.mean_return)
         rows.append(
             (
-                f"`{_text(each.controller)}`" if kept else f"`{each.controller}` (not in it)",
-                f"{each.episodes:,}" if kept else "",
-                f"{each.steps:,}" if kept else "",
+                f"`{_text(each.controller)}`" if is_in_set else f"`{each.controller}` (not in it)",
+                f"{each.episodes:,}" if is_in_set else "",
+                f"{each.steps:,}" if is_in_set else "",
                 f"{each.mean_return:.2f}",
                 "" if score is None else f"{100.0 * score:.1f}",
                 _change_pct(each, made.idle, "carbon_g"),

@@ -1,7 +1,7 @@
-"""Episodes of controllers in the weeks of a data center, as a learner would have seen them.
+"""Episodes of controllers in weeks of a data center, as an agent of its environment records them.
 
-A controller sees what controllers see, its commands become the nearest actions of an environment,
-and the environment does these. What is collected can therefore be done again, action by action.
+A controller acts on its usual view. Its commands become the nearest actions of an environment,
+which carries these out. So the actions of an episode reproduce it in that environment.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from sdc_taichi.sim.simulator import Simulator
 from sdc_taichi.types import F32, F64, I64, Actions, StepResult
 
 IDLE, RANDOM = "idle", "random"
-"""Controller that leaves everything as it is, and the one whose actions are drawn evenly."""
+"""Controller that changes nothing, and the one that draws actions evenly."""
 QUANTITIES = ("carbon_g", "grid_kwh", "energy_cost")
 """Quantities of ``StepResult`` in the infos of each step."""
 MOST_REPEATS = 10_000
@@ -61,7 +61,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Collection:
-    """Episodes to collect: of whom, in which weeks of one data center, in which environment."""
+    """Episodes to collect: controllers, weeks of one data center, options of its environment."""
 
     config: DataCenterConfig
     """The data center."""
@@ -144,7 +144,7 @@ class Collection:
         )
 
     def check(self) -> None:
-        """Make sure, before any work, that all controllers can act in the environment.
+        """Check before any work that all controllers can act in the environment.
 
         Raises:
             SdcError: an option or a controller that is not valid.
@@ -232,7 +232,7 @@ class _Commander:
 
     def __init__(self, controller: Controller, env: SdcVectorEnv, decided: tuple[str, ...]) -> None:
         self._controller, self._env, self._decided = controller, env, decided
-        self._given = Actions()
+        self._commands = Actions()
 
     def reset(self, starts: list[Start]) -> None:
         """Begin an episode of each environment."""
@@ -240,8 +240,8 @@ class _Commander:
 
     def act(self) -> npt.NDArray[Any]:
         """Actions for the step to come, (B,) or (B, k)."""
-        self._given = self._controller.act(self._env.core.view)
-        return self._env.actions_of(self._given)
+        self._commands = self._controller.act(self._env.core.view)
+        return self._env.actions_of(self._commands)
 
     def changed(self, result: Mapping[str, Any]) -> F64:
         """Share of its last commands that were carried out otherwise, (B,).
@@ -253,8 +253,8 @@ class _Commander:
         size = self._env.num_envs
         out = np.zeros(size)
         for name in done:
-            given = as_numbers(getattr(self._given, name))
-            of_each = given.reshape(size if given.ndim else 1, -1).mean(axis=1)
+            commands = as_numbers(getattr(self._commands, name))
+            of_each = commands.reshape(size if commands.ndim else 1, -1).mean(axis=1)
             out += np.abs(result[f"{name}_command"] - of_each) > _TOLERANCE
         return out / max(len(done), 1)
 

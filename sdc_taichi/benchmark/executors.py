@@ -225,9 +225,9 @@ def _pool_of_one(inputs: Inputs) -> ProcessPoolExecutor:
 
 @contextlib.contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C, which processes that are started meanwhile inherit.
+    """Block Ctrl-C; processes that start meanwhile inherit this.
 
-    A terminal sends it to all processes, also to those that are still importing modules.
+    A terminal sends Ctrl-C to all processes, including those that are still importing modules.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield

@@ -1,4 +1,4 @@
-"""Jobs: pieces of work that depend on their values alone, and run in any process on any machine."""
+"""Jobs: pieces of work that depend on their values and inputs alone and run in any process."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def digest_of(content: bytes) -> str:
 
 @cache
 def compute_in_one_thread() -> None:
-    """Make this process, a worker, compute in one thread from here on."""
+    """Limit this process to one thread of computation."""
     import threadpoolctl
 
     names = ("SDC_TAICHI_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

@@ -1,8 +1,8 @@
 """Tables of the rows of a case: standings with places, pairs of rows, and performance profiles.
 
-Rows share a place unless a 95 % interval of the paired difference of each of them to each row of
-another place excludes 0. So nothing is ranked within overlapping intervals, and the order within a
-place is that of the suite and says nothing. Too few weeks or seeds make no interval, and no place.
+Rows share a place unless the 95 % intervals of all paired differences between them and the rows of
+the next place exclude 0. The order within a place is that of the suite and has no meaning. Rows
+with too few weeks or seeds for an interval have no place.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ CONSTRAINTS = {
     "unmet_cooling_kwh": "heat left (kWh)",
     "lost_tasks": "lost (tasks)",
 }
-"""Metrics that have a column where one of them is not 0, as means of a week."""
+"""Metrics, as means of a week, that get a column if any row has a value other than 0."""
 OUTAGES = ("throttled_rack_h", "tripped_rack_h", "unserved_kwh", "lost_tasks")
-"""Those of them in which less is emitted because less is done."""
+"""Those of them that lower emissions because less work is done."""
 BOARD_TITLES = {
     **TITLES,
     **CONSTRAINTS,
@@ -160,7 +160,7 @@ def places(values: Mapping[str, float], drawn: Mapping[str, F64]) -> dict[str, t
 
 
 def _has_intervals(case: CaseResults, evaluation: Evaluation, name: str) -> bool:
-    """Whether a row has enough weeks and seeds for a place, which rests on its intervals."""
+    """Whether a row has enough weeks and seeds for intervals, and so for a place."""
     seeds = len(case.rows[name])
     weeks = int(np.bincount(evaluation.strata).min())
     return weeks >= FEWEST and (seeds >= FEWEST or case.kinds[name] != LEARNER)
@@ -195,7 +195,7 @@ def _standings(
     placed: Mapping[str, tuple[int, int]],
     order: list[str],
 ) -> pd.DataFrame:
-    """Rows by place, with what they came to."""
+    """Rows by place, with their changes and other metrics."""
     import pandas as pd
 
     table = summary(evaluation).rename(columns={"controller": "row"}).set_index("row").loc[order]

@@ -1,4 +1,4 @@
-"""Jobs on a Ray cluster: on this machine, or on others where the package is installed alike.
+"""Jobs on a Ray cluster, on this machine or on others with the same version of the package.
 
 Ray starts the workers, places the jobs, runs again what is lost with a worker or a machine, and
 shows all of it in its dashboard. Nothing is scheduled here.
@@ -167,7 +167,7 @@ def _reason(error: object) -> str:
 
 
 def _require_answer(address: str) -> None:
-    """Ask a cluster for its status in a process of its own, as Ray cannot be told to give up.
+    """Ask a cluster for its status in a separate process, because Ray itself has no time limit.
 
     Raises:
         ConfigError: it does not answer.

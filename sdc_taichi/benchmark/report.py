@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 _MOST_NAMED = 8
 _LEAST_SHARE_PCT = -100.0
-"""Share of the achievable below which pictures leave rows out, which would squeeze the others."""
+"""Share of the achievable below which pictures leave out rows, to keep the others readable."""
 _THRESHOLDS_PCT = np.linspace(-25.0, 110.0, 136)
 READING = (
     "Changes are of sums over all scored weeks, against idle commands in the same weeks, in %: "
@@ -147,7 +147,8 @@ def cost_text(suite: SuiteResults) -> str:
     """
     results = suite.results
     trained = [x for x in results if x.kind == LEARNER and x.submission is None]
-    whole_h, trained_h = (sum(x.record.core_s for x in own) / 3600 for own in (results, trained))
+    whole_h = sum(x.record.core_s for x in results) / 3600
+    trained_h = sum(x.record.core_s for x in trained) / 3600
     optima_h = sum(case.optima_core_s for case in suite.cases.values()) / 3600
     return (
         f"{len(results)} results took {whole_h:.2g} core hours, {trained_h:.2g} of them for "
@@ -188,8 +189,8 @@ def suite_notes(suite: SuiteResults) -> list[str]:
             notes.append(f"Results of several {what}: {_named(several)}.")
     if len({str(x.record.processor) for x in results if x.record.processor}) > 1:
         notes.append(
-            "Results of several kinds of processors, whose last bits differ, and with them what "
-            "was learnt."
+            "Results of several kinds of processors: their last bits differ, and so do the trained "
+            "policies."
         )
     for case in suite.cases.values():
         notes += [f"{case.name}: {text}" for text in _notes_of_case(case)]
@@ -217,7 +218,8 @@ def _notes_of_case(case: CaseResults) -> list[str]:
         notes.append(f"fewer than {FEWEST} weeks of a site, so rows have no place.")
     if not any(result.frame["achieved_figure"].notna().any() for result in results):
         notes.append(
-            "without an optimum ends have no value: an empty battery or work put off saves."
+            "without an optimum the ends of weeks have no value, so that an empty battery or "
+            "delayed work counts as a saving."
         )
     return notes
 
@@ -268,7 +270,7 @@ def _outage_notes(board: Leaderboard) -> list[Block]:
 
 
 def weeks_text(board: Leaderboard) -> str:
-    """Which weeks of which data centers a case is of.
+    """Objective, weeks and sites of a case, in words.
 
     Args:
         board: tables of the case.

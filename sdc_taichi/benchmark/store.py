@@ -54,8 +54,8 @@ class Study(Record):
     command: str
     """Command line that runs all jobs of the study."""
     settings: dict[str, Any]
-    """Everything that decides what the results mean, as JSON can hold it. A folder takes results of
-    equal settings alone."""
+    """Values, as JSON can hold them, on which the results depend; equal for all results of a
+    folder."""
     version: str = Field(default_factory=lambda: version("sdc-taichi"))
     """Version of the package."""
     source: str = Field(default_factory=source_digest)
@@ -68,7 +68,7 @@ class Study(Record):
 
 
 class ResultRecord(Record):
-    """Content of metrics.json, of which equal runs differ in the last two entries alone."""
+    """Content of metrics.json; equal runs differ in the last two entries alone."""
 
     format: Literal["sdc-result/1"]
     """Name and version of the format."""

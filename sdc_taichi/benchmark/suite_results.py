@@ -1,7 +1,7 @@
-"""Results of suites read from folders, and put together for reports.
+"""Results of suites, read from folders and combined for reports.
 
-Everything is read from the folders alone. So results of other authors, other machines and other
-versions of the package can be compared, if they are of the same weeks of the same data centers.
+The folders hold all that is needed. So results of other authors, machines and versions of the
+package can be compared if they are of the same weeks of the same data centers.
 """
 
 from __future__ import annotations
@@ -229,14 +229,14 @@ def evaluation_of(case: CaseResults) -> Evaluation:
     frames, alone = [], {}
     for name, results in case.rows.items():
         for result in results:
-            own = result.frame.assign(controller=name, training=result.seed)
+            frame = result.frame.assign(controller=name, training=result.seed)
             if result.kind == ACHIEVED:
                 alone = {
                     str(moves): part["figure"].to_numpy(np.float64)
-                    for moves, part in own[own["moves"] != ALL].groupby("moves", sort=False)
+                    for moves, part in frame[frame["moves"] != ALL].groupby("moves", sort=False)
                 }
-                own = own[own["moves"] == ALL]
-            frames.append(own)
+                frame = frame[frame["moves"] == ALL]
+            frames.append(frame)
     rows = pd.concat([each.astype({"broken": object}) for each in frames], ignore_index=True)
     first = frames[0][frames[0]["moves"] == ALL]
     sites = list(dict.fromkeys(first["site"]))

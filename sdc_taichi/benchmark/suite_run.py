@@ -1,4 +1,4 @@
-"""The run of a suite: its jobs, the optima first, and then the rows, which read the optima."""
+"""The run of a suite: jobs that solve for optima, then jobs of the rows, which read the optima."""
 
 from __future__ import annotations
 

@@ -55,8 +55,8 @@ if TYPE_CHECKING:
 MOST_RUNS = 100_000
 """Most runs of a sweep, unless a larger number is allowed."""
 MOST_DCS, MOST_RACKS = 1024, 2**18
-"""Most data centers of a job, and most racks of all of them, unless its number is given: more step
-no faster, and need more memory."""
+"""Most data centers of a job, and most racks of all of them, unless a sweep has its own ``batch``:
+larger batches are no faster and need more memory."""
 _CONFIG, _FILE = "config", "file "
 _TRIED = 100
 """Combinations of which one must be valid for a sweep to begin."""
@@ -111,7 +111,7 @@ class Sweep:
         return self.batch or max(1, min(MOST_DCS, MOST_RACKS // self.config.hall.racks))
 
     def settings(self) -> dict[str, Any]:
-        """All that decides the jobs, as JSON can hold it."""
+        """Values on which the jobs depend, as JSON can hold them."""
         return {
             "config": self.config.model_dump(mode="json"),
             "varied": [asdict(one) for one in self.varied],
@@ -138,7 +138,7 @@ def combinations(sweep: Sweep) -> Iterator[tuple[Any, ...]]:
 
 
 def check_sweep(sweep: Sweep, most_runs: int = MOST_RUNS) -> None:
-    """Make sure that a sweep can begin; single combinations may still fail.
+    """Check that a sweep can begin; single combinations may still fail.
 
     Args:
         sweep: the sweep.

@@ -36,7 +36,7 @@ class Grid:
         return kind_of(self.values)
 
     def with_value(self, value: Any) -> Grid:
-        """A grid with one more value behind the others, if it is not among them."""
+        """The grid with one more value at its end, unless it has that value."""
         return self if value in self.values else replace(self, values=(*self.values, value))
 
 
