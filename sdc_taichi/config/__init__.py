@@ -1,7 +1,7 @@
 """The configuration of a data center: its schema, and how files and overrides become one.
 
-What may be given, in which bounds, and the errors about it live here.
-Nothing here computes a hall or a plant, and no other module validates a configuration.
+Valid fields, their bounds and the errors about them are defined here. Nothing here computes a hall
+or a plant, and no other module validates a configuration.
 """
 
 from sdc_taichi.config.event_schema import (

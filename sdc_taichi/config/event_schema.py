@@ -161,10 +161,10 @@ def _check_fields_of_kind(event: ScheduledEvent | SampledEvent) -> None:
     for name in ("unit", "rack", "share", "offset_k"):
         if name not in type(event).model_fields:
             continue
-        given = getattr(event, name) is not None
-        if given and name not in required and name not in optional:
+        has_value = getattr(event, name) is not None
+        if has_value and name not in required and name not in optional:
             raise ValueError(f"{name} has no meaning for {event.kind}")
-        if not given and name in required:
+        if not has_value and name in required:
             raise ValueError(f"{event.kind} needs {name}")
     if event.kind == "rack_fan_failure" and (event.share or 0.0) < LEAST_DRAUGHT_SHARE:
         raise ValueError(

@@ -211,22 +211,22 @@ def _is_in(shape: tuple[int, ...], part: tuple[np.ndarray, ...]) -> np.ndarray:
     return out
 
 
-def _listed(what: str, text: str | None, count: int) -> list[int]:
+def _listed(field: str, text: str | None, count: int) -> list[int]:
     """Numbers of a text such as "0-2, 6", or all of ``count``.
 
     Raises:
-        ValueError: naming ``what`` and numbers that are not in 0..count - 1.
+        ValueError: naming the field and numbers that are not in 0..count - 1.
     """
-    found: list[int] = []
+    numbers: list[int] = []
     for part in (text or f"0-{count - 1}").split(","):
         first, _, last = part.partition("-")
         low, high = int(first), int(last or first)
         if not low <= high < count:
             raise ValueError(
-                f"{what} {part.strip()}: valid are 0..{count - 1}, the lower number first"
+                f"{field} {part.strip()}: valid are 0..{count - 1}, the lower number first"
             )
-        found += range(low, high + 1)
-    return found
+        numbers += range(low, high + 1)
+    return numbers
 
 
 class HallConfig(Section):
@@ -331,9 +331,9 @@ class HallConfig(Section):
 
     def rack_approach_k(self) -> np.ndarray:
         """Supply approach temperature of every rack within its limits, in K, (R,)."""
-        given = np.broadcast_to(np.asarray(self.supply_approach_k, np.float64), (self.racks,))
+        approach_k = np.broadcast_to(np.asarray(self.supply_approach_k, np.float64), (self.racks,))
         limits = self.supply_approach_limits_k
-        return given.copy() if limits is None else np.asarray(np.clip(given, *limits))
+        return approach_k.copy() if limits is None else np.asarray(np.clip(approach_k, *limits))
 
     @model_validator(mode="after")
     def _not_too_many_racks(self) -> Self:
@@ -495,9 +495,9 @@ class ServerConfig(Section):
         if self.power_w is not None and self.groups is not None:
             raise ValueError("power_w and groups are both given; valid is one, null for the other")
         if (self.fan_reference_w is None) == (self.fan_reference_share is None):
-            given = "neither" if self.fan_reference_w is None else "both"
+            number = "neither" if self.fan_reference_w is None else "both"
             raise ValueError(
-                f"fan_reference_w and fan_reference_share: {given} given; valid is one, null for "
+                f"fan_reference_w and fan_reference_share: {number} given; valid is one, null for "
                 "the other"
             )
         for rack, (full_w, idle_w) in enumerate(self.power_pairs):

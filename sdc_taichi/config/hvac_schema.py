@@ -169,10 +169,10 @@ class CracConfig(Section):
                 "valid is one of the two"
             )
         for name in ("airflow_m3s", "capacity_kw"):
-            given = getattr(self, name)
-            if isinstance(given, tuple) and len(given) != self.units:
+            values = getattr(self, name)
+            if isinstance(values, tuple) and len(values) != self.units:
                 raise ValueError(
-                    f"{name} has {len(given)} entries, expected {self.units} (units), or one "
+                    f"{name} has {len(values)} entries, expected {self.units} (units), or one "
                     "value for all"
                 )
         return self

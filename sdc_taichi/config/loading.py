@@ -109,9 +109,9 @@ def with_values(config: DataCenterConfig, assigned: Mapping[str, Any]) -> DataCe
 
 
 def _opened(config: DataCenterConfig, sections: set[str]) -> dict[str, Any]:
-    """A config as values, of which only some sections are plain, to be changed and validated anew.
+    """Values of a config, ready to be changed and validated: these sections as mappings.
 
-    Servers of a rack stand in either of two sections, so these are plain together.
+    ``hall`` and ``servers`` both describe the servers of a rack, so they are opened together.
     """
     opened = sections | ({"hall", "servers"} if sections & {"hall", "servers"} else set())
     values = dict(config)
@@ -164,30 +164,30 @@ def _with_base(label: str, values: dict[str, Any]) -> dict[str, Any]:
         )
     _, merged = _read_preset(str(base))
     merged = _merged(merged, values)
-    given = values.get("servers")
-    if isinstance(given, dict):
-        _replace_other_servers(merged["servers"], given)
+    servers = values.get("servers")
+    if isinstance(servers, dict):
+        _replace_other_servers(merged["servers"], servers)
     _replace_by_rack_types(merged, values)
     return merged
 
 
 def _replace_by_rack_types(merged: dict[str, Any], values: Mapping[str, Any]) -> None:
-    """Let types of racks take the place of inherited servers, and the other way round."""
+    """Remove inherited servers where a file has types of racks, and types where it has servers."""
     hall, servers = values.get("hall"), values.get("servers")
-    own = {k for k in ("power_w", "groups") if isinstance(servers, dict) and servers.get(k)}
+    named = {k for k in ("power_w", "groups") if isinstance(servers, dict) and servers.get(k)}
     if isinstance(hall, dict) and hall.get("rack_types"):
-        for name in {"power_w", "groups"} - own:
+        for name in {"power_w", "groups"} - named:
             merged["servers"][name] = None
-    elif own:
+    elif named:
         merged["hall"].pop("rack_types", None)
         merged["hall"].pop("rack_plan", None)
 
 
-def _replace_other_servers(servers: dict[str, Any], given: Mapping[str, Any]) -> None:
-    """Let groups take the place of inherited power pairs and so on, and the other way round."""
+def _replace_other_servers(servers: dict[str, Any], values: Mapping[str, Any]) -> None:
+    """Set an inherited setting to null where a file has the one that excludes it."""
     for one, other in _EITHER_OF_SERVERS:
         for new, old in ((one, other), (other, one)):
-            if given.get(new) is not None and old not in given:
+            if values.get(new) is not None and old not in values:
                 servers[old] = None
 
 

@@ -62,41 +62,42 @@ def odd_values(config: DataCenterConfig) -> Iterator[str]:
 
 
 def warn_of_odd_values(configs: Iterable[DataCenterConfig]) -> None:
-    """Warn of odd values of data centers, once for all that have them in common.
+    """Warn of odd values of data centers; a value that several of them share is named once.
 
     Warns:
         OddInputWarning: for each odd value.
     """
-    known: dict[tuple[int, ...], list[str]] = {}
-    found: list[tuple[str, list[str]]] = []
+    texts_of: dict[tuple[int, ...], list[str]] = {}
+    messages: list[tuple[str, list[str]]] = []
     for config in configs:
         # Copies share the sections themselves.
-        same = tuple(map(id, (config.hall, config.servers, config.hvac, config.electrical)))
-        if same not in known:
-            known[same] = [*odd_values(config)]
-        found.append((config.name, known[same]))
-    warn_of(found)
+        sections = tuple(map(id, (config.hall, config.servers, config.hvac, config.electrical)))
+        if sections not in texts_of:
+            texts_of[sections] = [*odd_values(config)]
+        messages.append((config.name, texts_of[sections]))
+    warn_of(messages)
 
 
-def warn_of(found: Iterable[tuple[str, Sequence[str]]]) -> None:
-    """Warn of what is odd about data centers, once for all that have it in common.
+def warn_of(messages: Iterable[tuple[str, Sequence[str]]]) -> None:
+    """Warn of odd data centers; a message that several of them share is given once.
 
     Args:
-        found: name of each data center, and messages about it.
+        messages: name of each data center, and the messages about it.
 
     Warns:
         OddInputWarning: for each message.
     """
     names: dict[str, list[str]] = {}
-    for name, texts in found:
+    for name, texts in messages:
         for text in texts:
             names.setdefault(text, []).append(name)
-    for text, listed in names.items():
-        others = f" and {len(listed) - 1} more" if len(listed) > 1 else ""
-        warnings.warn(f"{listed[0]}{others}: {text}", OddInputWarning, stacklevel=4)
+    for text, odd in names.items():
+        more = f" and {len(odd) - 1} more" if len(odd) > 1 else ""
+        warnings.warn(f"{odd[0]}{more}: {text}", OddInputWarning, stacklevel=4)
 
 
 def _odd_servers(config: DataCenterConfig) -> Iterator[str]:
+    """Messages about servers and racks of unusual power."""
     servers, types = config.servers, config.hall.rack_types
     listed_w, field = [full_w for full_w, _ in servers.power_pairs], "servers.power_w"
     if types:

@@ -116,10 +116,10 @@ def _set_plain_tags() -> None:
     constructors["tag:yaml.org,2002:float"] = _number_by(parse_number)
     constructors[None] = yaml.SafeLoader.construct_undefined
     _Loader.yaml_constructors = constructors
-    kept = [f"tag:yaml.org,2002:{name}" for name in ("null", "bool")]
+    plain_tags = [f"tag:yaml.org,2002:{name}" for name in ("null", "bool")]
     _Loader.yaml_implicit_resolvers = {
-        first: [(tag, pattern) for tag, pattern in found if tag in kept]
-        for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
+        first: [(tag, pattern) for tag, pattern in resolvers if tag in plain_tags]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
     for name, pattern in (("int", _WHOLE), ("float", _NUMBER)):
         _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{name}", pattern, list("-+.0123456789"))

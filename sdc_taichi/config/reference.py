@@ -30,7 +30,7 @@ LISTED: dict[str, type[BaseModel]] = {
     "events.sampled": SampledEvent,
     "tariff.periods": TariffPeriod,
 }
-"""Sections that stand in lists, by the path of the list."""
+"""Schemas of the sections in lists, by the path of the list."""
 
 _TITLES = {"DataCenterConfig": "A data center"}
 
@@ -154,24 +154,24 @@ def _number(value: Any) -> str:
 
 def _docstrings(model: type[BaseModel]) -> dict[str, str]:
     """Docstring of each field of a section, inherited ones included, on one line."""
-    found: dict[str, str] = {}
+    docs: dict[str, str] = {}
     for kind in reversed(model.__mro__):
         if issubclass(kind, BaseModel) and kind is not BaseModel:
             tree = ast.parse(inspect.getsource(sys.modules[kind.__module__]))
             classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-            found |= _docstrings_in(classes[kind.__name__].body)
-    return found
+            docs |= _docstrings_in(classes[kind.__name__].body)
+    return docs
 
 
 def _types() -> dict[str, str]:
     """Docstring of each type of numbers that fields share, on one line."""
-    found = _docstrings_in(ast.parse(inspect.getsource(types)).body)
-    return {name: text for name, text in found.items() if ".." in text}
+    docs = _docstrings_in(ast.parse(inspect.getsource(types)).body)
+    return {name: text for name, text in docs.items() if ".." in text}
 
 
 def _docstrings_in(body: list[ast.stmt]) -> dict[str, str]:
-    """Docstrings that stand below assignments, by the names that are assigned to."""
-    found = {}
+    """Docstrings below assignments, by the name assigned to."""
+    docs = {}
     for field, text in itertools.pairwise(body):
         target: ast.expr | None = None
         if isinstance(field, ast.AnnAssign):
@@ -180,8 +180,8 @@ def _docstrings_in(body: list[ast.stmt]) -> dict[str, str]:
             target = field.targets[0]
         doc = text.value if isinstance(text, ast.Expr) else None
         if isinstance(target, ast.Name) and isinstance(doc, ast.Constant):
-            found[target.id] = " ".join(str(doc.value).split())
-    return found
+            docs[target.id] = " ".join(str(doc.value).split())
+    return docs
 
 
 def commented_yaml(config: DataCenterConfig) -> str:

@@ -205,7 +205,7 @@ class DataCenterConfig(Section):
     def _check_approach_model(self) -> None:
         kinds = {e.kind for e in self.events.scheduled} | {e.kind for e in self.events.sampled}
         crac = self.hvac.crac
-        given = {
+        needs_air_flows = {
             f"hvac.crac.units {crac.units}": crac.units > 1,
             "hvac.crac.airflow_m3s": crac.airflow_m3s is not None,
             "hvac.crac.capacity_kw": crac.capacity_kw is not None,
@@ -217,13 +217,13 @@ class DataCenterConfig(Section):
             "event crac_down": "crac_down" in kinds,
             "event rack_fan_failure": "rack_fan_failure" in kinds,
         }
-        for what, is_given in given.items():
-            if is_given:
-                raise ValueError(f"{what} needs hall.inlet_model recirculation")
+        for setting, is_used in needs_air_flows.items():
+            if is_used:
+                raise ValueError(f"{setting} needs hall.inlet_model recirculation")
 
     def _check_recirculation_model(self) -> None:
         groups, hvac = self._given_groups().values(), self.hvac
-        holds = {
+        conditions = {
             "servers.outlet_model server": self.servers.outlet_model == "server",
             "hvac.cooling_load_model heat_balance": hvac.cooling_load_model == "heat_balance",
             "another hvac.crac.flow_model than per_watt": hvac.crac.flow_model != "per_watt",
@@ -232,9 +232,9 @@ class DataCenterConfig(Section):
                 g.inlet_offset_k for rack in groups for g in rack
             ),
         }
-        for what, is_so in holds.items():
-            if not is_so:
-                raise ValueError(f"hall.inlet_model recirculation needs {what}")
+        for condition, is_met in conditions.items():
+            if not is_met:
+                raise ValueError(f"hall.inlet_model recirculation needs {condition}")
 
     @model_validator(mode="after")
     def _events_fit_the_plant(self) -> Self:
@@ -254,10 +254,10 @@ class DataCenterConfig(Section):
         crac, racks = self.hvac.crac, self.hall.racks
         for index, event in enumerate(self.events.scheduled):
             for name, limit in (("unit", crac.units), ("rack", racks)):
-                given = getattr(event, name)
-                if given is not None and given >= limit:
+                number = getattr(event, name)
+                if number is not None and number >= limit:
                     raise ValueError(
-                        f"events.scheduled.{index}.{name} {given}: valid is 0..{limit - 1}"
+                        f"events.scheduled.{index}.{name} {number}: valid is 0..{limit - 1}"
                     )
         check_one_per_rack("hvac.crac.unit_shares", crac.unit_shares, racks)
         for rack, shares in enumerate(crac.unit_shares or ()):
@@ -310,8 +310,9 @@ class DataCenterConfig(Section):
         """Check that servers move air at their coldest inlets, where the airflow ratio is least."""
         racks, groups = self.hall.racks, self._listed_groups()
         lowest_k = np.array([min(g.inlet_offset_k for g in r) for r in groups] if groups else [0.0])
-        given = self.hall.inlet_model == "approach"
-        approach_k = self.hall.rack_approach_k() if given else np.zeros(racks)
+        approach_k = np.zeros(racks)
+        if self.hall.inlet_model == "approach":
+            approach_k = self.hall.rack_approach_k()
         coldest_c = self.hvac.setpoint.min_c + lowest_k + approach_k
         ratio = self.servers.curves.airflow_ratio(coldest_c, np.zeros(racks))
         worst = int(np.argmin(ratio))
@@ -325,14 +326,14 @@ class DataCenterConfig(Section):
     @property
     def server_heat_capacity_kj_per_k(self) -> float:
         """Heat capacity of one server, mean over the hall, in kJ/K."""
-        given = self.servers.heat_capacity_kj_per_k
-        return SERVER_J_PER_K_W * self._mean_server_w() / 1e3 if given is None else given
+        configured = self.servers.heat_capacity_kj_per_k
+        return SERVER_J_PER_K_W * self._mean_server_w() / 1e3 if configured is None else configured
 
     @property
     def room_heat_capacity_kj_per_k(self) -> float:
         """Heat capacity of what follows the supply air, in kJ/K per server."""
-        given = self.hall.room_heat_capacity_kj_per_k_per_server
-        return ROOM_J_PER_K_W * self._mean_server_w() / 1e3 if given is None else given
+        configured = self.hall.room_heat_capacity_kj_per_k_per_server
+        return ROOM_J_PER_K_W * self._mean_server_w() / 1e3 if configured is None else configured
 
     def _mean_server_w(self) -> float:
         """Power of a server at full load without its fans, mean over the hall, in W."""
@@ -374,9 +375,9 @@ class DataCenterConfig(Section):
         Raises:
             ConfigError: the capacity leaves racks without servers.
         """
-        racks, found = self.hall.racks, self._listed_groups()
-        if found is not None:
-            per_rack = found * racks if len(found) == 1 else found
+        racks, listed = self.hall.racks, self._listed_groups()
+        if listed is not None:
+            per_rack = listed * racks if len(listed) == 1 else listed
         else:
             pairs = self.servers.power_pairs
             pairs = pairs * racks if len(pairs) == 1 else pairs

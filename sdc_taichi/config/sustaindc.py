@@ -156,17 +156,17 @@ def _problems(values: Mapping[str, Any]) -> Iterator[str]:
             yield f"{section}: unknown section; valid: {', '.join(SECTIONS)}"
     racks = _racks(values.get(_HALL))
     for section, shapes in _KEYS.items():
-        given = values.get(section)
-        if not isinstance(given, dict):
+        content = values.get(section)
+        if not isinstance(content, dict):
             yield f"{section}: missing section"
             continue
-        for key in given:
+        for key in content:
             if key not in shapes:
                 yield f"{section}.{key}: unknown key{suggestion(key, shapes)}"
         for key, shape in shapes.items():
-            if key == "CPUS_PER_RACK" and isinstance(given.get(key), list):
+            if key == "CPUS_PER_RACK" and isinstance(content.get(key), list):
                 shape = _Shape(depth=1, per_rack=True, whole=True)
-            problem = _problem(given[key], shape, racks) if key in given else ": missing"
+            problem = _problem(content[key], shape, racks) if key in content else ": missing"
             if problem:
                 yield f"{section}.{key}{problem}"
 

@@ -1,7 +1,7 @@
 """Indices of air management in a hall: SHI, RHI, RTI, RCI, and the temperature ranges of ASHRAE.
 
-The indices are functions of sums, so that whoever carries only sums per data center and whoever has
-an entry per rack use the same; functions of inlets and flows make the sums from racks.
+The indices are functions of sums per data center, which the simulator carries; functions of inlets
+and flows make these sums from racks.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def allowable_c(ashrae_class: str | None) -> tuple[float, float]:
 def rank(temperature_c: Reals) -> F64:
     """Rank of temperatures by which they are compared, as in ``kernels.sums.rank``.
 
-    Temperatures of alike racks differ in their last bits, which depend on the processor; their
-    ranks, 1/``RANKS_PER_K`` apart, agree, so that the first of alike racks is the hottest.
+    Temperatures of equal racks differ in their last bits, which depend on the processor. Their
+    ranks, in steps of 1/``RANKS_PER_K`` K, agree, so that the first of equal racks is the hottest.
 
     Args:
         temperature_c: Temperatures, C, of any shape.

@@ -291,11 +291,11 @@ def _small_units(config: DataCenterConfig, design: DesignPoint) -> Iterator[str]
 
 def _racks(rack_rise_k: F64, limit_k: float) -> str:
     """Text that names the racks whose rise exceeds a limit, and by how much they warm the air."""
-    found = np.flatnonzero(rack_rise_k > limit_k)
-    numbers = ", ".join(map(str, found[:_MOST_LISTED]))
-    left = len(found) - _MOST_LISTED
+    warm = np.flatnonzero(rack_rise_k > limit_k)
+    numbers = ", ".join(map(str, warm[:_MOST_LISTED]))
+    left = len(warm) - _MOST_LISTED
     more = f" and {left:,} more" if left > 0 else ""
-    low, high = rack_rise_k[found].min(), rack_rise_k[found].max()
+    low, high = rack_rise_k[warm].min(), rack_rise_k[warm].max()
     span = f"{low:.3g}..{high:.3g}" if f"{low:.3g}" != f"{high:.3g}" else f"{high:.3g}"
-    racks = f"rack{'s' if len(found) > 1 else ''}"
+    racks = f"rack{'s' if len(warm) > 1 else ''}"
     return f"hall: servers of {racks} {numbers}{more} warm the air by {span} K"

@@ -239,9 +239,9 @@ def _design_patterns(states: _SteadyStates, recirculation: Recirculation) -> tup
     scales = np.concatenate([states.inlet_k, states.heat_k])
     shares = (scales / np.maximum(scales[:, -1:], 1e-9))[:, :-1]
     design = recirculation.design
-    own = np.stack([design.approach_k, design.outlet_rise_k - design.approach_k])
-    mixes = [recirculation.mix_weights.apply(row) for row in own]
-    return np.concatenate([mixes, own]), shares
+    racks = np.stack([design.approach_k, design.outlet_rise_k - design.approach_k])
+    mixes = [recirculation.mix_weights.apply(row) for row in racks]
+    return np.concatenate([mixes, racks]), shares
 
 
 @dataclass(slots=True)

@@ -126,12 +126,12 @@ def _read_npz(path: Path, file: BinaryIO, racks: int, wanted: str | None) -> tup
     if file.read(len(_NPY_MAGIC)) == _NPY_MAGIC:
         raise ConfigError(f"{path}: holds one array without a name; valid is an .npz with R or D")
     arrays = ArrayFile(file, path, ConfigError)
-    found = [name for name in ("R", "D") if name in arrays.names]
-    if len(found) != 1:
+    kinds = [name for name in ("R", "D") if name in arrays.names]
+    if len(kinds) != 1:
         raise ConfigError(
             f"{path}: holds {shortened(sorted(arrays.names))}; valid is one of the arrays R and D"
         )
-    (kind,) = found
+    (kind,) = kinds
     if wanted not in (None, kind):
         raise ConfigError(f"{path}: holds {kind}, hall.recirculation.matrix_kind is {wanted}")
     shape, dtype = arrays.header(kind)
@@ -181,11 +181,11 @@ def _check_lines(path: Path, lines: Iterable[str]) -> None:
             try:
                 parse_number(cell)
             except ValueError:
-                found = shortened(cell.strip())
+                text = shortened(cell.strip())
                 why = ", separated by ','" if ";" in cell or len(cell.split()) > 1 else ""
                 why += ", without a header" if not width else ""
                 raise ConfigError(
-                    f"{path}: line {number}: {found} is no number; valid are numbers alone{why}"
+                    f"{path}: line {number}: {text} is no number; valid are numbers alone{why}"
                 ) from None
         if width and len(cells) != width:
             raise ConfigError(

@@ -1,6 +1,6 @@
 """Where in the hall a data center's work runs: its utilisation spread over racks or server groups.
 
-Bins are the places for work, racks or groups of alike servers, those of all data centers end to
+Bins are the places for work, racks or groups of equal servers, those of all data centers end to
 end. What is placed is conserved: the loads, weighted by the servers of each bin, sum to the
 utilisation, as far as the usable servers suffice.
 """
@@ -33,7 +33,7 @@ class PlacementError(SdcError):
 
 @dataclass(frozen=True, slots=True)
 class Bins:
-    """Places for work in B data centers, n in all: racks, or groups of alike servers."""
+    """Places for work in B data centers, n in all: racks, or groups of equal servers."""
 
     offsets: I64
     """First bin of each data center, and the number of bins, (B + 1,)."""
@@ -166,7 +166,7 @@ def place(
 
 
 def _uniform(utilisation: F64, bins: Bins, count: F64, capacity: F64) -> tuple[F64, F64]:
-    """Load of each bin, (n,), and utilisation placed, (B,), alike as far as capacities allow."""
+    """Load of each bin, (n,), and utilisation placed, (B,), the same everywhere if it fits."""
     unhindered = utilisation <= np.minimum.reduceat(capacity, bins.offsets[:-1])
     if np.all(unhindered):
         return utilisation[bins.dc], utilisation.copy()
@@ -238,25 +238,25 @@ def _checked_weights(weights: npt.ArrayLike | None, bins: Bins) -> F64:
     if weights is None:
         raise PlacementError("placement weights: none given; valid is one per bin")
     try:
-        given = np.asarray(weights, dtype=np.float64)
+        values = np.asarray(weights, dtype=np.float64)
     except (TypeError, ValueError):
         raise PlacementError(f"placement weights {weights!r}: valid are numbers") from None
-    if given.shape != bins.dc.shape:
+    if values.shape != bins.dc.shape:
         raise PlacementError(
-            f"placement weights: shape {given.shape}, expected {bins.dc.shape}, one per bin"
+            f"placement weights: shape {values.shape}, expected {bins.dc.shape}, one per bin"
         )
-    wrong = np.flatnonzero(~(np.isfinite(given) & (given >= 0.0)))
+    wrong = np.flatnonzero(~(np.isfinite(values) & (values >= 0.0)))
     if len(wrong):
         dc = bins.dc[wrong[0]]
         raise PlacementError(
             f"{bins.names[dc]}: placement weight {wrong[0] - bins.offsets[dc]} is "
-            f"{given[wrong[0]]}; valid is a finite number of at least 0"
+            f"{values[wrong[0]]}; valid is a finite number of at least 0"
         )
-    largest = np.maximum.reduceat(given, bins.offsets[:-1])
+    largest = np.maximum.reduceat(values, bins.offsets[:-1])
     without = np.flatnonzero(largest == 0.0)
     if len(without):
         raise PlacementError(
             f"{bins.names[without[0]]}: all placement weights are 0; valid is at least one above 0"
         )
-    relative = given / largest[bins.dc]
-    return np.where(given > 0.0, np.maximum(relative, _LEAST_WEIGHT), 0.0)
+    relative = values / largest[bins.dc]
+    return np.where(values > 0.0, np.maximum(relative, _LEAST_WEIGHT), 0.0)

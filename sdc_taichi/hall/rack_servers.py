@@ -35,9 +35,9 @@ def air_properties(config: DataCenterConfig) -> AirProperties:
         DataError: a site or weather file that names no height.
     """
     hall, site = config.hall, config.site
-    given = hall.air_density_kg_m3
-    if given is not None:
-        return AirProperties(given, given * hall.air_heat_capacity_j_per_kg_k, CONSTANT)
+    configured = hall.air_density_kg_m3
+    if configured is not None:
+        return AirProperties(configured, configured * hall.air_heat_capacity_j_per_kg_k, CONSTANT)
     density = density_kg_m3(site_pressure_pa(site.location, site.weather_file), REFERENCE_C)
     return AirProperties(density, density * hall.air_heat_capacity_j_per_kg_k, OF_IDEAL_GAS)
 

@@ -1,4 +1,4 @@
-"""Heat recirculation: which rack breathes whose exhaust, and how much.
+"""Heat recirculation: the share of each rack's exhaust in the intake of each rack.
 
 With R_ji the share of rack j's intake that is rack i's exhaust,
 
@@ -7,9 +7,9 @@ With R_ji the share of rack j's intake that is rack i's exhaust,
 (Tang, Gupta and Varsamopoulos 2008, *Energy-efficient thermal-aware task scheduling for homogeneous
 high-performance computing data centers*, IEEE TPDS 19(11)). The weights w are those of the exhaust
 mix before each rack (``mix_weights``) or of a user's matrix (``matrix_file``); the shares r are
-such that the given approach temperatures come out exactly at the design point: of every rack, or on
-the mean of a row or of the hall, within which the exposure of the racks (``exposure``) or the
-matrix tells them apart.
+such that the configured approach temperatures hold exactly at the design point: of every rack, or
+as means of the rows or of the hall. Racks within a row or hall then differ by their exposure
+(``exposure``) or by the matrix.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -28,19 +29,21 @@ from sdc_taichi.hall.mix_weights import MixWeights, dense_weights, layout_weight
 from sdc_taichi.hall.rack_servers import RackServers, rack_servers
 from sdc_taichi.types import F64
 
+Result = TypeVar("Result")
+
 _MOST_ITERATIONS = 500
 _WITHIN_K = 1e-12
-"""Change of the approach temperatures, in K, at which they count as found."""
+"""Change of the approach temperatures, in K, below which iteration ends."""
 _MOST_MEAN_SHARE = 0.9
 """Largest share of the exhaust mix in the mean intake of a row or hall; beyond it, hardly any
 supply air reaches the racks."""
 _MOST_NEWTON_STEPS = 50
 _EXACT_RACKS, _LARGE_WITHIN_K = 10_000, 1e-3
-"""Most racks of a hall whose approach temperatures are found to ``_WITHIN_K`` where their means are
-given, and the change in K that counts as found in larger halls: each round leaves a twentieth of
-the change, and takes a second in a hall of a hundred thousand racks."""
+"""Most racks of a hall whose approach temperatures are computed to ``_WITHIN_K`` if their means are
+configured, and the change in K that ends iteration in larger halls: each iteration leaves a
+twentieth of the change, and takes a second in a hall of a hundred thousand racks."""
 _CONTAINED_WITHIN_K = 1e-9
-"""Change of the exhaust mixes of a contained hall, in K, at which they count as found."""
+"""Change of the exhaust mixes of a contained hall, in K, below which iteration ends."""
 
 
 OVER_M = 2.3
@@ -80,7 +83,7 @@ def calibrate(config: DataCenterConfig, servers: RackServers | None = None) -> R
 
     r_j = a_j / sum_i w_ji (a_i + dT_i) at the design point, less the share that containment
     closes; the approach temperatures a are those of the open hall, dT is the rise through a rack.
-    Where their means alone are given, r_j = k e_j / (1 + k e_j): exhaust and supply air share the
+    If only their means are configured, r_j = k e_j / (1 + k e_j): exhaust and supply air share the
     intake as k times the exposure e_j to 1, with the k of the row or of the hall.
 
     Args:
@@ -150,12 +153,12 @@ def _from_matrix_file(
     """Weights, exhaust shares and design point by a user's R or D."""
     settings = config.hall.recirculation
     path = Path(settings.matrix_file or "")
-    kind, given = read_matrix(config, path)
+    kind, values = read_matrix(config, path)
     if settings.scaled_to in ("row", "hall"):
         design = design_point(config, servers, _mean_approach_k(config))
     elif kind == "D" and settings.scaled_to == "none":
-        design = _solve_design_point(config, servers, lambda at: given @ at.it_w)
-    matrix = share_matrix(config, path, kind, given, design)
+        design = _solve_design_point(config, servers, lambda at: values @ at.it_w)
+    matrix = share_matrix(config, path, kind, values, design)
     sums = matrix.sum(axis=1)
     none = sums == 0
     wanted_k = design.approach_k * none
@@ -204,17 +207,16 @@ def _shares_by_exposure(
     Raises:
         ConfigError: means that exhaust air cannot bring about, or no steady state.
     """
-    wanted_k = before_k = _mean_approach_k(config)
-    within_k = _WITHIN_K if config.hall.racks <= _EXACT_RACKS else _LARGE_WITHIN_K
-    for _ in range(_MOST_ITERATIONS):
-        design = design_point(config, servers, before_k)
+    wanted_k = _mean_approach_k(config)
+
+    def update(approach_k: F64) -> tuple[F64, tuple[F64, DesignPoint]]:
+        design = design_point(config, servers, approach_k)
         mix_k = weights.apply(design.outlet_rise_k)
         share = _mean_share(config, mix_k, exposed, wanted_k)
-        after_k = share * mix_k
-        if np.max(np.abs(after_k - before_k)) < within_k:
-            return share, design
-        before_k = after_k
-    raise _no_steady_state(config)
+        return share * mix_k, (share, design)
+
+    within_k = _WITHIN_K if config.hall.racks <= _EXACT_RACKS else _LARGE_WITHIN_K
+    return _settled(config, wanted_k, update, within_k)
 
 
 def _mean_share(config: DataCenterConfig, mix_k: F64, exposed: F64, wanted_k: F64) -> F64:
@@ -255,8 +257,7 @@ def _solve_design_point(
 ) -> DesignPoint:
     """Design point whose approach temperatures are those that follow from it.
 
-    Power and airflow depend on the inlets, which depend on the outlets that power and airflow make:
-    the fixed point is found by repeated substitution.
+    Power and airflow depend on the inlets, which depend on the outlets that power and airflow make.
 
     Args:
         config: The data center.
@@ -266,14 +267,12 @@ def _solve_design_point(
     Raises:
         ConfigError: no steady state.
     """
-    before = config.hall.rack_approach_k()
-    for _ in range(_MOST_ITERATIONS):
-        design = design_point(config, servers, before)
-        after = approach_k(design)
-        if np.max(np.abs(after - before)) < _WITHIN_K:
-            return design
-        before = after
-    raise _no_steady_state(config)
+
+    def update(before_k: F64) -> tuple[F64, DesignPoint]:
+        design = design_point(config, servers, before_k)
+        return approach_k(design), design
+
+    return _settled(config, config.hall.rack_approach_k(), update, _WITHIN_K)
 
 
 def _contained_design(
@@ -295,24 +294,48 @@ def _contained_design(
     Raises:
         ConfigError: no steady state.
     """
-    mix_k = weights.apply(design.outlet_rise_k)
-    for _ in range(_MOST_ITERATIONS):
-        found = design_point_at(
+
+    def update(mix_k: F64) -> tuple[F64, DesignPoint]:
+        contained = design_point_at(
             config,
             servers,
             design.supply_c + servers.per_group(mix_k) * group_share,
             design.height_factor,
             full_airflow_m3s=design.full_airflow_m3s,
         )
-        before, mix_k = mix_k, weights.apply(found.outlet_rise_k)
-        if np.max(np.abs(mix_k - before)) < _CONTAINED_WITHIN_K:
-            return found
-    raise _no_steady_state(config)
+        return weights.apply(contained.outlet_rise_k), contained
+
+    return _settled(config, weights.apply(design.outlet_rise_k), update, _CONTAINED_WITHIN_K)
 
 
-def _no_steady_state(config: DataCenterConfig) -> ConfigError:
-    """Error of a hall whose inlets at full load do not settle."""
-    return ConfigError(
+def _settled(
+    config: DataCenterConfig,
+    start_k: F64,
+    update: Callable[[F64], tuple[F64, Result]],
+    within_k: float,
+) -> Result:
+    """Repeat an update of temperatures until they change by less than ``within_k``.
+
+    Args:
+        config: The data center, for the error.
+        start_k: Temperatures over supply air that the first update takes, K, (R,).
+        update: Temperatures that follow from those before, K, (R,), and the result that goes with
+            them.
+        within_k: Change at which the temperatures count as steady, K.
+
+    Returns:
+        Result of the last update.
+
+    Raises:
+        ConfigError: no steady state.
+    """
+    before_k = start_k
+    for _ in range(_MOST_ITERATIONS):
+        after_k, result = update(before_k)
+        if np.max(np.abs(after_k - before_k)) < within_k:
+            return result
+        before_k = after_k
+    raise ConfigError(
         f"{config.hall.recirculation.matrix_file or config.name}: the hall finds no steady state "
         "at full load; valid is less recirculation"
     )
@@ -441,7 +464,7 @@ def _demand(hall: HallConfig, airflow_m3s: F64) -> F64:
         return np.asarray(np.convolve(values, weights)[reach : reach + per_row])
 
     whole = smoothed(np.ones(per_row))
-    # Aisles of alike racks are most of all.
+    # Most aisles of a hall are equal.
     distinct, aisle = np.unique(drawn, axis=0, return_inverse=True)
     around = np.stack([smoothed(values) / whole for values in distinct])
     return np.asarray(np.repeat(around[aisle.reshape(-1)], 2, axis=0)[:rows])

@@ -21,7 +21,7 @@ DEFAULT_CELL_M = 0.3
 """Length of a cell unless another is asked for, in m."""
 LEAST_LEAK = 1e-3
 """Share of its free area that containment always leaves open: gaps, and a flow that must balance
-even where racks draw more than their closed aisle is given."""
+even where racks draw more than the tiles of their closed aisle supply."""
 
 _EDGE = (0.25, 0.5)
 """Cells at the edges of racks, in cells: potential flow is singular there."""
@@ -84,9 +84,9 @@ def build_grid(hall: HallConfig, airflow_m3s: F64, supply_m3s: float, cell_m: fl
     """Cut the hall into cells and place racks, tiles, returns and containment.
 
     Every measure of the layout is a whole number of cells, at most ``cell_m`` long and half as
-    high. Floor tiles fill the cold aisles between the row ends. What an aisle is given, and what is
-    taken above it with ceiling returns, goes by the airflow of the racks that face it; with returns
-    in the end walls it leaves evenly above the height of the racks.
+    high. Floor tiles fill the cold aisles between the row ends. The racks that face an aisle
+    determine its supply air by their airflow, and so the air that ceiling returns take above it;
+    returns in the end walls take air evenly above the height of the racks.
 
     Args:
         hall: Shape of the hall.

@@ -207,7 +207,7 @@ class _GridAir:
         entering = -grid.boundary_m3s[:-1].sum(axis=1)
         cells = np.arange(grid.cells, dtype=np.int32)
         offsets = np.array([0, grid.cells], np.int32)
-        found = self._solve(grid.conductance_m, diagonal, offsets, cells, entering, "potential")
+        potential = self._solve(grid.conductance_m, diagonal, offsets, cells, entering, "potential")
         imbalance_m3s = np.empty(grid.cells)
         self._run(
             self._kernels.transport_kernel(),
@@ -216,7 +216,7 @@ class _GridAir:
             boundary_m3s=grid.boundary_m3s,
             area_m2=grid.area_m2,
             mixing_m=MIXING_M,
-            potential_m2s=found.first_solution,
+            potential_m2s=potential.first_solution,
             speed_ms=np.zeros(grid.cells + 1),
             imbalance_m3s=imbalance_m3s,
             off_diagonal=self._off_diagonal,
@@ -236,10 +236,10 @@ class _GridAir:
         offsets = np.append(backs.face_offsets, end).astype(np.int32)
         cell = np.concatenate([backs.cell, grid.supply_cell])
         amount = np.concatenate([backs.m3s, grid.supply_m3s])
-        found = self._solve(self._off_diagonal, self._diagonal, offsets, cell, amount, "tags")
+        tags = self._solve(self._off_diagonal, self._diagonal, offsets, cell, amount, "tags")
         # The exact shares are positive; the solver leaves zeros of either sign.
-        shares = np.maximum(found.intake, 0.0)
-        return shares[:, :-1].copy(), shares[:, -1].copy(), found.returned[:-1]
+        shares = np.maximum(tags.intake, 0.0)
+        return shares[:, :-1].copy(), shares[:, -1].copy(), tags.returned[:-1]
 
     def temperatures(self, rise_k: F64) -> tuple[F64, float]:
         """Solve the temperatures of a hall in which air passes the racks.
@@ -254,7 +254,7 @@ class _GridAir:
         backs = self._grid.backs
         amount = backs.m3s * np.repeat(rise_k, np.diff(backs.face_offsets))
         offsets = np.array([0, len(amount)], np.int32)
-        found = self._solve(
+        temperatures = self._solve(
             self._off_diagonal,
             self._diagonal,
             offsets,
@@ -263,7 +263,7 @@ class _GridAir:
             "temperatures",
             through_racks=True,
         )
-        return found.intake[:, 0], float(found.returned[0])
+        return temperatures.intake[:, 0], float(temperatures.returned[0])
 
     def _solve(
         self,
@@ -293,7 +293,7 @@ class _GridAir:
         grid, kernels = self._grid, self._kernels
         right_sides = len(source_offsets) - 1
         slices = min(self._threads, right_sides)
-        found = _SystemSolution(
+        solution = _SystemSolution(
             first_solution=np.empty(grid.cells + 1),
             intake=np.empty((self._racks, right_sides)),
             returned=np.empty(right_sides),
@@ -322,13 +322,13 @@ class _GridAir:
             work=np.empty((slices, kernels.WORK_VECTORS, grid.cells + 1)),
             return_cell=grid.return_cell,
             return_m3s=grid.return_m3s,
-            first_solution=found.first_solution,
-            intake=found.intake,
-            returned=found.returned,
-            relative_residual=found.relative_residual,
-            iterations=found.iterations,
+            first_solution=solution.first_solution,
+            intake=solution.intake,
+            returned=solution.returned,
+            relative_residual=solution.relative_residual,
+            iterations=solution.iterations,
         )
-        residual, iterations = found.relative_residual, found.iterations
+        residual, iterations = solution.relative_residual, solution.iterations
         worst = int(np.argmax(np.where(np.isfinite(residual), residual, np.inf)))
         if not residual[worst] <= 100 * _TOLERANCE:
             raise SdcError(
@@ -336,7 +336,7 @@ class _GridAir:
                 f"{residual[worst]:.3g} after {iterations[worst]} iterations; valid is at most "
                 f"{100 * _TOLERANCE:g}: change cell_m, or measures of very different size"
             )
-        return found
+        return solution
 
 
 @dataclass(frozen=True, slots=True)
@@ -408,9 +408,9 @@ def _checked(
     return _per_rack("airflow_m3s", airflow_m3s, racks), _per_rack("power_w", power_w, racks)
 
 
-def _per_rack(name: str, given: F64, racks: int) -> F64:
+def _per_rack(name: str, numbers: F64, racks: int) -> F64:
     """Values of the racks, (R,), if they are finite numbers above 0."""
-    values: F64 = np.ascontiguousarray(given, dtype=np.float64)
+    values: F64 = np.ascontiguousarray(numbers, dtype=np.float64)
     if values.shape != (racks,):
         raise ConfigError(f"{name} has shape {values.shape}, expected ({racks},)")
     valid = np.isfinite(values) & (values > 0)

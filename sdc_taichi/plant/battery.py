@@ -127,7 +127,7 @@ def released(stored_kwh: Values, command: Values, point: BatteryPoint) -> Batter
     T = dt*max(4*sigmoid(10*(s - 0.25)), 0.5) and energy min(C, b/(T + 0.01), load/4)*T. The
     quarter comes from passing the energy of a quarter hour where a power belongs, so even a full
     battery carries less than the load. The code was only used with dt = 0.25 h. No losses but what
-    the rounding takes or gives, 5e-6 kWh at most: the store is kept in MWh with 8 decimals.
+    the rounding takes or gives, 5e-6 kWh at most: the store is in MWh with 8 decimals.
     """
     capacity_kwh, dt_h = point.capacity_kwh, point.dt_h
     exists = np.greater(capacity_kwh, 0.0)

@@ -299,7 +299,7 @@ def released(heat_w: Values, point: TowerPoint) -> TowerResult:
     """The tower of the released SustainDC code: a cubic fan on the airflow that carries the heat.
 
     V = Q/(cp*rho*max(50 - (T_amb - T_set), 1)), P = P_ref*min(V/V_ref, 1)^3, and no power at all
-    below 5 C outdoors. There is no water loop: the condenser setpoint counts as met.
+    below 5 C outdoors. There is no water loop: the condenser setpoint counts as reached.
     """
     air_m3s = _air_m3s(heat_w, point)
     running = np.greater_equal(point.outdoor_c, 5.0)

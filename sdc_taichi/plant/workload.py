@@ -141,6 +141,6 @@ def age_histogram(queue: F64, edges_steps: F64) -> F64:
     """
     last = queue.shape[1] - 1
     edges = np.asarray(edges_steps).astype(np.int64)
-    found: F64 = queue.T[np.maximum(last - edges, 0)]
-    found[:-1] -= found[1:]
-    return found.T
+    tasks: F64 = queue.T[np.maximum(last - edges, 0)]
+    tasks[:-1] -= tasks[1:]
+    return tasks.T
