@@ -54,9 +54,8 @@ def rows(**changes: object) -> pd.DataFrame:
 
 def figures(ours: pd.DataFrame, scored_h: float) -> PaperFigures:
     """Our figures of the constant setpoint in the units of table 4."""
-    found = {row.name: row.ours for row in compared(table(4), ours, scored_h)}[CONSTANT_ROW]
-    assert found is not None
-    return PaperFigures(*(interval.value for interval in found))
+    constant = compared(table(4), ours, scored_h).set_index("label").loc[CONSTANT_ROW]
+    return PaperFigures(*map(float, constant[list(PaperFigures._fields)].to_numpy()))
 
 
 def test_units_of_the_tables() -> None:
@@ -84,22 +83,19 @@ def test_rows_stand_beside_printed_ones_and_the_constant_setpoint() -> None:
         rows(row="happo", moves="load"),
         rows(row="bound", it_kwh=np.nan),
     ]
-    found = {row.name: row for row in compared(table(4), pd.concat(ours), SCORED_H)}
-    assert list(found) == [*table(4).rows, CONSTANT_ROW]
-    assert found["ippo"].ours is None
-    assert found["ippo"].seeds == 0
-    happo, constant = found["happo"], found[CONSTANT_ROW]
-    assert happo.seeds == 2
-    assert happo.label == "HAPPO"
-    told = finding([happo, constant])
-    assert told.startswith("Of 1 rows that the paper has, 1 emit less than the lowest setpoint")
-    assert "-5.44 to -5.44 %" in told
-    assert constant.printed is None
-    assert happo.against_constant_pct is not None
+    reached = compared(table(4), pd.concat(ours), SCORED_H).set_index("label")
+    assert list(reached.index) == [*(x.label for x in table(4).rows.values()), CONSTANT_ROW]
+    assert reached["seeds"].to_dict()["IPPO"] == 0
+    assert np.isnan(reached["cfp_kg"]["IPPO"])
+    assert reached["seeds"]["HAPPO"] == 2
+    text = finding(reached)
+    assert text.startswith("Of 1 rows that the paper has, 1 emit less than the lowest setpoint")
+    assert "-5.44 to -5.44 %" in text
+    assert np.isnan(reached["printed_cfp_kg"][CONSTANT_ROW])
     share = 0.9 * 300.0 / 551.75 + 251.75 / 551.75
-    assert happo.against_constant_pct.value == pytest.approx(100.0 * (share - 1.0))
-    assert constant.against_constant_pct is not None
-    assert constant.against_constant_pct.value == pytest.approx(0.0)
+    against_constant = reached["against_constant"]
+    assert against_constant["HAPPO"] == pytest.approx(100.0 * (share - 1.0))
+    assert against_constant[CONSTANT_ROW] == pytest.approx(0.0)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,6 @@ quarter hours. All of them follow from the metrics of a run on preset ``sustaind
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -46,6 +44,7 @@ _METRICS = ("cfp_kg", "grid_kwh", "hvac_kwh", "it_kwh", "queue_mean_tasks", "wat
 _QUARTERS_PER_H = 4
 _SEED = 0
 """Seed of the draws of intervals."""
+_NO_FIGURE = Interval(math.nan, math.nan, math.nan)
 
 
 PAPER = "paper"
@@ -121,25 +120,6 @@ class PaperTable(Section):
     """Printed rows by the name of the row of suite ``paper`` that reproduces them."""
 
 
-@dataclass(frozen=True, slots=True)
-class ComparedRow:
-    """A row of a table: what this package reaches, beside what is printed."""
-
-    name: str
-    """Name of the row in the suite."""
-    label: str
-    """Label of the printed row; the name of the row where none is printed."""
-    seeds: int
-    """Number of seeds of ours; 0 where the row has not been run."""
-    ours: tuple[Interval, ...] | None
-    """Our figures in the order of ``PaperFigures``, with 95 % intervals; None without a run."""
-    against_constant_pct: Interval | None
-    """Our carbon against that of the constant lowest setpoint in the same weeks, in %, with a 95 %
-    interval; None without a run of either."""
-    printed: PaperFigures | None
-    """Printed figures; None where the paper has no such row."""
-
-
 @cache
 def paper_tables() -> tuple[PaperTable, ...]:
     """Tables 2 to 7 of the paper as printed."""
@@ -147,7 +127,7 @@ def paper_tables() -> tuple[PaperTable, ...]:
     return tuple(PaperTable.model_validate(values) for values in yaml.safe_load(text))
 
 
-def compared(table: PaperTable, rows: pd.DataFrame, scored_h: float) -> list[ComparedRow]:
+def compared(table: PaperTable, rows: pd.DataFrame, scored_h: float) -> pd.DataFrame:
     """Rows of a table: those that are printed, and then all others of the case.
 
     Args:
@@ -156,9 +136,15 @@ def compared(table: PaperTable, rows: pd.DataFrame, scored_h: float) -> list[Com
             and ``seed``.
         scored_h: scored hours of each week.
 
+    Returns:
+        Columns of ``PAPER_TITLES`` without ``table``, with ends ``_low`` and ``_high`` of 95 %
+        intervals; nan where there is no figure.
+
     Raises:
         ConfigError: rows of one case that are not of the same weeks.
     """
+    import pandas as pd
+
     of_case = rows[(rows["case"] == table.case) & (rows["site"].str.upper() == table.site)]
     of_case = of_case[(of_case["moves"] == ALL) & of_case["it_kwh"].notna()]
     samples = {
@@ -168,32 +154,30 @@ def compared(table: PaperTable, rows: pd.DataFrame, scored_h: float) -> list[Com
     constant = samples.get(CONSTANT_ROW)
     elsewhere = {name for each in paper_tables() for name in each.rows} - set(table.rows)
     names = [*table.rows, *(x for x in samples if x not in table.rows and x not in elsewhere)]
-    return [_compared_row(name, table, samples.get(name), constant) for name in names]
+    return pd.DataFrame([_compared_row(name, table, samples.get(name), constant) for name in names])
 
 
-def finding(rows: Sequence[ComparedRow]) -> str:
-    """How the rows that the paper has stand to the constant lowest setpoint, in words.
+def finding(rows: pd.DataFrame) -> str:
+    """How the rows that the paper has compare with the constant lowest setpoint, in words.
 
     Args:
-        rows: rows of a table.
+        rows: rows of a table, as ``compared`` returns them.
 
     Returns:
         Two sentences; empty where none of these rows has been run beside it.
     """
-    of_paper = [row for row in rows if row.printed is not None]
-    against = [row.against_constant_pct for row in of_paper if row.against_constant_pct is not None]
-    if not against:
+    printed = rows[rows["printed_cfp_kg"].notna()]
+    run = printed[printed["against_constant"].notna()]
+    if run.empty:
         return ""
-    less, more = sum(x.high < 0.0 for x in against), sum(x.low > 0.0 for x in against)
-    values = [x.value for x in against]
-    printed_kg = [row.printed.cfp_kg for row in of_paper if row.printed is not None]
-    spread_pct = 100.0 * (max(printed_kg) / min(printed_kg) - 1.0)
-    equal = len(against) - less - more
+    less, more = (run["against_constant_high"] < 0).sum(), (run["against_constant_low"] > 0).sum()
+    least, most = run["against_constant"].min(), run["against_constant"].max()
+    spread_pct = 100.0 * (printed["printed_cfp_kg"].max() / printed["printed_cfp_kg"].min() - 1.0)
     return (
-        f"Of {len(against)} rows that the paper has, {less} emit less than the lowest setpoint "
-        f"held all the time, {more} more, and {equal} cannot be separated from it; they lie "
-        f"{min(values):+.2f} to {max(values):+.2f} % from it. As printed, their CFP "
-        f"spreads by {spread_pct:.1f} %."
+        f"Of {len(run)} rows that the paper has, {less} emit less than the lowest setpoint "
+        f"held all the time, {more} more, and {len(run) - less - more} cannot be separated from "
+        f"it; they lie {least:+.2f} to {most:+.2f} % from it. As printed, their CFP spreads by "
+        f"{spread_pct:.1f} %."
     )
 
 
@@ -225,27 +209,26 @@ def _samples(rows: pd.DataFrame, table: PaperTable, scored_h: float) -> F64:
 
 def _compared_row(
     name: str, table: PaperTable, sample: F64 | None, constant: F64 | None
-) -> ComparedRow:
+) -> dict[str, Any]:
     """A row of a table from its samples and those of the constant setpoint, (5, S, W) each."""
     printed = table.rows.get(name)
-    ours, against = None, None
-    if sample is not None:
-        ours = tuple(_interval(sample_mean, values) for values in sample)
-        if constant is not None:
-            if constant.shape[2] != sample.shape[2]:
-                raise ConfigError(
-                    f"table {table.number}: {name} has {sample.shape[2]} weeks and {CONSTANT_ROW} "
-                    f"{constant.shape[2]}; valid is the same weeks"
-                )
-            against = _interval(change_pct, sample[0], constant[0])
-    return ComparedRow(
-        name=name,
-        label=name if printed is None else printed.label,
-        seeds=0 if sample is None else sample.shape[1],
-        ours=ours,
-        against_constant_pct=against,
-        printed=None if printed is None else printed.figures,
-    )
+    row: dict[str, Any] = {
+        "label": name if printed is None else printed.label,
+        "seeds": 0 if sample is None else sample.shape[1],
+    }
+    for index, column in enumerate(PaperFigures._fields):
+        ours = _NO_FIGURE if sample is None else _interval(sample_mean, sample[index])
+        row |= interval_columns(column, ours) if column == "cfp_kg" else {column: ours.value}
+        row[f"printed_{column}"] = math.nan if printed is None else printed.figures[index]
+    against_constant = _NO_FIGURE
+    if sample is not None and constant is not None:
+        if constant.shape[2] != sample.shape[2]:
+            raise ConfigError(
+                f"table {table.number}: {name} has {sample.shape[2]} weeks and {CONSTANT_ROW} "
+                f"{constant.shape[2]}; valid is the same weeks"
+            )
+        against_constant = _interval(change_pct, sample[0], constant[0])
+    return row | interval_columns("against_constant", against_constant)
 
 
 def _interval(statistic: Statistic, *samples: F64) -> Interval:
@@ -267,9 +250,8 @@ def paper_rows(suite: SuiteResults) -> pd.DataFrame:
     """
     import pandas as pd
 
-    frames = [_frame(rows).assign(table=table.number) for table, rows in _compared_tables(suite)]
-    rows = pd.concat(frames, ignore_index=True)
-    return rows[["table", *(name for name in rows if name != "table")]]
+    tables = {table.number: rows for table, rows in _compared_tables(suite)}
+    return pd.concat(tables, names=["table"]).reset_index(level=0).reset_index(drop=True)
 
 
 def paper_sections(suite: SuiteResults) -> dict[str, list[Block]]:
@@ -281,13 +263,13 @@ def paper_sections(suite: SuiteResults) -> dict[str, list[Block]]:
     sections: dict[str, list[Block]] = {}
     for table, rows in _compared_tables(suite):
         sections[f"Table {table.number}: {table.title}"] = [
-            Table(f"{_CAPTION}, site {table.site}", _frame(rows), PAPER_TITLES),
+            Table(f"{_CAPTION}, site {table.site}", rows, PAPER_TITLES),
             Text(finding(rows) + _UNITS),
         ]
     return sections
 
 
-def _compared_tables(suite: SuiteResults) -> list[tuple[PaperTable, list[ComparedRow]]]:
+def _compared_tables(suite: SuiteResults) -> list[tuple[PaperTable, pd.DataFrame]]:
     """Tables whose cases have results, and their rows."""
     import pandas as pd
 
@@ -302,22 +284,3 @@ def _compared_tables(suite: SuiteResults) -> list[tuple[PaperTable, list[Compare
             rows = compared(table, pd.concat(frames, ignore_index=True), scored_h)
             tables.append((table, rows))
     return tables
-
-
-def _frame(rows: Sequence[ComparedRow]) -> pd.DataFrame:
-    """Rows of a table of the paper, ours and as printed."""
-    import pandas as pd
-
-    return pd.DataFrame([_values(row) for row in rows])
-
-
-def _values(row: ComparedRow) -> dict[str, Any]:
-    """Cells of a row; nan where there is no figure."""
-    nothing = Interval(math.nan, math.nan, math.nan)
-    values: dict[str, Any] = {"label": row.label, "seeds": row.seeds}
-    ours = row.ours or (nothing,) * len(_COLUMNS)
-    printed = row.printed or (math.nan,) * len(_COLUMNS)
-    for name, interval, other in zip(_COLUMNS, ours, printed, strict=True):
-        both = interval_columns(name, interval) if name == "cfp_kg" else {name: interval.value}
-        values |= both | {f"printed_{name}": other}
-    return values | interval_columns("against_constant", row.against_constant_pct or nothing)
