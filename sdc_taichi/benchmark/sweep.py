@@ -237,13 +237,49 @@ def run_part(values: Mapping[str, Any], inputs: Inputs) -> JobResult:
         A row for each combination with its values, its site and all metrics of its run. The metrics
         of the job are ``failed``, combinations without a row and why, and ``notes`` on inputs.
     """
+    cells: list[list[Any]] = values["cells"]
+    fields = [field for field, _ in values["columns"]]
+    outcomes: dict[int, dict[str, Metric] | str] = {}
+    notes: list[str] = []
+    fleets: dict[tuple[Any, ...], dict[int, DataCenterConfig]] = {}
     with tempfile.TemporaryDirectory() as folder:
         files = _written_files(inputs, Path(folder))
-        part = _Part(values, _base(inputs, files, str(values["start"])), files)
-        metrics, failed, notes = part.run()
-    return JobResult(
-        rows=part.rows(metrics), metrics={"failed": failed, "notes": list(dict.fromkeys(notes))}
-    )
+        base = _base(inputs, files, str(values["start"]))
+        for place, cell in enumerate(cells):
+            assigned = {
+                field: files.get(value, value) if field in FILE_FIELDS else value
+                for field, value in zip(fields, cell, strict=True)
+            }
+            try:
+                config = with_values(base, assigned)
+            except SdcError as error:
+                outcomes[place] = str(error)
+            else:
+                fleets.setdefault(shared_values(config), {})[place] = config
+        for configs in fleets.values():
+            names = place_names(list(configs.values()))
+            named = [
+                (place, config.model_copy(update={"name": name}))
+                for (place, config), name in zip(configs.items(), names, strict=True)
+            ]
+            outcomes |= _run_batch(named, values, notes)
+
+    def with_names(text: str) -> str:
+        """A message with files by their names in the sweep, which are the same everywhere."""
+        for name, path in files.items():
+            text = text.replace(path, name)
+        return text
+
+    failed = [
+        {
+            "combination": combination_text(fields, cells[place]),
+            "error": with_names(str(outcomes[place])),
+        }
+        for place in sorted(outcomes)
+        if isinstance(outcomes[place], str)
+    ]
+    notes = list(dict.fromkeys(map(with_names, notes)))
+    return JobResult(_rows(values, outcomes), {"failed": failed, "notes": notes})
 
 
 def metric_names(config: DataCenterConfig) -> tuple[str, ...]:
@@ -256,122 +292,64 @@ def metric_names(config: DataCenterConfig) -> tuple[str, ...]:
     return tuple(metrics_per_dc(totals, fleet)[0])
 
 
-class _Part:
-    """Combinations of a sweep that run under one controller from one day.
+def _run_batch(
+    configs: Sequence[tuple[int, DataCenterConfig]], values: Mapping[str, Any], notes: list[str]
+) -> dict[int, dict[str, Metric] | str]:
+    """Site and metrics of data centers by their places, or the error of those that fail.
+
+    They run as one batch; if one fails, the batch is halved until that one is isolated.
 
     Args:
+        configs: place and configuration of each data center.
         values: values of the job.
-        base: data center whose fields are varied.
-        files: path of each file by the name that the sweep has for it.
+        notes: notes on inputs are added to it.
     """
-
-    def __init__(
-        self, values: Mapping[str, Any], base: DataCenterConfig, files: Mapping[str, str]
-    ) -> None:
-        self._values, self._base, self._files = values, base, files
-        self._fields: list[str] = [field for field, _ in values["columns"]]
-        self._cells: list[list[Any]] = values["cells"]
-
-    def run(self) -> tuple[dict[int, dict[str, Metric]], list[dict[str, str]], list[str]]:
-        """Metrics of each combination by its place, those that failed, and notes on inputs."""
-        metrics: dict[int, dict[str, Metric]] = {}
-        errors: dict[int, str] = {}
-        notes: list[str] = []
-        fleets: dict[tuple[Any, ...], dict[int, DataCenterConfig]] = {}
-        for place, cell in enumerate(self._cells):
-            try:
-                config = with_values(self._base, self._assigned(cell))
-            except SdcError as error:
-                errors[place] = str(error)
-                continue
-            fleets.setdefault(shared_values(config), {})[place] = config
-        for configs in fleets.values():
-            names = place_names(list(configs.values()))
-            named = {
-                place: config.model_copy(update={"name": name})
-                for (place, config), name in zip(configs.items(), names, strict=True)
-            }
-            self._run_fleet(named, metrics, errors, notes)
-        failed = [
-            {
-                "combination": combination_text(self._fields, self._cells[place]),
-                "error": self._with_names(errors[place]),
-            }
-            for place in sorted(errors)
-        ]
-        return metrics, failed, [self._with_names(note) for note in notes]
-
-    def rows(self, metrics: Mapping[int, Mapping[str, Metric]]) -> pd.DataFrame | None:
-        """Rows of combinations: their values, their site and their metrics; None without any."""
-        import pandas as pd
-
-        if not metrics:
-            return None
-        places = sorted(metrics)
-        columns: dict[str, Any] = {}
-        for at, (field, kind) in enumerate(self._values["columns"]):
-            values = [self._cells[place][at] for place in places]
-            columns[field] = _column(values, kind)
-        for name in metrics[places[0]]:
-            values = [metrics[place][name] for place in places]
-            columns[name] = _column(values, kind_of(values))
-        return pd.DataFrame(columns)
-
-    def _run_fleet(
-        self,
-        configs: Mapping[int, DataCenterConfig],
-        metrics: dict[int, dict[str, Metric]],
-        errors: dict[int, str],
-        notes: list[str],
-    ) -> None:
-        """Run data centers as a batch; if one fails, halve the batch until it is isolated."""
-        try:
-            of_fleet, of_inputs = self._metrics(list(configs.values()))
-        except SdcError as error:
-            if len(configs) == 1:
-                errors[next(iter(configs))] = str(error)
-                return
-            listed = list(configs.items())
-            for half in (listed[: len(listed) // 2], listed[len(listed) // 2 :]):
-                self._run_fleet(dict(half), metrics, errors, notes)
-            return
-        places = locations(list(configs.values()))
-        for place, site, row in zip(configs, places, of_fleet, strict=True):
-            metrics[place] = {"site": site, **row}
-        notes += of_inputs
-
-    def _metrics(
-        self, configs: Sequence[DataCenterConfig]
-    ) -> tuple[list[dict[str, Metric]], tuple[str, ...]]:
-        """Metrics of runs of data centers, and notes on their inputs."""
-        values = self._values
+    batch = [config for _, config in configs]
+    try:
         with warnings.catch_warnings():
-            # Each combination would be odd in its own way.
+            # A warning for each combination would hide the others.
             warnings.simplefilter("ignore", OddInputWarning)
-            sim = Simulator(configs, precision=values["precision"])
+            sim = Simulator(batch, precision=values["precision"])
         with sim:
-            steps = whole_steps(values["days"], sim.fleet.steps_per_hour)
             totals = simulate(
                 sim,
                 make_controller(values["controller"], sim.fleet),
-                steps,
+                whole_steps(values["days"], sim.fleet.steps_per_hour),
                 np.full(sim.size, values["seed"]),
                 forecast_error=ForecastError(**values["forecast_error"]),
             )
-            return metrics_per_dc(totals, sim.fleet), sim.drivers.notes
+            metrics = metrics_per_dc(totals, sim.fleet)
+            notes += sim.drivers.notes
+    except SdcError as error:
+        if len(configs) == 1:
+            return {configs[0][0]: str(error)}
+        half = len(configs) // 2
+        return _run_batch(configs[:half], values, notes) | _run_batch(configs[half:], values, notes)
+    return {
+        place: {"site": site, **of_dc}
+        for (place, _), site, of_dc in zip(configs, locations(batch), metrics, strict=True)
+    }
 
-    def _with_names(self, text: str) -> str:
-        """A message with files by their names in the sweep, which are the same everywhere."""
-        for name, path in self._files.items():
-            text = text.replace(path, name)
-        return text
 
-    def _assigned(self, cell: Sequence[Any]) -> dict[str, Any]:
-        """Values of a combination by field, files by where they lie here."""
-        return {
-            field: self._files.get(value, value) if field in FILE_FIELDS else value
-            for field, value in zip(self._fields, cell, strict=True)
-        }
+def _rows(
+    values: Mapping[str, Any], outcomes: Mapping[int, Mapping[str, Metric] | str]
+) -> pd.DataFrame | None:
+    """Rows of combinations: their values, their site and their metrics; None without any."""
+    import pandas as pd
+
+    metrics = {
+        place: outcome for place, outcome in outcomes.items() if not isinstance(outcome, str)
+    }
+    if not metrics:
+        return None
+    places = sorted(metrics)
+    columns: dict[str, Any] = {}
+    for at, (field, kind) in enumerate(values["columns"]):
+        columns[field] = _column([values["cells"][place][at] for place in places], kind)
+    for name in metrics[places[0]]:
+        of_places = [metrics[place][name] for place in places]
+        columns[name] = _column(of_places, kind_of(of_places))
+    return pd.DataFrame(columns)
 
 
 def _run_days(sweep: Sweep, place: int) -> float:
