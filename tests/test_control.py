@@ -41,7 +41,6 @@ from sdc_taichi.control import (
 from sdc_taichi.control.rules import FixedSetpoint, quartile_command, slots_in_step
 from sdc_taichi.envs.options import make_options
 from sdc_taichi.learning.interface import interface_of
-from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.run.loop import simulate
 
 CHECKS = json.loads((Path(__file__).parent / "reference" / "physics_checks.json").read_text())
@@ -98,62 +97,6 @@ def make_setpoint(text: str, fleet: Fleet, parts: tuple[str, ...]) -> Controller
 # Trim and respond
 
 
-def test_what_a_spec_controls() -> None:
-    fleet = build_fleet(TINY)
-
-    def given_by(spec: str) -> tuple[str, ...]:
-        return commands_of(make_controller(spec, fleet))
-
-    assert given_by("g36") == given_by("constant:20") == ("cooling",)
-    assert given_by("greedy-ci") == ("load", "battery")
-    assert given_by("random") == CONTROLLABLE
-    assert given_by("mpc-24h:cost") == CONTROLLABLE
-    assert given_by("idle") == given_by("load=idle") == ()
-    assert given_by("load=greedy-ci, cooling=g36,battery=idle") == ("load", "cooling")
-
-
-def test_commands_that_are_not_repeated_stay_as_they_are() -> None:
-    command = np.array([0.5, 0.5, -0.5, 0.0, 1.0])
-    found = avoid_repeats(command, np.array([0.5, 0.25, -0.5, 0.0, np.nan]))
-    assert (found == command).tolist() == [False, True, False, True, True]
-    np.testing.assert_allclose(found, command, rtol=1e-15)
-
-
-def test_trim_and_respond_gives_the_reference_sequence() -> None:
-    given = TRIM["inputs"]
-    setpoint = np.array([given["SP0"]])
-    found = []
-    for requests in given["requests"]:
-        setpoint = trim_and_respond(
-            setpoint,
-            [requests],
-            low_c=given["SPmin"],
-            high_c=given["SPmax"],
-            trim_k=given["trim"],
-            respond_k=given["res"],
-            max_respond_k=given["maxres"],
-            ignored=given["I"],
-        )
-        found.append(float(setpoint[0]))
-    assert found == pytest.approx(TRIM["expected"]["sp"], **TRIM["tolerance"])
-
-
-def test_defaults_are_those_of_the_reference() -> None:
-    given = TRIM["inputs"]
-    requests = np.arange(12)
-    arguments = (np.full(12, 17.0), requests)
-    spelled = trim_and_respond(
-        *arguments,
-        low_c=12.0,
-        high_c=18.0,
-        trim_k=given["trim"],
-        respond_k=given["res"],
-        max_respond_k=given["maxres"],
-        ignored=given["I"],
-    )
-    assert np.array_equal(trim_and_respond(*arguments, low_c=12.0, high_c=18.0), spelled)
-
-
 @pytest.mark.parametrize("steps_per_hour", [1, 2, 3, 4, 5, 6, 10, 12, 15, 20, 30, 60])
 def test_twelve_slots_an_hour_whatever_the_step(steps_per_hour: int) -> None:
     slots = [slots_in_step(step, 1 / steps_per_hour) for step in range(3 * steps_per_hour)]
@@ -200,10 +143,6 @@ def g36(sim: Simulator) -> Controller:
 # Other rules
 
 
-def test_idle_leaves_everything_alone(sim: Simulator) -> None:
-    assert make_controller("idle", sim.fleet).act(view_maker(sim)(None)) == Actions()
-
-
 def test_random_is_reproducible_and_independent_of_the_batch() -> None:
     def drawn(count: int, seed: int, steps: int = 600) -> np.ndarray:
         with Simulator(fleet_of(count)) as sim:
@@ -220,12 +159,6 @@ def test_random_is_reproducible_and_independent_of_the_batch() -> None:
     values, counts = np.unique(three, return_counts=True)
     assert values.tolist() == [-1.0, 0.0, 1.0]
     assert counts == pytest.approx(np.full(3, three.size / 3), rel=0.1)
-
-
-def test_random_starts_again_at_reset(sim: Simulator) -> None:
-    controller = make_controller("random", sim.fleet)
-    first = [r.load_command.tolist() for r in results(sim, controller, 5, 3)]
-    assert [r.load_command.tolist() for r in results(sim, controller, 5, 3)] == first
 
 
 @pytest.mark.parametrize("model", ["symmetric", "accelerating"])
@@ -288,14 +221,6 @@ def test_greedy_follows_the_mean_of_the_coming_day() -> None:
     assert kept[-1].queue_tasks[0] == 0
 
 
-def test_greedy_idles_where_the_coming_day_rounds_to_the_mean() -> None:
-    # The first of these is the mean, but for the rounding of the sum.
-    config, drivers = one_with(300.1 + np.tile([0.0, 1.1, -1.1], 96))
-    with Simulator(config, drivers=drivers) as sim:
-        kept = results(sim, make_controller("greedy-ci", sim.fleet), 1)
-    assert kept[0].load_command[0] == 0.0
-
-
 # What a controller sees
 
 
@@ -330,11 +255,6 @@ def test_forecast_is_what_comes_also_over_the_turn_of_the_year() -> None:
         assert np.array_equal(getattr(forecast, name), seen), name
 
 
-def test_forecast_shorter_than_a_step_is_an_error(sim: Simulator) -> None:
-    with pytest.raises(ConfigError, match=r"forecast of 0 h: valid is 0\.25\.\.8,760 h"):
-        view_maker(sim)(None).forecast(0.0)
-
-
 # Names
 
 
@@ -358,12 +278,6 @@ def test_each_agent_may_have_its_own(sim: Simulator) -> None:
     for command, kept in alone.items():
         found = [getattr(r, command).tolist() for r in mixed]
         assert found == [getattr(r, command).tolist() for r in kept], command
-
-
-def test_agents_not_mentioned_stay_idle(sim: Simulator) -> None:
-    kept = results(sim, make_controller("battery=random", sim.fleet), 20)
-    assert not any(np.any(r.load_command) or np.any(r.cooling_command) for r in kept)
-    assert any(np.any(r.battery_command) for r in kept)
 
 
 @pytest.mark.parametrize(
@@ -499,3 +413,33 @@ def test_an_object_is_copied(sim: Simulator) -> None:
     mine.lock = threading.Lock()  # type: ignore[attr-defined]
     with pytest.raises(ConfigError, match=r"AlwaysCharge: cannot be copied .*copy\.deepcopy"):
         make_controller(mine, sim.fleet)
+
+
+@pytest.mark.parametrize(
+    ("spec", "commands"),
+    [
+        ("g36", ("cooling",)),
+        ("constant:20", ("cooling",)),
+        ("greedy-ci", ("load", "battery")),
+        ("random", CONTROLLABLE),
+        ("mpc-24h:cost", CONTROLLABLE),
+        ("idle", ()),
+        ("load=greedy-ci, cooling=g36,battery=idle", ("load", "cooling")),
+    ],
+)
+def test_commands_of_a_spec(spec: str, commands: tuple[str, ...]) -> None:
+    assert commands_of(make_controller(spec, build_fleet(TINY))) == commands
+
+
+def test_trim_and_respond_gives_the_reference_sequence() -> None:
+    inputs = TRIM["inputs"]
+    names = {"trim_k": "trim", "respond_k": "res", "max_respond_k": "maxres", "ignored": "I"}
+    spelled = {name: inputs[key] for name, key in names.items()}
+    for parameters in ({}, spelled):
+        setpoint, sequence = np.array([inputs["SP0"]]), []
+        for requests in inputs["requests"]:
+            setpoint = trim_and_respond(
+                setpoint, [requests], low_c=inputs["SPmin"], high_c=inputs["SPmax"], **parameters
+            )
+            sequence.append(float(setpoint[0]))
+        assert sequence == pytest.approx(TRIM["expected"]["sp"], **TRIM["tolerance"])

@@ -220,20 +220,6 @@ def test_gymnasiums_vector_wrappers(seen: str) -> None:
     assert same(*given)
 
 
-def test_a_multi_agent_batch_without_autoreset_waits_for_reset() -> None:
-    env = multi_agent(2, autoreset_mode="Disabled", **tiny())
-    hold = {agent: np.ones(2, np.int64) for agent in AGENTS}
-    env.reset(seed=0)
-    for _ in range(STEPS):
-        *_, truncated, infos = env.step(hold)
-    assert all(flags.all() for flags in truncated.values())
-    assert "final_obs" not in infos
-    with pytest.raises(RuntimeStateError, match="call reset"):
-        env.step(hold)
-    env.reset()
-    env.step(hold)
-
-
 def test_multi_agent_batches_have_the_attributes_of_pettingzoo() -> None:
     env, parallel = multi_agent(2, **BUSY), sdc_taichi.parallel_env(**BUSY)
     assert env.num_agents == len(env.agents) == 3
@@ -245,23 +231,6 @@ def test_multi_agent_batches_have_the_attributes_of_pettingzoo() -> None:
         assert env.action_space(agent) is env.action_space(agent)
     with pytest.raises(ConfigError, match="agent 'agent_x': does not learn here"):
         env.action_space("agent_x")
-
-
-def test_without_autoreset_the_batch_waits_for_reset() -> None:
-    env = gymnasium.make_vec(
-        "sdc_taichi/Battery-v0", num_envs=2, autoreset_mode="Disabled", **tiny()
-    )
-    env.reset(seed=0)
-    for _ in range(STEPS):
-        *_, truncated, infos = env.step(np.array([1, 1]))
-    assert truncated.all()
-    assert "final_obs" not in infos
-    with pytest.raises(RuntimeStateError, match="call reset"):
-        env.step(np.array([1, 1]))
-    with pytest.raises(ConfigError, match=r"reset_mask: .*valid selects all 2"):
-        env.reset(options={"reset_mask": np.array([True, False])})
-    env.reset(options={"reset_mask": np.array([True, True])})
-    env.step(np.array([1, 1]))
 
 
 def test_bounds_are_finite() -> None:
@@ -364,15 +333,6 @@ def trajectory(env: Any, start: Any, steps: int) -> list[Any]:
     return out
 
 
-def test_batch_is_closed_until_it_is_made() -> None:
-    """Gymnasium before 1.4 closes on deletion whatever says that it is open, whole or not."""
-    assert SdcVectorEnv.__new__(SdcVectorEnv).closed
-    env = SdcVectorEnv(2, **tiny())
-    assert not env.closed
-    env.close()
-    assert env.closed
-
-
 @pytest.mark.parametrize("saved_after", [0, 1, 40, STEPS - 1, STEPS])
 def test_goes_on_from_what_was_saved(saved_after: int) -> None:
     env = multi_agent(2, **{**BUSY, **playing(("agent_ls", "agent_dc"))})
@@ -416,99 +376,6 @@ def test_single_environments_go_on_from_what_was_saved() -> None:
         assert same(two.load_state_dict(one.state_dict()), begun[0])
         action_of_both = one.action_space.sample()
         assert same(two.step(action_of_both), one.step(action_of_both))
-
-
-def test_saved_by_another_environment() -> None:
-    env, other = sdc_taichi.parallel_env(**tiny()), multi_agent(2, **tiny())
-    env.reset(seed=0)
-    before = env.state_dict()
-    with pytest.raises(SdcError, match="made by 1 environments; valid is 2"):
-        other.load_state_dict(before)
-    with pytest.raises(SdcError, match=r"missing \['options', 'inputs', 'actions'"):
-        env.load_state_dict({"simulator": before["simulator"]})
-    with pytest.raises(SdcError, match=r"state: unknown \['more'\]"):
-        env.load_state_dict({**before, "more": 1})
-    with pytest.raises(SdcError, match="another fleet"):
-        sdc_taichi.parallel_env(**{**tiny(), "config": "corrected"}).load_state_dict(before)
-    one_unit = sdc_taichi.parallel_env("corrected", days=1)
-    one_unit.reset(seed=0)
-    one_unit.step(dict.fromkeys(AGENTS, 1))
-    with pytest.raises(SdcError, match="another fleet"):
-        sdc_taichi.parallel_env(EVENTFUL, days=1).load_state_dict(one_unit.state_dict())
-
-
-OTHERWISE: list[tuple[dict[str, Any], str]] = [
-    ({"days": 2}, "made with days 1; valid is 2, as here"),
-    ({"agents": ["agent_bat"]}, "made with agents"),
-    ({"actions": "continuous"}, "made with actions 'discrete'"),
-    ({"forecast_error": ForecastError(0.1)}, "made with forecast_error"),
-    ({"collaboration": 1.0}, "made with collaboration 0.8"),
-    ({"rewards": {"agent_dc": {"pue": 1.0}}}, "made with rewards {"),
-    ({"rewards": lambda result, view: -result.grid_kwh}, "made with rewards {"),
-    ({"tariff": {"price_per_kwh": [0.1]}}, "made with tariff"),
-]
-
-
-@pytest.mark.parametrize(("options", "message"), OTHERWISE)
-def test_saved_with_other_options(options: dict[str, Any], message: str) -> None:
-    env, other = sdc_taichi.parallel_env(**tiny()), sdc_taichi.parallel_env(**tiny(**options))
-    env.reset(seed=0)
-    with pytest.raises(SdcError, match=re.escape(message)):
-        other.load_state_dict(env.state_dict())
-
-
-SPOILT: list[tuple[str, Any, str]] = [
-    ("options", None, "options is a NoneType"),
-    ("options", {"days": 1}, r"options without \['action_order', "),
-    ("simulator", 3, "simulator is a int"),
-    ("simulator", {}, "snapshot: missing"),
-    ("generators", None, "generators is a NoneType"),
-    ("generators", [{}, {}], "generator 0 is not valid"),
-    ("generators", ["x", 3], "generator 0 is not valid"),
-    ("keys", None, "keys is a NoneType; valid is an array"),
-    ("keys", np.array([1.5, 2.0]), "keys are float64"),
-    ("keys", np.array([1, 2, 3]), r"keys are int64 \(3,\)"),
-    ("rewards", None, "rewards is a NoneType; valid is an array"),
-    ("rewards", np.full((2, 2), np.nan), "valid is finite numbers"),
-    ("rewards", np.zeros((1, 2)), r"rewards are float64 \(1, 2\)"),
-    ("rewards", np.zeros((2, 2)), "cannot be continued .highest billed power"),
-    ("rewards", np.full((2, 2), 1e300), "cannot be continued .highest billed power"),
-    ("actions", None, "no actions after 4 steps"),
-    ("actions", 3, "actions are 3; valid is a dict"),
-    ("actions", {"jump": np.zeros(2)}, r"actions are \['jump'\]; valid is a dict"),
-    ("actions", {"load": np.zeros(2), "cooling": np.zeros(2)}, "'battery', 'cooling', 'load'"),
-]
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("load", np.array([2.0, 0.0]), "actions of load are .*; valid is within -1..1"),
-        ("load", np.zeros(3), r"actions of load are float64 \(3,\)"),
-        ("cooling", np.array([np.inf, 0.0]), r"actions of cooling are .*; valid is within -1e\+06"),
-        ("battery", "charge", "actions of battery is a str; valid is an array"),
-    ],
-)
-def test_spoilt_commands(name: str, value: Any, message: str) -> None:
-    env = multi_agent(2, **tiny())
-    trajectory(env, env.reset(seed=7), 5)
-    state = env.state_dict()
-    with pytest.raises(SdcError, match=message):
-        env.load_state_dict({**state, "actions": {**state["actions"], name: value}})
-
-
-@pytest.mark.parametrize(("part", "value", "message"), SPOILT)
-def test_a_spoilt_state_leaves_everything_as_it_was(part: str, value: Any, message: str) -> None:
-    env, twin = (multi_agent(2, **tiny()) for _ in range(2))
-    for one in (env, twin):
-        trajectory(one, one.reset(seed=2), 3)
-    other = multi_agent(2, **tiny())
-    trajectory(other, other.reset(seed=7), 5)
-    with pytest.raises(SdcError, match=message):
-        env.load_state_dict({**other.state_dict(), part: value})
-    assert same(trajectory(env, None, STEPS), trajectory(twin, None, STEPS))
-    with pytest.raises(SdcError, match="state: is a int; valid is what state_dict"):
-        env.load_state_dict(3)
 
 
 def test_a_state_is_not_changed_by_going_on() -> None:
@@ -577,22 +444,6 @@ def test_continuous_setpoint_changes_are_what_was_asked_for(agents: tuple[str, .
     assert slow.step(lowered)[4]["agent_dc"]["setpoint_c"] == pytest.approx(18.5, abs=1e-6)
 
 
-@pytest.mark.parametrize("units", [1, 2])
-def test_continuous_actions_are_within_one(units: int) -> None:
-    config = load_config("corrected", [f"hvac.crac.units={units}"])
-    env = SdcEnv(config, actions="continuous", setpoint_change_k=3.0)
-    expected = gymnasium.spaces.Box(-1.0, 1.0, (2 + units,), np.float32)
-    assert env.action_space == expected
-
-
-def test_forecast_errors_leave_the_days_alone() -> None:
-    erring = ForecastError(ci_share=0.2, temperature_k=3.0)
-    envs = [multi_agent(3, **tiny(forecast_error=e)) for e in (ForecastError(), erring)]
-    drawn = [[env.reset(seed=s)[1]["start_day"] for s in (4, None, None)] for env in envs]
-    assert np.array_equal(drawn[0], drawn[1])
-    assert len(np.unique(drawn[0])) > 5
-
-
 def test_a_reset_that_fails_changes_nothing() -> None:
     env, twin = (multi_agent(2, **tiny()) for _ in range(2))
     for one in (env, twin):
@@ -607,16 +458,6 @@ def test_a_reset_that_fails_changes_nothing() -> None:
             env.reset(**given)
     for _ in range(3):
         assert same(env.reset(), twin.reset())
-
-
-def test_single_values_may_come_as_arrays() -> None:
-    env = multi_agent(2, **tiny())
-    found, infos = env.reset(seed=np.array(3), options={"start_day": np.array(5)})
-    assert infos["start_day"].tolist() == [5, 5]
-    assert same(found, env.reset(seed=3, options={"start_day": 5})[0])
-    assert env.reset(options={"start_day": np.array("03-01")})[1]["start_day"].tolist() == [59] * 2
-    with pytest.raises(ConfigError, match="start_day"):
-        env.reset(options={"start_day": np.array(1.5)})
 
 
 def test_terms_of_the_step_that_ends_an_episode() -> None:
@@ -643,26 +484,6 @@ def test_terms_of_the_step_that_ends_an_episode() -> None:
         assert rows(env.reward_terms(), 0) != expected
         env.reset()
         assert env.reward_terms() == {}
-
-
-def test_what_the_standards_do_not_know_is_reached_through_unwrapped() -> None:
-    wrapped = gymnasium.make("sdc_taichi/Joint-v0", render_mode="rgb_array", **tiny())
-    wrapped.reset(seed=0)
-    wrapped.step(np.array([1, 1, 1]))
-    env: Any = wrapped.unwrapped
-    assert env.state_space.contains(env.state())
-    assert env.reward_terms().keys() == TERMS.keys()
-    assert env.load_state_dict(env.state_dict()).shape == env.observation_space.shape
-    for name in ("state", "reward_terms", "state_dict"):
-        assert not hasattr(wrapped, name)
-
-    turns: Any = sdc_taichi.aec_env(**tiny())
-    turns.reset(seed=0)
-    assert env.state_space.contains(turns.state())
-    for name in ("reward_terms", "state_dict"):
-        assert not hasattr(turns, name)
-    assert isinstance(turns.unwrapped, SdcParallelEnv)
-    assert turns.unwrapped.reward_terms() == {}
 
 
 # --- what one learner sees of several agents ---
@@ -746,108 +567,6 @@ def test_start_day() -> None:
     assert fixed.reset(seed=0)[1] == fixed.reset(seed=1)[1] == {"start_day": 121}
 
 
-# --- bad input ---
-
-
-def test_made_of_bad_numbers() -> None:
-    for number in (0, -1, 2.5, True):
-        with pytest.raises(ConfigError, match=f"num_envs {number}: valid is a whole number"):
-            multi_agent(number, **tiny())  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="num_envs 0: valid"):
-        gymnasium.make_vec("sdc_taichi/Load-v0", num_envs=0, **tiny())
-    with pytest.raises(ConfigError, match="autoreset_mode 'never': valid is 'NextStep'"):
-        gymnasium.make_vec("sdc_taichi/Load-v0", num_envs=1, autoreset_mode="never", **tiny())
-    with pytest.raises(ConfigError, match="the one agent here is agent_ls"):
-        gymnasium.make("sdc_taichi/Load-v0", **tiny(agents=["agent_dc"]))
-    with pytest.raises(ConfigError, match="agent 'agent_bat': the one agent here is agent_ls"):
-        gymnasium.make("sdc_taichi/Load-v0", **tiny(agent="agent_bat"))
-    with pytest.raises(ConfigError, match="agent 'agent_bat': the one agent here is agent_ls"):
-        gymnasium.make_vec("sdc_taichi/Load-v0", num_envs=1, **tiny(agent="agent_bat"))
-    assert multi_agent(np.int64(3), **tiny()).num_envs == 3  # type: ignore[arg-type]
-    configs = [load_config("tiny")] * 2
-    with pytest.raises(ConfigError, match="num_envs 1: valid is at least 2, one for each config"):
-        multi_agent(1, config=configs)
-    with pytest.raises(ConfigError, match="num_envs 1: valid is at least 2"):
-        SdcVectorEnv(config=configs)
-    with pytest.raises(ConfigError, match="config: 2 data centers; valid is one"):
-        sdc_taichi.parallel_env(configs)
-    assert multi_agent(None, config=configs, days=1).num_envs == 2  # type: ignore[arg-type]
-    units = [load_config("corrected"), load_config("corrected", ["hvac.crac.units=2"])]
-    with pytest.raises(ConfigError, match=r"\(hvac\.crac\.units\); it is \[1, 2\]"):
-        multi_agent(2, config=units)
-
-
-RESET: list[tuple[dict[str, Any], str]] = [
-    ({"options": {"start_day": "13-01"}}, "start_day '13-01': valid is MM-DD"),
-    ({"options": {"start_day": 365}}, "start_day 365"),
-    ({"options": {"start_day": 1.5}}, "start_day 1.5"),
-    ({"options": {"start_day": [1, 2, 3]}}, "start_day: 3 days"),
-    ({"seed": -1}, "seed -1"),
-    ({"seed": "x"}, "seed 'x'"),
-    ({"seed": 1.0}, "seed 1.0"),
-    ({"seed": [1, 2, 3]}, "3 for"),
-    ({"seed": np.array(1.0)}, "seed np.float64(1.0)"),
-    ({"options": [1]}, "reset options [1]: valid is a dict"),
-]
-
-
-@pytest.mark.parametrize(("given", "message"), RESET)
-def test_reset_with_bad_values(given: dict[str, Any], message: str) -> None:
-    envs: list[Any] = [
-        sdc_taichi.parallel_env(**tiny()),
-        SdcEnv(**tiny()),
-        multi_agent(2, **tiny()),
-        SdcVectorEnv(2, **tiny()),
-    ]
-    for env in envs:
-        with pytest.raises(ConfigError, match=re.escape(message)):
-            env.reset(**given)
-
-
-def test_unknown_reset_option() -> None:
-    message = "reset options: unknown 'start_dy'; did you mean 'start_day'?"
-    for env in (SdcEnv(**tiny()), multi_agent(2, **tiny()), SdcVectorEnv(2, **tiny())):
-        with pytest.raises(ConfigError, match=re.escape(message)):
-            env.reset(options={"start_dy": 3})
-    # PettingZoo's own checkers pass an option that no environment knows.
-    parallel = sdc_taichi.parallel_env(**tiny())
-    with pytest.warns(UserWarning, match="'start_dy' is without effect; did you mean 'start_day'"):
-        parallel.reset(options={"start_dy": 3})
-
-
-ACTED: list[tuple[str, Any, str]] = [
-    ("discrete", {}, "none for agent_ls"),
-    ("discrete", {"agent_ls": 1, "agent_bat": 1}, "none for agent_dc"),
-    ("discrete", {a: 1 for a in (*AGENTS, "agent_x")}, "['agent_x'] do not learn here"),
-    ("discrete", dict.fromkeys(AGENTS, 3), "agent_ls: 3"),
-    ("discrete", dict.fromkeys(AGENTS, -1), "valid is 0, 1 or 2"),
-    ("discrete", dict.fromkeys(AGENTS, 1.0), "1.0"),
-    ("discrete", dict.fromkeys(AGENTS, None), "None (object); valid is 0, 1 or 2"),
-    ("discrete", dict.fromkeys(AGENTS, "up"), "up"),
-    ("discrete", {key: [1] for key in AGENTS}, "agent_ls: shape (1, 1), expected (1,)"),
-    ("continuous", {key: [1.5] for key in AGENTS}, "agent_ls: 1.5; valid is within -1..1"),
-    ("continuous", {key: [np.nan] for key in AGENTS}, "nan"),
-    ("continuous", dict.fromkeys(AGENTS, 0.5), "shape (1,), expected (1, 1)"),
-    ("continuous", {key: ["up"] for key in AGENTS}, "up"),
-    ("continuous", {key: [None] for key in AGENTS}, "None"),
-]
-
-
-@pytest.mark.parametrize(("mode", "actions", "message"), ACTED)
-def test_bad_actions(mode: str, actions: dict[str, Any], message: str) -> None:
-    env = sdc_taichi.parallel_env(**tiny(actions=mode))
-    env.reset(seed=0)
-    with pytest.raises(SdcError, match=re.escape(message)):
-        env.step(actions)
-    for nothing in (None, 3, [1]):
-        with pytest.raises(SdcError, match="valid is a dict of"):
-            env.step(nothing)  # type: ignore[arg-type]
-    batch = multi_agent(1, **tiny(actions=mode))
-    batch.reset(seed=0)
-    with pytest.raises(SdcError, match=re.escape(message)):
-        batch.step({agent: [action] for agent, action in actions.items()})
-
-
 def test_bad_actions_of_one_learner() -> None:
     joint = SdcEnv(**tiny())
     joint.reset(seed=0)
@@ -866,62 +585,218 @@ def test_bad_actions_of_one_learner() -> None:
         batch.step(np.array([1, 1, 1]))
 
 
-def test_out_of_order() -> None:
-    idle = dict.fromkeys(AGENTS, 1)
-    envs: list[tuple[Any, Any]] = [
-        (sdc_taichi.parallel_env(**tiny(), render_mode="rgb_array"), idle),
-        (SdcEnv(**tiny(), render_mode="rgb_array"), np.array([1, 1, 1])),
-        (SdcVectorEnv(1, **tiny(), render_mode="rgb_array"), np.array([[1, 1, 1]])),
+@pytest.mark.parametrize("kind", ["make_vec", "vector_env"])
+def test_without_autoreset_a_batch_waits_for_reset(kind: str) -> None:
+    options = tiny(num_envs=2, autoreset_mode="Disabled")
+    if kind == "make_vec":
+        env: Any = gymnasium.make_vec("sdc_taichi/Battery-v0", **options)
+        hold: Any = np.array([1, 1])
+    else:
+        env = multi_agent(**options)
+        hold = {agent: np.ones(2, np.int64) for agent in AGENTS}
+    env.reset(seed=0)
+    for _ in range(STEPS):
+        *_, truncated, infos = env.step(hold)
+    ended = truncated.values() if isinstance(truncated, dict) else [truncated]
+    assert all(flags.all() for flags in ended)
+    assert "final_obs" not in infos
+    with pytest.raises(RuntimeStateError, match="call reset"):
+        env.step(hold)
+    if kind == "make_vec":
+        with pytest.raises(ConfigError, match=r"reset_mask: .*valid selects all 2"):
+            env.reset(options={"reset_mask": np.array([True, False])})
+        env.reset(options={"reset_mask": np.array([True, True])})
+    else:
+        env.reset()
+    env.step(hold)
+
+
+# --- saved states that do not fit ---
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"config": "corrected"}, "another fleet"),
+        ({"days": 2}, "made with days 1; valid is 2, as here"),
+        ({"agents": ["agent_bat"]}, "made with agents"),
+        ({"actions": "continuous"}, "made with actions 'discrete'"),
+        ({"forecast_error": ForecastError(0.1)}, "made with forecast_error"),
+        ({"rewards": {"agent_dc": {"pue": 1.0}}}, "made with rewards {"),
+        ({"rewards": lambda result, view: -result.grid_kwh}, "made with rewards {"),
+        ({"tariff": {"price_per_kwh": [0.1]}}, "made with tariff"),
+    ],
+)
+def test_saved_by_another_environment(options: dict[str, Any], message: str) -> None:
+    env, other = sdc_taichi.parallel_env(**tiny()), sdc_taichi.parallel_env(**tiny(**options))
+    env.reset(seed=0)
+    with pytest.raises(SdcError, match=re.escape(message)):
+        other.load_state_dict(env.state_dict())
+    with pytest.raises(SdcError, match="made by 1 environments; valid is 2"):
+        multi_agent(2, **tiny()).load_state_dict(env.state_dict())
+
+
+HELD = {name: np.zeros(2) for name in ("load", "cooling", "battery")}
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "message"),
+    [
+        ("more", 1, r"state: unknown \['more'\]"),
+        ("options", None, "options is a NoneType"),
+        ("simulator", {}, "snapshot: missing"),
+        ("generators", [{}, {}], "generator 0 is not valid"),
+        ("keys", np.array([1.5, 2.0]), "keys are float64"),
+        ("keys", np.array([1, 2, 3]), r"keys are int64 \(3,\)"),
+        ("rewards", np.full((2, 2), np.nan), "valid is finite numbers"),
+        ("rewards", np.zeros((2, 2)), "cannot be continued .highest billed power"),
+        ("actions", None, "no actions after 4 steps"),
+        ("actions", {"jump": np.zeros(2)}, r"actions are \['jump'\]; valid is a dict"),
+        ("actions", {**HELD, "load": np.array([2.0, 0.0])}, "load are .*; valid is within -1..1"),
+        ("actions", {**HELD, "load": np.zeros(3)}, r"actions of load are float64 \(3,\)"),
+    ],
+)
+def test_a_malformed_state_leaves_the_environment_unchanged(
+    part: str, value: Any, message: str
+) -> None:
+    env, twin, other = (multi_agent(2, **tiny()) for _ in range(3))
+    for one, steps in ((env, 3), (twin, 3), (other, 5)):
+        trajectory(one, one.reset(seed=2), steps)
+    with pytest.raises(SdcError, match=message):
+        env.load_state_dict({**other.state_dict(), part: value})
+    assert same(trajectory(env, None, 20), trajectory(twin, None, 20))
+
+
+# --- malformed arguments ---
+
+
+@pytest.mark.parametrize("number", [0, -1, 2.5, True])
+def test_number_of_environments(number: Any) -> None:
+    for make in (multi_agent, SdcVectorEnv):
+        with pytest.raises(ConfigError, match=f"num_envs {number}: valid is a whole number"):
+            make(number, **tiny())
+    assert multi_agent(np.int64(3), **tiny()).num_envs == 3  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"autoreset_mode": "never"}, "autoreset_mode 'never': valid is 'NextStep'"),
+        ({"agents": ["agent_dc"]}, "the one agent here is agent_ls"),
+        ({"agent": "agent_bat"}, "agent 'agent_bat': the one agent here is agent_ls"),
         (
-            SdcVectorEnv(1, **tiny(), render_mode="rgb_array", autoreset_mode="NextStep"),
-            np.array([[1, 1, 1]]),
+            {"config": [load_config("tiny")] * 2},
+            "num_envs 1: valid is at least 2, one for each config",
         ),
-        (
-            sdc_taichi.vector_env(1, **tiny(), render_mode="rgb_array"),
-            {a: np.array([1]) for a in AGENTS},
-        ),
-    ]
-    for env, action in envs:
-        for too_early in (
-            lambda env=env, action=action: env.step(action),
-            env.state,
-            env.render,
-            env.reward_terms,
-            env.state_dict,
-        ):
-            with pytest.raises(RuntimeStateError, match="call reset"):
-                too_early()
+    ],
+)
+def test_batches_that_cannot_be_made(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        gymnasium.make_vec("sdc_taichi/Load-v0", num_envs=1, **tiny(**options))
+
+
+def test_several_configs() -> None:
+    configs = [load_config("corrected"), load_config("corrected", ["name=other"])]
+    assert sdc_taichi.vector_env(config=configs, days=1).num_envs == 2
+    with pytest.raises(ConfigError, match="config: 2 data centers; valid is one"):
+        sdc_taichi.parallel_env(configs)
+    configs[1] = load_config("corrected", ["hvac.crac.units=2"])
+    with pytest.raises(ConfigError, match=r"\(hvac\.crac\.units\); it is \[1, 2\]"):
+        sdc_taichi.vector_env(config=configs)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"options": {"start_day": "13-01"}}, "start_day '13-01': valid is MM-DD"),
+        ({"options": {"start_day": 365}}, "start_day 365"),
+        ({"options": {"start_day": 1.5}}, "start_day 1.5"),
+        ({"options": {"start_day": [1, 2, 3]}}, "start_day: 3 days"),
+        ({"seed": -1}, "seed -1"),
+        ({"seed": "x"}, "seed 'x'"),
+        ({"seed": 1.0}, "seed 1.0"),
+        ({"seed": [1, 2, 3]}, "3 for"),
+        ({"options": [1]}, "reset options [1]: valid is a dict"),
+        ({"options": {"start_dy": 3}}, "reset options: unknown 'start_dy'; did you mean"),
+    ],
+)
+def test_malformed_arguments_of_reset(arguments: dict[str, Any], message: str) -> None:
+    for env in (SdcEnv(**tiny()), multi_agent(2, **tiny()), SdcVectorEnv(2, **tiny())):
+        with pytest.raises(ConfigError, match=re.escape(message)):
+            env.reset(**arguments)
+
+
+def test_pettingzoo_only_warns_of_an_unknown_reset_option() -> None:
+    """PettingZoo's own checkers pass an option that no environment knows."""
+    parallel = sdc_taichi.parallel_env(**tiny())
+    with pytest.warns(UserWarning, match="'start_dy' is without effect; did you mean 'start_day'"):
+        parallel.reset(options={"start_dy": 3})
+
+
+@pytest.mark.parametrize(
+    ("mode", "actions", "message"),
+    [
+        ("discrete", None, "valid is a dict of"),
+        ("discrete", {"agent_ls": 1, "agent_bat": 1}, "none for agent_dc"),
+        ("discrete", dict.fromkeys((*AGENTS, "agent_x"), 1), "['agent_x'] do not learn here"),
+        ("discrete", dict.fromkeys(AGENTS, 3), "agent_ls: 3"),
+        ("discrete", dict.fromkeys(AGENTS, -1), "valid is 0, 1 or 2"),
+        ("discrete", dict.fromkeys(AGENTS, 1.0), "1.0"),
+        ("discrete", dict.fromkeys(AGENTS, "up"), "up"),
+        ("discrete", {key: [1] for key in AGENTS}, "agent_ls: shape (1, 1), expected (1,)"),
+        ("continuous", {key: [1.5] for key in AGENTS}, "agent_ls: 1.5; valid is within -1..1"),
+        ("continuous", {key: [np.nan] for key in AGENTS}, "nan"),
+        ("continuous", dict.fromkeys(AGENTS, 0.5), "shape (1,), expected (1, 1)"),
+        ("continuous", {key: ["up"] for key in AGENTS}, "up"),
+    ],
+)
+def test_malformed_actions(mode: str, actions: Any, message: str) -> None:
+    single, batch = (
+        sdc_taichi.parallel_env(**tiny(actions=mode)),
+        multi_agent(1, **tiny(actions=mode)),
+    )
+    of_batch = actions and {agent: [action] for agent, action in actions.items()}
+    for env, chosen in ((single, actions), (batch, of_batch)):
         env.reset(seed=0)
-        assert env.reward_terms() == {}
+        with pytest.raises(SdcError, match=re.escape(message)):
+            env.step(chosen)
+
+
+@pytest.mark.parametrize("kind", ["parallel_env", "SdcEnv", "SdcVectorEnv", "vector_env"])
+def test_calls_before_reset_and_after_close(kind: str) -> None:
+    options = tiny(render_mode="rgb_array")
+    makers: dict[str, tuple[Callable[..., Any], Any]] = {
+        "parallel_env": (sdc_taichi.parallel_env, dict.fromkeys(AGENTS, 1)),
+        "SdcEnv": (SdcEnv, np.array([1, 1, 1])),
+        "SdcVectorEnv": (SdcVectorEnv, np.array([[1, 1, 1]])),
+        "vector_env": (sdc_taichi.vector_env, dict.fromkeys(AGENTS, np.array([1]))),
+    }
+    make, action = makers[kind]
+    env = make(**options)
+    calls = [lambda: env.step(action), env.state, env.render, env.reward_terms, env.state_dict]
+    for call in calls:
+        with pytest.raises(RuntimeStateError, match="call reset"):
+            call()
+    env.reset(seed=0)
+    assert env.reward_terms() == {}
+    env.step(action)
+    saved = env.state_dict()
+    env.close()
+    env.close()
+    for call in (env.reset, lambda: env.load_state_dict(saved), *calls):
+        with pytest.raises(RuntimeStateError, match="the environment is closed; create a new"):
+            call()
+
+
+@pytest.mark.parametrize("kind", ["parallel_env", "SdcEnv"])
+def test_an_episode_that_is_over_needs_reset(kind: str) -> None:
+    env: Any = sdc_taichi.parallel_env(**tiny()) if kind == "parallel_env" else SdcEnv(**tiny())
+    action: Any = dict.fromkeys(AGENTS, 1) if kind == "parallel_env" else [1, 1, 1]
+    env.reset(seed=0)
+    for _ in range(STEPS):
         env.step(action)
-        saved = env.state_dict()
-        env.close()
-        env.close()
-        for too_late in (
-            env.reset,
-            lambda env=env, action=action: env.step(action),
-            env.state,
-            env.render,
-            env.reward_terms,
-            env.state_dict,
-            lambda env=env, saved=saved: env.load_state_dict(saved),
-        ):
-            with pytest.raises(RuntimeStateError, match="the environment is closed; create a new"):
-                too_late()
-    for env, action in envs[:2]:
-        again: Any = type(env)(**tiny())
-        again.reset(seed=0)
-        for _ in range(STEPS):
-            again.step(action)
-        with pytest.raises(RuntimeStateError, match="the episode is over; call reset"):
-            again.step(action)
-
-
-def test_unknown_agent() -> None:
-    env = sdc_taichi.parallel_env(**tiny(agents=["agent_bat"]))
-    for space in (env.observation_space, env.action_space):
-        with pytest.raises(ConfigError, match=r"agent 'agent_ls': does not learn here; valid: \["):
-            space("agent_ls")
+    with pytest.raises(RuntimeStateError, match="the episode is over; call reset"):
+        env.step(action)
 
 
 # --- pictures ---
@@ -929,28 +804,17 @@ def test_unknown_agent() -> None:
 
 def test_render() -> None:
     options = tiny(render_mode="rgb_array")
-    single = SdcEnv(**options)
+    single, batch = SdcEnv(**options), SdcVectorEnv(2, **options)
     single.reset(seed=0)
     before = single.render()
     single.step(np.array([1, 1, 1]))
     image = single.render()
     assert image.dtype == np.uint8
-    assert image.shape == before.shape
-    assert image.ndim == 3
-    assert image.shape[2] == 3
+    assert image.shape == (*before.shape[:2], 3)
     assert not np.array_equal(image, before)
-    batch = SdcVectorEnv(2, **options)
     batch.reset(seed=0)
     batch.step(np.array([[1, 1, 1]] * 2))
     assert np.array_equal(batch.render()[0], image)
-    multi = sdc_taichi.vector_env(2, **options)
-    multi.reset(seed=0)
-    multi.step({a: np.array([1, 1]) for a in AGENTS})
-    assert np.array_equal(multi.render()[1], batch.render()[1])
-    parallel = sdc_taichi.parallel_env(**options)
-    parallel.reset(seed=0)
-    parallel.step(dict.fromkeys(AGENTS, 1))
-    assert np.array_equal(parallel.render(), image)
     silent = SdcEnv(**tiny())
     silent.reset(seed=0)
     with pytest.raises(ConfigError, match="render_mode='rgb_array'"):
@@ -959,40 +823,18 @@ def test_render() -> None:
 
 def test_racks_have_the_colour_of_their_inlet() -> None:
     hall = load_config("corrected").hall
-    inlet_c = np.linspace(16.0, 34.0, hall.racks)
-    image = images.hall_image(hall, inlet_c)
-    colour = images.colours(inlet_c)
-    # Along the turned page: rows of racks from left to right, racks of a row from the top down.
-    measures = hall.layout
-    px = images.PX_PER_M
+    hot, cold = images.colours(np.array([34.0, 16.0]))
+    centres = []
     for rack in range(hall.racks):
-        row, place = divmod(rack, hall.racks_per_row)
-        aisles = {0: 0.0, 1: measures.cold_aisle_m}
-        pair = measures.cold_aisle_m + measures.hot_aisle_m
-        y_m = (
-            measures.side_margin_m
-            + (row + 0.5) * measures.rack_depth_m
-            + row // 2 * pair
-            + aisles[row % 2]
-        )
-        x_m = measures.end_margin_m + (place + 0.5) * measures.rack_pitch_m
-        assert image[int(x_m * px), int(y_m * px)].tolist() == colour[rack].tolist()
-    brightness = images.colours(np.linspace(*images.RANGE_C, 50)).astype(float) @ [
-        0.3,
-        0.6,
-        0.1,
-    ]
-    assert np.all(np.diff(brightness) > 0)
-    ends = images.colours(np.array([-5.0, 15.0, 35.0, 90.0]))
-    assert np.array_equal(ends[0], ends[1])
-    assert np.array_equal(ends[2], ends[3])
-
-
-def test_colours_are_those_of_the_figures() -> None:
-    matplotlib = pytest.importorskip("matplotlib")
-    celsius = np.linspace(*images.RANGE_C, 256)
-    expected = 255 * matplotlib.colormaps["inferno"](np.arange(256))[:, :3]
-    assert np.abs(images.colours(celsius) - expected).max() < 10
+        inlet_c = np.full(hall.racks, 16.0)
+        inlet_c[rack] = 34.0
+        pixels = np.all(images.hall_image(hall, inlet_c) == hot, axis=2)
+        centres.append(np.argwhere(pixels).mean(axis=0))
+    down, right = np.array(centres).reshape(hall.rows, hall.racks_per_row, 2).transpose(2, 0, 1)
+    # The page is turned: rows stand side by side, racks of a row below each other.
+    assert np.all(np.diff(right, axis=0) > 0)
+    assert np.all(np.diff(down, axis=1) > 0)
+    assert hot.sum() > cold.sum()
 
 
 def test_large_halls_are_drawn_smaller() -> None:

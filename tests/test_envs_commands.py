@@ -176,14 +176,17 @@ def test_commands_that_are_not_valid(commands: Any, message: str) -> None:
         sdc_taichi.parallel_env(CONTROLLED, commands=commands)
 
 
-def test_commands_fit_the_config_and_other_options() -> None:
-    for commands, needed in (
-        ({"agent_dc": ["fan"]}, "fan needs hvac.crac.flow_model=controlled; it is "),
-        ({"agent_ls": ["placement"]}, "placement needs workload.placement=weights; it is uniform"),
-    ):
-        with pytest.raises(ConfigError, match=re.escape(f"commands: {needed}")):
-            sdc_taichi.parallel_env("corrected", commands=commands)
-    for options, message in (
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"config": "corrected", "commands": {"agent_dc": ["fan"]}},
+            "commands: fan needs hvac.crac.flow_model=controlled; it is ",
+        ),
+        (
+            {"config": "corrected", "commands": {"agent_ls": ["placement"]}},
+            "commands: placement needs workload.placement=weights; it is uniform",
+        ),
         ({"agents": ["agent_bat"]}, "commands: without effect for agent_"),
         ({"fan_change": 0.1}, "fan_change: without effect with actions discrete"),
         (
@@ -191,30 +194,24 @@ def test_commands_fit_the_config_and_other_options() -> None:
             "fan_change: without effect without the command fan",
         ),
         (
-            {
-                "actions": "continuous",
-                "setpoint_change_k": 1.0,
-                "commands": {"agent_dc": ["fan"]},
-            },
+            {"actions": "continuous", "setpoint_change_k": 1, "commands": {"agent_dc": ["fan"]}},
             "setpoint_change_k: without effect without the command cooling",
         ),
-    ):
-        with pytest.raises(ConfigError, match=re.escape(message)):
-            sdc_taichi.parallel_env(**{**ALL, **options})
+    ],
+)
+def test_commands_fit_the_config_and_other_options(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        sdc_taichi.parallel_env(**{**ALL, **options})
+
+
+def test_placement_needs_halls_of_as_many_racks() -> None:
     large = load_config("corrected", ["workload.placement=weights"])
-    small = load_config(
-        "corrected",
-        [
-            "workload.placement=weights",
-            "hall.rows=2",
-            "hall.racks_per_row=2",
-            "hall.supply_approach_k=5",
-            "hall.return_approach_k=-3",
-            "servers.power_w=[300, 40]",
-        ],
-    )
+    small = load_config("tiny", ["workload.placement=weights"])
     with pytest.raises(ConfigError, match=r"same number of racks; it is \[20, 4\]"):
         sdc_taichi.vector_env(config=[large, small], commands={"agent_ls": ["placement"]})
+
+
+def test_shape_of_an_action_of_several_commands() -> None:
     env = sdc_taichi.parallel_env(**ALL)
     env.reset(seed=0)
     with pytest.raises(SdcError, match=re.escape("agent_dc: shape (1, 2), expected (1, 4)")):

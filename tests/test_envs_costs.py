@@ -85,24 +85,6 @@ def test_every_kind_of_environment_tells_the_same_costs() -> None:
     assert of_single["cost_grid_kwh_twice"] == 2 * of_single["grid_kwh"] > 0
 
 
-class WithCost(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """The wrapper in docs/environments.md."""
-
-    def step(self, action: Any) -> Any:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, info["cost"], terminated, truncated, info
-
-
-def test_six_values_for_safety_gymnasium() -> None:
-    made = gymnasium.make("sdc_taichi/Joint-v0", **options(costs=["hot_inlets"]))
-    env: Any = WithCost(made)
-    env.reset(seed=0)
-    _, _, cost, terminated, truncated, info = env.step(DEFER)
-    assert cost == info["cost_hot_inlets"] >= 0
-    assert not terminated
-    assert not truncated
-
-
 def test_costs_of_the_step_that_ends_an_episode() -> None:
     for mode in ("SameStep", "NextStep"):
         env: Any = gymnasium.make_vec(

@@ -33,11 +33,10 @@ from sdc_taichi.envs.features import (
     WEATHER_LEADS_H,
     Feature,
     all_features,
-    features_markdown,
 )
 from sdc_taichi.envs.images import HEAT_MAP_CHANNELS, heat_map, heat_map_space
 from sdc_taichi.envs.observer import Observer
-from sdc_taichi.envs.time_rows import Forecasts, lead_steps
+from sdc_taichi.envs.time_rows import Forecasts
 from sdc_taichi.sim.drivers import FleetSeries
 
 SITES = ("ny", "ca", "az")
@@ -278,30 +277,6 @@ def test_other_presets_and_models_fit_too(listed: list[str]) -> None:
     np.testing.assert_array_equal(found["age_histogram"][0], 0.0)
 
 
-def test_intensities_that_never_change_have_no_rank_and_no_swing() -> None:
-    n = 200
-    same = np.full(n, 20.0)
-    drivers = drivers_from_arrays(same, same - 1.0, np.full(n, 300.0), np.full(n, 0.5))
-    observer, seen = watch([load_config("tiny")], 1, drivers)
-    of_first = parts(seen[0][2], observer.state_features)
-    for name in ("ci_rank", "ci_relative", "ci_swing"):
-        assert not of_first[name].any()
-
-
-def test_values_beyond_a_range_are_cut_at_it() -> None:
-    n = 200
-    ci = np.where(np.arange(n) % 2 == 0, 0.0, 2000.0)
-    outdoor = np.where(np.arange(n) % 2 == 0, -60.0, 60.0)
-    drivers = drivers_from_arrays(outdoor, outdoor - 1.0, ci, np.full(n, 0.5))
-    leads: dict[str, Any] = {"ci_leads_h": [0.25], "weather_leads_h": [0.25]}
-    observer, seen = watch([load_config("tiny")], 1, drivers, **leads)
-    first, second = (parts(state, observer.state_features) for _, _, state, _ in seen)
-    for name in ("ci", "outdoor", "wet_bulb"):
-        assert (first[name].item(), second[name].item()) == (0.0, 1.0)
-        assert (first[f"{name}_forecast"].item(), second[f"{name}_forecast"].item()) == (1.0, 0.0)
-    assert (first["ci_change"].item(), second["ci_change"].item()) == (1.0, -1.0)
-
-
 def test_batch_equals_alone() -> None:
     configs = fleet_of("tiny")
     for error in (PERFECT, ForecastError(0.2, 3.0)):
@@ -334,23 +309,6 @@ def test_same_seed_same_observations_also_after_reset(error: ForecastError) -> N
             runs.append(np.stack(states))
     np.testing.assert_array_equal(runs[0], runs[1])
     assert np.array_equal(runs[0], runs[2]) == (error == ForecastError())
-
-
-def test_start_may_move_between_episodes() -> None:
-    with Simulator(fleet_of("tiny")) as sim:
-        sim.reset(0)
-        view = view_maker(sim)(None)
-        observer = Observer(sim.fleet)
-        observer.reset(view)
-        before = observer.state(view)
-        moved = replace(view.drivers, start=view.drivers.start + 96)
-        later = replace(view, drivers=moved)
-        observer.reset(later)
-        after = parts(observer.state(later), observer.state_features)
-    old = parts(before, observer.state_features)
-    np.testing.assert_array_equal(after["time_of_day"], old["time_of_day"])
-    np.testing.assert_array_equal(after["ci"][:, 0], old["ci_forecast"][:, -1])
-    np.testing.assert_array_equal(after["outdoor"][:, 0], old["outdoor_forecast"][:, -1])
 
 
 def test_what_is_handed_out_belongs_to_the_caller() -> None:
@@ -481,17 +439,6 @@ def test_successive_forecasts_of_one_hour_are_consistent() -> None:
     assert np.max(np.abs(mixed)) < 5 / math.sqrt(count)
 
 
-def test_forecast_of_a_step_does_not_depend_on_the_steps_looked_at() -> None:
-    error = ForecastError(0.1, 2.0)
-    every = walk_forecasts(error, 2, range(501))
-    for step in (1, 127, 128, 300, 500):
-        [alone] = walk_forecasts(error, 2, [step])
-        for a, b in zip(every[step], alone, strict=True):
-            np.testing.assert_array_equal(a, b)
-    with pytest.raises(RuntimeStateError, match="reset starts again"):
-        walk_forecasts(error, 2, [500, 0])
-
-
 def test_ci_forecasts_are_never_negative() -> None:
     [(ci, _, _)] = walk_forecasts(ForecastError(2.0, 0.0), 500, [0])
     assert ci.min() == 0.0
@@ -593,21 +540,6 @@ def test_wrong_choices_name_what_is_valid(options: dict[str, Any], message: str)
         Observer(sim.fleet, **options)
 
 
-@pytest.mark.parametrize("value", [-0.1, math.nan, math.inf, "big", True])
-def test_wrong_errors_are_refused(value: Any) -> None:
-    with pytest.raises(ConfigError, match="forecast error ci_share"):
-        ForecastError(ci_share=value)
-    with pytest.raises(ConfigError, match="forecast error temperature_k"):
-        ForecastError(temperature_k=value)
-
-
-def test_leads_follow_the_step() -> None:
-    np.testing.assert_array_equal(lead_steps("x", [0.25, 1, 24], 4), [1, 4, 96])
-    np.testing.assert_array_equal(lead_steps("x", [0.25, 1, 24], 60), [15, 60, 1440])
-    with pytest.raises(ConfigError, match="60 min"):
-        lead_steps("x", [0.25], 1)
-
-
 def test_reset_comes_first_and_errors_need_walks() -> None:
     with Simulator(fleet_of("tiny")) as sim:
         sim.reset(0)
@@ -621,45 +553,7 @@ def test_reset_comes_first_and_errors_need_walks() -> None:
         assert observer.observe(view)["agent_ls"].shape == (3, 40)
 
 
-def test_no_other_step_and_no_other_length_of_step_changes_meaning() -> None:
-    """With steps of 1 h and 5 min, leads and energies mean the same."""
-    hourly = watch(fleet_of("tiny", **{"simulation.steps_per_hour": 1}), 5)
-    fine = watch(fleet_of("tiny", **{"simulation.steps_per_hour": 12}), 60)
-    a, b = (parts(seen[-1][2], o.state_features) for o, seen in (hourly, fine))
-    np.testing.assert_allclose(a["time_of_day"], b["time_of_day"], atol=1e-6)
-    # Interpolated series differ from the mean of their hour by little.
-    for name in ("ci_forecast", "outdoor_forecast", "wet_bulb_forecast"):
-        np.testing.assert_allclose(a[name], b[name], atol=0.03)
-    for name in ("it_energy", "hvac_energy", "dc_load"):
-        np.testing.assert_allclose(a[name], b[name], atol=0.12)
-        assert np.all(a[name] > 0.02)
-
-
 # Several CRAC units
-
-
-def units(count: int, name: str) -> DataCenterConfig:
-    return load_config("corrected", [f"hvac.crac.units={count}", f"name={name}"])
-
-
-def test_setpoints_of_equal_numbers_of_units_stand_side_by_side() -> None:
-    with Simulator([units(2, "a"), units(2, "b")]) as sim:
-        sim.reset(0)
-        view = view_maker(sim)(sim.step(Actions(cooling=np.array([1.0, -1.0, 0.0, 2.0]))))
-        observer = Observer(sim.fleet)
-        observer.reset(view)
-        found = parts(observer.state(view), observer.state_features)["setpoint"]
-        np.testing.assert_allclose(found * 20.0 + 10.0, [[19, 17], [18, 20]], atol=1e-5)
-
-
-def test_setpoints_of_unlike_numbers_of_units_are_means() -> None:
-    with Simulator([units(1, "a"), units(3, "b")]) as sim:
-        sim.reset(0)
-        view = view_maker(sim)(sim.step(Actions(cooling=np.array([2.0, 1.0, 1.0, -2.0]))))
-        observer = Observer(sim.fleet)
-        observer.reset(view)
-        found = parts(observer.state(view), observer.state_features)["setpoint"]
-        np.testing.assert_allclose(found * 20.0 + 10.0, [[20], [18]], atol=1e-5)
 
 
 # Heat map
@@ -702,15 +596,50 @@ def test_heat_map_needs_halls_of_one_shape() -> None:
 # Documentation
 
 
-@pytest.mark.repo
-def test_the_table_describes_every_feature() -> None:
-    lines = features_markdown().splitlines()[2:]
-    assert len(lines) == len(all_features())
-    for line, feature in zip(lines, all_features(), strict=True):
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        assert cells[:2] == [f"`{feature.name}`", str(feature.size)]
-        assert "{" not in cells[2]
-        assert len(cells[2]) > 10
-        assert [bool(cell) for cell in cells[-3:]] == [
-            feature.name in AGENT_DEFINITIONS[agent].features for agent in AGENTS
-        ]
+@pytest.mark.parametrize(
+    ("counts", "command", "expected_c"),
+    [
+        ((2, 2), [1.0, -1.0, 0.0, 2.0], [[19, 17], [18, 20]]),
+        ((1, 3), [2.0, 1.0, 1.0, -2.0], [[20], [18]]),
+    ],
+    ids=["equal", "unequal"],
+)
+def test_setpoints_by_unit_or_as_means_of_unequal_halls(
+    counts: tuple[int, int], command: list[float], expected_c: list[list[float]]
+) -> None:
+    configs = [
+        load_config("corrected", [f"hvac.crac.units={count}", f"name=hall-{i}"])
+        for i, count in enumerate(counts)
+    ]
+    with Simulator(configs) as sim:
+        sim.reset(0)
+        view = view_maker(sim)(sim.step(Actions(cooling=np.array(command))))
+        observer = Observer(sim.fleet)
+        observer.reset(view)
+        entries = parts(observer.state(view), observer.state_features)["setpoint"]
+        np.testing.assert_allclose(entries * 20.0 + 10.0, expected_c, atol=1e-5)
+
+
+def test_values_beyond_a_range_and_series_that_never_change() -> None:
+    n = 200
+    ci = np.where(np.arange(n) % 2 == 0, 0.0, 2000.0)
+    outdoor = np.where(np.arange(n) % 2 == 0, -60.0, 60.0)
+    drivers = drivers_from_arrays(outdoor, outdoor - 1.0, ci, np.full(n, 0.5))
+    leads: dict[str, Any] = {"ci_leads_h": [0.25], "weather_leads_h": [0.25]}
+    observer, seen = watch([load_config("tiny")], 1, drivers, **leads)
+    first, second = (parts(state, observer.state_features) for _, _, state, _ in seen)
+    for name in ("ci", "outdoor", "wet_bulb"):
+        assert (first[name].item(), second[name].item()) == (0.0, 1.0)
+        assert (first[f"{name}_forecast"].item(), second[f"{name}_forecast"].item()) == (1.0, 0.0)
+    constant = drivers_from_arrays(outdoor, outdoor - 1.0, np.full(n, 300.0), np.full(n, 0.5))
+    observer, seen = watch([load_config("tiny")], 1, constant)
+    entries = parts(seen[0][2], observer.state_features)
+    for name in ("ci_rank", "ci_relative", "ci_swing"):
+        assert not entries[name].any()
+
+
+@pytest.mark.parametrize("value", [-0.1, math.nan, "big"])
+@pytest.mark.parametrize("field", ["ci_share", "temperature_k"])
+def test_wrong_errors_are_refused(field: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=f"forecast error {field}"):
+        ForecastError(**{field: value})

@@ -14,12 +14,9 @@ import pytest
 from gymnasium.utils.env_checker import data_equivalence
 
 import sdc_taichi
-from sdc_taichi import ConfigError, DataError, SdcError, Simulator, load_config, load_drivers
+from sdc_taichi import ConfigError, SdcError, Simulator, load_config, load_drivers
 from sdc_taichi.envs import time_rows
 from sdc_taichi.envs.agents import AGENTS
-from sdc_taichi.exogenous.registry import load_trace
-from sdc_taichi.sim import drivers
-from sdc_taichi.sim.drivers import InputReader
 
 STEPS = 96
 TRACES = ("alibaba_1", "alibaba_2")
@@ -163,15 +160,6 @@ def test_states_of_other_draws_are_refused_and_change_nothing() -> None:
         env.load_state_dict({**saved, "inputs": other})
 
 
-def test_devices_stay_as_they_were_sized() -> None:
-    env = sdc_taichi.parallel_env("corrected", days=1, years=range(100, 103))
-    plain = sdc_taichi.parallel_env("corrected", days=1)
-    for one in (env, plain):
-        one.reset(seed=0)
-    assert env.core.view.sizing.facility_w == plain.core.view.sizing.facility_w
-    assert env.core.start_info()["year"][0] in range(100, 103)
-
-
 def test_traces_from_files(trace_file: Path) -> None:
     env = sdc_taichi.parallel_env("tiny", days=1, traces=[trace_file])
     _, infos = env.reset(seed=0)
@@ -201,33 +189,6 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 def test_options_that_are_not_valid(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(message)):
         sdc_taichi.parallel_env("tiny", **options)
-
-
-def test_options_without_effect_or_data() -> None:
-    with pytest.raises(DataError, match="trace 'alibaba_9'"):
-        sdc_taichi.parallel_env("tiny", traces=["alibaba_1", "alibaba_9"])
-    with pytest.raises(SdcError, match=r"no_such\.csv"):
-        sdc_taichi.parallel_env("tiny", traces=["./no_such.csv"])
-
-
-def test_years_need_something_synthetic(trace_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drivers, "_site_is_synthetic", lambda site: False)
-    with pytest.raises(ConfigError, match=r"years: without effect on .*no input is synthetic"):
-        sdc_taichi.parallel_env("tiny", overrides=[f"site.workload_file={trace_file}"], years=3)
-
-
-def test_what_is_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = [InputReader([load_config("tiny")]).read([year]) for year in range(3)]
-    monkeypatch.setattr(drivers, "MAX_KEPT_BYTES", 600_000)
-    reader = InputReader([load_config("tiny")])
-    for year in (0, 1, 2, 1):
-        again = reader.read([year])
-        assert np.array_equal(again.outdoor_c.values, alone[year].outdoor_c.values)
-        assert again.digest() == alone[year].digest()
-    assert 0 < reader._kept_bytes <= 600_000
-    assert len(reader._kept) < 8
-    demand = load_trace(load_config("tiny").workload.trace, seed=2).values
-    assert alone[2].demand.values[2::4] == pytest.approx(demand, abs=0.2)
 
 
 def test_a_simulator_takes_other_inputs_at_reset() -> None:

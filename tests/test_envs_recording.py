@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import gc
 import pickle
-import re
 import socket
 import subprocess
 import sys
@@ -20,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from rerun.chunk import RrdReader
 
 import sdc_taichi
@@ -154,18 +153,6 @@ def test_a_recording_holds_the_steps_and_the_rewards(tmp_path: Path) -> None:
     assert str(first) == str(np.datetime64("2001-01-01") + day) + " 00:00:00"
 
 
-def test_rewards_of_ones_own_are_recorded_by_agent(tmp_path: Path) -> None:
-    env = sdc_taichi.parallel_env(
-        "tiny", days=1, rewards=lambda result, view: -result.it_kwh, recorder=tmp_path / "a.rrd"
-    )
-    played = play(env, 3)
-    env.close()
-    found = lines(read(tmp_path / "a-episode-0.rrd"), "/dc/tiny/series/rewards")
-    assert list(found) == [f"{agent} [-]" for agent in env.possible_agents]
-    expected = [step[1]["agent_bat"] for step in played[1:]]
-    np.testing.assert_array_equal(found["agent_bat [-]"], expected)
-
-
 # --- which episodes, which environments ---
 
 
@@ -225,18 +212,6 @@ def test_chosen_environments_of_one_config(tmp_path: Path) -> None:
     assert np.any(one["IT [kW]"] != other["IT [kW]"])
 
 
-def test_environments_of_different_names_go_by_them(tmp_path: Path) -> None:
-    config = load_config("tiny")
-    listed = [config.model_copy(update={"name": name}) for name in ("a", "b", "b")]
-    recorder = EpisodeRecorder(tmp_path / "run.rrd", envs=(0, 2))
-    env = sdc_taichi.vector_env(None, listed, days=1, recorder=recorder)
-    play(env, 2)
-    env.close()
-    entities = read(tmp_path / "run-episode-0.rrd")
-    recorded = {path.split("/")[2] for path in entities if path.startswith("/dc/")}
-    assert recorded == {"a", r"b\#2"}
-
-
 def test_the_wrapper_is_the_argument(tmp_path: Path) -> None:
     options: dict[str, Any] = {"num_envs": 3, "config": "tiny", "days": 1}
     settings: dict[str, Any] = {"episode_trigger": lambda e: e == 1, "envs": [2], "every": 4}
@@ -271,23 +246,6 @@ def test_a_recorder_of_ones_own(tmp_path: Path) -> None:
 
 
 # --- ends ---
-
-
-def test_closed_and_reset_in_the_middle_of_an_episode(tmp_path: Path) -> None:
-    env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
-    play(env, 30)
-    play(env, 7)
-    assert steps_of(tmp_path / "run-episode-0.rrd") == list(range(30))
-    env.close()
-    env.close()
-    assert steps_of(tmp_path / "run-episode-1.rrd") == list(range(7))
-
-
-def test_an_episode_without_a_step_leaves_no_file(tmp_path: Path) -> None:
-    env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
-    env.reset(seed=0)
-    env.close()
-    assert files(tmp_path) == []
 
 
 def test_an_environment_that_is_dropped_leaves_a_whole_file(tmp_path: Path) -> None:
@@ -331,17 +289,6 @@ def test_interrupted_training_leaves_a_whole_file(tmp_path: Path) -> None:
     assert steps_of(tmp_path / "run-episode-0.rrd") == list(range(42))
 
 
-def test_going_on_from_a_saved_state_begins_a_recording(tmp_path: Path) -> None:
-    env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
-    play(env, 20)
-    saved = env.state_dict()
-    env.load_state_dict(saved)
-    go_on(env, 4)
-    env.close()
-    assert steps_of(tmp_path / "run-episode-0.rrd") == list(range(20))
-    assert steps_of(tmp_path / "run-episode-1.rrd") == list(range(20, 24))
-
-
 # --- copies and processes ---
 
 
@@ -358,66 +305,7 @@ def test_copies(copied: Callable[[Any], Any], tmp_path: Path) -> None:
     assert steps_of(tmp_path / "run-episode-0.rrd") == [0, 1, 2]
 
 
-def test_settings_survive_the_spec_of_gymnasium(tmp_path: Path) -> None:
-    recorder = EpisodeRecorder(tmp_path / "run.rrd", episode_trigger=ALL)
-    env = gymnasium.make("sdc_taichi/Load-v0", config="tiny", days=1, recorder=recorder)
-    env.reset(seed=0)
-    assert env.spec is not None
-    assert env.spec.kwargs["recorder"] == recorder
-    env.step(env.action_space.sample())
-    env.close()
-    assert files(tmp_path) == ["run-episode-0.rrd"]
-
-
-@pytest.mark.slow
-def test_recorded_in_a_spawned_process(tmp_path: Path) -> None:
-    make = partial(
-        gymnasium.make,
-        "sdc_taichi:sdc_taichi/Battery-v0",
-        config="tiny",
-        days=1,
-        recorder=str(tmp_path / "run.rrd"),
-    )
-    env = AsyncVectorEnv([make], context="spawn")
-    play(env, 9)
-    env.close()
-    assert steps_of(tmp_path / "run-episode-0.rrd") == list(range(9))
-
-
 # --- bad use ---
-
-
-@pytest.mark.parametrize(
-    ("recorder", "message"),
-    [
-        ("run.txt", r"must end in \.rrd"),
-        ("/nowhere/at/all/run.rrd", "is no folder"),
-        ("rerun+http://127.0.0.1", "no address of a viewer"),
-        (3, "recorder 3: valid is a file ending in .rrd"),
-        (EpisodeRecorder("run.rrd", episode_trigger=3), "episode_trigger 3: valid is a function"),  # type: ignore[arg-type]
-        ("", r"must end in \.rrd"),
-        (EpisodeRecorder(b"run.rrd"), "recorder b'run.rrd': valid is a file"),  # type: ignore[arg-type]
-        (EpisodeRecorder("run.rrd", envs=[6]), "different numbers of 0..5"),
-        (EpisodeRecorder("run.rrd", envs=[]), r"envs \[\]: valid is a list of 1 to 4"),
-        (EpisodeRecorder("run.rrd", envs=[0, 1, 2, 3, 4]), "valid is a list of 1 to 4"),
-        (EpisodeRecorder("run.rrd", envs=[-1]), r"envs \[-1\]: valid is a list"),
-        (EpisodeRecorder("run.rrd", envs=[1.0]), r"envs \[1\.0\]: valid is a list"),  # type: ignore[list-item]
-        (EpisodeRecorder("run.rrd", envs=[True]), r"envs \[True\]: valid is a list"),
-        (EpisodeRecorder("run.rrd", envs="ab"), "envs 'ab': valid is a list"),  # type: ignore[arg-type]
-        (EpisodeRecorder("run.rrd", envs=[1, 1]), "different numbers"),
-        (EpisodeRecorder("run.rrd", every=0), "every 0: valid is a positive integer"),
-    ],
-    ids=str,
-)
-def test_bad_recorders_are_refused_at_once(recorder: Any, message: str) -> None:
-    with pytest.raises(SdcError, match=message):
-        sdc_taichi.vector_env(6, "tiny", recorder=recorder)
-
-
-def test_settings_without_effect_on_a_recorder(tmp_path: Path) -> None:
-    own = EpisodeRecorder(Recorder(tmp_path / "run.rrd"), every=3)
-    with pytest.raises(SdcError, match="without effect on a Recorder"):
-        sdc_taichi.parallel_env("tiny", recorder=own)
 
 
 def test_two_environments_and_one_place(tmp_path: Path) -> None:
@@ -484,16 +372,6 @@ def test_without_a_viewer_the_episode_goes_on() -> None:
     env.close()
 
 
-def test_the_folder_goes_away_before_the_first_episode(tmp_path: Path) -> None:
-    folder = tmp_path / "later"
-    folder.mkdir()
-    env = sdc_taichi.parallel_env("tiny", days=1, recorder=folder / "run.rrd")
-    folder.rmdir()
-    with pytest.raises(SdcError, match=re.escape(str(folder))):
-        env.reset(seed=0)
-    env.close()
-
-
 def test_the_folder_goes_away_in_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording_blocks, "MAX_BLOCK_STEPS", 10)
     folder, moved = tmp_path / "runs", tmp_path / "moved"
@@ -513,3 +391,43 @@ def test_the_folder_goes_away_in_training(tmp_path: Path, monkeypatch: pytest.Mo
     assert files(folder) == ["run-episode-2.rrd"]
     # The file that kept others out has moved along.
     assert files(moved) == [".run-episode-0.rrd.part", "run-episode-0.rrd"]
+
+
+@pytest.mark.parametrize(
+    ("recorder", "message"),
+    [
+        ("run.txt", r"must end in \.rrd"),
+        ("/nowhere/at/all/run.rrd", "is no folder"),
+        ("rerun+http://127.0.0.1", "no address of a viewer"),
+        (3, "recorder 3: valid is a file ending in .rrd"),
+        (EpisodeRecorder("run.rrd", episode_trigger=3), "episode_trigger 3: valid is a function"),  # type: ignore[arg-type]
+        (EpisodeRecorder("run.rrd", envs=[6]), "different numbers of 0..5"),
+        (EpisodeRecorder("run.rrd", envs=[0, 1, 2, 3, 4]), "valid is a list of 1 to 4"),
+        (EpisodeRecorder("run.rrd", envs=[1.0]), r"envs \[1\.0\]: valid is a list"),  # type: ignore[list-item]
+        (EpisodeRecorder("run.rrd", envs=[1, 1]), "different numbers"),
+        (EpisodeRecorder("run.rrd", every=0), "every 0: valid is a positive integer"),
+        (EpisodeRecorder(Recorder("run.rrd"), every=3), "without effect on a Recorder"),
+    ],
+    ids=str,
+)
+def test_malformed_recorders(recorder: Any, message: str) -> None:
+    with pytest.raises(SdcError, match=message):
+        sdc_taichi.vector_env(6, "tiny", recorder=recorder)
+
+
+def test_reset_close_and_saved_states_end_a_recording(tmp_path: Path) -> None:
+    env = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "run.rrd")
+    play(env, 30)
+    play(env, 7)
+    assert steps_of(tmp_path / "run-episode-0.rrd") == list(range(30))
+    env.load_state_dict(env.state_dict())
+    go_on(env, 4)
+    env.close()
+    env.close()
+    assert files(tmp_path) == ["run-episode-0.rrd", "run-episode-1.rrd"]
+    # Episode 8 is the next that is recorded; the one that continues is number 2.
+    assert steps_of(tmp_path / "run-episode-1.rrd") == list(range(7))
+    unused = sdc_taichi.parallel_env("tiny", days=1, recorder=tmp_path / "other.rrd")
+    unused.reset(seed=0)
+    unused.close()
+    assert len(files(tmp_path)) == 2

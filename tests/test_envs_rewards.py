@@ -102,14 +102,6 @@ def test_queued_tasks_cost_in_the_last_hour_of_the_day() -> None:
     assert queued > 0
 
 
-def test_an_hourly_step_has_its_whole_penalty_at_23() -> None:
-    env = core(["simulation.steps_per_hour=1"])
-    env.reset(0)
-    for step in range(24):
-        queued = env.step(act(1, 0)).result.queue_tasks[0]
-        assert env.reward_terms()["queue"][0] == pytest.approx(-queued / 10 if step == 23 else 0.0)
-
-
 def test_cost_follows_the_hour_and_the_peak_of_the_episode() -> None:
     prices = tuple(0.01 * hour for hour in range(24))
     scales = {"agent_ls": {"cost": 1.0}, "agent_bat": {"demand_charge": 1.0}}
@@ -138,22 +130,6 @@ def test_cost_follows_the_hour_and_the_peak_of_the_episode() -> None:
         # Half the design power is billed anyway.
         assert peak_kw > 0.5 * design_kw
         assert charged == pytest.approx((0.5 * design_kw - peak_kw) / (design_kw / 4))
-
-
-def test_rewards_of_the_paper() -> None:
-    env = core(rewards="paper", collaboration=1.0)
-    env.reset(0)
-    for _ in range(94):
-        done = env.step(act(1, 0))
-        terms = env.reward_terms()
-        own = {
-            "agent_ls": terms["carbon"] + terms["queue"] + 10.0 * terms["dropped"],
-            "agent_dc": terms["facility_energy"],
-            "agent_bat": terms["carbon"],
-        }
-        for agent, expected in own.items():
-            np.testing.assert_allclose(done.rewards[agent], expected, rtol=1e-12)
-    assert terms["queue"][0] < 0
 
 
 PARTS = {"carbon": ("work_carbon", "cooling_carbon", "battery_carbon")}
@@ -339,20 +315,6 @@ def test_a_joint_learner_gets_one_value_for_all_once() -> None:
     single.reset(seed=0)
     _, reward, *_ = single.step([1, 1, 1])
     assert reward == -done.result.water_l[0] != 0
-
-
-def test_the_first_step_of_an_episode_pays_no_more_than_others() -> None:
-    env = core(["hvac.setpoint.initial_c=20"], days=7, start="fixed")
-    env.reset(0)
-    found = []
-    for _ in range(96):
-        env.step(act(1, 1))
-        found.append(env.reward_terms())
-    cost = np.array([terms["cost"][0] for terms in found])
-    assert cost[0] > 2 * np.median(cost)
-    # However it goes, a week pays no more than what lies between half and full design power.
-    charged = sum(float(terms["demand_charge"][0]) for terms in found)
-    assert -0.6 * 12.0 * (7 / 30) / (0.1 / 4) < charged <= 0
 
 
 @pytest.mark.parametrize(

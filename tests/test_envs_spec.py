@@ -11,13 +11,10 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import data_equivalence
-from gymnasium.wrappers import TimeAwareObservation
 
-import sdc_taichi
 from sdc_taichi import ConfigError, EnvOptions, ForecastError, load_config
 from sdc_taichi.config.electrical_schema import TariffConfig
 from sdc_taichi.envs import IDS
-from sdc_taichi.envs.single import SdcEnv
 
 STEPS = 96
 TINY = load_config("tiny", ["site.location=CA"])
@@ -128,16 +125,6 @@ def test_both_ends_of_an_environment_made_again_agree() -> None:
             assert ends == [False] * (STEPS - 1) + [True]
 
 
-def test_time_aware_observation() -> None:
-    env = gymnasium.make("sdc_taichi/Battery-v0", config="tiny", days=1)
-    aware: Any = TimeAwareObservation(env, normalize_time=True)
-    assert aware.reset(seed=0)[0][-1] == 0.0
-    for _ in range(STEPS):
-        seen, *_, truncated, _ = aware.step(1)
-    assert truncated
-    assert seen[-1] == 1.0
-
-
 def test_fewer_steps_than_the_days_have() -> None:
     """As Gymnasium's ``TimeLimit`` around single environments."""
     given: list[Any] = [
@@ -178,11 +165,3 @@ def test_no_event_starts_after_the_last_of_fewer_steps() -> None:
     with pytest.raises(ConfigError, match=r"start_h 3: the episode ends after 3 h"):
         made(12)
     assert made(13).spec.max_episode_steps == 13
-
-
-def test_sections_of_a_config_are_a_config() -> None:
-    env = sdc_taichi.parallel_env(TINY.model_dump(mode="json"), days=1)
-    assert env.core.sim.fleet.configs == (TINY,)
-    with pytest.raises(ConfigError, match="unknown"):
-        sdc_taichi.parallel_env({**TINY.model_dump(mode="json"), "hal": {}})
-    assert SdcEnv(TINY, days=1).spec is None

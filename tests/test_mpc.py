@@ -20,10 +20,10 @@ from sdc_taichi import (
     simulate,
 )
 from sdc_taichi.control import PERFECT, view_maker
-from sdc_taichi.control.mpc import ModelPredictive, expected_demand
+from sdc_taichi.control.mpc import expected_demand
 from sdc_taichi.envs.core import Core
 from sdc_taichi.envs.options import EnvOptions
-from sdc_taichi.types import F64, Actions, StepResult
+from sdc_taichi.types import F64, StepResult
 
 DAY = 96
 CHEAP, DEAR = 200.0, 500.0
@@ -103,19 +103,6 @@ def test_all_agents_save_more_than_each() -> None:
     alone = [carbon(f"{agent}=mpc-24h") for agent in ("load", "cooling", "battery")]
     assert whole < min(alone)
     assert max(alone) < idle
-
-
-def test_one_plan_for_agents_of_one_name() -> None:
-    spec = "load=mpc-24h,cooling=mpc-24h,battery=mpc-24h"
-    each, whole = (results(s, tiny(), 24, drivers=inputs()) for s in (spec, "mpc-24h"))
-    for name in ("load_command", "cooling_command", "battery_command"):
-        np.testing.assert_array_equal(column(each, name), column(whole, name))
-
-
-def test_constant_inputs_move_neither_work_nor_energy() -> None:
-    kept = results("mpc-24h", tiny(), 24, drivers=inputs(np.full(2 * DAY, 300.0)))
-    assert not column(kept, "load_command").any()
-    assert not column(kept, "battery_command").any()
 
 
 def test_cost_follows_prices_and_shaves_the_peak_of_the_month() -> None:
@@ -266,15 +253,6 @@ def test_environments_with_drawn_starts_and_years() -> None:
     fresh.close()
 
 
-def test_asked_twice_it_answers_the_same() -> None:
-    with Simulator(tiny(), drivers=inputs()) as sim:
-        sim.reset(0)
-        view = view_maker(sim)(None)
-        controller = ModelPredictive(24.0)
-        first: Actions = controller.act(view)
-        assert controller.act(view) is first
-
-
 # Names
 
 
@@ -296,9 +274,3 @@ def test_wrong_names(spec: str, message: str) -> None:
     fleet = build_fleet(tiny())
     with pytest.raises(ConfigError, match=message):
         make_controller(spec, fleet)
-
-
-@pytest.mark.parametrize("spec", ["mpc-1h", "mpc-1.5h", "mpc-30h", "mpc-24h:carbon+2*cost"])
-def test_names_that_run(spec: str) -> None:
-    kept = results(spec, tiny(), 3, drivers=inputs())
-    assert len(kept) == 3

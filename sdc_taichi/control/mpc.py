@@ -1,10 +1,10 @@
-"""Model-predictive control: plans of the coming hours, of which the first step is done.
+"""Model-predictive control: plan the coming hours before each step, and apply the first command.
 
-Before each step it plans work, setpoint and battery over a horizon and gives the first commands of
-the plan. It knows what a controller may know: forecasts of weather and carbon intensity, prices,
-the work of the step to come, and for later steps the work of the same time on the last days. What
-a step costs it reads from a ``FacilityMap``, tables of the simulator at constant load and setpoint:
-halls that are transient, events and racks that protect themselves are not foreseen.
+A plan covers work, setpoint and battery over a horizon. It uses what every controller can see:
+forecasts of weather and carbon intensity, prices, and the work of the next step; later work is
+expected to resemble the work of the same time on past days. Energies come from a ``FacilityMap``,
+tables of the simulator at constant load and setpoint, so plans do not foresee transients, events
+or racks that throttle or switch off.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sdc_taichi.control.rules import setpoint_command
 from sdc_taichi.control.view import View
 from sdc_taichi.errors import ConfigError
 from sdc_taichi.number_text import parse_number
-from sdc_taichi.optimum.commands import setpoint_command
 from sdc_taichi.optimum.objective import Objective
 from sdc_taichi.optimum.problem import AGENTS, RAMP_K, Agent
 from sdc_taichi.sim.bills import BilledDemand, add_power, no_demand
@@ -30,55 +30,55 @@ if TYPE_CHECKING:
 HORIZON_H = (1.0, 168.0)
 """Shortest and longest horizon, in h."""
 CARBON = Objective(carbon=1.0)
-"""The objective of a name without one."""
+"""Objective of a controller whose name does not state one."""
 SETPOINT_STEP_K = 0.5
-"""Largest distance of the setpoints to choose from, in K."""
+"""Largest spacing of the candidate setpoints, in K."""
 KNOWN_DAYS = 7
-"""Days whose mean work is expected to come again."""
+"""Number of past days whose mean work is the expected work."""
 FADES_IN_H = 3.0
-"""Time in which the departure of the present work from that mean falls to 1/e, in h."""
+"""Time in which the deviation of the present work from the mean decays to 1/e, in h."""
 PEAKS = 8
-"""Peaks of the month that are tried where there is a demand charge."""
+"""Number of candidate peak powers of the month if there is a demand charge."""
 _NAME = re.compile(r"mpc-(?P<hours>[^:]*)h(?::(?P<objective>.*))?")
 
 
 def is_mpc(name: str) -> bool:
-    """Whether a name is meant for a ``ModelPredictive``."""
+    """Whether a controller name denotes a ``ModelPredictive``."""
     return name.startswith("mpc")
 
 
 def model_predictive(name: str, agents: tuple[Agent, ...]) -> ModelPredictive:
-    """A controller by its name, such as ``mpc-24h`` or ``mpc-72h:cost``.
+    """Model-predictive controller of a name such as ``mpc-24h`` or ``mpc-72h:cost``.
 
     Args:
-        name: horizon in hours, and an objective unless it is carbon.
-        agents: what it commands.
+        name: horizon in hours, and the objective if it is not carbon.
+        agents: agents whose commands it gives.
 
     Raises:
         ConfigError: a horizon or an objective that is not valid.
     """
-    found = _NAME.fullmatch(name)
+    match = _NAME.fullmatch(name)
     try:
-        hours = parse_number(found["hours"]) if found else math.nan
+        hours = parse_number(match["hours"]) if match else math.nan
     except ValueError:
         hours = math.nan
-    if found is None or math.isnan(hours):
+    if match is None or math.isnan(hours):
         raise ConfigError(
             f"controller {name!r}: valid is mpc-HOURSh or mpc-HOURSh:OBJECTIVE, such as mpc-24h or "
             "mpc-72h:cost"
         )
-    text = found["objective"]
+    text = match["objective"]
     objective = CARBON if text is None else Objective.parse(text)
     return ModelPredictive(hours, objective, agents)
 
 
 class ModelPredictive:
-    """Plans the coming hours anew before every step.
+    """Controller that plans the coming hours before every step.
 
     Args:
         hours: horizon, in h.
-        objective: what the plan minimises; water is no part of it.
-        agents: what it commands; the rest it takes to be neutral.
+        objective: quantity that the plan minimises, without water.
+        agents: agents whose commands it gives; it assumes neutral commands of the others.
 
     Attributes:
         commands: fields of ``Actions`` that it gives.
@@ -115,7 +115,7 @@ class ModelPredictive:
         self._actions = Actions()
 
     def act(self, view: View) -> Actions:
-        """Commands for what it controls; asked again with one view, the same ones."""
+        """Commands of its agents; a repeated call with the same view returns the same commands."""
         if view is not self._view:
             if self._planners is None or not self._planners.suit(view):
                 self._planners = _Planners(view, self._agents)
@@ -144,19 +144,19 @@ class ModelPredictive:
             view.setpoint_c,
             peaks=peaks,
         )
-        found: dict[str, F64] = {}
+        commands: dict[str, F64] = {}
         if "load" in self._agents:
-            found["load"] = work.load
+            commands["load"] = work.load
         if "cooling" in self._agents:
-            found["cooling"] = _cooling_command(view, planners, weather, work)
+            commands["cooling"] = _cooling_command(view, planners, weather, work)
         if planners.store is not None:
-            found["battery"] = planners.store.plan(
+            commands["battery"] = planners.store.plan(
                 view.state.stored_kwh, work.facility_kwh, cost, peaks=peaks
             )
-        return Actions(**found)
+        return Actions(**commands)
 
     def _month_peak_kw(self, view: View) -> F64:
-        """Highest power of the month that the step to come belongs to, in kW, (B,)."""
+        """Highest power so far in the month of the next step, in kW, (B,)."""
         step = view.state.step
         if self._bill is None:
             self._bill = no_demand(view.state.start, view.fleet.steps_per_hour)
@@ -166,7 +166,7 @@ class ModelPredictive:
 
 
 class _Planners:
-    """What plans are made with, which lasts as long as data centers and weather stay the same."""
+    """Planners and tables of a fleet, valid while data centers and weather series stay the same."""
 
     def __init__(self, view: View, agents: tuple[Agent, ...]) -> None:
         from sdc_taichi.control.plans import QueuePlanner, StorePlanner
@@ -181,9 +181,9 @@ class _Planners:
             setpoint_step_k=SETPOINT_STEP_K,
             precision=view.precision,
         )
-        bars = [not allowed.all() for allowed in self.facility.at_own_nodes(self.facility.allowed)]
-        self.is_limited = np.array(bars)[self.facility.which]
-        """Whether some setpoint is barred in some weather, (B,)."""
+        allowed = self.facility.at_own_nodes(self.facility.allowed)
+        self.is_limited = np.array([not nodes.all() for nodes in allowed])[self.facility.which]
+        """Whether an inlet limit rules out some setpoint in some weather, (B,)."""
         self.queue = QueuePlanner(
             view.fleet,
             self.facility,
@@ -195,20 +195,19 @@ class _Planners:
             self.store = StorePlanner(view.fleet, view.sizing, view.step_h)
 
     def suit(self, view: View) -> bool:
-        """Whether they were made for the data centers and the weather of a view."""
-        own, given = self._drivers, view.drivers
+        """Whether the planners were made for the data centers and the weather of a view."""
         return (
             view.sizing is self._sizing
-            and given.outdoor_c is own.outdoor_c
-            and given.wet_bulb_c is own.wet_bulb_c
+            and view.drivers.outdoor_c is self._drivers.outdoor_c
+            and view.drivers.wet_bulb_c is self._drivers.wet_bulb_c
         )
 
 
 def expected_demand(view: View, index: I64) -> F64:
-    """Work that is expected to arrive, as a share of capacity, (B, H).
+    """Expected arriving work as a share of capacity, (B, H).
 
-    That of the step to come is known. Later steps take the mean work of the same time on the last
-    days, and the departure of the present work from that mean, which fades.
+    The work of the next step is known. Later work is the mean of the same time on the past
+    ``KNOWN_DAYS`` days plus the decaying deviation of the present work from that mean.
 
     Args:
         view: the situation before the step.
@@ -219,14 +218,14 @@ def expected_demand(view: View, index: I64) -> F64:
     last = index - day * -(-lead // day)
     usual = np.mean([demand.at(last - day * back) for back in range(KNOWN_DAYS)], axis=0)
     before = index[:, :1] - day * np.arange(1, KNOWN_DAYS + 1)
-    departure = demand.at(index[:, :1]) - demand.at(before).mean(axis=1, keepdims=True)
-    expected = usual + departure * np.exp(-lead / (FADES_IN_H * per_hour))
+    deviation = demand.at(index[:, :1]) - demand.at(before).mean(axis=1, keepdims=True)
+    expected = usual + deviation * np.exp(-lead / (FADES_IN_H * per_hour))
     expected[:, :1] = demand.at(index[:, :1])
     return np.asarray(np.clip(expected, 0.0, 1.0))
 
 
 def _cooling_command(view: View, planners: _Planners, weather: Weather, work: QueuePlan) -> F64:
-    """Command towards the setpoint of least energy at the load and weather of the step, (B,)."""
+    """Command (B,) towards the setpoint of least energy at the load and weather of the step."""
     now = slice(0, 1)
     best_c = planners.facility.best_setpoint_c(
         (work.executed_tasks / 100.0)[:, None],
@@ -234,12 +233,7 @@ def _cooling_command(view: View, planners: _Planners, weather: Weather, work: Qu
         weather.wet_bulb_c[:, now],
     )[:, 0]
     target_c = np.minimum(best_c, view.setpoint_c + RAMP_K)
-    # Downwards there is no waiting where a hot inlet may be the reason.
-    slowly_c = np.maximum(target_c, view.setpoint_c - RAMP_K)
-    target_c = np.where(planners.is_limited, target_c, slowly_c)
-    return setpoint_command(
-        target_c,
-        setpoint_c=view.setpoint_c,
-        step_k=view.limits.setpoint_step_k,
-        last=view.cooling_last,
-    )
+    # A setpoint that falls because of hot inlets is not limited to the ramp.
+    gradual_c = np.maximum(target_c, view.setpoint_c - RAMP_K)
+    target_c = np.where(planners.is_limited, target_c, gradual_c)
+    return setpoint_command(target_c, view)

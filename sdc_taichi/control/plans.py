@@ -1,4 +1,4 @@
-"""Plans of queues and batteries: inputs and calls of the kernels in ``kernels/planning.py``."""
+"""Plans of queues and batteries by dynamic programming (kernels in ``kernels/planning.py``)."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ from sdc_taichi.sim.workload import due_steps, queue_limit_tasks
 from sdc_taichi.types import F64, I64, Work
 
 MOST_AT_ONCE = 256
-"""Data centers of a call, which limits the memory of its work space."""
+"""Data centers per kernel call, which bounds the memory of its work space."""
 
 
 def first_commands() -> F64:
-    """Candidates of the step to come, (C,), the mildest first: of equal ones the first counts."""
+    """Candidate commands of the next step, (C,), smallest first; ties go to the first."""
     steps = np.concatenate([[0.01, 0.02, 0.04, 0.06, 0.08], np.arange(1, 11) / 10.0])
     return np.concatenate([[0.0], np.stack([-steps, steps], axis=1).ravel()])
 
 
 class PlanningKernel:
-    """One of the two kernels with its work space.
+    """A planning kernel with its work space.
 
     Args:
         kernel: the kernel.
         arguments: spec of its arguments.
-        levels: levels of what is carried from step to step.
+        levels: number of levels of the state (queue or stored energy) between steps.
     """
 
     def __init__(self, kernel: Any, arguments: Mapping[str, Argument], levels: int) -> None:
@@ -75,30 +75,30 @@ class PlanningKernel:
             size: number of data centers, B.
             horizon: number of coming steps, H.
             commands: commands of steps after the first.
-            peaks: peaks of the month that are tried.
-            table: the kernel's argument of this name, if it has one.
-            facility_kwh: energy of the facility in each step, (B, H); None has it computed.
+            peaks: number of candidate peak powers of the month.
+            table: argument ``table`` of the kernel, if it has one.
+            facility_kwh: energy of the facility in each step, (B, H); None computes it.
             of_each: other arguments by name, with the data centers first.
 
         Returns:
-            Number of the command of the first step that is best, (B,), and ``facility_kwh``.
+            Index of the best first command, (B,), and ``facility_kwh``.
         """
         chosen = np.zeros(size, dtype=np.int32)
         kwh = np.zeros((size, horizon)) if facility_kwh is None else facility_kwh
-        given: dict[str, Any] = of_each | {"chosen": chosen, "facility_kwh": kwh}
-        whole = {"commands": commands, "peaks": peaks, "horizon": horizon}
+        by_dc: dict[str, Any] = of_each | {"chosen": chosen, "facility_kwh": kwh}
+        shared = {"commands": commands, "peaks": peaks, "horizon": horizon}
         if table is not None:
-            whole["table"] = table
+            shared["table"] = table
         for first in range(0, size, MOST_AT_ONCE):
             part = slice(first, min(first + MOST_AT_ONCE, size))
             count = part.stop - first
-            mine = {name: np.ascontiguousarray(values[part]) for name, values in given.items()}
-            flat = {n: v.reshape(-1) for n, v in mine.items() if self._arguments[n].of}
+            chunk = {name: np.ascontiguousarray(values[part]) for name, values in by_dc.items()}
+            flat = {n: v.reshape(-1) for n, v in chunk.items() if self._arguments[n].of}
             self._kernel(
                 size=count,
                 slices=min(count, 4 * self._threads),
-                **whole,
-                **(mine | flat),
+                **shared,
+                **(chunk | flat),
                 **self._work_space(count, horizon, table),
             )
         return chosen.astype(np.int64), kwh
@@ -114,11 +114,11 @@ class PlanningKernel:
 QUEUE_LEVELS, STORE_LEVELS = 51, 41
 """Levels of the queue and of the stored energy in plans."""
 COMMANDS = (0.0, -0.25, 0.25, -0.5, 0.5, -0.75, 0.75, -1.0, 1.0)
-"""Commands of steps after the first; of equal ones the first counts."""
+"""Candidate commands of steps after the first; ties go to the first."""
 
 
 class Weather(NamedTuple):
-    """Weather of the coming steps as it is forecast."""
+    """Forecast weather of the coming steps."""
 
     outdoor_c: F64
     """Dry bulb, in C, (B, H)."""
@@ -127,23 +127,23 @@ class Weather(NamedTuple):
 
 
 class EnergyCost(NamedTuple):
-    """What energy costs in the coming steps, in the unit of the objective."""
+    """Cost of energy in the coming steps, in the unit of the objective."""
 
     weight: F64
     """Cost of a kWh in each step, (B, H)."""
     peak_kwh: F64
-    """Energy of a step that the month is charged for already, (B,)."""
+    """Highest energy of a step that the month's demand charge already covers, in kWh, (B,)."""
     peak_cost: F64
-    """Cost of each kWh of the month's peak beyond it, (B,); 0 without a demand charge."""
+    """Cost of each kWh of a step above ``peak_kwh``, (B,); 0 without a demand charge."""
 
 
 class QueuePlan(NamedTuple):
-    """What to do with the work of the step to come, and what follows from it."""
+    """Load command of the next step, and the plan's work and energy."""
 
     load: F64
     """Load command, (B,)."""
     executed_tasks: F64
-    """Work that the step will do, in tasks, (B,)."""
+    """Work executed in the next step, in tasks, (B,)."""
     facility_kwh: F64
     """Energy of the facility in each step of the plan, in kWh, (B, H)."""
 
@@ -153,9 +153,9 @@ class QueuePlanner:
 
     Args:
         fleet: the data centers.
-        facility: what their steps cost.
-        moves_work: whether plans may move work; else they only say what neutral commands need.
-        moves_setpoint: whether each step is to have the best setpoint; else the present one holds.
+        facility: energy of their steps by load, weather and setpoint.
+        moves_work: whether plans may move work; else they give the energy of neutral commands.
+        moves_setpoint: whether each step has its best setpoint; else the present setpoint holds.
     """
 
     def __init__(
@@ -186,15 +186,15 @@ class QueuePlanner:
         *,
         peaks: int,
     ) -> QueuePlan:
-        """The plan of the coming steps.
+        """Plan the coming steps.
 
         Args:
-            queue: work in the queue by the step that put it in, oldest first, accumulated, (B, L).
-            demand: work that arrives, as a share of capacity, the step to come first, (B, H).
+            queue: accumulated work in the queue by the step of its arrival, oldest first, (B, L).
+            demand: arriving work as a share of capacity, the next step first, (B, H).
             weather: weather of the coming steps.
-            cost: what energy costs.
+            cost: cost of energy.
             setpoint_c: present setpoint, in C, (B,).
-            peaks: peaks of the month that are tried; 1 without a demand charge.
+            peaks: number of candidate peak powers of the month; 1 without a demand charge.
         """
         size, horizon = demand.shape
         waiting, due = queue[:, -1], _due_by(queue, self._due_steps, horizon)
@@ -230,7 +230,7 @@ class QueuePlanner:
         )
 
     def _first_step(self, demand: F64, waiting: F64, due: F64) -> Work:
-        """What each first command does with the work of the step to come, (B, C)."""
+        """Work of the next step under each candidate command, (B, C)."""
         shape = len(demand), len(self._first)
         demand, command, waiting, due = (
             np.broadcast_to(x, shape) for x in (demand, self._first, waiting, due)
@@ -248,7 +248,7 @@ class QueuePlanner:
         capacity = np.broadcast_to(self._cap * TASKS_PER_STEP, demand.shape)
         most_drained, most_due = np.full(demand.shape, UNLIMITED_TASKS), capacity
         if self._model == "tasks":
-            # Whole tasks; work beyond the capacity runs all the same.
+            # This model moves whole tasks, and inflexible work runs even beyond the capacity.
             flexible = np.floor(flexible)
             arrived = np.ceil(arrived * (1.0 - self._share)) + flexible
             capacity, most_drained = np.maximum(np.floor(capacity), arrived), flexible
@@ -280,19 +280,19 @@ class QueuePlanner:
         return total - np.where(before >= 0, gone, 0.0)
 
     def _place_of(self, setpoint_c: F64) -> F64:
-        """Place of setpoints between the nodes of the map, (B,)."""
+        """Fractional index of setpoints between the nodes of the map, (B,)."""
         low, share = self._facility.places_of_setpoints(setpoint_c[:, None])
         return (low + share)[:, 0]
 
 
 def _kwh(facility: FacilityMap) -> F64:
-    """Energy by map, weather, setpoint and utilisation; that of a single setpoint twice."""
+    """Energy by map, weather, setpoint and utilisation; a single setpoint is repeated."""
     kwh = np.ascontiguousarray(np.moveaxis(facility.facility_kwh, 4, 3))
     return kwh if kwh.shape[3] > 1 else np.repeat(kwh, 2, axis=3)
 
 
 def _kwh_of_best_setpoint(facility: FacilityMap) -> F64:
-    """Energy at the best setpoint, which stands for two, as the kernel reads between setpoints."""
+    """Energy at the best setpoint, repeated since the kernel interpolates between two setpoints."""
     return np.stack([facility.least_kwh] * 2, axis=3)
 
 
@@ -300,7 +300,7 @@ def _due_by(queue: F64, due_after_steps: F64, horizon: int) -> F64:
     """Work in the queue that is due by each coming step, in tasks, (B, H).
 
     Args:
-        queue: work in the queue by the step that put it in, oldest first, accumulated, (B, L).
+        queue: accumulated work in the queue by the step of its arrival, oldest first, (B, L).
         due_after_steps: age at which work is due, in steps, inf for never, (B,).
         horizon: number of coming steps.
     """
@@ -312,7 +312,7 @@ def _due_by(queue: F64, due_after_steps: F64, horizon: int) -> F64:
 
 
 _AMPLE_KW, _SLIGHT_KW = 1e9, 1e-3
-"""Powers of a facility that never limit, and always limit, what a battery delivers."""
+"""Facility powers, in kW, that never limit and that always limit the discharge of a battery."""
 
 
 class StorePlanner:
@@ -320,7 +320,7 @@ class StorePlanner:
 
     Args:
         fleet: the data centers.
-        sizing: their devices.
+        sizing: sizes of their devices.
         step_h: length of a step, in h.
     """
 
@@ -350,13 +350,13 @@ class StorePlanner:
         )
 
     def plan(self, stored_kwh: F64, facility_kwh: F64, cost: EnergyCost, *, peaks: int) -> F64:
-        """Battery command of the step to come, (B,).
+        """Battery command of the next step, (B,).
 
         Args:
             stored_kwh: energy in the store, in kWh, (B,).
             facility_kwh: energy of the facility in the coming steps, in kWh, (B, H).
-            cost: what energy costs.
-            peaks: peaks of the month that are tried; 1 without a demand charge.
+            cost: cost of energy.
+            peaks: number of candidate peak powers of the month; 1 without a demand charge.
         """
         size, horizon = facility_kwh.shape
         load_kw = facility_kwh[:, :1] / self._step_h
@@ -388,7 +388,7 @@ class StorePlanner:
     def _step(
         self, stored_kwh: F64, command: F64 | float, load_kw: F64 | float, limit: F64 | None = None
     ) -> BatteryResult:
-        """One step of each battery from several levels or by several commands, (B, n)."""
+        """One step of each battery from several levels or under several commands, (B, n)."""
         return self._model.step(
             stored_kwh,
             command,
@@ -403,5 +403,5 @@ class StorePlanner:
 
 
 def _ratio(part: F64, whole: F64) -> F64:
-    """Part over whole, (B,); 1 where there is nothing."""
+    """``part`` divided by ``whole``, (B,); 1 where ``whole`` is 0."""
     return np.divide(part, whole, out=np.ones_like(whole), where=whole > 0)

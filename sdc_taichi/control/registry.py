@@ -32,19 +32,19 @@ from sdc_taichi.sim.fleet import Fleet
 from sdc_taichi.user_functions import function_named, import_path, register_function
 
 CONTROLLABLE: tuple[Agent, ...] = AGENTS
-"""Names of the parts of a spec, each with the command of that name, as ``Actions`` has it."""
+"""Parts of a controller spec, named like the commands of ``Actions`` that they give."""
 ControllerMaker = Callable[[str, Fleet, tuple[str, ...]], Controller]
-"""Makes a controller from the text after the colon of its name, the data centers, and the parts of
-a spec that it is named for; a class is called without arguments."""
+"""Function that makes a controller from the text after the colon of its name, the data centers, and
+the parts of a spec that name it."""
 
 
 class _NamedController(NamedTuple):
-    """A controller that specs name."""
+    """A built-in controller."""
 
     make: Callable[[], Controller]
-    """Makes the controller."""
+    """Function that makes the controller."""
     parts: tuple[str, ...]
-    """Which of ``CONTROLLABLE`` it may be named for."""
+    """Parts of a spec that may name it, of ``CONTROLLABLE``."""
 
 
 _CONTROLLERS: dict[str, _NamedController] = {
@@ -61,8 +61,8 @@ _CONSTANT = "constant:C"
 _MPC = "mpc-24h"
 _POLICY = "policy:FOLDER"
 _registered: dict[str, Any] = {"policy": "sdc_taichi.learning.controller:policy_controller"}
-"""Makers by the part of a name before its colon, or their import paths, which nothing imports
-before they are named."""
+"""Makers, or their import paths, by the part of a name before its colon; import paths are resolved
+on first use."""
 _BUILT_IN = (*_CONTROLLERS, "constant", "policy")
 _SUGGESTION = " (did you mean {!r}?)"
 
@@ -70,26 +70,25 @@ _SUGGESTION = " (did you mean {!r}?)"
 def controller_names() -> tuple[str, ...]:
     """Valid names.
 
-    ``constant:C`` stands for a setpoint in C, such as ``constant:20``, ``mpc-24h`` for any horizon,
-    with or without an objective, such as ``mpc-72h:cost``, and ``policy:FOLDER`` for the folder of
-    a training run or a policy. An import path ``module:name`` is valid too.
+    ``constant:C`` stands for any setpoint in C, such as ``constant:20``; ``mpc-24h`` for any
+    horizon and objective, such as ``mpc-72h:cost``; ``policy:FOLDER`` for the folder of a training
+    run or a policy. An import path ``module:name`` is valid too.
     """
-    mine = (name for name in _registered if name not in _BUILT_IN)
-    return (*_CONTROLLERS, _CONSTANT, _MPC, _POLICY, *mine)
+    added = (name for name in _registered if name not in _BUILT_IN)
+    return (*_CONTROLLERS, _CONSTANT, _MPC, _POLICY, *added)
 
 
 def register_controller(name: str, maker: ControllerMaker | type[Any] | str) -> None:
-    """Make a controller available by a name, wherever a controller can be named.
+    """Register a controller under a name that every controller option accepts.
 
     Args:
-        name: an identifier; ``name:TEXT`` hands TEXT over to the maker.
-        maker: function of the text after the colon, the fleet, and the parts of the spec (of load,
-            cooling and battery) that the controller is named for, which returns the controller; a
-            class whose objects are controllers, made without arguments; or the import path
-            ``module:name`` of either.
+        name: an identifier; a spec ``name:TEXT`` passes TEXT to the maker.
+        maker: a function that returns the controller, called with the text after the colon, the
+            fleet, and the parts of the spec (load, cooling, battery) that name it; a controller
+            class without constructor arguments; or the import path ``module:name`` of either.
 
     Raises:
-        ConfigError: a name that is taken, or no maker.
+        ConfigError: the name is taken, or ``maker`` is neither a function nor a class.
     """
     if isinstance(maker, str):
         if not (isinstance(name, str) and name.isidentifier()) or name in _BUILT_IN:
@@ -105,11 +104,11 @@ def make_controller(spec: str | Controller, fleet: Fleet, *, imports: bool = Tru
     """A controller by name, one per agent, or a copy of a controller.
 
     Args:
-        spec: a name, ``agent=name`` parts joined by commas, such as ``load=greedy-ci,cooling=g36``,
-            where agents not mentioned stay idle; or a controller.
-        fleet: the data centers it is for.
-        imports: whether import paths ``module:name`` are valid: in text of the user's own, and not
-            in that of a file, which may be of anybody.
+        spec: a name; ``agent=name`` parts joined by commas, such as ``load=greedy-ci,cooling=g36``,
+            where all other agents stay idle; or a controller.
+        fleet: the data centers to control.
+        imports: whether import paths ``module:name`` are valid. They are not in files, which may
+            come from an untrusted source.
 
     Raises:
         ConfigError: an unknown agent or name, a controller that does not act on the agent, a
@@ -123,14 +122,14 @@ def make_controller(spec: str | Controller, fleet: Fleet, *, imports: bool = Tru
         return _make(spec.strip(), fleet, None, imports)
     chosen: dict[str, Controller] = {}
     for name in dict.fromkeys(named.values()):
-        # One controller for all agents that it is named for, as a plan or a policy is made.
-        own = tuple(part for part in CONTROLLABLE if named.get(part) == name)
-        chosen |= dict.fromkeys(own, _make(name, fleet, own, imports))
+        # Parts with the same name share one controller, so that a plan covers them together.
+        parts = tuple(part for part in CONTROLLABLE if named.get(part) == name)
+        chosen |= dict.fromkeys(parts, _make(name, fleet, parts, imports))
     return PerAgent(*(chosen.get(part, Idle()) for part in CONTROLLABLE))
 
 
 def parts_of(spec: str) -> dict[str, str]:
-    """Controllers by agent of a spec such as ``load=greedy-ci,cooling=g36``; none of a plain name.
+    """Names by agent in a spec such as ``load=greedy-ci,cooling=g36``; empty for a plain name.
 
     Raises:
         ConfigError: an unknown agent, or one that is given twice.
@@ -158,14 +157,14 @@ def controller_text(spec: str | Controller) -> str:
 
 
 def check_controller(given: Any, what: str = "") -> Controller:
-    """A controller that a user has made.
+    """Check that an object is a controller, and return it.
 
     Args:
         given: the object.
-        what: what it was given as, at the beginning of errors, if they do not say that themselves.
+        what: beginning of error messages, such as the option with the controller.
 
     Raises:
-        ConfigError: it lacks a method, is a class, or says that it gives what is no command.
+        ConfigError: the object lacks a method, is a class, or names an unknown command.
     """
     place = f"{what}: " if what else ""
     if isinstance(given, type):
@@ -189,7 +188,7 @@ def check_controller(given: Any, what: str = "") -> Controller:
 
 
 def _copy(given: Any) -> Controller:
-    """A controller of its own for each environment, as it may have a memory."""
+    """Deep copy of a controller, since controllers may have a memory."""
     controller = check_controller(given, "controller")
     try:
         return deepcopy(controller)
@@ -201,7 +200,7 @@ def _copy(given: Any) -> Controller:
 
 
 def _make(name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, imports: bool) -> Controller:
-    """Look a name up, for use on the ``parts`` that it is named for; None of a plain name."""
+    """Make a controller by name for the ``parts`` of a spec that name it; None for a plain name."""
     if is_mpc(name):
         return model_predictive(name, parts or CONTROLLABLE)
     kind, colon, text = name.partition(":")
@@ -221,15 +220,15 @@ def _make(name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, imports: boo
     return entry.make()
 
 
-def _first_missing(parts: tuple[Agent, ...] | None, own: Sequence[str]) -> Agent | None:
-    """The first of ``parts`` that is not in ``own``, if there is one."""
-    return next((part for part in parts or () if part not in own), None)
+def _first_missing(parts: tuple[Agent, ...] | None, valid: Sequence[str]) -> Agent | None:
+    """The first of ``parts`` that is not in ``valid``, if there is one."""
+    return next((part for part in parts or () if part not in valid), None)
 
 
 def _made_by_maker(
     name: str, fleet: Fleet, parts: tuple[Agent, ...] | None, imports: bool
 ) -> Controller:
-    """A controller of a registered maker, or of one that ``name`` has the import path of."""
+    """Make a controller by a registered maker, or by the maker whose import path is ``name``."""
     kind, _, text = name.partition(":")
     maker = _registered.get(kind)
     if maker is None:
@@ -264,11 +263,12 @@ def _made_by_maker(
     else:
         made = maker(text, fleet, parts or CONTROLLABLE)
     controller = check_controller(made, f"controller {name!r}")
-    given = commands_of(controller)
-    agent = _first_missing(parts, given)
+    commands = commands_of(controller)
+    agent = _first_missing(parts, commands)
     if agent is not None:
         raise ConfigError(
-            f"controller {name!r}: does not act on {agent}; it gives {', '.join(given) or 'none'}"
+            f"controller {name!r}: does not act on {agent}; it gives "
+            f"{', '.join(commands) or 'none'}"
         )
     return controller
 

@@ -1,7 +1,8 @@
-"""Controllers that are not learned; each acts on a whole fleet at once.
+"""Rule-based controllers of a whole fleet.
 
-A controller has ``reset(seed)`` and ``act(view) -> Actions``. What it does not control it leaves
-neutral: work neither deferred nor drained, setpoint held or on its schedule, battery idle.
+A controller has ``reset(seed)`` and ``act(view) -> Actions``. Commands that it does not give are
+neutral: work is neither deferred nor drained, the setpoint holds or follows its schedule, and the
+battery idles.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from sdc_taichi.plant.cooling import avoid_repeats
 from sdc_taichi.types import F64, I64, Actions
 
 SLOT_MIN = 5.0
-"""Interval of trim and respond, minutes."""
+"""Interval of trim and respond, in min."""
 REQUEST_INLET_C = 27.0
 """Highest recommended inlet temperature (ASHRAE TC 9.9); a rack above it requests cooling."""
 COMMANDS_OF_PART: dict[str, tuple[str, ...]] = {
@@ -27,34 +28,34 @@ COMMANDS_OF_PART: dict[str, tuple[str, ...]] = {
     "cooling": ("cooling", "fan", "placement"),
     "battery": ("battery",),
 }
-"""Fields of ``Actions`` that a controller may give as a part of ``PerAgent``."""
+"""Fields of ``Actions`` that each part of ``PerAgent`` may give."""
 _DRAWN_STEPS = 256
-"""Steps whose random commands are drawn at once."""
+"""Number of steps whose random commands are drawn at once."""
 
 
 class Controller(Protocol):
     """Source of the commands of each step: any object with these two methods.
 
-    One that gives other commands than load, cooling and battery, or fewer, says so by an attribute
-    ``commands``: names of the fields of ``Actions`` that it gives, see ``commands_of``.
+    A controller that does not give exactly load, cooling and battery has an attribute ``commands``
+    with the names of the fields of ``Actions`` that it gives; see ``commands_of``.
     """
 
     def reset(self, seed: Any) -> None:
-        """Begin an episode, on which earlier ones have no influence.
+        """Begin an episode that does not depend on earlier ones.
 
         Args:
-            seed: decides everything that is random; an integer, or in environments one for each
-                data center, (B,).
+            seed: seed of all randomness: an integer, or in environments one for each data center,
+                (B,).
         """
 
     def act(self, view: View) -> Actions:
-        """Commands for the step to come.
+        """Commands of the next step.
 
         Args:
-            view: the situation before the step, of B data centers.
+            view: state and forecasts of B data centers before the step.
 
         Returns:
-            Commands, each (B,) or one for all data centers; see ``Actions``.
+            Commands, each (B,) or one value for all data centers; see ``Actions``.
         """
 
 
@@ -73,17 +74,17 @@ class Idle:
 
 
 class Random:
-    """Each command drawn evenly from its three named actions.
+    """Uniformly random commands: each of the three named actions is equally likely.
 
-    Data center i draws from ``SeedSequence([seed, i])``, or with a seed of its own from
-    ``SeedSequence([seed, 0])``, whatever the batch it is in.
+    Data center i draws from ``SeedSequence([seed, i])``, or from ``SeedSequence([seed_i, 0])`` if
+    each data center has a seed, so its commands do not depend on the rest of the batch.
     """
 
     def __init__(self) -> None:
         self.reset(0)
 
     def reset(self, seed: int | I64) -> None:
-        """Draw anew from the streams of ``seed``."""
+        """Restart the random streams from ``seed``."""
         self._seed = seed
         self._streams: list[np.random.Generator] = []
         self._drawn = np.empty((0, 0, 3))
@@ -113,8 +114,9 @@ class Random:
 class TrimAndRespond:
     """Supply setpoint by trim and respond of ASHRAE Guideline 36 (2021), section 5.1.14.
 
-    The setpoint drifts up and is lowered on request, once per 5 min; a step of 15 min does three
-    slots on the requests of the step before. A rack whose hottest inlet is above 27 C requests.
+    Every 5 min the setpoint rises a little, or falls if racks request cooling. A step of 15 min
+    has three such slots, all with the requests of the previous step. A rack requests cooling if its
+    hottest inlet is above 27 C.
     """
 
     commands = ("cooling",)
@@ -144,7 +146,7 @@ class TrimAndRespond:
 
 
 class FixedSetpoint:
-    """Moves the setpoint to one temperature with its first command, and keeps it there.
+    """Constant setpoint, reached with the first command.
 
     Args:
         setpoint_c: temperature, C, or the name of a limit: ``low`` or ``high``.
@@ -171,12 +173,12 @@ class FixedSetpoint:
 
 
 class Lookahead:
-    """Battery against the carbon intensity of a coming window, known in advance.
+    """Battery that charges and discharges by the forecast carbon intensity of a coming window.
 
-    Charges at full power when the present intensity is in the lowest quarter of the window,
-    discharges when it is in the highest, otherwise idles; it also idles when the window's highest
-    and lowest intensity differ by less than what the battery loses. The idea, to time storage by a
-    forecast, is that of Carbon Explorer (Acun et al., ASPLOS 2023).
+    It charges at full power if the present intensity is in the lowest quarter of the window and
+    discharges if it is in the highest quarter. It idles otherwise, and if the ratio of the lowest
+    to the highest intensity exceeds the round-trip efficiency. Carbon Explorer times storage by
+    forecasts in the same way (Acun et al., ASPLOS 2023).
 
     Args:
         hours: length of the window, in h.
@@ -199,9 +201,10 @@ class Lookahead:
 
 
 class GreedyCarbon:
-    """Work and battery by whether the grid is now dirtier than on average over the coming window.
+    """Work and battery by the present carbon intensity relative to the mean of a coming window.
 
-    Above the mean it defers work and discharges, below it drains the queue and charges.
+    Above the mean, work is deferred and the battery discharges; below it, the queue drains and the
+    battery charges.
 
     Args:
         hours: length of the window, in h.
@@ -220,7 +223,7 @@ class GreedyCarbon:
         """Commands for work and battery."""
         ci = view.forecast(self._hours).ci_g_per_kwh
         mean, now = ci.mean(axis=1), ci[:, 0]
-        # The mean of a window may differ in the last bit from what it is exactly.
+        # The computed mean of a constant window can differ from its value in the last bit.
         command = np.where(np.abs(mean - now) > 1e-9 * mean, np.sign(mean - now), 0.0)
         return Actions(load=command, battery=command)
 
@@ -228,7 +231,7 @@ class GreedyCarbon:
 class PerAgent:
     """One controller for each of load, cooling and battery.
 
-    A controller that stands for several of them is asked once in a step.
+    A controller that has several of these parts acts once per step.
 
     Args:
         load: gives the load command, and the placement of work if it has one.
@@ -236,10 +239,10 @@ class PerAgent:
         battery: gives the battery command.
 
     Attributes:
-        commands: fields of ``Actions`` that they give.
+        commands: fields of ``Actions`` that the parts give.
 
     Raises:
-        ConfigError: two of them place work.
+        ConfigError: the load and the cooling controller both place work.
     """
 
     def __init__(self, load: Controller, cooling: Controller, battery: Controller) -> None:
@@ -261,7 +264,7 @@ class PerAgent:
             controller.reset(seed)
 
     def act(self, view: View) -> Actions:
-        """Take from each controller the commands that it is responsible for."""
+        """Combine the commands of the parts."""
         actions = {id(controller): controller.act(view) for controller in self._controllers}
         return Actions(
             **{name: getattr(actions[id(giver)], name) for name, giver in self._giver.items()}
@@ -269,10 +272,11 @@ class PerAgent:
 
 
 def commands_of(controller: Controller) -> tuple[str, ...]:
-    """Fields of ``Actions`` that a controller gives; those that it does not stay neutral.
+    """Fields of ``Actions`` that a controller gives; all others stay neutral.
 
     Args:
-        controller: one without an attribute ``commands`` gives load, cooling and battery.
+        controller: a controller; without an attribute ``commands`` it gives load, cooling and
+            battery.
     """
     return tuple(getattr(controller, "commands", AGENTS))
 
@@ -298,9 +302,9 @@ def trim_and_respond(
         requests: number of requests, (B,).
         low_c: lowest setpoint, in C, (B,) or one for all.
         high_c: highest setpoint, in C, (B,) or one for all.
-        trim_k: change of every slot, upwards, in K.
-        respond_k: change per request that counts, downwards, in K.
-        max_respond_k: largest change by requests in a slot, downwards, in K.
+        trim_k: change in every slot, positive, in K.
+        respond_k: change per request beyond ``ignored``, negative, in K.
+        max_respond_k: largest change by requests in a slot, negative, in K.
         ignored: number of requests without effect.
 
     Returns:
@@ -329,13 +333,13 @@ def setpoint_command(target_c: F64, view: View) -> F64:
 
 
 def quartile_command(ci_g_per_kwh: F64) -> F64:
-    """Battery command by where the present carbon intensity stands within a window.
+    """Battery command by the rank of the present carbon intensity within a window.
 
-    A value is in the lowest quarter of n if fewer than n/4 of them are lower. One that is in the
-    lowest and the highest, as all are in a constant window, gives 0.
+    A value is in the lowest quarter of n values if fewer than n/4 of them are lower. A value in
+    both the lowest and the highest quarter, as in a constant window, gives 0.
 
     Args:
-        ci_g_per_kwh: carbon intensity of the window, in g CO2e/kWh, the present one first, (B, n).
+        ci_g_per_kwh: carbon intensity of the window in g CO2e/kWh, the present value first, (B, n).
 
     Returns:
         1 (charge) in the lowest quarter, -1 (discharge) in the highest, else 0, (B,).
