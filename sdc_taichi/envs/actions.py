@@ -1,4 +1,4 @@
-"""Actions of agents: their spaces, and the commands of the simulator that they mean."""
+"""Action spaces of agents, and conversion between actions and commands of the simulator."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from sdc_taichi.sim.fleet import STAGE_MODELS, Fleet
 from sdc_taichi.types import F64, Actions, State
 
 BATTERY_COMMANDS = {"paper": (1.0, 0.0, -1.0), "sustaindc": (1.0, -1.0, 0.0)}
-"""Commands of the battery's discrete actions 0, 1 and 2, by value of ``action_order``: 1 charges,
--1 discharges."""
+"""Commands of the battery's discrete actions 0, 1 and 2 by ``action_order``: 1 charges, -1
+discharges."""
 PLACEMENT_FACTOR = 10.0
-"""Relative load of a rack at an action of 1, and 1 over that of one at -1."""
+"""Relative load of a rack at an action of 1; an action of -1 gives the reciprocal."""
 _NEUTRAL = {"placement": 1.0}
-"""Commands that change nothing where they are not 0."""
+"""Neutral values of commands whose neutral value is not 0."""
 _NEEDED_MODELS = {"fan": ("crac_flow", "controlled"), "placement": ("placement", "weights")}
-"""Stage and model that a command needs."""
+"""Stage and model that each command requires."""
 
 
 class AgentActions:
-    """Reads what agents do as commands of the simulator.
+    """Converts actions of agents to commands of the simulator and back.
 
     Args:
         fleet: the data centers, B.
-        options: which agents learn, what they decide and what their actions mean.
+        options: learning agents, their commands and the meaning of their actions.
 
     Attributes:
         spaces: space of the actions of each agent in one environment.
@@ -40,8 +40,8 @@ class AgentActions:
         action_order: order of the battery's discrete actions.
 
     Raises:
-        ConfigError: data centers that differ in the number of what is decided on, or whose models
-            do not take a command.
+        ConfigError: data centers with different numbers of racks or units that actions command, or
+            with a model that does not take a command.
     """
 
     def __init__(self, fleet: Fleet, options: EnvOptions) -> None:
@@ -84,12 +84,12 @@ class AgentActions:
         self._fan_steps = options.fan_change / np.repeat(fleet.values("hvac.crac.fan_step"), units)
 
     def decode(self, actions: Mapping[str, Any], state: State) -> dict[str, F64]:
-        """Commands of the learning agents by name, (B,) each, (U,) or (R,).
+        """Commands of the learning agents by name, each (B,), (U,) or (R,).
 
         Args:
             actions: one entry per learning agent, (B,) whole numbers, or (B, k) numbers with
                 continuous actions or several numbers to an action.
-            state: the situation before the step.
+            state: state of the simulator before the step.
 
         Raises:
             SdcError: actions that are missing, too many, or outside their space.
@@ -98,9 +98,9 @@ class AgentActions:
             raise SdcError(f"actions: {actions!r}; valid is a dict of {list(self._agents)}")
         commands: dict[str, F64] = {}
         for agent in self._agents:
-            given = self._checked(agent, actions)
+            action = self._checked(agent, actions)
             for name, columns in self._columns[agent]:
-                part = given if columns is None else given[:, columns]
+                part = action if columns is None else action[:, columns]
                 commands[name] = self._command(name, part.reshape(-1), state)
         if len(actions) > len(self._agents):
             extra = sorted(set(map(str, actions)) - set(self._agents))
@@ -108,38 +108,38 @@ class AgentActions:
         return commands
 
     def encode(self, commands: Actions) -> dict[str, npt.NDArray[Any]]:
-        """Actions of the learning agents by which they come nearest to commands.
+        """Actions of the learning agents that approximate commands most closely.
 
         Args:
-            commands: commands of one step; the named ones and numbers.
+            commands: commands of one step, named or numeric.
 
         Returns:
-            One entry per learning agent, as ``decode`` takes them.
+            Actions by learning agent, in the form that ``decode`` takes.
         """
         actions: dict[str, npt.NDArray[Any]] = {}
         for agent, shape in self._shapes.items():
             size, width = shape[0], self._widths[agent]
             parts = []
             for name, columns in self._columns[agent]:
-                given = as_numbers(getattr(commands, name), _NEUTRAL.get(name, 0.0))
-                numbers = width if columns is None else columns.stop - columns.start
-                of_each = given.reshape(size if given.ndim else 1, -1)
-                parts.append(self._action(name, np.broadcast_to(of_each, (size, numbers))))
+                command = as_numbers(getattr(commands, name), _NEUTRAL.get(name, 0.0))
+                count = width if columns is None else columns.stop - columns.start
+                by_dc = command.reshape(size if command.ndim else 1, -1)
+                parts.append(self._action(name, np.broadcast_to(by_dc, (size, count))))
             actions[agent] = np.concatenate(parts, axis=1).reshape(shape)
         return actions
 
     def idle_actions(self) -> dict[str, npt.NDArray[Any]]:
-        """Actions of the learning agents that leave everything as it is, (B,) or (B, k)."""
-        found: dict[str, npt.NDArray[Any]] = {}
+        """Neutral actions of the learning agents, (B,) or (B, k)."""
+        idle: dict[str, npt.NDArray[Any]] = {}
         for agent, shape in self._shapes.items():
             if self._continuous:
-                found[agent] = np.zeros(shape, dtype=np.float32)
+                idle[agent] = np.zeros(shape, dtype=np.float32)
             else:
                 (name, _), *_ = self._columns[agent]
                 commands = self._discrete_commands[name]
-                # The battery rests at 0, racks are alike at any equal load.
-                found[agent] = np.full(shape, 1 if name != "battery" else np.argmin(abs(commands)))
-        return found
+                # Only the battery has its neutral action elsewhere than in the middle.
+                idle[agent] = np.full(shape, 1 if name != "battery" else np.argmin(abs(commands)))
+        return idle
 
     def _space(self, width: int) -> spaces.Space[Any]:
         if self._continuous:
@@ -147,41 +147,41 @@ class AgentActions:
         return spaces.Discrete(3) if width == 1 else spaces.MultiDiscrete([3] * width)
 
     def _checked(self, agent: str, actions: Mapping[str, Any]) -> npt.NDArray[Any]:
-        """Action of one agent within its space, as int64 or float64."""
+        """Checked action of one agent, as int64 or float64."""
         if agent not in actions:
             raise SdcError(f"actions: none for {agent}; valid: {list(self._agents)}")
-        given = checked_array(actions[agent], f"action of {agent}")
-        if given.shape != self._shapes[agent]:
+        action = checked_array(actions[agent], f"action of {agent}")
+        if action.shape != self._shapes[agent]:
             raise SdcError(
-                f"action of {agent}: shape {given.shape}, expected {self._shapes[agent]}"
+                f"action of {agent}: shape {action.shape}, expected {self._shapes[agent]}"
             )
         if self._continuous:
-            return _checked_numbers(agent, given)
-        whole = given.dtype.kind in "iu"
+            return _checked_numbers(agent, action)
+        whole = action.dtype.kind in "iu"
         if whole:
-            chosen = given.astype(np.int64)
-            # Read without sign, what is below 0 is beyond 2 too.
-            if np.maximum.reduce(chosen.view(np.uint64), axis=None) <= 2:
-                return chosen
-            given = given[(given < 0) | (given > 2)]
-        kind = "" if whole else f" ({given.dtype})"
-        raise SdcError(f"action of {agent}: {given.flat[0]}{kind}; valid is 0, 1 or 2")
+            choices = action.astype(np.int64)
+            # As unsigned numbers, negative choices exceed 2 as well.
+            if np.maximum.reduce(choices.view(np.uint64), axis=None) <= 2:
+                return choices
+            action = action[(action < 0) | (action > 2)]
+        kind = "" if whole else f" ({action.dtype})"
+        raise SdcError(f"action of {agent}: {action.flat[0]}{kind}; valid is 0, 1 or 2")
 
-    def _command(self, name: str, given: npt.NDArray[Any], state: State) -> F64:
-        """A command from its part of an action, one number for each of what it is about."""
+    def _command(self, name: str, action: npt.NDArray[Any], state: State) -> F64:
+        """Command of the part of an action that belongs to it, each (B,), (U,) or (R,)."""
         if not self._continuous:
-            return self._discrete_commands[name].take(given)
+            return self._discrete_commands[name].take(action)
         if name == "placement":
-            return np.asarray(PLACEMENT_FACTOR**given)
+            return np.asarray(PLACEMENT_FACTOR**action)
         if name == "fan":
-            return np.asarray(given * self._fan_steps)
+            return np.asarray(action * self._fan_steps)
         if name == "cooling":
-            command = given * self._setpoint_change_k / self._setpoint_step_k
+            command = action * self._setpoint_change_k / self._setpoint_step_k
             return avoid_repeats(command, state.cooling_last)
-        return given
+        return action
 
     def _action(self, name: str, command: F64) -> npt.NDArray[Any]:
-        """The part of an action that comes nearest to a command, (B, k)."""
+        """Part of an action that approximates a command most closely, (B, k)."""
         if name == "placement":
             command = np.log10(command)
         if not self._continuous:
@@ -190,19 +190,19 @@ class AgentActions:
                 choices = np.log10(choices)
             return np.asarray(np.abs(command[..., None] - choices).argmin(-1))
         if name == "cooling":
-            of_one = self._setpoint_change_k / self._setpoint_step_k
-            command = command / of_one.reshape(command.shape)
+            largest = self._setpoint_change_k / self._setpoint_step_k
+            command = command / largest.reshape(command.shape)
         elif name == "fan":
             command = command / self._fan_steps.reshape(command.shape)
         return np.clip(command, -1.0, 1.0)
 
 
 def as_numbers(command: Any, neutral: float = 0.0) -> F64:
-    """A command of ``Actions``, which may be a named one, as numbers.
+    """Numeric values of a command of ``Actions``, which may be an enum member.
 
     Args:
         command: the command.
-        neutral: number of a command that is None.
+        neutral: value of a command that is None.
     """
     if command is None:
         command = neutral
@@ -210,14 +210,14 @@ def as_numbers(command: Any, neutral: float = 0.0) -> F64:
 
 
 def equal_number(offsets: npt.NDArray[np.integer], what: str) -> int:
-    """Number of units or racks that every data center has.
+    """Number of units or racks per data center, which all data centers must share.
 
     Args:
-        offsets: first one of each data center, and their number, (B + 1,).
-        what: what is counted, for errors.
+        offsets: index of each data center's first unit or rack, and the total, (B + 1,).
+        what: plural of the counted thing, for errors.
 
     Raises:
-        ConfigError: data centers that differ in it.
+        ConfigError: data centers with different numbers.
     """
     numbers = np.diff(offsets)
     if np.any(numbers != numbers[0]):
@@ -245,7 +245,7 @@ def _check_models(fleet: Fleet, commands: Sequence[str]) -> None:
 def _columns(
     names: Sequence[str], widths: Mapping[str, int]
 ) -> tuple[tuple[str, slice | None], ...]:
-    """Commands of an agent, and the columns of its action; None for all of them."""
+    """Commands of an agent and their columns in its action; None means all columns."""
     if len(names) == 1:
         return ((names[0], None),)
     ends = np.cumsum([widths.get(name, 1) for name in names]).tolist()
@@ -255,23 +255,22 @@ def _columns(
     )
 
 
-def _checked_numbers(agent: str, given: npt.NDArray[Any]) -> F64:
-    """A continuous action, cut at the ends of its space, which are those of f32."""
-    if given.dtype.kind not in "iuf":
-        raise SdcError(f"action of {agent}: {given.flat[0]!r}; valid is a number")
-    inside = np.abs(given) <= 1.0 + 1e-6
+def _checked_numbers(agent: str, action: npt.NDArray[Any]) -> F64:
+    """Checked continuous action; values beyond -1..1 by rounding of f32 are clipped."""
+    if action.dtype.kind not in "iuf":
+        raise SdcError(f"action of {agent}: {action.flat[0]!r}; valid is a number")
+    inside = np.abs(action) <= 1.0 + 1e-6
     if not np.all(inside):
-        wrong = given[~inside].flat[0]
-        raise SdcError(f"action of {agent}: {wrong}; valid is within -1..1")
-    return np.minimum(np.maximum(given.astype(np.float64), -1.0), 1.0)
+        raise SdcError(f"action of {agent}: {action[~inside].flat[0]}; valid is within -1..1")
+    return np.minimum(np.maximum(action.astype(np.float64), -1.0), 1.0)
 
 
 def checked_array(given: Any, name: str) -> npt.NDArray[Any]:
-    """Convert a value that a user gave to an array of any kind and shape.
+    """Convert a user's number, array or nested lists to an array of any type and shape.
 
     Args:
-        given: a number, an array, or nested lists.
-        name: what it is, for errors.
+        given: the value.
+        name: name of the value in errors.
 
     Raises:
         SdcError: nested lists of differing lengths.

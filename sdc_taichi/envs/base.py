@@ -1,4 +1,4 @@
-"""Parts that environments of all standards share: arguments, infos, added methods, spec."""
+"""Arguments, infos, methods and specs that all environments share."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 8}
 
 
 class Environment:
-    """Attributes and methods that all environments have beyond their standards."""
+    """Attributes and methods of all environments beyond Gymnasium and PettingZoo."""
 
     core: RecordingCore
     """The data centers."""
@@ -55,13 +55,13 @@ class Environment:
         recorder: RecorderOption = None,
         **keywords: Any,
     ) -> None:
-        """Make the data centers from the arguments that all entry points take alike.
+        """Make the data centers from the arguments of an entry point.
 
         Args:
             config: a preset, a file, a config or a dict of its sections; for batches several of
                 the latter two, of which environment i takes entry i modulo their number.
             num_envs: number of environments; None is one per config.
-            only_agent: the one agent that learns, if the entry point has a single one.
+            only_agent: the learning agent, if the entry point has a single one.
             overrides: values put into every config: a dict of section.key to value, or a list of
                 ``section.key=value``.
             options: options; None is the default ones.
@@ -88,7 +88,7 @@ class Environment:
         return frame(self.core.view, env)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the episodes continue; picklable."""
+        """Picklable state from which ``load_state_dict`` continues the episodes exactly."""
         return self.core.state_dict()
 
     def close(self) -> None:
@@ -97,7 +97,7 @@ class Environment:
 
 
 class SingleEnv(Environment):
-    """Methods that environments with one data center have beyond their standards."""
+    """Methods of environments with one data center beyond Gymnasium and PettingZoo."""
 
     def state(self) -> F32:
         """Shared state for centralised critics, (m,), of ``state_space``."""
@@ -117,7 +117,7 @@ class SingleEnv(Environment):
 
 
 class BatchEnv(Environment):
-    """Methods that batches of environments have beyond their standards."""
+    """Methods of batches of environments beyond Gymnasium."""
 
     num_envs: int
     """Number of environments, B."""
@@ -129,7 +129,7 @@ class BatchEnv(Environment):
     def reward_terms(self) -> dict[str, F64]:
         """All reward terms of the last step by name, (B,) each, unscaled; empty before the first.
 
-        A step that ends episodes and starts the next ones counts as the last step too.
+        After a step that ends episodes and starts the next ones, they belong to that step.
         """
         return self.core.reward_terms()
 
@@ -143,7 +143,7 @@ class BatchEnv(Environment):
 
 
 class AgentSpaces:
-    """Spaces by agent, as PettingZoo's environments give them."""
+    """Observation and action spaces by agent, as in PettingZoo."""
 
     observation_spaces: dict[str, spaces.Space[Any]]
     """Space of the observations of one environment, by agent."""
@@ -174,12 +174,12 @@ def _space_of(agent: str, by_agent: Mapping[str, spaces.Space[Any]]) -> spaces.S
 
 
 def start_day_option(options: Mapping[str, Any] | None, *, strict: bool = True) -> Any:
-    """The first day that the ``options`` of ``reset`` ask for, None if they do not.
+    """Option ``start_day`` of ``reset``, or None.
 
     Args:
         options: values by name.
-        strict: whether an unknown name is an error; else it is a warning, which PettingZoo's own
-            API test needs, as it passes an option of a name that no environment knows.
+        strict: whether an unknown name is an error instead of a warning. PettingZoo's own API test
+            passes an unknown option, so its environments only warn.
 
     Raises:
         ConfigError: an unknown option.
@@ -197,19 +197,19 @@ def start_day_option(options: Mapping[str, Any] | None, *, strict: bool = True) 
 
 
 def first_info(core: Core) -> dict[str, Any]:
-    """Infos of the first of a batch before the first step, as numbers and text."""
+    """Infos of the first environment before its first step, as numbers and text."""
     return {name: values.tolist()[0] for name, values in core.start_info().items()}
 
 
 def step_info(transition: Transition) -> dict[str, F64]:
-    """Quantities of a step and the costs that are wanted, by name, (B,) each."""
+    """Quantities and costs of a step by name, (B,) each."""
     info = transition.result.per_dc()
     info.update(transition.costs)
     return info
 
 
 def as_floats(quantities: Mapping[str, F64]) -> dict[str, float]:
-    """Quantities, (1,) each, of a batch of one as numbers."""
+    """Quantities of a batch of one, (1,) each, as numbers."""
     return {name: values.item() for name, values in quantities.items()}
 
 
@@ -221,7 +221,7 @@ def first_of_batch(observation: Observation) -> Observation:
 
 
 class HasSpec:
-    """Has the spec that Gymnasium keeps of an environment it has made."""
+    """Spec of an environment that ``gymnasium.make`` or ``make_vec`` made."""
 
     core: RecordingCore
     """The data centers."""
@@ -229,11 +229,11 @@ class HasSpec:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """The arguments as plain values, and the length of an episode; None if made without an id.
+        """Arguments as plain values, and the length of an episode; None if made without an id.
 
-        ``gymnasium.make``, or ``make_vec``, makes the same environment of it, or of
-        ``EnvSpec.from_json(spec.to_json())``. What has no plain form stays as it is: a recorder
-        other than a path, a function that cannot be imported, and a controller other than a name.
+        ``gymnasium.make`` or ``make_vec`` makes the same environment from the spec or from
+        ``EnvSpec.from_json(spec.to_json())``. Arguments without a plain form are kept as they are:
+        a recorder that is not a path, a function that cannot be imported, a controller object.
         """
         return self._spec
 
@@ -254,7 +254,7 @@ def check_steps(given: Any, core: Core) -> int:
         core: the data centers.
 
     Raises:
-        ConfigError: no whole number, or more steps than an episode has.
+        ConfigError: not a whole number, or more steps than an episode has.
     """
     if given is None or (given == -1 and not isinstance(given, bool)):
         return core.steps
@@ -268,22 +268,22 @@ def check_steps(given: Any, core: Core) -> int:
 
 
 def _plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of an entry point; those in ``options`` by keyword, which means the same."""
+    """Arguments of an entry point as plain values, with fields of ``options`` as keywords."""
     given = dict(arguments)
     options = given.pop("options", None)
     if isinstance(options, EnvOptions):
-        # Fields left at their default are not given: some are errors where they have no effect.
+        # Leave out fields at their default, since some are errors where they have no effect.
         given = {name: getattr(options, name) for name in options.model_fields_set} | given
     known: dict[int, Any] = {}
     return {name: _plain(value, known) for name, value in given.items()}
 
 
 def _plain(value: Any, known: dict[int, Any]) -> Any:
-    """A value as JSON has it, or the value itself.
+    """Value as JSON types, or the value itself.
 
     Args:
         value: any value.
-        known: models by id and what became of them, since configs of a batch are often the same.
+        known: plain form of each model by its id, since configs of a batch are often the same.
     """
     if isinstance(value, BaseModel):
         if id(value) not in known:
@@ -305,7 +305,7 @@ def _plain(value: Any, known: dict[int, Any]) -> Any:
 
 
 def _path_of(function: Callable[..., Any]) -> Any:
-    """Import path of a function, or the function if none leads to it in another process."""
+    """Import path of a function, or the function if no path imports it in another process."""
     path = import_path(function)
     module, _, name = path.partition(":")
     if module != "__main__":

@@ -1,8 +1,8 @@
-"""Episodes of many data centers at once; the environments are thin wrappers around them.
+"""Episodes of a batch of data centers; all environments are thin wrappers around ``Core``.
 
-A step decodes actions, lets a named controller play the agents that do not learn, advances the
-simulator, and takes rewards and observations from the view after the step. Arrays have the
-environments first.
+A step decodes the actions, adds the commands of a controller for the agents that do not learn,
+advances the simulator, and computes rewards and observations from the view after the step. The
+first axis of every array is the environment.
 """
 
 from __future__ import annotations
@@ -79,11 +79,11 @@ class Transition:
 
 
 class Core:
-    """Data centers that go through episodes together.
+    """A batch of data centers whose episodes begin and end together.
 
     Args:
         configs: configs of data centers; environment i takes config i modulo their number.
-        options: what agents do, see and get.
+        options: actions, observations and rewards of the agents.
         num_envs: number of environments; None is one per config.
         precision: precision of the server kernels.
 
@@ -115,11 +115,11 @@ class Core:
         self.num_envs = size
         if options.tariff is not None:
             configs = [c.model_copy(update={"tariff": options.tariff}) for c in configs]
-        of_each = [configs[i % len(configs)] for i in range(size)]
-        self._inputs = DrawnInputs(of_each, options) if draws_inputs(options) else None
+        by_env = [configs[i % len(configs)] for i in range(size)]
+        self._inputs = DrawnInputs(by_env, options) if draws_inputs(options) else None
         self._draw: Draw | None = None
         first = None if self._inputs is None else self._inputs.first()
-        self.sim = Simulator(of_each, drivers=first, precision=precision)
+        self.sim = Simulator(by_env, drivers=first, precision=precision)
         fleet = self.sim.fleet
         require_events_start_before(24.0 * options.days, fleet.configs, "the episode")
         self._others = make_controller(options.others, fleet)
@@ -137,7 +137,7 @@ class Core:
             days=options.days,
         )
         self._costs = Costs(options.costs, fleet)
-        # Plain values that tell environments apart. Nothing depends on costs.
+        # Plain values that identify the environment in saved states; costs change no episode.
         self._identity = options.model_dump(exclude={"rewards", "costs", "others"}) | {
             "rewards": self._rewards.identity,
             "others": controller_text(options.others),
@@ -180,10 +180,10 @@ class Core:
         """Start an episode in all environments.
 
         Args:
-            seed: environment i takes ``seed + i``, or entry i; None goes on with its generator, or
-                takes one from the system's entropy before the first.
-            start_day: day of the year as ``MM-DD`` or counted from 0, or one for each environment,
-                in place of what the options say.
+            seed: environment i takes ``seed + i``, or entry i of a sequence. None continues the
+                generator of the environment, or seeds a new one from the system's entropy.
+            start_day: day of the year as ``MM-DD`` or counted from 0, or one for each environment;
+                replaces the option ``start``.
 
         Returns:
             Observations before the first step, by learning agent.
@@ -221,7 +221,7 @@ class Core:
         return observations
 
     def _begin(self) -> None:
-        """Start what goes along with the simulator, which has been reset."""
+        """Reset controller, view, observer and rewards after a reset of the simulator."""
         self._final_terms = {}
         self._others.reset(self.sim.state.seed)
         error = self.options.forecast_error
@@ -233,7 +233,7 @@ class Core:
         self._rewards.reset(view)
 
     def _on_begin(self) -> None:
-        """Called when an episode has begun, or has been continued from a saved state."""
+        """Hook after an episode has begun or has been continued from a saved state."""
 
     def step(self, actions: Mapping[str, Any]) -> Transition:
         """Advance all environments.
@@ -270,16 +270,16 @@ class Core:
         )
 
     def actions_of(self, commands: Actions) -> dict[str, npt.NDArray[Any]]:
-        """Actions of the learning agents that come nearest to commands, as ``step`` takes them.
+        """Actions for ``step`` that approximate commands most closely, by learning agent.
 
         Args:
-            commands: commands of one step, such as those of a controller.
+            commands: commands of one step, for example of a controller.
         """
         return self._decoder.encode(commands)
 
     @property
     def view(self) -> View:
-        """The situation before the next step.
+        """View of the data centers before the next step.
 
         Raises:
             RuntimeStateError: before ``reset``, or after ``close``.
@@ -295,33 +295,33 @@ class Core:
         return self._view is not None and self._view.state.step >= self.steps
 
     def idle_actions(self) -> dict[str, npt.NDArray[Any]]:
-        """Actions of all learning agents that leave everything as it is, (B,) or (B, k)."""
+        """Neutral actions of all learning agents, (B,) or (B, k)."""
         return self._decoder.idle_actions()
 
     def start_info(self) -> dict[str, npt.NDArray[Any]]:
-        """Facts of the episodes under way by name, (B,) each: ``start_day``, and what was drawn.
+        """Start day and drawn inputs of the present episodes by name, (B,) each.
 
-        ``start_day`` is counted from 0 in the year. With the option ``years`` there is ``year``,
-        the seed of the synthetic series, with ``traces`` there is ``trace``.
+        ``start_day`` counts from 0 in the year. Option ``years`` adds ``year``, the seed of the
+        synthetic series, and option ``traces`` adds ``trace``.
         """
         start = self.view.state.start // self._steps_per_day
         return {"start_day": np.asarray(start, dtype=np.int64), **draw_info(self._draw)}
 
     def state(self) -> F32:
-        """Shared state for centralised critics, (B, m): all features, whoever learns."""
+        """Shared state for centralised critics, (B, m): all features of all agents."""
         view = self.view
         return self._observer.state(view)
 
     def reward_terms(self) -> dict[str, F64]:
         """Reward terms of the last step by name, unscaled, (B,) each; empty before the first.
 
-        After ``next_episode`` they are those of the step that ended the episode before.
+        After ``next_episode`` they still belong to the step that ended the previous episode.
         """
         last = self.view.last
         return dict(self._final_terms) if last is None else self._rewards.terms(last)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the episode goes on, for ``load_state_dict``; picklable."""
+        """Picklable state from which ``load_state_dict`` continues the episode exactly."""
         view = self.view
         state, commands = self._last or (view.state, None)
         return {
@@ -335,13 +335,14 @@ class Core:
         }
 
     def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
-        """Go on from a ``state_dict`` of environments with the same configs and options.
+        """Continue from a ``state_dict`` of environments with the same configs and options.
 
         Returns:
             Observations before the next step.
 
         Raises:
-            SdcError: made by other environments, incomplete, or not valid; nothing has changed.
+            SdcError: the state belongs to other environments, is incomplete or not valid; the
+                environments are unchanged.
         """
         self._check_open()
         saved = check_state(
@@ -367,7 +368,7 @@ class Core:
         return observations
 
     def _present(self) -> SavedState | None:
-        """The state under way; None before the first episode."""
+        """Present state of the episodes; None before the first."""
         if self._view is None:
             return None
         state, commands = self._last or (self._view.state, None)
@@ -382,7 +383,7 @@ class Core:
         )
 
     def _continue_from(self, saved: SavedState | None) -> None:
-        """Go on from a state; None is that before the first episode."""
+        """Continue from a state; None is the state before the first episode."""
         if saved is None:
             self.sim.continue_from(None)
             self._generators, self._draw, self._view, self._last = [], None, None, None
@@ -391,7 +392,7 @@ class Core:
         self._generators, self._keys, self._draw = saved.generators, saved.keys, saved.draw
         self._begin()
         if saved.commands is not None:
-            # The last step once more: what agents see of it is no part of the state.
+            # Repeat the last step, because its result is not part of the saved state.
             self._last = (self.sim.state, saved.commands)
             self._view = self._view_after(self.sim.step(Actions(**saved.commands)))
         self._rewards.load_peaks_kw(saved.peaks_kw)
@@ -418,14 +419,14 @@ class Core:
         return spaces.Dict({"features": features, "heat_map": image})
 
     def _observe(self, view: View) -> dict[str, Observation]:
-        found = self._observer.observe(view)
+        features = self._observer.observe(view)
         if not self.options.heat_map:
-            return {**found}
+            return {**features}
         image = heat_map(view)
-        return {a: {"features": found[a], "heat_map": image.copy()} for a in self.agents}
+        return {a: {"features": features[a], "heat_map": image.copy()} for a in self.agents}
 
     def _drawn_start_days(self, drawn: I64) -> I64:
-        """First day of each episode as the options say, from a random number each, (B,)."""
+        """First day of each episode from the options and a random number, (B,)."""
         if self.options.start == "fixed":
             starts = [c.site.start for c in self.sim.fleet.configs]
             return np.array([day_of_year(s) for s in starts], dtype=np.int64)
@@ -433,7 +434,7 @@ class Core:
 
 
 def _checked_size(num_envs: Any, configs: int) -> int:
-    """Number of environments, one for each config at least."""
+    """Number of environments, which is at least the number of configs."""
     size = whole_number("num_envs", configs if num_envs is None else num_envs, 1, MOST_DCS)
     if size < configs:
         raise ConfigError(f"num_envs {size}: valid is at least {configs}, one for each config")
@@ -441,10 +442,11 @@ def _checked_size(num_envs: Any, configs: int) -> int:
 
 
 def _check_others(options: EnvOptions, others: Controller) -> None:
-    """Refuse controllers that would act on nothing but what learns.
+    """Refuse a controller ``others`` that would have no effect.
 
     Raises:
-        ConfigError: a part of ``others`` is for an agent that learns, or all it controls learns.
+        ConfigError: a part of ``others`` is for a learning agent, or learning agents decide all
+            commands that ``others`` gives.
     """
     if "others" not in options.model_fields_set:
         return

@@ -1,10 +1,10 @@
-"""Costs of a step, for learners whose policy has to keep a constraint: named, 0 or more.
+"""Costs of a step for constrained learning: named quantities of at least 0.
 
-They are apart from rewards: libraries for safe reinforcement learning hold the sum of
+Costs are separate from rewards. Libraries for safe reinforcement learning keep the sum of
 ``info["cost"]`` over an episode below a limit.
 
-A user's own cost is a function of the result of a step and the view after it. It is named in the
-option ``costs`` as itself, by the name that ``register_cost`` gave it, or by its import path.
+A user's cost function takes the result of a step and the view after it. The option ``costs`` takes
+the function, the name under which ``register_cost`` registered it, or its import path.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sdc_taichi.user_functions import (
 )
 
 CostFunction = Callable[[StepResult, View], Any]
-"""A cost. It gets the result of a step and the view after it, and returns numbers of at least 0,
+"""Cost function of the result of a step and the view after it; returns values of at least 0,
 (B,)."""
 
 
@@ -54,7 +54,7 @@ COSTS: dict[str, CostFunction] = {
     function.__name__: function
     for function in (hot_inlets, throttled_racks, overdue_work, grid_overload)
 }
-"""Costs by name that need no registration."""
+"""Built-in costs by name."""
 _registered: dict[str, CostFunction] = {}
 
 
@@ -63,20 +63,20 @@ def register_cost(name: str, cost: CostFunction) -> None:
 
     Args:
         name: an identifier that no other cost has.
-        cost: the function; see ``CostFunction``. One of the same module and name as the function
-            before takes its place, as when a cell of a notebook runs again.
+        cost: the function; see ``CostFunction``. It replaces an earlier function of the same module
+            and name, for example when a notebook cell runs again.
 
     Raises:
-        ConfigError: a name that another function has, or no function.
+        ConfigError: the name belongs to another function, or ``cost`` is no function.
     """
     register_function("cost", name, cost, _registered, reserved=tuple(COSTS))
 
 
 class Costs:
-    """Costs that the option ``costs`` names.
+    """Costs of the option ``costs``.
 
     Args:
-        given: names, functions or their import paths, or a dict of them to weights; None is none.
+        given: names, functions or import paths, or a dict from them to weights; None for no costs.
         fleet: the data centers.
 
     Raises:
@@ -87,8 +87,8 @@ class Costs:
     def __init__(self, given: Any, fleet: Fleet) -> None:
         self._functions: dict[str, CostFunction] = {}
         self._weights: dict[str, float] = {}
-        for one, weight in _with_weights(given):
-            name, function = _named(one)
+        for cost, weight in _with_weights(given):
+            name, function = _named(cost)
             if name in self._functions:
                 raise ConfigError(f"costs: {name!r} is named twice")
             self._functions[name], self._weights[name] = function, _checked_weight(name, weight)
@@ -115,10 +115,10 @@ class Costs:
             view: the view after it.
 
         Returns:
-            Empty if no costs are wanted.
+            Costs by name; empty without the option ``costs``.
 
         Raises:
-            SdcError: a user's function returned something of another shape, not finite, or below 0.
+            SdcError: a user's function returned values of another shape, not finite, or below 0.
         """
         if not self._functions:
             return {}
@@ -141,13 +141,13 @@ def costs_markdown() -> str:
 
 
 def _with_weights(given: Any) -> list[tuple[Any, Any]]:
-    """Costs and their weights, 1 where only costs are given."""
+    """Costs and their weights; without weights each is 1."""
     if given is None:
         return []
     if isinstance(given, Mapping) and given:
         return list(given.items())
     if isinstance(given, Sequence) and not isinstance(given, str | bytes) and given:
-        return [(one, 1.0) for one in given]
+        return [(cost, 1.0) for cost in given]
     raise ConfigError(
         f"costs {shortened(given)}: valid is None, a list of costs, or a dict of cost to weight; "
         f"costs are {', '.join([*COSTS, *_registered])}, functions, and import paths module:name"

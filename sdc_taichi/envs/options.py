@@ -39,12 +39,12 @@ from sdc_taichi.exogenous.year_clock import DAYS_PER_YEAR, MONTH_OF_DAY
 
 
 def _plain_int(value: Any) -> Any:
-    """NumPy's whole numbers as Python's."""
+    """Python integers in place of NumPy integers."""
     return int(value) if isinstance(value, np.integer) else value
 
 
 PLAIN_INT = BeforeValidator(_plain_int)
-"""Takes whole numbers of NumPy too, where ``Field(strict=True)`` takes no float and no bool."""
+"""Accepts NumPy integers in fields with ``strict=True``, which refuse floats and booleans."""
 Month = Annotated[int, Field(strict=True, ge=1, le=12), PLAIN_INT]
 """A month, 1..12."""
 MOST_YEARS = 2**31
@@ -63,7 +63,7 @@ class EnvOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
     agents: tuple[Agent, ...] = AGENTS  # type: ignore[assignment]
-    """Agents that learn; ``others`` plays the rest."""
+    """Agents that learn; controller ``others`` commands the rest."""
     others: Any = "idle"
     """Controller of the agents that do not learn: a name as on the command line, or
     ``load=name,cooling=name,battery=name`` in part, or an object with ``reset(seed)`` and
@@ -186,7 +186,7 @@ class EnvOptions(BaseModel):
         return self
 
     def _without_effect(self) -> list[tuple[tuple[str, ...], bool, str]]:
-        """Names of options, whether they change nothing here, and why."""
+        """Names of options, whether they have no effect here, and the reason."""
         continuous = self.actions == "continuous"
         shared = isinstance(self.rewards, Mapping) or (
             isinstance(self.rewards, str) and self.rewards in REWARD_SETS
@@ -292,7 +292,7 @@ def _configs(source: Any, overrides: Overrides) -> list[DataCenterConfig]:
     if isinstance(source, str | os.PathLike):
         if isinstance(overrides, Mapping):
             return [_with_overrides(load_config(source), overrides)]
-        # With its overrides a file may be valid that is not without them.
+        # A file can be valid with its overrides only.
         return [load_config(source, list(overrides))]
     listed: list[Any] = list(source) if isinstance(source, Sequence) else [source]
     if not listed:
@@ -335,7 +335,7 @@ def _options(options: Any, keywords: Mapping[str, Any], only_agent: str | None) 
         raise ConfigError(f"options {options!r}: valid is EnvOptions, or its fields by keyword")
     given = dict(keywords)
     if options is not None:
-        # Fields left at their default are not given: some are errors where they have no effect.
+        # Leave out fields at their default, since some are errors where they have no effect.
         given = {name: getattr(options, name) for name in options.model_fields_set} | given
     if only_agent is not None:
         agents = given.setdefault("agents", (only_agent,))

@@ -1,10 +1,10 @@
-"""Recordings of the episodes of environments, one for each episode that is chosen.
+"""Recordings of chosen episodes of environments.
 
-``EpisodeRecorder`` says which episodes are recorded and where, as the option ``recorder`` of all
-environments; ``RecordEpisodes`` wraps a vector environment to the same effect. Both have a
-``Recorder`` (sdc_taichi.viz.recorder) write each episode. ``RecordingCore`` tells it of every step
-that a batch does, so a recording is the same whichever standard the environment follows and however
-its episodes begin, and nothing that is computed depends on whether it is recorded.
+Option ``recorder`` of all environments takes an ``EpisodeRecorder``, the choice of episodes and
+their destination; wrapper ``RecordEpisodes`` does the same for vector environments. A ``Recorder``
+(sdc_taichi.viz.recorder) writes each episode. ``RecordingCore`` passes it every step of the batch,
+so recordings do not depend on the interface of the environment, and results do not depend on
+whether they are recorded.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ else:
 
 
 def capped_cubic_schedule(episode: int) -> bool:
-    """Whether an episode is recorded by default: 0, 1, 8, 27 ... and from 1000 on every thousandth.
+    """Whether an episode is recorded by default: 0, 1, 8, 27, ..., 1000, 2000, 3000, ...
 
     Gymnasium's ``RecordVideo`` has the same default.
     """
@@ -49,24 +49,24 @@ def capped_cubic_schedule(episode: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRecorder:
-    """Which episodes of which environments are recorded, and where."""
+    """Choice of the recorded episodes and environments, and their destination."""
 
     target: str | os.PathLike[str] | Recorder
-    """Where recordings go.
+    """Destination of the recordings.
 
-    A file ending in .rrd, of which each episode gets one with its number, ``run-episode-8.rrd`` for
-    ``run.rrd``; the address of a viewer, which gets a recording for each; or a ``Recorder``, which
-    numbers by itself.
+    Either a path ending in .rrd, to whose name each file adds the number of its episode
+    (``run-episode-8.rrd`` for ``run.rrd``); the address of a viewer; or a ``Recorder``, which
+    numbers its own files.
     """
     episode_trigger: Callable[[int], bool] | None = None
-    """Tells by its number, from 0, whether an episode is recorded; None is
+    """Function of the episode's number, from 0, that decides whether to record it; None is
     ``capped_cubic_schedule``."""
     envs: Sequence[int] | None = None
-    """Numbers of up to 4 environments of a batch, recorded side by side; None is the first, or what
-    a ``Recorder`` has in focus."""
+    """Indices of up to 4 environments of a batch, recorded together; None is the first, or the
+    focus of a given ``Recorder``."""
     every: int | None = None
-    """Steps between two heat maps, and between two frames of the 3D hall; None follows the number
-    of racks recorded."""
+    """Steps between two heat maps, and between two frames of the 3D hall; None chooses by the
+    number of recorded racks."""
 
 
 RecorderOption: TypeAlias = "str | os.PathLike[str] | Recorder | EpisodeRecorder | None"
@@ -78,10 +78,10 @@ class RecordingCore(Core):
 
     Args:
         configs: configs of data centers; environment i takes config i modulo their number.
-        options: what agents do, see and get.
+        options: actions, observations and rewards of the agents.
         num_envs: number of environments; None is one per config.
         precision: number type of the server kernels.
-        recorder: which episodes are recorded and where; None records nothing.
+        recorder: chosen episodes and destination; None records nothing.
 
     Raises:
         SdcError: an argument that is not valid.
@@ -104,13 +104,13 @@ class RecordingCore(Core):
     def record_episodes(
         self, recorder: str | os.PathLike[str] | Recorder | EpisodeRecorder
     ) -> None:
-        """Record episodes from the next that begins.
+        """Record chosen episodes, starting with the next.
 
         Args:
-            recorder: which episodes are recorded and where.
+            recorder: chosen episodes and destination.
 
         Raises:
-            RuntimeStateError: they are recorded already.
+            RuntimeStateError: episodes are recorded already.
             SdcError: a recorder that is not valid.
         """
         if self._recordings is not None:
@@ -125,13 +125,14 @@ class RecordingCore(Core):
             self._recordings.begin(self.sim)
 
     def step(self, actions: Mapping[str, Any]) -> Transition:
-        """Do a step as ``Core.step`` does, and record it."""
-        done = super().step(actions)
+        """Advance all environments as ``Core.step`` does, and record the step."""
+        transition = super().step(actions)
         if self._recordings is not None and self._recordings.is_recording:
-            self._recordings.add(done.result, self._named_rewards(done))
-            if done.ended:
+            terms = self._rewards.terms(transition.result, self._rewards.used_terms)
+            self._recordings.add(transition.result, {**transition.rewards, **terms})
+            if transition.ended:
                 self._recordings.end()
-        return done
+        return transition
 
     def close(self) -> None:
         """End the recording and release the simulator."""
@@ -139,22 +140,18 @@ class RecordingCore(Core):
             self._recordings.end()
         super().close()
 
-    def _named_rewards(self, done: Transition) -> dict[str, F64]:
-        """Rewards by learning agent, and the unscaled terms that they are made of, (B,) each."""
-        return {**done.rewards, **self._rewards.terms(done.result, self._rewards.used_terms)}
-
 
 class RecordEpisodes(_VectorWrapper):
-    """Records chosen environments of what ``gymnasium.make_vec`` makes for the ids of sdc_taichi.
+    """Wrapper that records a vector environment of ``gymnasium.make_vec("sdc_taichi/...")``.
 
     ``RecordEpisodes(env, target, ...)`` does the same as ``make_vec`` with
     ``recorder=EpisodeRecorder(target, ...)``. Closing the environment ends the recording.
 
     Args:
         env: a batch of ``gymnasium.make_vec``, wrapped or not.
-        target: where recordings go, as ``EpisodeRecorder.target``.
-        episode_trigger: which episodes are recorded, as ``EpisodeRecorder.episode_trigger``.
-        envs: which environments are recorded, as ``EpisodeRecorder.envs``.
+        target: destination, as ``EpisodeRecorder.target``.
+        episode_trigger: choice of episodes, as ``EpisodeRecorder.episode_trigger``.
+        envs: choice of environments, as ``EpisodeRecorder.envs``.
         every: steps between two heat maps, and between two frames of the 3D hall.
 
     Raises:
@@ -182,10 +179,10 @@ class RecordEpisodes(_VectorWrapper):
 
 
 class _EpisodeRecordings:
-    """The recordings of a batch's episodes, one after the other.
+    """Successive recordings of a batch's episodes.
 
     Args:
-        settings: which episodes are recorded and where.
+        settings: chosen episodes and destination.
         sim: the simulator of the batch.
 
     Raises:
@@ -201,7 +198,7 @@ class _EpisodeRecordings:
         self._close_recorder: Any = None
         self._recorder: Recorder | None = None
         self._place: Path | Recorder | None = None
-        self._make_recorder(0)  # so that a target that is not valid is told before any episode
+        self._make_recorder(0)  # reports an invalid target before any episode
 
     @property
     def is_recording(self) -> bool:
@@ -209,9 +206,10 @@ class _EpisodeRecordings:
         return self._recorder is not None
 
     def begin(self, sim: Simulator) -> None:
-        """End the episode before, and record the one that has begun if it is chosen.
+        """End the previous recording, and begin one of the new episode if it is chosen.
 
-        Later ones go on without a recording that cannot be opened, after a ``RecordingWarning``.
+        If the recording of a later episode cannot be opened, the episode continues without it after
+        a ``RecordingWarning``.
 
         Args:
             sim: the simulator of the batch.
@@ -233,18 +231,18 @@ class _EpisodeRecordings:
             self._warn_without_recording(error)
             return
         self._recorder = recorder
-        # Files are made whole at exit too, where nothing closes the environment. Functions run at
-        # exit last in, first out: this one before those that Rerun, imported by now, has
-        # registered. Rerun imports this module when it needs it, which at exit would be too late.
+        # Complete the file at exit if nothing closes the environment. Exit functions run last in,
+        # first out, so this one precedes those that Rerun registered at its import. Rerun imports
+        # concurrent.futures.thread only when it needs it, which at exit would be too late.
         importlib.import_module("concurrent.futures.thread")
         self._close_recorder = weakref.finalize(self, recorder.close)
         atexit.register(self._close_recorder)
 
     def add(self, result: StepResult, rewards: Mapping[str, F64]) -> None:
-        """Record a step of the present episode, which is one that is recorded.
+        """Record a step of the present episode, which has a recording.
 
-        The episode goes on without its recording, after a ``RecordingWarning``, where a step before
-        ended in an error of a reward function.
+        If an earlier step is missing after an error of a reward function, the episode continues
+        without its recording after a ``RecordingWarning``.
 
         Args:
             result: the result of the step.
@@ -266,12 +264,12 @@ class _EpisodeRecordings:
         self._close_recorder = self._recorder = self._place = None
 
     def _warn_without_recording(self, error: SdcError) -> None:
-        """Warn that the present episode is not recorded any further."""
+        """Warn that the recording of the present episode ends."""
         message = f"{error}; episode {self._episode} goes on without a recording"
         warnings.warn(message, RecordingWarning, stacklevel=3)
 
     def _claim(self, recorder: Recorder) -> None:
-        """Make sure that no other environment of this process writes to the same place."""
+        """Reserve the destination, unless another environment of this process writes there."""
         is_given = recorder is self._settings.target
         place = recorder if is_given or recorder.file is None else recorder.file.resolve()
         if place in _recordings_by_place:
@@ -283,7 +281,7 @@ class _EpisodeRecordings:
         self._place = place
 
     def _make_recorder(self, episode: int) -> Recorder:
-        """The recorder of an episode: the one given, or one for the episode's own file."""
+        """Recorder of an episode: the given one, or a new one for the file of the episode."""
         from sdc_taichi.viz.recorder import Recorder, distinct_names
 
         target, every = self._settings.target, self._settings.every
@@ -300,14 +298,14 @@ class _EpisodeRecordings:
 _recordings_by_place: weakref.WeakValueDictionary[Path | Recorder | None, _EpisodeRecordings] = (
     weakref.WeakValueDictionary()
 )
-"""Files and recorders that environments of this process are being recorded to."""
+"""Recordings in progress in this process, by file or given recorder."""
 
 
 def _check(settings: EpisodeRecorder, size: int) -> None:
-    """Refuse before the first episode what would fail in one.
+    """Check settings before the first episode.
 
     Args:
-        settings: which episodes are recorded and where.
+        settings: chosen episodes and destination.
         size: number of environments.
     """
     from sdc_taichi.viz.recorder import MAX_FOCUS, Recorder

@@ -1,34 +1,33 @@
-"""Reward terms: what a step costs, by name.
+"""Reward terms of a step, by name.
 
-Energies, carbon, cost, fossil share and water are shares of what the data center would use, emit or
-pay in a step at its design point, about -1 at full load, so that sites and halls of any size give
-rewards of one size; ``sla`` is a share of the work of a full step. The others have units: ``pue``
-is a ratio, ``hot_inlets`` in K, ``queue`` and ``dropped`` in tasks, and ``demand_charge`` is in the
-money of ``cost``, due in the few steps that raise the highest power. Nothing is scaled by data of
-the run. All terms are 0 or less but those of one agent's part.
+Energies, carbon, cost, fossil share and water are divided by what the data center would use, emit
+or pay in a step at its design point. They are about -1 at full load for sites and halls of every
+size. ``sla`` is a share of the work of a full step. The others have units: ``pue`` is a ratio,
+``hot_inlets`` is in K, ``queue`` and ``dropped`` are in tasks, and ``demand_charge`` has the unit
+of ``cost`` and falls due in the few steps that raise the highest power. No term is scaled by data
+of the run. All terms are at most 0 except those of single agents, below.
 
-**Parts of agents.** Carbon follows demand and weather more than any action, so ``work_carbon``,
-``cooling_carbon`` and ``battery_carbon`` split the carbon of a step into what each agent can
-change. Besides, work that waits is a debt, and energy in the battery a credit, at the mean
-intensity M of the coming 24 h: with w the IT energy of a task at full load, Q the tasks that wait
-and S the energy stored,
+**Terms of single agents.** Carbon follows demand and weather more than any action, so
+``work_carbon``, ``cooling_carbon`` and ``battery_carbon`` split the carbon of a step into the parts
+that each agent can change. In addition, waiting work is a debt, and energy in the battery a credit,
+at the mean intensity M of the coming 24 h. With w the IT energy of a task at full load, Q the
+waiting tasks and S the stored energy,
 
     work_carbon + cooling_carbon + battery_carbon
         = -CI (E_grid - w (tasks that arrived - those dropped or lost)) + P' - P,  P = M (S - w Q)
 
-where ' is the end of the step, and dropped work counts as if it had run, as energy does that an
-outage withholds. P is a potential
-(Ng, Harada, Russell 1999): its changes add up to the difference between the ends of an episode, so
-that, undiscounted, the policy that is best by these terms is the one that emits least. An agent
-learns at once what an action is worth, where it would have to wait for the end of a cycle.
-``work_cost``, ``cooling_cost`` and ``battery_cost`` are the like with prices. The means are the
-true ones, whatever agents observe of them.
+where ' is the end of the step. Dropped work counts as if it had run, and so does energy that an
+outage withholds. P is a potential (Ng, Harada, Russell 1999): its changes add up to the difference
+between the two ends of an episode, so without discounting the policy with the highest sum of these
+terms emits least. The potential rewards an action at once instead of at the end of a cycle.
+``work_cost``, ``cooling_cost`` and ``battery_cost`` are the same with prices. The means use the
+true series, even if agents observe forecasts with errors.
 
-Add a term here: a function with the decorator ``reward_term``, whose name is the name of the term
-and whose docstring's first line describes it in the documentation. Terms are compiled together, so
-they use arithmetic, the NumPy functions of ``kernels/compiler/trace.py``, and ``np.where`` instead
-of branches on values. A quantity that neither the result nor ``TermContext`` has is a field there,
-with its value in ``RewardContext``.
+To add a term, write a function with the decorator ``reward_term``; its name is the name of the
+term, and the first line of its docstring describes it in the documentation. Terms are compiled
+together, so they use arithmetic, the NumPy functions of ``kernels/compiler/trace.py``, and
+``np.where`` instead of branches on values. A quantity that is not in the result of a step needs a
+field in ``TermContext`` and its value in ``RewardContext``.
 """
 
 from __future__ import annotations
@@ -65,17 +64,17 @@ HIGH_POWER_FACTOR = 40.0
 
 @dataclass(frozen=True, slots=True)
 class TermContext:
-    """Quantities that a reward term may use beside the result of the step."""
+    """Quantities for reward terms besides the result of the step."""
 
     design_kwh: F64
     """Energy of a step at the design point, in kWh, (B,)."""
     demand_charge_per_kw: F64
-    """Price of each kW of the highest power of a bill, (B,)."""
+    """Price per kW of the highest power of a billing period, (B,)."""
     peak_kw: F64
     """Highest power of the episode before this step, at least half the design power, in kW,
     (B,)."""
     bills: float
-    """Length of the episode over the 30 days of a bill."""
+    """Length of the episode divided by the 30 days of a billing period."""
     end_of_day_weight: F64
     """Weight of queued tasks, 0 before 23:00 and rising to 1 in the last step of the day, (B,)."""
     task_kwh: F64
@@ -99,7 +98,8 @@ TERMS: dict[str, Term] = {}
 def reward_term(function: Term) -> Term:
     """Add a function to ``TERMS`` under its own name.
 
-    One of the same module and name takes its place, as when a cell of a notebook runs again.
+    A function replaces an earlier one of the same module and name, for example when a notebook cell
+    runs again.
 
     Raises:
         ConfigError: another term has the name.
@@ -142,7 +142,7 @@ def hvac_energy(r: StepResult, c: TermContext) -> F64:
 
 @reward_term
 def cost(r: StepResult, c: TermContext) -> F64:
-    """Energy at the prices of the tariff, over the price of the design energy at 0.1 per kWh."""
+    """Energy at the prices of the tariff, divided by the design energy at 0.1 per kWh."""
     return -r.energy_cost / (PRICE_PER_KWH * c.design_kwh)
 
 
@@ -150,8 +150,8 @@ def cost(r: StepResult, c: TermContext) -> F64:
 def demand_charge(r: StepResult, c: TermContext) -> F64:
     """Increase of the peak power, counted from half the design power, in units of `cost`.
 
-    The charge of a bill times the length of the episode over 30 days. Half the design power is
-    billed in any case, so it is no part of the reward.
+    The charge is multiplied by the length of the episode divided by 30 days. Half the design power
+    is billed in every case, so it is not part of the reward.
     """
     above_kw = np.maximum(r.grid_kwh / r.step_h - c.peak_kw, 0.0)
     charge = above_kw * c.demand_charge_per_kw * c.bills
@@ -162,9 +162,9 @@ def demand_charge(r: StepResult, c: TermContext) -> F64:
 def high_power(r: StepResult, c: TermContext) -> F64:
     """Power above half the design power, squared: a demand charge spread over steps, as `cost`.
 
-    The demand charge falls due in the few steps that raise the highest power. While agents try
-    things out, some step raises it early whatever else they do, and what follows is free. Paid in
-    every step, power above half the design power has a price that rises with it.
+    The demand charge falls due in the few steps that raise the highest power. During exploration
+    some step raises it early, and later peaks cost nothing. This term instead charges every step
+    for power above half the design power, at a price that rises with the power.
     """
     share = np.maximum(r.grid_kwh / c.design_kwh - 0.5, 0.0)
     hourly = c.demand_charge_per_kw / (PRICE_PER_KWH * BILL_H)
@@ -180,13 +180,13 @@ def fossil_share(r: StepResult, c: TermContext) -> F64:
 
 @reward_term
 def pue(r: StepResult, c: TermContext) -> F64:
-    """Power beside IT over IT power, PUE - 1; 0 without IT power."""
+    """Overhead power divided by IT power, PUE - 1; 0 without IT power."""
     return np.where(r.it_w > 0.0, -r.overhead_w / np.where(r.it_w > 0.0, r.it_w, 1.0), 0.0)
 
 
 @reward_term
 def water(r: StepResult, c: TermContext) -> F64:
-    """Make-up water, over the design energy times 1.8 L/kWh."""
+    """Make-up water, divided by the design energy times 1.8 L/kWh."""
     return -r.water_l / (WATER_L_PER_KWH * c.design_kwh)
 
 
@@ -198,7 +198,7 @@ def hot_inlets(r: StepResult, c: TermContext) -> F64:
 
 @reward_term
 def queue(r: StepResult, c: TermContext) -> F64:
-    """Tasks queued in the last hour of the day over 10, weighed from 0 to 1 (paper, F.1, F.2)."""
+    """Queued tasks divided by 10, weighted 0 to 1 in the last hour of the day (paper, F.1, F.2)."""
     return -c.end_of_day_weight * r.queue_tasks / QUEUE_SCALE_TASKS
 
 
@@ -216,53 +216,53 @@ def sla(r: StepResult, c: TermContext) -> F64:
 
 @reward_term
 def work_carbon(r: StepResult, c: TermContext) -> F64:
-    """Carbon that moving work in time adds; what waits is due at the mean CI of the coming 24 h."""
+    """Carbon added by moving work in time; waiting work counts at the mean CI of the next 24 h."""
     added_g = _moved_work(r, c, r.ci_g_per_kwh, c.coming_ci_before, c.coming_ci)
     return -added_g / (c.design_kwh * CI_G_PER_KWH)
 
 
 @reward_term
 def cooling_carbon(r: StepResult, c: TermContext) -> F64:
-    """Carbon of the facility's energy less that of its executed work, 1/100 of full load a task."""
+    """Carbon of the facility's energy minus that of executed work at the energy per task."""
     return -r.ci_g_per_kwh * _beyond_work_kwh(r, c) / (c.design_kwh * CI_G_PER_KWH)
 
 
 @reward_term
 def battery_carbon(r: StepResult, c: TermContext) -> F64:
-    """Carbon that the battery adds; what it stores is worth the mean CI of the coming 24 h."""
+    """Carbon added by the battery; stored energy counts at the mean CI of the next 24 h."""
     added_g = _stored_energy(r, r.ci_g_per_kwh, c.coming_ci_before, c.coming_ci)
     return -added_g / (c.design_kwh * CI_G_PER_KWH)
 
 
 @reward_term
 def work_cost(r: StepResult, c: TermContext) -> F64:
-    """Price of moving work in time, as `work_carbon`, in units of `cost`."""
+    """Cost of moving work in time, as `work_carbon`, in units of `cost`."""
     added = _moved_work(r, c, r.price_per_kwh, c.coming_price_before, c.coming_price)
     return -added / (c.design_kwh * PRICE_PER_KWH)
 
 
 @reward_term
 def cooling_cost(r: StepResult, c: TermContext) -> F64:
-    """Price of the facility's energy less that of its executed work, in units of `cost`."""
+    """Cost of the facility's energy minus that of executed work, in units of `cost`."""
     return -r.price_per_kwh * _beyond_work_kwh(r, c) / (c.design_kwh * PRICE_PER_KWH)
 
 
 @reward_term
 def battery_cost(r: StepResult, c: TermContext) -> F64:
-    """Price of what the battery draws, as `battery_carbon`, in units of `cost`."""
+    """Cost added by the battery, as `battery_carbon`, in units of `cost`."""
     added = _stored_energy(r, r.price_per_kwh, c.coming_price_before, c.coming_price)
     return -added / (c.design_kwh * PRICE_PER_KWH)
 
 
 def _moved_work(r: StepResult, c: TermContext, rate: F64, before: F64, after: F64) -> F64:
-    """Carbon or cost that moving work in time adds, (B,), in the unit of ``rate`` times kWh.
+    """Carbon or cost added by moving work in time, (B,), in the unit of ``rate`` times kWh.
 
     Args:
         r: result of the step.
         c: context of the step.
         rate: carbon intensity or price in the step, per kWh, (B,).
-        before: rate at which work that waits is valued at the beginning of the step, (B,).
-        after: rate at which work that waits is valued at the end of the step, (B,).
+        before: rate of waiting work at the beginning of the step, (B,).
+        after: rate of waiting work at the end of the step, (B,).
     """
     longer_tasks = r.deferred_tasks - r.drained_tasks - (r.due_tasks - r.overdue_tasks)
     rise = after * r.queue_tasks - before * (r.queue_tasks - longer_tasks)
@@ -270,13 +270,13 @@ def _moved_work(r: StepResult, c: TermContext, rate: F64, before: F64, after: F6
 
 
 def _stored_energy(r: StepResult, rate: F64, before: F64, after: F64) -> F64:
-    """Carbon or cost that the battery adds, (B,), in the unit of ``rate`` times kWh.
+    """Carbon or cost added by the battery, (B,), in the unit of ``rate`` times kWh.
 
     Args:
         r: result of the step.
         rate: carbon intensity or price in the step, per kWh, (B,).
-        before: rate at which stored energy is valued at the beginning of the step, (B,).
-        after: rate at which stored energy is valued at the end of the step, (B,).
+        before: rate of stored energy at the beginning of the step, (B,).
+        after: rate of stored energy at the end of the step, (B,).
     """
     drawn_kwh = r.charge_kwh - r.discharge_kwh
     gained_kwh = drawn_kwh - r.battery_loss_kwh
@@ -284,7 +284,7 @@ def _stored_energy(r: StepResult, rate: F64, before: F64, after: F64) -> F64:
 
 
 def _beyond_work_kwh(r: StepResult, c: TermContext) -> F64:
-    """The facility's energy beyond that of the work it has executed, in kWh, (B,)."""
+    """Energy of the facility minus that of its executed work, in kWh, (B,)."""
     return r.facility_kwh - c.task_kwh * r.executed_tasks
 
 
@@ -295,22 +295,22 @@ def terms_markdown() -> str:
 
 
 END_OF_DAY_START_H = 23.0
-"""Hour of the day from which queued tasks cost, more and more (paper, F.1)."""
+"""Hour of the day from which queued tasks have a rising cost (paper, F.1)."""
 COMING_H = 24
-"""Hours over whose mean intensity or price waiting work and stored energy are valued."""
+"""Hours of the mean intensity or price that values waiting work and stored energy."""
 COMING_SERIES = {"coming_ci": "ci_g_per_kwh", "coming_price": "price_per_kwh"}
-"""Series whose coming means are values of the context, by the name of the value."""
+"""Series of the forward means in the context, by the name of the value."""
 
 
 class RewardContext:
-    """Fields of ``TermContext`` that follow from the time, the data centers and their inputs."""
+    """Values of ``TermContext`` from time, data centers and inputs."""
 
     def __init__(self) -> None:
-        # Values that hold for all steps of an episode.
+        # Values that are constant in an episode.
         self._fixed: dict[str, F64] = {}
         self._drivers: Drivers | None = None
         self._coming_steps = 0
-        # Means by name of the value, with the series that they are made of.
+        # Source series and its forward mean, by name of the value.
         self._means: dict[str, tuple[FleetSeries, FleetSeries]] = {}
         # By step of the day.
         self._end_of_day_weight = np.zeros(0)
@@ -351,7 +351,7 @@ class RewardContext:
         return self._coming(series_name, self._drivers).at(index + after)
 
     def _coming(self, name: str, drivers: Drivers) -> FleetSeries:
-        """Coming means of a series, made anew where the inputs are others."""
+        """Forward mean of a series, computed again if the inputs have changed."""
         series: FleetSeries = getattr(drivers, COMING_SERIES[name])
         if name not in self._means or self._means[name][0] is not series:
             self._means[name] = series, coming_means(series, self._coming_steps)
@@ -359,21 +359,21 @@ class RewardContext:
 
 
 def _end_of_day_weight(step_of_day: I64, step_h: float) -> F64:
-    """Weight of queued tasks by step of the day; 1 at the last."""
+    """Weight of queued tasks by step of the day, 1 in the last step."""
     hour, span_h = step_of_day * step_h, 24.0 - step_h - END_OF_DAY_START_H
     weight = (hour - END_OF_DAY_START_H) / span_h if span_h > 0 else np.ones(len(hour))
     return np.where(hour >= END_OF_DAY_START_H, weight, 0.0)
 
 
 def coming_means(series: FleetSeries, steps: int) -> FleetSeries:
-    """Mean of each series over the steps from a step on, for every step.
+    """Forward moving average over ``steps`` steps.
 
     Args:
         series: a series of each data center, each repeated after its last value.
         steps: number of steps, the present one included.
 
     Returns:
-        Series of the means, as long as those given.
+        Averages, as long as the series.
     """
     distinct, which = series.distinct()
     lengths = np.array([len(values) for values in distinct])
@@ -386,7 +386,7 @@ def coming_means(series: FleetSeries, steps: int) -> FleetSeries:
 
 
 def _coming_means(values: F64, steps: int) -> F64:
-    """Mean over ``steps`` values from each on, as differences of running sums, (T,)."""
+    """Forward moving average by differences of running sums, (T,)."""
     sums: F64 = np.cumsum(np.resize(values, len(values) + steps))
     means: F64 = (sums[steps - 1 : -1] - np.append(0.0, sums[: len(values) - 1])) / steps
     return means

@@ -29,14 +29,14 @@ from sdc_taichi.types import F32, F64
 
 
 class Learner(Protocol):
-    """Stands between the one learner of a batch and its agents; arrays have environments first."""
+    """Conversion between the single learner of a batch and its agents; environments come first."""
 
     observation_space: spaces.Space[Any]
     """Space of the learner's observation in one environment."""
     action_space: spaces.Space[Any]
     """Space of the learner's action in one environment."""
     features: tuple[Feature, ...]
-    """Features of the learner's observation, in its order."""
+    """Features of the learner's observation, in order."""
 
     def actions(self, given: Any) -> dict[str, Any]:
         """Actions of each agent from those of the learner, (B,) or (B, k)."""
@@ -52,7 +52,7 @@ class Learner(Protocol):
 
 
 class AgentLearner:
-    """One agent learns; it gets its own reward, shared as ``collaboration`` says.
+    """One learning agent with its collaborative reward.
 
     Args:
         core: data centers in which it alone learns.

@@ -1,4 +1,4 @@
-"""Many data centers as one environment, without a Python object for each."""
+"""Batches of data centers as one environment, without a Python object for each."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ Flags = npt.NDArray[np.bool_]
 
 
 class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
-    """Data centers with one learner each that step together, as ``gymnasium.make_vec`` gives them.
+    """Batch of data centers with one learner each, as made by ``gymnasium.make_vec``.
 
-    Gives what Gymnasium's ``SyncVectorEnv`` gives for single environments. All episodes have the
-    same length and end, by truncation, in the same step. The step after that starts the next ones:
+    Its results equal those of Gymnasium's ``SyncVectorEnv`` of single environments. All episodes
+    have the same length and end, by truncation, in the same step. The next step starts new episodes:
     it ignores its actions and returns first observations, rewards of 0 and the infos of ``reset``.
 
     Args:
@@ -55,7 +55,7 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
     """
 
     closed = True
-    """Whether there is nothing to close: before the environment is made, and once it is closed.
+    """Whether the environment is closed, or its constructor has not finished.
 
     Gymnasium closes every environment on deletion, even one whose constructor failed.
     """
@@ -141,32 +141,32 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         return self._learner.features
 
     def actions_of(self, commands: Actions) -> npt.NDArray[Any]:
-        """Actions of ``action_space`` that come nearest to commands, such as a controller's.
+        """Actions of ``action_space`` that approximate commands most closely.
 
         Args:
-            commands: commands of one step, for which a controller was shown ``core.view``.
+            commands: commands of one step, such as those of a controller for ``core.view``.
         """
         return self._learner.joined(self.core.actions_of(commands))
 
     def _infos(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Infos with Gymnasium's masks of the environments that have them, which is all."""
+        """Infos with Gymnasium's masks, which are true for all environments."""
         return {**values, **{f"_{name}": self._everyone for name in values}}
 
     def _one_by_one(self, observation: Observation) -> npt.NDArray[np.object_]:
-        """Observations one by one, as Gymnasium hands out ``final_obs``."""
+        """Observations as an array of objects, the form of Gymnasium's ``final_obs``."""
         out = np.empty(self.num_envs, dtype=object)
         for i, one in enumerate(iterate(self.observation_space, observation)):
             out[i] = one
         return out
 
     def load_state_dict(self, values: Mapping[str, Any]) -> Observation:
-        """Go on from the ``state_dict`` of a batch made alike.
+        """Continue from the ``state_dict`` of a batch with the same arguments.
 
         Returns:
             Observations before the next step.
 
         Raises:
-            SdcError: made by another batch, or incomplete.
+            SdcError: the state belongs to another batch, or is incomplete.
         """
         return self._learner.observation(self.core.load_state_dict(values))
 
@@ -178,7 +178,7 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
 
 
 class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
-    """Data centers with several learning agents each that step together.
+    """Batch of data centers with several learning agents each.
 
     All episodes have the same length and end, by truncation, in the same step. The step after that
     starts the next ones: it ignores its actions and returns first observations and rewards of 0.
@@ -228,12 +228,12 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
 
     @property
     def max_num_agents(self) -> int:
-        """Number of the agents that may ever learn, which are the same."""
+        """Number of possible agents, all of which learn."""
         return len(self.possible_agents)
 
     @property
     def unwrapped(self) -> Self:
-        """The environment itself, as it wraps no other."""
+        """The environment itself."""
         return self
 
     def reset(
@@ -309,13 +309,13 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
         return {agent: np.full(self.num_envs, value) for agent in self.agents}
 
     def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
-        """Go on from the ``state_dict`` of a batch made alike.
+        """Continue from the ``state_dict`` of a batch with the same arguments.
 
         Returns:
             Observations before the next step.
 
         Raises:
-            SdcError: made by another batch, or incomplete.
+            SdcError: the state belongs to another batch, or is incomplete.
         """
         return self.core.load_state_dict(values)
 
