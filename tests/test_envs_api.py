@@ -109,7 +109,7 @@ def test_parallel_api(agents: tuple[str, ...], seen: str, mode: str) -> None:
 
 @advice
 @probe_warning
-@pytest.mark.parametrize("agents", SUBSETS, ids="+".join)
+@pytest.mark.parametrize("agents", [("agent_bat",), AGENTS], ids="+".join)
 @pytest.mark.parametrize("seen", SEEN)
 @pytest.mark.parametrize("mode", MODES)
 def test_aec_api(agents: tuple[str, ...], seen: str, mode: str) -> None:

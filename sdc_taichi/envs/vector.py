@@ -34,8 +34,8 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
     """Batch of data centers with one learner each, as made by ``gymnasium.make_vec``.
 
     Its results equal those of Gymnasium's ``SyncVectorEnv`` of single environments. All episodes
-    have the same length and end, by truncation, in the same step. The next step starts new episodes:
-    it ignores its actions and returns first observations, rewards of 0 and the infos of ``reset``.
+    have the same length and end, by truncation, in the same step. The next step starts new ones: it
+    ignores its actions and returns first observations, rewards of 0 and the infos of ``reset``.
 
     Args:
         num_envs: number of environments.
