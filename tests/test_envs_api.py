@@ -18,7 +18,6 @@ import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import vector as wrappers
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from pettingzoo.test.state_test import state_test
 
@@ -193,31 +192,6 @@ def test_batches_start_the_next_episodes_when_gymnasiums_own_do() -> None:
     ]
     for env in batches:
         assert env.metadata["autoreset_mode"] is default
-
-
-@pytest.mark.parametrize("seen", SEEN)
-def test_gymnasiums_vector_wrappers(seen: str) -> None:
-    """Around a batch they give what they give around single environments."""
-    given: list[list[Any]] = []
-    for vectorization in (None, "sync"):
-        env: Any = gymnasium.make_vec(
-            "sdc_taichi/Battery-v0",
-            num_envs=2,
-            vectorization_mode=vectorization,
-            **tiny(actions="continuous", **SEEN[seen]),
-        )
-        env = wrappers.RecordEpisodeStatistics(env)
-        env = wrappers.NormalizeObservation(wrappers.FlattenObservation(env))
-        env.action_space.seed(0)
-        out = [env.reset(seed=3)]
-        for _ in range(STEPS + 2):
-            out.append(env.step(env.action_space.sample()))
-            out[-1][4].get("episode", {}).pop("t", None)  # seconds
-        ended = [infos["episode"]["l"].tolist() for *_, infos in out[1:] if "episode" in infos]
-        assert ended == [[STEPS, STEPS]]
-        given.append(out)
-        env.close()
-    assert same(*given)
 
 
 def test_multi_agent_batches_have_the_attributes_of_pettingzoo() -> None:
@@ -835,11 +809,3 @@ def test_racks_have_the_colour_of_their_inlet() -> None:
     assert np.all(np.diff(right, axis=0) > 0)
     assert np.all(np.diff(down, axis=1) > 0)
     assert hot.sum() > cold.sum()
-
-
-def test_large_halls_are_drawn_smaller() -> None:
-    hall = load_config("large").hall
-    image = images.hall_image(hall, np.full(hall.racks, 35.0))
-    assert max(image.shape) == images.LONGEST_PX
-    racks = np.all(image == images.colours(np.array([35.0]))[0], axis=2)
-    assert 0.2 < racks.mean() < 0.6

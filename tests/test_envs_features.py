@@ -277,40 +277,6 @@ def test_other_presets_and_models_fit_too(listed: list[str]) -> None:
     np.testing.assert_array_equal(found["age_histogram"][0], 0.0)
 
 
-def test_batch_equals_alone() -> None:
-    configs = fleet_of("tiny")
-    for error in (PERFECT, ForecastError(0.2, 3.0)):
-        _, together = watch(configs, 40, error=error)
-        for dc, config in enumerate(configs):
-            _, alone = watch([config], 40, first=dc, error=error)
-            for (_, a, state, image), (_, b, one_state, one_image) in zip(
-                together, alone, strict=True
-            ):
-                np.testing.assert_array_equal(state[dc], one_state[0])
-                np.testing.assert_array_equal(image[dc], one_image[0])
-                for agent in AGENTS:
-                    np.testing.assert_array_equal(a[agent][dc], b[agent][0])
-
-
-@pytest.mark.parametrize("error", [ForecastError(), ForecastError(0.2, 3.0)])
-def test_same_seed_same_observations_also_after_reset(error: ForecastError) -> None:
-    with Simulator(fleet_of("tiny")) as sim:
-        observer = Observer(sim.fleet)
-        runs = []
-        for seed in (1, 1, 2):
-            sim.reset(0)
-            see = view_maker(sim, error, keys(3, seed))
-            view = see(None)
-            observer.reset(view)
-            states = [observer.state(view)]
-            for step in range(30):
-                view = see(sim.step(commands(step, 3)))
-                states.append(observer.state(view))
-            runs.append(np.stack(states))
-    np.testing.assert_array_equal(runs[0], runs[1])
-    assert np.array_equal(runs[0], runs[2]) == (error == ForecastError())
-
-
 def test_what_is_handed_out_belongs_to_the_caller() -> None:
     with Simulator(fleet_of("tiny")) as sim:
         sim.reset(0)
@@ -385,23 +351,6 @@ def walk_forecasts(error: ForecastError, seeds: int, steps: Sequence[int]) -> li
     forecasts.reset(view)
     index = np.zeros(seeds, dtype=np.int64)
     return [[x.T for x in forecasts.at(index + k, index, k)[:3]] for k in steps]
-
-
-def test_perfect_forecasts_are_what_comes() -> None:
-    """A forecast of the state before is the present of the state then, entry by entry."""
-    observer, seen = watch(fleet_of("tiny"), 100)
-    found = [parts(state, observer.state_features) for _, _, state, _ in seen]
-    for name, leads in (
-        ("ci", CI_LEADS_H),
-        ("outdoor", WEATHER_LEADS_H),
-        ("wet_bulb", WEATHER_LEADS_H),
-    ):
-        for k, lead_h in enumerate(leads):
-            lead = round(lead_h * 4)
-            for step in range(101 - lead):
-                np.testing.assert_array_equal(
-                    found[step][f"{name}_forecast"][:, k], found[step + lead][name][:, 0]
-                )
 
 
 def test_errors_grow_with_the_square_root_of_the_lead() -> None:

@@ -25,9 +25,9 @@ from sdc_taichi.envs.options import ConfigSource
 class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
     """A PettingZoo environment: the learning agents of one data center act at the same time.
 
-    Episodes end by truncation: their length is a choice, the data center goes on. Infos are the
-    same for all agents: ``start_day`` and what was drawn after ``reset``, then every (B,) quantity
-    of ``StepResult`` by name and the costs that the option ``costs`` names.
+    Episodes end by truncation, as their length is a choice and the data center runs on. All agents
+    have the same infos: after ``reset`` ``start_day`` and drawn inputs, after a step every (B,)
+    quantity of ``StepResult`` by name and the costs of the option ``costs``.
 
     Args:
         config: a preset, a file or a config.
@@ -57,7 +57,7 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         """Start an episode.
 
         Args:
-            seed: decides everything random from here on; None goes on as before.
+            seed: seed of all randomness from here on; None continues the present generator.
             options: ``start_day``, a day of the year as ``MM-DD`` or counted from 0.
 
         Raises:
@@ -101,13 +101,13 @@ class SdcParallelEnv(SingleEnv, AgentSpaces, ParallelEnv[str, Observation, Any])
         )
 
     def load_state_dict(self, values: Mapping[str, Any]) -> dict[str, Observation]:
-        """Go on from the ``state_dict`` of an environment made alike.
+        """Continue from the ``state_dict`` of an environment with the same arguments.
 
         Returns:
             Observations before the next step.
 
         Raises:
-            SdcError: made by another environment, or incomplete.
+            SdcError: the state belongs to another environment, or is incomplete.
         """
         observations = self.core.load_state_dict(values)
         self.agents = [] if self.core.episode_over else list(self.possible_agents)

@@ -60,7 +60,7 @@ class AgentLearner:
     Attributes:
         observation_space: space of the agent's observation in one environment.
         action_space: space of the agent's action in one environment.
-        features: features of its observation, in their order.
+        features: features of its observation, in order.
     """
 
     def __init__(self, core: Core) -> None:
@@ -70,11 +70,11 @@ class AgentLearner:
         self.features = core.features[self._agent]
 
     def actions(self, given: Any) -> dict[str, Any]:
-        """The learner's action as the agent's."""
+        """Actions of the agent, which are those of the learner."""
         return {self._agent: given}
 
     def joined(self, by_agent: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        """The agent's actions as the learner's, (B,) or (B, k)."""
+        """Actions of the learner, which are those of the agent, (B,) or (B, k)."""
         return by_agent[self._agent].astype(self.action_space.dtype)
 
     def observation(self, by_agent: Mapping[str, Observation]) -> Observation:
@@ -89,11 +89,10 @@ class AgentLearner:
 class JointLearner:
     """All learning agents as one learner.
 
-    It sees their observations side by side, each feature once, rather than the shared state, which
-    would show it features that the option ``features`` left out. With rewards ``default`` and
-    ``bill`` its reward is each of their terms once. With others it is the sum of theirs, in which
-    the weights of ``collaboration`` cancel if all three agents learn. What a reward function of the
-    user's gives for all agents alike, it gets once.
+    Its observation is the concatenation of their observations with each feature once. The shared
+    state would include features that the option ``features`` leaves out. Its reward is
+    ``Transition.joint_reward``; if all three agents learn, the weights of ``collaboration`` cancel
+    in sums over the agents.
 
     Args:
         core: data centers in which the agents learn.
@@ -101,22 +100,21 @@ class JointLearner:
     Attributes:
         observation_space: space of all observations side by side in one environment.
         action_space: space of all actions side by side in one environment.
-        features: features of its observation, in their order.
+        features: features of its observation, in order.
     """
 
     def __init__(self, core: Core) -> None:
         self._core = core
         self._new_entries = entries_of_new_features(core.features)
-        every = [feature for agent in core.agents for feature in core.features[agent]]
-        self.features = tuple(dict.fromkeys(every))
+        self.features = tuple(dict.fromkeys(f for a in core.agents for f in core.features[a]))
         boxes = {agent: _features_box(core, agent) for agent in core.agents}
         low = np.concatenate([boxes[a].low[entries] for a, entries in self._new_entries.items()])
         high = np.concatenate([boxes[a].high[entries] for a, entries in self._new_entries.items()])
         features = spaces.Box(low, high, dtype=np.float32)
-        of_first = core.observation_spaces[core.agents[0]]
+        first_space = core.observation_spaces[core.agents[0]]
         self.observation_space: spaces.Space[Any] = features
-        if isinstance(of_first, spaces.Dict):
-            self.observation_space = spaces.Dict({**of_first.spaces, "features": features})
+        if isinstance(first_space, spaces.Dict):
+            self.observation_space = spaces.Dict({**first_space.spaces, "features": features})
         self.action_space = _actions_side_by_side([core.action_spaces[a] for a in core.agents])
 
     def actions(self, given: Any) -> dict[str, Any]:
@@ -148,8 +146,8 @@ class JointLearner:
         """Observations side by side, each feature once, (B, n)."""
         parts = [_features(by_agent[a])[:, entries] for a, entries in self._new_entries.items()]
         features: F32 = np.concatenate(parts, axis=1)
-        of_first = by_agent[self._core.agents[0]]
-        return {**of_first, "features": features} if isinstance(of_first, dict) else features
+        of_agent = by_agent[self._core.agents[0]]
+        return {**of_agent, "features": features} if isinstance(of_agent, dict) else features
 
     def reward(self, transition: Transition) -> F64:
         """The reward of all agents together, (B,)."""
@@ -157,15 +155,15 @@ class JointLearner:
 
 
 def make_learner(core: Core, agent: str | None) -> Learner:
-    """The learner of an environment for one agent, or with None for all that learn."""
+    """Learner for one agent, or with None for all learning agents together."""
     return JointLearner(core) if agent is None else AgentLearner(core)
 
 
 def learning_agent(agent: str | None, registered_agent: str | None) -> str | None:
-    """The agent that learns alone, None being all ``agents`` as one.
+    """The single learning agent, or None if all ``agents`` learn as one.
 
     Raises:
-        ConfigError: another agent than that of the id.
+        ConfigError: an agent that differs from that of the id.
     """
     if registered_agent is not None and agent not in (None, registered_agent):
         raise ConfigError(
@@ -177,9 +175,9 @@ def learning_agent(agent: str | None, registered_agent: str | None) -> str | Non
 def _features_box(core: Core, agent: str) -> spaces.Box:
     """Space of an agent's features, without the heat map."""
     space = core.observation_spaces[agent]
-    found = space["features"] if isinstance(space, spaces.Dict) else space
-    assert isinstance(found, spaces.Box)
-    return found
+    features = space["features"] if isinstance(space, spaces.Dict) else space
+    assert isinstance(features, spaces.Box)
+    return features
 
 
 def _features(observation: Observation) -> F32:
@@ -199,13 +197,13 @@ def _actions_side_by_side(parts: list[spaces.Space[Any]]) -> spaces.Space[Any]:
 class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
     """One data center with one learner.
 
-    Episodes end by truncation: their length is a choice, the data center goes on. Infos:
-    ``start_day`` and what was drawn after ``reset``, then every (B,) quantity of ``StepResult`` by
-    name and the costs that the option ``costs`` names.
+    Episodes end by truncation, as their length is a choice and the data center runs on. Infos after
+    ``reset`` are ``start_day`` and drawn inputs; infos of a step are every (B,) quantity of
+    ``StepResult`` by name and the costs of the option ``costs``.
 
     Args:
         config: a preset, a file or a config.
-        agent: agent that learns while ``others`` plays the rest; None is all ``agents`` as one.
+        agent: agent that learns while ``others`` commands the rest; None is all ``agents`` as one.
         registered_agent: set by the ids of one agent.
         arguments: ``overrides``, ``options``, ``precision``, ``render_mode``, ``recorder`` and
             fields of ``EnvOptions``, as docs/environments.md lists them.
@@ -236,7 +234,7 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
         """Start an episode.
 
         Args:
-            seed: decides everything random from here on; None goes on as before.
+            seed: seed of all randomness from here on; None continues the present generator.
             options: ``start_day``, a day of the year as ``MM-DD`` or counted from 0.
 
         Raises:
@@ -261,12 +259,12 @@ class SdcEnv(HasSpec, SingleEnv, gymnasium.Env[Any, Any]):
         return observation, reward, False, transition.ended, info
 
     def load_state_dict(self, values: Mapping[str, Any]) -> Observation:
-        """Go on from the ``state_dict`` of an environment made alike.
+        """Continue from the ``state_dict`` of an environment with the same arguments.
 
         Returns:
             The observation before the next step.
 
         Raises:
-            SdcError: made by another environment, or incomplete.
+            SdcError: the state belongs to another environment, or is incomplete.
         """
         return first_of_batch(self._learner.observation(self.core.load_state_dict(values)))

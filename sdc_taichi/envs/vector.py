@@ -40,7 +40,7 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
     Args:
         num_envs: number of environments.
         config: a preset, a file, or configs; environment i takes config i modulo their number.
-        agent: agent that learns while ``others`` plays the rest; None is all ``agents`` as one.
+        agent: agent that learns while ``others`` commands the rest; None is all ``agents`` as one.
         registered_agent: set by the ids of one agent.
         autoreset_mode: when the next episodes start, as the enum or its value: ``NextStep``, in the
             step after the one that ends the last ones; ``SameStep``, in that step itself;
@@ -92,7 +92,7 @@ class SdcVectorEnv(HasSpec, BatchEnv, VectorEnv[Any, Any, npt.NDArray[Any]]):
         """Start an episode in all environments.
 
         Args:
-            seed: environment i takes ``seed + i``, or entry i; None goes on as before.
+            seed: environment i takes ``seed + i``, or entry i; None continues the generator.
             options: ``start_day``, a day of the year as ``MM-DD`` or counted from 0, or one for
                 each environment; ``reset_mask`` of Gymnasium if it selects all.
 
@@ -242,7 +242,7 @@ class MultiAgentVectorEnv(BatchEnv, AgentSpaces):
         """Start an episode in all environments.
 
         Args:
-            seed: environment i takes ``seed + i``, or entry i; None goes on as before.
+            seed: environment i takes ``seed + i``, or entry i; None continues the generator.
             options: ``start_day``, a day of the year as ``MM-DD`` or counted from 0, or one for
                 each environment.
 
