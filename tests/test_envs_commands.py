@@ -206,7 +206,17 @@ def test_commands_fit_the_config_and_other_options(options: dict[str, Any], mess
 
 def test_placement_needs_halls_of_as_many_racks() -> None:
     large = load_config("corrected", ["workload.placement=weights"])
-    small = load_config("tiny", ["workload.placement=weights"])
+    small = load_config(
+        "corrected",
+        [
+            "workload.placement=weights",
+            "hall.rows=2",
+            "hall.racks_per_row=2",
+            "hall.supply_approach_k=5",
+            "hall.return_approach_k=-3",
+            "servers.power_w=[300, 40]",
+        ],
+    )
     with pytest.raises(ConfigError, match=r"same number of racks; it is \[20, 4\]"):
         sdc_taichi.vector_env(config=[large, small], commands={"agent_ls": ["placement"]})
 
