@@ -10,7 +10,7 @@ import pytest
 from sdc_taichi import Actions, Simulator, StepResult, load_config
 from sdc_taichi.config.electrical_schema import TariffConfig
 from sdc_taichi.control import view_maker
-from sdc_taichi.errors import ConfigError, OddInputWarning
+from sdc_taichi.errors import ConfigError
 from sdc_taichi.exogenous.year_clock import DAYS_PER_MONTH, FIRST_DAY_OF_MONTH
 from sdc_taichi.plant.electrical import loss_w
 from sdc_taichi.sim.bills import add_power, billed_kw_months, no_demand
@@ -66,11 +66,6 @@ def test_a_load_above_the_limit_empties_the_battery_and_then_overloads_the_conne
     np.testing.assert_allclose(over_kwh, np.maximum(grid_kwh - 37.5, 0), atol=1e-6)
 
 
-def test_a_connection_for_less_than_half_is_odd() -> None:
-    with pytest.warns(OddInputWarning, match=r"electrical\.grid_limit_ratio 0\.4"):
-        Simulator(load_config("tiny", ["electrical.grid_limit_ratio=0.4"])).close()
-
-
 def test_presets_of_the_paper_have_no_limit() -> None:
     for preset in ("paper", "sustaindc"):
         config = load_config(preset)
@@ -83,19 +78,6 @@ def test_a_battery_of_an_hour_carries_an_outage_at_one_c() -> None:
     found = charged([outage, "battery.initial_soc=1"], command=0.0, steps=4)
     assert np.all(column(found, "powered") == 1)
     assert not column(found, "unserved_kwh").any()
-
-
-@pytest.mark.parametrize(
-    ("override", "named"),
-    [
-        ("electrical.grid_limit_kw=0", r"electrical\.grid_limit_kw"),
-        ("electrical.grid_limit_ratio=-1", r"electrical\.grid_limit_ratio"),
-        ("electrical.grid_limit=1", "did you mean"),
-    ],
-)
-def test_bad_limits_are_named(override: str, named: str) -> None:
-    with pytest.raises(ConfigError, match=named):
-        load_config("corrected", [override])
 
 
 # Tariff
@@ -174,6 +156,9 @@ def test_months_pay_their_peaks_by_the_part_that_a_run_covers() -> None:
 @pytest.mark.parametrize(
     ("override", "named"),
     [
+        ("electrical.grid_limit_kw=0", r"electrical\.grid_limit_kw"),
+        ("electrical.grid_limit_ratio=-1", r"electrical\.grid_limit_ratio"),
+        ("electrical.grid_limit=1", "did you mean"),
         ("tariff.price_per_kwh=[1,2]", "2 prices; valid is 1, or 24"),
         ("tariff.price_per_kwh=[-1]", r"tariff\.price_per_kwh"),
         ("tariff.periods=[{months: [6, 6], price_per_kwh: 1}]", "each once"),
@@ -183,7 +168,7 @@ def test_months_pay_their_peaks_by_the_part_that_a_run_covers() -> None:
         ("tariff.demand_charge_per_kw=.inf", "demand_charge_per_kw"),
     ],
 )
-def test_bad_tariffs_are_named(override: str, named: str) -> None:
+def test_bad_limits_and_tariffs_are_named(override: str, named: str) -> None:
     with pytest.raises(ConfigError, match=named):
         load_config("corrected", [override])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,7 @@ def failed(error: type[SdcError], *arguments: object) -> str:
     return message
 
 
-def test_report_and_file_agree(tmp_path: Path) -> None:
+def test_report_and_file_agree_and_serve_as_matrix_file(tmp_path: Path) -> None:
     out = tmp_path / "new" / "hall.npz"
     report = solved("--out", out)
     with np.load(out) as file:
@@ -50,6 +49,9 @@ def test_report_and_file_agree(tmp_path: Path) -> None:
     assert provenance["cell_m"] == 0.8
     assert provenance["layout"]["rack_pitch_m"] == 0.6
     assert list(out.parent.iterdir()) == [out]
+    config = load_config("corrected", [f"hall.recirculation.matrix_file={out}"])
+    weights = calibrate(config).mix_weights.dense()
+    np.testing.assert_allclose(weights, R / R.sum(axis=1, keepdims=True), rtol=1e-12)
 
     design = design_point(load_config("corrected"))
     rise_k = design.it_w / (design.air_j_per_m3_k * design.airflow_m3s)
@@ -73,33 +75,6 @@ def test_equal_runs_write_equal_bytes(tmp_path: Path) -> None:
     assert other["provenance"]["config_sha256"] != before["config_sha256"]
 
 
-def test_the_matrix_serves_as_matrix_file(tmp_path: Path) -> None:
-    out = tmp_path / "hall.npz"
-    solved("--out", out)
-    config = load_config(
-        "corrected",
-        ["hall.inlet_model=recirculation", f"hall.recirculation.matrix_file={out}"],
-    )
-    R = np.load(out)["R"]
-    np.testing.assert_allclose(
-        calibrate(config).mix_weights.dense(), R / R.sum(axis=1, keepdims=True), rtol=1e-12
-    )
-
-
-def test_printed_report_shows_what_was_found() -> None:
-    text = call("--cell", 0.8).stdout
-    report = solved()
-    assert f"{report['approach_mean_k']:.2f}" in text
-    assert f"SHI {report['shi']:.3f}, RHI {report['rhi']:.3f}" in text
-    assert f"RTI {report['rti_pct']:.1f} %" in text
-    for name in ("hi", "lo"):
-        assert f"{name} {report[f'rci_{name}_pct']:.1f} %" in text
-    assert f"{report['cells']:,} cells" in text
-    assert "5.30" in text
-    assert "5.00" in text
-    assert re.search(r"energy \d\.\de-1\d", text)
-
-
 def test_a_hall_of_two_rows_has_no_inner_rows() -> None:
     report = solved("tiny")
     assert load_config("tiny").hall.rows <= 2
@@ -116,21 +91,16 @@ def test_an_existing_file_is_replaced_only_with_force(tmp_path: Path) -> None:
     assert np.load(out)["R"].shape == (20, 20)
 
 
-def test_bad_targets(tmp_path: Path) -> None:
+def test_bad_options_are_named(tmp_path: Path) -> None:
     assert "ends in .npz" in failed(ConfigError, "--out", tmp_path / "hall.csv")
     folder = tmp_path / "folder.npz"
     folder.mkdir()
     assert "is a folder" in failed(ConfigError, "--out", folder, "--force")
+    assert "cell_m 9" in failed(ConfigError, "--cell", 9)
     blocked = tmp_path / "file"
     blocked.write_text("")
     message = failed(SdcError, "tiny", "--cell", 1, "--out", blocked / "hall.npz")
     assert "cannot be written" in message
-
-
-def test_bad_values_are_named() -> None:
-    assert "cell_m 9" in failed(ConfigError, "--cell", 9)
-    assert "hall.layout.rack_pitch_m" in failed(ConfigError, "--set", "hall.layout.rack_pitch_m=0")
-    assert "no_such_preset" in failed(ConfigError, "no_such_preset")
 
 
 @pytest.mark.parametrize(("preset", "model"), [("sustaindc", "released"), ("paper", "rack")])

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sdc_taichi import DataCenterConfig, SdcError, load_config
+from sdc_taichi import SdcError, load_config
 from sdc_taichi.cli.hall import LISTED_ROWS, describe_hall, hall_app
 from sdc_taichi.hall.rack_servers import air_properties
 from sdc_taichi.hall.recirculation import calibrate
@@ -202,23 +201,3 @@ def test_picture_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(SdcError, match="cannot be written"):
         show("tiny", "--out", out / "below.png")
     assert [p.name for p in out.parent.iterdir()] == ["plan.png"]
-
-
-@pytest.mark.parametrize("units", [1, 9])
-def test_description_names_what_the_room_has(units: int) -> None:
-    config: DataCenterConfig = load_config(
-        "corrected",
-        [
-            f"hvac.crac.units={units}",
-            "hall.layout.returns=end_wall",
-            "hall.layout.containment=0.25",
-        ],
-    )
-    found = solve_design_hall(config)
-    text = describe_hall(found)
-    assert "25 %; returns in the end walls" in text
-    assert f"CRAC units    {units}, " in text
-    assert ("unit 0" in text) == (units == 1)
-    bare = describe_hall(replace(found, air=None))
-    assert "bypass" in text
-    assert "bypass" not in bare

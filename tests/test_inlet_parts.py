@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -211,13 +212,16 @@ def test_given_inlets_are_explained_by_their_approach_temperatures(tmp_path: Pat
         assert "is exhaust air" not in text
 
 
-def test_command_explains_a_run(run: RunFolder) -> None:
-    def call(*arguments: object) -> str:
-        done = CliRunner().invoke(hall_app, ["why", str(run.path), *map(str, arguments)])
-        if done.exception is not None:
-            raise done.exception
-        return done.stdout
+def why(*arguments: object) -> str:
+    """Output of ``sdc-taichi hall why``."""
+    done = CliRunner().invoke(hall_app, ["why", *map(str, arguments)])
+    if done.exception is not None:
+        raise done.exception
+    return done.stdout
 
+
+def test_command_explains_a_run(run: RunFolder) -> None:
+    call = partial(why, run.path)
     hottest = run.metrics["total"]["hottest_dc"]
     step = run.metrics["total"]["hottest_step"]
     assert call().startswith(f"{hottest}, at the end of its hottest step {step} of ")
@@ -233,8 +237,8 @@ def test_command_explains_a_run(run: RunFolder) -> None:
         with pytest.raises(SdcError, match=re.escape(message)):
             call(*arguments)
     for option in ("--dc", "--step"):
-        done = CliRunner().invoke(hall_app, ["why", "corrected", option, "1"])
-        assert f"{option}: given without a run" in str(done.exception)
+        with pytest.raises(SdcError, match=f"{option}: given without a run"):
+            why("corrected", option, "1")
 
 
 def test_setpoints_of_return_air_are_named_so() -> None:
@@ -253,26 +257,20 @@ def test_setpoints_of_return_air_are_named_so() -> None:
 
 
 def test_command_names_a_rack_by_number_or_by_row_and_place(tmp_path: Path) -> None:
-    def call(*arguments: str) -> str:
-        done = CliRunner().invoke(hall_app, ["why", *arguments])
-        if done.exception is not None:
-            raise done.exception
-        return done.stdout
-
-    text = call("--rack", "7")
+    text = why("--rack", "7")
     assert "rack 7 (row 1, place 2)" in text
-    assert call("corrected", "--rack", "1:2") == text
+    assert why("corrected", "--rack", "1:2") == text
     assert "exhaust of 14 other racks" in text
-    values = json.loads(call("--rack", "7", "--json"))
+    values = json.loads(why("--rack", "7", "--json"))
     parts_k = values["warming_k"] + sum(values["exhaust_k"])
     assert values["setpoint_c"] + parts_k == pytest.approx(values["inlet_c"], abs=1e-9)
     picture = tmp_path / "why.png"
-    assert call("--rack", "7", "--out", str(picture)) == f"{text}Floor plan: {picture}\n"
+    assert why("--rack", "7", "--out", str(picture)) == f"{text}Floor plan: {picture}\n"
     assert picture.read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ConfigError, match="exists; choose another name"):
-        call("--out", str(picture))
-    hottest = json.loads(call("--json"))
+        why("--out", str(picture))
+    hottest = json.loads(why("--json"))
     assert hottest["inlet_c"] >= values["inlet_c"]
     for bad in ("20", "4:0", "0:5", "-1", "x", "1:", "1:2:3"):
         with pytest.raises(ConfigError, match=r"valid is a rack 0\.\.19, or ROW:PLACE up to 3:4"):
-            call("--rack", bad)
+            why("--rack", bad)

@@ -1,14 +1,16 @@
+"""Placement of work: conservation, capacity, order and proportion."""
+
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sdc_taichi.errors import SdcError
 from sdc_taichi.hall.placement import MIN_HEADROOM_K, POLICIES, PlacementError, make_bins, place
 from sdc_taichi.types import F64, I64
 
@@ -49,6 +51,14 @@ class Case:
 
     def usable(self, policy: str) -> F64:
         return np.where((self.weights > 0.0) | (policy != "weights"), self.capacity, 0.0)
+
+
+def case_of(sizes: list[int], utilisation: list[float], **values: list[float]) -> Case:
+    """Halls of so many bins of one server and full capacity at 20 C, but for ``values``."""
+    n = sum(sizes)
+    bins = {"count": [1.0] * n, "capacity": [1.0] * n, "inlet_c": [20.0] * n, "weights": [1.0] * n}
+    arrays = {name: np.array(column, float) for name, column in {**bins, **values}.items()}
+    return Case(np.cumsum([0, *sizes]), np.array(utilisation), **arrays)
 
 
 @st.composite
@@ -137,13 +147,13 @@ def test_loads_are_in_proportion_up_to_capacity(case: Case, policy: str) -> None
 
 
 def test_a_hall_by_hand() -> None:
-    case = Case(
-        start=np.array([0, 4]),
-        utilisation=np.array([0.4]),
-        count=np.array([10.0, 20.0, 10.0, 10.0]),
-        capacity=np.array([1.0, 0.25, 1.0, 0.0]),
-        inlet_c=np.array([26.0, 20.0, 22.0, 18.0]),
-        weights=np.array([1.0, 0.0, 3.0, 9.0]),
+    case = case_of(
+        [4],
+        [0.4],
+        count=[10, 20, 10, 10],
+        capacity=[1, 0.25, 1, 0],
+        inlet_c=[26, 20, 22, 18],
+        weights=[1, 0, 3, 9],
     )
     # 20 servers' worth of work; rack 1 takes at most 5 of it and rack 3 none.
     for policy, load in {
@@ -164,14 +174,7 @@ def test_a_hall_by_hand() -> None:
 
 
 def test_without_limits_uniform_repeats_the_utilisation() -> None:
-    case = Case(
-        np.array([0, 3, 8]),
-        np.array([0.1, 1.0]),
-        np.full(8, 7.0),
-        np.ones(8),
-        np.full(8, 20.0),
-        np.ones(8),
-    )
+    case = case_of([3, 5], [0.1, 1.0], count=[7.0] * 8)
     load, placed = case.place("uniform")
     np.testing.assert_array_equal(load, [0.1] * 3 + [1.0] * 5)
     np.testing.assert_array_equal(placed, case.utilisation)
@@ -181,14 +184,8 @@ def test_a_limited_neighbour_changes_no_bit_of_a_uniform_load() -> None:
     # Through servers and back, a tenth or so of these would come out rounded otherwise.
     rng = np.random.default_rng(2)
     size = 200
-    case = Case(
-        start=3 * np.arange(size + 1),
-        utilisation=rng.random(size),
-        count=rng.integers(1, 100, 3 * size).astype(np.float64),
-        capacity=np.ones(3 * size),
-        inlet_c=np.full(3 * size, 20.0),
-        weights=np.ones(3 * size),
-    )
+    counts = rng.integers(1, 100, 3 * size).tolist()
+    case = case_of([3] * size, rng.random(size).tolist(), count=counts)
     case.capacity[0] = 0.0
     load, placed = case.place("uniform")
     np.testing.assert_array_equal(load[3:], np.repeat(case.utilisation[1:], 3))
@@ -196,14 +193,7 @@ def test_a_limited_neighbour_changes_no_bit_of_a_uniform_load() -> None:
 
 
 def test_coolest_first_breaks_ties_by_index() -> None:
-    case = Case(
-        np.array([0, 3]),
-        np.array([0.5]),
-        np.ones(3),
-        np.ones(3),
-        np.array([20.0, 19.0, 19.0]),
-        np.ones(3),
-    )
+    case = case_of([3], [0.5], inlet_c=[20.0, 19.0, 19.0])
     np.testing.assert_allclose(case.place("coolest-first")[0], [0.0, 1.0, 0.5])
     # Temperatures of alike bins differ in their last bits, by the processor.
     case.inlet_c[1] = np.nextafter(19.0, 20.0)
@@ -211,26 +201,12 @@ def test_coolest_first_breaks_ties_by_index() -> None:
 
 
 def test_racks_beyond_the_limit_share_what_the_others_leave() -> None:
-    case = Case(
-        np.array([0, 3]),
-        np.array([0.5]),
-        np.ones(3),
-        np.ones(3),
-        np.array([30.0, 45.0, 20.0]),
-        np.ones(3),
-    )
+    case = case_of([3], [0.5], inlet_c=[30.0, 45.0, 20.0])
     np.testing.assert_allclose(case.place("inlet-aware")[0], [0.25, 0.25, 1.0])
 
 
 def test_a_data_center_without_capacity_places_nothing() -> None:
-    case = Case(
-        np.array([0, 2, 4]),
-        np.array([0.5, 0.5]),
-        np.full(4, 3.0),
-        np.array([0.0, 0.0, 1.0, 1.0]),
-        np.full(4, 20.0),
-        np.ones(4),
-    )
+    case = case_of([2, 2], [0.5, 0.5], count=[3.0] * 4, capacity=[0.0, 0.0, 1.0, 1.0])
     for policy in POLICIES:
         load, placed = case.place(policy)
         np.testing.assert_array_equal(load[:2], 0.0)
@@ -255,47 +231,35 @@ def test_a_large_hall_conserves_work() -> None:
 
 
 @pytest.mark.parametrize(
-    ("weights", "message"),
+    ("policy", "changes", "message"),
     [
-        (None, "placement weights: none given"),
-        (np.ones(3), r"shape \(3,\), expected \(4,\)"),
-        ("heavy", "'heavy': valid are numbers"),
-        ([1.0, 1.0, 1.0, -2.0], "oslo: placement weight 1 is -2.0; valid is a finite number"),
-        ([1.0, np.nan, 1.0, 1.0], "bergen: placement weight 1 is nan"),
-        ([1.0, 0.0, 0.0, 0.0], "oslo: all placement weights are 0; valid is at least one above 0"),
-    ],
-)
-def test_weights_that_cannot_be_used_are_named(weights: object, message: str) -> None:
-    with pytest.raises(PlacementError, match=message):
-        place(
+        ("weights", {"weights": None}, "placement weights: none given"),
+        ("weights", {"weights": np.ones(3)}, r"shape \(3,\), expected \(4,\)"),
+        ("weights", {"weights": "heavy"}, "'heavy': valid are numbers"),
+        (
             "weights",
-            np.array([0.5, 0.5]),
-            bins=make_bins(np.array([0, 2, 4]), ["bergen", "oslo"]),
-            count=np.ones(4),
-            capacity=np.ones(4),
-            inlet_c=np.full(4, 20.0),
-            limit_c=LIMIT_C,
-            weights=weights,  # type: ignore[arg-type]
-        )
-
-
-@pytest.mark.parametrize(
-    ("policy", "limit_c", "message"),
-    [
-        ("even", 27.0, "placement 'even': valid are uniform, fill"),
-        ("inlet-aware", np.array([27.0, np.inf]), "data center 1: .* limit of inf C"),
+            {"weights": [1.0, 1.0, 1.0, -2.0]},
+            "oslo: placement weight 1 is -2.0; valid is a finite number",
+        ),
+        ("weights", {"weights": [1.0, np.nan, 1.0, 1.0]}, "bergen: placement weight 1 is nan"),
+        (
+            "weights",
+            {"weights": [1.0, 0.0, 0.0, 0.0]},
+            "oslo: all placement weights are 0; valid is at least one above 0",
+        ),
+        ("even", {}, "placement 'even': valid are uniform, fill"),
+        ("inlet-aware", {"limit_c": np.array([27.0, np.inf])}, "oslo: .* limit of inf C"),
     ],
 )
-def test_policies_and_limits_that_cannot_be_used_are_named(
-    policy: str, limit_c: F64 | float, message: str
+def test_values_that_cannot_be_used_are_named(
+    policy: str, changes: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(SdcError, match=message):
-        place(
-            policy,
-            np.array([0.5, 0.5]),
-            bins=make_bins(np.array([0, 2, 4])),
-            count=np.ones(4),
-            capacity=np.ones(4),
-            inlet_c=np.full(4, 20.0),
-            limit_c=limit_c,
-        )
+    values: dict[str, Any] = {
+        "count": np.ones(4),
+        "capacity": np.ones(4),
+        "inlet_c": np.full(4, 20.0),
+        "limit_c": LIMIT_C,
+    }
+    bins = make_bins(np.array([0, 2, 4]), ["bergen", "oslo"])
+    with pytest.raises(PlacementError, match=message):
+        place(policy, np.array([0.5, 0.5]), bins=bins, **{**values, **changes})

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from ledgers import LEDGERS, TRANSIENT_LEDGERS, residual
 from sdc_taichi import (
@@ -18,7 +17,6 @@ from sdc_taichi import (
     drivers_from_arrays,
     load_config,
 )
-from sdc_taichi.cli.hall import hall_app
 from sdc_taichi.hall.rack_servers import rack_servers
 from sdc_taichi.hall.recirculation import calibrate
 from sdc_taichi.sim.design_hall import solve_design_hall
@@ -101,7 +99,7 @@ def test_gpu_servers_leave_the_air_of_other_racks_alone() -> None:
     assert found.air.rti_pct < 120
 
 
-def test_odd_airflow_is_told(mixed: Path) -> None:
+def test_odd_airflow_is_warned_of(mixed: Path) -> None:
     warm = load_config(mixed, ["hall.rack_types.gpu.servers.design_rise_k=28"])
     with pytest.warns(OddInputWarning, match=r"racks 16, 17 warm the air by 28 K .* 25 K is us"):
         build_fleet(warm)
@@ -119,7 +117,7 @@ def test_usual_halls_are_not_odd(mixed: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ("hall.rack_plan=[{rows: 0-2, type: cpu}]", "rack 0 of row 3 has no type, as 5 of 20"),
         ("hall.rack_plan=[{type: cpu}, {rows: 1, type: gpu}]", "rack 0 of row 1 has a type alr"),
@@ -134,8 +132,8 @@ def test_usual_halls_are_not_odd(mixed: Path) -> None:
         ("hall.rack_types.gpu.servers.design_rise_k=50", "design_rise_k: .* equal to 40"),
     ],
 )
-def test_types_and_plans_that_are_not_valid(change: str, said: str, mixed: Path) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_types_and_plans_that_are_not_valid(change: str, message: str, mixed: Path) -> None:
+    with pytest.raises(ConfigError, match=message):
         load_config(mixed, [change])
 
 
@@ -175,12 +173,6 @@ def test_tall_servers_fill_a_rack_from_the_floor(mixed: Path) -> None:
     assert count.tolist() == [1, 1, 10, 10]
     assert full_w.tolist() == [3000, 3000, 200, 200]
     assert np.all(np.diff(servers.height_factor[first:end]) > 0)
-
-
-def test_hall_show_names_the_types(mixed: Path) -> None:
-    shown = CliRunner().invoke(hall_app, ["show", str(mixed)]).output
-    assert "type cpu: 18 racks of 40 x 200 W, 8." in shown
-    assert "type gpu: 2 racks of 40 x 750 W, 3" in shown
 
 
 @pytest.mark.parametrize("thermal", ["quasi_steady", "transient"])
