@@ -124,20 +124,20 @@ def done_job(
 
 def reference_jobs() -> list[DoneJob]:
     """Jobs that have solved for the optima of the made-up suite."""
-    found = []
+    jobs = []
     for at, site in enumerate(SITES):
-        own = slice(at * len(WEEKS), (at + 1) * len(WEEKS))
+        of_site = slice(at * len(WEEKS), (at + 1) * len(WEEKS))
         metrics = {
             "part": "held-out",
             "site": site,
             "weeks": list(WEEKS),
-            "idle_figure": IDLE[own].tolist(),
-            "achieved_figure": ACHIEVED[own].tolist(),
-            "bound_figure": BOUND[own].tolist(),
+            "idle_figure": IDLE[of_site].tolist(),
+            "achieved_figure": ACHIEVED[of_site].tolist(),
+            "bound_figure": BOUND[of_site].tolist(),
         }
         name = f"reference-held-out-{site}"
-        found.append(done_job(name, 0, None, spec={}, metrics=metrics))
-    return found
+        jobs.append(done_job(name, 0, None, spec={}, metrics=metrics))
+    return jobs
 
 
 def settings_of(rows: Sequence[str] = tuple(ROWS)) -> dict[str, Any]:

@@ -27,8 +27,8 @@ ALIKE, DECIDED_ALIKE = 1e-4, 1e-3
 
 def described(name: str) -> dict[str, Any]:
     """What was published of a suite."""
-    found: dict[str, Any] = json.loads((FOLDER / name / "published.json").read_text("utf-8"))
-    return found
+    published: dict[str, Any] = json.loads((FOLDER / name / "published.json").read_text("utf-8"))
+    return published
 
 
 def cells(name: str) -> dict[str, dict[str, Any]]:
@@ -41,8 +41,8 @@ def cells(name: str) -> dict[str, dict[str, Any]]:
 
 def suite_of(name: str) -> Suite:
     """The suite as it is defined."""
-    own = FOLDER / name / "suite.yaml"
-    return load_suite(str(own) if own.exists() else name)
+    file = FOLDER / name / "suite.yaml"
+    return load_suite(str(file) if file.exists() else name)
 
 
 def tolerance(row: str, published: dict[str, Any]) -> float:

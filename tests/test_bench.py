@@ -33,11 +33,11 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     )
     assert done.returncode == 0, done.stderr
     assert (folder / "bench.png").read_bytes().startswith(b"\x89PNG")
-    found = json.loads((folder / "bench.json").read_text(encoding="utf-8"))
+    written = json.loads((folder / "bench.json").read_text(encoding="utf-8"))
     # Every figure is printed as well.
-    for figure in found["figures"]:
+    for figure in written["figures"]:
         assert figure["name"] in done.stdout
-    return dict(found)
+    return dict(written)
 
 
 @pytest.mark.slow
@@ -76,17 +76,19 @@ def test_peers_compute_what_the_kernel_computes(
         fleet = build_fleet(make_configs(steps.unlike(["hall.inlet_model=approach"], 7), count=3))
     else:
         fleet = steps.fleet_of(3, 10, 7, "approach")
-    met = steps.conditions(fleet)
+    conditions = steps.conditions(fleet)
     hall = Hall(fleet, "f64")
-    sums, layers = hall.solve(met), hall.servers()
-    given = peers.Arguments(fleet, met)
-    peers.PEERS[peer](given, 2)()
+    sums, layers = hall.solve(conditions), hall.servers()
+    arguments = peers.Arguments(fleet, conditions)
+    peers.PEERS[peer](arguments, 2)()
     for name in ("inlet_c", "outlet_c", "power_w"):
-        np.testing.assert_allclose(getattr(given.layers, name), getattr(layers, name), rtol=2e-6)
+        np.testing.assert_allclose(
+            getattr(arguments.layers, name), getattr(layers, name), rtol=2e-6
+        )
     for column, name in enumerate(("cpu_w", "it_fan_w", "it_airflow_m3s")):
-        np.testing.assert_allclose(given.sums[:, column], getattr(sums, name), rtol=2e-6)
+        np.testing.assert_allclose(arguments.sums[:, column], getattr(sums, name), rtol=2e-6)
     for column, name in enumerate(
         ("cpu_w", "fan_w", "airflow_m3s", "inlet_c", "inlet_max_c", "outlet_c")
     ):
-        theirs, ours = given.racks[:, column], getattr(sums, f"rack_{name}")
+        theirs, ours = arguments.racks[:, column], getattr(sums, f"rack_{name}")
         np.testing.assert_allclose(theirs, ours, rtol=2e-6, err_msg=name)

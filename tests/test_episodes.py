@@ -65,13 +65,13 @@ def test_the_actions_of_an_episode_done_again_give_it_again(given: dict[str, Any
     chosen = collection("random", RULES, **given)
     with closing(chosen.make_env()) as env:
         for name in chosen.controllers:
-            found = list(episodes(chosen, name))
-            assert [(e.start.week, e.start.seed) for e in found] == [(0, 0), (26, 26)]
-            for episode in found:
+            recorded = list(episodes(chosen, name))
+            assert [(e.start.week, e.start.seed) for e in recorded] == [(0, 0), (26, 26)]
+            for episode in recorded:
                 assert_done_again(episode, env)
                 assert episode.changed_commands == 0.0
-    assert {"carbon_g", "grid_kwh", "energy_cost"} <= found[0].infos.keys()
-    assert ("cost_hot_inlets" in found[0].infos) == bool(given)
+    assert {"carbon_g", "grid_kwh", "energy_cost"} <= recorded[0].infos.keys()
+    assert ("cost_hot_inlets" in recorded[0].infos) == bool(given)
 
 
 def test_an_episode_is_the_same_in_any_company() -> None:
@@ -90,19 +90,19 @@ def test_the_optimum_of_an_agent_earns_most(tmp_path: Path, monkeypatch: Any) ->
     chosen = collection(RULES, weeks=(26,), agent="agent_bat")
     returns = {}
     for name in ("idle", RULES, "random", "optimum"):
-        (found,) = episodes(chosen, name)
-        returns[name] = found.rewards.sum()
-        assert found.changed_commands == 0.0
+        (episode,) = episodes(chosen, name)
+        returns[name] = episode.rewards.sum()
+        assert episode.changed_commands == 0.0
     assert max(returns, key=lambda name: returns[name]) == "optimum"
     assert returns["random"] < returns["idle"]
 
 
 def test_commands_that_no_action_gives_are_counted() -> None:
     environment = {"setpoint_change_k": 0.25}
-    (found,) = episodes(collection("coldest", weeks=(26,), environment=environment), "coldest")
+    (episode,) = episodes(collection("coldest", weeks=(26,), environment=environment), "coldest")
     # One of three commands, until the setpoint is down.
-    assert 0.0 < found.changed_commands < 1.0 / 3.0
-    assert found.actions[0, 1] == -1.0
+    assert 0.0 < episode.changed_commands < 1.0 / 3.0
+    assert episode.actions[0, 1] == -1.0
 
 
 def test_a_stopped_collection_ends_before_its_first_episode() -> None:
@@ -176,13 +176,13 @@ def test_actions_of_decoded_commands_are_the_actions(actions: str) -> None:
     for _ in range(3):
         widths = {"agent_ls": 1 + RACKS, "agent_dc": 4, "agent_bat": 1}
         if actions == "discrete":
-            given: Any = {a: rng.integers(3, size=(1, k)) for a, k in widths.items()}
-            given["agent_bat"] = given["agent_bat"][:, 0]
+            actions_of_agents: Any = {a: rng.integers(3, size=(1, k)) for a, k in widths.items()}
+            actions_of_agents["agent_bat"] = actions_of_agents["agent_bat"][:, 0]
         else:
-            given = {a: rng.uniform(-1.0, 1.0, (1, k)) for a, k in widths.items()}
-        commands = Actions(**core._decoder.decode(given, core.view.state))
-        for agent, found in core.actions_of(commands).items():
-            np.testing.assert_allclose(found, given[agent], rtol=1e-12)
+            actions_of_agents = {a: rng.uniform(-1.0, 1.0, (1, k)) for a, k in widths.items()}
+        commands = Actions(**core._decoder.decode(actions_of_agents, core.view.state))
+        for agent, decoded in core.actions_of(commands).items():
+            np.testing.assert_allclose(decoded, actions_of_agents[agent], rtol=1e-12)
 
 
 def test_named_commands_and_those_between_choices_are_the_nearest_actions() -> None:

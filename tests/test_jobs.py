@@ -38,15 +38,15 @@ def run(
 
 def content_of(folder: Path) -> dict[str, Any]:
     """Content of all files, without what may differ between equal runs."""
-    found: dict[str, Any] = {}
+    content: dict[str, Any] = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file():
-            found[str(path.relative_to(folder))] = path.read_bytes()
+            content[str(path.relative_to(folder))] = path.read_bytes()
             if path.name == "metrics.json":
                 metrics = json.loads(path.read_bytes())
                 assert metrics.pop("core_s") >= 0.0
-                found[str(path.relative_to(folder))] = json.dumps(metrics)
-    return found
+                content[str(path.relative_to(folder))] = json.dumps(metrics)
+    return content
 
 
 def draws(count: int, **values: Any) -> list[Job]:
@@ -72,11 +72,11 @@ def test_results_are_equal_to_the_bit_in_any_number_of_processes(
 def test_a_process_computes_in_one_thread(tmp_path: Path) -> None:
     job = toy_jobs.job("about_process", 0)
     run([job], tmp_path, LocalProcesses(2))
-    told = ResultStore(tmp_path).result(job.partition).metrics
-    assert set(told["pools"]) <= {1}
-    assert told["taichi"] == "1"
-    assert told["main"] is True
-    assert told["pid"] != os.getpid()
+    worker = ResultStore(tmp_path).result(job.partition).metrics
+    assert set(worker["pools"]) <= {1}
+    assert worker["taichi"] == "1"
+    assert worker["main"] is True
+    assert worker["pid"] != os.getpid()
 
 
 def test_rows_are_a_dataset_with_hive_partitions(tmp_path: Path) -> None:

@@ -35,8 +35,8 @@ def by_row(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 
 def test_rows_share_places_that_intervals_do_not_tell_apart(board: Leaderboard) -> None:
-    found = {name: row["place"] for name, row in by_row(board.standings).items()}
-    assert found == {
+    place_of = {name: row["place"] for name, row in by_row(board.standings).items()}
+    assert place_of == {
         "mpc-24h": "1",
         "g36": "2 to 3",
         "ippo": "2 to 3",
@@ -55,13 +55,13 @@ def test_no_two_places_have_an_interval_that_includes_0() -> None:
     for spread in (0.01, 0.3, 1.0, 3.0):
         values = {str(i): float(x) for i, x in enumerate(generator.normal(size=12))}
         drawn = {name: x + spread * generator.normal(size=400) for name, x in values.items()}
-        found = places(values, drawn)
-        assert sorted(found) == sorted(values)
-        for one, (_, last) in found.items():
-            for other, (first, _) in found.items():
+        shared = places(values, drawn)
+        assert sorted(shared) == sorted(values)
+        for one, (_, last) in shared.items():
+            for other, (first, _) in shared.items():
                 if last < first:
                     assert np.percentile(drawn[one] - drawn[other], 97.5) < 0.0
-        firsts = [first for first, _ in found.values()]
+        firsts = [first for first, _ in shared.values()]
         assert firsts == sorted(firsts)
 
 
@@ -69,9 +69,9 @@ def test_too_few_seeds_or_weeks_have_no_place(study: Path, tmp_path: Path) -> No
     few = write_study(tmp_path / "seeds", leave_out=["made-up/two-sites/ippo/1"])
     (suite,) = read_suites([few])
     board = leaderboard(suite.cases["two-sites"])
-    found = [(row["row"], row["place"]) for row in board.standings.to_dict("records")]
-    assert found[:3] == [("mpc-24h", "1"), ("g36", "2"), ("idle", "3")]
-    assert found[4:6] == [("ippo", "-"), ("optimum", "-")]
+    standings = [(row["row"], row["place"]) for row in board.standings.to_dict("records")]
+    assert standings[:3] == [("mpc-24h", "1"), ("g36", "2"), ("idle", "3")]
+    assert standings[4:6] == [("ippo", "-"), ("optimum", "-")]
     assert ("ippo", "g36") in [(row["row"], row["than"]) for row in board.pairs.to_dict("records")]
     store = ResultStore(tmp_path / "weeks")
     shutil.copytree(study, store.folder)
@@ -103,10 +103,13 @@ def test_constraints_have_a_column_where_one_is_broken(board: Leaderboard, tmp_p
     frame = frames_of_row("g36", 0).assign(throttled_rack_h=[6.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     store.keep(done_job("g36", 0, frame, spec=ROWS["g36"]))
     (suite,) = read_suites([store.folder])
-    found = by_row(leaderboard(suite.cases["two-sites"]).standings)
-    assert (found["g36"]["throttled_rack_h"], found["idle"]["throttled_rack_h"]) == (1.0, 0.0)
-    assert (found["g36"]["throttled_rack_h_low"], found["idle"]["throttled_rack_h_high"]) == (0, 0)
-    assert found["g36"]["throttled_rack_h_high"] > 1.0
+    standing = by_row(leaderboard(suite.cases["two-sites"]).standings)
+    assert (standing["g36"]["throttled_rack_h"], standing["idle"]["throttled_rack_h"]) == (1.0, 0.0)
+    assert (standing["g36"]["throttled_rack_h_low"], standing["idle"]["throttled_rack_h_high"]) == (
+        0,
+        0,
+    )
+    assert standing["g36"]["throttled_rack_h_high"] > 1.0
     out = tmp_path / "tables.md"
     write_report([store.folder], markdown=out)
     assert "> Places are by carbon alone." in out.read_text()
@@ -118,9 +121,9 @@ def test_each_row_stands_against_the_best_rule_and_the_row_below(board: Leaderbo
     assert ("mpc-24h", "g36") in pairs
     assert ("ippo", "idle") in pairs
     assert all(one not in ("optimum", "bound") for pair in pairs for one in pair)
-    (found,) = (x for x in board.pairs.to_dict("records") if x["row"] == "mpc-24h")
-    assert found["probability"] == 1.0
-    assert found["points_low"] <= found["points"] <= found["points_high"] < 0.0
+    (pair,) = (x for x in board.pairs.to_dict("records") if x["row"] == "mpc-24h")
+    assert pair["probability"] == 1.0
+    assert pair["points_low"] <= pair["points"] <= pair["points_high"] < 0.0
 
 
 def test_agents_trained_apart_stand_against_those_trained_together(tmp_path: Path) -> None:
@@ -159,11 +162,11 @@ def test_seeds_of_events_are_paired_with_those_of_idle_commands(tmp_path: Path) 
             frame = frame.assign(valued_figure=np.nan, achieved_figure=np.nan, share=np.nan)
             store.keep(done_job(name, seed, frame, spec=ROWS[name]))
     (suite,) = read_suites([store.folder])
-    found = by_row(leaderboard(suite.cases["two-sites"]).standings)
-    assert found["g36"]["place"] == "1"
-    assert found["g36"]["change_pct"] == pytest.approx(-2.0)
-    assert found["g36"]["change_pct_high"] - found["g36"]["change_pct_low"] < 1e-9
-    assert "share_pct" not in found["g36"]
+    standing = by_row(leaderboard(suite.cases["two-sites"]).standings)
+    assert standing["g36"]["place"] == "1"
+    assert standing["g36"]["change_pct"] == pytest.approx(-2.0)
+    assert standing["g36"]["change_pct_high"] - standing["g36"]["change_pct_low"] < 1e-9
+    assert "share_pct" not in standing["g36"]
 
 
 def test_folders_with_results_of_one_suite_are_put_together(study: Path, tmp_path: Path) -> None:

@@ -59,8 +59,8 @@ def figures(ours: pd.DataFrame, scored_h: float) -> PaperFigures:
 
 
 def test_units_of_the_tables() -> None:
-    found = figures(rows(), SCORED_H)
-    assert found == pytest.approx((0.55175 * 300.0, 300.0, 900.0, 3.0, 5.0 * 2880))
+    reached = figures(rows(), SCORED_H)
+    assert reached == pytest.approx((0.55175 * 300.0, 300.0, 900.0, 3.0, 5.0 * 2880))
 
 
 def test_printed_tables_hold_power_and_not_energy() -> None:
@@ -126,11 +126,11 @@ def coldest(overrides: list[str]) -> PaperFigures:
 
 def test_the_lowest_setpoint_stands_among_the_printed_learners() -> None:
     """Within 4 % of what the released code reaches, on synthetic inputs."""
-    found = coldest([])
-    assert found[:3] == pytest.approx(COLDEST, rel=0.04)
-    assert found.queue_tasks == 0.0
+    reached = coldest([])
+    assert reached[:3] == pytest.approx(COLDEST, rel=0.04)
+    assert reached.queue_tasks == 0.0
     printed = [row.figures.cfp_kg for row in table(4).rows.values()]
-    assert min(printed) < found.cfp_kg < max(printed)
+    assert min(printed) < reached.cfp_kg < max(printed)
 
 
 def released_utilisation(hourly: F64) -> F64:
@@ -161,11 +161,11 @@ def test_measured_inputs_give_the_figures_of_the_released_code(
         {"timestamp": stamps, "cpu_load": released_utilisation(hourly.to_numpy()[:8760])}
     )
     trace.to_csv(tmp_path / "trace.csv", index=False)
-    found = coldest(
+    reached = coldest(
         [
             f"site.weather_file={real_data}/weather/USA_NY_New.York-LaGuardia.epw",
             f"site.carbon_file={real_data}/carbon/NY_NG_&_avgCI.csv",
             f"site.workload_file={tmp_path}/trace.csv",
         ]
     )
-    assert found[:3] == pytest.approx(COLDEST, rel=0.03)
+    assert reached[:3] == pytest.approx(COLDEST, rel=0.03)

@@ -39,9 +39,9 @@ def test_suites_are_still_those_that_were_published(suite: str) -> None:
 def test_cells_are_reached_again(suite: str) -> None:
     if not (FOLDER / suite).is_dir():
         pytest.skip(f"suite {suite} is not published")
-    published, told = described(suite), cells(suite)
+    published, cell_of = described(suite), cells(suite)
     case = suite_of(suite).cases[published["case"]]
-    site, week = told["idle"]["site"], told["idle"]["week"]
+    site, week = cell_of["idle"]["site"], cell_of["idle"]["week"]
     configs = [x for x in data_centers(case, "held-out") if x.name == site]
     solved = suite == SHARES
     with prepare(
@@ -53,17 +53,17 @@ def test_cells_are_reached_again(suite: str) -> None:
         cache=False,
     ) as weeks:
         contenders = []
-        for name, cell in told.items():
+        for name, cell in cell_of.items():
             spec = cell["controller"].replace("policy:", f"policy:{FOLDER / suite}/")
             contenders.append(Contender(f"row {name}", make_controller(spec, weeks.sim.fleet)))
         rows = evaluate(weeks, contenders, beside=False).rows
-    assert len(rows) == len(told) > 1
-    for (name, cell), own in zip(told.items(), rows.to_dict("records"), strict=True):
+    assert len(rows) == len(cell_of) > 1
+    for (name, cell), reached in zip(cell_of.items(), rows.to_dict("records"), strict=True):
         limit = tolerance(name, published)
         for figure in FIGURES:
-            assert own[figure] == pytest.approx(cell[figure], rel=limit), (name, figure)
+            assert reached[figure] == pytest.approx(cell[figure], rel=limit), (name, figure)
         if solved:
-            assert own["share"] == pytest.approx(cell["share"], abs=100 * limit), name
+            assert reached["share"] == pytest.approx(cell["share"], abs=100 * limit), name
 
 
 # --- Publishing -----------------------------------------------------------------------------------

@@ -44,14 +44,14 @@ def target(study: Path, tmp_path: Path) -> Path:
 def write_row(out: Path, *saved: float, **names: Any) -> Path:
     """The folder of a row, with a seed for each share that it saves."""
     frames = {seed: frame_of(share) for seed, share in enumerate(saved or (0.05,))}
-    given: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "suite": "made-up",
         "case": "two-sites",
         "row": "theirs",
         "kind": "controller",
         "author": "A <b>university</b>",
     }
-    write_submission(out, frames, **(given | names))
+    write_submission(out, frames, **(defaults | names))
     return out
 
 
@@ -205,8 +205,8 @@ def test_policies_of_others_run_again(tmp_path: Path) -> None:
         frame = evaluate(weeks, [contender], beside=False).rows.drop(columns="training")
     names: dict[str, Any] = {"suite": "small", "case": "hall", "kind": "learner", "author": "a"}
 
-    def add(row: str, told: pd.DataFrame, policies: dict[str, bytes], weeks: int = 1) -> Result:
-        write_submission(tmp_path / row, {0: told}, **names, row=row, files={0: policies})
+    def add(row: str, figures: pd.DataFrame, policies: dict[str, bytes], weeks: int = 1) -> Result:
+        write_submission(tmp_path / row, {0: figures}, **names, row=row, files={0: policies})
         arguments = ["add", str(tmp_path / row), "--to", str(target), "--verify", str(weeks)]
         return CliRunner().invoke(app, ["benchmark", *arguments])
 

@@ -154,22 +154,24 @@ def test_the_quick_form_takes_the_place_of_values_and_leaves_rows_out(tmp_path: 
     quick = {"seeds": 1, "cases": {"tiny": {"sites": ["NY"]}}, "rows": {"ippo": None}}
     values = {k: v for k, v in SMALL.items() if k != "name"} | {"quick": quick}
     file.write_text(yaml.safe_dump(values))
-    whole, found = load_suite(str(file)), load_suite(str(file), quick=True)
-    assert found.name == "mine"
-    assert (whole.seeds, found.seeds) == (2, 1)
-    assert found.cases["tiny"].sites == ("NY",)
-    assert found.cases["tiny"].days == 2
-    assert set(whole.rows) - set(found.rows) == {"ippo"}
-    assert make_suite(yaml.safe_load(found.to_yaml())) == found
+    whole, quick_form = load_suite(str(file)), load_suite(str(file), quick=True)
+    assert quick_form.name == "mine"
+    assert (whole.seeds, quick_form.seeds) == (2, 1)
+    assert quick_form.cases["tiny"].sites == ("NY",)
+    assert quick_form.cases["tiny"].days == 2
+    assert set(whole.rows) - set(quick_form.rows) == {"ippo"}
+    assert make_suite(yaml.safe_load(quick_form.to_yaml())) == quick_form
 
 
 def test_the_test_may_be_of_other_data_centers() -> None:
     other = {"sites": ["TX"], "overrides": {"site": {"seed": 3}}}
     suite = small(**case(test=other))
-    held_out, own = (data_centers(suite.cases["tiny"], p) for p in ("held-out", "validation"))
+    held_out, validation = (
+        data_centers(suite.cases["tiny"], p) for p in ("held-out", "validation")
+    )
     assert [dc.site.location for dc in held_out] == ["TX"]
-    assert [dc.site.location for dc in own] == ["NY", "CA"]
-    assert (held_out[0].site.seed, own[0].site.seed) == (3, 10)
+    assert [dc.site.location for dc in validation] == ["NY", "CA"]
+    assert (held_out[0].site.seed, validation[0].site.seed) == (3, 10)
 
 
 def test_a_job_depends_on_what_it_is_of_and_not_on_titles_or_other_rows() -> None:
@@ -188,15 +190,15 @@ def test_a_job_depends_on_what_it_is_of_and_not_on_titles_or_other_rows() -> Non
 
 def run(suite: Suite, store: ResultStore, *, resume: bool = False) -> list[JobSummary]:
     """Run a suite in this process."""
-    found = []
+    summaries = []
 
     def stage(_: str, jobs: Sequence[Job], __: int, inputs: Inputs | None = None) -> JobSummary:
-        found.append(run_jobs(jobs, store, Executor(), inputs))
-        return found[-1]
+        summaries.append(run_jobs(jobs, store, Executor(), inputs))
+        return summaries[-1]
 
     with store.claimed(study_of(suite, suite, "command"), resume=resume):
         run_suite(suite, store, stage)
-    return found
+    return summaries
 
 
 @pytest.fixture(scope="module")
@@ -205,21 +207,21 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> ResultStore:
     suite = small(
         **case(sites=["NY"]), rows={k: v for k, v in SMALL["rows"].items() if k != "ippo"}
     )
-    found = ResultStore(tmp_path_factory.mktemp("suite") / "small")
-    assert [(each.done, each.failed) for each in run(suite, found)] == [(2, ()), (6, ())]
-    return found
+    results = ResultStore(tmp_path_factory.mktemp("suite") / "small")
+    assert [(each.done, each.failed) for each in run(suite, results)] == [(2, ()), (6, ())]
+    return results
 
 
 def test_rows_stand_between_idle_commands_and_the_bound(store: ResultStore) -> None:
     rows = store.rows().set_index("row")
-    own = rows[(rows["moves"] == "all") & (rows["seed"] == 0)]
-    assert set(own.index) == {"idle", "random", "best-constant", "optimum", "bound"}
-    assert (own["controller"] == own.index).all()
-    assert own["valued_figure"]["idle"] == own["idle_figure"]["idle"]
-    assert (own["valued_figure"] >= own["valued_figure"]["bound"] * (1 - 1e-9)).all()
-    assert own["share"]["idle"] == 0.0
-    assert own["share"]["optimum"] == pytest.approx(1.0)
-    assert own["share"]["bound"] >= 1.0 - 1e-9
+    scored = rows[(rows["moves"] == "all") & (rows["seed"] == 0)]
+    assert set(scored.index) == {"idle", "random", "best-constant", "optimum", "bound"}
+    assert (scored["controller"] == scored.index).all()
+    assert scored["valued_figure"]["idle"] == scored["idle_figure"]["idle"]
+    assert (scored["valued_figure"] >= scored["valued_figure"]["bound"] * (1 - 1e-9)).all()
+    assert scored["share"]["idle"] == 0.0
+    assert scored["share"]["optimum"] == pytest.approx(1.0)
+    assert scored["share"]["bound"] >= 1.0 - 1e-9
     assert set(rows["moves"]["optimum"]) == {"all", "load", "cooling", "battery"}
     assert rows["seed"]["random"].tolist() == [0, 1]
     assert rows["figure"]["random"].nunique() == 2
@@ -242,9 +244,9 @@ def test_a_reference_has_the_same_bits_again(store: ResultStore) -> None:
     job = reference_jobs(small(**case(sites=["NY"])))[0]
     again = run_job(job, {})
     assert again.rows == b""
-    kept = store.result(job.partition)
-    assert kept.metrics == again.metrics
-    assert {name: digest_of(x) for name, x in again.files.items()} == kept.files_sha256
+    stored = store.result(job.partition)
+    assert stored.metrics == again.metrics
+    assert {name: digest_of(x) for name, x in again.files.items()} == stored.files_sha256
 
 
 def test_a_row_whose_optimum_failed_fails_with_one_line(tmp_path: Path) -> None:
@@ -252,7 +254,7 @@ def test_a_row_whose_optimum_failed_fails_with_one_line(tmp_path: Path) -> None:
     jobs = row_jobs(suite, reference_jobs(suite))
     results = ResultStore(tmp_path / "out")
     with results.claimed(study_of(suite, suite, "")):
-        found = run_jobs(jobs, results, Executor())
-    ((name, error),) = found.failed
+        summary = run_jobs(jobs, results, Executor())
+    ((name, error),) = summary.failed
     assert name == "small/tiny/idle/0"
     assert "reference-held-out-ny" in error

@@ -91,11 +91,11 @@ def test_texts_that_are_not_valid_are_told(text: str, said: str) -> None:
 
 def test_combinations_are_those_of_grids_with_samples_in_the_order_of_the_fields() -> None:
     fields = varied(f"{SETPOINT}=16..20", "site.location=NY,CA", "site.seed=1..3")
-    found = list(combinations(Sweep(TINY, fields, samples=3, seed=4)))
-    assert len(found) == 6
-    assert [site for _, site, _ in found] == ["NY", "CA"] * 3
-    assert [each[0] for each in found[::2]] == [each[0] for each in found[1::2]]
-    assert all(16 <= setpoint < 20 and seed in (1, 2, 3) for setpoint, _, seed in found)
+    drawn = list(combinations(Sweep(TINY, fields, samples=3, seed=4)))
+    assert len(drawn) == 6
+    assert [site for _, site, _ in drawn] == ["NY", "CA"] * 3
+    assert [each[0] for each in drawn[::2]] == [each[0] for each in drawn[1::2]]
+    assert all(16 <= setpoint < 20 and seed in (1, 2, 3) for setpoint, _, seed in drawn)
 
 
 def test_samples_cover_a_range_and_more_of_them_begin_with_the_same() -> None:
@@ -254,8 +254,8 @@ def test_the_command_keeps_rows_and_tells_the_best_value(tmp_path: Path) -> None
 
 
 def test_what_would_run_is_shown_and_nothing_written(tmp_path: Path) -> None:
-    given = ["tiny", "--vary", "battery.capacity_kwh=0..500", "--sample", "8", "--site", "ny,ca"]
-    done = call(*given, "--months", "all", "--show", "--out", tmp_path / "sweep")
+    asked = ["tiny", "--vary", "battery.capacity_kwh=0..500", "--sample", "8", "--site", "ny,ca"]
+    done = call(*asked, "--months", "all", "--show", "--out", tmp_path / "sweep")
     assert done.exit_code == 0, (done.output, done.exception)
     shown = yaml.safe_load(done.stdout)
     assert (shown["runs"], shown["combinations"], shown["jobs"]) == (192, 16, 12)

@@ -20,14 +20,14 @@ SUITE, ROW, TORCH = "small", "ippo", "2.13.0"
 
 
 def test_a_training_reaches_what_was_published() -> None:
-    published, told = described(SUITE), cells(SUITE)
+    published, cell_of = described(SUITE), cells(SUITE)
     (job, *_) = row_jobs(suite_of(SUITE).chosen(rows=[ROW]), ())
     done = run_job(job, {})
     assert not done.error
-    (own,) = pd.read_parquet(io.BytesIO(done.rows)).to_dict("records")
+    (reached,) = pd.read_parquet(io.BytesIO(done.rows)).to_dict("records")
     limit = tolerance(ROW, published)
-    figure = own["figure"]
+    figure = reached["figure"]
     if torch.__version__.partition("+")[0] == TORCH and limit < 1e-5:
-        assert figure == pytest.approx(told[ROW]["figure"], rel=limit)
-    low, high = told[ROW]["lowest_figure"], told[ROW]["highest_figure"]
+        assert figure == pytest.approx(cell_of[ROW]["figure"], rel=limit)
+    low, high = cell_of[ROW]["lowest_figure"], cell_of[ROW]["highest_figure"]
     assert 2 * low - high <= figure <= 2 * high - low, "as far from the others as they are apart"

@@ -41,8 +41,6 @@ from sdc_taichi.run.achievable import AchievedPath, share_of_achievable
 if TYPE_CHECKING:
     import pandas as pd
 
-    from sdc_taichi.learning.trainer import Training
-
 _CURVES = ("training.csv", "validation.csv")
 """Files of a training that are kept beside its settings and policy."""
 _ROW = "row"
@@ -208,7 +206,11 @@ def _trained(task: _Task, scratch: Path, optima: Path) -> _Made:
         files |= {
             (Path(part) / name).as_posix(): x for name, x in _files_of_training(folder).items()
         }
-        metrics[part or "training"] = _metrics_of_training(done)
+        metrics[part or "training"] = {
+            "updates": done.updates,
+            "steps": done.steps,
+            "validation": None if done.best is None else done.best._asdict(),
+        }
         specs.append(f"{part}=policy:{folder}" if part else f"policy:{folder}")
     return _Made(",".join(specs), {"trainings": metrics}, files, moved)
 
@@ -218,6 +220,8 @@ def _files_of_training(folder: Path) -> dict[str, bytes]:
 
     Folders keep their places, so that the folder of the job is a controller ``policy:FOLDER``.
     """
+    import pandas as pd
+
     from sdc_taichi.learning.policy import FOLDERS
     from sdc_taichi.learning.training_folder import SETTINGS_FILE
 
@@ -227,27 +231,10 @@ def _files_of_training(folder: Path) -> dict[str, bytes]:
         path.relative_to(folder).as_posix(): path.read_bytes() for path in paths if path.is_file()
     }
     for name in _CURVES:
-        if (folder / name).is_file():
-            contents[name] = _without_seconds(folder / name)
+        if (path := folder / name).is_file():
+            curve = pd.read_csv(path, dtype=str, keep_default_na=False).drop(columns=_SECONDS)
+            contents[name] = curve.to_csv(index=False, lineterminator="\n").encode()
     return contents
-
-
-def _without_seconds(path: Path) -> bytes:
-    """A CSV file without the time that things took."""
-    import csv
-
-    with open(path, newline="", encoding="utf-8") as file:
-        lines = list(csv.reader(file))
-    at = lines[0].index(_SECONDS)
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(x[:at] + x[at + 1 :] for x in lines)
-    return out.getvalue().encode()
-
-
-def _metrics_of_training(done: Training) -> dict[str, Any]:
-    """Length of a training, and its best validation."""
-    best = None if done.best is None else done.best._asdict()
-    return {"updates": done.updates, "steps": done.steps, "validation": best}
 
 
 @contextlib.contextmanager
