@@ -19,7 +19,13 @@ from pydantic import BaseModel
 from sdc_taichi.control.view import ForecastError
 from sdc_taichi.envs.core import Core, Observation, Transition
 from sdc_taichi.envs.images import RENDER_MODES, Image, check_render_mode, frame
-from sdc_taichi.envs.options import ConfigSource, EnvOptions, Overrides, configs_and_options
+from sdc_taichi.envs.options import (
+    ConfigSource,
+    EnvOptions,
+    Overrides,
+    configs_and_options,
+    fields_set,
+)
 from sdc_taichi.envs.recording import RecorderOption, RecordingCore
 from sdc_taichi.errors import ConfigError, suggestion_or_valid
 from sdc_taichi.sim.hall_solver import Precision
@@ -186,14 +192,14 @@ def start_day_option(options: Mapping[str, Any] | None, *, strict: bool = True) 
     """
     if options is not None and not isinstance(options, Mapping):
         raise ConfigError(f"reset options {options!r}: valid is a dict")
-    given = dict(options or {})
-    for name in given:
+    values = dict(options or {})
+    for name in values:
         if name not in RESET_OPTIONS:
             meant = suggestion_or_valid(name, RESET_OPTIONS)
             if strict:
                 raise ConfigError(f"reset options: unknown {name!r}{meant}")
             warnings.warn(f"reset options: {name!r} is without effect{meant}", stacklevel=3)
-    return given.get("start_day")
+    return values.get("start_day")
 
 
 def first_info(core: Core) -> dict[str, Any]:
@@ -269,13 +275,12 @@ def check_steps(given: Any, core: Core) -> int:
 
 def _plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of an entry point as plain values, with fields of ``options`` as keywords."""
-    given = dict(arguments)
-    options = given.pop("options", None)
+    values = dict(arguments)
+    options = values.pop("options", None)
     if isinstance(options, EnvOptions):
-        # Leave out fields at their default, since some are errors where they have no effect.
-        given = {name: getattr(options, name) for name in options.model_fields_set} | given
+        values = fields_set(options) | values
     known: dict[int, Any] = {}
-    return {name: _plain(value, known) for name, value in given.items()}
+    return {name: _plain(value, known) for name, value in values.items()}
 
 
 def _plain(value: Any, known: dict[int, Any]) -> Any:

@@ -1,4 +1,4 @@
-"""Seeds and first days of episodes, as ``reset`` is given them."""
+"""Seeds, first days, drawn inputs and saved states of episodes."""
 
 from __future__ import annotations
 
@@ -247,7 +247,7 @@ def check_state(
     by_others: Sequence[str],
     steps: int,
 ) -> SavedState:
-    """Check a state against the environments that are to go on from it.
+    """Check a state against the environments that will continue from it.
 
     Args:
         values: what ``state_dict`` gave.

@@ -50,7 +50,7 @@ Month = Annotated[int, Field(strict=True, ge=1, le=12), PLAIN_INT]
 MOST_YEARS = 2**31
 """Largest number of years to draw from."""
 MOST_LISTED_YEARS = 100_000
-"""Largest number of years in a range, which is kept as a list."""
+"""Largest number of years in a range, which becomes a list."""
 Year = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1), PLAIN_INT]
 """Seed of a synthetic year, 0..2**63 - 1."""
 YearCount = Annotated[int, Field(strict=True, ge=1, le=MOST_YEARS), PLAIN_INT]
@@ -111,8 +111,9 @@ class EnvOptions(BaseModel):
     """Rewards: ``default``, ``bill``, ``paper``, ``sustaindc``, agent to term to scale, or a
     function, the name that ``register_reward`` gave it, or its import path ``module:name``."""
     collaboration: Annotated[float, Field(ge=0, le=1)] = 0.8
-    """Share a of an agent's own reward in what it gets, 0..1; those of the other two agents share
-    the rest evenly (paper, section 4.5). 1 is no collaboration."""
+    """Weight a of an agent's individual reward in the reward it receives, 0..1; the individual
+    rewards of the other two agents have the weight (1 - a)/2 each (paper, section 4.5). 1 is no
+    collaboration."""
     tariff: TariffConfig | None = None
     """Prices of electricity in place of those of the configs; None keeps them."""
     costs: Any = None
@@ -165,9 +166,9 @@ class EnvOptions(BaseModel):
     @model_validator(mode="after")
     def _options_fit_each_other(self) -> Self:
         for names, without_effect, why in self._without_effect():
-            given = [name for name in names if name in self.model_fields_set]
-            if given and without_effect:
-                raise ValueError(f"{', '.join(given)}: without effect {why}")
+            unused = [name for name in names if name in self.model_fields_set]
+            if unused and without_effect:
+                raise ValueError(f"{', '.join(unused)}: without effect {why}")
         for option in ("features", "commands"):
             for agent in getattr(self, option) or {}:
                 if agent in AGENTS and agent not in self.agents:
@@ -248,13 +249,18 @@ class EnvOptions(BaseModel):
         return [d for d in range(last + 1) if all(inside[d : d + self.days])]
 
 
-def make_options(**given: Any) -> EnvOptions:
+def fields_set(options: EnvOptions) -> dict[str, Any]:
+    """Options that were set, by name; the others may be errors where they have no effect."""
+    return {name: getattr(options, name) for name in options.model_fields_set}
+
+
+def make_options(**values: Any) -> EnvOptions:
     """Options by keyword.
 
     Raises:
         ConfigError: an unknown option or a value that is not valid.
     """
-    return validated(EnvOptions, given, "environment")
+    return validated(EnvOptions, values, "environment")
 
 
 OneConfig: TypeAlias = DataCenterConfig | Mapping[str, Any]
@@ -333,18 +339,15 @@ def _checked_overrides(given: Any) -> Overrides:
 def _options(options: Any, keywords: Mapping[str, Any], only_agent: str | None) -> EnvOptions:
     if options is not None and not isinstance(options, EnvOptions):
         raise ConfigError(f"options {options!r}: valid is EnvOptions, or its fields by keyword")
-    given = dict(keywords)
-    if options is not None:
-        # Leave out fields at their default, since some are errors where they have no effect.
-        given = {name: getattr(options, name) for name in options.model_fields_set} | given
+    values = (fields_set(options) if options else {}) | dict(keywords)
     if only_agent is not None:
-        agents = given.setdefault("agents", (only_agent,))
+        agents = values.setdefault("agents", (only_agent,))
         if agents not in ((only_agent,), [only_agent]):
             raise ConfigError(
                 f"agents {agents!r}: the one agent here is {only_agent}; valid with "
                 "sdc_taichi/Joint-v0"
             )
-    return make_options(**given)
+    return make_options(**values)
 
 
 def options_markdown() -> str:

@@ -132,4 +132,4 @@ def aec_env(config: ConfigSource = "corrected", **arguments: Any) -> AECEnv[str,
 
 def _first_of_each(observations: Mapping[str, Observation]) -> dict[str, Observation]:
     """Observations of a batch of one by agent, (n,) each."""
-    return {agent: first_of_batch(found) for agent, found in observations.items()}
+    return {agent: first_of_batch(values) for agent, values in observations.items()}
