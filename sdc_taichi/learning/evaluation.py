@@ -1,7 +1,8 @@
-"""Evaluation of controllers in given weeks, against idle commands and the optimum of these weeks.
+"""Evaluation of controllers in weeks of the year, against idle commands and the optimum.
 
-All begin in equal weeks and states. The first day of a week is run but not scored, and what is
-stored or waits at the end is valued, so that an empty battery or work put off is no saving.
+All controllers begin in the same weeks and states. The first day of a week is run but not scored.
+Stored energy and waiting work at the end of a week have a value, so that an empty battery or
+postponed work is no saving.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 IDLE = "idle"
-"""Name of the controller that all others are compared with."""
+"""Name of idle commands, with which all controllers are compared."""
 ALL = "all"
-"""Text for a controller that gives all its commands, where others stand for one agent alone."""
+"""Value of ``moves`` for a run in which a controller gives all its commands."""
 METRICS = (
     *("cfp_kg", "grid_kwh", "it_kwh", "hvac_kwh", "water_l", "cost", "peak_kw"),
     *("over_27_degree_h", "hottest_inlet_c", "arrived_tasks", "executed_tasks", "dropped_tasks"),
@@ -70,7 +71,7 @@ class DataCenterWeeks:
     weeks: tuple[int, ...]
     """Week of the year of each data center, 0..51, B."""
     objective: Objective
-    """Objective whose figure is compared, less is better."""
+    """Objective whose figure is compared; lower is better."""
     steps: int
     """Number of steps of a week that are run."""
     scored_from: int
@@ -82,7 +83,7 @@ class DataCenterWeeks:
     idle: F64
     """Figure of idle commands over the scored steps, in the unit of the objective, (B,)."""
     optimum: Optimum | None
-    """Known optimum of the same weeks; None if there is none to compare with."""
+    """Known optimum of the same weeks; None if it was not solved for."""
 
     def __enter__(self) -> Self:
         return self
@@ -101,12 +102,12 @@ class Validation(NamedTuple):
     """Result of a controller over all validation weeks together."""
 
     change_pct: float
-    """Change of the figure against idle commands, in %, with valued ends if there is an optimum."""
+    """Change of the figure against idle commands, in %; with an optimum, the figure includes the
+    value of energy and work left at the end."""
     share: float
     """Share of the achievable; nan without an optimum."""
     broken_weeks: int
-    """Number of weeks in which a constraint that the optimum keeps was broken; 0 without an
-    optimum."""
+    """Number of weeks that break a constraint of the optimum; 0 without an optimum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +115,7 @@ class Contender:
     """A controller to evaluate."""
 
     name: str
-    """Name of the controller in rows; trainings of one name are put together."""
+    """Name of the controller in the tables; trainings of one name share a row."""
     controller: Controller
     """Controller that is run."""
     seed: int | None = None
@@ -128,7 +129,7 @@ class Evaluation:
     """Figures and metrics of controllers in each data-center week."""
 
     rows: pd.DataFrame
-    """A row for each controller, training, what it moves, and data-center week, with the columns
+    """A row for each controller, training, moved agent and data-center week, with the columns
     ``controller``, ``training``, ``moves``, ``site``, ``week``, ``figure``, ``valued_figure``,
     ``idle_figure``, ``achieved_figure``, ``share``, ``broken`` and those of ``METRICS``."""
     objective: Objective
@@ -139,7 +140,7 @@ class Evaluation:
     strata: I64
     """Number of the site of each week, (B,)."""
     missing: tuple[str, ...]
-    """Controllers that an interruption left out."""
+    """Names of the runs that did not finish before ``stop`` returned true."""
 
 
 def prepare(
@@ -157,35 +158,35 @@ def prepare(
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> DataCenterWeeks:
-    """Make the data centers of weeks ready for controllers to run in.
+    """Build the data centers of all weeks, and compute the figures of idle commands and optimum.
 
     Args:
         configs: data centers, such as one for each site.
         weeks: weeks of the year, 0..51.
-        objective: what is compared, or its text.
-        optimum: whether to solve for the optimum, which values ends and gives the share of the
-            achievable.
-        exact_ends: whether to value the ends of each run by programmes of their own, at about a
-            second for each week, and not by curves.
+        objective: objective to compare, or its text.
+        optimum: whether to solve for the optimum, which gives the value of energy and work left at
+            the end, and the share of the achievable.
+        exact_ends: whether to solve a programme for the value of each run's end, which takes about
+            a second per week, rather than to interpolate it from curves.
         days: days of each week to run, 2..7; the first is not scored.
-        seed: of sampled events, of controllers and of errors of forecasts.
-        forecast_error: how the forecasts of controllers err.
-        precision: of the server kernels.
-        cache: whether to read and keep optima among the user's caches, or a folder for them.
-        progress: is told of the stages of solving.
-        stop: asked now and then; true ends the work.
+        seed: seed of sampled events, controllers and forecast errors.
+        forecast_error: sizes of the errors of the controllers' forecasts.
+        precision: precision of the server kernels.
+        cache: whether to read and write optima in the user's cache, or a folder for them.
+        progress: progress callback ``(stage, done, total)`` of solving.
+        stop: called repeatedly; true ends the work.
 
     Raises:
-        ConfigError: no data centers or weeks, or arguments that are not valid.
-        StoppedError: ``stop`` was true.
+        ConfigError: there are no data centers or weeks, or an argument is not valid.
+        StoppedError: ``stop`` returned true.
     """
-    given, chosen = list(configs), tuple(weeks)
-    if not given or not chosen:
-        what = "weeks" if given else "data centers"
+    sites, numbers = list(configs), tuple(weeks)
+    if not sites or not numbers:
+        what = "weeks" if sites else "data centers"
         raise ConfigError(f"evaluation: no {what}; valid is one or more")
     days = whole_number("days", days, UNSCORED_DAYS + 1, DAYS_PER_WEEK)
     aim = Objective.parse(objective) if isinstance(objective, str) else objective
-    sim = Simulator(data_center_weeks(given, chosen), precision=precision)
+    sim = Simulator(data_center_weeks(sites, numbers), precision=precision)
     try:
         per_day = 24 * sim.fleet.steps_per_hour
         steps, scored_from = days * per_day, UNSCORED_DAYS * per_day
@@ -208,8 +209,8 @@ def prepare(
         idle = np.empty(0) if best is None else best.idle
         made = DataCenterWeeks(
             sim=sim,
-            sites=tuple(config.name for config in given for _ in chosen),
-            weeks=chosen * len(given),
+            sites=tuple(config.name for config in sites for _ in numbers),
+            weeks=numbers * len(sites),
             objective=aim,
             steps=steps,
             scored_from=scored_from,
@@ -250,25 +251,25 @@ def validate(controller: Controller, weeks: DataCenterWeeks) -> Validation:
 
 
 def check_contenders(contenders: Iterable[Contender]) -> None:
-    """Refuse controllers whose rows could not be told apart, and agents that do not exist.
+    """Check that the rows of controllers can be distinguished, and that their agents exist.
 
     Args:
         contenders: the controllers.
 
     Raises:
-        ConfigError: a name and seed that is given twice, ``idle`` or ``optimum`` for another
-            controller, or an agent that is neither load, cooling nor battery.
+        ConfigError: two controllers have the same name and seed, a controller is called ``idle`` or
+            ``optimum``, or an agent is neither load, cooling nor battery.
     """
-    seen = set()
+    names = set()
     for each in contenders:
         if each.name == OPTIMUM or (each.name == IDLE and not isinstance(each.controller, Idle)):
             raise ConfigError(
                 f"evaluation: {each.name} names other rows of the tables; valid is another name"
             )
-        if each.name != IDLE and (each.name, each.seed) in seen:
+        if each.name != IDLE and (each.name, each.seed) in names:
             of = "" if each.seed is None else f" of seed {each.seed}"
             raise ConfigError(f"evaluation: {each.name}{of} is given twice; valid is each once")
-        seen.add((each.name, each.seed))
+        names.add((each.name, each.seed))
         for agent in each.agents:
             if agent not in AGENTS:
                 raise ConfigError(f"agent {agent!r} of {each.name}: valid are {', '.join(AGENTS)}")
@@ -287,14 +288,14 @@ def evaluate(
     Args:
         weeks: the weeks.
         contenders: the controllers.
-        beside: whether rows of idle commands come first and, where there is an optimum, those of
-            its achieved path last.
-        on_run: called with the name of each run before it; what it returns is called with the
-            result of every step.
-        stop: asked before every step; true ends the evaluation, and rows of whole runs are kept.
+        beside: whether to add rows of idle commands at the beginning and, with an optimum, rows of
+            its achieved path at the end.
+        on_run: called with the name of each run before it begins; returns a function that is called
+            with the result of every step, or None.
+        stop: called before every step; true ends the evaluation, and rows of finished runs remain.
 
     Raises:
-        ConfigError: names or agents that ``check_contenders`` refuses.
+        ConfigError: ``check_contenders`` refuses a name or an agent.
     """
     import pandas as pd
 
@@ -331,15 +332,15 @@ def evaluate(
 def _runs(
     weeks: DataCenterWeeks, contenders: Iterable[Contender], *, beside: bool
 ) -> list[tuple[str, str, Contender]]:
-    """Name, what is moved, and controller of each run, in the order of their rows."""
-    every = list(contenders)
-    check_contenders(every)
+    """Name, moved agents and controller of each run, in the order of the rows."""
+    listed = list(contenders)
+    check_contenders(listed)
     if beside:
-        every = [Contender(IDLE, Idle()), *(each for each in every if each.name != IDLE)]
+        listed = [Contender(IDLE, Idle()), *(each for each in listed if each.name != IDLE)]
     if beside and weeks.optimum is not None:
-        every.append(Contender(OPTIMUM, AchievedPath(weeks.optimum)))
+        listed.append(Contender(OPTIMUM, AchievedPath(weeks.optimum)))
     runs = []
-    for each in every:
+    for each in listed:
         label = each.name if each.seed is None else f"{each.name}, seed {each.seed}"
         runs.append((label, ALL, each))
         runs += [(f"{label}, {agent} alone", agent, each) for agent in each.agents]
@@ -423,57 +424,53 @@ def _run(
 
 
 def training_settings(folders: Sequence[Path]) -> TrainingSettings | None:
-    """Settings of the first of several trainings; None if none of the folders is of a training.
+    """Settings of the first of several trainings; None if no folder holds a training.
 
     Args:
         folders: folders of trainings or policies.
 
     Raises:
-        ConfigError: settings that are not valid, or trainings on other data centers than the first.
+        ConfigError: settings are not valid, or the trainings have different data centers.
     """
-    found: tuple[Path, TrainingSettings] | None = None
-    for folder in folders:
-        if not (folder / SETTINGS_FILE).is_file():
-            continue
-        settings = settings_of(folder)
-        if found is None:
-            found = folder, settings
+    trainings = [folder for folder in folders if (folder / SETTINGS_FILE).is_file()]
+    settings = [settings_of(folder) for folder in trainings]
+    for folder, other in zip(trainings[1:], settings[1:], strict=True):
         for name in ("config", "overrides"):
-            if getattr(settings, name) != getattr(found[1], name):
+            if getattr(other, name) != getattr(settings[0], name):
                 raise ConfigError(
-                    f"{folder}: was trained with another {name} than {found[0]}; valid with both "
-                    "is --config"
+                    f"{folder}: was trained with another {name} than {trainings[0]}; valid with "
+                    "both is --config"
                 )
-    return None if found is None else found[1]
+    return settings[0] if settings else None
 
 
 def contenders_of(
     folders: Sequence[Path], fleet: Fleet, *, agents_alone: bool = True
 ) -> list[Contender]:
-    """Policies of trainings as contenders; those that differ in their seed alone share a name.
+    """Policies of trainings as contenders; trainings that differ only in their seed share a name.
 
     Args:
         folders: folders of trainings or policies.
-        fleet: data centers that they are to control.
-        agents_alone: whether each agent of a policy of several also runs alone.
+        fleet: data centers to control.
+        agents_alone: whether each agent of a policy with several agents also runs alone.
 
     Raises:
-        SdcError: a folder without a policy, or a policy that does not fit the data centers.
+        SdcError: a folder has no policy, or a policy does not fit the data centers.
     """
     policies = [Policy.load(folder) for folder in folders]
     keys = [_key(folder, policy) for folder, policy in zip(folders, policies, strict=True)]
     names = _names(folders, policies, keys)
-    found = []
+    contenders = []
     for folder, policy, key in zip(folders, policies, keys, strict=True):
         controller = PolicyController(policy, fleet, f"policy {folder}")
-        parts = _parts(policy)
+        parts = tuple(AGENT_DEFINITIONS[agent].command for agent in policy.interface.agents)
         alone = parts if agents_alone and len(parts) > 1 else ()
-        found.append(Contender(names[key], controller, policy.about.seed, alone))
-    return found
+        contenders.append(Contender(names[key], controller, policy.about.seed, alone))
+    return contenders
 
 
 def _key(folder: Path, policy: Policy) -> str:
-    """Text that is equal for trainings which differ in their seed alone."""
+    """Text that is equal for trainings that differ only in their seed."""
     about = policy.about.model_dump(exclude={"seed", "fingerprint"})
     settings = {}
     if (folder / SETTINGS_FILE).is_file():
@@ -485,7 +482,7 @@ def _key(folder: Path, policy: Policy) -> str:
 def _names(
     folders: Sequence[Path], policies: Sequence[Policy], keys: Sequence[str]
 ) -> dict[str, str]:
-    """Name of each key: its algorithm, or its folder where another key has that algorithm."""
+    """Name of each key: its algorithm, or its folder if several keys have that algorithm."""
     first = {key: i for i, key in reversed(list(enumerate(keys)))}
     algorithms = [policies[i].about.algorithm for i in first.values()]
     names: dict[str, str] = {}
@@ -495,8 +492,3 @@ def _names(
             name = re.sub(r"[-_.]?(seed)?[-_.]?\d+$", "", folders[i].absolute().name) or name
         names[key] = name if name not in names.values() else str(folders[i])
     return names
-
-
-def _parts(policy: Policy) -> tuple[str, ...]:
-    """Of load, cooling and battery what the agents of a policy move."""
-    return tuple(AGENT_DEFINITIONS[agent].command for agent in policy.interface.agents)

@@ -1,7 +1,8 @@
-"""Tables of an evaluation, by controller, site, agent and pair, and the folder they are kept in.
+"""Tables of an evaluation, by controller, site, agent and pair, and the folder they are written to.
 
-Figures are those with valued ends where an optimum values them, and as they are where none does.
-Intervals are those of ``statistics.bootstrap_interval``, with the same draws for all rows.
+Figures include the value of stored energy and waiting work at the end if there is an optimum, which
+gives that value. Intervals are those of ``statistics.bootstrap_interval``, with the same draws for
+all rows.
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ from sdc_taichi.errors import ConfigError, SdcError, printable
 from sdc_taichi.learning.evaluation import ALL, IDLE, DataCenterWeeks, Evaluation
 from sdc_taichi.learning.policy import Policy
 from sdc_taichi.learning.statistics import (
-    Interval,
     Statistic,
     bootstrap_interval,
     change_pct,
@@ -47,7 +47,7 @@ _AGAINST_IDLE = {
     "cost_pct": "cost",
     "peak_pct": "peak_kw",
 }
-"""Columns of changes against idle commands, and the metrics that they are of."""
+"""Metric of each column of changes against idle commands."""
 TITLES = {
     "controller": "controller",
     "moves": "moves",
@@ -73,21 +73,22 @@ TITLES = {
 
 
 def summary(evaluation: Evaluation) -> pd.DataFrame:
-    """All weeks together, a row for each controller.
+    """Results of all weeks together, a row for each controller.
 
-    Changes against idle commands are of sums over all weeks, in %; those of ``change`` and
-    ``share`` and the mean of the middle half of all weeks' changes, ``interquartile_mean``, have
-    the ends ``_low`` and ``_high`` of a 95 % interval. ``over_27_degree_h`` (K h,
-    mean over the servers) and ``overdue_task_h`` are means of a week. ``dropped_pct`` is work
-    dropped of that arrived, ``broken_pct`` weeks that break a constraint the optimum keeps.
+    ``change_pct`` and the columns of single metrics are changes of the sum over all weeks against
+    idle commands, in %. ``interquartile_mean_pct`` is the mean of the middle half of all weeks'
+    changes, ``share_pct`` the share of the achievable. These three have the ends ``_low`` and
+    ``_high`` of a 95 % interval. ``over_27_degree_h`` (K h, mean over the servers) and
+    ``overdue_task_h`` are means per week, ``dropped_pct`` is the share of arrived work that was
+    dropped, and ``broken_pct`` the share of weeks that break a constraint of the optimum.
     """
     import pandas as pd
 
     return pd.DataFrame(
         [
-            {"controller": name, "trainings": len(_sample(own, "figure"))}
-            | _standing(evaluation, own)
-            for name, own in _groups(evaluation, ALL)
+            {"controller": name, "trainings": len(_sample(rows, "figure"))}
+            | _results(evaluation, rows)
+            for name, rows in _groups(evaluation, ALL)
         ]
     )
 
@@ -97,34 +98,37 @@ def by_site(evaluation: Evaluation) -> pd.DataFrame:
     import pandas as pd
 
     sites = list(dict.fromkeys(evaluation.rows["site"])) if len(evaluation.rows) else []
-    found = []
-    for name, own in _groups(evaluation, ALL):
-        changes = {site: _change(evaluation, own[own["site"] == site]) for site in sites}
-        found.append({"controller": name} | changes)
-    return pd.DataFrame(found)
+    table = []
+    for name, rows in _groups(evaluation, ALL):
+        of_sites = {site: rows[rows["site"] == site] for site in sites}
+        changes = {
+            site: float(change_pct(_sample(some, _column(evaluation)), _base(some)))
+            for site, some in of_sites.items()
+        }
+        table.append({"controller": name} | changes)
+    return pd.DataFrame(table)
 
 
 def by_agent(evaluation: Evaluation) -> pd.DataFrame:
-    """Each agent alone, the others idle, beside the optimum of that agent alone.
+    """Results of each agent while the others are idle, a row for each agent and controller.
 
-    Columns are those of ``summary``, with ``alone_pct`` for the optimum of the agent. Empty if no
-    agent ran alone.
+    Columns are those of ``summary``, and ``alone_pct`` is the change by the optimum of that agent
+    alone. The table is empty if no agent ran alone.
     """
     import pandas as pd
 
-    found = []
+    table = []
     for agent in AGENTS:
         best = evaluation.alone.get(agent)
-        for name, own in _groups(evaluation, agent):
-            base = _base(own)
-            alone = math.nan if best is None else float(change_pct(best[None], base))
+        for name, rows in _groups(evaluation, agent):
+            alone = math.nan if best is None else float(change_pct(best[None], _base(rows)))
             row = {"moves": agent, "controller": name, "alone_pct": alone}
-            found.append(row | _standing(evaluation, own, best))
-    return pd.DataFrame(found)
+            table.append(row | _results(evaluation, rows, best))
+    return pd.DataFrame(table)
 
 
 def differences(evaluation: Evaluation, controller: str) -> pd.DataFrame:
-    """A controller against all others in the same weeks.
+    """Comparison of a controller with each other one in the same weeks.
 
     Args:
         evaluation: the evaluation.
@@ -143,16 +147,15 @@ def differences(evaluation: Evaluation, controller: str) -> pd.DataFrame:
     def points(one: F64, idle: F64, other: F64, other_idle: F64) -> F64:
         return np.asarray(change_pct(one, idle) - change_pct(other, other_idle))
 
-    found = []
-    for name, own in groups.items():
+    table = []
+    for name, rows in groups.items():
         if name == controller:
             continue
-        theirs = _sample(own, _column(evaluation))
-        interval = _interval(evaluation, points, mine, base, theirs, _base(own))
-        probability = float(probability_of_improvement(mine, theirs))
-        found.append({"controller": controller, "than": name, **_ends("points", interval),
-                      "probability": probability})  # fmt: skip
-    return pd.DataFrame(found)
+        theirs = _sample(rows, _column(evaluation))
+        row: dict[str, Any] = {"controller": controller, "than": name}
+        row |= _interval(evaluation, "points", points, mine, base, theirs, _base(rows))
+        table.append(row | {"probability": float(probability_of_improvement(mine, theirs))})
+    return pd.DataFrame(table)
 
 
 def samples(evaluation: Evaluation, moves: str = ALL) -> dict[str, tuple[F64, F64]]:
@@ -160,26 +163,26 @@ def samples(evaluation: Evaluation, moves: str = ALL) -> dict[str, tuple[F64, F6
 
     Args:
         evaluation: the evaluation.
-        moves: what the controllers move: ``all``, or one of load, cooling and battery.
+        moves: commands that the controllers gave: ``all``, or one of load, cooling and battery.
 
     Returns:
-        By controller, its figures by training and week, (S, W), and those of idle commands, (1, W),
-        or (S, W) where they differ by seed.
+        For each controller, its figures by training and week, (S, W), and those of idle commands,
+        (1, W), or (S, W) where they differ by seed.
     """
     return {
-        name: (_sample(own, _column(evaluation)), _base(own))
-        for name, own in _groups(evaluation, moves)
+        name: (_sample(rows, _column(evaluation)), _base(rows))
+        for name, rows in _groups(evaluation, moves)
     }
 
 
 def text_rows(
     table: pd.DataFrame, titles: Mapping[str, str] = TITLES
 ) -> tuple[list[str], list[list[str]]]:
-    """Titles and cells of a table to print: intervals of some width in brackets, nan as a dash.
+    """Titles and cells of a table for display, with intervals in brackets and a dash for nan.
 
     Args:
         table: one of the tables of this module.
-        titles: title of each column; one without a title is told by its name.
+        titles: title of each column; a column without one has its name.
     """
     shown = [str(name) for name in table.columns if not str(name).endswith(("_low", "_high"))]
     rows = []
@@ -197,11 +200,11 @@ def text_rows(
 
 
 def markdown(table: pd.DataFrame, titles: Mapping[str, str] = TITLES) -> str:
-    """A table as Markdown, in which text is no markup.
+    """A table as Markdown, with special characters of texts escaped.
 
     Args:
         table: one of the tables of this module.
-        titles: title of each column; one without a title is told by its name.
+        titles: title of each column; a column without one has its name.
     """
     heads, rows = text_rows(table, titles)
     lines = [" | ".join(map(literal_markdown, cells)) for cells in (heads, *rows)]
@@ -210,77 +213,64 @@ def markdown(table: pd.DataFrame, titles: Mapping[str, str] = TITLES) -> str:
 
 
 def literal_markdown(text: str) -> str:
-    """Text on one line as Markdown that shows it unchanged."""
+    """A text as one line of Markdown, with special characters escaped."""
     return re.sub(r"([\\`*_\[\]<>|])", r"\\\1", printable(" ".join(text.split())))
 
 
 def _groups(evaluation: Evaluation, moves: str) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Rows of each controller, in their order, of what is moved."""
+    """Rows of each controller that gave the commands ``moves``, in the order of the rows."""
     rows = evaluation.rows
-    if not len(rows):
-        return
-    own = rows[rows["moves"] == moves]
-    for name in dict.fromkeys(own["controller"]):
-        yield str(name), own[own["controller"] == name]
+    if len(rows):
+        for name, group in rows[rows["moves"] == moves].groupby("controller", sort=False):
+            yield str(name), group
 
 
-def _standing(
-    evaluation: Evaluation, own: pd.DataFrame, best: F64 | None = None
+def _results(
+    evaluation: Evaluation, rows: pd.DataFrame, best: F64 | None = None
 ) -> dict[str, float]:
-    """Figures of one controller in ``summary``, by column.
+    """Results of one controller in ``summary``, by column.
 
     Args:
         evaluation: the evaluation.
-        own: rows of the controller.
+        rows: rows of the controller.
         best: figures that give a share of 1, (B,); None is those of the optimum of all agents.
     """
-    base, figures = _base(own), _sample(own, _column(evaluation))
-    achieved = _sample(own, "achieved_figure")[:1] if best is None else best[None]
+    base, figures = _base(rows), _sample(rows, _column(evaluation))
+    achieved = _sample(rows, "achieved_figure")[:1] if best is None else best[None]
     of_weeks = 100.0 * (figures / base - 1.0)
     idle = dict(_groups(evaluation, ALL)).get(IDLE)
-    arrived = own["arrived_tasks"].sum(skipna=False)
+    arrived = rows["arrived_tasks"].sum(skipna=False)
+    # A bound has a figure and no metrics, and breaks no constraint.
+    checked = rows["broken"][rows["broken"].notna() & rows["cfp_kg"].notna()]
     return {
-        **_ends("change_pct", _interval(evaluation, change_pct, figures, base)),
-        **_ends("interquartile_mean_pct", _interval(evaluation, interquartile_mean, of_weeks)),
-        **_ends("share_pct", _interval(evaluation, share_pct, figures, base, achieved)),
+        **_interval(evaluation, "change_pct", change_pct, figures, base),
+        **_interval(evaluation, "interquartile_mean_pct", interquartile_mean, of_weeks),
+        **_interval(evaluation, "share_pct", share_pct, figures, base, achieved),
         **{
             name: math.nan
             if idle is None
-            else float(change_pct(_sample(own, metric), _sample(idle, metric)))
+            else float(change_pct(_sample(rows, metric), _sample(idle, metric)))
             for name, metric in _AGAINST_IDLE.items()
         },
-        "over_27_degree_h": float(own["over_27_degree_h"].mean()),
-        "overdue_task_h": float(own["overdue_task_h"].mean()),
-        "dropped_pct": 100.0 * float(own["dropped_tasks"].sum() / arrived) if arrived else 0.0,
-        "broken_pct": _broken_pct(own),
+        "over_27_degree_h": float(rows["over_27_degree_h"].mean()),
+        "overdue_task_h": float(rows["overdue_task_h"].mean()),
+        "dropped_pct": 100.0 * float(rows["dropped_tasks"].sum() / arrived) if arrived else 0.0,
+        "broken_pct": 100.0 * float((checked != "").mean()) if len(checked) else math.nan,
     }
 
 
-def _broken_pct(own: pd.DataFrame) -> float:
-    """Share of weeks that break a constraint, in %; nan without an optimum, and for its bound."""
-    known = own["broken"].notna() & own["cfp_kg"].notna()  # of the bound the figure alone is known
-    return 100.0 * float((own["broken"][known] != "").mean()) if known.any() else math.nan
-
-
-def _change(evaluation: Evaluation, own: pd.DataFrame) -> float:
-    """Change of some weeks against idle commands, in %."""
-    return float(change_pct(_sample(own, _column(evaluation)), _base(own)))
-
-
-def _interval(evaluation: Evaluation, statistic: Statistic, *samples: F64) -> Interval:
-    """A statistic with its interval, by the same draws whatever the row."""
+def _interval(
+    evaluation: Evaluation, name: str, statistic: Statistic, *samples: F64
+) -> dict[str, float]:
+    """Columns of a statistic and its interval, with the same draws for every row."""
     generator = np.random.Generator(np.random.PCG64(_SEED))
     paired = len(_base(evaluation.rows)) > 1
-    return bootstrap_interval(statistic, samples, evaluation.strata, generator, paired=paired)
-
-
-def _ends(name: str, interval: Interval) -> dict[str, float]:
-    """Columns of an interval."""
+    interval = bootstrap_interval(statistic, samples, evaluation.strata, generator, paired=paired)
     return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
 
 
 def _column(evaluation: Evaluation) -> str:
-    """Column of the figures that are compared."""
+    """Name of the column with the figures that are compared."""
     has_optimum = bool(evaluation.rows["achieved_figure"].notna().any())
     return "valued_figure" if has_optimum else "figure"
 
@@ -292,7 +282,7 @@ def _base(rows: pd.DataFrame) -> F64:
 
 
 def _sample(rows: pd.DataFrame, column: str) -> F64:
-    """Values by training and week, (S, W), of rows that follow each other week by week."""
+    """Values of a column by training and week, (S, W); rows are in the order of the weeks."""
     width = len(set(zip(rows["site"], rows["week"], strict=True)))
     return rows[column].to_numpy(np.float64).reshape(-1, width)
 
@@ -315,7 +305,6 @@ FORMAT = "sdc-evaluation/1"
 """Version of the format of evaluation.json."""
 EVALUATION_FILE, ROWS_FILE, TABLE_FILE = "evaluation.json", "rows.csv", "table.md"
 """Files of an evaluation."""
-_BOUND_IS_NONE = "none"
 
 
 def evaluation_content(
@@ -329,8 +318,8 @@ def evaluation_content(
 
     Args:
         evaluation: the evaluation.
-        weeks: the weeks that it is of.
-        command: command line that does it again.
+        weeks: the weeks of the evaluation.
+        command: command line that repeats the evaluation.
         folders: folders of its trainings or policies.
     """
     names = [n for n in dict.fromkeys(evaluation.rows.get("controller", ())) if is_compared(n)]
@@ -359,10 +348,10 @@ def evaluation_content(
 
 
 def remarks(weeks: DataCenterWeeks) -> list[str]:
-    """Sentences that warn of figures without an optimum, or whose ends are not valued.
+    """Warnings about weeks in which energy and work left at the end have no value.
 
     Args:
-        weeks: the weeks that it is of.
+        weeks: the weeks of the evaluation.
     """
     if weeks.optimum is None:
         return ["Without an optimum ends have no value: an empty battery or work put off saves."]
@@ -370,7 +359,7 @@ def remarks(weeks: DataCenterWeeks) -> list[str]:
     return [
         f"{name}: bound {kind}; ends that differ have no value there"
         for name, kind in zip(names, kinds, strict=True)
-        if kind.startswith(_BOUND_IS_NONE)
+        if kind.startswith("none")
     ]
 
 
@@ -379,31 +368,31 @@ def tables_of(evaluation: Evaluation, weeks: DataCenterWeeks) -> list[tuple[str,
 
     Args:
         evaluation: the evaluation.
-        weeks: the weeks that it is of.
+        weeks: the weeks of the evaluation.
     """
     names = [n for n in dict.fromkeys(evaluation.rows["controller"]) if is_compared(n)]
     days = weeks.steps // (24 * weeks.sim.fleet.steps_per_hour)
     scored = "day 2" if days == 2 else f"days 2 to {days}"
     title = f"{weeks.objective}, {scored} of {len(weeks.weeks)} data-center weeks, 95 % intervals"
-    found = [
+    tables = [
         (title, summary(evaluation)),
         ("against idle commands by site (%)", by_site(evaluation)),
         ("each agent alone, the others idle", by_agent(evaluation)),
     ]
     if names:
-        found.append((f"{names[0]} against the others", differences(evaluation, names[0])))
-    return [(title, table) for title, table in found if len(table)]
+        tables.append((f"{names[0]} against the others", differences(evaluation, names[0])))
+    return [(title, table) for title, table in tables if len(table)]
 
 
 def prepare_evaluation_folder(out: Path, *, force: bool = False) -> None:
-    """Make the folder of an evaluation, or see that its files may be replaced.
+    """Create the folder of an evaluation, or check that its files may be replaced.
 
     Args:
         out: the folder.
-        force: also take a folder with other files.
+        force: whether to accept a folder with other files.
 
     Raises:
-        SdcError: a file, a folder with other files, or one that cannot be made.
+        SdcError: ``out`` is a file, holds other files, or cannot be created.
     """
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out {out}: is a file; valid is a folder")
@@ -427,7 +416,7 @@ def write_evaluation(
     Args:
         out: the folder.
         evaluation: the evaluation.
-        weeks: the weeks that it is of.
+        weeks: the weeks of the evaluation.
         content: content of evaluation.json.
 
     Raises:
@@ -453,12 +442,6 @@ def content_json(content: Mapping[str, Any]) -> str:
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
-def _records(table: Any) -> list[dict[str, Any]]:
-    """Rows of a table for JSON, which has no nan."""
-    return [
-        {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in row.items()
-        }
-        for row in table.to_dict("records")
-    ]
+def _records(table: pd.DataFrame) -> Any:
+    """Rows of a table for JSON, with None for nan."""
+    return table.astype(object).where(table.notna(), None).to_dict("records")

@@ -1,18 +1,17 @@
-"""Policies: networks of a training with the interface that they fit, kept in a folder.
+"""Policies: networks of a training with the interface that they fit, and their files.
 
-``policy.safetensors`` holds the networks, and in its header everything else as JSON, so that it is
-whole or it is not there; ``policy.json`` is the header for people to read.
+``policy.safetensors`` holds the networks, and everything else as JSON in its header, so that a
+policy is one file; ``policy.json`` is a readable copy of the header.
 """
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -39,7 +38,7 @@ from sdc_taichi.user_file import decoding, read_bytes
 WEIGHTS, DESCRIPTION = "policy.safetensors", "policy.json"
 """Names of the files of a policy."""
 FOLDERS = ("best", "policy")
-"""Folders of a training run that may hold a policy, the one to prefer first."""
+"""Folders of a training that may hold a policy, in order of preference."""
 CHOICES = 3
 """Number of discrete actions for each number that an agent decides."""
 MOST_BYTES = 256_000_000
@@ -49,7 +48,7 @@ MOST_DECISION_STEPS = 96
 Activation = Literal["tanh", "relu"]
 """Function of the units of hidden layers."""
 SERIAL_PRODUCTS = 2_000_000
-"""Products of a call that one thread computes sooner than several are woken."""
+"""Multiplications of a call up to which one thread is faster than several."""
 Head = Literal["argmax", "clip", "tanh"]
 """How actions follow from the outputs of the last layer: ``argmax`` takes the choice of the highest
 score for each number that is decided; ``clip`` cuts outputs at -1 and 1; ``tanh`` takes their
@@ -86,26 +85,17 @@ class PolicyNetwork:
     """Number of scores for each number that is decided, with head ``argmax``."""
 
     def __post_init__(self) -> None:
-        """Check the values, and take arrays of their own in f32."""
+        """Check shapes and numbers, and copy the arrays as f32."""
         who = f"network of {', '.join(self.agents)}"
-        for name, valid in (("activation", Activation), ("head", Head)):
-            if getattr(self, name) not in get_args(valid):
-                raise SdcError(
-                    f"{who}: {name} {getattr(self, name)!r}; valid: {', '.join(get_args(valid))}"
-                )
-        if not 0.0 < self.clip < math.inf:
-            raise SdcError(f"{who}: clip {self.clip!r}; valid is a number above 0")
-        if not self.layers:
-            raise SdcError(f"{who}: has no layer")
         mean, std = (_numbers(getattr(self, n), f"{who}: {n}", 1) for n in ("mean", "std"))
         if std.shape != mean.shape or not len(mean) or std.min() <= 0.0:
             raise SdcError(
                 f"{who}: std {std.shape} of mean {mean.shape}; valid is above 0 for each"
             )
         layers, width = [], len(mean)
-        for i, (given_weight, given_bias) in enumerate(self.layers):
-            weight = _numbers(given_weight, f"{who}: weight of layer {i}", 2)
-            bias = _numbers(given_bias, f"{who}: bias of layer {i}", 1)
+        for i, arrays in enumerate(self.layers):
+            weight = _numbers(arrays[0], f"{who}: weight of layer {i}", 2)
+            bias = _numbers(arrays[1], f"{who}: bias of layer {i}", 1)
             if not len(bias) or weight.shape != (len(bias), width):
                 raise SdcError(
                     f"{who}: layer {i} has weight {weight.shape} and bias {bias.shape} after "
@@ -113,15 +103,12 @@ class PolicyNetwork:
                 )
             layers.append((weight, bias))
             width = len(bias)
-        if self.choices < 2:
-            raise SdcError(f"{who}: {self.choices} choices; valid is at least 2")
         if self.head == "argmax" and width % self.choices:
             raise SdcError(
                 f"{who}: {width} outputs; valid is a multiple of {self.choices} for argmax"
             )
         for name, value in (("mean", mean), ("std", std), ("layers", tuple(layers))):
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "clip", float(self.clip))
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -194,8 +181,8 @@ class Forward:
         size, blocks = len(inputs), -(-len(inputs) // ROWS)
         rows = np.zeros((blocks * ROWS, self._inputs), dtype=np.float32)
         rows[:size] = inputs
-        given = aligned((blocks, self._inputs, ROWS), np.float32)
-        given[:] = rows.reshape(blocks, ROWS, -1).transpose(0, 2, 1)
+        columns = aligned((blocks, self._inputs, ROWS), np.float32)
+        columns[:] = rows.reshape(blocks, ROWS, -1).transpose(0, 2, 1)
         outputs = aligned((blocks, _whole_units(self._outputs), ROWS), np.float32)
         serial = size * self._products <= SERIAL_PRODUCTS
         slices = 1 if serial else min(blocks, 4 * self._threads)
@@ -203,16 +190,16 @@ class Forward:
             serial=serial,
             slices=slices,
             blocks=blocks,
-            inputs=given,
+            inputs=columns,
             work=aligned((slices, 2 * self._widest, ROWS), np.float32),
             outputs=outputs,
         )
-        found = outputs.transpose(0, 2, 1).reshape(blocks * ROWS, -1)
-        return np.ascontiguousarray(found[:size, : self._outputs])
+        by_row = outputs.transpose(0, 2, 1).reshape(blocks * ROWS, -1)
+        return np.ascontiguousarray(by_row[:size, : self._outputs])
 
 
 def _whole_units(count: int) -> int:
-    """A number of units, filled up as the kernel computes them."""
+    """A number of units, rounded up to a multiple of ``UNITS``."""
     return -(-count // UNITS) * UNITS
 
 
@@ -260,10 +247,6 @@ class Policy:
 
     def __post_init__(self) -> None:
         """Check that the networks fit the interface."""
-        if not 1 <= self.decision_steps <= MOST_DECISION_STEPS:
-            raise SdcError(
-                f"policy: decision_steps {self.decision_steps!r}; valid is 1..{MOST_DECISION_STEPS}"
-            )
         served = [agent for network in self.networks for agent in network.agents]
         if sorted(served) != sorted(self.interface.agents):
             raise SdcError(
@@ -289,18 +272,18 @@ class Policy:
 
     def actions(self, observations: Mapping[str, F32]) -> dict[str, F32 | I64]:
         """Actions of each agent, (B, k), from the observations of each agent, (B, n)."""
-        found: dict[str, F32 | I64] = {}
+        by_agent: dict[str, F32 | I64] = {}
         for network, entries in zip(self.networks, self.entries, strict=True):
-            parts = [observations[agent][:, of_agent] for agent, of_agent in entries.items()]
+            parts = [observations[agent][:, columns] for agent, columns in entries.items()]
             actions = network.actions(parts[0] if len(parts) == 1 else np.concatenate(parts, 1))
             if network.head == "argmax" and self.interface.actions == "continuous":
                 actions = action_levels(network.choices)[np.asarray(actions, dtype=np.int64)]
             first = 0
             for agent in network.agents:
                 end = first + self.interface.action_width(agent)
-                found[agent] = actions[:, first:end]
+                by_agent[agent] = actions[:, first:end]
                 first = end
-        return {agent: found[agent] for agent in self.interface.agents}
+        return {agent: by_agent[agent] for agent in self.interface.agents}
 
     @cached_property
     def entries(self) -> tuple[dict[str, npt.NDArray[np.int64] | slice], ...]:
@@ -318,14 +301,7 @@ class Policy:
             about=self.about,
             interface=self.interface,
             networks=tuple(
-                _NetworkDescription(
-                    agents=network.agents,
-                    sizes=network.sizes,
-                    activation=network.activation,
-                    clip=network.clip,
-                    head=network.head,
-                    choices=network.choices,
-                )
+                _NetworkDescription.model_validate(network, from_attributes=True)
                 for network in self.networks
             ),
             decision_steps=self.decision_steps,
@@ -333,12 +309,12 @@ class Policy:
         return described.model_dump_json(indent=1)
 
     def save(self, folder: Path) -> None:
-        """Write the policy into a folder, in place of one that is there.
+        """Write the policy into a folder, replacing a policy that is already there.
 
-        Whoever reads finds the one before or this one, whole.
+        A concurrent reader gets either the complete old policy or the complete new one.
 
         Args:
-            folder: the folder, made if it is not there.
+            folder: the folder; created if it does not exist.
 
         Raises:
             SdcError: the files cannot be written.
@@ -359,13 +335,13 @@ class Policy:
 
     @classmethod
     def load(cls, folder: Path) -> Policy:
-        """Read the policy of a folder, or of the training run in it, the best one first.
+        """Read the policy of a folder, or of the training in it (the best one if there is one).
 
         Args:
             folder: the folder.
 
         Raises:
-            SdcError: no policy there, or a file that is damaged or of another kind.
+            SdcError: there is no policy, or its file is damaged or of another kind.
         """
         path = policy_folder(folder) / WEIGHTS
         content = read_bytes(path, MOST_BYTES)
@@ -410,9 +386,9 @@ def policy_folder(folder: Path) -> Path:
     Raises:
         SdcError: there is no such folder, or no policy in it.
     """
-    for found in (folder, *(folder / name for name in FOLDERS)):
-        if (found / WEIGHTS).exists():
-            return found
+    for candidate in (folder, *(folder / name for name in FOLDERS)):
+        if (candidate / WEIGHTS).exists():
+            return candidate
     if not folder.is_dir():
         raise SdcError(f"{folder}: no such folder; valid is that of a training run or a policy")
     raise SdcError(
@@ -424,11 +400,11 @@ class _NetworkDescription(Section):
     """Everything of a network but its arrays."""
 
     agents: tuple[str, ...]
-    sizes: tuple[int, ...]
+    sizes: tuple[int, ...] = Field(min_length=2)
     activation: Activation
-    clip: float
+    clip: float = Field(gt=0, allow_inf_nan=False)
     head: Head
-    choices: int
+    choices: int = Field(ge=2)
 
 
 class _Description(Section):
@@ -464,14 +440,10 @@ def _network(number: int, described: _NetworkDescription, tensors: dict[str, Any
         for i in range(len(described.sizes) - 1)
     )
     network = PolicyNetwork(
-        agents=described.agents,
         mean=take("mean"),
         std=take("std"),
-        clip=described.clip,
         layers=layers,
-        activation=described.activation,
-        head=described.head,
-        choices=described.choices,
+        **described.model_dump(exclude={"sizes"}),
     )
     if network.sizes != described.sizes:
         raise SdcError(
@@ -480,13 +452,13 @@ def _network(number: int, described: _NetworkDescription, tensors: dict[str, Any
     return network
 
 
-def _numbers(given: Any, what: str, ndim: int) -> F32:
-    """An array of finite numbers in f32, which nobody else can change."""
-    array = np.asarray(given)
+def _numbers(values: Any, what: str, ndim: int) -> F32:
+    """Read-only f32 copy of an array of finite numbers."""
+    array = np.asarray(values)
     if array.dtype.kind != "f" or array.ndim != ndim:
         raise SdcError(f"{what} is {array.dtype} {array.shape}; valid is {ndim}-D, of real numbers")
     if not np.all(np.isfinite(array)):
         raise SdcError(f"{what} has {array[~np.isfinite(array)].flat[0]}; valid is finite numbers")
-    own = np.array(array, dtype=np.float32, order="C")
-    own.flags.writeable = False
-    return own
+    copy = np.array(array, dtype=np.float32, order="C")
+    copy.flags.writeable = False
+    return copy

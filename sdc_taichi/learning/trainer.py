@@ -1,7 +1,7 @@
 """Training of policies by an algorithm in a stream of environments, and the files it writes.
 
-Each file of the folder is replaced as a whole, and the checkpoint last, so that the last one stays
-whatever ends a process.
+Each file of the folder is replaced as a whole, and the checkpoint last, so that a complete
+checkpoint exists however the process ends.
 """
 
 from __future__ import annotations
@@ -115,23 +115,24 @@ def train(
     on_stage: StageProgress | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Training:
-    """Train policies, and keep them in a folder.
+    """Train policies, and write them to a folder.
 
     Args:
         settings: settings of the training.
-        out: folder, made if need be.
-        resume: whether to go on with the training in the folder, to the same bits as if it had not
-            been interrupted; its settings must be those given, but that ``steps`` may be more.
-        cache: whether to read and keep optima of the validation weeks among the user's caches, or
-            a folder for them.
+        out: folder; created if it does not exist.
+        resume: whether to continue the training in the folder, to the same bits as without the
+            interruption. Its settings must equal ``settings``, except that ``steps`` may be larger.
+        cache: whether to read and write optima of the validation weeks in the user's cache, or a
+            folder for them.
         on_update: called after every update.
-        on_stage: is told of the stages of solving for the optima of the validation weeks.
-        stop: asked after every update; true ends the training, which can be resumed.
+        on_stage: progress callback ``(stage, done, total)`` of solving for the optima of the
+            validation weeks.
+        stop: called before every update; true ends the training, which can be resumed.
 
     Raises:
-        SdcError: the folder is not free, holds a training with other settings or is written by
-            another process; settings do not fit each other; a file cannot be written; or the
-            training diverges. Checkpoint and policies are those of the last checkpoint then.
+        SdcError: the folder holds other files or a training with other settings, or another
+            process writes to it; settings contradict each other; a file cannot be written; or the
+            training diverges. The last checkpoint and its policies stay.
     """
     path = Path(out)
     with _one_thread(), claimed(path, settings, resume=resume):
@@ -139,10 +140,10 @@ def train(
         try:
             if resume:
                 run.resume()
-            # Settings that do not fit leave the folder as it was.
+            # Only now: invalid settings leave the folder unchanged.
             write_settings(path, settings)
             with run.validation(cache, on_stage, stop) as weeks:
-                run.go_on(weeks, on_update or (lambda _: None), stop or (lambda: False))
+                run.update_all(weeks, on_update or (lambda _: None), stop or (lambda: False))
         finally:
             run.close()
         return run.result()
@@ -178,7 +179,7 @@ class _Run:
             env.close()
             raise
         self._fingerprint = _fingerprint(settings, env)
-        self._update = self._kept = 0
+        self._update = self._checkpoint_update = 0
         self._begun = time.perf_counter()
         self._best: Validation | None = None
 
@@ -187,7 +188,7 @@ class _Run:
         self._env.close()
 
     def resume(self) -> None:
-        """Go on from the checkpoint; from the beginning if the training had not come to one."""
+        """Continue from the checkpoint; start anew if the training has not written one."""
         path = self._folder / CHECKPOINT_FILE
         if not path.exists():
             return
@@ -197,7 +198,7 @@ class _Run:
                 raise SdcError("is of other data centers or inputs; valid is with those of then")
             self._stream.load_state_dict(saved["stream"])
             self._algorithm.load_state_dict(saved["algorithm"])
-            self._update = self._kept = int(saved["update"])
+            self._update = self._checkpoint_update = int(saved["update"])
             self._begun = time.perf_counter() - float(saved["seconds"])
             self._best = None if saved["best"] is None else Validation(*saved["best"])
         except SdcError as error:
@@ -217,22 +218,22 @@ class _Run:
         progress: StageProgress | None,
         stop: Callable[[], bool] | None,
     ) -> Iterator[DataCenterWeeks | None]:
-        """Prepared validation weeks; None if there are none, or if preparing them was stopped.
+        """Prepared validation weeks; None without validation, or if ``stop`` returned true.
 
         Raises:
-            SdcError: there is no optimum of them.
+            SdcError: their optimum cannot be computed.
         """
-        settings, chosen = self._settings, self._settings.validation
-        if not chosen.steps or self._update == self._updates:
+        settings, validation = self._settings, self._settings.validation
+        if not validation.steps or self._update == self._updates:
             yield None
             return
         try:
             weeks = prepare(
                 settings.data_centers_of_sites(),
-                VALIDATION if chosen.weeks == "validation" else chosen.weeks,
-                objective=chosen.objective,
-                optimum=chosen.optimum,
-                days=chosen.days,
+                VALIDATION if validation.weeks == "validation" else validation.weeks,
+                objective=validation.objective,
+                optimum=validation.optimum,
+                days=validation.days,
                 forecast_error=self._env.core.options.forecast_error,
                 precision=settings.precision,
                 cache=cache,
@@ -247,64 +248,75 @@ class _Run:
         with weeks:
             yield weeks
 
-    def go_on(
+    def update_all(
         self,
         weeks: DataCenterWeeks | None,
         on_update: Callable[[Progress], None],
         stop: Callable[[], bool],
     ) -> None:
-        """Update until all steps are done, or until told to stop.
+        """Make the updates that are left, or those until ``stop`` returns true.
 
         Raises:
             SdcError: the training diverges, or a file cannot be written.
         """
+        settings, folder = self._settings, self._folder
+        events = folder / EVENTS if settings.tensorboard else None
+        first_update, begun = self._update, time.perf_counter()
         try:
-            self._go_on(weeks, on_update, stop)
+            curves = CsvLog(folder / TRAINING_FILE, self._update)
+            validations = CsvLog(folder / VALIDATION_FILE, self._update)
+            with EventLog(events, after=self._steps) as log:
+                while self._update < self._updates and not stop():
+                    numbers = self._learn()
+                    curves.add(self._row() | numbers)
+                    log.add(numbers, self._steps)
+                    validation = None
+                    if weeks is not None and self._is_due(settings.validation.steps):
+                        validation = self._validate(weeks)
+                        results = validation._asdict()
+                        validations.add(self._row() | results)
+                        log.add({f"validation/{k}": x for k, x in results.items()}, self._steps)
+                    if self._is_due(settings.checkpoint_steps):
+                        self._write_checkpoint()
+                        log.flush()
+                    passed_s = time.perf_counter() - begun
+                    done = self._update - first_update
+                    on_update(
+                        Progress(
+                            update=self._update,
+                            updates=self._updates,
+                            steps=self._steps,
+                            passed_s=passed_s,
+                            steps_per_s=done * self._steps_each / passed_s,
+                            left_s=passed_s / done * (self._updates - self._update),
+                            numbers=numbers,
+                            validation=validation,
+                        )
+                    )
+            if self._checkpoint_update != self._update:
+                self._write_checkpoint()
         except SdcError as error:
-            kept = f"the checkpoint of update {self._kept} is kept"
-            raise SdcError(f"{error}; {kept if self._kept else 'no checkpoint yet'}") from None
-
-    def _go_on(
-        self,
-        weeks: DataCenterWeeks | None,
-        on_update: Callable[[Progress], None],
-        stop: Callable[[], bool],
-    ) -> None:
-        settings = self._settings
-        events = self._folder / EVENTS if settings.tensorboard else None
-        table = CsvLog(self._folder / TRAINING_FILE, self._update)
-        validations = CsvLog(self._folder / VALIDATION_FILE, self._update)
-        meter = _Speed(self._steps_each)
-        with EventLog(events, after=self._steps) as log:
-            while self._update < self._updates and not stop():
-                numbers = self._learn()
-                table.add(self._row() | numbers)
-                log.add(numbers, self._steps)
-                tried = None
-                if weeks is not None and self._is_due(settings.validation.steps):
-                    tried = self._validate(weeks)
-                    validations.add(self._row() | tried._asdict())
-                    log.add({f"validation/{k}": x for k, x in tried._asdict().items()}, self._steps)
-                if self._is_due(settings.checkpoint_steps):
-                    self._keep()
-                    log.flush()
-                on_update(meter.progress(self._update, self._updates, numbers, tried))
-        if self._kept != self._update:
-            self._keep()
+            checkpoint = "no checkpoint yet"
+            if self._checkpoint_update:
+                checkpoint = f"the checkpoint of update {self._checkpoint_update} is kept"
+            raise SdcError(f"{error}; {checkpoint}") from None
 
     def _row(self) -> dict[str, Any]:
-        """First entries of the rows of an update."""
-        seconds = round(self._seconds, 3)
-        return {"update": self._update, "steps": self._steps, "seconds": seconds}
+        """Columns that the rows of both curves begin with."""
+        return {
+            "update": self._update,
+            "steps": self._steps,
+            "seconds": round(self._seconds, 3),
+        }
 
     def _validate(self, weeks: DataCenterWeeks) -> Validation:
-        """Run the policy in the validation weeks, and save it if its figure is the least of all."""
+        """Run the policy in the validation weeks, and save it if its figure is the lowest so far."""
         policy = self._policy()
-        found = validate(PolicyController(policy, weeks.sim.fleet), weeks)
-        if self._best is None or found.change_pct < self._best.change_pct:
-            self._best = found
+        validation = validate(PolicyController(policy, weeks.sim.fleet), weeks)
+        if self._best is None or validation.change_pct < self._best.change_pct:
+            self._best = validation
             policy.save(self._folder / BEST_POLICY)
-        return found
+        return validation
 
     def result(self) -> Training:
         """Folder, length and best policy of the training."""
@@ -328,7 +340,7 @@ class _Run:
         return time.perf_counter() - self._begun
 
     def _is_due(self, interval: int) -> bool:
-        """Whether the last update is the last of all, or passed a multiple of a number of steps."""
+        """Whether the latest update is the final one, or passed a multiple of ``interval`` steps."""
         if self._update == self._updates:
             return True
         return self._steps // interval > (self._steps - self._steps_each) // interval
@@ -339,8 +351,8 @@ class _Run:
             numbers = self._algorithm.update(self._stream)
             numbers |= {f"return/{name}": x for name, x in self._stream.returns.items()}
             check_numbers(numbers)
-            for name, seen in self._stream.observations.items():
-                if not torch.isfinite(seen).all():
+            for name, observations in self._stream.observations.items():
+                if not torch.isfinite(observations).all():
                     raise SdcError(f"an observation of {name} is no finite number")
             self._algorithm.networks()
         except SdcError as error:
@@ -348,7 +360,7 @@ class _Run:
         self._update += 1
         return numbers
 
-    def _keep(self) -> None:
+    def _write_checkpoint(self) -> None:
         """Write the policy and a checkpoint.
 
         Raises:
@@ -364,7 +376,7 @@ class _Run:
             "stream": self._stream.state_dict(),
         }
         write_state(self._folder / CHECKPOINT_FILE, state)
-        self._kept = self._update
+        self._checkpoint_update = self._update
 
     def _policy(self) -> Policy:
         """The policy as it is."""
@@ -385,16 +397,16 @@ class _Run:
 
 
 class Algorithm(Protocol):
-    """A learner in a stream of environments that makes networks of policies."""
+    """A learning algorithm, which acts in a stream of environments and updates networks."""
 
     def update(self, stream: EnvironmentStream) -> dict[str, float]:
         """Act for some steps, learn, and return numbers to log by name."""
 
     def networks(self) -> tuple[PolicyNetwork, ...]:
-        """Networks of the policies as they are now."""
+        """Networks of the current policies."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the training goes on."""
+        """Complete state, from which the training continues to the same bits."""
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
         """Restore what ``state_dict`` of an algorithm of equal settings returned."""
@@ -423,34 +435,6 @@ def make_algorithm(
         case CrossEntropySettings():
             return CrossEntropySearch(settings, stream, updates=updates, seed=seed)
     raise TypeError(f"no algorithm has {type(settings).__name__}")
-
-
-class _Speed:
-    """Steps per second since the process began."""
-
-    def __init__(self, steps_each: int) -> None:
-        self._steps_each, self._begun, self._done = steps_each, time.perf_counter(), 0
-
-    def progress(
-        self,
-        update: int,
-        updates: int,
-        numbers: dict[str, float],
-        validation: Validation | None,
-    ) -> Progress:
-        """Progress of the training after one more update."""
-        self._done += 1
-        seconds = time.perf_counter() - self._begun
-        return Progress(
-            update=update,
-            updates=updates,
-            steps=update * self._steps_each,
-            passed_s=seconds,
-            steps_per_s=self._done * self._steps_each / seconds,
-            left_s=seconds / self._done * (updates - update),
-            numbers=numbers,
-            validation=validation,
-        )
 
 
 def make_env(settings: TrainingSettings) -> MultiAgentVectorEnv:
@@ -510,7 +494,7 @@ def check_numbers(numbers: Mapping[str, float]) -> None:
 
 
 def _fingerprint(settings: TrainingSettings, env: MultiAgentVectorEnv) -> str:
-    """Fingerprint of what a training learns from."""
+    """Fingerprint of the simulator and of all settings but ``steps``."""
     digest = hashlib.sha256(env.core.sim.fingerprint().encode())
     digest.update(settings.model_copy(update={"steps": 1}).to_yaml().encode())
     return digest.hexdigest()
